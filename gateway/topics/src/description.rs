@@ -1,0 +1,152 @@
+//! What the numbers mean: which channel, joint or contact has which name, kind, bus and longest silence.
+
+use crate::{Header, Kind, Nanos};
+use core::fmt;
+use iceoryx2_bb_derive_macros::ZeroCopySend;
+use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+
+/// A name of at most 63 bytes of UTF-8, ended by a zero byte.
+#[repr(C)]
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ZeroCopySend)]
+pub struct Name {
+    bytes: [u8; 64],
+}
+
+impl Name {
+    /// The longest name \[bytes\].
+    pub const CAPACITY: usize = 63;
+    /// No name.
+    pub const EMPTY: Self = Self { bytes: [0; 64] };
+
+    /// `text` as a name; `None` if it is longer than [`Name::CAPACITY`] bytes or holds a zero byte.
+    #[must_use]
+    pub fn new(text: &str) -> Option<Self> {
+        let mut bytes = [0; 64];
+        if text.len() > Self::CAPACITY || text.bytes().any(|b| b == 0) {
+            return None;
+        }
+        bytes.get_mut(..text.len())?.copy_from_slice(text.as_bytes());
+        Some(Self { bytes })
+    }
+
+    /// The text.
+    #[must_use]
+    pub fn as_str(&self) -> &str {
+        let end = self.bytes.iter().position(|&b| b == 0).unwrap_or(Self::CAPACITY);
+        let bytes = self.bytes.get(..end).unwrap_or_default();
+        core::str::from_utf8(bytes).unwrap_or("?")
+    }
+}
+
+impl fmt::Debug for Name {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Debug::fmt(self.as_str(), f)
+    }
+}
+
+impl fmt::Display for Name {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.as_str())
+    }
+}
+
+/// Who sends a description.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
+pub enum Publisher {
+    /// The gateway: channels of `<robot>/samples`.
+    Gateway = 0,
+    /// The estimator: joints of `<robot>/estimate/torque`, contacts of `<robot>/estimate/contact`, and the channels
+    /// that its reasons point to.
+    Estimator = 1,
+}
+
+/// What an entry's number counts.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
+pub enum Role {
+    /// `Sample::channel` (from the gateway), `JointTorque::cause` (from the estimator).
+    Channel = 0,
+    /// The index into `TorqueEstimate::joints`.
+    Joint = 1,
+    /// The index into `ContactEstimate::contacts`.
+    Contact = 2,
+}
+
+/// One named number.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
+pub struct Entry {
+    /// Its name.
+    pub name: Name,
+    /// For a contact, the frame its wrench is expressed in: axes and point. Otherwise empty.
+    pub frame: Name,
+    /// The longest time between two samples that is still normal \[ns\]; 0 where it has no meaning.
+    pub max_silence: Nanos,
+    /// What the number counts.
+    pub role: Role,
+    /// The number.
+    pub index: u32,
+    /// What it measures (channels), else `Kind::Joint` for a joint and `Kind::Wrench` for a contact.
+    pub kind: Kind,
+    /// The bus that a channel is on.
+    pub bus: u32,
+}
+
+/// The names behind the numbers of one publisher: the payload of `<robot>/description`, of which late readers get the last.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, ZeroCopySend)]
+#[type_name("proprio/Description/1")]
+pub struct Description {
+    /// When, in which order; `epoch` is that of the publisher's samples.
+    pub header: Header,
+    /// Who sends it.
+    pub publisher: Publisher,
+    /// How many of `entries` are set.
+    pub count: u32,
+    /// The entries.
+    pub entries: [Entry; Self::CAPACITY],
+}
+
+impl Description {
+    /// The most entries.
+    pub const CAPACITY: usize = crate::MAX_CHANNELS + crate::MAX_JOINTS + crate::MAX_CONTACTS;
+
+    /// The entries that are set.
+    #[must_use]
+    pub fn entries(&self) -> &[Entry] {
+        self.entries.get(..self.count as usize).unwrap_or(&self.entries)
+    }
+
+    /// The entry for number `index` of `role`.
+    #[must_use]
+    pub fn find(&self, role: Role, index: u32) -> Option<&Entry> {
+        self.entries().iter().find(|e| e.role == role && e.index == index)
+    }
+
+    /// The number that `name` has in `role`.
+    #[must_use]
+    pub fn index(&self, role: Role, name: &str) -> Option<u32> {
+        self.entries()
+            .iter()
+            .find(|e| e.role == role && e.name.as_str() == name)
+            .map(|e| e.index)
+    }
+}
+
+const _: () = assert!(size_of::<Entry>() == 152);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::string::ToString;
+
+    #[test]
+    fn names_hold_63_bytes_of_utf8() {
+        assert_eq!(Name::new("l_elbow").map(|n| n.to_string()).as_deref(), Some("l_elbow"));
+        let longest = "x".repeat(63);
+        assert_eq!(Name::new(&longest).as_ref().map(Name::as_str), Some(longest.as_str()));
+        assert!(Name::new(&"x".repeat(64)).is_none());
+        assert!(Name::new("a\0b").is_none());
+    }
+}

@@ -1,0 +1,322 @@
+//! One shared-memory domain: a directory and a name. Processes meet only inside one domain.
+
+use super::lock::{Lock, Patience};
+use super::sweep::{self, Place, SHM, Swept};
+use super::{DomainError, PortError};
+use iceoryx2::prelude::{
+    Config, FileName, LogLevel, Node, NodeBuilder, Path as IoxPath, SemanticString, ServiceName, SignalHandlingMode,
+    ipc, set_log_level_from_env_or,
+};
+use nix::unistd::{AccessFlags, access, geteuid};
+use std::borrow::ToOwned;
+use std::format;
+use std::fs::{self, DirBuilder};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::path::{Path, PathBuf};
+use std::string::{String, ToString};
+use std::sync::{Arc, Mutex, Once, PoisonError};
+
+/// Which domain: where its files are and what it is called.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DomainConfig {
+    /// The directory that holds the domains of this machine (or user, or test): absolute, at most 65 bytes.
+    pub base: PathBuf,
+    /// The domain's name: 1 to 32 letters, digits, `-` or `_`.
+    pub name: String,
+}
+
+impl DomainConfig {
+    /// A domain `name` under `base`.
+    #[must_use]
+    pub fn new(base: impl Into<PathBuf>, name: &str) -> Self {
+        Self {
+            base: base.into(),
+            name: name.to_owned(),
+        }
+    }
+
+    /// The domain that the environment names, else the default one.
+    ///
+    /// Name: `PROPRIO_DOMAIN`, else `default`. Base: `PROPRIO_RUNTIME_DIR`; else `/run/proprio` if it can be written (or
+    /// created), or if a domain of this name is there already; else `$XDG_RUNTIME_DIR/proprio`; else `/tmp/proprio-<uid>`.
+    #[must_use]
+    pub fn from_env() -> Self {
+        let set = |key| std::env::var_os(key).filter(|v| !v.is_empty());
+        let name = set("PROPRIO_DOMAIN").map_or_else(|| "default".to_owned(), |v| v.to_string_lossy().into_owned());
+        let base = set("PROPRIO_RUNTIME_DIR").map(PathBuf::from).unwrap_or_else(|| {
+            let system = PathBuf::from("/run/proprio");
+            let _ = DirBuilder::new().mode(0o755).create(&system);
+            // Somebody else's domain of that name is not passed over in silence: opening it tells whose it is.
+            if access(&system, AccessFlags::W_OK).is_ok() || system.join(format!("{name}.lock")).exists() {
+                return system;
+            }
+            match set("XDG_RUNTIME_DIR") {
+                Some(dir) => PathBuf::from(dir).join("proprio"),
+                None => PathBuf::from(format!("/tmp/proprio-{}", geteuid())),
+            }
+        });
+        Self { base, name }
+    }
+
+    fn place(&self) -> Result<Place, DomainError> {
+        let legal = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+        if self.name.is_empty() || self.name.len() > 32 || !self.name.chars().all(legal) {
+            return Err(DomainError::Name {
+                name: self.name.clone(),
+            });
+        }
+        // iceoryx2's paths end at 255 bytes; a connection's name needs 157 of them, the domain's 33.
+        if !self.base.is_absolute() || self.base.to_str().is_none_or(|b| b.len() > 65) {
+            return Err(DomainError::Base {
+                base: self.base.clone(),
+            });
+        }
+        let io = |doing| {
+            move |source| DomainError::Io {
+                doing,
+                path: self.base.clone(),
+                source,
+            }
+        };
+        DirBuilder::new()
+            .recursive(true)
+            .mode(0o755)
+            .create(&self.base)
+            .map_err(io("cannot create directory"))?;
+        let base = fs::metadata(&self.base).map_err(io("cannot examine directory"))?;
+        let (root, lock) = (
+            self.base.join(&self.name),
+            self.base.join(format!("{}.lock", self.name)),
+        );
+        for path in [&root, &lock] {
+            owned_by_us(path)?;
+        }
+        // /tmp is everybody's: a directory that somebody else has put there first must not be trusted.
+        if self.base.starts_with("/tmp") && base.mode() & 0o1000 == 0 {
+            owned_by_us(&self.base)?;
+        }
+        access(&self.base, AccessFlags::W_OK | AccessFlags::X_OK)
+            .map_err(|e| io("cannot write to directory")(e.into()))?;
+        access(SHM, AccessFlags::W_OK | AccessFlags::X_OK)
+            .map_err(|e| DomainError::NoSharedMemory { problem: e.into() })?;
+        // Two directories of the same path in different mount namespaces are two domains, though /dev/shm may be one.
+        let mut hash = Fnv::new();
+        hash.add(root.as_os_str().as_encoded_bytes());
+        hash.add(&base.dev().to_le_bytes());
+        hash.add(&base.ino().to_le_bytes());
+        Ok(Place {
+            root,
+            lock,
+            prefix: format!("proprio_{:016x}_", hash.0),
+        })
+    }
+}
+
+fn owned_by_us(path: &Path) -> Result<(), DomainError> {
+    let user = geteuid().as_raw();
+    match fs::symlink_metadata(path) {
+        Ok(meta) if meta.uid() != user => Err(DomainError::ForeignOwner {
+            path: path.to_path_buf(),
+            owner: meta.uid(),
+            user,
+        }),
+        _ => Ok(()),
+    }
+}
+
+/// An open domain. Clones share it; when the last of them and the last port are gone, so is its share of the domain,
+/// and with the last process the domain's files.
+#[derive(Debug, Clone)]
+pub struct Domain {
+    inner: Arc<Inner>,
+}
+
+#[derive(Debug)]
+struct Inner {
+    config: DomainConfig,
+    place: Place,
+    iceoryx: Config,
+    epoch: u64,
+    id: u128,
+    // `None` only while it is dropped.
+    node: Mutex<Option<Node<ipc::Service>>>,
+}
+
+impl Domain {
+    /// Opens the domain; creates it if it is not there. Removes what dead processes have left in it.
+    ///
+    /// Sets iceoryx2's log level of this process to `Fatal`, unless `IOX2_LOG_LEVEL` is set. Installs no signal handlers.
+    ///
+    /// # Errors
+    /// [`DomainError`]: a bad name or directory, no shared memory, no permission, another owner, or another process that holds the lock.
+    pub fn open(config: &DomainConfig) -> Result<Self, DomainError> {
+        static QUIET: Once = Once::new();
+        QUIET.call_once(|| set_log_level_from_env_or(LogLevel::Fatal));
+
+        let place = config.place()?;
+        let iceoryx = iceoryx(&place)?;
+        let _lock = Lock::take(&place.lock, Patience::Normal)?;
+        sweep::sweep(&place, &iceoryx)?;
+        let failed = |problem: String| DomainError::Transport {
+            root: place.root.clone(),
+            doing: "cannot create a node",
+            problem,
+        };
+        let node = NodeBuilder::new()
+            .config(&iceoryx)
+            .signal_handling_mode(SignalHandlingMode::Disabled)
+            .create::<ipc::Service>()
+            .map_err(|e| failed(e.to_string()))?;
+        let id = node.id().value();
+        sweep::register(&place, id);
+        let mut epoch = Fnv::new();
+        epoch.add(&id.to_le_bytes());
+        let inner = Inner {
+            config: config.clone(),
+            place,
+            iceoryx,
+            epoch: epoch.0.max(1),
+            id,
+            node: Mutex::new(Some(node)),
+        };
+        Ok(Self { inner: Arc::new(inner) })
+    }
+
+    /// Which domain it is.
+    #[must_use]
+    pub fn config(&self) -> &DomainConfig {
+        &self.inner.config
+    }
+
+    /// A number that is new each time a domain is opened: the epoch for the writers of a publisher that starts now.
+    #[must_use]
+    pub fn epoch(&self) -> u64 {
+        self.inner.epoch
+    }
+
+    /// Removes what dead processes have left. Opening a domain or a port does it too.
+    ///
+    /// # Errors
+    /// As [`Domain::open`].
+    pub fn sweep(&self) -> Result<Swept, DomainError> {
+        let _lock = Lock::take(&self.inner.place.lock, Patience::Normal)?;
+        sweep::sweep(&self.inner.place, &self.inner.iceoryx)
+    }
+
+    /// Removes all of a domain if nobody alive uses it; returns whether there is nothing left.
+    ///
+    /// The last process to leave a domain does it by itself. This is for whoever kills processes: a test, a demonstration.
+    ///
+    /// # Errors
+    /// As [`Domain::open`].
+    pub fn remove_if_unused(config: &DomainConfig) -> Result<bool, DomainError> {
+        let place = config.place()?;
+        let lock = Lock::take(&place.lock, Patience::Normal)?;
+        let swept = sweep::sweep(&place, &iceoryx(&place)?)?;
+        if swept.alive == 0 {
+            lock.remove();
+        }
+        Ok(swept.alive == 0)
+    }
+
+    /// Runs `create` under the domain's lock, after a sweep.
+    pub(super) fn locked<R>(
+        &self,
+        patience: Patience,
+        create: impl FnOnce(&Node<ipc::Service>) -> Result<R, PortError>,
+    ) -> Result<R, PortError> {
+        let _lock = Lock::take(&self.inner.place.lock, patience)?;
+        sweep::sweep(&self.inner.place, &self.inner.iceoryx)?;
+        match &*self.inner.node.lock().unwrap_or_else(PoisonError::into_inner) {
+            Some(node) => create(node),
+            None => Err(self.gone().into()),
+        }
+    }
+
+    /// Drops a port under the domain's lock, so that nobody sees it half removed.
+    pub(super) fn drop_locked<P>(&self, port: P) {
+        // Without the lock after all, if somebody stopped holds it: a program must be able to end.
+        let _lock = Lock::take(&self.inner.place.lock, Patience::Normal);
+        drop(port);
+    }
+
+    pub(super) fn iceoryx(&self) -> &Config {
+        &self.inner.iceoryx
+    }
+
+    /// The process that runs a node; 0 if it is not known.
+    pub(super) fn process_of(&self, node: u128) -> i32 {
+        sweep::holder_of(&self.inner.place, node)
+    }
+
+    fn gone(&self) -> DomainError {
+        DomainError::Transport {
+            root: self.inner.place.root.clone(),
+            doing: "cannot create a port",
+            problem: "the domain is being closed".to_owned(),
+        }
+    }
+}
+
+impl Drop for Inner {
+    fn drop(&mut self) {
+        let lock = Lock::take(&self.place.lock, Patience::Normal);
+        drop(self.node.lock().unwrap_or_else(PoisonError::into_inner).take());
+        sweep::deregister(&self.place, self.id);
+        if let Ok(lock) = lock
+            && sweep::sweep(&self.place, &self.iceoryx).is_ok_and(|s| s.alive == 0)
+        {
+            lock.remove();
+        }
+    }
+}
+
+/// The name of a robot's service.
+pub(super) fn service_name(robot: &str, suffix: &str) -> Result<ServiceName, PortError> {
+    let legal = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
+    if robot.is_empty() || robot.len() > 64 || !robot.chars().all(legal) {
+        return Err(PortError::Robot {
+            robot: robot.to_owned(),
+        });
+    }
+    let name = format!("{robot}/{suffix}");
+    ServiceName::new(&name).map_err(|e| PortError::Transport {
+        service: name,
+        problem: e.to_string(),
+    })
+}
+
+/// Every setting is explicit: iceoryx2's default reads `config/iceoryx2.toml` of whatever directory a consumer runs in.
+fn iceoryx(place: &Place) -> Result<Config, DomainError> {
+    let failed = |problem: String| DomainError::Transport {
+        root: place.root.clone(),
+        doing: "cannot name the domain's files",
+        problem,
+    };
+    let mut config = Config::default();
+    let root = place.root.as_os_str().as_encoded_bytes();
+    config.global.prefix = FileName::new(place.prefix.as_bytes()).map_err(|e| failed(format!("{e:?}")))?;
+    config
+        .global
+        .set_root_path(&IoxPath::new(root).map_err(|e| failed(format!("{e:?}")))?);
+    // All cleaning is ours: theirs runs without the lock.
+    config.global.node.cleanup_dead_nodes_on_creation = false;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
+    config.global.service.cleanup_dead_nodes_on_open = false;
+    Ok(config)
+}
+
+/// FNV-1a, 64 bits: a hash that is the same in every build.
+struct Fnv(u64);
+
+impl Fnv {
+    fn new() -> Self {
+        Self(0xcbf2_9ce4_8422_2325)
+    }
+
+    fn add(&mut self, bytes: &[u8]) {
+        for &byte in bytes {
+            self.0 = (self.0 ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
+        }
+    }
+}

@@ -1,0 +1,329 @@
+//! Takes the payloads of one topic, and tells what was lost and how old the last one is.
+
+use super::domain::service_name;
+use super::lock::Patience;
+use super::writer::explain;
+use super::{Domain, PortError, TakeError, Topic};
+use crate::{Header, Nanos};
+use iceoryx2::port::ReceiveError;
+use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
+use iceoryx2::prelude::{CallbackProgression, PortFactory as _, ipc};
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+use std::string::ToString;
+use std::vec::Vec;
+
+/// How old is what was read last.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Freshness {
+    /// Nothing has ever been read.
+    NeverSeen,
+    /// It is no older than allowed.
+    Fresh {
+        /// Its age \[ns\], from its acquisition.
+        age: Nanos,
+    },
+    /// It is older than allowed.
+    Stale {
+        /// Its age \[ns\], from its acquisition.
+        age: Nanos,
+    },
+}
+
+impl Freshness {
+    /// The freshness at `now` of what was acquired at `acquired`, when `max_age` is still fresh.
+    #[must_use]
+    pub fn of(acquired: Option<Nanos>, now: Nanos, max_age: Nanos) -> Self {
+        match acquired.map(|t| now.saturating_sub(t)) {
+            None => Self::NeverSeen,
+            Some(age) if age <= max_age => Self::Fresh { age },
+            Some(age) => Self::Stale { age },
+        }
+    }
+
+    /// Whether it is fresh.
+    #[must_use]
+    pub fn is_fresh(self) -> bool {
+        matches!(self, Self::Fresh { .. })
+    }
+}
+
+type Ports<T> = (Subscriber<ipc::Service, T, ()>, PortFactory<ipc::Service, T, ()>);
+
+/// The receiving end of a topic. Belongs to one thread: open it where it is used.
+///
+/// It stays open when its writers die and start again: what they send comes here.
+#[derive(Debug)]
+pub struct Reader<T: Topic> {
+    // Dropped under the domain's lock.
+    ports: Option<Ports<T>>,
+    domain: Domain,
+    tally: Tally,
+    last: Option<Header>,
+}
+
+impl<T: Topic> Reader<T> {
+    /// Opens `<robot>/<T::SUFFIX>`. Never creates it: the first to create a service fixes its quality, and that is the writer's to do.
+    ///
+    /// # Errors
+    /// [`PortError::NotYet`] if nobody offers it; [`PortError::Incompatible`] if it has another version; [`PortError::Full`];
+    /// [`PortError::Denied`]; others as [`Domain::open`].
+    pub fn open(domain: &Domain, robot: &str) -> Result<Self, PortError> {
+        Self::open_with(domain, robot, Patience::Normal)
+    }
+
+    /// Opens it when it is there: tries, and calls `again` (with the number of attempts so far) after each attempt that found nothing yet,
+    /// until that returns false. `again` sleeps and minds the deadline; nothing here reads a clock.
+    ///
+    /// # Errors
+    /// [`PortError::NotYet`] if `again` gave up; others as [`Reader::open`].
+    pub fn wait_open(domain: &Domain, robot: &str, mut again: impl FnMut(u32) -> bool) -> Result<Self, PortError> {
+        let mut attempts = 0;
+        loop {
+            match Self::open(domain, robot) {
+                Err(PortError::NotYet { service }) => {
+                    attempts += 1;
+                    if !again(attempts) {
+                        return Err(PortError::NotYet { service });
+                    }
+                }
+                other => return other,
+            }
+        }
+    }
+
+    pub(super) fn open_with(domain: &Domain, robot: &str, patience: Patience) -> Result<Self, PortError> {
+        let name = service_name(robot, T::SUFFIX)?;
+        let (subscriber, service, elders) = domain.locked(patience, |node| {
+            let service = node
+                .service_builder(&name)
+                .publish_subscribe::<T>()
+                .open()
+                .map_err(|e| explain::<T>(domain, &name, e))?;
+            let mut elders = Vec::new();
+            service.dynamic_config().list_publishers(|p| {
+                elders.push(p.publisher_id.value());
+                CallbackProgression::Continue
+            });
+            let subscriber = service.subscriber_builder().create().map_err(|e| match e {
+                SubscriberCreateError::ExceedsMaxSupportedSubscribers => PortError::Full {
+                    service: name.to_string(),
+                    what: "reader",
+                },
+                e => PortError::Transport {
+                    service: name.to_string(),
+                    problem: e.to_string(),
+                },
+            })?;
+            Ok((subscriber, service, elders))
+        })?;
+        Ok(Self {
+            ports: Some((subscriber, service)),
+            domain: domain.clone(),
+            tally: Tally::new(elders),
+            last: None,
+        })
+    }
+
+    /// The next payload of those waiting, in each writer's order; `None` if there is none. Never waits, never allocates.
+    ///
+    /// # Errors
+    /// [`TakeError`]; the reader stays usable.
+    pub fn try_take(&mut self) -> Result<Option<T>, TakeError> {
+        let Some((subscriber, _)) = &self.ports else {
+            return Err(TakeError::Internal);
+        };
+        let sample = subscriber.receive().map_err(|e| match e {
+            ReceiveError::ConnectionFailure(_) => TakeError::Connection,
+            ReceiveError::ExceedsMaxBorrows => TakeError::Internal,
+        })?;
+        let Some(sample) = sample else { return Ok(None) };
+        let value = *sample.payload();
+        let writer = sample.header().publisher_id().value();
+        drop(sample);
+        self.tally.count(writer, value.header());
+        self.last = Some(*value.header());
+        Ok(Some(value))
+    }
+
+    /// Takes all that is waiting and returns the newest; `None` if nothing is waiting.
+    ///
+    /// Ends even if a writer sends as fast as this reads: after as many payloads as can wait.
+    ///
+    /// # Errors
+    /// As [`Reader::try_take`].
+    pub fn latest(&mut self) -> Result<Option<T>, TakeError> {
+        let mut newest = None;
+        for _ in 0..T::QUALITY.buffer.saturating_mul(T::QUALITY.publishers) {
+            match self.try_take()? {
+                None => break,
+                some => newest = some,
+            }
+        }
+        Ok(newest)
+    }
+
+    /// How old at `now` is what was taken last, when `max_age` is still fresh.
+    #[must_use]
+    pub fn freshness(&self, now: Nanos, max_age: Nanos) -> Freshness {
+        Freshness::of(self.last.map(|h| h.acquired), now, max_age)
+    }
+
+    /// How many payloads did not arrive: gaps in the writers' sequence numbers. What a writer sent before this reader opened is not counted.
+    #[must_use]
+    pub fn lost(&self) -> u64 {
+        self.tally.lost
+    }
+
+    /// How many payloads were taken.
+    #[must_use]
+    pub fn taken(&self) -> u64 {
+        self.tally.taken
+    }
+
+    /// How many different epochs were seen: 1, and 1 more for each restart of a publisher.
+    #[must_use]
+    pub fn epochs(&self) -> u64 {
+        self.tally.epochs
+    }
+
+    /// How many writers there are now. One that died still counts until somebody opens a domain or a port.
+    #[must_use]
+    pub fn writers(&self) -> usize {
+        self.ports
+            .as_ref()
+            .map_or(0, |(_, service)| service.dynamic_config().number_of_publishers())
+    }
+}
+
+impl<T: Topic> Drop for Reader<T> {
+    fn drop(&mut self) {
+        let ports = self.ports.take();
+        self.domain.drop_locked(ports);
+    }
+}
+
+/// The last writers seen and what comes next from each; a fixed number of them, so that counting never allocates.
+#[derive(Debug)]
+struct Tally {
+    /// Writers older than the reader: their first payload seen may have any number. All others begin at 0.
+    elders: Vec<u128>,
+    writers: [Option<Seen>; Self::WRITERS],
+    known_epochs: [u64; Self::WRITERS],
+    taken: u64,
+    lost: u64,
+    epochs: u64,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Seen {
+    writer: u128,
+    next: u64,
+    last_taken: u64,
+}
+
+impl Tally {
+    /// Twice the writers of the topic that has most.
+    const WRITERS: usize = 2 * crate::MAX_BUSES;
+
+    fn new(elders: Vec<u128>) -> Self {
+        Self {
+            elders,
+            writers: [None; Self::WRITERS],
+            known_epochs: [0; Self::WRITERS],
+            taken: 0,
+            lost: 0,
+            epochs: 0,
+        }
+    }
+
+    fn count(&mut self, writer: u128, header: &Header) {
+        self.taken += 1;
+        if !self.known_epochs.contains(&header.epoch) || (header.epoch == 0 && self.epochs == 0) {
+            let len = self.known_epochs.len() as u64;
+            // The oldest is forgotten.
+            if let Some(place) = self.known_epochs.get_mut((self.epochs % len) as usize) {
+                *place = header.epoch;
+            }
+            self.epochs += 1;
+        }
+        let next = header.sequence.saturating_add(1);
+        if let Some(seen) = self.writers.iter_mut().flatten().find(|s| s.writer == writer) {
+            self.lost = self.lost.saturating_add(header.sequence.saturating_sub(seen.next));
+            seen.next = next;
+            seen.last_taken = self.taken;
+            return;
+        }
+        if !self.elders.contains(&writer) {
+            self.lost = self.lost.saturating_add(header.sequence);
+        }
+        // A free place, else that of the writer not heard of for longest: it is dead.
+        let place = self.writers.iter_mut().min_by_key(|s| s.map_or(0, |s| s.last_taken));
+        if let Some(place) = place {
+            *place = Some(Seen {
+                writer,
+                next,
+                last_taken: self.taken,
+            });
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::vec;
+
+    fn header(epoch: u64, sequence: u64) -> Header {
+        Header {
+            epoch,
+            sequence,
+            ..Header::default()
+        }
+    }
+
+    #[test]
+    fn gaps_are_counted_per_writer() {
+        let mut tally = Tally::new(vec![1]);
+        for (writer, epoch, sequence, lost) in [
+            (1, 7, 100, 0), // older than the reader: no loss
+            (1, 7, 101, 0),
+            (2, 8, 0, 0),
+            (1, 7, 104, 2),
+            (2, 8, 1, 2),
+            (3, 9, 5, 7), // younger: its first five are lost
+            (3, 9, 6, 7),
+        ] {
+            tally.count(writer, &header(epoch, sequence));
+            assert_eq!(tally.lost, lost, "writer {writer} sequence {sequence}");
+        }
+        assert_eq!((tally.epochs, tally.taken), (3, 7));
+    }
+
+    #[test]
+    fn any_number_of_restarts_is_counted() {
+        let mut tally = Tally::new(vec![]);
+        for restart in 0..100 {
+            tally.count(u128::from(restart), &header(1000 + restart, 0));
+            tally.count(u128::from(restart), &header(1000 + restart, 1));
+        }
+        assert_eq!((tally.epochs, tally.lost), (100, 0));
+    }
+
+    #[test]
+    fn freshness_is_a_comparison_of_ages() {
+        let max_age = Nanos(10);
+        assert_eq!(Freshness::of(None, Nanos(5), max_age), Freshness::NeverSeen);
+        assert_eq!(
+            Freshness::of(Some(Nanos(0)), Nanos(10), max_age),
+            Freshness::Fresh { age: Nanos(10) }
+        );
+        assert_eq!(
+            Freshness::of(Some(Nanos(0)), Nanos(11), max_age),
+            Freshness::Stale { age: Nanos(11) }
+        );
+        assert!(
+            Freshness::of(Some(Nanos(12)), Nanos(11), max_age).is_fresh(),
+            "stamped by a clock a little ahead"
+        );
+    }
+}

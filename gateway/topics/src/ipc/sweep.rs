@@ -1,0 +1,331 @@
+//! Removes what dead processes have left. Everything here runs under the domain's lock, when nothing of a live process is half made.
+//!
+//! iceoryx2's own cleaning handles a process that died in steady state. It hangs on an empty segment, ignores a node that died
+//! before its monitor file was finished, and knows nothing of services whose last user died while it removed them. So the
+//! unfinished is removed first, then iceoryx2 cleans the dead nodes, then all that has no live owner goes.
+
+use super::DomainError;
+use iceoryx2::node::NodeView;
+use iceoryx2::prelude::{CallbackProgression, Config, Node, NodeState, ipc};
+use iceoryx2::service::Service;
+use nix::fcntl::{FcntlArg, fcntl};
+use nix::libc;
+use std::borrow::ToOwned;
+use std::collections::BTreeSet;
+use std::ffi::OsString;
+use std::fs::{self, Metadata, OpenOptions};
+use std::io;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+use std::string::{String, ToString};
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+use std::vec::Vec;
+
+pub(super) const SHM: &str = "/dev/shm";
+
+/// What a sweep has removed.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Swept {
+    /// Dead nodes (processes).
+    pub nodes: usize,
+    /// Shared-memory segments: unfinished, or without a live owner.
+    pub segments: usize,
+    /// Services: unfinished, or without a live user.
+    pub services: usize,
+    /// Dead nodes that could not be removed; tried again next time.
+    pub failures: usize,
+    /// Nodes that are alive, in this process and in others.
+    pub alive: usize,
+}
+
+/// Where a domain's files are.
+#[derive(Debug, Clone)]
+pub(super) struct Place {
+    /// `<base>/<name>`.
+    pub(super) root: PathBuf,
+    /// `<base>/<name>.lock`.
+    pub(super) lock: PathBuf,
+    /// What the names of its segments and files begin with.
+    pub(super) prefix: String,
+}
+
+/// The nodes of this process: (prefix of the domain, number). Their files must never be opened here: closing any
+/// descriptor of a file frees all of the process's POSIX locks on it, and the locks are how others see that we live.
+static OWN: Mutex<Vec<(String, u128)>> = Mutex::new(Vec::new());
+
+pub(super) fn register(place: &Place, node: u128) {
+    OWN.lock()
+        .unwrap_or_else(PoisonError::into_inner)
+        .push((place.prefix.clone(), node));
+}
+
+pub(super) fn deregister(place: &Place, node: u128) {
+    OWN.lock()
+        .unwrap_or_else(PoisonError::into_inner)
+        .retain(|(p, n)| (p, *n) != (&place.prefix, node));
+}
+
+fn is_own(place: &Place, node: u128) -> bool {
+    OWN.lock()
+        .unwrap_or_else(PoisonError::into_inner)
+        .iter()
+        .any(|(p, n)| (p, *n) == (&place.prefix, node))
+}
+
+/// Removes what the dead have left; with nobody alive, everything (and the directory itself).
+pub(super) fn sweep(place: &Place, config: &Config) -> Result<Swept, DomainError> {
+    let mut swept = Swept::default();
+    let nodes = place.nodes()?;
+    let (alive, dead): (Vec<u128>, Vec<u128>) = nodes
+        .into_iter()
+        .partition(|&n| is_own(place, n) || monitor_holder(&place.monitor(n)).is_some());
+    swept.alive = alive.len();
+    if alive.is_empty() {
+        swept.nodes = dead.len();
+        for (path, _) in place.segments()? {
+            swept.segments += usize::from(remove(&path));
+        }
+        swept.services = list(&place.root.join("services"))?.len();
+        return match fs::remove_dir_all(&place.root) {
+            Err(source) if source.kind() != io::ErrorKind::NotFound => Err(DomainError::Io {
+                doing: "cannot remove",
+                path: place.root.clone(),
+                source,
+            }),
+            _ => Ok(swept),
+        };
+    }
+
+    // Unfinished, therefore dead: a segment is created with mode 0200 and no size, a service file with mode 0600.
+    for (path, meta) in place.segments()? {
+        if meta.len() == 0 || meta.permissions().mode() & 0o400 == 0 {
+            swept.segments += usize::from(remove(&path));
+        }
+    }
+    for (path, meta) in list(&place.root.join("services"))? {
+        if meta.permissions().mode() & 0o200 != 0 {
+            swept.services += usize::from(remove(&path));
+        }
+    }
+
+    if !dead.is_empty() {
+        clean_dead(place, config, &dead, &mut swept);
+    }
+    remove_ownerless(place, config, &mut swept)?;
+    Ok(swept)
+}
+
+fn clean_dead(place: &Place, config: &Config, dead: &[u128], swept: &mut Swept) {
+    let mut failed = BTreeSet::new();
+    let _ = Node::<ipc::Service>::list(config, |state| {
+        // Without its details, iceoryx2 would take another domain's configuration; such a node has no ports any more.
+        if let NodeState::Dead(view) = state
+            && view.details().is_some()
+        {
+            let id = view.id().value();
+            if dead.contains(&id)
+                && view
+                    .blocking_remove_stale_resources(Duration::from_millis(100))
+                    .is_err()
+            {
+                failed.insert(id);
+            }
+        }
+        CallbackProgression::Continue
+    });
+    for &node in dead {
+        if failed.contains(&node) {
+            swept.failures += 1;
+            continue;
+        }
+        swept.nodes += 1;
+        let _ = fs::remove_dir_all(place.node(node));
+        for suffix in ["", "_owner_lock", "_context"] {
+            let mut name = place.monitor(node).into_os_string();
+            name.push(suffix);
+            remove(Path::new(&name));
+        }
+    }
+}
+
+fn remove_ownerless(place: &Place, config: &Config, swept: &mut Swept) -> Result<(), DomainError> {
+    // A service without a tag of a live node, a segment without a tag of a live port.
+    let (mut services, mut ports) = (BTreeSet::new(), BTreeSet::new());
+    for node in place.nodes()? {
+        for (path, _) in list(&place.node(node))? {
+            match place.strip(&path) {
+                Some((name, "service_tag")) => drop(services.insert(name.to_owned())),
+                Some((name, "port_tag")) => drop(name.parse::<u128>().map(|p| ports.insert(p))),
+                _ => {}
+            }
+        }
+    }
+    let mut files = 0;
+    for (path, _) in list(&place.root.join("services"))? {
+        if let Some((name, "service")) = place.strip(&path) {
+            if services.contains(name) {
+                files += 1;
+            } else {
+                swept.services += usize::from(remove(&path));
+            }
+        }
+    }
+    let segments = place.segments()?;
+    let dynamic = segments
+        .iter()
+        .filter(|(p, _)| matches!(place.strip_segment(p), Some((_, "dynamic"))))
+        .count();
+    let mut known = BTreeSet::new();
+    if dynamic > files {
+        let _ = ipc::Service::list(config, |details| {
+            known.insert(details.static_details.unique_service_id().value());
+            CallbackProgression::Continue
+        });
+    }
+    for (path, _) in segments {
+        let ownerless = match place.strip_segment(&path) {
+            Some((name, "data")) => number(name).is_some_and(|p| !ports.contains(&p)),
+            Some((name, "connection")) => match name.split_once('_').map(|(s, r)| (number(s), number(r))) {
+                Some((Some(sender), Some(receiver))) => !ports.contains(&sender) && !ports.contains(&receiver),
+                _ => false,
+            },
+            // Only when every service file could be read: otherwise one that is in use might look unknown.
+            Some((name, "dynamic")) => {
+                dynamic > files && known.len() == files && number(name).is_some_and(|s| !known.contains(&s))
+            }
+            _ => false,
+        };
+        if ownerless {
+            swept.segments += usize::from(remove(&path));
+        }
+    }
+    Ok(())
+}
+
+/// A name that is a number and nothing else; what looks otherwise is not ours to judge.
+fn number(name: &str) -> Option<u128> {
+    name.parse().ok()
+}
+
+/// The process that holds the lock of a node's monitor file; `None` if the node is dead. 0 where it cannot be told.
+fn monitor_holder(path: &Path) -> Option<i32> {
+    let file = match OpenOptions::new().write(true).open(path) {
+        Ok(file) => file,
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return None,
+        // What cannot be examined must not be removed.
+        Err(_) => return Some(0),
+    };
+    #[allow(
+        clippy::cast_possible_truncation,
+        reason = "the constants are small; their type differs from the fields'"
+    )]
+    let mut query = libc::flock {
+        l_type: libc::F_WRLCK as i16,
+        l_whence: libc::SEEK_SET as i16,
+        l_start: 0,
+        l_len: 0,
+        l_pid: 0,
+    };
+    match fcntl(&file, FcntlArg::F_GETLK(&mut query)) {
+        #[allow(clippy::cast_possible_truncation, reason = "as above")]
+        Ok(_) if query.l_type == libc::F_UNLCK as i16 => None,
+        Ok(_) => Some(query.l_pid),
+        Err(_) => Some(0),
+    }
+}
+
+/// The process that runs a node of another process; 0 if it is not known.
+pub(super) fn holder_of(place: &Place, node: u128) -> i32 {
+    if is_own(place, node) {
+        return i32::try_from(std::process::id()).unwrap_or(0);
+    }
+    monitor_holder(&place.monitor(node)).unwrap_or(0)
+}
+
+/// Whether the file is gone by our doing.
+fn remove(path: &Path) -> bool {
+    fs::remove_file(path).is_ok()
+}
+
+/// The files of a directory; none if it is not there.
+fn list(path: &Path) -> Result<Vec<(PathBuf, Metadata)>, DomainError> {
+    let io = |source| DomainError::Io {
+        doing: "cannot list",
+        path: path.to_path_buf(),
+        source,
+    };
+    let entries = match fs::read_dir(path) {
+        Ok(entries) => entries,
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(e) => return Err(io(e)),
+    };
+    let mut files = Vec::new();
+    for entry in entries {
+        let path = entry.map_err(io)?.path();
+        // It may be gone by now: /dev/shm is everybody's.
+        if let Ok(meta) = fs::symlink_metadata(&path) {
+            files.push((path, meta));
+        }
+    }
+    Ok(files)
+}
+
+impl Place {
+    fn node(&self, node: u128) -> PathBuf {
+        self.root.join("nodes").join(node.to_string())
+    }
+
+    fn monitor(&self, node: u128) -> PathBuf {
+        let mut name = self.prefix.clone();
+        name.push_str(&node.to_string());
+        name.push_str(".node_monitor");
+        self.root.join("nodes").join(name)
+    }
+
+    /// The nodes that have left any trace.
+    fn nodes(&self) -> Result<BTreeSet<u128>, DomainError> {
+        let mut nodes = BTreeSet::new();
+        for (path, meta) in list(&self.root.join("nodes"))? {
+            let name = path
+                .file_name()
+                .map(|n| n.to_string_lossy().into_owned())
+                .unwrap_or_default();
+            let id = if meta.is_dir() {
+                number(&name)
+            } else {
+                name.strip_prefix(&self.prefix)
+                    .and_then(|n| n.split_once('.'))
+                    .and_then(|(n, _)| number(n))
+            };
+            nodes.extend(id);
+        }
+        Ok(nodes)
+    }
+
+    /// The domain's shared-memory segments that belong to this user.
+    fn segments(&self) -> Result<Vec<(PathBuf, Metadata)>, DomainError> {
+        let user = nix::unistd::geteuid().as_raw();
+        let mut segments = list(Path::new(SHM))?;
+        segments.retain(|(path, meta)| {
+            let name = path.file_name().map(OsString::from).unwrap_or_default();
+            meta.uid() == user && name.to_string_lossy().starts_with(&self.prefix)
+        });
+        Ok(segments)
+    }
+
+    /// A segment's name without prefix and type (40 hexadecimal digits and `_`), and its suffix.
+    fn strip_segment<'a>(&self, path: &'a Path) -> Option<(&'a str, &'a str)> {
+        let (name, suffix) = self.strip(path)?;
+        let (kind, name) = name.split_once('_')?;
+        (kind.len() == 40 && kind.bytes().all(|b| b.is_ascii_hexdigit())).then_some((name, suffix))
+    }
+
+    /// A file's name without prefix, and its suffix.
+    fn strip<'a>(&self, path: &'a Path) -> Option<(&'a str, &'a str)> {
+        path.file_name()?
+            .to_str()?
+            .strip_prefix(self.prefix.as_str())?
+            .rsplit_once('.')
+    }
+}

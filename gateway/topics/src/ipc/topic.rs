@@ -1,0 +1,139 @@
+//! The services: which payload travels under which name, and with which quality of service. Nowhere else.
+
+use crate::{
+    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth, Header, Sample, TorqueEstimate,
+};
+use core::fmt::Debug;
+use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+
+/// The quality of service of one service; the first process to create the service fixes it.
+///
+/// A publisher reserves `subscribers * (buffer + 2) + history` payloads in shared memory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct QualityOfService {
+    /// The most writers at one time. 1 where a second writer would be a mistake.
+    pub publishers: usize,
+    /// The most readers at one time.
+    pub subscribers: usize,
+    /// The most processes (domains opened) at one time, writers and readers together.
+    pub nodes: usize,
+    /// How many payloads of each writer wait for a reader; then the oldest is replaced.
+    pub buffer: usize,
+    /// How many of its last payloads a writer hands to a reader that comes late.
+    pub history: usize,
+}
+
+/// A payload that has a service of its own: `<robot>/<SUFFIX>`.
+///
+/// The version of its layout is in its type name (`proprio/Sample/1`): a reader of another version gets
+/// `PortError::Incompatible`, never a misread payload. The next service is one more implementation of this trait.
+pub trait Topic: ZeroCopySend + Copy + Debug + 'static {
+    /// The service's name after the robot's.
+    const SUFFIX: &'static str;
+    /// Its quality of service.
+    const QUALITY: QualityOfService;
+
+    /// The header.
+    fn header(&self) -> &Header;
+    /// The header, to be filled by the writer.
+    fn header_mut(&mut self) -> &mut Header;
+}
+
+macro_rules! topic {
+    ($payload:ty, $suffix:literal, $quality:expr) => {
+        impl Topic for $payload {
+            const SUFFIX: &'static str = $suffix;
+            const QUALITY: QualityOfService = $quality;
+            fn header(&self) -> &Header {
+                &self.header
+            }
+            fn header_mut(&mut self) -> &mut Header {
+                &mut self.header
+            }
+        }
+    };
+}
+
+const NODES: usize = 64;
+
+// One publisher per bus. 2048 samples are a second of 20 channels at 100 Hz per bus; 20 MB per bus.
+topic!(
+    Sample,
+    "samples",
+    QualityOfService {
+        publishers: crate::MAX_BUSES,
+        subscribers: 40,
+        nodes: NODES,
+        buffer: 2048,
+        history: 0
+    }
+);
+// The gateway's and the estimator's, and one more of each while a predecessor is still going.
+topic!(
+    Description,
+    "description",
+    QualityOfService {
+        publishers: 4,
+        subscribers: 40,
+        nodes: NODES,
+        buffer: 4,
+        history: 1
+    }
+);
+// A control loop wants the newest; 256 let a recorder pause for a quarter of a second at 1 kHz.
+topic!(
+    TorqueEstimate,
+    "estimate/torque",
+    QualityOfService {
+        publishers: 1,
+        subscribers: 24,
+        nodes: NODES,
+        buffer: 256,
+        history: 0
+    }
+);
+topic!(
+    ContactEstimate,
+    "estimate/contact",
+    QualityOfService {
+        publishers: 1,
+        subscribers: 24,
+        nodes: NODES,
+        buffer: 256,
+        history: 0
+    }
+);
+topic!(
+    ContactDeclaration,
+    "contact/declared",
+    QualityOfService {
+        publishers: 8,
+        subscribers: 8,
+        nodes: NODES,
+        buffer: 64,
+        history: 1
+    }
+);
+// One gateway and one estimator per robot: the health service admits one publisher, so the second is refused.
+topic!(
+    GatewayHealth,
+    "health/gateway",
+    QualityOfService {
+        publishers: 1,
+        subscribers: 16,
+        nodes: NODES,
+        buffer: 8,
+        history: 1
+    }
+);
+topic!(
+    EstimatorHealth,
+    "health/estimator",
+    QualityOfService {
+        publishers: 1,
+        subscribers: 16,
+        nodes: NODES,
+        buffer: 8,
+        history: 1
+    }
+);

@@ -1,0 +1,248 @@
+//! Sends the payloads of one topic. Never waits for a reader.
+
+use super::domain::service_name;
+use super::lock::Patience;
+use super::{Domain, PortError, SendError, Topic};
+use crate::Nanos;
+use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::port::{LoanError, SendError as IoxSendError};
+use iceoryx2::prelude::{
+    BackpressureStrategy, CallbackProgression, MessagingPattern, PortFactory as _, ServiceName, ipc,
+};
+use iceoryx2::service::Service;
+use iceoryx2::service::builder::publish_subscribe::{
+    PublishSubscribeOpenError as OpenError, PublishSubscribeOpenOrCreateError as OpenOrCreateError,
+};
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+use iceoryx2::service::static_config::message_type_details::{TypeDetail, TypeVariant};
+use std::format;
+use std::string::{String, ToString};
+
+/// What became of a payload.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Sent {
+    /// Its number in `header.sequence`.
+    pub sequence: u64,
+    /// How many readers have it.
+    pub readers: usize,
+    /// How many reader connections were made for it: the only work in `send` that is not constant (a few mapped files each).
+    pub connected: usize,
+}
+
+type Ports<T> = (Publisher<ipc::Service, T, ()>, PortFactory<ipc::Service, T, ()>);
+
+/// The sending end of a topic. Belongs to one thread: create it where it is used.
+#[derive(Debug)]
+pub struct Writer<T: Topic> {
+    // Dropped under the domain's lock.
+    ports: Option<Ports<T>>,
+    domain: Domain,
+    epoch: u64,
+    sequence: u64,
+    readers: usize,
+}
+
+impl<T: Topic> Writer<T> {
+    /// A writer of `<robot>/<T::SUFFIX>`; creates the service if it is not there.
+    ///
+    /// `epoch` goes into every header: one for all writers of a publisher, new at each of its starts ([`Domain::epoch`]).
+    /// A gateway (estimator) creates the writer of its health first: that is how it finds out that it is the only one of its robot.
+    ///
+    /// # Errors
+    /// [`PortError::Taken`] if the topic has all the writers that it admits; [`PortError::Incompatible`] if somebody alive
+    /// uses another version of the topic; others as [`Domain::open`].
+    pub fn create(domain: &Domain, robot: &str, epoch: u64) -> Result<Self, PortError> {
+        let name = service_name(robot, T::SUFFIX)?;
+        let quality = T::QUALITY;
+        let (publisher, service) = domain.locked(Patience::Normal, |node| {
+            let service = node
+                .service_builder(&name)
+                .publish_subscribe::<T>()
+                .max_publishers(quality.publishers)
+                .max_subscribers(quality.subscribers)
+                .max_nodes(quality.nodes)
+                .subscriber_max_buffer_size(quality.buffer)
+                .subscriber_max_borrowed_samples(2)
+                .history_size(quality.history)
+                .enable_safe_overflow(true)
+                .open_or_create()
+                .map_err(|e| match e {
+                    OpenOrCreateError::PublishSubscribeOpenError(e) => explain::<T>(domain, &name, e),
+                    e => PortError::Transport {
+                        service: name.to_string(),
+                        problem: e.to_string(),
+                    },
+                })?;
+            let publisher = service
+                .publisher_builder()
+                .max_loaned_samples(1)
+                .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .create()
+                .map_err(|e| match e {
+                    PublisherCreateError::ExceedsMaxSupportedPublishers => {
+                        let mut holder = 0;
+                        service.dynamic_config().list_publishers(|p| {
+                            holder = domain.process_of(p.node_id.value());
+                            CallbackProgression::Stop
+                        });
+                        PortError::Taken {
+                            service: name.to_string(),
+                            most: quality.publishers,
+                            holder,
+                        }
+                    }
+                    e => PortError::Transport {
+                        service: name.to_string(),
+                        problem: e.to_string(),
+                    },
+                })?;
+            Ok((publisher, service))
+        })?;
+        let readers = service.dynamic_config().number_of_subscribers();
+        Ok(Self {
+            ports: Some((publisher, service)),
+            domain: domain.clone(),
+            epoch,
+            sequence: 0,
+            readers,
+        })
+    }
+
+    /// Sends a copy of `value`, with epoch, sequence number and `published` (now \[ns\]) in its header.
+    ///
+    /// A reader that does not keep up loses its oldest payloads. One allocation of 48 bytes in iceoryx2, none of our own; no system call
+    /// unless a reader has come or gone.
+    ///
+    /// # Errors
+    /// [`SendError`]; the sequence number is used up, so that readers count the loss.
+    pub fn send(&mut self, value: &T, published: Nanos) -> Result<Sent, SendError> {
+        let connected = self.newcomers();
+        let sequence = self.sequence;
+        self.sequence += 1;
+        let Some((publisher, _)) = &self.ports else {
+            return Err(SendError::Internal);
+        };
+        let mut sample = publisher
+            .loan_uninit()
+            .map_err(|e| send_error(e.into()))?
+            .write_payload(*value);
+        let header = sample.payload_mut().header_mut();
+        header.epoch = self.epoch;
+        header.sequence = sequence;
+        header.published = published;
+        let readers = sample.send().map_err(send_error)?;
+        Ok(Sent {
+            sequence,
+            readers,
+            connected,
+        })
+    }
+
+    /// Connects readers that have come since, and hands them the history: what a writer does while it has nothing to send.
+    /// Returns how many connections were made.
+    ///
+    /// # Errors
+    /// [`SendError::Connection`] if one could not be made.
+    pub fn update_connections(&mut self) -> Result<usize, SendError> {
+        let connected = self.newcomers();
+        let Some((publisher, _)) = &self.ports else {
+            return Err(SendError::Internal);
+        };
+        publisher.update_connections().map_err(|_| SendError::Connection)?;
+        Ok(connected)
+    }
+
+    /// The number that the next payload gets.
+    #[must_use]
+    pub fn sequence(&self) -> u64 {
+        self.sequence
+    }
+
+    /// How many readers there are now.
+    #[must_use]
+    pub fn readers(&self) -> usize {
+        self.ports
+            .as_ref()
+            .map_or(0, |(_, service)| service.dynamic_config().number_of_subscribers())
+    }
+
+    /// By how many the readers have increased. One that leaves while another comes is not seen.
+    fn newcomers(&mut self) -> usize {
+        let before = self.readers;
+        self.readers = self.readers();
+        self.readers.saturating_sub(before)
+    }
+}
+
+impl<T: Topic> Drop for Writer<T> {
+    fn drop(&mut self) {
+        let ports = self.ports.take();
+        self.domain.drop_locked(ports);
+    }
+}
+
+fn send_error(e: IoxSendError) -> SendError {
+    match e {
+        IoxSendError::LoanError(LoanError::OutOfMemory) => SendError::OutOfMemory,
+        IoxSendError::ConnectionError(_) | IoxSendError::ConnectionCorrupted | IoxSendError::UnableToDeliver => {
+            SendError::Connection
+        }
+        _ => SendError::Internal,
+    }
+}
+
+/// Why a service cannot be opened, for a person. Called under the lock.
+pub(super) fn explain<T: Topic>(domain: &Domain, name: &ServiceName, e: OpenError) -> PortError {
+    let service = name.to_string();
+    match e {
+        OpenError::DoesNotExist | OpenError::IsMarkedForDestruction => PortError::NotYet { service },
+        OpenError::InsufficientPermissions => PortError::Denied { service },
+        OpenError::ExceedsMaxNumberOfNodes => PortError::Full {
+            service,
+            what: "process",
+        },
+        OpenError::IncompatibleTypes
+        | OpenError::IncompatibleMessagingPattern
+        | OpenError::IncompatibleAttributes
+        | OpenError::IncompatibleOverflowBehavior
+        | OpenError::VersionMismatch
+        | OpenError::DoesNotSupportRequestedMinBufferSize
+        | OpenError::DoesNotSupportRequestedMinHistorySize
+        | OpenError::DoesNotSupportRequestedMinSubscriberBorrowedSamples
+        | OpenError::DoesNotSupportRequestedAmountOfPublishers
+        | OpenError::DoesNotSupportRequestedAmountOfSubscribers
+        | OpenError::DoesNotSupportRequestedAmountOfNodes => {
+            let needed = TypeDetail::new::<T>(TypeVariant::FixedSize);
+            let offered = ipc::Service::details(name, domain.iceoryx(), MessagingPattern::PublishSubscribe);
+            let offered = match offered {
+                Ok(Some(details)) => {
+                    let offered = details
+                        .static_details
+                        .publish_subscribe()
+                        .message_type_details()
+                        .payload;
+                    if offered == needed {
+                        format!("{} with another quality of service ({e:?})", describe(&offered))
+                    } else {
+                        describe(&offered)
+                    }
+                }
+                _ => format!("something else ({e:?})"),
+            };
+            PortError::Incompatible {
+                service,
+                offered,
+                needed: describe(&needed),
+            }
+        }
+        e => PortError::Transport {
+            service,
+            problem: e.to_string(),
+        },
+    }
+}
+
+fn describe(detail: &TypeDetail) -> String {
+    format!("{} ({} bytes)", detail.type_name(), detail.size())
+}

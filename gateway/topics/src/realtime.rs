@@ -1,0 +1,49 @@
+//! How a data-plane thread is scheduled: bound to a processor, SCHED_FIFO, memory locked. For gateway, estimator and
+//! control loops alike.
+
+use nix::sched::{CpuSet, sched_setaffinity};
+use nix::sys::mman::{MlockAllFlags, mlockall};
+use nix::unistd::Pid;
+use std::format;
+use std::string::{String, ToString};
+use std::vec::Vec;
+use thread_priority::unix::{
+    RealtimeThreadSchedulePolicy, ThreadSchedulePolicy, set_thread_priority_and_policy, thread_native_id,
+};
+use thread_priority::{ThreadPriority, ThreadPriorityValue};
+
+/// Binds the calling thread to `cpu` and gives it SCHED_FIFO `priority` (1 to 99) with the process's memory locked, each
+/// where given. What can not be had is told, not fatal: a data plane works without it.
+///
+/// Returns what was not granted, each with what would grant it.
+#[must_use]
+pub fn apply(cpu: Option<usize>, priority: Option<i32>) -> Vec<String> {
+    let mut refused = Vec::new();
+    if let Some(cpu) = cpu {
+        let mut set = CpuSet::new();
+        if let Err(error) = set.set(cpu).and_then(|()| sched_setaffinity(Pid::from_raw(0), &set)) {
+            refused.push(format!("processor {cpu}: {error}; nproc tells how many there are"));
+        }
+    }
+    if let Some(priority) = priority {
+        if let Err(error) = mlockall(MlockAllFlags::MCL_CURRENT | MlockAllFlags::MCL_FUTURE) {
+            refused.push(format!(
+                "locked memory: {error}; LimitMEMLOCK=infinity in the unit grants it"
+            ));
+        }
+        let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
+        let set = u8::try_from(priority)
+            .map_err(|e| e.to_string())
+            .and_then(|p| ThreadPriorityValue::try_from(p).map_err(|e| e.to_string()))
+            .and_then(|p| {
+                set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(p), policy)
+                    .map_err(|e| format!("{e:?}"))
+            });
+        if let Err(error) = set {
+            refused.push(format!(
+                "SCHED_FIFO {priority}: {error}; LimitRTPRIO={priority} in the unit grants it"
+            ));
+        }
+    }
+    refused
+}

@@ -1,0 +1,199 @@
+//! A reading on its way: which channel, when it was acquired, how good it is, which in the sequence.
+
+use crate::{Nanos, Reading};
+use core::fmt;
+use core::ops::{BitOr, BitOrAssign};
+use iceoryx2_bb_derive_macros::ZeroCopySend;
+use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+
+/// Where an acquisition stamp comes from, best last.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, ZeroCopySend)]
+pub enum StampKind {
+    /// There is no stamp (a log without time stamps): order is all that is known.
+    #[default]
+    None = 0,
+    /// Read from the clock by the receiving program, after the fact.
+    User = 1,
+    /// As recorded in a log.
+    Log = 2,
+    /// The kernel's receive stamp.
+    Software = 3,
+    /// The CAN adapter's receive stamp, brought to CLOCK_MONOTONIC.
+    Hardware = 4,
+}
+
+/// How a six-axis sensor's channel is saturated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Saturation {
+    /// Within its range.
+    None,
+    /// At the lower end of its range.
+    Low,
+    /// At the upper end of its range.
+    High,
+}
+
+/// What is known against a sample: a set of bits, empty when nothing is.
+#[repr(C)]
+#[derive(Clone, Copy, Default, PartialEq, Eq, Hash, ZeroCopySend)]
+pub struct Quality(pub u32);
+
+impl Quality {
+    /// Nothing is known against it.
+    pub const GOOD: Self = Self(0);
+    /// At least one reading of this channel was lost just before this one.
+    pub const GAP_BEFORE: Self = Self(1);
+    /// At least one channel of the sensor is at an end of its range; see [`Quality::saturation`].
+    pub const SATURATED: Self = Self(1 << 1);
+    /// The device repeats its last value instead of measuring (iCub strain boards do so while saturated).
+    pub const FROZEN: Self = Self(1 << 2);
+    /// The device reports a fault of its own.
+    pub const DEVICE_FAULT: Self = Self(1 << 3);
+    /// The device says that it is not calibrated.
+    pub const NOT_CALIBRATED: Self = Self(1 << 4);
+    /// `Header::device_counter` is the device's own sequence number.
+    pub const DEVICE_COUNTER: Self = Self(1 << 5);
+
+    const NAMED: [(Self, &'static str); 6] = [
+        (Self::GAP_BEFORE, "gap_before"),
+        (Self::SATURATED, "saturated"),
+        (Self::FROZEN, "frozen"),
+        (Self::DEVICE_FAULT, "device_fault"),
+        (Self::NOT_CALIBRATED, "not_calibrated"),
+        (Self::DEVICE_COUNTER, "device_counter"),
+    ];
+    const SATURATION_SHIFT: u32 = 16;
+
+    /// Whether all bits of `other` are set.
+    #[must_use]
+    pub const fn contains(self, other: Self) -> bool {
+        self.0 & other.0 == other.0
+    }
+
+    /// Whether any bit of `other` is set.
+    #[must_use]
+    pub const fn intersects(self, other: Self) -> bool {
+        self.0 & other.0 != 0
+    }
+
+    /// This set with axis `axis` (0 to 5: fx fy fz tx ty tz) marked as `saturation`; sets SATURATED too.
+    #[must_use]
+    pub const fn with_saturation(self, axis: u32, saturation: Saturation) -> Self {
+        let code = match saturation {
+            Saturation::None => return self,
+            Saturation::Low => 1,
+            Saturation::High => 2,
+        };
+        if axis > 5 {
+            return self;
+        }
+        Self(self.0 | Self::SATURATED.0 | code << (Self::SATURATION_SHIFT + 2 * axis))
+    }
+
+    /// How axis `axis` (0 to 5: fx fy fz tx ty tz) is saturated.
+    #[must_use]
+    pub const fn saturation(self, axis: u32) -> Saturation {
+        if axis > 5 {
+            return Saturation::None;
+        }
+        match self.0 >> (Self::SATURATION_SHIFT + 2 * axis) & 3 {
+            1 => Saturation::Low,
+            2 => Saturation::High,
+            _ => Saturation::None,
+        }
+    }
+}
+
+impl BitOr for Quality {
+    type Output = Self;
+    fn bitor(self, other: Self) -> Self {
+        Self(self.0 | other.0)
+    }
+}
+
+impl BitOrAssign for Quality {
+    fn bitor_assign(&mut self, other: Self) {
+        self.0 |= other.0;
+    }
+}
+
+impl fmt::Debug for Quality {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Quality({self})")
+    }
+}
+
+impl fmt::Display for Quality {
+    /// The names of the bits joined by `|`, or `good`.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut first = true;
+        for (bit, name) in Self::NAMED {
+            if self.contains(bit) {
+                f.write_str(if first { "" } else { "|" })?;
+                f.write_str(name)?;
+                first = false;
+            }
+        }
+        if first { f.write_str("good") } else { Ok(()) }
+    }
+}
+
+/// When and in which order: the same in everything that is published.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ZeroCopySend)]
+pub struct Header {
+    /// New at each start of the publisher: a change means that `sequence` starts again.
+    pub epoch: u64,
+    /// Counts what this publisher has sent on this service, from 0; a gap is a loss between publisher and reader.
+    pub sequence: u64,
+    /// When the first CAN frame that this is made of was received \[ns\]; for an estimate, the instant it is of.
+    pub acquired: Nanos,
+    /// Just before it was sent \[ns\].
+    pub published: Nanos,
+    /// The device's own sequence number where it has one (then `quality` has DEVICE_COUNTER), else 0.
+    pub device_counter: u32,
+    /// What is known against this sample.
+    pub quality: Quality,
+    /// Where `acquired` comes from.
+    pub stamp: StampKind,
+    /// The bus that it came from: its number in the gateway's configuration, from 0.
+    pub bus: u32,
+}
+
+/// One reading of one channel: the payload of `<robot>/samples`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[type_name("proprio/Sample/1")]
+pub struct Sample {
+    /// When, in which order, how good.
+    pub header: Header,
+    /// The channel's number; `<robot>/description` tells its name and kind.
+    pub channel: u32,
+    /// Unused, zero.
+    pub reserved: u32,
+    /// What was measured.
+    pub reading: Reading,
+}
+
+const _: () = assert!(size_of::<Header>() == 48 && core::mem::offset_of!(Header, bus) == 44);
+const _: () = assert!(size_of::<Sample>() == 192 && core::mem::offset_of!(Sample, reading) == 56);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::string::ToString;
+
+    #[test]
+    fn saturation_is_kept_per_axis() {
+        let q = Quality::FROZEN
+            .with_saturation(0, Saturation::Low)
+            .with_saturation(5, Saturation::High);
+        assert_eq!(q.saturation(0), Saturation::Low);
+        assert_eq!(q.saturation(5), Saturation::High);
+        assert_eq!(q.saturation(1), Saturation::None);
+        assert_eq!(q.to_string(), "saturated|frozen");
+        assert_eq!(Quality::GOOD.to_string(), "good");
+        assert_eq!(Quality::GOOD.with_saturation(6, Saturation::High), Quality::GOOD);
+    }
+}

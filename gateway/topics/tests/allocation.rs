@@ -1,0 +1,99 @@
+//! Sending and taking allocate nothing of ours: one allocation of 48 bytes per payload sent is iceoryx2's loan.
+// A global allocator can only be made with unsafe code.
+#![allow(missing_docs, unsafe_code, clippy::unwrap_used)]
+
+use proprio_topics::ipc::{Domain, DomainConfig, Reader, TorqueReader, Writer, monotonic};
+use proprio_topics::{Header, JointState, JointTorque, MAX_JOINTS, Nanos, Reading, Reason, Sample, TorqueEstimate};
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+
+thread_local! {
+    static COUNTED: Cell<(usize, usize)> = const { Cell::new((0, 0)) };
+}
+
+struct Counting;
+
+// SAFETY: every call is passed on unchanged to the system's allocator, which upholds the contract; counting uses a
+// thread-local that is initialised at compile time, has no destructor and does not allocate.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        let _ = COUNTED.try_with(|c| c.set((c.get().0 + 1, c.get().1 + layout.size())));
+        // SAFETY: the caller upholds `alloc`'s contract.
+        unsafe { System.alloc(layout) }
+    }
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller upholds `dealloc`'s contract; the pointer came from `System`.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// Allocations and bytes of this thread during `run`.
+fn counted(run: impl FnOnce()) -> (usize, usize) {
+    let before = COUNTED.get();
+    run();
+    let after = COUNTED.get();
+    (after.0 - before.0, after.1 - before.1)
+}
+
+#[test]
+fn sending_and_taking_allocate_nothing_of_ours() {
+    let base = tempfile::tempdir().unwrap();
+    let domain = Domain::open(&DomainConfig::new(base.path(), "test")).unwrap();
+    assert_ne!(
+        counted(|| drop(std::hint::black_box(vec![0_u8; 8]))).0,
+        0,
+        "the counter counts"
+    );
+
+    let mut writer = Writer::<Sample>::create(&domain, "icub", 1).unwrap();
+    let mut reader = Reader::<Sample>::open(&domain, "icub").unwrap();
+    let sample = Sample {
+        header: Header::default(),
+        channel: 0,
+        reserved: 0,
+        reading: Reading::Joint(JointState::ABSENT),
+    };
+    writer.send(&sample, Nanos(0)).unwrap();
+    reader.latest().unwrap().unwrap();
+
+    const N: usize = 5000; // more than the buffer: overflow included
+    let (count, bytes) =
+        counted(|| (0..N).for_each(|_| assert_eq!(writer.send(&sample, Nanos(0)).unwrap().readers, 1)));
+    assert_eq!((count, bytes), (N, 48 * N), "iceoryx2's loan alone");
+    assert_eq!(counted(|| assert_eq!(writer.update_connections(), Ok(0))), (0, 0));
+    assert_eq!(counted(|| while reader.try_take().unwrap().is_some() {}), (0, 0));
+    assert!(reader.taken() > 2000);
+
+    let mut estimates = Writer::<TorqueEstimate>::create(&domain, "icub", 1).unwrap();
+    let _names = Writer::<proprio_topics::Description>::create(&domain, "icub", 1).unwrap();
+    let mut torques = TorqueReader::new(&domain, "icub", Nanos::from_millis(50));
+    let joint = JointTorque {
+        torque: 1.0,
+        valid: 1,
+        reason: Reason::None,
+        ..JointTorque::ABSENT
+    };
+    let mut estimate = TorqueEstimate {
+        header: Header::default(),
+        count: 1,
+        reserved: 0,
+        joints: [joint; MAX_JOINTS],
+    };
+    torques.update(monotonic());
+    assert!(torques.problem().is_none());
+    estimates.send(&estimate, Nanos(0)).unwrap(); // connects
+    torques.update(monotonic());
+    let counted = counted(|| {
+        for _ in 0..1000 {
+            let now = monotonic();
+            estimate.header.acquired = now;
+            estimates.send(&estimate, now).unwrap();
+            assert!(torques.update(now).is_fresh());
+            assert_eq!(torques.torque_at(0).unwrap().torque, 1.0);
+        }
+    });
+    assert_eq!(counted, (1000, 48_000), "iceoryx2's loan alone");
+}

@@ -1,0 +1,562 @@
+//! Ports within one process: order, overflow, loss, late readers, isolation, versions, limits, and what the errors say.
+#![allow(missing_docs, clippy::unwrap_used)]
+
+use iceoryx2_bb_derive_macros::ZeroCopySend;
+use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+use proprio_topics::ipc::{
+    Domain, DomainConfig, DomainError, Freshness, NoTorque, PortError, QualityOfService, Reader, Topic, TorqueReader,
+    Writer, monotonic,
+};
+use proprio_topics::{
+    ContactDeclaration, Description, Entry, EstimatorHealth, GatewayHealth, Header, JointState, JointTorque, Kind,
+    MAX_JOINTS, Name, Nanos, Publisher, Reading, Reason, Role, Sample, TorqueEstimate,
+};
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+
+fn place() -> (tempfile::TempDir, DomainConfig) {
+    let base = tempfile::tempdir().unwrap();
+    let config = DomainConfig::new(base.path(), "test");
+    (base, config)
+}
+
+fn sample(channel: u32) -> Sample {
+    let joint = JointState {
+        position: f64::from(channel),
+        velocity: 1.0,
+        acceleration: 2.0,
+        torque: 3.0,
+        current: 4.0,
+    };
+    Sample {
+        header: Header::default(),
+        channel,
+        reserved: 0,
+        reading: Reading::Joint(joint),
+    }
+}
+
+fn description(publisher: Publisher, entries: &[(&str, Role, u32)]) -> Description {
+    let none = Entry {
+        name: Name::EMPTY,
+        frame: Name::EMPTY,
+        max_silence: Nanos::ZERO,
+        role: Role::Channel,
+        index: 0,
+        kind: Kind::Joint,
+        bus: 0,
+    };
+    let mut d = Description {
+        header: Header::default(),
+        publisher,
+        count: entries.len() as u32,
+        entries: [none; Description::CAPACITY],
+    };
+    for (entry, &(name, role, index)) in d.entries.iter_mut().zip(entries) {
+        *entry = Entry {
+            name: Name::new(name).unwrap(),
+            role,
+            index,
+            ..none
+        };
+    }
+    d
+}
+
+fn estimate(acquired: Nanos, joints: &[JointTorque]) -> TorqueEstimate {
+    let mut e = TorqueEstimate {
+        header: Header {
+            acquired,
+            ..Header::default()
+        },
+        count: joints.len() as u32,
+        reserved: 0,
+        joints: [JointTorque::ABSENT; MAX_JOINTS],
+    };
+    e.joints[..joints.len()].copy_from_slice(joints);
+    e
+}
+
+fn is_empty(dir: &Path) -> bool {
+    std::fs::read_dir(dir).unwrap().next().is_none()
+}
+
+#[test]
+fn what_is_sent_arrives_in_order_and_nothing_remains() {
+    let (base, config) = place();
+    let prefix;
+    {
+        let domain = Domain::open(&config).unwrap();
+        let mut writer = Writer::<Sample>::create(&domain, "icub", 7).unwrap();
+        let mut reader = Reader::<Sample>::open(&domain, "icub").unwrap();
+        for channel in 0..100 {
+            let sent = writer.send(&sample(channel), Nanos(5)).unwrap();
+            assert_eq!((sent.sequence, sent.readers), (u64::from(channel), 1));
+            assert_eq!(sent.connected, usize::from(channel == 0));
+        }
+        for channel in 0..100 {
+            let got = reader.try_take().unwrap().unwrap();
+            assert_eq!((got.channel, got.header.sequence), (channel, u64::from(channel)));
+            assert_eq!((got.header.epoch, got.header.published), (7, Nanos(5)));
+            assert_eq!(got.reading, sample(channel).reading);
+        }
+        assert_eq!(reader.try_take().unwrap(), None);
+        assert_eq!((reader.lost(), reader.taken(), reader.epochs()), (0, 100, 1));
+        prefix = our_segments(&config);
+        assert!(!prefix.is_empty());
+    }
+    assert!(is_empty(base.path()), "files remain");
+    for segment in prefix {
+        assert!(!Path::new("/dev/shm").join(&segment).exists(), "{segment} remains");
+    }
+}
+
+/// The segments of a domain, by the prefix that its node files show.
+fn our_segments(config: &DomainConfig) -> Vec<String> {
+    let nodes = config.base.join(&config.name).join("nodes");
+    let prefix = std::fs::read_dir(nodes)
+        .unwrap()
+        .filter_map(|e| e.unwrap().file_name().into_string().ok())
+        .find_map(|n| {
+            n.strip_prefix("proprio_")
+                .and_then(|n| n.split_once('_').map(|(hash, _)| hash.to_owned()))
+        })
+        .unwrap();
+    std::fs::read_dir("/dev/shm")
+        .unwrap()
+        .filter_map(|e| e.unwrap().file_name().into_string().ok())
+        .filter(|n| n.contains(&prefix))
+        .collect()
+}
+
+#[test]
+fn overflow_keeps_the_newest_and_the_writer_never_waits() {
+    let (_base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    let mut writer = Writer::<Sample>::create(&domain, "icub", 1).unwrap();
+    let mut reader = Reader::<Sample>::open(&domain, "icub").unwrap();
+    let buffer = Sample::QUALITY.buffer as u64;
+    let sent = 3 * buffer + 17;
+    for k in 0..sent {
+        assert_eq!(writer.send(&sample(k as u32), Nanos(0)).unwrap().readers, 1);
+    }
+    for k in sent - buffer..sent {
+        assert_eq!(reader.try_take().unwrap().unwrap().header.sequence, k);
+    }
+    assert_eq!(reader.try_take().unwrap(), None);
+    // The reader is older than the writer's first payload only in connection order: it joined late, so the first number seen is no loss ...
+    assert_eq!(reader.lost(), 0);
+    // ... but a gap afterwards is.
+    for k in 0..buffer + 5 {
+        writer.send(&sample(k as u32), Nanos(0)).unwrap();
+    }
+    assert_eq!(reader.latest().unwrap().unwrap().header.sequence, sent + buffer + 4);
+    assert_eq!(reader.lost(), 5);
+}
+
+#[test]
+fn a_reader_older_than_the_writer_counts_from_its_first_payload() {
+    let (_base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    let first = Writer::<Sample>::create(&domain, "icub", 1).unwrap();
+    let mut reader = Reader::<Sample>::open(&domain, "icub").unwrap();
+    drop(first);
+    let mut writer = Writer::<Sample>::create(&domain, "icub", 2).unwrap();
+    for k in 0..Sample::QUALITY.buffer as u32 + 9 {
+        writer.send(&sample(k), Nanos(0)).unwrap();
+    }
+    while reader.try_take().unwrap().is_some() {}
+    assert_eq!((reader.lost(), reader.epochs()), (9, 1));
+}
+
+#[test]
+fn sixteen_buses_are_counted_apart_and_a_seventeenth_is_refused() {
+    let (_base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    let epoch = domain.epoch();
+    let mut writers: Vec<_> = (0..16)
+        .map(|_| Writer::<Sample>::create(&domain, "icub", epoch).unwrap())
+        .collect();
+    let mut reader = Reader::<Sample>::open(&domain, "icub").unwrap();
+    for turn in 0..50 {
+        for (bus, writer) in writers.iter_mut().enumerate() {
+            let mut s = sample(turn);
+            s.header.bus = bus as u32;
+            writer.send(&s, Nanos(0)).unwrap();
+        }
+    }
+    let mut taken = [0; 16];
+    while let Some(s) = reader.try_take().unwrap() {
+        assert_eq!(s.header.sequence, taken[s.header.bus as usize]);
+        taken[s.header.bus as usize] += 1;
+    }
+    assert_eq!(taken, [50; 16]);
+    assert_eq!((reader.lost(), reader.epochs(), reader.writers()), (0, 1, 16));
+    match Writer::<Sample>::create(&domain, "icub", epoch) {
+        Err(PortError::Taken { most: 16, holder, .. }) => assert_eq!(holder, std::process::id() as i32),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn a_late_reader_gets_the_last_description_of_each_publisher() {
+    let (_base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    let mut gateway = Writer::<Description>::create(&domain, "icub", 1).unwrap();
+    let mut estimator = Writer::<Description>::create(&domain, "icub", 2).unwrap();
+    gateway
+        .send(&description(Publisher::Gateway, &[("old", Role::Channel, 0)]), Nanos(0))
+        .unwrap();
+    gateway
+        .send(&description(Publisher::Gateway, &[("imu", Role::Channel, 0)]), Nanos(0))
+        .unwrap();
+    estimator
+        .send(
+            &description(Publisher::Estimator, &[("l_elbow", Role::Joint, 0)]),
+            Nanos(0),
+        )
+        .unwrap();
+
+    let mut reader = Reader::<Description>::open(&domain, "icub").unwrap();
+    assert!(
+        reader.try_take().unwrap().is_none(),
+        "history comes with the writer's next turn"
+    );
+    assert_eq!(gateway.update_connections().unwrap(), 1);
+    assert_eq!(estimator.update_connections().unwrap(), 1);
+    assert_eq!(gateway.update_connections().unwrap(), 0);
+    let mut names = Vec::new();
+    while let Some(d) = reader.try_take().unwrap() {
+        names.push((d.publisher as u32, d.entries()[0].name.to_string()));
+    }
+    names.sort();
+    assert_eq!(names, [(0, "imu".to_owned()), (1, "l_elbow".to_owned())]);
+    assert_eq!(reader.lost(), 0);
+}
+
+#[test]
+fn a_reader_before_the_writer_is_told_so_and_then_works() {
+    let (_base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    assert!(
+        matches!(Reader::<GatewayHealth>::open(&domain, "icub"), Err(PortError::NotYet { service }) if service == "icub/health/gateway")
+    );
+    let mut attempts = 0;
+    let none = Reader::<Sample>::wait_open(&domain, "icub", |n| {
+        attempts = n;
+        n < 3
+    });
+    assert!(matches!(none, Err(PortError::NotYet { .. })));
+    assert_eq!(attempts, 3);
+
+    let mut writer = None;
+    let mut reader = Reader::<Sample>::wait_open(&domain, "icub", |_| {
+        writer = Some(Writer::<Sample>::create(&domain, "icub", 1).unwrap());
+        true
+    })
+    .unwrap();
+    writer.as_mut().unwrap().send(&sample(3), Nanos(0)).unwrap();
+    assert_eq!(reader.latest().unwrap().unwrap().channel, 3);
+    drop(writer.take());
+    assert_eq!(reader.writers(), 0);
+    // The service lives on with its reader, and the next writer finds it.
+    let mut writer = Writer::<Sample>::create(&domain, "icub", 2).unwrap();
+    writer.send(&sample(4), Nanos(0)).unwrap();
+    assert_eq!(reader.latest().unwrap().unwrap().channel, 4);
+    assert_eq!(reader.epochs(), 2);
+}
+
+#[test]
+fn domains_and_robots_are_isolated() {
+    let (base, config) = place();
+    let other = DomainConfig::new(base.path(), "other");
+    let (a, b) = (Domain::open(&config).unwrap(), Domain::open(&other).unwrap());
+    assert_ne!(a.epoch(), b.epoch());
+    let mut here = Writer::<Sample>::create(&a, "icub", 1).unwrap();
+    let mut there = Writer::<Sample>::create(&b, "icub", 2).unwrap();
+    let _twin = Writer::<GatewayHealth>::create(&a, "icub", 1).unwrap();
+    let _not_a_twin = Writer::<GatewayHealth>::create(&b, "icub", 2).unwrap();
+    assert!(matches!(
+        Reader::<Sample>::open(&a, "ergocub"),
+        Err(PortError::NotYet { .. })
+    ));
+    let mut ours = Reader::<Sample>::open(&a, "icub").unwrap();
+    here.send(&sample(1), Nanos(0)).unwrap();
+    there.send(&sample(2), Nanos(0)).unwrap();
+    assert_eq!(ours.try_take().unwrap().unwrap().channel, 1);
+    assert_eq!(ours.try_take().unwrap(), None);
+    // Closing one domain leaves the other alone.
+    drop((there, _not_a_twin, b));
+    here.send(&sample(3), Nanos(0)).unwrap();
+    assert_eq!(ours.try_take().unwrap().unwrap().channel, 3);
+    assert!(!base.path().join("other").exists() && base.path().join("test").exists());
+}
+
+#[test]
+fn a_second_gateway_of_a_robot_is_refused() {
+    let (_base, config) = place();
+    let first = Domain::open(&config).unwrap();
+    let second = Domain::open(&config).unwrap();
+    let gateway = Writer::<GatewayHealth>::create(&first, "icub", 1).unwrap();
+    let error = Writer::<GatewayHealth>::create(&second, "icub", 2).unwrap_err();
+    let PortError::Taken { most: 1, holder, .. } = error else {
+        panic!("{error:?}")
+    };
+    assert_eq!(holder, std::process::id() as i32);
+    assert!(error.to_string().contains("only one gateway"), "{error}");
+    let _another_robot = Writer::<GatewayHealth>::create(&second, "ergocub", 2).unwrap();
+    let _its_estimator = Writer::<EstimatorHealth>::create(&second, "icub", 2).unwrap();
+    drop(gateway);
+    Writer::<GatewayHealth>::create(&second, "icub", 3).unwrap();
+}
+
+/// A later version of the sample, on the same service.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, ZeroCopySend)]
+#[type_name("proprio/Sample/2")]
+struct NextSample {
+    header: Header,
+    more: [u64; 18],
+}
+
+impl Topic for NextSample {
+    const SUFFIX: &'static str = Sample::SUFFIX;
+    const QUALITY: QualityOfService = Sample::QUALITY;
+    fn header(&self) -> &Header {
+        &self.header
+    }
+    fn header_mut(&mut self) -> &mut Header {
+        &mut self.header
+    }
+}
+
+#[test]
+fn another_version_is_told_apart_although_its_size_is_the_same() {
+    assert_eq!(size_of::<NextSample>(), size_of::<Sample>());
+    let (_base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    let _writer = Writer::<NextSample>::create(&domain, "icub", 1).unwrap();
+    for error in [
+        Reader::<Sample>::open(&domain, "icub").unwrap_err(),
+        Writer::<Sample>::create(&domain, "icub", 1).unwrap_err(),
+    ] {
+        let PortError::Incompatible { offered, needed, .. } = error else {
+            panic!("{error:?}")
+        };
+        assert_eq!(
+            (offered.as_str(), needed.as_str()),
+            ("proprio/Sample/2 (192 bytes)", "proprio/Sample/1 (192 bytes)")
+        );
+    }
+}
+
+#[test]
+fn names_are_checked() {
+    let (base, _) = place();
+    for name in ["", "a b", "a/b", "..", "a.lock", "ä", &"x".repeat(33)] {
+        let result = Domain::open(&DomainConfig::new(base.path(), name));
+        assert!(matches!(result, Err(DomainError::Name { .. })), "{name:?}");
+    }
+    for dir in ["relative", &format!("/{}", "x".repeat(65))] {
+        let result = Domain::open(&DomainConfig::new(dir, "test"));
+        assert!(matches!(result, Err(DomainError::Base { .. })), "{dir:?}");
+    }
+    assert!(is_empty(base.path()));
+    // The longest legal path works, ports included.
+    let longest = base.path().join("y".repeat(64 - base.path().as_os_str().len()));
+    let domain = Domain::open(&DomainConfig::new(&longest, &"x".repeat(32))).unwrap();
+    let robot = "r".repeat(64);
+    let mut writer = Writer::<ContactDeclaration>::create(&domain, &robot, 1).unwrap();
+    let mut reader = Reader::<ContactDeclaration>::open(&domain, &robot).unwrap();
+    let declared = ContactDeclaration {
+        header: Header::default(),
+        contact: Name::new("hand").unwrap(),
+        active: 1,
+        reserved: 0,
+    };
+    writer.send(&declared, Nanos(0)).unwrap();
+    assert_eq!(reader.latest().unwrap().unwrap().contact.as_str(), "hand");
+    for robot in ["", "a/b", "a b", "ä", &"r".repeat(65)] {
+        assert!(
+            matches!(
+                Writer::<Sample>::create(&domain, robot, 1),
+                Err(PortError::Robot { .. })
+            ),
+            "{robot:?}"
+        );
+    }
+}
+
+#[test]
+fn anothers_domain_is_refused_by_name_of_its_owner() {
+    let (base, config) = place();
+    if std::fs::metadata(base.path()).unwrap().uid() != 0 {
+        eprintln!("skipped: only the superuser can give a directory away");
+        return;
+    }
+    std::fs::create_dir(base.path().join("test")).unwrap();
+    std::os::unix::fs::chown(base.path().join("test"), Some(65534), Some(65534)).unwrap();
+    let error = Domain::open(&config).unwrap_err();
+    assert!(
+        matches!(
+            error,
+            DomainError::ForeignOwner {
+                owner: 65534,
+                user: 0,
+                ..
+            }
+        ),
+        "{error:?}"
+    );
+    assert!(error.to_string().contains("must run as the same user"), "{error}");
+}
+
+#[test]
+fn a_base_that_is_a_file_is_said_to_be() {
+    let file = tempfile::NamedTempFile::new().unwrap();
+    let error = Domain::open(&DomainConfig::new(file.path(), "test")).unwrap_err();
+    assert!(
+        matches!(error, DomainError::Io { .. }) && error.to_string().contains("PROPRIO_RUNTIME_DIR"),
+        "{error}"
+    );
+}
+
+#[test]
+fn torques_come_with_a_reason_when_they_do_not_come() {
+    let (_base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    let max_age = Nanos::from_millis(50);
+    let mut torques = TorqueReader::new(&domain, "icub", max_age);
+    let mut now = monotonic();
+    let step = Nanos::from_millis(100);
+    assert_eq!(torques.update(now), Freshness::NeverSeen);
+    assert!(matches!(torques.problem(), Some(PortError::NotYet { .. })));
+    assert_eq!(torques.torque("l_elbow"), Err(NoTorque::NeverSeen));
+
+    // The estimator appears.
+    let start = |epoch| {
+        (
+            Writer::<TorqueEstimate>::create(&domain, "icub", epoch).unwrap(),
+            Writer::<Description>::create(&domain, "icub", epoch).unwrap(),
+        )
+    };
+    let (mut estimates, mut descriptions) = start(1);
+    now += step;
+    torques.update(now);
+    assert!(torques.problem().is_none());
+    let good = JointTorque {
+        torque: 1.5,
+        standard_deviation: 0.1,
+        valid: 1,
+        reason: Reason::None,
+        ..JointTorque::ABSENT
+    };
+    let bad = JointTorque {
+        torque: 2.5,
+        valid: 0,
+        reason: Reason::Stale,
+        cause: 3,
+        ..JointTorque::ABSENT
+    };
+    estimates.send(&estimate(now, &[good, bad]), now).unwrap();
+    torques.update(now);
+    assert_eq!(torques.torque("l_elbow"), Err(NoTorque::NotDescribed));
+    assert_eq!(torques.torque_at(0).unwrap().torque, 1.5);
+    let entries = [
+        ("l_elbow", Role::Joint, 0),
+        ("l_wrist", Role::Joint, 1),
+        ("l_arm_ft", Role::Channel, 3),
+    ];
+    let gateways = description(
+        Publisher::Gateway,
+        &[("l_elbow", Role::Channel, 9), ("wrong", Role::Joint, 0)],
+    );
+    let mut other = Writer::<Description>::create(&domain, "icub", 1).unwrap();
+    descriptions
+        .send(&description(Publisher::Estimator, &entries), now)
+        .unwrap();
+    other.send(&gateways, now).unwrap();
+    torques.update(now + Nanos(1_000));
+    let torque = torques.torque("l_elbow").unwrap();
+    assert_eq!(
+        (torque.torque, torque.standard_deviation, torque.age),
+        (1.5, 0.1, Nanos(1_000))
+    );
+    let withheld = torques.torque("l_wrist").unwrap_err();
+    assert_eq!(withheld.to_string(), "withheld: stale (l_arm_ft)");
+    assert!(matches!(withheld, NoTorque::Withheld { torque: 2.5, .. }));
+    assert_eq!(torques.torque("r_elbow"), Err(NoTorque::UnknownJoint));
+    assert_eq!(torques.joints().collect::<Vec<_>>(), ["l_elbow", "l_wrist"]);
+
+    // It falls silent.
+    assert_eq!(torques.update(now + max_age), Freshness::Fresh { age: max_age });
+    let late = now + max_age + Nanos(1);
+    assert_eq!(
+        torques.update(late),
+        Freshness::Stale {
+            age: max_age + Nanos(1)
+        }
+    );
+    assert!(matches!(torques.torque("l_elbow"), Err(NoTorque::Stale { .. })));
+
+    // It restarts, and numbers its joints the other way round: names must not be mixed up in between.
+    drop((estimates, descriptions));
+    let (mut estimates, mut descriptions) = start(2);
+    now = late + step;
+    estimates.send(&estimate(now, &[bad, good]), now).unwrap();
+    torques.update(now);
+    assert_eq!(torques.torque("l_elbow"), Err(NoTorque::NotDescribed));
+    let entries = [("l_wrist", Role::Joint, 0), ("l_elbow", Role::Joint, 1)];
+    descriptions
+        .send(&description(Publisher::Estimator, &entries), now)
+        .unwrap();
+    torques.update(now);
+    assert_eq!(torques.torque("l_elbow").unwrap().torque, 1.5);
+}
+
+#[test]
+fn a_control_loop_does_not_wait_for_who_holds_the_lock() {
+    let (base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    let _estimates = Writer::<TorqueEstimate>::create(&domain, "icub", 1).unwrap();
+    let _descriptions = Writer::<Description>::create(&domain, "icub", 1).unwrap();
+    let mut torques = TorqueReader::new(&domain, "icub", Nanos::from_millis(50));
+    // The holder is this test: had the reader waited, it would have waited in vain and said so much later.
+    let lock = std::fs::File::open(base.path().join("test.lock")).unwrap();
+    lock.lock().unwrap();
+    torques.update(Nanos(0));
+    match torques.problem() {
+        Some(PortError::Domain(DomainError::Busy { holder, .. })) => assert_eq!(*holder, std::process::id()),
+        other => panic!("{other:?}"),
+    }
+    drop(lock);
+    torques.update(Nanos::from_millis(99));
+    assert!(torques.problem().is_some(), "the next look is after 100 ms");
+    torques.update(Nanos::from_millis(100));
+    assert!(torques.problem().is_none());
+}
+
+#[test]
+fn ports_of_many_threads_share_one_domain() {
+    let (base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    std::thread::scope(|scope| {
+        for bus in 0..8 {
+            let domain = domain.clone();
+            scope.spawn(move || {
+                for turn in 0..5 {
+                    let mut writer = Writer::<Sample>::create(&domain, "icub", u64::from(turn * 8 + bus)).unwrap();
+                    let mut reader = Reader::<Sample>::open(&domain, "icub").unwrap();
+                    writer.send(&sample(bus), Nanos(0)).unwrap();
+                    let mut seen = false;
+                    while let Some(s) = reader.try_take().unwrap() {
+                        seen |= s.channel == bus;
+                    }
+                    assert!(seen);
+                }
+            });
+        }
+    });
+    drop(domain);
+    assert!(is_empty(base.path()));
+}
