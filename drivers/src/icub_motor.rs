@@ -1,0 +1,389 @@
+//! iCub motor boards 2foc, amcbldc, amc2c and amcfoc: position, velocity and current of the motor shaft, status and faults.
+//!
+//! Streams of address `a`, little-endian, class 1:
+//!
+//! | identifier | name | bytes | content |
+//! |---|---|---|---|
+//! | `1a0` | 2FOC | 8 | current i16 \[mA\], velocity i16 \[icubdeg/ms\], position i32 \[icubdeg\] |
+//! | `1a3` | STATUS | 8 | mode u8, encoder u8, duty i16 (32000 is 1), faults u32 |
+//! | `1aC` | ADDITIONAL_STATUS | 4 | 2 bytes unused, motor temperature i16, raw |
+//! | `1a5` | OVERFLOW | any | the board lost frames that it should have received |
+//!
+//! - 1 icubdeg = 360 / 65536 deg = 0.0054931640625 deg, of the *motor shaft*: `ratio` in the joint's table makes it the
+//!   joint's. A step of velocity is 5.4931640625 deg/s of the shaft.
+//! - The motor temperature's scale is stated nowhere: the frame is checked for its length and yields no reading.
+//! - `mode`: 0 idle, 1 position, 6 current, 9 forced idle, 0x0A voltage, 0x50 open loop, 0xA0 hardware fault, 0xB0 not
+//!   configured.
+//! - `encoder`, bits: 0 dirty, 1 stuck, 2 index broken, 3 phase broken, 4 not calibrated.
+//! - `faults`: bit numbers in [`fault`].
+//!
+//! STATUS yields an actuator reading and tells the quality of the joint readings after it: DEVICE_FAULT for mode 0xA0, for
+//! encoder bits 0 to 3 and for every fault bit except those that only speak of the bus ([`fault::BUS`]); NOT_CALIBRATED for
+//! encoder bit 4 and for mode 0xB0.
+//!
+//! These boards are commanded by somebody else, once a millisecond (`10F`, four target currents, which triggers the answers
+//! above): this driver never transmits. It watches for silence.
+//!
+//! Sources: `TSD-ICUBUNIT-canprotocol-motorboards.docx` (icub-firmware b4299211), `iCubCanProto_motorControlMessages.h`
+//! (icub-firmware-shared 62f2818a). Certain.
+//!
+//! # Keys
+//! ```toml
+//! period_ms = 1      # 1 to 255; what its commander makes of it: the pace of a simulated board
+//! velocity = true    # false: the board's velocity is not passed on (it is coarse where `ratio` is small), and encoded as 0
+//! ```
+
+use crate::icub::{self, Bringup, NoInquiry, class};
+use crate::{
+    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Spec, SpecError, State, Transmit, device,
+};
+use arrayvec::ArrayVec;
+use core::f64::consts::TAU;
+use proprio_topics::{Actuator, Counter, JointState, Kind, Nanos, Quality, Reading};
+use serde::Deserialize;
+
+/// Types of the streams.
+mod kind {
+    pub(super) const TWO_FOC: u8 = 0x0;
+    pub(super) const STATUS: u8 = 0x3;
+    pub(super) const OVERFLOW: u8 = 0x5;
+    pub(super) const ADDITIONAL_STATUS: u8 = 0xC;
+}
+
+/// Bits of `Actuator::faults`.
+pub mod fault {
+    /// An illegal command was received.
+    pub const CAN_INVALID_PROTOCOL: u32 = 1;
+    /// Impossible order of Hall sensor states.
+    pub const HALL_SEQUENCE: u32 = 1 << 1;
+    /// Checksum of the absolute encoder.
+    pub const ENCODER_CHECKSUM: u32 = 1 << 2;
+    /// Impossible Hall sensor state.
+    pub const HALL_VALUE: u32 = 1 << 3;
+    /// Current above its limit.
+    pub const OVER_CURRENT: u32 = 1 << 4;
+    /// Supply above its limit.
+    pub const OVER_VOLTAGE: u32 = 1 << 5;
+    /// Supply below its limit.
+    pub const UNDER_VOLTAGE: u32 = 1 << 6;
+    /// The emergency button.
+    pub const EXTERNAL: u32 = 1 << 7;
+    /// Temperature above its limit.
+    pub const OVER_HEATING: u32 = 1 << 9;
+    /// The position encoder.
+    pub const ENCODER: u32 = 1 << 19;
+    /// Mean current above its limit.
+    pub const I2T: u32 = 1 << 22;
+    /// Bits that speak of the bus and of commands on it, not of the motor or its encoder: 10 to 13 (warning and passive
+    /// states), 15 (buffer overrun), 27 to 31 (illegal length, past states, remote requests). They alone do not make a
+    /// position doubtful, and the past states stay set until the board is reset.
+    pub const BUS: u32 = 0b1111 << 10 | 1 << 15 | 0b11111 << 27;
+}
+
+/// Bits of `Actuator::encoder`.
+pub mod encoder {
+    /// Any of dirty, stuck, index broken, phase broken.
+    pub const BROKEN: u32 = 0b1111;
+    /// Not calibrated.
+    pub const NOT_CALIBRATED: u32 = 1 << 4;
+}
+
+/// Values of `Actuator::mode` that bear on quality.
+pub mod mode {
+    /// The power stage or its supervision failed.
+    pub const HARDWARE_FAULT: u32 = 0xA0;
+    /// The board has not been told its motor's parameters.
+    pub const NOT_CONFIGURED: u32 = 0xB0;
+}
+
+/// One icubdeg \[rad\].
+const RAD_PER_LSB: f64 = TAU / 65536.0;
+/// One icubdeg per ms \[rad/s\].
+const RAD_PER_S_PER_LSB: f64 = RAD_PER_LSB * 1000.0;
+/// One step of current \[A\].
+const AMPERE_PER_LSB: f64 = 1e-3;
+/// One step of duty.
+const DUTY_PER_LSB: f64 = 1.0 / 32000.0;
+
+/// The keys of `driver = "icub_motor"`.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// Period at which its commander makes it answer \[ms\], 1 to 255; default 1.
+    pub period_ms: u32,
+    /// Whether the board's velocity is passed on; default true.
+    pub velocity: bool,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            period_ms: 1,
+            velocity: true,
+        }
+    }
+}
+
+/// That channel 0, the only one, is a joint.
+fn one_joint(spec: &Spec) -> Result<(), SpecError> {
+    if spec.outputs.0.is_empty() {
+        return Err(SpecError::Joints(
+            "a motor board needs a joint: [[bus.device.joint]] with channel = 0",
+        ));
+    }
+    match spec.outputs.0.iter().find(|&&channel| channel != 0) {
+        Some(&channel) => Err(SpecError::Channel {
+            channel,
+            least: 0,
+            most: 0,
+        }),
+        None => Ok(()),
+    }
+}
+
+/// What a status tells of the readings beside it.
+fn quality_of(actuator: &Actuator) -> Quality {
+    let mut quality = Quality::GOOD;
+    let broken = actuator.encoder & encoder::BROKEN != 0;
+    if broken || actuator.faults & !fault::BUS != 0 || actuator.mode == mode::HARDWARE_FAULT {
+        quality |= Quality::DEVICE_FAULT;
+    }
+    if actuator.encoder & encoder::NOT_CALIBRATED != 0 || actuator.mode == mode::NOT_CONFIGURED {
+        quality |= Quality::NOT_CALIBRATED;
+    }
+    quality
+}
+
+/// The host's side of a motor board.
+#[derive(Debug)]
+pub struct Motor {
+    address: u8,
+    claims: ArrayVec<Claim, 4>,
+    bringup: Bringup,
+    velocity: bool,
+    /// What the last status told.
+    status: Quality,
+    /// A reading has been given: from then on a restart leaves a gap.
+    seen: bool,
+    gap: bool,
+}
+
+impl Motor {
+    /// A board that nothing is known of yet.
+    ///
+    /// # Errors
+    /// [`SpecError`]: an address outside 1 to 14, no joint, a joint's channel that is not 0, a period out of range.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        let address = icub::address(spec)?;
+        one_joint(spec)?;
+        icub::period_ms("period_ms", options.period_ms)?;
+        let kinds = [kind::TWO_FOC, kind::STATUS, kind::ADDITIONAL_STATUS, kind::OVERFLOW];
+        let watched = icub::stream(class::PERIODIC_MOTOR, address, kind::TWO_FOC);
+        Ok(Self {
+            address,
+            claims: icub::claims(class::PERIODIC_MOTOR, address, &kinds),
+            bringup: Bringup::new(spec, Mode::Listen, Nanos::ZERO, watched),
+            velocity: options.velocity,
+            status: Quality::GOOD,
+            seen: false,
+            gap: false,
+        })
+    }
+
+    fn motion(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+        let mut quality = self.status;
+        if quality.contains(Quality::DEVICE_FAULT) {
+            out.fault(Counter::DeviceFault, 1, frame.id);
+        }
+        if core::mem::take(&mut self.gap) | self.bringup.reading(frame.t) {
+            quality |= Quality::GAP_BEFORE;
+        }
+        self.seen = true;
+        let velocity = f64::from(icub::i16_le(data, 2)) * RAD_PER_S_PER_LSB;
+        let reading = Reading::Joint(JointState {
+            position: f64::from(icub::u32_le(data, 4).cast_signed()) * RAD_PER_LSB,
+            velocity: if self.velocity { velocity } else { f64::NAN },
+            current: f64::from(icub::i16_le(data, 0)) * AMPERE_PER_LSB,
+            ..JointState::ABSENT
+        });
+        out.push(output(frame, quality, reading), frame.id);
+    }
+
+    fn status(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+        let &[mode, encoder, ..] = data else { return };
+        let actuator = Actuator {
+            duty: f64::from(icub::i16_le(data, 2)) * DUTY_PER_LSB,
+            mode: u32::from(mode),
+            encoder: u32::from(encoder),
+            faults: icub::u32_le(data, 4),
+            reserved: 0,
+        };
+        self.status = quality_of(&actuator);
+        out.push(output(frame, self.status, Reading::Actuator(actuator)), frame.id);
+    }
+}
+
+/// The reading of a single frame.
+fn output(frame: &Frame, quality: Quality, reading: Reading) -> device::Output {
+    device::Output {
+        output: 0,
+        acquired: frame.t,
+        stamp: frame.stamp,
+        device_counter: 0,
+        quality,
+        reading,
+    }
+}
+
+impl Device for Motor {
+    fn kind(&self) -> Kind {
+        Kind::Joint
+    }
+
+    fn claims(&self) -> &[Claim] {
+        &self.claims
+    }
+
+    fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
+        if !self.bringup.active() {
+            return;
+        }
+        let Some(stream) = icub::stream_type(frame.id, class::PERIODIC_MOTOR, self.address) else {
+            return;
+        };
+        if !matches!(
+            stream,
+            kind::TWO_FOC | kind::STATUS | kind::ADDITIONAL_STATUS | kind::OVERFLOW
+        ) {
+            return;
+        }
+        let Some(data) = icub::payload(frame, out) else { return };
+        match (stream, data.len()) {
+            (kind::TWO_FOC, 8) => self.motion(data, frame, out),
+            (kind::STATUS, 8) => self.status(data, frame, out),
+            (kind::ADDITIONAL_STATUS, 4) => {}
+            (kind::OVERFLOW, _) => out.fault(Counter::DeviceFault, 1, frame.id),
+            _ => out.fault(Counter::Length, 1, frame.id),
+        }
+    }
+
+    fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
+        self.bringup.poll(now, &mut NoInquiry, out)
+    }
+
+    fn next_wake(&self) -> Option<Nanos> {
+        self.bringup.next_wake(&NoInquiry)
+    }
+
+    fn state(&self) -> State {
+        self.bringup.state(&NoInquiry)
+    }
+
+    fn stop(&mut self, _now: Nanos) {
+        self.bringup.stop();
+    }
+
+    fn restart(&mut self, _now: Nanos) {
+        self.bringup.restart();
+        self.status = Quality::GOOD;
+        self.gap |= self.seen;
+    }
+}
+
+/// The board's own side: it streams by itself, as if it were commanded once a period.
+#[derive(Debug)]
+pub struct MotorBoard {
+    address: u8,
+    period: Nanos,
+    velocity: bool,
+    /// What its last status told.
+    status: Quality,
+}
+
+impl MotorBoard {
+    /// A board that is being commanded.
+    ///
+    /// # Errors
+    /// As [`Motor::new`].
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        one_joint(spec)?;
+        let period = Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));
+        Ok(Self {
+            address: icub::address(spec)?,
+            period,
+            velocity: options.velocity,
+            status: Quality::GOOD,
+        })
+    }
+
+    fn send_status(&mut self, actuator: &Actuator, out: &mut Frames) -> Result<(), EncodeError> {
+        if !actuator.duty.is_finite() {
+            return Err(EncodeError::NotFinite);
+        }
+        #[allow(clippy::cast_possible_truncation)] // both are bytes on the wire
+        let (mode, encoder) = (actuator.mode as u8, actuator.encoder as u8);
+        #[allow(clippy::cast_possible_truncation)] // limited to 16 bits
+        let [d0, d1] = (icub::quantise(actuator.duty, DUTY_PER_LSB, -32000, 32000) as i16).to_le_bytes();
+        let [f0, f1, f2, f3] = actuator.faults.to_le_bytes();
+        let id = icub::stream(class::PERIODIC_MOTOR, self.address, kind::STATUS);
+        let _ = out.try_push(Frame::new(id, &[mode, encoder, d0, d1, f0, f1, f2, f3]));
+        self.status = quality_of(actuator);
+        Ok(())
+    }
+}
+
+impl Board for MotorBoard {
+    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
+        icub::answer_management(frame, class::POLLING_MOTOR, self.address, icub::board::TWO_FOC, out);
+    }
+
+    fn period(&self) -> Option<Nanos> {
+        Some(self.period)
+    }
+
+    /// A joint reading with other faults than the last status told is preceded by a status that tells them. Torque and
+    /// acceleration have no place in the frame; a current that is absent is sent as 0.
+    fn encode(&mut self, output: u8, reading: &Reading, quality: Quality, out: &mut Frames) -> Result<(), EncodeError> {
+        if output != 0 {
+            return Err(EncodeError::Output(output));
+        }
+        match reading {
+            Reading::Joint(joint) => {
+                let velocity = if self.velocity { joint.velocity } else { 0.0 };
+                if !joint.position.is_finite() || !velocity.is_finite() {
+                    return Err(EncodeError::NotFinite);
+                }
+                let told = Quality::DEVICE_FAULT | Quality::NOT_CALIBRATED;
+                if self.status.0 & told.0 != quality.0 & told.0 {
+                    let mut actuator = Actuator {
+                        duty: 0.0,
+                        mode: 6,
+                        encoder: 0,
+                        faults: 0,
+                        reserved: 0,
+                    };
+                    if quality.contains(Quality::DEVICE_FAULT) {
+                        actuator.faults = fault::ENCODER;
+                    }
+                    if quality.contains(Quality::NOT_CALIBRATED) {
+                        actuator.encoder = encoder::NOT_CALIBRATED;
+                    }
+                    self.send_status(&actuator, out)?;
+                }
+                let current = if joint.current.is_finite() { joint.current } else { 0.0 };
+                let [c0, c1] = icub::quantise_i16(current, AMPERE_PER_LSB).to_le_bytes();
+                let [v0, v1] = icub::quantise_i16(velocity, RAD_PER_S_PER_LSB).to_le_bytes();
+                let position = icub::quantise(joint.position, RAD_PER_LSB, i64::from(i32::MIN), i64::from(i32::MAX));
+                #[allow(clippy::cast_possible_truncation)] // limited to 32 bits
+                let [p0, p1, p2, p3] = (position as i32).to_le_bytes();
+                let id = icub::stream(class::PERIODIC_MOTOR, self.address, kind::TWO_FOC);
+                let _ = out.try_push(Frame::new(id, &[c0, c1, v0, v1, p0, p1, p2, p3]));
+                Ok(())
+            }
+            Reading::Actuator(actuator) => self.send_status(actuator, out),
+            Reading::Wrench(_) | Reading::Imu(_) | Reading::Gauges(_) | Reading::Temperature(_) => {
+                Err(EncodeError::Kind)
+            }
+        }
+    }
+}

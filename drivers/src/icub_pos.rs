@@ -1,0 +1,393 @@
+//! iCub POS encoders (boards psc and mtb4fap): angles of finger joints, or lengths.
+//!
+//! Stream of address `a`, little-endian, class 3:
+//!
+//! | identifier | name | bytes | content |
+//! |---|---|---|---|
+//! | `3a1` | POS | 8 | type u8, label << 4 \| n, then three values i16 of which the first n count |
+//!
+//! - Type 0: 0.1 deg; type 1: 0.1 mm. Value k belongs to label + k: that is the `channel` of a joint.
+//! - A psc sends both its sensors in one frame, n = 2.
+//!
+//! Commands on `20a`, neither acknowledged:
+//!
+//! | bytes | meaning |
+//! |---|---|
+//! | `52 id<<4\|type S0 S1` | configuration; S: enabled, inverted, rotation (2 bits: 0, 180, 90, -90 deg), label (4 bits), zero i16 in 0.1 deg |
+//! | `53 ms` | period, 0 stops |
+//!
+//! The board then sends ((v + rotation) mod 360 deg) - ((zero + rotation) mod 360 deg), negated if inverted.
+//!
+//! Sources: `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12, `embot_prot_can_analog_periodic.cpp` (icub-firmware
+//! b4299211). Certain.
+//!
+//! # Keys
+//! ```toml
+//! period_ms = 10            # 1 to 255
+//! quantity = "angle"        # "angle" (rad) or "length" (m): what the board must send
+//! power_on_silence_ms = 0   # see `crate::icub`
+//! listen = false            # true: somebody else commands this board; never transmit
+//! # What to configure a psc's one or two sensors to; without it the board keeps what it has.
+//! sensors = [{ label = 0, inverted = false, rotation_deg = 0, zero_deg = 0.0 }, { label = 1 }]
+//! ```
+
+use crate::icub::{self, Bringup, NoInquiry, class, command};
+use crate::{
+    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Outputs, Spec, SpecError, State, Transmit, device,
+};
+use alloc::vec::Vec;
+use arrayvec::ArrayVec;
+use core::f64::consts::TAU;
+use proprio_topics::{Counter, JointState, Kind, Nanos, Quality, Reading};
+use serde::Deserialize;
+
+/// Type of the stream.
+const POS: u8 = 1;
+/// How many values fit a frame.
+const VALUES: u8 = 3;
+/// The highest label.
+const LABEL_MOST: u8 = 15;
+/// 0.1 deg \[rad\].
+const RAD_PER_LSB: f64 = TAU / 3600.0;
+/// 0.1 mm \[m\].
+const METRE_PER_LSB: f64 = 1e-4;
+
+/// What a POS board measures.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Quantity {
+    /// Angles \[rad\].
+    #[default]
+    Angle,
+    /// Lengths \[m\].
+    Length,
+}
+
+impl Quantity {
+    /// Its number in a frame, and one step \[rad or m\].
+    const fn code_and_lsb(self) -> (u8, f64) {
+        match self {
+            Self::Angle => (0, RAD_PER_LSB),
+            Self::Length => (1, METRE_PER_LSB),
+        }
+    }
+}
+
+/// The configuration of one sensor of a board.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Sensor {
+    /// The label it is sent under: the joint's channel.
+    pub label: u8,
+    /// Negate its value; default false.
+    pub inverted: bool,
+    /// Added before the zero is taken off \[deg\]: 0, 90, 180 or -90; default 0.
+    pub rotation_deg: i32,
+    /// What counts as zero \[deg\]; default 0.
+    pub zero_deg: f64,
+}
+
+impl Sensor {
+    /// Its three bytes in POS_CONFIG_SET.
+    fn bytes(&self) -> Result<[u8; 3], SpecError> {
+        let rotation = match self.rotation_deg {
+            0 => 0,
+            180 => 1,
+            90 => 2,
+            -90 => 3,
+            other => {
+                let expected = "0, 90, 180 or -90";
+                return Err(SpecError::Key {
+                    key: "rotation_deg",
+                    value: f64::from(other),
+                    expected,
+                });
+            }
+        };
+        if self.label > LABEL_MOST {
+            return Err(SpecError::Key {
+                key: "label",
+                value: f64::from(self.label),
+                expected: "at most 15",
+            });
+        }
+        if !(self.zero_deg >= -360.0 && self.zero_deg <= 360.0) {
+            return Err(SpecError::Key {
+                key: "zero_deg",
+                value: self.zero_deg,
+                expected: "from -360 to 360",
+            });
+        }
+        let [low, high] = icub::quantise_i16(self.zero_deg, 0.1).to_le_bytes();
+        Ok([
+            0x80 | u8::from(self.inverted) << 6 | rotation << 4 | self.label,
+            low,
+            high,
+        ])
+    }
+}
+
+/// The keys of `driver = "icub_pos"`.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// Period \[ms\], 1 to 255; default 10.
+    pub period_ms: u32,
+    /// What the board must send; default angles.
+    pub quantity: Quantity,
+    /// Silence kept after power-on \[ms\]; default 0.
+    pub power_on_silence_ms: u32,
+    /// Somebody else commands this board; default false.
+    pub listen: bool,
+    /// What to configure its sensors to, at most two; default: what the board has.
+    pub sensors: Option<Vec<Sensor>>,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            period_ms: 10,
+            quantity: Quantity::Angle,
+            power_on_silence_ms: 0,
+            listen: false,
+            sensors: None,
+        }
+    }
+}
+
+impl Options {
+    /// The bytes of POS_CONFIG_SET, if the sensors are to be configured.
+    fn configuration(&self) -> Result<Option<[u8; 8]>, SpecError> {
+        let Some(sensors) = &self.sensors else { return Ok(None) };
+        let (first, second) = match sensors.as_slice() {
+            [first] => (first.bytes()?, [0; 3]),
+            [first, second] => (first.bytes()?, second.bytes()?),
+            _ => {
+                return Err(SpecError::Keys {
+                    key: "sensors",
+                    expected: "a list of one or two sensors",
+                });
+            }
+        };
+        let ([a, b, c], [d, e, f]) = (first, second);
+        // Identity 0: all of a psc.
+        Ok(Some([
+            command::POS_CONFIG_SET,
+            self.quantity.code_and_lsb().0,
+            a,
+            b,
+            c,
+            d,
+            e,
+            f,
+        ]))
+    }
+}
+
+/// That there are joints, and all are labels.
+fn joints(spec: &Spec) -> Result<(), SpecError> {
+    if spec.outputs.0.is_empty() {
+        return Err(SpecError::Joints(
+            "a POS board needs a joint: [[bus.device.joint]] with channel = its label",
+        ));
+    }
+    match spec.outputs.0.iter().find(|&&channel| channel > LABEL_MOST) {
+        Some(&channel) => Err(SpecError::Channel {
+            channel,
+            least: 0,
+            most: LABEL_MOST,
+        }),
+        None => Ok(()),
+    }
+}
+
+/// The host's side of a POS board.
+#[derive(Debug)]
+pub struct Pos {
+    address: u8,
+    claims: ArrayVec<Claim, 1>,
+    bringup: Bringup,
+    quantity: Quantity,
+    outputs: Outputs,
+    /// Labels whose next reading follows a gap, one bit each.
+    gap: u16,
+    /// Labels that have been read, one bit each.
+    seen: u16,
+}
+
+impl Pos {
+    /// A board that nothing is known of yet.
+    ///
+    /// # Errors
+    /// [`SpecError`]: an address outside 1 to 14, no joint or one whose channel is not 0 to 15, a key out of range.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        let address = icub::address(spec)?;
+        joints(spec)?;
+        let period = icub::period_ms("period_ms", options.period_ms)?;
+        let silence = icub::power_on_silence(options.power_on_silence_ms)?;
+        let mode = if options.listen { Mode::Listen } else { spec.mode };
+        let watched = icub::stream(class::PERIODIC_ANALOG, address, POS);
+        let mut bringup = Bringup::new(spec, mode, silence, watched);
+        let id = icub::to_board(class::POLLING_ANALOG, address);
+        if let Some(configuration) = options.configuration()? {
+            bringup.start_with(id, &configuration);
+        }
+        bringup.start_with(id, &[command::POS_TRANSMIT, period]);
+        bringup.stop_with(id, &[command::POS_TRANSMIT, 0]);
+        let claims = icub::claims(class::PERIODIC_ANALOG, address, &[POS]);
+        Ok(Self {
+            address,
+            claims,
+            bringup,
+            quantity: options.quantity,
+            outputs: spec.outputs.clone(),
+            gap: 0,
+            seen: 0,
+        })
+    }
+}
+
+impl Device for Pos {
+    fn kind(&self) -> Kind {
+        Kind::Joint
+    }
+
+    fn claims(&self) -> &[Claim] {
+        &self.claims
+    }
+
+    fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
+        if !self.bringup.active() || icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address) != Some(POS) {
+            return;
+        }
+        let Some(data) = icub::payload(frame, out) else { return };
+        let &[quantity, label_and_count, ref values @ ..] = data else {
+            return out.fault(Counter::Length, 1, frame.id);
+        };
+        if values.len() != 2 * usize::from(VALUES) {
+            return out.fault(Counter::Length, 1, frame.id);
+        }
+        let (label, count) = (label_and_count >> 4, label_and_count & 0xF);
+        let (code, lsb) = self.quantity.code_and_lsb();
+        if quantity != code || !(1..=VALUES).contains(&count) || label + count - 1 > LABEL_MOST {
+            return out.fault(Counter::Value, 1, frame.id);
+        }
+        if self.bringup.reading(frame.t) {
+            self.gap = self.seen;
+        }
+        for (output, value) in (label..).zip(values.chunks_exact(2)).take(usize::from(count)) {
+            if !self.outputs.0.contains(&output) {
+                continue;
+            }
+            let bit = 1 << output;
+            let quality = if self.gap & bit == 0 {
+                Quality::GOOD
+            } else {
+                Quality::GAP_BEFORE
+            };
+            self.gap &= !bit;
+            self.seen |= bit;
+            let position = f64::from(icub::i16_le(value, 0)) * lsb;
+            let reading = Reading::Joint(JointState {
+                position,
+                ..JointState::ABSENT
+            });
+            let output = device::Output {
+                output,
+                acquired: frame.t,
+                stamp: frame.stamp,
+                device_counter: 0,
+                quality,
+                reading,
+            };
+            out.push(output, frame.id);
+        }
+    }
+
+    fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
+        self.bringup.poll(now, &mut NoInquiry, out)
+    }
+
+    fn next_wake(&self) -> Option<Nanos> {
+        self.bringup.next_wake(&NoInquiry)
+    }
+
+    fn state(&self) -> State {
+        self.bringup.state(&NoInquiry)
+    }
+
+    fn stop(&mut self, _now: Nanos) {
+        self.bringup.stop();
+    }
+
+    fn restart(&mut self, _now: Nanos) {
+        self.bringup.restart();
+        self.gap = self.seen;
+    }
+}
+
+/// The board's own side. It sends each value in a frame of its own (n = 1), which the protocol allows.
+#[derive(Debug)]
+pub struct PosBoard {
+    address: u8,
+    period: Nanos,
+    streaming: bool,
+    quantity: Quantity,
+}
+
+impl PosBoard {
+    /// A board just powered. With `listen` somebody else has started it already.
+    ///
+    /// # Errors
+    /// As [`Pos::new`].
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        joints(spec)?;
+        options.configuration()?;
+        let period = Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));
+        Ok(Self {
+            address: icub::address(spec)?,
+            period,
+            streaming: options.listen,
+            quantity: options.quantity,
+        })
+    }
+}
+
+impl Board for PosBoard {
+    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
+        icub::answer_management(frame, class::POLLING_ANALOG, self.address, icub::board::PSC, out);
+        if let Some(&[command::POS_TRANSMIT, ms]) = icub::command_for(frame, class::POLLING_ANALOG, self.address) {
+            self.streaming = ms > 0;
+            if ms > 0 {
+                self.period = Nanos::from_millis(i64::from(ms));
+            }
+        }
+    }
+
+    fn period(&self) -> Option<Nanos> {
+        self.streaming.then_some(self.period)
+    }
+
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        _quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        let Reading::Joint(joint) = reading else {
+            return Err(EncodeError::Kind);
+        };
+        if output > LABEL_MOST {
+            return Err(EncodeError::Output(output));
+        }
+        if !joint.position.is_finite() {
+            return Err(EncodeError::NotFinite);
+        }
+        let (code, lsb) = self.quantity.code_and_lsb();
+        let [low, high] = icub::quantise_i16(joint.position, lsb).to_le_bytes();
+        let id = icub::stream(class::PERIODIC_ANALOG, self.address, POS);
+        let _ = out.try_push(Frame::new(id, &[code, output << 4 | 1, low, high, 0, 0, 0, 0]));
+        Ok(())
+    }
+}

@@ -1,0 +1,216 @@
+//! Any frame, in any order, at any time: no panic, no endless loop, no number that is not finite in a wrench.
+
+use crate::rig::{options, spec};
+use proprio_drivers::{Board, Decoded, Device, Format, Frame, Frames, Id, Mode};
+use proprio_topics::{Nanos, Quality, Reading, StampKind};
+use proptest::prelude::*;
+
+/// Every family, in every way it can be set up.
+const SETUPS: [(&str, &str, &[u8]); 9] = [
+    ("icub_strain", "", &[]),
+    (
+        "icub_strain",
+        "full_scale_n = [9, 9, 9]\nfull_scale_nm = [1, 1, 1]\ntemperature_period_s = 1",
+        &[],
+    ),
+    ("icub_strain", "stream = \"both\"\npower_on_silence_ms = 20", &[]),
+    ("icub_imu", "", &[]),
+    (
+        "icub_imu",
+        r#"quantities = ["acceleration", "magnetic_field", "angular_velocity", "orientation", "status"]"#,
+        &[],
+    ),
+    ("icub_imu", r#"legacy = "mtb""#, &[]),
+    ("icub_imu", r#"legacy = "bno055""#, &[]),
+    ("icub_motor", "", &[0]),
+    ("icub_pos", "", &[0, 1, 2, 15]),
+];
+
+/// About 18 years: clocks jump, but not to where nanoseconds end.
+const YEARS: i64 = 1 << 59;
+
+/// What the bus and the clock do.
+#[derive(Debug, Clone)]
+enum Event {
+    Frame {
+        id: u16,
+        any: Option<u32>,
+        format: u8,
+        data: Vec<u8>,
+        command: Option<u8>,
+        stamped: bool,
+    },
+    Pass {
+        ns: i64,
+    },
+    Poll,
+    Restart,
+    Stop,
+}
+
+fn event() -> impl Strategy<Value = Event> {
+    let data = prop_oneof![
+        // Lengths that the protocol has, mostly.
+        8 => proptest::collection::vec(any::<u8>(), 4..=8),
+        1 => proptest::collection::vec(any::<u8>(), 0..=8),
+    ];
+    // Streams and replies of address 1 in all classes, so that most frames concern the device.
+    // And commands to address 1 and to everyone, so that the board is driven too.
+    let id = prop_oneof![
+        4 => (0_u16..8, 0_u16..16).prop_map(|(class, low)| class << 8 | 0x10 | low),
+        1 => prop_oneof![Just(0x001), Just(0x201), Just(0x20F), Just(0x701), Just(0x70F)],
+    ];
+    let command = proptest::option::of(prop_oneof![
+        Just(0x18),
+        Just(0x33),
+        Just(0x07),
+        Just(0x34),
+        Just(0x35),
+        Just(0x53)
+    ]);
+    let any_id = proptest::option::weighted(0.1, any::<u32>());
+    prop_oneof![
+        40 => (id, any_id, 0_u8..20, data, command, proptest::bool::weighted(0.9))
+            .prop_map(|(id, any, format, data, command, stamped)| Event::Frame { id, any, format, data, command, stamped }),
+        10 => prop_oneof![0_i64..1_000_000, 0_i64..100_000_000, -5_000_000_i64..2_000_000_000, -YEARS..YEARS]
+            .prop_map(|ns| Event::Pass { ns }),
+        10 => Just(Event::Poll),
+        1 => Just(Event::Restart),
+        1 => Just(Event::Stop),
+    ]
+}
+
+fn to_frame(event: &Event, now: Nanos) -> Option<Frame> {
+    let Event::Frame {
+        id,
+        any,
+        format,
+        data,
+        command,
+        stamped,
+    } = event
+    else {
+        return None;
+    };
+    let mut data = data.clone();
+    if let (Some(command), Some(first)) = (command, data.first_mut()) {
+        *first = *command;
+    }
+    let id = any.map_or(Id::standard(*id), Id::extended);
+    let format = match format {
+        0 => Format::Fd {
+            bit_rate_switch: true,
+            error_state: false,
+        },
+        1 => Format::Remote,
+        2 => Format::Error,
+        _ => Format::Classic,
+    };
+    let stamp = if *stamped { StampKind::Software } else { StampKind::None };
+    Frame::with_format(id, format, &data).map(|frame| frame.at(now, stamp))
+}
+
+fn is_finite(reading: &Reading) -> bool {
+    match reading {
+        Reading::Wrench(wrench) => wrench.force.iter().chain(&wrench.torque).all(|value| value.is_finite()),
+        Reading::Imu(imu) => imu
+            .proper_acceleration
+            .iter()
+            .chain(&imu.angular_velocity)
+            .all(|value| value.is_finite()),
+        Reading::Joint(joint) => joint.position.is_finite(),
+        Reading::Temperature(temperature) => temperature.celsius.is_finite(),
+        Reading::Actuator(actuator) => actuator.duty.is_finite(),
+        Reading::Gauges(_) => true,
+    }
+}
+
+fn drive(device: &mut dyn Device, board: &mut dyn Board, events: &[Event], listens: bool) {
+    let mut now = Nanos::from_millis(1000);
+    let mut out = Decoded::new();
+    for event in events {
+        out.clear();
+        match event {
+            Event::Frame { .. } => {
+                let Some(frame) = to_frame(event, now) else { continue };
+                device.on_frame(&frame, &mut out);
+                let mut answers = Frames::new();
+                board.on_frame(&frame, &mut answers);
+                for answer in answers {
+                    device.on_frame(&answer.at(now, StampKind::Software), &mut out);
+                }
+            }
+            Event::Pass { ns } => now = Nanos((now.0 + ns).clamp(-YEARS, YEARS)),
+            Event::Poll => {
+                for turn in 0.. {
+                    assert!(turn < 32, "it never stops sending");
+                    let Some(transmit) = device.poll_transmit(now, &mut out) else {
+                        break;
+                    };
+                    assert!(!listens, "a listener sends {transmit:?}");
+                    let mut answers = Frames::new();
+                    board.on_frame(&transmit.frame, &mut answers);
+                }
+            }
+            Event::Restart => device.restart(now),
+            Event::Stop => device.stop(now),
+        }
+        let _ = (device.state(), device.next_wake(), board.period());
+        for output in &out.readings {
+            assert!(is_finite(&output.reading), "{output:?}");
+            // What was decoded can be encoded again (a wrench only if its scale is known to this board).
+            let mut frames = Frames::new();
+            let _ = board.encode(
+                output.output,
+                &output.reading,
+                output.quality | Quality::GOOD,
+                &mut frames,
+            );
+        }
+    }
+}
+
+proptest! {
+    #[test]
+    fn does_no_harm(setup in 0..SETUPS.len(), listens: bool, events in proptest::collection::vec(event(), 1..300)) {
+        let (driver, keys, outputs) = SETUPS[setup];
+        let mode = if listens { Mode::Listen } else { Mode::Supervise };
+        let options = options(driver, keys);
+        let spec = spec(1, mode, outputs);
+        let mut device = options.device(&spec).unwrap();
+        let mut board = options.board(&spec).unwrap();
+        drive(&mut *device, &mut *board, &events, listens || driver == "icub_motor");
+    }
+}
+
+/// Sensors, encoders and motors of one board can be configured side by side; two devices of a kind can not.
+#[test]
+fn claims_are_exclusive_within_a_kind_only() {
+    let claims = |driver: &str, outputs: &[u8], address| {
+        let device = options(driver, "")
+            .device(&spec(address, Mode::Supervise, outputs))
+            .unwrap();
+        device.claims().to_vec()
+    };
+    let collide = |a: &[proprio_drivers::Claim], b: &[proprio_drivers::Claim]| {
+        a.iter()
+            .any(|a| b.iter().any(|b| a.exclusive && b.exclusive && a.overlaps(b)))
+    };
+    let families: [(&str, &[u8]); 4] = [
+        ("icub_strain", &[]),
+        ("icub_imu", &[]),
+        ("icub_motor", &[0]),
+        ("icub_pos", &[0]),
+    ];
+    for (k, (driver, outputs)) in families.iter().enumerate() {
+        let mine = claims(driver, outputs, 13);
+        assert!(collide(&mine, &mine), "{driver} shares its streams");
+        assert!(
+            !collide(&mine, &claims(driver, outputs, 12)),
+            "{driver} takes another address's streams"
+        );
+        for (other, outputs) in families.iter().skip(k + 1) {
+            assert!(!collide(&mine, &claims(other, outputs, 13)), "{driver} and {other}");
+        }
+    }
+}

@@ -1,0 +1,473 @@
+//! Bring-up of each family against its own board: what is sent, what a loss does, silence, restart, refusal, stop.
+
+use crate::rig::{Rig, decode, frame, listener, options, spec};
+use proprio_drivers::{Mode, Refusal, SpecError, State};
+use proprio_topics::{Counter, Imu, JointState, Nanos, Quality, Reading, Wrench};
+
+const SCALES: &str = "full_scale_n = [1804, 1804, 1804]\nfull_scale_nm = [31, 31, 31]\n";
+
+fn wrench() -> (u8, Reading) {
+    (
+        0,
+        Reading::Wrench(Wrench {
+            force: [1.0, 2.0, 3.0],
+            torque: [0.1, 0.2, 0.3],
+        }),
+    )
+}
+
+fn imu() -> (u8, Reading) {
+    let imu = Imu {
+        proper_acceleration: [0.0, 0.0, 9.81],
+        angular_velocity: [0.0; 3],
+        ..Imu::ABSENT
+    };
+    (0, Reading::Imu(imu))
+}
+
+fn strain() -> Rig {
+    Rig::new("icub_strain", "", &[], wrench())
+}
+
+#[test]
+fn a_strain_board_is_asked_started_and_stopped() {
+    let mut rig = strain();
+    rig.run(100);
+    assert_eq!(
+        rig.sent,
+        [
+            "201#1800", "201#1801", "201#1802", "201#1803", "201#1804", "201#1805", "201#080A", "201#0700"
+        ]
+    );
+    assert_eq!(rig.device.state(), State::Streaming);
+    assert_eq!(rig.readings.len(), 10);
+    let Reading::Wrench(wrench) = rig.readings[0].reading else {
+        panic!()
+    };
+    assert!((wrench.force[1] - 2.0).abs() < 0.03 && (wrench.torque[2] - 0.3).abs() < 5e-4);
+    rig.device.stop(rig.now);
+    rig.run(30);
+    assert_eq!(rig.sent.last().unwrap(), "201#0701");
+    assert_eq!(
+        (rig.device.state(), rig.board.period(), rig.readings.len()),
+        (State::Stopped, None, 10)
+    );
+    assert_eq!((rig.count(Counter::Starts), rig.faults.len()), (1, 1));
+}
+
+#[test]
+fn temperature_and_both_streams_are_started_too() {
+    let mut rig = Rig::new(
+        "icub_strain",
+        &format!("{SCALES}stream = \"both\"\ntemperature_period_s = 2"),
+        &[],
+        wrench(),
+    );
+    rig.run(40);
+    assert_eq!(
+        rig.sent,
+        ["201#080A", "201#3901", "201#3A02", "201#0704"],
+        "a configured scale is not asked for"
+    );
+    let kinds: Vec<bool> = rig
+        .readings
+        .iter()
+        .map(|r| matches!(r.reading, Reading::Gauges(_)))
+        .collect();
+    assert_eq!(kinds, [false, true, false, true, false, true, false, true]);
+    rig.device.stop(rig.now);
+    rig.run(2);
+    assert_eq!(rig.sent[4..], ["201#3A00", "201#0701"]);
+}
+
+#[test]
+fn lost_questions_and_answers_are_asked_again() {
+    let mut rig = strain();
+    // Every question needs three attempts: the first is lost, then its answer.
+    let mut turn = 0;
+    rig.host_loses = Box::new(move |_, frame| {
+        turn += 1;
+        frame.data().first() == Some(&0x18) && turn % 3 == 1
+    });
+    let mut answers = 0;
+    rig.board_loses = Box::new(move |_, frame| {
+        let answer = frame.data().first() == Some(&0x18) && frame.len() == 4;
+        answers += u32::from(answer);
+        answer && answers % 2 == 1
+    });
+    rig.run(300);
+    assert_eq!(rig.device.state(), State::Streaming);
+    assert_eq!(rig.sent.iter().filter(|text| text.starts_with("201#18")).count(), 18);
+    assert_eq!(rig.count(Counter::Unexpected), 0);
+}
+
+#[test]
+fn a_lost_start_is_repeated() {
+    let mut rig = strain();
+    let mut starts = 0;
+    rig.host_loses = Box::new(move |_, frame| {
+        let start = frame.data() == [0x07, 0x00];
+        starts += u32::from(start);
+        start && starts <= 2
+    });
+    rig.run(2000);
+    assert_eq!(rig.device.state(), State::Streaming);
+    assert_eq!(rig.count(Counter::Starts), 3);
+    assert_eq!(
+        rig.count(Counter::Silences),
+        0,
+        "it was never heard, so it did not fall silent"
+    );
+}
+
+#[test]
+fn a_board_that_is_off_is_refused_and_comes_up_when_it_gets_power() {
+    let mut rig = strain();
+    rig.host_loses = Box::new(|_, _| true);
+    rig.run(5000);
+    assert_eq!(rig.device.state(), State::Refused(Refusal::NoFullScale));
+    assert_eq!(rig.states, [State::Asking, State::Refused(Refusal::NoFullScale)]);
+    // 15 quick attempts, then two a second.
+    assert!((20..=30).contains(&rig.sent.len()), "{}", rig.sent.len());
+    rig.host_loses = Box::new(|_, _| false);
+    rig.run(600);
+    assert_eq!(rig.device.state(), State::Streaming);
+}
+
+#[test]
+fn silence_is_kept_after_power_on() {
+    let mut rig = Rig::new("icub_strain", "power_on_silence_ms = 6000", &[], wrench());
+    rig.run(5999);
+    assert!(rig.sent.is_empty());
+    assert_eq!(rig.device.state(), State::Waiting);
+    rig.run(100);
+    assert_eq!(rig.device.state(), State::Streaming);
+    // A board that streams already has left its bootloader: no need to wait.
+    let keys = format!("{SCALES}power_on_silence_ms = 6000");
+    let mut rig = Rig::with_board("icub_strain", &keys, &format!("{SCALES}listen = true"), &[], wrench());
+    rig.run(30);
+    assert_eq!(rig.device.state(), State::Streaming);
+    assert_eq!(rig.sent.len(), 2);
+}
+
+#[test]
+fn a_silent_board_is_counted_once_and_started_again() {
+    let mut rig = strain();
+    rig.run(100);
+    rig.board_loses = Box::new(|_, frame| frame.data().first() != Some(&0x18) || frame.len() != 4);
+    rig.run(3000);
+    assert_eq!(rig.device.state(), State::Silent);
+    assert_eq!(rig.count(Counter::Silences), 1);
+    let starts = rig.count(Counter::Starts);
+    assert!((4..=8).contains(&starts), "{starts} attempts in 3 s");
+    let before = rig.readings.len();
+    rig.board_loses = Box::new(|_, _| false);
+    rig.run(100);
+    assert_eq!(rig.device.state(), State::Streaming);
+    assert!(rig.readings[before].quality.contains(Quality::GAP_BEFORE));
+    assert!(!rig.readings[before + 1].quality.contains(Quality::GAP_BEFORE));
+}
+
+#[test]
+fn a_board_that_was_reset_is_brought_up_again() {
+    let mut rig = strain();
+    rig.run(100);
+    // Power cut: a fresh board that streams nothing.
+    rig.board = options("icub_strain", "")
+        .board(&spec(1, Mode::Supervise, &[]))
+        .unwrap();
+    rig.run(200);
+    assert_eq!(
+        (rig.device.state(), rig.count(Counter::Silences)),
+        (State::Streaming, 1)
+    );
+    // The link was lost and is back.
+    rig.board = options("icub_strain", "")
+        .board(&spec(1, Mode::Supervise, &[]))
+        .unwrap();
+    let before = rig.readings.len();
+    rig.device.restart(rig.now);
+    rig.run(20);
+    assert_eq!(
+        (rig.device.state(), rig.count(Counter::Silences)),
+        (State::Streaming, 1)
+    );
+    assert!(rig.readings[before].quality.contains(Quality::GAP_BEFORE));
+}
+
+#[test]
+fn a_scale_of_zero_is_refused_until_it_is_repaired() {
+    let zero = "full_scale_n = [1804, 1804, 0]\nfull_scale_nm = [31, 31, 31]";
+    let mut rig = Rig::with_board("icub_strain", "", zero, &[], wrench());
+    rig.run(3000);
+    assert_eq!(
+        rig.device.state(),
+        State::Refused(Refusal::ZeroFullScale { channel: 2 })
+    );
+    assert!(rig.readings.is_empty() && rig.board.period().is_none());
+    assert!(rig.sent.len() < 12, "{:?}", rig.sent);
+    rig.board = options("icub_strain", "")
+        .board(&spec(1, Mode::Supervise, &[]))
+        .unwrap();
+    rig.run(600);
+    assert_eq!(rig.device.state(), State::Streaming);
+    // A value in the configuration overrides what the board has.
+    let mut rig = Rig::with_board("icub_strain", SCALES, zero, &[], wrench());
+    rig.run(100);
+    assert_eq!(rig.device.state(), State::Streaming);
+}
+
+#[test]
+fn a_scale_that_changed_is_refused_for_good() {
+    let mut rig = strain();
+    rig.run(100);
+    let other = "full_scale_n = [1804, 1804, 1805]\nfull_scale_nm = [31, 31, 31]";
+    rig.board = options("icub_strain", other)
+        .board(&spec(1, Mode::Supervise, &[]))
+        .unwrap();
+    let before = rig.readings.len();
+    rig.run(1000);
+    assert_eq!(rig.device.state(), State::Refused(Refusal::Changed));
+    assert_eq!((rig.count(Counter::Changed), rig.readings.len()), (1, before));
+    rig.device.restart(rig.now);
+    rig.run(1000);
+    assert_eq!(rig.device.state(), State::Refused(Refusal::Changed));
+}
+
+#[test]
+fn an_answer_counts_only_while_it_is_asked_for() {
+    let mut rig = strain();
+    rig.run(3000);
+    let state = rig.device.state();
+    let now = rig.now.seconds() * 1e3;
+    let at = |text| frame(text, now);
+    let (_, faults) = decode(&mut *rig.device, &[at("210#1800070C")]);
+    assert_eq!(
+        faults.iter().map(|f| f.counter).collect::<Vec<_>>(),
+        [Counter::Unexpected]
+    );
+    let (_, faults) = decode(&mut *rig.device, &[at("210#18000001")]);
+    assert_eq!(
+        faults.iter().map(|f| f.counter).collect::<Vec<_>>(),
+        [Counter::Changed, Counter::Unexpected]
+    );
+    // Answers to what others ask of the board are none of this driver's business.
+    let (_, faults) = decode(&mut *rig.device, &[at("210#1C0C020008020001"), at("210#18100001")]);
+    assert!(faults.is_empty(), "{faults:?}");
+    assert_eq!(rig.device.state(), state);
+}
+
+#[test]
+fn a_listener_learns_the_scale_from_the_log() {
+    let mut device = listener("icub_strain", "", &[]);
+    let pair = [frame("31A#E380B76A1887", 0.0), frame("31B#2184BE770881", 0.1)];
+    assert_eq!(device.state(), State::Starting);
+    let (readings, _) = decode(&mut *device, &pair);
+    assert!(readings.is_empty(), "no reading without a scale");
+    assert_eq!(device.state(), State::Refused(Refusal::NoFullScale));
+    let answers = ["1800070C", "1801070C", "1802070C", "1803001F", "1804001F", "1805001F"];
+    let answers: Vec<_> = answers.iter().map(|data| frame(&format!("210#{data}"), 1.0)).collect();
+    let (_, faults) = decode(&mut *device, &answers);
+    assert!(faults.is_empty(), "{faults:?}");
+    let (readings, _) = decode(&mut *device, &pair);
+    assert_eq!((readings.len(), device.state()), (1, State::Streaming));
+    // The same again is no news; another value makes everything doubtful.
+    let (_, faults) = decode(&mut *device, &answers);
+    assert!(faults.is_empty(), "{faults:?}");
+    let (_, faults) = decode(&mut *device, &[frame("210#18000001", 2.0)]);
+    assert_eq!(faults.iter().map(|f| f.counter).collect::<Vec<_>>(), [Counter::Changed]);
+    let (readings, _) = decode(&mut *device, &pair);
+    assert_eq!((readings.len(), device.state()), (0, State::Refused(Refusal::Changed)));
+}
+
+#[test]
+fn a_listener_watches_for_silence() {
+    let mut rig = Rig::new("icub_strain", &format!("{SCALES}listen = true"), &[], wrench());
+    rig.run(100);
+    assert_eq!(rig.device.state(), State::Streaming);
+    let woken = rig.device.next_wake().unwrap();
+    assert!(woken > rig.now && woken < rig.now + Nanos::from_millis(60));
+    rig.board_loses = Box::new(|_, _| true);
+    rig.run(500);
+    assert_eq!((rig.device.state(), rig.count(Counter::Silences)), (State::Silent, 1));
+    assert_eq!(rig.device.next_wake(), None);
+    rig.board_loses = Box::new(|_, _| false);
+    rig.run(20);
+    assert_eq!((rig.device.state(), rig.sent.len()), (State::Streaming, 0));
+}
+
+#[test]
+fn an_imu_is_told_asked_and_started_as_in_the_document() {
+    let keys = r#"quantities = ["acceleration", "angular_velocity", "status"]"#;
+    let mut rig = Rig::new("icub_imu", keys, &[], imu());
+    rig.run(100);
+    // The document's example: 201#3405800100000000, 201#350A.
+    assert_eq!(rig.sent, ["201#3405800100000000", "201#33", "201#350A"]);
+    assert_eq!((rig.device.state(), rig.readings.len()), (State::Streaming, 10));
+    rig.device.stop(rig.now);
+    rig.run(2);
+    assert_eq!(
+        (rig.sent.last().unwrap().as_str(), rig.board.period()),
+        ("201#3500", None)
+    );
+}
+
+#[test]
+fn an_imu_that_lost_its_configuration_is_told_again() {
+    let mut rig = Rig::new("icub_imu", "placement = 6\nmode = \"imu\"", &[], imu());
+    rig.host_loses = Box::new(|number, _| number == 1);
+    rig.run(100);
+    assert_eq!(
+        rig.sent,
+        [
+            "201#3405008886000000",
+            "201#33",
+            "201#3405008886000000",
+            "201#33",
+            "201#350A"
+        ]
+    );
+    assert_eq!(rig.device.state(), State::Streaming);
+    assert_eq!(rig.count(Counter::Changed), 0);
+}
+
+#[test]
+fn an_imu_that_does_not_answer_is_started_all_the_same() {
+    let mut rig = Rig::new("icub_imu", "", &[], imu());
+    rig.board_loses = Box::new(|_, frame| frame.data().first() == Some(&0x33));
+    rig.run(500);
+    assert_eq!(rig.device.state(), State::Streaming);
+}
+
+#[test]
+fn a_silent_imu_is_started_again_and_its_counter_begins_anew() {
+    let mut rig = Rig::new("icub_imu", "", &[], imu());
+    rig.run(500);
+    rig.board = options("icub_imu", "").board(&spec(1, Mode::Supervise, &[])).unwrap();
+    let before = rig.readings.len();
+    rig.run(200);
+    assert_eq!(
+        (
+            rig.device.state(),
+            rig.count(Counter::Silences),
+            rig.count(Counter::Lost)
+        ),
+        (State::Streaming, 1, 0)
+    );
+    assert!(rig.readings[before].quality.contains(Quality::GAP_BEFORE));
+    assert_eq!(rig.readings[before].device_counter, 1);
+}
+
+#[test]
+fn a_legacy_imu_is_started_with_its_own_command() {
+    let mut rig = Rig::new("icub_imu", "legacy = \"mtb\"\nperiod_ms = 20", &[], imu());
+    rig.run(100);
+    assert_eq!(rig.sent, ["201#4F0614"]);
+    assert_eq!((rig.device.state(), rig.readings.len()), (State::Streaming, 5));
+    rig.device.stop(rig.now);
+    rig.run(2);
+    assert_eq!(
+        (rig.sent.last().unwrap().as_str(), rig.board.period()),
+        ("201#4F0000", None)
+    );
+}
+
+#[test]
+fn a_motor_board_is_only_listened_to() {
+    let joint = JointState {
+        position: 1.0,
+        velocity: 0.0,
+        current: 0.5,
+        ..JointState::ABSENT
+    };
+    let mut rig = Rig::new("icub_motor", "period_ms = 2", &[0], (0, Reading::Joint(joint)));
+    rig.run(100);
+    assert_eq!(
+        (rig.device.state(), rig.readings.len(), rig.sent.len()),
+        (State::Streaming, 50, 0)
+    );
+    rig.board_loses = Box::new(|_, _| true);
+    rig.run(200);
+    assert_eq!((rig.device.state(), rig.count(Counter::Silences)), (State::Silent, 1));
+    rig.device.stop(rig.now);
+    rig.run(2);
+    assert_eq!((rig.device.state(), rig.sent.len()), (State::Stopped, 0));
+}
+
+#[test]
+fn a_pos_board_is_configured_and_started() {
+    let joint = (
+        2,
+        Reading::Joint(JointState {
+            position: 0.5,
+            ..JointState::ABSENT
+        }),
+    );
+    let keys =
+        "sensors = [{ label = 2, inverted = true, rotation_deg = -90, zero_deg = 25.6 }, { label = 3 }]\nperiod_ms = 5";
+    let mut rig = Rig::new("icub_pos", keys, &[2], joint);
+    rig.run(50);
+    // F2: enabled, inverted, -90 deg, label 2; zero 0x0100. 83: enabled, label 3.
+    assert_eq!(rig.sent, ["201#5200F20001830000", "201#5305"]);
+    assert_eq!((rig.device.state(), rig.readings.len()), (State::Streaming, 10));
+    rig.device.stop(rig.now);
+    rig.run(2);
+    assert_eq!(
+        (rig.sent.last().unwrap().as_str(), rig.board.period()),
+        ("201#5300", None)
+    );
+}
+
+#[test]
+fn configurations_that_can_not_work_are_named() {
+    let error = |driver: &str, keys: &str, address: u32, outputs: &[u8]| {
+        let spec = spec(address, Mode::Supervise, outputs);
+        match options(driver, keys).device(&spec) {
+            Err(error) => error.to_string(),
+            Ok(_) => panic!("{driver} accepts {keys:?}"),
+        }
+    };
+    assert_eq!(error("icub_strain", "", 0, &[]), "address = 0 is outside 1 to 14");
+    assert_eq!(error("icub_imu", "", 15, &[]), "address = 15 is outside 1 to 14");
+    assert_eq!(
+        error("icub_strain", "period_ms = 0", 1, &[]),
+        "period_ms = 0 must be an integer from 1 to 255"
+    );
+    assert_eq!(
+        error("icub_strain", "full_scale_n = [1, 2, 3]", 1, &[]),
+        "full_scale_nm is missing: it goes with full_scale_n"
+    );
+    assert_eq!(
+        error(
+            "icub_strain",
+            "full_scale_n = [1, 0, 3]\nfull_scale_nm = [1, 2, 3]",
+            1,
+            &[]
+        ),
+        "full_scale_n = 0 must be above 0 and at most 65535"
+    );
+    assert!(
+        error("icub_imu", "quantities = [\"status\"]", 1, &[])
+            .starts_with("quantities must be a list with at least one")
+    );
+    assert!(error("icub_imu", "placement = 8", 1, &[]).contains("placement = 8"));
+    assert!(error("icub_motor", "", 1, &[]).contains("needs a joint"));
+    assert_eq!(
+        error("icub_motor", "", 1, &[3]),
+        "joint channel 3 does not exist; this device has channels 0 to 0"
+    );
+    assert!(error("icub_pos", "sensors = []", 1, &[0]).starts_with("sensors must be"));
+    let missing = SpecError::Incomplete {
+        given: "a",
+        missing: "b",
+    };
+    assert_eq!(missing.to_string(), "b is missing: it goes with a");
+    // Unknown keys are errors.
+    for driver in proprio_drivers::DRIVERS {
+        let table: toml::Table = "full_scale = 3".parse().unwrap();
+        assert!(
+            proprio_drivers::Options::deserialize(driver, table).is_err(),
+            "{driver}"
+        );
+    }
+}

@@ -1,0 +1,9 @@
+//! What every driver promises, tested through its public face alone: golden bytes from the protocol's documents, decoding
+//! as the inverse of encoding, no harm from any frame, and bring-up against a board that answers like a real one.
+
+mod any_frame;
+mod bringup;
+mod golden;
+mod pairing;
+mod rig;
+mod round_trip;

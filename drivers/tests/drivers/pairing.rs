@@ -1,0 +1,203 @@
+//! Force and torque frames carry no number: they must never be paired across readings, whatever is lost or late.
+
+use crate::rig::{board, count, decode, encode, listener};
+use proprio_drivers::{Frame, Id};
+use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind, Wrench};
+use proptest::prelude::*;
+
+const KEYS: &str = "full_scale_n = [32768, 32768, 32768]\nfull_scale_nm = [32768, 32768, 32768]";
+const PERIOD_US: i64 = 10_000;
+/// From a force frame to its torque frame on a bus without other traffic.
+const USUAL_US: i64 = 150;
+
+/// The two frames of reading `number`, which both say so: a step is 1 N or 1 Nm.
+fn halves(number: u16) -> [Frame; 2] {
+    let value = f64::from(number);
+    let reading = Reading::Wrench(Wrench {
+        force: [value; 3],
+        torque: [value; 3],
+    });
+    encode(&mut *board("icub_strain", KEYS, &[]), 0, &reading, Quality::GOOD)
+        .try_into()
+        .unwrap()
+}
+
+fn at(frame: Frame, us: i64) -> Frame {
+    frame.at(Nanos::from_micros(us), StampKind::Software)
+}
+
+/// The numbers of the readings that come out, which must be the same in force and torque.
+fn numbers(frames: &[Frame]) -> (Vec<u16>, Vec<bool>, u32) {
+    let (readings, faults) = decode(&mut *listener("icub_strain", KEYS, &[]), frames);
+    let numbers = readings
+        .iter()
+        .map(|output| {
+            let Reading::Wrench(wrench) = output.reading else {
+                panic!("{output:?}")
+            };
+            assert_eq!(wrench.force, wrench.torque, "halves of two readings");
+            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+            let number = wrench.force[0] as u16;
+            number
+        })
+        .collect();
+    let gaps = readings
+        .iter()
+        .map(|output| output.quality.contains(Quality::GAP_BEFORE))
+        .collect();
+    (numbers, gaps, count(&faults, Counter::Unpaired))
+}
+
+/// Frames named as `F1` or `T1`, at the times given in units of a period.
+fn sequence(items: &[(&str, f64)]) -> Vec<Frame> {
+    items
+        .iter()
+        .map(|(name, periods)| {
+            let [force, torque] = halves(name[1..].parse().unwrap());
+            #[allow(clippy::cast_possible_truncation)]
+            at(
+                if name.starts_with('F') { force } else { torque },
+                (periods * PERIOD_US as f64) as i64,
+            )
+        })
+        .collect()
+}
+
+#[test]
+fn a_late_torque_is_not_paired_with_the_next_force() {
+    let frames = sequence(&[
+        ("F0", 0.0),
+        ("T0", 0.015),
+        ("F1", 1.0),
+        ("F2", 2.0),
+        ("T1", 2.01),
+        ("T2", 2.015),
+        ("F3", 3.0),
+        ("T3", 3.015),
+    ]);
+    let (numbers, gaps, unpaired) = numbers(&frames);
+    assert_eq!((numbers, gaps, unpaired), (vec![0, 3], vec![false, true], 4));
+}
+
+#[test]
+fn order_alone_decides_where_there_are_no_stamps() {
+    let mut frames = sequence(&[
+        ("F0", 0.0),
+        ("T0", 0.0),
+        ("F1", 0.0),
+        ("F2", 0.0),
+        ("T1", 0.0),
+        ("T2", 0.0),
+        ("F3", 0.0),
+        ("T3", 0.0),
+        ("F4", 0.0),
+        ("F5", 0.0),
+        ("T5", 0.0),
+        ("F6", 0.0),
+        ("T6", 0.0),
+        ("T7", 0.0),
+        ("F8", 0.0),
+        ("T8", 0.0),
+    ]);
+    for frame in &mut frames {
+        *frame = frame.at(Nanos::ZERO, StampKind::None);
+    }
+    let (numbers, gaps, unpaired) = numbers(&frames);
+    assert_eq!(numbers, [0, 3, 6, 8]);
+    assert_eq!(gaps, [false, true, true, true]);
+    assert_eq!(unpaired, 4 + 3 + 1);
+}
+
+#[test]
+fn a_torque_too_long_after_its_force_is_not_paired_either() {
+    let (numbers, _, unpaired) = numbers(&sequence(&[("F0", 0.0), ("T0", 0.6), ("F1", 1.0), ("T1", 1.015)]));
+    assert_eq!((numbers, unpaired), (vec![1], 2));
+}
+
+#[test]
+fn two_boards_do_not_disturb_each_other() {
+    let other = |frame: &Frame| {
+        let Id::Standard(id) = frame.id else { panic!("{frame}") };
+        Frame::new(Id::standard(id + 0x10), frame.data()).at(frame.t, frame.stamp)
+    };
+    // 31A 32A 31B 32B: each device is given all frames and takes its own.
+    let mut frames = Vec::new();
+    for number in 0..50_u16 {
+        let [force, torque] = halves(number);
+        let t = i64::from(number) * PERIOD_US;
+        let [force, torque] = [at(force, t), at(torque, t + 300)];
+        frames.extend([force, other(&force), torque, other(&torque)]);
+    }
+    let (numbers, _, unpaired) = numbers(&frames);
+    assert_eq!((numbers, unpaired), ((0..50).collect(), 0));
+}
+
+/// What happens to a torque frame.
+#[derive(Debug, Clone, Copy)]
+enum Fate {
+    Comes,
+    Lost,
+    /// Late by this \[us\].
+    Late(i64),
+}
+
+proptest! {
+    /// Any torque frames lost, any late by up to two periods unless the one before is late too.
+    #[test]
+    fn halves_of_two_readings_are_never_put_together(fates in proptest::collection::vec(
+        prop_oneof![
+            6 => Just(Fate::Comes),
+            2 => Just(Fate::Lost),
+            2 => (0_i64..2 * PERIOD_US - USUAL_US - 1).prop_map(Fate::Late),
+            // Just into the gap between the next force and its torque: the hardest place.
+            2 => (PERIOD_US - USUAL_US..=PERIOD_US).prop_map(Fate::Late),
+        ], 1..60,
+    )) {
+        let mut events = Vec::new();
+        let mut late_before = false;
+        let mut on_time = Vec::new();
+        for (number, fate) in (0_u16..).zip(&fates) {
+            let [force, torque] = halves(number);
+            let t = i64::from(number) * PERIOD_US;
+            events.push((t, at(force, t)));
+            let delay = match fate {
+                Fate::Lost => { late_before = false; continue }
+                Fate::Late(delay) if !late_before && *delay > 0 => { late_before = true; *delay }
+                Fate::Comes | Fate::Late(_) => { late_before = false; on_time.push(number); 0 }
+            };
+            let t = t + USUAL_US + delay;
+            events.push((t, at(torque, t)));
+        }
+        events.sort_by_key(|(t, _)| *t);
+        let frames: Vec<Frame> = events.into_iter().map(|(_, frame)| frame).collect();
+        let halves_in = u32::try_from(frames.len()).unwrap();
+        let (numbers, gaps, unpaired) = numbers(&frames);
+        // In order, and every half is either in a reading, or counted, or (the last force) still waiting.
+        prop_assert!(numbers.is_sorted());
+        let paired = 2 * u32::try_from(numbers.len()).unwrap();
+        prop_assert!((halves_in - 1..=halves_in).contains(&(paired + unpaired)), "{} of {}", paired + unpaired, halves_in);
+        // Every reading that follows a lost one says so.
+        for (k, pair) in numbers.windows(2).enumerate() {
+            prop_assert_eq!(gaps[k + 1], pair[1] != pair[0] + 1);
+        }
+    }
+
+    /// Losses alone cost at most one reading more than was hit.
+    #[test]
+    fn a_loss_costs_at_most_the_reading_after_it(lost in proptest::collection::vec(proptest::bool::weighted(0.2), 2..100)) {
+        let mut frames = Vec::new();
+        let mut expected = Vec::new();
+        for (number, half_lost) in (0_u16..).zip(lost.chunks(2)) {
+            let [force, torque] = halves(number);
+            let t = i64::from(number) * PERIOD_US;
+            let lost = |half: usize| half_lost.get(half).copied().unwrap_or(false);
+            if !lost(0) { frames.push(at(force, t)); }
+            if !lost(1) { frames.push(at(torque, t + USUAL_US)); }
+            if !lost(0) && !lost(1) { expected.push(number); }
+        }
+        let (numbers, _, _) = numbers(&frames);
+        let hit = lost.chunks(2).filter(|halves| halves.contains(&true)).count();
+        prop_assert!(numbers.iter().all(|number| expected.contains(number)));
+        prop_assert!(numbers.len() + hit >= expected.len());
+    }
+}

@@ -1,0 +1,195 @@
+//! Drivers and boards built from TOML as the gateway builds them, and a bus between the two that loses what it is told to.
+
+use proprio_drivers::{Board, Decoded, Device, Fault, Frame, Frames, Id, Mode, Options, Output, Outputs, Spec, State};
+use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind};
+
+/// The keys of a driver, read from TOML.
+pub(crate) fn options(driver: &str, keys: &str) -> Options {
+    let table: toml::Table = keys.parse().expect("test keys are TOML");
+    match Options::deserialize(driver, table) {
+        Ok(options) => options,
+        Err(error) => panic!("{driver}: {error:?}"),
+    }
+}
+
+/// A device at `address` that may be silent for 50 ms.
+pub(crate) fn spec(address: u32, mode: Mode, outputs: &[u8]) -> Spec {
+    let outputs = Outputs(outputs.iter().copied().collect());
+    Spec {
+        address,
+        max_silence: Nanos::from_millis(50),
+        mode,
+        outputs,
+    }
+}
+
+/// A device that only listens.
+pub(crate) fn listener(driver: &str, keys: &str, outputs: &[u8]) -> Box<dyn Device> {
+    options(driver, keys)
+        .device(&spec(1, Mode::Listen, outputs))
+        .expect("a legal configuration")
+}
+
+/// A board.
+pub(crate) fn board(driver: &str, keys: &str, outputs: &[u8]) -> Box<dyn Board> {
+    options(driver, keys)
+        .board(&spec(1, Mode::Supervise, outputs))
+        .expect("a legal configuration")
+}
+
+/// The frame that can-utils write as `text`, received at `ms`.
+pub(crate) fn frame(text: &str, ms: f64) -> Frame {
+    let (id, data) = text.split_once('#').expect("id#data");
+    let bytes: Vec<u8> = (0..data.len())
+        .step_by(2)
+        .map(|at| u8::from_str_radix(&data[at..at + 2], 16).unwrap())
+        .collect();
+    let id = u32::from_str_radix(id, 16).unwrap();
+    Frame::new(Id::standard(u16::try_from(id).unwrap()), &bytes).at(Nanos::from_seconds(ms * 1e-3), StampKind::Software)
+}
+
+/// What `frames` yield, readings and faults in order.
+pub(crate) fn decode(device: &mut dyn Device, frames: &[Frame]) -> (Vec<Output>, Vec<Fault>) {
+    let (mut readings, mut faults) = (Vec::new(), Vec::new());
+    let mut out = Decoded::new();
+    for frame in frames {
+        out.clear();
+        device.on_frame(frame, &mut out);
+        readings.extend(out.readings.iter().copied());
+        faults.extend(out.faults.iter().copied());
+    }
+    (readings, faults)
+}
+
+/// How often `counter` was counted.
+pub(crate) fn count(faults: &[Fault], counter: Counter) -> u32 {
+    faults
+        .iter()
+        .filter(|fault| fault.counter == counter)
+        .map(|fault| fault.count)
+        .sum()
+}
+
+/// The frames that `reading` is encoded to.
+pub(crate) fn encode(board: &mut dyn Board, output: u8, reading: &Reading, quality: Quality) -> Vec<Frame> {
+    let mut out = Frames::new();
+    board
+        .encode(output, reading, quality, &mut out)
+        .expect("a reading that this board has");
+    out.to_vec()
+}
+
+/// Whether the n-th frame of one side, which is this, is lost.
+type Loss = Box<dyn FnMut(usize, &Frame) -> bool>;
+
+/// One device and one board on a bus with 1 ms to a turn.
+pub(crate) struct Rig {
+    pub(crate) device: Box<dyn Device>,
+    pub(crate) board: Box<dyn Board>,
+    /// What the board measures.
+    pub(crate) reading: (u8, Reading),
+    pub(crate) now: Nanos,
+    /// What the host sends in vain.
+    pub(crate) host_loses: Loss,
+    /// What the board sends in vain.
+    pub(crate) board_loses: Loss,
+    /// Everything that the host sent, lost or not.
+    pub(crate) sent: Vec<String>,
+    pub(crate) received: usize,
+    pub(crate) readings: Vec<Output>,
+    pub(crate) faults: Vec<Fault>,
+    /// States that were passed, without repetition.
+    pub(crate) states: Vec<State>,
+    due: Option<Nanos>,
+}
+
+impl Rig {
+    /// A device and a board with the same keys.
+    pub(crate) fn new(driver: &str, keys: &str, outputs: &[u8], reading: (u8, Reading)) -> Self {
+        Self::with_board(driver, keys, keys, outputs, reading)
+    }
+
+    /// A device and a board with keys of their own.
+    pub(crate) fn with_board(
+        driver: &str,
+        keys: &str,
+        board_keys: &str,
+        outputs: &[u8],
+        reading: (u8, Reading),
+    ) -> Self {
+        let spec = spec(1, Mode::Supervise, outputs);
+        Self {
+            device: options(driver, keys).device(&spec).expect("a legal configuration"),
+            board: options(driver, board_keys).board(&spec).expect("a legal configuration"),
+            reading,
+            now: Nanos::from_millis(1000),
+            host_loses: Box::new(|_, _| false),
+            board_loses: Box::new(|_, _| false),
+            sent: Vec::new(),
+            received: 0,
+            readings: Vec::new(),
+            faults: Vec::new(),
+            states: Vec::new(),
+            due: None,
+        }
+    }
+
+    fn deliver(&mut self, frames: &[Frame]) {
+        for frame in frames {
+            self.received += 1;
+            if (self.board_loses)(self.received, frame) {
+                continue;
+            }
+            let mut out = Decoded::new();
+            self.device.on_frame(&frame.at(self.now, StampKind::Software), &mut out);
+            self.readings.extend(out.readings);
+            self.faults.extend(out.faults);
+        }
+    }
+
+    fn note(&mut self) {
+        let state = self.device.state();
+        if self.states.last() != Some(&state) {
+            self.states.push(state);
+        }
+    }
+
+    /// Lets `ms` milliseconds pass.
+    pub(crate) fn run(&mut self, ms: u32) -> &mut Self {
+        for _ in 0..ms {
+            let mut out = Decoded::new();
+            while let Some(transmit) = self.device.poll_transmit(self.now, &mut out) {
+                assert!(transmit.deadline > self.now, "a frame that may not be sent any more");
+                self.sent.push(transmit.frame.to_string());
+                assert!(self.sent.len() < 10_000, "it never stops sending");
+                if (self.host_loses)(self.sent.len(), &transmit.frame) {
+                    continue;
+                }
+                let mut answers = Frames::new();
+                self.board.on_frame(&transmit.frame, &mut answers);
+                self.deliver(&answers);
+            }
+            self.faults.extend(out.faults);
+            self.note();
+            match self.board.period() {
+                None => self.due = None,
+                Some(period) => {
+                    let due = *self.due.get_or_insert(self.now);
+                    if self.now >= due {
+                        self.due = Some(due + period);
+                        let (output, reading) = self.reading;
+                        let frames = encode(&mut *self.board, output, &reading, Quality::GOOD);
+                        self.deliver(&frames);
+                    }
+                }
+            }
+            self.note();
+            self.now += Nanos::from_millis(1);
+        }
+        self
+    }
+
+    pub(crate) fn count(&self, counter: Counter) -> u32 {
+        count(&self.faults, counter)
+    }
+}
