@@ -1,0 +1,135 @@
+//! gateway.toml as it is typed. [`crate::plan`] checks it and resolves it; nothing else sees this form.
+
+use serde::Deserialize;
+use std::path::PathBuf;
+use toml::Spanned;
+
+/// The whole file.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Raw {
+    /// The version of this form: 1.
+    pub schema: u32,
+    /// The robot's name: the first part of every service's name.
+    pub robot: String,
+    /// The buses.
+    #[serde(default)]
+    pub bus: Vec<RawBus>,
+}
+
+/// `[[bus]]`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RawBus {
+    /// Its name.
+    pub name: String,
+    /// Where its frames come from.
+    pub source: Source,
+    /// How its thread is scheduled.
+    pub realtime: Option<Realtime>,
+    /// `[[bus.device]]`: common keys and the driver's own keys in one table.
+    #[serde(default)]
+    pub device: Vec<Spanned<toml::Table>>,
+}
+
+/// Where a bus's frames come from.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
+pub enum Source {
+    /// A CAN interface of the kernel.
+    SocketCan {
+        /// Its name, such as `can0`.
+        interface: String,
+    },
+    /// The virtual bus on the loopback interface.
+    Virtual {
+        /// Its name.
+        name: String,
+    },
+    /// A recorded log.
+    Replay {
+        /// The file, relative to the configuration.
+        log: PathBuf,
+        /// How fast.
+        #[serde(default)]
+        pace: Pace,
+    },
+}
+
+/// How fast a log is replayed.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Pace {
+    /// As it was recorded; stamps are rebased to now.
+    #[default]
+    Recorded,
+    /// As fast as it goes, with the log's own stamps; offline only.
+    Fast,
+}
+
+/// How a thread is scheduled.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Realtime {
+    /// The processor it is bound to.
+    pub cpu: Option<usize>,
+    /// Its SCHED_FIFO priority, 1 to 99.
+    pub priority: Option<i32>,
+}
+
+/// The keys that every device has.
+#[derive(Debug, Deserialize)]
+pub struct RawDevice {
+    /// Which driver.
+    pub driver: String,
+    /// Its name: the channel's name of a sensor.
+    pub name: String,
+    /// Its address as the driver counts.
+    pub address: u32,
+    /// How long it may be silent \[ms\].
+    #[serde(default = "default_max_silence_ms")]
+    pub max_silence_ms: f64,
+    /// Never send to it: somebody else commands it.
+    #[serde(default)]
+    pub listen_only: bool,
+    /// `[[bus.device.joint]]`.
+    #[serde(default)]
+    pub joint: Vec<RawJoint>,
+}
+
+impl RawDevice {
+    /// The names of the keys above; the others are the driver's.
+    pub const KEYS: [&str; 6] = ["driver", "name", "address", "max_silence_ms", "listen_only", "joint"];
+}
+
+const fn default_max_silence_ms() -> f64 {
+    100.0
+}
+
+/// `[[bus.device.joint]]`: which channel of the device is which joint: joint = sign * device / ratio + offset.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RawJoint {
+    /// The joint's name.
+    pub name: String,
+    /// The device's channel.
+    #[serde(default)]
+    pub channel: u8,
+    /// Gear ratio: device angle per joint angle.
+    #[serde(default = "one")]
+    pub ratio: f64,
+    /// 1 or -1.
+    #[serde(default = "plus")]
+    pub sign: i8,
+    /// The joint's angle where the device says zero \[rad\].
+    #[serde(default)]
+    pub offset_rad: f64,
+}
+
+const fn one() -> f64 {
+    1.0
+}
+
+const fn plus() -> i8 {
+    1
+}

@@ -1,0 +1,245 @@
+//! A recorded log as a link: candump's formats, at the recorded pace or as fast as they can be read.
+//!
+//! | pace | when a frame is handed out | its stamp |
+//! |---|---|---|
+//! | [`Pace::Recorded`] | at its stamp, the first stamp being the first call of [`Link::recv`] | the log's, moved to now |
+//! | [`Pace::Fast`] | at once | the log's |
+//!
+//! A log answers nothing, so it takes nothing: [`Link::send`] is [`SendError::Unsupported`]. Devices that only listen
+//! never send.
+
+use super::{Link, LinkCounters, OpenError, Received, SendError, passes};
+use crate::candump::{Reader, Report};
+use crate::clock::{Clock, Monotonic, sleep_until};
+pub use crate::config::Pace;
+use proprio_drivers::{Claim, Format, Frame};
+use proprio_topics::{LinkState, Nanos, StampKind};
+use std::fs::File;
+use std::io::{self, BufReader};
+use std::path::Path;
+
+/// How much of the log is read at a time \[bytes\].
+const BUFFER: usize = 1 << 16;
+
+/// Which frames of a log with several interfaces belong to one bus.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Matching {
+    interface: Option<String>,
+    name: Option<String>,
+}
+
+impl Matching {
+    /// What bus number `this` of `buses`, each with its interface (if its source is one) and its name, takes of a log: with one
+    /// bus everything (`None`), with several the frames of its interface, and those of an interface that is called like the
+    /// bus and belongs to no other.
+    #[must_use]
+    pub fn of(buses: &[(Option<&str>, &str)], this: usize) -> Option<Self> {
+        let (interface, name) = buses.get(this).filter(|_| buses.len() > 1)?;
+        let taken = buses
+            .iter()
+            .enumerate()
+            .any(|(i, (other, _))| i != this && *other == Some(*name));
+        Some(Self {
+            interface: interface.map(str::to_owned),
+            name: (!taken).then(|| (*name).to_owned()),
+        })
+    }
+
+    /// Whether frames that the log shows on `interface` belong to it.
+    #[must_use]
+    pub fn takes(&self, interface: &str) -> bool {
+        self.interface.as_deref() == Some(interface) || self.name.as_deref() == Some(interface)
+    }
+}
+
+/// A log that is being replayed.
+#[derive(Debug)]
+pub struct Replay {
+    log: Reader<BufReader<File>>,
+    pace: Pace,
+    matching: Option<Matching>,
+    claims: Vec<Claim>,
+    clock: Monotonic,
+    /// The next frame: read, not yet due.
+    pending: Option<Frame>,
+    /// The log's first stamp, whichever interface it is of.
+    origin: Nanos,
+    /// What is added to the log's stamps, once known.
+    shift: Option<Nanos>,
+    /// The stamp handed out last, for frames without.
+    last: Nanos,
+    ended: bool,
+    failure: Option<io::ErrorKind>,
+    unmatched: u64,
+    counters: LinkCounters,
+}
+
+impl Replay {
+    /// Opens the log at `path`, of which only frames that `interface` takes (all if `None`) and one of `claims` matches (all
+    /// if there are none) are handed out.
+    ///
+    /// # Errors
+    /// [`OpenError::Log`]: it can not be read, or has no time stamps to keep the pace by.
+    pub fn open(path: &Path, pace: Pace, interface: Option<Matching>, claims: &[Claim]) -> Result<Self, OpenError> {
+        let fail = |cause| OpenError::Log {
+            path: path.to_owned(),
+            cause,
+        };
+        let file = File::open(path).map_err(fail)?;
+        let mut replay = Self {
+            log: Reader::new(BufReader::with_capacity(BUFFER, file)),
+            pace,
+            matching: interface,
+            claims: claims.to_vec(),
+            clock: Monotonic,
+            pending: None,
+            origin: Nanos::ZERO,
+            shift: None,
+            last: Nanos::ZERO,
+            ended: false,
+            failure: None,
+            unmatched: 0,
+            counters: LinkCounters::default(),
+        };
+        // The first frame of the whole log sets the origin, so that the buses of one log stay in step.
+        let matches = |interface: &str| replay.matching.as_ref().is_none_or(|m| m.takes(interface));
+        let first = replay
+            .log
+            .next_record()
+            .map_err(fail)?
+            .map(|r| (r.stamp, matches(r.interface), r.frame));
+        match first {
+            None => replay.ended = true,
+            Some((None, ..)) if pace == Pace::Recorded => {
+                let cause =
+                    "it has no time stamps to keep the pace by; record with `candump -l`, or use pace = \"fast\"";
+                return Err(fail(io::Error::new(io::ErrorKind::InvalidData, cause)));
+            }
+            Some((stamp, matches, frame)) => {
+                replay.origin = stamp.unwrap_or_default();
+                replay.last = replay.origin;
+                replay.pending = replay.sort(frame, matches);
+            }
+        }
+        Ok(replay)
+    }
+
+    /// What the log's reader has seen so far: bad lines, frames without stamps.
+    #[must_use]
+    pub const fn report(&self) -> &Report {
+        self.log.report()
+    }
+
+    /// Puts the log's first stamp at `now`, rather than at the first call of [`Link::recv`]: so that several buses replayed from
+    /// one log stay in step.
+    pub const fn start_at(&mut self, now: Nanos) {
+        self.shift = Some(now.saturating_sub(self.origin));
+    }
+
+    /// Frames of interfaces that are not this bus.
+    #[must_use]
+    pub const fn unmatched(&self) -> u64 {
+        self.unmatched
+    }
+
+    /// What reading failed with, if the log ended for that reason.
+    #[must_use]
+    pub const fn failure(&self) -> Option<io::ErrorKind> {
+        self.failure
+    }
+
+    /// Whether a frame is to be handed out; counts it if not.
+    fn sort(&mut self, frame: Frame, matches: bool) -> Option<Frame> {
+        if !matches {
+            self.unmatched += 1;
+            return None;
+        }
+        if frame.format == Format::Error {
+            self.counters.error_frames += 1;
+            return None;
+        }
+        passes(&self.claims, &frame).then_some(frame)
+    }
+
+    /// The next frame to hand out, due or not.
+    fn next(&mut self) -> Option<Frame> {
+        if let Some(frame) = self.pending.take() {
+            return Some(frame);
+        }
+        while !self.ended {
+            let (frame, matches) = match self.log.next_record() {
+                Ok(Some(record)) => (
+                    record.frame,
+                    self.matching.as_ref().is_none_or(|m| m.takes(record.interface)),
+                ),
+                Ok(None) => {
+                    self.ended = true;
+                    break;
+                }
+                Err(error) => {
+                    self.failure = Some(error.kind());
+                    self.ended = true;
+                    self.counters.losses += 1;
+                    break;
+                }
+            };
+            if let Some(frame) = self.sort(frame, matches) {
+                return Some(frame);
+            }
+        }
+        None
+    }
+}
+
+impl Link for Replay {
+    /// As [`Link::recv`]; a frame at the recorded pace that is not due by `deadline` is [`Received::TimedOut`], and handed out
+    /// by a later call.
+    fn recv(&mut self, deadline: Nanos) -> Received {
+        let Some(frame) = self.next() else {
+            return Received::Ended;
+        };
+        let handed_out = match self.pace {
+            Pace::Fast => frame,
+            Pace::Recorded => {
+                // A line without a stamp among others comes with the one before it.
+                let recorded = if frame.stamp == StampKind::None {
+                    self.last
+                } else {
+                    frame.t
+                };
+                let now = self.clock.now();
+                let shift = *self.shift.get_or_insert(now.saturating_sub(self.origin));
+                let due = recorded.saturating_add(shift);
+                if due > now {
+                    sleep_until(due.min(deadline));
+                    if due > deadline {
+                        self.pending = Some(frame);
+                        return Received::TimedOut;
+                    }
+                }
+                self.last = recorded;
+                frame.at(due, StampKind::Log)
+            }
+        };
+        self.counters.received += 1;
+        Received::Frame(handed_out)
+    }
+
+    /// Never sends: a log answers nothing.
+    fn send(&mut self, _frame: &Frame, _deadline: Nanos) -> Result<(), SendError> {
+        self.counters.send_failures += 1;
+        Err(SendError::Unsupported)
+    }
+
+    fn state(&self) -> LinkState {
+        if self.ended && self.pending.is_none() {
+            LinkState::Ended
+        } else {
+            LinkState::Up
+        }
+    }
+
+    fn counters(&self) -> LinkCounters {
+        self.counters
+    }
+}

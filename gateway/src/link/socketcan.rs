@@ -1,0 +1,499 @@
+//! A CAN interface of the kernel.
+//!
+//! Identifiers are filtered by the kernel, frames come in batches with the adapter's stamps where it makes any and the
+//! kernel's otherwise, lost frames are counted, and frames that this link sent itself do not come back. CAN FD works where
+//! the interface has it on (`mtu 72`).
+//!
+//! | what happens | state | how it comes back |
+//! |---|---|---|
+//! | `ip link set can0 down` | [`LinkState::Down`] | by itself once the interface is up |
+//! | the adapter is pulled, the interface deleted | [`LinkState::Gone`] | a new socket once one of the same name is there |
+//! | too many errors: bus-off | [`LinkState::BusOff`] | the controller restarts (`restart-ms`, `type can restart`) |
+//!
+//! Recovery happens inside [`Link::recv`], which looks every 50 ms. As long as the state is not up nothing is sent, so that
+//! no stale command waits in a queue for the bus to come back.
+
+use super::socket::{RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, interface_flags, newly_dropped, wait};
+use super::{Link, LinkCounters, OpenError, Received, SendError, passes};
+use crate::clock::{Clock, HardwareToMonotonic, Monotonic, sleep_until};
+use nix::errno::Errno;
+use nix::poll::PollFlags;
+use nix::sys::socket::{MsgFlags, send, setsockopt, sockopt};
+use proprio_drivers::{Claim, Format, Frame, Id};
+use proprio_topics::{LinkState, Nanos, StampKind};
+use socketcan::{CanAddr, CanFdSocket, Socket, SocketOptions};
+use std::io;
+use std::os::fd::{AsFd, AsRawFd};
+
+/// How often a lost interface is looked for.
+const RETRY: Nanos = Nanos::from_millis(50);
+/// How long to wait before a full transmit queue is tried again; the socket can not be polled for that.
+const QUEUE_RETRY: Nanos = Nanos::from_micros(200);
+/// The most filters that the kernel takes (`CAN_RAW_FILTER_MAX`).
+const MOST_FILTERS: usize = 512;
+/// Sizes of `struct can_frame` and `struct canfd_frame`.
+const CLASSIC: usize = 16;
+const FD: usize = 72;
+/// Where the data begin, in both.
+const DATA: usize = 8;
+/// `CANFD_BRS`, `CANFD_ESI`.
+const BIT_RATE_SWITCH: u8 = 1;
+const ERROR_STATE: u8 = 2;
+
+/// A raw CAN socket on one interface.
+pub struct SocketCan {
+    interface: String,
+    socket: CanFdSocket,
+    /// `struct can_filter`s as bytes.
+    filters: Vec<u8>,
+    /// What to filter here, because the kernel does not take so many filters.
+    claims: Vec<Claim>,
+    receiver: Receiver<FD>,
+    adapter: HardwareToMonotonic,
+    state: LinkState,
+    /// The state has changed outside of `recv`, which is to say so.
+    changed: bool,
+    /// A frame that showed that the link is up again; handed out after the change was told.
+    pending: Option<Frame>,
+    /// When to look for the lost interface again.
+    retry: Nanos,
+    counters: LinkCounters,
+}
+
+impl std::fmt::Debug for SocketCan {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("SocketCan")
+            .field("interface", &self.interface)
+            .field("state", &self.state)
+            .field("counters", &self.counters)
+            .finish_non_exhaustive()
+    }
+}
+
+impl SocketCan {
+    /// Opens `interface` and receives what one of `claims` matches (everything if there are none). The interface may be down.
+    ///
+    /// # Errors
+    /// [`OpenError`]: there is no such interface, it is not a CAN interface, the kernel has no CAN, or we may not.
+    pub fn open(interface: &str, claims: &[Claim]) -> Result<Self, OpenError> {
+        let by_kernel = claims.len() <= MOST_FILTERS;
+        let filters = if by_kernel { filters(claims) } else { filters(&[]) };
+        let mut receiver = Receiver::new();
+        let socket = open_socket(interface, &filters, &mut receiver).map_err(|e| open_error(interface, e))?;
+        let state = current_state(&socket, interface);
+        Ok(Self {
+            interface: interface.to_owned(),
+            socket,
+            filters,
+            claims: if by_kernel { Vec::new() } else { claims.to_vec() },
+            receiver,
+            adapter: HardwareToMonotonic::default(),
+            state,
+            changed: false,
+            pending: None,
+            retry: Nanos::ZERO,
+            counters: LinkCounters::default(),
+        })
+    }
+
+    /// Sets the state; tells whether it is another one.
+    fn set_state(&mut self, state: LinkState) -> bool {
+        if self.state == state {
+            return false;
+        }
+        if self.state == LinkState::Up {
+            self.counters.losses += 1;
+        }
+        self.state = state;
+        true
+    }
+
+    /// Sets the state that a failure of the socket means; tells whether it is another one.
+    fn lose(&mut self, error: Errno) -> bool {
+        self.retry = Monotonic.now().saturating_add(RETRY);
+        // Whatever else may be wrong with the socket, it is looked at again.
+        self.set_state(if matches!(error, Errno::ENODEV | Errno::ENXIO) {
+            LinkState::Gone
+        } else {
+            LinkState::Down
+        })
+    }
+
+    /// Looks whether the lost interface is back, if it is time to; tells whether the state is another one.
+    fn recover(&mut self) -> bool {
+        let now = Monotonic.now();
+        if now < self.retry {
+            return false;
+        }
+        self.retry = now.saturating_add(RETRY);
+        // An interface that was deleted and made anew is another one, which the old socket knows nothing of.
+        if self.state == LinkState::Gone {
+            match open_socket(&self.interface, &self.filters, &mut self.receiver) {
+                Ok(socket) => self.socket = socket,
+                Err(_) => return false,
+            }
+            self.adapter = HardwareToMonotonic::default();
+        }
+        let state = current_state(&self.socket, &self.interface);
+        self.set_state(state)
+    }
+
+    /// Takes the next frame from the batch. `None`: the batch is empty.
+    fn next(&mut self) -> Option<Received> {
+        while let Some(message) = self.receiver.batch.next() {
+            self.counters.dropped += newly_dropped(&mut self.receiver.drops, message.control.drops);
+            let frame = match decode(message.bytes) {
+                Some(Decoded::Frame(frame)) if passes(&self.claims, &frame) => frame,
+                Some(Decoded::Error(classes)) => {
+                    self.counters.error_frames += 1;
+                    let state = match self.state {
+                        _ if classes & libc::CAN_ERR_BUSOFF != 0 => LinkState::BusOff,
+                        // Restarted; or counting errors again, as adapters that restart by themselves say it.
+                        LinkState::BusOff if classes & (libc::CAN_ERR_RESTARTED | libc::CAN_ERR_CRTL) != 0 => {
+                            LinkState::Up
+                        }
+                        state => state,
+                    };
+                    if self.set_state(state) {
+                        return Some(Received::StateChanged);
+                    }
+                    continue;
+                }
+                _ => continue,
+            };
+            let (adapter, times) = (&mut self.adapter, &mut self.receiver.times);
+            let software = message.control.software.map(|t| times.convert(t));
+            let hardware = message
+                .control
+                .hardware
+                .zip(software)
+                .and_then(|(h, s)| adapter.convert(h, s));
+            let (stamp, kind) = match (hardware, software) {
+                (Some(stamp), _) => (stamp, StampKind::Hardware),
+                (None, Some(stamp)) => (stamp, StampKind::Software),
+                (None, None) => (times.now(), StampKind::User),
+            };
+            let frame = frame.at(times.limit(stamp), kind);
+            // Who receives is on the bus.
+            if self.set_state(LinkState::Up) {
+                self.pending = Some(frame);
+                return Some(Received::StateChanged);
+            }
+            self.counters.received += 1;
+            return Some(Received::Frame(frame));
+        }
+        None
+    }
+}
+
+/// `struct can_filter { id, mask }` for each claim; without claims the one that lets everything pass.
+fn filters(claims: &[Claim]) -> Vec<u8> {
+    let everything = [[0_u32, 0]];
+    let claims = claims.iter().map(|claim| {
+        let (id, mask) = match claim.id {
+            Id::Standard(id) => (u32::from(id), claim.mask & libc::CAN_SFF_MASK),
+            Id::Extended(id) => (id | libc::CAN_EFF_FLAG, claim.mask & libc::CAN_EFF_MASK),
+        };
+        // Without the flags in the mask, a standard filter would pass extended identifiers that end alike, and remote requests.
+        [id, mask | libc::CAN_EFF_FLAG | libc::CAN_RTR_FLAG]
+    });
+    let all: Vec<[u32; 2]> = if claims.len() == 0 {
+        everything.to_vec()
+    } else {
+        claims.collect()
+    };
+    all.iter().flatten().flat_map(|word| word.to_ne_bytes()).collect()
+}
+
+/// A socket on `interface` with everything set, that has received nothing yet.
+fn open_socket(interface: &str, filters: &[u8], receiver: &mut Receiver<FD>) -> io::Result<CanFdSocket> {
+    let socket = CanFdSocket::open_addr(&CanAddr::from_iface(interface)?)?;
+    socket.set_nonblocking(true)?;
+    socket.set_socket_option_bytes(libc::SOL_CAN_RAW, libc::CAN_RAW_FILTER, filters)?;
+    socket.set_error_filter_accept_all()?;
+    socket.set_recv_own_msgs(false)?;
+    let software = libc::SOF_TIMESTAMPING_RX_SOFTWARE | libc::SOF_TIMESTAMPING_SOFTWARE;
+    let hardware = libc::SOF_TIMESTAMPING_RX_HARDWARE | libc::SOF_TIMESTAMPING_RAW_HARDWARE;
+    socket.set_timestamping(if socket.has_hw_timestamps() {
+        software | hardware
+    } else {
+        software
+    })?;
+    setsockopt(&socket, sockopt::RxqOvfl, &1)?;
+    enlarge_receive_buffer(&socket, RECEIVE_BUFFER);
+    // What came between binding and filtering is not filtered. Nor is it waited for: the bus goes on.
+    receiver.reset();
+    for _ in 0..1_000 {
+        match receiver.batch.receive(socket.as_fd()) {
+            Ok(_) => {}
+            // A socket on an interface that is down says so once.
+            Err(_) => break,
+        }
+    }
+    receiver.reset();
+    Ok(socket)
+}
+
+/// The state of an interface as the system sees it.
+fn current_state(socket: &CanFdSocket, interface: &str) -> LinkState {
+    match interface_flags(socket.as_fd(), interface) {
+        Ok(flags) if flags & libc::IFF_UP != 0 => LinkState::Up,
+        Ok(_) => LinkState::Down,
+        Err(_) => LinkState::Gone,
+    }
+}
+
+/// What a failure to open means for a person.
+fn open_error(interface: &str, cause: io::Error) -> OpenError {
+    let interface = interface.to_owned();
+    // Which of the two is missing, the interface or CAN altogether?
+    let can = CanFdSocket::open_iface(0).err();
+    let no_can = |error: &io::Error| {
+        matches!(
+            error.raw_os_error(),
+            Some(libc::EAFNOSUPPORT | libc::EPROTONOSUPPORT | libc::ENOPROTOOPT | libc::ESOCKTNOSUPPORT)
+        )
+    };
+    match (can, cause.raw_os_error()) {
+        (Some(error), _) if no_can(&error) => OpenError::NoCan { cause: error },
+        (_, Some(libc::EPERM | libc::EACCES)) => OpenError::Permission {
+            action: format!("open {interface}"),
+            cause,
+        },
+        (_, Some(libc::ENODEV | libc::ENXIO | libc::EINVAL)) => match nix::net::if_::if_nametoindex(interface.as_str())
+        {
+            Ok(_) => OpenError::NotCan { interface },
+            Err(_) => OpenError::NoInterface { interface },
+        },
+        _ => OpenError::System {
+            action: format!("open {interface}"),
+            cause,
+        },
+    }
+}
+
+enum Decoded {
+    Frame(Frame),
+    /// Error classes. Only two of them matter here, and socketcan's full decoding allocates from the third cause on.
+    Error(u32),
+}
+
+/// Reads a `struct can_frame` or `struct canfd_frame`.
+fn decode(bytes: &[u8]) -> Option<Decoded> {
+    let raw = u32::from_ne_bytes(*bytes.first_chunk()?);
+    let (len, flags) = (*bytes.get(4)?, *bytes.get(5)?);
+    let len = usize::from(len);
+    let payload = bytes.get(DATA..)?.get(..len);
+    if raw & libc::CAN_ERR_FLAG != 0 {
+        return Some(Decoded::Error(raw & libc::CAN_ERR_MASK));
+    }
+    let id = if raw & libc::CAN_EFF_FLAG != 0 {
+        Id::extended(raw & libc::CAN_EFF_MASK)
+    } else {
+        #[allow(clippy::cast_possible_truncation)] // 11 bits
+        Id::standard((raw & libc::CAN_SFF_MASK) as u16)
+    };
+    let frame = match bytes.len() {
+        #[allow(clippy::cast_possible_truncation)] // of a byte
+        CLASSIC if raw & libc::CAN_RTR_FLAG != 0 => Frame::remote(id, len as u8),
+        CLASSIC => Frame::with_format(id, Format::Classic, payload?)?,
+        FD => {
+            let format = Format::Fd {
+                bit_rate_switch: flags & BIT_RATE_SWITCH != 0,
+                error_state: flags & ERROR_STATE != 0,
+            };
+            Frame::with_format(id, format, payload?)?
+        }
+        _ => return None,
+    };
+    Some(Decoded::Frame(frame))
+}
+
+/// Puts a frame into a `struct can_frame` or `struct canfd_frame` and gives its size; `None` for an error frame.
+fn encode(frame: &Frame, bytes: &mut [u8; FD]) -> Option<usize> {
+    let id = match frame.id {
+        Id::Standard(id) => u32::from(id),
+        Id::Extended(id) => id | libc::CAN_EFF_FLAG,
+    };
+    let (id, flags, size) = match frame.format {
+        Format::Classic => (id, 0, CLASSIC),
+        Format::Remote => (id | libc::CAN_RTR_FLAG, 0, CLASSIC),
+        Format::Fd {
+            bit_rate_switch,
+            error_state,
+        } => {
+            let flags = if bit_rate_switch { BIT_RATE_SWITCH } else { 0 } | if error_state { ERROR_STATE } else { 0 };
+            (id, flags, FD)
+        }
+        Format::Error => return None,
+    };
+    bytes.get_mut(..4)?.copy_from_slice(&id.to_ne_bytes());
+    *bytes.get_mut(4)? = u8::try_from(frame.len()).ok()?;
+    *bytes.get_mut(5)? = flags;
+    bytes
+        .get_mut(DATA..DATA + frame.data().len())?
+        .copy_from_slice(frame.data());
+    Some(size)
+}
+
+impl Link for SocketCan {
+    fn recv(&mut self, deadline: Nanos) -> Received {
+        if std::mem::take(&mut self.changed) {
+            return Received::StateChanged;
+        }
+        if let Some(frame) = self.pending.take() {
+            self.counters.received += 1;
+            return Received::Frame(frame);
+        }
+        let mut asked = false;
+        loop {
+            if let Some(received) = self.next() {
+                return received;
+            }
+            if matches!(self.state, LinkState::Down | LinkState::Gone) && self.recover() {
+                return Received::StateChanged;
+            }
+            // Error frames without end must not hold the caller beyond its deadline.
+            if asked && Monotonic.now() >= deadline {
+                return Received::TimedOut;
+            }
+            asked = true;
+            let until = match self.state {
+                LinkState::Gone => {
+                    // The old socket has said all it will ever say.
+                    sleep_until(deadline.min(self.retry));
+                    continue;
+                }
+                LinkState::Down => deadline.min(self.retry),
+                _ => deadline,
+            };
+            if let Err(error) = self.receiver.fill(self.socket.as_fd(), until)
+                && self.lose(error)
+            {
+                return Received::StateChanged;
+            }
+        }
+    }
+
+    /// As [`Link::send`]. While the transmit queue of the interface is full it is tried again until the deadline.
+    fn send(&mut self, frame: &Frame, deadline: Nanos) -> Result<(), SendError> {
+        let mut bytes = [0; FD];
+        let sent = match encode(frame, &mut bytes).and_then(|size| bytes.get(..size)) {
+            None => Err(SendError::Unsupported),
+            Some(_) if self.state != LinkState::Up => Err(SendError::NotUp),
+            Some(bytes) => loop {
+                let now = Monotonic.now();
+                if now > deadline {
+                    break Err(SendError::Deadline);
+                }
+                match send(self.socket.as_raw_fd(), bytes, MsgFlags::MSG_DONTWAIT) {
+                    Ok(_) => break Ok(()),
+                    Err(Errno::EINTR) => {}
+                    Err(Errno::EAGAIN) => {
+                        if let Err(error) = wait(self.socket.as_fd(), PollFlags::POLLOUT, deadline.saturating_sub(now))
+                        {
+                            break Err(SendError::System(error as i32));
+                        }
+                    }
+                    Err(Errno::ENOBUFS) => sleep_until(deadline.min(now.saturating_add(QUEUE_RETRY))),
+                    Err(error @ (Errno::ENETDOWN | Errno::ENODEV | Errno::ENXIO)) => {
+                        self.changed |= self.lose(error);
+                        break Err(SendError::NotUp);
+                    }
+                    Err(Errno::EINVAL | Errno::EMSGSIZE) => break Err(SendError::Unsupported),
+                    Err(error) => break Err(SendError::System(error as i32)),
+                }
+            },
+        };
+        match sent {
+            Ok(()) => self.counters.sent += 1,
+            Err(_) => self.counters.send_failures += 1,
+        }
+        sent
+    }
+
+    fn state(&self) -> LinkState {
+        self.state
+    }
+
+    fn counters(&self) -> LinkCounters {
+        self.counters
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn filters_tell_standard_from_extended() {
+        let claims = [
+            Claim::exclusive(Id::standard(0x123)),
+            Claim {
+                mask: 0x1FFF_FF00,
+                ..Claim::shared(Id::extended(0x1234_5600))
+            },
+        ];
+        let words: Vec<u32> = filters(&claims)
+            .chunks_exact(4)
+            .map(|w| u32::from_ne_bytes(w.try_into().unwrap()))
+            .collect();
+        assert_eq!(words, [0x123, 0xC000_07FF, 0x9234_5600, 0xDFFF_FF00]);
+        assert_eq!(filters(&[]), [0; 8]);
+    }
+
+    #[test]
+    fn frames_are_laid_out_as_linux_can_h_says() {
+        let mut bytes = [0; FD];
+        assert_eq!(
+            encode(&Frame::new(Id::extended(0x18FF_0001), &[1, 2, 3]), &mut bytes),
+            Some(CLASSIC)
+        );
+        assert_eq!(bytes[..4], 0x98FF_0001_u32.to_ne_bytes());
+        assert_eq!(bytes[4..16], [3, 0, 0, 0, 1, 2, 3, 0, 0, 0, 0, 0]);
+    }
+
+    fn frame() -> impl Strategy<Value = Frame> {
+        let id = prop_oneof![
+            (0..=0x7FF_u16).prop_map(Id::Standard),
+            (0..=0x1FFF_FFFF_u32).prop_map(Id::Extended)
+        ];
+        (
+            id,
+            0..4,
+            any::<(bool, bool)>(),
+            proptest::collection::vec(any::<u8>(), 0..=64),
+        )
+            .prop_map(|(id, kind, (bit_rate_switch, error_state), data)| match kind {
+                0 => Frame::remote(id, (data.len() % 9) as u8),
+                1 => Frame::with_format(
+                    id,
+                    Format::Fd {
+                        bit_rate_switch,
+                        error_state,
+                    },
+                    &data,
+                )
+                .unwrap(),
+                _ => Frame::new(id, &data),
+            })
+    }
+
+    proptest! {
+        #[test]
+        fn frames_survive(frame in frame()) {
+            let mut bytes = [0; FD];
+            let size = encode(&frame, &mut bytes).unwrap();
+            match decode(&bytes[..size]) {
+                Some(Decoded::Frame(back)) => prop_assert_eq!(back, frame),
+                _ => prop_assert!(false),
+            }
+        }
+
+        #[test]
+        fn any_bytes_are_legal_input(bytes in proptest::collection::vec(any::<u8>(), 0..=FD)) {
+            let _ = decode(&bytes);
+        }
+    }
+}

@@ -1,0 +1,307 @@
+//! A recorded log to a table of samples, and back: `proprio decode` and `proprio encode`. No daemon, no clock.
+
+use crate::candump;
+use crate::config::Source;
+use crate::decoder::Decoder;
+use crate::plan::{BusPlan, Plan};
+use crate::status::BusStatus;
+use proprio_drivers::{Board, Frame, Frames, Mode, Spec, State};
+use proprio_topics::csv::{self, Columns, Item, Series, Value, What};
+use proprio_topics::{Counter, Nanos, Reading, Sample, StampKind};
+use std::collections::VecDeque;
+use std::io::{self, BufRead, Write};
+use std::sync::Arc;
+use std::sync::atomic::Ordering::Relaxed;
+
+/// How far back in time a sample may lie behind one that came before it and still find its place in the table: a wrench
+/// is stamped by its first frame and complete with its second.
+const REORDER: Nanos = Nanos::from_millis(100);
+
+/// Why a log or a table could not be converted at all.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum OfflineError {
+    /// A file could not be read or written.
+    #[error("{0}")]
+    Io(#[from] io::Error),
+    /// The table can not be read.
+    #[error("{0}")]
+    Table(#[from] csv::Error),
+    /// A device can not be built.
+    #[error("{device}: {cause}")]
+    Device {
+        /// Its name.
+        device: String,
+        /// Why.
+        cause: proprio_drivers::SpecError,
+    },
+    /// The log holds no frame.
+    #[error("the log holds no frame; {0}")]
+    NoFrame(String),
+}
+
+/// What became of a log.
+#[derive(Debug, Clone, Default)]
+pub struct DecodeReport {
+    /// Frames in the log.
+    pub frames: u64,
+    /// Of these, frames of interfaces that belong to no bus of the configuration.
+    pub other_interfaces: u64,
+    /// Of these, frames that no device claims.
+    pub unclaimed: u64,
+    /// Samples written.
+    pub samples: u64,
+    /// Samples that came so late that the table is not in order there.
+    pub out_of_order: u64,
+    /// Lines that are not frames.
+    pub bad_lines: u64,
+    /// The first of them, with their line numbers.
+    pub bad: Vec<String>,
+    /// Per device: its name, what was counted other than frames and readings, and why it could not be used, if so.
+    pub devices: Vec<DeviceReport>,
+}
+
+/// What became of one device's frames.
+#[derive(Debug, Clone)]
+pub struct DeviceReport {
+    /// Its name.
+    pub name: String,
+    /// Frames of its identifiers.
+    pub frames: u64,
+    /// Its readings.
+    pub readings: u64,
+    /// What else was counted.
+    pub counts: Vec<(Counter, u64)>,
+    /// Why it could not be used.
+    pub refusal: Option<String>,
+}
+
+/// Whether frames of `interface` belong to `bus`: by the interface it is configured for, then by the bus's name.
+#[must_use]
+pub fn belongs(bus: &BusPlan, interface: &str) -> bool {
+    match &bus.source {
+        Source::SocketCan { interface: own } if own == interface => true,
+        Source::Virtual { name } if name == interface => true,
+        _ => bus.name == interface,
+    }
+}
+
+/// Holds samples back until no earlier one can come, so that the table is in order of time.
+struct InOrder {
+    waiting: VecDeque<Sample>,
+    newest: Nanos,
+    written: Nanos,
+    out_of_order: u64,
+}
+
+impl InOrder {
+    fn push(&mut self, sample: Sample, mut write: impl FnMut(&Sample) -> io::Result<()>) -> io::Result<()> {
+        let t = sample.header.acquired;
+        if sample.header.stamp == StampKind::None {
+            return write(&sample);
+        }
+        self.out_of_order += u64::from(t < self.written);
+        self.newest = self.newest.max(t);
+        let at = self.waiting.iter().rposition(|s| s.header.acquired <= t).map_or(0, |i| i + 1);
+        self.waiting.insert(at, sample);
+        while let Some(first) = self.waiting.front()
+            && self.newest - first.header.acquired > REORDER
+        {
+            self.written = self.written.max(first.header.acquired);
+            write(first)?;
+            self.waiting.pop_front();
+        }
+        Ok(())
+    }
+}
+
+/// Decodes a log to a table of samples.
+///
+/// With one bus in the plan every frame is its, whatever the interface; with several each takes the frames of its own.
+///
+/// # Errors
+/// [`OfflineError`]: a file that can not be read or written, or a log without a single frame.
+pub fn decode(plan: &Plan, log: impl BufRead, table: impl Write, columns: Columns) -> Result<DecodeReport, OfflineError> {
+    let series: Vec<Series> =
+        plan.channels.iter().map(|c| Series { what: What::Channel(c.kind), name: c.name.clone() }).collect();
+    let mut writer = csv::Writer::new(table, &series, columns)?;
+    let mut buses = Vec::new();
+    for (bus, number) in plan.buses.iter().zip(0..) {
+        let status = Arc::new(BusStatus::new(number, bus));
+        let decoder = Decoder::new(number, bus, Some(Mode::Listen), Arc::clone(&status))
+            .map_err(|cause| OfflineError::Device { device: bus.name.clone(), cause })?;
+        buses.push((bus, decoder, status));
+    }
+    let mut report = DecodeReport::default();
+    let mut order =
+        InOrder { waiting: VecDeque::new(), newest: Nanos::MIN, written: Nanos::MIN, out_of_order: 0 };
+    let mut failure = None;
+    let mut reader = candump::Reader::new(log);
+    let mut last_bus = 0;
+    let alone = buses.len() == 1;
+    while let Some(record) = reader.next_record()? {
+        report.frames += 1;
+        // Frames of one interface come in runs: the bus of the last one is tried first.
+        if !alone && buses.get(last_bus).is_none_or(|(bus, ..)| !belongs(bus, record.interface)) {
+            match buses.iter().position(|(bus, ..)| belongs(bus, record.interface)) {
+                Some(bus) => last_bus = bus,
+                None => {
+                    report.other_interfaces += 1;
+                    continue;
+                }
+            }
+        }
+        let Some((_, decoder, _)) = buses.get_mut(last_bus) else { continue };
+        decoder.on_frame(&record.frame, |sample| {
+            let written = order.push(*sample, |s| write_sample(&mut writer, s));
+            if let Err(error) = written {
+                failure.get_or_insert(error);
+            }
+            report.samples += 1;
+        });
+        if let Some(error) = failure.take() {
+            return Err(error.into());
+        }
+    }
+    for sample in std::mem::take(&mut order.waiting) {
+        write_sample(&mut writer, &sample)?;
+    }
+    writer.finish()?;
+    report.out_of_order = order.out_of_order;
+    report.bad_lines = reader.report().bad;
+    report.bad = reader.report().first_bad.iter().map(|(line, error)| format!("line {line}: {error}")).collect();
+    if report.frames == 0 {
+        let why = report.bad.first().map_or_else(|| "it is empty".to_owned(), |bad| format!("its first line: {bad}"));
+        return Err(OfflineError::NoFrame(why));
+    }
+    for (bus, decoder, status) in &buses {
+        report.unclaimed += status.unclaimed.load(Relaxed);
+        for ((device, health), state) in bus.devices.iter().zip(status.devices()).zip(decoder.states()) {
+            let count = |c: Counter| health.counters.get(c as usize).copied().unwrap_or(0);
+            report.devices.push(DeviceReport {
+                name: device.name.clone(),
+                frames: count(Counter::Frames),
+                readings: count(Counter::Readings),
+                counts: Counter::ALL.into_iter().skip(2).map(|c| (c, count(c))).filter(|(_, n)| *n > 0).collect(),
+                refusal: if let State::Refused(refusal) = state { Some(refusal.to_string()) } else { None },
+            });
+        }
+    }
+    Ok(report)
+}
+
+fn write_sample<W: Write>(writer: &mut csv::Writer<W>, sample: &Sample) -> io::Result<()> {
+    let t = (sample.header.stamp != StampKind::None).then_some(sample.header.acquired);
+    writer.push(t, sample.channel as usize, &Value::Reading(sample.reading, sample.header.quality))
+}
+
+/// What became of a table.
+#[derive(Debug, Clone, Default)]
+pub struct EncodeReport {
+    /// Frames written.
+    pub frames: u64,
+    /// Samples that they carry.
+    pub samples: u64,
+    /// Samples that their device can not send, and why the first could not.
+    pub refused: u64,
+    /// The first refusal.
+    pub first_refusal: Option<String>,
+    /// Channels of the table that the configuration does not name.
+    pub unknown_channels: Vec<String>,
+    /// What the table's reader skipped.
+    pub table: csv::Report,
+}
+
+/// The time that a frame takes on a bus, about: what separates the frames of one reading in an encoded log.
+const FRAME_TIME: Nanos = Nanos::from_micros(130);
+
+/// Encodes a table of samples as a CAN log, through the drivers' own encoders: the inverse of [`decode`].
+///
+/// A reading's first frame has the row's stamp, the next ones follow at the time that a frame takes on the bus.
+///
+/// # Errors
+/// [`OfflineError`]: a file that can not be read or written, or a device that can not be built.
+pub fn encode(plan: &Plan, table: impl io::Read, mut log: impl Write) -> Result<EncodeReport, OfflineError> {
+    let mut reader = csv::Reader::new(table)?;
+    let mut report = EncodeReport::default();
+    // Per series: the bus, the board's number, its route.
+    let mut targets = Vec::new();
+    for series in reader.series() {
+        let channel = plan.channels.iter().find(|c| What::Channel(c.kind) == series.what && c.name == series.name);
+        if channel.is_none() && series.what != What::Contact {
+            report.unknown_channels.push(series.name.clone());
+        }
+        targets.push(channel.and_then(|channel| {
+            let number = plan.channel(&channel.name)?;
+            let device = plan.buses.get(channel.bus)?.devices.get(channel.device)?;
+            let route = *device.routes.iter().find(|r| r.channel == number)?;
+            Some((channel.bus, channel.device, route))
+        }));
+    }
+    let mut boards: Vec<Vec<Box<dyn Board>>> = Vec::new();
+    for bus in &plan.buses {
+        let mut of_bus = Vec::new();
+        for device in &bus.devices {
+            let spec = Spec { mode: Mode::Listen, ..device.spec.clone() };
+            let board = device.options.board(&spec);
+            of_bus.push(board.map_err(|cause| OfflineError::Device { device: device.name.clone(), cause })?);
+        }
+        boards.push(of_bus);
+    }
+    let interfaces: Vec<&str> = plan.buses.iter().map(interface).collect();
+    let mut waiting: VecDeque<(Nanos, usize, Frame)> = VecDeque::new();
+    let mut row = csv::Row::default();
+    let mut frames = Frames::new();
+    while reader.next_row(&mut row)? {
+        for Item { series, value } in &row.items {
+            let (Some(Some((bus, device, route))), Value::Reading(reading, quality)) = (targets.get(*series), value) else {
+                continue;
+            };
+            let Some(board) = boards.get_mut(*bus).and_then(|b| b.get_mut(*device)) else { continue };
+            let reading = match reading {
+                Reading::Joint(state) => Reading::Joint(route.map.device(*state)),
+                other => *other,
+            };
+            frames.clear();
+            if let Err(error) = board.encode(route.output, &reading, *quality, &mut frames) {
+                report.refused += 1;
+                report.first_refusal.get_or_insert_with(|| format!("line {}: {error}", row.line));
+                continue;
+            }
+            report.samples += 1;
+            let mut t = row.t.unwrap_or(Nanos::ZERO);
+            for frame in &frames {
+                report.frames += 1;
+                if row.t.is_none() {
+                    // The log format without its stamp: order is all that is known.
+                    writeln!(log, "{} {frame}", interfaces.get(*bus).unwrap_or(&"can0"))?;
+                    continue;
+                }
+                let at = waiting.iter().rposition(|(other, ..)| *other <= t).map_or(0, |i| i + 1);
+                waiting.insert(at, (t, *bus, *frame));
+                t += FRAME_TIME;
+            }
+        }
+        while let Some((t, bus, frame)) = waiting.front()
+            && row.t.is_some_and(|now| now - *t > REORDER)
+        {
+            candump::write_log_line(&mut log, *t, interfaces.get(*bus).unwrap_or(&"can0"), frame)?;
+            waiting.pop_front();
+        }
+    }
+    for (t, bus, frame) in waiting {
+        candump::write_log_line(&mut log, t, interfaces.get(bus).unwrap_or(&"can0"), &frame)?;
+    }
+    log.flush()?;
+    report.table = reader.report().clone();
+    Ok(report)
+}
+
+/// The interface that frames of `bus` have in a log.
+fn interface(bus: &BusPlan) -> &str {
+    match &bus.source {
+        Source::SocketCan { interface } => interface,
+        Source::Virtual { name } => name,
+        Source::Replay { .. } => &bus.name,
+    }
+}

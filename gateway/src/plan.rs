@@ -1,0 +1,483 @@
+//! gateway.toml, checked and resolved: what the rest of the gateway works with.
+
+use crate::config::{Pace, Raw, RawBus, RawDevice, Realtime, Source};
+use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, Spec};
+use proprio_topics::{Description, Entry, Header, JointState, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, Role};
+use std::collections::HashMap;
+use std::fmt::{self, Write as _};
+use std::path::{Path, PathBuf};
+
+/// A configuration that can not be used: exit 2.
+#[derive(Debug, thiserror::Error)]
+#[error("{}: {problem}", .file.display())]
+pub struct ConfigError {
+    /// The file.
+    pub file: PathBuf,
+    /// Where in it, what is wrong, and what would be legal.
+    pub problem: String,
+}
+
+/// The gateway's plan.
+#[derive(Debug, Clone)]
+pub struct Plan {
+    /// The robot's name.
+    pub robot: String,
+    /// The buses.
+    pub buses: Vec<BusPlan>,
+    /// The channels that samples are numbered by.
+    pub channels: Vec<ChannelPlan>,
+}
+
+/// One bus.
+#[derive(Debug, Clone)]
+pub struct BusPlan {
+    /// Its name.
+    pub name: String,
+    /// Where its frames come from.
+    pub source: Source,
+    /// How its thread is scheduled.
+    pub realtime: Option<Realtime>,
+    /// Its devices.
+    pub devices: Vec<DevicePlan>,
+}
+
+/// One device.
+#[derive(Debug, Clone)]
+pub struct DevicePlan {
+    /// Its name.
+    pub name: String,
+    /// The driver's name.
+    pub driver: String,
+    /// The driver and its keys.
+    pub options: Options,
+    /// Address, silence, outputs.
+    pub spec: Spec,
+    /// Which output is which channel.
+    pub routes: Vec<Route>,
+}
+
+/// One output of a device.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Route {
+    /// The device's output.
+    pub output: u8,
+    /// The channel it becomes.
+    pub channel: u32,
+    /// How a device angle becomes a joint angle; the identity for sensors.
+    pub map: JointMap,
+}
+
+/// joint = sign * device / ratio + offset.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct JointMap {
+    /// sign / ratio.
+    pub gain: f64,
+    /// \[rad\].
+    pub offset: f64,
+}
+
+impl JointMap {
+    /// Nothing changes.
+    pub const IDENTITY: Self = Self { gain: 1.0, offset: 0.0 };
+
+    /// The joint's state from the device's: positions and their derivatives by gain and offset. Torque and current are
+    /// quantities of their own and pass unchanged.
+    #[must_use]
+    pub fn joint(&self, device: JointState) -> JointState {
+        JointState {
+            position: device.position * self.gain + self.offset,
+            velocity: device.velocity * self.gain,
+            acceleration: device.acceleration * self.gain,
+            ..device
+        }
+    }
+
+    /// The device's state from the joint's: the inverse of [`JointMap::joint`].
+    #[must_use]
+    pub fn device(&self, joint: JointState) -> JointState {
+        JointState {
+            position: (joint.position - self.offset) / self.gain,
+            velocity: joint.velocity / self.gain,
+            acceleration: joint.acceleration / self.gain,
+            ..joint
+        }
+    }
+}
+
+/// One channel.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ChannelPlan {
+    /// Its name: the sensor's or the joint's.
+    pub name: String,
+    /// What it measures.
+    pub kind: Kind,
+    /// The number of its bus.
+    pub bus: usize,
+    /// The number of its device on that bus.
+    pub device: usize,
+    /// The longest time between two samples that is still normal.
+    pub max_silence: Nanos,
+}
+
+impl Plan {
+    /// Reads and checks a configuration file.
+    ///
+    /// # Errors
+    /// [`ConfigError`], naming file, place, value and what would be legal.
+    pub fn load(file: &Path) -> Result<Self, ConfigError> {
+        let error = |problem| ConfigError { file: file.to_owned(), problem };
+        let text = std::fs::read_to_string(file).map_err(|e| error(format!("can not be read: {e}")))?;
+        Self::parse(&text, file.parent().unwrap_or(Path::new("."))).map_err(error)
+    }
+
+    /// Checks a configuration given as text; paths in it are relative to `folder`.
+    ///
+    /// # Errors
+    /// What is wrong, where, and what would be legal.
+    pub fn parse(text: &str, folder: &Path) -> Result<Self, String> {
+        let raw: Raw = toml::from_str(text).map_err(|e| e.to_string())?;
+        Builder { text, folder, plan: Self { robot: raw.robot.clone(), buses: vec![], channels: vec![] } }.build(raw)
+    }
+
+    /// The number of channel `name`.
+    #[must_use]
+    pub fn channel(&self, name: &str) -> Option<u32> {
+        self.channels.iter().position(|c| c.name == name).and_then(|i| u32::try_from(i).ok())
+    }
+
+    /// The plan as the description that goes with the samples.
+    #[must_use]
+    pub fn description(&self, header: Header) -> Box<Description> {
+        let none = Entry {
+            name: Name::EMPTY,
+            frame: Name::EMPTY,
+            max_silence: Nanos::ZERO,
+            role: Role::Channel,
+            index: 0,
+            kind: Kind::Joint,
+            bus: 0,
+        };
+        let mut description =
+            Box::new(Description { header, publisher: Publisher::Gateway, count: 0, entries: [none; Description::CAPACITY] });
+        for (entry, channel) in description.entries.iter_mut().zip(&self.channels) {
+            *entry = Entry {
+                name: Name::new(&channel.name).unwrap_or(Name::EMPTY),
+                max_silence: channel.max_silence,
+                index: description.count,
+                kind: channel.kind,
+                bus: u32::try_from(channel.bus).unwrap_or(u32::MAX),
+                ..none
+            };
+            description.count += 1;
+        }
+        description
+    }
+}
+
+struct Builder<'a> {
+    text: &'a str,
+    folder: &'a Path,
+    plan: Plan,
+}
+
+impl Builder<'_> {
+    fn build(mut self, raw: Raw) -> Result<Plan, String> {
+        if raw.schema != 1 {
+            return Err(format!("schema = {} is not known; this version reads schema = 1", raw.schema));
+        }
+        check_service_name("robot", &raw.robot)?;
+        if raw.bus.is_empty() {
+            return Err("there is no [[bus]]: a gateway needs at least one".into());
+        }
+        if raw.bus.len() > MAX_BUSES {
+            return Err(format!("there are {} buses; at most {MAX_BUSES} are possible", raw.bus.len()));
+        }
+        for bus in raw.bus {
+            self.bus(bus)?;
+        }
+        Ok(self.plan)
+    }
+
+    fn bus(&mut self, raw: RawBus) -> Result<(), String> {
+        let place = format!("bus {:?}", raw.name);
+        check_name("bus: name", &raw.name)?;
+        let mut source = raw.source;
+        match &mut source {
+            Source::SocketCan { interface } if interface.is_empty() || interface.len() > 15 => {
+                return Err(format!("{place}: interface = {interface:?} must have 1 to 15 characters, such as \"can0\""));
+            }
+            Source::Virtual { name } => check_name(&format!("{place}: source.name"), name)?,
+            Source::Replay { log, .. } => *log = self.folder.join(&*log),
+            Source::SocketCan { .. } => {}
+        }
+        for other in &self.plan.buses {
+            if other.name == raw.name {
+                return Err(format!("two buses are named {:?}; each needs a name of its own", raw.name));
+            }
+            let same = match (&other.source, &source) {
+                (Source::Replay { .. }, Source::Replay { .. }) => false,
+                (a, b) => a == b,
+            };
+            if same {
+                return Err(format!("{place}: has the same source as bus {:?}: list its devices there", other.name));
+            }
+        }
+        if let Some(Realtime { priority: Some(priority), .. }) = raw.realtime
+            && !(1..=99).contains(&priority)
+        {
+            return Err(format!("{place}: realtime.priority = {priority} must be 1 to 99"));
+        }
+        self.plan.buses.push(BusPlan { name: raw.name, source, realtime: raw.realtime, devices: Vec::new() });
+        for table in raw.device {
+            let line = self.text.get(..table.span().start).map_or(0, |before| before.matches('\n').count() + 1);
+            self.device(table.into_inner()).map_err(|e| format!("{place}, device at line {line}: {e}"))?;
+        }
+        self.check_claims(&place)
+    }
+
+    fn device(&mut self, mut table: toml::Table) -> Result<(), String> {
+        let mut common = toml::Table::new();
+        for key in RawDevice::KEYS {
+            if let Some(value) = table.remove(key) {
+                common.insert(key.to_owned(), value);
+            }
+        }
+        let raw: RawDevice = common.try_into().map_err(|e: toml::de::Error| e.message().to_owned())?;
+        let name = &raw.name;
+        check_name("name", name)?;
+        let options = Options::deserialize(&raw.driver, table).map_err(|e| match e {
+            OptionsError::UnknownDriver => format!("driver = {:?} is not known; there is {}", raw.driver, DRIVERS.join(", ")),
+            OptionsError::Keys(e) => format!("{name:?} ({}): {}", raw.driver, e.message()),
+        })?;
+        if !(raw.max_silence_ms > 0.0 && raw.max_silence_ms <= 3.6e6) {
+            return Err(format!("{name:?}: max_silence_ms = {} must be above 0, at most an hour", raw.max_silence_ms));
+        }
+        let max_silence = Nanos::from_seconds(raw.max_silence_ms * 1e-3);
+        let kind = options.kind();
+        let bus = self.plan.buses.len() - 1;
+        let device = self.plan.buses.last().map_or(0, |b| b.devices.len());
+        let mut spec = Spec {
+            address: raw.address,
+            max_silence,
+            mode: if raw.listen_only { Mode::Listen } else { Mode::Supervise },
+            outputs: proprio_drivers::Outputs::default(),
+        };
+        let mut routes = Vec::new();
+        match (kind, raw.joint.is_empty()) {
+            (Kind::Joint, true) => {
+                return Err(format!("{name:?}: {} measures joints: say which, in [[bus.device.joint]]", raw.driver));
+            }
+            (Kind::Wrench | Kind::Imu, false) => {
+                return Err(format!("{name:?}: {} is a sensor: [[bus.device.joint]] does not belong here", raw.driver));
+            }
+            (Kind::Wrench | Kind::Imu, true) => {
+                let channel = self.channel(ChannelPlan { name: name.clone(), kind, bus, device, max_silence })?;
+                routes.push(Route { output: 0, channel, map: JointMap::IDENTITY });
+            }
+            (Kind::Joint, false) => {
+                for joint in raw.joint {
+                    let at = format!("{name:?}, joint {:?}", joint.name);
+                    check_name(&at, &joint.name)?;
+                    if !joint.ratio.is_finite() || joint.ratio == 0.0 {
+                        return Err(format!("{at}: ratio = {} must be a number other than 0", joint.ratio));
+                    }
+                    if joint.sign.abs() != 1 {
+                        return Err(format!("{at}: sign = {} must be 1 or -1", joint.sign));
+                    }
+                    if !joint.offset_rad.is_finite() {
+                        return Err(format!("{at}: offset_rad = {} must be a finite number", joint.offset_rad));
+                    }
+                    if spec.outputs.0.contains(&joint.channel) {
+                        return Err(format!("{at}: channel = {} is already another joint", joint.channel));
+                    }
+                    if spec.outputs.0.try_push(joint.channel).is_err() {
+                        return Err(format!("{at}: a device has at most {} joints", spec.outputs.0.capacity()));
+                    }
+                    let map = JointMap { gain: f64::from(joint.sign) / joint.ratio, offset: joint.offset_rad };
+                    let channel = self.channel(ChannelPlan { name: joint.name, kind, bus, device, max_silence })?;
+                    routes.push(Route { output: joint.channel, channel, map });
+                }
+            }
+        }
+        // Built once here so that a wrong address or value shows at --check; the bus thread builds its own.
+        options.device(&spec).map_err(|e| format!("{name:?}: {e}"))?;
+        let plan = DevicePlan { name: raw.name, driver: raw.driver, options, spec, routes };
+        if let Some(bus) = self.plan.buses.last_mut() {
+            if bus.devices.iter().any(|d| d.name == plan.name) {
+                return Err(format!("two devices are named {:?}", plan.name));
+            }
+            bus.devices.push(plan);
+        }
+        Ok(())
+    }
+
+    fn channel(&mut self, channel: ChannelPlan) -> Result<u32, String> {
+        if self.plan.channel(&channel.name).is_some() {
+            return Err(format!("two channels are named {:?}; joints and sensors share their names' space", channel.name));
+        }
+        if self.plan.channels.len() >= MAX_CHANNELS {
+            return Err(format!("there are more than {MAX_CHANNELS} channels"));
+        }
+        self.plan.channels.push(channel);
+        u32::try_from(self.plan.channels.len() - 1).map_err(|e| e.to_string())
+    }
+
+    /// No identifier may belong to two devices, unless both only listen to it.
+    fn check_claims(&self, place: &str) -> Result<(), String> {
+        let Some(bus) = self.plan.buses.last() else { return Ok(()) };
+        let mut claimed: Vec<(&str, Box<dyn Device>)> = Vec::new();
+        for plan in &bus.devices {
+            let device = plan.options.device(&plan.spec).map_err(|e| e.to_string())?;
+            for (other, taken) in &claimed {
+                for (a, b) in device.claims().iter().flat_map(|a| taken.claims().iter().map(move |b| (a, b))) {
+                    if a.overlaps(b) && (a.exclusive || b.exclusive) {
+                        return Err(format!(
+                            "{place}: devices {:?} and {other:?} both claim identifier {}: one of their addresses is wrong",
+                            plan.name, a.id
+                        ));
+                    }
+                }
+            }
+            claimed.push((&plan.name, device));
+        }
+        Ok(())
+    }
+}
+
+fn check_name(place: &str, name: &str) -> Result<(), String> {
+    if name.is_empty() || name.len() > Name::CAPACITY || name.contains(['/', ',', '"', '\n', '\0']) {
+        return Err(format!("{place} = {name:?} must have 1 to {} bytes, none of them / , \" or a line's end", Name::CAPACITY));
+    }
+    Ok(())
+}
+
+/// Service names are 7-bit ASCII in the transport.
+fn check_service_name(place: &str, name: &str) -> Result<(), String> {
+    let fits = !name.is_empty() && name.len() <= Name::CAPACITY;
+    if !fits || !name.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'_' | b'-' | b'.')) {
+        return Err(format!("{place} = {name:?} must have 1 to {} letters, digits, _ - or .", Name::CAPACITY));
+    }
+    Ok(())
+}
+
+impl fmt::Display for Plan {
+    /// A table for people: `proprio gateway --check` prints it.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "robot {}: {} buses, {} channels", self.robot, self.buses.len(), self.channels.len())?;
+        for bus in &self.buses {
+            let source = match &bus.source {
+                Source::SocketCan { interface } => format!("CAN interface {interface}"),
+                Source::Virtual { name } => format!("virtual bus {name}"),
+                Source::Replay { log, pace } => {
+                    format!("log {} ({})", log.display(), if *pace == Pace::Fast { "fast" } else { "as recorded" })
+                }
+            };
+            write!(f, "\nbus {}: {source}", bus.name)?;
+            if let Some(realtime) = bus.realtime {
+                realtime.cpu.map_or(Ok(()), |cpu| write!(f, ", cpu {cpu}"))?;
+                realtime.priority.map_or(Ok(()), |p| write!(f, ", SCHED_FIFO {p}"))?;
+            }
+            writeln!(f)?;
+            for device in &bus.devices {
+                let mut ids = String::new();
+                if let Ok(built) = device.options.device(&device.spec) {
+                    for claim in built.claims() {
+                        write!(ids, " {}{}", claim.id, if claim.exclusive { "" } else { "*" })?;
+                    }
+                }
+                let listen = if device.spec.mode == Mode::Listen { ", listens only" } else { "" };
+                writeln!(f, "  {} ({}, address {}{listen}): identifiers{ids}", device.name, device.driver, device.spec.address)?;
+                for route in &device.routes {
+                    let Some(channel) = self.channels.get(route.channel as usize) else { continue };
+                    write!(f, "    channel {:>3} {} {}", route.channel, channel.kind.word(), channel.name)?;
+                    if channel.kind == Kind::Joint {
+                        write!(f, " = {} * channel {} {:+} rad", route.map.gain, route.output, route.map.offset)?;
+                    }
+                    writeln!(f, ", silent at most {} s", channel.max_silence)?;
+                }
+            }
+        }
+        writeln!(f, "\n* shared with other devices of the same board")
+    }
+}
+
+/// The channels of a plan by name.
+#[must_use]
+pub fn channel_numbers(plan: &Plan) -> HashMap<String, u32> {
+    plan.channels.iter().zip(0..).map(|(c, i)| (c.name.clone(), i)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ARM: &str = r#"
+        schema = 1
+        robot = "icub"
+        [[bus]]
+        name = "arm"
+        source = { kind = "virtual", name = "arm" }
+          [[bus.device]]
+          driver = "icub_strain"
+          name = "ft"
+          address = 13
+          max_silence_ms = 30
+          full_scale_n = [1804.0, 1804.0, 1804.0]
+          full_scale_nm = [31.0, 31.0, 31.0]
+          [[bus.device]]
+          driver = "icub_motor"
+          name = "elbow_board"
+          address = 4
+            [[bus.device.joint]]
+            name = "elbow"
+            ratio = 100.0
+            sign = -1
+            offset_rad = 0.5
+    "#;
+
+    fn problem(from: &str, to: &str) -> String {
+        assert!(ARM.contains(from), "{from}");
+        Plan::parse(&ARM.replacen(from, to, 1), Path::new(".")).map(|p| p.to_string()).unwrap_err()
+    }
+
+    #[test]
+    fn the_plan_resolves_channels_and_maps() {
+        let plan = Plan::parse(ARM, Path::new(".")).unwrap();
+        assert_eq!(plan.channel("ft"), Some(0));
+        assert_eq!(plan.channel("elbow"), Some(1));
+        let map = plan.buses[0].devices[1].routes[0].map;
+        let joint = map.joint(JointState { position: 10.0, velocity: 100.0, ..JointState::ABSENT });
+        assert!((joint.position - 0.4).abs() < 1e-15 && (joint.velocity + 1.0).abs() < 1e-15);
+        assert!((map.device(joint).position - 10.0).abs() < 1e-12);
+        assert!(plan.to_string().contains("31A"), "{plan}");
+    }
+
+    #[test]
+    fn each_mistake_has_one_clear_message() {
+        for (from, to, expected) in [
+            ("schema = 1", "schema = 2", "schema = 2 is not known"),
+            ("robot = \"icub\"", "robot = \"i cub\"", "robot = \"i cub\" must have"),
+            ("robot = \"icub\"", "robbot = \"icub\"", "unknown field `robbot`, expected one of `schema`, `robot`, `bus`"),
+            ("kind = \"virtual\"", "kind = \"virtuel\"", "unknown variant `virtuel`"),
+            ("\"icub_strain\"", "\"icub_strian\"", "driver = \"icub_strian\" is not known; there is icub_strain, icub_imu"),
+            ("max_silence_ms = 30", "max_silence_ms = 0", "max_silence_ms = 0 must be above 0"),
+            ("full_scale_n = ", "full_scale_N = ", "unknown field `full_scale_N`"),
+            ("address = 13", "address = 15", "address = 15 is outside 1 to 14"),
+            ("address = 13", "", "missing field `address`"),
+            ("sign = -1", "sign = 2", "sign = 2 must be 1 or -1"),
+            ("ratio = 100.0", "ratio = 0.0", "ratio = 0 must be a number other than 0"),
+            ("name = \"elbow\"", "name = \"ft\"", "two channels are named \"ft\""),
+            ("name = \"elbow_board\"", "name = \"ft\"", "two devices are named \"ft\""),
+        ] {
+            let problem = problem(from, to);
+            assert!(problem.contains(expected), "{from} -> {to}: {problem}");
+        }
+    }
+
+    #[test]
+    fn two_devices_can_not_claim_one_identifier() {
+        let second = "[[bus.device]]\n driver = \"icub_strain\"\n name = \"ft2\"\n address = 13\n [[bus.device]]";
+        let problem = problem("[[bus.device]]", second);
+        assert!(problem.contains("\"ft\" and \"ft2\" both claim identifier 31"), "{problem}");
+    }
+}

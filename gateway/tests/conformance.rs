@@ -1,0 +1,876 @@
+//! What every link must do, as one suite of properties that runs against all three; and what each does beyond it.
+//!
+//! The links to SocketCAN run on vcan0 if PROPRIO_VCAN=1 says that it is there (`tests/vcan/with-vcan` provides it).
+
+use proprio_drivers::{Claim, Format, Frame, Id};
+use proprio_gateway::candump::write_log_line;
+use proprio_gateway::clock::{Clock, Monotonic, sleep_until};
+use proprio_gateway::link::replay::{Matching, Pace, Replay};
+use proprio_gateway::link::socketcan::SocketCan;
+use proprio_gateway::link::virtual_bus::VirtualBus;
+use proprio_gateway::link::{Link, OpenError, Received, SendError};
+use proprio_topics::{LinkState, Nanos, StampKind};
+use std::path::PathBuf;
+use std::process::Command;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+/// Long enough for anything to arrive on a machine that is busy; never waited for where all is well.
+const PATIENCE: Nanos = Nanos(20_000_000_000);
+/// How long to listen for what must not come.
+const SILENCE: Nanos = Nanos(60_000_000);
+
+fn now() -> Nanos {
+    Monotonic.now()
+}
+
+fn unique() -> String {
+    static COUNT: AtomicU32 = AtomicU32::new(0);
+    format!("{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed))
+}
+
+/// A bus to test a kind of link on.
+trait Fixture {
+    /// Whether links of one bus send to each other, now; a log was recorded before.
+    fn live(&self) -> bool;
+
+    /// A participant, where there can be several.
+    fn join(&self, claims: &[Claim]) -> Box<dyn Link>;
+
+    /// A participant that has been there when somebody else sent `frames`.
+    fn play(&self, claims: &[Claim], frames: &[Frame]) -> Box<dyn Link> {
+        let link = self.join(claims);
+        let mut peer = self.join(&[]);
+        for frame in frames {
+            peer.send(frame, now() + PATIENCE).unwrap();
+        }
+        assert_eq!(peer.counters().sent, frames.len() as u64);
+        link
+    }
+}
+
+/// A virtual bus of its own for each test.
+struct Virtual {
+    domain: String,
+}
+
+impl Virtual {
+    fn new() -> Self {
+        Self {
+            domain: format!("conformance-{}", unique()),
+        }
+    }
+}
+
+impl Fixture for Virtual {
+    fn live(&self) -> bool {
+        true
+    }
+
+    fn join(&self, claims: &[Claim]) -> Box<dyn Link> {
+        Box::new(VirtualBus::open(&self.domain, "arm", claims).unwrap())
+    }
+}
+
+/// A log of the frames that are played.
+struct Log {
+    folder: tempfile::TempDir,
+    pace: Pace,
+}
+
+/// The recorded stamps are a millisecond apart, from here on.
+const RECORDED: Nanos = Nanos(1_479_121_923_123_456_789);
+
+impl Log {
+    fn new(pace: Pace) -> Self {
+        Self {
+            folder: tempfile::tempdir().unwrap(),
+            pace,
+        }
+    }
+
+    fn write(&self, lines: &[u8]) -> PathBuf {
+        let path = self.folder.path().join(unique());
+        std::fs::write(&path, lines).unwrap();
+        path
+    }
+}
+
+impl Fixture for Log {
+    fn live(&self) -> bool {
+        false
+    }
+
+    fn join(&self, _claims: &[Claim]) -> Box<dyn Link> {
+        unreachable!("a log has no participants")
+    }
+
+    fn play(&self, claims: &[Claim], frames: &[Frame]) -> Box<dyn Link> {
+        let mut log = Vec::new();
+        for (i, frame) in frames.iter().enumerate() {
+            write_log_line(&mut log, RECORDED + Nanos::from_millis(i as i64), "can0", frame).unwrap();
+        }
+        Box::new(Replay::open(&self.write(&log), self.pace, None, claims).unwrap())
+    }
+}
+
+/// A CAN interface of the kernel.
+struct Can {
+    interface: String,
+}
+
+impl Fixture for Can {
+    fn live(&self) -> bool {
+        true
+    }
+
+    fn join(&self, claims: &[Claim]) -> Box<dyn Link> {
+        Box::new(SocketCan::open(&self.interface, claims).unwrap())
+    }
+}
+
+/// The next frame, however long it takes; anything else fails.
+fn frame(link: &mut dyn Link) -> Frame {
+    match link.recv(now() + PATIENCE) {
+        Received::Frame(frame) => frame,
+        other => panic!("{other:?} instead of a frame"),
+    }
+}
+
+/// Exactly `count` frames: no other comes.
+fn exactly(link: &mut dyn Link, count: usize) -> Vec<Frame> {
+    let frames = (0..count).map(|_| frame(link)).collect();
+    silent(link);
+    frames
+}
+
+fn silent(link: &mut dyn Link) {
+    match link.recv(now() + SILENCE) {
+        Received::TimedOut | Received::Ended => {}
+        other => panic!("{other:?} instead of nothing"),
+    }
+}
+
+/// The same frame without its stamp.
+fn bare(frame: &Frame) -> Frame {
+    frame.at(Nanos::ZERO, StampKind::None)
+}
+
+fn fd(id: Id, bit_rate_switch: bool, error_state: bool, data: &[u8]) -> Frame {
+    Frame::with_format(
+        id,
+        Format::Fd {
+            bit_rate_switch,
+            error_state,
+        },
+        data,
+    )
+    .unwrap()
+}
+
+/// Frames of every kind, in which no two are equal.
+fn variety() -> Vec<Frame> {
+    let bytes: Vec<u8> = (0..64).map(|i| 255 - i * 3).collect();
+    let mut frames = Vec::new();
+    for id in [
+        Id::standard(0),
+        Id::standard(0x123),
+        Id::standard(0x7FF),
+        Id::extended(0x123),
+        Id::extended(0x1FFF_FFFF),
+    ] {
+        for len in 0..=8 {
+            frames.push(Frame::new(id, &bytes[..len]));
+            frames.push(Frame::remote(id, len as u8));
+        }
+        // The lengths that CAN FD has.
+        for len in [0, 1, 8, 12, 16, 20, 24, 32, 48, 64] {
+            frames.push(fd(id, len % 3 == 0, len % 2 == 0, &bytes[..len]));
+        }
+    }
+    frames
+}
+
+/// Distinct frames with standard identifiers.
+fn numbered(count: u32) -> Vec<Frame> {
+    (0..count)
+        .map(|i| Frame::new(Id::standard((i % 0x700) as u16), &i.to_le_bytes()))
+        .collect()
+}
+
+fn order_and_values_are_kept(bus: &dyn Fixture) {
+    let sent = variety();
+    let received: Vec<Frame> = exactly(&mut *bus.play(&[], &sent), sent.len())
+        .iter()
+        .map(bare)
+        .collect();
+    assert_eq!(received, sent);
+    // More than one batch.
+    let sent = numbered(200);
+    let mut link = bus.play(&[], &sent);
+    let received: Vec<Frame> = exactly(&mut *link, sent.len()).iter().map(bare).collect();
+    assert_eq!(received, sent);
+    let counters = link.counters();
+    assert_eq!(
+        (
+            counters.received,
+            counters.dropped,
+            counters.error_frames,
+            counters.losses
+        ),
+        (200, 0, 0, 0)
+    );
+}
+
+fn exactly_the_claims_pass(bus: &dyn Fixture) {
+    let masked = |id, mask| Claim {
+        mask,
+        ..Claim::shared(id)
+    };
+    let claims = [
+        Claim::exclusive(Id::standard(0x123)),
+        masked(Id::standard(0x200), 0x7F0),
+        Claim::shared(Id::extended(0x456)),
+        masked(Id::extended(0x1234_0000), 0x1FFF_0000),
+    ];
+    let data = [1, 2, 3];
+    let (standard, extended) = (
+        |id| Frame::new(Id::standard(id), &data),
+        |id| Frame::new(Id::extended(id), &data),
+    );
+    let cases = [
+        (true, standard(0x123)),
+        (false, extended(0x123)),
+        (false, standard(0x122)),
+        (true, standard(0x200)),
+        (true, standard(0x20F)),
+        (false, standard(0x210)),
+        (false, extended(0x200)),
+        (true, extended(0x456)),
+        (false, standard(0x456)),
+        (true, extended(0x1234_FFFF)),
+        (false, extended(0x1235_0000)),
+        (false, extended(0x1000_0123)),
+        (false, Frame::remote(Id::standard(0x123), 0)),
+        (true, fd(Id::standard(0x123), true, false, &data)),
+        (true, Frame::new(Id::standard(0x123), &[])),
+    ];
+    let sent: Vec<Frame> = cases.iter().map(|(_, frame)| *frame).collect();
+    let expected: Vec<Frame> = cases
+        .iter()
+        .filter(|(passes, _)| *passes)
+        .map(|(_, frame)| *frame)
+        .collect();
+    let mut link = bus.play(&claims, &sent);
+    assert_eq!(
+        exactly(&mut *link, expected.len()).iter().map(bare).collect::<Vec<_>>(),
+        expected
+    );
+    assert_eq!(link.counters().received, expected.len() as u64);
+
+    // More claims than the kernel takes filters.
+    let even: Vec<Claim> = (0..600).map(|i| Claim::exclusive(Id::standard(i * 2))).collect();
+    let sent: Vec<Frame> = (0..40).map(|i| Frame::new(Id::standard(i), &[])).collect();
+    let expected: Vec<Frame> = sent.iter().copied().filter(|f| f.id.raw() % 2 == 0).collect();
+    assert_eq!(
+        exactly(&mut *bus.play(&even, &sent), 20)
+            .iter()
+            .map(bare)
+            .collect::<Vec<_>>(),
+        expected
+    );
+}
+
+fn stamps_are_monotone_and_true(bus: &dyn Fixture) {
+    let sent = numbered(100);
+    let before = now();
+    let mut link = bus.play(&[], &sent);
+    let received = exactly(&mut *link, sent.len());
+    let after = now();
+    assert!(received.windows(2).all(|w| w[0].t <= w[1].t), "stamps run backwards");
+    if bus.live() {
+        assert!(
+            received
+                .iter()
+                .all(|f| matches!(f.stamp, StampKind::Software | StampKind::Hardware))
+        );
+        // The kernel's clock is not the one that we read: what it takes to compare the two is what they may differ by.
+        let tolerance = Nanos::from_millis(1);
+        assert!(received.iter().all(|f| f.t >= before - tolerance && f.t <= after));
+    } else {
+        assert!(received.iter().all(|f| f.stamp == StampKind::Log));
+    }
+}
+
+fn deadlines_are_honoured(bus: &dyn Fixture) {
+    let mut link = bus.join(&[]);
+    let deadline = now() + Nanos::from_millis(30);
+    assert_eq!(link.recv(deadline), Received::TimedOut);
+    assert!(now() >= deadline, "too early");
+    for past in [deadline, Nanos::ZERO, Nanos(-5), Nanos::MIN] {
+        assert_eq!(link.recv(past), Received::TimedOut);
+    }
+    // What has arrived is handed out even if the deadline has passed.
+    let mut peer = bus.join(&[]);
+    peer.send(&Frame::new(Id::standard(1), &[]), now() + PATIENCE).unwrap();
+    let give_up = now() + PATIENCE;
+    while link.recv(Nanos::ZERO) == Received::TimedOut {
+        assert!(now() < give_up, "it never arrives");
+    }
+    // A frame whose time is over is not sent.
+    let late = Frame::new(Id::standard(2), &[]);
+    assert_eq!(peer.send(&late, now() - Nanos(1)), Err(SendError::Deadline));
+    assert_eq!(peer.send(&late, Nanos::ZERO), Err(SendError::Deadline));
+    silent(&mut *link);
+    let counters = peer.counters();
+    assert_eq!((counters.sent, counters.send_failures), (1, 2));
+}
+
+fn own_frames_do_not_come_back(bus: &dyn Fixture) {
+    let (mut a, mut b) = (bus.join(&[]), bus.join(&[]));
+    let of = |who: u16, i: u8| Frame::new(Id::standard(who), &[i]);
+    for i in 0..40 {
+        a.send(&of(1, i), now() + PATIENCE).unwrap();
+        b.send(&of(2, i), now() + PATIENCE).unwrap();
+    }
+    let expected = |who| (0..40).map(|i| of(who, i)).collect::<Vec<_>>();
+    assert_eq!(exactly(&mut *a, 40).iter().map(bare).collect::<Vec<_>>(), expected(2));
+    assert_eq!(exactly(&mut *b, 40).iter().map(bare).collect::<Vec<_>>(), expected(1));
+}
+
+fn all_participants_see_the_same(bus: &dyn Fixture) {
+    let mut links: Vec<Box<dyn Link>> = (0..4).map(|_| bus.join(&[])).collect();
+    let sent = numbered(60);
+    for (i, frame) in sent.iter().enumerate() {
+        links[i % 2].send(frame, now() + PATIENCE).unwrap();
+    }
+    for (i, link) in links.iter_mut().enumerate() {
+        let expected: Vec<Frame> = sent
+            .iter()
+            .enumerate()
+            .filter(|(from, _)| from % 2 != i)
+            .map(|(_, frame)| *frame)
+            .collect();
+        assert_eq!(
+            exactly(&mut **link, expected.len())
+                .iter()
+                .map(bare)
+                .collect::<Vec<_>>(),
+            expected,
+            "participant {i}"
+        );
+    }
+    // One that leaves does not disturb the others.
+    links.pop();
+    links[0].send(&sent[0], now() + PATIENCE).unwrap();
+    assert_eq!(bare(&frame(&mut *links[2])), sent[0]);
+}
+
+fn what_a_flood_drops_is_counted(bus: &dyn Fixture) {
+    let mut link = bus.join(&[]);
+    let mut peer = bus.join(&[]);
+    // More than the enlarged buffer holds; with fewer rights it is smaller.
+    let flood = 25_000_u64;
+    for i in 0..flood {
+        peer.send(&Frame::new(Id::standard(1), &i.to_le_bytes()), now() + PATIENCE)
+            .unwrap();
+    }
+    let mut last = None;
+    let mut drain = |link: &mut dyn Link| {
+        let mut count = 0;
+        while let Received::Frame(frame) = link.recv(now() + SILENCE) {
+            let number = u64::from_le_bytes(frame.data().try_into().unwrap());
+            assert!(last < Some(number), "in order");
+            last = Some(number);
+            count += 1;
+        }
+        count
+    };
+    let first = drain(&mut *link);
+    assert!(first > 0 && first < flood, "{first} of {flood} fit");
+    // The count comes with what arrives after the loss.
+    peer.send(&Frame::new(Id::standard(1), &flood.to_le_bytes()), now() + PATIENCE)
+        .unwrap();
+    assert_eq!(drain(&mut *link), 1);
+    let counters = link.counters();
+    assert_eq!(counters.received, first + 1);
+    assert_eq!(counters.received + counters.dropped, flood + 1);
+    assert_eq!(peer.counters().sent, flood + 1);
+}
+
+fn what_can_not_be_sent_is_refused(bus: &dyn Fixture) {
+    let mut link = bus.play(&[], &[]);
+    let error = Frame::with_format(Id::extended(4), Format::Error, &[0; 8]).unwrap();
+    assert_eq!(link.send(&error, now() + PATIENCE), Err(SendError::Unsupported));
+    if !bus.live() {
+        assert_eq!(
+            link.send(&Frame::new(Id::standard(1), &[]), now() + PATIENCE),
+            Err(SendError::Unsupported)
+        );
+    }
+    assert_eq!(link.counters().sent, 0);
+    assert!(link.counters().send_failures > 0);
+}
+
+fn the_state_tells_whether_more_can_come(bus: &dyn Fixture) {
+    let mut link = bus.play(&[], &numbered(3));
+    assert_eq!(link.state(), LinkState::Up);
+    for _ in 0..3 {
+        frame(&mut *link);
+    }
+    for _ in 0..2 {
+        let (received, state) = if bus.live() {
+            (Received::TimedOut, LinkState::Up)
+        } else {
+            (Received::Ended, LinkState::Ended)
+        };
+        assert_eq!(link.recv(now() + SILENCE), received);
+        assert_eq!(link.state(), state);
+    }
+}
+
+type Property = fn(&dyn Fixture);
+
+/// What holds for every link.
+const EVERY: [Property; 5] = [
+    order_and_values_are_kept,
+    exactly_the_claims_pass,
+    stamps_are_monotone_and_true,
+    what_can_not_be_sent_is_refused,
+    the_state_tells_whether_more_can_come,
+];
+
+/// What holds for links to a bus on which others are.
+const LIVE: [Property; 4] = [
+    deadlines_are_honoured,
+    own_frames_do_not_come_back,
+    all_participants_see_the_same,
+    what_a_flood_drops_is_counted,
+];
+
+#[test]
+fn a_log_at_once_is_a_link() {
+    for property in EVERY {
+        property(&Log::new(Pace::Fast));
+    }
+}
+
+#[test]
+fn a_log_at_its_pace_is_a_link() {
+    for property in EVERY {
+        property(&Log::new(Pace::Recorded));
+    }
+}
+
+#[test]
+fn the_virtual_bus_is_a_link() {
+    for property in EVERY.into_iter().chain(LIVE) {
+        property(&Virtual::new());
+    }
+}
+
+/// Whether there are virtual CAN interfaces; says so if not.
+fn vcan() -> bool {
+    let there = std::env::var("PROPRIO_VCAN").is_ok_and(|v| v == "1");
+    if !there {
+        println!("skipped: PROPRIO_VCAN=1 is not set (tests/vcan/with-vcan provides vcan0)");
+    }
+    there
+}
+
+#[test]
+fn socketcan_is_a_link() {
+    if vcan() {
+        for property in EVERY.into_iter().chain(LIVE) {
+            property(&Can {
+                interface: "vcan0".to_owned(),
+            });
+        }
+    }
+}
+
+// --- Replay alone --------------------------------------------------------------------------------------------------
+
+#[test]
+fn a_log_at_its_pace_is_moved_to_now() {
+    let bus = Log::new(Pace::Recorded);
+    let mut log = Vec::new();
+    for ms in [0, 5, 5, 205] {
+        write_log_line(
+            &mut log,
+            RECORDED + Nanos::from_millis(ms),
+            "can0",
+            &Frame::new(Id::standard(1), &[]),
+        )
+        .unwrap();
+    }
+    let mut link = Replay::open(&bus.write(&log), Pace::Recorded, None, &[]).unwrap();
+    let before = now();
+    let first = frame(&mut link);
+    assert!(first.t >= before && first.t <= now());
+    for ms in [5, 5] {
+        let next = frame(&mut link);
+        assert_eq!((next.t - first.t, next.stamp), (Nanos::from_millis(ms), StampKind::Log));
+        assert!(now() >= next.t, "not before its time");
+    }
+    let deadline = now() + Nanos::from_millis(10);
+    // Unless the machine has slept, the last one is not due yet.
+    if deadline < first.t + Nanos::from_millis(200) {
+        assert_eq!(link.recv(deadline), Received::TimedOut);
+        assert!(now() >= deadline);
+        assert_eq!(link.recv(Nanos::ZERO), Received::TimedOut);
+        assert_eq!(link.state(), LinkState::Up);
+    }
+    assert_eq!(frame(&mut link).t - first.t, Nanos::from_millis(205));
+    assert_eq!(link.recv(now()), Received::Ended);
+    assert_eq!(link.counters().received, 4);
+
+    // Several buses of one log stay in step, whenever each is first read.
+    let (start, path) = (now() - Nanos::from_millis(300), bus.write(&log));
+    for _ in 0..2 {
+        let mut link = Replay::open(&path, Pace::Recorded, None, &[]).unwrap();
+        link.start_at(start);
+        assert_eq!(exactly(&mut link, 4)[3].t, start + Nanos::from_millis(205));
+    }
+}
+
+#[test]
+fn a_log_at_once_keeps_its_stamps_and_its_lack_of_them() {
+    let bus = Log::new(Pace::Fast);
+    let path = bus.write(
+        b"(1479121923.123456) can0 123#11\nrubbish\n  can0  123   [1]  22\n(1.5) can0 20000004#00\n(2.5) can0 123#33\n",
+    );
+    let mut link = Replay::open(&path, Pace::Fast, None, &[]).unwrap();
+    let stamps: Vec<_> = exactly(&mut link, 3).iter().map(|f| (f.t.0, f.stamp)).collect();
+    assert_eq!(
+        stamps,
+        [
+            (1_479_121_923_123_456_000, StampKind::Log),
+            (0, StampKind::None),
+            (2_500_000_000, StampKind::Log)
+        ]
+    );
+    assert_eq!(
+        (link.report().bad, link.report().unstamped, link.counters().error_frames),
+        (1, 1, 1)
+    );
+    // Without stamps there is no pace to keep.
+    let path = bus.write(b"  can0  123   [1]  22\n");
+    let error = Replay::open(&path, Pace::Recorded, None, &[]).unwrap_err();
+    assert!(error.to_string().contains("no time stamps"), "{error}");
+    assert!(Replay::open(&path, Pace::Fast, None, &[]).is_ok());
+    let missing = bus.folder.path().join("missing.log");
+    assert!(
+        Replay::open(&missing, Pace::Fast, None, &[])
+            .unwrap_err()
+            .to_string()
+            .contains("missing.log")
+    );
+    let mut empty = Replay::open(&bus.write(b""), Pace::Recorded, None, &[]).unwrap();
+    assert_eq!(
+        (empty.recv(now() + PATIENCE), empty.state()),
+        (Received::Ended, LinkState::Ended)
+    );
+}
+
+#[test]
+fn a_log_of_several_buses_is_taken_apart_by_interface_then_by_name() {
+    let bus = Log::new(Pace::Fast);
+    let path = bus.write(b"(1.0) can0 001#\n(1.1) can1 002#\n(1.2) left 003#\n(1.3) other 004#\n(1.4) can0 005#\n");
+    let buses = [(Some("can0"), "left"), (Some("can1"), "can0"), (None, "right")];
+    let ids = |this, buses: &[_]| {
+        let mut link = Replay::open(&path, Pace::Fast, Matching::of(buses, this), &[]).unwrap();
+        let mut ids = Vec::new();
+        while let Received::Frame(frame) = link.recv(now()) {
+            ids.push(frame.id.raw());
+        }
+        assert_eq!(link.unmatched() + ids.len() as u64, 5);
+        ids
+    };
+    assert_eq!(ids(0, &buses), [1, 3, 5]);
+    assert_eq!(
+        ids(1, &buses),
+        [2],
+        "can0 is the other's interface, though it is this one's name"
+    );
+    assert!(ids(2, &buses).is_empty());
+    assert_eq!(ids(0, &buses[..1]), [1, 2, 3, 4, 5], "one bus takes all");
+}
+
+// --- The virtual bus alone -------------------------------------------------------------------------------------------
+
+#[test]
+fn virtual_buses_do_not_mix() {
+    let domain = format!("mix-{}", unique());
+    let mut links: Vec<VirtualBus> = [(&*domain, "a"), (&*domain, "b"), ("another", "a"), (&*domain, "a")]
+        .into_iter()
+        .map(|(domain, name)| VirtualBus::open(domain, name, &[]).unwrap())
+        .collect();
+    links[0]
+        .send(&Frame::new(Id::standard(1), &[]), now() + PATIENCE)
+        .unwrap();
+    assert_eq!(exactly(&mut links[3], 1).len(), 1);
+    silent(&mut links[1]);
+    silent(&mut links[2]);
+    for (domain, name) in [("d", ""), ("d", "a\0b"), ("a\0b", "c"), (&*"d".repeat(200), "a")] {
+        assert!(
+            matches!(VirtualBus::open(domain, name, &[]), Err(OpenError::System { .. })),
+            "{name:?}"
+        );
+    }
+}
+
+/// Where nothing is up but the loopback interface: no route for multicast leads anywhere.
+#[test]
+fn the_virtual_bus_needs_only_the_loopback_interface() {
+    const INSIDE: &str = "PROPRIO_TEST_LOOPBACK_ONLY";
+    if std::env::var_os(INSIDE).is_some() {
+        for property in EVERY.into_iter().chain(LIVE) {
+            property(&Virtual::new());
+        }
+        return;
+    }
+    let lo_up = "PATH=$PATH:/usr/sbin:/sbin; ip link set lo up && exec \"$@\"";
+    let inside = |unshare: &[&str], then: &[&std::ffi::OsStr]| {
+        let mut command = Command::new("unshare");
+        command
+            .args(unshare)
+            .args(["--net", "sh", "-c", lo_up, "sh"])
+            .args(then);
+        command.env(INSIDE, "1").output()
+    };
+    let root = inside(&[], &["true".as_ref()]);
+    let unshare: &[&str] = if root.is_ok_and(|o| o.status.success()) {
+        &[]
+    } else {
+        &["--user", "--map-root-user"]
+    };
+    if !inside(unshare, &["true".as_ref()]).is_ok_and(|o| o.status.success()) {
+        println!("skipped: no right to make a network namespace");
+        return;
+    }
+    let me = std::env::current_exe().unwrap();
+    let test = [
+        "--exact",
+        "the_virtual_bus_needs_only_the_loopback_interface",
+        "--nocapture",
+    ]
+    .map(std::ffi::OsStr::new);
+    let output = inside(unshare, &[&[me.as_os_str()][..], &test].concat()).unwrap();
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert!(
+        output.status.success() && text.contains("1 passed"),
+        "{text}{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+}
+
+// --- SocketCAN alone -------------------------------------------------------------------------------------------------
+
+/// An interface of this test's own, which it may take down.
+struct OwnInterface {
+    name: String,
+}
+
+impl OwnInterface {
+    fn new() -> Self {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let name = format!("pv{}.{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let own = Self { name };
+        own.create();
+        own
+    }
+
+    fn create(&self) {
+        self.ip("link add dev NAME type vcan");
+        self.ip("link set dev NAME mtu 72 up");
+    }
+
+    fn ip(&self, words: &str) {
+        let words = words
+            .split(' ')
+            .map(|word| if word == "NAME" { &*self.name } else { word });
+        let path = format!("{}:/usr/sbin:/sbin", std::env::var("PATH").unwrap_or_default());
+        assert!(
+            Command::new("ip")
+                .args(words)
+                .env("PATH", path)
+                .status()
+                .unwrap()
+                .success()
+        );
+    }
+
+    fn peer_sends(&self, frame: &Frame) {
+        SocketCan::open(&self.name, &[])
+            .unwrap()
+            .send(frame, now() + PATIENCE)
+            .unwrap();
+    }
+}
+
+impl Drop for OwnInterface {
+    fn drop(&mut self) {
+        let _ = Command::new("/usr/sbin/ip")
+            .args(["link", "del", "dev", &self.name])
+            .status();
+    }
+}
+
+/// Receives until the state changes to `state`.
+fn changes_to(link: &mut dyn Link, state: LinkState) {
+    let give_up = now() + PATIENCE;
+    while link.state() != state {
+        let received = link.recv(now() + SILENCE);
+        assert!(
+            matches!(received, Received::TimedOut | Received::StateChanged),
+            "{received:?}"
+        );
+        assert!(now() < give_up, "still {:?} instead of {state:?}", link.state());
+    }
+}
+
+#[test]
+fn a_lost_interface_is_told_and_found_again() {
+    if !vcan() {
+        return;
+    }
+    let own = OwnInterface::new();
+    let mut link = SocketCan::open(&own.name, &[Claim::exclusive(Id::standard(7))]).unwrap();
+    let wanted = Frame::new(Id::standard(7), &[1]);
+    own.peer_sends(&wanted);
+    assert_eq!(bare(&frame(&mut link)), wanted);
+
+    own.ip("link set dev NAME down");
+    assert_eq!(link.recv(now() + PATIENCE), Received::StateChanged);
+    assert_eq!(link.state(), LinkState::Down);
+    assert_eq!(link.send(&wanted, now() + PATIENCE), Err(SendError::NotUp));
+    // Down from the start.
+    assert_eq!(SocketCan::open(&own.name, &[]).unwrap().state(), LinkState::Down);
+    silent(&mut link);
+    own.ip("link set dev NAME up");
+    changes_to(&mut link, LinkState::Up);
+    own.peer_sends(&Frame::new(Id::standard(8), &[]));
+    own.peer_sends(&wanted);
+    assert_eq!(
+        bare(&frame(&mut link)),
+        wanted,
+        "with the same filters, and nothing stale"
+    );
+
+    for _ in 0..2 {
+        own.ip("link del dev NAME");
+        assert_eq!(link.recv(now() + PATIENCE), Received::StateChanged);
+        assert_eq!(link.state(), LinkState::Gone);
+        assert_eq!(link.send(&wanted, now() + PATIENCE), Err(SendError::NotUp));
+        silent(&mut link);
+        assert_eq!(link.recv(Nanos::ZERO), Received::TimedOut);
+        own.create();
+        changes_to(&mut link, LinkState::Up);
+        own.peer_sends(&Frame::new(Id::extended(7), &[]));
+        own.peer_sends(&wanted);
+        assert_eq!(bare(&frame(&mut link)), wanted);
+        silent(&mut link);
+    }
+    // Found by sending, told by receiving.
+    own.ip("link del dev NAME");
+    assert_eq!(link.send(&wanted, now() + PATIENCE), Err(SendError::NotUp));
+    assert_eq!(
+        (link.state(), link.recv(Nanos::ZERO)),
+        (LinkState::Gone, Received::StateChanged)
+    );
+    // Made anew, but down.
+    own.ip("link add dev NAME type vcan");
+    changes_to(&mut link, LinkState::Down);
+    own.ip("link set dev NAME mtu 16 up");
+    changes_to(&mut link, LinkState::Up);
+    // Without mtu 72 there is no CAN FD.
+    assert_eq!(
+        link.send(&fd(Id::standard(7), false, false, &[]), now() + PATIENCE),
+        Err(SendError::Unsupported)
+    );
+    assert_eq!(link.send(&wanted, now() + PATIENCE), Ok(()));
+    let counters = link.counters();
+    assert_eq!(
+        (
+            counters.losses,
+            counters.received,
+            counters.sent,
+            counters.send_failures
+        ),
+        (4, 4, 1, 5)
+    );
+}
+
+#[test]
+fn error_frames_set_the_state() {
+    if !vcan() {
+        return;
+    }
+    let own = OwnInterface::new();
+    let mut link = SocketCan::open(&own.name, &[Claim::exclusive(Id::standard(7))]).unwrap();
+    // The interface's driver sends these; on a virtual one anybody may.
+    let error = |classes: &str| {
+        let frame = format!("{classes}#0000000000000000");
+        assert!(
+            Command::new("cansend")
+                .args([&own.name, &frame])
+                .status()
+                .unwrap()
+                .success()
+        );
+    };
+    error("20000004");
+    silent(&mut link);
+    assert_eq!((link.state(), link.counters().error_frames), (LinkState::Up, 1));
+    error("20000040");
+    assert_eq!(link.recv(now() + PATIENCE), Received::StateChanged);
+    assert_eq!(link.state(), LinkState::BusOff);
+    assert_eq!(
+        link.send(&Frame::new(Id::standard(7), &[]), now() + PATIENCE),
+        Err(SendError::NotUp)
+    );
+    error("20000100");
+    assert_eq!(link.recv(now() + PATIENCE), Received::StateChanged);
+    assert_eq!(link.state(), LinkState::Up);
+    // So does a controller that counts its errors again, having restarted by itself.
+    error("20000040");
+    changes_to(&mut link, LinkState::BusOff);
+    error("20000004");
+    changes_to(&mut link, LinkState::Up);
+    // Frames that come tell it as well; none is lost for the telling.
+    error("20000040");
+    changes_to(&mut link, LinkState::BusOff);
+    let wanted = Frame::new(Id::standard(7), &[1]);
+    own.peer_sends(&wanted);
+    assert_eq!(
+        (link.recv(now() + PATIENCE), link.state()),
+        (Received::StateChanged, LinkState::Up)
+    );
+    assert_eq!(bare(&frame(&mut link)), wanted);
+    let counters = link.counters();
+    assert_eq!((counters.error_frames, counters.losses, counters.received), (6, 3, 1));
+}
+
+#[test]
+fn what_can_not_be_opened_is_explained() {
+    let missing = SocketCan::open("nosuchcan0", &[]).unwrap_err();
+    assert!(missing.to_string().contains("virtual"), "{missing}");
+    if vcan() {
+        assert!(matches!(missing, OpenError::NoInterface { .. }), "{missing}");
+        assert!(matches!(SocketCan::open("lo", &[]), Err(OpenError::NotCan { .. })));
+        assert!(matches!(SocketCan::open("", &[]), Err(OpenError::NoInterface { .. })));
+        assert!(matches!(
+            SocketCan::open("much-too-long-for-an-interface", &[]),
+            Err(OpenError::NoInterface { .. })
+        ));
+    }
+}
+
+#[test]
+fn a_past_deadline_does_not_sleep() {
+    // `sleep_until` with instants that no clock will show again.
+    for past in [Nanos::MIN, Nanos(-1), Nanos::ZERO, Nanos(1)] {
+        sleep_until(past);
+    }
+    assert!(now() > Nanos::ZERO);
+}
