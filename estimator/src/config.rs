@@ -1,0 +1,425 @@
+//! estimator.toml: as typed ([`Config`]), with every key's meaning and default.
+//!
+//! [`crate::setup`] checks it against the model and resolves names; nothing after that sees this form.
+
+use serde::Deserialize;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// A configuration that can not be used: exit 2.
+#[derive(Debug, thiserror::Error)]
+#[error("{}: {problem}", .file.display())]
+pub struct ConfigError {
+    /// The file.
+    pub file: PathBuf,
+    /// Where in it, what is wrong, and what would be legal.
+    pub problem: String,
+}
+
+/// The whole file.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// The version of this form: 1.
+    pub schema: u32,
+    /// The robot's name: the first part of every service's name.
+    pub robot: String,
+    /// The URDF, relative to this file.
+    pub model: PathBuf,
+    /// Identified parameters and offsets to start from, relative to this file.
+    pub parameters: Option<PathBuf>,
+    /// How the estimator's thread is scheduled.
+    pub realtime: Option<Realtime>,
+    /// Where kinematics start.
+    pub base: Base,
+    /// Joints nobody measures, and where they are \[rad or m\].
+    #[serde(default)]
+    pub locked: BTreeMap<String, f64>,
+    /// The force/torque sensors, at which the tree is cut.
+    #[serde(default)]
+    pub force_torque: Vec<ForceTorque>,
+    /// The unknown external wrenches.
+    #[serde(default)]
+    pub contact: Vec<Contact>,
+    /// What is identified from which measurements.
+    #[serde(default)]
+    pub identification: Identification,
+    /// How velocities and accelerations are had.
+    #[serde(default)]
+    pub differentiation: Differentiation,
+    /// How samples are taken in.
+    #[serde(default)]
+    pub input: Input,
+    /// When and what is published.
+    #[serde(default)]
+    pub output: Output,
+}
+
+/// How a thread is scheduled.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Realtime {
+    /// The processor it is bound to.
+    pub cpu: Option<usize>,
+    /// Its SCHED_FIFO priority, 1 to 99.
+    pub priority: Option<i32>,
+}
+
+/// Where kinematics start.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
+pub enum Base {
+    /// A link that stands still. It implies an unknown wrench on that link: what it stands on.
+    Fixed {
+        /// The link or folded frame.
+        link: String,
+        /// Physical gravity, pointing down, in the axes of `link` \[m/s^2\].
+        #[serde(default = "standard_gravity")]
+        gravity_mps2: [f64; 3],
+    },
+    /// An IMU on a link.
+    Imu {
+        /// Its channel.
+        sensor: String,
+        /// The link or folded frame it sits on.
+        link: String,
+        /// Its origin in that frame \[m\].
+        #[serde(default)]
+        xyz_m: [f64; 3],
+        /// Its axes in that frame: roll, pitch, yaw about fixed axes, as URDF has it \[rad\].
+        #[serde(default)]
+        rpy_rad: [f64; 3],
+    },
+}
+
+const fn standard_gravity() -> [f64; 3] {
+    [0.0, 0.0, -9.80665]
+}
+
+/// A force/torque sensor.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ForceTorque {
+    /// Its channel.
+    pub sensor: String,
+    /// The URDF joint that it sits in; the tree is cut here.
+    pub joint: String,
+    /// Whose axes and whose origin its reading has; default: as the URDF's sensor element says, else `child`.
+    pub frame: Option<SensorFrame>,
+    /// Whose wrench on whom it is; default: as the URDF's sensor element says, else `child_to_parent`.
+    pub direction: Option<Direction>,
+    /// With `frame = "sensor"`: the sensor's origin in the child link's frame \[m\].
+    pub xyz_m: Option<[f64; 3]>,
+    /// With `frame = "sensor"`: the sensor's axes in the child link's frame: roll, pitch, yaw \[rad\].
+    pub rpy_rad: Option<[f64; 3]>,
+    /// Standard deviation of its forces \[N\]. The default is an iCub arm's sensor, robot still.
+    #[serde(default = "default_noise_n")]
+    pub noise_n: [f64; 3],
+    /// Standard deviation of its torques \[Nm\]. The default as above.
+    #[serde(default = "default_noise_nm")]
+    pub noise_nm: [f64; 3],
+    /// What it reads with no load: forces \[N\].
+    #[serde(default)]
+    pub offset_n: [f64; 3],
+    /// What it reads with no load: torques \[Nm\].
+    #[serde(default)]
+    pub offset_nm: [f64; 3],
+}
+
+const fn default_noise_n() -> [f64; 3] {
+    [0.08, 0.09, 0.18]
+}
+
+const fn default_noise_nm() -> [f64; 3] {
+    [0.002, 0.003, 0.0015]
+}
+
+/// Whose axes and whose origin a force/torque reading has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SensorFrame {
+    /// The child link's.
+    Child,
+    /// The parent link's.
+    Parent,
+    /// The sensor's own, posed relative to the child link.
+    Sensor,
+}
+
+/// Whose wrench on whom a force/torque reading is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Direction {
+    /// By the child on the parent: reading = -(wrench by the parent on the child) + offset.
+    ChildToParent,
+    /// By the parent on the child: reading = wrench by the parent on the child + offset.
+    ParentToChild,
+}
+
+/// An unknown external wrench.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Contact {
+    /// Its name in tables and services; default: `link`.
+    pub name: Option<String>,
+    /// The link or folded frame that it acts on; its result is in that frame's axes, about that frame's origin.
+    pub link: String,
+    /// How many unknowns it has.
+    #[serde(default)]
+    pub kind: ContactKind,
+    /// The direction of a `force_along`, in the frame's axes.
+    pub direction: Option<[f64; 3]>,
+    /// Where it acts, in the frame's axes \[m\].
+    #[serde(default)]
+    pub position_m: [f64; 3],
+    /// Whether it is always there.
+    #[serde(default)]
+    pub presence: Presence,
+}
+
+/// How many unknowns a contact has.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ContactKind {
+    /// A force and a torque: 6.
+    #[default]
+    Wrench,
+    /// A force through `position_m`: 3.
+    Force,
+    /// A force through `position_m` along `direction`: 1.
+    ForceAlong,
+}
+
+/// Whether a contact is always there.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Presence {
+    /// It is.
+    #[default]
+    Always,
+    /// It is taken as absent unless somebody declares it.
+    Possible,
+}
+
+/// `[identification]`.
+#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Identification {
+    /// Whether parameters are identified on-line.
+    #[serde(default)]
+    pub enabled: bool,
+    /// From which measurements.
+    #[serde(default)]
+    pub inputs: Vec<IdentificationInput>,
+}
+
+/// A measurement that parameters are identified from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum IdentificationInput {
+    /// The force/torque sensors.
+    Wrench,
+    /// Measured joint torques.
+    Torque,
+}
+
+/// `[differentiation]`: velocities and accelerations from samples, by adaptive windows.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Differentiation {
+    /// Peak noise of a joint position: at least half its resolution \[rad or m\].
+    pub position_noise_rad: f64,
+    /// Peak noise of an IMU's angular velocity \[rad/s\].
+    pub angular_velocity_noise_radps: f64,
+    /// The longest window \[ms\].
+    pub max_window_ms: f64,
+}
+
+impl Default for Differentiation {
+    fn default() -> Self {
+        // Half of 0.055 deg, iCub's coarsest encoders; and three times the noise density of a BNO055 at 100 Hz.
+        Self { position_noise_rad: 4.8e-4, angular_velocity_noise_radps: 5e-3, max_window_ms: 300.0 }
+    }
+}
+
+/// `[input]`: how samples are taken in.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Input {
+    /// How long a channel may be silent before what depends on it is withheld \[ms\].
+    pub max_silence_ms: f64,
+}
+
+impl Default for Input {
+    fn default() -> Self {
+        Self { max_silence_ms: 100.0 }
+    }
+}
+
+/// `[output]`: when and what is published.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Output {
+    /// The channel each of whose stamps gives one estimate; default: the first force/torque sensor, else the first joint.
+    pub trigger: Option<String>,
+    /// How long, counted in stamps, an estimate waits for the other channels to pass its instant \[ms\].
+    pub max_wait_ms: f64,
+    /// A joint torque whose predicted standard deviation exceeds this is withheld \[Nm\]; default: no bound.
+    pub max_torque_std_nm: Option<f64>,
+}
+
+impl Default for Output {
+    fn default() -> Self {
+        Self { trigger: None, max_wait_ms: 1.0, max_torque_std_nm: None }
+    }
+}
+
+impl Config {
+    /// Reads a configuration file; its paths become relative to where the file is.
+    ///
+    /// # Errors
+    /// [`ConfigError`]: not readable, not TOML, an unknown key, a wrong value.
+    pub fn load(file: &Path) -> Result<Self, ConfigError> {
+        let error = |problem| ConfigError { file: file.to_owned(), problem };
+        let text = std::fs::read_to_string(file).map_err(|e| error(format!("can not be read: {e}")))?;
+        let mut config = Self::parse(&text).map_err(error)?;
+        let folder = file.parent().unwrap_or(Path::new("."));
+        config.model = folder.join(&config.model);
+        config.parameters = config.parameters.map(|p| folder.join(p));
+        Ok(config)
+    }
+
+    /// Reads and checks a configuration given as text.
+    ///
+    /// # Errors
+    /// What is wrong, where, and what would be legal.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        let config: Self = toml::from_str(text).map_err(|e| e.to_string())?;
+        config.check()?;
+        Ok(config)
+    }
+
+    fn check(&self) -> Result<(), String> {
+        if self.schema != 1 {
+            return Err(format!("schema = {} is not known; this version reads schema = 1", self.schema));
+        }
+        if let Some(Realtime { priority: Some(priority), .. }) = self.realtime
+            && !(1..=99).contains(&priority)
+        {
+            return Err(format!("realtime.priority = {priority} must be 1 to 99"));
+        }
+        let positive = |key: &str, value: f64, most: f64| {
+            if value > 0.0 && value <= most { Ok(()) } else { Err(format!("{key} = {value} must be above 0, at most {most}")) }
+        };
+        positive("input.max_silence_ms", self.input.max_silence_ms, 3.6e6)?;
+        positive("differentiation.position_noise_rad", self.differentiation.position_noise_rad, 1.0)?;
+        positive("differentiation.angular_velocity_noise_radps", self.differentiation.angular_velocity_noise_radps, 10.0)?;
+        positive("differentiation.max_window_ms", self.differentiation.max_window_ms, 1e4)?;
+        self.output.max_torque_std_nm.map_or(Ok(()), |bound| positive("output.max_torque_std_nm", bound, f64::MAX))?;
+        if !(self.output.max_wait_ms >= 0.0 && self.output.max_wait_ms <= 1000.0) {
+            return Err(format!("output.max_wait_ms = {} must be 0 to 1000", self.output.max_wait_ms));
+        }
+        let finite = |key: &str, values: &[f64]| match values.iter().find(|v| !v.is_finite()) {
+            Some(value) => Err(format!("{key} has the value {value}; it must be finite")),
+            None => Ok(()),
+        };
+        match &self.base {
+            Base::Fixed { gravity_mps2, .. } => finite("base.gravity_mps2", gravity_mps2)?,
+            Base::Imu { xyz_m, rpy_rad, .. } => {
+                finite("base.xyz_m", xyz_m)?;
+                finite("base.rpy_rad", rpy_rad)?;
+            }
+        }
+        for (joint, position) in &self.locked {
+            finite(&format!("locked.{joint}"), &[*position])?;
+        }
+        for ft in &self.force_torque {
+            let at = |key: &str| format!("force_torque {:?}: {key}", ft.sensor);
+            for (key, noise) in [("noise_n", ft.noise_n), ("noise_nm", ft.noise_nm)] {
+                if let Some(value) = noise.into_iter().find(|v| v.is_nan() || *v <= 0.0 || v.is_infinite()) {
+                    return Err(format!("{} has the value {value}; a standard deviation must be above 0", at(key)));
+                }
+            }
+            finite(&at("offset_n"), &ft.offset_n)?;
+            finite(&at("offset_nm"), &ft.offset_nm)?;
+            finite(&at("xyz_m"), &ft.xyz_m.unwrap_or_default())?;
+            finite(&at("rpy_rad"), &ft.rpy_rad.unwrap_or_default())?;
+        }
+        for contact in &self.contact {
+            let at = |key: &str| format!("contact {:?}: {key}", contact.name());
+            finite(&at("position_m"), &contact.position_m)?;
+            match (contact.kind, contact.direction) {
+                (ContactKind::ForceAlong, None) => {
+                    return Err(format!("{} is missing: kind = \"force_along\" needs it", at("direction")));
+                }
+                (ContactKind::ForceAlong, Some(direction)) => {
+                    finite(&at("direction"), &direction)?;
+                    if direction == [0.0; 3] {
+                        return Err(format!("{} must not be zero", at("direction")));
+                    }
+                }
+                (_, Some(_)) => return Err(format!("{} belongs to kind = \"force_along\" only", at("direction"))),
+                (_, None) => {}
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Contact {
+    /// Its name: as given, else its link's.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        self.name.as_deref().unwrap_or(&self.link)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ARM: &str = r#"
+        schema = 1
+        robot = "icub"
+        model = "model.urdf"
+        [base]
+        kind = "fixed"
+        link = "chest"
+        [[force_torque]]
+        sensor = "ft"
+        joint = "ft_joint"
+        [[contact]]
+        name = "hand"
+        link = "l_hand"
+        [output]
+        trigger = "ft"
+    "#;
+
+    #[test]
+    fn defaults_are_as_documented() {
+        let config = Config::parse(ARM).unwrap();
+        assert_eq!(config.base, Base::Fixed { link: "chest".into(), gravity_mps2: [0.0, 0.0, -9.80665] });
+        assert_eq!(config.force_torque[0].noise_n, [0.08, 0.09, 0.18]);
+        assert_eq!(config.contact[0].kind, ContactKind::Wrench);
+        assert_eq!(config.contact[0].presence, Presence::Always);
+        assert!(!config.identification.enabled);
+    }
+
+    #[test]
+    fn each_mistake_has_one_clear_message() {
+        for (from, to, expected) in [
+            ("schema = 1", "schema = 3", "schema = 3 is not known"),
+            ("kind = \"fixed\"", "kind = \"fixd\"", "unknown variant `fixd`, expected `fixed` or `imu`"),
+            ("joint = \"ft_joint\"", "joint = \"ft_joint\"\nnoise_n = [0.1, 0.0, 0.1]", "noise_n has the value 0"),
+            ("link = \"l_hand\"", "link = \"l_hand\"\nkind = \"force_along\"", "direction is missing"),
+            ("link = \"l_hand\"", "link = \"l_hand\"\ndirection = [0.0, 0.0, 1.0]", "belongs to kind = \"force_along\" only"),
+            ("trigger = \"ft\"", "triger = \"ft\"", "unknown field `triger`"),
+            ("trigger = \"ft\"", "max_wait_ms = -1.0", "max_wait_ms = -1 must be 0 to 1000"),
+            ("link = \"chest\"", "link = \"chest\"\ngravity_mps2 = [0.0, 0.0, nan]", "base.gravity_mps2 has the value NaN"),
+        ] {
+            assert!(ARM.contains(from), "{from}");
+            let problem = Config::parse(&ARM.replacen(from, to, 1)).unwrap_err();
+            assert!(problem.contains(expected), "{from} -> {to}: {problem}");
+        }
+    }
+}

@@ -1,0 +1,273 @@
+//! The estimator daemon: one data-plane thread from samples to estimates, and a control plane that looks after it.
+//!
+//! The data-plane thread polls shared memory; it takes no lock and allocates nothing once its ports are open. A service
+//! that is not there yet is looked for now and then, so gateway and estimator can start in any order, and either can be
+//! killed and started again.
+
+use crate::config::{Config, ConfigError};
+use crate::pipeline::Pipeline;
+use crate::setup::Setup;
+use anyhow::{Context, anyhow};
+use proprio_topics::ipc::{Domain, DomainConfig, PortError, Reader, Topic, Writer, monotonic};
+use proprio_topics::realtime;
+use proprio_topics::{
+    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, Header, Nanos, Publisher, Role, Sample,
+    TorqueEstimate,
+};
+use sd_notify::NotifyState;
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::Ordering::{Acquire, Relaxed, Release};
+use std::sync::atomic::{AtomicBool, AtomicI64};
+use std::sync::mpsc;
+use std::time::Duration;
+use tokio::signal::unix::{SignalKind, signal};
+
+/// How long the data plane sleeps when there is nothing to do.
+const NAP: Duration = Duration::from_micros(100);
+/// How often a service that is not there is looked for.
+const LOOK: Nanos = Nanos::from_millis(50);
+/// How often health is sent.
+const HEALTH_PERIOD: Nanos = Nanos::from_millis(100);
+/// A data plane that has not turned for so long is stuck.
+const STUCK: Nanos = Nanos::from_millis(500);
+
+/// Runs the estimator until SIGTERM or SIGINT.
+///
+/// # Errors
+/// One chain that says what, where and what to do; [`ConfigError`] at its root is a wrong configuration.
+pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<()> {
+    let (config, setup) = load(config)?;
+    if check {
+        print!("{setup}");
+        return Ok(());
+    }
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start")?;
+    runtime.block_on(serve(&config, setup, domain))
+}
+
+/// Reads a configuration and its model; tells warnings to the log.
+///
+/// # Errors
+/// [`ConfigError`].
+pub fn load(file: &Path) -> Result<(Config, Setup), ConfigError> {
+    let config = Config::load(file)?;
+    let setup = Setup::new(&config).map_err(|problem| ConfigError { file: file.to_owned(), problem })?;
+    for warning in setup.warnings() {
+        tracing::warn!("{}: {warning}", file.display());
+    }
+    Ok((config, setup))
+}
+
+/// The exit code for an error that `run` ended with, after telling it: 2 for a wrong configuration, else 1.
+pub fn report(error: &anyhow::Error) -> ExitCode {
+    eprintln!("error: {error:#}");
+    ExitCode::from(if error.chain().any(|cause| cause.is::<ConfigError>()) { 2 } else { 1 })
+}
+
+async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::Result<()> {
+    let mut terminate = signal(SignalKind::terminate()).context("cannot catch SIGTERM")?;
+    let mut interrupt = signal(SignalKind::interrupt()).context("cannot catch SIGINT")?;
+    let stop = Arc::new(AtomicBool::new(false));
+    let last_turn = Arc::new(AtomicI64::new(monotonic().0));
+    let (ready, is_ready) = mpsc::channel();
+    let (robot, realtime, domain) = (config.robot.clone(), config.realtime, domain.clone());
+    let (stop_there, turn_there) = (Arc::clone(&stop), Arc::clone(&last_turn));
+    let thread = std::thread::Builder::new()
+        .name("estimate".into())
+        .spawn(move || {
+            let mut plane = match DataPlane::open(&domain, &robot, setup, turn_there) {
+                Ok(plane) => plane,
+                Err(error) => return drop(ready.send(Err(error))),
+            };
+            let refused = realtime.map(|r| realtime::apply(r.cpu, r.priority)).unwrap_or_default();
+            let _ = ready.send(Ok(refused));
+            plane.run(&stop_there);
+        })
+        .context("cannot start a thread")?;
+    for refusal in is_ready.recv().map_err(|_| anyhow!("the data plane ended at once"))?? {
+        tracing::warn!("real-time scheduling not granted: {refusal}");
+    }
+    tracing::info!(robot = config.robot, "running");
+    let _ = sd_notify::notify(&[NotifyState::Ready, NotifyState::Status("running")]);
+    let watchdog = sd_notify::watchdog_enabled();
+    let mut ticks = tokio::time::interval(Duration::from_millis(100));
+    ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
+    let why = loop {
+        tokio::select! {
+            _ = terminate.recv() => break "SIGTERM",
+            _ = interrupt.recv() => break "SIGINT",
+            _ = ticks.tick() => {}
+        }
+        if thread.is_finished() {
+            break "the data plane has ended";
+        }
+        if watchdog.is_some() && monotonic() - Nanos(last_turn.load(Relaxed)) < STUCK {
+            let _ = sd_notify::notify(&[NotifyState::Watchdog]);
+        }
+    };
+    tracing::info!(why, "stopping");
+    let _ = sd_notify::notify(&[NotifyState::Stopping]);
+    stop.store(true, Release);
+    thread.join().map_err(|_| anyhow!("the data plane panicked; this is a mistake in the program"))
+}
+
+/// What the data-plane thread owns.
+struct DataPlane {
+    domain: Domain,
+    robot: String,
+    pipeline: Pipeline,
+    samples: Option<Reader<Sample>>,
+    descriptions: Option<Reader<Description>>,
+    declarations: Option<Reader<ContactDeclaration>>,
+    /// Per channel number of the gateway: the pipeline's channel.
+    map: Vec<Option<usize>>,
+    /// The gateway's epoch that `map` belongs to.
+    mapped: u64,
+    torques: Writer<TorqueEstimate>,
+    contacts: Writer<ContactEstimate>,
+    health_writer: Writer<EstimatorHealth>,
+    description_writer: Writer<Description>,
+    health: EstimatorHealth,
+    next_look: Nanos,
+    next_health: Nanos,
+    last_turn: Arc<AtomicI64>,
+}
+
+impl DataPlane {
+    fn open(domain: &DomainConfig, robot: &str, setup: Setup, last_turn: Arc<AtomicI64>) -> anyhow::Result<Self> {
+        let domain = Domain::open(domain)?;
+        let epoch = domain.epoch();
+        // The health first: it admits one writer, which is how a second estimator of this robot finds out.
+        let health_writer = Writer::create(&domain, robot, epoch)?;
+        let mut description_writer = Writer::<Description>::create(&domain, robot, epoch)?;
+        let torques = Writer::create(&domain, robot, epoch)?;
+        let contacts = Writer::create(&domain, robot, epoch)?;
+        let now = monotonic();
+        description_writer.send(&setup.description(Header::default()), now)?;
+        Ok(Self {
+            robot: robot.to_owned(),
+            pipeline: Pipeline::new(setup),
+            samples: None,
+            descriptions: None,
+            declarations: None,
+            map: Vec::with_capacity(proprio_topics::MAX_CHANNELS),
+            mapped: 0,
+            torques,
+            contacts,
+            health_writer,
+            description_writer,
+            health: EstimatorHealth { started: now, ..EstimatorHealth::default() },
+            next_look: Nanos::ZERO,
+            next_health: Nanos::ZERO,
+            last_turn,
+            domain,
+        })
+    }
+
+    fn run(&mut self, stop: &AtomicBool) {
+        while !stop.load(Acquire) {
+            let now = monotonic();
+            self.last_turn.store(now.0, Relaxed);
+            self.health.last_turn = now;
+            if now >= self.next_look {
+                self.next_look = now + LOOK;
+                look(&mut self.samples, &self.domain, &self.robot);
+                look(&mut self.descriptions, &self.domain, &self.robot);
+                look(&mut self.declarations, &self.domain, &self.robot);
+            }
+            self.take_declarations();
+            let idle = !self.take_samples();
+            if now >= self.next_health {
+                self.next_health = now + HEALTH_PERIOD;
+                self.tell_health(now);
+            }
+            if idle {
+                std::thread::sleep(NAP);
+            }
+        }
+        self.tell_health(monotonic());
+    }
+
+    /// Takes what is waiting and publishes what it completes; whether there was anything.
+    fn take_samples(&mut self) -> bool {
+        let mut any = false;
+        // As many as may wait from one bus; then health and shutdown get their turn.
+        for _ in 0..<Sample as Topic>::QUALITY.buffer {
+            let Some(Ok(Some(sample))) = self.samples.as_mut().map(Reader::try_take) else { break };
+            any = true;
+            self.health.samples += 1;
+            if sample.header.epoch != self.mapped {
+                self.take_descriptions();
+            }
+            let channel = self.map.get(sample.channel as usize).copied().flatten();
+            if sample.header.epoch != self.mapped {
+                self.health.unknown_channel += 1;
+                continue;
+            }
+            // A channel that the configuration does not name is not an error: the gateway may serve others.
+            let Some(channel) = channel else { continue };
+            self.pipeline.push(channel, sample.header.acquired, &sample.reading, sample.header.quality);
+            while let Some(estimate) = self.pipeline.poll() {
+                let now = monotonic();
+                let sent = self.torques.send(&estimate.torques, now).is_ok() & self.contacts.send(&estimate.contacts, now).is_ok();
+                self.health.estimates += 1;
+                self.health.publish_failures += u64::from(!sent);
+                self.health.withheld += u64::from(estimate.torques.joints().iter().any(|j| j.valid != 1));
+                self.health.last_estimate = estimate.t;
+            }
+        }
+        any
+    }
+
+    /// Reads who is who from the gateway.
+    fn take_descriptions(&mut self) {
+        while let Some(Ok(Some(description))) = self.descriptions.as_mut().map(Reader::try_take) {
+            if description.publisher != Publisher::Gateway {
+                continue;
+            }
+            self.map.clear();
+            for number in 0..proprio_topics::MAX_CHANNELS {
+                let entry = u32::try_from(number).ok().and_then(|n| description.find(Role::Channel, n));
+                self.map.push(entry.and_then(|e| self.pipeline.setup().channel(e.kind, e.name.as_str())));
+            }
+            self.mapped = description.header.epoch;
+            let missing = (0..self.pipeline.setup().channels().len()).filter(|c| !self.map.contains(&Some(*c)));
+            for channel in missing {
+                let name = self.pipeline.setup().channels().get(channel).map_or("", |c| c.name.as_str());
+                tracing::error!(channel = name, "the gateway has no such channel: what depends on it is withheld; measure it, or lock it in [locked]");
+            }
+        }
+    }
+
+    fn take_declarations(&mut self) {
+        while let Some(Ok(Some(declared))) = self.declarations.as_mut().map(Reader::try_take) {
+            match self.pipeline.setup().contact(declared.contact.as_str()) {
+                Some(contact) => self.pipeline.declare(contact, declared.header.acquired, declared.active != 0),
+                None => tracing::warn!(contact = declared.contact.as_str(), "a contact was declared that the configuration does not have"),
+            }
+        }
+    }
+
+    fn tell_health(&mut self, now: Nanos) {
+        let counts = self.pipeline.counts();
+        (self.health.late, self.health.backward, self.health.not_finite) = (counts.late, counts.backward, counts.not_finite);
+        self.health.lost = self.samples.as_ref().map_or(0, Reader::lost);
+        self.health.epochs = self.samples.as_ref().map_or(0, Reader::epochs);
+        // Who can not be reached now gets the next one.
+        let _ = self.health_writer.send(&self.health, now);
+        let _ = self.description_writer.update_connections();
+    }
+}
+
+/// Opens a service that is not open yet, if it is there.
+fn look<T: Topic>(reader: &mut Option<Reader<T>>, domain: &Domain, robot: &str) {
+    if reader.is_none() {
+        match Reader::open(domain, robot) {
+            Ok(opened) => *reader = Some(opened),
+            Err(PortError::NotYet { .. }) => {}
+            Err(error) => tracing::warn!("{error}; trying again"),
+        }
+    }
+}

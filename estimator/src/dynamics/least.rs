@@ -1,0 +1,233 @@
+//! Weighted least squares of least norm for six equations and any number of unknowns, without allocation.
+//!
+//! For `A x = b` with noise covariance `C = L L^T` on `b` and weights `w_j` on the unknowns: of all `x` that minimise `(b - A x)^T C^-1 (b - A x)`, the one
+//! that minimises `sum (x_j / w_j)^2`. With `M = L^-1 A W` this is `x = W M^+ L^-1 b`. The pseudo-inverse comes from a one-sided Jacobi
+//! rotation of the six rows of `M` until they are orthogonal, `Q^T M = diag(sigma) V^T`: singular values to full relative accuracy (Demmel, Veselic 1992), so that
+//! the rank is decided on them and not on their squares, in a handful of sweeps over fixed storage.
+//!
+//! Both the covariance and the weights are properties of sensors and contacts, not of coordinates: whatever point and axes the six equations are
+//! written in, the same `x` comes out.
+
+use nalgebra::{Matrix6, Vector6};
+
+/// Singular values below this, relative to the greatest, count as zero.
+const RANK_TOLERANCE: f64 = 1e-8;
+/// Rows count as orthogonal below this cosine.
+const ORTHOGONAL: f64 = 1e-15;
+/// Rows whose square is below this share of all squares are rounding: they are left alone, or the loop would chase them.
+const NEGLIGIBLE: f64 = 1e-26;
+/// Sweeps over all pairs of rows; six or seven do, the bound only guards the loop.
+const SWEEPS: usize = 30;
+
+/// Solution operator of one set of six equations.
+#[derive(Clone, Debug)]
+pub(super) struct LeastSquares {
+    /// Columns of `Q^T M`, one per unknown.
+    columns: Vec<Vector6<f64>>,
+    weights: Vec<f64>,
+    /// `1 / sigma_i^2`, or zero where `sigma_i` counts as zero.
+    inverse_squares: Vector6<f64>,
+    /// Columns `L^-T q_i`.
+    dual: Matrix6<f64>,
+    rank: usize,
+}
+
+impl LeastSquares {
+    /// Room for `capacity` unknowns.
+    pub(super) fn with_capacity(capacity: usize) -> Self {
+        Self {
+            columns: Vec::with_capacity(capacity),
+            weights: Vec::with_capacity(capacity),
+            inverse_squares: Vector6::zeros(),
+            dual: Matrix6::identity(),
+            rank: 0,
+        }
+    }
+
+    /// Forgets all unknowns.
+    pub(super) fn clear(&mut self) {
+        self.columns.clear();
+        self.weights.clear();
+    }
+
+    /// Adds an unknown: its column of `A` and its weight `w_j`.
+    pub(super) fn push(&mut self, column: Vector6<f64>, weight: f64) {
+        self.columns.push(column);
+        self.weights.push(weight);
+    }
+
+    /// Factorises, given the lower Cholesky factor `L` of the covariance.
+    pub(super) fn factorise(&mut self, lower: &Matrix6<f64>) {
+        for (column, weight) in self.columns.iter_mut().zip(&self.weights) {
+            lower.solve_lower_triangular_unchecked_mut(column);
+            *column *= *weight;
+        }
+        let negligible = NEGLIGIBLE * self.columns.iter().map(nalgebra::Matrix::norm_squared).sum::<f64>();
+        let mut q = Matrix6::<f64>::identity();
+        for _ in 0..SWEEPS {
+            let mut rotated = false;
+            for i in 0..5 {
+                for j in i + 1..6 {
+                    rotated |= self.rotate_rows(&mut q, i, j, negligible);
+                }
+            }
+            if !rotated {
+                break;
+            }
+        }
+        let squares = self
+            .columns
+            .iter()
+            .fold(Vector6::zeros(), |sum, column| sum + column.component_mul(column));
+        let least = squares.max() * RANK_TOLERANCE * RANK_TOLERANCE;
+        self.inverse_squares = squares.map(|square| {
+            if square > least && square > 0.0 {
+                1.0 / square
+            } else {
+                0.0
+            }
+        });
+        self.rank = self.inverse_squares.iter().filter(|&&x| x > 0.0).count();
+        lower.tr_solve_lower_triangular_unchecked_mut(&mut q);
+        self.dual = q;
+    }
+
+    /// One Jacobi rotation; whether one was needed.
+    fn rotate_rows(&mut self, q: &mut Matrix6<f64>, i: usize, j: usize, negligible: f64) -> bool {
+        let (mut ii, mut jj, mut ij) = (0.0, 0.0, 0.0);
+        for column in &self.columns {
+            ii += column[i] * column[i];
+            jj += column[j] * column[j];
+            ij += column[i] * column[j];
+        }
+        if ij == 0.0 || ij.abs() <= ORTHOGONAL * (ii * jj).sqrt() || ii.min(jj) <= negligible {
+            return false;
+        }
+        let zeta = (jj - ii) / (2.0 * ij);
+        let t = zeta.signum() / (zeta.abs() + (1.0 + zeta * zeta).sqrt());
+        let c = 1.0 / (1.0 + t * t).sqrt();
+        let s = c * t;
+        for column in &mut self.columns {
+            let (a, b) = (column[i], column[j]);
+            column[i] = c * a - s * b;
+            column[j] = s * a + c * b;
+        }
+        for row in 0..6 {
+            let (a, b) = (q[(row, i)], q[(row, j)]);
+            q[(row, i)] = c * a - s * b;
+            q[(row, j)] = s * a + c * b;
+        }
+        true
+    }
+
+    /// Rank of the six equations in the unknowns.
+    pub(super) fn rank(&self) -> usize {
+        self.rank
+    }
+
+    /// The row of the solution operator for unknown `j`: `x_j = k . b`.
+    pub(super) fn gain(&self, j: usize) -> Vector6<f64> {
+        self.dual * self.columns[j].component_mul(&self.inverse_squares) * self.weights[j]
+    }
+
+    /// How far unknown `j` is fixed by the equations: 1 entirely, 0 not at all (the rest is the least norm's choice).
+    pub(super) fn determinacy(&self, j: usize) -> f64 {
+        self.columns[j]
+            .component_mul(&self.columns[j])
+            .dot(&self.inverse_squares)
+    }
+
+    /// Whether `sum_j g_j x_j` is fixed by the equations; `gradient` gives `g_j`.
+    pub(super) fn determines(&self, gradient: impl Fn(usize) -> f64, tolerance: f64) -> bool {
+        let (mut total, mut along) = (0.0, Vector6::zeros());
+        for (j, (column, weight)) in self.columns.iter().zip(&self.weights).enumerate() {
+            let g = gradient(j) * weight;
+            total += g * g;
+            along += column * g;
+        }
+        let seen = along.component_mul(&along).dot(&self.inverse_squares);
+        total - seen <= tolerance * total
+    }
+
+    /// `L^-T (1 - Q_r Q_r^T) L^-1`: what weighs the part of `b` that no unknown explains. `b^T P b` is its chi-square; zero where the rank is 6.
+    pub(super) fn unexplained(&self) -> Matrix6<f64> {
+        let mut weight = Matrix6::zeros();
+        for (column, &inverse) in self.dual.column_iter().zip(&self.inverse_squares) {
+            if inverse == 0.0 {
+                weight += column * column.transpose();
+            }
+        }
+        weight
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{DMatrix, DVector};
+    use proptest::prelude::*;
+
+    fn build(columns: &[[f64; 6]], weights: &[f64], lower: &Matrix6<f64>) -> LeastSquares {
+        let mut solver = LeastSquares::with_capacity(columns.len());
+        for (column, weight) in columns.iter().zip(weights) {
+            solver.push(Vector6::from(*column), *weight);
+        }
+        solver.factorise(lower);
+        solver
+    }
+
+    fn lower() -> impl Strategy<Value = Matrix6<f64>> {
+        prop::collection::vec(-1.0..1.0_f64, 36)
+            .prop_map(|v| Matrix6::from_iterator(v).lower_triangle() + Matrix6::identity() * 1.5)
+    }
+
+    proptest! {
+        /// Against nalgebra's dense singular value decomposition, any shape and rank.
+        #[test]
+        fn is_the_weighted_pseudo_inverse(
+            columns in prop::collection::vec(prop::array::uniform6(-1.0..1.0_f64), 1..14),
+            repeated in any::<bool>(),
+            weights in prop::collection::vec(0.1..2.0_f64, 14),
+            b in prop::array::uniform6(-5.0..5.0_f64),
+            lower in lower(),
+        ) {
+            let mut columns = columns;
+            if repeated {
+                // Rank-deficient: every column but the first three repeats one of them.
+                for j in 3..columns.len() {
+                    columns[j] = columns[j % 3].map(|x| 0.5 * x);
+                }
+            }
+            let n = columns.len();
+            let whiten = lower.try_inverse().expect("invertible");
+            let m = DMatrix::from_fn(6, n, |i, j| (whiten * Vector6::from(columns[j]))[i] * weights[j]);
+            let svd = m.clone().svd(true, true);
+            let least = svd.singular_values.max() * 1e-9;
+            let condition = svd.singular_values.max() / svd.singular_values.iter().copied().filter(|&s| s > least).fold(f64::INFINITY, f64::min);
+            prop_assume!(condition < 1e4);
+            let white = DVector::from_column_slice((whiten * Vector6::from(b)).as_slice());
+            let expected = svd.solve(&white, least).expect("u and v computed");
+            let solver = build(&columns, &weights, &lower);
+            prop_assert_eq!(solver.rank(), svd.rank(least));
+            for j in 0..n {
+                let got = solver.gain(j).dot(&Vector6::from(b));
+                prop_assert!((got - expected[j] * weights[j]).abs() < 1e-9 * (1.0 + expected.amax()), "{} {}", got, expected[j]);
+            }
+            let residual = &white - m * &expected;
+            let chi_square = (solver.unexplained() * Vector6::from(b)).dot(&Vector6::from(b));
+            prop_assert!((chi_square - residual.norm_squared()).abs() < 1e-8 * (1.0 + white.norm_squared()));
+        }
+    }
+
+    #[test]
+    fn no_unknown_and_zero_columns_are_no_trouble() {
+        let empty = build(&[], &[], &Matrix6::identity());
+        assert_eq!(empty.rank(), 0);
+        assert_eq!(empty.unexplained(), Matrix6::identity());
+        let zero = build(&[[0.0; 6], [0.0; 6]], &[1.0, 1.0], &Matrix6::identity());
+        assert_eq!(zero.rank(), 0);
+        assert_eq!(zero.gain(1), Vector6::zeros());
+        assert_eq!(zero.determinacy(0), 0.0);
+        assert!(!zero.determines(|_| 1.0, 1e-9));
+    }
+}

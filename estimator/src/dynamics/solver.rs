@@ -1,0 +1,563 @@
+//! The reordered recursive Newton-Euler algorithm: F/T readings in, joint torques and unknown contact wrenches out.
+//!
+//! For each sub-tree, in base coordinates, with `F` the sum of net wrenches less sensors' and known external wrenches, over the whole sub-tree (`b`) or over
+//! what lies below a joint (`F_j`):
+//!
+//! ```text
+//! unknowns:    A x = b            x = K b            K: least.rs; C = sum over sensors X Sigma X^T weighs the six equations
+//! unexplained: r = b - A K b      spread over the sensors by their noise: e_k = C_k C^-1 r, so that the balance holds exactly
+//! torque:      tau_j = s_j . (F_j - what contacts and corrections below j contribute) = s_j . F_j - h_j . b
+//! ```
+//!
+//! `h_j` depends on where nothing unknown acts ([`Route`]): `0` from the side of the child; `s_j` from that of the parent; `C^-1 C_j s_j` fused;
+//! `K^T A_j^T s_j + P C_j s_j` for the whole sub-tree, `P = C^-1 (1 - A K)`; `A_j`, `C_j` count what lies below `j`. So the two sides of a joint never disagree about
+//! which one was used, and the noise of a torque is that of `s_j . F_j - h_j . b`: a sensor at `k` enters with the motion `h_j - [k below j] s_j`.
+//!
+//! One full unknown wrench in a sub-tree, the paper's case, needs no solving: it is `b`, moved to the contact.
+
+use nalgebra::{Matrix6, Vector6};
+
+use super::kinematics::check_external;
+use super::least::LeastSquares;
+use super::structure::{ContactKind, ContactSet, ContactSpec, Route, Structure};
+use super::{DynamicsError, ExternalWrench, Kinematics, check_size};
+use crate::model::Model;
+use crate::spatial::{Mat3, Motion, Pose, Vec3, Wrench};
+
+/// A value counts as determined if at most this share of it (squared) is the least norm's choice.
+const UNDETERMINED: f64 = 1e-9;
+
+/// What a result rests on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Certainty {
+    /// On measurements and the model.
+    Determined,
+    /// Also on a choice: the contacts leave more unknown than six equations tell, and the least norm was taken; or nothing measures the wrench that
+    /// holds the sub-tree, and its imbalance was left where it is.
+    Assumed,
+    /// The contact is not present; its wrench is zero by declaration.
+    Absent,
+}
+
+/// The wrench of one contact.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ContactEstimate {
+    /// By the environment on the link, in the axes and at the origin of the contact's frame.
+    pub wrench: Wrench,
+    /// Standard deviations from F/T noise, `[fx fy fz tx ty tz]` [N, Nm]; see [`Solver::update_deviations`].
+    pub deviation: [f64; 6],
+    /// What it rests on.
+    pub certainty: Certainty,
+}
+
+impl ContactEstimate {
+    const ABSENT: Self = Self {
+        wrench: Wrench {
+            torque: Vec3::new(0.0, 0.0, 0.0),
+            force: Vec3::new(0.0, 0.0, 0.0),
+        },
+        deviation: [0.0; 6],
+        certainty: Certainty::Absent,
+    };
+}
+
+/// How well a sub-tree's six equations close.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Balance {
+    /// What the links need and neither sensors nor contacts explain, at the origin and in the axes of the sub-tree's top link.
+    pub residual: Wrench,
+    /// The residual squared, weighted by the inverse covariance of F/T noise: chi-square distributed if the model is right and no undeclared contact acts.
+    /// None if no sensor measures the sub-tree.
+    pub chi_square: Option<f64>,
+    /// Its degrees of freedom: six less the rank of the unknowns.
+    pub degrees: usize,
+}
+
+/// Torques and contact wrenches from F/T readings; holds its results and all the room it needs.
+#[derive(Clone, Debug)]
+pub struct Solver {
+    // Results.
+    torque: Vec<f64>,
+    torque_deviation: Vec<f64>,
+    torque_certainty: Vec<Certainty>,
+    contacts: Vec<ContactEstimate>,
+    balances: Vec<Balance>,
+    // Kept from `solve` for `update_deviations`, in base coordinates.
+    axes: Vec<Motion>,
+    responses: Vec<Motion>,
+    gains: Vec<[Motion; 6]>,
+    sensor_poses: Vec<Pose>,
+    // Scratch.
+    wrenches: Vec<Wrench>,
+    least: LeastSquares,
+    columns: Vec<Vector6<f64>>,
+    owners: Vec<usize>,
+    starts: Vec<usize>,
+}
+
+impl Solver {
+    /// For a structure.
+    pub fn new(structure: &Structure) -> Self {
+        let (dofs, contacts) = (structure.dof_count(), structure.contacts().len());
+        let still = Motion::zero();
+        Self {
+            torque: vec![0.0; dofs],
+            torque_deviation: vec![0.0; dofs],
+            torque_certainty: vec![Certainty::Assumed; dofs],
+            contacts: vec![ContactEstimate::ABSENT; contacts],
+            balances: vec![
+                Balance {
+                    residual: Wrench::zero(),
+                    chi_square: None,
+                    degrees: 6
+                };
+                structure.subtrees().len()
+            ],
+            axes: vec![still; dofs],
+            responses: vec![still; dofs],
+            gains: vec![[still; 6]; contacts],
+            sensor_poses: vec![Pose::identity(); structure.sensors().len()],
+            wrenches: vec![Wrench::zero(); structure.link_count()],
+            least: LeastSquares::with_capacity(6 * contacts),
+            columns: Vec::with_capacity(6 * contacts),
+            owners: Vec::with_capacity(6 * contacts),
+            starts: vec![0; contacts],
+        }
+    }
+
+    /// Solves all sub-trees. `readings` are those of the structure's sensors, offsets removed, in their measurement frames; the contacts in
+    /// `active` are present, the others are taken to be absent; `external` wrenches are known.
+    ///
+    /// # Errors
+    /// Objects made for another model or structure, wrong sizes, numbers that are not finite. Results are unchanged then.
+    pub fn solve(
+        &mut self,
+        model: &Model,
+        structure: &Structure,
+        kinematics: &Kinematics,
+        readings: &[Wrench],
+        active: &ContactSet,
+        external: &[ExternalWrench],
+    ) -> Result<(), DynamicsError> {
+        check_size("links of the model", model.link_count(), self.wrenches.len())?;
+        check_size("links of the kinematics", kinematics.link_count(), self.wrenches.len())?;
+        self.check_structure(structure)?;
+        check_size("F/T readings", readings.len(), structure.sensors().len())?;
+        if let Some(index) = readings.iter().position(|reading| !reading.is_finite()) {
+            return Err(DynamicsError::NotFinite {
+                what: "F/T reading",
+                index,
+            });
+        }
+        check_external(external, self.wrenches.len())?;
+
+        self.wrenches.copy_from_slice(kinematics.net_wrenches());
+        for wrench in external {
+            self.wrenches[wrench.frame.link] -= wrench.in_base(kinematics);
+        }
+        for ((sensor, reading), x_bm) in structure.sensors().iter().zip(readings).zip(&mut self.sensor_poses) {
+            let child = sensor.joint() + 1;
+            let pose = kinematics.pose(child);
+            *x_bm = *pose * *sensor.pose();
+            let by_parent_on_child = pose.wrench(&sensor.transmitted(reading));
+            self.wrenches[child] -= by_parent_on_child;
+            self.wrenches[structure.places[child].parent] += by_parent_on_child;
+        }
+        for link in (1..self.wrenches.len()).rev() {
+            let place = &structure.places[link];
+            if !place.is_top {
+                let below = self.wrenches[link];
+                self.wrenches[place.parent] += below;
+            }
+        }
+        for number in 0..structure.subtrees().len() {
+            self.solve_subtree(number, model, structure, kinematics, active);
+        }
+        Ok(())
+    }
+
+    fn check_structure(&self, structure: &Structure) -> Result<(), DynamicsError> {
+        check_size("links of the structure", structure.link_count(), self.wrenches.len())?;
+        check_size(
+            "degrees of freedom of the structure",
+            structure.dof_count(),
+            self.torque.len(),
+        )?;
+        check_size(
+            "contacts of the structure",
+            structure.contacts().len(),
+            self.contacts.len(),
+        )?;
+        check_size(
+            "sensors of the structure",
+            structure.sensors().len(),
+            self.sensor_poses.len(),
+        )?;
+        check_size(
+            "sub-trees of the structure",
+            structure.subtrees().len(),
+            self.balances.len(),
+        )
+    }
+
+    fn solve_subtree(
+        &mut self,
+        number: usize,
+        model: &Model,
+        structure: &Structure,
+        kinematics: &Kinematics,
+        active: &ContactSet,
+    ) {
+        let subtree = &structure.subtrees()[number];
+        let present = subtree.contacts.intersection(active);
+        for contact in subtree.contacts.difference(active).iter() {
+            self.contacts[contact] = ContactEstimate::ABSENT;
+            self.gains[contact] = [Motion::zero(); 6];
+        }
+        let b = self.wrenches[subtree.top];
+        let single = match (present.iter().next(), present.len()) {
+            (Some(contact), 1) if structure.contacts()[contact].kind == ContactKind::Wrench => Some(contact),
+            _ => None,
+        };
+        // What is unexplained, and the point about which the six equations are written; neither matters to a single full wrench.
+        let mut unexplained = None;
+        let mut point = Vec3::zeros();
+        if let Some(contact) = single {
+            let spec = &structure.contacts()[contact];
+            let x_bf = contact_pose(spec, kinematics);
+            self.contacts[contact] = ContactEstimate {
+                wrench: x_bf.wrench_back(&b),
+                deviation: [0.0; 6],
+                certainty: Certainty::Determined,
+            };
+            for axis in 0..3 {
+                let direction = x_bf.rotation.column(axis).into_owned();
+                self.gains[contact][axis] = Motion::translation(&direction);
+                self.gains[contact][axis + 3] = Motion::rotation(&direction, &x_bf.translation);
+            }
+            self.balances[number] = Balance {
+                residual: Wrench::zero(),
+                chi_square: None,
+                degrees: 0,
+            };
+            if !subtree.sensors.is_empty() {
+                self.balances[number].chi_square = Some(0.0);
+            }
+        } else {
+            point = self.reference_point(structure, kinematics, &subtree.sensors, &present);
+            unexplained = self.solve_unknowns(number, structure, kinematics, &present, &point);
+        }
+
+        for link in structure.links_of(number) {
+            if link == subtree.top {
+                continue;
+            }
+            let joint = &model.joints()[link - 1];
+            let (Some(dof), Some(axis)) = (joint.dof, kinematics.joint_axis(joint)) else {
+                continue;
+            };
+            let route = structure.route_above(link, active);
+            let mut certainty = Certainty::Determined;
+            let response = match route {
+                Route::Child => {
+                    if present.is_empty() && subtree.sensors.is_empty() {
+                        certainty = Certainty::Assumed;
+                    }
+                    Motion::zero()
+                }
+                Route::Parent => axis,
+                Route::Fused | Route::Whole => {
+                    let place = &structure.places[link];
+                    let about_point = Motion {
+                        angular: axis.angular,
+                        linear: axis.linear - point.cross(&axis.angular),
+                    };
+                    let s = stack(&about_point.angular, &about_point.linear);
+                    let mut h = Vector6::zeros();
+                    if let Some(weight) = &unexplained {
+                        let mut noise = Wrench::zero();
+                        for sensor in place.sensors_below.iter() {
+                            let x_bm = &self.sensor_poses[sensor];
+                            let scaled = structure.sensors()[sensor].covariance_times(&x_bm.twist_back(&axis));
+                            noise += x_bm.wrench(&scaled);
+                        }
+                        let noise = noise.about(&point);
+                        h += weight * stack(&noise.torque, &noise.force);
+                    }
+                    if route == Route::Whole {
+                        let below = |j: usize| place.contacts_below.contains(self.owners[j]);
+                        for (j, column) in self.columns.iter().enumerate() {
+                            if below(j) {
+                                h += self.least.gain(j) * column.dot(&s);
+                            }
+                        }
+                        let gradient = |j: usize| if below(j) { self.columns[j].dot(&s) } else { 0.0 };
+                        let balanced = self.least.rank() == 6 || unexplained.is_some();
+                        if !(balanced && self.least.determines(gradient, UNDETERMINED)) {
+                            certainty = Certainty::Assumed;
+                        }
+                    }
+                    about_origin(&h, &point)
+                }
+            };
+            self.torque[dof] = match route {
+                Route::Child => axis.dot(&self.wrenches[link]),
+                Route::Parent => axis.dot(&(self.wrenches[link] - b)),
+                _ => axis.dot(&self.wrenches[link]) - response.dot(&b),
+            };
+            self.torque_certainty[dof] = certainty;
+            self.axes[dof] = axis;
+            self.responses[dof] = response;
+        }
+    }
+
+    /// Mean position of the sensors, or else of the contacts: near them the covariance is best conditioned. The order of either does not matter
+    /// beyond rounding.
+    fn reference_point(
+        &self,
+        structure: &Structure,
+        kinematics: &Kinematics,
+        sensors: &ContactSet,
+        present: &ContactSet,
+    ) -> Vec3 {
+        let mean = |sum: Vec3, count: usize| if count == 0 { sum } else { sum / count as f64 };
+        if sensors.is_empty() {
+            let sum = present.iter().fold(Vec3::zeros(), |sum, contact| {
+                let spec = &structure.contacts()[contact];
+                sum + contact_pose(spec, kinematics).point(&spec.position)
+            });
+            mean(sum, present.len())
+        } else {
+            mean(
+                sensors
+                    .iter()
+                    .fold(Vec3::zeros(), |sum, k| sum + self.sensor_poses[k].translation),
+                sensors.len(),
+            )
+        }
+    }
+
+    /// Any set of contacts: least squares of least norm. Returns the weight of what is unexplained, if sensors can take it up.
+    fn solve_unknowns(
+        &mut self,
+        number: usize,
+        structure: &Structure,
+        kinematics: &Kinematics,
+        present: &ContactSet,
+        point: &Vec3,
+    ) -> Option<Matrix6<f64>> {
+        let subtree = &structure.subtrees()[number];
+        let length = structure.length_scale;
+        self.least.clear();
+        self.columns.clear();
+        self.owners.clear();
+        for contact in present.iter() {
+            let spec = &structure.contacts()[contact];
+            let x_bf = contact_pose(spec, kinematics);
+            let arm = x_bf.point(&spec.position) - point;
+            let force = |direction: Vec3| (stack(&arm.cross(&direction), &direction), 1.0);
+            let torque = |direction: Vec3| (stack(&direction, &Vec3::zeros()), length);
+            let axis = |i: usize| x_bf.rotation.column(i).into_owned();
+            self.starts[contact] = self.columns.len();
+            let mut push = |(column, weight): (Vector6<f64>, f64)| {
+                self.columns.push(column);
+                self.owners.push(contact);
+                self.least.push(column, weight);
+            };
+            match spec.kind {
+                ContactKind::Wrench => {
+                    (0..3).for_each(|i| push(force(axis(i))));
+                    (0..3).for_each(|i| push(torque(axis(i))));
+                }
+                ContactKind::Force => (0..3).for_each(|i| push(force(axis(i)))),
+                ContactKind::ForceAlong(direction) => push(force(x_bf.rotation * direction)),
+            }
+        }
+
+        let measured = !subtree.sensors.is_empty();
+        let lower = measured.then(|| {
+            let mut covariance = Matrix6::zeros();
+            for sensor in subtree.sensors.iter() {
+                add_covariance(&mut covariance, structure, sensor, &self.sensor_poses[sensor], point);
+            }
+            covariance.cholesky().map(|factor| factor.unpack())
+        });
+        // Without sensors nothing weighs the equations: the length scale does, about the contacts. (A covariance has a factor: variances are positive.)
+        let scale = || Matrix6::from_diagonal(&Vector6::new(length, length, length, 1.0, 1.0, 1.0));
+        let lower = lower.flatten().unwrap_or_else(scale);
+        self.least.factorise(&lower);
+
+        let b = self.wrenches[subtree.top].about(point);
+        let b = stack(&b.torque, &b.force);
+        let mut residual = b;
+        for contact in present.iter() {
+            let spec = &structure.contacts()[contact];
+            let start = self.starts[contact];
+            let mut determined = self.least.rank() == 6 || measured;
+            // Force and torque about the contact's position, each as a row of motions that give it when applied to b.
+            let mut rows = [Vector6::zeros(); 6];
+            for i in 0..spec.kind.unknowns() {
+                let gain = self.least.gain(start + i);
+                residual -= self.columns[start + i] * gain.dot(&b);
+                determined &= self.least.determinacy(start + i) >= 1.0 - UNDETERMINED;
+                if let ContactKind::ForceAlong(direction) = spec.kind {
+                    (0..3).for_each(|axis| rows[axis] = gain * direction[axis]);
+                } else {
+                    rows[i] = gain;
+                }
+            }
+            // Torque from the contact's position to the frame's origin: n + position x f.
+            let p = &spec.position;
+            let force = [rows[0], rows[1], rows[2]];
+            for axis in 0..3 {
+                let (next, last) = ((axis + 1) % 3, (axis + 2) % 3);
+                rows[axis + 3] += force[last] * p[next] - force[next] * p[last];
+            }
+            let value = rows.map(|row| row.dot(&b));
+            self.contacts[contact] = ContactEstimate {
+                wrench: Wrench::from_parts([value[0], value[1], value[2]], [value[3], value[4], value[5]]),
+                deviation: [0.0; 6],
+                certainty: if determined {
+                    Certainty::Determined
+                } else {
+                    Certainty::Assumed
+                },
+            };
+            self.gains[contact] = rows.map(|row| about_origin(&row, point));
+        }
+
+        let weight = self.least.unexplained();
+        let residual = Wrench {
+            torque: residual.fixed_rows::<3>(0).into_owned(),
+            force: residual.fixed_rows::<3>(3).into_owned(),
+        };
+        // From the reference point to base coordinates, then to the top link.
+        let residual = kinematics.pose(subtree.top).wrench_back(&residual.about(&-point));
+        let chi_square = measured.then(|| (weight * b).dot(&b));
+        self.balances[number] = Balance {
+            residual,
+            chi_square,
+            degrees: 6 - self.least.rank(),
+        };
+        measured.then_some(weight)
+    }
+
+    /// Computes the standard deviations of torques and contact wrenches that F/T noise causes, for the last solution. Inertial parameters are taken as
+    /// exact; so are a least norm's choice and a declared absence.
+    ///
+    /// # Errors
+    /// The structure is not the one that was solved.
+    pub fn update_deviations(&mut self, structure: &Structure) -> Result<(), DynamicsError> {
+        self.check_structure(structure)?;
+        let Self {
+            sensor_poses,
+            axes,
+            responses,
+            gains,
+            torque_deviation,
+            contacts,
+            ..
+        } = self;
+        let variance = |sensor: usize, motion: &Motion| {
+            let in_sensor = sensor_poses[sensor].twist_back(motion);
+            in_sensor.dot(&structure.sensors()[sensor].covariance_times(&in_sensor))
+        };
+        for link in 1..structure.link_count() {
+            let Some(dof) = structure.dof_of(link) else { continue };
+            let place = &structure.places[link];
+            let (s, h) = (&axes[dof], &responses[dof]);
+            let mut sum = 0.0;
+            for sensor in structure.subtrees()[place.subtree].sensors.iter() {
+                if place.sensors_below.contains(sensor) {
+                    sum += variance(
+                        sensor,
+                        &Motion {
+                            angular: h.angular - s.angular,
+                            linear: h.linear - s.linear,
+                        },
+                    );
+                } else {
+                    sum += variance(sensor, h);
+                }
+            }
+            torque_deviation[dof] = sum.sqrt();
+        }
+        for subtree in structure.subtrees() {
+            for contact in subtree.contacts.iter() {
+                let rows = &gains[contact];
+                contacts[contact].deviation = rows.map(|row| {
+                    subtree
+                        .sensors
+                        .iter()
+                        .map(|sensor| variance(sensor, &row))
+                        .sum::<f64>()
+                        .sqrt()
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// Joint torques [Nm or N], by degree of freedom: along the URDF axis, by the parent on the child, on the link side.
+    pub fn torque(&self) -> &[f64] {
+        &self.torque
+    }
+
+    /// Standard deviations of the torques from F/T noise [Nm or N]; see [`Solver::update_deviations`].
+    pub fn torque_deviation(&self) -> &[f64] {
+        &self.torque_deviation
+    }
+
+    /// What each torque rests on.
+    pub fn torque_certainty(&self) -> &[Certainty] {
+        &self.torque_certainty
+    }
+
+    /// The contacts, in the order of the structure's.
+    pub fn contacts(&self) -> &[ContactEstimate] {
+        &self.contacts
+    }
+
+    /// How well each sub-tree balances, in the order of the structure's.
+    pub fn balances(&self) -> &[Balance] {
+        &self.balances
+    }
+}
+
+fn contact_pose(spec: &ContactSpec, kinematics: &Kinematics) -> Pose {
+    *kinematics.pose(spec.frame.link) * spec.frame.pose
+}
+
+fn stack(upper: &Vec3, lower: &Vec3) -> Vector6<f64> {
+    Vector6::new(upper.x, upper.y, upper.z, lower.x, lower.y, lower.z)
+}
+
+/// A row of motion coordinates about `point`, as a motion about the origin.
+fn about_origin(row: &Vector6<f64>, point: &Vec3) -> Motion {
+    let angular = row.fixed_rows::<3>(0).into_owned();
+    Motion {
+        angular,
+        linear: row.fixed_rows::<3>(3) + point.cross(&angular),
+    }
+}
+
+/// Adds `X Sigma X^T` of a sensor, about `point`.
+fn add_covariance(covariance: &mut Matrix6<f64>, structure: &Structure, sensor: usize, x_bm: &Pose, point: &Vec3) {
+    let (r, cut) = (&x_bm.rotation, &structure.sensors()[sensor]);
+    let units = cut.covariance_times(&Motion {
+        angular: Vec3::repeat(1.0),
+        linear: Vec3::repeat(1.0),
+    });
+    let turned = |variances: &Vec3| r * Mat3::from_diagonal(variances) * r.transpose();
+    let (torque, force) = (turned(&units.torque), turned(&units.force));
+    let arm = (x_bm.translation - point).cross_matrix();
+    let mixed = arm * force;
+    let mut add = |row: usize, column: usize, block: &Mat3| {
+        let mut view = covariance.fixed_view_mut::<3, 3>(row, column);
+        view += block;
+    };
+    add(0, 0, &(torque + mixed * arm.transpose()));
+    add(0, 3, &mixed);
+    add(3, 0, &mixed.transpose());
+    add(3, 3, &force);
+}

@@ -1,0 +1,643 @@
+//! The robot cut at its F/T sensors: sub-trees, the places where the environment may touch it, and what each torque depends on.
+//!
+//! Cutting the tree at `n` sensors leaves `n + 1` sub-trees. Each must balance by itself: six equations,
+//!
+//! ```text
+//! sum of net wrenches of its links = sum of its sensors' wrenches + known external wrenches + unknown contact wrenches
+//! ```
+//!
+//! (eq. (3) of the paper, first six rows, for a sub-tree and any base.) Six unknowns or fewer can be found from it; more cannot.
+
+use super::Kinematics;
+use crate::model::{Frame, JointKind, MeasurementDirection, MeasurementFrame, Model};
+use crate::spatial::{Motion, Pose, Vec3, Wrench};
+
+/// A set of small numbers in a fixed number of words: copied, never allocated.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct BitSet<const WORDS: usize>([u64; WORDS]);
+
+/// Numbers of F/T sensors.
+pub type SensorSet = BitSet<1>;
+/// Numbers of contacts.
+pub type ContactSet = BitSet<1>;
+/// Numbers of degrees of freedom.
+pub type DofSet = BitSet<8>;
+/// Numbers of links.
+pub type LinkSet = BitSet<8>;
+
+impl<const WORDS: usize> Default for BitSet<WORDS> {
+    fn default() -> Self {
+        Self::EMPTY
+    }
+}
+
+impl<const WORDS: usize> BitSet<WORDS> {
+    /// How many different numbers fit.
+    pub const CAPACITY: usize = 64 * WORDS;
+
+    /// Nothing.
+    pub const EMPTY: Self = Self([0; WORDS]);
+
+    /// The numbers below `count` (at most [`BitSet::CAPACITY`]).
+    pub fn first(count: usize) -> Self {
+        let mut set = Self::EMPTY;
+        (0..count).for_each(|number| set.insert(number));
+        set
+    }
+
+    /// Adds a number; one beyond the capacity is ignored.
+    pub fn insert(&mut self, number: usize) {
+        if let Some(word) = self.0.get_mut(number / 64) {
+            *word |= 1 << (number % 64);
+        }
+    }
+
+    /// Takes a number out.
+    pub fn remove(&mut self, number: usize) {
+        if let Some(word) = self.0.get_mut(number / 64) {
+            *word &= !(1 << (number % 64));
+        }
+    }
+
+    /// Whether the number is in the set.
+    pub fn contains(&self, number: usize) -> bool {
+        self.0
+            .get(number / 64)
+            .is_some_and(|word| word >> (number % 64) & 1 == 1)
+    }
+
+    /// Whether it has no element.
+    pub fn is_empty(&self) -> bool {
+        self.0.iter().all(|&word| word == 0)
+    }
+
+    /// How many elements it has.
+    pub fn len(&self) -> usize {
+        self.0.iter().map(|word| word.count_ones() as usize).sum()
+    }
+
+    /// Elements of either.
+    pub fn union(&self, other: &Self) -> Self {
+        self.combine(other, |a, b| a | b)
+    }
+
+    /// Elements of both.
+    pub fn intersection(&self, other: &Self) -> Self {
+        self.combine(other, |a, b| a & b)
+    }
+
+    /// Elements of this one that are not in the other.
+    pub fn difference(&self, other: &Self) -> Self {
+        self.combine(other, |a, b| a & !b)
+    }
+
+    /// The elements, ascending.
+    pub fn iter(&self) -> impl Iterator<Item = usize> + use<WORDS> {
+        let words = self.0;
+        words.into_iter().enumerate().flat_map(|(index, word)| {
+            std::iter::successors((word != 0).then_some(word), |&left| {
+                let rest = left & (left - 1);
+                (rest != 0).then_some(rest)
+            })
+            .map(move |left| 64 * index + left.trailing_zeros() as usize)
+        })
+    }
+
+    fn combine(&self, other: &Self, with: impl Fn(u64, u64) -> u64) -> Self {
+        let mut words = self.0;
+        for (word, &other) in words.iter_mut().zip(&other.0) {
+            *word = with(*word, other);
+        }
+        Self(words)
+    }
+}
+
+impl<const WORDS: usize> FromIterator<usize> for BitSet<WORDS> {
+    fn from_iter<I: IntoIterator<Item = usize>>(numbers: I) -> Self {
+        let mut set = Self::EMPTY;
+        numbers.into_iter().for_each(|number| set.insert(number));
+        set
+    }
+}
+
+/// Standard deviations of an F/T sensor's six channels, in its measurement frame; channels are taken as independent.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Noise {
+    /// Of the force [N].
+    pub force: [f64; 3],
+    /// Of the torque [Nm].
+    pub torque: [f64; 3],
+}
+
+/// An F/T sensor: the fixed joint where the tree is cut, and what the sensor reports of the wrench that goes through it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SensorCut {
+    joint: usize,
+    /// Measurement frame in the child, `x_cm`.
+    pose: Pose,
+    direction: MeasurementDirection,
+    /// Variances.
+    force: Vec3,
+    torque: Vec3,
+}
+
+impl SensorCut {
+    /// A sensor in the joint named `joint` (which the model must have kept). `pose` is the sensor's in the joint's child link, `x_cs`, and counts with
+    /// [`MeasurementFrame::Sensor`] only.
+    ///
+    /// # Errors
+    /// The model has no such joint, the joint moves, or the noise is not positive and finite.
+    pub fn new(
+        model: &Model,
+        joint: &str,
+        frame: MeasurementFrame,
+        direction: MeasurementDirection,
+        pose: &Pose,
+        noise: &Noise,
+    ) -> Result<Self, StructureError> {
+        let name = || joint.to_owned();
+        let number = model.joint(joint).ok_or_else(|| StructureError::NoJoint(name()))?;
+        let facts = model
+            .joints()
+            .get(number)
+            .ok_or_else(|| StructureError::NoJoint(name()))?;
+        if facts.kind != JointKind::Fixed {
+            return Err(StructureError::JointMoves(name()));
+        }
+        if noise
+            .force
+            .iter()
+            .chain(&noise.torque)
+            .any(|&deviation| !(deviation.is_finite() && deviation > 0.0))
+        {
+            return Err(StructureError::Noise(name()));
+        }
+        let x_cm = match frame {
+            // A body has the frame of the link that its joint moves, so the child link's is the body's.
+            MeasurementFrame::Child => Pose::identity(),
+            MeasurementFrame::Parent => {
+                let parent_link = model.joint_links(number).and_then(|(parent, _)| model.frame(parent));
+                let x_body_link = parent_link.ok_or_else(|| StructureError::NoJoint(name()))?.pose;
+                facts.placement.inverse() * x_body_link
+            }
+            MeasurementFrame::Sensor => *pose,
+        };
+        let square = |deviations: [f64; 3]| Vec3::from(deviations.map(|deviation| deviation * deviation));
+        Ok(Self {
+            joint: number,
+            pose: x_cm,
+            direction,
+            force: square(noise.force),
+            torque: square(noise.torque),
+        })
+    }
+
+    /// Number of the joint it sits in.
+    pub fn joint(&self) -> usize {
+        self.joint
+    }
+
+    /// Pose of the measurement frame in the joint's child, `x_cm`.
+    pub fn pose(&self) -> &Pose {
+        &self.pose
+    }
+
+    /// Standard deviations of its channels, in the measurement frame.
+    pub fn noise(&self) -> Noise {
+        Noise {
+            force: self.force.map(f64::sqrt).into(),
+            torque: self.torque.map(f64::sqrt).into(),
+        }
+    }
+
+    /// What the sensor reads, without offset, when the parent exerts `wrench` on the child (at the origin and in the axes of the child).
+    pub fn reading(&self, wrench: &Wrench) -> Wrench {
+        self.signed(self.pose.wrench_back(wrench))
+    }
+
+    /// The wrench that the parent exerts on the child (at the origin and in the axes of the child) when the sensor reads `reading`, offset removed.
+    pub fn transmitted(&self, reading: &Wrench) -> Wrench {
+        self.signed(self.pose.wrench(reading))
+    }
+
+    fn signed(&self, wrench: Wrench) -> Wrench {
+        match self.direction {
+            MeasurementDirection::ChildToParent => -wrench,
+            MeasurementDirection::ParentToChild => wrench,
+        }
+    }
+
+    /// `Sigma m`: the covariance of the readings applied to a motion in the measurement frame.
+    #[inline]
+    pub(super) fn covariance_times(&self, motion: &Motion) -> Wrench {
+        Wrench {
+            torque: self.torque.component_mul(&motion.angular),
+            force: self.force.component_mul(&motion.linear),
+        }
+    }
+}
+
+/// How much of a contact's wrench is unknown.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum ContactKind {
+    /// Force and torque: six unknowns.
+    Wrench,
+    /// A force through the contact's position: three unknowns.
+    Force,
+    /// A force through the contact's position along this direction of the contact's frame: one unknown.
+    ForceAlong(Vec3),
+}
+
+impl ContactKind {
+    /// Number of unknowns.
+    pub fn unknowns(&self) -> usize {
+        match self {
+            Self::Wrench => 6,
+            Self::Force => 3,
+            Self::ForceAlong(_) => 1,
+        }
+    }
+}
+
+/// A place where the environment may exert an unknown wrench. A fixed base is one, of kind `Wrench`: who builds the structure adds it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ContactSpec {
+    /// The frame in whose axes and at whose origin the wrench is reported.
+    pub frame: Frame,
+    /// What is unknown.
+    pub kind: ContactKind,
+    /// Where the contact is, in that frame [m]: where forces act, and the point about which the minimum norm takes the contact's torque.
+    pub position: Vec3,
+}
+
+/// One piece of the robot between F/T sensors.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SubTree {
+    /// Its link nearest to the model's root.
+    pub top: usize,
+    /// The F/T sensors at its ends.
+    pub sensors: SensorSet,
+    /// The contacts on its links.
+    pub contacts: ContactSet,
+}
+
+/// From where a joint torque is computed. Take the joint out of its sub-tree: two sides remain, and each would do if nothing unknown acted on it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Route {
+    /// From the side of the child: no unknown contact there.
+    Child,
+    /// From the side of the parent: no unknown contact there.
+    Parent,
+    /// From both sides, weighted by their covariance: neither has an unknown contact, and both have sensors.
+    Fused,
+    /// From the solution of the whole sub-tree: unknown contacts on both sides.
+    Whole,
+}
+
+/// What a torque or a contact wrench depends on.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Dependence {
+    /// F/T sensors whose readings enter.
+    pub sensors: SensorSet,
+    /// Degrees of freedom whose measured motion enters.
+    pub dofs: DofSet,
+    /// Links whose inertial parameters enter.
+    pub links: LinkSet,
+    /// Whether the motion of the base enters: it does as soon as any link's inertia does.
+    pub base: bool,
+    /// Unknown contacts that were solved for on the way: the value assumes that they are of the declared kind and at the declared place.
+    pub contacts: ContactSet,
+    /// Possible contacts that are assumed to be absent.
+    pub absent: ContactSet,
+}
+
+/// Per link: where it belongs.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct LinkPlace {
+    pub(super) parent: usize,
+    pub(super) subtree: usize,
+    /// One past the last link below this one: links are numbered depth first.
+    pub(super) end: usize,
+    /// The joint above is a cut; also true of the root.
+    pub(super) is_top: bool,
+    /// Contacts and sensors at links at or below this one, within its sub-tree.
+    pub(super) contacts_below: ContactSet,
+    pub(super) sensors_below: SensorSet,
+}
+
+/// The robot cut at its F/T sensors, with its possible contacts. Immutable; shared by any number of solvers.
+#[derive(Clone, Debug)]
+pub struct Structure {
+    sensors: Vec<SensorCut>,
+    contacts: Vec<ContactSpec>,
+    pub(super) places: Vec<LinkPlace>,
+    subtrees: Vec<SubTree>,
+    dof_links: Vec<usize>,
+    link_dofs: Vec<Option<usize>>,
+    pub(super) length_scale: f64,
+}
+
+impl Structure {
+    /// How a force and a torque are compared by default in the minimum norm: 0.1 m, so that 1 N weighs as much as 0.1 Nm.
+    pub const LENGTH_SCALE: f64 = 0.1;
+
+    /// Cuts a model at its sensors. `length_scale` [m] compares forces and torques where contacts leave more than six unknowns.
+    ///
+    /// # Errors
+    /// [`StructureError`]: too many of something, two sensors in one joint, a contact on no link or along no direction, a length that is none.
+    pub fn new(
+        model: &Model,
+        sensors: &[SensorCut],
+        contacts: &[ContactSpec],
+        length_scale: f64,
+    ) -> Result<Self, StructureError> {
+        for (what, count, most) in [
+            ("F/T sensors", sensors.len(), SensorSet::CAPACITY),
+            ("contacts", contacts.len(), ContactSet::CAPACITY),
+            ("links", model.link_count(), LinkSet::CAPACITY),
+        ] {
+            if count > most {
+                return Err(StructureError::TooMany { what, count, most });
+            }
+        }
+        if !(length_scale.is_finite() && length_scale > 0.0) {
+            return Err(StructureError::LengthScale(length_scale));
+        }
+        let mut contacts = contacts.to_vec();
+        for (index, contact) in contacts.iter_mut().enumerate() {
+            if contact.frame.link >= model.link_count() || !contact.position.iter().all(|x| x.is_finite()) {
+                return Err(StructureError::Contact { index });
+            }
+            if let ContactKind::ForceAlong(direction) = &mut contact.kind {
+                let norm = direction.norm();
+                if !norm.is_finite() || norm < 1e-9 {
+                    return Err(StructureError::Direction { index });
+                }
+                *direction /= norm;
+            }
+        }
+
+        let mut places: Vec<LinkPlace> = (0..model.link_count())
+            .map(|link| LinkPlace {
+                parent: if link == 0 { 0 } else { model.joints()[link - 1].parent },
+                subtree: 0,
+                end: link + 1,
+                is_top: link == 0,
+                contacts_below: ContactSet::EMPTY,
+                sensors_below: SensorSet::EMPTY,
+            })
+            .collect();
+        for sensor in sensors {
+            let place = places
+                .get_mut(sensor.joint + 1)
+                .ok_or_else(|| StructureError::NoJoint(String::new()))?;
+            if std::mem::replace(&mut place.is_top, true) {
+                return Err(StructureError::TwoSensors(model.joint_name(sensor.joint).to_owned()));
+            }
+        }
+        let mut subtrees = Vec::with_capacity(sensors.len() + 1);
+        for link in 0..places.len() {
+            if places[link].is_top {
+                places[link].subtree = subtrees.len();
+                subtrees.push(SubTree {
+                    top: link,
+                    sensors: SensorSet::EMPTY,
+                    contacts: ContactSet::EMPTY,
+                });
+            } else {
+                places[link].subtree = places[places[link].parent].subtree;
+            }
+        }
+        for (index, contact) in contacts.iter().enumerate() {
+            let place = &mut places[contact.frame.link];
+            place.contacts_below.insert(index);
+            subtrees[place.subtree].contacts.insert(index);
+        }
+        for (index, sensor) in sensors.iter().enumerate() {
+            // To the child's side the sensor hangs on top of the sub-tree, above all of its joints; to the parent's side it hangs below.
+            let child = sensor.joint + 1;
+            let parent = places[child].parent;
+            places[parent].sensors_below.insert(index);
+            for link in [child, parent] {
+                subtrees[places[link].subtree].sensors.insert(index);
+            }
+        }
+        for link in (1..places.len()).rev() {
+            let LinkPlace {
+                parent,
+                end,
+                is_top,
+                contacts_below,
+                sensors_below,
+                ..
+            } = places[link];
+            let above = &mut places[parent];
+            above.end = above.end.max(end);
+            if !is_top {
+                above.contacts_below = above.contacts_below.union(&contacts_below);
+                above.sensors_below = above.sensors_below.union(&sensors_below);
+            }
+        }
+        let dof_links: Vec<usize> = (0..model.dof_count())
+            .filter_map(|dof| model.dof_joint(dof))
+            .map(|joint| joint + 1)
+            .collect();
+        let mut link_dofs = vec![None; places.len()];
+        for (dof, &link) in dof_links.iter().enumerate() {
+            link_dofs[link] = Some(dof);
+        }
+        Ok(Self {
+            sensors: sensors.to_vec(),
+            contacts,
+            places,
+            subtrees,
+            dof_links,
+            link_dofs,
+            length_scale,
+        })
+    }
+
+    /// The F/T sensors.
+    pub fn sensors(&self) -> &[SensorCut] {
+        &self.sensors
+    }
+
+    /// The contacts.
+    pub fn contacts(&self) -> &[ContactSpec] {
+        &self.contacts
+    }
+
+    /// The sub-trees: the first holds the model's root.
+    pub fn subtrees(&self) -> &[SubTree] {
+        &self.subtrees
+    }
+
+    /// Number of the sub-tree that a link belongs to.
+    pub fn subtree_of(&self, link: usize) -> Option<usize> {
+        self.places.get(link).map(|place| place.subtree)
+    }
+
+    /// Number of degrees of freedom.
+    pub fn dof_count(&self) -> usize {
+        self.dof_links.len()
+    }
+
+    /// Number of links.
+    pub fn link_count(&self) -> usize {
+        self.places.len()
+    }
+
+    /// From where the torque of a degree of freedom is computed while the contacts in `active` are present; none if there is no such dof.
+    pub fn route(&self, dof: usize, active: &ContactSet) -> Option<Route> {
+        self.dof_links.get(dof).map(|&link| self.route_above(link, active))
+    }
+
+    /// Route of the joint above a link.
+    #[inline]
+    pub(super) fn route_above(&self, link: usize, active: &ContactSet) -> Route {
+        let place = &self.places[link];
+        let subtree = &self.subtrees[place.subtree];
+        let unknown_below = !place.contacts_below.intersection(active).is_empty();
+        let unknown_above = !subtree
+            .contacts
+            .difference(&place.contacts_below)
+            .intersection(active)
+            .is_empty();
+        let measured_below = !place.sensors_below.is_empty();
+        let measured_above = !subtree.sensors.difference(&place.sensors_below).is_empty();
+        match (unknown_below, unknown_above) {
+            (true, true) => Route::Whole,
+            (false, true) => Route::Child,
+            (true, false) => Route::Parent,
+            // A side without sensors is exact as far as noise goes; the other then adds nothing.
+            (false, false) if measured_below && measured_above => Route::Fused,
+            (false, false) if measured_below => Route::Parent,
+            (false, false) => Route::Child,
+        }
+    }
+
+    /// What the torque of a degree of freedom depends on, by the locality theorem, with the kinematics' present base and the contacts in `active`
+    /// present: on one side of the joint alone where nothing unknown acts there ([`Route`]).
+    pub fn torque_dependence(&self, dof: usize, kinematics: &Kinematics, active: &ContactSet) -> Option<Dependence> {
+        let &link = self.dof_links.get(dof)?;
+        let place = &self.places[link];
+        let subtree = &self.subtrees[place.subtree];
+        let is_below = |other: usize| (link..place.end).contains(&other);
+        let (sensors, contacts, links): (_, _, LinkSet) = match self.route_above(link, active) {
+            Route::Child => (
+                place.sensors_below,
+                place.contacts_below,
+                self.links_of(place.subtree).filter(|&l| is_below(l)).collect(),
+            ),
+            Route::Parent => (
+                subtree.sensors.difference(&place.sensors_below),
+                subtree.contacts.difference(&place.contacts_below),
+                self.links_of(place.subtree).filter(|&l| !is_below(l)).collect(),
+            ),
+            Route::Fused | Route::Whole => (
+                subtree.sensors,
+                subtree.contacts,
+                self.links_of(place.subtree).collect(),
+            ),
+        };
+        Some(self.dependence(sensors, contacts, links, kinematics, active))
+    }
+
+    /// What the wrench of a contact depends on: its whole sub-tree.
+    pub fn contact_dependence(
+        &self,
+        contact: usize,
+        kinematics: &Kinematics,
+        active: &ContactSet,
+    ) -> Option<Dependence> {
+        let link = self.contacts.get(contact)?.frame.link;
+        let number = self.subtree_of(link)?;
+        let subtree = &self.subtrees[number];
+        let links = self.links_of(number).collect();
+        Some(self.dependence(subtree.sensors, subtree.contacts, links, kinematics, active))
+    }
+
+    fn dependence(
+        &self,
+        sensors: SensorSet,
+        contacts: ContactSet,
+        links: LinkSet,
+        kinematics: &Kinematics,
+        active: &ContactSet,
+    ) -> Dependence {
+        // A link's pose and motion come along the way from the base to it.
+        let mut dofs = DofSet::EMPTY;
+        for link in links.iter() {
+            let (mut a, mut b) = (kinematics.base(), link);
+            while a != b {
+                let lower = if a > b { &mut a } else { &mut b };
+                if let Some(dof) = self.dof_of(*lower) {
+                    dofs.insert(dof);
+                }
+                *lower = self.places[*lower].parent;
+            }
+        }
+        Dependence {
+            sensors,
+            dofs,
+            links,
+            base: !links.is_empty(),
+            contacts: contacts.intersection(active),
+            absent: contacts.difference(active),
+        }
+    }
+
+    /// The degree of freedom of the joint above a link.
+    pub(super) fn dof_of(&self, link: usize) -> Option<usize> {
+        self.link_dofs.get(link).copied().flatten()
+    }
+
+    /// The links of a sub-tree, ascending.
+    pub(super) fn links_of(&self, subtree: usize) -> impl Iterator<Item = usize> {
+        let top = self.subtrees[subtree].top;
+        (top..self.places[top].end).filter(move |&link| self.places[link].subtree == subtree)
+    }
+}
+
+/// Why a structure cannot be built.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum StructureError {
+    /// The model has no such joint, or it was folded because it was not named when the model was read.
+    #[error("joint {0}, which is said to carry an F/T sensor, is not in the model")]
+    NoJoint(String),
+    /// The joint moves.
+    #[error("joint {0} is said to carry an F/T sensor, but it moves; a sensor sits in a fixed joint")]
+    JointMoves(String),
+    /// Two sensors in one joint.
+    #[error("two F/T sensors are said to sit in joint {0}")]
+    TwoSensors(String),
+    /// A standard deviation that is zero, negative or not finite.
+    #[error("F/T sensor in joint {0}: every standard deviation of its noise must be positive and finite")]
+    Noise(String),
+    /// More than there is room for.
+    #[error("{count} {what}: {most} at most")]
+    TooMany {
+        /// Of what.
+        what: &'static str,
+        /// How many there are.
+        count: usize,
+        /// How many there may be.
+        most: usize,
+    },
+    /// A contact on a link that is not there, or at a position that is not finite.
+    #[error("contact {index}: its link does not exist, or its position is not finite")]
+    Contact {
+        /// Its number.
+        index: usize,
+    },
+    /// A contact along no direction.
+    #[error("contact {index}: its direction is zero or not finite")]
+    Direction {
+        /// Its number.
+        index: usize,
+    },
+    /// A length scale that is none.
+    #[error("the length scale is {0} m; it must be positive and finite")]
+    LengthScale(f64),
+}

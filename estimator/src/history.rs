@@ -1,0 +1,129 @@
+//! The last samples of one channel, for values that are used as measured: exactly at an instant, or between two samples.
+
+use proprio_topics::{Nanos, Quality};
+
+/// How many samples are kept: what a channel can send while an estimate waits for the others.
+const KEPT: usize = 256;
+
+/// The last samples of one channel. `D` numbers each; NaN where one is absent.
+#[derive(Debug, Clone)]
+pub struct History<const D: usize> {
+    samples: Box<[Entry<D>; KEPT]>,
+    /// How many were ever pushed; the newest is at `(count - 1) % KEPT`.
+    count: usize,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Entry<const D: usize> {
+    t: Nanos,
+    value: [f64; D],
+    quality: Quality,
+}
+
+/// What a channel says about one instant.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Held<const D: usize> {
+    /// The value.
+    pub value: [f64; D],
+    /// What is known against the samples it rests on, together.
+    pub quality: Quality,
+    /// How long before the instant the last sample up to it lies \[ns\].
+    pub age: Nanos,
+    /// Whether a sample is stamped with the instant itself.
+    pub exact: bool,
+    /// Whether a later sample was used.
+    pub interpolated: bool,
+}
+
+impl<const D: usize> Default for History<D> {
+    fn default() -> Self {
+        let none = Entry { t: Nanos::MIN, value: [f64::NAN; D], quality: Quality::GOOD };
+        Self { samples: Box::new([none; KEPT]), count: 0 }
+    }
+}
+
+impl<const D: usize> History<D> {
+    /// Adds a sample; its stamp must be later than the last one's.
+    pub fn push(&mut self, t: Nanos, value: [f64; D], quality: Quality) {
+        if let Some(place) = self.samples.get_mut(self.count % KEPT) {
+            *place = Entry { t, value, quality };
+        }
+        self.count += 1;
+    }
+
+    /// The stamp of the newest sample.
+    #[must_use]
+    pub fn newest(&self) -> Option<Nanos> {
+        self.get(0).map(|e| e.t)
+    }
+
+    fn get(&self, age: usize) -> Option<&Entry<D>> {
+        if age >= self.count.min(KEPT) {
+            return None;
+        }
+        self.samples.get((self.count - 1 - age) % KEPT)
+    }
+
+    /// What it says about `t`: the sample of that instant; else a straight line between the last before and the first after,
+    /// provided that is stamped `until` or earlier; else the last before, held. `None` if there is none up to `t`.
+    ///
+    /// It depends on stamps alone: a sample that came early counts no more than one that came in time.
+    #[must_use]
+    pub fn at(&self, t: Nanos, until: Nanos) -> Option<Held<D>> {
+        let mut after = None;
+        let mut age = 0;
+        let before = loop {
+            let entry = self.get(age)?;
+            if entry.t <= t {
+                break entry;
+            }
+            after = Some(entry);
+            age += 1;
+        };
+        let since = t - before.t;
+        let held = Held { value: before.value, quality: before.quality, age: since, exact: since == Nanos::ZERO, interpolated: false };
+        match after {
+            Some(after) if !held.exact && after.t <= until => {
+                let part = since.seconds() / (after.t - before.t).seconds();
+                let mut value = before.value;
+                for (v, next) in value.iter_mut().zip(after.value) {
+                    *v += part * (next - *v);
+                }
+                Some(Held { value, quality: before.quality | after.quality, interpolated: true, ..held })
+            }
+            _ => Some(held),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exact_between_and_held() {
+        let mut history = History::<1>::default();
+        assert!(history.at(Nanos(5), Nanos(9)).is_none());
+        history.push(Nanos(10), [1.0], Quality::GOOD);
+        history.push(Nanos(20), [3.0], Quality::SATURATED);
+        history.push(Nanos(30), [9.0], Quality::GOOD);
+        assert!(history.at(Nanos(5), Nanos(100)).is_none());
+        let at = |t, until| history.at(Nanos(t), Nanos(until)).map(|h| (h.value[0], h.quality, h.exact, h.interpolated));
+        assert_eq!(at(10, 100), Some((1.0, Quality::GOOD, true, false)));
+        assert_eq!(at(15, 100), Some((2.0, Quality::SATURATED, false, true)));
+        // The next sample is later than allowed: held, whether it has come or not.
+        assert_eq!(at(15, 19), Some((1.0, Quality::GOOD, false, false)));
+        assert_eq!(at(35, 100), Some((9.0, Quality::GOOD, false, false)));
+    }
+
+    #[test]
+    fn the_oldest_give_way() {
+        let mut history = History::<1>::default();
+        for i in 0..1000 {
+            history.push(Nanos(i), [0.0], Quality::GOOD);
+        }
+        assert_eq!(history.newest(), Some(Nanos(999)));
+        assert!(history.at(Nanos(1000 - 257), Nanos::MAX).is_none());
+        assert!(history.at(Nanos(1000 - 256), Nanos::MAX).is_some());
+    }
+}

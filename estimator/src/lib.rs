@@ -1,0 +1,26 @@
+//! Samples in, joint torques and contact wrenches out.
+//!
+//! ```text
+//! samples -> Pipeline: every channel at each stamp T of the trigger channel
+//!                -> Kinematics -> net wrenches -> Solver, sub-tree by sub-tree -> torques, contact wrenches
+//! ```
+//!
+//! - [`config`]: estimator.toml, as typed; [`setup`]: the same, checked against the URDF and resolved.
+//! - [`spatial`]: motion and force vectors, rigid transforms, rigid-body inertia; the notation page of the crate.
+//! - [`model`]: an undirected tree of links from a URDF; massless frames folded; F/T joints kept.
+//! - [`dynamics`]: kinematics from any base, sub-trees cut at the F/T sensors, reordered recursive Newton-Euler.
+//! - [`differentiate`]: position, velocity and acceleration at any instant from noisy, quantised samples; [`history`]: what
+//!   is used as measured.
+//! - [`pipeline`]: samples in, estimates out; no input, no output, no clock.
+//! - [`offline`]: a table of samples to a table of estimates; [`daemon`]: the same from and to shared memory.
+
+pub mod config;
+pub mod daemon;
+pub mod differentiate;
+pub mod dynamics;
+pub mod history;
+pub mod model;
+pub mod offline;
+pub mod pipeline;
+pub mod setup;
+pub mod spatial;

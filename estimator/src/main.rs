@@ -1,0 +1,30 @@
+//! The estimator daemon: `proprio estimator` without the rest of the command.
+
+use clap::Parser;
+use proprio_estimator::daemon;
+use proprio_topics::ipc::DomainConfig;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+/// Samples in, joint torques and contact wrenches out.
+#[derive(Parser)]
+#[command(version, about)]
+struct Args {
+    /// The configuration: estimator.toml.
+    #[arg(long)]
+    config: PathBuf,
+    /// Print what would be estimated from what, and end.
+    #[arg(long)]
+    check: bool,
+}
+
+fn main() -> ExitCode {
+    let args = Args::parse();
+    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_target(false).with_writer(std::io::stderr).init();
+    match daemon::run(&args.config, &DomainConfig::from_env(), args.check) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => daemon::report(&error),
+    }
+}

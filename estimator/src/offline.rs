@@ -1,0 +1,214 @@
+//! A table of samples to a table of estimates: `proprio estimate`. The same [`Pipeline`] as in the daemon.
+//!
+//! | column | meaning |
+//! |---|---|
+//! | `t` | the instant, as in the log |
+//! | `torque/<joint>` | \[Nm\], by the parent link on the child link along the URDF axis |
+//! | `torque_std/<joint>` | its standard deviation |
+//! | `contact/<name>/fx fy fz tx ty tz` | \[N, Nm\], on the link by the environment, axes and origin of the frame that `link` names |
+//! | `valid/<joint>` | 1 if it may be used, else 0 |
+//! | `reason/<joint>` | why not: a word, and the channel to blame behind a colon |
+
+use crate::pipeline::{Estimate, Pipeline};
+use crate::setup::Setup;
+use proprio_topics::csv::{Item, Reader, Report, Row, Value, What};
+use proprio_topics::{ContactWrench, JointTorque, Kind, NO_CAUSE, Nanos, Reason};
+use std::io::{self, Read, Write};
+
+/// Why a log gives no estimates.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum OfflineError {
+    /// The log can not be read.
+    #[error("{0}")]
+    Log(#[from] proprio_topics::csv::Error),
+    /// The estimates can not be written.
+    #[error("the estimates can not be written: {0}")]
+    Write(#[from] io::Error),
+    /// The log lacks channels that the configuration names.
+    #[error("the log has no column for {}", .0.join(", "))]
+    MissingChannels(Vec<String>),
+}
+
+/// What became of a log.
+#[derive(Debug, Clone, Default)]
+pub struct EstimateReport {
+    /// Estimates written.
+    pub estimates: u64,
+    /// Torques in them that are withheld.
+    pub withheld: u64,
+    /// What the log's reader skipped.
+    pub log: Report,
+    /// Samples dropped: late, not later than the last, not finite.
+    pub dropped: [u64; 3],
+    /// Channels of the log that the configuration does not name.
+    pub unused_channels: Vec<String>,
+}
+
+/// A pseudo-period for logs without stamps: so long that nothing is carried from one row to the next.
+const APART: Nanos = Nanos::from_millis(3_600_000);
+
+/// Estimates for every trigger stamp of a log.
+///
+/// # Errors
+/// [`OfflineError`]; a joint that the log lacks and the configuration does not lock is one.
+pub fn estimate(setup: Setup, log: impl Read, out: impl Write) -> Result<EstimateReport, OfflineError> {
+    let mut reader = Reader::new(log)?;
+    let mut report = EstimateReport::default();
+    let mut pipeline = Pipeline::new(setup);
+    let mut missing: Vec<String> = Vec::new();
+    for channel in pipeline.setup().channels() {
+        let there = reader.series().iter().any(|s| s.what == What::Channel(channel.kind) && s.name == channel.name);
+        if !there {
+            let what = format!("{}/{}", channel.kind.word(), channel.name);
+            let hint = if channel.kind == Kind::Joint { " (measure it, or lock it in [locked])" } else { "" };
+            missing.push(format!("{what}{hint}"));
+        }
+    }
+    if !missing.is_empty() {
+        return Err(OfflineError::MissingChannels(missing));
+    }
+    let targets: Vec<Target> = reader
+        .series()
+        .iter()
+        .map(|s| {
+            let target = match s.what {
+                What::Channel(kind) => pipeline.setup().channel(kind, &s.name).map(Target::Channel),
+                What::Contact => pipeline.setup().contact(&s.name).map(Target::Contact),
+            };
+            if target.is_none() {
+                report.unused_channels.push(s.name.clone());
+            }
+            target.unwrap_or(Target::None)
+        })
+        .collect();
+    let mut table = Table::new(out, pipeline.setup())?;
+    let (mut row, mut pseudo) = (Row::default(), Nanos::ZERO);
+    let mut stamped = true;
+    while reader.next_row(&mut row)? {
+        let t = row.t.unwrap_or_else(|| {
+            stamped = false;
+            pseudo = pseudo + APART;
+            pseudo
+        });
+        for Item { series, value } in &row.items {
+            match (targets.get(*series), value) {
+                (Some(Target::Channel(channel)), Value::Reading(reading, quality)) => {
+                    pipeline.push(*channel, t, reading, *quality);
+                }
+                (Some(Target::Contact(contact)), Value::Active(active)) => pipeline.declare(*contact, t, *active),
+                _ => {}
+            }
+        }
+        while let Some(estimate) = pipeline.poll() {
+            table.write(estimate, stamped)?;
+        }
+    }
+    pipeline.finish();
+    while let Some(estimate) = pipeline.poll() {
+        table.write(estimate, stamped)?;
+    }
+    (report.estimates, report.withheld) = (table.rows, table.withheld);
+    table.out.flush()?;
+    let counts = pipeline.counts();
+    report.dropped = [counts.late, counts.backward, counts.not_finite];
+    report.log = reader.report().clone();
+    Ok(report)
+}
+
+#[derive(Clone, Copy)]
+enum Target {
+    None,
+    Channel(usize),
+    Contact(usize),
+}
+
+/// Writes estimates row by row.
+pub struct Table<W> {
+    out: W,
+    channels: Vec<String>,
+    joints: usize,
+    contacts: usize,
+    text: Vec<u8>,
+    rows: u64,
+    withheld: u64,
+}
+
+impl<W: Write> Table<W> {
+    /// Writes the header.
+    ///
+    /// # Errors
+    /// If `out` can not be written.
+    pub fn new(mut out: W, setup: &Setup) -> io::Result<Self> {
+        let joints: Vec<&str> = setup.joint_names().collect();
+        let contacts: Vec<&str> = setup.contact_names().collect();
+        let mut header = String::from("t");
+        for part in ["torque", "torque_std"] {
+            joints.iter().for_each(|j| header.push_str(&format!(",{part}/{j}")));
+        }
+        for contact in &contacts {
+            ["fx", "fy", "fz", "tx", "ty", "tz"].iter().for_each(|c| header.push_str(&format!(",contact/{contact}/{c}")));
+        }
+        for part in ["valid", "reason"] {
+            joints.iter().for_each(|j| header.push_str(&format!(",{part}/{j}")));
+        }
+        header.push('\n');
+        out.write_all(header.as_bytes())?;
+        let channels = setup.channels().iter().map(|c| c.name.clone()).collect();
+        Ok(Self { out, channels, joints: joints.len(), contacts: contacts.len(), text: Vec::new(), rows: 0, withheld: 0 })
+    }
+
+    /// Writes one estimate; `stamped` says whether its instant means anything.
+    ///
+    /// # Errors
+    /// If the output can not be written.
+    pub fn write(&mut self, estimate: &Estimate, stamped: bool) -> io::Result<()> {
+        let joints = || (0..self.joints).map(|i| estimate.torques.joints().get(i).copied().unwrap_or(JointTorque::ABSENT));
+        self.text.clear();
+        if stamped {
+            write!(self.text, "{}", estimate.t)?;
+        }
+        for joint in joints() {
+            number(&mut self.text, joint.torque);
+        }
+        for joint in joints() {
+            number(&mut self.text, joint.standard_deviation);
+        }
+        for i in 0..self.contacts {
+            let contact = estimate.contacts.contacts().get(i).copied().unwrap_or(ContactWrench::ABSENT);
+            contact.force.into_iter().chain(contact.torque).for_each(|v| number(&mut self.text, v));
+        }
+        for joint in joints() {
+            self.text.extend_from_slice(if joint.valid == 1 { b",1" } else { b",0" });
+            self.withheld += u64::from(joint.valid != 1);
+        }
+        for joint in joints() {
+            self.text.push(b',');
+            if joint.reason != Reason::None {
+                self.text.extend_from_slice(joint.reason.word().as_bytes());
+                if joint.cause != NO_CAUSE
+                    && let Some(channel) = self.channels.get(joint.cause as usize)
+                {
+                    self.text.push(b':');
+                    self.text.extend_from_slice(channel.as_bytes());
+                }
+            }
+        }
+        self.text.push(b'\n');
+        self.rows += 1;
+        self.out.write_all(&self.text)
+    }
+
+    /// Gives the output back.
+    pub fn into_inner(self) -> W {
+        self.out
+    }
+}
+
+/// A cell: the shortest text that reads back as the same number; empty for NaN.
+fn number(text: &mut Vec<u8>, value: f64) {
+    text.push(b',');
+    if !value.is_nan() {
+        text.extend_from_slice(zmij::Buffer::new().format(value).as_bytes());
+    }
+}

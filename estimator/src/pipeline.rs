@@ -1,0 +1,522 @@
+//! Samples in, estimates out: alignment of all channels to the trigger's stamps, and the estimate at each.
+//!
+//! Each stamp T of the trigger channel gives exactly one estimate, in order. It is released once every channel has passed
+//! T, or the newest stamp of any channel is later than T + wait. It rests on the samples stamped T or earlier and, of each
+//! channel, the first later one if that is stamped T + wait or earlier. A sample that comes after its instant was released
+//! is dropped and counted. So the estimates depend on stamps alone, not on the time of day, and not on the order of arrival
+//! either as long as no sample is later than the wait; what runs live is, bit for bit, what a replay gives.
+//!
+//! A channel stamped exactly T is used as it is, its velocity and acceleration too where it has them; otherwise they come
+//! from its adaptive window ([`crate::differentiate`]). Wrenches and proper accelerations lie on straight lines between samples.
+
+use crate::differentiate::{Unavailable, Window};
+use crate::dynamics::{Certainty, ContactSet, Dependence, FrameMotion, JointState, Kinematics, Solver};
+use crate::history::{Held, History};
+use crate::setup::{BaseMotion, Setup, Use};
+use crate::spatial::{Vec3, Wrench};
+use proprio_topics::{
+    ContactEstimate, ContactWrench, Header, JointTorque, MAX_CONTACTS, MAX_JOINTS, NO_CAUSE, Nanos, Quality, Reading,
+    Reason, TorqueEstimate,
+};
+use std::collections::VecDeque;
+
+/// The most instants that wait at one time; beyond it the oldest is released at once.
+const MOST_WAITING: usize = 256;
+/// How many declarations of a contact are remembered: what may come while an instant waits.
+const DECLARATIONS: usize = 16;
+
+/// The torques and contact wrenches of one instant.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Estimate {
+    /// The instant.
+    pub t: Nanos,
+    /// The torques; only `acquired` of the header is set.
+    pub torques: TorqueEstimate,
+    /// The contacts; likewise.
+    pub contacts: ContactEstimate,
+}
+
+impl Estimate {
+    /// Nothing estimated, at `t`.
+    #[must_use]
+    pub fn absent(t: Nanos) -> Self {
+        let header = Header { acquired: t, ..Header::default() };
+        Self {
+            t,
+            torques: TorqueEstimate { header, count: 0, reserved: 0, joints: [JointTorque::ABSENT; MAX_JOINTS] },
+            contacts: ContactEstimate { header, count: 0, reserved: 0, contacts: [ContactWrench::ABSENT; MAX_CONTACTS] },
+        }
+    }
+}
+
+/// What became of the samples.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Taken.
+    pub taken: u64,
+    /// Dropped: their instant had been released.
+    pub late: u64,
+    /// Dropped: not later than the last of their channel.
+    pub backward: u64,
+    /// Dropped: a number in them is not finite.
+    pub not_finite: u64,
+}
+
+/// One channel: what it held, and for what is differentiated a window.
+enum Track {
+    /// Position, velocity, acceleration; the latter two NaN if not measured.
+    Joint(History<3>, Box<Window<1>>),
+    /// Force and torque.
+    Sensor(History<6>),
+    /// Proper acceleration, angular velocity, angular acceleration (NaN if not measured).
+    Imu(History<9>, Box<Window<3>>),
+}
+
+impl Track {
+    fn newest(&self) -> Option<Nanos> {
+        match self {
+            Self::Joint(h, _) => h.newest(),
+            Self::Sensor(h) => h.newest(),
+            Self::Imu(h, _) => h.newest(),
+        }
+    }
+}
+
+/// Who says when a contact is present.
+#[derive(Clone, Default)]
+struct Declarations {
+    /// The last ones, oldest first: from when, present or not.
+    said: arrayvec::ArrayVec<(Nanos, bool), DECLARATIONS>,
+}
+
+impl Declarations {
+    fn say(&mut self, t: Nanos, active: bool) {
+        let at = self.said.iter().rposition(|(other, _)| *other <= t).map_or(0, |i| i + 1);
+        if self.said.is_full() {
+            self.said.remove(0);
+        }
+        self.said.insert(at.min(self.said.len()), (t, active));
+    }
+
+    fn at(&self, t: Nanos) -> Option<bool> {
+        self.said.iter().rev().find(|(from, _)| *from <= t).map(|(_, active)| *active)
+    }
+}
+
+/// The estimator's core: no input, no output, no clock.
+pub struct Pipeline {
+    setup: Setup,
+    tracks: Vec<Track>,
+    /// Per channel at the present instant: what speaks against it.
+    faults: Vec<Reason>,
+    declarations: Vec<Declarations>,
+    waiting: VecDeque<Nanos>,
+    newest: Nanos,
+    released: Nanos,
+    finished: bool,
+    counts: Counts,
+    kinematics: Kinematics,
+    solver: Solver,
+    position: Vec<f64>,
+    velocity: Vec<f64>,
+    acceleration: Vec<f64>,
+    readings: Vec<Wrench>,
+    dependences: Dependences,
+    estimate: Box<Estimate>,
+}
+
+/// What each torque and contact depends on; it changes only with the set of contacts present.
+struct Dependences {
+    active: Option<ContactSet>,
+    torques: Vec<Dependence>,
+    contacts: Vec<Dependence>,
+}
+
+impl Pipeline {
+    /// Ready for samples.
+    ///
+    /// # Panics
+    /// Not with a [`Setup`] that was built by its own constructors: they check what could fail here.
+    #[must_use]
+    #[allow(clippy::expect_used, reason = "the setup was checked when it was built")]
+    pub fn new(setup: Setup) -> Self {
+        let tracks = setup.channels().iter().map(|c| match c.role {
+            Use::Joint(_) => {
+                Track::Joint(History::default(), Box::new(Window::new(setup.joint_settings).expect("settings were checked")))
+            }
+            Use::Sensor(_) => Track::Sensor(History::default()),
+            Use::Base => Track::Imu(History::default(), Box::new(Window::new(setup.gyro_settings).expect("settings were checked"))),
+        });
+        let kinematics = Kinematics::new(&setup.model, setup.base_link).expect("the base is a link of the model");
+        let (dofs, contacts) = (setup.model.dof_count(), setup.structure.contacts().len());
+        let mut estimate = Box::new(Estimate::absent(Nanos::ZERO));
+        estimate.torques.count = u32::try_from(dofs).unwrap_or(0);
+        estimate.contacts.count = u32::try_from(setup.contacts.len()).unwrap_or(0);
+        Self {
+            tracks: tracks.collect(),
+            faults: vec![Reason::NeverSeen; setup.channels().len()],
+            declarations: vec![Declarations::default(); setup.contacts.len()],
+            waiting: VecDeque::with_capacity(MOST_WAITING),
+            newest: Nanos::MIN,
+            released: Nanos::MIN,
+            finished: false,
+            counts: Counts::default(),
+            kinematics,
+            solver: Solver::new(&setup.structure),
+            position: setup.locked.iter().map(|q| if q.is_nan() { 0.0 } else { *q }).collect(),
+            velocity: vec![0.0; dofs],
+            acceleration: vec![0.0; dofs],
+            readings: vec![Wrench::zero(); setup.structure.sensors().len()],
+            dependences: Dependences {
+                active: None,
+                torques: vec![Dependence::default(); dofs],
+                contacts: vec![Dependence::default(); contacts],
+            },
+            estimate,
+            setup,
+        }
+    }
+
+    /// What it works with.
+    #[must_use]
+    pub fn setup(&self) -> &Setup {
+        &self.setup
+    }
+
+    /// What became of the samples so far.
+    #[must_use]
+    pub fn counts(&self) -> Counts {
+        self.counts
+    }
+
+    /// Takes a sample of channel number `channel` (see [`Setup::channel`]), acquired at `t`. Readings that are not the channel's
+    /// main one are ignored. Call [`Pipeline::poll`] until it gives nothing before the next.
+    pub fn push(&mut self, channel: usize, t: Nanos, reading: &Reading, quality: Quality) {
+        let Some(track) = self.tracks.get_mut(channel) else { return };
+        let newest = track.newest().unwrap_or(Nanos::MIN);
+        let all_finite = |values: &[f64]| values.iter().all(|v| v.is_finite());
+        let finite_or_absent = |values: &[f64]| values.iter().all(|v| !v.is_infinite());
+        // First whether it may be taken, then the window, then the history.
+        let (mut late, mut backward) = (false, false);
+        let mut admit = |whole: bool| {
+            late = whole && t <= self.released;
+            backward = whole && !late && t <= newest;
+            whole && !late && !backward
+        };
+        let whole = match (track, reading) {
+            (Track::Joint(history, window), Reading::Joint(j)) => {
+                let whole = j.position.is_finite() && finite_or_absent(&[j.velocity, j.acceleration]);
+                if j.position.is_nan() {
+                    // A row with a torque alone, say: nothing to differentiate.
+                    return;
+                }
+                if admit(whole) {
+                    let _ = window.push(t, [j.position]);
+                    history.push(t, [j.position, j.velocity, j.acceleration], quality);
+                }
+                whole
+            }
+            (Track::Sensor(history), Reading::Wrench(w)) => {
+                let ([fx, fy, fz], [tx, ty, tz]) = (w.force, w.torque);
+                let value = [fx, fy, fz, tx, ty, tz];
+                let whole = all_finite(&value);
+                if admit(whole) {
+                    history.push(t, value, quality);
+                }
+                whole
+            }
+            (Track::Imu(history, window), Reading::Imu(i)) => {
+                let whole = all_finite(&i.proper_acceleration)
+                    && all_finite(&i.angular_velocity)
+                    && finite_or_absent(&i.angular_acceleration);
+                if admit(whole) {
+                    let _ = window.push(t, i.angular_velocity);
+                    let ([ax, ay, az], [gx, gy, gz], [bx, by, bz]) =
+                        (i.proper_acceleration, i.angular_velocity, i.angular_acceleration);
+                    history.push(t, [ax, ay, az, gx, gy, gz, bx, by, bz], quality);
+                }
+                whole
+            }
+            _ => return,
+        };
+        self.counts.not_finite += u64::from(!whole);
+        self.counts.late += u64::from(late);
+        self.counts.backward += u64::from(backward);
+        if !whole || late || backward {
+            return;
+        }
+        self.counts.taken += 1;
+        self.newest = self.newest.max(t);
+        if channel == self.setup.trigger && !self.waiting.contains(&t) {
+            if self.waiting.len() < MOST_WAITING {
+                self.waiting.push_back(t);
+            } else {
+                self.counts.late += 1;
+            }
+        }
+    }
+
+    /// Says that contact number `contact` (see [`Setup::contact`]) is present, or not, from `t` on.
+    pub fn declare(&mut self, contact: usize, t: Nanos, active: bool) {
+        if let Some(declarations) = self.declarations.get_mut(contact) {
+            declarations.say(t, active);
+        }
+    }
+
+    /// No sample will come any more: what still waits is released.
+    pub fn finish(&mut self) {
+        self.finished = true;
+    }
+
+    /// The next estimate, if one can be made now.
+    pub fn poll(&mut self) -> Option<&Estimate> {
+        let t = *self.waiting.front()?;
+        let passed = || self.tracks.iter().all(|track| track.newest().is_some_and(|newest| newest >= t));
+        let waited = self.newest > t + self.setup.max_wait;
+        if !(self.finished || waited || self.waiting.len() == MOST_WAITING || passed()) {
+            return None;
+        }
+        self.waiting.pop_front();
+        self.released = t;
+        self.compute(t);
+        Some(&self.estimate)
+    }
+
+    /// Brings every channel to `t` and estimates.
+    fn compute(&mut self, t: Nanos) {
+        let until = t + self.setup.max_wait;
+        let mut base = match self.setup.base {
+            BaseMotion::Standing(motion) => motion,
+            BaseMotion::Imu(_) => FrameMotion::standing(&Vec3::zeros()),
+        };
+        for ((track, channel), fault) in self.tracks.iter().zip(self.setup.channels()).zip(&mut self.faults) {
+            *fault = match (track, channel.role) {
+                (Track::Joint(history, window), Use::Joint(dof)) => match history.at(t, until) {
+                    None => Reason::NeverSeen,
+                    Some(held) => {
+                        let (state, reason) = joint_at(t, until, &held, window, self.setup.max_silence);
+                        let places = (self.position.get_mut(dof), self.velocity.get_mut(dof), self.acceleration.get_mut(dof));
+                        if let (Some(q), Some(dq), Some(ddq)) = places {
+                            [*q, *dq, *ddq] = state;
+                        }
+                        // An encoder that says it is not calibrated tells no position.
+                        reason.or(quality_reason(held.quality, Quality::DEVICE_FAULT | Quality::NOT_CALIBRATED))
+                    }
+                },
+                (Track::Sensor(history), Use::Sensor(number)) => match history.at(t, until) {
+                    None => Reason::NeverSeen,
+                    Some(held) => {
+                        let [fx, fy, fz, tx, ty, tz] = held.value;
+                        if let (Some(place), Some(offset)) = (self.readings.get_mut(number), self.setup.offsets.get(number)) {
+                            *place = Wrench::from_parts([fx, fy, fz], [tx, ty, tz]) - *offset;
+                        }
+                        stale(&held, self.setup.max_silence).or(quality_reason(held.quality, Quality::DEVICE_FAULT))
+                    }
+                },
+                (Track::Imu(history, window), Use::Base) => match history.at(t, until) {
+                    None => Reason::NeverSeen,
+                    Some(held) => {
+                        let (measured, reason) = imu_at(t, until, &held, window, self.setup.max_silence);
+                        if let BaseMotion::Imu(pose) = &self.setup.base {
+                            base = FrameMotion::of_link_from_imu(&measured, pose);
+                        }
+                        reason.or(quality_reason(held.quality, Quality::DEVICE_FAULT))
+                    }
+                },
+                // Tracks were made from the channels' roles.
+                _ => Reason::NeverSeen,
+            };
+        }
+        let mut active = self.setup.always;
+        for (contact, declarations) in self.declarations.iter().enumerate() {
+            match declarations.at(t) {
+                Some(true) => active.insert(contact),
+                Some(false) => active.remove(contact),
+                None => {}
+            }
+        }
+        let Setup { model, structure, .. } = &self.setup;
+        let state =
+            JointState { position: &self.position, velocity: &self.velocity, acceleration: &self.acceleration };
+        let solved = self
+            .kinematics
+            .update(model, state, &base)
+            .and_then(|()| self.solver.solve(model, structure, &self.kinematics, &self.readings, &active, &[]))
+            .and_then(|()| self.solver.update_deviations(structure))
+            .is_ok();
+        if self.dependences.active != Some(active) {
+            self.dependences.active = Some(active);
+            for (dof, place) in self.dependences.torques.iter_mut().enumerate() {
+                *place = structure.torque_dependence(dof, &self.kinematics, &active).unwrap_or_default();
+            }
+            for (contact, place) in self.dependences.contacts.iter_mut().enumerate() {
+                *place = structure.contact_dependence(contact, &self.kinematics, &active).unwrap_or_default();
+            }
+        }
+        self.tell(t, solved);
+    }
+
+    /// Writes the estimate: numbers, validity, reasons.
+    fn tell(&mut self, t: Nanos, solved: bool) {
+        self.estimate.t = t;
+        self.estimate.torques.header.acquired = t;
+        self.estimate.contacts.header.acquired = t;
+        let judge = Judge { channels: self.setup.channels(), faults: &self.faults };
+        let results = self.solver.torque().iter().zip(self.solver.torque_deviation()).zip(self.solver.torque_certainty());
+        let places = self.estimate.torques.joints.iter_mut().zip(&self.dependences.torques);
+        for ((place, dependence), ((torque, deviation), certainty)) in places.zip(results) {
+            let (mut reason, cause) = judge.verdict(dependence);
+            if reason == Reason::None && *certainty == Certainty::Assumed {
+                reason = Reason::Undetermined;
+            }
+            if reason == Reason::None && *deviation > self.setup.max_deviation {
+                reason = Reason::Uncertain;
+            }
+            if !solved || !torque.is_finite() || !deviation.is_finite() {
+                reason = Reason::NotFinite;
+            }
+            // A number that rests on a channel nobody has seen is no number.
+            let known = solved && reason != Reason::NeverSeen;
+            *place = JointTorque {
+                torque: if known { *torque } else { f64::NAN },
+                standard_deviation: if known { *deviation } else { f64::NAN },
+                valid: u32::from(reason == Reason::None),
+                reason,
+                cause,
+                reserved: 0,
+            };
+        }
+        let places = self.estimate.contacts.contacts.iter_mut().zip(&self.dependences.contacts);
+        for ((place, dependence), result) in places.zip(self.solver.contacts()).take(self.setup.contacts.len()) {
+            let (mut reason, cause) = judge.verdict(dependence);
+            match result.certainty {
+                Certainty::Absent => reason = Reason::Absent,
+                Certainty::Assumed if reason == Reason::None => reason = Reason::Undetermined,
+                _ => {}
+            }
+            if !solved || !result.wrench.is_finite() {
+                reason = Reason::NotFinite;
+            }
+            let known = solved && reason != Reason::NeverSeen;
+            let [fx, fy, fz, tx, ty, tz] = if known { result.wrench.force_first() } else { [f64::NAN; 6] };
+            *place = ContactWrench {
+                force: [fx, fy, fz],
+                torque: [tx, ty, tz],
+                standard_deviation: if known { result.deviation } else { [f64::NAN; 6] },
+                valid: u32::from(reason == Reason::None),
+                reason,
+                cause: if reason == Reason::Absent { NO_CAUSE } else { cause },
+                reserved: 0,
+            };
+        }
+    }
+}
+
+/// Finds what speaks against a value: the first channel it depends on that is at fault.
+struct Judge<'a> {
+    channels: &'a [crate::setup::Channel],
+    faults: &'a [Reason],
+}
+
+impl Judge<'_> {
+    fn verdict(&self, dependence: &Dependence) -> (Reason, u32) {
+        let needed = |role: Use| match role {
+            Use::Joint(dof) => dependence.dofs.contains(dof),
+            Use::Sensor(number) => dependence.sensors.contains(number),
+            Use::Base => dependence.base,
+        };
+        // What was never seen comes first: then there is not even a number.
+        let mut found = (Reason::None, NO_CAUSE);
+        for ((channel, fault), number) in self.channels.iter().zip(self.faults).zip(0..) {
+            if *fault == Reason::None || !needed(channel.role) {
+                continue;
+            }
+            if *fault == Reason::NeverSeen {
+                return (*fault, number);
+            }
+            if found.0 == Reason::None {
+                found = (*fault, number);
+            }
+        }
+        found
+    }
+}
+
+trait OrReason {
+    /// This reason, or `other` if there is none.
+    fn or(self, other: Self) -> Self;
+}
+
+impl OrReason for Reason {
+    fn or(self, other: Self) -> Self {
+        if self == Self::None { other } else { self }
+    }
+}
+
+fn quality_reason(quality: Quality, faults: Quality) -> Reason {
+    if quality.intersects(Quality::SATURATED | Quality::FROZEN) {
+        Reason::Saturated
+    } else if quality.intersects(faults) {
+        Reason::DeviceFault
+    } else {
+        Reason::None
+    }
+}
+
+fn stale<const D: usize>(held: &Held<D>, max_silence: Nanos) -> Reason {
+    // Between two samples that are too far apart it was silent too long all the same.
+    if held.age > max_silence { Reason::Stale } else { Reason::None }
+}
+
+/// Position, velocity and acceleration of a joint at `t`, and what speaks against them.
+fn joint_at(t: Nanos, until: Nanos, held: &Held<3>, window: &Window<1>, max_silence: Nanos) -> ([f64; 3], Reason) {
+    let [position, velocity, acceleration] = held.value;
+    if held.exact && velocity.is_finite() && acceleration.is_finite() {
+        return ([position, velocity, acceleration], Reason::None);
+    }
+    // A channel stamped exactly t needs no later sample.
+    let until = if held.exact { t } else { until };
+    match window.at_using(t, until) {
+        Ok(estimate) => {
+            let ([value], [first], [second]) = (estimate.value, estimate.first, estimate.second);
+            let given = |measured: f64, estimated: f64| if held.exact && measured.is_finite() { measured } else { estimated };
+            ([given(position, value), given(velocity, first), given(acceleration, second)], stale(held, max_silence))
+        }
+        Err(unavailable) => ([position, 0.0, 0.0], why(unavailable, held, max_silence)),
+    }
+}
+
+/// Motion of the IMU at `t`, and what speaks against it.
+fn imu_at(t: Nanos, until: Nanos, held: &Held<9>, window: &Window<3>, max_silence: Nanos) -> (FrameMotion, Reason) {
+    let [ax, ay, az, gx, gy, gz, bx, by, bz] = held.value;
+    let mut motion = FrameMotion {
+        angular_velocity: Vec3::new(gx, gy, gz),
+        angular_acceleration: Vec3::new(bx, by, bz),
+        proper_acceleration: Vec3::new(ax, ay, az),
+    };
+    if held.exact && motion.angular_acceleration.iter().all(|x| x.is_finite()) {
+        return (motion, Reason::None);
+    }
+    let until = if held.exact { t } else { until };
+    match window.at_using(t, until) {
+        Ok(estimate) => {
+            if !held.exact {
+                motion.angular_velocity = Vec3::from(estimate.value);
+            }
+            motion.angular_acceleration = Vec3::from(estimate.first);
+            (motion, stale(held, max_silence))
+        }
+        Err(unavailable) => {
+            motion.angular_acceleration = Vec3::zeros();
+            (motion, why(unavailable, held, max_silence))
+        }
+    }
+}
+
+fn why<const D: usize>(unavailable: Unavailable, held: &Held<D>, max_silence: Nanos) -> Reason {
+    match (stale(held, max_silence), unavailable) {
+        (Reason::Stale, _) | (_, Unavailable::Stale { .. }) => Reason::Stale,
+        (_, Unavailable::Overflow) => Reason::NotFinite,
+        _ => Reason::Starting,
+    }
+}

@@ -1,0 +1,483 @@
+//! estimator.toml and the URDF, checked against each other and resolved: what the rest of the estimator works with.
+
+use crate::config::{Base, Config, ContactKind as KindWord, Differentiation, Direction, Presence, SensorFrame};
+use crate::differentiate::Settings;
+use crate::dynamics::{ContactKind, ContactSet, ContactSpec, FrameMotion, Noise, SensorCut, Structure, StructureError};
+use crate::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
+use crate::spatial::{Pose, Vec3, Wrench};
+use proprio_topics::{Description, Entry, Header, Kind, MAX_CONTACTS, MAX_JOINTS, Name, Nanos, Publisher, Role};
+use std::fmt;
+
+/// How many samples an estimate of velocity and acceleration uses at the most: the differentiator keeps 128, and the rest
+/// are those that may come while an instant is waiting for other channels.
+const WINDOW: usize = 96;
+
+/// What a channel of the pipeline is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Use {
+    /// Degree of freedom number.
+    Joint(usize),
+    /// F/T sensor number.
+    Sensor(usize),
+    /// The IMU of the base.
+    Base,
+}
+
+/// A channel that the pipeline reads.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Channel {
+    /// What it measures.
+    pub kind: Kind,
+    /// Its name.
+    pub name: String,
+    /// What it is for.
+    pub role: Use,
+}
+
+/// Where kinematics start.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum BaseMotion {
+    /// The base link stands still: its motion is this, always.
+    Standing(FrameMotion),
+    /// An IMU at this pose in the base link tells.
+    Imu(Pose),
+}
+
+/// A contact as it is published.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NamedContact {
+    /// Its name.
+    pub name: String,
+    /// The frame that its wrench is expressed in.
+    pub frame: String,
+    /// Whether it is there unless declared absent.
+    pub always: bool,
+}
+
+/// Everything that does not change while the estimator runs.
+#[derive(Debug, Clone)]
+pub struct Setup {
+    /// The robot's name.
+    pub robot: String,
+    /// The model.
+    pub model: Model,
+    /// Sub-trees, sensors, contacts.
+    pub structure: Structure,
+    /// The link where kinematics start.
+    pub base_link: usize,
+    /// Its motion.
+    pub base: BaseMotion,
+    /// Per degree of freedom, where it is locked; NaN if it is measured.
+    pub locked: Vec<f64>,
+    /// Per F/T sensor, what it reads with no load.
+    pub offsets: Vec<Wrench>,
+    /// The contacts that are published. The structure may have one more, the last: what a fixed base stands on.
+    pub contacts: Vec<NamedContact>,
+    /// The contacts present when nobody declares anything.
+    pub always: ContactSet,
+    /// The number of the trigger's channel.
+    pub trigger: usize,
+    /// How long an estimate waits.
+    pub max_wait: Nanos,
+    /// How long a channel may be silent.
+    pub max_silence: Nanos,
+    /// A torque whose standard deviation exceeds this is withheld \[Nm\].
+    pub max_deviation: f64,
+    /// How joint positions are differentiated.
+    pub joint_settings: Settings,
+    /// How angular velocities are differentiated.
+    pub gyro_settings: Settings,
+    channels: Vec<Channel>,
+    warnings: Vec<String>,
+}
+
+impl Setup {
+    /// Reads the model and resolves every name.
+    ///
+    /// # Errors
+    /// What is wrong, where, and what would be legal.
+    pub fn new(config: &Config) -> Result<Self, String> {
+        let keep: Vec<&str> = config.force_torque.iter().map(|f| f.joint.as_str()).collect();
+        let model = Model::from_file(&config.model, &keep).map_err(|e| {
+            let text = e.to_string();
+            if text.contains(&*config.model.to_string_lossy()) { text } else { format!("{}: {text}", config.model.display()) }
+        })?;
+        Self::with_model(config, model)
+    }
+
+    /// Resolves every name of `config` in `model`, in which the joints of the F/T sensors were kept.
+    ///
+    /// # Errors
+    /// As [`Setup::new`].
+    pub fn with_model(config: &Config, model: Model) -> Result<Self, String> {
+        let mut warnings: Vec<String> = model.warnings().to_vec();
+        if config.parameters.is_some() {
+            return Err("parameters: this version takes its parameters from the URDF and its offsets from this file".into());
+        }
+        if config.identification.enabled {
+            warnings.push("identification.enabled: this version does not identify; the URDF's parameters are used".into());
+        }
+        let dofs = model.dof_count();
+        if dofs > MAX_JOINTS {
+            return Err(format!("the model has {dofs} moving joints; at most {MAX_JOINTS} are possible"));
+        }
+        let mut locked = vec![f64::NAN; dofs];
+        for (joint, position) in &config.locked {
+            let dof = model.dof(joint).ok_or_else(|| format!("locked.{joint}: {}", no_joint(&model, joint)))?;
+            if let Some(place) = locked.get_mut(dof) {
+                *place = *position;
+            }
+        }
+        let mut channels = Vec::new();
+        let mut add = |kind, name: &str, role| match channels.iter().find(|c: &&Channel| c.name == name) {
+            Some(other) => Err(format!("{name:?} is a {} and a {}: channels need names of their own", other.kind.word(), Kind::word(kind))),
+            None => {
+                channels.push(Channel { kind, name: name.to_owned(), role });
+                Ok(())
+            }
+        };
+        let sensors = sensors(config, &model, &mut warnings)?;
+        for (number, ft) in config.force_torque.iter().enumerate() {
+            add(Kind::Wrench, &ft.sensor, Use::Sensor(number))?;
+        }
+        for (dof, position) in locked.iter().enumerate() {
+            if position.is_nan() {
+                add(Kind::Joint, model.dof_name(dof), Use::Joint(dof))?;
+            }
+        }
+        let (base_link, base) = match &config.base {
+            Base::Fixed { link, gravity_mps2 } => {
+                let frame = frame(&model, link).map_err(|e| format!("base.link: {e}"))?;
+                let standing = FrameMotion::standing(&Vec3::from(*gravity_mps2));
+                (frame.link, BaseMotion::Standing(FrameMotion::of_link_from_imu(&standing, &frame.pose)))
+            }
+            Base::Imu { sensor, link, xyz_m, rpy_rad } => {
+                let frame = frame(&model, link).map_err(|e| format!("base.link: {e}"))?;
+                add(Kind::Imu, sensor, Use::Base)?;
+                (frame.link, BaseMotion::Imu(frame.pose * Pose::from_xyz_rpy(*xyz_m, *rpy_rad)))
+            }
+        };
+        let (contacts, mut specs) = contacts(config, &model)?;
+        if let BaseMotion::Standing(_) = base {
+            // What a fixed base stands on, unless the configuration has it as a contact of its own.
+            let there = specs.iter().any(|s| s.frame.link == base_link && s.kind == ContactKind::Wrench);
+            if !there {
+                let frame = Frame { link: base_link, pose: Pose::identity() };
+                specs.push(ContactSpec { frame, kind: ContactKind::Wrench, position: Vec3::zeros() });
+            }
+        }
+        let mut always = ContactSet::first(specs.len());
+        contacts.iter().enumerate().filter(|(_, c)| !c.always).for_each(|(i, _)| always.remove(i));
+        let structure = Structure::new(&model, &sensors, &specs, Structure::LENGTH_SCALE).map_err(|e| match e {
+            StructureError::Contact { index } | StructureError::Direction { index } => {
+                format!("contact {:?}: {e}", contacts.get(index).map_or("", |c| c.name.as_str()))
+            }
+            e => e.to_string(),
+        })?;
+        let trigger = match &config.output.trigger {
+            Some(name) => channels.iter().position(|c| c.name == *name).ok_or_else(|| {
+                let names: Vec<_> = channels.iter().map(|c| c.name.as_str()).collect();
+                format!("output.trigger = {name:?} is not a channel that is read; these are: {}", names.join(", "))
+            })?,
+            // Sensors come first, then joints.
+            None => 0,
+        };
+        if channels.is_empty() {
+            return Err("nothing is measured: no force_torque, no joint that is not locked, no IMU".into());
+        }
+        let Differentiation { position_noise_rad, angular_velocity_noise_radps, max_window_ms } = config.differentiation;
+        let max_silence = Nanos::from_seconds(config.input.max_silence_ms * 1e-3);
+        let settings = |noise| Settings {
+            noise,
+            capacity: WINDOW,
+            max_window: Nanos::from_seconds(max_window_ms * 1e-3),
+            max_gap: max_silence,
+        };
+        let vector = |v: [f64; 3]| Vec3::from(v);
+        Ok(Self {
+            robot: config.robot.clone(),
+            structure,
+            base_link,
+            base,
+            locked,
+            offsets: config
+                .force_torque
+                .iter()
+                .map(|f| Wrench { torque: vector(f.offset_nm), force: vector(f.offset_n) })
+                .collect(),
+            contacts,
+            always,
+            trigger,
+            max_wait: Nanos::from_seconds(config.output.max_wait_ms * 1e-3),
+            max_silence,
+            max_deviation: config.output.max_torque_std_nm.unwrap_or(f64::INFINITY),
+            joint_settings: settings(position_noise_rad),
+            gyro_settings: settings(angular_velocity_noise_radps),
+            channels,
+            warnings,
+            model,
+        })
+    }
+
+    /// The channels that are read.
+    #[must_use]
+    pub fn channels(&self) -> &[Channel] {
+        &self.channels
+    }
+
+    /// The number of a channel.
+    #[must_use]
+    pub fn channel(&self, kind: Kind, name: &str) -> Option<usize> {
+        self.channels.iter().position(|c| c.kind == kind && c.name == name)
+    }
+
+    /// The number of a contact that is published.
+    #[must_use]
+    pub fn contact(&self, name: &str) -> Option<usize> {
+        self.contacts.iter().position(|c| c.name == name)
+    }
+
+    /// The names of the joints, in the order of the estimates.
+    pub fn joint_names(&self) -> impl Iterator<Item = &str> {
+        (0..self.model.dof_count()).map(|dof| self.model.dof_name(dof))
+    }
+
+    /// The names of the contacts, in the order of the estimates.
+    pub fn contact_names(&self) -> impl Iterator<Item = &str> {
+        self.contacts.iter().map(|c| c.name.as_str())
+    }
+
+    /// What is odd but not wrong, one sentence each.
+    #[must_use]
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
+    }
+
+    /// Which torques rest on links that no F/T sensor measures the far side of alone: a sentence for people, empty if none.
+    ///
+    /// A joint between the base and an F/T sensor has as its torque the sensor's reading and what the links in between weigh;
+    /// these links' parameters are the URDF's.
+    #[must_use]
+    pub fn upstream_note(&self) -> String {
+        let mut parts = Vec::new();
+        for sensor in self.structure.sensors() {
+            let mut joints = Vec::new();
+            // Up from the sensor to the next sensor or to the base's path.
+            let mut joint = sensor.joint();
+            loop {
+                let parent = self.model.joints().get(joint).map_or(0, |j| j.parent);
+                if parent == self.base_link || parent == 0 {
+                    break;
+                }
+                joint = parent - 1;
+                if self.structure.sensors().iter().any(|s| s.joint() == joint) {
+                    break;
+                }
+                if self.model.joints().get(joint).is_some_and(|j| j.dof.is_some()) {
+                    joints.push(self.model.joint_name(joint));
+                }
+            }
+            if !joints.is_empty() {
+                joints.reverse();
+                parts.push(format!(
+                    "{} lies beyond {}: their torques also rest on the URDF's links in between.",
+                    self.model.joint_name(sensor.joint()),
+                    joints.join(", ")
+                ));
+            }
+        }
+        parts.join(" ")
+    }
+
+    /// The names behind the numbers of the estimates.
+    #[must_use]
+    pub fn description(&self, header: Header) -> Box<Description> {
+        let none = Entry {
+            name: Name::EMPTY,
+            frame: Name::EMPTY,
+            max_silence: Nanos::ZERO,
+            role: Role::Channel,
+            index: 0,
+            kind: Kind::Joint,
+            bus: 0,
+        };
+        let name = |text: &str| Name::new(text).unwrap_or(Name::EMPTY);
+        let channels = self.channels.iter().map(|c| Entry {
+            name: name(&c.name),
+            kind: c.kind,
+            max_silence: self.max_silence,
+            ..none
+        });
+        let joints = self.joint_names().map(|j| Entry { name: name(j), role: Role::Joint, ..none });
+        let contacts = self.contacts.iter().map(|c| Entry {
+            name: name(&c.name),
+            frame: name(&c.frame),
+            role: Role::Contact,
+            kind: Kind::Wrench,
+            ..none
+        });
+        let numbered = channels.zip(0..).chain(joints.zip(0..)).chain(contacts.zip(0..)).map(|(e, index)| Entry { index, ..e });
+        let mut description =
+            Box::new(Description { header, publisher: Publisher::Estimator, count: 0, entries: [none; Description::CAPACITY] });
+        for (place, entry) in description.entries.iter_mut().zip(numbered) {
+            *place = entry;
+            description.count += 1;
+        }
+        description
+    }
+}
+
+fn sensors(config: &Config, model: &Model, warnings: &mut Vec<String>) -> Result<Vec<SensorCut>, String> {
+    let mut cuts = Vec::new();
+    for ft in &config.force_torque {
+        let at = format!("force_torque {:?}", ft.sensor);
+        let element = model.sensors().iter().find(|e| e.joint == ft.joint);
+        let frame = ft.frame.map(|f| match f {
+            SensorFrame::Child => MeasurementFrame::Child,
+            SensorFrame::Parent => MeasurementFrame::Parent,
+            SensorFrame::Sensor => MeasurementFrame::Sensor,
+        });
+        let direction = ft.direction.map(|d| match d {
+            Direction::ChildToParent => MeasurementDirection::ChildToParent,
+            Direction::ParentToChild => MeasurementDirection::ParentToChild,
+        });
+        if let Some(element) = element {
+            if frame.is_some_and(|f| f != element.frame) {
+                warnings.push(format!("{at}: frame is {:?} here and {:?} in the URDF; this file counts", frame, element.frame));
+            }
+            if direction.is_some_and(|d| d != element.direction) {
+                warnings.push(format!("{at}: direction is {:?} here and {:?} in the URDF; this file counts", direction, element.direction));
+            }
+        }
+        let frame = frame.or(element.map(|e| e.frame)).unwrap_or(MeasurementFrame::Child);
+        let direction = direction.or(element.map(|e| e.direction)).unwrap_or(MeasurementDirection::ChildToParent);
+        let given = ft.xyz_m.is_some() || ft.rpy_rad.is_some();
+        if given && frame != MeasurementFrame::Sensor {
+            return Err(format!("{at}: xyz_m and rpy_rad belong to frame = \"sensor\" only"));
+        }
+        let pose = match element {
+            _ if given => Pose::from_xyz_rpy(ft.xyz_m.unwrap_or_default(), ft.rpy_rad.unwrap_or_default()),
+            Some(element) => element.pose,
+            None if frame == MeasurementFrame::Sensor => {
+                return Err(format!("{at}: frame = \"sensor\" needs its pose: xyz_m and rpy_rad here, or a sensor element in the URDF"));
+            }
+            None => Pose::identity(),
+        };
+        let noise = Noise { force: ft.noise_n, torque: ft.noise_nm };
+        let cut = SensorCut::new(model, &ft.joint, frame, direction, &pose, &noise).map_err(|e| match e {
+            StructureError::NoJoint(_) => format!("{at}: joint = {:?}: {}", ft.joint, no_joint(model, &ft.joint)),
+            e => format!("{at}: {e}"),
+        })?;
+        cuts.push(cut);
+    }
+    Ok(cuts)
+}
+
+fn contacts(config: &Config, model: &Model) -> Result<(Vec<NamedContact>, Vec<ContactSpec>), String> {
+    let (mut names, mut specs) = (Vec::<NamedContact>::new(), Vec::new());
+    if config.contact.len() >= MAX_CONTACTS {
+        return Err(format!("there are {} contacts; fewer than {MAX_CONTACTS} are possible", config.contact.len()));
+    }
+    for contact in &config.contact {
+        let at = format!("contact {:?}", contact.name());
+        if Name::new(contact.name()).is_none() || contact.name().contains(['/', ',', '"', '\n']) {
+            return Err(format!("{at}: a name has at most {} bytes, none of them / , \" or a line's end", Name::CAPACITY));
+        }
+        if names.iter().any(|n| n.name == contact.name()) {
+            return Err(format!("{at}: two contacts have this name; give each a name of its own"));
+        }
+        let frame = frame(model, &contact.link).map_err(|e| format!("{at}: link: {e}"))?;
+        let kind = match (contact.kind, contact.direction) {
+            (KindWord::Wrench, _) => ContactKind::Wrench,
+            (KindWord::Force, _) => ContactKind::Force,
+            (KindWord::ForceAlong, direction) => ContactKind::ForceAlong(Vec3::from(direction.unwrap_or_default())),
+        };
+        specs.push(ContactSpec { frame, kind, position: Vec3::from(contact.position_m) });
+        let always = contact.presence == Presence::Always;
+        names.push(NamedContact { name: contact.name().to_owned(), frame: contact.link.clone(), always });
+    }
+    Ok((names, specs))
+}
+
+/// Where a link or folded frame is; what is near in name, if there is none of that name.
+fn frame(model: &Model, name: &str) -> Result<Frame, String> {
+    model.frame(name).ok_or_else(|| format!("{name:?} is not a link of the URDF{}", nearest(name, model.frame_names())))
+}
+
+fn no_joint(model: &Model, name: &str) -> String {
+    if let Some(joint) = model.joint(name)
+        && model.joints().get(joint).is_some_and(|j| j.dof.is_none())
+    {
+        return format!("{name:?} is a fixed joint; there is nothing to lock");
+    }
+    if model.is_folded(name) {
+        return format!("{name:?} is a fixed joint");
+    }
+    let names = (0..model.joint_count()).map(|j| model.joint_name(j));
+    format!("{name:?} is not a joint of the URDF{}", nearest(name, names))
+}
+
+/// A hint for somebody who misspelt a name.
+fn nearest<'a>(name: &str, names: impl Iterator<Item = &'a str>) -> String {
+    let mut names: Vec<_> = names.map(|n| (strsim::damerau_levenshtein(name, n), n)).collect();
+    names.sort_unstable();
+    match names.first() {
+        Some((distance, near)) if *distance <= name.len() / 2 => format!("; did you mean {near:?}?"),
+        _ => {
+            let some: Vec<_> = names.iter().take(8).map(|(_, n)| *n).collect();
+            format!("; there is {}{}", some.join(", "), if names.len() > 8 { ", ..." } else { "" })
+        }
+    }
+}
+
+impl fmt::Display for Setup {
+    /// A table for people: `proprio estimator --check` prints it.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "robot {}: {} links, {} moving joints, {} sub-trees",
+            self.robot,
+            self.model.link_count(),
+            self.model.dof_count(),
+            self.structure.subtrees().len()
+        )?;
+        let how = if let BaseMotion::Imu(_) = self.base { "an IMU tells its motion" } else { "it stands still" };
+        writeln!(f, "base {}: {how}", self.model.link_name(self.base_link))?;
+        for (number, channel) in self.channels.iter().enumerate() {
+            let trigger = if number == self.trigger { " (each of its stamps gives an estimate)" } else { "" };
+            writeln!(f, "  reads {} {}{trigger}", channel.kind.word(), channel.name)?;
+        }
+        for (dof, position) in self.locked.iter().enumerate() {
+            if !position.is_nan() {
+                writeln!(f, "  locked {} at {position}", self.model.dof_name(dof))?;
+            }
+        }
+        for (number, subtree) in self.structure.subtrees().iter().enumerate() {
+            let sensors: Vec<_> = subtree
+                .sensors
+                .iter()
+                .filter_map(|s| self.structure.sensors().get(s))
+                .map(|s| self.model.joint_name(s.joint()))
+                .collect();
+            let contacts: Vec<_> =
+                subtree.contacts.iter().map(|c| self.contacts.get(c).map_or("what the base stands on", |c| c.name.as_str())).collect();
+            let unknowns: usize =
+                subtree.contacts.iter().filter_map(|c| self.structure.contacts().get(c)).map(|c| c.kind.unknowns()).sum();
+            writeln!(
+                f,
+                "sub-tree {number} from {}: F/T [{}], contacts [{}]: {unknowns} unknowns in 6 equations",
+                self.model.link_name(subtree.top),
+                sensors.join(", "),
+                contacts.join(", ")
+            )?;
+        }
+        let note = self.upstream_note();
+        if !note.is_empty() {
+            writeln!(f, "{note}")?;
+        }
+        for warning in &self.warnings {
+            writeln!(f, "note: {warning}")?;
+        }
+        Ok(())
+    }
+}

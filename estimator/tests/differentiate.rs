@@ -1,0 +1,471 @@
+//! Window: exact where it must be, bounded where it can only be bounded, and refusals instead of panics.
+//!
+//! Angles are in degrees here, as in the figures of the module's head: the window has no unit of its own.
+
+use proprio_estimator::differentiate::{
+    Estimate, MAX_SAMPLES, Pushed, Refused, Settings, SettingsError, Unavailable, Window,
+};
+use proprio_topics::Nanos;
+use proptest::prelude::*;
+use std::f64::consts::TAU;
+
+/// Position, velocity, acceleration at a time \[s\].
+type Motion<'a> = &'a dyn Fn(f64) -> [f64; 3];
+
+/// A small generator of its own: the benchmarks are the same numbers everywhere.
+struct Random(u64);
+
+impl Random {
+    fn uniform(&mut self) -> f64 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        (self.0 >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
+    /// Standard normal, by the sum of twelve.
+    fn normal(&mut self) -> f64 {
+        (0..12).map(|_| self.uniform()).sum::<f64>() - 6.0
+    }
+}
+
+/// How a benchmark samples its motion.
+#[derive(Clone, Copy)]
+struct Sampling {
+    /// Intervals are spread evenly between these \[s\].
+    interval: [f64; 2],
+    quantum: f64,
+    /// Standard deviation of what is added before quantisation \[quanta\].
+    jitter: f64,
+    capacity: usize,
+    /// Where the estimate is wanted, after the newest sample \[s\].
+    after: f64,
+}
+
+const COARSE: Sampling = Sampling {
+    interval: [0.01, 0.01],
+    quantum: 0.055,
+    jitter: 0.0,
+    capacity: MAX_SAMPLES,
+    after: 0.0,
+};
+
+/// Errors of value, velocity, acceleration over a run; what the window said of itself beside them.
+#[derive(Debug, Default)]
+struct Errors {
+    rms: [f64; 3],
+    worst: [f64; 3],
+    /// Share of errors within two of the standard deviations given.
+    covered: [f64; 3],
+}
+
+fn settings(sampling: Sampling) -> Settings {
+    Settings {
+        capacity: sampling.capacity,
+        ..Settings::new(sampling.quantum / 2.0)
+    }
+}
+
+fn channels(e: &Estimate<1>) -> [[f64; 2]; 3] {
+    [
+        [e.value[0], e.value_std[0]],
+        [e.first[0], e.first_std[0]],
+        [e.second[0], e.second_std[0]],
+    ]
+}
+
+/// Runs `seconds` of every motion, and compares after the first second of each.
+fn run(motions: &[Motion<'_>], sampling: Sampling, seconds: f64) -> Errors {
+    let (mut errors, mut count) = (Errors::default(), 0.0);
+    for (seed, motion) in (1_u64..).zip(motions) {
+        let mut random = Random(0x9E37_79B9_7F4A_7C15 ^ (seed * 77_777));
+        let mut window = Window::<1>::new(settings(sampling)).unwrap();
+        let mut now = 0.0;
+        while now < seconds {
+            let measured = motion(now)[0] + sampling.jitter * sampling.quantum * random.normal();
+            let rounded = (measured / sampling.quantum).round() * sampling.quantum;
+            window.push(Nanos::from_seconds(now), [rounded]).unwrap();
+            if now > 1.0 {
+                let at = now + sampling.after;
+                let estimate = window.at(Nanos::from_seconds(at)).unwrap();
+                for (m, ([e, std], truth)) in channels(&estimate).into_iter().zip(motion(at)).enumerate() {
+                    errors.rms[m] += (e - truth).powi(2);
+                    errors.worst[m] = errors.worst[m].max((e - truth).abs());
+                    errors.covered[m] += f64::from((e - truth).abs() < 2.0 * std);
+                }
+                count += 1.0;
+            }
+            now += sampling.interval[0] + (sampling.interval[1] - sampling.interval[0]) * random.uniform();
+        }
+    }
+    errors.rms = errors.rms.map(|sum| (sum / count).sqrt());
+    errors.covered = errors.covered.map(|n| n / count);
+    println!("{errors:.5?}");
+    errors
+}
+
+fn sine(amplitude: f64, hertz: f64, phase: f64, t: f64) -> [f64; 3] {
+    let (w, (s, c)) = (TAU * hertz, (TAU * hertz * t + phase).sin_cos());
+    [amplitude * s, amplitude * w * c, -amplitude * w * w * s]
+}
+
+/// Joint `j` of seven: three sines, 20 deg at about 0.3 Hz to 3 deg at 1.3 to 1.9 Hz.
+fn arm(j: f64, t: f64) -> [f64; 3] {
+    let a = sine(20.0, 0.25 + 0.02 * j, j, t);
+    let b = sine(10.0, 0.6 + 0.05 * j, 2.0 * j, t);
+    let c = sine(3.0, 1.3 + 0.1 * j, 3.0 * j, t);
+    std::array::from_fn(|m| a[m] + b[m] + c[m])
+}
+
+/// At rest until 1.5 s, then 40 deg in 0.8 s with the least jerk, then at rest.
+fn reach(offset: f64, t: f64) -> [f64; 3] {
+    let (whole, amplitude) = (0.8, 40.0);
+    let u = ((t - 1.5) / whole).clamp(0.0, 1.0);
+    [
+        offset + amplitude * u.powi(3) * (10.0 - 15.0 * u + 6.0 * u * u),
+        amplitude / whole * 30.0 * (u * (1.0 - u)).powi(2),
+        amplitude / whole.powi(2) * 60.0 * u * (1.0 - u) * (1.0 - 2.0 * u),
+    ]
+}
+
+const OFFSETS: [f64; 5] = [0.013, 7.0001, 0.0275, 3.04, -11.02];
+
+fn with_arm(sampling: Sampling, seconds: f64) -> Errors {
+    let joints: Vec<_> = (0..7).map(|j| move |t| arm(f64::from(j), t)).collect();
+    run(
+        &joints.iter().map(|m| m as Motion<'_>).collect::<Vec<_>>(),
+        sampling,
+        seconds,
+    )
+}
+
+fn at_rest(sampling: Sampling) -> Errors {
+    let motions = OFFSETS.map(|offset| move |_| [offset, 0.0, 0.0]);
+    run(&motions.each_ref().map(|m| m as Motion<'_>), sampling, 5.0)
+}
+
+fn reaching(sampling: Sampling) -> Errors {
+    let motions = OFFSETS.map(|offset| move |t| reach(offset, t));
+    run(&motions.each_ref().map(|m| m as Motion<'_>), sampling, 3.5)
+}
+
+// What other adaptive windows reach on a sine of 20 deg, 0.5 Hz at 100 Hz with 0.055 deg, velocity RMS error moving / at
+// rest: 6.39 / 0.13 (line), 3.92 / 0.77 (line through the ends), 5.61 / 0.12 (best line), 2.43 / 0.26 deg/s (quadratic).
+// The bounds below are the figures reached, rounded up.
+
+#[test]
+fn a_sine_seen_by_a_coarse_encoder() {
+    let motion = |t| sine(20.0, 0.5, 0.0, t);
+    for (what, sampling, velocity, acceleration) in [
+        ("at the newest sample", COARSE, 0.7, 16.0),
+        ("window of 64", Sampling { capacity: 64, ..COARSE }, 0.8, 19.0),
+        (
+            "half a period back",
+            Sampling {
+                after: -0.005,
+                ..COARSE
+            },
+            0.65,
+            15.0,
+        ),
+        ("half a period ahead", Sampling { after: 0.005, ..COARSE }, 0.75, 17.0),
+        ("0.3 quanta of noise", Sampling { jitter: 0.3, ..COARSE }, 0.8, 20.0),
+        (
+            "irregular stamps",
+            Sampling {
+                interval: [0.005, 0.017],
+                ..COARSE
+            },
+            0.8,
+            19.0,
+        ),
+    ] {
+        let errors = run(&[&motion], sampling, 8.0);
+        assert!(
+            errors.rms[1] < velocity && errors.rms[2] < acceleration,
+            "{what}: {errors:?}"
+        );
+        assert!(errors.covered.iter().all(|share| *share > 0.7), "{what}: {errors:?}");
+    }
+}
+
+#[test]
+fn nothing_moves_at_rest() {
+    for (what, jitter, velocity, acceleration) in [
+        ("no noise", 0.0, 1e-9, 1e-6),
+        ("rare ticks", 0.05, 0.1, 0.5),
+        ("ticks all the time", 0.3, 0.1, 0.5),
+    ] {
+        let errors = at_rest(Sampling { jitter, ..COARSE });
+        assert!(
+            errors.rms[1] < velocity && errors.rms[2] < acceleration,
+            "{what}: {errors:?}"
+        );
+        // One tick in neighbouring samples is 550 deg/s^2 to a plain second difference.
+        assert!(errors.worst[1] < 0.5 && errors.worst[2] < 3.0, "{what}: {errors:?}");
+    }
+    let short = at_rest(Sampling {
+        jitter: 0.3,
+        capacity: 64,
+        ..COARSE
+    });
+    assert!(short.rms[1] < 0.26 && short.worst[2] < 10.0, "{short:?}");
+}
+
+#[test]
+fn an_arm_with_fine_encoders() {
+    let fine = |interval: f64| Sampling {
+        interval: [interval; 2],
+        quantum: 5.5e-5,
+        ..COARSE
+    };
+    let errors = with_arm(fine(0.004), 4.0);
+    assert!(errors.rms[1] < 0.01 && errors.rms[2] < 1.6, "250 Hz: {errors:?}");
+    let errors = with_arm(fine(0.001), 2.0);
+    assert!(errors.rms[1] < 0.01 && errors.rms[2] < 1.4, "1 kHz: {errors:?}");
+}
+
+#[test]
+fn the_onset_of_motion_is_not_overshot() {
+    // The motion's own peaks: 93.75 deg/s and 360.8 deg/s^2.
+    let coarse = reaching(COARSE);
+    assert!(coarse.worst[1] < 10.0 && coarse.worst[2] < 360.8, "{coarse:?}");
+    let fine = reaching(Sampling {
+        interval: [0.001; 2],
+        quantum: 5.5e-5,
+        ..COARSE
+    });
+    assert!(
+        fine.worst[1] < 0.2 && fine.worst[2] < 40.0 && fine.rms[2] < 3.0,
+        "{fine:?}"
+    );
+}
+
+/// Stamps from intervals in microseconds.
+fn stamps(start: i64, intervals: &[i64]) -> Vec<Nanos> {
+    intervals
+        .iter()
+        .scan(Nanos(start), |t, dt| {
+            *t += Nanos::from_micros(*dt);
+            Some(*t)
+        })
+        .collect()
+}
+
+proptest! {
+    /// Any polynomial up to the second degree comes back, whatever the stamps, at a sample, between two and beyond.
+    #[test]
+    fn quadratics_are_exact(
+        start in -1_000_000_000_000_000_i64..1_000_000_000_000_000,
+        intervals in prop::collection::vec(200_i64..20_000, 3..200),
+        coefficients in prop::array::uniform3(-10.0..10.0_f64),
+        degree in 0_usize..3,
+        noise in 1e-6..1.0_f64,
+        ahead in -1.0..1.0_f64,
+    ) {
+        let stamps = stamps(start, &intervals);
+        let last = *stamps.last().unwrap();
+        let c: [f64; 3] = std::array::from_fn(|k| if k <= degree { coefficients[k] } else { 0.0 });
+        let signal = |t: Nanos| {
+            let s = (t - last).seconds();
+            [c[0] + s * (c[1] + s * c[2]), c[1] + 2.0 * s * c[2], 2.0 * c[2]]
+        };
+        let mut window = Window::<1>::new(Settings::new(noise)).unwrap();
+        for t in &stamps {
+            window.push(*t, [signal(*t)[0]]).unwrap();
+        }
+        let before = stamps[stamps.len() - 2];
+        let span = (last - window.oldest().unwrap().0).seconds().min(1.0);
+        for t in [last, before, last + Nanos::from_seconds(ahead * (last - before).seconds())] {
+            let e = window.at(t).unwrap();
+            let scale = 1e-12 * (1.0 + c[0].abs() + c[1].abs() + c[2].abs());
+            for (m, ([got, std], want)) in channels(&e).into_iter().zip(signal(t)).enumerate() {
+                // What rounding the samples to doubles costs, through the noise gain of the window.
+                let allowed = scale / (span / 4.0).powi(i32::try_from(m).unwrap());
+                prop_assert!((got - want).abs() <= allowed, "{m}: {got} for {want}, allowed {allowed}");
+                prop_assert!(std > 0.0);
+            }
+            prop_assert_eq!(e.ahead, window.newest_for(t, Nanos::MAX).unwrap() - t);
+        }
+    }
+
+    /// No input panics, and no estimate is given that is not finite.
+    #[test]
+    fn whatever_comes_is_refused_or_finite(
+        samples in prop::collection::vec((any::<i64>(), prop::array::uniform3(any::<f64>())), 0..40),
+        close in prop::collection::vec((1_i64..2_000, prop::array::uniform3(-1e200..1e200_f64)), 0..200),
+        instants in prop::collection::vec((any::<i64>(), any::<i64>()), 1..10),
+    ) {
+        let mut window = Window::<3>::new(Settings::new(1e-3)).unwrap();
+        let mut ask = Vec::new();
+        for (t, v) in samples {
+            let before = window.newest();
+            match window.push(Nanos(t), v) {
+                Ok(_) => prop_assert!(before.is_none_or(|(newest, _)| Nanos(t) > newest)),
+                Err(_) => prop_assert_eq!(window.newest(), before),
+            }
+        }
+        window.clear();
+        let mut t = Nanos::ZERO;
+        for (dt, v) in close {
+            t += Nanos(dt);
+            prop_assert!(window.push(t, v).is_ok());
+            ask.push((t, Nanos::MAX));
+            ask.push((t - Nanos(dt / 2), t));
+        }
+        ask.extend(instants.into_iter().map(|(t, until)| (Nanos(t), Nanos(until))));
+        for (t, until) in ask {
+            if let Ok(e) = window.at_using(t, until) {
+                for v in [e.value, e.first, e.second, e.value_std, e.first_std, e.second_std].as_flattened() {
+                    prop_assert!(v.is_finite());
+                }
+                prop_assert!(e.samples.iter().all(|n| (3..=MAX_SAMPLES).contains(n)));
+            }
+        }
+    }
+
+    /// Three components in one window are three windows of one.
+    #[test]
+    fn components_do_not_mix(
+        intervals in prop::collection::vec(1_000_i64..9_000, 20..100),
+        values in prop::collection::vec(prop::array::uniform3(-1.0..1.0_f64), 100),
+    ) {
+        let mut all = Window::<3>::new(Settings::new(0.2)).unwrap();
+        let mut each = [(); 3].map(|()| Window::<1>::new(Settings::new(0.2)).unwrap());
+        for (t, v) in stamps(0, &intervals).into_iter().zip(values) {
+            all.push(t, v).unwrap();
+            for (window, v) in each.iter_mut().zip(v) {
+                window.push(t, [v]).unwrap();
+            }
+        }
+        let t = all.newest().unwrap().0 - Nanos(300_000);
+        let joint = all.at(t).unwrap();
+        for (i, window) in each.iter().enumerate() {
+            let alone = window.at(t).unwrap();
+            prop_assert_eq!(alone.value[0].to_bits(), joint.value[i].to_bits());
+            prop_assert_eq!(alone.first[0].to_bits(), joint.first[i].to_bits());
+            prop_assert_eq!(alone.second[0].to_bits(), joint.second[i].to_bits());
+            prop_assert_eq!(alone.second_std[0].to_bits(), joint.second_std[i].to_bits());
+        }
+    }
+
+    /// An estimate depends on the samples up to its instant and the first later one alone: what was pushed before them
+    /// and fell out, and what was pushed after them, changes not a bit.
+    #[test]
+    fn only_the_samples_that_may_count_count(
+        intervals in prop::collection::vec(1_000_i64..9_000, 60..120),
+        values in prop::collection::vec(-1.0..1.0_f64, 120),
+        later in 1_usize..20,
+        wait_us in 0_i64..12_000,
+        offset_us in 0_i64..9_000,
+    ) {
+        let stamps = stamps(0, &intervals);
+        let settings = Settings { capacity: 30, ..Settings::new(0.1) };
+        let cut = stamps.len() - later;
+        let t = stamps[cut - 1] + Nanos::from_micros(offset_us.min(intervals[cut] - 1));
+        let until = t + Nanos::from_micros(wait_us);
+        // All that may count: one more if it is there and not too late.
+        let counted = if stamps[cut] <= until { cut + 1 } else { cut };
+        let mut expected = Window::<1>::new(Settings { capacity: 30 - later, ..settings }).unwrap();
+        for (t, v) in stamps.iter().zip(&values).take(counted).skip(counted - (30 - later)) {
+            expected.push(*t, [*v]).unwrap();
+        }
+        let mut early = Window::<1>::new(Settings { capacity: 30 - later, ..settings }).unwrap();
+        let mut late = Window::<1>::new(Settings { capacity: 29, ..settings }).unwrap();
+        for (i, (t, v)) in stamps.iter().zip(&values).enumerate() {
+            if i < counted {
+                early.push(*t, [*v]).unwrap();
+            }
+            if i >= counted - (30 - later) {
+                late.push(*t, [*v]).unwrap();
+            }
+        }
+        prop_assert_eq!(expected.newest_for(t, until), Some(stamps[counted - 1]));
+        let want = expected.at(t);
+        prop_assert_eq!(early.at_using(t, until), want);
+        prop_assert_eq!(late.at_using(t, until), want);
+        prop_assert!(want.is_ok());
+    }
+}
+
+#[test]
+fn a_gap_starts_anew() {
+    let mut window = Window::<1>::new(Settings::new(0.01)).unwrap();
+    let ms = Nanos::from_millis;
+    for i in 0..50 {
+        assert_eq!(window.push(ms(i * 10), [5.0]), Ok(Pushed::Added));
+    }
+    assert_eq!(window.at(ms(590)).unwrap().value[0], 5.0);
+    assert_eq!(window.at(ms(591)), Err(Unavailable::Stale { by: ms(101) }));
+    assert_eq!(window.push(ms(591), [7.0]), Ok(Pushed::Restarted { gap: ms(101) }));
+    assert_eq!((window.len(), window.oldest()), (1, Some((ms(591), [7.0]))));
+    assert_eq!(window.at(ms(591)), Err(Unavailable::Starting { samples: 1 }));
+    assert_eq!(window.at(ms(590)), Err(Unavailable::Before { by: ms(1) }));
+    window.push(ms(601), [7.0]).unwrap();
+    assert_eq!(window.at(ms(601)), Err(Unavailable::Starting { samples: 2 }));
+    window.push(ms(611), [7.0]).unwrap();
+    let e = window.at(ms(611)).unwrap();
+    assert_eq!((e.value, e.first, e.second, e.samples), ([7.0], [0.0], [0.0], [3; 3]));
+}
+
+#[test]
+fn old_samples_go() {
+    let settings = Settings {
+        capacity: 16,
+        max_window: Nanos::from_millis(50),
+        ..Settings::new(0.01)
+    };
+    let mut window = Window::<1>::new(settings).unwrap();
+    let ms = Nanos::from_millis;
+    for i in 0..1000 {
+        // A constant that changes: only what is recent counts.
+        window.push(ms(i * 10), [if i < 990 { 1.0 } else { 2.0 }]).unwrap();
+        assert_eq!(window.len(), 16.min(usize::try_from(i).unwrap() + 1));
+        assert_eq!(window.oldest().unwrap().0, ms((i - 15).max(0) * 10));
+    }
+    assert_eq!(window.exactly(ms(9_980)), Some([2.0]));
+    assert_eq!(window.exactly(ms(9_981)), None);
+    let e = window.at(ms(9_990)).unwrap();
+    // Within 50 ms: six samples, all of the new value.
+    assert_eq!((e.value, e.first, e.second, e.samples), ([2.0], [0.0], [0.0], [6; 3]));
+    assert_eq!(window.at(ms(9_839)), Err(Unavailable::Before { by: ms(1) }));
+}
+
+#[test]
+fn what_is_wrong_is_refused_and_said() {
+    let good = Settings::new(0.1);
+    for noise in [0.0, -1.0, f64::INFINITY] {
+        assert_eq!(
+            Window::<1>::new(Settings { noise, ..good }).unwrap_err(),
+            SettingsError::Noise(noise)
+        );
+    }
+    assert!(matches!(
+        Window::<1>::new(Settings::new(f64::NAN)).unwrap_err(),
+        SettingsError::Noise(_)
+    ));
+    for capacity in [0, 2, MAX_SAMPLES + 1] {
+        assert_eq!(
+            Window::<1>::new(Settings { capacity, ..good }).unwrap_err(),
+            SettingsError::Capacity(capacity)
+        );
+    }
+    let zero = Nanos::ZERO;
+    assert_eq!(
+        Window::<1>::new(Settings { max_gap: zero, ..good }).unwrap_err(),
+        SettingsError::Duration(zero)
+    );
+    let mut window = Window::<1>::new(good).unwrap();
+    assert_eq!(window.at(zero), Err(Unavailable::Starting { samples: 0 }));
+    window.push(Nanos(10), [1.0]).unwrap();
+    for got in [Nanos(10), Nanos(9), Nanos::MIN] {
+        assert_eq!(
+            window.push(got, [2.0]),
+            Err(Refused::NotLater { newest: Nanos(10), got })
+        );
+    }
+    for v in [f64::NAN, f64::INFINITY] {
+        assert_eq!(window.push(Nanos(20), [v]), Err(Refused::NotFinite));
+    }
+    assert_eq!(window.newest(), Some((Nanos(10), [1.0])));
+}

@@ -1,0 +1,461 @@
+//! The pipeline on a robot whose truth three other libraries agree about, and its rules: stamps alone decide, what is
+//! missing withholds only what depends on it, bad samples are counted and lose nothing else.
+
+use proprio_estimator::config::Config;
+use proprio_estimator::offline;
+use proprio_estimator::pipeline::{Estimate, Pipeline};
+use proprio_estimator::setup::Setup;
+use proprio_topics::csv::{Reader, Row, Value, What};
+use proprio_topics::{JointState, Kind, Nanos, Quality, Reading, Reason, Wrench};
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_owned()
+}
+
+/// The configuration of the arm, with no sensor offset (the golden files have none) and `more` at the end.
+fn setup(change: impl FnOnce(&mut Config)) -> Setup {
+    let mut config = Config::load(&root().join("config/icub_left_arm/estimator.toml")).unwrap();
+    for ft in &mut config.force_torque {
+        (ft.offset_n, ft.offset_nm) = ([0.0; 3], [0.0; 3]);
+    }
+    change(&mut config);
+    Setup::new(&config).unwrap()
+}
+
+fn golden(name: &str) -> String {
+    std::fs::read_to_string(root().join("tests/oracle").join(name)).unwrap()
+}
+
+/// A table of numbers by column name.
+fn table(text: &str) -> HashMap<String, Vec<String>> {
+    let mut reader = csv::Reader::from_reader(text.as_bytes());
+    let names: Vec<String> = reader.headers().unwrap().iter().map(str::to_owned).collect();
+    let mut columns: HashMap<String, Vec<String>> = names.iter().map(|n| (n.clone(), vec![])).collect();
+    for record in reader.records() {
+        for (name, cell) in names.iter().zip(record.unwrap().iter()) {
+            columns.get_mut(name).unwrap().push(cell.to_owned());
+        }
+    }
+    columns
+}
+
+#[test]
+fn estimates_from_a_file_are_those_of_other_libraries() {
+    for (name, base_is_imu) in [
+        ("icub_left_arm_mujoco.csv", true),
+        ("icub_left_arm_mujoco.csv", false),
+        ("icub_left_arm_mujoco_contact.csv", true),
+        ("icub_left_arm_mujoco_contact.csv", false),
+    ] {
+        let setup = setup(|config| {
+            if !base_is_imu {
+                config.base = proprio_estimator::config::Base::Fixed {
+                    link: "chest".into(),
+                    gravity_mps2: [0.0, 0.0, -9.80665],
+                };
+                config.contact.retain(|c| c.name() != "stand");
+            }
+        });
+        let joints: Vec<String> = setup.joint_names().map(str::to_owned).collect();
+        let (log, mut out) = (golden(name), Vec::new());
+        let report = offline::estimate(setup, log.as_bytes(), &mut out).unwrap();
+        let (want, got) = (table(&log), table(std::str::from_utf8(&out).unwrap()));
+        assert_eq!(report.estimates, 201);
+        assert_eq!(want["t"].len(), got["t"].len());
+        let number = |s: &String| s.parse::<f64>().unwrap();
+        assert!(
+            want["t"].iter().zip(&got["t"]).all(|(a, b)| number(a) == number(b)),
+            "the same instants"
+        );
+        for joint in &joints {
+            let pairs = want[&format!("joint/{joint}/torque")]
+                .iter()
+                .zip(&got[&format!("torque/{joint}")]);
+            for (want, got) in pairs {
+                let (want, got) = (number(want), number(got));
+                assert!(
+                    (want - got).abs() < 1e-9 * (1.0 + want.abs()),
+                    "{name} imu {base_is_imu} {joint}: {want} {got}"
+                );
+            }
+            assert!(got[&format!("valid/{joint}")].iter().all(|v| v == "1"));
+            assert!(got[&format!("reason/{joint}")].iter().all(String::is_empty));
+        }
+        for part in ["fx", "fy", "fz", "tx", "ty", "tz"] {
+            let column = format!("contact/hand/{part}");
+            for (row, got) in got[&column].iter().enumerate() {
+                let want = want.get(&column).map_or(0.0, |w| number(&w[row]));
+                assert!((want - number(got)).abs() < 1e-9, "{name} {column} {row}: {want} {got}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_log_without_stamps_keeps_its_order_and_its_estimates() {
+    let log = golden("icub_left_arm_mujoco.csv");
+    let blank: String = log
+        .lines()
+        .enumerate()
+        .map(|(i, line)| {
+            if i == 0 {
+                format!("{line}\n")
+            } else {
+                format!(",{}\n", line.split_once(',').unwrap().1)
+            }
+        })
+        .collect();
+    let run = |text: &str| {
+        let mut out = Vec::new();
+        offline::estimate(setup(|_| {}), text.as_bytes(), &mut out).unwrap();
+        table(std::str::from_utf8(&out).unwrap())
+    };
+    let (with, without) = (run(&log), run(&blank));
+    assert_eq!(with["torque/l_elbow"], without["torque/l_elbow"]);
+    assert!(without["t"].iter().all(String::is_empty));
+}
+
+/// One sample of a recording: channel, stamp, reading, quality.
+type Event = (usize, Nanos, Reading, Quality);
+
+/// A recording at realistic, unequal rates, made from the golden trajectory: F/T at 1 kHz, joints at 250 Hz with positions
+/// only, IMU at 100 Hz; each channel with its own phase.
+fn recording(setup: &Setup, seconds: f64) -> Vec<Event> {
+    let mut reader = Reader::new(golden("icub_left_arm_mujoco.csv").leak().as_bytes()).unwrap();
+    let channel = |s: &proprio_topics::csv::Series| match s.what {
+        What::Channel(kind) => setup.channel(kind, &s.name),
+        What::Contact => None,
+    };
+    let series: Vec<_> = reader.series().iter().map(channel).collect();
+    let mut rows: Vec<(f64, HashMap<usize, Reading>)> = vec![];
+    let mut row = Row::default();
+    while reader.next_row(&mut row).unwrap() {
+        let items = row.items.iter().filter_map(|i| match i.value {
+            Value::Reading(reading, _) => Some((series[i.series]?, reading)),
+            Value::Active(_) => None,
+        });
+        rows.push((row.t.unwrap().seconds(), items.collect()));
+    }
+    let mix = |a: f64, b: f64, p: f64| a + (b - a) * p;
+    let at = |channel: usize, t: f64| {
+        let after = rows.partition_point(|(x, _)| *x <= t).min(rows.len() - 1);
+        let ((t0, a), (t1, b)) = (&rows[after - 1], &rows[after]);
+        let p = (t - t0) / (t1 - t0);
+        match (a[&channel], b[&channel]) {
+            (Reading::Joint(a), Reading::Joint(b)) => Reading::Joint(JointState {
+                position: mix(a.position, b.position, p),
+                ..JointState::ABSENT
+            }),
+            (Reading::Wrench(a), Reading::Wrench(b)) => Reading::Wrench(Wrench {
+                force: std::array::from_fn(|i| mix(a.force[i], b.force[i], p)),
+                torque: std::array::from_fn(|i| mix(a.torque[i], b.torque[i], p)),
+            }),
+            (a, _) => a,
+        }
+    };
+    let mut events = vec![];
+    for (number, channel) in setup.channels().iter().enumerate() {
+        let period = match channel.kind {
+            Kind::Wrench => 1e-3,
+            Kind::Joint => 4e-3,
+            Kind::Imu => 1e-2,
+        };
+        let mut t = 0.0001 * number as f64;
+        while t < seconds {
+            events.push((number, Nanos::from_seconds(t), at(number, t), Quality::GOOD));
+            t += period;
+        }
+    }
+    events.sort_by_key(|e| (e.1, e.0));
+    events
+}
+
+fn run(setup: Setup, events: &[Event]) -> (Vec<Estimate>, Pipeline) {
+    let mut pipeline = Pipeline::new(setup);
+    let mut estimates = vec![];
+    for (channel, t, reading, quality) in events {
+        pipeline.push(*channel, *t, reading, *quality);
+        while let Some(estimate) = pipeline.poll() {
+            estimates.push(estimate.clone());
+        }
+    }
+    pipeline.finish();
+    while let Some(estimate) = pipeline.poll() {
+        estimates.push(estimate.clone());
+    }
+    (estimates, pipeline)
+}
+
+/// Bit for bit: NaN equals NaN.
+fn bits(estimates: &[Estimate]) -> Vec<(Nanos, Vec<(u64, u64, u32, Reason, u32)>)> {
+    let joint = |j: &proprio_topics::JointTorque| {
+        (
+            j.torque.to_bits(),
+            j.standard_deviation.to_bits(),
+            j.valid,
+            j.reason,
+            j.cause,
+        )
+    };
+    estimates
+        .iter()
+        .map(|e| (e.t, e.torques.joints().iter().map(joint).collect()))
+        .collect()
+}
+
+#[test]
+fn every_trigger_stamp_gives_one_estimate_in_order() {
+    let setup = setup(|_| {});
+    let events = recording(&setup, 0.5);
+    let stamps: Vec<Nanos> = events.iter().filter(|e| e.0 == setup.trigger).map(|e| e.1).collect();
+    let (estimates, _) = run(setup, &events);
+    assert_eq!(estimates.iter().map(|e| e.t).collect::<Vec<_>>(), stamps);
+    // Once every channel has three samples, everything is valid.
+    assert!(
+        estimates.iter().filter(|e| e.t > Nanos::from_millis(40)).all(|e| e
+            .torques
+            .joints()
+            .iter()
+            .all(|j| j.valid == 1))
+    );
+}
+
+#[test]
+fn the_order_of_arrival_does_not_matter_within_the_wait() {
+    let base = setup(|_| {});
+    let events = recording(&base, 0.4);
+    let (want, _) = run(base.clone(), &events);
+    let mut state = 12345_u64;
+    let mut random = || {
+        state = state
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
+        (state >> 33) as i64
+    };
+    for trial in 0..5 {
+        // Each channel arrives late by its own delay, and a little more or less, but less than the wait of 1 ms.
+        let delays: Vec<i64> = base.channels().iter().map(|_| random() % 800_000).collect();
+        let mut arrivals: Vec<(i64, Event)> = events
+            .iter()
+            .map(|e| (e.1.0 + delays[e.0] + random() % 50_000, *e))
+            .collect();
+        arrivals.sort_by_key(|(at, e)| (*at, e.1));
+        let shuffled: Vec<Event> = arrivals.into_iter().map(|(_, e)| e).collect();
+        assert_ne!(
+            shuffled.iter().map(|e| e.0).collect::<Vec<_>>(),
+            events.iter().map(|e| e.0).collect::<Vec<_>>()
+        );
+        let (got, pipeline) = run(base.clone(), &shuffled);
+        assert_eq!(pipeline.counts().late + pipeline.counts().backward, 0, "trial {trial}");
+        assert_eq!(bits(&got), bits(&want), "trial {trial}");
+    }
+}
+
+#[test]
+fn a_stale_channel_withholds_only_what_depends_on_it() {
+    let setup = setup(|_| {});
+    let elbow = setup.channel(Kind::Joint, "l_elbow").unwrap();
+    let names: Vec<String> = setup.joint_names().map(str::to_owned).collect();
+    let mut events = recording(&setup, 0.6);
+    events.retain(|e| e.0 != elbow || e.1 < Nanos::from_millis(200));
+    let (estimates, _) = run(setup, &events);
+    let last = estimates.last().unwrap();
+    for (name, joint) in names.iter().zip(last.torques.joints()) {
+        // With an unknown wrench on the hand, a torque rests on the F/T and on the links between it and the joint: the
+        // elbow's own angle decides about the links beyond it, which only the wrist's torques need.
+        let depends = name.starts_with("l_wrist");
+        assert_eq!(joint.valid, u32::from(!depends), "{name}");
+        assert_eq!(
+            joint.reason,
+            if depends { Reason::Stale } else { Reason::None },
+            "{name}"
+        );
+        assert!(joint.torque.is_finite(), "a withheld torque keeps its number");
+        if depends {
+            assert_eq!(joint.cause, u32::try_from(elbow).unwrap());
+        }
+    }
+}
+
+#[test]
+fn saturation_withholds_and_a_channel_never_seen_gives_no_number() {
+    let setup = setup(|_| {});
+    let (ft, imu) = (
+        setup.channel(Kind::Wrench, "l_arm_ft_sensor").unwrap(),
+        setup.channel(Kind::Imu, "chest_imu").unwrap(),
+    );
+    let mut events = recording(&setup, 0.3);
+    for event in &mut events {
+        if event.0 == ft && event.1 >= Nanos::from_millis(200) {
+            event.3 = Quality::SATURATED | Quality::FROZEN;
+        }
+    }
+    let (estimates, _) = run(setup.clone(), &events);
+    let before = estimates.iter().find(|e| e.t > Nanos::from_millis(150)).unwrap();
+    assert!(before.torques.joints().iter().all(|j| j.valid == 1));
+    assert!(
+        estimates
+            .last()
+            .unwrap()
+            .torques
+            .joints()
+            .iter()
+            .all(|j| j.valid == 0 && j.reason == Reason::Saturated)
+    );
+    events.retain(|e| e.0 != imu);
+    let (estimates, _) = run(setup, &events);
+    assert!(!estimates.is_empty());
+    for joint in estimates.iter().flat_map(|e| e.torques.joints()) {
+        assert!(joint.torque.is_nan() && joint.reason == Reason::NeverSeen && joint.valid == 0);
+    }
+}
+
+#[test]
+fn bad_samples_are_counted_and_lose_nothing_else() {
+    let setup = setup(|_| {});
+    let events = recording(&setup, 0.3);
+    let (want, clean) = run(setup.clone(), &events);
+    assert_eq!(clean.counts().taken, events.len() as u64);
+    let mut bad = vec![];
+    let (mut backward, mut not_finite) = (0, 0);
+    for (i, event) in events.iter().enumerate() {
+        bad.push(*event);
+        if i % 7 == 0 {
+            // The same stamp again, with another value.
+            let Reading::Joint(state) = event.2 else { continue };
+            bad.push((
+                event.0,
+                event.1,
+                Reading::Joint(JointState {
+                    position: 99.0,
+                    ..state
+                }),
+                event.3,
+            ));
+            backward += 1;
+        }
+        if let (0, Reading::Wrench(wrench)) = (i % 5, event.2) {
+            let force = [f64::NAN, wrench.force[1], wrench.force[2]];
+            bad.push((
+                event.0,
+                event.1 + Nanos(1),
+                Reading::Wrench(Wrench { force, ..wrench }),
+                event.3,
+            ));
+            not_finite += 1;
+        }
+    }
+    let (got, pipeline) = run(setup, &bad);
+    assert!(backward > 10 && not_finite > 10);
+    assert_eq!(
+        (pipeline.counts().backward, pipeline.counts().not_finite),
+        (backward, not_finite)
+    );
+    assert_eq!(bits(&got), bits(&want));
+}
+
+#[test]
+fn a_sample_that_comes_too_late_is_dropped_and_counted() {
+    let setup = setup(|_| {});
+    let mut events = recording(&setup, 0.3);
+    let at = events
+        .iter()
+        .position(|e| e.0 != setup.trigger && e.1 > Nanos::from_millis(100))
+        .unwrap();
+    let late = events.remove(at);
+    let after = events
+        .iter()
+        .position(|e| e.1 > late.1 + Nanos::from_millis(10))
+        .unwrap();
+    events.insert(after, late);
+    let count = events.iter().filter(|e| e.0 == setup.trigger).count();
+    let (estimates, pipeline) = run(setup, &events);
+    assert_eq!(pipeline.counts().late + pipeline.counts().backward, 1);
+    assert_eq!(estimates.len(), count);
+}
+
+#[test]
+fn a_possible_contact_is_absent_unless_declared() {
+    let possible = |config: &mut Config| {
+        for contact in config.contact.iter_mut().filter(|c| c.name() == "hand") {
+            contact.presence = proprio_estimator::config::Presence::Possible;
+        }
+    };
+    let setup = setup(possible);
+    let hand = setup.contact("hand").unwrap();
+    let events = recording(&setup, 0.3);
+    let mut pipeline = Pipeline::new(setup);
+    pipeline.declare(hand, Nanos::from_millis(200), true);
+    for (channel, t, reading, quality) in &events {
+        pipeline.push(*channel, *t, reading, *quality);
+        while let Some(estimate) = pipeline.poll() {
+            let contact = estimate.contacts.contacts()[hand];
+            if estimate.t < Nanos::from_millis(50) {
+                continue;
+            }
+            if estimate.t < Nanos::from_millis(200) {
+                assert_eq!(
+                    (contact.valid, contact.reason, contact.force),
+                    (0, Reason::Absent, [0.0; 3])
+                );
+            } else {
+                assert_eq!((contact.valid, contact.reason), (1, Reason::None));
+                assert!(contact.force.iter().any(|f| *f != 0.0));
+            }
+        }
+    }
+}
+
+#[test]
+fn each_mistake_between_configuration_and_model_has_one_clear_message() {
+    let load = || Config::load(&root().join("config/icub_left_arm/estimator.toml")).unwrap();
+    let problem = |change: &dyn Fn(&mut Config)| {
+        let mut config = load();
+        change(&mut config);
+        Setup::new(&config).map(|s| s.to_string()).unwrap_err()
+    };
+    for (change, expected) in [
+        (
+            &|c: &mut Config| c.contact[1].link = "l_hnad".into(),
+            "contact \"hand\": link: \"l_hnad\" is not a link of the URDF; did you mean \"l_hand\"?",
+        ),
+        (
+            &|c: &mut Config| c.force_torque[0].joint = "l_arm_ft".into(),
+            "joint l_arm_ft, which is said to carry an F/T sensor, is not in the URDF; its fixed joints that could: l_arm_ft_sensor",
+        ),
+        (
+            &|c: &mut Config| c.force_torque[0].joint = "l_elbow".into(),
+            "joint l_elbow is said to carry an F/T sensor, but it moves",
+        ),
+        (
+            &|c: &mut Config| {
+                c.locked.insert("l_elbw".into(), 0.5);
+            },
+            "locked.l_elbw: \"l_elbw\" is not a joint of the URDF; did you mean \"l_elbow\"?",
+        ),
+        (
+            &|c: &mut Config| c.output.trigger = Some("nobody".into()),
+            "output.trigger = \"nobody\" is not a channel that is read",
+        ),
+        (
+            &|c: &mut Config| c.contact[1].name = Some("stand".into()),
+            "two contacts have this name",
+        ),
+        (&|c: &mut Config| c.model = "nowhere.urdf".into(), "nowhere.urdf"),
+    ] as [(&dyn Fn(&mut Config), &str); 7]
+    {
+        let problem = problem(change);
+        assert!(problem.contains(expected), "{expected}: {problem}");
+    }
+    // A joint that is neither measured nor locked.
+    let log = golden("icub_left_arm_mujoco.csv").replace("joint/l_elbow/", "joint/other/");
+    let error = offline::estimate(setup(|_| {}), log.as_bytes(), Vec::new())
+        .unwrap_err()
+        .to_string();
+    assert!(
+        error.contains("joint/l_elbow (measure it, or lock it in [locked])"),
+        "{error}"
+    );
+}
