@@ -1,0 +1,317 @@
+//! Faults on request: what the simulated boards and buses do wrong, and when.
+//!
+//! | text | what happens |
+//! |---|---|
+//! | `lost:0.01` | every frame is lost with this probability; with `@2..8` only then |
+//! | `silent:l_arm_ft_sensor@3..4` | the board neither sends nor listens; afterwards it goes on where it was |
+//! | `reboot:l_arm_ft_sensor@5` | the board is gone for half a second, then as after power-on: it waits to be started |
+//! | `saturate:l_arm_ft_sensor@5..5.5` | a gauge is at its upper end: flagged, and the values frozen, as strain boards do |
+//! | `spike:l_arm_ft_sensor@6` | one reading is off by 200 N and 5 Nm on every axis |
+//! | `late_half:l_arm_ft_sensor@2..8` | about one reading in ten has its second half come late: just behind the next reading's first; with `@6` one reading |
+//!
+//! Times are seconds since the simulation began; an end may be left out (`5..`). A board is named as in gateway.toml, or by
+//! one of its channels.
+
+use std::fmt;
+use std::str::FromStr;
+
+/// One fault.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Fault {
+    /// Frames are lost on all buses.
+    Lost {
+        /// Of each frame, 0 to 1.
+        probability: f64,
+        /// When.
+        window: Window,
+    },
+    /// A board neither sends nor listens.
+    Silent {
+        /// Which.
+        device: String,
+        /// When.
+        window: Window,
+    },
+    /// A board loses its state and starts again.
+    Reboot {
+        /// Which.
+        device: String,
+        /// When \[s\].
+        at: f64,
+    },
+    /// An F/T sensor is saturated.
+    Saturate {
+        /// Which.
+        device: String,
+        /// When.
+        window: Window,
+    },
+    /// One F/T reading is far off.
+    Spike {
+        /// Whose.
+        device: String,
+        /// When \[s\].
+        at: f64,
+    },
+    /// Second halves of readings come late.
+    LateHalf {
+        /// Whose.
+        device: String,
+        /// When.
+        window: Window,
+        /// Only the first reading in it.
+        once: bool,
+    },
+}
+
+/// From when until when, in seconds since the simulation began; the end does not belong to it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Window {
+    /// The first instant \[s\].
+    pub from: f64,
+    /// The first instant after it \[s\]; infinite if it never ends.
+    pub until: f64,
+}
+
+impl Window {
+    /// All the time.
+    pub const ALWAYS: Self = Self {
+        from: 0.0,
+        until: f64::INFINITY,
+    };
+
+    /// Whether `t` \[s\] is in it.
+    #[must_use]
+    pub fn contains(&self, t: f64) -> bool {
+        t >= self.from && t < self.until
+    }
+}
+
+/// A fault that can not be understood or can not happen to this robot.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum FaultError {
+    /// No such fault.
+    #[error(
+        "fault {text:?}: {kind:?} is not known; there is lost, silent, reboot, saturate, spike, late_half; for example {EXAMPLES}"
+    )]
+    Kind {
+        /// What was typed.
+        text: String,
+        /// Its first word.
+        kind: String,
+    },
+    /// It is not complete.
+    #[error("fault {text:?}: it must have the form {form}, for example {example}")]
+    Form {
+        /// What was typed.
+        text: String,
+        /// What would be legal.
+        form: &'static str,
+        /// An example.
+        example: &'static str,
+    },
+    /// No such board.
+    #[error("fault {fault}: this robot has no board or channel {device:?}; there is {}", known.join(", "))]
+    Device {
+        /// The fault.
+        fault: String,
+        /// Whose it should be.
+        device: String,
+        /// The boards.
+        known: Vec<String>,
+    },
+    /// A board to which this can not happen.
+    #[error("fault {fault}: {device:?} is not {needed}")]
+    NotPossible {
+        /// The fault.
+        fault: String,
+        /// Whose it should be.
+        device: String,
+        /// What it would have to be.
+        needed: &'static str,
+    },
+}
+
+const EXAMPLES: &str = "\"lost:0.01\", \"silent:l_arm_ft_sensor@3..4\", \"spike:l_arm_ft_sensor@6\"";
+
+impl Fault {
+    /// The board that it is about.
+    #[must_use]
+    pub fn device(&self) -> Option<&str> {
+        match self {
+            Self::Lost { .. } => None,
+            Self::Silent { device, .. }
+            | Self::Reboot { device, .. }
+            | Self::Saturate { device, .. }
+            | Self::Spike { device, .. }
+            | Self::LateHalf { device, .. } => Some(device),
+        }
+    }
+}
+
+/// `5`, as seconds.
+fn instant(text: &str) -> Option<f64> {
+    text.trim().parse().ok().filter(|t: &f64| t.is_finite() && *t >= 0.0)
+}
+
+/// `3..4` or `3..`.
+fn window(text: &str) -> Option<Window> {
+    let (from, until) = text.split_once("..")?;
+    let from = instant(from)?;
+    let until = if until.trim().is_empty() {
+        f64::INFINITY
+    } else {
+        instant(until)?
+    };
+    (from < until).then_some(Window { from, until })
+}
+
+impl FromStr for Fault {
+    type Err = FaultError;
+
+    fn from_str(text: &str) -> Result<Self, FaultError> {
+        let (kind, rest) = text.split_once(':').unwrap_or((text, ""));
+        let form = |form, example| FaultError::Form {
+            text: text.to_owned(),
+            form,
+            example,
+        };
+        let (what, when) = match rest.rsplit_once('@') {
+            Some((what, when)) => (what, Some(when)),
+            None => (rest, None),
+        };
+        let device = what.to_owned();
+        let named = !what.is_empty();
+        let span = when.and_then(window).filter(|_| named);
+        let moment = when.and_then(instant).filter(|_| named);
+        match kind {
+            "lost" => {
+                let probability = what.parse().ok().filter(|p: &f64| (0.0..=1.0).contains(p));
+                let window = when.map_or(Some(Window::ALWAYS), window);
+                match (probability, window) {
+                    (Some(probability), Some(window)) => Ok(Self::Lost { probability, window }),
+                    _ => Err(form(
+                        "lost:PROBABILITY[@FROM..UNTIL] with a probability from 0 to 1",
+                        "\"lost:0.01\"",
+                    )),
+                }
+            }
+            "silent" => span
+                .map(|window| Self::Silent { device, window })
+                .ok_or_else(|| form("silent:BOARD@FROM..UNTIL", "\"silent:l_arm_ft_sensor@3..4\"")),
+            "saturate" => span
+                .map(|window| Self::Saturate { device, window })
+                .ok_or_else(|| form("saturate:BOARD@FROM..UNTIL", "\"saturate:l_arm_ft_sensor@5..5.5\"")),
+            "reboot" => moment
+                .map(|at| Self::Reboot { device, at })
+                .ok_or_else(|| form("reboot:BOARD@TIME", "\"reboot:l_arm_ft_sensor@5\"")),
+            "spike" => moment
+                .map(|at| Self::Spike { device, at })
+                .ok_or_else(|| form("spike:BOARD@TIME", "\"spike:l_arm_ft_sensor@6\"")),
+            "late_half" => match (span, moment) {
+                (Some(window), _) => Ok(Self::LateHalf {
+                    device,
+                    window,
+                    once: false,
+                }),
+                (None, Some(from)) => Ok(Self::LateHalf {
+                    device,
+                    window: Window {
+                        from,
+                        until: f64::INFINITY,
+                    },
+                    once: true,
+                }),
+                (None, None) => Err(form(
+                    "late_half:BOARD@FROM..UNTIL or late_half:BOARD@TIME",
+                    "\"late_half:l_arm_ft_sensor@2..8\"",
+                )),
+            },
+            _ => Err(FaultError::Kind {
+                text: text.to_owned(),
+                kind: kind.to_owned(),
+            }),
+        }
+    }
+}
+
+impl fmt::Display for Window {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.until.is_finite() {
+            write!(f, "{}..{}", self.from, self.until)
+        } else {
+            write!(f, "{}..", self.from)
+        }
+    }
+}
+
+impl fmt::Display for Fault {
+    /// As it is typed.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Lost { probability, window } if *window == Window::ALWAYS => write!(f, "lost:{probability}"),
+            Self::Lost { probability, window } => write!(f, "lost:{probability}@{window}"),
+            Self::Silent { device, window } => write!(f, "silent:{device}@{window}"),
+            Self::Reboot { device, at } => write!(f, "reboot:{device}@{at}"),
+            Self::Saturate { device, window } => write!(f, "saturate:{device}@{window}"),
+            Self::Spike { device, at } => write!(f, "spike:{device}@{at}"),
+            Self::LateHalf {
+                device,
+                window,
+                once: true,
+            } => write!(f, "late_half:{device}@{}", window.from),
+            Self::LateHalf {
+                device,
+                window,
+                once: false,
+            } => write!(f, "late_half:{device}@{window}"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_typed_is_what_is_printed() {
+        for text in [
+            "lost:0.01",
+            "lost:1@2..8",
+            "silent:l_arm_ft_sensor@3..4",
+            "silent:l_arm_ft_sensor@3..",
+            "reboot:chest_imu@5",
+            "saturate:l_arm_ft_sensor@5..5.5",
+            "spike:l_arm_ft_sensor@6",
+            "late_half:l_arm_ft_sensor@2..8",
+            "late_half:l_arm_ft_sensor@2.5",
+        ] {
+            assert_eq!(text.parse::<Fault>().unwrap().to_string(), text);
+        }
+    }
+
+    #[test]
+    fn each_mistake_is_answered_with_what_would_be_legal() {
+        for (text, expected) in [
+            ("lose:0.1", "\"lose\" is not known; there is lost, silent, reboot"),
+            ("lost:1.5", "lost:PROBABILITY"),
+            ("lost", "lost:PROBABILITY"),
+            ("lost:0.1@4..3", "lost:PROBABILITY"),
+            (
+                "silent:ft",
+                "silent:BOARD@FROM..UNTIL, for example \"silent:l_arm_ft_sensor@3..4\"",
+            ),
+            ("silent:ft@3", "silent:BOARD@FROM..UNTIL"),
+            ("silent:@3..4", "silent:BOARD@FROM..UNTIL"),
+            ("spike:ft@-1", "spike:BOARD@TIME"),
+            ("spike:ft@nan", "spike:BOARD@TIME"),
+            ("reboot:ft@1..2", "reboot:BOARD@TIME"),
+            ("saturate:ft@inf..", "saturate:BOARD@FROM..UNTIL"),
+            ("late_half:ft", "late_half:BOARD@FROM..UNTIL or"),
+        ] {
+            let message = text.parse::<Fault>().unwrap_err().to_string();
+            assert!(message.contains(expected), "{text}: {message}");
+        }
+    }
+}

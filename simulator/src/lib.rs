@@ -1,0 +1,28 @@
+//! A simulated robot whose boards speak CAN: they answer the commands that start the real ones, stream with realistic rates,
+//! quantisation and noise, and fail on request. What really happens, torques included, is known.
+//!
+//! ```text
+//! Robot (gateway.toml, estimator.toml, URDF)
+//!   -> Trajectory, from a seed -> Simulation: the truth at any instant -> Simulator: boards, noise, faults -> buses
+//! ```
+//!
+//! - [`robot`]: the three files, found by the robot's name.
+//! - [`trajectory`]: how the joints move; [`truth`]: what every sensor would read without noise, through the estimator's own
+//!   dynamics (which are checked against three others in `tests/oracle`).
+//! - [`simulator`]: the boards, without links and without a clock; [`fault`]: what can be made to go wrong.
+//! - [`run`]: live, on CAN interfaces or virtual buses; [`record`]: offline, a whole session as a CAN log.
+
+pub mod fault;
+mod noise;
+pub mod record;
+pub mod robot;
+pub mod run;
+pub mod simulator;
+pub mod trajectory;
+pub mod truth;
+
+pub use fault::{Fault, FaultError};
+pub use robot::{Robot, RobotError};
+pub use run::{Options, OptionsError, Summary, is_configuration, parse_bus, run};
+pub use simulator::{Settings, Simulator, SimulatorError};
+pub use truth::{Simulation, Truth};

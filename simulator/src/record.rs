@@ -1,0 +1,236 @@
+//! The simulated robot without any link: a whole session, host's commands included, straight into a CAN log, as fast as the
+//! machine goes. And its truth as a table.
+
+use crate::robot::Robot;
+use crate::simulator::{BusCounts, Settings, Simulator, SimulatorError};
+use crate::truth::Simulation;
+use proprio_drivers::{Frame, State};
+use proprio_gateway::candump::write_log_line;
+use proprio_gateway::config::Source;
+use proprio_gateway::decoder::Decoder;
+use proprio_gateway::plan::BusPlan;
+use proprio_gateway::status::BusStatus;
+use proprio_topics::{Nanos, StampKind};
+use std::collections::VecDeque;
+use std::io::{self, Write};
+use std::sync::Arc;
+
+/// The time that a frame takes on a bus at 1 Mbit/s, about: frames of one bus are at least that far apart in a log.
+const FRAME_TIME: Nanos = Nanos::from_micros(130);
+
+/// A session that could not be recorded.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum RecordError {
+    /// The robot can not be simulated as asked.
+    #[error(transparent)]
+    Simulator(#[from] SimulatorError),
+    /// A device can not be built.
+    #[error("bus {bus:?}: {cause}")]
+    Device {
+        /// Its bus.
+        bus: String,
+        /// Why.
+        cause: proprio_drivers::SpecError,
+    },
+    /// The log could not be written.
+    #[error("the log can not be written: {0}")]
+    Io(#[from] io::Error),
+}
+
+/// What a recorded session holds, per bus.
+#[derive(Debug, Clone)]
+pub struct Recorded {
+    /// Frames that the boards sent.
+    pub sent: u64,
+    /// Frames that the host sent to them.
+    pub commands: u64,
+    /// What else is known of the boards.
+    pub counts: BusCounts,
+    /// Where the host's devices stand at the end.
+    pub states: Vec<State>,
+}
+
+/// Records `seconds` of a robot's life from `t0` on as a candump log: its boards, and a gateway's host side that starts them.
+///
+/// The interface in the log is the one that the bus is configured for, or its name for a replayed one.
+///
+/// # Errors
+/// [`RecordError`].
+pub fn record(
+    robot: &Robot,
+    settings: &Settings,
+    seconds: f64,
+    t0: Nanos,
+    mut log: impl Write,
+) -> Result<Vec<Recorded>, RecordError> {
+    let mut simulator = Simulator::new(robot, settings, t0)?;
+    let end = t0 + Nanos::from_seconds(seconds);
+    let mut hosts = Vec::new();
+    for (plan, number) in robot.plan.buses.iter().zip(0..) {
+        let decoder = Decoder::new(number, plan, None, Arc::new(BusStatus::new(number, plan))).map_err(|cause| {
+            RecordError::Device {
+                bus: plan.name.clone(),
+                cause,
+            }
+        })?;
+        hosts.push(Host {
+            decoder,
+            interface: interface(plan),
+            free: Nanos::MIN,
+            sent: 0,
+            commands: 0,
+        });
+    }
+    // In order of their stamps; a frame that waits for its bus may be later than the next one of another bus.
+    let mut waiting: VecDeque<(Nanos, usize, Frame)> = VecDeque::new();
+    let enqueue = |waiting: &mut VecDeque<(Nanos, usize, Frame)>, bus, frame: Frame| {
+        let at = waiting.iter().rposition(|(t, ..)| *t <= frame.t).map_or(0, |i| i + 1);
+        waiting.insert(at, (frame.t, bus, frame));
+    };
+    let mut now = t0;
+    while now < end {
+        for (bus, host) in hosts.iter_mut().enumerate() {
+            let mut commands = Vec::new();
+            host.decoder
+                .poll_transmit(now, |transmit| commands.push(transmit.frame));
+            for command in commands {
+                let command = host.transfer(command, now);
+                host.commands += 1;
+                simulator.on_frame(bus, &command, now);
+                enqueue(&mut waiting, bus, command);
+            }
+        }
+        while let Some((bus, frame)) = simulator.poll(now) {
+            let Some(host) = hosts.get_mut(bus) else { continue };
+            let frame = host.transfer(frame, now);
+            host.sent += 1;
+            host.decoder.on_frame(&frame, |_| {});
+            enqueue(&mut waiting, bus, frame);
+        }
+        while let Some((t, bus, frame)) = waiting.front()
+            && *t <= now
+        {
+            write_log_line(&mut log, *t, hosts.get(*bus).map_or("can0", |h| h.interface), frame)?;
+            waiting.pop_front();
+        }
+        let wakes = hosts
+            .iter()
+            .filter_map(|h| h.decoder.next_wake())
+            .chain(simulator.next_wake());
+        // Whoever wants to be called at once has answered to something that just happened: the next nanosecond will do.
+        now = wakes.min().unwrap_or(end).max(now + Nanos(1));
+    }
+    for (t, bus, frame) in waiting {
+        write_log_line(&mut log, t, hosts.get(bus).map_or("can0", |h| h.interface), &frame)?;
+    }
+    log.flush()?;
+    let counts = simulator.buses().iter().map(crate::simulator::BusSimulator::counts);
+    Ok(hosts
+        .iter()
+        .zip(counts)
+        .map(|(host, counts)| Recorded {
+            sent: host.sent,
+            commands: host.commands,
+            counts,
+            states: host.decoder.states().collect(),
+        })
+        .collect())
+}
+
+struct Host<'a> {
+    decoder: Decoder,
+    interface: &'a str,
+    /// When the bus is free again.
+    free: Nanos,
+    sent: u64,
+    commands: u64,
+}
+
+impl Host<'_> {
+    /// The frame as it arrives: after those before it.
+    fn transfer(&mut self, frame: Frame, now: Nanos) -> Frame {
+        let t = now.max(self.free);
+        self.free = t + FRAME_TIME;
+        frame.at(t, StampKind::Log)
+    }
+}
+
+/// The interface that frames of `bus` have in a log.
+fn interface(bus: &BusPlan) -> &str {
+    match &bus.source {
+        Source::SocketCan { interface } => interface,
+        Source::Virtual { name } => name,
+        Source::Replay { .. } => &bus.name,
+    }
+}
+
+/// Writes the truth as a table, one row every `period` from `t0` on, as long as `until` is not passed; returns the rows.
+///
+/// The columns are those of a sample log, velocities, accelerations and torques included, and the wrench of every contact:
+/// `contact/<name>/fx fy fz tx ty tz` \[N, Nm\], by the environment on the link, in the contact's frame. F/T readings hold
+/// their offset; nothing holds noise.
+///
+/// # Errors
+/// If `out` can not be written.
+pub fn write_truth(
+    simulation: &mut Simulation,
+    t0: Nanos,
+    until: Nanos,
+    period: Nanos,
+    mut out: impl Write,
+) -> io::Result<u64> {
+    let mut line = Vec::with_capacity(2048);
+    line.push(b't');
+    for name in simulation.joint_names() {
+        for part in ["position", "velocity", "acceleration", "torque"] {
+            write!(line, ",joint/{name}/{part}")?;
+        }
+    }
+    const WRENCH: [&str; 6] = ["fx", "fy", "fz", "tx", "ty", "tz"];
+    for name in simulation.wrench_names() {
+        for part in WRENCH {
+            write!(line, ",wrench/{name}/{part}")?;
+        }
+    }
+    for name in simulation.imu_names() {
+        for part in ["ax", "ay", "az", "gx", "gy", "gz", "alx", "aly", "alz"] {
+            write!(line, ",imu/{name}/{part}")?;
+        }
+    }
+    for name in simulation.contact_names() {
+        for part in WRENCH {
+            write!(line, ",contact/{name}/{part}")?;
+        }
+    }
+    let (mut now, mut rows) = (t0, 0);
+    let mut number = zmij::Buffer::new();
+    while now <= until {
+        line.push(b'\n');
+        out.write_all(&line)?;
+        line.clear();
+        write!(line, "{now}")?;
+        let mut cell = |value: f64| {
+            line.push(b',');
+            line.extend_from_slice(number.format(value).as_bytes());
+        };
+        let truth = simulation.at((now - t0).seconds());
+        for joint in &truth.joints {
+            [joint.position, joint.velocity, joint.acceleration, joint.torque]
+                .into_iter()
+                .for_each(&mut cell);
+        }
+        truth.wrenches.iter().flatten().copied().for_each(&mut cell);
+        for imu in &truth.imus {
+            let parts = [imu.proper_acceleration, imu.angular_velocity, imu.angular_acceleration];
+            parts.into_iter().flatten().for_each(&mut cell);
+        }
+        truth.contacts.iter().flatten().copied().for_each(&mut cell);
+        rows += 1;
+        now += period;
+    }
+    line.push(b'\n');
+    out.write_all(&line)?;
+    out.flush()?;
+    Ok(rows)
+}

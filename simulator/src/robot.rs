@@ -1,0 +1,199 @@
+//! A robot as its configuration folder describes it: gateway.toml, estimator.toml and the URDF that the latter names.
+
+use proprio_estimator::config::Config;
+use proprio_estimator::model::{Model, ModelError};
+use proprio_gateway::plan::Plan;
+use std::path::{Path, PathBuf};
+
+/// One robot: what the simulator, the gateway and the estimator know of it.
+#[derive(Debug, Clone)]
+pub struct Robot {
+    /// The folder that it was loaded from.
+    pub folder: PathBuf,
+    /// Its buses and boards: gateway.toml, checked.
+    pub plan: Plan,
+    /// Its sensors, contacts and base: estimator.toml.
+    pub config: Config,
+    /// Its bodies and joints; the joints that carry F/T sensors are kept.
+    pub model: Model,
+}
+
+/// A robot that can not be had: a wrong name or a wrong configuration.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum RobotError {
+    /// No folder of that name.
+    #[error(
+        "there is no robot {name:?}; looked for gateway.toml in {}; give the name of a folder there, or a path to one",
+        .tried.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", ")
+    )]
+    NotFound {
+        /// What was asked for.
+        name: String,
+        /// Where it was looked for.
+        tried: Vec<PathBuf>,
+    },
+    /// gateway.toml is wrong.
+    #[error(transparent)]
+    Gateway(#[from] proprio_gateway::plan::ConfigError),
+    /// estimator.toml is wrong.
+    #[error(transparent)]
+    Estimator(#[from] proprio_estimator::config::ConfigError),
+    /// The URDF is wrong.
+    #[error("{}: {cause}", .file.display())]
+    Model {
+        /// The file.
+        file: PathBuf,
+        /// What is wrong with it.
+        cause: Box<ModelError>,
+    },
+    /// The files do not fit each other.
+    #[error("{}: {problem}", .folder.display())]
+    Mismatch {
+        /// Their folder.
+        folder: PathBuf,
+        /// What one says and the other does not.
+        problem: String,
+    },
+}
+
+impl Robot {
+    /// The folders in which a robot called `name` may be, in order: `name` itself as a path; `config/NAME` of the working
+    /// directory, of the executable's folder and of those above it; of the source tree that this was built from;
+    /// `/usr/share/proprio/config/NAME`; `/etc/proprio/NAME`.
+    #[must_use]
+    pub fn candidates(name: &str) -> Vec<PathBuf> {
+        let mut folders = vec![PathBuf::from(name)];
+        // With a slash it can only be a path.
+        if name.contains('/') || name.is_empty() || name == ".." || name == "." {
+            return folders;
+        }
+        let below = |root: &Path| root.join("config").join(name);
+        folders.push(below(Path::new(".")));
+        if let Ok(executable) = std::env::current_exe() {
+            // An executable in target/release has the source tree's config above it.
+            folders.extend(executable.ancestors().skip(1).take(4).map(below));
+        }
+        if let Some(tree) = Path::new(env!("CARGO_MANIFEST_DIR")).parent() {
+            folders.push(below(tree));
+        }
+        folders.push(below(Path::new("/usr/share/proprio")));
+        folders.push(Path::new("/etc/proprio").join(name));
+        let mut seen = Vec::new();
+        folders.retain(|folder| {
+            let new = !seen.contains(folder);
+            seen.push(folder.clone());
+            new
+        });
+        folders
+    }
+
+    /// Finds the folder of a robot by its name or path.
+    ///
+    /// # Errors
+    /// [`RobotError::NotFound`], with everything that was tried.
+    pub fn find(name: &str) -> Result<PathBuf, RobotError> {
+        let tried = Self::candidates(name);
+        match tried.iter().find(|folder| folder.join("gateway.toml").is_file()) {
+            Some(folder) => Ok(folder.clone()),
+            None => Err(RobotError::NotFound {
+                name: name.to_owned(),
+                tried,
+            }),
+        }
+    }
+
+    /// Finds a robot by name or path, and loads it.
+    ///
+    /// # Errors
+    /// [`RobotError`].
+    pub fn open(name: &str) -> Result<Self, RobotError> {
+        Self::load(&Self::find(name)?)
+    }
+
+    /// Loads the robot in `folder`.
+    ///
+    /// # Errors
+    /// [`RobotError`]: a file that can not be used, or files that do not fit each other.
+    pub fn load(folder: &Path) -> Result<Self, RobotError> {
+        let plan = Plan::load(&folder.join("gateway.toml"))?;
+        let config = Config::load(&folder.join("estimator.toml"))?;
+        let keep: Vec<&str> = config.force_torque.iter().map(|ft| ft.joint.as_str()).collect();
+        let model = Model::from_file(&config.model, &keep).map_err(|cause| RobotError::Model {
+            file: config.model.clone(),
+            cause: Box::new(cause),
+        })?;
+        if plan.robot != config.robot {
+            let problem = format!(
+                "gateway.toml says robot = {:?}, estimator.toml robot = {:?}: they would not find each other",
+                plan.robot, config.robot
+            );
+            return Err(RobotError::Mismatch {
+                folder: folder.to_owned(),
+                problem,
+            });
+        }
+        Ok(Self {
+            folder: folder.to_owned(),
+            plan,
+            config,
+            model,
+        })
+    }
+
+    /// Something that the files of this robot do not agree about.
+    pub(crate) fn mismatch(&self, problem: String) -> RobotError {
+        RobotError::Mismatch {
+            folder: self.folder.clone(),
+            problem,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_robot_of_the_source_tree_is_found_from_anywhere() {
+        let robot = Robot::open("icub_left_arm").unwrap();
+        assert_eq!(robot.plan.robot, "icub_left_arm");
+        assert_eq!(robot.model.dof_count(), 7);
+        assert!(robot.model.joint("l_arm_ft_sensor").is_some(), "the F/T joint is kept");
+        let by_path = Robot::open(robot.folder.to_str().unwrap()).unwrap();
+        assert_eq!(by_path.plan.channels, robot.plan.channels);
+    }
+
+    #[test]
+    fn a_robot_that_is_not_there_is_told_with_all_that_was_tried() {
+        let message = Robot::open("no_such_robot").unwrap_err().to_string();
+        for place in [
+            "\"no_such_robot\"",
+            "./config/no_such_robot",
+            "/etc/proprio/no_such_robot",
+            "/usr/share/proprio/config/",
+        ] {
+            assert!(message.contains(place), "{place}: {message}");
+        }
+        // A path is not looked for anywhere else.
+        assert_eq!(Robot::candidates("some/where"), [PathBuf::from("some/where")]);
+    }
+
+    #[test]
+    fn files_that_do_not_fit_each_other_are_refused() {
+        let source = Robot::find("icub_left_arm").unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        for file in ["gateway.toml", "estimator.toml", "model.urdf"] {
+            std::fs::copy(source.join(file), folder.path().join(file)).unwrap();
+        }
+        let file = folder.path().join("estimator.toml");
+        let text = std::fs::read_to_string(&file).unwrap();
+        std::fs::write(&file, text.replace("robot = \"icub_left_arm\"", "robot = \"other\"")).unwrap();
+        let message = Robot::load(folder.path()).unwrap_err().to_string();
+        assert!(message.contains("robot = \"other\""), "{message}");
+        std::fs::write(folder.path().join("model.urdf"), "<robot").unwrap();
+        std::fs::write(&file, text).unwrap();
+        let message = Robot::load(folder.path()).unwrap_err().to_string();
+        assert!(message.contains("model.urdf"), "{message}");
+    }
+}

@@ -1,0 +1,307 @@
+//! The simulated robot alone, live: its boards on CAN interfaces or virtual buses, one thread per bus. `proprio simulate`.
+
+use crate::record::write_truth;
+use crate::robot::Robot;
+use crate::simulator::{BusCounts, BusSimulator, Settings, Simulator};
+use crate::truth::Simulation;
+use anyhow::Context as _;
+use proprio_gateway::clock::{Clock, Monotonic};
+use proprio_gateway::config::Source;
+use proprio_gateway::daemon::open_link;
+use proprio_gateway::link::{Link, Received};
+use proprio_topics::Nanos;
+use serde::Serialize;
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::thread;
+
+/// The truth is written with one row per millisecond.
+pub const TRUTH_PERIOD: Nanos = Nanos::from_millis(1);
+
+/// The longest that a bus thread waits: then it looks whether it should stop.
+const MOST_WAIT: Nanos = Nanos::from_millis(20);
+/// How long a frame may wait for a full queue.
+const SEND_WITHIN: Nanos = Nanos::from_millis(20);
+
+/// How to run the simulated robot.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Options {
+    /// Where the buses are, in the order of gateway.toml: `can0` or `virtual:NAME` ([`parse_bus`]). Empty: the sources that
+    /// gateway.toml gives.
+    pub buses: Vec<Source>,
+    /// The domain of virtual buses: the gateway's.
+    pub domain: String,
+    /// How long; `None`: until it is told to stop.
+    pub seconds: Option<f64>,
+    /// What the robot does. The push on its hand comes once in `seconds` if they are given, else once in `settings.cycle`.
+    pub settings: Settings,
+    /// Where to write the truth, once it is over.
+    pub truth: Option<PathBuf>,
+}
+
+/// Options that can not be followed: exit 2.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum OptionsError {
+    /// A bus that is neither an interface nor a virtual bus.
+    #[error("bus {0:?}: it must be a CAN interface such as \"can0\", or a virtual bus such as \"virtual:left_arm\"")]
+    Bus(String),
+    /// Not as many buses as the robot has.
+    #[error("{given} buses are given; the robot has {}: {}; give one for each, in this order, or none", names.len(), names.join(", "))]
+    BusCount {
+        /// How many.
+        given: usize,
+        /// The robot's.
+        names: Vec<String>,
+    },
+    /// The same bus twice.
+    #[error("two buses of the robot have the same source; each needs one of its own")]
+    SameBus,
+    /// A bus on which nothing can be sent.
+    #[error("bus {0:?} is a replayed log; give --bus with an interface or a virtual bus")]
+    Replay(String),
+    /// A duration that is none.
+    #[error("seconds = {0} must be above 0")]
+    Seconds(f64),
+}
+
+/// Reads `can0` or `virtual:NAME`.
+///
+/// # Errors
+/// [`OptionsError::Bus`].
+pub fn parse_bus(text: &str) -> Result<Source, OptionsError> {
+    match text.split_once(':') {
+        Some(("virtual", name)) if !name.is_empty() => Ok(Source::Virtual { name: name.to_owned() }),
+        None if !text.is_empty() && text.len() <= 15 && text != "virtual" => Ok(Source::SocketCan {
+            interface: text.to_owned(),
+        }),
+        _ => Err(OptionsError::Bus(text.to_owned())),
+    }
+}
+
+/// What became of a run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Summary {
+    /// The robot's name.
+    pub robot: String,
+    /// The seed.
+    pub seed: u64,
+    /// When the simulation began: CLOCK_MONOTONIC \[ns\].
+    pub t0: i64,
+    /// How long it ran \[s\].
+    pub seconds: f64,
+    /// Frames that reached a bus, all together.
+    pub sent: u64,
+    /// Frames that a `lost` fault took, all together: not among those sent.
+    pub lost_on_request: u64,
+    /// The buses, in the order of gateway.toml.
+    pub buses: Vec<BusSummary>,
+    /// Rows of truth written.
+    pub truth_rows: u64,
+}
+
+/// What became of one bus.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct BusSummary {
+    /// Its name.
+    pub name: String,
+    /// Where it is, as [`parse_bus`] reads it.
+    pub source: String,
+    /// Frames that reached the bus.
+    pub sent: u64,
+    /// Frames that could not be sent: the interface was down, or its queue full.
+    pub send_failures: u64,
+    /// Frames received: commands to the boards.
+    pub received: u64,
+    /// Frames that a `lost` fault took.
+    pub lost_on_request: u64,
+    /// Readings left out because this machine was too slow for them.
+    pub skipped: u64,
+    /// Readings that a board could not encode.
+    pub refused: u64,
+    /// The longest that an emission was late \[s\].
+    pub latest: f64,
+}
+
+/// Runs `robot` until `options.seconds` are over or `stop` is set.
+///
+/// # Errors
+/// One chain that says what, where and what to do: [`OptionsError`] and [`crate::SimulatorError`] at its root are wrong
+/// configurations ([`is_configuration`]); a bus that can not be opened; a file that can not be written.
+pub fn run(robot: &Robot, options: &Options, stop: &AtomicBool) -> anyhow::Result<Summary> {
+    let buses = sources(robot, options)?;
+    let mut settings = options.settings.clone();
+    if let Some(seconds) = options.seconds {
+        settings.cycle = seconds;
+    }
+    // Whatever can be wrong shows before anything is sent.
+    let mut simulation = Simulation::new(robot, &settings).map_err(crate::SimulatorError::from)?;
+    let truth = options
+        .truth
+        .as_deref()
+        .map(|path| Ok::<_, anyhow::Error>((path, create(path)?)))
+        .transpose()?;
+    let mut links = Vec::new();
+    for (plan, source) in robot.plan.buses.iter().zip(&buses) {
+        let mut plan = plan.clone();
+        plan.source = source.clone();
+        // No claims: boards hear everything, as on a real bus.
+        let link = open_link(&plan, &options.domain, &[]);
+        links.push(link.with_context(|| format!("bus {:?} ({})", plan.name, source_text(source)))?);
+    }
+    let clock = Monotonic;
+    let t0 = clock.now();
+    let end = options.seconds.map_or(Nanos::MAX, |s| t0 + Nanos::from_seconds(s));
+    let simulator = Simulator::new(robot, &settings, t0)?;
+    tracing::info!(
+        robot = robot.plan.robot,
+        seed = settings.seed,
+        buses = buses.len(),
+        "the simulated robot has power"
+    );
+    let mut summaries = Vec::new();
+    thread::scope(|scope| {
+        let threads: Vec<_> = simulator
+            .into_buses()
+            .into_iter()
+            .zip(links)
+            .map(|(bus, link)| {
+                let name: String = format!("board {}", bus.name()).chars().take(15).collect();
+                thread::Builder::new()
+                    .name(name)
+                    .spawn_scoped(scope, move || turn_until(bus, link, &clock, end, stop))
+            })
+            .collect();
+        for thread in threads {
+            let thread = thread
+                .context("cannot start a thread")
+                .inspect_err(|_| stop.store(true, Relaxed))?;
+            summaries.push(
+                thread
+                    .join()
+                    .map_err(|_| anyhow::anyhow!("a bus thread panicked; this is a mistake in the program"))?,
+            );
+        }
+        Ok::<_, anyhow::Error>(())
+    })?;
+    let ended = clock.now().min(end);
+    let truth_rows = match truth {
+        None => 0,
+        Some((path, file)) => write_truth(&mut simulation, t0, ended, TRUTH_PERIOD, file)
+            .with_context(|| format!("cannot write {}", path.display()))?,
+    };
+    let buses: Vec<BusSummary> = robot
+        .plan
+        .buses
+        .iter()
+        .zip(&buses)
+        .zip(summaries)
+        .map(|((plan, source), (counts, link))| BusSummary {
+            name: plan.name.clone(),
+            source: source_text(source),
+            sent: link.sent,
+            send_failures: link.send_failures,
+            received: link.received,
+            lost_on_request: counts.lost_on_request,
+            skipped: counts.skipped,
+            refused: counts.refused,
+            latest: counts.latest.seconds(),
+        })
+        .collect();
+    Ok(Summary {
+        robot: robot.plan.robot.clone(),
+        seed: settings.seed,
+        t0: t0.0,
+        seconds: (ended - t0).seconds(),
+        sent: buses.iter().map(|b| b.sent).sum(),
+        lost_on_request: buses.iter().map(|b| b.lost_on_request).sum(),
+        buses,
+        truth_rows,
+    })
+}
+
+/// Whether an error that [`run`] or [`Robot::open`] ended with is a wrong configuration: exit 2.
+#[must_use]
+pub fn is_configuration(error: &anyhow::Error) -> bool {
+    error.chain().any(|cause| {
+        cause.is::<OptionsError>()
+            || cause.is::<crate::SimulatorError>()
+            || cause.is::<crate::RobotError>()
+            || cause.is::<crate::FaultError>()
+    })
+}
+
+/// The loop of one bus: send what is due, wait for a frame or for the next time that something is due.
+fn turn_until(
+    mut bus: BusSimulator,
+    mut link: Box<dyn Link>,
+    clock: &impl Clock,
+    end: Nanos,
+    stop: &AtomicBool,
+) -> (BusCounts, proprio_gateway::link::LinkCounters) {
+    loop {
+        let now = clock.now();
+        if now >= end || stop.load(Relaxed) {
+            break;
+        }
+        while let Some(frame) = bus.poll(clock.now()) {
+            // The link counts what it could not send.
+            let _ = link.send(&frame, clock.now() + SEND_WITHIN);
+        }
+        let deadline = (clock.now() + MOST_WAIT)
+            .min(end)
+            .min(bus.next_wake().unwrap_or(Nanos::MAX));
+        match link.recv(deadline) {
+            Received::Frame(frame) => bus.on_frame(&frame, clock.now()),
+            Received::TimedOut | Received::StateChanged => {}
+            Received::Ended => break,
+        }
+    }
+    (bus.counts(), link.counters())
+}
+
+fn sources(robot: &Robot, options: &Options) -> Result<Vec<Source>, OptionsError> {
+    if let Some(seconds) = options.seconds
+        && !(seconds > 0.0 && seconds.is_finite())
+    {
+        return Err(OptionsError::Seconds(seconds));
+    }
+    let plans = &robot.plan.buses;
+    let own: Vec<Source> = plans.iter().map(|b| b.source.clone()).collect();
+    let sources = if options.buses.is_empty() {
+        own
+    } else {
+        options.buses.clone()
+    };
+    if sources.len() != plans.len() {
+        let names = plans.iter().map(|b| b.name.clone()).collect();
+        return Err(OptionsError::BusCount {
+            given: sources.len(),
+            names,
+        });
+    }
+    for (number, (source, plan)) in sources.iter().zip(plans).enumerate() {
+        if matches!(source, Source::Replay { .. }) {
+            return Err(OptionsError::Replay(plan.name.clone()));
+        }
+        if sources.iter().take(number).any(|other| other == source) {
+            return Err(OptionsError::SameBus);
+        }
+    }
+    Ok(sources)
+}
+
+fn source_text(source: &Source) -> String {
+    match source {
+        Source::SocketCan { interface } => interface.clone(),
+        Source::Virtual { name } => format!("virtual:{name}"),
+        Source::Replay { log, .. } => log.display().to_string(),
+    }
+}
+
+fn create(path: &Path) -> anyhow::Result<BufWriter<File>> {
+    let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
+    Ok(BufWriter::new(file))
+}

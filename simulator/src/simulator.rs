@@ -1,0 +1,676 @@
+//! The robot's boards on its buses, without links and without a clock: frames in, frames out, time as an argument.
+//!
+//! ```text
+//! commands --> on_frame --> Board (drivers) --> answers --\
+//!                             ^ encode                     >--> lost on request? --> poll --> the bus
+//! Simulation::at(now) --> measure: noise, faults --> frames /
+//! ```
+//!
+//! Every board has a clock of its own: it starts at a random phase, runs up to 30 ppm fast or slow, and each emission is up to
+//! 2 % of the period (0.1 ms at most) late. A reading is the truth *at the instant it is sent*: where the machine that simulates
+//! was held up, readings are missing, as if the board had skipped them, but none is old.
+
+use crate::fault::{Fault, FaultError, Window};
+use crate::noise::Random;
+use crate::robot::{Robot, RobotError};
+use crate::truth::Simulation;
+use proprio_drivers::{Board, Decoded, Frame, Frames, Mode, Options, Spec};
+use proprio_gateway::plan::{DevicePlan, JointMap};
+use proprio_topics::{Actuator, Imu, JointState, Kind, Nanos, Quality, Reading, Saturation, StampKind, Wrench};
+use std::collections::VecDeque;
+
+/// Standard deviation of a simulated joint position: what gears and bearings add to the encoder's steps \[rad or m\].
+pub const JOINT_NOISE: f64 = 2e-5;
+/// Standard deviation of a simulated IMU's acceleration \[m/s^2\].
+pub const ACCELERATION_NOISE: f64 = 0.03;
+/// Standard deviation of a simulated IMU's angular velocity \[rad/s\].
+pub const ANGULAR_VELOCITY_NOISE: f64 = 0.002;
+
+/// How far off a spike is, on every axis: \[N\] and \[Nm\].
+const SPIKE: (f64, f64) = (200.0, 5.0);
+/// How long a board is gone when it reboots \[s\].
+const REBOOT: f64 = 0.5;
+/// How often a second half comes late while `late_half` lasts.
+const LATE_SHARE: f64 = 0.1;
+/// How often a motor board tells its status. (A real one does with every reading; that would double the frames for nothing.)
+const STATUS_PERIOD: Nanos = Nanos::from_millis(100);
+/// The mode that a simulated motor board tells: current control.
+const CURRENT_CONTROL: u32 = 6;
+/// Most that a board's clock is off.
+const DRIFT: f64 = 30e-6;
+/// Most that an emission is late, as a share of the period, and at all \[ns\].
+const JITTER: (f64, f64) = (0.02, 100_000.0);
+
+/// What the simulated robot does.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Settings {
+    /// Motion, noise and faults are drawn from it.
+    pub seed: u64,
+    /// How long the robot stands still at first \[s\].
+    pub still: f64,
+    /// Whether something pushes its hand, from 40 % to 60 % of every cycle.
+    pub push: bool,
+    /// The length of a cycle \[s\].
+    pub cycle: f64,
+    /// Whether sensors are noisy. Without, only the boards' own quantisation is left.
+    pub noise: bool,
+    /// What goes wrong.
+    pub faults: Vec<Fault>,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            still: 1.0,
+            push: true,
+            cycle: 20.0,
+            noise: true,
+            faults: Vec::new(),
+        }
+    }
+}
+
+/// A robot that can not be simulated as asked.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SimulatorError {
+    /// Its files are wrong or do not fit each other.
+    #[error(transparent)]
+    Robot(#[from] RobotError),
+    /// A fault that can not happen to it.
+    #[error(transparent)]
+    Fault(#[from] FaultError),
+}
+
+/// What one bus has done.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct BusCounts {
+    /// Frames that a `lost` fault took: they never reached the bus.
+    pub lost_on_request: u64,
+    /// Readings not sent because the boards were polled too late for them.
+    pub skipped: u64,
+    /// Readings that a board could not encode.
+    pub refused: u64,
+    /// The longest that an emission was late \[ns\].
+    pub latest: Nanos,
+}
+
+/// All boards of a robot.
+#[derive(Debug)]
+pub struct Simulator {
+    buses: Vec<BusSimulator>,
+}
+
+impl Simulator {
+    /// The boards of `robot`, powered at `t0`. Those that need to be started stay silent until somebody does.
+    ///
+    /// # Errors
+    /// [`SimulatorError`]: files that do not fit each other, a fault that can not happen to this robot.
+    pub fn new(robot: &Robot, settings: &Settings, t0: Nanos) -> Result<Self, SimulatorError> {
+        let simulation = Simulation::new(robot, settings)?;
+        let mut buses = Vec::new();
+        for (number, bus) in robot.plan.buses.iter().enumerate() {
+            let mut nodes = Vec::new();
+            for device in &bus.devices {
+                let stream = nodes.len() + 1000 * number;
+                nodes.push(Node::new(robot, &simulation, device, settings, stream, t0)?);
+            }
+            buses.push(BusSimulator {
+                name: bus.name.clone(),
+                simulation: simulation.clone(),
+                t0,
+                nodes,
+                outbox: VecDeque::with_capacity(64),
+                losses: Vec::new(),
+                random: Random::new(settings.seed, "bus", number),
+                counts: BusCounts::default(),
+            });
+        }
+        let mut this = Self { buses };
+        for fault in &settings.faults {
+            this.arrange(robot, fault)?;
+        }
+        Ok(this)
+    }
+
+    /// The buses, in the order of the plan.
+    #[must_use]
+    pub fn buses(&self) -> &[BusSimulator] {
+        &self.buses
+    }
+
+    /// The buses, each to be run by a thread of its own.
+    #[must_use]
+    pub fn into_buses(self) -> Vec<BusSimulator> {
+        self.buses
+    }
+
+    /// Takes a frame from bus number `bus` at `now`.
+    pub fn on_frame(&mut self, bus: usize, frame: &Frame, now: Nanos) {
+        if let Some(bus) = self.buses.get_mut(bus) {
+            bus.on_frame(frame, now);
+        }
+    }
+
+    /// The next frame that is due at `now`, with the number of its bus; call until `None`.
+    pub fn poll(&mut self, now: Nanos) -> Option<(usize, Frame)> {
+        self.buses
+            .iter_mut()
+            .enumerate()
+            .find_map(|(number, bus)| bus.poll(now).map(|frame| (number, frame)))
+    }
+
+    /// When to poll again; `None`: nothing will be due until a frame comes.
+    #[must_use]
+    pub fn next_wake(&self) -> Option<Nanos> {
+        self.buses.iter().filter_map(BusSimulator::next_wake).min()
+    }
+
+    fn arrange(&mut self, robot: &Robot, fault: &Fault) -> Result<(), FaultError> {
+        let Some(name) = fault.device() else {
+            if let Fault::Lost { probability, window } = fault {
+                self.buses
+                    .iter_mut()
+                    .for_each(|bus| bus.losses.push((*probability, *window)));
+            }
+            return Ok(());
+        };
+        // By the board's own name, else by the name of one of its channels.
+        let channel = robot.plan.channels.iter().find(|c| c.name == name);
+        let place = robot.plan.buses.iter().enumerate().find_map(|(bus, plan)| {
+            plan.devices
+                .iter()
+                .position(|d| d.name == name)
+                .map(|device| (bus, device))
+        });
+        let place = place.or(channel.map(|c| (c.bus, c.device)));
+        let node = place.and_then(|(bus, device)| self.buses.get_mut(bus)?.nodes.get_mut(device));
+        let Some(node) = node else {
+            let known = robot
+                .plan
+                .buses
+                .iter()
+                .flat_map(|b| &b.devices)
+                .map(|d| d.name.clone())
+                .collect();
+            return Err(FaultError::Device {
+                fault: fault.to_string(),
+                device: name.to_owned(),
+                known,
+            });
+        };
+        let possible = |holds: bool, needed| {
+            if holds {
+                return Ok(());
+            }
+            Err(FaultError::NotPossible {
+                fault: fault.to_string(),
+                device: name.to_owned(),
+                needed,
+            })
+        };
+        match fault {
+            Fault::Lost { .. } => {}
+            Fault::Silent { window, .. } => node.silences.push(*window),
+            Fault::Reboot { at, .. } => {
+                node.silences.push(Window {
+                    from: *at,
+                    until: at + REBOOT,
+                });
+                node.reboots.push(Nanos::from_seconds(*at));
+            }
+            Fault::Saturate { window, .. } => {
+                possible(node.kind == Kind::Wrench, "an F/T sensor")?;
+                node.saturations.push(*window);
+            }
+            Fault::Spike { at, .. } => {
+                possible(node.kind == Kind::Wrench, "an F/T sensor")?;
+                node.spikes.push(*at);
+            }
+            Fault::LateHalf { window, once, .. } => {
+                possible(
+                    node.kind != Kind::Joint,
+                    "a board that sends a reading in several frames",
+                )?;
+                node.late.push((*window, *once));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The boards of one bus.
+#[derive(Debug)]
+pub struct BusSimulator {
+    name: String,
+    simulation: Simulation,
+    t0: Nanos,
+    nodes: Vec<Node>,
+    /// Frames that are due.
+    outbox: VecDeque<Frame>,
+    losses: Vec<(f64, Window)>,
+    random: Random,
+    counts: BusCounts,
+}
+
+impl BusSimulator {
+    /// The bus's name in the plan.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// What it has done.
+    #[must_use]
+    pub const fn counts(&self) -> BusCounts {
+        self.counts
+    }
+
+    /// Takes a frame from the bus at `now`; [`BusSimulator::poll`] gives the answers.
+    pub fn on_frame(&mut self, frame: &Frame, now: Nanos) {
+        let t = (now - self.t0).seconds();
+        let mut answers = Frames::new();
+        for node in &mut self.nodes {
+            if node.is_silent(t) {
+                continue;
+            }
+            node.board.on_frame(frame, &mut answers);
+            node.follow(now);
+        }
+        self.post(&answers, t);
+    }
+
+    /// The next frame that is due at `now`, stamped so; call until `None`.
+    pub fn poll(&mut self, now: Nanos) -> Option<Frame> {
+        loop {
+            if let Some(frame) = self.outbox.pop_front() {
+                return Some(frame.at(now, StampKind::None));
+            }
+            let t0 = self.t0;
+            for node in &mut self.nodes {
+                node.reboot_if_due(now - t0, now);
+            }
+            let due = |node: &Node| node.slots.as_ref().map(|s| s.due).filter(|due| *due <= now);
+            let (index, _) = self
+                .nodes
+                .iter()
+                .enumerate()
+                .filter_map(|(i, n)| Some((i, due(n)?)))
+                .min_by_key(|(_, due)| *due)?;
+            self.emit(index, now);
+        }
+    }
+
+    /// When to poll again; `None`: nothing will be due until a frame comes.
+    #[must_use]
+    pub fn next_wake(&self) -> Option<Nanos> {
+        if !self.outbox.is_empty() {
+            return Some(Nanos::MIN);
+        }
+        let slots = self.nodes.iter().filter_map(|n| n.slots.as_ref().map(|s| s.due));
+        let reboots = self.nodes.iter().flat_map(|n| n.reboots.iter().map(|at| self.t0 + *at));
+        slots.chain(reboots).min()
+    }
+
+    /// Board `index` sends its reading of `now`.
+    fn emit(&mut self, index: usize, now: Nanos) {
+        let Some(node) = self.nodes.get_mut(index) else { return };
+        let Some(slots) = &mut node.slots else { return };
+        self.counts.latest = self.counts.latest.max(now - slots.due);
+        self.counts.skipped += slots.advance(now, &mut node.random);
+        let t = (now - self.t0).seconds();
+        let mut frames = Frames::new();
+        let refused = node.read(&mut self.simulation, t, now, &mut frames);
+        self.counts.refused += refused;
+        if node.is_silent(t) {
+            // What it measures meanwhile nobody gets to know; neither the half that was still to come.
+            node.held.clear();
+            return;
+        }
+        node.delay_second_half(t, &mut frames);
+        self.post(&frames, t);
+    }
+
+    /// Puts frames on the bus, but for those that a fault takes.
+    fn post(&mut self, frames: &Frames, t: f64) {
+        for frame in frames {
+            let lost = self
+                .losses
+                .iter()
+                .any(|(p, window)| window.contains(t) && self.random.happens(*p));
+            if lost {
+                self.counts.lost_on_request += 1;
+            } else {
+                self.outbox.push_back(*frame);
+            }
+        }
+    }
+}
+
+/// What an output of a board measures.
+#[derive(Debug, Clone, Copy)]
+enum Source {
+    /// Joint of this number in the simulation.
+    Joint(usize),
+    /// F/T sensor of this number, with its noise.
+    Wrench(usize, [f64; 3], [f64; 3]),
+    /// IMU of this number.
+    Imu(usize),
+}
+
+/// One board, what it measures, and what is to go wrong with it.
+struct Node {
+    kind: Kind,
+    options: Options,
+    spec: Spec,
+    board: Box<dyn Board>,
+    outputs: Vec<(u8, JointMap, Source)>,
+    noise: bool,
+    random: Random,
+    /// Where in its period it begins, 0 to 1.
+    phase: f64,
+    /// By how much its clock is off.
+    drift: f64,
+    /// When it sends; `None` while it does not stream.
+    slots: Option<Slots>,
+    /// When a motor board next tells its status.
+    status: Option<Nanos>,
+    silences: Vec<Window>,
+    saturations: Vec<Window>,
+    spikes: Vec<f64>,
+    reboots: Vec<Nanos>,
+    late: Vec<(Window, bool)>,
+    /// The half that comes late.
+    held: Frames,
+}
+
+impl std::fmt::Debug for Node {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Node")
+            .field("kind", &self.kind)
+            .field("spec", &self.spec)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Node {
+    fn new(
+        robot: &Robot,
+        simulation: &Simulation,
+        device: &DevicePlan,
+        settings: &Settings,
+        stream: usize,
+        t0: Nanos,
+    ) -> Result<Self, RobotError> {
+        let mut outputs = Vec::new();
+        for route in &device.routes {
+            let Some(channel) = robot.plan.channels.get(route.channel as usize) else {
+                continue;
+            };
+            let missing = |problem: &str| robot.mismatch(format!("gateway.toml has {:?}: {problem}", channel.name));
+            let source = match channel.kind {
+                Kind::Joint => Source::Joint(
+                    simulation.joint(&channel.name).ok_or_else(|| missing("the URDF has no moving joint of that name"))?,
+                ),
+                Kind::Wrench => {
+                    let number = simulation.wrench(&channel.name);
+                    let number = number.ok_or_else(|| missing("estimator.toml has no [[force_torque]] with that sensor"))?;
+                    let ft = robot.config.force_torque.get(number).ok_or_else(|| missing("it is not configured"))?;
+                    Source::Wrench(number, ft.noise_n, ft.noise_nm)
+                }
+                Kind::Imu => Source::Imu(simulation.imu(&channel.name).ok_or_else(|| {
+                    missing("where it sits is not known: it is not the [base] of estimator.toml, and no link of the URDF has its name")
+                })?),
+            };
+            outputs.push((route.output, route.map, source));
+        }
+        let mut random = Random::new(settings.seed, "board", stream);
+        let mut node = Self {
+            kind: device.options.kind(),
+            board: power_on(robot, device)?,
+            options: device.options.clone(),
+            spec: device.spec.clone(),
+            outputs,
+            noise: settings.noise,
+            phase: random.uniform(0.0, 1.0),
+            drift: random.uniform(-DRIFT, DRIFT),
+            random,
+            slots: None,
+            status: matches!(device.options, Options::IcubMotor(_)).then_some(t0),
+            silences: Vec::new(),
+            saturations: Vec::new(),
+            spikes: Vec::new(),
+            reboots: Vec::new(),
+            late: Vec::new(),
+            held: Frames::new(),
+        };
+        node.follow(t0);
+        Ok(node)
+    }
+
+    fn is_silent(&self, t: f64) -> bool {
+        self.silences.iter().any(|w| w.contains(t))
+    }
+
+    /// Sends as its board has been told, from `now` on.
+    fn follow(&mut self, now: Nanos) {
+        match self.board.period() {
+            None => self.slots = None,
+            Some(period) if self.slots.as_ref().is_some_and(|s| s.period == period) => {}
+            Some(period) => {
+                let origin = now + scaled(period, self.phase);
+                self.slots = Some(Slots::new(period, origin, self.drift, &mut self.random));
+            }
+        }
+    }
+
+    fn reboot_if_due(&mut self, since_t0: Nanos, now: Nanos) {
+        let before = self.reboots.len();
+        self.reboots.retain(|at| *at > since_t0);
+        if self.reboots.len() < before
+            && let Ok(board) = power_on_with(&self.options, &self.spec)
+        {
+            self.board = board;
+            self.slots = None;
+            self.held.clear();
+            self.follow(now);
+        }
+    }
+
+    /// Encodes what it measures at `t`; returns how many readings its board refused.
+    fn read(&mut self, simulation: &mut Simulation, t: f64, now: Nanos, frames: &mut Frames) -> u64 {
+        let mut refused = 0;
+        let mut quality = Quality::GOOD;
+        if self.saturations.iter().any(|w| w.contains(t)) {
+            quality = quality.with_saturation(2, Saturation::High);
+        }
+        let spikes = self.spikes.len();
+        self.spikes.retain(|at| *at > t);
+        let spike = self.spikes.len() < spikes;
+        for (output, map, source) in &self.outputs {
+            let reading = match *source {
+                Source::Joint(joint) => {
+                    let Some(point) = simulation.motion(joint, t) else {
+                        continue;
+                    };
+                    let noise = if self.noise {
+                        JOINT_NOISE * self.random.normal()
+                    } else {
+                        0.0
+                    };
+                    let state = JointState {
+                        position: point.position + noise,
+                        velocity: point.velocity,
+                        acceleration: point.acceleration,
+                        ..JointState::ABSENT
+                    };
+                    Reading::Joint(map.device(state))
+                }
+                Source::Wrench(number, noise_n, noise_nm) => {
+                    let Some(&[fx, fy, fz, tx, ty, tz]) = simulation.at(t).wrenches.get(number) else {
+                        continue;
+                    };
+                    let mut wrench = Wrench {
+                        force: [fx, fy, fz],
+                        torque: [tx, ty, tz],
+                    };
+                    if self.noise {
+                        self.random.disturb(&mut wrench.force, noise_n);
+                        self.random.disturb(&mut wrench.torque, noise_nm);
+                    }
+                    if spike {
+                        wrench.force = wrench.force.map(|f| f + SPIKE.0);
+                        wrench.torque = wrench.torque.map(|n| n + SPIKE.1);
+                    }
+                    Reading::Wrench(wrench)
+                }
+                Source::Imu(number) => {
+                    let Some(truth) = simulation.at(t).imus.get(number) else {
+                        continue;
+                    };
+                    let mut imu = Imu {
+                        proper_acceleration: truth.proper_acceleration,
+                        angular_velocity: truth.angular_velocity,
+                        // Not simulated: constants for boards that are told to send them.
+                        magnetic_field: [2e-5, 0.0, -4e-5],
+                        orientation: [1.0, 0.0, 0.0, 0.0],
+                        ..Imu::ABSENT
+                    };
+                    if self.noise {
+                        self.random
+                            .disturb(&mut imu.proper_acceleration, [ACCELERATION_NOISE; 3]);
+                        self.random
+                            .disturb(&mut imu.angular_velocity, [ANGULAR_VELOCITY_NOISE; 3]);
+                    }
+                    Reading::Imu(imu)
+                }
+            };
+            refused += u64::from(self.board.encode(*output, &reading, quality, frames).is_err());
+        }
+        if let Some(status) = self.status
+            && status <= now
+        {
+            self.status = Some(now + STATUS_PERIOD);
+            let actuator = Actuator {
+                duty: 0.0,
+                mode: CURRENT_CONTROL,
+                encoder: 0,
+                faults: 0,
+                reserved: 0,
+            };
+            refused += u64::from(
+                self.board
+                    .encode(0, &Reading::Actuator(actuator), quality, frames)
+                    .is_err(),
+            );
+        }
+        refused
+    }
+
+    /// Sends the half that was held back behind the first half of this reading, and perhaps holds this one's.
+    fn delay_second_half(&mut self, t: f64, frames: &mut Frames) {
+        let mut together = Frames::new();
+        let mut own = std::mem::take(frames).into_iter();
+        together.extend(own.next());
+        let nothing_held = self.held.is_empty();
+        together.extend(self.held.drain(..));
+        let random = &mut self.random;
+        let late = nothing_held
+            && self
+                .late
+                .iter()
+                .any(|(w, once)| w.contains(t) && (*once || random.happens(LATE_SHARE)));
+        if late {
+            self.late.retain(|(w, once)| !(*once && w.contains(t)));
+            self.held.extend(own);
+        } else {
+            together.extend(own);
+        }
+        *frames = together;
+    }
+}
+
+/// When a board sends.
+#[derive(Debug)]
+struct Slots {
+    period: Nanos,
+    origin: Nanos,
+    drift: f64,
+    next: i64,
+    due: Nanos,
+}
+
+impl Slots {
+    fn new(period: Nanos, origin: Nanos, drift: f64, random: &mut Random) -> Self {
+        let mut this = Self {
+            period,
+            origin,
+            drift,
+            next: 0,
+            due: origin,
+        };
+        this.due = this.nominal(0) + this.jitter(random);
+        this
+    }
+
+    #[allow(clippy::cast_precision_loss)] // a slot number is far below 2^52
+    fn nominal(&self, slot: i64) -> Nanos {
+        let elapsed = Nanos(self.period.0.saturating_mul(slot));
+        self.origin + elapsed + scaled(elapsed, self.drift)
+    }
+
+    fn jitter(&self, random: &mut Random) -> Nanos {
+        let most = scaled(self.period, JITTER.0).seconds().min(JITTER.1 * 1e-9);
+        Nanos::from_seconds(random.uniform(0.0, most))
+    }
+
+    /// Goes on to the first slot after `now`; returns how many were passed over.
+    fn advance(&mut self, now: Nanos, random: &mut Random) -> u64 {
+        let mut skipped = 0;
+        self.next += 1;
+        while self.nominal(self.next) <= now {
+            self.next += 1;
+            skipped += 1;
+        }
+        self.due = self.nominal(self.next) + self.jitter(random);
+        skipped
+    }
+}
+
+#[allow(clippy::cast_precision_loss)] // a difference of instants, far below 2^52 ns
+fn scaled(duration: Nanos, factor: f64) -> Nanos {
+    Nanos::from_seconds(duration.0 as f64 * factor * 1e-9)
+}
+
+fn power_on(robot: &Robot, device: &DevicePlan) -> Result<Box<dyn Board>, RobotError> {
+    power_on_with(&device.options, &device.spec)
+        .map_err(|e| robot.mismatch(format!("gateway.toml, {:?}: {e}", device.name)))
+}
+
+/// A board just powered. One that the gateway may only listen to is started right away, by playing whoever commands it.
+fn power_on_with(options: &Options, spec: &Spec) -> Result<Box<dyn Board>, proprio_drivers::SpecError> {
+    let mut board = options.board(spec)?;
+    if spec.mode == Mode::Listen && board.period().is_none() {
+        let mut host = options.device(&Spec {
+            mode: Mode::Supervise,
+            ..spec.clone()
+        })?;
+        let (mut decoded, mut answers) = (Decoded::new(), Frames::new());
+        let mut now = Nanos::ZERO;
+        // A host asks for at most a dozen things, then starts the board.
+        for _ in 0..64 {
+            decoded.clear();
+            match host.poll_transmit(now, &mut decoded) {
+                Some(transmit) => board.on_frame(&transmit.frame, &mut answers),
+                None if board.period().is_some() => break,
+                None => now = host.next_wake().unwrap_or(now).max(now),
+            }
+            for answer in answers.drain(..) {
+                decoded.clear();
+                host.on_frame(&answer.at(now, StampKind::User), &mut decoded);
+            }
+        }
+    }
+    Ok(board)
+}

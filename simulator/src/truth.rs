@@ -1,0 +1,615 @@
+//! What really happens to the simulated robot at any instant: motion, joint torques, what ideal sensors read, contact wrenches.
+//!
+//! One link stands still and carries the robot: the fixed base, or with an IMU as base the link of the first contact that is on
+//! the IMU's link (else of the first contact that is not pushed). Gravity points down its frame's z axis, or as `gravity_mps2`
+//! says. What else touches the robot is one push on its hand: the contact named `hand`, else the last one that does not carry it.
+
+use crate::noise::Random;
+use crate::robot::{Robot, RobotError};
+use crate::simulator::Settings;
+use crate::trajectory::{Point, Trajectory, window};
+use proprio_estimator::config::{Base, Contact, ContactKind, Direction, ForceTorque, SensorFrame};
+use proprio_estimator::dynamics::{
+    DynamicsError, ExternalWrench, FrameMotion, InverseDynamics, JointState, Kinematics, Noise, SensorCut,
+};
+use proprio_estimator::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
+use proprio_estimator::spatial::{Pose, Vec3, Wrench};
+use proprio_topics::Kind;
+
+/// Standard gravity \[m/s^2\].
+const GRAVITY: f64 = 9.80665;
+/// The push on the hand: how strong \[N\], and its torque \[Nm\].
+const PUSH: (f64, f64) = (10.0, 0.3);
+/// When in a cycle it begins and ends, and what share of it each flank takes.
+const PUSH_TIME: (f64, f64, f64) = (0.4, 0.6, 0.25);
+
+/// What really happens at one instant.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Truth {
+    /// The instant: seconds since the simulation began.
+    pub t: f64,
+    /// The joints, by degree of freedom.
+    pub joints: Vec<JointTruth>,
+    /// What the F/T sensors read, their offsets included: fx fy fz tx ty tz \[N, Nm\], in the order of estimator.toml.
+    pub wrenches: Vec<[f64; 6]>,
+    /// What the IMUs read.
+    pub imus: Vec<ImuTruth>,
+    /// The contacts' wrenches, by the environment on the link, in the axes and at the origin of the frame that `link` names:
+    /// fx fy fz tx ty tz \[N, Nm\], in the order of estimator.toml.
+    pub contacts: Vec<[f64; 6]>,
+}
+
+/// One joint.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct JointTruth {
+    /// \[rad or m\].
+    pub position: f64,
+    /// \[rad/s or m/s\].
+    pub velocity: f64,
+    /// \[rad/s^2 or m/s^2\].
+    pub acceleration: f64,
+    /// Along the URDF axis, by the parent on the child, without friction and rotor inertia \[Nm or N\].
+    pub torque: f64,
+}
+
+/// What an ideal IMU reads, in its axes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ImuTruth {
+    /// Classical acceleration of its origin minus gravity \[m/s^2\].
+    pub proper_acceleration: [f64; 3],
+    /// \[rad/s\].
+    pub angular_velocity: [f64; 3],
+    /// \[rad/s^2\].
+    pub angular_acceleration: [f64; 3],
+}
+
+/// The simulated robot's mechanics. Every thread has its own copy; all copies tell the same.
+#[derive(Debug, Clone)]
+pub struct Simulation {
+    model: Model,
+    joint_names: Vec<String>,
+    /// Where a joint stands that does not move.
+    standing: Vec<Option<f64>>,
+    trajectory: Trajectory,
+    kinematics: Kinematics,
+    dynamics: InverseDynamics,
+    /// The motion of the link that stands still.
+    base: FrameMotion,
+    sensors: Vec<Sensor>,
+    imus: Vec<(String, Frame)>,
+    contacts: Vec<(String, Frame)>,
+    /// Which contact carries the robot.
+    carries: Option<usize>,
+    push: Option<Push>,
+    state: [Vec<f64>; 3],
+    truth: Truth,
+}
+
+#[derive(Debug, Clone)]
+struct Sensor {
+    name: String,
+    cut: SensorCut,
+    offset: [f64; 6],
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Push {
+    contact: usize,
+    frame: Frame,
+    /// At its strongest, at the frame's origin.
+    wrench: Wrench,
+    cycle: f64,
+}
+
+impl Push {
+    /// Its wrench at `t`, without any at the beginning and end of each cycle.
+    fn at(&self, t: f64) -> Wrench {
+        let (from, until, flank) = PUSH_TIME;
+        let x = ((t / self.cycle).rem_euclid(1.0) - from) / (until - from);
+        self.wrench * (window(x / flank).0 * window((1.0 - x) / flank).0)
+    }
+}
+
+impl Simulation {
+    /// The mechanics of `robot`.
+    ///
+    /// # Errors
+    /// [`RobotError::Mismatch`]: estimator.toml names a joint or link that the URDF lacks, or gives values that do not fit.
+    pub fn new(robot: &Robot, settings: &Settings) -> Result<Self, RobotError> {
+        let model = robot.model.clone();
+        let wrong = |problem: String| robot.mismatch(format!("estimator.toml, {problem}"));
+        let frame = |place: &str, link: &str| {
+            model
+                .frame(link)
+                .ok_or_else(|| wrong(format!("{place}: link = {link:?} is not a link of the URDF")))
+        };
+        let mut contacts = Vec::new();
+        for contact in &robot.config.contact {
+            let name = contact.name().to_owned();
+            contacts.push((name.clone(), frame(&format!("contact {name:?}"), &contact.link)?));
+        }
+        let mut sensors = Vec::new();
+        for ft in &robot.config.force_torque {
+            let cut = sensor_cut(&model, ft).map_err(|e| wrong(format!("force_torque {:?}: {e}", ft.sensor)))?;
+            let ([a, b, c], [d, e, f]) = (ft.offset_n, ft.offset_nm);
+            sensors.push(Sensor {
+                name: ft.sensor.clone(),
+                cut,
+                offset: [a, b, c, d, e, f],
+            });
+        }
+
+        let hand = contacts.iter().position(|(name, _)| name == "hand");
+        let mut imus = Vec::new();
+        let (carrier, carries, gravity) = match &robot.config.base {
+            Base::Fixed { link, gravity_mps2 } => {
+                let base = frame("base", link)?;
+                let carries = contacts.iter().position(|(_, f)| f.link == base.link);
+                (base, carries, Vec3::from(*gravity_mps2))
+            }
+            Base::Imu {
+                sensor,
+                link,
+                xyz_m,
+                rpy_rad,
+            } => {
+                let mut imu = frame("base", link)?;
+                let beside = contacts.iter().position(|(_, f)| f.link == imu.link);
+                let carries = beside.or_else(|| (0..contacts.len()).find(|c| Some(*c) != hand));
+                let carrier = carries.and_then(|c| contacts.get(c)).map_or(imu, |(_, f)| *f);
+                imu.pose = imu.pose * Pose::from_xyz_rpy(*xyz_m, *rpy_rad);
+                imus.push((sensor.clone(), imu));
+                (carrier, carries, Vec3::new(0.0, 0.0, -GRAVITY))
+            }
+        };
+        // Other IMUs can only be where a link of their name is.
+        for channel in robot.plan.channels.iter().filter(|c| c.kind == Kind::Imu) {
+            if let Some(frame) = model.frame(&channel.name)
+                && imus.iter().all(|(name, _)| *name != channel.name)
+            {
+                imus.push((channel.name.clone(), frame));
+            }
+        }
+        let on_hand = hand.or_else(|| (0..contacts.len()).rev().find(|c| Some(*c) != carries));
+        let push = on_hand
+            .filter(|c| settings.push && Some(*c) != carries)
+            .and_then(|contact| {
+                let (frame, config) = (contacts.get(contact)?.1, robot.config.contact.get(contact)?);
+                Some(Push {
+                    contact,
+                    frame,
+                    wrench: push_wrench(config, settings.seed),
+                    cycle: settings.cycle,
+                })
+            });
+
+        let dofs = model.dof_count();
+        let joint_names: Vec<String> = (0..dofs).map(|dof| model.dof_name(dof).to_owned()).collect();
+        let ranges: Vec<_> = (0..dofs).map(|dof| model.limits(model.dof_joint(dof)?)).collect();
+        let trajectory = Trajectory::new(&ranges, settings.seed, settings.still);
+        let standing = joint_names
+            .iter()
+            .enumerate()
+            .map(|(dof, name)| match robot.config.locked.get(name) {
+                Some(position) => Some(*position),
+                // Nobody would know where it is if it moved.
+                None if robot.plan.channel(name).is_none() => trajectory.at(dof, 0.0).map(|rest| rest.position),
+                None => None,
+            });
+        let standing = standing.collect();
+        let kinematics = Kinematics::new(&model, carrier.link).map_err(|e| wrong(format!("base: {e}")))?;
+        let mut this = Self {
+            base: FrameMotion::of_link_from_imu(&FrameMotion::standing(&gravity), &carrier.pose),
+            dynamics: InverseDynamics::new(&model),
+            truth: Truth {
+                t: f64::NAN,
+                joints: vec![
+                    JointTruth {
+                        position: f64::NAN,
+                        velocity: f64::NAN,
+                        acceleration: f64::NAN,
+                        torque: f64::NAN
+                    };
+                    dofs
+                ],
+                wrenches: vec![[f64::NAN; 6]; sensors.len()],
+                imus: vec![ImuTruth::UNKNOWN; imus.len()],
+                contacts: vec![[0.0; 6]; contacts.len()],
+            },
+            state: [vec![0.0; dofs], vec![0.0; dofs], vec![0.0; dofs]],
+            model,
+            joint_names,
+            standing,
+            trajectory,
+            kinematics,
+            sensors,
+            imus,
+            contacts,
+            carries,
+            push,
+        };
+        // What does not fit shows here rather than as absent readings later.
+        this.evaluate(0.0).map_err(|e| wrong(e.to_string()))?;
+        Ok(this)
+    }
+
+    /// The number of the joint of this name.
+    #[must_use]
+    pub fn joint(&self, name: &str) -> Option<usize> {
+        self.joint_names.iter().position(|n| n == name)
+    }
+
+    /// The number of the F/T sensor of this name.
+    #[must_use]
+    pub fn wrench(&self, name: &str) -> Option<usize> {
+        self.sensors.iter().position(|s| s.name == name)
+    }
+
+    /// The number of the IMU of this name.
+    #[must_use]
+    pub fn imu(&self, name: &str) -> Option<usize> {
+        self.imus.iter().position(|(n, _)| n == name)
+    }
+
+    /// The joints' names, by degree of freedom.
+    pub fn joint_names(&self) -> impl Iterator<Item = &str> {
+        self.joint_names.iter().map(String::as_str)
+    }
+
+    /// The F/T sensors' names.
+    pub fn wrench_names(&self) -> impl Iterator<Item = &str> {
+        self.sensors.iter().map(|s| s.name.as_str())
+    }
+
+    /// The IMUs' names.
+    pub fn imu_names(&self) -> impl Iterator<Item = &str> {
+        self.imus.iter().map(|(name, _)| name.as_str())
+    }
+
+    /// The contacts' names.
+    pub fn contact_names(&self) -> impl Iterator<Item = &str> {
+        self.contacts.iter().map(|(name, _)| name.as_str())
+    }
+
+    /// How joint `joint` moves at `t` seconds, without computing anything else; `None` if there is no such joint.
+    #[must_use]
+    pub fn motion(&self, joint: usize, t: f64) -> Option<Point> {
+        match self.standing.get(joint)? {
+            Some(position) => Some(Point {
+                position: *position,
+                velocity: 0.0,
+                acceleration: 0.0,
+            }),
+            None => self.trajectory.at(joint, t),
+        }
+    }
+
+    /// The truth at `t` seconds. Everything that depends on forces is NaN where it can not be computed (never, for a robot
+    /// that could be built).
+    pub fn at(&mut self, t: f64) -> &Truth {
+        #[allow(clippy::float_cmp)] // the very same instant, asked for again
+        if self.truth.t != t && self.evaluate(t).is_err() {
+            self.truth.joints.iter_mut().for_each(|joint| joint.torque = f64::NAN);
+            self.truth.wrenches.fill([f64::NAN; 6]);
+            self.truth.imus.fill(ImuTruth::UNKNOWN);
+            self.truth.contacts.fill([f64::NAN; 6]);
+            self.truth.t = t;
+        }
+        &self.truth
+    }
+
+    fn evaluate(&mut self, t: f64) -> Result<(), DynamicsError> {
+        for dof in 0..self.joint_names.len() {
+            let Some(point) = self.motion(dof, t) else { continue };
+            let [position, velocity, acceleration] = &mut self.state;
+            let slots = [position, velocity, acceleration].into_iter().map(|v| v.get_mut(dof));
+            for (slot, value) in slots.zip([point.position, point.velocity, point.acceleration]) {
+                if let Some(slot) = slot {
+                    *slot = value;
+                }
+            }
+        }
+        let push = self.push.map(|push| (push, push.at(t)));
+        self.solve(push)?;
+        self.truth.t = t;
+        Ok(())
+    }
+
+    /// Fills in the truth for the joints' `state` and a push.
+    fn solve(&mut self, push: Option<(Push, Wrench)>) -> Result<(), DynamicsError> {
+        let [position, velocity, acceleration] = &self.state;
+        self.kinematics.update(
+            &self.model,
+            JointState {
+                position,
+                velocity,
+                acceleration,
+            },
+            &self.base,
+        )?;
+        let external = push.map(|(push, wrench)| ExternalWrench {
+            frame: push.frame,
+            wrench,
+        });
+        self.dynamics
+            .update(&self.model, &self.kinematics, external.as_slice())?;
+        let state = position
+            .iter()
+            .zip(velocity)
+            .zip(acceleration)
+            .zip(self.dynamics.torque());
+        for (joint, (((position, velocity), acceleration), torque)) in self.truth.joints.iter_mut().zip(state) {
+            *joint = JointTruth {
+                position: *position,
+                velocity: *velocity,
+                acceleration: *acceleration,
+                torque: *torque,
+            };
+        }
+        for (reading, sensor) in self.truth.wrenches.iter_mut().zip(&self.sensors) {
+            let transmitted = self.dynamics.transmitted(&self.kinematics, sensor.cut.joint());
+            *reading = sensor.cut.reading(&transmitted).force_first();
+            reading
+                .iter_mut()
+                .zip(sensor.offset)
+                .for_each(|(value, offset)| *value += offset);
+        }
+        for (truth, (_, frame)) in self.truth.imus.iter_mut().zip(&self.imus) {
+            let motion = self.kinematics.frame_motion(frame);
+            *truth = ImuTruth {
+                proper_acceleration: motion.proper_acceleration.into(),
+                angular_velocity: motion.angular_velocity.into(),
+                angular_acceleration: motion.angular_acceleration.into(),
+            };
+        }
+        for (number, (truth, (_, frame))) in self.truth.contacts.iter_mut().zip(&self.contacts).enumerate() {
+            *truth = match push {
+                // The base of the kinematics is the body that carries the robot.
+                _ if self.carries == Some(number) => frame.pose.wrench_back(&self.dynamics.base_wrench()).force_first(),
+                Some((push, wrench)) if push.contact == number => wrench.force_first(),
+                _ => [0.0; 6],
+            };
+        }
+        Ok(())
+    }
+}
+
+impl ImuTruth {
+    const UNKNOWN: Self = Self {
+        proper_acceleration: [f64::NAN; 3],
+        angular_velocity: [f64::NAN; 3],
+        angular_acceleration: [f64::NAN; 3],
+    };
+}
+
+/// The cut at an F/T sensor: what estimator.toml says of it, else what the URDF's sensor element does, else the usual.
+fn sensor_cut(model: &Model, ft: &ForceTorque) -> Result<SensorCut, proprio_estimator::dynamics::StructureError> {
+    let element = model.sensors().iter().find(|s| s.joint == ft.joint);
+    let frame = match ft.frame {
+        Some(SensorFrame::Child) => MeasurementFrame::Child,
+        Some(SensorFrame::Parent) => MeasurementFrame::Parent,
+        Some(SensorFrame::Sensor) => MeasurementFrame::Sensor,
+        None => element.map_or(MeasurementFrame::Child, |e| e.frame),
+    };
+    let direction = match ft.direction {
+        Some(Direction::ChildToParent) => MeasurementDirection::ChildToParent,
+        Some(Direction::ParentToChild) => MeasurementDirection::ParentToChild,
+        None => element.map_or(MeasurementDirection::ChildToParent, |e| e.direction),
+    };
+    let pose = match (ft.xyz_m, ft.rpy_rad) {
+        (None, None) => element.map_or_else(Pose::identity, |e| e.pose),
+        (xyz, rpy) => Pose::from_xyz_rpy(xyz.unwrap_or_default(), rpy.unwrap_or_default()),
+    };
+    SensorCut::new(
+        model,
+        &ft.joint,
+        frame,
+        direction,
+        &pose,
+        &Noise {
+            force: ft.noise_n,
+            torque: ft.noise_nm,
+        },
+    )
+}
+
+/// A push that a contact of this kind can exert, in a direction drawn from the seed.
+fn push_wrench(contact: &Contact, seed: u64) -> Wrench {
+    let mut random = Random::new(seed, "push", 0);
+    let mut unit = || {
+        let direction = Vec3::new(random.normal(), random.normal(), random.normal());
+        direction.try_normalize(1e-9).unwrap_or_else(Vec3::x)
+    };
+    let (force, torque) = (unit() * PUSH.0, unit() * PUSH.1);
+    let through = |force: Vec3| Wrench {
+        force,
+        torque: Vec3::from(contact.position_m).cross(&force),
+    };
+    match (contact.kind, contact.direction) {
+        (ContactKind::Wrench, _) => Wrench { force, torque },
+        (ContactKind::ForceAlong, Some(direction)) => {
+            through(Vec3::from(direction).try_normalize(1e-9).unwrap_or_else(Vec3::x) * PUSH.0)
+        }
+        (ContactKind::Force | ContactKind::ForceAlong, _) => through(force),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::HashMap;
+    use std::path::Path;
+
+    fn robot() -> Robot {
+        Robot::open("icub_left_arm").unwrap()
+    }
+
+    /// The rows of a golden table, as columns by name.
+    fn golden(file: &str) -> Vec<HashMap<String, f64>> {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/oracle").join(file);
+        let text = std::fs::read_to_string(path).unwrap();
+        let mut lines = text.lines();
+        let names: Vec<&str> = lines.next().unwrap().split(',').collect();
+        lines
+            .map(|l| {
+                names
+                    .iter()
+                    .map(|n| (*n).to_owned())
+                    .zip(l.split(',').map(|v| v.parse().unwrap()))
+                    .collect()
+            })
+            .collect()
+    }
+
+    /// This crate's truth against MuJoCo's: `tests/oracle/README.md` says how those tables were made.
+    fn agrees(file: &str, rows: usize) {
+        let mut robot = robot();
+        let offsets = robot.config.force_torque[0].clone();
+        robot.config.force_torque[0].offset_n = [0.0; 3];
+        robot.config.force_torque[0].offset_nm = [0.0; 3];
+        let mut simulation = Simulation::new(&robot, &Settings::default()).unwrap();
+        let push = simulation.push.unwrap();
+        let table = golden(file);
+        assert_eq!(table.len(), rows);
+        let parts = ["fx", "fy", "fz", "tx", "ty", "tz"];
+        for row in table {
+            let value = |column: String| row[&column];
+            for (dof, name) in simulation.joint_names.clone().iter().enumerate() {
+                for (slot, part) in simulation
+                    .state
+                    .iter_mut()
+                    .zip(["position", "velocity", "acceleration"])
+                {
+                    slot[dof] = value(format!("joint/{name}/{part}"));
+                }
+            }
+            let six = |what: &str| parts.map(|part| row.get(&format!("{what}/{part}")).copied().unwrap_or(0.0));
+            let [fx, fy, fz, tx, ty, tz] = six("contact/hand");
+            let hand = Wrench::from_parts([fx, fy, fz], [tx, ty, tz]);
+            simulation.solve(Some((push, hand))).unwrap();
+            let close =
+                |ours: f64, theirs: f64, what: &str| assert!((ours - theirs).abs() < 1e-9, "{what}: {ours}, {theirs}");
+            for (joint, name) in simulation.truth.joints.iter().zip(&simulation.joint_names) {
+                close(joint.torque, value(format!("joint/{name}/torque")), name);
+            }
+            for (ours, theirs) in simulation.truth.wrenches[0]
+                .into_iter()
+                .zip(six("wrench/l_arm_ft_sensor"))
+            {
+                close(ours, theirs, "F/T");
+            }
+            let imu = simulation.truth.imus[0];
+            let ours = [imu.proper_acceleration, imu.angular_velocity, imu.angular_acceleration];
+            for (ours, part) in ours
+                .into_iter()
+                .flatten()
+                .zip(["ax", "ay", "az", "gx", "gy", "gz", "alx", "aly", "alz"])
+            {
+                close(ours, value(format!("imu/chest_imu/{part}")), part);
+            }
+            assert_eq!(simulation.truth.contacts[1], [fx, fy, fz, tx, ty, tz]);
+        }
+        // The offset is what estimator.toml says, on top of that.
+        let bare = simulation.at(3.0).wrenches[0];
+        robot.config.force_torque[0] = offsets.clone();
+        let mut simulation = Simulation::new(&robot, &Settings::default()).unwrap();
+        let offset = [offsets.offset_n, offsets.offset_nm].concat();
+        assert!(
+            offset.iter().all(|o| *o != 0.0),
+            "a robot whose offsets are zero shows nothing"
+        );
+        for ((with, without), offset) in simulation.at(3.0).wrenches[0].into_iter().zip(bare).zip(offset) {
+            assert!((with - without - offset).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn the_truth_agrees_with_mujoco() {
+        agrees("icub_left_arm_mujoco.csv", 201);
+    }
+
+    #[test]
+    fn the_truth_agrees_with_mujoco_while_the_hand_is_pushed() {
+        agrees("icub_left_arm_mujoco_contact.csv", 201);
+    }
+
+    #[test]
+    fn what_carries_the_standing_robot_is_its_weight() {
+        let robot = robot();
+        let mut simulation = Simulation::new(
+            &robot,
+            &Settings {
+                push: false,
+                ..Settings::default()
+            },
+        )
+        .unwrap();
+        let mass: f64 = robot.model.inertias().iter().map(|i| i.mass).sum();
+        let [fx, fy, fz, ..] = simulation.at(0.5).contacts[0];
+        assert!(
+            fx.abs() < 1e-9 && fy.abs() < 1e-9 && (fz - mass * GRAVITY).abs() < 1e-9,
+            "{fx} {fy} {fz}, {mass}"
+        );
+    }
+
+    #[test]
+    fn the_hand_is_pushed_in_the_middle_of_a_cycle_and_only_then() {
+        let mut simulation = Simulation::new(
+            &robot(),
+            &Settings {
+                cycle: 10.0,
+                ..Settings::default()
+            },
+        )
+        .unwrap();
+        assert_eq!(simulation.contact_names().collect::<Vec<_>>(), ["stand", "hand"]);
+        let mut force = |t: f64| {
+            let [fx, fy, fz, ..] = simulation.at(t).contacts[1];
+            (fx * fx + fy * fy + fz * fz).sqrt()
+        };
+        for t in [0.0, 3.99, 6.01, 9.9, 13.99] {
+            assert_eq!(force(t), 0.0, "{t}");
+        }
+        for t in [5.0, 15.0] {
+            assert!((force(t) - PUSH.0).abs() < 1e-9, "{t}");
+        }
+        // It comes and goes smoothly.
+        let steepest = (0..2000)
+            .map(|k| f64::from(k) * 1e-3 + 4.0)
+            .map(|t| (force(t + 1e-3) - force(t)).abs())
+            .fold(0.0, f64::max);
+        assert!(steepest < 1e-3 * PUSH.0 * 140.0 / 64.0 / 0.5 * 1.01, "{steepest}");
+    }
+
+    #[test]
+    fn a_joint_that_nobody_measures_stands_still() {
+        let mut robot = robot();
+        let mut locked = robot.clone();
+        locked.config.locked.insert("l_elbow".into(), 1.0);
+        let simulation = Simulation::new(&locked, &Settings::default()).unwrap();
+        let elbow = simulation.joint("l_elbow").unwrap();
+        assert_eq!(
+            simulation.motion(elbow, 7.0),
+            Some(Point {
+                position: 1.0,
+                velocity: 0.0,
+                acceleration: 0.0
+            })
+        );
+        robot.plan.channels.retain(|c| c.name != "l_elbow");
+        let simulation = Simulation::new(&robot, &Settings::default()).unwrap();
+        assert_eq!(simulation.motion(elbow, 7.0), simulation.motion(elbow, 0.0));
+        assert_ne!(simulation.motion(elbow + 1, 7.0), simulation.motion(elbow + 1, 0.0));
+    }
+
+    #[test]
+    fn a_link_that_the_urdf_lacks_is_named() {
+        let mut robot = robot();
+        robot.config.contact[1].link = "left_hand".into();
+        let message = Simulation::new(&robot, &Settings::default()).unwrap_err().to_string();
+        assert!(
+            message.contains("contact \"hand\": link = \"left_hand\" is not a link of the URDF"),
+            "{message}"
+        );
+    }
+}
