@@ -1,0 +1,276 @@
+//! The verbs that turn one file into another: decode, encode, estimate.
+
+use anyhow::{Context, bail};
+use proprio_gateway::offline;
+use proprio_gateway::plan::Plan;
+use proprio_topics::csv::{Columns, Report};
+use serde_json::json;
+use std::fs::File;
+use std::io::{BufReader, BufWriter, IsTerminal, Read, Write};
+use std::path::{Path, PathBuf};
+
+/// `proprio decode`.
+#[derive(clap::Args)]
+pub(crate) struct Decode {
+    /// gateway.toml: which devices there are; its sources are not opened
+    #[arg(long, value_name = "FILE")]
+    config: PathBuf,
+    /// The recorded log, in any of candump's formats; - for standard input
+    #[arg(long, value_name = "FILE")]
+    log: PathBuf,
+    /// The table to write; - for standard output
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Also what an estimator does not read: currents, temperatures, gauges, orientation, motor states
+    #[arg(long)]
+    all: bool,
+    /// Print what became of the log as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// `proprio encode`.
+#[derive(clap::Args)]
+pub(crate) struct Encode {
+    /// gateway.toml: which devices there are
+    #[arg(long, value_name = "FILE")]
+    config: PathBuf,
+    /// The table of samples; - for standard input
+    #[arg(long, value_name = "FILE")]
+    samples: PathBuf,
+    /// The log to write, in candump's log format; - for standard output
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Print what became of the table as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// `proprio estimate`.
+#[derive(clap::Args)]
+pub(crate) struct Estimate {
+    /// estimator.toml
+    #[arg(long, value_name = "FILE")]
+    config: PathBuf,
+    /// Identified parameters and offsets to use instead of the URDF's
+    #[arg(long, value_name = "FILE")]
+    parameters: Option<PathBuf>,
+    /// The table of samples; - for standard input
+    #[arg(long, value_name = "FILE")]
+    log: PathBuf,
+    /// The table of estimates to write; - for standard output
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Print what became of the log as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+fn input(path: &Path) -> anyhow::Result<Box<dyn Read>> {
+    if path == Path::new("-") {
+        return Ok(Box::new(std::io::stdin().lock()));
+    }
+    let file = File::open(path).with_context(|| format!("{}: can not be read", path.display()))?;
+    let length = file.metadata().map(|m| m.len()).unwrap_or(0);
+    // Long work shows its progress where somebody looks.
+    if length > 64 << 20 && std::io::stderr().is_terminal() {
+        let bar = indicatif::ProgressBar::new(length).with_style(
+            indicatif::ProgressStyle::with_template("{bar:40} {bytes}/{total_bytes} {eta}")
+                .unwrap_or_else(|_| indicatif::ProgressStyle::default_bar()),
+        );
+        return Ok(Box::new(bar.wrap_read(file)));
+    }
+    Ok(Box::new(file))
+}
+
+/// The file that a conversion writes. It gets its name when it is complete: an error leaves no half table, and an input
+/// that is also the output is not destroyed before it is read.
+struct Output {
+    writer: Option<BufWriter<Box<dyn Write>>>,
+    temporary: Option<(tempfile::TempPath, PathBuf)>,
+}
+
+impl Output {
+    fn new(path: &Path) -> anyhow::Result<Self> {
+        let special = std::fs::metadata(path).is_ok_and(|m| !m.is_file());
+        let (writer, temporary): (Box<dyn Write>, _) = if path == Path::new("-") {
+            (Box::new(std::io::stdout().lock()), None)
+        } else if special {
+            // A pipe or /dev/null: nothing to replace.
+            let file = File::create(path).with_context(|| format!("{}: can not be written", path.display()))?;
+            (Box::new(file), None)
+        } else {
+            let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+            let (file, temporary) = tempfile::NamedTempFile::new_in(folder)
+                .with_context(|| format!("{}: can not be written", path.display()))?
+                .into_parts();
+            (Box::new(file), Some((temporary, path.to_owned())))
+        };
+        Ok(Self { writer: Some(BufWriter::with_capacity(1 << 18, writer)), temporary })
+    }
+
+    fn writer(&mut self) -> &mut BufWriter<Box<dyn Write>> {
+        #[allow(clippy::expect_used, reason = "taken only by finish, which consumes self")]
+        self.writer.as_mut().expect("an output that is not finished has a writer")
+    }
+
+    fn finish(mut self) -> anyhow::Result<()> {
+        if let Some(mut writer) = self.writer.take() {
+            writer.flush().context("can not be written")?;
+        }
+        if let Some((temporary, path)) = self.temporary.take() {
+            use std::os::unix::fs::PermissionsExt as _;
+            // Temporary files are private; a result is for whoever may read the folder.
+            std::fs::set_permissions(&temporary, std::fs::Permissions::from_mode(0o644))?;
+            temporary.persist(&path).with_context(|| format!("{}: can not be written", path.display()))?;
+        }
+        Ok(())
+    }
+}
+
+fn tell_table(log: &Path, report: &Report) {
+    for bad in &report.bad {
+        eprintln!("{}: line {}: skipped: {}", log.display(), bad.line, bad.reason);
+    }
+    if report.bad_rows > report.bad.len() as u64 {
+        eprintln!("{}: {} rows skipped in all", log.display(), report.bad_rows);
+    }
+    if !report.unknown_columns.is_empty() {
+        eprintln!("{}: columns not used: {}", log.display(), report.unknown_columns.join(", "));
+    }
+}
+
+/// Decodes a log.
+pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
+    let plan = Plan::load(&args.config)?;
+    let log = BufReader::with_capacity(1 << 18, input(&args.log)?);
+    let mut out = Output::new(&args.out)?;
+    let columns = if args.all { Columns::All } else { Columns::Main };
+    let report = offline::decode(&plan, log, out.writer(), columns).with_context(|| args.log.display().to_string())?;
+    out.finish().with_context(|| args.out.display().to_string())?;
+    for bad in &report.bad {
+        eprintln!("{}: skipped: {bad}", args.log.display());
+    }
+    if report.bad_lines > report.bad.len() as u64 {
+        eprintln!("{}: {} lines skipped in all", args.log.display(), report.bad_lines);
+    }
+    for device in &report.devices {
+        if let Some(refusal) = &device.refusal {
+            eprintln!("{}: refused: {refusal}", device.name);
+        }
+        for (counter, count) in &device.counts {
+            eprintln!("{}: {}: {count}", device.name, counter.word());
+        }
+    }
+    if args.json {
+        let devices: Vec<_> = report
+            .devices
+            .iter()
+            .map(|d| {
+                let counts: serde_json::Map<_, _> = d.counts.iter().map(|(c, n)| (c.word().to_owned(), json!(n))).collect();
+                json!({ "name": d.name, "frames": d.frames, "readings": d.readings, "counts": counts, "refusal": d.refusal })
+            })
+            .collect();
+        let summary = json!({
+            "frames": report.frames, "samples": report.samples, "unclaimed": report.unclaimed, "bad_lines": report.bad_lines,
+            "other_interfaces": report.other_interfaces, "out_of_order": report.out_of_order, "devices": devices,
+        });
+        tell_json(&args.out, &summary);
+    } else {
+        eprintln!(
+            "{} frames, {} samples; {} frames of no device, {} of other interfaces, {} lines skipped",
+            report.frames, report.samples, report.unclaimed, report.other_interfaces, report.bad_lines
+        );
+    }
+    if report.samples == 0 {
+        let hint = if report.other_interfaces == report.frames {
+            "its interfaces are none of the configuration's buses"
+        } else {
+            "are the addresses right?"
+        };
+        bail!("{}: no sample in {} frames: {hint}", args.log.display(), report.frames);
+    }
+    Ok(())
+}
+
+/// Encodes a table.
+pub(crate) fn encode(args: &Encode) -> anyhow::Result<()> {
+    let plan = Plan::load(&args.config)?;
+    let samples = input(&args.samples)?;
+    let mut out = Output::new(&args.out)?;
+    let report = offline::encode(&plan, samples, out.writer()).with_context(|| args.samples.display().to_string())?;
+    out.finish().with_context(|| args.out.display().to_string())?;
+    tell_table(&args.samples, &report.table);
+    if !report.unknown_channels.is_empty() {
+        eprintln!("{}: not in {}: {}", args.samples.display(), args.config.display(), report.unknown_channels.join(", "));
+    }
+    if let Some(first) = &report.first_refusal {
+        eprintln!("{}: {} samples not encoded; the first: {first}", args.samples.display(), report.refused);
+    }
+    if args.json {
+        let summary = json!({
+            "frames": report.frames, "samples": report.samples, "refused": report.refused, "rows": report.table.rows,
+            "bad_rows": report.table.bad_rows, "unknown_channels": report.unknown_channels,
+        });
+        tell_json(&args.out, &summary);
+    } else {
+        eprintln!("{} samples, {} frames", report.samples, report.frames);
+    }
+    if report.samples == 0 {
+        bail!("{}: not one sample could be encoded", args.samples.display());
+    }
+    Ok(())
+}
+
+/// Estimates from a table.
+pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
+    if let Some(parameters) = &args.parameters {
+        return Err(proprio_estimator::config::ConfigError {
+            file: parameters.clone(),
+            problem: "this version takes its parameters from the URDF and its offsets from estimator.toml alone".into(),
+        }
+        .into());
+    }
+    let (_, setup) = proprio_estimator::daemon::load(&args.config)?;
+    let log = input(&args.log)?;
+    let mut out = Output::new(&args.out)?;
+    let report = match proprio_estimator::offline::estimate(setup, log, out.writer()) {
+        Ok(report) => report,
+        Err(error @ proprio_estimator::offline::OfflineError::MissingChannels(_)) => {
+            // The log is what it is: the configuration does not fit it.
+            let problem = format!("{}: {error}", args.log.display());
+            return Err(proprio_estimator::config::ConfigError { file: args.config.clone(), problem }.into());
+        }
+        Err(error) => return Err(error).with_context(|| args.log.display().to_string()),
+    };
+    out.finish().with_context(|| args.out.display().to_string())?;
+    tell_table(&args.log, &report.log);
+    if !report.unused_channels.is_empty() {
+        eprintln!("{}: not in {}: {}", args.log.display(), args.config.display(), report.unused_channels.join(", "));
+    }
+    let [late, backward, not_finite] = report.dropped;
+    if late + backward + not_finite > 0 {
+        eprintln!(
+            "{}: samples dropped: {late} late, {backward} not later than their channel's last, {not_finite} not finite",
+            args.log.display()
+        );
+    }
+    if args.json {
+        let summary = json!({
+            "estimates": report.estimates, "torques_withheld": report.withheld, "rows": report.log.rows,
+            "bad_rows": report.log.bad_rows, "late": late, "backward": backward, "not_finite": not_finite,
+        });
+        tell_json(&args.out, &summary);
+    } else {
+        eprintln!("{} estimates from {} rows; {} torques withheld", report.estimates, report.log.rows, report.withheld);
+    }
+    if report.estimates == 0 {
+        bail!("{}: the trigger channel has no sample, so there is no estimate", args.log.display());
+    }
+    Ok(())
+}
+
+/// JSON goes to standard output, unless the table itself does.
+fn tell_json(out: &Path, summary: &serde_json::Value) {
+    if out == Path::new("-") { eprintln!("{summary}") } else { println!("{summary}") }
+}

@@ -1,0 +1,187 @@
+//! `proprio doctor`: what this machine lacks, and what would give it.
+
+use anyhow::bail;
+use nix::sys::resource::{Resource, getrlimit};
+use nix::sys::socket::{AddressFamily, SockFlag, SockType};
+use proprio_drivers::{Frame, Id};
+use proprio_gateway::clock::{Clock, Monotonic};
+use proprio_gateway::link::virtual_bus::VirtualBus;
+use proprio_gateway::link::{Link, Received};
+use proprio_topics::Nanos;
+use proprio_topics::ipc::{Domain, DomainConfig};
+use serde_json::json;
+use std::fs;
+
+/// `proprio doctor`.
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    /// Print the findings as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// How a check went.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Verdict {
+    /// As it should be.
+    Ok,
+    /// It works, but not as well as it could.
+    Lacking,
+    /// Proprio can not run like this.
+    Failed,
+}
+
+struct Finding {
+    what: &'static str,
+    verdict: Verdict,
+    says: String,
+    hint: String,
+}
+
+/// Looks at everything; fails if something is missing without which nothing runs.
+pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
+    let findings = [can(), interfaces(), virtual_bus(domain), shared_memory(domain), buffers(), realtime(), locked_memory()];
+    if args.json {
+        let rows: Vec<_> = findings
+            .iter()
+            .map(|f| json!({ "check": f.what, "verdict": word(f.verdict), "says": f.says, "hint": f.hint }))
+            .collect();
+        println!("{}", serde_json::Value::from(rows));
+    } else {
+        for f in &findings {
+            println!("{:<8} {:<16} {}", word(f.verdict), f.what, f.says);
+            if !f.hint.is_empty() {
+                println!("{:<26}-> {}", "", f.hint);
+            }
+        }
+    }
+    let failed: Vec<_> = findings.iter().filter(|f| f.verdict == Verdict::Failed).map(|f| f.what).collect();
+    if failed.is_empty() { Ok(()) } else { bail!("this machine can not run proprio: {}", failed.join(", ")) }
+}
+
+const fn word(verdict: Verdict) -> &'static str {
+    match verdict {
+        Verdict::Ok => "ok",
+        Verdict::Lacking => "lacking",
+        Verdict::Failed => "FAILED",
+    }
+}
+
+fn finding(what: &'static str, verdict: Verdict, says: impl Into<String>, hint: &str) -> Finding {
+    Finding { what, verdict, says: says.into(), hint: if verdict == Verdict::Ok { String::new() } else { hint.into() } }
+}
+
+fn can() -> Finding {
+    // SockProtocol has no CAN_RAW; family and type are enough to learn whether the kernel has CAN at all.
+    match nix::sys::socket::socket(AddressFamily::Can, SockType::Raw, SockFlag::SOCK_CLOEXEC, None) {
+        Ok(_) => finding("kernel CAN", Verdict::Ok, "the kernel has raw CAN sockets", ""),
+        // A family that is there refuses protocol 0; a family that is not there says so.
+        Err(nix::Error::EPROTONOSUPPORT | nix::Error::EPROTOTYPE) => {
+            finding("kernel CAN", Verdict::Ok, "the kernel has CAN", "")
+        }
+        Err(error) => finding(
+            "kernel CAN",
+            Verdict::Lacking,
+            format!("the kernel has no CAN ({error})"),
+            "`modprobe can-raw` where the kernel has it as a module; else use the virtual bus: source = { kind = \"virtual\", name = \"...\" }",
+        ),
+    }
+}
+
+fn interfaces() -> Finding {
+    const ARPHRD_CAN: &str = "280";
+    let mut names = Vec::new();
+    for entry in fs::read_dir("/sys/class/net").into_iter().flatten().flatten() {
+        let read = |file: &str| fs::read_to_string(entry.path().join(file)).unwrap_or_default().trim().to_owned();
+        if read("type") == ARPHRD_CAN {
+            names.push(format!("{} ({}, queue {})", entry.file_name().to_string_lossy(), read("operstate"), read("tx_queue_len")));
+        }
+    }
+    if names.is_empty() {
+        let hint = "`ip link add dev vcan0 type vcan && ip link set vcan0 up` makes a virtual one; \
+                    `ip link set can0 up type can bitrate 1000000 restart-ms 100` brings a real one up";
+        return finding("CAN interfaces", Verdict::Lacking, "there is none", hint);
+    }
+    finding("CAN interfaces", Verdict::Ok, names.join(", "), "")
+}
+
+fn virtual_bus(domain: &DomainConfig) -> Finding {
+    let clock = Monotonic;
+    let name = format!("doctor-{}", std::process::id());
+    let test = || -> Result<Nanos, String> {
+        let open = || VirtualBus::open(&domain.name, &name, &[]).map_err(|e| e.to_string());
+        let (mut one, mut other) = (open()?, open()?);
+        let sent = clock.now();
+        one.send(&Frame::new(Id::standard(0x123), &[1, 2, 3]), sent + Nanos::from_millis(100)).map_err(|e| e.to_string())?;
+        match other.recv(sent + Nanos::from_millis(500)) {
+            Received::Frame(_) => Ok(clock.now() - sent),
+            _ => Err("a frame sent on it does not arrive; is the loopback interface up?".into()),
+        }
+    };
+    match test() {
+        Ok(took) => finding("virtual bus", Verdict::Ok, format!("a frame arrives after {} us", took.0 / 1000), ""),
+        Err(problem) => finding("virtual bus", Verdict::Lacking, problem, "`ip link set lo up`; IPv4 multicast on it must not be filtered"),
+    }
+}
+
+fn shared_memory(domain: &DomainConfig) -> Finding {
+    let probe = DomainConfig { name: format!("doctor-{}", std::process::id()), ..domain.clone() };
+    let opened = Domain::open(&probe).map(drop);
+    let _ = Domain::remove_if_unused(&probe);
+    match opened {
+        Ok(()) => finding("shared memory", Verdict::Ok, format!("a domain opens in {}", probe.base.display()), ""),
+        Err(error) => finding("shared memory", Verdict::Failed, error.to_string(), "gateway, estimator and consumers need it"),
+    }
+}
+
+fn buffers() -> Finding {
+    const WANTED: u64 = 4 << 20;
+    let number = |path: &str| fs::read_to_string(path).ok().and_then(|t| t.trim().parse::<u64>().ok());
+    let most = number("/proc/sys/net/core/rmem_max").unwrap_or(0);
+    if most >= WANTED || has_net_admin() {
+        return finding("receive buffers", Verdict::Ok, "a burst of thousands of frames fits", "");
+    }
+    finding(
+        "receive buffers",
+        Verdict::Lacking,
+        format!("at most {most} bytes: some {} frames wait while the gateway does not run", most / 768),
+        "`sysctl -w net.core.rmem_max=4194304`, or give the gateway CAP_NET_ADMIN",
+    )
+}
+
+/// Whether this process may exceed net.core.rmem_max.
+fn has_net_admin() -> bool {
+    const CAP_NET_ADMIN: u32 = 12;
+    let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|l| l.strip_prefix("CapEff:")).and_then(|m| u64::from_str_radix(m.trim(), 16).ok());
+    mask.is_some_and(|m| m >> CAP_NET_ADMIN & 1 == 1)
+}
+
+fn realtime() -> Finding {
+    let limit = getrlimit(Resource::RLIMIT_RTPRIO).map_or(0, |(soft, _)| soft);
+    let rt_kernel = fs::read_to_string("/sys/kernel/realtime").is_ok_and(|t| t.trim() == "1");
+    let kernel = if rt_kernel { "PREEMPT_RT kernel" } else { "not a PREEMPT_RT kernel" };
+    if limit > 0 || nix::unistd::geteuid().is_root() {
+        return finding("real-time", Verdict::Ok, format!("SCHED_FIFO is allowed; {kernel}"), "");
+    }
+    finding(
+        "real-time",
+        Verdict::Lacking,
+        format!("SCHED_FIFO is not allowed; {kernel}"),
+        "LimitRTPRIO=80 in the unit, or `ulimit -r 80`; needed only for realtime = { priority = ... }",
+    )
+}
+
+fn locked_memory() -> Finding {
+    const WANTED: u64 = 256 << 20;
+    let limit = getrlimit(Resource::RLIMIT_MEMLOCK).map_or(0, |(soft, _)| soft);
+    if limit >= WANTED || nix::unistd::geteuid().is_root() {
+        return finding("locked memory", Verdict::Ok, "memory can be locked", "");
+    }
+    finding(
+        "locked memory",
+        Verdict::Lacking,
+        format!("at most {limit} bytes can be locked"),
+        "LimitMEMLOCK=infinity in the unit, or `ulimit -l unlimited`; needed only for realtime = { priority = ... }",
+    )
+}
