@@ -1,0 +1,62 @@
+/* Lets Debian's user-mode Linux 6.1 run on hosts whose x86 extended register state is larger than it knows.
+ *
+ * That kernel saves and restores the state of its processes with ptrace, in a buffer sized at compile time for
+ * AVX-512. On a CPU with more (AMX: 11008 bytes) the host takes the short read but refuses the short write
+ * ("userspace - ptrace set fp regs failed, errno = 14"): it wants the whole buffer. Preloaded, this completes the
+ * write, leaving in their initial state the parts that the short buffer has no room for. Newer kernels (6.13) ask
+ * the host for the size and need none of this. Built and used by `with-vcan` alone.
+ */
+#define _GNU_SOURCE
+#include <cpuid.h>
+#include <dlfcn.h>
+#include <elf.h>
+#include <errno.h>
+#include <stdarg.h>
+#include <string.h>
+#include <sys/ptrace.h>
+#include <sys/syscall.h>
+#include <sys/uio.h>
+#include <unistd.h>
+
+#define XSTATE_BV 512 /* where the XSAVE area says which components it holds (Intel SDM 1, 13.4.2) */
+
+static long complete_write(pid_t pid, void *type, const struct iovec *given)
+{
+    static unsigned char whole[65536] __attribute__((aligned(64)));
+    struct iovec iov = {whole, sizeof whole};
+    unsigned long components;
+    unsigned a, size, offset, d;
+
+    /* A read of the whole state tells how long it is, and fills what the caller does not give. */
+    if (syscall(SYS_ptrace, PTRACE_GETREGSET, pid, type, &iov) < 0)
+        return -1;
+    if (given->iov_len < XSTATE_BV + sizeof components || given->iov_len >= iov.iov_len)
+        return syscall(SYS_ptrace, PTRACE_SETREGSET, pid, type, given);
+
+    memcpy(whole, given->iov_base, given->iov_len);
+    memcpy(&components, whole + XSTATE_BV, sizeof components);
+    for (unsigned i = 2; i < 63; i++) {
+        __cpuid_count(0xd, i, size, offset, a, d);
+        if (size != 0 && (unsigned long)offset + size > given->iov_len)
+            components &= ~(1UL << i);
+    }
+    memcpy(whole + XSTATE_BV, &components, sizeof components);
+    return syscall(SYS_ptrace, PTRACE_SETREGSET, pid, type, &iov);
+}
+
+long ptrace(enum __ptrace_request request, ...)
+{
+    static long (*next)(enum __ptrace_request, pid_t, void *, void *);
+    va_list list;
+    va_start(list, request);
+    pid_t pid = va_arg(list, pid_t);
+    void *address = va_arg(list, void *);
+    void *data = va_arg(list, void *);
+    va_end(list);
+
+    if (request == PTRACE_SETREGSET && address == (void *)NT_X86_XSTATE)
+        return complete_write(pid, address, data);
+    if (!next)
+        next = (long (*)(enum __ptrace_request, pid_t, void *, void *))dlsym(RTLD_NEXT, "ptrace");
+    return next(request, pid, address, data);
+}
