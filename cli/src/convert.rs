@@ -101,7 +101,9 @@ impl Output {
             (Box::new(file), None)
         } else {
             let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-            let (file, temporary) = tempfile::NamedTempFile::new_in(folder)
+            // tempfile names its own file in the error, which means nothing to whoever named another one.
+            let (file, temporary) = std::fs::metadata(folder)
+                .and_then(|_| tempfile::NamedTempFile::new_in(folder).map_err(|error| error.kind().into()))
                 .with_context(|| format!("{}: can not be written", path.display()))?
                 .into_parts();
             (Box::new(file), Some((temporary, path.to_owned())))
@@ -173,7 +175,7 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
             .collect();
         let summary = json!({
             "frames": report.frames, "samples": report.samples, "unclaimed": report.unclaimed, "bad_lines": report.bad_lines,
-            "other_interfaces": report.other_interfaces, "out_of_order": report.out_of_order, "devices": devices,
+            "other_interfaces": report.other_interfaces, "error_frames": report.error_frames, "out_of_order": report.out_of_order, "devices": devices,
         });
         tell_json(&args.out, &summary);
     } else {
@@ -251,8 +253,10 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
     let [late, backward, not_finite] = report.dropped;
     if late + backward + not_finite > 0 {
         eprintln!(
-            "{}: samples dropped: {late} late, {backward} not later than their channel's last, {not_finite} not finite",
-            args.log.display()
+            "{}: samples dropped, the first in line {}: {late} late (stamped before an estimate that was made already), {backward} not later than their \
+             channel's last, {not_finite} not finite",
+            args.log.display(),
+            report.first_dropped.unwrap_or_default()
         );
     }
     if args.json {
@@ -272,5 +276,5 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
 
 /// JSON goes to standard output, unless the table itself does.
 fn tell_json(out: &Path, summary: &serde_json::Value) {
-    if out == Path::new("-") { eprintln!("{summary}") } else { println!("{summary}") }
+    if out == Path::new("-") { eprintln!("{summary}") } else { say!("{summary}") }
 }

@@ -11,7 +11,7 @@ use proprio_estimator::config::ConfigError;
 use proprio_estimator::offline::Table;
 use proprio_estimator::pipeline::Estimate;
 use proprio_estimator::setup::Setup;
-use proprio_simulator::Robot;
+use proprio_simulator::{Fault, Robot, Settings, Simulator};
 use proprio_topics::csv::{self, Value};
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, Topic, monotonic};
 use proprio_topics::{
@@ -22,6 +22,9 @@ use std::fs::{self, File};
 use std::io::{BufReader, BufWriter, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
 /// `proprio demo`.
@@ -62,6 +65,13 @@ const SETTLE: Nanos = Nanos::from_millis(1000);
 /// Runs the demonstration.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let original = Robot::open(&args.robot)?;
+    // A wrong fault shows before anything is started.
+    let faults = args.fault.iter().map(|f| f.parse::<Fault>()).collect::<Result<Vec<_>, _>>()?;
+    Simulator::new(&original, &Settings { faults, ..Settings::default() }, Nanos::ZERO)?;
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
+        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot catch signals")?;
+    }
     fs::create_dir_all(&args.out).with_context(|| format!("{}: can not be created", args.out.display()))?;
     let out = args.out.canonicalize()?;
     let private = tempfile::Builder::new().prefix("proprio-").tempdir().context("no temporary folder")?;
@@ -71,8 +81,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let robot = Robot::load(&folder)?;
     let setup = Setup::new(&robot.config).map_err(|problem| ConfigError { file: folder.join("estimator.toml"), problem })?;
 
-    println!("robot {}: simulator, gateway and estimator as three processes; {} s", robot.config.robot, args.seconds);
-    let mut processes = Processes { private: private.path().to_owned(), domain: domain.clone(), out: out.clone(), running: vec![] };
+    say!("robot {}: simulator, gateway and estimator as three processes; {} s", robot.config.robot, args.seconds);
+    let mut processes = Processes { private: private.path().to_owned(), domain: domain.clone(), out: out.clone(), running: vec![], stop };
     let outcome = watch(args, &robot, &setup, &mut processes);
     let ended = processes.end();
     let watched = outcome.map_err(|error| processes.explain(error))?;
@@ -133,6 +143,8 @@ struct Processes {
     domain: DomainConfig,
     out: PathBuf,
     running: Vec<(&'static str, Child)>,
+    /// Set by a signal: everything is to end.
+    stop: Arc<AtomicBool>,
 }
 
 impl Processes {
@@ -156,6 +168,9 @@ impl Processes {
 
     /// Whether `name` has ended, and how.
     fn ended(&mut self, name: &str) -> anyhow::Result<bool> {
+        if self.stop.load(Relaxed) {
+            bail!("interrupted");
+        }
         let Some((_, child)) = self.running.iter_mut().find(|(n, _)| *n == name) else { return Ok(true) };
         match child.try_wait()? {
             None => Ok(false),
@@ -389,7 +404,7 @@ impl Screen {
                 .enumerate()
                 .map(|(i, j)| of(i).map_or_else(String::new, |t| format!("{j} {:.2}{}", t.torque, if t.valid == 1 { "" } else { "!" })))
                 .collect();
-            println!("{elapsed:5.1} s  {}", cells.join("  "));
+            say!("{elapsed:5.1} s  {}", cells.join("  "));
             return;
         }
         let mut text = String::new();
@@ -400,9 +415,9 @@ impl Screen {
         }
         self.bar.suspend(|| {
             if self.lines > 0 {
-                print!("\x1b[{}A", self.lines);
+                say_part!("\x1b[{}A", self.lines);
             }
-            print!("{text}");
+            say_part!("{text}");
             let _ = std::io::stdout().flush();
         });
         self.lines = self.joints.len();
@@ -551,15 +566,15 @@ fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Tru
     fs::write(out.join("report.html"), report::page(&format!("proprio demo: {}", setup.robot), &facts, &blocks))?;
 
     for (name, value) in &facts {
-        println!("{name:<10} {value}");
+        say!("{name:<10} {value}");
     }
-    println!("RMS error of the torques against the simulator's truth, from one second on:");
+    say!("RMS error of the torques against the simulator's truth, from one second on:");
     for (joint, error) in &errors {
-        println!("  {joint:<20} {:.4} Nm", error.as_f64().unwrap_or(f64::NAN));
+        say!("  {joint:<20} {:.4} Nm", error.as_f64().unwrap_or(f64::NAN));
     }
     if !upstream.is_empty() {
-        println!("{upstream}");
+        say!("{upstream}");
     }
-    println!("{}: report.html, estimates.csv, summary.json and the processes' logs", args.out.display());
+    say!("{}: report.html, estimates.csv, summary.json and the processes' logs", args.out.display());
     Ok(())
 }

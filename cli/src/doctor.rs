@@ -46,12 +46,12 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
             .iter()
             .map(|f| json!({ "check": f.what, "verdict": word(f.verdict), "says": f.says, "hint": f.hint }))
             .collect();
-        println!("{}", serde_json::Value::from(rows));
+        say!("{}", serde_json::Value::from(rows));
     } else {
         for f in &findings {
-            println!("{:<8} {:<16} {}", word(f.verdict), f.what, f.says);
+            say!("{:<8} {:<16} {}", word(f.verdict), f.what, f.says);
             if !f.hint.is_empty() {
-                println!("{:<26}-> {}", "", f.hint);
+                say!("{:<26}-> {}", "", f.hint);
             }
         }
     }

@@ -1,5 +1,21 @@
 //! The `proprio` command: every verb in one program. `proprio --help` lists them.
 
+/// `println!` for people who pipe into `head`: an output that nobody reads any more is not an error.
+macro_rules! say {
+    ($($text:tt)*) => {{
+        use std::io::Write as _;
+        let _ = writeln!(std::io::stdout(), $($text)*);
+    }};
+}
+
+/// The same without a line's end.
+macro_rules! say_part {
+    ($($text:tt)*) => {{
+        use std::io::Write as _;
+        let _ = write!(std::io::stdout(), $($text)*);
+    }};
+}
+
 mod convert;
 mod demo;
 mod doctor;
@@ -7,7 +23,7 @@ mod report;
 mod simulate;
 
 use clap::{Parser, Subcommand};
-use proprio_topics::ipc::DomainConfig;
+use proprio_topics::ipc::{DomainConfig, DomainError};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -81,7 +97,9 @@ fn main() -> ExitCode {
 fn fail(error: &anyhow::Error) -> ExitCode {
     eprintln!("error: {error:#}");
     let configuration = proprio_simulator::is_configuration(error) || error.chain().any(|cause| {
-        cause.is::<proprio_gateway::plan::ConfigError>() || cause.is::<proprio_estimator::config::ConfigError>()
+        cause.is::<proprio_gateway::plan::ConfigError>()
+            || cause.is::<proprio_estimator::config::ConfigError>()
+            || cause.downcast_ref().is_some_and(DomainError::is_configuration)
     });
     ExitCode::from(if configuration { 2 } else { 1 })
 }

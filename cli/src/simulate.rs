@@ -50,7 +50,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     }
     let summary = proprio_simulator::run(&robot, &options, &stop)?;
     if args.json {
-        println!("{}", serde_json::to_string(&summary)?);
+        say!("{}", serde_json::to_string(&summary)?);
     } else {
         eprintln!("{} frames sent in {:.1} s", summary.sent, summary.seconds);
     }

@@ -8,13 +8,14 @@ use crate::config::{Config, ConfigError};
 use crate::pipeline::Pipeline;
 use crate::setup::Setup;
 use anyhow::{Context, anyhow};
-use proprio_topics::ipc::{Domain, DomainConfig, PortError, Reader, Topic, Writer, monotonic};
+use proprio_topics::ipc::{Domain, DomainConfig, DomainError, PortError, Reader, Topic, Writer, monotonic};
 use proprio_topics::realtime;
 use proprio_topics::{
     ContactDeclaration, ContactEstimate, Description, EstimatorHealth, Header, Nanos, Publisher, Role, Sample,
     TorqueEstimate,
 };
 use sd_notify::NotifyState;
+use std::io::Write as _;
 use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -40,7 +41,8 @@ const STUCK: Nanos = Nanos::from_millis(500);
 pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<()> {
     let (config, setup) = load(config)?;
     if check {
-        print!("{setup}");
+        // Whoever reads it may stop early.
+        let _ = write!(std::io::stdout(), "{setup}");
         return Ok(());
     }
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start")?;
@@ -63,7 +65,8 @@ pub fn load(file: &Path) -> Result<(Config, Setup), ConfigError> {
 /// The exit code for an error that `run` ended with, after telling it: 2 for a wrong configuration, else 1.
 pub fn report(error: &anyhow::Error) -> ExitCode {
     eprintln!("error: {error:#}");
-    ExitCode::from(if error.chain().any(|cause| cause.is::<ConfigError>()) { 2 } else { 1 })
+    let wrong_domain = |e: &(dyn std::error::Error + 'static)| e.downcast_ref().is_some_and(DomainError::is_configuration);
+    ExitCode::from(if error.chain().any(|cause| cause.is::<ConfigError>() || wrong_domain(cause)) { 2 } else { 1 })
 }
 
 async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::Result<()> {

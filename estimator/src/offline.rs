@@ -20,10 +20,10 @@ use std::io::{self, Read, Write};
 #[non_exhaustive]
 pub enum OfflineError {
     /// The log can not be read.
-    #[error("{0}")]
+    #[error(transparent)]
     Log(#[from] proprio_topics::csv::Error),
     /// The estimates can not be written.
-    #[error("the estimates can not be written: {0}")]
+    #[error("the estimates can not be written")]
     Write(#[from] io::Error),
     /// The log lacks channels that the configuration names.
     #[error("the log has no column for {}", .0.join(", "))]
@@ -41,6 +41,8 @@ pub struct EstimateReport {
     pub log: Report,
     /// Samples dropped: late, not later than the last, not finite.
     pub dropped: [u64; 3],
+    /// The line of the first row with a dropped sample.
+    pub first_dropped: Option<u64>,
     /// Channels of the log that the configuration does not name.
     pub unused_channels: Vec<String>,
 }
@@ -99,6 +101,10 @@ pub fn estimate(setup: Setup, log: impl Read, out: impl Write) -> Result<Estimat
                 (Some(Target::Contact(contact)), Value::Active(active)) => pipeline.declare(*contact, t, *active),
                 _ => {}
             }
+        }
+        let counts = pipeline.counts();
+        if report.first_dropped.is_none() && counts.late + counts.backward + counts.not_finite > 0 {
+            report.first_dropped = Some(row.line);
         }
         while let Some(estimate) = pipeline.poll() {
             table.write(estimate, stamped)?;

@@ -262,22 +262,22 @@ impl Setup {
         let mut parts = Vec::new();
         for sensor in self.structure.sensors() {
             let mut joints = Vec::new();
-            // Up from the sensor to the next sensor or to the base's path.
             let mut joint = sensor.joint();
-            loop {
+            // Up to the root, or to the next sensor: beyond that one, both sides are measured.
+            let bounded = loop {
                 let parent = self.model.joints().get(joint).map_or(0, |j| j.parent);
-                if parent == self.base_link || parent == 0 {
-                    break;
+                if parent == 0 {
+                    break false;
                 }
                 joint = parent - 1;
                 if self.structure.sensors().iter().any(|s| s.joint() == joint) {
-                    break;
+                    break true;
                 }
                 if self.model.joints().get(joint).is_some_and(|j| j.dof.is_some()) {
                     joints.push(self.model.joint_name(joint));
                 }
-            }
-            if !joints.is_empty() {
+            };
+            if !joints.is_empty() && !bounded {
                 joints.reverse();
                 parts.push(format!(
                     "{} lies beyond {}: their torques also rest on the URDF's links in between.",

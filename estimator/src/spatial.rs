@@ -548,6 +548,8 @@ mod tests {
     }
 
     proptest! {
+        #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
+
         #[test]
         fn power_is_the_same_in_every_frame(x_ab in pose(), angular in vector(), linear in vector(), torque in vector(), force in vector()) {
             let (twist, wrench) = (Motion { angular, linear }, Wrench { torque, force });

@@ -294,6 +294,27 @@ fn malformed_files_have_one_clear_message_each() {
     assert!(missing.starts_with("cannot read /nowhere/model.urdf: "), "{missing}");
 }
 
+/// What dynamics do not need may be as odd as it likes.
+#[test]
+fn shapes_and_extensions_are_not_read() {
+    let odd = "<visual><geometry><blob/></geometry><origin xyz=\"a\"/></visual></link><transmission/><material/><link name=\"tip\">";
+    let model = read(
+        &robot()
+            .replace("<link name=\"tip\"/>", "<link name=\"tip\"></link>")
+            .replacen("<link name=\"tip\">", &format!("<link name=\"side\">{odd}"), 1),
+    );
+    assert!(
+        matches!(model, Err(ModelError::SeveralRoots(_))),
+        "side is a link of its own"
+    );
+    let shaped = robot().replacen(
+        "<link name=\"tip\"/>",
+        "<link name=\"tip\"><visual><geometry><blob/></geometry></visual></link>",
+        1,
+    );
+    assert_eq!(read(&shaped).unwrap().warnings(), &[] as &[String]);
+}
+
 #[test]
 fn sensor_joints_must_be_there_and_fixed() {
     let error = |keep: &str| Model::from_urdf(&robot(), &[keep]).unwrap_err().to_string();
@@ -335,6 +356,10 @@ fn what_is_only_odd_is_a_warning() {
         )
         .starts_with("root link base: neither it")
     );
+    assert_eq!(
+        warning("<child link=\"tip\"/>", "<child link=\"tip\"/><origin xyz=\"9 9 9\"/>"),
+        "joint end: <origin> is there twice; the first counts"
+    );
     // Declared to weigh nothing.
     let nothing = "<link name=\"finger\"><inertial><mass value=\"0\"/><inertia ixx=\"0\" ixy=\"0\" ixz=\"0\" iyy=\"0\" iyz=\"0\" izz=\"0\"/></inertial></link>";
     assert_eq!(
@@ -344,7 +369,23 @@ fn what_is_only_odd_is_a_warning() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 60, failure_persistence: None, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: 400, failure_persistence: None, ..ProptestConfig::default() })]
+
+    /// A damaged file gives a model or an error, never a panic.
+    #[test]
+    fn a_damaged_file_is_no_crash(cuts in prop::collection::vec((any::<prop::sample::Index>(), 0..60_usize), 1..4), swap in any::<prop::sample::Index>()) {
+        let mut text = robot().into_bytes();
+        for (at, length) in cuts {
+            let start = at.index(text.len());
+            text.drain(start..(start + length).min(text.len()));
+        }
+        let at = swap.index(text.len());
+        text[at] = b'9';
+        let text = String::from_utf8(text).expect("ASCII");
+        if let Err(error) = Model::from_urdf(&text, &["grip"]) {
+            prop_assert!(!error.to_string().is_empty());
+        }
+    }
 
     /// Folding moves nothing and loses nothing: every link is where the unfolded robot has it, and the total mass is the sum of all.
     #[test]

@@ -17,12 +17,13 @@ use crate::publish::Shared;
 use crate::status::BusStatus;
 use anyhow::{Context, anyhow, bail};
 use proprio_drivers::{Claim, Refusal, State};
-use proprio_topics::ipc::{Domain, DomainConfig, Writer};
+use proprio_topics::ipc::{Domain, DomainConfig, DomainError, Writer};
 use proprio_topics::realtime;
 use proprio_topics::{
     Counter, Description, DeviceHealth, GatewayHealth, Header, LinkState, MAX_CHANNELS, Nanos, Sample,
 };
 use sd_notify::NotifyState;
+use std::io::Write as _;
 use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -35,6 +36,8 @@ use tokio::signal::unix::{SignalKind, signal};
 
 /// How often health is sent.
 const HEALTH_PERIOD: Duration = Duration::from_millis(100);
+/// How long after the start a replayed log begins.
+const REPLAY_DELAY: Nanos = Nanos::from_millis(200);
 /// A bus thread that has not turned for so long is stuck.
 const STUCK: Nanos = Nanos::from_millis(500);
 
@@ -45,7 +48,8 @@ const STUCK: Nanos = Nanos::from_millis(500);
 pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<()> {
     let plan = Plan::load(config)?;
     if check {
-        print!("{plan}");
+        // Whoever reads it may stop early.
+        let _ = write!(std::io::stdout(), "{plan}");
         return Ok(());
     }
     for bus in &plan.buses {
@@ -64,7 +68,8 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
 /// The exit code for an error that `run` ended with, after telling it: 2 for a wrong configuration, else 1.
 pub fn report(error: &anyhow::Error) -> ExitCode {
     eprintln!("error: {error:#}");
-    ExitCode::from(if error.chain().any(|cause| cause.is::<ConfigError>()) { 2 } else { 1 })
+    let wrong_domain = |e: &(dyn std::error::Error + 'static)| e.downcast_ref().is_some_and(DomainError::is_configuration);
+    ExitCode::from(if error.chain().any(|cause| cause.is::<ConfigError>() || wrong_domain(cause)) { 2 } else { 1 })
 }
 
 async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> {
@@ -80,9 +85,11 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
     description_writer.send(&plan.description(Header::default()), clock.now())?;
 
     let stop = Arc::new(AtomicBool::new(false));
+    // The buses of one log stay in step; by then all of them are open.
+    let replay_start = clock.now() + REPLAY_DELAY;
     let mut threads = Vec::new();
     for (bus, number) in plan.buses.iter().zip(0_u32..) {
-        threads.push(BusThread::start(plan, bus, number, &domain, epoch, &stop).map_err(|error| {
+        threads.push(BusThread::start(plan, bus, number, &domain, epoch, &stop, replay_start).map_err(|error| {
             stop.store(true, Release);
             error.context(format!("bus {:?}", bus.name))
         })?);
@@ -165,10 +172,17 @@ impl BusThread {
         domain: &Domain,
         epoch: u64,
         stop: &Arc<AtomicBool>,
+        replay_start: Nanos,
     ) -> anyhow::Result<Self> {
         let status = Arc::new(BusStatus::new(number, bus));
         let decoder = Decoder::new(number, bus, None, Arc::clone(&status))?;
-        let link = open_link(bus, &domain.config().name, &decoder.claims())?;
+        let link: Box<dyn Link> = if let Source::Replay { log, pace } = &bus.source {
+            let mut replay = Replay::open(log, *pace, plan.matching(number as usize), &decoder.claims())?;
+            replay.start_at(replay_start);
+            Box::new(replay)
+        } else {
+            open_link(bus, &domain.config().name, &decoder.claims())?
+        };
         let ended = Arc::new(AtomicBool::new(false));
         let (ready, is_ready) = mpsc::channel();
         let (domain, robot, realtime) = (domain.clone(), plan.robot.clone(), bus.realtime);
@@ -205,7 +219,7 @@ impl BusThread {
     }
 }
 
-/// Opens the link that `bus` is configured for.
+/// Opens the link that `bus` is configured for; of a log it takes every frame.
 ///
 /// # Errors
 /// [`OpenError`], which says what to do.

@@ -2,10 +2,11 @@
 
 use crate::candump;
 use crate::config::Source;
+use crate::link::replay::Matching;
 use crate::decoder::Decoder;
 use crate::plan::{BusPlan, Plan};
 use crate::status::BusStatus;
-use proprio_drivers::{Board, Frame, Frames, Mode, Spec, State};
+use proprio_drivers::{Board, Format, Frame, Frames, Mode, Spec, State};
 use proprio_topics::csv::{self, Columns, Item, Series, Value, What};
 use proprio_topics::{Counter, Nanos, Reading, Sample, StampKind};
 use std::collections::VecDeque;
@@ -22,10 +23,10 @@ const REORDER: Nanos = Nanos::from_millis(100);
 #[non_exhaustive]
 pub enum OfflineError {
     /// A file could not be read or written.
-    #[error("{0}")]
+    #[error(transparent)]
     Io(#[from] io::Error),
     /// The table can not be read.
-    #[error("{0}")]
+    #[error(transparent)]
     Table(#[from] csv::Error),
     /// A device can not be built.
     #[error("{device}: {cause}")]
@@ -49,6 +50,8 @@ pub struct DecodeReport {
     pub other_interfaces: u64,
     /// Of these, frames that no device claims.
     pub unclaimed: u64,
+    /// Of these, error frames of the interface.
+    pub error_frames: u64,
     /// Samples written.
     pub samples: u64,
     /// Samples that came so late that the table is not in order there.
@@ -74,16 +77,6 @@ pub struct DeviceReport {
     pub counts: Vec<(Counter, u64)>,
     /// Why it could not be used.
     pub refusal: Option<String>,
-}
-
-/// Whether frames of `interface` belong to `bus`: by the interface it is configured for, then by the bus's name.
-#[must_use]
-pub fn belongs(bus: &BusPlan, interface: &str) -> bool {
-    match &bus.source {
-        Source::SocketCan { interface: own } if own == interface => true,
-        Source::Virtual { name } if name == interface => true,
-        _ => bus.name == interface,
-    }
 }
 
 /// Holds samples back until no earlier one can come, so that the table is in order of time.
@@ -130,7 +123,7 @@ pub fn decode(plan: &Plan, log: impl BufRead, table: impl Write, columns: Column
         let status = Arc::new(BusStatus::new(number, bus));
         let decoder = Decoder::new(number, bus, Some(Mode::Listen), Arc::clone(&status))
             .map_err(|cause| OfflineError::Device { device: bus.name.clone(), cause })?;
-        buses.push((bus, decoder, status));
+        buses.push((plan.matching(number as usize), decoder, status));
     }
     let mut report = DecodeReport::default();
     let mut order =
@@ -138,12 +131,16 @@ pub fn decode(plan: &Plan, log: impl BufRead, table: impl Write, columns: Column
     let mut failure = None;
     let mut reader = candump::Reader::new(log);
     let mut last_bus = 0;
-    let alone = buses.len() == 1;
+    let takes = |matching: &Option<Matching>, interface: &str| matching.as_ref().is_none_or(|m| m.takes(interface));
     while let Some(record) = reader.next_record()? {
         report.frames += 1;
+        if record.frame.format == Format::Error {
+            report.error_frames += 1;
+            continue;
+        }
         // Frames of one interface come in runs: the bus of the last one is tried first.
-        if !alone && buses.get(last_bus).is_none_or(|(bus, ..)| !belongs(bus, record.interface)) {
-            match buses.iter().position(|(bus, ..)| belongs(bus, record.interface)) {
+        if buses.get(last_bus).is_none_or(|(matching, ..)| !takes(matching, record.interface)) {
+            match buses.iter().position(|(matching, ..)| takes(matching, record.interface)) {
                 Some(bus) => last_bus = bus,
                 None => {
                     report.other_interfaces += 1;
@@ -174,7 +171,7 @@ pub fn decode(plan: &Plan, log: impl BufRead, table: impl Write, columns: Column
         let why = report.bad.first().map_or_else(|| "it is empty".to_owned(), |bad| format!("its first line: {bad}"));
         return Err(OfflineError::NoFrame(why));
     }
-    for (bus, decoder, status) in &buses {
+    for ((_, decoder, status), bus) in buses.iter().zip(&plan.buses) {
         report.unclaimed += status.unclaimed.load(Relaxed);
         for ((device, health), state) in bus.devices.iter().zip(status.devices()).zip(decoder.states()) {
             let count = |c: Counter| health.counters.get(c as usize).copied().unwrap_or(0);

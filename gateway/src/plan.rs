@@ -1,9 +1,9 @@
 //! gateway.toml, checked and resolved: what the rest of the gateway works with.
 
 use crate::config::{Pace, Raw, RawBus, RawDevice, Realtime, Source};
+use crate::link::replay::Matching;
 use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, Spec};
 use proprio_topics::{Description, Entry, Header, JointState, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, Role};
-use std::collections::HashMap;
 use std::fmt::{self, Write as _};
 use std::path::{Path, PathBuf};
 
@@ -137,6 +137,17 @@ impl Plan {
     pub fn parse(text: &str, folder: &Path) -> Result<Self, String> {
         let raw: Raw = toml::from_str(text).map_err(|e| e.to_string())?;
         Builder { text, folder, plan: Self { robot: raw.robot.clone(), buses: vec![], channels: vec![] } }.build(raw)
+    }
+
+    /// What bus number `bus` takes of a log that holds the frames of all buses.
+    #[must_use]
+    pub fn matching(&self, bus: usize) -> Option<Matching> {
+        let interfaces = self.buses.iter().map(|b| match &b.source {
+            Source::SocketCan { interface } => (Some(interface.as_str()), b.name.as_str()),
+            Source::Virtual { name } => (Some(name.as_str()), b.name.as_str()),
+            Source::Replay { .. } => (None, b.name.as_str()),
+        });
+        Matching::of(&interfaces.collect::<Vec<_>>(), bus)
     }
 
     /// The number of channel `name`.
@@ -401,12 +412,6 @@ impl fmt::Display for Plan {
     }
 }
 
-/// The channels of a plan by name.
-#[must_use]
-pub fn channel_numbers(plan: &Plan) -> HashMap<String, u32> {
-    plan.channels.iter().zip(0..).map(|(c, i)| (c.name.clone(), i)).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -449,7 +454,7 @@ mod tests {
         let joint = map.joint(JointState { position: 10.0, velocity: 100.0, ..JointState::ABSENT });
         assert!((joint.position - 0.4).abs() < 1e-15 && (joint.velocity + 1.0).abs() < 1e-15);
         assert!((map.device(joint).position - 10.0).abs() < 1e-12);
-        assert!(plan.to_string().contains("31A"), "{plan}");
+        assert!(plan.to_string().contains("3DA"), "{plan}");
     }
 
     #[test]
@@ -478,6 +483,6 @@ mod tests {
     fn two_devices_can_not_claim_one_identifier() {
         let second = "[[bus.device]]\n driver = \"icub_strain\"\n name = \"ft2\"\n address = 13\n [[bus.device]]";
         let problem = problem("[[bus.device]]", second);
-        assert!(problem.contains("\"ft\" and \"ft2\" both claim identifier 31"), "{problem}");
+        assert!(problem.contains("\"ft\" and \"ft2\" both claim identifier 3DA"), "{problem}");
     }
 }

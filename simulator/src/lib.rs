@@ -10,7 +10,7 @@
 //! - [`trajectory`]: how the joints move; [`truth`]: what every sensor would read without noise, through the estimator's own
 //!   dynamics (which are checked against three others in `tests/oracle`).
 //! - [`simulator`]: the boards, without links and without a clock; [`fault`]: what can be made to go wrong.
-//! - [`run`]: live, on CAN interfaces or virtual buses; [`record`]: offline, a whole session as a CAN log.
+//! - [`mod@run`]: live, on CAN interfaces or virtual buses; [`record`]: offline, a whole session as a CAN log.
 
 pub mod fault;
 mod noise;

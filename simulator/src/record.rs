@@ -34,7 +34,7 @@ pub enum RecordError {
         cause: proprio_drivers::SpecError,
     },
     /// The log could not be written.
-    #[error("the log can not be written: {0}")]
+    #[error("the log can not be written")]
     Io(#[from] io::Error),
 }
 

@@ -5,7 +5,7 @@ use proprio_drivers::{Frame, State};
 use proprio_gateway::decoder::Decoder;
 use proprio_gateway::plan::Plan;
 use proprio_gateway::status::BusStatus;
-use proprio_simulator::simulator::{ACCELERATION_NOISE, ANGULAR_VELOCITY_NOISE, BusCounts, JOINT_NOISE};
+use proprio_simulator::simulator::{ACCELERATION_NOISE, ANGULAR_VELOCITY_NOISE, BusCounts, BusSimulator, JOINT_NOISE};
 use proprio_simulator::{Robot, Settings, Simulation, Simulator};
 use proprio_topics::{Counter, Nanos, Quality, Reading, Sample, StampKind};
 use std::collections::HashMap;
@@ -121,7 +121,7 @@ fn session_from(robot: &Robot, settings: &Settings, seconds: f64, start: Nanos) 
     Session {
         samples,
         frames,
-        counts: simulator.buses().iter().map(|b| b.counts()).collect(),
+        counts: simulator.buses().iter().map(BusSimulator::counts).collect(),
         states: hosts.iter().map(|(d, _)| d.states().collect()).collect(),
         health: health
             .map(|h| (h.name.as_str().to_owned(), h.counters.to_vec()))

@@ -130,23 +130,22 @@ impl LeastSquares {
         self.dual * self.columns[j].component_mul(&self.inverse_squares) * self.weights[j]
     }
 
-    /// How far unknown `j` is fixed by the equations: 1 entirely, 0 not at all (the rest is the least norm's choice).
-    pub(super) fn determinacy(&self, j: usize) -> f64 {
-        self.columns[j]
-            .component_mul(&self.columns[j])
-            .dot(&self.inverse_squares)
-    }
-
-    /// Whether `sum_j g_j x_j` is fixed by the equations; `gradient` gives `g_j`.
+    /// Whether `sum_j g_j x_j` is fixed by the equations, rather than by the least norm: whether the part of `g` (scaled by the weights) outside of the
+    /// rows' span is below `tolerance` of it. `gradient` gives `g_j`.
     pub(super) fn determines(&self, gradient: impl Fn(usize) -> f64, tolerance: f64) -> bool {
-        let (mut total, mut along) = (0.0, Vector6::zeros());
-        for (j, (column, weight)) in self.columns.iter().zip(&self.weights).enumerate() {
-            let g = gradient(j) * weight;
+        let scaled = |j: usize, weight: f64| gradient(j) * weight;
+        let columns = || self.columns.iter().zip(&self.weights).enumerate();
+        let along = columns().fold(Vector6::zeros(), |sum, (j, (column, &weight))| {
+            sum + column * scaled(j, weight)
+        });
+        let inside = along.component_mul(&self.inverse_squares);
+        let (mut total, mut outside) = (0.0, 0.0);
+        for (j, (column, &weight)) in columns() {
+            let g = scaled(j, weight);
             total += g * g;
-            along += column * g;
+            outside += (g - column.dot(&inside)).powi(2);
         }
-        let seen = along.component_mul(&along).dot(&self.inverse_squares);
-        total - seen <= tolerance * total
+        outside <= tolerance * tolerance * total
     }
 
     /// `L^-T (1 - Q_r Q_r^T) L^-1`: what weighs the part of `b` that no unknown explains. `b^T P b` is its chi-square; zero where the rank is 6.
@@ -182,7 +181,10 @@ mod tests {
     }
 
     proptest! {
-        /// Against nalgebra's dense singular value decomposition, any shape and rank.
+        #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
+
+        /// The four Penrose conditions, which only the pseudo-inverse meets, for any shape and rank. (nalgebra's dense singular value decomposition is no oracle
+        /// here: 0.35.0 gives wrong vectors for some matrices of rank 3.)
         #[test]
         fn is_the_weighted_pseudo_inverse(
             columns in prop::collection::vec(prop::array::uniform6(-1.0..1.0_f64), 1..14),
@@ -201,21 +203,26 @@ mod tests {
             let n = columns.len();
             let whiten = lower.try_inverse().expect("invertible");
             let m = DMatrix::from_fn(6, n, |i, j| (whiten * Vector6::from(columns[j]))[i] * weights[j]);
-            let svd = m.clone().svd(true, true);
-            let least = svd.singular_values.max() * 1e-9;
-            let condition = svd.singular_values.max() / svd.singular_values.iter().copied().filter(|&s| s > least).fold(f64::INFINITY, f64::min);
-            prop_assume!(condition < 1e4);
-            let white = DVector::from_column_slice((whiten * Vector6::from(b)).as_slice());
-            let expected = svd.solve(&white, least).expect("u and v computed");
             let solver = build(&columns, &weights, &lower);
-            prop_assert_eq!(solver.rank(), svd.rank(least));
-            for j in 0..n {
-                let got = solver.gain(j).dot(&Vector6::from(b));
-                prop_assert!((got - expected[j] * weights[j]).abs() < 1e-9 * (1.0 + expected.amax()), "{} {}", got, expected[j]);
-            }
-            let residual = &white - m * &expected;
+            let inverse = DMatrix::from_fn(n, 6, |j, i| (lower.transpose() * solver.gain(j))[i] / weights[j]);
+            let tolerance = 1e-12 * (1.0 + inverse.amax().powi(2));
+            let near = |a: &DMatrix<f64>, b: &DMatrix<f64>| (a - b).amax() < tolerance;
+            prop_assert!(near(&(&m * &inverse * &m), &m));
+            prop_assert!(near(&(&inverse * &m * &inverse), &inverse));
+            prop_assert!(near(&(&m * &inverse), &(&m * &inverse).transpose()));
+            prop_assert!(near(&(&inverse * &m), &(&inverse * &m).transpose()));
+            // The projectors' trace is the rank, and what they leave is the residual.
+            prop_assert!(((&m * &inverse).trace() - solver.rank() as f64).abs() < tolerance);
+            let white = DVector::from_column_slice((whiten * Vector6::from(b)).as_slice());
+            let residual = &white - &m * &inverse * &white;
             let chi_square = (solver.unexplained() * Vector6::from(b)).dot(&Vector6::from(b));
-            prop_assert!((chi_square - residual.norm_squared()).abs() < 1e-8 * (1.0 + white.norm_squared()));
+            prop_assert!((chi_square - residual.norm_squared()).abs() < tolerance * (1.0 + white.norm_squared()));
+            // An unknown is determined exactly if the projector onto the rows has a one there.
+            let rows = &inverse * &m;
+            for j in 0..n {
+                let determined = solver.determines(|k| f64::from(u8::from(k == j)), 1e-5);
+                prop_assert_eq!(determined, rows[(j, j)] > 1.0 - 1e-10);
+            }
         }
     }
 
@@ -227,7 +234,6 @@ mod tests {
         let zero = build(&[[0.0; 6], [0.0; 6]], &[1.0, 1.0], &Matrix6::identity());
         assert_eq!(zero.rank(), 0);
         assert_eq!(zero.gain(1), Vector6::zeros());
-        assert_eq!(zero.determinacy(0), 0.0);
         assert!(!zero.determines(|_| 1.0, 1e-9));
     }
 }

@@ -24,7 +24,7 @@ use super::{DynamicsError, ExternalWrench, Kinematics, check_size};
 use crate::model::Model;
 use crate::spatial::{Mat3, Motion, Pose, Vec3, Wrench};
 
-/// A value counts as determined if at most this share of it (squared) is the least norm's choice.
+/// A value counts as determined if at most this share of it is the least norm's choice.
 const UNDETERMINED: f64 = 1e-9;
 
 /// What a result rests on.
@@ -380,7 +380,7 @@ impl Solver {
             for sensor in subtree.sensors.iter() {
                 add_covariance(&mut covariance, structure, sensor, &self.sensor_poses[sensor], point);
             }
-            covariance.cholesky().map(|factor| factor.unpack())
+            covariance.cholesky().map(nalgebra::Cholesky::unpack)
         });
         // Without sensors nothing weighs the equations: the length scale does, about the contacts. (A covariance has a factor: variances are positive.)
         let scale = || Matrix6::from_diagonal(&Vector6::new(length, length, length, 1.0, 1.0, 1.0));
@@ -399,7 +399,9 @@ impl Solver {
             for i in 0..spec.kind.unknowns() {
                 let gain = self.least.gain(start + i);
                 residual -= self.columns[start + i] * gain.dot(&b);
-                determined &= self.least.determinacy(start + i) >= 1.0 - UNDETERMINED;
+                determined &= self
+                    .least
+                    .determines(|j| if j == start + i { 1.0 } else { 0.0 }, UNDETERMINED);
                 if let ContactKind::ForceAlong(direction) = spec.kind {
                     (0..3).for_each(|axis| rows[axis] = gain * direction[axis]);
                 } else {

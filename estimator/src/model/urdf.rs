@@ -1,7 +1,7 @@
 //! A URDF text to a [`Model`]: parsed by urdf-rs, checked here (urdf-rs checks nothing), folded, numbered.
 //!
 //! The text is read twice. roxmltree first: for what urdf-rs drops (`<sensor>`, `<gazebo>`, whether an `<inertial>` was there at all) and for the line of a
-//! number that is none. Then urdf-rs, for everything else.
+//! number that is none. Then urdf-rs, for everything else, on the links and joints alone.
 //!
 //! What is an error and what a warning: an error is what would make the dynamics wrong or meaningless without anyone noticing. A triangle inequality that is
 //! violated (CAD exports do it) is a warning: the numbers computed are those of the inertia as written.
@@ -74,7 +74,8 @@ pub(super) fn read(text: &str, keep: &[&str]) -> Result<Model, ModelError> {
     let mut warnings = Vec::new();
     let with_inertial = check_numbers(&document)?;
     let sensors = read_sensors(&document, &mut warnings);
-    let robot = urdf_rs::read_from_string(text).map_err(|error| ModelError::NotUrdf(error.to_string()))?;
+    let robot = urdf_rs::read_from_string(&dynamics_only(text, &document, &mut warnings))
+        .map_err(|error| ModelError::NotUrdf(error.to_string()))?;
 
     let (links, numbers) = read_links(&robot, &with_inertial, &mut warnings)?;
     let joints = read_joints(&robot, &numbers, &mut warnings)?;
@@ -171,6 +172,52 @@ fn check_numbers(document: &roxmltree::Document<'_>) -> Result<HashSet<String>, 
         }
     }
     Ok(with_inertial)
+}
+
+/// The text without what dynamics do not need (shapes, materials, extensions: most of a URDF) and without repeated elements, at which urdf-rs stumbles. Of
+/// repeated ones the first counts, as for urdfdom.
+fn dynamics_only(text: &str, document: &roxmltree::Document<'_>, warnings: &mut Vec<String>) -> String {
+    let mut dropped = Vec::new();
+    let mut keep_first = |node: roxmltree::Node<'_, '_>, wanted: &[&str], owner: &str| {
+        let mut seen = HashSet::new();
+        for child in node.children().filter(roxmltree::Node::is_element) {
+            let tag = child.tag_name().name();
+            if wanted.contains(&tag) && !seen.insert(tag) {
+                warnings.push(format!("{owner}: <{tag}> is there twice; the first counts"));
+                dropped.push(child.range());
+            } else if !wanted.contains(&tag) {
+                dropped.push(child.range());
+            }
+        }
+    };
+    let mut others = Vec::new();
+    for node in document.root_element().children().filter(roxmltree::Node::is_element) {
+        let owner = format!(
+            "{} {}",
+            node.tag_name().name(),
+            node.attribute("name").unwrap_or("(without a name)")
+        );
+        match node.tag_name().name() {
+            "link" => {
+                keep_first(node, &["inertial"], &owner);
+                if let Some(inertial) = node.children().find(|child| child.has_tag_name("inertial")) {
+                    keep_first(inertial, &["origin", "mass", "inertia"], &owner);
+                }
+            }
+            "joint" => keep_first(node, &["origin", "parent", "child", "axis", "limit", "mimic"], &owner),
+            _ => others.push(node.range()),
+        }
+    }
+    dropped.extend(others);
+    dropped.sort_by_key(|range| range.start);
+    let mut kept = String::with_capacity(text.len());
+    let mut end = 0;
+    for range in dropped {
+        kept.push_str(text.get(end..range.start).unwrap_or_default());
+        end = end.max(range.end);
+    }
+    kept.push_str(text.get(end..).unwrap_or_default());
+    kept
 }
 
 // ---------------------------------------------------------------- sensors

@@ -93,10 +93,10 @@ pub enum Value {
 #[non_exhaustive]
 pub enum Error {
     /// The file could not be read.
-    #[error("{0}")]
+    #[error(transparent)]
     Io(#[from] io::Error),
     /// It is not a table.
-    #[error("it is not a CSV table: {0}")]
+    #[error("it is not a CSV table")]
     Csv(#[from] ::csv::Error),
     /// It has no column `t`.
     #[error("its first row must name the columns, `t` among them; it begins with {0:?}")]

@@ -72,10 +72,10 @@ impl DomainConfig {
             });
         }
         let io = |doing| {
-            move |source| DomainError::Io {
+            move |cause| DomainError::Io {
                 doing,
                 path: self.base.clone(),
-                source,
+                cause,
             }
         };
         DirBuilder::new()

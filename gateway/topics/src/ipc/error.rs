@@ -44,14 +44,14 @@ pub enum DomainError {
         user: u32,
     },
     /// A directory or file cannot be created, read or written.
-    #[error("shared-memory domain: {} {}: {source} (PROPRIO_RUNTIME_DIR chooses another place)", doing, path.display())]
+    #[error("shared-memory domain: {} {}: {cause} (PROPRIO_RUNTIME_DIR chooses another place)", doing, path.display())]
     Io {
         /// What was tried.
         doing: &'static str,
         /// With what.
         path: PathBuf,
         /// What the system says.
-        source: io::Error,
+        cause: io::Error,
     },
     /// Another process has been creating something for longer than it may.
     #[error("shared-memory domain: process {holder} holds {} and does not let go; is it stopped?", path.display())]
@@ -71,6 +71,14 @@ pub enum DomainError {
         /// What it says.
         problem: String,
     },
+}
+
+impl DomainError {
+    /// Whether it is a name or a directory that cannot be used on any machine: a wrong configuration, not a lack of this one.
+    #[must_use]
+    pub fn is_configuration(&self) -> bool {
+        matches!(self, Self::Name { .. } | Self::Base { .. })
+    }
 }
 
 /// Why a port cannot be had.

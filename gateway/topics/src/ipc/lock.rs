@@ -32,10 +32,10 @@ impl Lock {
     /// Takes the lock at `path`, creating the file if need be.
     pub(super) fn take(path: &Path, patience: Patience) -> Result<Self, DomainError> {
         let io = |doing| {
-            move |source| DomainError::Io {
+            move |cause| DomainError::Io {
                 doing,
                 path: path.to_path_buf(),
-                source,
+                cause,
             }
         };
         let mut steps = if patience == Patience::None { 0 } else { STEPS };

@@ -88,10 +88,10 @@ pub(super) fn sweep(place: &Place, config: &Config) -> Result<Swept, DomainError
         }
         swept.services = list(&place.root.join("services"))?.len();
         return match fs::remove_dir_all(&place.root) {
-            Err(source) if source.kind() != io::ErrorKind::NotFound => Err(DomainError::Io {
+            Err(cause) if cause.kind() != io::ErrorKind::NotFound => Err(DomainError::Io {
                 doing: "cannot remove",
                 path: place.root.clone(),
-                source,
+                cause,
             }),
             _ => Ok(swept),
         };
@@ -250,10 +250,10 @@ fn remove(path: &Path) -> bool {
 
 /// The files of a directory; none if it is not there.
 fn list(path: &Path) -> Result<Vec<(PathBuf, Metadata)>, DomainError> {
-    let io = |source| DomainError::Io {
+    let io = |cause| DomainError::Io {
         doing: "cannot list",
         path: path.to_path_buf(),
-        source,
+        cause,
     };
     let entries = match fs::read_dir(path) {
         Ok(entries) => entries,
