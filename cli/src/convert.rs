@@ -86,8 +86,43 @@ fn input(path: &Path) -> anyhow::Result<Box<dyn Read>> {
 /// The file that a conversion writes. It gets its name when it is complete: an error leaves no half table, and an input
 /// that is also the output is not destroyed before it is read.
 struct Output {
-    writer: Option<BufWriter<Box<dyn Write>>>,
+    writer: Option<BufWriter<Marked>>,
     temporary: Option<(tempfile::TempPath, PathBuf)>,
+}
+
+/// Why an output could not be written, kept apart from why an input could not be read.
+#[derive(Debug)]
+struct Unwritable(std::io::Error);
+
+impl std::fmt::Display for Unwritable {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+impl std::error::Error for Unwritable {}
+
+/// Marks what goes wrong with an output.
+struct Marked(Box<dyn Write>);
+
+impl Write for Marked {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0.write(bytes).map_err(|e| std::io::Error::new(e.kind(), Unwritable(e)))
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.0.flush().map_err(|e| std::io::Error::new(e.kind(), Unwritable(e)))
+    }
+}
+
+/// A conversion's error with the file that it is about.
+fn blame(error: offline::OfflineError, input: &Path, output: &Path) -> anyhow::Error {
+    match error {
+        offline::OfflineError::Io(e) if e.get_ref().is_some_and(|e| e.is::<Unwritable>()) => {
+            anyhow::anyhow!("{}: can not be written: {e}", output.display())
+        }
+        error => anyhow::Error::from(error).context(input.display().to_string()),
+    }
 }
 
 impl Output {
@@ -108,10 +143,10 @@ impl Output {
                 .into_parts();
             (Box::new(file), Some((temporary, path.to_owned())))
         };
-        Ok(Self { writer: Some(BufWriter::with_capacity(1 << 18, writer)), temporary })
+        Ok(Self { writer: Some(BufWriter::with_capacity(1 << 18, Marked(writer))), temporary })
     }
 
-    fn writer(&mut self) -> &mut BufWriter<Box<dyn Write>> {
+    fn writer(&mut self) -> &mut BufWriter<Marked> {
         #[allow(clippy::expect_used, reason = "taken only by finish, which consumes self")]
         self.writer.as_mut().expect("an output that is not finished has a writer")
     }
@@ -148,7 +183,7 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
     let log = BufReader::with_capacity(1 << 18, input(&args.log)?);
     let mut out = Output::new(&args.out)?;
     let columns = if args.all { Columns::All } else { Columns::Main };
-    let report = offline::decode(&plan, log, out.writer(), columns).with_context(|| args.log.display().to_string())?;
+    let report = offline::decode(&plan, log, out.writer(), columns).map_err(|e| blame(e, &args.log, &args.out))?;
     out.finish().with_context(|| args.out.display().to_string())?;
     for bad in &report.bad {
         eprintln!("{}: skipped: {bad}", args.log.display());
@@ -200,7 +235,7 @@ pub(crate) fn encode(args: &Encode) -> anyhow::Result<()> {
     let plan = Plan::load(&args.config)?;
     let samples = input(&args.samples)?;
     let mut out = Output::new(&args.out)?;
-    let report = offline::encode(&plan, samples, out.writer()).with_context(|| args.samples.display().to_string())?;
+    let report = offline::encode(&plan, samples, out.writer()).map_err(|e| blame(e, &args.samples, &args.out))?;
     out.finish().with_context(|| args.out.display().to_string())?;
     tell_table(&args.samples, &report.table);
     if !report.unknown_channels.is_empty() {
@@ -243,6 +278,7 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
             let problem = format!("{}: {error}", args.log.display());
             return Err(proprio_estimator::config::ConfigError { file: args.config.clone(), problem }.into());
         }
+        Err(proprio_estimator::offline::OfflineError::Write(error)) => bail!("{}: can not be written: {error}", args.out.display()),
         Err(error) => return Err(error).with_context(|| args.log.display().to_string()),
     };
     out.finish().with_context(|| args.out.display().to_string())?;

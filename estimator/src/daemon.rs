@@ -33,6 +33,8 @@ const LOOK: Nanos = Nanos::from_millis(50);
 const HEALTH_PERIOD: Nanos = Nanos::from_millis(100);
 /// A data plane that has not turned for so long is stuck.
 const STUCK: Nanos = Nanos::from_millis(500);
+/// How many samples are taken at once, at the most: as many as may wait from one bus.
+const INBOX: usize = <Sample as Topic>::QUALITY.buffer;
 
 /// Runs the estimator until SIGTERM or SIGINT.
 ///
@@ -122,6 +124,8 @@ struct DataPlane {
     robot: String,
     pipeline: Pipeline,
     samples: Option<Reader<Sample>>,
+    /// What was waiting, to be put in order; never grows.
+    inbox: Vec<Sample>,
     descriptions: Option<Reader<Description>>,
     declarations: Option<Reader<ContactDeclaration>>,
     /// Per channel number of the gateway: the pipeline's channel.
@@ -153,6 +157,7 @@ impl DataPlane {
             robot: robot.to_owned(),
             pipeline: Pipeline::new(setup),
             samples: None,
+            inbox: Vec::with_capacity(INBOX),
             descriptions: None,
             declarations: None,
             map: Vec::with_capacity(proprio_topics::MAX_CHANNELS),
@@ -195,12 +200,18 @@ impl DataPlane {
 
     /// Takes what is waiting and publishes what it completes; whether there was anything.
     fn take_samples(&mut self) -> bool {
-        let mut any = false;
-        // As many as may wait from one bus; then health and shutdown get their turn.
-        for _ in 0..<Sample as Topic>::QUALITY.buffer {
-            let Some(Ok(Some(sample))) = self.samples.as_mut().map(Reader::try_take) else { break };
-            any = true;
-            self.health.samples += 1;
+        // Shared memory hands out all of one bus before the next one's. After a stall that would let the first bus run ahead by more
+        // than an estimate waits, and what the others sent meanwhile would be late: so they are put in order first.
+        self.inbox.clear();
+        while self.inbox.len() < INBOX
+            && let Some(Ok(Some(sample))) = self.samples.as_mut().map(Reader::try_take)
+        {
+            self.inbox.push(sample);
+        }
+        self.inbox.sort_unstable_by_key(|s| (s.header.acquired, s.header.bus, s.header.sequence));
+        self.health.samples += self.inbox.len() as u64;
+        for at in 0..self.inbox.len() {
+            let Some(sample) = self.inbox.get(at).copied() else { break };
             if sample.header.epoch != self.mapped {
                 self.take_descriptions();
             }
@@ -221,7 +232,7 @@ impl DataPlane {
                 self.health.last_estimate = estimate.t;
             }
         }
-        any
+        !self.inbox.is_empty()
     }
 
     /// Reads who is who from the gateway.

@@ -90,7 +90,7 @@ pub fn estimate(setup: Setup, log: impl Read, out: impl Write) -> Result<Estimat
     while reader.next_row(&mut row)? {
         let t = row.t.unwrap_or_else(|| {
             stamped = false;
-            pseudo = pseudo + APART;
+            pseudo += APART;
             pseudo
         });
         for Item { series, value } in &row.items {

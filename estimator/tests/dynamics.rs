@@ -530,6 +530,76 @@ proptest! {
         }
     }
 
+    /// A reading is about the origin and in the axes of the frame that was named, folded parent links included.
+    #[test]
+    fn readings_are_in_the_named_frame((links, seed) in robots()) {
+        let mut random = Random::new(seed);
+        let robot = RandomRobot::new(links, &mut random);
+        let model = robot.model();
+        let (state, motion) = (State::new(&model, &mut random), motion(&mut random));
+        let kinematics = kinematics(&model, 0, &state, &motion);
+        let inverse = inverse(&model, &kinematics, &[]);
+        let noise = Noise { force: [1.0; 3], torque: [1.0; 3] };
+        for joint in &robot.cuts {
+            let number = model.joint(joint).unwrap();
+            let (parent, child) = model.joint_links(number).unwrap();
+            let place = |link: &str| {
+                let frame = model.frame(link).unwrap();
+                *kinematics.pose(frame.link) * frame.pose
+            };
+            let transmitted = inverse.transmitted(&kinematics, number);
+            let in_base = place(child).wrench(&transmitted);
+            let own = random.pose();
+            let cases = [
+                (MeasurementFrame::Child, place(child)),
+                (MeasurementFrame::Parent, place(parent)),
+                (MeasurementFrame::Sensor, place(child) * own),
+            ];
+            for (frame, x_bm) in cases {
+                for (direction, sign) in [(MeasurementDirection::ChildToParent, -1.0), (MeasurementDirection::ParentToChild, 1.0)] {
+                    let cut = SensorCut::new(&model, joint, frame, direction, &own, &noise).unwrap();
+                    let (got, expected) = (cut.reading(&transmitted), x_bm.wrench_back(&in_base) * sign);
+                    prop_assert!(wrench_gap(&got, &expected) < EXACT * size(&in_base.force_first()), "{frame:?}");
+                    prop_assert!(wrench_gap(&cut.transmitted(&got), &transmitted) < EXACT * size(&in_base.force_first()));
+                }
+            }
+        }
+    }
+
+    /// Chi-square of a sub-tree without contacts: its residual, weighted by the inverse of the sensors' covariance written out column by column.
+    #[test]
+    fn chi_square_is_the_residual_weighted_by_the_noise((links, seed) in robots()) {
+        use nalgebra::{DMatrix, DVector};
+        let mut scene = Scene::new(links, seed, 0);
+        scene.disturb(&mut Random::new(seed ^ 6));
+        let structure = scene.structure();
+        let (solver, kinematics) = (scene.solve(&structure, &ContactSet::EMPTY), scene.kinematics());
+        for (balance, subtree) in solver.balances().iter().zip(structure.subtrees()) {
+            prop_assert_eq!(balance.degrees, 6);
+            let mut columns = Vec::new();
+            for sensor in subtree.sensors.iter() {
+                let cut = &scene.sensors[sensor];
+                let x_bm = *kinematics.pose(cut.joint() + 1) * *cut.pose();
+                for (channel, deviation) in deviations_of(cut).into_iter().enumerate() {
+                    let mut unit = [0.0; 6];
+                    unit[channel] = deviation;
+                    let unit = Wrench::from_parts([unit[0], unit[1], unit[2]], [unit[3], unit[4], unit[5]]);
+                    columns.push(DVector::from_row_slice(&kinematics.pose(subtree.top).wrench_back(&x_bm.wrench(&unit)).force_first()));
+                }
+            }
+            if columns.is_empty() {
+                prop_assert_eq!(balance.chi_square, None);
+                continue;
+            }
+            let root = DMatrix::from_columns(&columns);
+            let covariance = &root * root.transpose();
+            let residual = DVector::from_row_slice(&balance.residual.force_first());
+            let expected = residual.dot(&covariance.lu().solve(&residual).unwrap());
+            let got = balance.chi_square.unwrap();
+            prop_assert!((got - expected).abs() < 1e-6 * expected, "{got} {expected}");
+        }
+    }
+
     /// Deviations are those of the linear map from readings to results, column by column.
     #[test]
     fn deviations_are_the_noise_carried_through((links, seed) in robots()) {

@@ -188,8 +188,11 @@ fn run(setup: Setup, events: &[Event]) -> (Vec<Estimate>, Pipeline) {
     (estimates, pipeline)
 }
 
+/// A torque bit for bit: value, deviation, validity, reason, cause.
+type Bits = (u64, u64, u32, Reason, u32);
+
 /// Bit for bit: NaN equals NaN.
-fn bits(estimates: &[Estimate]) -> Vec<(Nanos, Vec<(u64, u64, u32, Reason, u32)>)> {
+fn bits(estimates: &[Estimate]) -> Vec<(Nanos, Vec<Bits>)> {
     let joint = |j: &proprio_topics::JointTorque| {
         (
             j.torque.to_bits(),

@@ -15,7 +15,7 @@ use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
 use proprio_gateway::publish::Shared;
 use proprio_gateway::status::BusStatus;
-use proprio_gateway::{candump, link};
+use proprio_gateway::candump;
 use proprio_topics::csv::Columns;
 use proprio_topics::ipc::{Domain, DomainConfig, Writer};
 use proprio_topics::{LinkState, Nanos, Sample};
@@ -68,7 +68,7 @@ fn log(frames: u64) -> Vec<u8> {
 
 /// `proprio decode` without the disk: text in, text out.
 #[divan::bench(sample_count = 20)]
-fn decode_log_to_table(bencher: Bencher) {
+fn decode_log_to_table(bencher: Bencher<'_, '_>) {
     let log = log(300_000);
     let frames = log.iter().filter(|b| **b == b'\n').count();
     bencher.counter(ItemsCount::new(frames)).bench(|| {
@@ -79,7 +79,7 @@ fn decode_log_to_table(bencher: Bencher) {
 
 /// The text of a log to frames.
 #[divan::bench(sample_count = 20)]
-fn parse_log(bencher: Bencher) {
+fn parse_log(bencher: Bencher<'_, '_>) {
     let log = log(300_000);
     let frames = log.iter().filter(|b| **b == b'\n').count();
     bencher.counter(ItemsCount::new(frames)).bench(|| {
@@ -109,7 +109,7 @@ fn fill(bus: &mut VirtualBus, frames: &[Frame]) {
 
 /// Reads what has arrived, and nothing else.
 #[divan::bench(sample_count = 50)]
-fn bare_receive(bencher: Bencher) {
+fn bare_receive(bencher: Bencher<'_, '_>) {
     let domain = format!("bench{}", std::process::id());
     let mut sender = VirtualBus::open(&domain, "bare", &[]).unwrap();
     let receiver = std::cell::RefCell::new(VirtualBus::open(&domain, "bare", &[]).unwrap());
@@ -125,7 +125,7 @@ fn bare_receive(bencher: Bencher) {
 
 /// Frames waiting at the link to samples in shared memory: the whole of the data plane.
 #[divan::bench(sample_count = 50)]
-fn frames_to_shared_memory(bencher: Bencher) {
+fn frames_to_shared_memory(bencher: Bencher<'_, '_>) {
     let base = tempfile::tempdir().unwrap();
     let domain = Domain::open(&DomainConfig::new(base.path(), "bench")).unwrap();
     let name = format!("bench{}", std::process::id());
@@ -148,7 +148,7 @@ fn frames_to_shared_memory(bencher: Bencher) {
 struct Waiting(VirtualBus);
 
 impl Link for Waiting {
-    fn recv(&mut self, _: Nanos) -> link::Received {
+    fn recv(&mut self, _: Nanos) -> Received {
         self.0.recv(Nanos::ZERO)
     }
     fn send(&mut self, frame: &Frame, deadline: Nanos) -> Result<(), SendError> {

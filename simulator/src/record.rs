@@ -150,7 +150,9 @@ struct Host<'a> {
 impl Host<'_> {
     /// The frame as it arrives: after those before it.
     fn transfer(&mut self, frame: Frame, now: Nanos) -> Frame {
+        // Whole microseconds, as candump writes them: some canplayers read no others.
         let t = now.max(self.free);
+        let t = Nanos(t.0 + (1000 - t.0.rem_euclid(1000)) % 1000);
         self.free = t + FRAME_TIME;
         frame.at(t, StampKind::Log)
     }

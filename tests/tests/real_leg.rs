@@ -6,8 +6,10 @@ use proprio_estimator::offline::estimate;
 use proprio_estimator::setup::Setup;
 use proprio_gateway::offline::{decode, encode};
 use proprio_gateway::plan::Plan;
+use proprio_tests::watch::{Newest, Recorder, rows};
+use proprio_tests::{Rig, can, now};
 use proprio_topics::csv::{self, Columns, Row, Series, Value, What};
-use proprio_topics::{Kind, Nanos, Reading};
+use proprio_topics::{EstimatorHealth, GatewayHealth, Kind, Nanos, Reading};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
@@ -45,7 +47,7 @@ impl Leg {
     }
 
     /// Estimates of a table: per instant, per joint, the torque.
-    fn estimates(&self, table: &str) -> Vec<(Nanos, Vec<f64>, Vec<bool>)> {
+    fn estimates(&self, table: &str) -> Estimates {
         let mut out = Vec::new();
         estimate(self.setup(), table.as_bytes(), &mut out).expect("estimates");
         let text = String::from_utf8(out).expect("text");
@@ -69,23 +71,37 @@ impl Leg {
     }
 }
 
-/// RMS difference per joint over the instants of both that are valid in both, and how many these are.
-fn rms(a: &[(Nanos, Vec<f64>, Vec<bool>)], b: &[(Nanos, Vec<f64>, Vec<bool>)]) -> (Vec<f64>, usize) {
-    let joints = a.first().map_or(0, |x| x.1.len());
-    let (mut sums, mut count) = (vec![0.0; joints], 0);
-    for (x, y) in a.iter().zip(b) {
+/// Estimates by instant: the torques, and which of them are valid.
+type Estimates = Vec<(Nanos, Vec<f64>, Vec<bool>)>;
+
+/// RMS difference per joint over the pairs of instants that are valid in both, and how many these are.
+fn rms(a: &Estimates, b: &Estimates, pairs: &[(Nanos, Nanos)]) -> (Vec<f64>, usize) {
+    let by_time = |e: &Estimates| -> HashMap<Nanos, usize> { e.iter().enumerate().map(|(i, x)| (x.0, i)).collect() };
+    let (of_a, of_b) = (by_time(a), by_time(b));
+    let (mut sums, mut count) = (vec![0.0; a[0].1.len()], 0);
+    for (t, u) in pairs {
+        let (Some(x), Some(y)) = (of_a.get(t).map(|i| &a[*i]), of_b.get(u).map(|i| &b[*i])) else { continue };
         if x.2.iter().chain(&y.2).all(|valid| *valid) {
             count += 1;
-            sums.iter_mut()
-                .zip(x.1.iter().zip(&y.1))
-                .for_each(|(s, (p, q))| *s += (p - q).powi(2));
+            sums.iter_mut().zip(x.1.iter().zip(&y.1)).for_each(|(s, (p, q))| *s += (p - q).powi(2));
         }
     }
     (sums.into_iter().map(|s| (s / count as f64).sqrt()).collect(), count)
 }
 
+/// The instants of the trigger in `a` and in `b`, of which `a` may lack some: paired by what the sensor read.
+fn pairs(a: &str, b: &str) -> Vec<(Nanos, Nanos)> {
+    let trigger = (Kind::Wrench, "r_leg_ft_sensor".to_owned());
+    let (a, b) = (values(a).remove(&trigger).expect("the trigger"), values(b).remove(&trigger).expect("the trigger"));
+    let mut rest = b.iter();
+    a.iter().filter_map(|(t, value)| rest.find(|(_, other)| other == value).map(|(u, _)| (*t, *u))).collect()
+}
+
+/// The values of each channel at its instants.
+type Values = HashMap<(Kind, String), Vec<(Nanos, Vec<f64>)>>;
+
 /// All values of a table by kind, channel and instant.
-fn values(table: &str) -> HashMap<(Kind, String), Vec<(Nanos, Vec<f64>)>> {
+fn values(table: &str) -> Values {
     let mut reader = csv::Reader::new(table.as_bytes()).expect("a table");
     let series = reader.series().to_vec();
     let (mut row, mut values) = (Row::default(), HashMap::<_, Vec<_>>::new());
@@ -153,10 +169,110 @@ fn encoded_and_decoded_every_value_is_within_half_a_step() {
     }
     let (original, quantised) = (leg.estimates(&leg.table), leg.estimates(&decoded));
     assert_eq!(original.len(), quantised.len());
-    let (differences, count) = rms(&original, &quantised);
+    let (differences, count) = rms(&original, &quantised, &pairs(&decoded, &decoded));
     assert!(count * 10 > original.len() * 9, "{count} of {}", original.len());
     let worst = differences.iter().copied().fold(0.0, f64::max);
     println!("RMS torque difference after quantisation to CAN frames: worst joint {worst:.4} Nm over {count} instants");
     // A step of the sensors is 0.055 N and 0.001 Nm; a leg is 0.7 m long.
     assert!(worst < 0.05, "{differences:?}");
+}
+
+#[test]
+fn played_onto_vcan_the_live_estimates_are_those_of_the_samples_received() {
+    if !can::vcan() {
+        return;
+    }
+    let Some(leg) = leg() else { return };
+    let rig = Rig::new();
+    let file = |name: &str| rig.path(name).to_str().expect("a path in UTF-8").to_owned();
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("real_leg");
+    std::fs::copy(folder.join("gateway.toml"), file("gateway.toml")).expect("a copy");
+    let text = std::fs::read_to_string(folder.join("estimator.toml")).expect("the configuration");
+    let model = format!("model = {:?}", leg.config.model);
+    std::fs::write(
+        file("estimator.toml"),
+        text.replacen("model = \"model.urdf\"", &model, 1),
+    )
+    .expect("a copy");
+    std::fs::write(file("leg.csv"), &leg.table).expect("a copy");
+    rig.run(&[
+        "encode",
+        "--config",
+        &file("gateway.toml"),
+        "--samples",
+        &file("leg.csv"),
+        "--out",
+        &file("leg.log"),
+    ]);
+
+    let mut gateway = rig.start(&["gateway", "--config", &file("gateway.toml")]);
+    let mut estimator = rig.start(&["estimator", "--config", &file("estimator.toml")]);
+    let domain = rig.open();
+    let mut recorder = Recorder::of_all(&domain, "icub_legs");
+    let mut gateway_health: Newest<GatewayHealth> = Newest::open(&domain, "icub_legs");
+    let mut health: Newest<EstimatorHealth> = Newest::open(&domain, "icub_legs");
+    gateway_health.fresh();
+    health.fresh();
+    let frames = std::fs::read_to_string(file("leg.log"))
+        .expect("the log")
+        .lines()
+        .count() as u64;
+    let mut player = rig.spawn(
+        can::tool(&format!("canplayer -I {} vcan0=vcan0 vcan1=vcan1", file("leg.log"))),
+        "canplayer",
+    );
+    // The log is 20 s long; what follows its end is the last estimates, which wait for later samples.
+    let mut quiet_since = now();
+    let mut seen = 0;
+    while player.ended().is_none() || now() - quiet_since < Nanos::from_millis(1000) {
+        recorder.take();
+        if recorder.taken.len() != seen {
+            (seen, quiet_since) = (recorder.taken.len(), now());
+        }
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    gateway_health.fresh();
+    let received: u64 = gateway_health.fresh().buses().iter().map(|b| b.frames).sum();
+    assert_eq!(received, frames, "every frame that canplayer sent");
+    health.fresh();
+    let told = health.fresh();
+    assert_eq!(
+        (recorder.lost(), told.lost, told.late),
+        (0, 0, 0),
+        "nothing lost on the way here or to the estimator, nothing late"
+    );
+    gateway.end();
+    estimator.end();
+
+    let setup = leg.setup();
+    let channels: Vec<(Kind, String)> = leg.plan.channels.iter().map(|c| (c.kind, c.name.clone())).collect();
+    let received = rig.path("received.csv");
+    recorder.write_samples(&channels, &received);
+    let received = std::fs::read_to_string(received).expect("the samples");
+    let mut out = Vec::new();
+    estimate(leg.setup(), received.as_bytes(), &mut out).expect("estimates");
+    let offline = rows(&String::from_utf8(out).expect("text"));
+    let live = recorder.estimate_rows(&setup);
+    // The last instants may still have been waiting when the estimator was stopped.
+    assert!(
+        live.len() + 5 >= offline.len(),
+        "{} live, {} offline",
+        live.len(),
+        offline.len()
+    );
+    let different = live.iter().filter(|(t, row)| offline.get(*t) != Some(*row)).count();
+    assert_eq!(different, 0, "of {} live estimates", live.len());
+
+    let log = std::fs::read(file("leg.log")).expect("the log");
+    let mut decoded = Vec::new();
+    decode(&leg.plan, log.as_slice(), &mut decoded, Columns::Main).expect("decoded");
+    let pairs = pairs(&received, &String::from_utf8(decoded).expect("text"));
+    let (original, quantised) = (leg.estimates(&leg.table), leg.estimates(&received));
+    let (differences, count) = rms(&quantised, &original, &pairs);
+    let worst = differences.iter().copied().fold(0.0, f64::max);
+    println!(
+        "{} live estimates, bit for bit those of a replay; RMS torque difference to the original log: worst joint {worst:.4} Nm over {count} instants",
+        live.len() - 1
+    );
+    assert!(count * 10 > original.len() * 9, "{count} of {}", original.len());
 }

@@ -174,8 +174,9 @@ impl SocketCan {
                 (None, None) => (times.now(), StampKind::User),
             };
             let frame = frame.at(times.limit(stamp), kind);
-            // Who receives is on the bus.
-            if self.set_state(LinkState::Up) {
+            // Who receives is on the bus. Not so where the interface was lost: this frame may have been waiting since before
+            // then, and the system tells a loss only once.
+            if self.state == LinkState::BusOff && self.set_state(LinkState::Up) {
                 self.pending = Some(frame);
                 return Some(Received::StateChanged);
             }

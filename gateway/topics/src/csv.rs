@@ -282,7 +282,7 @@ impl<R: io::Read> Reader<R> {
                     *column = Some(Column {
                         series: number,
                         field: Field::Quality,
-                    })
+                    });
                 }
                 _ => report.unknown_columns.push(format!("{channel}/quality")),
             }

@@ -1,0 +1,162 @@
+//! Variants of `config/icub_left_arm`: the same arm on other buses, at another pace, with another patience.
+
+use proprio_simulator::Robot;
+use std::fs;
+use std::path::Path;
+use toml::{Table, Value};
+
+/// The two files of the arm's configuration, to be changed and written.
+#[derive(Debug, Clone)]
+pub struct Arm {
+    /// gateway.toml.
+    pub gateway: Table,
+    /// estimator.toml.
+    pub estimator: Table,
+}
+
+impl Default for Arm {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Arm {
+    /// The configuration as it is in the repository.
+    ///
+    /// # Panics
+    /// If it is not there.
+    #[must_use]
+    pub fn new() -> Self {
+        let folder = Robot::find("icub_left_arm").expect("the robot of this repository");
+        let read = |name: &str| -> Table {
+            fs::read_to_string(folder.join(name))
+                .expect(name)
+                .parse()
+                .expect("it is TOML")
+        };
+        let (gateway, mut estimator) = (read("gateway.toml"), read("estimator.toml"));
+        let model = folder.join("model.urdf").canonicalize().expect("the robot's model");
+        estimator.insert("model".into(), model.to_str().expect("a path in UTF-8").into());
+        Self { gateway, estimator }
+    }
+
+    /// A pace for a single slow processor: F/T every 10 ms, joints and IMU every 20 ms, and patience to go with it.
+    #[must_use]
+    pub fn slow() -> Self {
+        let paced = Self::new().periods(10, 20, 20).patience(1000.0, 25.0);
+        // The halves of a wrench, too, may come far apart where everything shares one processor.
+        paced.each_device(|driver, device| {
+            if driver == "icub_strain" {
+                device.insert("pair_timeout_ms".into(), 500.0.into());
+            }
+        })
+    }
+
+    /// Sets the periods of the F/T sensor, the IMU and the motor boards \[ms\].
+    #[must_use]
+    pub fn periods(self, force_torque: i64, imu: i64, motors: i64) -> Self {
+        self.each_device(|driver, device| {
+            let period = match driver {
+                "icub_strain" => force_torque,
+                "icub_imu" => imu,
+                _ => motors,
+            };
+            device.insert("period_ms".into(), period.into());
+        })
+    }
+
+    /// Sets how long devices and channels may be silent, and how long an estimate waits \[ms\].
+    #[must_use]
+    pub fn patience(self, max_silence_ms: f64, max_wait_ms: f64) -> Self {
+        let mut this = self.each_device(|_, device| {
+            device.insert("max_silence_ms".into(), max_silence_ms.into());
+        });
+        this.set("input", "max_silence_ms", max_silence_ms);
+        this.set("output", "max_wait_ms", max_wait_ms);
+        this
+    }
+
+    fn set(&mut self, table: &str, key: &str, value: f64) {
+        let table = self.estimator.entry(table).or_insert_with(|| Table::new().into());
+        table.as_table_mut().expect("a table").insert(key.into(), value.into());
+    }
+
+    /// Puts the buses onto CAN interfaces.
+    #[must_use]
+    pub fn on_interfaces(self, interfaces: [&str; 2]) -> Self {
+        self.on("socketcan", "interface", interfaces)
+    }
+
+    /// Puts the buses onto virtual buses of these names.
+    #[must_use]
+    pub fn on_virtual(self, names: [&str; 2]) -> Self {
+        self.on("virtual", "name", names)
+    }
+
+    fn on(mut self, kind: &str, key: &str, names: [&str; 2]) -> Self {
+        for (bus, name) in self.buses().zip(names) {
+            let source = Table::from_iter([("kind".to_owned(), kind.into()), (key.to_owned(), name.into())]);
+            bus.insert("source".into(), source.into());
+        }
+        self
+    }
+
+    /// Changes every device, given its driver's name.
+    #[must_use]
+    pub fn each_device(mut self, mut change: impl FnMut(&str, &mut Table)) -> Self {
+        for bus in self.buses() {
+            for device in bus
+                .get_mut("device")
+                .and_then(Value::as_array_mut)
+                .into_iter()
+                .flatten()
+            {
+                let device = device.as_table_mut().expect("a device is a table");
+                let driver = device
+                    .get("driver")
+                    .and_then(Value::as_str)
+                    .expect("a device has a driver")
+                    .to_owned();
+                change(&driver, device);
+            }
+        }
+        self
+    }
+
+    fn buses(&mut self) -> impl Iterator<Item = &mut Table> {
+        let buses = self.gateway.get_mut("bus").and_then(Value::as_array_mut);
+        buses.into_iter().flatten().filter_map(Value::as_table_mut)
+    }
+
+    /// Writes both files into `folder` and loads them.
+    ///
+    /// # Panics
+    /// If they can not be written, or are no configuration.
+    #[must_use]
+    pub fn write(&self, folder: &Path) -> Written {
+        fs::create_dir_all(folder).expect("a folder for the configuration");
+        for (name, table) in [("gateway.toml", &self.gateway), ("estimator.toml", &self.estimator)] {
+            fs::write(folder.join(name), table.to_string()).expect("a configuration can be written");
+        }
+        let text = |name: &str| folder.join(name).to_str().expect("a path in UTF-8").to_owned();
+        Written {
+            robot: Robot::load(folder).unwrap_or_else(|error| panic!("{error}")),
+            folder: text(""),
+            gateway: text("gateway.toml"),
+            estimator: text("estimator.toml"),
+        }
+    }
+}
+
+/// A configuration on disk.
+#[derive(Debug, Clone)]
+pub struct Written {
+    /// It, loaded.
+    pub robot: Robot,
+    /// The path of its folder.
+    pub folder: String,
+    /// The path of gateway.toml.
+    pub gateway: String,
+    /// The path of estimator.toml.
+    pub estimator: String,
+}
