@@ -118,7 +118,7 @@ impl Write for Marked {
 /// A conversion's error with the file that it is about.
 fn blame(error: offline::OfflineError, input: &Path, output: &Path) -> anyhow::Error {
     match error {
-        offline::OfflineError::Io(e) if e.get_ref().is_some_and(|e| e.is::<Unwritable>()) => {
+        offline::OfflineError::Io(e) if e.get_ref().and_then(|e| e.downcast_ref::<Unwritable>()).is_some() => {
             anyhow::anyhow!("{}: can not be written: {e}", output.display())
         }
         error => anyhow::Error::from(error).context(input.display().to_string()),

@@ -68,6 +68,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     // A wrong fault shows before anything is started.
     let faults = args.fault.iter().map(|f| f.parse::<Fault>()).collect::<Result<Vec<_>, _>>()?;
     Simulator::new(&original, &Settings { faults, ..Settings::default() }, Nanos::ZERO)?;
+    // Ctrl-C reaches the processes too, which end in order; this one must stay until they have, to clean up after them.
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot catch signals")?;
@@ -85,13 +86,16 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let mut processes = Processes { private: private.path().to_owned(), domain: domain.clone(), out: out.clone(), running: vec![], stop };
     let outcome = watch(args, &robot, &setup, &mut processes);
     let ended = processes.end();
-    let watched = outcome.map_err(|error| processes.explain(error))?;
-    ended?;
-    let truth = Truth::read(&private.path().join("truth.csv"), &watched.joints).context("the simulator's truth")?;
     let removed = Domain::remove_if_unused(&domain);
     if !matches!(removed, Ok(true)) {
         eprintln!("note: shared memory of the demonstration could not be removed: {removed:?}");
     }
+    if processes.stop.load(Relaxed) {
+        bail!("interrupted");
+    }
+    let watched = outcome.map_err(|error| processes.explain(error))?;
+    ended?;
+    let truth = Truth::read(&private.path().join("truth.csv"), &watched.joints).context("the simulator's truth")?;
     finish(args, &setup, &out, &watched, &truth)
 }
 
@@ -283,6 +287,8 @@ fn watch(args: &Args, robot: &Robot, setup: &Setup, processes: &mut Processes) -
     let mut contacts: Reader<ContactEstimate> = open(&domain, &name, processes)?;
     let mut gateway_health: Reader<GatewayHealth> = open(&domain, &name, processes)?;
     let mut estimator_health: Reader<EstimatorHealth> = open(&domain, &name, processes)?;
+    // The gateway tells its health once all its links are open: from then on no frame is lost.
+    let gateway = Box::new(wait_for(&mut gateway_health, processes)?);
     processes.start("simulate", &simulate)?;
 
     let joints: Vec<String> = setup.joint_names().map(ToOwned::to_owned).collect();
@@ -291,7 +297,7 @@ fn watch(args: &Args, robot: &Robot, setup: &Setup, processes: &mut Processes) -
         joints,
         estimates: Vec::with_capacity((args.seconds * 1100.0) as usize),
         lost_estimates: 0,
-        gateway: Box::new(wait_for(&mut gateway_health, processes)?),
+        gateway,
         estimator: EstimatorHealth::default(),
         simulator: Json::Null,
     };

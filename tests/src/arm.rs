@@ -43,7 +43,7 @@ impl Arm {
     /// A pace for a single slow processor: F/T every 10 ms, joints and IMU every 20 ms, and patience to go with it.
     #[must_use]
     pub fn slow() -> Self {
-        let paced = Self::new().periods(10, 20, 20).patience(1000.0, 25.0);
+        let paced = Self::new().periods(10, 20, 20).patience(1000.0, 100.0);
         // The halves of a wrench, too, may come far apart where everything shares one processor.
         paced.each_device(|driver, device| {
             if driver == "icub_strain" {

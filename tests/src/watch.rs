@@ -328,20 +328,13 @@ impl Truth {
         (t >= t0).then(|| y0 + (y1 - y0) * ((t - t0).seconds() / (t1 - t0).seconds()))
     }
 
-    /// The RMS error of joint `joint` in `estimates`, in those within the truth's time; with their number.
+    /// The errors of joint `joint` in those of `estimates` that are within the truth's time \[Nm\].
     #[must_use]
-    pub fn rms_error<'a>(&self, joint: usize, estimates: impl Iterator<Item = &'a TorqueEstimate>) -> (f64, u32) {
-        let (mut square, mut count) = (0.0, 0);
-        for estimate in estimates {
-            let (Some(torque), Some(right)) = (
-                estimate.joints().get(joint),
-                self.torque(joint, estimate.header.acquired),
-            ) else {
-                continue;
-            };
-            square += (torque.torque - right).powi(2);
-            count += 1;
-        }
-        ((square / f64::from(count)).sqrt(), count)
+    pub fn errors<'a>(&self, joint: usize, estimates: impl Iterator<Item = &'a TorqueEstimate>) -> Vec<f64> {
+        let error = |estimate: &TorqueEstimate| {
+            let right = self.torque(joint, estimate.header.acquired)?;
+            Some(estimate.joints().get(joint)?.torque - right)
+        };
+        estimates.filter_map(error).collect()
     }
 }

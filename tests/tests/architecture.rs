@@ -251,7 +251,7 @@ fn libraries_with_one_owner_stay_with_it() {
         let dependencies = package["dependencies"].as_array_mut().unwrap();
         match name.as_str() {
             "proprio-cli" => {
-                dependencies.push(serde_json::json!({ "name": "socketcan", "kind": null, "optional": false }))
+                dependencies.push(serde_json::json!({ "name": "socketcan", "kind": null, "optional": false }));
             }
             "proprio-gateway" => {
                 dependencies.push(serde_json::json!({ "name": "iceoryx2", "kind": null, "optional": true }));
@@ -411,7 +411,7 @@ fn walk(root: &Path, below: &str, found: &mut Vec<String>) {
         };
         match entry.file_type() {
             Ok(kind) if kind.is_dir() && !["target", ".git", "proprio-demo"].contains(&name.as_str()) => {
-                walk(root, &path, found)
+                walk(root, &path, found);
             }
             Ok(kind) if kind.is_file() => found.push(path),
             _ => {}

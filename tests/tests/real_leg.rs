@@ -80,10 +80,14 @@ fn rms(a: &Estimates, b: &Estimates, pairs: &[(Nanos, Nanos)]) -> (Vec<f64>, usi
     let (of_a, of_b) = (by_time(a), by_time(b));
     let (mut sums, mut count) = (vec![0.0; a[0].1.len()], 0);
     for (t, u) in pairs {
-        let (Some(x), Some(y)) = (of_a.get(t).map(|i| &a[*i]), of_b.get(u).map(|i| &b[*i])) else { continue };
+        let (Some(x), Some(y)) = (of_a.get(t).map(|i| &a[*i]), of_b.get(u).map(|i| &b[*i])) else {
+            continue;
+        };
         if x.2.iter().chain(&y.2).all(|valid| *valid) {
             count += 1;
-            sums.iter_mut().zip(x.1.iter().zip(&y.1)).for_each(|(s, (p, q))| *s += (p - q).powi(2));
+            sums.iter_mut()
+                .zip(x.1.iter().zip(&y.1))
+                .for_each(|(s, (p, q))| *s += (p - q).powi(2));
         }
     }
     (sums.into_iter().map(|s| (s / count as f64).sqrt()).collect(), count)
@@ -92,9 +96,14 @@ fn rms(a: &Estimates, b: &Estimates, pairs: &[(Nanos, Nanos)]) -> (Vec<f64>, usi
 /// The instants of the trigger in `a` and in `b`, of which `a` may lack some: paired by what the sensor read.
 fn pairs(a: &str, b: &str) -> Vec<(Nanos, Nanos)> {
     let trigger = (Kind::Wrench, "r_leg_ft_sensor".to_owned());
-    let (a, b) = (values(a).remove(&trigger).expect("the trigger"), values(b).remove(&trigger).expect("the trigger"));
+    let (a, b) = (
+        values(a).remove(&trigger).expect("the trigger"),
+        values(b).remove(&trigger).expect("the trigger"),
+    );
     let mut rest = b.iter();
-    a.iter().filter_map(|(t, value)| rest.find(|(_, other)| other == value).map(|(u, _)| (*t, *u))).collect()
+    a.iter()
+        .filter_map(|(t, value)| rest.find(|(_, other)| other == value).map(|(u, _)| (*t, *u)))
+        .collect()
 }
 
 /// The values of each channel at its instants.
