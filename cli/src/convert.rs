@@ -184,9 +184,15 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
     let mut out = Output::new(&args.out)?;
     let columns = if args.all { Columns::All } else { Columns::Main };
     let report = offline::decode(&plan, log, out.writer(), columns).map_err(|e| blame(e, &args.log, &args.out))?;
-    out.finish().with_context(|| args.out.display().to_string())?;
+    // A result without a row replaces nothing.
+    if report.samples > 0 {
+        out.finish().with_context(|| args.out.display().to_string())?;
+    }
     for bad in &report.bad {
         eprintln!("{}: skipped: {bad}", args.log.display());
+    }
+    if report.dropped > 0 {
+        eprintln!("{}: {} frames were lost while it was recorded, as candump says in it", args.log.display(), report.dropped);
     }
     if report.bad_lines > report.bad.len() as u64 {
         eprintln!("{}: {} lines skipped in all", args.log.display(), report.bad_lines);
@@ -210,7 +216,7 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
             .collect();
         let summary = json!({
             "frames": report.frames, "samples": report.samples, "unclaimed": report.unclaimed, "bad_lines": report.bad_lines,
-            "other_interfaces": report.other_interfaces, "error_frames": report.error_frames, "out_of_order": report.out_of_order, "devices": devices,
+            "other_interfaces": report.other_interfaces, "error_frames": report.error_frames, "dropped": report.dropped, "out_of_order": report.out_of_order, "devices": devices,
         });
         tell_json(&args.out, &summary);
     } else {
@@ -236,7 +242,9 @@ pub(crate) fn encode(args: &Encode) -> anyhow::Result<()> {
     let samples = input(&args.samples)?;
     let mut out = Output::new(&args.out)?;
     let report = offline::encode(&plan, samples, out.writer()).map_err(|e| blame(e, &args.samples, &args.out))?;
-    out.finish().with_context(|| args.out.display().to_string())?;
+    if report.samples > 0 {
+        out.finish().with_context(|| args.out.display().to_string())?;
+    }
     tell_table(&args.samples, &report.table);
     if !report.unknown_channels.is_empty() {
         eprintln!("{}: not in {}: {}", args.samples.display(), args.config.display(), report.unknown_channels.join(", "));
@@ -281,7 +289,9 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
         Err(proprio_estimator::offline::OfflineError::Write(error)) => bail!("{}: can not be written: {error}", args.out.display()),
         Err(error) => return Err(error).with_context(|| args.log.display().to_string()),
     };
-    out.finish().with_context(|| args.out.display().to_string())?;
+    if report.estimates > 0 {
+        out.finish().with_context(|| args.out.display().to_string())?;
+    }
     tell_table(&args.log, &report.log);
     if !report.unused_channels.is_empty() {
         eprintln!("{}: not in {}: {}", args.log.display(), args.config.display(), report.unused_channels.join(", "));

@@ -15,7 +15,7 @@ use proprio_simulator::{Fault, Robot, Settings, Simulator};
 use proprio_topics::csv::{self, Value};
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, Topic, monotonic};
 use proprio_topics::{
-    ContactEstimate, EstimatorHealth, GatewayHealth, Kind, Nanos, Reading, TorqueEstimate,
+    ContactEstimate, ContactWrench, EstimatorHealth, GatewayHealth, JointTorque, Kind, Nanos, Reading, TorqueEstimate,
 };
 use serde_json::{Value as Json, json};
 use std::fs::{self, File};
@@ -52,8 +52,8 @@ pub(crate) struct Args {
 
 fn seconds(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
-        Ok(s) if (2.0..=3600.0).contains(&s) => Ok(s),
-        _ => Err("must be 2 to 3600".into()),
+        Ok(s) if (2.0..=600.0).contains(&s) => Ok(s),
+        _ => Err("must be 2 to 600".into()),
     }
 }
 
@@ -70,11 +70,15 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     Simulator::new(&original, &Settings { faults, ..Settings::default() }, Nanos::ZERO)?;
     // Ctrl-C reaches the processes too, which end in order; this one must stay until they have, to clean up after them.
     let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
+    for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT, signal_hook::consts::SIGHUP, signal_hook::consts::SIGQUIT] {
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot catch signals")?;
     }
     fs::create_dir_all(&args.out).with_context(|| format!("{}: can not be created", args.out.display()))?;
     let out = args.out.canonicalize()?;
+    // Results of an earlier run are not those of this one.
+    for name in ["summary.json", "report.html", "estimates.csv"] {
+        let _ = fs::remove_file(out.join(name));
+    }
     let private = tempfile::Builder::new().prefix("proprio-").tempdir().context("no temporary folder")?;
     let domain = DomainConfig::new(private.path(), &format!("demo-{}", std::process::id()));
     let folder = private.path().join("robot");
@@ -121,7 +125,8 @@ fn copy_robot(robot: &Robot, buses: &[String], to: &Path) -> anyhow::Result<()> 
                 bus.insert("device".into(), devices.into());
             }
         } else if buses.len() != list.len() {
-            bail!("--bus is given {} times; {} has {} buses: give one interface for each, or one for all", buses.len(), robot.config.robot, list.len());
+            let problem = format!("--bus is given {} times; the robot has {} buses: give one interface for each, or one for all", buses.len(), list.len());
+            return Err(ConfigError { file: robot.folder.join("gateway.toml"), problem }.into());
         }
         for (bus, interface) in list.iter_mut().zip(buses) {
             if let Some(bus) = bus.as_table_mut() {
@@ -245,8 +250,8 @@ struct Watched {
 struct Seen {
     t: Nanos,
     published: Nanos,
-    torques: Box<TorqueEstimate>,
-    contacts: Option<Box<ContactEstimate>>,
+    joints: Box<[JointTorque]>,
+    contacts: Box<[ContactWrench]>,
 }
 
 fn open<T: Topic>(domain: &Domain, robot: &str, processes: &mut Processes) -> anyhow::Result<Reader<T>> {
@@ -310,15 +315,15 @@ fn watch(args: &Args, robot: &Robot, setup: &Setup, processes: &mut Processes) -
             watched.estimates.push(Seen {
                 t: estimate.header.acquired,
                 published: estimate.header.published,
-                torques: Box::new(estimate),
-                contacts: None,
+                joints: estimate.joints().into(),
+                contacts: Box::default(),
             });
         }
         while let Some(estimate) = contacts.try_take()? {
             // The contacts of an instant follow its torques at once.
             let seen = watched.estimates.iter_mut().rev().take(600).find(|s| s.t == estimate.header.acquired);
             if let Some(seen) = seen {
-                seen.contacts = Some(Box::new(estimate));
+                seen.contacts = estimate.contacts().into();
             }
         }
         if let Some(health) = gateway_health.latest()? {
@@ -340,7 +345,8 @@ fn watch(args: &Args, robot: &Robot, setup: &Setup, processes: &mut Processes) -
         if processes.ended("simulate")? && now - last_seen > Nanos::from_millis(400) {
             break;
         }
-        if now - begin > Nanos::from_seconds(args.seconds) + PATIENCE {
+        // The truth is written after the motion, a row for each of its milliseconds.
+        if now - begin > Nanos::from_seconds(1.5 * args.seconds) + PATIENCE {
             bail!("the simulator does not end");
         }
         std::thread::sleep(Duration::from_millis(2));
@@ -402,7 +408,7 @@ impl Screen {
         let Some(last) = last.filter(|_| now >= self.next) else { return };
         self.next = now + if self.terminal { Nanos::from_millis(100) } else { Nanos::from_millis(1000) };
         let elapsed = (now - begin).seconds();
-        let of = |i: usize| last.torques.joints().get(i);
+        let of = |i: usize| last.joints.get(i);
         if !self.terminal {
             let cells: Vec<_> = self
                 .joints
@@ -492,22 +498,28 @@ fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Tru
     let mut table = Table::new(file("estimates.csv")?, setup)?;
     for seen in &watched.estimates {
         let mut estimate = Estimate::absent(seen.t);
-        estimate.torques = *seen.torques;
-        if let Some(contacts) = &seen.contacts {
-            estimate.contacts = **contacts;
-        }
+        estimate.torques.joints.iter_mut().zip(&seen.joints).for_each(|(to, from)| *to = *from);
+        estimate.contacts.contacts.iter_mut().zip(&seen.contacts).for_each(|(to, from)| *to = *from);
+        estimate.torques.count = u32::try_from(seen.joints.len())?;
+        estimate.contacts.count = u32::try_from(seen.contacts.len())?;
         table.write(&estimate, true)?;
     }
     table.into_inner().flush()?;
 
     let sum = |f: fn(&proprio_topics::BusHealth) -> u64| watched.gateway.buses().iter().map(f).sum::<u64>();
     let (frames, samples) = (sum(|b| b.frames), sum(|b| b.published));
-    let sent = watched.simulator.get("sent").and_then(Json::as_u64).context("the simulator's number of frames")?;
-    let lost = sent.abs_diff(frames) + watched.estimator.lost;
+    // Bus by bus: what one has too many must not hide what another lost.
+    let (mut lost, mut foreign) = (watched.estimator.lost, 0);
+    for bus in watched.gateway.buses() {
+        let of_simulator = watched.simulator["buses"].as_array().into_iter().flatten().find(|b| b["name"] == bus.name.as_str());
+        let sent = of_simulator.and_then(|b| b["sent"].as_u64()).with_context(|| format!("the simulator's count of bus {}", bus.name))?;
+        lost += sent.saturating_sub(bus.frames);
+        foreign += bus.frames.saturating_sub(sent);
+    }
     let first = watched.estimates.first().map_or(Nanos::ZERO, |s| s.t);
     let last = watched.estimates.last().map_or(Nanos::ZERO, |s| s.t);
     let rate = (watched.estimates.len() as f64 - 1.0) / (last - first).seconds();
-    let torques = || watched.estimates.iter().flat_map(|s| s.torques.joints());
+    let torques = || watched.estimates.iter().flat_map(|s| &s.joints);
     let valid_share = torques().filter(|j| j.valid == 1).count() as f64 / torques().count() as f64;
     let mut latency: Vec<f64> = watched.estimates.iter().map(|s| (s.published - s.t).seconds() * 1e6).collect();
     latency.sort_by(f64::total_cmp);
@@ -519,7 +531,7 @@ fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Tru
         let (mut square, mut truth_square, mut count) = (0.0, 0.0, 0_u32);
         let (mut estimated, mut real, mut error) = (vec![], vec![], vec![]);
         for seen in &watched.estimates {
-            let Some(torque) = seen.torques.joints().get(joint) else { continue };
+            let Some(torque) = seen.joints.get(joint) else { continue };
             let right = truth.torque(joint, seen.t);
             let t = (seen.t - first).seconds();
             estimated.push((t, torque.torque));
@@ -531,6 +543,9 @@ fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Tru
                 truth_square += right.powi(2);
                 count += 1;
             }
+        }
+        if count == 0 {
+            bail!("no estimate of {name} can be compared with the truth: the motion was too short, or nothing came after its first second");
         }
         let rms = (square / f64::from(count)).sqrt();
         errors.insert(name.clone(), json!(rms));
@@ -554,7 +569,7 @@ fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Tru
     let latency_us = json!({ "p50": quantile(&latency, 0.5), "p99": quantile(&latency, 0.99), "p999": quantile(&latency, 0.999) });
     let summary = json!({
         "robot": setup.robot, "seconds": args.seconds, "seed": args.seed,
-        "frames": frames, "samples": samples, "lost": lost, "estimates": watched.estimates.len(),
+        "frames": frames, "samples": samples, "lost": lost, "foreign": foreign, "estimates": watched.estimates.len(),
         "lost_estimates": watched.lost_estimates, "late": watched.estimator.late,
         "rate_hz": rate, "valid_share": valid_share, "latency_us": latency_us, "torque_rms_error_nm": errors,
         "simulator": watched.simulator,

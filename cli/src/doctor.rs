@@ -79,6 +79,12 @@ fn can() -> Finding {
         Err(nix::Error::EPROTONOSUPPORT | nix::Error::EPROTOTYPE) => {
             finding("kernel CAN", Verdict::Ok, "the kernel has CAN", "")
         }
+        Err(nix::Error::EPERM | nix::Error::EACCES) => finding(
+            "kernel CAN",
+            Verdict::Lacking,
+            "the kernel has CAN, but this user may not open it",
+            "give the process CAP_NET_RAW, or run it as another user",
+        ),
         Err(error) => finding(
             "kernel CAN",
             Verdict::Lacking,
@@ -138,7 +144,7 @@ fn buffers() -> Finding {
     const WANTED: u64 = 4 << 20;
     let number = |path: &str| fs::read_to_string(path).ok().and_then(|t| t.trim().parse::<u64>().ok());
     let most = number("/proc/sys/net/core/rmem_max").unwrap_or(0);
-    if most >= WANTED || has_net_admin() {
+    if most >= WANTED || has_capability(CAP_NET_ADMIN) {
         return finding("receive buffers", Verdict::Ok, "a burst of thousands of frames fits", "");
     }
     finding(
@@ -149,19 +155,25 @@ fn buffers() -> Finding {
     )
 }
 
-/// Whether this process may exceed net.core.rmem_max.
-fn has_net_admin() -> bool {
-    const CAP_NET_ADMIN: u32 = 12;
+/// May exceed net.core.rmem_max (linux/capability.h).
+const CAP_NET_ADMIN: u32 = 12;
+/// May lock any amount of memory.
+const CAP_IPC_LOCK: u32 = 14;
+/// May schedule in real time.
+const CAP_SYS_NICE: u32 = 23;
+
+/// Whether this process has a capability.
+fn has_capability(number: u32) -> bool {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     let mask = status.lines().find_map(|l| l.strip_prefix("CapEff:")).and_then(|m| u64::from_str_radix(m.trim(), 16).ok());
-    mask.is_some_and(|m| m >> CAP_NET_ADMIN & 1 == 1)
+    mask.is_some_and(|m| m >> number & 1 == 1)
 }
 
 fn realtime() -> Finding {
     let limit = getrlimit(Resource::RLIMIT_RTPRIO).map_or(0, |(soft, _)| soft);
     let rt_kernel = fs::read_to_string("/sys/kernel/realtime").is_ok_and(|t| t.trim() == "1");
     let kernel = if rt_kernel { "PREEMPT_RT kernel" } else { "not a PREEMPT_RT kernel" };
-    if limit > 0 || nix::unistd::geteuid().is_root() {
+    if limit > 0 || has_capability(CAP_SYS_NICE) {
         return finding("real-time", Verdict::Ok, format!("SCHED_FIFO is allowed; {kernel}"), "");
     }
     finding(
@@ -175,7 +187,7 @@ fn realtime() -> Finding {
 fn locked_memory() -> Finding {
     const WANTED: u64 = 256 << 20;
     let limit = getrlimit(Resource::RLIMIT_MEMLOCK).map_or(0, |(soft, _)| soft);
-    if limit >= WANTED || nix::unistd::geteuid().is_root() {
+    if limit >= WANTED || has_capability(CAP_IPC_LOCK) {
         return finding("locked memory", Verdict::Ok, "memory can be locked", "");
     }
     finding(

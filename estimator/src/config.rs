@@ -252,7 +252,7 @@ pub struct Input {
 
 impl Default for Input {
     fn default() -> Self {
-        Self { max_silence_ms: 100.0 }
+        Self { max_silence_ms: 50.0 }
     }
 }
 
@@ -262,7 +262,9 @@ impl Default for Input {
 pub struct Output {
     /// The channel each of whose stamps gives one estimate; default: the first force/torque sensor, else the first joint.
     pub trigger: Option<String>,
-    /// How long, counted in stamps, an estimate waits for the other channels to pass its instant \[ms\].
+    /// How long, counted in stamps, an estimate waits for the other channels to pass its instant \[ms\]: at the most 32 periods of
+    /// the fastest channel. A channel that has died costs this wait. The order of arrival does not matter as long as no sample
+    /// comes more than half of it behind a later one.
     pub max_wait_ms: f64,
     /// A joint torque whose predicted standard deviation exceeds this is withheld \[Nm\]; default: no bound.
     pub max_torque_std_nm: Option<f64>,
@@ -316,8 +318,9 @@ impl Config {
         positive("differentiation.angular_velocity_noise_radps", self.differentiation.angular_velocity_noise_radps, 10.0)?;
         positive("differentiation.max_window_ms", self.differentiation.max_window_ms, 1e4)?;
         self.output.max_torque_std_nm.map_or(Ok(()), |bound| positive("output.max_torque_std_nm", bound, f64::MAX))?;
-        if !(self.output.max_wait_ms >= 0.0 && self.output.max_wait_ms <= 1000.0) {
-            return Err(format!("output.max_wait_ms = {} must be 0 to 1000", self.output.max_wait_ms));
+        // What may come while an instant waits is kept: 32 samples of a channel beside those of its window, 256 instants.
+        if !(self.output.max_wait_ms >= 0.0 && self.output.max_wait_ms <= 250.0) {
+            return Err(format!("output.max_wait_ms = {} must be 0 to 250", self.output.max_wait_ms));
         }
         let finite = |key: &str, values: &[f64]| match values.iter().find(|v| !v.is_finite()) {
             Some(value) => Err(format!("{key} has the value {value}; it must be finite")),
@@ -414,7 +417,7 @@ mod tests {
             ("link = \"l_hand\"", "link = \"l_hand\"\nkind = \"force_along\"", "direction is missing"),
             ("link = \"l_hand\"", "link = \"l_hand\"\ndirection = [0.0, 0.0, 1.0]", "belongs to kind = \"force_along\" only"),
             ("trigger = \"ft\"", "triger = \"ft\"", "unknown field `triger`"),
-            ("trigger = \"ft\"", "max_wait_ms = -1.0", "max_wait_ms = -1 must be 0 to 1000"),
+            ("trigger = \"ft\"", "max_wait_ms = -1.0", "max_wait_ms = -1 must be 0 to 250"),
             ("link = \"chest\"", "link = \"chest\"\ngravity_mps2 = [0.0, 0.0, nan]", "base.gravity_mps2 has the value NaN"),
         ] {
             assert!(ARM.contains(from), "{from}");

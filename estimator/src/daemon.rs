@@ -33,8 +33,8 @@ const LOOK: Nanos = Nanos::from_millis(50);
 const HEALTH_PERIOD: Nanos = Nanos::from_millis(100);
 /// A data plane that has not turned for so long is stuck.
 const STUCK: Nanos = Nanos::from_millis(500);
-/// How many samples are taken at once, at the most: as many as may wait from one bus.
-const INBOX: usize = <Sample as Topic>::QUALITY.buffer;
+/// How many samples are taken at once, at the most: as many as may wait from all buses (6 MB).
+const INBOX: usize = <Sample as Topic>::QUALITY.buffer * <Sample as Topic>::QUALITY.publishers;
 
 /// Runs the estimator until SIGTERM or SIGINT.
 ///
@@ -127,7 +127,8 @@ struct DataPlane {
     /// What was waiting, to be put in order; never grows.
     inbox: Vec<Sample>,
     descriptions: Option<Reader<Description>>,
-    declarations: Option<Reader<ContactDeclaration>>,
+    declarations: Reader<ContactDeclaration>,
+    told_of_contact: bool,
     /// Per channel number of the gateway: the pipeline's channel.
     map: Vec<Option<usize>>,
     /// The gateway's epoch that `map` belongs to.
@@ -159,7 +160,14 @@ impl DataPlane {
             samples: None,
             inbox: Vec::with_capacity(INBOX),
             descriptions: None,
-            declarations: None,
+            // Its service is created here, so that it need not be looked for: whoever declares comes when he likes.
+            declarations: {
+                let creator = Writer::<ContactDeclaration>::create(&domain, robot, epoch)?;
+                let reader = Reader::open(&domain, robot)?;
+                drop(creator);
+                reader
+            },
+            told_of_contact: false,
             map: Vec::with_capacity(proprio_topics::MAX_CHANNELS),
             mapped: 0,
             torques,
@@ -183,7 +191,6 @@ impl DataPlane {
                 self.next_look = now + LOOK;
                 look(&mut self.samples, &self.domain, &self.robot);
                 look(&mut self.descriptions, &self.domain, &self.robot);
-                look(&mut self.declarations, &self.domain, &self.robot);
             }
             self.take_declarations();
             let idle = !self.take_samples();
@@ -256,10 +263,15 @@ impl DataPlane {
     }
 
     fn take_declarations(&mut self) {
-        while let Some(Ok(Some(declared))) = self.declarations.as_mut().map(Reader::try_take) {
+        while let Ok(Some(declared)) = self.declarations.try_take() {
             match self.pipeline.setup().contact(declared.contact.as_str()) {
                 Some(contact) => self.pipeline.declare(contact, declared.header.acquired, declared.active != 0),
-                None => tracing::warn!(contact = declared.contact.as_str(), "a contact was declared that the configuration does not have"),
+                // Once: whoever misspells a name may do so a thousand times a second.
+                None if !self.told_of_contact => {
+                    self.told_of_contact = true;
+                    tracing::warn!(contact = declared.contact.as_str(), "a contact was declared that the configuration does not have");
+                }
+                None => {}
             }
         }
     }

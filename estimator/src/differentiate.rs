@@ -131,7 +131,7 @@ pub enum SettingsError {
 pub enum Pushed {
     /// Added to the window.
     Added,
-    /// The samples before it were dropped: they ended longer ago than `max_gap`.
+    /// Added; it does not join the samples before it, which ended longer ago than `max_gap`.
     Restarted {
         /// Time since the sample before.
         gap: Nanos,
@@ -212,6 +212,9 @@ pub struct Window<const D: usize> {
     settings: Settings,
     stamps: [Nanos; MAX_SAMPLES],
     values: [[f64; D]; MAX_SAMPLES],
+    /// Which samples begin anew: what came before them does not belong to the same motion.
+    anew: [bool; MAX_SAMPLES],
+    interrupted: bool,
     /// Where the newest sample is, and how many there are, oldest at `newest + 1 - len` modulo the length.
     newest: usize,
     len: usize,
@@ -261,6 +264,8 @@ impl<const D: usize> Window<D> {
             settings,
             stamps: [Nanos::ZERO; MAX_SAMPLES],
             values: [[0.0; D]; MAX_SAMPLES],
+            anew: [false; MAX_SAMPLES],
+            interrupted: false,
             newest: 0,
             len: 0,
         })
@@ -281,17 +286,28 @@ impl<const D: usize> Window<D> {
             }
             let gap = stamp - newest;
             if gap > self.settings.max_gap {
-                self.len = 0;
                 pushed = Pushed::Restarted { gap };
             }
         }
         self.newest = (self.newest + 1) % MAX_SAMPLES;
+        if let Some(anew) = self.anew.get_mut(self.newest) {
+            *anew = std::mem::take(&mut self.interrupted);
+        }
         if let (Some(s), Some(v)) = (self.stamps.get_mut(self.newest), self.values.get_mut(self.newest)) {
             (*s, *v) = (stamp, value);
         }
         // More are kept than an estimate uses: what came after the samples of an earlier instant must not push those out.
         self.len = (self.len + 1).min(MAX_SAMPLES);
         Ok(pushed)
+    }
+
+    /// What came so far does not belong together with what comes next: the next sample begins anew.
+    pub fn interrupt(&mut self) {
+        self.interrupted = true;
+    }
+
+    fn begins_anew(&self, age: usize) -> bool {
+        self.anew.get((self.newest + MAX_SAMPLES - age) % MAX_SAMPLES).copied().unwrap_or(false)
     }
 
     /// Forgets every sample.
@@ -402,8 +418,15 @@ impl<const D: usize> Window<D> {
         let mut scratch = Scratch::new();
         let mut used = 0;
         let mut oldest = newest;
+        let mut later_begins_anew = false;
         for age in skipped..self.len {
             let Some((stamp, value)) = self.get(age) else { break };
+            // Instants before a gap still have their samples; those after it do not look across. What is kept apart is decided by
+            // stamps alone, whenever the samples came.
+            if used > 0 && (later_begins_anew || oldest - stamp > self.settings.max_gap) {
+                break;
+            }
+            later_begins_anew = self.begins_anew(age);
             if used == self.settings.capacity || newest - stamp > self.settings.max_window {
                 break;
             }

@@ -6,6 +6,7 @@
 //! | `torque/<joint>` | \[Nm\], by the parent link on the child link along the URDF axis |
 //! | `torque_std/<joint>` | its standard deviation |
 //! | `contact/<name>/fx fy fz tx ty tz` | \[N, Nm\], on the link by the environment, axes and origin of the frame that `link` names |
+//! | `contact/<name>/valid`, `contact/<name>/reason` | as below, of the contact |
 //! | `valid/<joint>` | 1 if it may be used, else 0 |
 //! | `reason/<joint>` | why not: a word, and the channel to blame behind a colon |
 
@@ -47,9 +48,6 @@ pub struct EstimateReport {
     pub unused_channels: Vec<String>,
 }
 
-/// A pseudo-period for logs without stamps: so long that nothing is carried from one row to the next.
-const APART: Nanos = Nanos::from_millis(3_600_000);
-
 /// Estimates for every trigger stamp of a log.
 ///
 /// # Errors
@@ -85,12 +83,14 @@ pub fn estimate(setup: Setup, log: impl Read, out: impl Write) -> Result<Estimat
         })
         .collect();
     let mut table = Table::new(out, pipeline.setup())?;
+    // Rows of a log without stamps are so far apart that nothing is carried from one to the next.
+    let apart = pipeline.setup().max_silence + pipeline.setup().max_silence + Nanos(1);
     let (mut row, mut pseudo) = (Row::default(), Nanos::ZERO);
     let mut stamped = true;
     while reader.next_row(&mut row)? {
         let t = row.t.unwrap_or_else(|| {
             stamped = false;
-            pseudo += APART;
+            pseudo += apart;
             pseudo
         });
         for Item { series, value } in &row.items {
@@ -153,7 +153,7 @@ impl<W: Write> Table<W> {
             joints.iter().for_each(|j| header.push_str(&format!(",{part}/{j}")));
         }
         for contact in &contacts {
-            ["fx", "fy", "fz", "tx", "ty", "tz"].iter().for_each(|c| header.push_str(&format!(",contact/{contact}/{c}")));
+            ["fx", "fy", "fz", "tx", "ty", "tz", "valid", "reason"].iter().for_each(|c| header.push_str(&format!(",contact/{contact}/{c}")));
         }
         for part in ["valid", "reason"] {
             joints.iter().for_each(|j| header.push_str(&format!(",{part}/{j}")));
@@ -183,22 +183,15 @@ impl<W: Write> Table<W> {
         for i in 0..self.contacts {
             let contact = estimate.contacts.contacts().get(i).copied().unwrap_or(ContactWrench::ABSENT);
             contact.force.into_iter().chain(contact.torque).for_each(|v| number(&mut self.text, v));
+            self.text.extend_from_slice(if contact.valid == 1 { b",1" } else { b",0" });
+            reason(&mut self.text, &self.channels, contact.reason, contact.cause);
         }
         for joint in joints() {
             self.text.extend_from_slice(if joint.valid == 1 { b",1" } else { b",0" });
             self.withheld += u64::from(joint.valid != 1);
         }
         for joint in joints() {
-            self.text.push(b',');
-            if joint.reason != Reason::None {
-                self.text.extend_from_slice(joint.reason.word().as_bytes());
-                if joint.cause != NO_CAUSE
-                    && let Some(channel) = self.channels.get(joint.cause as usize)
-                {
-                    self.text.push(b':');
-                    self.text.extend_from_slice(channel.as_bytes());
-                }
-            }
+            reason(&mut self.text, &self.channels, joint.reason, joint.cause);
         }
         self.text.push(b'\n');
         self.rows += 1;
@@ -208,6 +201,21 @@ impl<W: Write> Table<W> {
     /// Gives the output back.
     pub fn into_inner(self) -> W {
         self.out
+    }
+}
+
+/// A cell: why something is withheld, and the channel to blame behind a colon; empty if it is valid.
+fn reason(text: &mut Vec<u8>, channels: &[String], reason: Reason, cause: u32) {
+    text.push(b',');
+    if reason == Reason::None {
+        return;
+    }
+    text.extend_from_slice(reason.word().as_bytes());
+    if cause != NO_CAUSE
+        && let Some(channel) = channels.get(cause as usize)
+    {
+        text.push(b':');
+        text.extend_from_slice(channel.as_bytes());
     }
 }
 

@@ -2,9 +2,9 @@
 //!
 //! Each stamp T of the trigger channel gives exactly one estimate, in order. It is released once every channel has passed
 //! T, or the newest stamp of any channel is later than T + wait. It rests on the samples stamped T or earlier and, of each
-//! channel, the first later one if that is stamped T + wait or earlier. A sample that comes after its instant was released
+//! channel, the first later one if that is stamped T + wait/2 or earlier. A sample that comes after its instant was released
 //! is dropped and counted. So the estimates depend on stamps alone, not on the time of day, and not on the order of arrival
-//! either as long as no sample is later than the wait; what runs live is, bit for bit, what a replay gives.
+//! either as long as no sample comes more than wait/2 behind a later one; what runs live is, bit for bit, what a replay gives.
 //!
 //! A channel stamped exactly T is used as it is, its velocity and acceleration too where it has them; otherwise they come
 //! from its adaptive window ([`crate::differentiate`]). Wrenches and proper accelerations lie on straight lines between samples.
@@ -85,21 +85,28 @@ impl Track {
 /// Who says when a contact is present.
 #[derive(Clone, Default)]
 struct Declarations {
-    /// The last ones, oldest first: from when, present or not.
+    /// The last changes, oldest first: from when, present or not.
     said: arrayvec::ArrayVec<(Nanos, bool), DECLARATIONS>,
+    /// What was said before these.
+    before: Option<bool>,
 }
 
 impl Declarations {
     fn say(&mut self, t: Nanos, active: bool) {
-        let at = self.said.iter().rposition(|(other, _)| *other <= t).map_or(0, |i| i + 1);
-        if self.said.is_full() {
-            self.said.remove(0);
+        let place = |said: &[(Nanos, bool)]| said.iter().rposition(|(other, _)| *other <= t).map_or(0, |i| i + 1);
+        let previous = place(&self.said).checked_sub(1).and_then(|i| self.said.get(i)).map_or(self.before, |(_, a)| Some(*a));
+        // Whoever repeats himself says nothing new, unless somebody contradicts him from a later instant on.
+        if previous == Some(active) {
+            return;
         }
-        self.said.insert(at.min(self.said.len()), (t, active));
+        if self.said.is_full() {
+            self.before = Some(self.said.remove(0).1);
+        }
+        self.said.insert(place(&self.said), (t, active));
     }
 
     fn at(&self, t: Nanos) -> Option<bool> {
-        self.said.iter().rev().find(|(from, _)| *from <= t).map(|(_, active)| *active)
+        self.said.iter().rev().find(|(from, _)| *from <= t).map_or(self.before, |(_, active)| Some(*active))
     }
 }
 
@@ -211,7 +218,12 @@ impl Pipeline {
                     return;
                 }
                 if admit(whole) {
-                    let _ = window.push(t, [j.position]);
+                    // What an encoder says of itself that it can not be trusted is told on, but not differentiated.
+                    if quality_reason(quality, UNTRUSTED_ENCODER) == Reason::None {
+                        let _ = window.push(t, [j.position]);
+                    } else {
+                        window.interrupt();
+                    }
                     history.push(t, [j.position, j.velocity, j.acceleration], quality);
                 }
                 whole
@@ -230,7 +242,11 @@ impl Pipeline {
                     && all_finite(&i.angular_velocity)
                     && finite_or_absent(&i.angular_acceleration);
                 if admit(whole) {
-                    let _ = window.push(t, i.angular_velocity);
+                    if quality_reason(quality, Quality::DEVICE_FAULT) == Reason::None {
+                        let _ = window.push(t, i.angular_velocity);
+                    } else {
+                        window.interrupt();
+                    }
                     let ([ax, ay, az], [gx, gy, gz], [bx, by, bz]) =
                         (i.proper_acceleration, i.angular_velocity, i.angular_acceleration);
                     history.push(t, [ax, ay, az, gx, gy, gz, bx, by, bz], quality);
@@ -247,7 +263,7 @@ impl Pipeline {
         }
         self.counts.taken += 1;
         self.newest = self.newest.max(t);
-        if channel == self.setup.trigger && !self.waiting.contains(&t) {
+        if channel == self.setup.trigger {
             if self.waiting.len() < MOST_WAITING {
                 self.waiting.push_back(t);
             } else {
@@ -259,6 +275,8 @@ impl Pipeline {
     /// Says that contact number `contact` (see [`Setup::contact`]) is present, or not, from `t` on.
     pub fn declare(&mut self, contact: usize, t: Nanos, active: bool) {
         if let Some(declarations) = self.declarations.get_mut(contact) {
+            // For instants that are already told it comes too late; from the next one on it holds.
+            self.counts.late += u64::from(t <= self.released);
             declarations.say(t, active);
         }
     }
@@ -284,7 +302,8 @@ impl Pipeline {
 
     /// Brings every channel to `t` and estimates.
     fn compute(&mut self, t: Nanos) {
-        let until = t + self.setup.max_wait;
+        // Half of the wait, so that a sample which counts can be as late as the other half and still be there.
+        let until = t + Nanos(self.setup.max_wait.0 / 2);
         let mut base = match self.setup.base {
             BaseMotion::Standing(motion) => motion,
             BaseMotion::Imu(_) => FrameMotion::standing(&Vec3::zeros()),
@@ -299,8 +318,7 @@ impl Pipeline {
                         if let (Some(q), Some(dq), Some(ddq)) = places {
                             [*q, *dq, *ddq] = state;
                         }
-                        // An encoder that says it is not calibrated tells no position.
-                        reason.or(quality_reason(held.quality, Quality::DEVICE_FAULT | Quality::NOT_CALIBRATED))
+                        quality_reason(held.quality, UNTRUSTED_ENCODER).or(reason)
                     }
                 },
                 (Track::Sensor(history), Use::Sensor(number)) => match history.at(t, until) {
@@ -320,7 +338,7 @@ impl Pipeline {
                         if let BaseMotion::Imu(pose) = &self.setup.base {
                             base = FrameMotion::of_link_from_imu(&measured, pose);
                         }
-                        reason.or(quality_reason(held.quality, Quality::DEVICE_FAULT))
+                        quality_reason(held.quality, Quality::DEVICE_FAULT).or(reason)
                     }
                 },
                 // Tracks were made from the channels' roles.
@@ -331,7 +349,8 @@ impl Pipeline {
         for (contact, declarations) in self.declarations.iter().enumerate() {
             match declarations.at(t) {
                 Some(true) => active.insert(contact),
-                Some(false) => active.remove(contact),
+                Some(false) if self.setup.support != Some(contact) => active.remove(contact),
+                Some(false) => {}
                 None => {}
             }
         }
@@ -365,21 +384,23 @@ impl Pipeline {
         let results = self.solver.torque().iter().zip(self.solver.torque_deviation()).zip(self.solver.torque_certainty());
         let places = self.estimate.torques.joints.iter_mut().zip(&self.dependences.torques);
         for ((place, dependence), ((torque, deviation), certainty)) in places.zip(results) {
-            let (mut reason, cause) = judge.verdict(dependence);
+            let (mut reason, mut cause) = judge.verdict(dependence);
+            // Without a sensor in it a torque rests on the model alone, whose uncertainty is not known.
+            let deviation = if dependence.sensors.is_empty() { f64::NAN } else { *deviation };
             if reason == Reason::None && *certainty == Certainty::Assumed {
                 reason = Reason::Undetermined;
             }
-            if reason == Reason::None && *deviation > self.setup.max_deviation {
+            if reason == Reason::None && deviation > self.setup.max_deviation {
                 reason = Reason::Uncertain;
             }
-            if !solved || !torque.is_finite() || !deviation.is_finite() {
-                reason = Reason::NotFinite;
+            if !solved || !torque.is_finite() || deviation.is_infinite() {
+                (reason, cause) = (Reason::NotFinite, NO_CAUSE);
             }
             // A number that rests on a channel nobody has seen is no number.
             let known = solved && reason != Reason::NeverSeen;
             *place = JointTorque {
                 torque: if known { *torque } else { f64::NAN },
-                standard_deviation: if known { *deviation } else { f64::NAN },
+                standard_deviation: if known { deviation } else { f64::NAN },
                 valid: u32::from(reason == Reason::None),
                 reason,
                 cause,
@@ -388,14 +409,14 @@ impl Pipeline {
         }
         let places = self.estimate.contacts.contacts.iter_mut().zip(&self.dependences.contacts);
         for ((place, dependence), result) in places.zip(self.solver.contacts()).take(self.setup.contacts.len()) {
-            let (mut reason, cause) = judge.verdict(dependence);
+            let (mut reason, mut cause) = judge.verdict(dependence);
             match result.certainty {
-                Certainty::Absent => reason = Reason::Absent,
+                Certainty::Absent => (reason, cause) = (Reason::Absent, NO_CAUSE),
                 Certainty::Assumed if reason == Reason::None => reason = Reason::Undetermined,
                 _ => {}
             }
             if !solved || !result.wrench.is_finite() {
-                reason = Reason::NotFinite;
+                (reason, cause) = (Reason::NotFinite, NO_CAUSE);
             }
             let known = solved && reason != Reason::NeverSeen;
             let [fx, fy, fz, tx, ty, tz] = if known { result.wrench.force_first() } else { [f64::NAN; 6] };
@@ -405,7 +426,7 @@ impl Pipeline {
                 standard_deviation: if known { result.deviation } else { [f64::NAN; 6] },
                 valid: u32::from(reason == Reason::None),
                 reason,
-                cause: if reason == Reason::Absent { NO_CAUSE } else { cause },
+                cause,
                 reserved: 0,
             };
         }
@@ -452,6 +473,9 @@ impl OrReason for Reason {
         if self == Self::None { other } else { self }
     }
 }
+
+/// What disqualifies a joint's position: one that is not calibrated tells no position.
+const UNTRUSTED_ENCODER: Quality = Quality(Quality::DEVICE_FAULT.0 | Quality::NOT_CALIBRATED.0);
 
 fn quality_reason(quality: Quality, faults: Quality) -> Reason {
     if quality.intersects(Quality::SATURATED | Quality::FROZEN) {

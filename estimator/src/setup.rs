@@ -75,6 +75,8 @@ pub struct Setup {
     pub contacts: Vec<NamedContact>,
     /// The contacts present when nobody declares anything.
     pub always: ContactSet,
+    /// The published contact that carries a fixed base, if one does: nobody can declare it absent.
+    pub support: Option<usize>,
     /// The number of the trigger's channel.
     pub trigger: usize,
     /// How long an estimate waits.
@@ -130,6 +132,7 @@ impl Setup {
         }
         let mut channels = Vec::new();
         let mut add = |kind, name: &str, role| match channels.iter().find(|c: &&Channel| c.name == name) {
+            Some(other) if other.kind == kind => Err(format!("two {} channels are named {name:?}", Kind::word(kind))),
             Some(other) => Err(format!("{name:?} is a {} and a {}: channels need names of their own", other.kind.word(), Kind::word(kind))),
             None => {
                 channels.push(Channel { kind, name: name.to_owned(), role });
@@ -158,10 +161,14 @@ impl Setup {
             }
         };
         let (contacts, mut specs) = contacts(config, &model)?;
+        let mut support = None;
         if let BaseMotion::Standing(_) = base {
             // What a fixed base stands on, unless the configuration has it as a contact of its own.
-            let there = specs.iter().any(|s| s.frame.link == base_link && s.kind == ContactKind::Wrench);
-            if !there {
+            let there = |(spec, contact): (&ContactSpec, &NamedContact)| {
+                spec.frame.link == base_link && spec.kind == ContactKind::Wrench && contact.always
+            };
+            support = specs.iter().zip(&contacts).position(there);
+            if support.is_none() {
                 let frame = Frame { link: base_link, pose: Pose::identity() };
                 specs.push(ContactSpec { frame, kind: ContactKind::Wrench, position: Vec3::zeros() });
             }
@@ -207,6 +214,7 @@ impl Setup {
                 .collect(),
             contacts,
             always,
+            support,
             trigger,
             max_wait: Nanos::from_seconds(config.output.max_wait_ms * 1e-3),
             max_silence,
@@ -351,7 +359,10 @@ fn sensors(config: &Config, model: &Model, warnings: &mut Vec<String>) -> Result
         }
         let frame = frame.or(element.map(|e| e.frame)).unwrap_or(MeasurementFrame::Child);
         let direction = direction.or(element.map(|e| e.direction)).unwrap_or(MeasurementDirection::ChildToParent);
-        let given = ft.xyz_m.is_some() || ft.rpy_rad.is_some();
+        let given = ft.xyz_m.is_some();
+        if ft.xyz_m.is_some() != ft.rpy_rad.is_some() {
+            return Err(format!("{at}: xyz_m and rpy_rad go together: give both or neither"));
+        }
         if given && frame != MeasurementFrame::Sensor {
             return Err(format!("{at}: xyz_m and rpy_rad belong to frame = \"sensor\" only"));
         }
@@ -363,6 +374,13 @@ fn sensors(config: &Config, model: &Model, warnings: &mut Vec<String>) -> Result
             }
             None => Pose::identity(),
         };
+        if let Some(element) = element.filter(|_| given) {
+            let apart = element.pose.inverse() * pose;
+            let turned = (apart.rotation.trace() - 3.0).abs();
+            if apart.translation.norm() > 1e-6 || turned > 1e-9 {
+                warnings.push(format!("{at}: its pose here is another one than in the URDF; this file counts"));
+            }
+        }
         let noise = Noise { force: ft.noise_n, torque: ft.noise_nm };
         let cut = SensorCut::new(model, &ft.joint, frame, direction, &pose, &noise).map_err(|e| match e {
             StructureError::NoJoint(_) => format!("{at}: joint = {:?}: {}", ft.joint, no_joint(model, &ft.joint)),
@@ -376,7 +394,7 @@ fn sensors(config: &Config, model: &Model, warnings: &mut Vec<String>) -> Result
 fn contacts(config: &Config, model: &Model) -> Result<(Vec<NamedContact>, Vec<ContactSpec>), String> {
     let (mut names, mut specs) = (Vec::<NamedContact>::new(), Vec::new());
     if config.contact.len() >= MAX_CONTACTS {
-        return Err(format!("there are {} contacts; fewer than {MAX_CONTACTS} are possible", config.contact.len()));
+        return Err(format!("there are {} contacts; at most {} are possible", config.contact.len(), MAX_CONTACTS - 1));
     }
     for contact in &config.contact {
         let at = format!("contact {:?}", contact.name());

@@ -398,7 +398,6 @@ fn a_gap_starts_anew() {
     assert_eq!(window.at(ms(590)).unwrap().value[0], 5.0);
     assert_eq!(window.at(ms(591)), Err(Unavailable::Stale { by: ms(101) }));
     assert_eq!(window.push(ms(591), [7.0]), Ok(Pushed::Restarted { gap: ms(101) }));
-    assert_eq!((window.len(), window.oldest()), (1, Some((ms(591), [7.0]))));
     assert_eq!(window.at(ms(591)), Err(Unavailable::Starting { samples: 1 }));
     assert_eq!(window.at(ms(590)), Err(Unavailable::Before { by: ms(1) }));
     window.push(ms(601), [7.0]).unwrap();
@@ -420,15 +419,37 @@ fn old_samples_go() {
     for i in 0..1000 {
         // A constant that changes: only what is recent counts.
         window.push(ms(i * 10), [if i < 990 { 1.0 } else { 2.0 }]).unwrap();
-        assert_eq!(window.len(), 16.min(usize::try_from(i).unwrap() + 1));
-        assert_eq!(window.oldest().unwrap().0, ms((i - 15).max(0) * 10));
+        assert_eq!(window.len(), 128.min(usize::try_from(i).unwrap() + 1));
+        assert_eq!(window.oldest().unwrap().0, ms((i - 127).max(0) * 10));
     }
     assert_eq!(window.exactly(ms(9_980)), Some([2.0]));
     assert_eq!(window.exactly(ms(9_981)), None);
     let e = window.at(ms(9_990)).unwrap();
     // Within 50 ms: six samples, all of the new value.
     assert_eq!((e.value, e.first, e.second, e.samples), ([2.0], [0.0], [0.0], [6; 3]));
-    assert_eq!(window.at(ms(9_839)), Err(Unavailable::Before { by: ms(1) }));
+    assert_eq!(window.at(ms(8_719)), Err(Unavailable::Before { by: ms(1) }));
+}
+
+#[test]
+fn samples_that_came_later_do_not_change_an_estimate() {
+    let settings = Settings {
+        capacity: 96,
+        ..Settings::new(1e-4)
+    };
+    let ms = Nanos::from_millis;
+    // At rest the window is as long as it may be.
+    let signal = |i: i64| [if i % 3 == 0 { 1e-4 } else { -1e-4 }];
+    let mut window = Window::<1>::new(settings).unwrap();
+    for i in 0..200 {
+        window.push(ms(i), signal(i)).unwrap();
+    }
+    let t = ms(198) + Nanos(400_000);
+    let early = window.at_using(t, ms(200)).unwrap();
+    assert_eq!(early.samples.iter().max(), Some(&96));
+    for i in 200..230 {
+        window.push(ms(i), signal(i)).unwrap();
+    }
+    assert_eq!(window.at_using(t, ms(200)).unwrap(), early);
 }
 
 #[test]
@@ -468,4 +489,29 @@ fn what_is_wrong_is_refused_and_said() {
         assert_eq!(window.push(Nanos(20), [v]), Err(Refused::NotFinite));
     }
     assert_eq!(window.newest(), Some((Nanos(10), [1.0])));
+}
+
+#[test]
+fn instants_before_a_gap_keep_their_samples_whenever_the_gap_ends() {
+    let settings = Settings {
+        max_gap: Nanos::from_millis(50),
+        ..Settings::new(1e-6)
+    };
+    let ms = Nanos::from_millis;
+    let mut window = Window::<1>::new(settings).unwrap();
+    for i in 0..20 {
+        window.push(ms(i), [i as f64]).unwrap();
+    }
+    let before = window.at_using(ms(19), ms(20)).unwrap();
+    for i in 200..203 {
+        window.push(ms(i), [1000.0 - i as f64]).unwrap();
+    }
+    assert_eq!(window.at_using(ms(19), ms(20)).unwrap(), before);
+    // What comes after it does not look across.
+    let after = window.at(ms(202)).unwrap();
+    assert!((after.first[0] + 1000.0).abs() < 1e-3 && after.samples == [3; 3], "{after:?}");
+    window.interrupt();
+    window.push(ms(203), [0.0]).unwrap();
+    assert_eq!(window.at(ms(203)), Err(Unavailable::Starting { samples: 1 }));
+    assert_eq!(window.at_using(ms(202), ms(202)).unwrap(), after);
 }

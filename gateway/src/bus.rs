@@ -24,6 +24,8 @@ pub struct Bus<S> {
     sink: S,
     status: Arc<BusStatus>,
     link_was_up: bool,
+    /// The stamp of the frame taken last, as long as more may be waiting behind it.
+    heard: Option<Nanos>,
 }
 
 /// Whether there is more to come.
@@ -39,7 +41,7 @@ impl<S: Sink> Bus<S> {
     /// Puts link, devices and sink together.
     pub fn new(link: Box<dyn Link>, decoder: Decoder, sink: S, status: Arc<BusStatus>) -> Self {
         let link_was_up = link.state() == LinkState::Up;
-        Self { link, decoder, sink, status, link_was_up }
+        Self { link, decoder, sink, status, link_was_up, heard: None }
     }
 
     /// One turn: send what is due, wait for a frame, take it.
@@ -53,17 +55,25 @@ impl<S: Sink> Bus<S> {
                 self.decoder.restart(now);
             }
             let link = &mut self.link;
+            // After a stall old frames are waiting: a device is not silent as long as what it sent has not been read. So time passes
+            // for the devices as it does in the frames, and by the clock only once nothing is waiting.
+            let then = self.heard.map_or(now, |t| t.min(now));
+            let behind = now - then;
             // A failure is counted by the link; what to do about it is the device's to decide when its reply stays out.
-            self.decoder.poll_transmit(now, |t| {
-                let _ = link.send(&t.frame, t.deadline);
+            self.decoder.poll_transmit(then, |t| {
+                let _ = link.send(&t.frame, t.deadline + behind);
             });
             deadline = self.decoder.next_wake().map_or(deadline, |wake| wake.min(deadline));
-        } else {
+        } else if self.link_was_up {
+            // Nothing streams over a link that is lost, and its health should not say so.
             self.link_was_up = false;
+            self.decoder.restart(now);
         }
         let received = self.link.recv(deadline);
+        self.heard = None;
         match received {
             Received::Frame(frame) => {
+                self.heard = None;
                 let (sink, status) = (&mut self.sink, &self.status);
                 self.decoder.on_frame(&frame, |sample| match sink.publish(sample, clock.now()) {
                     Ok(connections) => {
@@ -96,6 +106,12 @@ impl<S: Sink> Bus<S> {
                 break;
             }
         }
+    }
+
+    /// What a person should know of the link at its end.
+    #[must_use]
+    pub fn link_note(&self) -> Option<String> {
+        self.link.note()
     }
 
     /// Gives the sink back.

@@ -16,7 +16,7 @@ use crate::plan::{BusPlan, ConfigError, Plan};
 use crate::publish::Shared;
 use crate::status::BusStatus;
 use anyhow::{Context, anyhow, bail};
-use proprio_drivers::{Claim, Refusal, State};
+use proprio_drivers::{Claim, Mode, Refusal, State};
 use proprio_topics::ipc::{Domain, DomainConfig, DomainError, Writer};
 use proprio_topics::realtime;
 use proprio_topics::{
@@ -47,11 +47,6 @@ const STUCK: Nanos = Nanos::from_millis(500);
 /// One chain that says what, where and what to do; [`ConfigError`] at its root is a wrong configuration.
 pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<()> {
     let plan = Plan::load(config)?;
-    if check {
-        // Whoever reads it may stop early.
-        let _ = write!(std::io::stdout(), "{plan}");
-        return Ok(());
-    }
     for bus in &plan.buses {
         if let Source::Replay { pace: Pace::Fast, .. } = bus.source {
             let problem = format!(
@@ -60,6 +55,11 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
             );
             return Err(ConfigError { file: config.to_owned(), problem }.into());
         }
+    }
+    if check {
+        // Whoever reads it may stop early.
+        let _ = write!(std::io::stdout(), "{plan}");
+        return Ok(());
     }
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start")?;
     runtime.block_on(serve(&plan, domain))
@@ -88,11 +88,20 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
     // The buses of one log stay in step; by then all of them are open.
     let replay_start = clock.now() + REPLAY_DELAY;
     let mut threads = Vec::new();
+    let mut failure = None;
     for (bus, number) in plan.buses.iter().zip(0_u32..) {
-        threads.push(BusThread::start(plan, bus, number, &domain, epoch, &stop, replay_start).map_err(|error| {
-            stop.store(true, Release);
-            error.context(format!("bus {:?}", bus.name))
-        })?);
+        match BusThread::start(plan, bus, number, &domain, epoch, &stop, replay_start) {
+            Ok(thread) => threads.push(thread),
+            Err(error) => {
+                failure = Some(error.context(format!("bus {:?}", bus.name)));
+                break;
+            }
+        }
+    }
+    if let Some(error) = failure {
+        // Those that have begun must stop their boards and give back their ports.
+        join(&mut threads, &stop);
+        return Err(error);
     }
     tracing::info!(robot = plan.robot, buses = plan.buses.len(), channels = plan.channels.len(), "running");
     let _ = sd_notify::notify(&[NotifyState::Ready, NotifyState::Status("running")]);
@@ -114,9 +123,8 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
         // A reader that can not be reached now is not worth ending for; the next health comes in a tenth of a second.
         let _ = health_writer.send(&health, now);
         let _ = description_writer.update_connections();
-        if let Some(failed) = threads.iter().find(|t| t.thread.is_finished() && !t.ended.load(Acquire)) {
-            stop.store(true, Release);
-            bail!("the thread of bus {:?} has ended unexpectedly", failed.name);
+        if threads.iter().any(|t| t.thread.is_finished() && !t.ended.load(Acquire)) {
+            break "a bus thread has ended unexpectedly";
         }
         if threads.iter().all(|t| t.ended.load(Acquire)) {
             break "the end of all logs";
@@ -130,16 +138,25 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
     };
     tracing::info!(why, "stopping");
     let _ = sd_notify::notify(&[NotifyState::Stopping]);
-    stop.store(true, Release);
-    let mut panicked = None;
-    for thread in &mut threads {
-        if let Some(thread) = thread.take() && thread.join().is_err() {
-            panicked = Some(());
-        }
-    }
+    let panicked = join(&mut threads, &stop);
     fill_health(&mut health, &threads);
     let _ = health_writer.send(&health, clock.now());
-    panicked.map_or(Ok(()), |()| Err(anyhow!("a bus thread panicked; this is a mistake in the program")))
+    match panicked {
+        None => Ok(()),
+        Some(bus) => bail!("the thread of bus {bus:?} panicked; this is a mistake in the program"),
+    }
+}
+
+/// Stops all bus threads and waits for them; the name of the first that panicked.
+fn join(threads: &mut [BusThread], stop: &AtomicBool) -> Option<String> {
+    stop.store(true, Release);
+    let mut panicked = None;
+    for bus in threads {
+        if let Some(thread) = bus.take() && thread.join().is_err() {
+            panicked.get_or_insert_with(|| bus.name.clone());
+        }
+    }
+    panicked
 }
 
 /// One bus thread, as the control plane sees it.
@@ -175,7 +192,9 @@ impl BusThread {
         replay_start: Nanos,
     ) -> anyhow::Result<Self> {
         let status = Arc::new(BusStatus::new(number, bus));
-        let decoder = Decoder::new(number, bus, None, Arc::clone(&status))?;
+        // The boards of a log answered whoever commanded them when it was recorded.
+        let mode = matches!(bus.source, Source::Replay { .. }).then_some(Mode::Listen);
+        let decoder = Decoder::new(number, bus, mode, Arc::clone(&status))?;
         let link: Box<dyn Link> = if let Source::Replay { log, pace } = &bus.source {
             let mut replay = Replay::open(log, *pace, plan.matching(number as usize), &decoder.claims())?;
             replay.start_at(replay_start);
@@ -199,6 +218,9 @@ impl BusThread {
             let mut bus = Bus::new(link, decoder, Shared(writer), status_there);
             while !stop.load(Acquire) {
                 if bus.turn(&clock) == Turn::Ended {
+                    if let Some(note) = bus.link_note() {
+                        tracing::warn!("{note}");
+                    }
                     ended_there.store(true, Release);
                     // Readers may still be reading what was published last: the port stays until the end.
                     while !stop.load(Acquire) {
@@ -275,6 +297,8 @@ struct Diary {
     last: Option<Box<GatewayHealth>>,
     /// Per device and counter, how many ticks in a row brought more; per bus likewise for drops.
     quiet: Vec<[u32; Counter::ALL.len()]>,
+    /// Per bus, for how many more ticks a dropped frame is the same trouble as the last one.
+    dropping: Vec<u32>,
 }
 
 impl Diary {
@@ -296,7 +320,13 @@ impl Diary {
                 }
             }
             let dropped = bus.dropped - before.map_or(0, |b| b.dropped.min(bus.dropped));
-            if dropped > 0 {
+            self.dropping.resize(health.buses().len(), 0);
+            let first = self.dropping.get_mut(i).is_none_or(|rest| {
+                let first = *rest == 0;
+                *rest = if dropped > 0 { Self::REST } else { rest.saturating_sub(1) };
+                first
+            });
+            if dropped > 0 && first {
                 tracing::warn!(bus = bus.name.as_str(), dropped, "the kernel dropped frames: the receive buffer was full");
             }
         }

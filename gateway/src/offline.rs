@@ -52,6 +52,8 @@ pub struct DecodeReport {
     pub unclaimed: u64,
     /// Of these, error frames of the interface.
     pub error_frames: u64,
+    /// Frames that candump says it lost while it recorded.
+    pub dropped: u64,
     /// Samples written.
     pub samples: u64,
     /// Samples that came so late that the table is not in order there.
@@ -165,7 +167,7 @@ pub fn decode(plan: &Plan, log: impl BufRead, table: impl Write, columns: Column
     }
     writer.finish()?;
     report.out_of_order = order.out_of_order;
-    report.bad_lines = reader.report().bad;
+    (report.bad_lines, report.dropped) = (reader.report().bad, reader.report().dropped);
     report.bad = reader.report().first_bad.iter().map(|(line, error)| format!("line {line}: {error}")).collect();
     if report.frames == 0 {
         let why = report.bad.first().map_or_else(|| "it is empty".to_owned(), |bad| format!("its first line: {bad}"));

@@ -139,15 +139,26 @@ impl Plan {
         Builder { text, folder, plan: Self { robot: raw.robot.clone(), buses: vec![], channels: vec![] } }.build(raw)
     }
 
-    /// What bus number `bus` takes of a log that holds the frames of all buses.
+    /// What bus number `bus` takes of the log that its source replays, or of a log given for all buses: of a log that only this bus
+    /// replays, everything.
     #[must_use]
     pub fn matching(&self, bus: usize) -> Option<Matching> {
-        let interfaces = self.buses.iter().map(|b| match &b.source {
-            Source::SocketCan { interface } => (Some(interface.as_str()), b.name.as_str()),
-            Source::Virtual { name } => (Some(name.as_str()), b.name.as_str()),
-            Source::Replay { .. } => (None, b.name.as_str()),
-        });
-        Matching::of(&interfaces.collect::<Vec<_>>(), bus)
+        let own = self.buses.get(bus).map(|b| &b.source);
+        let mut this = 0;
+        let mut buses = Vec::new();
+        for (number, other) in self.buses.iter().enumerate() {
+            let interface = match (&other.source, own) {
+                (Source::SocketCan { interface }, _) => Some(interface.as_str()),
+                (Source::Virtual { name }, _) => Some(name.as_str()),
+                (Source::Replay { log, .. }, Some(Source::Replay { log: own, .. })) if log != own => continue,
+                (Source::Replay { .. }, _) => None,
+            };
+            if number == bus {
+                this = buses.len();
+            }
+            buses.push((interface, other.name.as_str()));
+        }
+        Matching::of(&buses, this)
     }
 
     /// The number of channel `name`.
@@ -253,12 +264,12 @@ impl Builder<'_> {
                 common.insert(key.to_owned(), value);
             }
         }
-        let raw: RawDevice = common.try_into().map_err(|e: toml::de::Error| e.message().to_owned())?;
+        let raw: RawDevice = common.try_into().map_err(|e: toml::de::Error| one_line(&e))?;
         let name = &raw.name;
         check_name("name", name)?;
         let options = Options::deserialize(&raw.driver, table).map_err(|e| match e {
             OptionsError::UnknownDriver => format!("driver = {:?} is not known; there is {}", raw.driver, DRIVERS.join(", ")),
-            OptionsError::Keys(e) => format!("{name:?} ({}): {}", raw.driver, e.message()),
+            OptionsError::Keys(e) => format!("{name:?} ({}): {}", raw.driver, one_line(&e)),
         })?;
         if !(raw.max_silence_ms > 0.0 && raw.max_silence_ms <= 3.6e6) {
             return Err(format!("{name:?}: max_silence_ms = {} must be above 0, at most an hour", raw.max_silence_ms));
@@ -353,6 +364,11 @@ impl Builder<'_> {
         }
         Ok(())
     }
+}
+
+/// An error of one table, with the key that it is about.
+fn one_line(error: &toml::de::Error) -> String {
+    error.to_string().lines().map(str::trim).filter(|l| !l.is_empty()).collect::<Vec<_>>().join(" ")
 }
 
 fn check_name(place: &str, name: &str) -> Result<(), String> {

@@ -76,6 +76,13 @@ impl Arm {
         this
     }
 
+    /// Sets the peak error of joint positions that the estimator reckons with \[rad\].
+    #[must_use]
+    pub fn position_noise(mut self, rad: f64) -> Self {
+        self.set("differentiation", "position_noise_rad", rad);
+        self
+    }
+
     fn set(&mut self, table: &str, key: &str, value: f64) {
         let table = self.estimator.entry(table).or_insert_with(|| Table::new().into());
         table.as_table_mut().expect("a table").insert(key.into(), value.into());

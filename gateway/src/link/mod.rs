@@ -81,6 +81,11 @@ pub trait Link: Send {
 
     /// What it has counted since it was opened.
     fn counters(&self) -> LinkCounters;
+
+    /// What a person should know of it when it has ended: lines of a log that could not be read, say.
+    fn note(&self) -> Option<String> {
+        None
+    }
 }
 
 /// A link that could not be opened.

@@ -109,7 +109,13 @@ impl Replay {
             .map_err(fail)?
             .map(|r| (r.stamp, matches(r.interface), r.frame));
         match first {
-            None => replay.ended = true,
+            None => {
+                let why = replay.log.report().first_bad.first().map_or_else(
+                    || "it is empty".to_owned(),
+                    |(line, error)| format!("it holds no frame; line {line}: {error}"),
+                );
+                return Err(fail(io::Error::new(io::ErrorKind::InvalidData, why)));
+            }
             Some((None, ..)) if pace == Pace::Recorded => {
                 let cause =
                     "it has no time stamps to keep the pace by; record with `candump -l`, or use pace = \"fast\"";
@@ -192,6 +198,21 @@ impl Replay {
 }
 
 impl Link for Replay {
+    fn note(&self) -> Option<String> {
+        let report = self.log.report();
+        let mut notes = Vec::new();
+        if let Some(failure) = self.failure {
+            notes.push(format!("the log could not be read to its end: {failure}"));
+        }
+        if let Some((line, error)) = report.first_bad.first() {
+            notes.push(format!("{} lines of the log were skipped; the first, line {line}: {error}", report.bad));
+        }
+        if self.counters.received == 0 {
+            notes.push(format!("none of the log's {} frames is for this bus", report.records));
+        }
+        (!notes.is_empty()).then(|| notes.join("; "))
+    }
+
     /// As [`Link::recv`]; a frame at the recorded pace that is not due by `deadline` is [`Received::TimedOut`], and handed out
     /// by a later call.
     fn recv(&mut self, deadline: Nanos) -> Received {

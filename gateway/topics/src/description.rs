@@ -134,7 +134,7 @@ impl Description {
     }
 }
 
-const _: () = assert!(size_of::<Entry>() == 152);
+const _: () = assert!(size_of::<Entry>() == 152 && size_of::<Description>() == 56 + 152 * Description::CAPACITY);
 
 #[cfg(test)]
 mod tests {

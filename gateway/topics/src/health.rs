@@ -229,3 +229,5 @@ pub struct EstimatorHealth {
 }
 
 const _: () = assert!(size_of::<BusHealth>() == 64 + 13 * 8 && size_of::<DeviceHealth>() == 64 + 13 * 8 + 16);
+const _: () = assert!(size_of::<GatewayHealth>() == 64 + 168 * MAX_BUSES + 184 * MAX_CHANNELS);
+const _: () = assert!(size_of::<EstimatorHealth>() == 48 + 13 * 8);
