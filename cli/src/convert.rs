@@ -107,7 +107,9 @@ struct Marked(Box<dyn Write>);
 
 impl Write for Marked {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        self.0.write(bytes).map_err(|e| std::io::Error::new(e.kind(), Unwritable(e)))
+        self.0
+            .write(bytes)
+            .map_err(|e| std::io::Error::new(e.kind(), Unwritable(e)))
     }
 
     fn flush(&mut self) -> std::io::Result<()> {
@@ -135,7 +137,10 @@ impl Output {
             let file = File::create(path).with_context(|| format!("{}: can not be written", path.display()))?;
             (Box::new(file), None)
         } else {
-            let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+            let folder = path
+                .parent()
+                .filter(|p| !p.as_os_str().is_empty())
+                .unwrap_or(Path::new("."));
             // tempfile names its own file in the error, which means nothing to whoever named another one.
             let (file, temporary) = std::fs::metadata(folder)
                 .and_then(|_| tempfile::NamedTempFile::new_in(folder).map_err(|error| error.kind().into()))
@@ -143,12 +148,17 @@ impl Output {
                 .into_parts();
             (Box::new(file), Some((temporary, path.to_owned())))
         };
-        Ok(Self { writer: Some(BufWriter::with_capacity(1 << 18, Marked(writer))), temporary })
+        Ok(Self {
+            writer: Some(BufWriter::with_capacity(1 << 18, Marked(writer))),
+            temporary,
+        })
     }
 
     fn writer(&mut self) -> &mut BufWriter<Marked> {
         #[allow(clippy::expect_used, reason = "taken only by finish, which consumes self")]
-        self.writer.as_mut().expect("an output that is not finished has a writer")
+        self.writer
+            .as_mut()
+            .expect("an output that is not finished has a writer")
     }
 
     fn finish(mut self) -> anyhow::Result<()> {
@@ -159,7 +169,9 @@ impl Output {
             use std::os::unix::fs::PermissionsExt as _;
             // Temporary files are private; a result is for whoever may read the folder.
             std::fs::set_permissions(&temporary, std::fs::Permissions::from_mode(0o644))?;
-            temporary.persist(&path).with_context(|| format!("{}: can not be written", path.display()))?;
+            temporary
+                .persist(&path)
+                .with_context(|| format!("{}: can not be written", path.display()))?;
         }
         Ok(())
     }
@@ -173,7 +185,11 @@ fn tell_table(log: &Path, report: &Report) {
         eprintln!("{}: {} rows skipped in all", log.display(), report.bad_rows);
     }
     if !report.unknown_columns.is_empty() {
-        eprintln!("{}: columns not used: {}", log.display(), report.unknown_columns.join(", "));
+        eprintln!(
+            "{}: columns not used: {}",
+            log.display(),
+            report.unknown_columns.join(", ")
+        );
     }
 }
 
@@ -192,7 +208,11 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
         eprintln!("{}: skipped: {bad}", args.log.display());
     }
     if report.dropped > 0 {
-        eprintln!("{}: {} frames were lost while it was recorded, as candump says in it", args.log.display(), report.dropped);
+        eprintln!(
+            "{}: {} frames were lost while it was recorded, as candump says in it",
+            args.log.display(),
+            report.dropped
+        );
     }
     if report.bad_lines > report.bad.len() as u64 {
         eprintln!("{}: {} lines skipped in all", args.log.display(), report.bad_lines);
@@ -247,10 +267,19 @@ pub(crate) fn encode(args: &Encode) -> anyhow::Result<()> {
     }
     tell_table(&args.samples, &report.table);
     if !report.unknown_channels.is_empty() {
-        eprintln!("{}: not in {}: {}", args.samples.display(), args.config.display(), report.unknown_channels.join(", "));
+        eprintln!(
+            "{}: not in {}: {}",
+            args.samples.display(),
+            args.config.display(),
+            report.unknown_channels.join(", ")
+        );
     }
     if let Some(first) = &report.first_refusal {
-        eprintln!("{}: {} samples not encoded; the first: {first}", args.samples.display(), report.refused);
+        eprintln!(
+            "{}: {} samples not encoded; the first: {first}",
+            args.samples.display(),
+            report.refused
+        );
     }
     if args.json {
         let summary = json!({
@@ -284,9 +313,15 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
         Err(error @ proprio_estimator::offline::OfflineError::MissingChannels(_)) => {
             // The log is what it is: the configuration does not fit it.
             let problem = format!("{}: {error}", args.log.display());
-            return Err(proprio_estimator::config::ConfigError { file: args.config.clone(), problem }.into());
+            return Err(proprio_estimator::config::ConfigError {
+                file: args.config.clone(),
+                problem,
+            }
+            .into());
         }
-        Err(proprio_estimator::offline::OfflineError::Write(error)) => bail!("{}: can not be written: {error}", args.out.display()),
+        Err(proprio_estimator::offline::OfflineError::Write(error)) => {
+            bail!("{}: can not be written: {error}", args.out.display())
+        }
         Err(error) => return Err(error).with_context(|| args.log.display().to_string()),
     };
     if report.estimates > 0 {
@@ -294,7 +329,12 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
     }
     tell_table(&args.log, &report.log);
     if !report.unused_channels.is_empty() {
-        eprintln!("{}: not in {}: {}", args.log.display(), args.config.display(), report.unused_channels.join(", "));
+        eprintln!(
+            "{}: not in {}: {}",
+            args.log.display(),
+            args.config.display(),
+            report.unused_channels.join(", ")
+        );
     }
     let [late, backward, not_finite] = report.dropped;
     if late + backward + not_finite > 0 {
@@ -312,15 +352,25 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
         });
         tell_json(&args.out, &summary);
     } else {
-        eprintln!("{} estimates from {} rows; {} torques withheld", report.estimates, report.log.rows, report.withheld);
+        eprintln!(
+            "{} estimates from {} rows; {} torques withheld",
+            report.estimates, report.log.rows, report.withheld
+        );
     }
     if report.estimates == 0 {
-        bail!("{}: the trigger channel has no sample, so there is no estimate", args.log.display());
+        bail!(
+            "{}: the trigger channel has no sample, so there is no estimate",
+            args.log.display()
+        );
     }
     Ok(())
 }
 
 /// JSON goes to standard output, unless the table itself does.
 fn tell_json(out: &Path, summary: &serde_json::Value) {
-    if out == Path::new("-") { eprintln!("{summary}") } else { say!("{summary}") }
+    if out == Path::new("-") {
+        eprintln!("{summary}")
+    } else {
+        say!("{summary}")
+    }
 }

@@ -66,11 +66,27 @@ const SETTLE: Nanos = Nanos::from_millis(1000);
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let original = Robot::open(&args.robot)?;
     // A wrong fault shows before anything is started.
-    let faults = args.fault.iter().map(|f| f.parse::<Fault>()).collect::<Result<Vec<_>, _>>()?;
-    Simulator::new(&original, &Settings { faults, ..Settings::default() }, Nanos::ZERO)?;
+    let faults = args
+        .fault
+        .iter()
+        .map(|f| f.parse::<Fault>())
+        .collect::<Result<Vec<_>, _>>()?;
+    Simulator::new(
+        &original,
+        &Settings {
+            faults,
+            ..Settings::default()
+        },
+        Nanos::ZERO,
+    )?;
     // Ctrl-C reaches the processes too, which end in order; this one must stay until they have, to clean up after them.
     let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT, signal_hook::consts::SIGHUP, signal_hook::consts::SIGQUIT] {
+    for signal in [
+        signal_hook::consts::SIGTERM,
+        signal_hook::consts::SIGINT,
+        signal_hook::consts::SIGHUP,
+        signal_hook::consts::SIGQUIT,
+    ] {
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot catch signals")?;
     }
     fs::create_dir_all(&args.out).with_context(|| format!("{}: can not be created", args.out.display()))?;
@@ -79,15 +95,31 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     for name in ["summary.json", "report.html", "estimates.csv"] {
         let _ = fs::remove_file(out.join(name));
     }
-    let private = tempfile::Builder::new().prefix("proprio-").tempdir().context("no temporary folder")?;
+    let private = tempfile::Builder::new()
+        .prefix("proprio-")
+        .tempdir()
+        .context("no temporary folder")?;
     let domain = DomainConfig::new(private.path(), &format!("demo-{}", std::process::id()));
     let folder = private.path().join("robot");
     copy_robot(&original, &args.bus, &folder)?;
     let robot = Robot::load(&folder)?;
-    let setup = Setup::new(&robot.config).map_err(|problem| ConfigError { file: folder.join("estimator.toml"), problem })?;
+    let setup = Setup::new(&robot.config).map_err(|problem| ConfigError {
+        file: folder.join("estimator.toml"),
+        problem,
+    })?;
 
-    say!("robot {}: simulator, gateway and estimator as three processes; {} s", robot.config.robot, args.seconds);
-    let mut processes = Processes { private: private.path().to_owned(), domain: domain.clone(), out: out.clone(), running: vec![], stop };
+    say!(
+        "robot {}: simulator, gateway and estimator as three processes; {} s",
+        robot.config.robot,
+        args.seconds
+    );
+    let mut processes = Processes {
+        private: private.path().to_owned(),
+        domain: domain.clone(),
+        out: out.clone(),
+        running: vec![],
+        stop,
+    };
     let outcome = watch(args, &robot, &setup, &mut processes);
     let ended = processes.end();
     let removed = Domain::remove_if_unused(&domain);
@@ -125,8 +157,16 @@ fn copy_robot(robot: &Robot, buses: &[String], to: &Path) -> anyhow::Result<()> 
                 bus.insert("device".into(), devices.into());
             }
         } else if buses.len() != list.len() {
-            let problem = format!("--bus is given {} times; the robot has {} buses: give one interface for each, or one for all", buses.len(), list.len());
-            return Err(ConfigError { file: robot.folder.join("gateway.toml"), problem }.into());
+            let problem = format!(
+                "--bus is given {} times; the robot has {} buses: give one interface for each, or one for all",
+                buses.len(),
+                list.len()
+            );
+            return Err(ConfigError {
+                file: robot.folder.join("gateway.toml"),
+                problem,
+            }
+            .into());
         }
         for (bus, interface) in list.iter_mut().zip(buses) {
             if let Some(bus) = bus.as_table_mut() {
@@ -137,8 +177,14 @@ fn copy_robot(robot: &Robot, buses: &[String], to: &Path) -> anyhow::Result<()> 
         }
     }
     let mut estimator = read("estimator.toml")?;
-    let model = robot.config.model.canonicalize().with_context(|| robot.config.model.display().to_string())?;
-    let model = model.to_str().with_context(|| format!("{} is not UTF-8", model.display()))?;
+    let model = robot
+        .config
+        .model
+        .canonicalize()
+        .with_context(|| robot.config.model.display().to_string())?;
+    let model = model
+        .to_str()
+        .with_context(|| format!("{} is not UTF-8", model.display()))?;
     estimator.insert("model".into(), model.into());
     fs::create_dir_all(to)?;
     fs::write(to.join("gateway.toml"), gateway.to_string())?;
@@ -160,7 +206,11 @@ impl Processes {
     fn start(&mut self, name: &'static str, args: &[&str]) -> anyhow::Result<()> {
         let program = std::env::current_exe().context("this program's own path")?;
         let log = File::create(self.out.join(format!("{name}.log")))?;
-        let output = if name == "simulate" { File::create(self.private.join("simulate.json"))?.into() } else { Stdio::null() };
+        let output = if name == "simulate" {
+            File::create(self.private.join("simulate.json"))?.into()
+        } else {
+            Stdio::null()
+        };
         let child = Command::new(program)
             .arg(name)
             .args(args)
@@ -180,7 +230,9 @@ impl Processes {
         if self.stop.load(Relaxed) {
             bail!("interrupted");
         }
-        let Some((_, child)) = self.running.iter_mut().find(|(n, _)| *n == name) else { return Ok(true) };
+        let Some((_, child)) = self.running.iter_mut().find(|(n, _)| *n == name) else {
+            return Ok(true);
+        };
         match child.try_wait()? {
             None => Ok(false),
             Some(status) if status.success() => Ok(true),
@@ -207,7 +259,10 @@ impl Processes {
                 std::thread::sleep(Duration::from_millis(5));
             };
             if !status.success() && problem.is_ok() {
-                problem = Err(anyhow!("{name} ended with {status}; see {}", self.out.join(format!("{name}.log")).display()));
+                problem = Err(anyhow!(
+                    "{name} ended with {status}; see {}",
+                    self.out.join(format!("{name}.log")).display()
+                ));
             }
         }
         problem
@@ -218,12 +273,19 @@ impl Processes {
         let mut text = String::new();
         for name in ["gateway", "estimator", "simulate"] {
             let log = fs::read_to_string(self.out.join(format!("{name}.log"))).unwrap_or_default();
-            let lines: Vec<_> = log.lines().filter(|l| l.contains("ERROR") || l.starts_with("error")).collect();
+            let lines: Vec<_> = log
+                .lines()
+                .filter(|l| l.contains("ERROR") || l.starts_with("error"))
+                .collect();
             for line in lines.iter().rev().take(3).rev() {
                 text.push_str(&format!("\n  {name}: {line}"));
             }
         }
-        if text.is_empty() { error } else { error.context(format!("the processes' own words:{text}\n")) }
+        if text.is_empty() {
+            error
+        } else {
+            error.context(format!("the processes' own words:{text}\n"))
+        }
     }
 }
 
@@ -259,11 +321,13 @@ fn open<T: Topic>(domain: &Domain, robot: &str, processes: &mut Processes) -> an
     let mut ended = None;
     let reader = Reader::wait_open(domain, robot, |_| {
         std::thread::sleep(Duration::from_millis(5));
-        let failed = ["gateway", "estimator"].into_iter().find_map(|p| match processes.ended(p) {
-            Ok(false) => None,
-            Ok(true) => Some(anyhow!("{p} ended too early")),
-            Err(error) => Some(error),
-        });
+        let failed = ["gateway", "estimator"]
+            .into_iter()
+            .find_map(|p| match processes.ended(p) {
+                Ok(false) => None,
+                Ok(true) => Some(anyhow!("{p} ended too early")),
+                Err(error) => Some(error),
+            });
         ended = failed;
         ended.is_none() && monotonic() < end
     });
@@ -275,14 +339,30 @@ fn open<T: Topic>(domain: &Domain, robot: &str, processes: &mut Processes) -> an
 
 /// Starts the processes and watches until the robot has stopped.
 fn watch(args: &Args, robot: &Robot, setup: &Setup, processes: &mut Processes) -> anyhow::Result<Watched> {
-    let text = |p: &Path| p.to_str().map(ToOwned::to_owned).with_context(|| format!("{} is not UTF-8", p.display()));
+    let text = |p: &Path| {
+        p.to_str()
+            .map(ToOwned::to_owned)
+            .with_context(|| format!("{} is not UTF-8", p.display()))
+    };
     let truth = text(&processes.private.join("truth.csv"))?;
     let (duration, seed) = (args.seconds.to_string(), args.seed.to_string());
     let folder = text(&robot.folder)?;
-    let mut simulate = vec!["--robot", &folder, "--seconds", &duration, "--seed", &seed, "--truth", &truth, "--json"];
+    let mut simulate = vec![
+        "--robot",
+        &folder,
+        "--seconds",
+        &duration,
+        "--seed",
+        &seed,
+        "--truth",
+        &truth,
+        "--json",
+    ];
     args.fault.iter().for_each(|f| simulate.extend(["--fault", f.as_str()]));
-    let (gateway_toml, estimator_toml) =
-        (text(&robot.folder.join("gateway.toml"))?, text(&robot.folder.join("estimator.toml"))?);
+    let (gateway_toml, estimator_toml) = (
+        text(&robot.folder.join("gateway.toml"))?,
+        text(&robot.folder.join("estimator.toml"))?,
+    );
     processes.start("gateway", &["--config", &gateway_toml])?;
     processes.start("estimator", &["--config", &estimator_toml])?;
 
@@ -321,7 +401,12 @@ fn watch(args: &Args, robot: &Robot, setup: &Setup, processes: &mut Processes) -
         }
         while let Some(estimate) = contacts.try_take()? {
             // The contacts of an instant follow its torques at once.
-            let seen = watched.estimates.iter_mut().rev().take(600).find(|s| s.t == estimate.header.acquired);
+            let seen = watched
+                .estimates
+                .iter_mut()
+                .rev()
+                .take(600)
+                .find(|s| s.t == estimate.header.acquired);
             if let Some(seen) = seen {
                 seen.contacts = estimate.contacts().into();
             }
@@ -398,15 +483,33 @@ struct Screen {
 impl Screen {
     fn new(seconds: f64, joints: &[String]) -> Self {
         let terminal = std::io::stdout().is_terminal();
-        let bar = if terminal { ProgressBar::new((seconds * 10.0) as u64) } else { ProgressBar::hidden() };
+        let bar = if terminal {
+            ProgressBar::new((seconds * 10.0) as u64)
+        } else {
+            ProgressBar::hidden()
+        };
         bar.set_style(ProgressStyle::with_template("{bar:40} {msg}").unwrap_or_else(|_| ProgressStyle::default_bar()));
-        Self { terminal, bar, joints: joints.to_vec(), begin: None, next: Nanos::ZERO, lines: 0 }
+        Self {
+            terminal,
+            bar,
+            joints: joints.to_vec(),
+            begin: None,
+            next: Nanos::ZERO,
+            lines: 0,
+        }
     }
 
     fn show(&mut self, last: Option<&Seen>, now: Nanos) {
         let begin = *self.begin.get_or_insert(now);
-        let Some(last) = last.filter(|_| now >= self.next) else { return };
-        self.next = now + if self.terminal { Nanos::from_millis(100) } else { Nanos::from_millis(1000) };
+        let Some(last) = last.filter(|_| now >= self.next) else {
+            return;
+        };
+        self.next = now
+            + if self.terminal {
+                Nanos::from_millis(100)
+            } else {
+                Nanos::from_millis(1000)
+            };
         let elapsed = (now - begin).seconds();
         let of = |i: usize| last.joints.get(i);
         if !self.terminal {
@@ -414,7 +517,11 @@ impl Screen {
                 .joints
                 .iter()
                 .enumerate()
-                .map(|(i, j)| of(i).map_or_else(String::new, |t| format!("{j} {:.2}{}", t.torque, if t.valid == 1 { "" } else { "!" })))
+                .map(|(i, j)| {
+                    of(i).map_or_else(String::new, |t| {
+                        format!("{j} {:.2}{}", t.torque, if t.valid == 1 { "" } else { "!" })
+                    })
+                })
                 .collect();
             say!("{elapsed:5.1} s  {}", cells.join("  "));
             return;
@@ -422,8 +529,15 @@ impl Screen {
         let mut text = String::new();
         for (i, joint) in self.joints.iter().enumerate() {
             let Some(torque) = of(i) else { continue };
-            let state = if torque.valid == 1 { "valid" } else { torque.reason.word() };
-            text.push_str(&format!("\x1b[2K{joint:<20} {:>9.3} Nm  +- {:>6.3}  {state}\n", torque.torque, torque.standard_deviation));
+            let state = if torque.valid == 1 {
+                "valid"
+            } else {
+                torque.reason.word()
+            };
+            text.push_str(&format!(
+                "\x1b[2K{joint:<20} {:>9.3} Nm  +- {:>6.3}  {state}\n",
+                torque.torque, torque.standard_deviation
+            ));
         }
         self.bar.suspend(|| {
             if self.lines > 0 {
@@ -454,18 +568,30 @@ impl Truth {
         let mut reader = csv::Reader::new(BufReader::new(File::open(file)?))?;
         let series: Vec<Option<usize>> = joints
             .iter()
-            .map(|j| reader.series().iter().position(|s| s.what == csv::What::Channel(Kind::Joint) && s.name == *j))
+            .map(|j| {
+                reader
+                    .series()
+                    .iter()
+                    .position(|s| s.what == csv::What::Channel(Kind::Joint) && s.name == *j)
+            })
             .collect();
-        let mut this = Self { t: vec![], torques: vec![vec![]; joints.len()] };
+        let mut this = Self {
+            t: vec![],
+            torques: vec![vec![]; joints.len()],
+        };
         let mut row = csv::Row::default();
         while reader.next_row(&mut row)? {
             let Some(t) = row.t else { continue };
             this.t.push(t);
             for (torques, series) in this.torques.iter_mut().zip(&series) {
-                let torque = row.items.iter().find(|i| Some(i.series) == *series).and_then(|i| match i.value {
-                    Value::Reading(Reading::Joint(state), _) => Some(state.torque),
-                    _ => None,
-                });
+                let torque = row
+                    .items
+                    .iter()
+                    .find(|i| Some(i.series) == *series)
+                    .and_then(|i| match i.value {
+                        Value::Reading(Reading::Joint(state), _) => Some(state.torque),
+                        _ => None,
+                    });
                 torques.push(torque.unwrap_or(f64::NAN));
             }
         }
@@ -493,13 +619,25 @@ fn quantile(sorted: &[f64], q: f64) -> f64 {
 /// Writes estimates.csv, summary.json and report.html, and tells the result.
 fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Truth) -> anyhow::Result<()> {
     let file = |name: &str| -> anyhow::Result<_> {
-        Ok(BufWriter::new(File::create(out.join(name)).with_context(|| out.join(name).display().to_string())?))
+        Ok(BufWriter::new(
+            File::create(out.join(name)).with_context(|| out.join(name).display().to_string())?,
+        ))
     };
     let mut table = Table::new(file("estimates.csv")?, setup)?;
     for seen in &watched.estimates {
         let mut estimate = Estimate::absent(seen.t);
-        estimate.torques.joints.iter_mut().zip(&seen.joints).for_each(|(to, from)| *to = *from);
-        estimate.contacts.contacts.iter_mut().zip(&seen.contacts).for_each(|(to, from)| *to = *from);
+        estimate
+            .torques
+            .joints
+            .iter_mut()
+            .zip(&seen.joints)
+            .for_each(|(to, from)| *to = *from);
+        estimate
+            .contacts
+            .contacts
+            .iter_mut()
+            .zip(&seen.contacts)
+            .for_each(|(to, from)| *to = *from);
         estimate.torques.count = u32::try_from(seen.joints.len())?;
         estimate.contacts.count = u32::try_from(seen.contacts.len())?;
         table.write(&estimate, true)?;
@@ -511,8 +649,14 @@ fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Tru
     // Bus by bus: what one has too many must not hide what another lost.
     let (mut lost, mut foreign) = (watched.estimator.lost, 0);
     for bus in watched.gateway.buses() {
-        let of_simulator = watched.simulator["buses"].as_array().into_iter().flatten().find(|b| b["name"] == bus.name.as_str());
-        let sent = of_simulator.and_then(|b| b["sent"].as_u64()).with_context(|| format!("the simulator's count of bus {}", bus.name))?;
+        let of_simulator = watched.simulator["buses"]
+            .as_array()
+            .into_iter()
+            .flatten()
+            .find(|b| b["name"] == bus.name.as_str());
+        let sent = of_simulator
+            .and_then(|b| b["sent"].as_u64())
+            .with_context(|| format!("the simulator's count of bus {}", bus.name))?;
         lost += sent.saturating_sub(bus.frames);
         foreign += bus.frames.saturating_sub(sent);
     }
@@ -521,7 +665,11 @@ fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Tru
     let rate = (watched.estimates.len() as f64 - 1.0) / (last - first).seconds();
     let torques = || watched.estimates.iter().flat_map(|s| &s.joints);
     let valid_share = torques().filter(|j| j.valid == 1).count() as f64 / torques().count() as f64;
-    let mut latency: Vec<f64> = watched.estimates.iter().map(|s| (s.published - s.t).seconds() * 1e6).collect();
+    let mut latency: Vec<f64> = watched
+        .estimates
+        .iter()
+        .map(|s| (s.published - s.t).seconds() * 1e6)
+        .collect();
     latency.sort_by(f64::total_cmp);
 
     let mut errors = serde_json::Map::new();
@@ -545,7 +693,9 @@ fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Tru
             }
         }
         if count == 0 {
-            bail!("no estimate of {name} can be compared with the truth: the motion was too short, or nothing came after its first second");
+            bail!(
+                "no estimate of {name} can be compared with the truth: the motion was too short, or nothing came after its first second"
+            );
         }
         let rms = (square / f64::from(count)).sqrt();
         errors.insert(name.clone(), json!(rms));
@@ -554,19 +704,34 @@ fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Tru
             report::escape(name),
             (truth_square / f64::from(count)).sqrt()
         ));
-        let curve = |name, colour, points| Curve { name, colour, points: report::thin(points, 1500) };
+        let curve = |name, colour, points| Curve {
+            name,
+            colour,
+            points: report::thin(points, 1500),
+        };
         blocks.push(report::plot(
             name,
             "Nm",
-            &[curve("truth", RGBColor(0, 0, 0), real), curve("estimated", RGBColor(0, 130, 60), estimated)],
+            &[
+                curve("truth", RGBColor(0, 0, 0), real),
+                curve("estimated", RGBColor(0, 130, 60), estimated),
+            ],
         )?);
-        blocks.push(report::plot("error", "Nm", &[curve("estimated - truth", RGBColor(200, 60, 30), error)])?);
+        blocks.push(report::plot(
+            "error",
+            "Nm",
+            &[curve("estimated - truth", RGBColor(200, 60, 30), error)],
+        )?);
     }
     rows.push_str("</table>");
     let upstream = setup.upstream_note();
-    blocks.insert(0, format!("<h2>Joint torques</h2>{rows}<p>{}</p>", report::escape(&upstream)));
+    blocks.insert(
+        0,
+        format!("<h2>Joint torques</h2>{rows}<p>{}</p>", report::escape(&upstream)),
+    );
 
-    let latency_us = json!({ "p50": quantile(&latency, 0.5), "p99": quantile(&latency, 0.99), "p999": quantile(&latency, 0.999) });
+    let latency_us =
+        json!({ "p50": quantile(&latency, 0.5), "p99": quantile(&latency, 0.99), "p999": quantile(&latency, 0.999) });
     let summary = json!({
         "robot": setup.robot, "seconds": args.seconds, "seed": args.seed,
         "frames": frames, "samples": samples, "lost": lost, "foreign": foreign, "estimates": watched.estimates.len(),
@@ -581,10 +746,27 @@ fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Tru
         ("robot", setup.robot.clone()),
         ("motion", format!("{} s, seed {}", args.seconds, args.seed)),
         ("frames", format!("{frames} received, {lost} lost")),
-        ("estimates", format!("{} at {rate:.1} Hz, {:.2} % of torques valid", watched.estimates.len(), valid_share * 100.0)),
-        ("latency", format!("{:.0} us median, {:.0} us at 99 %, from frame stamp to torque published", quantile(&latency, 0.5), quantile(&latency, 0.99))),
+        (
+            "estimates",
+            format!(
+                "{} at {rate:.1} Hz, {:.2} % of torques valid",
+                watched.estimates.len(),
+                valid_share * 100.0
+            ),
+        ),
+        (
+            "latency",
+            format!(
+                "{:.0} us median, {:.0} us at 99 %, from frame stamp to torque published",
+                quantile(&latency, 0.5),
+                quantile(&latency, 0.99)
+            ),
+        ),
     ];
-    fs::write(out.join("report.html"), report::page(&format!("proprio demo: {}", setup.robot), &facts, &blocks))?;
+    fs::write(
+        out.join("report.html"),
+        report::page(&format!("proprio demo: {}", setup.robot), &facts, &blocks),
+    )?;
 
     for (name, value) in &facts {
         say!("{name:<10} {value}");
@@ -596,6 +778,9 @@ fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Tru
     if !upstream.is_empty() {
         say!("{upstream}");
     }
-    say!("{}: report.html, estimates.csv, summary.json and the processes' logs", args.out.display());
+    say!(
+        "{}: report.html, estimates.csv, summary.json and the processes' logs",
+        args.out.display()
+    );
     Ok(())
 }

@@ -40,7 +40,15 @@ struct Finding {
 
 /// Looks at everything; fails if something is missing without which nothing runs.
 pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
-    let findings = [can(), interfaces(), virtual_bus(domain), shared_memory(domain), buffers(), realtime(), locked_memory()];
+    let findings = [
+        can(),
+        interfaces(),
+        virtual_bus(domain),
+        shared_memory(domain),
+        buffers(),
+        realtime(),
+        locked_memory(),
+    ];
     if args.json {
         let rows: Vec<_> = findings
             .iter()
@@ -55,8 +63,16 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
             }
         }
     }
-    let failed: Vec<_> = findings.iter().filter(|f| f.verdict == Verdict::Failed).map(|f| f.what).collect();
-    if failed.is_empty() { Ok(()) } else { bail!("this machine can not run proprio: {}", failed.join(", ")) }
+    let failed: Vec<_> = findings
+        .iter()
+        .filter(|f| f.verdict == Verdict::Failed)
+        .map(|f| f.what)
+        .collect();
+    if failed.is_empty() {
+        Ok(())
+    } else {
+        bail!("this machine can not run proprio: {}", failed.join(", "))
+    }
 }
 
 const fn word(verdict: Verdict) -> &'static str {
@@ -68,7 +84,16 @@ const fn word(verdict: Verdict) -> &'static str {
 }
 
 fn finding(what: &'static str, verdict: Verdict, says: impl Into<String>, hint: &str) -> Finding {
-    Finding { what, verdict, says: says.into(), hint: if verdict == Verdict::Ok { String::new() } else { hint.into() } }
+    Finding {
+        what,
+        verdict,
+        says: says.into(),
+        hint: if verdict == Verdict::Ok {
+            String::new()
+        } else {
+            hint.into()
+        },
+    }
 }
 
 fn can() -> Finding {
@@ -98,9 +123,19 @@ fn interfaces() -> Finding {
     const ARPHRD_CAN: &str = "280";
     let mut names = Vec::new();
     for entry in fs::read_dir("/sys/class/net").into_iter().flatten().flatten() {
-        let read = |file: &str| fs::read_to_string(entry.path().join(file)).unwrap_or_default().trim().to_owned();
+        let read = |file: &str| {
+            fs::read_to_string(entry.path().join(file))
+                .unwrap_or_default()
+                .trim()
+                .to_owned()
+        };
         if read("type") == ARPHRD_CAN {
-            names.push(format!("{} ({}, queue {})", entry.file_name().to_string_lossy(), read("operstate"), read("tx_queue_len")));
+            names.push(format!(
+                "{} ({}, queue {})",
+                entry.file_name().to_string_lossy(),
+                read("operstate"),
+                read("tx_queue_len")
+            ));
         }
     }
     if names.is_empty() {
@@ -118,25 +153,52 @@ fn virtual_bus(domain: &DomainConfig) -> Finding {
         let open = || VirtualBus::open(&domain.name, &name, &[]).map_err(|e| e.to_string());
         let (mut one, mut other) = (open()?, open()?);
         let sent = clock.now();
-        one.send(&Frame::new(Id::standard(0x123), &[1, 2, 3]), sent + Nanos::from_millis(100)).map_err(|e| e.to_string())?;
+        one.send(
+            &Frame::new(Id::standard(0x123), &[1, 2, 3]),
+            sent + Nanos::from_millis(100),
+        )
+        .map_err(|e| e.to_string())?;
         match other.recv(sent + Nanos::from_millis(500)) {
             Received::Frame(_) => Ok(clock.now() - sent),
             _ => Err("a frame sent on it does not arrive; is the loopback interface up?".into()),
         }
     };
     match test() {
-        Ok(took) => finding("virtual bus", Verdict::Ok, format!("a frame arrives after {} us", took.0 / 1000), ""),
-        Err(problem) => finding("virtual bus", Verdict::Lacking, problem, "`ip link set lo up`; IPv4 multicast on it must not be filtered"),
+        Ok(took) => finding(
+            "virtual bus",
+            Verdict::Ok,
+            format!("a frame arrives after {} us", took.0 / 1000),
+            "",
+        ),
+        Err(problem) => finding(
+            "virtual bus",
+            Verdict::Lacking,
+            problem,
+            "`ip link set lo up`; IPv4 multicast on it must not be filtered",
+        ),
     }
 }
 
 fn shared_memory(domain: &DomainConfig) -> Finding {
-    let probe = DomainConfig { name: format!("doctor-{}", std::process::id()), ..domain.clone() };
+    let probe = DomainConfig {
+        name: format!("doctor-{}", std::process::id()),
+        ..domain.clone()
+    };
     let opened = Domain::open(&probe).map(drop);
     let _ = Domain::remove_if_unused(&probe);
     match opened {
-        Ok(()) => finding("shared memory", Verdict::Ok, format!("a domain opens in {}", probe.base.display()), ""),
-        Err(error) => finding("shared memory", Verdict::Failed, error.to_string(), "gateway, estimator and consumers need it"),
+        Ok(()) => finding(
+            "shared memory",
+            Verdict::Ok,
+            format!("a domain opens in {}", probe.base.display()),
+            "",
+        ),
+        Err(error) => finding(
+            "shared memory",
+            Verdict::Failed,
+            error.to_string(),
+            "gateway, estimator and consumers need it",
+        ),
     }
 }
 
@@ -145,12 +207,20 @@ fn buffers() -> Finding {
     let number = |path: &str| fs::read_to_string(path).ok().and_then(|t| t.trim().parse::<u64>().ok());
     let most = number("/proc/sys/net/core/rmem_max").unwrap_or(0);
     if most >= WANTED || has_capability(CAP_NET_ADMIN) {
-        return finding("receive buffers", Verdict::Ok, "a burst of thousands of frames fits", "");
+        return finding(
+            "receive buffers",
+            Verdict::Ok,
+            "a burst of thousands of frames fits",
+            "",
+        );
     }
     finding(
         "receive buffers",
         Verdict::Lacking,
-        format!("at most {most} bytes: some {} frames wait while the gateway does not run", most / 768),
+        format!(
+            "at most {most} bytes: some {} frames wait while the gateway does not run",
+            most / 768
+        ),
         "`sysctl -w net.core.rmem_max=4194304`, or give the gateway CAP_NET_ADMIN",
     )
 }
@@ -165,14 +235,21 @@ const CAP_SYS_NICE: u32 = 23;
 /// Whether this process has a capability.
 fn has_capability(number: u32) -> bool {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let mask = status.lines().find_map(|l| l.strip_prefix("CapEff:")).and_then(|m| u64::from_str_radix(m.trim(), 16).ok());
+    let mask = status
+        .lines()
+        .find_map(|l| l.strip_prefix("CapEff:"))
+        .and_then(|m| u64::from_str_radix(m.trim(), 16).ok());
     mask.is_some_and(|m| m >> number & 1 == 1)
 }
 
 fn realtime() -> Finding {
     let limit = getrlimit(Resource::RLIMIT_RTPRIO).map_or(0, |(soft, _)| soft);
     let rt_kernel = fs::read_to_string("/sys/kernel/realtime").is_ok_and(|t| t.trim() == "1");
-    let kernel = if rt_kernel { "PREEMPT_RT kernel" } else { "not a PREEMPT_RT kernel" };
+    let kernel = if rt_kernel {
+        "PREEMPT_RT kernel"
+    } else {
+        "not a PREEMPT_RT kernel"
+    };
     if limit > 0 || has_capability(CAP_SYS_NICE) {
         return finding("real-time", Verdict::Ok, format!("SCHED_FIFO is allowed; {kernel}"), "");
     }

@@ -96,10 +96,11 @@ fn main() -> ExitCode {
 /// Tells an error as one chain; 2 if a wrong configuration is at its root, else 1.
 fn fail(error: &anyhow::Error) -> ExitCode {
     eprintln!("error: {error:#}");
-    let configuration = proprio_simulator::is_configuration(error) || error.chain().any(|cause| {
-        cause.is::<proprio_gateway::plan::ConfigError>()
-            || cause.is::<proprio_estimator::config::ConfigError>()
-            || cause.downcast_ref().is_some_and(DomainError::is_configuration)
-    });
+    let configuration = proprio_simulator::is_configuration(error)
+        || error.chain().any(|cause| {
+            cause.is::<proprio_gateway::plan::ConfigError>()
+                || cause.is::<proprio_estimator::config::ConfigError>()
+                || cause.downcast_ref().is_some_and(DomainError::is_configuration)
+        });
     ExitCode::from(if configuration { 2 } else { 1 })
 }

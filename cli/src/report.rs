@@ -15,7 +15,12 @@ pub(crate) struct Curve<'a> {
 
 /// A plot of `curves` over time as SVG text.
 pub(crate) fn plot(title: &str, unit: &str, curves: &[Curve<'_>]) -> anyhow::Result<String> {
-    let finite = || curves.iter().flat_map(|c| &c.points).filter(|(t, y)| t.is_finite() && y.is_finite());
+    let finite = || {
+        curves
+            .iter()
+            .flat_map(|c| &c.points)
+            .filter(|(t, y)| t.is_finite() && y.is_finite())
+    };
     let (mut x, mut y) = ((f64::MAX, f64::MIN), (f64::MAX, f64::MIN));
     for (px, py) in finite() {
         x = (x.0.min(*px), x.1.max(*px));
@@ -33,19 +38,35 @@ pub(crate) fn plot(title: &str, unit: &str, curves: &[Curve<'_>]) -> anyhow::Res
             .x_label_area_size(26)
             .y_label_area_size(58)
             .build_cartesian_2d(x.0..x.1, y.0 - margin..y.1 + margin)?;
-        chart.configure_mesh().light_line_style(WHITE).x_desc("t [s]").y_desc(format!("{title} [{unit}]")).draw()?;
+        chart
+            .configure_mesh()
+            .light_line_style(WHITE)
+            .x_desc("t [s]")
+            .y_desc(format!("{title} [{unit}]"))
+            .draw()?;
         for curve in curves {
             let style = curve.colour.stroke_width(1);
             // A line series draws through gaps, so each run of numbers is a series of its own.
-            for (i, run) in curve.points.split(|(t, y)| !t.is_finite() || !y.is_finite()).filter(|r| !r.is_empty()).enumerate() {
+            for (i, run) in curve
+                .points
+                .split(|(t, y)| !t.is_finite() || !y.is_finite())
+                .filter(|r| !r.is_empty())
+                .enumerate()
+            {
                 let series = chart.draw_series(LineSeries::new(run.iter().copied(), style))?;
                 if i == 0 {
                     let colour = curve.colour;
-                    series.label(curve.name).legend(move |(x, y)| PathElement::new([(x, y), (x + 14, y)], colour));
+                    series
+                        .label(curve.name)
+                        .legend(move |(x, y)| PathElement::new([(x, y), (x + 14, y)], colour));
                 }
             }
         }
-        chart.configure_series_labels().background_style(WHITE.mix(0.8)).border_style(BLACK.mix(0.3)).draw()?;
+        chart
+            .configure_series_labels()
+            .background_style(WHITE.mix(0.8))
+            .border_style(BLACK.mix(0.3))
+            .draw()?;
         area.present()?;
     }
     // Scales with the page: a view box instead of a fixed size.
@@ -81,5 +102,8 @@ pub(crate) fn page(title: &str, facts: &[(&str, String)], blocks: &[String]) -> 
 
 /// Text that is safe in HTML.
 pub(crate) fn escape(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+    text.replace('&', "&amp;")
+        .replace('<', "&lt;")
+        .replace('>', "&gt;")
+        .replace('"', "&quot;")
 }

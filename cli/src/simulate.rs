@@ -36,12 +36,20 @@ pub(crate) struct Args {
 /// Runs the simulated robot.
 pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     let robot = Robot::open(&args.robot)?;
-    let faults = args.fault.iter().map(|f| f.parse::<Fault>()).collect::<Result<Vec<_>, _>>()?;
+    let faults = args
+        .fault
+        .iter()
+        .map(|f| f.parse::<Fault>())
+        .collect::<Result<Vec<_>, _>>()?;
     let options = Options {
         buses: args.bus.iter().map(|b| parse_bus(b)).collect::<Result<_, _>>()?,
         domain: domain.name.clone(),
         seconds: args.seconds,
-        settings: Settings { seed: args.seed, faults, ..Settings::default() },
+        settings: Settings {
+            seed: args.seed,
+            faults,
+            ..Settings::default()
+        },
         truth: args.truth.clone(),
     };
     let stop = Arc::new(AtomicBool::new(false));

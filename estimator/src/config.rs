@@ -238,7 +238,11 @@ pub struct Differentiation {
 impl Default for Differentiation {
     fn default() -> Self {
         // Half of 0.055 deg, iCub's coarsest encoders; and three times the noise density of a BNO055 at 100 Hz.
-        Self { position_noise_rad: 4.8e-4, angular_velocity_noise_radps: 5e-3, max_window_ms: 300.0 }
+        Self {
+            position_noise_rad: 4.8e-4,
+            angular_velocity_noise_radps: 5e-3,
+            max_window_ms: 300.0,
+        }
     }
 }
 
@@ -272,7 +276,11 @@ pub struct Output {
 
 impl Default for Output {
     fn default() -> Self {
-        Self { trigger: None, max_wait_ms: 1.0, max_torque_std_nm: None }
+        Self {
+            trigger: None,
+            max_wait_ms: 1.0,
+            max_torque_std_nm: None,
+        }
     }
 }
 
@@ -282,7 +290,10 @@ impl Config {
     /// # Errors
     /// [`ConfigError`]: not readable, not TOML, an unknown key, a wrong value.
     pub fn load(file: &Path) -> Result<Self, ConfigError> {
-        let error = |problem| ConfigError { file: file.to_owned(), problem };
+        let error = |problem| ConfigError {
+            file: file.to_owned(),
+            problem,
+        };
         let text = std::fs::read_to_string(file).map_err(|e| error(format!("can not be read: {e}")))?;
         let mut config = Self::parse(&text).map_err(error)?;
         let folder = file.parent().unwrap_or(Path::new("."));
@@ -303,24 +314,47 @@ impl Config {
 
     fn check(&self) -> Result<(), String> {
         if self.schema != 1 {
-            return Err(format!("schema = {} is not known; this version reads schema = 1", self.schema));
+            return Err(format!(
+                "schema = {} is not known; this version reads schema = 1",
+                self.schema
+            ));
         }
-        if let Some(Realtime { priority: Some(priority), .. }) = self.realtime
+        if let Some(Realtime {
+            priority: Some(priority),
+            ..
+        }) = self.realtime
             && !(1..=99).contains(&priority)
         {
             return Err(format!("realtime.priority = {priority} must be 1 to 99"));
         }
         let positive = |key: &str, value: f64, most: f64| {
-            if value > 0.0 && value <= most { Ok(()) } else { Err(format!("{key} = {value} must be above 0, at most {most}")) }
+            if value > 0.0 && value <= most {
+                Ok(())
+            } else {
+                Err(format!("{key} = {value} must be above 0, at most {most}"))
+            }
         };
         positive("input.max_silence_ms", self.input.max_silence_ms, 3.6e6)?;
-        positive("differentiation.position_noise_rad", self.differentiation.position_noise_rad, 1.0)?;
-        positive("differentiation.angular_velocity_noise_radps", self.differentiation.angular_velocity_noise_radps, 10.0)?;
+        positive(
+            "differentiation.position_noise_rad",
+            self.differentiation.position_noise_rad,
+            1.0,
+        )?;
+        positive(
+            "differentiation.angular_velocity_noise_radps",
+            self.differentiation.angular_velocity_noise_radps,
+            10.0,
+        )?;
         positive("differentiation.max_window_ms", self.differentiation.max_window_ms, 1e4)?;
-        self.output.max_torque_std_nm.map_or(Ok(()), |bound| positive("output.max_torque_std_nm", bound, f64::MAX))?;
+        self.output
+            .max_torque_std_nm
+            .map_or(Ok(()), |bound| positive("output.max_torque_std_nm", bound, f64::MAX))?;
         // What may come while an instant waits is kept: 32 samples of a channel beside those of its window, 256 instants.
         if !(self.output.max_wait_ms >= 0.0 && self.output.max_wait_ms <= 250.0) {
-            return Err(format!("output.max_wait_ms = {} must be 0 to 250", self.output.max_wait_ms));
+            return Err(format!(
+                "output.max_wait_ms = {} must be 0 to 250",
+                self.output.max_wait_ms
+            ));
         }
         let finite = |key: &str, values: &[f64]| match values.iter().find(|v| !v.is_finite()) {
             Some(value) => Err(format!("{key} has the value {value}; it must be finite")),
@@ -340,7 +374,10 @@ impl Config {
             let at = |key: &str| format!("force_torque {:?}: {key}", ft.sensor);
             for (key, noise) in [("noise_n", ft.noise_n), ("noise_nm", ft.noise_nm)] {
                 if let Some(value) = noise.into_iter().find(|v| v.is_nan() || *v <= 0.0 || v.is_infinite()) {
-                    return Err(format!("{} has the value {value}; a standard deviation must be above 0", at(key)));
+                    return Err(format!(
+                        "{} has the value {value}; a standard deviation must be above 0",
+                        at(key)
+                    ));
                 }
             }
             finite(&at("offset_n"), &ft.offset_n)?;
@@ -353,7 +390,10 @@ impl Config {
             finite(&at("position_m"), &contact.position_m)?;
             match (contact.kind, contact.direction) {
                 (ContactKind::ForceAlong, None) => {
-                    return Err(format!("{} is missing: kind = \"force_along\" needs it", at("direction")));
+                    return Err(format!(
+                        "{} is missing: kind = \"force_along\" needs it",
+                        at("direction")
+                    ));
                 }
                 (ContactKind::ForceAlong, Some(direction)) => {
                     finite(&at("direction"), &direction)?;
@@ -401,7 +441,13 @@ mod tests {
     #[test]
     fn defaults_are_as_documented() {
         let config = Config::parse(ARM).unwrap();
-        assert_eq!(config.base, Base::Fixed { link: "chest".into(), gravity_mps2: [0.0, 0.0, -9.80665] });
+        assert_eq!(
+            config.base,
+            Base::Fixed {
+                link: "chest".into(),
+                gravity_mps2: [0.0, 0.0, -9.80665]
+            }
+        );
         assert_eq!(config.force_torque[0].noise_n, [0.08, 0.09, 0.18]);
         assert_eq!(config.contact[0].kind, ContactKind::Wrench);
         assert_eq!(config.contact[0].presence, Presence::Always);
@@ -412,13 +458,37 @@ mod tests {
     fn each_mistake_has_one_clear_message() {
         for (from, to, expected) in [
             ("schema = 1", "schema = 3", "schema = 3 is not known"),
-            ("kind = \"fixed\"", "kind = \"fixd\"", "unknown variant `fixd`, expected `fixed` or `imu`"),
-            ("joint = \"ft_joint\"", "joint = \"ft_joint\"\nnoise_n = [0.1, 0.0, 0.1]", "noise_n has the value 0"),
-            ("link = \"l_hand\"", "link = \"l_hand\"\nkind = \"force_along\"", "direction is missing"),
-            ("link = \"l_hand\"", "link = \"l_hand\"\ndirection = [0.0, 0.0, 1.0]", "belongs to kind = \"force_along\" only"),
+            (
+                "kind = \"fixed\"",
+                "kind = \"fixd\"",
+                "unknown variant `fixd`, expected `fixed` or `imu`",
+            ),
+            (
+                "joint = \"ft_joint\"",
+                "joint = \"ft_joint\"\nnoise_n = [0.1, 0.0, 0.1]",
+                "noise_n has the value 0",
+            ),
+            (
+                "link = \"l_hand\"",
+                "link = \"l_hand\"\nkind = \"force_along\"",
+                "direction is missing",
+            ),
+            (
+                "link = \"l_hand\"",
+                "link = \"l_hand\"\ndirection = [0.0, 0.0, 1.0]",
+                "belongs to kind = \"force_along\" only",
+            ),
             ("trigger = \"ft\"", "triger = \"ft\"", "unknown field `triger`"),
-            ("trigger = \"ft\"", "max_wait_ms = -1.0", "max_wait_ms = -1 must be 0 to 250"),
-            ("link = \"chest\"", "link = \"chest\"\ngravity_mps2 = [0.0, 0.0, nan]", "base.gravity_mps2 has the value NaN"),
+            (
+                "trigger = \"ft\"",
+                "max_wait_ms = -1.0",
+                "max_wait_ms = -1 must be 0 to 250",
+            ),
+            (
+                "link = \"chest\"",
+                "link = \"chest\"\ngravity_mps2 = [0.0, 0.0, nan]",
+                "base.gravity_mps2 has the value NaN",
+            ),
         ] {
             assert!(ARM.contains(from), "{from}");
             let problem = Config::parse(&ARM.replacen(from, to, 1)).unwrap_err();

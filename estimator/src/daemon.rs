@@ -47,7 +47,10 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
         let _ = write!(std::io::stdout(), "{setup}");
         return Ok(());
     }
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start")?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .context("cannot start")?;
     runtime.block_on(serve(&config, setup, domain))
 }
 
@@ -57,7 +60,10 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
 /// [`ConfigError`].
 pub fn load(file: &Path) -> Result<(Config, Setup), ConfigError> {
     let config = Config::load(file)?;
-    let setup = Setup::new(&config).map_err(|problem| ConfigError { file: file.to_owned(), problem })?;
+    let setup = Setup::new(&config).map_err(|problem| ConfigError {
+        file: file.to_owned(),
+        problem,
+    })?;
     for warning in setup.warnings() {
         tracing::warn!("{}: {warning}", file.display());
     }
@@ -67,8 +73,18 @@ pub fn load(file: &Path) -> Result<(Config, Setup), ConfigError> {
 /// The exit code for an error that `run` ended with, after telling it: 2 for a wrong configuration, else 1.
 pub fn report(error: &anyhow::Error) -> ExitCode {
     eprintln!("error: {error:#}");
-    let wrong_domain = |e: &(dyn std::error::Error + 'static)| e.downcast_ref().is_some_and(DomainError::is_configuration);
-    ExitCode::from(if error.chain().any(|cause| cause.is::<ConfigError>() || wrong_domain(cause)) { 2 } else { 1 })
+    let wrong_domain =
+        |e: &(dyn std::error::Error + 'static)| e.downcast_ref().is_some_and(DomainError::is_configuration);
+    ExitCode::from(
+        if error
+            .chain()
+            .any(|cause| cause.is::<ConfigError>() || wrong_domain(cause))
+        {
+            2
+        } else {
+            1
+        },
+    )
 }
 
 async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::Result<()> {
@@ -115,7 +131,9 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
     tracing::info!(why, "stopping");
     let _ = sd_notify::notify(&[NotifyState::Stopping]);
     stop.store(true, Release);
-    thread.join().map_err(|_| anyhow!("the data plane panicked; this is a mistake in the program"))
+    thread
+        .join()
+        .map_err(|_| anyhow!("the data plane panicked; this is a mistake in the program"))
 }
 
 /// What the data-plane thread owns.
@@ -174,7 +192,10 @@ impl DataPlane {
             contacts,
             health_writer,
             description_writer,
-            health: EstimatorHealth { started: now, ..EstimatorHealth::default() },
+            health: EstimatorHealth {
+                started: now,
+                ..EstimatorHealth::default()
+            },
             next_look: Nanos::ZERO,
             next_health: Nanos::ZERO,
             last_turn,
@@ -215,10 +236,13 @@ impl DataPlane {
         {
             self.inbox.push(sample);
         }
-        self.inbox.sort_unstable_by_key(|s| (s.header.acquired, s.header.bus, s.header.sequence));
+        self.inbox
+            .sort_unstable_by_key(|s| (s.header.acquired, s.header.bus, s.header.sequence));
         self.health.samples += self.inbox.len() as u64;
         for at in 0..self.inbox.len() {
-            let Some(sample) = self.inbox.get(at).copied() else { break };
+            let Some(sample) = self.inbox.get(at).copied() else {
+                break;
+            };
             if sample.header.epoch != self.mapped {
                 self.take_descriptions();
             }
@@ -229,10 +253,12 @@ impl DataPlane {
             }
             // A channel that the configuration does not name is not an error: the gateway may serve others.
             let Some(channel) = channel else { continue };
-            self.pipeline.push(channel, sample.header.acquired, &sample.reading, sample.header.quality);
+            self.pipeline
+                .push(channel, sample.header.acquired, &sample.reading, sample.header.quality);
             while let Some(estimate) = self.pipeline.poll() {
                 let now = monotonic();
-                let sent = self.torques.send(&estimate.torques, now).is_ok() & self.contacts.send(&estimate.contacts, now).is_ok();
+                let sent = self.torques.send(&estimate.torques, now).is_ok()
+                    & self.contacts.send(&estimate.contacts, now).is_ok();
                 self.health.estimates += 1;
                 self.health.publish_failures += u64::from(!sent);
                 self.health.withheld += u64::from(estimate.torques.joints().iter().any(|j| j.valid != 1));
@@ -250,14 +276,25 @@ impl DataPlane {
             }
             self.map.clear();
             for number in 0..proprio_topics::MAX_CHANNELS {
-                let entry = u32::try_from(number).ok().and_then(|n| description.find(Role::Channel, n));
-                self.map.push(entry.and_then(|e| self.pipeline.setup().channel(e.kind, e.name.as_str())));
+                let entry = u32::try_from(number)
+                    .ok()
+                    .and_then(|n| description.find(Role::Channel, n));
+                self.map
+                    .push(entry.and_then(|e| self.pipeline.setup().channel(e.kind, e.name.as_str())));
             }
             self.mapped = description.header.epoch;
             let missing = (0..self.pipeline.setup().channels().len()).filter(|c| !self.map.contains(&Some(*c)));
             for channel in missing {
-                let name = self.pipeline.setup().channels().get(channel).map_or("", |c| c.name.as_str());
-                tracing::error!(channel = name, "the gateway has no such channel: what depends on it is withheld; measure it, or lock it in [locked]");
+                let name = self
+                    .pipeline
+                    .setup()
+                    .channels()
+                    .get(channel)
+                    .map_or("", |c| c.name.as_str());
+                tracing::error!(
+                    channel = name,
+                    "the gateway has no such channel: what depends on it is withheld; measure it, or lock it in [locked]"
+                );
             }
         }
     }
@@ -265,11 +302,16 @@ impl DataPlane {
     fn take_declarations(&mut self) {
         while let Ok(Some(declared)) = self.declarations.try_take() {
             match self.pipeline.setup().contact(declared.contact.as_str()) {
-                Some(contact) => self.pipeline.declare(contact, declared.header.acquired, declared.active != 0),
+                Some(contact) => self
+                    .pipeline
+                    .declare(contact, declared.header.acquired, declared.active != 0),
                 // Once: whoever misspells a name may do so a thousand times a second.
                 None if !self.told_of_contact => {
                     self.told_of_contact = true;
-                    tracing::warn!(contact = declared.contact.as_str(), "a contact was declared that the configuration does not have");
+                    tracing::warn!(
+                        contact = declared.contact.as_str(),
+                        "a contact was declared that the configuration does not have"
+                    );
                 }
                 None => {}
             }
@@ -278,7 +320,8 @@ impl DataPlane {
 
     fn tell_health(&mut self, now: Nanos) {
         let counts = self.pipeline.counts();
-        (self.health.late, self.health.backward, self.health.not_finite) = (counts.late, counts.backward, counts.not_finite);
+        (self.health.late, self.health.backward, self.health.not_finite) =
+            (counts.late, counts.backward, counts.not_finite);
         self.health.lost = self.samples.as_ref().map_or(0, Reader::lost);
         self.health.epochs = self.samples.as_ref().map_or(0, Reader::epochs);
         // Who can not be reached now gets the next one.

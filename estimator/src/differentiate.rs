@@ -307,7 +307,10 @@ impl<const D: usize> Window<D> {
     }
 
     fn begins_anew(&self, age: usize) -> bool {
-        self.anew.get((self.newest + MAX_SAMPLES - age) % MAX_SAMPLES).copied().unwrap_or(false)
+        self.anew
+            .get((self.newest + MAX_SAMPLES - age) % MAX_SAMPLES)
+            .copied()
+            .unwrap_or(false)
     }
 
     /// Forgets every sample.

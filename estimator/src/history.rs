@@ -37,8 +37,15 @@ pub struct Held<const D: usize> {
 
 impl<const D: usize> Default for History<D> {
     fn default() -> Self {
-        let none = Entry { t: Nanos::MIN, value: [f64::NAN; D], quality: Quality::GOOD };
-        Self { samples: Box::new([none; KEPT]), count: 0 }
+        let none = Entry {
+            t: Nanos::MIN,
+            value: [f64::NAN; D],
+            quality: Quality::GOOD,
+        };
+        Self {
+            samples: Box::new([none; KEPT]),
+            count: 0,
+        }
     }
 }
 
@@ -81,7 +88,13 @@ impl<const D: usize> History<D> {
             age += 1;
         };
         let since = t - before.t;
-        let held = Held { value: before.value, quality: before.quality, age: since, exact: since == Nanos::ZERO, interpolated: false };
+        let held = Held {
+            value: before.value,
+            quality: before.quality,
+            age: since,
+            exact: since == Nanos::ZERO,
+            interpolated: false,
+        };
         match after {
             Some(after) if !held.exact && after.t <= until => {
                 let part = since.seconds() / (after.t - before.t).seconds();
@@ -89,7 +102,12 @@ impl<const D: usize> History<D> {
                 for (v, next) in value.iter_mut().zip(after.value) {
                     *v += part * (next - *v);
                 }
-                Some(Held { value, quality: before.quality | after.quality, interpolated: true, ..held })
+                Some(Held {
+                    value,
+                    quality: before.quality | after.quality,
+                    interpolated: true,
+                    ..held
+                })
             }
             _ => Some(held),
         }
@@ -108,7 +126,11 @@ mod tests {
         history.push(Nanos(20), [3.0], Quality::SATURATED);
         history.push(Nanos(30), [9.0], Quality::GOOD);
         assert!(history.at(Nanos(5), Nanos(100)).is_none());
-        let at = |t, until| history.at(Nanos(t), Nanos(until)).map(|h| (h.value[0], h.quality, h.exact, h.interpolated));
+        let at = |t, until| {
+            history
+                .at(Nanos(t), Nanos(until))
+                .map(|h| (h.value[0], h.quality, h.exact, h.interpolated))
+        };
         assert_eq!(at(10, 100), Some((1.0, Quality::GOOD, true, false)));
         assert_eq!(at(15, 100), Some((2.0, Quality::SATURATED, false, true)));
         // The next sample is later than allowed: held, whether it has come or not.

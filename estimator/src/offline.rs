@@ -58,10 +58,17 @@ pub fn estimate(setup: Setup, log: impl Read, out: impl Write) -> Result<Estimat
     let mut pipeline = Pipeline::new(setup);
     let mut missing: Vec<String> = Vec::new();
     for channel in pipeline.setup().channels() {
-        let there = reader.series().iter().any(|s| s.what == What::Channel(channel.kind) && s.name == channel.name);
+        let there = reader
+            .series()
+            .iter()
+            .any(|s| s.what == What::Channel(channel.kind) && s.name == channel.name);
         if !there {
             let what = format!("{}/{}", channel.kind.word(), channel.name);
-            let hint = if channel.kind == Kind::Joint { " (measure it, or lock it in [locked])" } else { "" };
+            let hint = if channel.kind == Kind::Joint {
+                " (measure it, or lock it in [locked])"
+            } else {
+                ""
+            };
             missing.push(format!("{what}{hint}"));
         }
     }
@@ -153,7 +160,9 @@ impl<W: Write> Table<W> {
             joints.iter().for_each(|j| header.push_str(&format!(",{part}/{j}")));
         }
         for contact in &contacts {
-            ["fx", "fy", "fz", "tx", "ty", "tz", "valid", "reason"].iter().for_each(|c| header.push_str(&format!(",contact/{contact}/{c}")));
+            ["fx", "fy", "fz", "tx", "ty", "tz", "valid", "reason"]
+                .iter()
+                .for_each(|c| header.push_str(&format!(",contact/{contact}/{c}")));
         }
         for part in ["valid", "reason"] {
             joints.iter().for_each(|j| header.push_str(&format!(",{part}/{j}")));
@@ -161,7 +170,15 @@ impl<W: Write> Table<W> {
         header.push('\n');
         out.write_all(header.as_bytes())?;
         let channels = setup.channels().iter().map(|c| c.name.clone()).collect();
-        Ok(Self { out, channels, joints: joints.len(), contacts: contacts.len(), text: Vec::new(), rows: 0, withheld: 0 })
+        Ok(Self {
+            out,
+            channels,
+            joints: joints.len(),
+            contacts: contacts.len(),
+            text: Vec::new(),
+            rows: 0,
+            withheld: 0,
+        })
     }
 
     /// Writes one estimate; `stamped` says whether its instant means anything.
@@ -169,7 +186,8 @@ impl<W: Write> Table<W> {
     /// # Errors
     /// If the output can not be written.
     pub fn write(&mut self, estimate: &Estimate, stamped: bool) -> io::Result<()> {
-        let joints = || (0..self.joints).map(|i| estimate.torques.joints().get(i).copied().unwrap_or(JointTorque::ABSENT));
+        let joints =
+            || (0..self.joints).map(|i| estimate.torques.joints().get(i).copied().unwrap_or(JointTorque::ABSENT));
         self.text.clear();
         if stamped {
             write!(self.text, "{}", estimate.t)?;
@@ -181,13 +199,24 @@ impl<W: Write> Table<W> {
             number(&mut self.text, joint.standard_deviation);
         }
         for i in 0..self.contacts {
-            let contact = estimate.contacts.contacts().get(i).copied().unwrap_or(ContactWrench::ABSENT);
-            contact.force.into_iter().chain(contact.torque).for_each(|v| number(&mut self.text, v));
-            self.text.extend_from_slice(if contact.valid == 1 { b",1" } else { b",0" });
+            let contact = estimate
+                .contacts
+                .contacts()
+                .get(i)
+                .copied()
+                .unwrap_or(ContactWrench::ABSENT);
+            contact
+                .force
+                .into_iter()
+                .chain(contact.torque)
+                .for_each(|v| number(&mut self.text, v));
+            self.text
+                .extend_from_slice(if contact.valid == 1 { b",1" } else { b",0" });
             reason(&mut self.text, &self.channels, contact.reason, contact.cause);
         }
         for joint in joints() {
-            self.text.extend_from_slice(if joint.valid == 1 { b",1" } else { b",0" });
+            self.text
+                .extend_from_slice(if joint.valid == 1 { b",1" } else { b",0" });
             self.withheld += u64::from(joint.valid != 1);
         }
         for joint in joints() {

@@ -40,11 +40,24 @@ impl Estimate {
     /// Nothing estimated, at `t`.
     #[must_use]
     pub fn absent(t: Nanos) -> Self {
-        let header = Header { acquired: t, ..Header::default() };
+        let header = Header {
+            acquired: t,
+            ..Header::default()
+        };
         Self {
             t,
-            torques: TorqueEstimate { header, count: 0, reserved: 0, joints: [JointTorque::ABSENT; MAX_JOINTS] },
-            contacts: ContactEstimate { header, count: 0, reserved: 0, contacts: [ContactWrench::ABSENT; MAX_CONTACTS] },
+            torques: TorqueEstimate {
+                header,
+                count: 0,
+                reserved: 0,
+                joints: [JointTorque::ABSENT; MAX_JOINTS],
+            },
+            contacts: ContactEstimate {
+                header,
+                count: 0,
+                reserved: 0,
+                contacts: [ContactWrench::ABSENT; MAX_CONTACTS],
+            },
         }
     }
 }
@@ -94,7 +107,10 @@ struct Declarations {
 impl Declarations {
     fn say(&mut self, t: Nanos, active: bool) {
         let place = |said: &[(Nanos, bool)]| said.iter().rposition(|(other, _)| *other <= t).map_or(0, |i| i + 1);
-        let previous = place(&self.said).checked_sub(1).and_then(|i| self.said.get(i)).map_or(self.before, |(_, a)| Some(*a));
+        let previous = place(&self.said)
+            .checked_sub(1)
+            .and_then(|i| self.said.get(i))
+            .map_or(self.before, |(_, a)| Some(*a));
         // Whoever repeats himself says nothing new, unless somebody contradicts him from a later instant on.
         if previous == Some(active) {
             return;
@@ -106,7 +122,11 @@ impl Declarations {
     }
 
     fn at(&self, t: Nanos) -> Option<bool> {
-        self.said.iter().rev().find(|(from, _)| *from <= t).map_or(self.before, |(_, active)| Some(*active))
+        self.said
+            .iter()
+            .rev()
+            .find(|(from, _)| *from <= t)
+            .map_or(self.before, |(_, active)| Some(*active))
     }
 }
 
@@ -148,11 +168,15 @@ impl Pipeline {
     #[allow(clippy::expect_used, reason = "the setup was checked when it was built")]
     pub fn new(setup: Setup) -> Self {
         let tracks = setup.channels().iter().map(|c| match c.role {
-            Use::Joint(_) => {
-                Track::Joint(History::default(), Box::new(Window::new(setup.joint_settings).expect("settings were checked")))
-            }
+            Use::Joint(_) => Track::Joint(
+                History::default(),
+                Box::new(Window::new(setup.joint_settings).expect("settings were checked")),
+            ),
             Use::Sensor(_) => Track::Sensor(History::default()),
-            Use::Base => Track::Imu(History::default(), Box::new(Window::new(setup.gyro_settings).expect("settings were checked"))),
+            Use::Base => Track::Imu(
+                History::default(),
+                Box::new(Window::new(setup.gyro_settings).expect("settings were checked")),
+            ),
         });
         let kinematics = Kinematics::new(&setup.model, setup.base_link).expect("the base is a link of the model");
         let (dofs, contacts) = (setup.model.dof_count(), setup.structure.contacts().len());
@@ -199,7 +223,9 @@ impl Pipeline {
     /// Takes a sample of channel number `channel` (see [`Setup::channel`]), acquired at `t`. Readings that are not the channel's
     /// main one are ignored. Call [`Pipeline::poll`] until it gives nothing before the next.
     pub fn push(&mut self, channel: usize, t: Nanos, reading: &Reading, quality: Quality) {
-        let Some(track) = self.tracks.get_mut(channel) else { return };
+        let Some(track) = self.tracks.get_mut(channel) else {
+            return;
+        };
         let newest = track.newest().unwrap_or(Nanos::MIN);
         let all_finite = |values: &[f64]| values.iter().all(|v| v.is_finite());
         let finite_or_absent = |values: &[f64]| values.iter().all(|v| !v.is_infinite());
@@ -289,7 +315,11 @@ impl Pipeline {
     /// The next estimate, if one can be made now.
     pub fn poll(&mut self) -> Option<&Estimate> {
         let t = *self.waiting.front()?;
-        let passed = || self.tracks.iter().all(|track| track.newest().is_some_and(|newest| newest >= t));
+        let passed = || {
+            self.tracks
+                .iter()
+                .all(|track| track.newest().is_some_and(|newest| newest >= t))
+        };
         let waited = self.newest > t + self.setup.max_wait;
         if !(self.finished || waited || self.waiting.len() == MOST_WAITING || passed()) {
             return None;
@@ -314,7 +344,11 @@ impl Pipeline {
                     None => Reason::NeverSeen,
                     Some(held) => {
                         let (state, reason) = joint_at(t, until, &held, window, self.setup.max_silence);
-                        let places = (self.position.get_mut(dof), self.velocity.get_mut(dof), self.acceleration.get_mut(dof));
+                        let places = (
+                            self.position.get_mut(dof),
+                            self.velocity.get_mut(dof),
+                            self.acceleration.get_mut(dof),
+                        );
                         if let (Some(q), Some(dq), Some(ddq)) = places {
                             [*q, *dq, *ddq] = state;
                         }
@@ -325,7 +359,9 @@ impl Pipeline {
                     None => Reason::NeverSeen,
                     Some(held) => {
                         let [fx, fy, fz, tx, ty, tz] = held.value;
-                        if let (Some(place), Some(offset)) = (self.readings.get_mut(number), self.setup.offsets.get(number)) {
+                        if let (Some(place), Some(offset)) =
+                            (self.readings.get_mut(number), self.setup.offsets.get(number))
+                        {
                             *place = Wrench::from_parts([fx, fy, fz], [tx, ty, tz]) - *offset;
                         }
                         stale(&held, self.setup.max_silence).or(quality_reason(held.quality, Quality::DEVICE_FAULT))
@@ -355,21 +391,31 @@ impl Pipeline {
             }
         }
         let Setup { model, structure, .. } = &self.setup;
-        let state =
-            JointState { position: &self.position, velocity: &self.velocity, acceleration: &self.acceleration };
+        let state = JointState {
+            position: &self.position,
+            velocity: &self.velocity,
+            acceleration: &self.acceleration,
+        };
         let solved = self
             .kinematics
             .update(model, state, &base)
-            .and_then(|()| self.solver.solve(model, structure, &self.kinematics, &self.readings, &active, &[]))
+            .and_then(|()| {
+                self.solver
+                    .solve(model, structure, &self.kinematics, &self.readings, &active, &[])
+            })
             .and_then(|()| self.solver.update_deviations(structure))
             .is_ok();
         if self.dependences.active != Some(active) {
             self.dependences.active = Some(active);
             for (dof, place) in self.dependences.torques.iter_mut().enumerate() {
-                *place = structure.torque_dependence(dof, &self.kinematics, &active).unwrap_or_default();
+                *place = structure
+                    .torque_dependence(dof, &self.kinematics, &active)
+                    .unwrap_or_default();
             }
             for (contact, place) in self.dependences.contacts.iter_mut().enumerate() {
-                *place = structure.contact_dependence(contact, &self.kinematics, &active).unwrap_or_default();
+                *place = structure
+                    .contact_dependence(contact, &self.kinematics, &active)
+                    .unwrap_or_default();
             }
         }
         self.tell(t, solved);
@@ -380,13 +426,25 @@ impl Pipeline {
         self.estimate.t = t;
         self.estimate.torques.header.acquired = t;
         self.estimate.contacts.header.acquired = t;
-        let judge = Judge { channels: self.setup.channels(), faults: &self.faults };
-        let results = self.solver.torque().iter().zip(self.solver.torque_deviation()).zip(self.solver.torque_certainty());
+        let judge = Judge {
+            channels: self.setup.channels(),
+            faults: &self.faults,
+        };
+        let results = self
+            .solver
+            .torque()
+            .iter()
+            .zip(self.solver.torque_deviation())
+            .zip(self.solver.torque_certainty());
         let places = self.estimate.torques.joints.iter_mut().zip(&self.dependences.torques);
         for ((place, dependence), ((torque, deviation), certainty)) in places.zip(results) {
             let (mut reason, mut cause) = judge.verdict(dependence);
             // Without a sensor in it a torque rests on the model alone, whose uncertainty is not known.
-            let deviation = if dependence.sensors.is_empty() { f64::NAN } else { *deviation };
+            let deviation = if dependence.sensors.is_empty() {
+                f64::NAN
+            } else {
+                *deviation
+            };
             if reason == Reason::None && *certainty == Certainty::Assumed {
                 reason = Reason::Undetermined;
             }
@@ -407,7 +465,12 @@ impl Pipeline {
                 reserved: 0,
             };
         }
-        let places = self.estimate.contacts.contacts.iter_mut().zip(&self.dependences.contacts);
+        let places = self
+            .estimate
+            .contacts
+            .contacts
+            .iter_mut()
+            .zip(&self.dependences.contacts);
         for ((place, dependence), result) in places.zip(self.solver.contacts()).take(self.setup.contacts.len()) {
             let (mut reason, mut cause) = judge.verdict(dependence);
             match result.certainty {
@@ -419,7 +482,11 @@ impl Pipeline {
                 (reason, cause) = (Reason::NotFinite, NO_CAUSE);
             }
             let known = solved && reason != Reason::NeverSeen;
-            let [fx, fy, fz, tx, ty, tz] = if known { result.wrench.force_first() } else { [f64::NAN; 6] };
+            let [fx, fy, fz, tx, ty, tz] = if known {
+                result.wrench.force_first()
+            } else {
+                [f64::NAN; 6]
+            };
             *place = ContactWrench {
                 force: [fx, fy, fz],
                 torque: [tx, ty, tz],
@@ -489,7 +556,11 @@ fn quality_reason(quality: Quality, faults: Quality) -> Reason {
 
 fn stale<const D: usize>(held: &Held<D>, max_silence: Nanos) -> Reason {
     // Between two samples that are too far apart it was silent too long all the same.
-    if held.age > max_silence { Reason::Stale } else { Reason::None }
+    if held.age > max_silence {
+        Reason::Stale
+    } else {
+        Reason::None
+    }
 }
 
 /// Position, velocity and acceleration of a joint at `t`, and what speaks against them.
@@ -503,8 +574,21 @@ fn joint_at(t: Nanos, until: Nanos, held: &Held<3>, window: &Window<1>, max_sile
     match window.at_using(t, until) {
         Ok(estimate) => {
             let ([value], [first], [second]) = (estimate.value, estimate.first, estimate.second);
-            let given = |measured: f64, estimated: f64| if held.exact && measured.is_finite() { measured } else { estimated };
-            ([given(position, value), given(velocity, first), given(acceleration, second)], stale(held, max_silence))
+            let given = |measured: f64, estimated: f64| {
+                if held.exact && measured.is_finite() {
+                    measured
+                } else {
+                    estimated
+                }
+            };
+            (
+                [
+                    given(position, value),
+                    given(velocity, first),
+                    given(acceleration, second),
+                ],
+                stale(held, max_silence),
+            )
         }
         Err(unavailable) => ([position, 0.0, 0.0], why(unavailable, held, max_silence)),
     }

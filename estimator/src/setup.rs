@@ -102,7 +102,11 @@ impl Setup {
         let keep: Vec<&str> = config.force_torque.iter().map(|f| f.joint.as_str()).collect();
         let model = Model::from_file(&config.model, &keep).map_err(|e| {
             let text = e.to_string();
-            if text.contains(&*config.model.to_string_lossy()) { text } else { format!("{}: {text}", config.model.display()) }
+            if text.contains(&*config.model.to_string_lossy()) {
+                text
+            } else {
+                format!("{}: {text}", config.model.display())
+            }
         })?;
         Self::with_model(config, model)
     }
@@ -114,18 +118,25 @@ impl Setup {
     pub fn with_model(config: &Config, model: Model) -> Result<Self, String> {
         let mut warnings: Vec<String> = model.warnings().to_vec();
         if config.parameters.is_some() {
-            return Err("parameters: this version takes its parameters from the URDF and its offsets from this file".into());
+            return Err(
+                "parameters: this version takes its parameters from the URDF and its offsets from this file".into(),
+            );
         }
         if config.identification.enabled {
-            warnings.push("identification.enabled: this version does not identify; the URDF's parameters are used".into());
+            warnings
+                .push("identification.enabled: this version does not identify; the URDF's parameters are used".into());
         }
         let dofs = model.dof_count();
         if dofs > MAX_JOINTS {
-            return Err(format!("the model has {dofs} moving joints; at most {MAX_JOINTS} are possible"));
+            return Err(format!(
+                "the model has {dofs} moving joints; at most {MAX_JOINTS} are possible"
+            ));
         }
         let mut locked = vec![f64::NAN; dofs];
         for (joint, position) in &config.locked {
-            let dof = model.dof(joint).ok_or_else(|| format!("locked.{joint}: {}", no_joint(&model, joint)))?;
+            let dof = model
+                .dof(joint)
+                .ok_or_else(|| format!("locked.{joint}: {}", no_joint(&model, joint)))?;
             if let Some(place) = locked.get_mut(dof) {
                 *place = *position;
             }
@@ -133,9 +144,17 @@ impl Setup {
         let mut channels = Vec::new();
         let mut add = |kind, name: &str, role| match channels.iter().find(|c: &&Channel| c.name == name) {
             Some(other) if other.kind == kind => Err(format!("two {} channels are named {name:?}", Kind::word(kind))),
-            Some(other) => Err(format!("{name:?} is a {} and a {}: channels need names of their own", other.kind.word(), Kind::word(kind))),
+            Some(other) => Err(format!(
+                "{name:?} is a {} and a {}: channels need names of their own",
+                other.kind.word(),
+                Kind::word(kind)
+            )),
             None => {
-                channels.push(Channel { kind, name: name.to_owned(), role });
+                channels.push(Channel {
+                    kind,
+                    name: name.to_owned(),
+                    role,
+                });
                 Ok(())
             }
         };
@@ -152,12 +171,23 @@ impl Setup {
             Base::Fixed { link, gravity_mps2 } => {
                 let frame = frame(&model, link).map_err(|e| format!("base.link: {e}"))?;
                 let standing = FrameMotion::standing(&Vec3::from(*gravity_mps2));
-                (frame.link, BaseMotion::Standing(FrameMotion::of_link_from_imu(&standing, &frame.pose)))
+                (
+                    frame.link,
+                    BaseMotion::Standing(FrameMotion::of_link_from_imu(&standing, &frame.pose)),
+                )
             }
-            Base::Imu { sensor, link, xyz_m, rpy_rad } => {
+            Base::Imu {
+                sensor,
+                link,
+                xyz_m,
+                rpy_rad,
+            } => {
                 let frame = frame(&model, link).map_err(|e| format!("base.link: {e}"))?;
                 add(Kind::Imu, sensor, Use::Base)?;
-                (frame.link, BaseMotion::Imu(frame.pose * Pose::from_xyz_rpy(*xyz_m, *rpy_rad)))
+                (
+                    frame.link,
+                    BaseMotion::Imu(frame.pose * Pose::from_xyz_rpy(*xyz_m, *rpy_rad)),
+                )
             }
         };
         let (contacts, mut specs) = contacts(config, &model)?;
@@ -169,12 +199,23 @@ impl Setup {
             };
             support = specs.iter().zip(&contacts).position(there);
             if support.is_none() {
-                let frame = Frame { link: base_link, pose: Pose::identity() };
-                specs.push(ContactSpec { frame, kind: ContactKind::Wrench, position: Vec3::zeros() });
+                let frame = Frame {
+                    link: base_link,
+                    pose: Pose::identity(),
+                };
+                specs.push(ContactSpec {
+                    frame,
+                    kind: ContactKind::Wrench,
+                    position: Vec3::zeros(),
+                });
             }
         }
         let mut always = ContactSet::first(specs.len());
-        contacts.iter().enumerate().filter(|(_, c)| !c.always).for_each(|(i, _)| always.remove(i));
+        contacts
+            .iter()
+            .enumerate()
+            .filter(|(_, c)| !c.always)
+            .for_each(|(i, _)| always.remove(i));
         let structure = Structure::new(&model, &sensors, &specs, Structure::LENGTH_SCALE).map_err(|e| match e {
             StructureError::Contact { index } | StructureError::Direction { index } => {
                 format!("contact {:?}: {e}", contacts.get(index).map_or("", |c| c.name.as_str()))
@@ -184,7 +225,10 @@ impl Setup {
         let trigger = match &config.output.trigger {
             Some(name) => channels.iter().position(|c| c.name == *name).ok_or_else(|| {
                 let names: Vec<_> = channels.iter().map(|c| c.name.as_str()).collect();
-                format!("output.trigger = {name:?} is not a channel that is read; these are: {}", names.join(", "))
+                format!(
+                    "output.trigger = {name:?} is not a channel that is read; these are: {}",
+                    names.join(", ")
+                )
             })?,
             // Sensors come first, then joints.
             None => 0,
@@ -192,7 +236,11 @@ impl Setup {
         if channels.is_empty() {
             return Err("nothing is measured: no force_torque, no joint that is not locked, no IMU".into());
         }
-        let Differentiation { position_noise_rad, angular_velocity_noise_radps, max_window_ms } = config.differentiation;
+        let Differentiation {
+            position_noise_rad,
+            angular_velocity_noise_radps,
+            max_window_ms,
+        } = config.differentiation;
         let max_silence = Nanos::from_seconds(config.input.max_silence_ms * 1e-3);
         let settings = |noise| Settings {
             noise,
@@ -210,7 +258,10 @@ impl Setup {
             offsets: config
                 .force_torque
                 .iter()
-                .map(|f| Wrench { torque: vector(f.offset_nm), force: vector(f.offset_n) })
+                .map(|f| Wrench {
+                    torque: vector(f.offset_nm),
+                    force: vector(f.offset_n),
+                })
                 .collect(),
             contacts,
             always,
@@ -316,7 +367,11 @@ impl Setup {
             max_silence: self.max_silence,
             ..none
         });
-        let joints = self.joint_names().map(|j| Entry { name: name(j), role: Role::Joint, ..none });
+        let joints = self.joint_names().map(|j| Entry {
+            name: name(j),
+            role: Role::Joint,
+            ..none
+        });
         let contacts = self.contacts.iter().map(|c| Entry {
             name: name(&c.name),
             frame: name(&c.frame),
@@ -324,9 +379,17 @@ impl Setup {
             kind: Kind::Wrench,
             ..none
         });
-        let numbered = channels.zip(0..).chain(joints.zip(0..)).chain(contacts.zip(0..)).map(|(e, index)| Entry { index, ..e });
-        let mut description =
-            Box::new(Description { header, publisher: Publisher::Estimator, count: 0, entries: [none; Description::CAPACITY] });
+        let numbered = channels
+            .zip(0..)
+            .chain(joints.zip(0..))
+            .chain(contacts.zip(0..))
+            .map(|(e, index)| Entry { index, ..e });
+        let mut description = Box::new(Description {
+            header,
+            publisher: Publisher::Estimator,
+            count: 0,
+            entries: [none; Description::CAPACITY],
+        });
         for (place, entry) in description.entries.iter_mut().zip(numbered) {
             *place = entry;
             description.count += 1;
@@ -351,14 +414,22 @@ fn sensors(config: &Config, model: &Model, warnings: &mut Vec<String>) -> Result
         });
         if let Some(element) = element {
             if frame.is_some_and(|f| f != element.frame) {
-                warnings.push(format!("{at}: frame is {:?} here and {:?} in the URDF; this file counts", frame, element.frame));
+                warnings.push(format!(
+                    "{at}: frame is {:?} here and {:?} in the URDF; this file counts",
+                    frame, element.frame
+                ));
             }
             if direction.is_some_and(|d| d != element.direction) {
-                warnings.push(format!("{at}: direction is {:?} here and {:?} in the URDF; this file counts", direction, element.direction));
+                warnings.push(format!(
+                    "{at}: direction is {:?} here and {:?} in the URDF; this file counts",
+                    direction, element.direction
+                ));
             }
         }
         let frame = frame.or(element.map(|e| e.frame)).unwrap_or(MeasurementFrame::Child);
-        let direction = direction.or(element.map(|e| e.direction)).unwrap_or(MeasurementDirection::ChildToParent);
+        let direction = direction
+            .or(element.map(|e| e.direction))
+            .unwrap_or(MeasurementDirection::ChildToParent);
         let given = ft.xyz_m.is_some();
         if ft.xyz_m.is_some() != ft.rpy_rad.is_some() {
             return Err(format!("{at}: xyz_m and rpy_rad go together: give both or neither"));
@@ -370,7 +441,9 @@ fn sensors(config: &Config, model: &Model, warnings: &mut Vec<String>) -> Result
             _ if given => Pose::from_xyz_rpy(ft.xyz_m.unwrap_or_default(), ft.rpy_rad.unwrap_or_default()),
             Some(element) => element.pose,
             None if frame == MeasurementFrame::Sensor => {
-                return Err(format!("{at}: frame = \"sensor\" needs its pose: xyz_m and rpy_rad here, or a sensor element in the URDF"));
+                return Err(format!(
+                    "{at}: frame = \"sensor\" needs its pose: xyz_m and rpy_rad here, or a sensor element in the URDF"
+                ));
             }
             None => Pose::identity(),
         };
@@ -378,10 +451,15 @@ fn sensors(config: &Config, model: &Model, warnings: &mut Vec<String>) -> Result
             let apart = element.pose.inverse() * pose;
             let turned = (apart.rotation.trace() - 3.0).abs();
             if apart.translation.norm() > 1e-6 || turned > 1e-9 {
-                warnings.push(format!("{at}: its pose here is another one than in the URDF; this file counts"));
+                warnings.push(format!(
+                    "{at}: its pose here is another one than in the URDF; this file counts"
+                ));
             }
         }
-        let noise = Noise { force: ft.noise_n, torque: ft.noise_nm };
+        let noise = Noise {
+            force: ft.noise_n,
+            torque: ft.noise_nm,
+        };
         let cut = SensorCut::new(model, &ft.joint, frame, direction, &pose, &noise).map_err(|e| match e {
             StructureError::NoJoint(_) => format!("{at}: joint = {:?}: {}", ft.joint, no_joint(model, &ft.joint)),
             e => format!("{at}: {e}"),
@@ -394,15 +472,24 @@ fn sensors(config: &Config, model: &Model, warnings: &mut Vec<String>) -> Result
 fn contacts(config: &Config, model: &Model) -> Result<(Vec<NamedContact>, Vec<ContactSpec>), String> {
     let (mut names, mut specs) = (Vec::<NamedContact>::new(), Vec::new());
     if config.contact.len() >= MAX_CONTACTS {
-        return Err(format!("there are {} contacts; at most {} are possible", config.contact.len(), MAX_CONTACTS - 1));
+        return Err(format!(
+            "there are {} contacts; at most {} are possible",
+            config.contact.len(),
+            MAX_CONTACTS - 1
+        ));
     }
     for contact in &config.contact {
         let at = format!("contact {:?}", contact.name());
         if Name::new(contact.name()).is_none() || contact.name().contains(['/', ',', '"', '\n']) {
-            return Err(format!("{at}: a name has at most {} bytes, none of them / , \" or a line's end", Name::CAPACITY));
+            return Err(format!(
+                "{at}: a name has at most {} bytes, none of them / , \" or a line's end",
+                Name::CAPACITY
+            ));
         }
         if names.iter().any(|n| n.name == contact.name()) {
-            return Err(format!("{at}: two contacts have this name; give each a name of its own"));
+            return Err(format!(
+                "{at}: two contacts have this name; give each a name of its own"
+            ));
         }
         let frame = frame(model, &contact.link).map_err(|e| format!("{at}: link: {e}"))?;
         let kind = match (contact.kind, contact.direction) {
@@ -410,16 +497,29 @@ fn contacts(config: &Config, model: &Model) -> Result<(Vec<NamedContact>, Vec<Co
             (KindWord::Force, _) => ContactKind::Force,
             (KindWord::ForceAlong, direction) => ContactKind::ForceAlong(Vec3::from(direction.unwrap_or_default())),
         };
-        specs.push(ContactSpec { frame, kind, position: Vec3::from(contact.position_m) });
+        specs.push(ContactSpec {
+            frame,
+            kind,
+            position: Vec3::from(contact.position_m),
+        });
         let always = contact.presence == Presence::Always;
-        names.push(NamedContact { name: contact.name().to_owned(), frame: contact.link.clone(), always });
+        names.push(NamedContact {
+            name: contact.name().to_owned(),
+            frame: contact.link.clone(),
+            always,
+        });
     }
     Ok((names, specs))
 }
 
 /// Where a link or folded frame is; what is near in name, if there is none of that name.
 fn frame(model: &Model, name: &str) -> Result<Frame, String> {
-    model.frame(name).ok_or_else(|| format!("{name:?} is not a link of the URDF{}", nearest(name, model.frame_names())))
+    model.frame(name).ok_or_else(|| {
+        format!(
+            "{name:?} is not a link of the URDF{}",
+            nearest(name, model.frame_names())
+        )
+    })
 }
 
 fn no_joint(model: &Model, name: &str) -> String {
@@ -443,7 +543,11 @@ fn nearest<'a>(name: &str, names: impl Iterator<Item = &'a str>) -> String {
         Some((distance, near)) if *distance <= name.len() / 2 => format!("; did you mean {near:?}?"),
         _ => {
             let some: Vec<_> = names.iter().take(8).map(|(_, n)| *n).collect();
-            format!("; there is {}{}", some.join(", "), if names.len() > 8 { ", ..." } else { "" })
+            format!(
+                "; there is {}{}",
+                some.join(", "),
+                if names.len() > 8 { ", ..." } else { "" }
+            )
         }
     }
 }
@@ -459,10 +563,18 @@ impl fmt::Display for Setup {
             self.model.dof_count(),
             self.structure.subtrees().len()
         )?;
-        let how = if let BaseMotion::Imu(_) = self.base { "an IMU tells its motion" } else { "it stands still" };
+        let how = if let BaseMotion::Imu(_) = self.base {
+            "an IMU tells its motion"
+        } else {
+            "it stands still"
+        };
         writeln!(f, "base {}: {how}", self.model.link_name(self.base_link))?;
         for (number, channel) in self.channels.iter().enumerate() {
-            let trigger = if number == self.trigger { " (each of its stamps gives an estimate)" } else { "" };
+            let trigger = if number == self.trigger {
+                " (each of its stamps gives an estimate)"
+            } else {
+                ""
+            };
             writeln!(f, "  reads {} {}{trigger}", channel.kind.word(), channel.name)?;
         }
         for (dof, position) in self.locked.iter().enumerate() {
@@ -477,10 +589,21 @@ impl fmt::Display for Setup {
                 .filter_map(|s| self.structure.sensors().get(s))
                 .map(|s| self.model.joint_name(s.joint()))
                 .collect();
-            let contacts: Vec<_> =
-                subtree.contacts.iter().map(|c| self.contacts.get(c).map_or("what the base stands on", |c| c.name.as_str())).collect();
-            let unknowns: usize =
-                subtree.contacts.iter().filter_map(|c| self.structure.contacts().get(c)).map(|c| c.kind.unknowns()).sum();
+            let contacts: Vec<_> = subtree
+                .contacts
+                .iter()
+                .map(|c| {
+                    self.contacts
+                        .get(c)
+                        .map_or("what the base stands on", |c| c.name.as_str())
+                })
+                .collect();
+            let unknowns: usize = subtree
+                .contacts
+                .iter()
+                .filter_map(|c| self.structure.contacts().get(c))
+                .map(|c| c.kind.unknowns())
+                .sum();
             writeln!(
                 f,
                 "sub-tree {number} from {}: F/T [{}], contacts [{}]: {unknowns} unknowns in 6 equations",

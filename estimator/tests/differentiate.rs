@@ -509,7 +509,10 @@ fn instants_before_a_gap_keep_their_samples_whenever_the_gap_ends() {
     assert_eq!(window.at_using(ms(19), ms(20)).unwrap(), before);
     // What comes after it does not look across.
     let after = window.at(ms(202)).unwrap();
-    assert!((after.first[0] + 1000.0).abs() < 1e-3 && after.samples == [3; 3], "{after:?}");
+    assert!(
+        (after.first[0] + 1000.0).abs() < 1e-3 && after.samples == [3; 3],
+        "{after:?}"
+    );
     window.interrupt();
     window.push(ms(203), [0.0]).unwrap();
     assert_eq!(window.at(ms(203)), Err(Unavailable::Starting { samples: 1 }));

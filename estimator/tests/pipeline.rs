@@ -235,19 +235,31 @@ fn the_order_of_arrival_does_not_matter_within_half_the_wait() {
     let base = setup(|_| {});
     let mut state = 12345_u64;
     let mut random = move || {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        state = state
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
         (state >> 33) as i64
     };
     for trial in 0..12 {
-        let phases: Vec<f64> = base.channels().iter().map(|_| (random() % 4_000_000) as f64 * 1e-9).collect();
+        let phases: Vec<f64> = base
+            .channels()
+            .iter()
+            .map(|_| (random() % 4_000_000) as f64 * 1e-9)
+            .collect();
         let events = recording_with(&base, 0.25, |channel| phases[channel]);
         let (want, _) = run(base.clone(), &events);
         // Each channel arrives late by its own delay, and a little more or less, but less than half of the wait of 1 ms.
         let delays: Vec<i64> = base.channels().iter().map(|_| random() % 440_000).collect();
-        let mut arrivals: Vec<(i64, Event)> = events.iter().map(|e| (e.1.0 + delays[e.0] + random() % 50_000, *e)).collect();
+        let mut arrivals: Vec<(i64, Event)> = events
+            .iter()
+            .map(|e| (e.1.0 + delays[e.0] + random() % 50_000, *e))
+            .collect();
         arrivals.sort_by_key(|(at, e)| (*at, e.1));
         let shuffled: Vec<Event> = arrivals.into_iter().map(|(_, e)| e).collect();
-        assert_ne!(shuffled.iter().map(|e| e.0).collect::<Vec<_>>(), events.iter().map(|e| e.0).collect::<Vec<_>>());
+        assert_ne!(
+            shuffled.iter().map(|e| e.0).collect::<Vec<_>>(),
+            events.iter().map(|e| e.0).collect::<Vec<_>>()
+        );
         let (got, pipeline) = run(base.clone(), &shuffled);
         assert_eq!(pipeline.counts().late + pipeline.counts().backward, 0, "trial {trial}");
         assert_eq!(bits(&got), bits(&want), "trial {trial}");
@@ -362,14 +374,27 @@ fn a_channel_that_comes_too_late_is_dropped_and_counted() {
     let setup = setup(|_| {});
     let elbow = setup.channel(Kind::Joint, "l_elbow").unwrap();
     let events = recording(&setup, 0.3);
-    let arrives = |e: &Event| if e.0 == elbow && e.1 > Nanos::from_millis(200) { e.1 + Nanos::from_millis(30) } else { e.1 };
+    let arrives = |e: &Event| {
+        if e.0 == elbow && e.1 > Nanos::from_millis(200) {
+            e.1 + Nanos::from_millis(30)
+        } else {
+            e.1
+        }
+    };
     let mut late = events.clone();
     late.sort_by_key(|e| (arrives(e), e.0));
-    let expected = events.iter().filter(|e| e.0 == elbow && e.1 > Nanos::from_millis(200)).count();
+    let expected = events
+        .iter()
+        .filter(|e| e.0 == elbow && e.1 > Nanos::from_millis(200))
+        .count();
     let triggers = events.iter().filter(|e| e.0 == setup.trigger).count();
     let (estimates, pipeline) = run(setup, &late);
     // Those of the last 30 ms still find an instant that waits, or none.
-    assert!((expected - 10..=expected).contains(&(pipeline.counts().late as usize)), "{:?} of {expected}", pipeline.counts());
+    assert!(
+        (expected - 10..=expected).contains(&(pipeline.counts().late as usize)),
+        "{:?} of {expected}",
+        pipeline.counts()
+    );
     assert_eq!(pipeline.counts().backward, 0);
     assert_eq!(estimates.len(), triggers);
 }
@@ -381,7 +406,11 @@ fn a_gap_of_everything_does_not_reach_back() {
     events.retain(|e| e.1 < Nanos::from_millis(200) || e.1 > Nanos::from_millis(400));
     let (want, _) = run(base.clone(), &events);
     let last = want.iter().filter(|e| e.t < Nanos::from_millis(200)).last().unwrap();
-    assert!(last.torques.joints().iter().all(|j| j.valid == 1), "the last instant before the gap: {:?}", last.torques.joints());
+    assert!(
+        last.torques.joints().iter().all(|j| j.valid == 1),
+        "the last instant before the gap: {:?}",
+        last.torques.joints()
+    );
     // After the gap, whoever comes first.
     let after = events.iter().position(|e| e.1 > Nanos::from_millis(400)).unwrap();
     for k in 1..6 {
@@ -404,8 +433,13 @@ fn what_an_uncalibrated_encoder_said_is_not_differentiated() {
     let (clean, _) = run(setup.clone(), &events);
     let mut bad = events;
     for event in bad.iter_mut().filter(|e| e.0 == elbow && e.1 < Nanos::from_millis(300)) {
-        let Reading::Joint(state) = event.2 else { panic!("a joint") };
-        event.2 = Reading::Joint(JointState { position: state.position + 1.0, ..state });
+        let Reading::Joint(state) = event.2 else {
+            panic!("a joint")
+        };
+        event.2 = Reading::Joint(JointState {
+            position: state.position + 1.0,
+            ..state
+        });
         event.3 = Quality::NOT_CALIBRATED;
     }
     let (estimates, _) = run(setup, &bad);
@@ -427,8 +461,15 @@ fn what_an_uncalibrated_encoder_said_is_not_differentiated() {
 fn what_carries_a_fixed_base_can_not_be_declared_away() {
     let fixed = |presence| {
         move |config: &mut Config| {
-            config.base = proprio_estimator::config::Base::Fixed { link: "chest".into(), gravity_mps2: [0.0, 0.0, -9.80665] };
-            config.contact.iter_mut().filter(|c| c.name() == "stand").for_each(|c| c.presence = presence);
+            config.base = proprio_estimator::config::Base::Fixed {
+                link: "chest".into(),
+                gravity_mps2: [0.0, 0.0, -9.80665],
+            };
+            config
+                .contact
+                .iter_mut()
+                .filter(|c| c.name() == "stand")
+                .for_each(|c| c.presence = presence);
         }
     };
     use proprio_estimator::config::Presence::{Always, Possible};
@@ -474,7 +515,12 @@ fn whoever_repeats_a_declaration_says_nothing_new() {
         }
         pipeline.push(*channel, *t, reading, *quality);
         while let Some(estimate) = pipeline.poll() {
-            assert_ne!(estimate.contacts.contacts()[hand].reason, Reason::Absent, "at {}", estimate.t);
+            assert_ne!(
+                estimate.contacts.contacts()[hand].reason,
+                Reason::Absent,
+                "at {}",
+                estimate.t
+            );
         }
     }
     // More changes than are remembered: the last one of those forgotten still holds.

@@ -7,6 +7,7 @@ use divan::Bencher;
 use divan::counter::ItemsCount;
 use proprio_drivers::Frame;
 use proprio_gateway::bus::{Bus, Turn};
+use proprio_gateway::candump;
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::decoder::Decoder;
 use proprio_gateway::link::virtual_bus::VirtualBus;
@@ -15,7 +16,6 @@ use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
 use proprio_gateway::publish::Shared;
 use proprio_gateway::status::BusStatus;
-use proprio_gateway::candump;
 use proprio_topics::csv::Columns;
 use proprio_topics::ipc::{Domain, DomainConfig, Writer};
 use proprio_topics::{LinkState, Nanos, Sample};
@@ -55,11 +55,25 @@ fn plan() -> Plan {
 /// A log of `frames` frames, of which two in three are halves of wrenches: that is what a robot's bus carries.
 fn log(frames: u64) -> Vec<u8> {
     let mut table = String::from("t,joint/elbow/position,joint/elbow/velocity");
-    ["fx", "fy", "fz", "tx", "ty", "tz"].iter().for_each(|c| write!(table, ",wrench/ft/{c}").unwrap());
+    ["fx", "fy", "fz", "tx", "ty", "tz"]
+        .iter()
+        .for_each(|c| write!(table, ",wrench/ft/{c}").unwrap());
     table.push('\n');
     for i in 0..frames / 3 {
         let (t, x) = (Nanos(i64::try_from(i).unwrap() * 1_000_000), (i as f64 * 0.01).sin());
-        writeln!(table, "{t},{},{},{},{},{},{},{},{}", x, -x, 10.0 * x, 3.0 - x, 100.0 * x, x, -x, 0.3 * x).unwrap();
+        writeln!(
+            table,
+            "{t},{},{},{},{},{},{},{},{}",
+            x,
+            -x,
+            10.0 * x,
+            3.0 - x,
+            100.0 * x,
+            x,
+            -x,
+            0.3 * x
+        )
+        .unwrap();
     }
     let mut log = Vec::new();
     offline::encode(&plan(), table.as_bytes(), &mut log).unwrap();
@@ -73,7 +87,9 @@ fn decode_log_to_table(bencher: Bencher<'_, '_>) {
     let frames = log.iter().filter(|b| **b == b'\n').count();
     bencher.counter(ItemsCount::new(frames)).bench(|| {
         let mut table = Vec::with_capacity(64 << 20);
-        offline::decode(&plan(), log.as_slice(), &mut table, Columns::Main).unwrap().samples
+        offline::decode(&plan(), log.as_slice(), &mut table, Columns::Main)
+            .unwrap()
+            .samples
     });
 }
 
@@ -114,13 +130,16 @@ fn bare_receive(bencher: Bencher<'_, '_>) {
     let mut sender = VirtualBus::open(&domain, "bare", &[]).unwrap();
     let receiver = std::cell::RefCell::new(VirtualBus::open(&domain, "bare", &[]).unwrap());
     let frames = frames();
-    bencher.counter(ItemsCount::new(FRAMES)).with_inputs(|| fill(&mut sender, &frames)).bench_local_values(|()| {
-        let mut count = 0;
-        while let Received::Frame(_) = receiver.borrow_mut().recv(Nanos::ZERO) {
-            count += 1;
-        }
-        assert_eq!(count, FRAMES);
-    });
+    bencher
+        .counter(ItemsCount::new(FRAMES))
+        .with_inputs(|| fill(&mut sender, &frames))
+        .bench_local_values(|()| {
+            let mut count = 0;
+            while let Received::Frame(_) = receiver.borrow_mut().recv(Nanos::ZERO) {
+                count += 1;
+            }
+            assert_eq!(count, FRAMES);
+        });
 }
 
 /// Frames waiting at the link to samples in shared memory: the whole of the data plane.
@@ -137,11 +156,14 @@ fn frames_to_shared_memory(bencher: Bencher<'_, '_>) {
     let link = Waiting(VirtualBus::open(&name, "arm", &decoder.claims()).unwrap());
     let bus = std::cell::RefCell::new(Bus::new(Box::new(link), decoder, Shared(writer), status));
     let frames = frames();
-    bencher.counter(ItemsCount::new(FRAMES)).with_inputs(|| fill(&mut sender, &frames)).bench_local_values(|()| {
-        for _ in 0..FRAMES {
-            assert_eq!(bus.borrow_mut().turn(&Monotonic), Turn::Continue);
-        }
-    });
+    bencher
+        .counter(ItemsCount::new(FRAMES))
+        .with_inputs(|| fill(&mut sender, &frames))
+        .bench_local_values(|()| {
+            for _ in 0..FRAMES {
+                assert_eq!(bus.borrow_mut().turn(&Monotonic), Turn::Continue);
+            }
+        });
 }
 
 /// A link that never waits: what is measured is work, not waiting.

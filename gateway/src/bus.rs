@@ -41,7 +41,14 @@ impl<S: Sink> Bus<S> {
     /// Puts link, devices and sink together.
     pub fn new(link: Box<dyn Link>, decoder: Decoder, sink: S, status: Arc<BusStatus>) -> Self {
         let link_was_up = link.state() == LinkState::Up;
-        Self { link, decoder, sink, status, link_was_up, heard: None }
+        Self {
+            link,
+            decoder,
+            sink,
+            status,
+            link_was_up,
+            heard: None,
+        }
     }
 
     /// One turn: send what is due, wait for a frame, take it.
@@ -73,17 +80,18 @@ impl<S: Sink> Bus<S> {
         self.heard = None;
         match received {
             Received::Frame(frame) => {
-                self.heard = None;
+                self.heard = Some(frame.t);
                 let (sink, status) = (&mut self.sink, &self.status);
-                self.decoder.on_frame(&frame, |sample| match sink.publish(sample, clock.now()) {
-                    Ok(connections) => {
-                        status.published.fetch_add(1, Relaxed);
-                        status.connections.fetch_add(u64::from(connections), Relaxed);
-                    }
-                    Err(_) => {
-                        status.publish_failures.fetch_add(1, Relaxed);
-                    }
-                });
+                self.decoder
+                    .on_frame(&frame, |sample| match sink.publish(sample, clock.now()) {
+                        Ok(connections) => {
+                            status.published.fetch_add(1, Relaxed);
+                            status.connections.fetch_add(u64::from(connections), Relaxed);
+                        }
+                        Err(_) => {
+                            status.publish_failures.fetch_add(1, Relaxed);
+                        }
+                    });
             }
             Received::TimedOut => self.sink.idle(),
             Received::StateChanged => {}

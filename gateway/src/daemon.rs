@@ -27,8 +27,8 @@ use std::io::Write as _;
 use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::sync::atomic::Ordering::{Acquire, Relaxed, Release};
 use std::sync::atomic::AtomicBool;
+use std::sync::atomic::Ordering::{Acquire, Relaxed, Release};
 use std::sync::mpsc;
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -53,7 +53,11 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
                 "bus {:?}: pace = \"fast\" is for offline use (proprio decode); a daemon replays with pace = \"recorded\"",
                 bus.name
             );
-            return Err(ConfigError { file: config.to_owned(), problem }.into());
+            return Err(ConfigError {
+                file: config.to_owned(),
+                problem,
+            }
+            .into());
         }
     }
     if check {
@@ -61,15 +65,28 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
         let _ = write!(std::io::stdout(), "{plan}");
         return Ok(());
     }
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start")?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .context("cannot start")?;
     runtime.block_on(serve(&plan, domain))
 }
 
 /// The exit code for an error that `run` ended with, after telling it: 2 for a wrong configuration, else 1.
 pub fn report(error: &anyhow::Error) -> ExitCode {
     eprintln!("error: {error:#}");
-    let wrong_domain = |e: &(dyn std::error::Error + 'static)| e.downcast_ref().is_some_and(DomainError::is_configuration);
-    ExitCode::from(if error.chain().any(|cause| cause.is::<ConfigError>() || wrong_domain(cause)) { 2 } else { 1 })
+    let wrong_domain =
+        |e: &(dyn std::error::Error + 'static)| e.downcast_ref().is_some_and(DomainError::is_configuration);
+    ExitCode::from(
+        if error
+            .chain()
+            .any(|cause| cause.is::<ConfigError>() || wrong_domain(cause))
+        {
+            2
+        } else {
+            1
+        },
+    )
 }
 
 async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> {
@@ -103,7 +120,12 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
         join(&mut threads, &stop);
         return Err(error);
     }
-    tracing::info!(robot = plan.robot, buses = plan.buses.len(), channels = plan.channels.len(), "running");
+    tracing::info!(
+        robot = plan.robot,
+        buses = plan.buses.len(),
+        channels = plan.channels.len(),
+        "running"
+    );
     let _ = sd_notify::notify(&[NotifyState::Ready, NotifyState::Status("running")]);
     let watchdog = sd_notify::watchdog_enabled();
 
@@ -129,9 +151,9 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
         if threads.iter().all(|t| t.ended.load(Acquire)) {
             break "the end of all logs";
         }
-        let stuck = threads.iter().any(|t| {
-            !t.ended.load(Relaxed) && now - Nanos(t.status.last_turn.load(Relaxed)) > STUCK
-        });
+        let stuck = threads
+            .iter()
+            .any(|t| !t.ended.load(Relaxed) && now - Nanos(t.status.last_turn.load(Relaxed)) > STUCK);
         if watchdog.is_some() && !stuck {
             let _ = sd_notify::notify(&[NotifyState::Watchdog]);
         }
@@ -152,7 +174,9 @@ fn join(threads: &mut [BusThread], stop: &AtomicBool) -> Option<String> {
     stop.store(true, Release);
     let mut panicked = None;
     for bus in threads {
-        if let Some(thread) = bus.take() && thread.join().is_err() {
+        if let Some(thread) = bus.take()
+            && thread.join().is_err()
+        {
             panicked.get_or_insert_with(|| bus.name.clone());
         }
     }
@@ -232,12 +256,20 @@ impl BusThread {
             bus.stop(&clock);
         };
         let name: String = format!("bus {}", bus.name).chars().take(15).collect();
-        let thread = std::thread::Builder::new().name(name).spawn(body).context("cannot start a thread")?;
+        let thread = std::thread::Builder::new()
+            .name(name)
+            .spawn(body)
+            .context("cannot start a thread")?;
         let refused = is_ready.recv().map_err(|_| anyhow!("its thread ended at once"))??;
         for refusal in refused {
             tracing::warn!(bus = bus.name, "real-time scheduling not granted: {refusal}");
         }
-        Ok(Self { name: bus.name.clone(), status, ended, thread: Finished(Some(thread)) })
+        Ok(Self {
+            name: bus.name.clone(),
+            status,
+            ended,
+            thread: Finished(Some(thread)),
+        })
     }
 }
 
@@ -254,12 +286,15 @@ pub fn open_link(bus: &BusPlan, domain: &str, claims: &[Claim]) -> Result<Box<dy
 }
 
 fn empty_health(started: Nanos) -> GatewayHealth {
-    let bus = BusStatus::new(0, &BusPlan {
-        name: String::new(),
-        source: Source::Virtual { name: String::new() },
-        realtime: None,
-        devices: vec![],
-    })
+    let bus = BusStatus::new(
+        0,
+        &BusPlan {
+            name: String::new(),
+            source: Source::Virtual { name: String::new() },
+            realtime: None,
+            devices: vec![],
+        },
+    )
     .bus();
     let device = DeviceHealth {
         name: proprio_topics::Name::EMPTY,
@@ -285,7 +320,11 @@ fn fill_health(health: &mut GatewayHealth, threads: &[BusThread]) {
         *slot = thread.status.bus();
         health.bus_count += 1;
     }
-    for (slot, device) in health.devices.iter_mut().zip(threads.iter().flat_map(|t| t.status.devices())) {
+    for (slot, device) in health
+        .devices
+        .iter_mut()
+        .zip(threads.iter().flat_map(|t| t.status.devices()))
+    {
         *slot = device;
         health.device_count += 1;
     }
@@ -307,7 +346,8 @@ impl Diary {
 
     fn tell(&mut self, health: &GatewayHealth) {
         let last = self.last.replace(Box::new(*health));
-        self.quiet.resize(health.devices().len(), [Self::REST; Counter::ALL.len()]);
+        self.quiet
+            .resize(health.devices().len(), [Self::REST; Counter::ALL.len()]);
         for (i, bus) in health.buses().iter().enumerate() {
             let before = last.as_ref().and_then(|l| l.buses().get(i));
             let was = before.map_or(LinkState::Up, |b| b.link);
@@ -323,11 +363,19 @@ impl Diary {
             self.dropping.resize(health.buses().len(), 0);
             let first = self.dropping.get_mut(i).is_none_or(|rest| {
                 let first = *rest == 0;
-                *rest = if dropped > 0 { Self::REST } else { rest.saturating_sub(1) };
+                *rest = if dropped > 0 {
+                    Self::REST
+                } else {
+                    rest.saturating_sub(1)
+                };
                 first
             });
             if dropped > 0 && first {
-                tracing::warn!(bus = bus.name.as_str(), dropped, "the kernel dropped frames: the receive buffer was full");
+                tracing::warn!(
+                    bus = bus.name.as_str(),
+                    dropped,
+                    "the kernel dropped frames: the receive buffer was full"
+                );
             }
         }
         for (i, device) in health.devices().iter().enumerate() {
@@ -340,7 +388,10 @@ impl Diary {
                 }
             }
             let Some(quiet) = self.quiet.get_mut(i) else { continue };
-            for counter in Counter::ALL.into_iter().filter(|c| !matches!(c, Counter::Frames | Counter::Readings | Counter::Starts)) {
+            for counter in Counter::ALL
+                .into_iter()
+                .filter(|c| !matches!(c, Counter::Frames | Counter::Readings | Counter::Starts))
+            {
                 let at = counter as usize;
                 let count = device.counters.get(at).copied().unwrap_or(0);
                 let new = count - before.and_then(|b| b.counters.get(at).copied()).unwrap_or(0).min(count);
@@ -349,7 +400,12 @@ impl Diary {
                     *rest = (*rest + 1).min(Self::REST);
                 } else {
                     if *rest >= Self::REST {
-                        tracing::warn!(device = name, total = count, "{}: {new} (further ones are counted in health)", counter.word());
+                        tracing::warn!(
+                            device = name,
+                            total = count,
+                            "{}: {new} (further ones are counted in health)",
+                            counter.word()
+                        );
                     }
                     *rest = 0;
                 }

@@ -35,12 +35,22 @@ impl Decoder {
             .map(|device| {
                 let mut spec = device.spec.clone();
                 spec.mode = mode.unwrap_or(spec.mode);
-                Ok(Running { device: device.options.device(&spec)?, routes: device.routes.clone() })
+                Ok(Running {
+                    device: device.options.device(&spec)?,
+                    routes: device.routes.clone(),
+                })
             })
             .collect::<Result<Vec<_>, SpecError>>()?;
         let dispatch = Dispatch::new(devices.iter().map(|d| d.device.claims()));
         let last = [Nanos::MIN; MAX_CHANNELS];
-        let this = Self { bus, devices, dispatch, last, decoded: Decoded::new(), status };
+        let this = Self {
+            bus,
+            devices,
+            dispatch,
+            last,
+            decoded: Decoded::new(),
+            status,
+        };
         this.store_states();
         Ok(this)
     }
@@ -48,7 +58,11 @@ impl Decoder {
     /// What the devices claim: the link's filters.
     #[must_use]
     pub fn claims(&self) -> Vec<Claim> {
-        let mut claims: Vec<Claim> = self.devices.iter().flat_map(|d| d.device.claims().iter().copied()).collect();
+        let mut claims: Vec<Claim> = self
+            .devices
+            .iter()
+            .flat_map(|d| d.device.claims().iter().copied())
+            .collect();
         claims.dedup();
         claims
     }
@@ -61,7 +75,9 @@ impl Decoder {
         // The dispatch table is left alone while a device runs: its numbers are copied out, at most four a frame.
         for number in self.dispatch.find(frame.id) {
             claimed = true;
-            let Some(running) = self.devices.get_mut(usize::from(number)) else { continue };
+            let Some(running) = self.devices.get_mut(usize::from(number)) else {
+                continue;
+            };
             self.decoded.clear();
             running.device.on_frame(frame, &mut self.decoded);
             self.status.count(number, Counter::Frames, 1);
@@ -69,7 +85,9 @@ impl Decoder {
                 self.status.count(number, fault.counter, u64::from(fault.count));
             }
             for output in &self.decoded.readings {
-                let Some(route) = running.routes.iter().find(|r| r.output == output.output) else { continue };
+                let Some(route) = running.routes.iter().find(|r| r.output == output.output) else {
+                    continue;
+                };
                 let main = match output.reading {
                     Reading::Joint(_) | Reading::Wrench(_) | Reading::Imu(_) => true,
                     Reading::Gauges(_) | Reading::Temperature(_) | Reading::Actuator(_) => false,
@@ -94,7 +112,12 @@ impl Decoder {
                     ..Header::default()
                 };
                 self.status.count(number, Counter::Readings, 1);
-                publish(&mut Sample { header, channel: route.channel, reserved: 0, reading });
+                publish(&mut Sample {
+                    header,
+                    channel: route.channel,
+                    reserved: 0,
+                    reading,
+                });
             }
             self.status.set_state(number, running.device.state());
         }
@@ -112,7 +135,9 @@ impl Decoder {
             self.decoded.clear();
             // A device has a handful of frames to send at once; the bound keeps a faulty one from holding the loop.
             for _ in 0..64 {
-                let Some(transmit) = running.device.poll_transmit(now, &mut self.decoded) else { break };
+                let Some(transmit) = running.device.poll_transmit(now, &mut self.decoded) else {
+                    break;
+                };
                 send(&transmit);
             }
             for fault in &self.decoded.faults {
@@ -174,7 +199,10 @@ const SHARERS: usize = 4;
 
 impl Dispatch {
     fn new<'a>(claims: impl Iterator<Item = &'a [Claim]>) -> Self {
-        let mut this = Self { standard: vec![arrayvec::ArrayVec::new(); 2048], extended: Vec::new() };
+        let mut this = Self {
+            standard: vec![arrayvec::ArrayVec::new(); 2048],
+            extended: Vec::new(),
+        };
         for (claims, device) in claims.zip(0_u16..) {
             for claim in claims {
                 match claim.id {

@@ -2,8 +2,8 @@
 
 use crate::candump;
 use crate::config::Source;
-use crate::link::replay::Matching;
 use crate::decoder::Decoder;
+use crate::link::replay::Matching;
 use crate::plan::{BusPlan, Plan};
 use crate::status::BusStatus;
 use proprio_drivers::{Board, Format, Frame, Frames, Mode, Spec, State};
@@ -97,7 +97,11 @@ impl InOrder {
         }
         self.out_of_order += u64::from(t < self.written);
         self.newest = self.newest.max(t);
-        let at = self.waiting.iter().rposition(|s| s.header.acquired <= t).map_or(0, |i| i + 1);
+        let at = self
+            .waiting
+            .iter()
+            .rposition(|s| s.header.acquired <= t)
+            .map_or(0, |i| i + 1);
         self.waiting.insert(at, sample);
         while let Some(first) = self.waiting.front()
             && self.newest - first.header.acquired > REORDER
@@ -116,20 +120,39 @@ impl InOrder {
 ///
 /// # Errors
 /// [`OfflineError`]: a file that can not be read or written, or a log without a single frame.
-pub fn decode(plan: &Plan, log: impl BufRead, table: impl Write, columns: Columns) -> Result<DecodeReport, OfflineError> {
-    let series: Vec<Series> =
-        plan.channels.iter().map(|c| Series { what: What::Channel(c.kind), name: c.name.clone() }).collect();
+pub fn decode(
+    plan: &Plan,
+    log: impl BufRead,
+    table: impl Write,
+    columns: Columns,
+) -> Result<DecodeReport, OfflineError> {
+    let series: Vec<Series> = plan
+        .channels
+        .iter()
+        .map(|c| Series {
+            what: What::Channel(c.kind),
+            name: c.name.clone(),
+        })
+        .collect();
     let mut writer = csv::Writer::new(table, &series, columns)?;
     let mut buses = Vec::new();
     for (bus, number) in plan.buses.iter().zip(0..) {
         let status = Arc::new(BusStatus::new(number, bus));
-        let decoder = Decoder::new(number, bus, Some(Mode::Listen), Arc::clone(&status))
-            .map_err(|cause| OfflineError::Device { device: bus.name.clone(), cause })?;
+        let decoder = Decoder::new(number, bus, Some(Mode::Listen), Arc::clone(&status)).map_err(|cause| {
+            OfflineError::Device {
+                device: bus.name.clone(),
+                cause,
+            }
+        })?;
         buses.push((plan.matching(number as usize), decoder, status));
     }
     let mut report = DecodeReport::default();
-    let mut order =
-        InOrder { waiting: VecDeque::new(), newest: Nanos::MIN, written: Nanos::MIN, out_of_order: 0 };
+    let mut order = InOrder {
+        waiting: VecDeque::new(),
+        newest: Nanos::MIN,
+        written: Nanos::MIN,
+        out_of_order: 0,
+    };
     let mut failure = None;
     let mut reader = candump::Reader::new(log);
     let mut last_bus = 0;
@@ -141,8 +164,14 @@ pub fn decode(plan: &Plan, log: impl BufRead, table: impl Write, columns: Column
             continue;
         }
         // Frames of one interface come in runs: the bus of the last one is tried first.
-        if buses.get(last_bus).is_none_or(|(matching, ..)| !takes(matching, record.interface)) {
-            match buses.iter().position(|(matching, ..)| takes(matching, record.interface)) {
+        if buses
+            .get(last_bus)
+            .is_none_or(|(matching, ..)| !takes(matching, record.interface))
+        {
+            match buses
+                .iter()
+                .position(|(matching, ..)| takes(matching, record.interface))
+            {
                 Some(bus) => last_bus = bus,
                 None => {
                     report.other_interfaces += 1;
@@ -150,7 +179,9 @@ pub fn decode(plan: &Plan, log: impl BufRead, table: impl Write, columns: Column
                 }
             }
         }
-        let Some((_, decoder, _)) = buses.get_mut(last_bus) else { continue };
+        let Some((_, decoder, _)) = buses.get_mut(last_bus) else {
+            continue;
+        };
         decoder.on_frame(&record.frame, |sample| {
             let written = order.push(*sample, |s| write_sample(&mut writer, s));
             if let Err(error) = written {
@@ -168,9 +199,17 @@ pub fn decode(plan: &Plan, log: impl BufRead, table: impl Write, columns: Column
     writer.finish()?;
     report.out_of_order = order.out_of_order;
     (report.bad_lines, report.dropped) = (reader.report().bad, reader.report().dropped);
-    report.bad = reader.report().first_bad.iter().map(|(line, error)| format!("line {line}: {error}")).collect();
+    report.bad = reader
+        .report()
+        .first_bad
+        .iter()
+        .map(|(line, error)| format!("line {line}: {error}"))
+        .collect();
     if report.frames == 0 {
-        let why = report.bad.first().map_or_else(|| "it is empty".to_owned(), |bad| format!("its first line: {bad}"));
+        let why = report
+            .bad
+            .first()
+            .map_or_else(|| "it is empty".to_owned(), |bad| format!("its first line: {bad}"));
         return Err(OfflineError::NoFrame(why));
     }
     for ((_, decoder, status), bus) in buses.iter().zip(&plan.buses) {
@@ -181,8 +220,17 @@ pub fn decode(plan: &Plan, log: impl BufRead, table: impl Write, columns: Column
                 name: device.name.clone(),
                 frames: count(Counter::Frames),
                 readings: count(Counter::Readings),
-                counts: Counter::ALL.into_iter().skip(2).map(|c| (c, count(c))).filter(|(_, n)| *n > 0).collect(),
-                refusal: if let State::Refused(refusal) = state { Some(refusal.to_string()) } else { None },
+                counts: Counter::ALL
+                    .into_iter()
+                    .skip(2)
+                    .map(|c| (c, count(c)))
+                    .filter(|(_, n)| *n > 0)
+                    .collect(),
+                refusal: if let State::Refused(refusal) = state {
+                    Some(refusal.to_string())
+                } else {
+                    None
+                },
             });
         }
     }
@@ -191,7 +239,11 @@ pub fn decode(plan: &Plan, log: impl BufRead, table: impl Write, columns: Column
 
 fn write_sample<W: Write>(writer: &mut csv::Writer<W>, sample: &Sample) -> io::Result<()> {
     let t = (sample.header.stamp != StampKind::None).then_some(sample.header.acquired);
-    writer.push(t, sample.channel as usize, &Value::Reading(sample.reading, sample.header.quality))
+    writer.push(
+        t,
+        sample.channel as usize,
+        &Value::Reading(sample.reading, sample.header.quality),
+    )
 }
 
 /// What became of a table.
@@ -226,7 +278,10 @@ pub fn encode(plan: &Plan, table: impl io::Read, mut log: impl Write) -> Result<
     // Per series: the bus, the board's number, its route.
     let mut targets = Vec::new();
     for series in reader.series() {
-        let channel = plan.channels.iter().find(|c| What::Channel(c.kind) == series.what && c.name == series.name);
+        let channel = plan
+            .channels
+            .iter()
+            .find(|c| What::Channel(c.kind) == series.what && c.name == series.name);
         if channel.is_none() && series.what != What::Contact {
             report.unknown_channels.push(series.name.clone());
         }
@@ -241,9 +296,15 @@ pub fn encode(plan: &Plan, table: impl io::Read, mut log: impl Write) -> Result<
     for bus in &plan.buses {
         let mut of_bus = Vec::new();
         for device in &bus.devices {
-            let spec = Spec { mode: Mode::Listen, ..device.spec.clone() };
+            let spec = Spec {
+                mode: Mode::Listen,
+                ..device.spec.clone()
+            };
             let board = device.options.board(&spec);
-            of_bus.push(board.map_err(|cause| OfflineError::Device { device: device.name.clone(), cause })?);
+            of_bus.push(board.map_err(|cause| OfflineError::Device {
+                device: device.name.clone(),
+                cause,
+            })?);
         }
         boards.push(of_bus);
     }
@@ -253,10 +314,13 @@ pub fn encode(plan: &Plan, table: impl io::Read, mut log: impl Write) -> Result<
     let mut frames = Frames::new();
     while reader.next_row(&mut row)? {
         for Item { series, value } in &row.items {
-            let (Some(Some((bus, device, route))), Value::Reading(reading, quality)) = (targets.get(*series), value) else {
+            let (Some(Some((bus, device, route))), Value::Reading(reading, quality)) = (targets.get(*series), value)
+            else {
                 continue;
             };
-            let Some(board) = boards.get_mut(*bus).and_then(|b| b.get_mut(*device)) else { continue };
+            let Some(board) = boards.get_mut(*bus).and_then(|b| b.get_mut(*device)) else {
+                continue;
+            };
             let reading = match reading {
                 Reading::Joint(state) => Reading::Joint(route.map.device(*state)),
                 other => *other,
@@ -264,7 +328,9 @@ pub fn encode(plan: &Plan, table: impl io::Read, mut log: impl Write) -> Result<
             frames.clear();
             if let Err(error) = board.encode(route.output, &reading, *quality, &mut frames) {
                 report.refused += 1;
-                report.first_refusal.get_or_insert_with(|| format!("line {}: {error}", row.line));
+                report
+                    .first_refusal
+                    .get_or_insert_with(|| format!("line {}: {error}", row.line));
                 continue;
             }
             report.samples += 1;

@@ -3,7 +3,9 @@
 use crate::config::{Pace, Raw, RawBus, RawDevice, Realtime, Source};
 use crate::link::replay::Matching;
 use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, Spec};
-use proprio_topics::{Description, Entry, Header, JointState, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, Role};
+use proprio_topics::{
+    Description, Entry, Header, JointState, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, Role,
+};
 use std::fmt::{self, Write as _};
 use std::path::{Path, PathBuf};
 
@@ -125,7 +127,10 @@ impl Plan {
     /// # Errors
     /// [`ConfigError`], naming file, place, value and what would be legal.
     pub fn load(file: &Path) -> Result<Self, ConfigError> {
-        let error = |problem| ConfigError { file: file.to_owned(), problem };
+        let error = |problem| ConfigError {
+            file: file.to_owned(),
+            problem,
+        };
         let text = std::fs::read_to_string(file).map_err(|e| error(format!("can not be read: {e}")))?;
         Self::parse(&text, file.parent().unwrap_or(Path::new("."))).map_err(error)
     }
@@ -136,7 +141,16 @@ impl Plan {
     /// What is wrong, where, and what would be legal.
     pub fn parse(text: &str, folder: &Path) -> Result<Self, String> {
         let raw: Raw = toml::from_str(text).map_err(|e| e.to_string())?;
-        Builder { text, folder, plan: Self { robot: raw.robot.clone(), buses: vec![], channels: vec![] } }.build(raw)
+        Builder {
+            text,
+            folder,
+            plan: Self {
+                robot: raw.robot.clone(),
+                buses: vec![],
+                channels: vec![],
+            },
+        }
+        .build(raw)
     }
 
     /// What bus number `bus` takes of the log that its source replays, or of a log given for all buses: of a log that only this bus
@@ -164,7 +178,10 @@ impl Plan {
     /// The number of channel `name`.
     #[must_use]
     pub fn channel(&self, name: &str) -> Option<u32> {
-        self.channels.iter().position(|c| c.name == name).and_then(|i| u32::try_from(i).ok())
+        self.channels
+            .iter()
+            .position(|c| c.name == name)
+            .and_then(|i| u32::try_from(i).ok())
     }
 
     /// The plan as the description that goes with the samples.
@@ -179,8 +196,12 @@ impl Plan {
             kind: Kind::Joint,
             bus: 0,
         };
-        let mut description =
-            Box::new(Description { header, publisher: Publisher::Gateway, count: 0, entries: [none; Description::CAPACITY] });
+        let mut description = Box::new(Description {
+            header,
+            publisher: Publisher::Gateway,
+            count: 0,
+            entries: [none; Description::CAPACITY],
+        });
         for (entry, channel) in description.entries.iter_mut().zip(&self.channels) {
             *entry = Entry {
                 name: Name::new(&channel.name).unwrap_or(Name::EMPTY),
@@ -205,14 +226,20 @@ struct Builder<'a> {
 impl Builder<'_> {
     fn build(mut self, raw: Raw) -> Result<Plan, String> {
         if raw.schema != 1 {
-            return Err(format!("schema = {} is not known; this version reads schema = 1", raw.schema));
+            return Err(format!(
+                "schema = {} is not known; this version reads schema = 1",
+                raw.schema
+            ));
         }
         check_service_name("robot", &raw.robot)?;
         if raw.bus.is_empty() {
             return Err("there is no [[bus]]: a gateway needs at least one".into());
         }
         if raw.bus.len() > MAX_BUSES {
-            return Err(format!("there are {} buses; at most {MAX_BUSES} are possible", raw.bus.len()));
+            return Err(format!(
+                "there are {} buses; at most {MAX_BUSES} are possible",
+                raw.bus.len()
+            ));
         }
         for bus in raw.bus {
             self.bus(bus)?;
@@ -226,7 +253,9 @@ impl Builder<'_> {
         let mut source = raw.source;
         match &mut source {
             Source::SocketCan { interface } if interface.is_empty() || interface.len() > 15 => {
-                return Err(format!("{place}: interface = {interface:?} must have 1 to 15 characters, such as \"can0\""));
+                return Err(format!(
+                    "{place}: interface = {interface:?} must have 1 to 15 characters, such as \"can0\""
+                ));
             }
             Source::Virtual { name } => check_name(&format!("{place}: source.name"), name)?,
             Source::Replay { log, .. } => *log = self.folder.join(&*log),
@@ -234,25 +263,43 @@ impl Builder<'_> {
         }
         for other in &self.plan.buses {
             if other.name == raw.name {
-                return Err(format!("two buses are named {:?}; each needs a name of its own", raw.name));
+                return Err(format!(
+                    "two buses are named {:?}; each needs a name of its own",
+                    raw.name
+                ));
             }
             let same = match (&other.source, &source) {
                 (Source::Replay { .. }, Source::Replay { .. }) => false,
                 (a, b) => a == b,
             };
             if same {
-                return Err(format!("{place}: has the same source as bus {:?}: list its devices there", other.name));
+                return Err(format!(
+                    "{place}: has the same source as bus {:?}: list its devices there",
+                    other.name
+                ));
             }
         }
-        if let Some(Realtime { priority: Some(priority), .. }) = raw.realtime
+        if let Some(Realtime {
+            priority: Some(priority),
+            ..
+        }) = raw.realtime
             && !(1..=99).contains(&priority)
         {
             return Err(format!("{place}: realtime.priority = {priority} must be 1 to 99"));
         }
-        self.plan.buses.push(BusPlan { name: raw.name, source, realtime: raw.realtime, devices: Vec::new() });
+        self.plan.buses.push(BusPlan {
+            name: raw.name,
+            source,
+            realtime: raw.realtime,
+            devices: Vec::new(),
+        });
         for table in raw.device {
-            let line = self.text.get(..table.span().start).map_or(0, |before| before.matches('\n').count() + 1);
-            self.device(table.into_inner()).map_err(|e| format!("{place}, device at line {line}: {e}"))?;
+            let line = self
+                .text
+                .get(..table.span().start)
+                .map_or(0, |before| before.matches('\n').count() + 1);
+            self.device(table.into_inner())
+                .map_err(|e| format!("{place}, device at line {line}: {e}"))?;
         }
         self.check_claims(&place)
     }
@@ -268,11 +315,18 @@ impl Builder<'_> {
         let name = &raw.name;
         check_name("name", name)?;
         let options = Options::deserialize(&raw.driver, table).map_err(|e| match e {
-            OptionsError::UnknownDriver => format!("driver = {:?} is not known; there is {}", raw.driver, DRIVERS.join(", ")),
+            OptionsError::UnknownDriver => format!(
+                "driver = {:?} is not known; there is {}",
+                raw.driver,
+                DRIVERS.join(", ")
+            ),
             OptionsError::Keys(e) => format!("{name:?} ({}): {}", raw.driver, one_line(&e)),
         })?;
         if !(raw.max_silence_ms > 0.0 && raw.max_silence_ms <= 3.6e6) {
-            return Err(format!("{name:?}: max_silence_ms = {} must be above 0, at most an hour", raw.max_silence_ms));
+            return Err(format!(
+                "{name:?}: max_silence_ms = {} must be above 0, at most an hour",
+                raw.max_silence_ms
+            ));
         }
         let max_silence = Nanos::from_seconds(raw.max_silence_ms * 1e-3);
         let kind = options.kind();
@@ -287,14 +341,30 @@ impl Builder<'_> {
         let mut routes = Vec::new();
         match (kind, raw.joint.is_empty()) {
             (Kind::Joint, true) => {
-                return Err(format!("{name:?}: {} measures joints: say which, in [[bus.device.joint]]", raw.driver));
+                return Err(format!(
+                    "{name:?}: {} measures joints: say which, in [[bus.device.joint]]",
+                    raw.driver
+                ));
             }
             (Kind::Wrench | Kind::Imu, false) => {
-                return Err(format!("{name:?}: {} is a sensor: [[bus.device.joint]] does not belong here", raw.driver));
+                return Err(format!(
+                    "{name:?}: {} is a sensor: [[bus.device.joint]] does not belong here",
+                    raw.driver
+                ));
             }
             (Kind::Wrench | Kind::Imu, true) => {
-                let channel = self.channel(ChannelPlan { name: name.clone(), kind, bus, device, max_silence })?;
-                routes.push(Route { output: 0, channel, map: JointMap::IDENTITY });
+                let channel = self.channel(ChannelPlan {
+                    name: name.clone(),
+                    kind,
+                    bus,
+                    device,
+                    max_silence,
+                })?;
+                routes.push(Route {
+                    output: 0,
+                    channel,
+                    map: JointMap::IDENTITY,
+                });
             }
             (Kind::Joint, false) => {
                 for joint in raw.joint {
@@ -307,23 +377,48 @@ impl Builder<'_> {
                         return Err(format!("{at}: sign = {} must be 1 or -1", joint.sign));
                     }
                     if !joint.offset_rad.is_finite() {
-                        return Err(format!("{at}: offset_rad = {} must be a finite number", joint.offset_rad));
+                        return Err(format!(
+                            "{at}: offset_rad = {} must be a finite number",
+                            joint.offset_rad
+                        ));
                     }
                     if spec.outputs.0.contains(&joint.channel) {
                         return Err(format!("{at}: channel = {} is already another joint", joint.channel));
                     }
                     if spec.outputs.0.try_push(joint.channel).is_err() {
-                        return Err(format!("{at}: a device has at most {} joints", spec.outputs.0.capacity()));
+                        return Err(format!(
+                            "{at}: a device has at most {} joints",
+                            spec.outputs.0.capacity()
+                        ));
                     }
-                    let map = JointMap { gain: f64::from(joint.sign) / joint.ratio, offset: joint.offset_rad };
-                    let channel = self.channel(ChannelPlan { name: joint.name, kind, bus, device, max_silence })?;
-                    routes.push(Route { output: joint.channel, channel, map });
+                    let map = JointMap {
+                        gain: f64::from(joint.sign) / joint.ratio,
+                        offset: joint.offset_rad,
+                    };
+                    let channel = self.channel(ChannelPlan {
+                        name: joint.name,
+                        kind,
+                        bus,
+                        device,
+                        max_silence,
+                    })?;
+                    routes.push(Route {
+                        output: joint.channel,
+                        channel,
+                        map,
+                    });
                 }
             }
         }
         // Built once here so that a wrong address or value shows at --check; the bus thread builds its own.
         options.device(&spec).map_err(|e| format!("{name:?}: {e}"))?;
-        let plan = DevicePlan { name: raw.name, driver: raw.driver, options, spec, routes };
+        let plan = DevicePlan {
+            name: raw.name,
+            driver: raw.driver,
+            options,
+            spec,
+            routes,
+        };
         if let Some(bus) = self.plan.buses.last_mut() {
             if bus.devices.iter().any(|d| d.name == plan.name) {
                 return Err(format!("two devices are named {:?}", plan.name));
@@ -335,7 +430,10 @@ impl Builder<'_> {
 
     fn channel(&mut self, channel: ChannelPlan) -> Result<u32, String> {
         if self.plan.channel(&channel.name).is_some() {
-            return Err(format!("two channels are named {:?}; joints and sensors share their names' space", channel.name));
+            return Err(format!(
+                "two channels are named {:?}; joints and sensors share their names' space",
+                channel.name
+            ));
         }
         if self.plan.channels.len() >= MAX_CHANNELS {
             return Err(format!("there are more than {MAX_CHANNELS} channels"));
@@ -346,12 +444,18 @@ impl Builder<'_> {
 
     /// No identifier may belong to two devices, unless both only listen to it.
     fn check_claims(&self, place: &str) -> Result<(), String> {
-        let Some(bus) = self.plan.buses.last() else { return Ok(()) };
+        let Some(bus) = self.plan.buses.last() else {
+            return Ok(());
+        };
         let mut claimed: Vec<(&str, Box<dyn Device>)> = Vec::new();
         for plan in &bus.devices {
             let device = plan.options.device(&plan.spec).map_err(|e| e.to_string())?;
             for (other, taken) in &claimed {
-                for (a, b) in device.claims().iter().flat_map(|a| taken.claims().iter().map(move |b| (a, b))) {
+                for (a, b) in device
+                    .claims()
+                    .iter()
+                    .flat_map(|a| taken.claims().iter().map(move |b| (a, b)))
+                {
                     if a.overlaps(b) && (a.exclusive || b.exclusive) {
                         return Err(format!(
                             "{place}: devices {:?} and {other:?} both claim identifier {}: one of their addresses is wrong",
@@ -368,12 +472,21 @@ impl Builder<'_> {
 
 /// An error of one table, with the key that it is about.
 fn one_line(error: &toml::de::Error) -> String {
-    error.to_string().lines().map(str::trim).filter(|l| !l.is_empty()).collect::<Vec<_>>().join(" ")
+    error
+        .to_string()
+        .lines()
+        .map(str::trim)
+        .filter(|l| !l.is_empty())
+        .collect::<Vec<_>>()
+        .join(" ")
 }
 
 fn check_name(place: &str, name: &str) -> Result<(), String> {
     if name.is_empty() || name.len() > Name::CAPACITY || name.contains(['/', ',', '"', '\n', '\0']) {
-        return Err(format!("{place} = {name:?} must have 1 to {} bytes, none of them / , \" or a line's end", Name::CAPACITY));
+        return Err(format!(
+            "{place} = {name:?} must have 1 to {} bytes, none of them / , \" or a line's end",
+            Name::CAPACITY
+        ));
     }
     Ok(())
 }
@@ -381,8 +494,15 @@ fn check_name(place: &str, name: &str) -> Result<(), String> {
 /// Service names are 7-bit ASCII in the transport.
 fn check_service_name(place: &str, name: &str) -> Result<(), String> {
     let fits = !name.is_empty() && name.len() <= Name::CAPACITY;
-    if !fits || !name.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'_' | b'-' | b'.')) {
-        return Err(format!("{place} = {name:?} must have 1 to {} letters, digits, _ - or .", Name::CAPACITY));
+    if !fits
+        || !name
+            .bytes()
+            .all(|b| b.is_ascii_alphanumeric() || matches!(b, b'_' | b'-' | b'.'))
+    {
+        return Err(format!(
+            "{place} = {name:?} must have 1 to {} letters, digits, _ - or .",
+            Name::CAPACITY
+        ));
     }
     Ok(())
 }
@@ -390,13 +510,23 @@ fn check_service_name(place: &str, name: &str) -> Result<(), String> {
 impl fmt::Display for Plan {
     /// A table for people: `proprio gateway --check` prints it.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "robot {}: {} buses, {} channels", self.robot, self.buses.len(), self.channels.len())?;
+        writeln!(
+            f,
+            "robot {}: {} buses, {} channels",
+            self.robot,
+            self.buses.len(),
+            self.channels.len()
+        )?;
         for bus in &self.buses {
             let source = match &bus.source {
                 Source::SocketCan { interface } => format!("CAN interface {interface}"),
                 Source::Virtual { name } => format!("virtual bus {name}"),
                 Source::Replay { log, pace } => {
-                    format!("log {} ({})", log.display(), if *pace == Pace::Fast { "fast" } else { "as recorded" })
+                    format!(
+                        "log {} ({})",
+                        log.display(),
+                        if *pace == Pace::Fast { "fast" } else { "as recorded" }
+                    )
                 }
             };
             write!(f, "\nbus {}: {source}", bus.name)?;
@@ -412,13 +542,33 @@ impl fmt::Display for Plan {
                         write!(ids, " {}{}", claim.id, if claim.exclusive { "" } else { "*" })?;
                     }
                 }
-                let listen = if device.spec.mode == Mode::Listen { ", listens only" } else { "" };
-                writeln!(f, "  {} ({}, address {}{listen}): identifiers{ids}", device.name, device.driver, device.spec.address)?;
+                let listen = if device.spec.mode == Mode::Listen {
+                    ", listens only"
+                } else {
+                    ""
+                };
+                writeln!(
+                    f,
+                    "  {} ({}, address {}{listen}): identifiers{ids}",
+                    device.name, device.driver, device.spec.address
+                )?;
                 for route in &device.routes {
-                    let Some(channel) = self.channels.get(route.channel as usize) else { continue };
-                    write!(f, "    channel {:>3} {} {}", route.channel, channel.kind.word(), channel.name)?;
+                    let Some(channel) = self.channels.get(route.channel as usize) else {
+                        continue;
+                    };
+                    write!(
+                        f,
+                        "    channel {:>3} {} {}",
+                        route.channel,
+                        channel.kind.word(),
+                        channel.name
+                    )?;
                     if channel.kind == Kind::Joint {
-                        write!(f, " = {} * channel {} {:+} rad", route.map.gain, route.output, route.map.offset)?;
+                        write!(
+                            f,
+                            " = {} * channel {} {:+} rad",
+                            route.map.gain, route.output, route.map.offset
+                        )?;
                     }
                     writeln!(f, ", silent at most {} s", channel.max_silence)?;
                 }
@@ -458,7 +608,9 @@ mod tests {
 
     fn problem(from: &str, to: &str) -> String {
         assert!(ARM.contains(from), "{from}");
-        Plan::parse(&ARM.replacen(from, to, 1), Path::new(".")).map(|p| p.to_string()).unwrap_err()
+        Plan::parse(&ARM.replacen(from, to, 1), Path::new("."))
+            .map(|p| p.to_string())
+            .unwrap_err()
     }
 
     #[test]
@@ -467,7 +619,11 @@ mod tests {
         assert_eq!(plan.channel("ft"), Some(0));
         assert_eq!(plan.channel("elbow"), Some(1));
         let map = plan.buses[0].devices[1].routes[0].map;
-        let joint = map.joint(JointState { position: 10.0, velocity: 100.0, ..JointState::ABSENT });
+        let joint = map.joint(JointState {
+            position: 10.0,
+            velocity: 100.0,
+            ..JointState::ABSENT
+        });
         assert!((joint.position - 0.4).abs() < 1e-15 && (joint.velocity + 1.0).abs() < 1e-15);
         assert!((map.device(joint).position - 10.0).abs() < 1e-12);
         assert!(plan.to_string().contains("3DA"), "{plan}");
@@ -478,17 +634,37 @@ mod tests {
         for (from, to, expected) in [
             ("schema = 1", "schema = 2", "schema = 2 is not known"),
             ("robot = \"icub\"", "robot = \"i cub\"", "robot = \"i cub\" must have"),
-            ("robot = \"icub\"", "robbot = \"icub\"", "unknown field `robbot`, expected one of `schema`, `robot`, `bus`"),
+            (
+                "robot = \"icub\"",
+                "robbot = \"icub\"",
+                "unknown field `robbot`, expected one of `schema`, `robot`, `bus`",
+            ),
             ("kind = \"virtual\"", "kind = \"virtuel\"", "unknown variant `virtuel`"),
-            ("\"icub_strain\"", "\"icub_strian\"", "driver = \"icub_strian\" is not known; there is icub_strain, icub_imu"),
-            ("max_silence_ms = 30", "max_silence_ms = 0", "max_silence_ms = 0 must be above 0"),
+            (
+                "\"icub_strain\"",
+                "\"icub_strian\"",
+                "driver = \"icub_strian\" is not known; there is icub_strain, icub_imu",
+            ),
+            (
+                "max_silence_ms = 30",
+                "max_silence_ms = 0",
+                "max_silence_ms = 0 must be above 0",
+            ),
             ("full_scale_n = ", "full_scale_N = ", "unknown field `full_scale_N`"),
             ("address = 13", "address = 15", "address = 15 is outside 1 to 14"),
             ("address = 13", "", "missing field `address`"),
             ("sign = -1", "sign = 2", "sign = 2 must be 1 or -1"),
-            ("ratio = 100.0", "ratio = 0.0", "ratio = 0 must be a number other than 0"),
+            (
+                "ratio = 100.0",
+                "ratio = 0.0",
+                "ratio = 0 must be a number other than 0",
+            ),
             ("name = \"elbow\"", "name = \"ft\"", "two channels are named \"ft\""),
-            ("name = \"elbow_board\"", "name = \"ft\"", "two devices are named \"ft\""),
+            (
+                "name = \"elbow_board\"",
+                "name = \"ft\"",
+                "two devices are named \"ft\"",
+            ),
         ] {
             let problem = problem(from, to);
             assert!(problem.contains(expected), "{from} -> {to}: {problem}");
@@ -499,6 +675,9 @@ mod tests {
     fn two_devices_can_not_claim_one_identifier() {
         let second = "[[bus.device]]\n driver = \"icub_strain\"\n name = \"ft2\"\n address = 13\n [[bus.device]]";
         let problem = problem("[[bus.device]]", second);
-        assert!(problem.contains("\"ft\" and \"ft2\" both claim identifier 3DA"), "{problem}");
+        assert!(
+            problem.contains("\"ft\" and \"ft2\" both claim identifier 3DA"),
+            "{problem}"
+        );
     }
 }

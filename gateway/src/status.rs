@@ -68,7 +68,11 @@ impl BusStatus {
 
     /// Adds `n` to a counter of a device.
     pub fn count(&self, device: u16, counter: Counter, n: u64) {
-        if let Some(cell) = self.devices.get(usize::from(device)).and_then(|d| d.counters.get(counter as usize)) {
+        if let Some(cell) = self
+            .devices
+            .get(usize::from(device))
+            .and_then(|d| d.counters.get(counter as usize))
+        {
             cell.fetch_add(n, Relaxed);
         }
     }
@@ -76,7 +80,11 @@ impl BusStatus {
     /// Sets the state of a device.
     pub fn set_state(&self, device: u16, state: State) {
         if let Some(status) = self.devices.get(usize::from(device)) {
-            let refusal = if let State::Refused(refusal) = state { refusal.code() } else { 0 };
+            let refusal = if let State::Refused(refusal) = state {
+                refusal.code()
+            } else {
+                0
+            };
             status.state.store(state.code(), Relaxed);
             status.refusal.store(refusal, Relaxed);
         }
@@ -84,8 +92,19 @@ impl BusStatus {
 
     /// Takes over what the link counts.
     pub fn set_link(&self, state: LinkState, counters: &LinkCounters) {
-        let LinkCounters { dropped, error_frames, sent, send_failures, losses, received: _ } = *counters;
-        for (cell, value) in self.link.iter().zip([dropped, error_frames, sent, send_failures, losses]) {
+        let LinkCounters {
+            dropped,
+            error_frames,
+            sent,
+            send_failures,
+            losses,
+            received: _,
+        } = *counters;
+        for (cell, value) in self
+            .link
+            .iter()
+            .zip([dropped, error_frames, sent, send_failures, losses])
+        {
             cell.store(value, Relaxed);
         }
         self.link_state.store(state as u32, Relaxed);
@@ -94,10 +113,15 @@ impl BusStatus {
     /// The bus as its health tells it.
     #[must_use]
     pub fn bus(&self) -> BusHealth {
-        let [dropped, error_frames, sent, send_failures, link_losses] = [0, 1, 2, 3, 4].map(|i| {
-            self.link.get(i).map_or(0, |c: &AtomicU64| c.load(Relaxed))
-        });
-        let states = [LinkState::Up, LinkState::Down, LinkState::Gone, LinkState::BusOff, LinkState::Ended];
+        let [dropped, error_frames, sent, send_failures, link_losses] =
+            [0, 1, 2, 3, 4].map(|i| self.link.get(i).map_or(0, |c: &AtomicU64| c.load(Relaxed)));
+        let states = [
+            LinkState::Up,
+            LinkState::Down,
+            LinkState::Gone,
+            LinkState::BusOff,
+            LinkState::Ended,
+        ];
         let state = self.link_state.load(Relaxed);
         BusHealth {
             name: self.name,
@@ -122,7 +146,10 @@ impl BusStatus {
     pub fn devices(&self) -> impl Iterator<Item = DeviceHealth> + '_ {
         self.devices.iter().map(|d| {
             let mut counters = [0; Counter::ALL.len()];
-            counters.iter_mut().zip(&d.counters).for_each(|(to, from)| *to = from.load(Relaxed));
+            counters
+                .iter_mut()
+                .zip(&d.counters)
+                .for_each(|(to, from)| *to = from.load(Relaxed));
             DeviceHealth {
                 name: d.name,
                 counters,

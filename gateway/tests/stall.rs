@@ -31,7 +31,10 @@ impl Link for Script {
         LinkState::Up
     }
     fn counters(&self) -> LinkCounters {
-        LinkCounters { sent: self.sent, ..LinkCounters::default() }
+        LinkCounters {
+            sent: self.sent,
+            ..LinkCounters::default()
+        }
     }
 }
 
@@ -64,7 +67,15 @@ fn a_backlog_is_no_silence() {
         let torque = Frame::new(Id::standard(0x31B), &[0, 0x80, 0, 0x80, 0, 0x80]);
         [force, torque.at(t + Nanos::from_micros(130), StampKind::Software)]
     });
-    let mut bus = Bus::new(Box::new(Script { frames: frames.collect(), sent: 0 }), decoder, Memory::default(), Arc::clone(&status));
+    let mut bus = Bus::new(
+        Box::new(Script {
+            frames: frames.collect(),
+            sent: 0,
+        }),
+        decoder,
+        Memory::default(),
+        Arc::clone(&status),
+    );
     let count = |counter: Counter| status.devices().next().map_or(0, |d| d.counters[counter as usize]);
     for i in 0..40 {
         clock.set(start + Nanos::from_millis(5 * i + 2));

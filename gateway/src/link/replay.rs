@@ -109,13 +109,14 @@ impl Replay {
             .map_err(fail)?
             .map(|r| (r.stamp, matches(r.interface), r.frame));
         match first {
-            None => {
-                let why = replay.log.report().first_bad.first().map_or_else(
-                    || "it is empty".to_owned(),
-                    |(line, error)| format!("it holds no frame; line {line}: {error}"),
-                );
-                return Err(fail(io::Error::new(io::ErrorKind::InvalidData, why)));
-            }
+            None => match replay.log.report().first_bad.first() {
+                // Nothing was recorded.
+                None => replay.ended = true,
+                Some((line, error)) => {
+                    let why = format!("it is not a log: it holds no frame; line {line}: {error}");
+                    return Err(fail(io::Error::new(io::ErrorKind::InvalidData, why)));
+                }
+            },
             Some((None, ..)) if pace == Pace::Recorded => {
                 let cause =
                     "it has no time stamps to keep the pace by; record with `candump -l`, or use pace = \"fast\"";
@@ -205,7 +206,10 @@ impl Link for Replay {
             notes.push(format!("the log could not be read to its end: {failure}"));
         }
         if let Some((line, error)) = report.first_bad.first() {
-            notes.push(format!("{} lines of the log were skipped; the first, line {line}: {error}", report.bad));
+            notes.push(format!(
+                "{} lines of the log were skipped; the first, line {line}: {error}",
+                report.bad
+            ));
         }
         if self.counters.received == 0 {
             notes.push(format!("none of the log's {} frames is for this bus", report.records));

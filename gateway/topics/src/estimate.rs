@@ -186,5 +186,7 @@ pub struct ContactDeclaration {
 }
 
 const _: () = assert!(size_of::<JointTorque>() == 32 && size_of::<ContactWrench>() == 112);
-const _: () = assert!(size_of::<TorqueEstimate>() == 56 + 32 * MAX_JOINTS && size_of::<ContactEstimate>() == 56 + 112 * MAX_CONTACTS);
+const _: () = assert!(
+    size_of::<TorqueEstimate>() == 56 + 32 * MAX_JOINTS && size_of::<ContactEstimate>() == 56 + 112 * MAX_CONTACTS
+);
 const _: () = assert!(size_of::<ContactDeclaration>() == 120);
