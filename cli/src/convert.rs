@@ -369,8 +369,8 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
 /// JSON goes to standard output, unless the table itself does.
 fn tell_json(out: &Path, summary: &serde_json::Value) {
     if out == Path::new("-") {
-        eprintln!("{summary}")
+        eprintln!("{summary}");
     } else {
-        say!("{summary}")
+        say!("{summary}");
     }
 }
