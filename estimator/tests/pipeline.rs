@@ -405,11 +405,7 @@ fn a_gap_of_everything_does_not_reach_back() {
     let mut events = recording(&base, 0.6);
     events.retain(|e| e.1 < Nanos::from_millis(200) || e.1 > Nanos::from_millis(400));
     let (want, _) = run(base.clone(), &events);
-    let last = want
-        .iter()
-        .filter(|e| e.t < Nanos::from_millis(200))
-        .next_back()
-        .unwrap();
+    let last = want.iter().rfind(|e| e.t < Nanos::from_millis(200)).unwrap();
     assert!(
         last.torques.joints().iter().all(|j| j.valid == 1),
         "the last instant before the gap: {:?}",
