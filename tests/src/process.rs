@@ -213,6 +213,13 @@ impl Rig {
     }
 }
 
+impl Drop for Rig {
+    fn drop(&mut self) {
+        // A test that failed killed its processes: what they left would stay in shared memory.
+        let _ = Domain::remove_if_unused(&self.domain);
+    }
+}
+
 /// The names in a folder, sorted; none if it is not there.
 fn names(folder: &Path) -> Vec<String> {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
