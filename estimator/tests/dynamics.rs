@@ -1373,17 +1373,22 @@ mod golden {
 
     /// A whole iCub (32 joints, 6 F/T sensors, 7 sub-trees, one full wrench in each, kinematics from the chest's IMU) as iDynTree solves it.
     ///
-    /// The robot's URDF may not be redistributed here, so the test runs where it is at hand: `PROPRIO_ICUB_URDF` names the file (iCubGazeboV2_5 of the
-    /// PyPI package icub-models 3.2.0), `PROPRIO_DATA` the folder that holds `icub_v25_idyntree.json`.
+    /// The robot's URDF may not be redistributed here, so the test runs where it is at hand: `PROPRIO_ICUB_MODELS` names the folder with
+    /// iCubGazeboV2_5.urdf (of the PyPI package icub-models 3.2.0), `PROPRIO_DATA` that of the recorded logs, beside which the golden file is.
     #[test]
     fn whole_icub_as_idyntree_has_it() {
-        let (Ok(urdf), Ok(data)) = (std::env::var("PROPRIO_ICUB_URDF"), std::env::var("PROPRIO_DATA")) else {
-            println!("skipped: PROPRIO_ICUB_URDF and PROPRIO_DATA do not say where the robot and the golden file are");
+        let (Ok(models), Ok(data)) = (std::env::var("PROPRIO_ICUB_MODELS"), std::env::var("PROPRIO_DATA")) else {
+            println!(
+                "skipped: PROPRIO_ICUB_MODELS and PROPRIO_DATA do not say where the robot and the golden file are"
+            );
             return;
         };
-        let golden: serde_json::Value =
-            serde_json::from_str(&std::fs::read_to_string(PathBuf::from(data).join("icub_v25_idyntree.json")).unwrap())
-                .unwrap();
+        let golden = PathBuf::from(data).join("../oracle/icub_v25_idyntree.json");
+        let Ok(golden) = std::fs::read_to_string(&golden) else {
+            println!("skipped: there is no {}", golden.display());
+            return;
+        };
+        let golden: serde_json::Value = serde_json::from_str(&golden).unwrap();
         let names = |key: &str| -> Vec<String> {
             golden[key]
                 .as_array()
@@ -1392,7 +1397,7 @@ mod golden {
                 .map(|name| name.as_str().unwrap().to_owned())
                 .collect()
         };
-        let text = std::fs::read_to_string(urdf).unwrap();
+        let text = std::fs::read_to_string(PathBuf::from(models).join("iCubGazeboV2_5.urdf")).unwrap();
         let elements = Model::from_urdf(&text, &[]).unwrap().sensors().to_vec();
         let sensors: Vec<_> = names("ft")
             .iter()

@@ -1,5 +1,6 @@
 //! A real iCub's log, through every way there is: encoded to CAN frames and decoded again, from a file and, on vcan, played by canplayer
-//! through gateway and estimator. Needs the log (`PROPRIO_DATA`) and the robot's URDF (`PROPRIO_ICUB_URDF`); says that it skips without.
+//! through gateway and estimator. Needs the log (`PROPRIO_DATA`) and the folder of the robot's URDF (`PROPRIO_ICUB_MODELS`); says that it skips
+//! without.
 
 use proprio_estimator::config::Config;
 use proprio_estimator::offline::estimate;
@@ -22,8 +23,11 @@ struct Leg {
 
 /// The configuration and the log, or nothing if they are not at hand.
 fn leg() -> Option<Leg> {
-    let (Some(data), Some(urdf)) = (std::env::var_os("PROPRIO_DATA"), std::env::var_os("PROPRIO_ICUB_URDF")) else {
-        println!("skipped: PROPRIO_DATA (recorded logs) or PROPRIO_ICUB_URDF (iCubGenova02 of icub-models) is not set");
+    let (Some(data), Some(models)) = (
+        std::env::var_os("PROPRIO_DATA"),
+        std::env::var_os("PROPRIO_ICUB_MODELS"),
+    ) else {
+        println!("skipped: PROPRIO_DATA (recorded logs) or PROPRIO_ICUB_MODELS (robots of icub-models) is not set");
         return None;
     };
     let log = PathBuf::from(data).join("icub_leg_24_44s.csv");
@@ -33,7 +37,7 @@ fn leg() -> Option<Leg> {
     };
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("real_leg");
     let mut config = Config::load(&folder.join("estimator.toml")).expect("the configuration");
-    config.model = urdf.into();
+    config.model = PathBuf::from(models).join("iCubGenova02.urdf");
     Some(Leg {
         plan: Plan::load(&folder.join("gateway.toml")).expect("the plan"),
         config,
