@@ -11,8 +11,7 @@ use anyhow::{Context, anyhow};
 use proprio_topics::ipc::{Domain, DomainConfig, DomainError, PortError, Reader, Topic, Writer, monotonic};
 use proprio_topics::realtime;
 use proprio_topics::{
-    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, Header, Nanos, Publisher, Role, Sample,
-    TorqueEstimate,
+    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, Nanos, Publisher, Role, Sample, TorqueEstimate,
 };
 use sd_notify::NotifyState;
 use std::io::Write as _;
@@ -171,7 +170,7 @@ impl DataPlane {
         let torques = Writer::create(&domain, robot, epoch)?;
         let contacts = Writer::create(&domain, robot, epoch)?;
         let now = monotonic();
-        description_writer.send(&setup.description(Header::default()), now)?;
+        description_writer.send(&setup.description(), now)?;
         Ok(Self {
             robot: robot.to_owned(),
             pipeline: Pipeline::new(setup),

@@ -5,7 +5,7 @@ use crate::differentiate::Settings;
 use crate::dynamics::{ContactKind, ContactSet, ContactSpec, FrameMotion, Noise, SensorCut, Structure, StructureError};
 use crate::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
 use crate::spatial::{Pose, Vec3, Wrench};
-use proprio_topics::{Description, Entry, Header, Kind, MAX_CONTACTS, MAX_JOINTS, Name, Nanos, Publisher, Role};
+use proprio_topics::{Description, Entry, Kind, MAX_CONTACTS, MAX_JOINTS, Name, Nanos, Publisher, Role};
 use std::fmt;
 
 /// How many samples an estimate of velocity and acceleration uses at the most: the differentiator keeps 128, and the rest
@@ -350,51 +350,31 @@ impl Setup {
 
     /// The names behind the numbers of the estimates.
     #[must_use]
-    pub fn description(&self, header: Header) -> Box<Description> {
-        let none = Entry {
-            name: Name::EMPTY,
-            frame: Name::EMPTY,
-            max_silence: Nanos::ZERO,
-            role: Role::Channel,
-            index: 0,
-            kind: Kind::Joint,
-            bus: 0,
-        };
+    pub fn description(&self) -> Box<Description> {
         let name = |text: &str| Name::new(text).unwrap_or(Name::EMPTY);
         let channels = self.channels.iter().map(|c| Entry {
             name: name(&c.name),
             kind: c.kind,
             max_silence: self.max_silence,
-            ..none
+            ..Entry::NONE
         });
         let joints = self.joint_names().map(|j| Entry {
             name: name(j),
             role: Role::Joint,
-            ..none
+            ..Entry::NONE
         });
         let contacts = self.contacts.iter().map(|c| Entry {
             name: name(&c.name),
             frame: name(&c.frame),
             role: Role::Contact,
             kind: Kind::Wrench,
-            ..none
+            ..Entry::NONE
         });
-        let numbered = channels
-            .zip(0..)
-            .chain(joints.zip(0..))
-            .chain(contacts.zip(0..))
-            .map(|(e, index)| Entry { index, ..e });
-        let mut description = Box::new(Description {
-            header,
-            publisher: Publisher::Estimator,
-            count: 0,
-            entries: [none; Description::CAPACITY],
-        });
-        for (place, entry) in description.entries.iter_mut().zip(numbered) {
-            *place = entry;
-            description.count += 1;
-        }
-        description
+        let numbered = channels.zip(0..).chain(joints.zip(0..)).chain(contacts.zip(0..));
+        Box::new(Description::new(
+            Publisher::Estimator,
+            numbered.map(|(entry, index)| Entry { index, ..entry }),
+        ))
     }
 }
 

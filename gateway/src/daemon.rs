@@ -99,7 +99,7 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
     // The health first: it admits one writer, which is how a second gateway of this robot finds out.
     let mut health_writer = Writer::<GatewayHealth>::create(&domain, &plan.robot, epoch)?;
     let mut description_writer = Writer::<Description>::create(&domain, &plan.robot, epoch)?;
-    description_writer.send(&plan.description(Header::default()), clock.now())?;
+    description_writer.send(&plan.description(), clock.now())?;
 
     let stop = Arc::new(AtomicBool::new(false));
     // The buses of one log stay in step; by then all of them are open.

@@ -3,9 +3,7 @@
 use crate::config::{Pace, Raw, RawBus, RawDevice, Realtime, Source};
 use crate::link::replay::Matching;
 use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, Spec};
-use proprio_topics::{
-    Description, Entry, Header, JointState, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, Role,
-};
+use proprio_topics::{Description, Entry, JointState, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, Role};
 use std::fmt::{self, Write as _};
 use std::path::{Path, PathBuf};
 
@@ -186,34 +184,17 @@ impl Plan {
 
     /// The plan as the description that goes with the samples.
     #[must_use]
-    pub fn description(&self, header: Header) -> Box<Description> {
-        let none = Entry {
-            name: Name::EMPTY,
-            frame: Name::EMPTY,
-            max_silence: Nanos::ZERO,
+    pub fn description(&self) -> Box<Description> {
+        let entries = self.channels.iter().zip(0..).map(|(channel, index)| Entry {
+            name: Name::new(&channel.name).unwrap_or(Name::EMPTY),
+            max_silence: channel.max_silence,
             role: Role::Channel,
-            index: 0,
-            kind: Kind::Joint,
-            bus: 0,
-        };
-        let mut description = Box::new(Description {
-            header,
-            publisher: Publisher::Gateway,
-            count: 0,
-            entries: [none; Description::CAPACITY],
+            index,
+            kind: channel.kind,
+            bus: u32::try_from(channel.bus).unwrap_or(u32::MAX),
+            ..Entry::NONE
         });
-        for (entry, channel) in description.entries.iter_mut().zip(&self.channels) {
-            *entry = Entry {
-                name: Name::new(&channel.name).unwrap_or(Name::EMPTY),
-                max_silence: channel.max_silence,
-                index: description.count,
-                kind: channel.kind,
-                bus: u32::try_from(channel.bus).unwrap_or(u32::MAX),
-                ..none
-            };
-            description.count += 1;
-        }
-        description
+        Box::new(Description::new(Publisher::Gateway, entries))
     }
 }
 

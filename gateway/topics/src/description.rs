@@ -108,7 +108,36 @@ pub struct Description {
     pub entries: [Entry; Self::CAPACITY],
 }
 
+impl Entry {
+    /// Names nothing.
+    pub const NONE: Self = Self {
+        name: Name::EMPTY,
+        frame: Name::EMPTY,
+        max_silence: Nanos::ZERO,
+        role: Role::Channel,
+        index: 0,
+        kind: Kind::Joint,
+        bus: 0,
+    };
+}
+
 impl Description {
+    /// The description that `publisher` sends; entries beyond [`Description::CAPACITY`] are left out.
+    #[must_use]
+    pub fn new(publisher: Publisher, entries: impl IntoIterator<Item = Entry>) -> Self {
+        let mut description = Self {
+            header: Header::default(),
+            publisher,
+            count: 0,
+            entries: [Entry::NONE; Self::CAPACITY],
+        };
+        for (place, entry) in description.entries.iter_mut().zip(entries) {
+            *place = entry;
+            description.count += 1;
+        }
+        description
+    }
+
     /// The most entries.
     pub const CAPACITY: usize = crate::MAX_CHANNELS + crate::MAX_JOINTS + crate::MAX_CONTACTS;
 
