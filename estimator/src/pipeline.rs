@@ -67,7 +67,7 @@ impl Estimate {
 pub struct Counts {
     /// Taken.
     pub taken: u64,
-    /// Dropped: their instant had been released.
+    /// Too late: dropped because their instant had been released, or taken after an instant that would have used them.
     pub late: u64,
     /// Dropped: not later than the last of their channel.
     pub backward: u64,
@@ -288,6 +288,9 @@ impl Pipeline {
             return;
         }
         self.counts.taken += 1;
+        // Taken, but an instant was told without it that a replay tells with it.
+        let until = self.released.saturating_add(Nanos(self.setup.max_wait.0 / 2));
+        self.counts.late += u64::from(newest > Nanos::MIN && newest < self.released && t <= until);
         self.newest = self.newest.max(t);
         if channel == self.setup.trigger {
             if self.waiting.len() < MOST_WAITING {

@@ -251,8 +251,16 @@ type Play<'a> = &'a dyn Fn(&Rig, &str) -> Box<dyn FnMut() -> bool>;
 
 /// Plays the log, until stamp `until`, onto two buses and compares what is estimated live with a replay of the samples received.
 fn live_is_replay(buses: [&str; 2], until: Option<Nanos>, play: impl Fn(&Rig, &str) -> Box<dyn FnMut() -> bool>) {
-    let play: Play<'_> = &play;
-    let Some(mut leg) = leg() else { return };
+    // A machine that is held up for longer than half the wait makes samples late; it may try again.
+    let tries = 3;
+    if !(0..tries).any(|_| one_live_is_replay(buses, until, &play)) {
+        panic!("samples were late in each of {tries} tries: this machine is too slow for the configured wait");
+    }
+}
+
+/// One try; false if samples were late, so that nothing can be compared.
+fn one_live_is_replay(buses: [&str; 2], until: Option<Nanos>, play: Play<'_>) -> bool {
+    let Some(mut leg) = leg() else { return true };
     if let Some(until) = until {
         let stamp = |line: &str| line.split(',').next().and_then(Nanos::parse_seconds);
         leg.table = leg
@@ -325,12 +333,16 @@ fn live_is_replay(buses: [&str; 2], until: Option<Nanos>, play: impl Fn(&Rig, &s
     health.fresh();
     let told = health.fresh();
     assert_eq!(
-        (recorder.lost(), told.lost, told.late),
-        (0, 0, 0),
-        "nothing lost on the way here or to the estimator, nothing late"
+        (recorder.lost(), told.lost),
+        (0, 0),
+        "nothing lost on the way here or to the estimator"
     );
     gateway.end();
     estimator.end();
+    if told.late > 0 {
+        println!("{} samples were late: trying again", told.late);
+        return false;
+    }
 
     let setup = leg.setup();
     let channels: Vec<(Kind, String)> = leg.plan.channels.iter().map(|c| (c.kind, c.name.clone())).collect();
@@ -363,4 +375,5 @@ fn live_is_replay(buses: [&str; 2], until: Option<Nanos>, play: impl Fn(&Rig, &s
         live.len() - 1
     );
     assert!(count * 10 > original.len() * 9, "{count} of {}", original.len());
+    true
 }
