@@ -428,6 +428,49 @@ fn what_is_half_made_is_removed_while_others_work() {
     assert_nothing_left(&config, &prefix);
 }
 
+/// Whoever dies while it clears away another may have removed a port's tag, and not yet freed the port's place in its service.
+#[test]
+fn a_place_is_freed_although_who_was_freeing_it_died() {
+    let base = tempfile::tempdir().unwrap();
+    let config = DomainConfig::new(base.path(), "test");
+    let domain = Domain::open(&config).unwrap();
+    let prefix = prefix(&config);
+    let nodes = || -> Vec<std::path::PathBuf> {
+        let entries = std::fs::read_dir(base.path().join("test/nodes")).unwrap();
+        entries.map(|e| e.unwrap().path()).filter(|p| p.is_dir()).collect()
+    };
+    let before = nodes();
+    let mut writer = spawn("lonely writer", &config);
+    await_ready(&mut writer, || {});
+    // The service stays, and with it the places of its ports.
+    let reader = Reader::<GatewayHealth>::open(&domain, "icub").unwrap();
+    kill(writer);
+
+    let mut dead = nodes();
+    dead.retain(|node| !before.contains(node));
+    let [dead] = dead.as_slice() else {
+        panic!("one node has died: {dead:?}")
+    };
+    // A sweep that is killed after it has removed the first tags.
+    let kept = base.path().join("test/kept").join(dead.file_name().unwrap());
+    std::fs::create_dir_all(&kept).unwrap();
+    let mut tags = 0;
+    for entry in std::fs::read_dir(dead).unwrap() {
+        let tag = entry.unwrap().path();
+        if tag.extension().is_some_and(|e| e == "port_tag") {
+            std::fs::rename(&tag, kept.join(tag.file_name().unwrap())).unwrap();
+            tags += 1;
+        }
+    }
+    assert_eq!(tags, 2, "the writer's ports");
+
+    let next = Writer::<GatewayHealth>::create(&domain, "icub", domain.epoch());
+    assert!(next.is_ok(), "{}", next.unwrap_err());
+    assert!(!kept.exists(), "nothing is kept of what is gone");
+    drop((next, reader, domain));
+    assert_nothing_left(&config, &prefix);
+}
+
 #[test]
 fn a_domain_in_use_is_not_removed() {
     let base = tempfile::tempdir().unwrap();

@@ -23,6 +23,8 @@ use std::time::Duration;
 use std::vec::Vec;
 
 pub(super) const SHM: &str = "/dev/shm";
+/// Beside iceoryx2's own directories: the tags of nodes that are being cleaned.
+const KEPT: &str = "kept";
 
 /// What a sweep has removed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -117,6 +119,9 @@ pub(super) fn sweep(place: &Place, config: &Config) -> Result<Swept, DomainError
 }
 
 fn clean_dead(place: &Place, config: &Config, dead: &[u128], swept: &mut Swept) {
+    for &node in dead {
+        keep_tags(place, node);
+    }
     let mut failed = BTreeSet::new();
     let _ = Node::<ipc::Service>::list(config, |state| {
         // Without its details, iceoryx2 would take another domain's configuration; such a node has no ports any more.
@@ -149,10 +154,35 @@ fn clean_dead(place: &Place, config: &Config, dead: &[u128], swept: &mut Swept) 
     }
 }
 
+/// Keeps a second link to a dead node's port tags until the node is gone, and puts back those that a sweep before has lost.
+///
+/// iceoryx2 frees a port's place in its service only if it finds the port's tag, and removes the tag first: a process that dies
+/// between the two would leave the place taken for ever, and a topic of one writer without a writer.
+fn keep_tags(place: &Place, node: u128) {
+    let (home, kept) = (place.node(node), place.kept(node));
+    // What fails here makes things no worse than they are without it: the node is cleaned all the same.
+    let _ = fs::create_dir_all(&kept);
+    for (from, to) in [(&home, &kept), (&kept, &home)] {
+        for (tag, _) in list(from).unwrap_or_default() {
+            if let (Some((_, "port_tag")), Some(name)) = (place.strip(&tag), tag.file_name()) {
+                // It is there already, but for those that are missed.
+                let _ = fs::hard_link(&tag, to.join(name));
+            }
+        }
+    }
+}
+
 fn remove_ownerless(place: &Place, config: &Config, swept: &mut Swept) -> Result<(), DomainError> {
+    let nodes = place.nodes()?;
+    for (kept, _) in list(&place.root.join(KEPT))? {
+        let node = kept.file_name().and_then(|n| number(&n.to_string_lossy()));
+        if node.is_none_or(|n| !nodes.contains(&n)) {
+            let _ = fs::remove_dir_all(kept);
+        }
+    }
     // A service without a tag of a live node, a segment without a tag of a live port.
     let (mut services, mut ports) = (BTreeSet::new(), BTreeSet::new());
-    for node in place.nodes()? {
+    for node in nodes {
         for (path, _) in list(&place.node(node))? {
             match place.strip(&path) {
                 Some((name, "service_tag")) => drop(services.insert(name.to_owned())),
@@ -274,6 +304,10 @@ fn list(path: &Path) -> Result<Vec<(PathBuf, Metadata)>, DomainError> {
 impl Place {
     fn node(&self, node: u128) -> PathBuf {
         self.root.join("nodes").join(node.to_string())
+    }
+
+    fn kept(&self, node: u128) -> PathBuf {
+        self.root.join(KEPT).join(node.to_string())
     }
 
     fn monitor(&self, node: u128) -> PathBuf {
