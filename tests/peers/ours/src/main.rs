@@ -1,0 +1,281 @@
+//! Times this project's estimator. Usage: peers-ours robot.urdf states.txt        (conversation: ../../server.rs)
+
+#[path = "../../server.rs"]
+#[allow(dead_code, reason = "each program uses its own part")]
+mod server;
+
+use std::fmt::Display;
+use std::rc::Rc;
+
+use proprio_estimator::dynamics::{
+    ContactKind, ContactSet, ContactSpec, FrameMotion, InverseDynamics, JointState, Kinematics, Noise, SensorCut,
+    Solver, Structure,
+};
+use proprio_estimator::model::Model;
+use proprio_estimator::regressor::Regressor;
+use proprio_estimator::spatial::{Vec3, Wrench};
+use server::{Bench, Output, States, fail};
+
+/// The result, or the end of the program.
+fn must<T, E: Display>(result: Result<T, E>) -> T {
+    result.unwrap_or_else(|error| fail(&error.to_string()))
+}
+
+/// A model, and the states in its order of joints.
+struct Robot {
+    model: Model,
+    states: States,
+    /// Motion of body 0 at each state: standing, or moving.
+    bases: Vec<FrameMotion>,
+}
+
+impl Robot {
+    fn new(urdf: &str, keep: &[&str], states: &str, floating: bool) -> Rc<Self> {
+        let model = must(Model::from_urdf(urdf, keep));
+        let names: Vec<&str> = (0..model.dof_count()).map(|dof| model.dof_name(dof)).collect();
+        let states = States::read(states).in_order_of(&names);
+        let gravity = Vec3::from(states.gravity);
+        let bases = states
+            .states
+            .iter()
+            .map(|state| {
+                if !floating {
+                    return FrameMotion::standing(&gravity);
+                }
+                FrameMotion {
+                    angular_velocity: Vec3::from(state.base.angular_velocity),
+                    angular_acceleration: Vec3::from(state.base.angular_acceleration),
+                    proper_acceleration: Vec3::from(state.base.acceleration) - gravity,
+                }
+            })
+            .collect();
+        Rc::new(Self { model, states, bases })
+    }
+
+    fn update(&self, kinematics: &mut Kinematics, state: usize) {
+        let s = &self.states.states[state];
+        must(kinematics.update(
+            &self.model,
+            JointState {
+                position: &s.position,
+                velocity: &s.velocity,
+                acceleration: &s.acceleration,
+            },
+            &self.bases[state],
+        ));
+    }
+
+    fn show_torque(&self, torque: &[f64], output: &mut Output) {
+        for (name, torque) in self.states.joints.iter().zip(torque) {
+            output.add("torque", name, *torque);
+        }
+    }
+}
+
+fn show_wrench(name: &str, wrench: &Wrench, output: &mut Output) {
+    output.add3("force", name, wrench.force.iter().copied());
+    output.add3("moment", name, wrench.torque.iter().copied());
+}
+
+/// Pose and motion of every link; net wrenches too, which the peers leave to their second pass.
+struct Pass {
+    robot: Rc<Robot>,
+    kinematics: Kinematics,
+}
+
+impl Bench for Pass {
+    fn run(&mut self, state: usize) {
+        self.robot.update(&mut self.kinematics, state);
+    }
+
+    fn show(&self, output: &mut Output) {
+        for link in 1..self.robot.model.link_count() {
+            let name = self.robot.model.link_name(link);
+            let motion = self.kinematics.motion(link);
+            output.add3("position", name, self.kinematics.pose(link).translation.iter().copied());
+            output.add3("omega", name, motion.angular_velocity.iter().copied());
+            output.add3("alpha", name, motion.angular_acceleration.iter().copied());
+            output.add3("acceleration", name, motion.proper_acceleration.iter().copied());
+        }
+    }
+}
+
+/// Inverse dynamics without external wrenches.
+struct Inverse {
+    robot: Rc<Robot>,
+    kinematics: Kinematics,
+    inverse: InverseDynamics,
+    floating: bool,
+}
+
+impl Bench for Inverse {
+    fn run(&mut self, state: usize) {
+        self.robot.update(&mut self.kinematics, state);
+        must(self.inverse.update(&self.robot.model, &self.kinematics, &[]));
+    }
+
+    fn show(&self, output: &mut Output) {
+        self.robot.show_torque(self.inverse.torque(), output);
+        if self.floating {
+            show_wrench("base", &self.inverse.base_wrench(), output);
+        }
+    }
+}
+
+/// The regressor of the wrench on the base and of all torques.
+struct Regression {
+    robot: Rc<Robot>,
+    kinematics: Kinematics,
+    regressor: Regressor,
+}
+
+impl Bench for Regression {
+    fn run(&mut self, state: usize) {
+        self.robot.update(&mut self.kinematics, state);
+        must(self.regressor.update(&self.robot.model, &self.kinematics));
+    }
+
+    /// Times parameters that are random numbers: every column counts.
+    fn show(&self, output: &mut Output) {
+        let (model, states) = (&self.robot.model, &self.robot.states);
+        let parameters: Vec<f64> = (0..model.link_count())
+            .flat_map(|link| match link {
+                0 => states.parameters[0],
+                _ => states.parameters[server::place(&states.bodies, model.link_name(link))],
+            })
+            .collect();
+        let times = |row: &[f64]| row.iter().zip(&parameters).map(|(a, b)| a * b).sum::<f64>();
+        output.add3("moment", "base", self.regressor.base_torque_rows().map(times));
+        output.add3("force", "base", self.regressor.base_force_rows().map(times));
+        let rows = (0..model.dof_count()).filter_map(|dof| self.regressor.joint_row(dof));
+        self.robot.show_torque(&rows.map(times).collect::<Vec<_>>(), output);
+    }
+}
+
+/// F/T readings in; one full contact wrench per sub-tree and all torques out.
+struct Cycle {
+    robot: Rc<Robot>,
+    structure: Structure,
+    readings: Vec<Vec<Wrench>>,
+    active: ContactSet,
+    kinematics: Kinematics,
+    solver: Solver,
+}
+
+impl Cycle {
+    fn new(robot: &Rc<Robot>) -> Self {
+        let (model, states) = (&robot.model, &robot.states);
+        let (mut cuts, mut columns) = (Vec::new(), Vec::new());
+        for sensor in model.sensors() {
+            // Their size does not matter here: with one full wrench per sub-tree nothing is left to weigh.
+            let noise = Noise {
+                force: [0.1; 3],
+                torque: [0.003; 3],
+            };
+            cuts.push(must(SensorCut::new(
+                model,
+                &sensor.joint,
+                sensor.frame,
+                sensor.direction,
+                &sensor.pose,
+                &noise,
+            )));
+            columns.push(server::place(&states.sensors, &sensor.name));
+        }
+        let contacts: Vec<ContactSpec> = states
+            .contacts
+            .iter()
+            .map(|name| ContactSpec {
+                frame: model.frame(name).unwrap_or_else(|| fail(&format!("no link {name}"))),
+                kind: ContactKind::Wrench,
+                position: Vec3::zeros(),
+            })
+            .collect();
+        let structure = must(Structure::new(model, &cuts, &contacts, Structure::LENGTH_SCALE));
+        if structure.subtrees().iter().any(|subtree| subtree.contacts.len() != 1) {
+            fail("not one contact in every sub-tree");
+        }
+        let readings = states
+            .states
+            .iter()
+            .map(|state| {
+                let wrench = |&column: &usize| {
+                    let [force, torque] = state.readings[column];
+                    Wrench::from_parts(force, torque)
+                };
+                columns.iter().map(wrench).collect()
+            })
+            .collect();
+        Self {
+            robot: Rc::clone(robot),
+            readings,
+            active: ContactSet::first(contacts.len()),
+            kinematics: must(Kinematics::new(model, 0)),
+            solver: Solver::new(&structure),
+            structure,
+        }
+    }
+}
+
+impl Bench for Cycle {
+    fn run(&mut self, state: usize) {
+        self.robot.update(&mut self.kinematics, state);
+        must(self.solver.solve(
+            &self.robot.model,
+            &self.structure,
+            &self.kinematics,
+            &self.readings[state],
+            &self.active,
+            &[],
+        ));
+    }
+
+    fn show(&self, output: &mut Output) {
+        self.robot.show_torque(self.solver.torque(), output);
+        for (name, contact) in self.robot.states.contacts.iter().zip(self.solver.contacts()) {
+            show_wrench(name, &contact.wrench, output);
+        }
+    }
+}
+
+fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [urdf, states] = &arguments[..] else {
+        fail("usage: peers-ours robot.urdf states.txt");
+    };
+    let text = must(std::fs::read_to_string(urdf));
+    let folded = Robot::new(&text, &[], states, false);
+    let folded_floating = Robot::new(&text, &[], states, true);
+    let sensors = folded.model.sensors().to_vec();
+    let cuts: Vec<&str> = sensors.iter().map(|sensor| sensor.joint.as_str()).collect();
+    let kept = Robot::new(&text, &cuts, states, false);
+    let kept_floating = Robot::new(&text, &cuts, states, true);
+
+    let inverse = |robot: &Rc<Robot>, floating| Inverse {
+        robot: Rc::clone(robot),
+        kinematics: must(Kinematics::new(&robot.model, 0)),
+        inverse: InverseDynamics::new(&robot.model),
+        floating,
+    };
+    let regression = |robot: &Rc<Robot>| Regression {
+        robot: Rc::clone(robot),
+        kinematics: must(Kinematics::new(&robot.model, 0)),
+        regressor: Regressor::new(&robot.model),
+    };
+    let pass = Pass {
+        robot: Rc::clone(&folded),
+        kinematics: must(Kinematics::new(&folded.model, 0)),
+    };
+    let count = folded.states.states.len();
+    server::serve(
+        count,
+        &mut [
+            ("kinematics", Box::new(pass)),
+            ("rnea", Box::new(inverse(&folded, false))),
+            ("rnea_floating", Box::new(inverse(&folded_floating, true))),
+            ("regressor_33", Box::new(regression(&folded_floating))),
+            ("regressor_39", Box::new(regression(&kept_floating))),
+            ("cycle", Box::new(Cycle::new(&kept))),
+        ],
+    );
+}

@@ -1,0 +1,191 @@
+// Times Pinocchio. Usage: peers-pinocchio pinocchio.txt states.txt        (conversation: server.rs)
+//
+// Templates alone, compiled for this very processor; nothing of Pinocchio's own is linked. (Its libraries are compiled for any processor, and Eigen lays
+// out memory otherwise there: the two must not meet in one program.) The model therefore comes as text, from prepare.py.
+
+#include "server.hpp"
+
+#include <pinocchio/multibody.hpp>
+
+#include <pinocchio/algorithm/joint-configuration.hpp>
+#include <pinocchio/algorithm/kinematics.hpp>
+#include <pinocchio/algorithm/regressor.hpp>
+#include <pinocchio/algorithm/rnea.hpp>
+
+namespace pin = pinocchio;
+using peers::fail;
+using peers::Output;
+using peers::Row;
+using peers::State;
+using peers::States;
+
+namespace {
+
+Eigen::Vector3d vector(const peers::Triple& values)
+{
+    return Eigen::Vector3d(values[0], values[1], values[2]);
+}
+
+struct Robot
+{
+    const States& states;
+    pin::Model model;
+    // Numbers of the joints of the robot, of their child links and of the base, in the model.
+    std::vector<std::string> joints, children;
+    pin::JointIndex root = 0;
+    std::vector<Eigen::VectorXd> positions, velocities, accelerations;
+
+    Robot(const std::string& path, const States& states_, bool floating)
+        : states(states_)
+    {
+        std::ifstream in(path);
+        if (!in)
+            fail("cannot read " + path);
+        in.exceptions(std::ios::failbit | std::ios::badbit);
+        model.gravity.linear(vector(states.gravity));
+        std::size_t count = 0;
+        in >> count;
+        const pin::Inertia base = inertia(in);
+        if (floating)
+        {
+            root = model.addJoint(0, pin::JointModelFreeFlyer(), pin::SE3::Identity(), "root");
+            model.appendBodyToJoint(root, base, pin::SE3::Identity());
+        }
+        for (std::size_t number = 0; number < count; ++number)
+        {
+            std::size_t parent = 0;
+            std::string name, child, kind;
+            Eigen::Vector3d axis, translation;
+            Eigen::Matrix3d rotation;
+            in >> parent >> name >> child >> kind;
+            for (int i = 0; i < 3; ++i)
+                in >> axis[i];
+            for (int row = 0; row < 3; ++row)
+                for (int column = 0; column < 3; ++column)
+                    in >> rotation(row, column);
+            for (int i = 0; i < 3; ++i)
+                in >> translation[i];
+            const pin::SE3 placement(rotation, translation);
+            const pin::JointIndex joint = add(kind, axis, root + parent, placement, name);
+            model.appendBodyToJoint(joint, inertia(in), pin::SE3::Identity());
+            joints.push_back(name);
+            children.push_back(child);
+        }
+        for (const State& state : states.states)
+        {
+            Eigen::VectorXd q = pin::neutral(model), dq = Eigen::VectorXd::Zero(model.nv), ddq = dq;
+            if (floating)
+            {
+                dq.head<6>() << vector(state.baseVelocity), vector(state.baseAngularVelocity);
+                ddq.head<6>() << vector(states.baseSpatialAcceleration(state)), vector(state.baseAngularAcceleration);
+            }
+            for (std::size_t joint = 0; joint < count; ++joint)
+            {
+                const std::size_t at = peers::place(states.joints, joints[joint]);
+                q.tail(count)[joint] = state.position[at];
+                dq.tail(count)[joint] = state.velocity[at];
+                ddq.tail(count)[joint] = state.acceleration[at];
+            }
+            positions.push_back(q);
+            velocities.push_back(dq);
+            accelerations.push_back(ddq);
+        }
+    }
+
+    void showGeneralized(const Eigen::VectorXd& generalized, Output& output) const
+    {
+        if (root != 0)
+        {
+            output.add3("force", "base", generalized.segment<3>(0));
+            output.add3("moment", "base", generalized.segment<3>(3));
+        }
+        for (std::size_t joint = 0; joint < joints.size(); ++joint)
+            output.add("torque", joints[joint], generalized.tail(joints.size())[joint]);
+    }
+
+    void showKinematics(const pin::Data& data, Output& output) const
+    {
+        for (std::size_t number = 0; number < children.size(); ++number)
+        {
+            const pin::JointIndex joint = root + 1 + number;
+            const Eigen::Vector3d omega = data.v[joint].angular();
+            const Eigen::Vector3d gravity = data.oMi[joint].rotation().transpose() * model.gravity.linear();
+            const Eigen::Vector3d acceleration = data.a[joint].linear() + omega.cross(data.v[joint].linear()) - gravity;
+            output.add3("position", children[number], data.oMi[joint].translation());
+            output.add3("omega", children[number], omega);
+            output.add3("alpha", children[number], data.a[joint].angular());
+            output.add3("acceleration", children[number], acceleration);
+        }
+    }
+
+    // The regressor times parameters that are random numbers: every column counts.
+    void showRegressor(const pin::Data& data, Output& output) const
+    {
+        // Pinocchio's order of the tensor of inertia is xx xy yy xz yz zz, that of the states xx xy xz yy yz zz.
+        const std::array<int, 10> order{0, 1, 2, 3, 4, 5, 7, 6, 8, 9};
+        Eigen::VectorXd parameters(10 * (1 + children.size()));
+        for (std::size_t link = 0; link <= children.size(); ++link)
+        {
+            const std::size_t body = link == 0 ? 0 : peers::place(states.bodies, children[link - 1]);
+            for (int i = 0; i < 10; ++i)
+                parameters[10 * link + i] = states.parameters[body][order[i]];
+        }
+        showGeneralized(data.jointTorqueRegressor * parameters, output);
+    }
+
+private:
+    static pin::Inertia inertia(std::istream& in)
+    {
+        Eigen::VectorXd parameters(10);
+        for (int i = 0; i < 10; ++i)
+            in >> parameters[i];
+        return pin::Inertia::FromDynamicParameters(parameters);
+    }
+
+    // The type that Pinocchio's own reader chose: about x, y or z where it saw so.
+    pin::JointIndex add(const std::string& kind, const Eigen::Vector3d& axis, pin::JointIndex parent, const pin::SE3& at, const std::string& name)
+    {
+        if (kind == "JointModelRX")
+            return model.addJoint(parent, pin::JointModelRX(), at, name);
+        if (kind == "JointModelRY")
+            return model.addJoint(parent, pin::JointModelRY(), at, name);
+        if (kind == "JointModelRZ")
+            return model.addJoint(parent, pin::JointModelRZ(), at, name);
+        if (kind == "JointModelRevoluteUnaligned")
+            return model.addJoint(parent, pin::JointModelRevoluteUnaligned(axis), at, name);
+        fail("joint " + name + " is a " + kind + ", which this program does not know");
+    }
+};
+
+} // namespace
+
+int main(int count, char** arguments)
+{
+    if (count != 3)
+        fail("usage: peers-pinocchio pinocchio.txt states.txt");
+    const States states(arguments[2]);
+    const Robot fixed(arguments[1], states, false), floating(arguments[1], states, true);
+    pin::Data fixedData(fixed.model), floatingData(floating.model);
+
+    peers::serve(
+        states.states.size(),
+        {
+            {"kinematics",
+             [&](std::size_t k) { pin::forwardKinematics(fixed.model, fixedData, fixed.positions[k], fixed.velocities[k], fixed.accelerations[k]); },
+             [&](Output& o) { fixed.showKinematics(fixedData, o); }},
+            {"rnea",
+             [&](std::size_t k) { pin::rnea(fixed.model, fixedData, fixed.positions[k], fixed.velocities[k], fixed.accelerations[k]); },
+             [&](Output& o) { fixed.showGeneralized(fixedData.tau, o); }},
+            {"rnea_floating",
+             [&](std::size_t k) {
+                 pin::rnea(floating.model, floatingData, floating.positions[k], floating.velocities[k], floating.accelerations[k]);
+             },
+             [&](Output& o) { floating.showGeneralized(floatingData.tau, o); }},
+            {"regressor_33",
+             [&](std::size_t k) {
+                 pin::computeJointTorqueRegressor(
+                     floating.model, floatingData, floating.positions[k], floating.velocities[k], floating.accelerations[k]);
+             },
+             [&](Output& o) { floating.showRegressor(floatingData, o); }},
+        });
+}
