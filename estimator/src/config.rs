@@ -77,6 +77,11 @@ pub enum Base {
         #[serde(default = "standard_gravity")]
         gravity_mps2: [f64; 3],
     },
+    /// One of several links stands still, which one changes: the feet of a walking robot.
+    Stance {
+        /// The links, in order of preference: the first whose contact is present is the base.
+        foot: Vec<Foot>,
+    },
     /// An IMU on a link.
     Imu {
         /// Its channel.
@@ -90,6 +95,19 @@ pub enum Base {
         #[serde(default)]
         rpy_rad: [f64; 3],
     },
+}
+
+/// A link that stands still while its contact is present.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Foot {
+    /// The link or folded frame.
+    pub link: String,
+    /// Physical gravity, pointing down, in the axes of `link` while it stands \[m/s^2\].
+    #[serde(default = "standard_gravity")]
+    pub gravity_mps2: [f64; 3],
+    /// The name of the contact, of kind `wrench` and on this link, that carries the robot there.
+    pub contact: String,
 }
 
 const fn standard_gravity() -> [f64; 3] {
@@ -362,6 +380,14 @@ impl Config {
         };
         match &self.base {
             Base::Fixed { gravity_mps2, .. } => finite("base.gravity_mps2", gravity_mps2)?,
+            Base::Stance { foot } => {
+                if foot.is_empty() {
+                    return Err("base.foot is empty; give each link that may stand still one [[base.foot]]".into());
+                }
+                for foot in foot {
+                    finite(&format!("base.foot {:?}: gravity_mps2", foot.link), &foot.gravity_mps2)?;
+                }
+            }
             Base::Imu { xyz_m, rpy_rad, .. } => {
                 finite("base.xyz_m", xyz_m)?;
                 finite("base.rpy_rad", rpy_rad)?;
@@ -461,7 +487,7 @@ mod tests {
             (
                 "kind = \"fixed\"",
                 "kind = \"fixd\"",
-                "unknown variant `fixd`, expected `fixed` or `imu`",
+                "unknown variant `fixd`, expected one of `fixed`, `stance`, `imu`",
             ),
             (
                 "joint = \"ft_joint\"",
@@ -488,6 +514,16 @@ mod tests {
                 "link = \"chest\"",
                 "link = \"chest\"\ngravity_mps2 = [0.0, 0.0, nan]",
                 "base.gravity_mps2 has the value NaN",
+            ),
+            (
+                "kind = \"fixed\"\n        link = \"chest\"",
+                "kind = \"stance\"\n        foot = []",
+                "base.foot is empty",
+            ),
+            (
+                "kind = \"fixed\"\n        link = \"chest\"",
+                "kind = \"stance\"\n        foot = [{ link = \"chest\" }]",
+                "missing field `contact`",
             ),
         ] {
             assert!(ARM.contains(from), "{from}");

@@ -9,6 +9,7 @@
 //! - [`spatial`]: motion and force vectors, rigid transforms, rigid-body inertia; the notation page of the crate.
 //! - [`model`]: an undirected tree of links from a URDF; massless frames folded; F/T joints kept.
 //! - [`dynamics`]: kinematics from any base, sub-trees cut at the F/T sensors, reordered recursive Newton-Euler.
+//! - [`regressor`]: wrenches and torques as linear functions of the inertial parameters, and which of these can be identified at all.
 //! - [`differentiate`]: position, velocity and acceleration at any instant from noisy, quantised samples; [`history`]: what
 //!   is used as measured.
 //! - [`pipeline`]: samples in, estimates out; no input, no output, no clock.
@@ -22,5 +23,6 @@ pub mod history;
 pub mod model;
 pub mod offline;
 pub mod pipeline;
+pub mod regressor;
 pub mod setup;
 pub mod spatial;

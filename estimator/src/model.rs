@@ -44,13 +44,16 @@ pub enum AxisKind {
 }
 
 impl Axis {
-    /// The axis along `direction`, normalised; none if its length is zero or not finite.
+    /// The axis along `direction`, normalised; none if its length is zero or not finite. Components that are only what rounding left are taken as zero.
     pub fn new(direction: Vec3) -> Option<Self> {
+        const ROUNDING: f64 = 1e-14;
         let norm = direction.norm();
         if !norm.is_finite() || norm < 1e-9 {
             return None;
         }
-        let vector = direction / norm;
+        // URDFs made by a program have axes such as -2.2e-16 -0.9999999999999998 0, and mean y.
+        let cleaned = (direction / norm).map(|x| if x.abs() < ROUNDING { 0.0 } else { x });
+        let vector = cleaned.normalize();
         let kind = match (vector.x, vector.y, vector.z) {
             (x, 0.0, 0.0) => AxisKind::X(x.signum()),
             (0.0, y, 0.0) => AxisKind::Y(y.signum()),
@@ -61,9 +64,13 @@ impl Axis {
     }
 
     /// `r * Rot(axis, angle)`: `r` turned by `angle` [rad] about this axis of its own.
-    #[inline]
     pub fn turn(&self, r: &Mat3, angle: f64) -> Mat3 {
-        let (sin, c) = angle.sin_cos();
+        self.turn_by(r, angle.sin_cos())
+    }
+
+    /// The same from the angle's sine and cosine.
+    #[inline(always)]
+    fn turn_by(&self, r: &Mat3, (sin, c): (f64, f64)) -> Mat3 {
         let columns = |i: usize| r.column(i).into_owned();
         match self.kind {
             AxisKind::X(sign) => {
@@ -122,12 +129,17 @@ pub struct Joint {
 
 impl Joint {
     /// Pose of the child in the parent, `x_pc(q)`, with the joint at `q` [rad or m]; `q` means nothing to a fixed joint.
-    #[inline]
     pub fn pose(&self, q: f64) -> Pose {
+        self.pose_by(q, q.sin_cos())
+    }
+
+    /// The same, with sine and cosine of `q` given.
+    #[inline(always)]
+    pub(crate) fn pose_by(&self, q: f64, sin_cos: (f64, f64)) -> Pose {
         let Pose { rotation, translation } = &self.placement;
         match &self.kind {
             JointKind::Revolute(axis) => Pose {
-                rotation: axis.turn(rotation, q),
+                rotation: axis.turn_by(rotation, sin_cos),
                 translation: *translation,
             },
             JointKind::Prismatic(axis) => Pose {
@@ -283,11 +295,21 @@ impl Model {
         &self.inertias
     }
 
-    /// Replaces the inertia of a body (identified parameters); nothing happens if there is no such body.
-    pub fn set_inertia(&mut self, link: usize, inertia: RigidInertia) {
-        if let Some(old) = self.inertias.get_mut(link) {
-            *old = inertia;
+    /// Replaces the inertia of a body (identified parameters). Whether such a body can exist is not asked ([`RigidInertia::check`] tells).
+    ///
+    /// # Errors
+    /// There is no such body, or a number is not finite. Nothing is changed then.
+    pub fn set_inertia(&mut self, link: usize, inertia: RigidInertia) -> Result<(), ModelError> {
+        if link >= self.inertias.len() {
+            return Err(ModelError::NoLink(link));
         }
+        if !inertia.is_finite() {
+            return Err(ModelError::InertiaNotFinite {
+                link: self.link_name(link).to_owned(),
+            });
+        }
+        self.inertias[link] = inertia;
+        Ok(())
     }
 
     /// Where the URDF link of this name is, whether it is a body of its own or was folded into one.
@@ -311,7 +333,7 @@ impl Model {
     }
 }
 
-/// Why a URDF cannot be used.
+/// Why a URDF, or a change of the model made from it, is refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum ModelError {
@@ -455,6 +477,15 @@ pub enum ModelError {
     /// A joint to be kept that moves.
     #[error("joint {0} is said to carry an F/T sensor, but it moves; a sensor sits in a fixed joint")]
     SensorJointMoves(String),
+    /// A number that no body has.
+    #[error("there is no link {0}")]
+    NoLink(usize),
+    /// An inertia with NaN or infinity, for a body of the model.
+    #[error("link {link}: the inertia given for it is not finite")]
+    InertiaNotFinite {
+        /// The link.
+        link: String,
+    },
 }
 
 fn or_none(names: &[String]) -> String {
@@ -487,6 +518,10 @@ mod tests {
             let expected = r * Rotation3::from_axis_angle(&Unit::new_normalize(Vec3::from(direction)), 0.7).matrix();
             assert!((axis.turn(&r, 0.7) - expected).amax() < 1e-15, "{direction:?}");
         }
+        let almost = Axis::new(Vec3::new(-2.2e-16, -0.999_999_999_999_999_8, 0.0)).expect("not zero");
+        assert_eq!((almost.vector, almost.kind), (-Vec3::y(), AxisKind::Y(-1.0)));
+        let oblique = Axis::new(Vec3::new(1e-12, 1.0, 0.0)).expect("not zero");
+        assert_eq!(oblique.kind, AxisKind::Any);
         assert_eq!(Axis::new(Vec3::zeros()), None);
         assert_eq!(Axis::new(Vec3::new(f64::NAN, 0.0, 0.0)), None);
     }

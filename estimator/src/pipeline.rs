@@ -136,6 +136,8 @@ pub struct Pipeline {
     tracks: Vec<Track>,
     /// Per channel at the present instant: what speaks against it.
     faults: Vec<Reason>,
+    /// What speaks against the motion of the base, if no channel tells it.
+    base_fault: Reason,
     declarations: Vec<Declarations>,
     waiting: VecDeque<Nanos>,
     newest: Nanos,
@@ -186,6 +188,7 @@ impl Pipeline {
         Self {
             tracks: tracks.collect(),
             faults: vec![Reason::NeverSeen; setup.channels().len()],
+            base_fault: Reason::None,
             declarations: vec![Declarations::default(); setup.contacts.len()],
             waiting: VecDeque::with_capacity(MOST_WAITING),
             newest: Nanos::MIN,
@@ -333,14 +336,47 @@ impl Pipeline {
         Some(&self.estimate)
     }
 
+    /// The contacts present at `t`.
+    fn active(&self, t: Nanos) -> ContactSet {
+        let mut active = self.setup.always;
+        for (contact, declarations) in self.declarations.iter().enumerate() {
+            match declarations.at(t) {
+                Some(true) => active.insert(contact),
+                Some(false) if self.setup.support != Some(contact) => active.remove(contact),
+                Some(false) => {}
+                None => {}
+            }
+        }
+        active
+    }
+
+    /// Starts kinematics at the link that stands still, if it is not an IMU that tells, and says how it moves: not at all.
+    fn base_standing(&mut self, active: &ContactSet) -> FrameMotion {
+        self.base_fault = Reason::None;
+        let stances = match &self.setup.base {
+            BaseMotion::Standing(motion) => return *motion,
+            BaseMotion::Imu(_) => return FrameMotion::standing(&Vec3::zeros()),
+            BaseMotion::Stance(stances) => stances,
+        };
+        let standing = stances.iter().find(|stance| active.contains(stance.contact));
+        if standing.is_none() {
+            self.base_fault = Reason::NoStance;
+        }
+        let Some(stance) = standing.or(stances.first()) else {
+            return FrameMotion::standing(&Vec3::zeros());
+        };
+        if stance.link != self.kinematics.base() && self.kinematics.set_base(&self.setup.model, stance.link).is_err() {
+            self.base_fault = Reason::NotFinite;
+        }
+        stance.motion
+    }
+
     /// Brings every channel to `t` and estimates.
     fn compute(&mut self, t: Nanos) {
         // Half of the wait, so that a sample which counts can be as late as the other half and still be there.
         let until = t + Nanos(self.setup.max_wait.0 / 2);
-        let mut base = match self.setup.base {
-            BaseMotion::Standing(motion) => motion,
-            BaseMotion::Imu(_) => FrameMotion::standing(&Vec3::zeros()),
-        };
+        let active = self.active(t);
+        let mut base = self.base_standing(&active);
         for ((track, channel), fault) in self.tracks.iter().zip(self.setup.channels()).zip(&mut self.faults) {
             *fault = match (track, channel.role) {
                 (Track::Joint(history, window), Use::Joint(dof)) => match history.at(t, until) {
@@ -384,15 +420,6 @@ impl Pipeline {
                 _ => Reason::NeverSeen,
             };
         }
-        let mut active = self.setup.always;
-        for (contact, declarations) in self.declarations.iter().enumerate() {
-            match declarations.at(t) {
-                Some(true) => active.insert(contact),
-                Some(false) if self.setup.support != Some(contact) => active.remove(contact),
-                Some(false) => {}
-                None => {}
-            }
-        }
         let Setup { model, structure, .. } = &self.setup;
         let state = JointState {
             position: &self.position,
@@ -432,6 +459,7 @@ impl Pipeline {
         let judge = Judge {
             channels: self.setup.channels(),
             faults: &self.faults,
+            base_fault: self.base_fault,
         };
         let results = self
             .solver
@@ -507,6 +535,7 @@ impl Pipeline {
 struct Judge<'a> {
     channels: &'a [crate::setup::Channel],
     faults: &'a [Reason],
+    base_fault: Reason,
 }
 
 impl Judge<'_> {
@@ -528,6 +557,9 @@ impl Judge<'_> {
             if found.0 == Reason::None {
                 found = (*fault, number);
             }
+        }
+        if found.0 == Reason::None && dependence.base {
+            found.0 = self.base_fault;
         }
         found
     }

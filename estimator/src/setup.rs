@@ -1,9 +1,10 @@
 //! estimator.toml and the URDF, checked against each other and resolved: what the rest of the estimator works with.
 
-use crate::config::{Base, Config, ContactKind as KindWord, Differentiation, Direction, Presence, SensorFrame};
+use crate::config::{Base, Config, ContactKind as KindWord, Differentiation, Direction, Foot, Presence, SensorFrame};
 use crate::differentiate::Settings;
 use crate::dynamics::{ContactKind, ContactSet, ContactSpec, FrameMotion, Noise, SensorCut, Structure, StructureError};
 use crate::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
+use crate::regressor::identifiable::{BaseRegime, Identifiable, JointMotion, Measured, Offsets, Regime, Scope};
 use crate::spatial::{Pose, Vec3, Wrench};
 use proprio_topics::{Description, Entry, Kind, MAX_CONTACTS, MAX_JOINTS, Name, Nanos, Publisher, Role};
 use std::fmt;
@@ -35,12 +36,25 @@ pub struct Channel {
 }
 
 /// Where kinematics start.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum BaseMotion {
     /// The base link stands still: its motion is this, always.
     Standing(FrameMotion),
+    /// The first of these whose contact is present is the base link, and stands still.
+    Stance(Vec<Stance>),
     /// An IMU at this pose in the base link tells.
     Imu(Pose),
+}
+
+/// A link that stands still while its contact is present.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Stance {
+    /// The link.
+    pub link: usize,
+    /// Its motion then.
+    pub motion: FrameMotion,
+    /// The number of its contact.
+    pub contact: usize,
 }
 
 /// A contact as it is published.
@@ -63,7 +77,7 @@ pub struct Setup {
     pub model: Model,
     /// Sub-trees, sensors, contacts.
     pub structure: Structure,
-    /// The link where kinematics start.
+    /// The link where kinematics start; with [`BaseMotion::Stance`] where they start first.
     pub base_link: usize,
     /// Its motion.
     pub base: BaseMotion,
@@ -167,14 +181,15 @@ impl Setup {
                 add(Kind::Joint, model.dof_name(dof), Use::Joint(dof))?;
             }
         }
+        let (contacts, mut specs) = contacts(config, &model)?;
         let (base_link, base) = match &config.base {
             Base::Fixed { link, gravity_mps2 } => {
                 let frame = frame(&model, link).map_err(|e| format!("base.link: {e}"))?;
-                let standing = FrameMotion::standing(&Vec3::from(*gravity_mps2));
-                (
-                    frame.link,
-                    BaseMotion::Standing(FrameMotion::of_link_from_imu(&standing, &frame.pose)),
-                )
+                (frame.link, BaseMotion::Standing(standing(&frame, *gravity_mps2)))
+            }
+            Base::Stance { foot } => {
+                let stances = stances(foot, &model, &contacts, &specs)?;
+                (stances.first().map_or(0, |s| s.link), BaseMotion::Stance(stances))
             }
             Base::Imu {
                 sensor,
@@ -190,7 +205,6 @@ impl Setup {
                 )
             }
         };
-        let (contacts, mut specs) = contacts(config, &model)?;
         let mut support = None;
         if let BaseMotion::Standing(_) = base {
             // What a fixed base stands on, unless the configuration has it as a contact of its own.
@@ -348,6 +362,75 @@ impl Setup {
         parts.join(" ")
     }
 
+    /// What can move while the estimator runs, for the question which parameters its sensors can see at all ([`Identifiable`]). A robot with several feet
+    /// is taken to stand on the first.
+    #[must_use]
+    pub fn regime(&self) -> Regime {
+        let fixed = |motion: &FrameMotion| BaseRegime::Restricted {
+            gravity: -motion.proper_acceleration,
+            joints: Vec::new(),
+        };
+        let motion = match &self.base {
+            BaseMotion::Standing(motion) => fixed(motion),
+            BaseMotion::Stance(stances) => stances.first().map_or(BaseRegime::Free, |stance| fixed(&stance.motion)),
+            BaseMotion::Imu(_) => BaseRegime::Free,
+        };
+        let joint = |&locked: &f64| {
+            if locked.is_nan() {
+                JointMotion::Moving
+            } else {
+                JointMotion::Locked(locked)
+            }
+        };
+        Regime {
+            base: self.base_link,
+            motion,
+            joints: self.locked.iter().map(joint).collect(),
+            contacts: ContactSet::EMPTY,
+            tolerance: Regime::TOLERANCE,
+        }
+    }
+
+    /// What a sub-tree's F/T sensors can tell of its inertial parameters: a sentence for people. None without a sensor.
+    fn sight(&self, number: usize) -> Option<String> {
+        let subtree = self.structure.subtrees().get(number)?;
+        if subtree.sensors.is_empty() {
+            return None;
+        }
+        // One that nobody can declare absent takes up whatever the links make.
+        let hides = |contact: &usize| {
+            let spec = self.structure.contacts().get(*contact);
+            self.always.contains(*contact) && spec.is_some_and(|spec| spec.kind == ContactKind::Wrench)
+        };
+        if let Some(contact) = subtree.contacts.iter().find(hides) {
+            let name = self.contact_label(contact);
+            return Some(format!(
+                "none of its inertial parameters shows in its F/T while {name} is present"
+            ));
+        }
+        let seen = |offsets| {
+            let scope = Scope::SubTree(&self.structure, number);
+            Identifiable::new(&self.model, scope, &self.regime(), Measured::Wrench, offsets).ok()
+        };
+        let (known, unknown) = (seen(Offsets::Known)?, seen(Offsets::Unknown)?);
+        let lost = match unknown.confused() {
+            0 => String::new(),
+            n => format!("; {n} of these cannot be told from the sensors' offsets"),
+        };
+        Some(format!(
+            "{} independent combinations of its {} inertial parameters show in its F/T{lost}",
+            known.rank(),
+            known.columns().len()
+        ))
+    }
+
+    /// The name of a contact for people.
+    fn contact_label(&self, contact: usize) -> &str {
+        self.contacts
+            .get(contact)
+            .map_or("what the base stands on", |c| c.name.as_str())
+    }
+
     /// The names behind the numbers of the estimates.
     #[must_use]
     pub fn description(&self) -> Box<Description> {
@@ -492,6 +575,50 @@ fn contacts(config: &Config, model: &Model) -> Result<(Vec<NamedContact>, Vec<Co
     Ok((names, specs))
 }
 
+/// How a link moves while `frame`, which is fixed to it, stands still.
+fn standing(frame: &Frame, gravity: [f64; 3]) -> FrameMotion {
+    FrameMotion::of_link_from_imu(&FrameMotion::standing(&Vec3::from(gravity)), &frame.pose)
+}
+
+fn stances(
+    feet: &[Foot],
+    model: &Model,
+    contacts: &[NamedContact],
+    specs: &[ContactSpec],
+) -> Result<Vec<Stance>, String> {
+    let mut stances = Vec::<Stance>::new();
+    for (number, foot) in feet.iter().enumerate() {
+        let at = format!("base.foot {:?}", foot.link);
+        let frame = frame(model, &foot.link).map_err(|e| format!("{at}: link: {e}"))?;
+        let contact = contacts.iter().position(|c| c.name == foot.contact).ok_or_else(|| {
+            let names = nearest(&foot.contact, contacts.iter().map(|c| c.name.as_str()));
+            format!("{at}: contact = {:?} is not a contact{names}", foot.contact)
+        })?;
+        let carries = |spec: &ContactSpec| spec.frame.link == frame.link && spec.kind == ContactKind::Wrench;
+        if !specs.get(contact).is_some_and(carries) {
+            return Err(format!(
+                "{at}: contact {:?} must be on the same link and of kind \"wrench\" to carry the robot",
+                foot.contact
+            ));
+        }
+        if stances.iter().any(|other| other.contact == contact) {
+            return Err(format!("{at}: contact {:?} is another foot's already", foot.contact));
+        }
+        if number + 1 < feet.len() && contacts.get(contact).is_some_and(|c| c.always) {
+            return Err(format!(
+                "{at}: contact {:?} is always present, so that no foot after this one would ever be the base; give it presence = \"possible\"",
+                foot.contact
+            ));
+        }
+        stances.push(Stance {
+            link: frame.link,
+            motion: standing(&frame, foot.gravity_mps2),
+            contact,
+        });
+    }
+    Ok(stances)
+}
+
 /// Where a link or folded frame is; what is near in name, if there is none of that name.
 fn frame(model: &Model, name: &str) -> Result<Frame, String> {
     model.frame(name).ok_or_else(|| {
@@ -543,12 +670,18 @@ impl fmt::Display for Setup {
             self.model.dof_count(),
             self.structure.subtrees().len()
         )?;
-        let how = if let BaseMotion::Imu(_) = self.base {
-            "an IMU tells its motion"
-        } else {
-            "it stands still"
-        };
-        writeln!(f, "base {}: {how}", self.model.link_name(self.base_link))?;
+        let base = self.model.link_name(self.base_link);
+        match &self.base {
+            BaseMotion::Imu(_) => writeln!(f, "base {base}: an IMU tells its motion")?,
+            BaseMotion::Standing(_) => writeln!(f, "base {base}: it stands still")?,
+            BaseMotion::Stance(stances) => {
+                writeln!(f, "base: the first of these that has its contact stands still")?;
+                for stance in stances {
+                    let contact = self.contacts.get(stance.contact).map_or("", |c| c.name.as_str());
+                    writeln!(f, "  {} with contact {contact}", self.model.link_name(stance.link))?;
+                }
+            }
+        }
         for (number, channel) in self.channels.iter().enumerate() {
             let trigger = if number == self.trigger {
                 " (each of its stamps gives an estimate)"
@@ -569,15 +702,7 @@ impl fmt::Display for Setup {
                 .filter_map(|s| self.structure.sensors().get(s))
                 .map(|s| self.model.joint_name(s.joint()))
                 .collect();
-            let contacts: Vec<_> = subtree
-                .contacts
-                .iter()
-                .map(|c| {
-                    self.contacts
-                        .get(c)
-                        .map_or("what the base stands on", |c| c.name.as_str())
-                })
-                .collect();
+            let contacts: Vec<_> = subtree.contacts.iter().map(|c| self.contact_label(c)).collect();
             let unknowns: usize = subtree
                 .contacts
                 .iter()
@@ -591,6 +716,9 @@ impl fmt::Display for Setup {
                 sensors.join(", "),
                 contacts.join(", ")
             )?;
+            if let Some(sight) = self.sight(number) {
+                writeln!(f, "  {sight}")?;
+            }
         }
         let note = self.upstream_note();
         if !note.is_empty() {

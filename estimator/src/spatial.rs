@@ -16,6 +16,7 @@
 //! **Transforms.** For frames rigidly attached to each other, `x_ab = (R, t)`:
 //! - wrench, [`Pose::wrench`]: `f_a = R f_b`, `n_a = R n_b + t x f_a` (the `X*` of the book);
 //! - twist, [`Pose::twist`]: `omega_a = R omega_b`, `v_a = R v_b + t x omega_a` (the `X` of the book);
+//! - `S(v)` is the matrix of the cross product, `S(v) w = v x w`;
 //! - power is invariant: `n . omega + f . v` is the same in `a` and `b`.
 //!
 //! **Accelerations** are classical, not spatial: `a_O` is the second derivative of the position of the origin. A point at `r` in the same body has
@@ -24,6 +25,8 @@
 //!
 //! **Gravity** never appears by itself. Accelerations are *proper*: `a - g`, with `g` the physical gravity, pointing down. It is what an accelerometer
 //! reads; a link standing still has `-g`, upwards. (Eq. (9) and (10) of the paper add `I a_g`: right with `a_g = -g`.)
+//! There is one exception, the bias of the equation of motion: [`crate::dynamics::EquationOfMotion`] puts weight there if gravity is given to it, and
+//! the base's acceleration that goes with this bias is `a`, not `a - g`. Where else gravity is asked for, of a base that stands, `-g` is made of it at once.
 //!
 //! **Inertia.** `I` is about the link's *origin*, in link axes; `h = m c` is the first moment, `c` the centre of mass. The ten parameters are, in this order,
 //! `[m, m c_x, m c_y, m c_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz]` (the paper's `vech`; iDynTree's order; Pinocchio swaps `I_xz` and `I_yy`).
@@ -36,13 +39,57 @@
 //!
 //! which is `I a + v x* I v` (Featherstone 2008, eq. 2.72) written with classical accelerations.
 //!
+//! The *pseudo-inertia* is the same ten numbers as a symmetric 4 x 4 matrix, `[[Sigma, h], [h^T, m]]` with `Sigma = tr(I)/2 1 - I`
+//! ([`RigidInertia::pseudo_inertia`]): positive semidefinite exactly for bodies that can exist (Wensing, Kim, Slotine, RA-L 2018).
+//!
 //! **Signs.** A joint's wrench is by its URDF parent on its URDF child; its torque (or force, if prismatic) is the component of that wrench along the
-//! URDF axis, on the link side: without rotor inertia and friction. An external wrench is by the environment on the link. An F/T sensor with direction
-//! `child_to_parent` reads the wrench by the child on the parent: minus the joint's wrench.
+//! URDF axis, on the link side: without rotor inertia and friction. A joint's position, velocity and acceleration are of the child relative to the parent about
+//! that axis. Wherever the base is, these do not change. An external wrench is by the environment on the link.
+//!
+//! **F/T sensors** sit in fixed joints. With `f_c` the joint's wrench (parent on child, at the child's origin), and `m` the measurement frame, whose
+//! axes the readings have and whose origin their torque is about (child link's, parent link's, or the sensor's own, which is given in the child's):
+//!
+//! ```text
+//! raw = reading + offset        reading = sign X*_mc f_c        sign = -1: child_to_parent, +1: parent_to_child
+//! ```
+//!
+//! An offset is what the sensor adds, six numbers in the axes and about the origin of `m`: it is subtracted from what comes in, and a positive one makes the raw
+//! reading larger whichever the direction. Noise is independent per channel of `m`, so a motion `s` sees the variance `s_m . (Sigma s_m)`.
+//! The balance of a sub-tree counts each sensor's wrench *on the sub-tree*: `f_c` for the one that has the child, `-f_c` for the one that has the parent.
+//!
+//! **Regressors** ([`crate::regressor`]) are matrices `Y` with `wrench or torques = Y phi`. Rows: the wrench [torque; force], then degrees of freedom. Columns:
+//! the ten parameters of each link in turn, about that link's own origin and in its own axes; then offsets, six per sensor [torque; force]. The wrench
+//! rows are in the frame that the regressor names: that of the link, of the base, or of the sub-tree's top link. *Base parameters* are the coordinates
+//! `pi = B^T phi` in an orthonormal basis `B` of the identifiable subspace; they mix kg, kg m and kg m^2, and `B pi` is that choice of `phi` with these base
+//! parameters which has the least norm.
+//!
+//! # Quantities
+//!
+//! SI units throughout, angles in radians. `n` degrees of freedom, `L` links.
+//!
+//! | quantity | where | shape | axes | about or of | unit | source |
+//! |---|---|---|---|---|---|---|
+//! | pose `x_bl` | [`Pose`] | 3 x 3, 3 | base | origin of the link | 1, m | Featherstone 2008, ch. 2 |
+//! | motion | [`crate::dynamics::FrameMotion`] | 3, 3, 3 | the frame's own | its origin | rad/s, rad/s^2, m/s^2 | classical, proper |
+//! | twist, joint axis | [`Motion`] | [3; 3] | as stated | point at the origin | rad/s, m/s; unit | Featherstone 2008, eq. 2.31 |
+//! | wrench | [`Wrench`] | [3; 3] | as stated | origin of those axes | Nm, N | Featherstone 2008, eq. 2.32 |
+//! | inertia | [`RigidInertia`] | 10 | link | origin of the link | kg, kg m, kg m^2 | paper, eq. (8) |
+//! | net wrench of a link | [`RigidInertia::net_wrench`] | [3; 3] | link | origin of the link | Nm, N | Featherstone 2008, eq. 2.72 |
+//! | net wrenches | [`crate::dynamics::Kinematics`] | `L` of them | base | origin of the base | Nm, N | the same, carried by `X*` |
+//! | joint torques | [`crate::dynamics::InverseDynamics`], [`crate::dynamics::Solver`] | n | joint axis | | Nm or N | paper, eq. (3) |
+//! | contact wrench | [`crate::dynamics::ContactEstimate`] | [3; 3] | contact's frame | its origin | Nm, N | paper, eq. (3), rows 1 to 6 |
+//! | F/T reading, offset | [`crate::dynamics::SensorCut`] | [3; 3] | measurement frame | its origin | Nm, N | above |
+//! | mass matrix, bias | [`crate::dynamics::EquationOfMotion`] | (6 + n) x (6 + n) | base; joint axes | origin of the base | mixed | paper, eq. (3) |
+//! | regressor of a link | [`crate::regressor::link_regressor`] | 6 x 10 | link | origin of the link | mixed | paper, eq. (8) to (10) |
+//! | regressor of the robot | [`crate::regressor::Regressor`] | (6 + n) x 10 L | base; joint axes | origin of the base | mixed | paper, eq. (11), (12) |
+//! | identifiable basis `B` | [`crate::regressor::identifiable::Identifiable`] | columns x rank | | | 1 | paper, eq. (6), (7) |
+//!
+//! "Paper" is S. Traversaro, A. Del Prete, S. Ivaldi, F. Nori, "Inertial parameters identification and joint torques estimation with proximal force/torque
+//! sensing", ICRA 2015.
 
 use std::ops::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
 
-use nalgebra::{Matrix3, Matrix4, Vector3};
+use nalgebra::{Matrix3, Matrix4, Vector3, Vector6};
 
 /// A vector in three-dimensional space.
 pub type Vec3 = Vector3<f64>;
@@ -105,6 +152,58 @@ impl Motion {
         Wrench {
             torque: self.angular.cross(&wrench.torque) + self.linear.cross(&wrench.force),
             force: self.angular.cross(&wrench.force),
+        }
+    }
+}
+
+impl Add for Motion {
+    type Output = Self;
+    #[inline]
+    fn add(self, other: Self) -> Self {
+        Self {
+            angular: self.angular + other.angular,
+            linear: self.linear + other.linear,
+        }
+    }
+}
+
+impl Sub for Motion {
+    type Output = Self;
+    #[inline]
+    fn sub(self, other: Self) -> Self {
+        Self {
+            angular: self.angular - other.angular,
+            linear: self.linear - other.linear,
+        }
+    }
+}
+
+impl AddAssign for Motion {
+    #[inline]
+    fn add_assign(&mut self, other: Self) {
+        self.angular += other.angular;
+        self.linear += other.linear;
+    }
+}
+
+impl Neg for Motion {
+    type Output = Self;
+    #[inline]
+    fn neg(self) -> Self {
+        Self {
+            angular: -self.angular,
+            linear: -self.linear,
+        }
+    }
+}
+
+impl Mul<f64> for Motion {
+    type Output = Self;
+    #[inline]
+    fn mul(self, factor: f64) -> Self {
+        Self {
+            angular: self.angular * factor,
+            linear: self.linear * factor,
         }
     }
 }
@@ -229,6 +328,12 @@ impl Mul<f64> for Wrench {
     }
 }
 
+/// Six numbers from two vectors: [angular; linear] or [torque; force].
+#[inline]
+pub(crate) fn stack(upper: &Vec3, lower: &Vec3) -> Vector6<f64> {
+    Vector6::new(upper.x, upper.y, upper.z, lower.x, lower.y, lower.z)
+}
+
 /// Pose of one frame in another: `x_ab` takes coordinates in `b` to coordinates in `a`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose {
@@ -262,6 +367,14 @@ impl Pose {
         }
     }
 
+    /// Whether every component is finite.
+    pub fn is_finite(&self) -> bool {
+        self.rotation
+            .iter()
+            .chain(self.translation.iter())
+            .all(|value| value.is_finite())
+    }
+
     /// `x_ba` from `x_ab`.
     pub fn inverse(&self) -> Self {
         let rotation = self.rotation.transpose();
@@ -271,14 +384,15 @@ impl Pose {
         }
     }
 
+    // `#[inline(always)]` here and below: as the crate grew, the compiler began to call these, and the kinematic pass took a third longer.
     /// A point of `b`, in `a`.
-    #[inline]
+    #[inline(always)]
     pub fn point(&self, point_b: &Vec3) -> Vec3 {
         self.rotation * point_b + self.translation
     }
 
     /// A wrench about the origin of `b`, taken to `a`: `X* f_b`.
-    #[inline]
+    #[inline(always)]
     pub fn wrench(&self, wrench_b: &Wrench) -> Wrench {
         let force = self.rotation * wrench_b.force;
         Wrench {
@@ -320,13 +434,26 @@ impl Pose {
     }
 }
 
+/// `a * b`, written out: nalgebra's loops over rows and columns are not unrolled here, and the kinematic pass took a fifth longer.
+#[inline(always)]
+fn product(a: &Mat3, b: &Mat3) -> Mat3 {
+    let at = |i: usize, j: usize| a[(i, 0)] * b[(0, j)] + a[(i, 1)] * b[(1, j)] + a[(i, 2)] * b[(2, j)];
+    #[rustfmt::skip]
+    let product = Mat3::new(
+        at(0, 0), at(0, 1), at(0, 2),
+        at(1, 0), at(1, 1), at(1, 2),
+        at(2, 0), at(2, 1), at(2, 2),
+    );
+    product
+}
+
 impl Mul for Pose {
     type Output = Self;
     /// `x_ac = x_ab * x_bc`.
-    #[inline]
+    #[inline(always)]
     fn mul(self, other: Self) -> Self {
         Self {
-            rotation: self.rotation * other.rotation,
+            rotation: product(&self.rotation, &other.rotation),
             translation: self.point(&other.translation),
         }
     }
@@ -380,6 +507,12 @@ impl RigidInertia {
             first_moment: centre * mass,
             inertia: inertia + shift * mass,
         }
+    }
+
+    /// Whether every component is finite.
+    pub fn is_finite(&self) -> bool {
+        let mut vectors = self.first_moment.iter().chain(self.inertia.iter());
+        self.mass.is_finite() && vectors.all(|value| value.is_finite())
     }
 
     /// From the ten parameters `[m, h_x, h_y, h_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz]` about the origin of the link.
@@ -449,7 +582,7 @@ impl RigidInertia {
     ///
     /// `f = m a + alpha x h + omega x (omega x h)`, `n = I alpha + omega x I omega + h x a`; `omega` [rad/s] and `alpha` [rad/s^2] are those of the
     /// body, `a` [m/s^2] the proper acceleration of the link's origin, all in link axes. Source: Featherstone 2008, eq. 2.72, with classical accelerations.
-    #[inline]
+    #[inline(always)]
     pub fn net_wrench(&self, omega: &Vec3, alpha: &Vec3, a: &Vec3) -> Wrench {
         let h = &self.first_moment;
         Wrench {
@@ -586,6 +719,20 @@ mod tests {
             prop_assert!((in_a.torque - carried.torque).norm() < 1e-11 * (1.0 + carried.torque.norm()));
             prop_assert!((in_a.force - carried.force).norm() < 1e-11 * (1.0 + carried.force.norm()));
             prop_assert_eq!(RigidInertia::from_parameters(&body.parameters()), body);
+        }
+
+        /// Motions add, subtract and scale as the space that power is linear on.
+        #[test]
+        fn power_is_linear_in_motions(m in (vector(), vector()), n in (vector(), vector()), f in (vector(), vector()), factor in -2.0..2.0_f64) {
+            let (m, n) = (Motion { angular: m.0, linear: m.1 }, Motion { angular: n.0, linear: n.1 });
+            let f = Wrench { torque: f.0, force: f.1 };
+            let (a, b) = (m.dot(&f), n.dot(&f));
+            let mut sum = m;
+            sum += n;
+            prop_assert_eq!(sum, m + n);
+            for (got, expected) in [((m + n).dot(&f), a + b), ((m - n).dot(&f), a - b), ((-m).dot(&f), -a), ((m * factor).dot(&f), a * factor)] {
+                prop_assert!((got - expected).abs() < 1e-12);
+            }
         }
 
         /// The check agrees with the definition: the pseudo-inertia is positive semidefinite.

@@ -2,12 +2,12 @@
 
 mod common;
 
-use common::{Random, RandomRobot, State, contact, external, gap, motion, size, wrench_gap};
+use common::{Random, RandomRobot, State, contact, external, gap, joint_axis, motion, size, twists, wrench_gap};
 use proprio_estimator::dynamics::{
-    Certainty, ContactKind, ContactSet, ContactSpec, ExternalWrench, FrameMotion, InverseDynamics, Kinematics, Noise,
-    Route, SensorCut, Solver, Structure,
+    Certainty, ContactKind, ContactSet, ContactSpec, Disagreement, ExternalWrench, FrameMotion, InverseDynamics,
+    Kinematics, Noise, Route, SensorCut, SensorSet, Sides, Solver, Structure,
 };
-use proprio_estimator::model::{Frame, JointKind, MeasurementDirection, MeasurementFrame, Model};
+use proprio_estimator::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
 use proprio_estimator::spatial::{Mat3, Motion, Pose, RigidInertia, Vec3, Wrench};
 use proptest::prelude::*;
 
@@ -151,6 +151,62 @@ impl Scene {
         }
     }
 
+    /// One side of a degree of freedom's joint within its sub-tree, link by link: the way the definition goes, not the solver.
+    fn side(&self, structure: &Structure, dof: usize, below: bool, active: &ContactSet) -> OneSide {
+        let kinematics = self.kinematics();
+        let joint = self.model.joints()[self.model.dof_joint(dof).unwrap()];
+        let number = structure.subtree_of(joint.child);
+        let members: Vec<usize> = (0..self.model.link_count())
+            .filter(|&link| structure.subtree_of(link) == number)
+            .filter(|&link| {
+                // Up the way to the root: whether the joint is on it.
+                let way = std::iter::successors(Some(link), |&at| (at > 0).then(|| self.model.joints()[at - 1].parent));
+                way.into_iter().any(|at| at == joint.child) == below
+            })
+            .collect();
+        let mut needs = Wrench::zero();
+        for &link in &members {
+            needs += kinematics.net_wrenches()[link];
+        }
+        for known in self.known.iter().filter(|known| members.contains(&known.frame.link)) {
+            needs -= kinematics
+                .pose(known.frame.link)
+                .wrench(&known.frame.pose.wrench(&known.wrench));
+        }
+        let (mut sensors, mut noise) = (SensorSet::EMPTY, Vec::new());
+        for (index, cut) in self.sensors.iter().enumerate() {
+            let sensor_joint = self.model.joints()[cut.joint()];
+            let sign = match [sensor_joint.child, sensor_joint.parent].map(|link| members.contains(&link)) {
+                [true, false] => 1.0,
+                [false, true] => -1.0,
+                _ => continue,
+            };
+            sensors.insert(index);
+            let pose = kinematics.pose(sensor_joint.child);
+            needs -= pose.wrench(&cut.transmitted(&self.readings[index])) * sign;
+            for (channel, deviation) in deviations_of(cut).into_iter().enumerate() {
+                let mut unit = [0.0; 6];
+                unit[channel] = deviation;
+                let unit = Wrench::from_parts([unit[0], unit[1], unit[2]], [unit[3], unit[4], unit[5]]);
+                noise.push(pose.wrench(&cut.transmitted(&unit)));
+            }
+        }
+        let axis = joint_axis(&kinematics, &joint).expect("it has a degree of freedom");
+        // By the parent on the child: what the child's side needs, and what is too much for the parent's.
+        let wrench = if below { needs } else { -needs };
+        OneSide {
+            is_free: !active
+                .iter()
+                .any(|contact| members.contains(&self.contacts[contact].frame.link)),
+            torque: axis.dot(&wrench),
+            deviation: noise.iter().map(|unit| axis.dot(unit).powi(2)).sum::<f64>().sqrt(),
+            sensors,
+            axis,
+            wrench,
+            noise,
+        }
+    }
+
     /// Magnitude that rounding is relative to: the greatest wrench anywhere, at arms of metres.
     fn size(&self) -> f64 {
         let kinematics = self.kinematics();
@@ -165,6 +221,20 @@ impl Scene {
         }
         size(&values)
     }
+}
+
+/// One side of a joint, in base coordinates.
+struct OneSide {
+    /// No contact that is present acts there.
+    is_free: bool,
+    torque: f64,
+    deviation: f64,
+    sensors: SensorSet,
+    axis: Motion,
+    /// By the joint's parent on its child.
+    wrench: Wrench,
+    /// What one deviation of each channel adds to it.
+    noise: Vec<Wrench>,
 }
 
 fn active_some(count: usize, random: &mut Random) -> ContactSet {
@@ -260,30 +330,11 @@ proptest! {
         let kinematics = kinematics(&model, random.below(model.link_count()), &state, &motion);
         let inverse = inverse(&model, &kinematics, &[]);
         let velocity = random.vector(1.0);
-        // Twists by their own recursion, in base coordinates: v_child = v_parent + s dq, the base moving at will.
+        // The base moves at will.
         let base_twist = Motion { angular: random.vector(1.0), linear: velocity };
-        let mut relative = vec![Motion::zero(); model.link_count()];
-        for joint in model.joints() {
-            let pose = kinematics.pose(joint.child);
-            let axis = match &joint.kind {
-                JointKind::Revolute(axis) => Motion::rotation(&(pose.rotation * axis.vector), &pose.translation),
-                JointKind::Prismatic(axis) => Motion::translation(&(pose.rotation * axis.vector)),
-                JointKind::Fixed => Motion::zero(),
-            };
-            let rate = joint.dof.map_or(0.0, |dof| state.0[1][dof]);
-            relative[joint.child] = Motion {
-                angular: relative[joint.parent].angular + axis.angular * rate,
-                linear: relative[joint.parent].linear + axis.linear * rate,
-            };
-        }
-        let of_base = relative[kinematics.base()];
         let mut power = -base_twist.dot(&inverse.base_wrench());
         let mut scale = power.abs().max(1.0);
-        for (twist, wrench) in relative.iter().zip(kinematics.net_wrenches()) {
-            let twist = Motion {
-                angular: base_twist.angular + twist.angular - of_base.angular,
-                linear: base_twist.linear + twist.linear - of_base.linear,
-            };
+        for (twist, wrench) in twists(&model, &kinematics, &state.0[1], &base_twist).iter().zip(kinematics.net_wrenches()) {
             power += twist.dot(wrench);
             scale += twist.dot(wrench).abs();
         }
@@ -456,10 +507,10 @@ proptest! {
         for link in 0..scene.model.link_count() {
             let old = scene.model.inertias()[link];
             let parameters = old.parameters().map(|x| x + random.real(0.5));
-            scene.model.set_inertia(link, RigidInertia::from_parameters(&parameters));
+            scene.model.set_inertia(link, RigidInertia::from_parameters(&parameters)).unwrap();
             let after = scene.solve(&structure, &active);
             unchanged(&after, &|dof| torque_dependence[dof].links.contains(link), &|k| contact_dependence[k].links.contains(link))?;
-            scene.model.set_inertia(link, old);
+            scene.model.set_inertia(link, old).unwrap();
         }
         for dof in 0..scene.model.dof_count() {
             let old = scene.state.clone();
@@ -639,6 +690,123 @@ proptest! {
         for (contact, variances) in before.contacts().iter().zip(&contacts) {
             for (deviation, variance) in contact.deviation.iter().zip(variances) {
                 prop_assert!((deviation - variance.sqrt()).abs() < tolerance, "{} {}", deviation, variance.sqrt());
+            }
+        }
+    }
+
+    /// A joint torque from one side is what the links of that side need less what its sensors and known wrenches give: nothing of the other side enters. There is
+    /// one exactly where no contact that is present acts, its deviation is that of its linear map from readings, and it is what `torque` uses where it uses one side.
+    #[test]
+    fn sides_are_each_sides_own((links, seed) in robots()) {
+        let mut random = Random::new(seed ^ 7);
+        let mut scene = Scene::new(links, seed, 3);
+        let structure = scene.structure();
+        let active = active_some(scene.contacts.len(), &mut random);
+        let exact = scene.solve(&structure, &scene.all());
+        let scale = scene.size();
+        for dof in 0..scene.model.dof_count() {
+            let Sides { child, parent } = exact.sides(&structure, dof).unwrap();
+            for side in [child, parent].into_iter().flatten() {
+                prop_assert!((side.torque - scene.torque[dof]).abs() < EXACT * scale, "readings of the truth tell it");
+            }
+        }
+        scene.disturb(&mut random);
+        let solver = scene.solve(&structure, &active);
+        let scale = scene.size();
+        for dof in 0..scene.model.dof_count() {
+            let sides = solver.sides(&structure, dof).unwrap();
+            let own = [true, false].map(|below| scene.side(&structure, dof, below, &active));
+            for (side, own) in [sides.child, sides.parent].into_iter().zip(&own) {
+                prop_assert_eq!(side.is_some(), own.is_free, "dof {}", dof);
+                let Some(side) = side else { continue };
+                prop_assert!((side.torque - own.torque).abs() < EXACT * scale, "{} {}", side.torque, own.torque);
+                prop_assert!((side.deviation - own.deviation).abs() < EXACT * scale, "{} {}", side.deviation, own.deviation);
+                prop_assert_eq!(side.sensors, own.sensors);
+            }
+            let (torque, deviation) = (solver.torque()[dof], solver.torque_deviation()[dof]);
+            match structure.route(dof, &active).unwrap() {
+                Route::Child => prop_assert_eq!(sides.child.unwrap().torque, torque),
+                Route::Parent => prop_assert_eq!(sides.parent.unwrap().torque, torque),
+                Route::Fused => {
+                    for side in [sides.child.unwrap(), sides.parent.unwrap()] {
+                        prop_assert!(deviation <= side.deviation * (1.0 + 1e-9));
+                    }
+                }
+                Route::Whole => prop_assert_eq!(sides, Sides::default()),
+            }
+            match (sides.disagreement(), &own) {
+                (Some(Disagreement { difference, deviation }), [child, parent]) => {
+                    prop_assert!((difference - (child.torque - parent.torque)).abs() < 2.0 * EXACT * scale);
+                    prop_assert!((deviation.powi(2) - child.deviation.powi(2) - parent.deviation.powi(2)).abs() < EXACT * scale);
+                }
+                (None, [child, parent]) => {
+                    let comparable = child.is_free && parent.is_free && !child.sensors.union(&parent.sensors).is_empty();
+                    prop_assert!(!comparable);
+                }
+            }
+        }
+    }
+
+    /// A wrong reading is seen on the side where its sensor is, and there only; so a large disagreement tells that one of the two is wrong.
+    #[test]
+    fn a_wrong_reading_stays_on_its_side((links, seed) in robots()) {
+        let mut random = Random::new(seed ^ 8);
+        let mut scene = Scene::new(links, seed, 2);
+        let structure = scene.structure();
+        let active = active_some(scene.contacts.len(), &mut random);
+        let before = scene.solve(&structure, &active);
+        for sensor in 0..scene.sensors.len() {
+            let old = scene.readings[sensor];
+            scene.readings[sensor] += random.wrench();
+            let (after, scale) = (scene.solve(&structure, &active), scene.size());
+            for dof in 0..scene.model.dof_count() {
+                let [a, b] = [&before, &after].map(|solver| solver.sides(&structure, dof).unwrap());
+                for (a, b) in [(a.child, b.child), (a.parent, b.parent)] {
+                    let (Some(a), Some(b)) = (a, b) else { continue };
+                    let change = (a.torque - b.torque).abs();
+                    if a.sensors.contains(sensor) {
+                        prop_assert!(change > 1e-9, "dof {} does not feel sensor {}", dof, sensor);
+                    } else {
+                        prop_assert!(change < EXACT * scale, "dof {} feels sensor {}", dof, sensor);
+                    }
+                    prop_assert_eq!((a.deviation, a.sensors), (b.deviation, b.sensors));
+                }
+            }
+            scene.readings[sensor] = old;
+        }
+    }
+
+    /// The order in which sensors are listed changes their numbers, nothing else; and the same input gives the same bits.
+    #[test]
+    fn sensor_order_is_irrelevant((links, seed) in robots()) {
+        let mut random = Random::new(seed ^ 9);
+        let mut scene = Scene::new(links, seed, 4);
+        scene.disturb(&mut random);
+        let active = active_some(scene.contacts.len(), &mut random);
+        let structure = scene.structure();
+        let (before, again) = (scene.solve(&structure, &active), scene.solve(&structure, &active));
+        prop_assert_eq!(before.torque(), again.torque());
+        let mut order: Vec<usize> = (0..scene.sensors.len()).collect();
+        random.shuffle(&mut order);
+        scene.sensors = order.iter().map(|&k| scene.sensors[k]).collect();
+        scene.readings = order.iter().map(|&k| scene.readings[k]).collect();
+        let other = scene.structure();
+        let after = scene.solve(&other, &active);
+        let scale = scene.size() * amplification(&before);
+        prop_assert!(gap(before.torque(), after.torque()) < EXACT * scale);
+        prop_assert!(gap(before.torque_deviation(), after.torque_deviation()) < 1e-7 * size(before.torque_deviation()));
+        for (a, b) in before.contacts().iter().zip(after.contacts()) {
+            prop_assert_eq!(a.certainty, b.certainty);
+            prop_assert!(wrench_gap(&a.wrench, &b.wrench) < EXACT * scale);
+        }
+        for dof in 0..scene.model.dof_count() {
+            let (a, b) = (before.sides(&structure, dof).unwrap(), after.sides(&other, dof).unwrap());
+            prop_assert_eq!(a, again.sides(&structure, dof).unwrap());
+            for (a, b) in [(a.child, b.child), (a.parent, b.parent)] {
+                prop_assert_eq!(a.is_some(), b.is_some());
+                let (Some(a), Some(b)) = (a, b) else { continue };
+                prop_assert!((a.torque - b.torque).abs() < EXACT * scale && (a.deviation - b.deviation).abs() < EXACT);
+                prop_assert_eq!(a.sensors, b.sensors.iter().map(|k| order[k]).collect());
             }
         }
     }
@@ -1022,6 +1190,410 @@ fn odd_sets_of_contacts_get_an_answer() {
     }
 }
 
+/// Fused is the mean of the two sides' wrenches, weighted by inverse covariance, along the axis: all six rows of the balance. So it is never worse than the two
+/// torques weighted by inverse variance, and mostly better.
+#[test]
+fn fused_is_the_mean_of_wrenches_weighted_by_inverse_covariance() {
+    use nalgebra::{Matrix6, Vector6};
+    let (mut fused, mut ratio) = (0, 0.0);
+    for seed in 0..150 {
+        let mut scene = Scene::new(25 + seed as usize % 16, seed, 1);
+        scene.disturb(&mut Random::new(seed ^ 10));
+        let structure = scene.structure();
+        let active = ContactSet::EMPTY;
+        let solver = scene.solve(&structure, &active);
+        let scale = scene.size();
+        for dof in 0..scene.model.dof_count() {
+            if structure.route(dof, &active) != Some(Route::Fused) {
+                continue;
+            }
+            let sides = [true, false].map(|below| scene.side(&structure, dof, below, &active));
+            // About the joint, where the two covariances are best compared.
+            let point = scene
+                .kinematics()
+                .pose(scene.model.dof_joint(dof).unwrap() + 1)
+                .translation;
+            let stack = |wrench: &Wrench| {
+                let Wrench { torque, force } = wrench.about(&point);
+                Vector6::new(torque.x, torque.y, torque.z, force.x, force.y, force.z)
+            };
+            let covariances = [0, 1].map(|i: usize| {
+                let columns = sides[i].noise.iter().map(&stack);
+                columns.fold(Matrix6::zeros(), |sum: Matrix6<f64>, column| {
+                    sum + column * column.transpose()
+                })
+            });
+            let weights =
+                covariances.map(|covariance| covariance.cholesky().expect("noise in all directions").inverse());
+            let together = (weights[0] + weights[1]).cholesky().unwrap();
+            let mean = together.solve(&(weights[0] * stack(&sides[0].wrench) + weights[1] * stack(&sides[1].wrench)));
+            let axis = &sides[0].axis;
+            let linear = axis.linear + axis.angular.cross(&point);
+            let s = Vector6::from_iterator(axis.angular.iter().chain(linear.iter()).copied());
+            let deviation = s.dot(&together.solve(&s)).sqrt();
+            assert!(
+                (solver.torque()[dof] - s.dot(&mean)).abs() < 1e-8 * scale,
+                "{} {}",
+                solver.torque()[dof],
+                s.dot(&mean)
+            );
+            assert!((solver.torque_deviation()[dof] - deviation).abs() < 1e-6 * deviation);
+            let two_numbers = (sides[0].deviation.powi(-2) + sides[1].deviation.powi(-2)).powf(-0.5);
+            assert!(deviation <= two_numbers * (1.0 + 1e-9));
+            ratio += deviation / two_numbers;
+            fused += 1;
+        }
+    }
+    assert!(fused > 100, "{fused}");
+    let ratio = ratio / f64::from(fused);
+    println!("{fused} fused torques; deviation {ratio:.3} of that of the mean of two numbers");
+    assert!(ratio < 0.95, "{ratio}");
+}
+
+/// Noise drawn again and again: the spread of both sides, of their difference, of the fused torque and of chi-square is what is announced.
+#[test]
+fn deviations_are_those_of_many_draws() {
+    const DRAWS: usize = 4000;
+    let model = leg();
+    let sensors = vec![
+        child_sensor(&model, "hip_ft", 0.2, 0.004),
+        child_sensor(&model, "foot_ft", 0.1, 0.002),
+    ];
+    let mut random = Random::new(21);
+    let mut scene = Scene::with(model, sensors, vec![], vec![], &mut random);
+    let (structure, exact) = (scene.structure(), scene.readings.clone());
+    let number = structure.subtree_of(scene.model.frame("link2").unwrap().link).unwrap();
+    // Irwin and Hall: twelve uniform numbers have a variance of one.
+    let mut normal = || (0..12).map(|_| random.real(0.5)).sum::<f64>();
+    let mut squares = [[0.0; 4]; 2];
+    let (mut chi_square, mut solver) = (0.0, None);
+    for _ in 0..DRAWS {
+        for ((reading, exact), cut) in scene.readings.iter_mut().zip(&exact).zip(&scene.sensors) {
+            let noise = deviations_of(cut).map(|deviation| deviation * normal());
+            *reading = *exact + Wrench::from_parts([noise[0], noise[1], noise[2]], [noise[3], noise[4], noise[5]]);
+        }
+        let drawn = scene.solve(&structure, &ContactSet::EMPTY);
+        chi_square += drawn.balances()[number].chi_square.unwrap() / DRAWS as f64;
+        for (dof, squares) in squares.iter_mut().enumerate() {
+            let sides = drawn.sides(&structure, dof).unwrap();
+            let (truth, apart) = (scene.torque[dof], sides.disagreement().unwrap());
+            let errors = [
+                sides.child.unwrap().torque - truth,
+                sides.parent.unwrap().torque - truth,
+                apart.difference,
+                drawn.torque()[dof] - truth,
+            ];
+            for (sum, error) in squares.iter_mut().zip(errors) {
+                *sum += error * error / DRAWS as f64;
+            }
+        }
+        solver = Some(drawn);
+    }
+    let solver = solver.unwrap();
+    // A mean square of 4000 draws is within 2.2 % of its expectation one time in two to three (1 / sqrt(2000)), and within four times that all but always.
+    let near = |mean_square: f64, deviation: f64| (mean_square / deviation.powi(2) - 1.0).abs() < 0.09;
+    for (dof, squares) in squares.iter().enumerate() {
+        let sides = solver.sides(&structure, dof).unwrap();
+        let announced = [
+            sides.child.unwrap().deviation,
+            sides.parent.unwrap().deviation,
+            sides.disagreement().unwrap().deviation,
+            solver.torque_deviation()[dof],
+        ];
+        for (square, deviation) in squares.iter().zip(announced) {
+            assert!(near(*square, deviation), "dof {dof}: {} {deviation}", square.sqrt());
+        }
+    }
+    assert_eq!(solver.balances()[number].degrees, 6);
+    assert!(near(chi_square, 6.0_f64.sqrt()), "{chi_square}");
+}
+
+/// Nothing is told of what was not solved or is not there.
+#[test]
+fn sides_of_nothing() {
+    let model = leg();
+    let sensors = vec![child_sensor(&model, "hip_ft", 0.2, 0.004)];
+    let scene = Scene::with(model.clone(), sensors.clone(), vec![], vec![], &mut Random::new(22));
+    let structure = scene.structure();
+    assert_eq!(Solver::new(&structure).sides(&structure, 0), Ok(Sides::default()));
+    let solver = scene.solve(&structure, &ContactSet::EMPTY);
+    assert_eq!(solver.sides(&structure, 99), Ok(Sides::default()));
+    let other = Structure::new(&model, &[], &[], 0.1).unwrap();
+    assert!(solver.sides(&other, 0).is_err());
+    // Beyond the hip's sensor everything hangs free: the model alone from the child's side, the sensor from the parent's.
+    let Sides { child, parent } = solver.sides(&structure, 0).unwrap();
+    let (child, parent) = (child.unwrap(), parent.unwrap());
+    assert!(child.sensors.is_empty() && child.deviation == 0.0);
+    assert!(parent.sensors.contains(0) && parent.deviation > 0.0);
+    assert_eq!(
+        solver.sides(&structure, 0).unwrap().disagreement().unwrap().deviation,
+        parent.deviation
+    );
+    // No sensor at all: two sides of which nothing is measured can not disagree.
+    let bare = Scene::with(model, vec![], vec![], vec![], &mut Random::new(23));
+    let sides = bare.solve(&other, &ContactSet::EMPTY).sides(&other, 0).unwrap();
+    assert!(sides.child.is_some() && sides.parent.is_some() && sides.disagreement().is_none());
+}
+
+/// What a contact of one kind can not explain shows in chi-square, by the amount that the sensor's noise says.
+#[test]
+fn contradictory_readings_show_in_chi_square() {
+    let model = chain(&[("ft", "fixed"), ("elbow", "continuous")]);
+    let sensors = vec![child_sensor(&model, "ft", 0.1, 0.002)];
+    // The contacts are at the sensor's point and along its axes; the elbow has no part in it.
+    let at = |kind| ContactSpec {
+        frame: model.frame("link1").unwrap(),
+        kind,
+        position: Vec3::zeros(),
+    };
+    let kinds = [
+        (ContactKind::ForceAlong(Vec3::x() * 3.0), 5),
+        (ContactKind::Force, 3),
+        (ContactKind::Wrench, 0),
+    ];
+    for (kind, degrees) in kinds {
+        let truth = vec![Wrench {
+            torque: Vec3::zeros(),
+            force: Vec3::new(7.0, 0.0, 0.0),
+        }];
+        let mut scene = Scene::with(
+            model.clone(),
+            sensors.clone(),
+            vec![at(kind)],
+            truth,
+            &mut Random::new(24),
+        );
+        let structure = scene.structure();
+        let number = structure.subtree_of(1).unwrap();
+        let balance = |scene: &Scene| {
+            let solver = scene.solve(&structure, &scene.all());
+            assert_eq!(solver.contacts()[0].certainty, Certainty::Determined);
+            // One unknown through the sensor's own point: its deviation is that of the sensor's force.
+            assert!((solver.contacts()[0].deviation[0] - 0.1).abs() < 1e-12);
+            let force = solver.contacts()[0].wrench.force.x;
+            (solver.balances()[number], force)
+        };
+        let (quiet, force) = balance(&scene);
+        assert_eq!(quiet.degrees, degrees);
+        assert!(quiet.chi_square.unwrap() < 1e-9 && (force - 7.0).abs() < 1e-9);
+        // 0.5 N across, 0.03 Nm: five and fifteen deviations.
+        scene.readings[0].force.y += 0.5;
+        scene.readings[0].torque.z += 0.03;
+        let (loud, force) = balance(&scene);
+        let expected = match degrees {
+            5 => 25.0 + 225.0,
+            3 => 225.0,
+            _ => 0.0,
+        };
+        let chi_square = loud.chi_square.unwrap();
+        assert!(
+            (chi_square - expected).abs() < 1e-6 * (1.0 + expected),
+            "{kind:?}: {chi_square}"
+        );
+        assert!((force - 7.0).abs() < 1e-9, "what the contact can explain is as before");
+        // The sensor reads the wrench by the child on the parent, so what the links need less of it grows by what was added; the rest stays unexplained.
+        let unexplained = [f64::from(degrees == 5) * 0.5, f64::from(degrees > 0) * 0.03];
+        let residual = loud.residual;
+        assert!((residual.force.y - unexplained[0]).abs() < 1e-9, "{residual:?}");
+        assert!((residual.torque.z - unexplained[1]).abs() < 1e-9, "{residual:?}");
+    }
+}
+
+/// Two forces push against each other along the line between them, and nobody sees how hard. A joint between whose axis meets that line does not feel it: its
+/// torque is determined; one whose axis does not is not. Even where the forces' directions are known to be that line, so that nothing of them but rounding
+/// reaches the joint.
+#[test]
+fn what_two_forces_do_to_each_other_is_not_seen() {
+    let text = |axis: &str| {
+        let inertial = "<inertial><origin xyz=\"0.01 0.02 0.1\"/><mass value=\"1.5\"/>\
+                        <inertia ixx=\"0.02\" ixy=\"0\" ixz=\"0\" iyy=\"0.03\" iyz=\"0\" izz=\"0.04\"/></inertial>";
+        let links: String = (0..3)
+            .map(|link| format!("<link name=\"link{link}\">{inertial}</link>"))
+            .collect();
+        format!(
+            "<robot name=\"grip\">{links}\
+             <joint name=\"ft\" type=\"fixed\"><parent link=\"link0\"/><child link=\"link1\"/><origin xyz=\"0.3 0.1 0.2\" rpy=\"0.4 0.5 0.6\"/></joint>\
+             <joint name=\"elbow\" type=\"continuous\"><parent link=\"link1\"/><child link=\"link2\"/><origin xyz=\"0.13 -0.27 0.31\"/><axis xyz=\"{axis}\"/></joint></robot>"
+        )
+    };
+    let u = Vec3::new(0.5, -0.1, 0.9);
+    let cases = [
+        (ContactKind::Force, 1, "0.2 0.7 0.3", Certainty::Determined),
+        (ContactKind::Force, 1, "0.2 0.7 0.3000001", Certainty::Assumed),
+        (ContactKind::ForceAlong(u), 5, "0.2 0.7 0.3", Certainty::Determined),
+        (ContactKind::ForceAlong(u), 5, "0.2 0.7 0.3000001", Certainty::Assumed),
+    ];
+    for (kind, degrees, axis, certainty) in cases {
+        let model = Model::from_urdf(&text(axis), &["ft"]).unwrap();
+        let elbow = Vec3::new(0.13, -0.27, 0.31);
+        // With the elbow at zero link 1 and link 2 have the same axes. Both contacts in the plane of the first axis and u, the line through q = elbow + 0.17 axis.
+        let direction = Vec3::new(0.2, 0.7, 0.3);
+        let meeting = elbow + direction * 0.17;
+        let at = |link: &str, position: Vec3| ContactSpec {
+            frame: model.frame(link).unwrap(),
+            kind,
+            position,
+        };
+        let contacts = vec![at("link1", meeting - u * 0.3), at("link2", meeting + u * 0.45 - elbow)];
+        let sensors = vec![child_sensor(&model, "ft", 0.1, 0.002)];
+        let mut random = Random::new(25);
+        let mut scene = Scene::with(model.clone(), sensors, contacts, vec![Wrench::zero(); 2], &mut random);
+        scene.state.0[0].fill(0.0);
+        let structure = scene.structure();
+        assert_eq!(structure.route(0, &scene.all()), Some(Route::Whole));
+        let solver = scene.solve(&structure, &scene.all());
+        assert_eq!(solver.balances()[1].degrees, degrees);
+        assert!(
+            solver
+                .contacts()
+                .iter()
+                .all(|contact| contact.certainty == Certainty::Assumed)
+        );
+        assert_eq!(solver.torque_certainty()[0], certainty, "{kind:?} axis {axis}");
+    }
+}
+
+/// As many contacts as there may be, all in one sub-tree and many of them alike, on links some of which have no mass: the balance closes, the sum of the forces is
+/// what the sensor says, and their order does not matter.
+#[test]
+fn sixty_four_contacts_in_one_subtree() {
+    let mut model = chain(&[
+        ("ft", "fixed"),
+        ("elbow", "continuous"),
+        ("wrist", "prismatic"),
+        ("tip", "continuous"),
+    ]);
+    model.set_inertia(2, RigidInertia::zero()).unwrap();
+    model.set_inertia(4, RigidInertia::zero()).unwrap();
+    for seed in 0..20 {
+        let mut random = Random::new(seed);
+        let mut contacts = Vec::new();
+        for number in 0..64 {
+            let link = 1 + random.below(4);
+            let frame = Frame {
+                link,
+                pose: random.pose(),
+            };
+            let position = random.vector(0.2);
+            let kind = match (seed + number) % 4 {
+                0 if seed % 3 == 0 => ContactKind::Wrench,
+                1 => ContactKind::ForceAlong(random.vector(1.0).add_scalar(0.01)),
+                _ => ContactKind::Force,
+            };
+            contacts.push(ContactSpec { frame, kind, position });
+            if contacts.len() > 2 && random.chance(30) {
+                let twin = contacts[random.below(contacts.len())];
+                contacts[number as usize] = twin;
+            }
+        }
+        // Everything on one line, for once.
+        if seed == 7 {
+            for (contact, step) in contacts.iter_mut().zip(0..) {
+                let frame = Frame {
+                    link: 1,
+                    pose: Pose::identity(),
+                };
+                let position = Vec3::new(0.1, 0.2, 0.3) * f64::from(step);
+                *contact = ContactSpec {
+                    frame,
+                    kind: ContactKind::Force,
+                    position,
+                };
+            }
+        }
+        let truth = vec![Wrench::zero(); 64];
+        let mut scene = Scene::with(
+            model.clone(),
+            vec![child_sensor(&model, "ft", 0.1, 0.002)],
+            contacts,
+            truth,
+            &mut random,
+        );
+        scene.disturb(&mut random);
+        let structure = scene.structure();
+        let solver = scene.solve(&structure, &scene.all());
+        let number = structure.subtree_of(1).unwrap();
+        let balance = solver.balances()[number];
+        assert_eq!(balance.degrees, if seed == 7 { 1 } else { 0 });
+        assert!(
+            solver
+                .contacts()
+                .iter()
+                .all(|contact| contact.certainty == Certainty::Assumed)
+        );
+        let scale = scene.size();
+        if seed != 7 {
+            assert!(wrench_gap(&balance.residual, &Wrench::zero()) < EXACT * scale);
+            assert!(balance.chi_square.unwrap() < EXACT * scale);
+        }
+        let kinematics = scene.kinematics();
+        let mut sum = Wrench::zero();
+        for (contact, spec) in solver.contacts().iter().zip(&scene.contacts) {
+            sum += (*kinematics.pose(spec.frame.link) * spec.frame.pose).wrench(&contact.wrench);
+        }
+        let none = scene.solve(&structure, &ContactSet::EMPTY).balances()[number].residual;
+        let residual = kinematics.pose(1).wrench(&(none - balance.residual));
+        assert!(
+            wrench_gap(&sum, &residual) < EXACT * scale,
+            "the contacts are what the rest leaves"
+        );
+        let mut order: Vec<usize> = (0..64).collect();
+        random.shuffle(&mut order);
+        scene.contacts = order.iter().map(|&k| scene.contacts[k]).collect();
+        let after = scene.solve(&scene.structure(), &scene.all());
+        assert!(gap(solver.torque(), after.torque()) < EXACT * scale);
+        for (new, &old) in order.iter().enumerate() {
+            assert!(wrench_gap(&solver.contacts()[old].wrench, &after.contacts()[new].wrench) < EXACT * scale);
+        }
+    }
+}
+
+/// Noise of very different sizes, contacts far outside of the robot, readings beyond any sensor: numbers all the same (`solve` of a scene checks every one).
+#[test]
+fn extremes_give_numbers() {
+    let model = leg();
+    let direction = Vec3::new(0.3, 0.2, 0.1);
+    for (force, torque) in [(0.1, 0.002), (1e9, 1e-9), (1e-9, 1e9)] {
+        let noise = Noise {
+            force: [force, 0.1, 1.0],
+            torque: [0.1, torque, 0.01],
+        };
+        let uneven = SensorCut::new(
+            &model,
+            "foot_ft",
+            MeasurementFrame::Child,
+            MeasurementDirection::ChildToParent,
+            &Pose::identity(),
+            &noise,
+        )
+        .unwrap();
+        for (far, load) in [(0.1, 1.0), (1e10, 1e12), (1e80, 1e6), (1e200, 1e100)] {
+            for kind in [
+                ContactKind::Wrench,
+                ContactKind::Force,
+                ContactKind::ForceAlong(direction),
+            ] {
+                for other in [child_sensor(&model, "foot_ft", 0.1, 0.002), uneven] {
+                    let at = |link: &str, position: Vec3| ContactSpec {
+                        frame: model.frame(link).unwrap(),
+                        kind,
+                        position,
+                    };
+                    let contacts = vec![at("link2", Vec3::new(1.0, 0.3, 0.1) * far), at("link3", direction)];
+                    let sensors = vec![child_sensor(&model, "hip_ft", force, torque), other];
+                    let truth = vec![Wrench::zero(); 2];
+                    let mut scene = Scene::with(model.clone(), sensors, contacts, truth, &mut Random::new(3));
+                    scene.readings[0].force.x += load;
+                    let structure = scene.structure();
+                    for active in [scene.all(), [0].into_iter().collect(), ContactSet::EMPTY] {
+                        scene.solve(&structure, &active);
+                    }
+                }
+            }
+        }
+    }
+}
+
 /// Whatever does not fit is refused, and the results stay as they were.
 #[test]
 fn wrong_input_is_refused_and_changes_nothing() {
@@ -1087,6 +1659,23 @@ fn wrong_input_is_refused_and_changes_nothing() {
         &[nowhere],
     );
     assert_eq!(refused, Err(DynamicsError::NoLink(77)));
+    let mut askew = ExternalWrench {
+        frame: Frame {
+            link: 1,
+            ..nowhere.frame
+        },
+        ..nowhere
+    };
+    askew.frame.pose.translation.z = f64::NAN;
+    let refused = solver.solve(
+        &model,
+        &structure,
+        &kinematics,
+        &scene.readings,
+        &ContactSet::EMPTY,
+        &[askew],
+    );
+    assert!(matches!(refused, Err(DynamicsError::NotFinite { index: 0, .. })));
     assert_eq!(solver.torque(), before);
 
     let (zeros, mut bad) = (vec![0.0; 3], vec![0.0; 3]);
@@ -1136,6 +1725,12 @@ fn wrong_input_is_refused_and_changes_nothing() {
         ),
         Some(StructureError::Contact { index: 0 })
     );
+    let mut askew = flat;
+    askew.frame.pose.rotation[(1, 2)] = f64::NAN;
+    assert_eq!(
+        build(&sensors, &[askew], 0.1),
+        Some(StructureError::Contact { index: 0 })
+    );
     assert!(matches!(
         build(&sensors, &vec![flat; 65], 0.1),
         Some(StructureError::TooMany { most: 64, .. })
@@ -1156,6 +1751,15 @@ fn wrong_input_is_refused_and_changes_nothing() {
         .err()
     };
     assert_eq!(cut("hip_ft", 0.0), Some(StructureError::Noise("hip_ft".to_owned())));
+    assert_eq!(cut("hip_ft", 1e-200), Some(StructureError::Noise("hip_ft".to_owned())));
+    let noise = sensors[0].noise();
+    let mut nowhere = Pose::identity();
+    nowhere.translation.y = f64::INFINITY;
+    let (frame, direction) = (MeasurementFrame::Sensor, MeasurementDirection::ChildToParent);
+    assert_eq!(
+        SensorCut::new(&model, "hip_ft", frame, direction, &nowhere, &noise).err(),
+        Some(StructureError::SensorPose("hip_ft".to_owned()))
+    );
     assert_eq!(cut("knee", 0.1), Some(StructureError::JointMoves("knee".to_owned())));
     assert_eq!(cut("nose", 0.1), Some(StructureError::NoJoint("nose".to_owned())));
 }
@@ -1469,4 +2073,63 @@ mod golden {
             }
         }
     }
+}
+
+/// A base changed between two updates, in every kind of robot: everything is at once as if it had been the base from the start.
+#[test]
+fn a_new_base_holds_at_once() {
+    let mut random = Random::new(31);
+    for links in [1, 2, 7, 25] {
+        let robot = RandomRobot::new(links, &mut random);
+        let model = robot.model();
+        let state = State::new(&model, &mut random);
+        let first = random.below(model.link_count());
+        let mut changed = kinematics(&model, first, &state, &motion(&mut random));
+        for _ in 0..3 {
+            let second = random.below(model.link_count());
+            let fresh = kinematics(&model, second, &state, changed.motion(second));
+            changed.set_base(&model, second).unwrap();
+            assert_eq!(changed.base(), second);
+            let size = size(
+                &fresh
+                    .net_wrenches()
+                    .iter()
+                    .flat_map(Wrench::force_first)
+                    .collect::<Vec<_>>(),
+            );
+            for link in 0..model.link_count() {
+                let (got, want) = (changed.pose(link), fresh.pose(link));
+                assert!(
+                    (got.rotation - want.rotation).amax() < EXACT
+                        && (got.translation - want.translation).amax() < EXACT
+                );
+                let gap = wrench_gap(&changed.net_wrenches()[link], &fresh.net_wrenches()[link]);
+                assert!(gap < EXACT * size, "{gap}");
+            }
+            let (a, b) = (inverse(&model, &changed, &[]), inverse(&model, &fresh, &[]));
+            assert!(gap(a.torque(), b.torque()) < EXACT * size);
+            assert!(wrench_gap(&a.base_wrench(), &b.base_wrench()) < EXACT * size);
+        }
+    }
+}
+
+/// As many links, other joints: refused, not computed with what another model left behind.
+#[test]
+fn a_model_with_other_joints_is_refused() {
+    use proprio_estimator::dynamics::DynamicsError;
+    let (moving, kept) = (
+        chain(&[("a", "revolute"), ("b", "prismatic")]),
+        chain(&[("a", "revolute"), ("b", "fixed")]),
+    );
+    assert_eq!(moving.link_count(), kept.link_count());
+    let state = State([vec![0.1; 2], vec![0.0; 2], vec![0.0; 2]]);
+    let still = FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.81));
+    let mut kinematics = Kinematics::new(&kept, 0).unwrap();
+    let refused = DynamicsError::Size {
+        what: "degrees of freedom of the model",
+        got: 2,
+        expected: 1,
+    };
+    assert_eq!(kinematics.update(&moving, state.get(), &still), Err(refused));
+    assert_eq!(kinematics.set_base(&moving, 1), Err(refused));
 }

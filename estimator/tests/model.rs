@@ -418,3 +418,37 @@ proptest! {
         }
     }
 }
+
+/// An inertia goes to the body that was named or nowhere, and only if it is made of numbers.
+#[test]
+fn an_inertia_is_replaced_or_refused() {
+    let mut model = RandomRobot::new(6, &mut Random::new(1)).model();
+    let count = model.link_count();
+    let before = model.inertias().to_vec();
+    let new = RigidInertia::from_parameters(&[1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0]);
+    assert_eq!(model.set_inertia(count, new), Err(ModelError::NoLink(count)));
+    for parameter in 0..10 {
+        for wrong in [f64::NAN, f64::INFINITY] {
+            let mut parameters = new.parameters();
+            parameters[parameter] = wrong;
+            let error = model
+                .set_inertia(1, RigidInertia::from_parameters(&parameters))
+                .unwrap_err();
+            assert_eq!(
+                error.to_string(),
+                format!("link {}: the inertia given for it is not finite", model.link_name(1))
+            );
+        }
+    }
+    assert_eq!(model.inertias(), before);
+    model.set_inertia(1, new).unwrap();
+    assert_eq!(model.inertias()[1], new);
+    assert!(
+        model
+            .inertias()
+            .iter()
+            .zip(&before)
+            .enumerate()
+            .all(|(link, (now, old))| (now == old) == (link != 1))
+    );
+}

@@ -612,3 +612,213 @@ fn each_mistake_between_configuration_and_model_has_one_clear_message() {
         "{error}"
     );
 }
+
+/// A robot that stands on its chest, then on its hand, then on nothing: the base changes with what is declared, and the torques are the truth's.
+#[test]
+fn the_base_is_the_link_that_stands() {
+    use proprio_estimator::config::{Base, Foot, Presence};
+    use proprio_estimator::dynamics::{FrameMotion, InverseDynamics, JointState as State, Kinematics};
+    use proprio_estimator::spatial::Vec3;
+
+    const GRAVITY: [[f64; 3]; 2] = [[0.0, 0.0, -9.80665], [3.0, 0.0, -9.3]];
+    let on = |config: &mut Config| {
+        let foot = |link: &str, contact: &str, gravity_mps2| Foot {
+            link: link.into(),
+            contact: contact.into(),
+            gravity_mps2,
+        };
+        config.base = Base::Stance {
+            foot: vec![foot("chest", "stand", GRAVITY[0]), foot("l_hand", "hand", GRAVITY[1])],
+        };
+        for contact in &mut config.contact {
+            contact.presence = Presence::Possible;
+        }
+    };
+    let setup = setup(on);
+    let (stand, hand) = (setup.contact("stand").unwrap(), setup.contact("hand").unwrap());
+    let dofs = setup.model.dof_count();
+    let mut pipeline = Pipeline::new(setup.clone());
+    let ms = Nanos::from_millis;
+    for (contact, t, active) in [
+        (stand, 0, true),
+        (stand, 40, false),
+        (hand, 30, true),
+        (hand, 70, false),
+    ] {
+        pipeline.declare(contact, ms(t), active);
+    }
+    for step in 0..100 {
+        let t = ms(step);
+        let value = |dof: usize, factor: f64| (0.05 * step as f64 * factor + dof as f64).sin();
+        let states = [1.0, 2.0, 5.0].map(|factor| (0..dofs).map(|dof| value(dof, factor)).collect::<Vec<f64>>());
+        // While both are declared, the one that is listed first is the base.
+        let foot = usize::from(step >= 40);
+        let base = [setup.base_link, setup.model.frame("l_hand").unwrap().link][foot];
+        let mut truth = Kinematics::new(&setup.model, base).unwrap();
+        let state = State {
+            position: &states[0],
+            velocity: &states[1],
+            acceleration: &states[2],
+        };
+        let standing = FrameMotion::standing(&Vec3::from(GRAVITY[foot]));
+        truth.update(&setup.model, state, &standing).unwrap();
+        let mut dynamics = InverseDynamics::new(&setup.model);
+        dynamics.update(&setup.model, &truth, &[]).unwrap();
+        let sensor = setup.structure.sensors()[0];
+        let [fx, fy, fz, tx, ty, tz] = sensor
+            .reading(&dynamics.transmitted(&truth, sensor.joint()))
+            .force_first();
+        for (number, channel) in setup.channels().iter().enumerate() {
+            let reading = match channel.role {
+                proprio_estimator::setup::Use::Joint(dof) => Reading::Joint(JointState {
+                    position: states[0][dof],
+                    velocity: states[1][dof],
+                    acceleration: states[2][dof],
+                    ..JointState::ABSENT
+                }),
+                _ => Reading::Wrench(Wrench {
+                    force: [fx, fy, fz],
+                    torque: [tx, ty, tz],
+                }),
+            };
+            pipeline.push(number, t, &reading, Quality::GOOD);
+        }
+        let estimate = pipeline.poll().expect("every channel has this instant");
+        for (joint, want) in estimate.torques.joints().iter().zip(dynamics.torque()) {
+            // Both are declared from 30 to 40 ms: each half of the robot has one of them.
+            if step < 70 {
+                assert_eq!((joint.valid, joint.reason), (1, Reason::None), "at {step} ms");
+                assert!(
+                    (joint.torque - want).abs() < 1e-10,
+                    "at {step} ms: {} {want}",
+                    joint.torque
+                );
+            } else {
+                // Nothing tells how the base moves; and what carries the robot is not known either.
+                assert_eq!((joint.valid, joint.reason), (0, Reason::NoStance), "at {step} ms");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_foot_needs_a_contact_that_can_carry() {
+    use proprio_estimator::config::{Base, ContactKind, Foot};
+    let foot = |link: &str, contact: &str| Foot {
+        link: link.into(),
+        contact: contact.into(),
+        gravity_mps2: [0.0, 0.0, -9.8],
+    };
+    let problem = |kind, foot| {
+        let mut config = Config::load(&root().join("config/icub_left_arm/estimator.toml")).unwrap();
+        config.contact[0].kind = kind;
+        config.base = Base::Stance { foot };
+        Setup::new(&config).map(|s| s.to_string()).unwrap_err()
+    };
+    for (second, expected) in [
+        (
+            foot("l_hand", "hand"),
+            "contact \"stand\" is always present, so that no foot after this one would ever be the base",
+        ),
+        (foot("chest", "stand"), "contact \"stand\" is always present"),
+    ] {
+        let problem = problem(ContactKind::Wrench, vec![foot("chest", "stand"), second]);
+        assert!(problem.contains(expected), "{expected}: {problem}");
+    }
+    for (link, contact, kind, expected) in [
+        (
+            "chst",
+            "stand",
+            ContactKind::Wrench,
+            "base.foot \"chst\": link: \"chst\" is not a link of the URDF; did you mean \"chest\"?",
+        ),
+        (
+            "chest",
+            "stnd",
+            ContactKind::Wrench,
+            "contact = \"stnd\" is not a contact; did you mean \"stand\"?",
+        ),
+        (
+            "chest",
+            "hand",
+            ContactKind::Wrench,
+            "must be on the same link and of kind \"wrench\"",
+        ),
+        (
+            "chest",
+            "stand",
+            ContactKind::Force,
+            "must be on the same link and of kind \"wrench\"",
+        ),
+    ] {
+        let problem = problem(kind, vec![foot(link, contact)]);
+        assert!(problem.contains(expected), "{expected}: {problem}");
+    }
+}
+
+#[test]
+fn the_plan_says_what_each_sensor_can_tell_of_the_links() {
+    use proprio_estimator::config::{Base, Presence};
+    let possible = |config: &mut Config| {
+        for contact in &mut config.contact {
+            contact.presence = Presence::Possible;
+        }
+    };
+    // Four links and three revolute joints above the sensor, five and four beyond it; each joint hides three directions.
+    let text = setup(possible).to_string();
+    for expected in [
+        "31 independent combinations of its 40 inertial parameters show",
+        "38 independent combinations of its 50 inertial parameters show",
+    ] {
+        assert!(text.contains(expected), "{expected}:\n{text}");
+    }
+    // A contact that is always there takes up whatever the links make.
+    let text = setup(|_| {}).to_string();
+    for contact in ["stand", "hand"] {
+        let expected = format!("none of its inertial parameters shows in its F/T while {contact} is present");
+        assert!(text.contains(&expected), "{expected}:\n{text}");
+    }
+    // So does what carries a fixed base; and a locked joint makes one body of two.
+    let less = setup(|config| {
+        possible(config);
+        config.base = Base::Fixed {
+            link: "chest".into(),
+            gravity_mps2: [0.0, 0.0, -9.80665],
+        };
+        config.locked.insert("l_wrist_yaw".into(), 0.3);
+    });
+    let text = less.to_string();
+    for expected in [
+        "none of its inertial parameters shows in its F/T while what the base stands on is present",
+        "31 independent combinations of its 50 inertial parameters show",
+    ] {
+        assert!(text.contains(expected), "{expected}:\n{text}");
+    }
+}
+
+#[test]
+fn a_torque_that_is_too_uncertain_is_withheld() {
+    let estimate = |bound| {
+        let setup = setup(|config| config.output.max_torque_std_nm = Some(bound));
+        let events = recording(&setup, 0.2);
+        run(setup, &events).0.pop().unwrap()
+    };
+    let wide = estimate(1.0);
+    let deviations: Vec<f64> = wide.torques.joints().iter().map(|j| j.standard_deviation).collect();
+    assert!(wide.torques.joints().iter().all(|j| j.valid == 1), "{deviations:?}");
+    // Between the least and the greatest: some are withheld and keep their numbers.
+    let greatest = deviations.iter().copied().fold(0.0, f64::max);
+    let narrow = estimate(0.9 * greatest);
+    assert!(narrow.torques.joints().iter().any(|j| j.valid == 1));
+    for (joint, other) in narrow.torques.joints().iter().zip(wide.torques.joints()) {
+        let expected = if other.standard_deviation > 0.9 * greatest {
+            Reason::Uncertain
+        } else {
+            Reason::None
+        };
+        assert_eq!(
+            (joint.reason, joint.torque.to_bits()),
+            (expected, other.torque.to_bits())
+        );
+    }
+}

@@ -21,7 +21,7 @@ const SWEEPS: usize = 30;
 
 /// Solution operator of one set of six equations.
 #[derive(Clone, Debug)]
-pub(super) struct LeastSquares {
+pub(crate) struct LeastSquares {
     /// Columns of `Q^T M`, one per unknown.
     columns: Vec<Vector6<f64>>,
     weights: Vec<f64>,
@@ -34,7 +34,7 @@ pub(super) struct LeastSquares {
 
 impl LeastSquares {
     /// Room for `capacity` unknowns.
-    pub(super) fn with_capacity(capacity: usize) -> Self {
+    pub(crate) fn with_capacity(capacity: usize) -> Self {
         Self {
             columns: Vec::with_capacity(capacity),
             weights: Vec::with_capacity(capacity),
@@ -45,19 +45,19 @@ impl LeastSquares {
     }
 
     /// Forgets all unknowns.
-    pub(super) fn clear(&mut self) {
+    pub(crate) fn clear(&mut self) {
         self.columns.clear();
         self.weights.clear();
     }
 
     /// Adds an unknown: its column of `A` and its weight `w_j`.
-    pub(super) fn push(&mut self, column: Vector6<f64>, weight: f64) {
+    pub(crate) fn push(&mut self, column: Vector6<f64>, weight: f64) {
         self.columns.push(column);
         self.weights.push(weight);
     }
 
     /// Factorises, given the lower Cholesky factor `L` of the covariance.
-    pub(super) fn factorise(&mut self, lower: &Matrix6<f64>) {
+    pub(crate) fn factorise(&mut self, lower: &Matrix6<f64>) {
         for (column, weight) in self.columns.iter_mut().zip(&self.weights) {
             lower.solve_lower_triangular_unchecked_mut(column);
             *column *= *weight;
@@ -121,19 +121,20 @@ impl LeastSquares {
     }
 
     /// Rank of the six equations in the unknowns.
-    pub(super) fn rank(&self) -> usize {
+    pub(crate) fn rank(&self) -> usize {
         self.rank
     }
 
     /// The row of the solution operator for unknown `j`: `x_j = k . b`.
-    pub(super) fn gain(&self, j: usize) -> Vector6<f64> {
+    pub(crate) fn gain(&self, j: usize) -> Vector6<f64> {
         self.dual * self.columns[j].component_mul(&self.inverse_squares) * self.weights[j]
     }
 
     /// Whether `sum_j g_j x_j` is fixed by the equations, rather than by the least norm: whether the part of `g` (scaled by the weights) outside of the
-    /// rows' span is below `tolerance` of it. `gradient` gives `g_j`.
-    pub(super) fn determines(&self, gradient: impl Fn(usize) -> f64, tolerance: f64) -> bool {
-        let scaled = |j: usize, weight: f64| gradient(j) * weight;
+    /// rows' span is below `tolerance` of what `g` could be. `gradient` gives `g_j`, and its size were there no cancellation within it, so that a `g` that
+    /// is zero but for rounding (a force whose line meets the joint's axis) is not taken for one that the equations leave open.
+    pub(super) fn determines(&self, gradient: impl Fn(usize) -> (f64, f64), tolerance: f64) -> bool {
+        let scaled = |j: usize, weight: f64| gradient(j).0 * weight;
         let columns = || self.columns.iter().zip(&self.weights).enumerate();
         let along = columns().fold(Vector6::zeros(), |sum, (j, (column, &weight))| {
             sum + column * scaled(j, weight)
@@ -142,22 +143,36 @@ impl LeastSquares {
         let (mut total, mut outside) = (0.0, 0.0);
         for (j, (column, &weight)) in columns() {
             let g = scaled(j, weight);
-            total += g * g;
+            total += (gradient(j).1 * weight).powi(2);
             outside += (g - column.dot(&inside)).powi(2);
         }
         outside <= tolerance * tolerance * total
     }
 
-    /// `L^-T (1 - Q_r Q_r^T) L^-1`: what weighs the part of `b` that no unknown explains. `b^T P b` is its chi-square; zero where the rank is 6.
-    pub(super) fn unexplained(&self) -> Matrix6<f64> {
-        let mut weight = Matrix6::zeros();
-        for (column, &inverse) in self.dual.column_iter().zip(&self.inverse_squares) {
-            if inverse == 0.0 {
-                weight += column * column.transpose();
-            }
-        }
-        weight
+    /// Rows `p = q_i^T L^-1` that no unknown reaches, `p A = 0`: six less the rank of them, orthonormal in the metric of the covariance, `p C p'^T = 1 or 0`.
+    pub(crate) fn complement(&self) -> impl Iterator<Item = Vector6<f64>> {
+        let free = self.dual.column_iter().zip(&self.inverse_squares);
+        free.filter(|(_, inverse)| **inverse == 0.0)
+            .map(|(row, _)| row.into_owned())
     }
+
+    /// `L^-T (1 - Q_r Q_r^T) L^-1`: what weighs the part of `b` that no unknown explains. `b^T P b` is its chi-square; zero where the rank is 6.
+    pub(crate) fn unexplained(&self) -> Matrix6<f64> {
+        self.complement()
+            .fold(Matrix6::zeros(), |sum, row| sum + row * row.transpose())
+    }
+}
+
+/// What weighs six equations [torque; force] whose noise has this covariance: its lower Cholesky factor. A covariance has one, but for rounding
+/// where channels of one sensor differ by a factor of 1e8 in noise: then its variances alone weigh.
+pub(crate) fn noise_factor(covariance: Matrix6<f64>) -> Matrix6<f64> {
+    let variances = || Matrix6::from_diagonal(&covariance.diagonal().map(f64::sqrt));
+    covariance.cholesky().map_or_else(variances, nalgebra::Cholesky::unpack)
+}
+
+/// What weighs them where nothing is known of noise: torques are compared with forces by a length [m].
+pub(crate) fn scale_factor(length: f64) -> Matrix6<f64> {
+    Matrix6::from_diagonal(&Vector6::new(length, length, length, 1.0, 1.0, 1.0))
 }
 
 #[cfg(test)]
@@ -220,7 +235,7 @@ mod tests {
             // An unknown is determined exactly if the projector onto the rows has a one there.
             let rows = &inverse * &m;
             for j in 0..n {
-                let determined = solver.determines(|k| f64::from(u8::from(k == j)), 1e-5);
+                let determined = solver.determines(|k| if k == j { (1.0, 1.0) } else { (0.0, 0.0) }, 1e-5);
                 prop_assert_eq!(determined, rows[(j, j)] > 1.0 - 1e-10);
             }
         }
@@ -234,6 +249,6 @@ mod tests {
         let zero = build(&[[0.0; 6], [0.0; 6]], &[1.0, 1.0], &Matrix6::identity());
         assert_eq!(zero.rank(), 0);
         assert_eq!(zero.gain(1), Vector6::zeros());
-        assert!(!zero.determines(|_| 1.0, 1e-9));
+        assert!(!zero.determines(|_| (1.0, 1.0), 1e-9));
     }
 }

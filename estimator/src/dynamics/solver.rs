@@ -13,16 +13,18 @@
 //! `K^T A_j^T s_j + P C_j s_j` for the whole sub-tree, `P = C^-1 (1 - A K)`; `A_j`, `C_j` count what lies below `j`. So the two sides of a joint never disagree about
 //! which one was used, and the noise of a torque is that of `s_j . F_j - h_j . b`: a sensor at `k` enters with the motion `h_j - [k below j] s_j`.
 //!
+//! Where both sides would do, [`Sides`] has the two values, and says in what sense fused is better than their mean.
+//!
 //! One full unknown wrench in a sub-tree, the paper's case, needs no solving: it is `b`, moved to the contact.
 
 use nalgebra::{Matrix6, Vector6};
 
-use super::kinematics::check_external;
-use super::least::LeastSquares;
-use super::structure::{ContactKind, ContactSet, ContactSpec, Route, Structure};
+use super::kinematics::{check_external, check_readings};
+use super::least::{LeastSquares, noise_factor, scale_factor};
+use super::structure::{ContactKind, ContactSet, ContactSpec, Route, SensorSet, Structure};
 use super::{DynamicsError, ExternalWrench, Kinematics, check_size};
 use crate::model::Model;
-use crate::spatial::{Mat3, Motion, Pose, Vec3, Wrench};
+use crate::spatial::{Mat3, Motion, Pose, Vec3, Wrench, stack};
 
 /// A value counts as determined if at most this share of it is the least norm's choice.
 const UNDETERMINED: f64 = 1e-9;
@@ -73,6 +75,65 @@ pub struct Balance {
     pub degrees: usize,
 }
 
+/// A joint torque as one side of the joint, within its sub-tree, tells it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SideTorque {
+    /// The torque [Nm or N], with the sign of [`Solver::torque`].
+    pub torque: f64,
+    /// Its standard deviation from the noise of this side's F/T sensors [Nm or N]. Zero if there is none, which is not certainty.
+    pub deviation: f64,
+    /// This side's F/T sensors. If there is none, the side is a free end, and the torque what the model alone says its motion needs: no measurement, but
+    /// one to compare the other side with.
+    pub sensors: SensorSet,
+}
+
+/// A joint torque from either side of the joint, each without the other's sensors and links. None where an unknown contact acts.
+///
+/// With `F_j` the sum of net wrenches, less sensors' and known external wrenches, of the links below joint `j` in its sub-tree, `b` that of the whole sub-tree, and `s_j` the
+/// joint's unit motion, the side of the child gives `s_j . F_j` and that of the parent `s_j . (F_j - b)` ([`Solver::sides`]).
+/// Their sensors are different ones, so their errors are independent, and their difference `s_j . b`, the imbalance seen along the axis, has the
+/// variance `s_j^T C s_j` (`C`, `C_j`: covariance of `b`, of `F_j` from the noise of their sensors): a check of calibration joint by joint.
+///
+/// Fused they are more than the mean of two torques weighted by inverse variance. Without unknowns all six components of `b` are noise, correlated with that of
+/// `s_j . F_j` by `C_j s_j`, and of all `s_j . F_j - h . b` the one of least variance has `h = C^-1 C_j s_j` (Gauss, Markov). That is the axis' component of the
+/// mean of the two *wrenches*, `F_j` with covariance `C_j` and `F_j - b` with `C - C_j`, weighted by inverse covariance:
+///
+/// ```text
+/// s . (C_j^-1 + (C - C_j)^-1)^-1 (C_j^-1 F_j + (C - C_j)^-1 (F_j - b)) = s . F_j - s . C_j C^-1 b
+/// ```
+///
+/// The mean of the two torques is the member `h = w s_j` of that family; it does as well only where `C_j s_j` is along `C s_j`, so that the other
+/// five equations tell nothing about the noise in this one.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Sides {
+    /// From the side of the URDF child.
+    pub child: Option<SideTorque>,
+    /// From the side of the URDF parent.
+    pub parent: Option<SideTorque>,
+}
+
+/// How far the two sides of a joint are apart.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Disagreement {
+    /// Torque from the child's side less torque from the parent's [Nm or N].
+    pub difference: f64,
+    /// The standard deviation that F/T noise gives the difference: the two sides share no sensor, so their variances add. Far more than it is an
+    /// error of calibration or model, or a contact that nobody declared.
+    pub deviation: f64,
+}
+
+impl Sides {
+    /// The two-route check; none unless there are both sides, and a sensor on at least one.
+    pub fn disagreement(&self) -> Option<Disagreement> {
+        let (child, parent) = (self.child?, self.parent?);
+        let measured = !(child.sensors.is_empty() && parent.sensors.is_empty());
+        measured.then(|| Disagreement {
+            difference: child.torque - parent.torque,
+            deviation: child.deviation.hypot(parent.deviation),
+        })
+    }
+}
+
 /// Torques and contact wrenches from F/T readings; holds its results and all the room it needs.
 #[derive(Clone, Debug)]
 pub struct Solver {
@@ -82,13 +143,16 @@ pub struct Solver {
     torque_certainty: Vec<Certainty>,
     contacts: Vec<ContactEstimate>,
     balances: Vec<Balance>,
-    // Kept from `solve` for `update_deviations`, in base coordinates.
+    // Kept from `solve` for `update_deviations` and `sides`, in base coordinates.
+    /// The contacts that were present; none before the first solution.
+    active: Option<ContactSet>,
+    /// Per link: what it and the links below it in its sub-tree need beyond what is known, `F_j`.
+    wrenches: Vec<Wrench>,
     axes: Vec<Motion>,
     responses: Vec<Motion>,
     gains: Vec<[Motion; 6]>,
     sensor_poses: Vec<Pose>,
     // Scratch.
-    wrenches: Vec<Wrench>,
     least: LeastSquares,
     columns: Vec<Vector6<f64>>,
     owners: Vec<usize>,
@@ -113,11 +177,12 @@ impl Solver {
                 };
                 structure.subtrees().len()
             ],
+            active: None,
+            wrenches: vec![Wrench::zero(); structure.link_count()],
             axes: vec![still; dofs],
             responses: vec![still; dofs],
             gains: vec![[still; 6]; contacts],
             sensor_poses: vec![Pose::identity(); structure.sensors().len()],
-            wrenches: vec![Wrench::zero(); structure.link_count()],
             least: LeastSquares::with_capacity(6 * contacts),
             columns: Vec::with_capacity(6 * contacts),
             owners: Vec::with_capacity(6 * contacts),
@@ -127,6 +192,9 @@ impl Solver {
 
     /// Solves all sub-trees. `readings` are those of the structure's sensors, offsets removed, in their measurement frames; the contacts in
     /// `active` are present, the others are taken to be absent; `external` wrenches are known.
+    ///
+    /// Every set of contacts gets an answer: fewer unknowns than equations the least squares, more the least norm, and [`Certainty`] says which value is a choice.
+    /// Readings that no wrenches of the declared kinds explain show in [`Balance`]. Results are finite unless a number overflows (beyond 1e100 or so).
     ///
     /// # Errors
     /// Objects made for another model or structure, wrong sizes, numbers that are not finite. Results are unchanged then.
@@ -142,15 +210,10 @@ impl Solver {
         check_size("links of the model", model.link_count(), self.wrenches.len())?;
         check_size("links of the kinematics", kinematics.link_count(), self.wrenches.len())?;
         self.check_structure(structure)?;
-        check_size("F/T readings", readings.len(), structure.sensors().len())?;
-        if let Some(index) = readings.iter().position(|reading| !reading.is_finite()) {
-            return Err(DynamicsError::NotFinite {
-                what: "F/T reading",
-                index,
-            });
-        }
+        check_readings(readings, structure.sensors().len())?;
         check_external(external, self.wrenches.len())?;
 
+        self.active = Some(*active);
         self.wrenches.copy_from_slice(kinematics.net_wrenches());
         for wrench in external {
             self.wrenches[wrench.frame.link] -= wrench.in_base(kinematics);
@@ -176,7 +239,7 @@ impl Solver {
         Ok(())
     }
 
-    fn check_structure(&self, structure: &Structure) -> Result<(), DynamicsError> {
+    pub(crate) fn check_structure(&self, structure: &Structure) -> Result<(), DynamicsError> {
         check_size("links of the structure", structure.link_count(), self.wrenches.len())?;
         check_size(
             "degrees of freedom of the structure",
@@ -291,7 +354,14 @@ impl Solver {
                                 h += self.least.gain(j) * column.dot(&s);
                             }
                         }
-                        let gradient = |j: usize| if below(j) { self.columns[j].dot(&s) } else { 0.0 };
+                        let gradient = |j: usize| {
+                            let column = &self.columns[j];
+                            if below(j) {
+                                (column.dot(&s), column.abs().dot(&s.abs()))
+                            } else {
+                                (0.0, 0.0)
+                            }
+                        };
                         let balanced = self.least.rank() == 6 || unexplained.is_some();
                         if !(balanced && self.least.determines(gradient, UNDETERMINED)) {
                             certainty = Certainty::Assumed;
@@ -380,11 +450,10 @@ impl Solver {
             for sensor in subtree.sensors.iter() {
                 add_covariance(&mut covariance, structure, sensor, &self.sensor_poses[sensor], point);
             }
-            covariance.cholesky().map(nalgebra::Cholesky::unpack)
+            noise_factor(covariance)
         });
-        // Without sensors nothing weighs the equations: the length scale does, about the contacts. (A covariance has a factor: variances are positive.)
-        let scale = || Matrix6::from_diagonal(&Vector6::new(length, length, length, 1.0, 1.0, 1.0));
-        let lower = lower.flatten().unwrap_or_else(scale);
+        // Without sensors nothing weighs the equations: the length scale does, about the contacts.
+        let lower = lower.unwrap_or_else(|| scale_factor(length));
         self.least.factorise(&lower);
 
         let b = self.wrenches[subtree.top].about(point);
@@ -401,7 +470,7 @@ impl Solver {
                 residual -= self.columns[start + i] * gain.dot(&b);
                 determined &= self
                     .least
-                    .determines(|j| if j == start + i { 1.0 } else { 0.0 }, UNDETERMINED);
+                    .determines(|j| if j == start + i { (1.0, 1.0) } else { (0.0, 0.0) }, UNDETERMINED);
                 if let ContactKind::ForceAlong(direction) = spec.kind {
                     (0..3).for_each(|axis| rows[axis] = gain * direction[axis]);
                 } else {
@@ -460,27 +529,15 @@ impl Solver {
             contacts,
             ..
         } = self;
-        let variance = |sensor: usize, motion: &Motion| {
-            let in_sensor = sensor_poses[sensor].twist_back(motion);
-            in_sensor.dot(&structure.sensors()[sensor].covariance_times(&in_sensor))
-        };
+        let variance = |sensor: usize, motion: &Motion| variance(structure, sensor, &sensor_poses[sensor], motion);
         for link in 1..structure.link_count() {
             let Some(dof) = structure.dof_of(link) else { continue };
             let place = &structure.places[link];
-            let (s, h) = (&axes[dof], &responses[dof]);
+            let (s, h) = (axes[dof], responses[dof]);
             let mut sum = 0.0;
             for sensor in structure.subtrees()[place.subtree].sensors.iter() {
-                if place.sensors_below.contains(sensor) {
-                    sum += variance(
-                        sensor,
-                        &Motion {
-                            angular: h.angular - s.angular,
-                            linear: h.linear - s.linear,
-                        },
-                    );
-                } else {
-                    sum += variance(sensor, h);
-                }
+                let motion = if place.sensors_below.contains(sensor) { h - s } else { h };
+                sum += variance(sensor, &motion);
             }
             torque_deviation[dof] = sum.sqrt();
         }
@@ -500,12 +557,73 @@ impl Solver {
         Ok(())
     }
 
+    /// The torque of a degree of freedom from either side of its joint, in the last solution: `s . F_j` and `s . (F_j - b)`, each with the standard
+    /// deviation from F/T noise. Where [`Route`] is `Child` or `Parent`, that side's torque is [`Solver::torque`] to the last bit; where it is `Fused`, both are there
+    /// and the torque is a weighted mean ([`Sides`] says of what). No side before the first solution, nor if there is no such degree of freedom.
+    ///
+    /// Costs nothing until it is called, and does not need [`Solver::update_deviations`].
+    ///
+    /// # Errors
+    /// The structure is not the one that was solved.
+    pub fn sides(&self, structure: &Structure, dof: usize) -> Result<Sides, DynamicsError> {
+        self.check_structure(structure)?;
+        let (Some(active), Some(link)) = (&self.active, structure.link_of(dof)) else {
+            return Ok(Sides::default());
+        };
+        let place = &structure.places[link];
+        let subtree = &structure.subtrees()[place.subtree];
+        let (axis, below) = (&self.axes[dof], self.wrenches[link]);
+        let side = |contacts: &ContactSet, sensors: SensorSet, wrench: Wrench| {
+            contacts.intersection(active).is_empty().then(|| SideTorque {
+                torque: axis.dot(&wrench),
+                deviation: sensors
+                    .iter()
+                    .map(|sensor| variance(structure, sensor, &self.sensor_poses[sensor], axis))
+                    .sum::<f64>()
+                    .sqrt(),
+                sensors,
+            })
+        };
+        Ok(Sides {
+            child: side(&place.contacts_below, place.sensors_below, below),
+            parent: side(
+                &subtree.contacts.difference(&place.contacts_below),
+                subtree.sensors.difference(&place.sensors_below),
+                below - self.wrenches[subtree.top],
+            ),
+        })
+    }
+
+    /// `s_j` and `h_j` of the last solution, in base coordinates: `tau_j = s_j . F_j - h_j . b` (see the top of this file).
+    pub(crate) fn torque_motions(&self, dof: usize) -> (&Motion, &Motion) {
+        (&self.axes[dof], &self.responses[dof])
+    }
+
+    /// Rows `k` of the last solution in base coordinates, `x_i = k_i . b`, force first, as the contact's wrench is reported.
+    pub(crate) fn contact_motions(&self, contact: usize) -> &[Motion; 6] {
+        &self.gains[contact]
+    }
+
+    /// Whether its last solution is of these kinematics, as far as the poses of the F/T sensors tell. Not before the first.
+    pub(crate) fn is_solved(&self, structure: &Structure, kinematics: &Kinematics) -> bool {
+        // The same product of the same numbers has the same bits.
+        let mut poses = structure.sensors().iter().zip(&self.sensor_poses);
+        self.active.is_some()
+            && poses.all(|(sensor, x_bm)| *kinematics.pose(sensor.joint() + 1) * *sensor.pose() == *x_bm)
+    }
+
+    /// Measurement frame of a sensor in base coordinates, `x_bm`, at the last solution.
+    pub(crate) fn sensor_pose(&self, sensor: usize) -> &Pose {
+        &self.sensor_poses[sensor]
+    }
+
     /// Joint torques [Nm or N], by degree of freedom: along the URDF axis, by the parent on the child, on the link side.
     pub fn torque(&self) -> &[f64] {
         &self.torque
     }
 
-    /// Standard deviations of the torques from F/T noise [Nm or N]; see [`Solver::update_deviations`].
+    /// Standard deviations of the torques from F/T noise [Nm or N]; see [`Solver::update_deviations`]. Zero where no sensor's reading enters, at a free end or in
+    /// a sub-tree that nothing measures: then nothing is known of the torque's error, and [`Structure::torque_dependence`] names no sensor.
     pub fn torque_deviation(&self) -> &[f64] {
         &self.torque_deviation
     }
@@ -526,12 +644,15 @@ impl Solver {
     }
 }
 
-fn contact_pose(spec: &ContactSpec, kinematics: &Kinematics) -> Pose {
-    *kinematics.pose(spec.frame.link) * spec.frame.pose
+/// Variance of what a sensor at `x_bm` adds to `motion . wrench`.
+#[inline]
+fn variance(structure: &Structure, sensor: usize, x_bm: &Pose, motion: &Motion) -> f64 {
+    let in_sensor = x_bm.twist_back(motion);
+    in_sensor.dot(&structure.sensors()[sensor].covariance_times(&in_sensor))
 }
 
-fn stack(upper: &Vec3, lower: &Vec3) -> Vector6<f64> {
-    Vector6::new(upper.x, upper.y, upper.z, lower.x, lower.y, lower.z)
+fn contact_pose(spec: &ContactSpec, kinematics: &Kinematics) -> Pose {
+    *kinematics.pose(spec.frame.link) * spec.frame.pose
 }
 
 /// A row of motion coordinates about `point`, as a motion about the origin.

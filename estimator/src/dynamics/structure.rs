@@ -146,7 +146,7 @@ impl SensorCut {
     /// [`MeasurementFrame::Sensor`] only.
     ///
     /// # Errors
-    /// The model has no such joint, the joint moves, or the noise is not positive and finite.
+    /// The model has no such joint, the joint moves, the noise is not positive and finite, or the pose is not finite.
     pub fn new(
         model: &Model,
         joint: &str,
@@ -168,9 +168,13 @@ impl SensorCut {
             .force
             .iter()
             .chain(&noise.torque)
-            .any(|&deviation| !(deviation.is_finite() && deviation > 0.0))
+            // Variances are what is used: they must not vanish or overflow either.
+            .any(|&deviation| !(deviation > 0.0 && (deviation * deviation).is_normal()))
         {
             return Err(StructureError::Noise(name()));
+        }
+        if !pose.is_finite() {
+            return Err(StructureError::SensorPose(name()));
         }
         let x_cm = match frame {
             // A body has the frame of the link that its joint moves, so the child link's is the body's.
@@ -218,6 +222,14 @@ impl SensorCut {
     /// The wrench that the parent exerts on the child (at the origin and in the axes of the child) when the sensor reads `reading`, offset removed.
     pub fn transmitted(&self, reading: &Wrench) -> Wrench {
         self.signed(self.pose.wrench(reading))
+    }
+
+    /// 1 if the reading is the wrench by the parent on the child, -1 if it is its opposite.
+    pub(crate) fn sign(&self) -> f64 {
+        match self.direction {
+            MeasurementDirection::ChildToParent => -1.0,
+            MeasurementDirection::ParentToChild => 1.0,
+        }
     }
 
     fn signed(&self, wrench: Wrench) -> Wrench {
@@ -288,7 +300,8 @@ pub enum Route {
     Child,
     /// From the side of the parent: no unknown contact there.
     Parent,
-    /// From both sides, weighted by their covariance: neither has an unknown contact, and both have sensors.
+    /// From both sides, the wrenches that they tell weighted by their inverse covariance: neither has an unknown contact, and both have sensors. (One by
+    /// one: [`super::Solver::sides`].)
     Fused,
     /// From the solution of the whole sub-tree: unknown contacts on both sides.
     Whole,
@@ -365,7 +378,8 @@ impl Structure {
         }
         let mut contacts = contacts.to_vec();
         for (index, contact) in contacts.iter_mut().enumerate() {
-            if contact.frame.link >= model.link_count() || !contact.position.iter().all(|x| x.is_finite()) {
+            let is_placed = contact.frame.pose.is_finite() && contact.position.iter().all(|x| x.is_finite());
+            if contact.frame.link >= model.link_count() || !is_placed {
                 return Err(StructureError::Contact { index });
             }
             if let ContactKind::ForceAlong(direction) = &mut contact.kind {
@@ -587,13 +601,33 @@ impl Structure {
         }
     }
 
+    /// The links at or below a link: they are numbered depth first.
+    pub(crate) fn below(&self, link: usize) -> std::ops::Range<usize> {
+        link..self.places[link].end
+    }
+
+    /// The link next to a link towards the model's root; the root's own is itself.
+    pub(crate) fn parent_of(&self, link: usize) -> usize {
+        self.places[link].parent
+    }
+
+    /// How a force and a torque are compared where noise does not tell [m].
+    pub(crate) fn length_scale(&self) -> f64 {
+        self.length_scale
+    }
+
+    /// The link that a degree of freedom moves.
+    pub(crate) fn link_of(&self, dof: usize) -> Option<usize> {
+        self.dof_links.get(dof).copied()
+    }
+
     /// The degree of freedom of the joint above a link.
-    pub(super) fn dof_of(&self, link: usize) -> Option<usize> {
+    pub(crate) fn dof_of(&self, link: usize) -> Option<usize> {
         self.link_dofs.get(link).copied().flatten()
     }
 
     /// The links of a sub-tree, ascending.
-    pub(super) fn links_of(&self, subtree: usize) -> impl Iterator<Item = usize> {
+    pub(crate) fn links_of(&self, subtree: usize) -> impl Iterator<Item = usize> {
         let top = self.subtrees[subtree].top;
         (top..self.places[top].end).filter(move |&link| self.places[link].subtree == subtree)
     }
@@ -615,6 +649,9 @@ pub enum StructureError {
     /// A standard deviation that is zero, negative or not finite.
     #[error("F/T sensor in joint {0}: every standard deviation of its noise must be positive and finite")]
     Noise(String),
+    /// The pose of a sensor is not finite.
+    #[error("F/T sensor in joint {0}: its pose is not finite")]
+    SensorPose(String),
     /// More than there is room for.
     #[error("{count} {what}: {most} at most")]
     TooMany {
@@ -625,8 +662,8 @@ pub enum StructureError {
         /// How many there may be.
         most: usize,
     },
-    /// A contact on a link that is not there, or at a position that is not finite.
-    #[error("contact {index}: its link does not exist, or its position is not finite")]
+    /// A contact on a link that is not there, or whose frame or position is not finite.
+    #[error("contact {index}: its link does not exist, or its frame or position is not finite")]
     Contact {
         /// Its number.
         index: usize,

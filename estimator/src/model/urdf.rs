@@ -139,35 +139,33 @@ fn check_numbers(document: &roxmltree::Document<'_>) -> Result<HashSet<String>, 
                     continue;
                 };
                 let numbers: Result<Vec<f64>, _> = value.split_whitespace().map(str::parse).collect();
-                let (line, owner, attribute, value) =
-                    (line(element), label.clone(), attribute.to_owned(), value.to_owned());
-                let shown = format!("<{}>", element.tag_name().name());
-                match numbers {
-                    Ok(numbers) if numbers.len() == count => {
-                        // An infinite limit is no limit.
-                        let infinite = numbers.iter().any(|x| x.is_infinite()) && !element.has_tag_name("limit");
-                        if infinite || numbers.iter().any(|x| x.is_nan()) {
-                            return Err(ModelError::NotFinite {
-                                line,
-                                owner,
-                                element: shown,
-                                attribute,
-                                value,
-                            });
-                        }
-                    }
-                    _ => {
-                        let expected = if count == 3 { "three numbers" } else { "a number" };
-                        return Err(ModelError::Number {
-                            line,
-                            owner,
-                            element: shown,
-                            attribute,
-                            value,
-                            expected,
-                        });
-                    }
+                let is_number = matches!(&numbers, Ok(numbers) if numbers.len() == count);
+                // An infinite limit is no limit.
+                let is_wrong = |x: &f64| x.is_nan() || (x.is_infinite() && !element.has_tag_name("limit"));
+                if is_number && !numbers.iter().flatten().any(is_wrong) {
+                    continue;
                 }
+                // Only here, for finding the line reads the text from its beginning.
+                let (line, owner, attribute, value) = (line(element), label, attribute.to_owned(), value.to_owned());
+                let element = format!("<{}>", element.tag_name().name());
+                return Err(if is_number {
+                    ModelError::NotFinite {
+                        line,
+                        owner,
+                        element,
+                        attribute,
+                        value,
+                    }
+                } else {
+                    ModelError::Number {
+                        line,
+                        owner,
+                        element,
+                        attribute,
+                        value,
+                        expected: if count == 3 { "three numbers" } else { "a number" },
+                    }
+                });
             }
         }
     }

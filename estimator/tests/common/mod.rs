@@ -5,10 +5,10 @@
 use std::fmt::Write as _;
 
 use proprio_estimator::dynamics::{
-    ContactKind, ContactSpec, ExternalWrench, FrameMotion, JointState, Noise, SensorCut,
+    ContactKind, ContactSpec, ExternalWrench, FrameMotion, JointState, Kinematics, Noise, SensorCut,
 };
-use proprio_estimator::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
-use proprio_estimator::spatial::{Pose, Vec3, Wrench};
+use proprio_estimator::model::{Frame, Joint, JointKind, MeasurementDirection, MeasurementFrame, Model};
+use proprio_estimator::spatial::{Motion, Pose, Vec3, Wrench};
 
 /// SplitMix64: small, and the same everywhere.
 pub(crate) struct Random(u64);
@@ -168,6 +168,54 @@ impl RandomRobot {
     }
 }
 
+/// An iCub's tree, 39 links and 32 joints, as text, and the joints of its six F/T sensors: torso and head of three joints, arms of seven with a sensor after
+/// three, legs of six with sensors after two and at the foot.
+pub(crate) fn humanoid() -> (String, Vec<String>) {
+    let mut random = Random::new(2015);
+    let (mut text, mut sensors, mut links) = (String::from("<robot name=\"generated\">"), Vec::new(), 0);
+    let mut link = |text: &mut String, parent: Option<usize>, kind: &str| {
+        let [x, y, z] = random.triple(0.1);
+        let _ = write!(
+            text,
+            "<link name=\"link{links}\"><inertial><origin xyz=\"{x} {y} {z}\" rpy=\"0 0 0\"/><mass value=\"1\"/>\
+             <inertia ixx=\"0.01\" ixy=\"0\" ixz=\"0\" iyy=\"0.012\" iyz=\"0\" izz=\"0.015\"/></inertial></link>"
+        );
+        if let Some(parent) = parent {
+            let axis = ["1 0 0", "0 1 0", "0 0 -1"][links % 3];
+            let _ = write!(
+                text,
+                "<joint name=\"joint{links}\" type=\"{kind}\"><parent link=\"link{parent}\"/><child link=\"link{links}\"/>\
+                 <origin xyz=\"{y} {z} {x}\" rpy=\"{x} {y} {z}\"/><axis xyz=\"{axis}\"/>\
+                 <limit lower=\"-3\" upper=\"3\" effort=\"1\" velocity=\"1\"/></joint>"
+            );
+        }
+        links += 1;
+        links - 1
+    };
+    let root = link(&mut text, None, "");
+    let mut chest = root;
+    for _ in 0..3 {
+        chest = link(&mut text, Some(chest), "revolute");
+    }
+    for (from, joints, after) in [
+        (chest, 3, &[] as &[usize]),
+        (chest, 7, &[3]),
+        (chest, 7, &[3]),
+        (root, 6, &[2, 6]),
+        (root, 6, &[2, 6]),
+    ] {
+        let mut parent = from;
+        for joint in 1..=joints {
+            parent = link(&mut text, Some(parent), "revolute");
+            if after.contains(&joint) {
+                parent = link(&mut text, Some(parent), "fixed");
+                sensors.push(format!("joint{parent}"));
+            }
+        }
+    }
+    (text + "</robot>", sensors)
+}
+
 fn join(values: [f64; 3]) -> String {
     values.map(|value| format!("{value:e}")).join(" ")
 }
@@ -197,6 +245,30 @@ pub(crate) fn motion(random: &mut Random) -> FrameMotion {
         angular_acceleration: random.vector(5.0),
         proper_acceleration: random.vector(10.0),
     }
+}
+
+/// The unit motion of a joint's URDF child relative to its parent, in base coordinates, from the child's pose; none for a fixed joint.
+pub(crate) fn joint_axis(kinematics: &Kinematics, joint: &Joint) -> Option<Motion> {
+    let pose = kinematics.pose(joint.child);
+    match &joint.kind {
+        JointKind::Revolute(axis) => Some(Motion::rotation(&(pose.rotation * axis.vector), &pose.translation)),
+        JointKind::Prismatic(axis) => Some(Motion::translation(&(pose.rotation * axis.vector))),
+        JointKind::Fixed => None,
+    }
+}
+
+/// Twists of all links in base coordinates, by their own recursion from the model's root, when the base moves with `base_twist`.
+pub(crate) fn twists(model: &Model, kinematics: &Kinematics, velocity: &[f64], base_twist: &Motion) -> Vec<Motion> {
+    let mut twists = vec![Motion::zero(); model.link_count()];
+    for joint in model.joints() {
+        twists[joint.child] = twists[joint.parent];
+        if let (Some(dof), Some(axis)) = (joint.dof, joint_axis(kinematics, joint)) {
+            twists[joint.child] += axis * velocity[dof];
+        }
+    }
+    let shift = *base_twist - twists[kinematics.base()];
+    twists.iter_mut().for_each(|twist| *twist += shift);
+    twists
 }
 
 /// A contact of any kind anywhere, and a wrench of that kind in its frame.
