@@ -23,7 +23,7 @@ mod report;
 mod simulate;
 
 use clap::{Parser, Subcommand};
-use proprio_topics::ipc::{DomainConfig, DomainError};
+use proprio_topics::ipc::DomainConfig;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -97,10 +97,7 @@ fn main() -> ExitCode {
 fn fail(error: &anyhow::Error) -> ExitCode {
     eprintln!("error: {error:#}");
     let configuration = proprio_simulator::is_configuration(error)
-        || error.chain().any(|cause| {
-            cause.is::<proprio_gateway::plan::ConfigError>()
-                || cause.is::<proprio_estimator::config::ConfigError>()
-                || cause.downcast_ref().is_some_and(DomainError::is_configuration)
-        });
+        || proprio_gateway::daemon::is_configuration(error)
+        || proprio_estimator::daemon::is_configuration(error);
     ExitCode::from(if configuration { 2 } else { 1 })
 }

@@ -25,7 +25,6 @@ use proprio_topics::{
 use sd_notify::NotifyState;
 use std::io::Write as _;
 use std::path::Path;
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::{Acquire, Relaxed, Release};
@@ -72,21 +71,11 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
     runtime.block_on(serve(&plan, domain))
 }
 
-/// The exit code for an error that `run` ended with, after telling it: 2 for a wrong configuration, else 1.
-pub fn report(error: &anyhow::Error) -> ExitCode {
-    eprintln!("error: {error:#}");
-    let wrong_domain =
-        |e: &(dyn std::error::Error + 'static)| e.downcast_ref().is_some_and(DomainError::is_configuration);
-    ExitCode::from(
-        if error
-            .chain()
-            .any(|cause| cause.is::<ConfigError>() || wrong_domain(cause))
-        {
-            2
-        } else {
-            1
-        },
-    )
+/// Whether an error that [`run`] ended with is a wrong configuration: exit 2, else 1.
+pub fn is_configuration(error: &anyhow::Error) -> bool {
+    error
+        .chain()
+        .any(|cause| cause.is::<ConfigError>() || cause.downcast_ref().is_some_and(DomainError::is_configuration))
 }
 
 async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> {

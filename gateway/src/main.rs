@@ -23,6 +23,9 @@ fn main() -> ExitCode {
     daemon::start_logging();
     match daemon::run(&args.config, &DomainConfig::from_env(), args.check) {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => daemon::report(&error),
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::from(if daemon::is_configuration(&error) { 2 } else { 1 })
+        }
     }
 }

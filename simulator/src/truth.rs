@@ -147,6 +147,12 @@ impl Simulation {
                 let carries = contacts.iter().position(|(_, f)| f.link == base.link);
                 (base, carries, Vec3::from(*gravity_mps2))
             }
+            // It does not walk: it stands on its first foot.
+            Base::Stance { foot } => {
+                let foot = foot.first().ok_or_else(|| wrong("base.foot is empty".into()))?;
+                let carries = contacts.iter().position(|(name, _)| *name == foot.contact);
+                (frame("base.foot", &foot.link)?, carries, Vec3::from(foot.gravity_mps2))
+            }
             Base::Imu {
                 sensor,
                 link,

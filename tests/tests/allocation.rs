@@ -1,5 +1,5 @@
 //! The data planes allocate nothing of their own once they run: a gateway's bus, from link to shared memory, bad frames
-//! included, and an estimator's pipeline, from samples to torques.
+//! included, and an estimator's pipeline, from samples to torques; nor does any part of the dynamics once it is built.
 //!
 //! Counted is what the thread under test asks the allocator for. The only thing it may ask for is iceoryx2's: one loan of
 //! 48 bytes per payload sent.
@@ -8,8 +8,17 @@
 #![allow(unsafe_code)]
 
 use proprio_drivers::{Claim, Frame, Id, Mode};
+use proprio_estimator::dynamics::{
+    ContactKind, ContactSet, ContactSpec, DynamicsError, EquationOfMotion, ExternalWrench, FrameMotion,
+    InverseDynamics, JointState, Kinematics, Noise, SensorCut, Solver, Structure,
+};
+use proprio_estimator::model::{self, Model};
 use proprio_estimator::pipeline::Pipeline;
+use proprio_estimator::regressor::{
+    Actuator, Coupling, EstimateRows, MotorRegressor, Regressor, StackedRegressor, Transmission, Weighting,
+};
 use proprio_estimator::setup::Setup;
+use proprio_estimator::spatial::{self, Motion, Pose, Vec3};
 use proprio_gateway::bus::{Bus, Turn};
 use proprio_gateway::candump;
 use proprio_gateway::clock::{Clock, Monotonic};
@@ -386,4 +395,191 @@ fn the_pipeline_allocates_nothing_once_it_runs() {
         counts.late + counts.backward > 100 && counts.not_finite > 10,
         "{counts:?}"
     );
+}
+
+/// Runs one call of a part of the dynamics, which must succeed, and sees that it allocates nothing.
+fn allocates_nothing<E: std::fmt::Debug>(what: &str, call: impl FnOnce() -> Result<(), E>) {
+    let mut outcome = Ok(());
+    assert_eq!(counted(|| outcome = call()), (0, 0), "{what}");
+    outcome.expect(what);
+}
+
+/// From the first call on, for every base, for any set of contacts; and what is refused is refused without allocating too.
+#[test]
+fn the_dynamics_allocate_nothing_after_construction() {
+    let text = std::fs::read_to_string(&robot().config.model).unwrap();
+    let elements = Model::from_urdf(&text, &[]).unwrap().sensors().to_vec();
+    let keep: Vec<&str> = elements.iter().map(|sensor| sensor.joint.as_str()).collect();
+    let model = &Model::from_urdf(&text, &keep).unwrap();
+    let noise = Noise {
+        force: [0.1; 3],
+        torque: [0.003; 3],
+    };
+    let sensors: Vec<_> = elements
+        .iter()
+        .map(|s| SensorCut::new(model, &s.joint, s.frame, s.direction, &s.pose, &noise).unwrap())
+        .collect();
+    // One contact of each kind on every link: none, one full wrench, too few and too many unknowns can all be chosen.
+    let frame = |link| model::Frame {
+        link,
+        pose: Pose::from_xyz_rpy([0.02, -0.01, 0.05], [0.1, -0.2, 0.3]),
+    };
+    let kinds = [
+        ContactKind::Wrench,
+        ContactKind::Force,
+        ContactKind::ForceAlong(Vec3::new(0.0, 0.6, 0.8)),
+    ];
+    let contacts: Vec<_> = (0..model.link_count())
+        .flat_map(|link| {
+            kinds.map(|kind| ContactSpec {
+                frame: frame(link),
+                kind,
+                position: Vec3::new(0.0, 0.0, 0.1),
+            })
+        })
+        .take(ContactSet::CAPACITY)
+        .collect();
+    let structure = &Structure::new(model, &sensors, &contacts, Structure::LENGTH_SCALE).unwrap();
+    let readings = vec![spatial::Wrench::from_parts([10.0, -5.0, 40.0], [1.0, 0.5, -0.3]); sensors.len()];
+    let push = spatial::Wrench::from_parts([1.0, 2.0, 3.0], [0.1, 0.2, 0.3]);
+    let external = [ExternalWrench {
+        frame: frame(model.link_count() - 1),
+        wrench: push,
+    }];
+    assert!(sensors.len() == 1 && model.dof_count() > 5 && contacts.len() > 20);
+
+    let values = |scale: f64| (0..model.dof_count()).map(|dof| scale * (dof as f64).sin()).collect();
+    let (position, velocity, acceleration): (Vec<f64>, Vec<f64>, Vec<f64>) = (values(0.5), values(1.0), values(3.0));
+    let state = JointState {
+        position: &position,
+        velocity: &velocity,
+        acceleration: &acceleration,
+    };
+    let motion = &FrameMotion {
+        angular_velocity: Vec3::new(0.3, -0.2, 0.1),
+        angular_acceleration: Vec3::new(1.0, 2.0, -1.0),
+        proper_acceleration: Vec3::new(0.5, -0.3, 9.81),
+    };
+    let none = ContactSet::EMPTY;
+    let all = ContactSet::first(contacts.len());
+    let one_each = (0..contacts.len()).map(|contact| [contact].into_iter().collect());
+    let sets: Vec<ContactSet> = [none, all].into_iter().chain(one_each).collect();
+    let mut kinematics = Kinematics::new(model, 0).unwrap();
+    let mut inverse = InverseDynamics::new(model);
+    let mut solver = Solver::new(structure);
+    let mut equation = EquationOfMotion::new(model);
+    let mut regressor = Regressor::new(model);
+    let mut stacked = StackedRegressor::new(structure);
+    // A matrix of any size, had from one that is there: this crate does not depend on the library of matrices.
+    let matrix = |rows, columns, value| {
+        equation
+            .joint_inertia()
+            .clone()
+            .resize(0, 0, 0.0)
+            .resize(rows, columns, value)
+    };
+    // Two joints that share their motors, the others with one each.
+    let mut shared = matrix(2, 2, 0.5);
+    (shared[(0, 0)], shared[(1, 1)]) = (1.0, 1.0);
+    let coupled = Coupling {
+        name: "coupled".to_owned(),
+        dofs: vec![0, 1],
+        matrix: shared,
+    };
+    let actuator = Actuator {
+        rotor_inertia: true,
+        coulomb: Some(0.1),
+        viscous: true,
+        offset: true,
+    };
+    let dofs = model.dof_count();
+    let transmission = Transmission::new(dofs, &[coupled]).unwrap();
+    let mut motors = MotorRegressor::new(regressor.column_count(), transmission, &vec![actuator; dofs]).unwrap();
+    let mut torque = vec![f64::NAN; dofs];
+    let mut jacobian = matrix(6, dofs, f64::NAN);
+    let mut floating_jacobian = matrix(6, 6 + dofs, f64::NAN);
+    let mut row = vec![0.0; regressor.column_count() + 6 * sensors.len()];
+    for base in 0..model.link_count() {
+        allocates_nothing("set_base", || kinematics.set_base(model, base));
+        allocates_nothing("kinematics", || kinematics.update(model, state, motion));
+        allocates_nothing("inverse dynamics", || inverse.update(model, &kinematics, &external));
+        allocates_nothing("equation of motion", || {
+            equation.update(model, &kinematics, &Vec3::zeros())?;
+            equation.update(model, &kinematics, &Vec3::new(0.0, 0.0, -9.81))?;
+            equation
+                .left_side(&Motion::zero(), &acceleration, &mut torque)
+                .map(drop)
+        });
+        allocates_nothing("Jacobians", || {
+            (0..model.link_count()).try_for_each(|link| {
+                kinematics.jacobian(model, &frame(link), jacobian.as_view_mut())?;
+                kinematics.floating_jacobian(model, &frame(link), floating_jacobian.as_view_mut())
+            })
+        });
+        allocates_nothing("regressor", || regressor.update(model, &kinematics));
+        allocates_nothing("motor regressor", || {
+            motors.update(|dof| regressor.joint_row(dof), state)
+        });
+        for active in &sets {
+            allocates_nothing("solver", || {
+                solver.solve(model, structure, &kinematics, &readings, active, &external)
+            });
+            allocates_nothing("deviations", || solver.update_deviations(structure));
+            allocates_nothing("sides", || {
+                (0..dofs).try_for_each(|dof| solver.sides(structure, dof).map(drop))
+            });
+            allocates_nothing("stacked regressor", || {
+                stacked.update(&kinematics, &readings, active, &external)
+            });
+            for weighting in [Weighting::Noise, Weighting::LengthScale] {
+                allocates_nothing("elimination", || {
+                    stacked.eliminate_contacts(weighting);
+                    Ok::<_, DynamicsError>(())
+                });
+            }
+            allocates_nothing("estimate rows", || {
+                let rows = EstimateRows::new(structure, &solver, &kinematics)?;
+                for dof in 0..dofs {
+                    let width = rows.torque_subtree(dof).and_then(|subtree| rows.column_count(subtree));
+                    rows.torque_row(dof, &mut row[..width.unwrap_or(0)])?;
+                    rows.torque_measured(dof, &readings, &external)?;
+                }
+                for contact in active.iter() {
+                    let width = rows
+                        .contact_subtree(contact)
+                        .and_then(|subtree| rows.column_count(subtree));
+                    for component in 0..6 {
+                        rows.contact_row(contact, component, &mut row[..width.unwrap_or(0)])?;
+                        rows.contact_measured(contact, component, &readings, &external)?;
+                    }
+                }
+                Ok::<_, DynamicsError>(())
+            });
+        }
+    }
+    let results = [inverse.torque(), solver.torque(), equation.bias_torque(), &torque, &row];
+    assert!(results.into_iter().flatten().all(|x| x.is_finite()));
+    let matrices = [
+        jacobian.as_slice(),
+        floating_jacobian.as_slice(),
+        regressor.row(6),
+        motors.row(0),
+    ];
+    assert!(matrices.into_iter().flatten().all(|x| x.is_finite()));
+    assert!(stacked.subtrees().iter().any(|subtree| subtree.remaining() > 0));
+
+    let unknown = [f64::NAN; 64];
+    let wrong = JointState {
+        velocity: &unknown[..velocity.len()],
+        ..state
+    };
+    let refused = counted(|| {
+        assert!(equation.update(model, &kinematics, &Vec3::repeat(f64::NAN)).is_err());
+        assert!(motors.update(|dof| regressor.joint_row(dof), wrong).is_err());
+        assert!(stacked.update(&kinematics, &[], &all, &[]).is_err());
+        assert!(kinematics.update(model, wrong, motion).is_err());
+        assert!(kinematics.set_base(model, model.link_count()).is_err());
+        assert!(solver.solve(model, structure, &kinematics, &[], &all, &[]).is_err());
+    });
+    assert_eq!(refused, (0, 0));
 }

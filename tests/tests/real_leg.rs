@@ -202,7 +202,7 @@ fn played_onto_vcan_the_live_estimates_are_those_of_the_samples_received() {
                 "canplayer",
             )
         };
-        live_is_replay(["vcan0", "vcan1"], None, |rig, log| {
+        live_is_replay(["vcan0", "vcan1"], |rig, log| {
             let mut player = player(rig, log);
             Box::new(move || player.ended().is_some())
         });
@@ -216,8 +216,7 @@ fn played_onto_virtual_buses_the_live_estimates_are_those_of_the_samples_receive
         return;
     }
     let names = ["l", "r"].map(|side| format!("leg_{side}_{}", std::process::id()));
-    // The first six seconds will do: they play in six seconds.
-    live_is_replay([&names[0], &names[1]], Some(Nanos::from_millis(30_000)), |rig, log| {
+    live_is_replay([&names[0], &names[1]], |rig, log| {
         let (log, domain, names) = (log.to_owned(), rig.domain.name.clone(), names.clone());
         let player = std::thread::spawn(move || {
             let mut buses = names
@@ -249,27 +248,27 @@ fn played_onto_virtual_buses_the_live_estimates_are_those_of_the_samples_receive
 /// Starts a player of a log; the answer tells whether it has ended.
 type Play<'a> = &'a dyn Fn(&Rig, &str) -> Box<dyn FnMut() -> bool>;
 
-/// Plays the log, until stamp `until`, onto two buses and compares what is estimated live with a replay of the samples received.
-fn live_is_replay(buses: [&str; 2], until: Option<Nanos>, play: impl Fn(&Rig, &str) -> Box<dyn FnMut() -> bool>) {
+/// Plays the log's first six seconds onto two buses and compares what is estimated live with a replay of the samples received.
+fn live_is_replay(buses: [&str; 2], play: impl Fn(&Rig, &str) -> Box<dyn FnMut() -> bool>) {
     // A machine that is held up for longer than half the wait makes samples late; it may try again.
-    let tries = 3;
-    if !(0..tries).any(|_| one_live_is_replay(buses, until, &play)) {
+    let tries = 5;
+    if !(0..tries).any(|_| one_live_is_replay(buses, &play)) {
         panic!("samples were late in each of {tries} tries: this machine is too slow for the configured wait");
     }
 }
 
 /// One try; false if samples were late, so that nothing can be compared.
-fn one_live_is_replay(buses: [&str; 2], until: Option<Nanos>, play: Play<'_>) -> bool {
+fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
     let Some(mut leg) = leg() else { return true };
-    if let Some(until) = until {
-        let stamp = |line: &str| line.split(',').next().and_then(Nanos::parse_seconds);
-        leg.table = leg
-            .table
-            .lines()
-            .filter(|l| stamp(l).is_none_or(|t| t < until))
-            .flat_map(|l| [l, "\n"])
-            .collect();
-    }
+    // Its stamps begin at 24 s.
+    let until = Nanos::from_millis(30_000);
+    let stamp = |line: &str| line.split(',').next().and_then(Nanos::parse_seconds);
+    leg.table = leg
+        .table
+        .lines()
+        .filter(|l| stamp(l).is_none_or(|t| t < until))
+        .flat_map(|l| [l, "\n"])
+        .collect();
     let rig = Rig::new();
     let file = |name: &str| rig.path(name).to_str().expect("a path in UTF-8").to_owned();
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("real_leg");

@@ -30,6 +30,8 @@ pub enum Reason {
     Absent = 8,
     /// Too few samples yet to tell a velocity and an acceleration of a channel it depends on.
     Starting = 9,
+    /// It depends on how the base moves, and no link is declared to stand still.
+    NoStance = 10,
 }
 
 impl Reason {
@@ -47,6 +49,7 @@ impl Reason {
             Self::NotFinite => "not_finite",
             Self::Absent => "absent",
             Self::Starting => "starting",
+            Self::NoStance => "no_stance",
         }
     }
 }
@@ -94,7 +97,7 @@ impl JointTorque {
 /// The torques of all joints at one instant: the payload of `<robot>/estimate/torque`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
-#[type_name("proprio/TorqueEstimate/1")]
+#[type_name("proprio/TorqueEstimate/2")]
 pub struct TorqueEstimate {
     /// When; `acquired` is the instant that the torques are of.
     pub header: Header,
@@ -150,7 +153,7 @@ impl ContactWrench {
 /// The wrenches of all contacts at one instant: the payload of `<robot>/estimate/contact`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
-#[type_name("proprio/ContactEstimate/1")]
+#[type_name("proprio/ContactEstimate/2")]
 pub struct ContactEstimate {
     /// When; `acquired` is the instant that the wrenches are of.
     pub header: Header,
