@@ -10,6 +10,7 @@
 //! - [`model`]: an undirected tree of links from a URDF; massless frames folded; F/T joints kept.
 //! - [`dynamics`]: kinematics from any base, sub-trees cut at the F/T sensors, reordered recursive Newton-Euler.
 //! - [`regressor`]: wrenches and torques as linear functions of the inertial parameters, and which of these can be identified at all.
+//! - [`identify`]: the parameters themselves, from what the sensors measure while the robot moves.
 //! - [`differentiate`]: position, velocity and acceleration at any instant from noisy, quantised samples; [`history`]: what
 //!   is used as measured.
 //! - [`pipeline`]: samples in, estimates out; no input, no output, no clock.
@@ -20,6 +21,7 @@ pub mod daemon;
 pub mod differentiate;
 pub mod dynamics;
 pub mod history;
+pub mod identify;
 pub mod model;
 pub mod offline;
 pub mod pipeline;

@@ -28,15 +28,15 @@
 //! - The ten columns of a link lie side by side in every row, so that loops of fixed length over them become vector instructions on any processor.
 //! - Zeros are written once. They change only with the base, and then only in the rows of joints between the old one and the new.
 //!
-//! iCub V2.5, 32 joints, another state at every call, kinematics included, one core; every line the fastest of a hundred rounds of one interleaved
-//! run (`tests/peers/run`, on a shared two-core virtual machine, AMD EPYC, which was not idle) [us]:
+//! iCub V2.5, 32 joints, another state at every call, kinematics included, one core, one interleaved run with equal outputs (`tests/peers/run`; idle two-core
+//! virtual machine, Intel Xeon); least and median of 100 rounds \[us\], and their time as a multiple of ours built alike, of the medians:
 //!
 //! | | 38 x 330, all fixed joints folded | 38 x 390, six F/T joints kept |
 //! |---|---|---|
-//! | [`Regressor`], plain x86-64 | 3.9 | 4.4 |
-//! | [`Regressor`], `-C target-cpu=native` | 4.2 | 4.8 |
-//! | Pinocchio 4.1.0, `-march=native` | 15.0 | |
-//! | iDynTree 15.1.0, `-O3` | 73 | 86 |
+//! | [`Regressor`], plain x86-64 | 3.19 / 3.43 | 3.61 / 3.91 |
+//! | [`Regressor`], `-C target-cpu=native` | 3.56 / 3.90 | 4.08 / 4.45 |
+//! | Pinocchio 4.1.0, `-march=native` | 11.08 / 12.01 (3.1 x native) | |
+//! | iDynTree 15.1.0, its wheel | 41.3 / 44.6 (13.0 x plain) | 48.8 / 52.5 (13.4 x plain) |
 //!
 //! The others, likewise with kinematics (1.6 us of each), 39 bodies, plain x86-64, `cargo bench -p proprio-estimator --bench regressor` on the same
 //! machine, fastest of 100: [`Regressor`] with the base changing from foot to foot at every call 5.4; [`StackedRegressor`] with seven full wrenches

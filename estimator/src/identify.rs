@@ -1,0 +1,1 @@
+//! Identifies a robot's inertial parameters, and the offsets of its F/T sensors, from what they measure while it moves.
