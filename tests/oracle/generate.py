@@ -2,6 +2,7 @@
 
 Usage: python generate.py [--out DIR]                      (DIR: this file's folder by default; packages: requirements.txt)
        python generate.py --icub URDF --out DIR            (the iCub's file alone, which is no part of the repository)
+       python generate.py --sessions [--icub URDF] [--seed N] --out DIR     (sessions alone, in full length and rate, of the arm or of the iCub)
        With --any-version also with other versions than those of requirements.txt.
 
 Every number is computed by two or three of the libraries, each from the URDF by its own reader, and the script fails if they disagree. README.md says
@@ -16,6 +17,7 @@ sys.dont_write_bytecode = True  # no __pycache__ beside the golden files
 
 import arm
 import icub
+import sessions
 import walker
 from libraries import made_with, must, pinned
 
@@ -27,9 +29,13 @@ def main():
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     arguments.add_argument("--out", type=pathlib.Path, default=HERE, help="folder to write the golden files to (default: this file's)")
     arguments.add_argument("--icub", type=pathlib.Path, help="iCubGazeboV2_5.urdf of icub-models: makes icub_v25.json, and nothing else")
+    arguments.add_argument("--sessions", action="store_true", help="makes sessions in full, and nothing else")
+    arguments.add_argument("--seed", type=int, default=sessions.SEED, help="of the sessions (default: that of the repository's)")
     arguments.add_argument("--any-version", action="store_true", help="let versions differ from requirements.txt: digits may, then, too")
     arguments = arguments.parse_args()
     out = arguments.out.resolve()
+    must(not arguments.sessions or out != HERE, "generate.py: --sessions wants an --out elsewhere: those of the repository are shorter")
+    must(arguments.sessions or arguments.seed == sessions.SEED, "generate.py: --seed is for --sessions: the golden files have their own")
     must(
         not arguments.icub or out != HERE,
         "generate.py: --icub wants an --out elsewhere: what is made from that URDF is under its licence, and is not to be in the repository",
@@ -39,11 +45,17 @@ def main():
     must(not others or arguments.any_version, f"generate.py: {'; '.join(others)} (requirements.txt). --any-version takes them as they are")
     out.mkdir(parents=True, exist_ok=True)
 
-    if arguments.icub:
+    urdf = CONFIG / "icub_left_arm" / "model.urdf"
+    if arguments.sessions and arguments.icub:
+        sessions.write_icub(arguments.icub, out, arguments.seed)
+    elif arguments.sessions:
+        sessions.write_arm(urdf, out, arguments.seed, full=True)
+    elif arguments.icub:
         icub.write(arguments.icub, out)
     else:
-        arm.write(CONFIG / "icub_left_arm" / "model.urdf", out)
+        arm.write(urdf, out)
         walker.write(out)
+        sessions.write_arm(urdf, out / "sessions")
 
 
 if __name__ == "__main__":
