@@ -104,6 +104,24 @@ def wrong_urdf(path, random):
     return ElementTree.tostring(tree, encoding="unicode") + "\n"
 
 
+def wrong_enough(plan, world, path, random, file):
+    """The first such URDF by which, in every joint beyond a sensor, torques are off by more than a tenth of their RMS: errors of neighbouring links may
+    cancel, and there would be nothing to identify. `file` is where it may be kept meanwhile."""
+    robot = world.robot
+    joints = [robot.joints.index(joint) for joint in plan["distal"]]
+    instants = np.linspace(0, plan["durations"]["train"], 25)
+    torques = lambda world: np.array([world.at(t)["torque"][joints] for t in instants])
+    truth = torques(world)
+    for _ in range(2000):
+        text = wrong_urdf(path, random)
+        file.write_text(text)
+        engines = {"bare": (MuJoCo(Robot(file, robot.imu), floating=True), world.engines["bare"][1])}
+        wrong = torques(World(plan, robot, engines, world.motion, world.leaning, None, None))
+        if (np.sum((wrong - truth) ** 2, axis=0) > 0.1**2 * np.sum(truth**2, axis=0)).all():
+            return text
+    raise SystemExit("no URDF is wrong enough")
+
+
 def loaded(robot, hand, centre):
     """The robot with a cube of PAYLOAD_MASS in its hand, `centre` in the hand's axes."""
     other = Robot(robot.path, robot.imu)
@@ -351,8 +369,7 @@ def make(plan, urdf, out, seed):
     robot = Robot(urdf, plan["imu_frame"])
     stream = lambda *what: np.random.default_rng([seed, *(number_of(w) for w in what)])
     out.mkdir(parents=True, exist_ok=True)
-    (out / "cad.urdf").write_text(wrong_urdf(urdf, stream("cad")))
-    (out / "estimator.toml").write_text(plan["config"])
+    (out / "estimator.toml").write_text(plan["config"].replace("POSITION_NOISE", f"{plan['encoder_step'] / 2 + 1.4e-4:.2g}"))
     point = np.array(plan["palm"])
     payload = loaded(robot, plan["hand"], point)
     engines = {
@@ -373,6 +390,8 @@ def make(plan, urdf, out, seed):
         leaning = Leaning(of("leaning"), still) if plan["stands_on"] is None else None
         pushes = Pushes(of("pushes"), still + 3.0, duration - 2.0, point) if name == "contact" else None
         world = World(plan, robot, engines, motion, leaning, pushes, duration / 2 if name == "payload" else None)
+        if name == "train":
+            (out / "cad.urdf").write_text(wrong_enough(plan, world, urdf, stream("cad"), out / "cad.urdf"))
         exact += compare(plan, robot, idyn, world, name, of("exact").uniform(0, duration, plan["compared"]))
         text, truth = record(plan, robot, world, duration, of)
         (out / f"{name}.csv").write_text(text)
@@ -466,8 +485,8 @@ link = "l_hand"
 presence = "possible"
 
 [differentiation]
-# An encoder's noise of 2e-5 rad, its step of 1e-5 rad, and stamps that are late by up to 0.1 ms: at 1 rad/s this is 1e-4 rad.
-position_noise_rad = 1.5e-4
+# Half an encoder's step, its noise of 2e-5 rad, and stamps that are late by up to 0.1 ms: at 1 rad/s this is 1e-4 rad.
+position_noise_rad = POSITION_NOISE
 
 [input]
 max_silence_ms = 100.0
@@ -485,9 +504,10 @@ ARM = {
     "encoders": [
         ["l_shoulder_pitch", "l_shoulder_roll", "l_shoulder_yaw", "l_elbow"], ["l_wrist_prosup", "l_wrist_pitch", "l_wrist_yaw"],
     ],
+    "distal": ["l_elbow", "l_wrist_prosup", "l_wrist_pitch", "l_wrist_yaw"],
     # The motor's encoder behind a gear has finer steps than these; what a log of five decimals keeps.
     "encoder_noise": 2e-5, "encoder_step": 1e-5,
-    "reach": 0.8, "speed": 1.2, "compared": 10,
+    "reach": 0.8, "speed": 1.2, "compared": 30,
 }
 # In the repository: small. Everything every 20 ms.
 SMALL = {"ft_period": 0.02, "encoder_period": 0.02, "imu_period": 0.02,
@@ -523,8 +543,8 @@ link = "l_hand"
 presence = "possible"
 
 [differentiation]
-# Half an encoder's step of 0.055 deg, and stamps that are late by up to 0.1 ms.
-position_noise_rad = 6e-4
+# Half an encoder's step, its noise of 2e-5 rad, and stamps that are late by up to 0.1 ms: at 1 rad/s this is 1e-4 rad.
+position_noise_rad = POSITION_NOISE
 
 [input]
 max_silence_ms = 100.0
@@ -538,18 +558,24 @@ ICUB = {
     "imu": None, "imu_frame": "chest", "stands_on": "l_sole",
     "hand": "l_hand", "palm": [0.0, 0.0, 0.06], "contact": "hand",
     "encoders": [*limb("l"), *limb("r"), ["torso_pitch", "torso_roll", "torso_yaw"], ["neck_pitch", "neck_roll", "neck_yaw"]],
-    "encoder_noise": 0.0, "encoder_step": np.radians(0.055),
-    "reach": 0.4, "speed": 1.0, "compared": 5,
+    "distal": [*limb("l")[0][3:], *limb("r")[0][3:], *limb("r")[1][2:]],
+    "encoder_noise": 2e-5, "encoder_step": 1e-5,
+    "reach": 0.4, "speed": 1.0, "compared": 25,
 }
 
 
-def write_arm(urdf, out, seed=SEED, full=False):
-    """The arm's sessions into `out`: small, as in the repository, or in full."""
-    make({**ARM, **(FULL if full else SMALL)}, urdf, out, seed)
+def write_arm(urdf, out):
+    """The arm's sessions as they are in the repository: small."""
+    make({**ARM, **SMALL}, urdf, out, SEED)
 
 
-def write_icub(urdf, out, seed=SEED):
-    """The iCub's sessions, in full, into `out`."""
-    sensors = [sensor.name for sensor in Robot(urdf, ICUB["imu_frame"]).sensors]
-    tables = "".join(f'\n[[force_torque]]\nsensor = "{name}"\njoint = "{name}"\n' for name in sensors)
-    make({**ICUB, **FULL, "config": ICUB_CONFIG_HEAD + tables + ICUB_CONFIG_TAIL}, urdf, out, seed)
+def write_in_full(urdf, icub, out, seed, encoder_step_deg=None):
+    """Sessions of the arm, or of the iCub, in full length and rate; encoders in other steps, if wanted."""
+    plan = {**(ICUB if icub else ARM), **FULL}
+    if encoder_step_deg:
+        plan["encoder_step"] = np.radians(encoder_step_deg)
+    if icub:
+        sensors = Robot(urdf, plan["imu_frame"]).sensors
+        tables = "".join(f'\n[[force_torque]]\nsensor = "{sensor.name}"\njoint = "{sensor.joint}"\n' for sensor in sensors)
+        plan["config"] = ICUB_CONFIG_HEAD + tables + ICUB_CONFIG_TAIL
+    make(plan, urdf, out, seed)

@@ -36,6 +36,11 @@ struct Sessions {
     facts: Json,
     /// Joints beyond an F/T sensor, from the body: their torques rest on readings and on identifiable links alone.
     distal: Vec<&'static str>,
+    /// With noise and exact parameters, torques are this near, relative to their RMS. An iCub's model has links with 0.01 kg m^2 about every axis (they
+    /// steady a simulator): there, what is not known of accelerations counts.
+    near: f64,
+    /// With noise, those of CAD are at least so many times further off, in every joint of `distal`.
+    cad_further: f64,
 }
 
 fn arm() -> Sessions {
@@ -45,6 +50,7 @@ fn arm() -> Sessions {
         here.join("oracle/sessions"),
         here.join("../config/icub_left_arm/model.urdf"),
         distal,
+        (0.03, 7.5),
     )
 }
 
@@ -76,6 +82,7 @@ fn icub() -> Option<Sessions> {
         folder,
         Path::new(&models).join("iCubGazeboV2_5.urdf"),
         distal,
+        (0.15, 1.5),
     ))
 }
 
@@ -93,13 +100,15 @@ enum Urdf {
 }
 
 impl Sessions {
-    fn new(folder: PathBuf, urdf: PathBuf, distal: Vec<&'static str>) -> Self {
+    fn new(folder: PathBuf, urdf: PathBuf, distal: Vec<&'static str>, (near, cad_further): (f64, f64)) -> Self {
         let facts = serde_json::from_str(&read(&folder.join("sessions.json"))).unwrap();
         Self {
             folder,
             urdf,
             facts,
             distal,
+            near,
+            cad_further,
         }
     }
 
@@ -335,16 +344,17 @@ fn with_noise_the_true_urdf_is_as_near_as_noise_explains_and_cad_is_not() {
                         "{name} {joint}: {error:.4} Nm of {size:.3}, CAD {:.4}",
                         cad[joint].error
                     );
-                    // Nothing touches them: by the links beyond them, so by how well the motion is known.
-                    assert!(error < &(0.03 * size), "{name} {joint}: {error} of {size}");
+                    // Nothing touches what is beyond them: by the links there, so by how well the motion is known.
+                    assert!(*error < sessions.near * size, "{name} {joint}: {error} of {size}");
+                    let further = cad[joint].error / error;
                     assert!(
-                        cad[joint].error > 7.5 * error,
-                        "{name} {joint}: {error}, CAD {}",
-                        cad[joint].error
+                        further > sessions.cad_further,
+                        "{name} {joint}: CAD {further} times further off"
                     );
-                } else if stated.is_finite() {
-                    // By the sensor's reading, whose offset drifts by some tenths of a newton.
-                    assert!(error < &(3.0 * stated), "{name} {joint}: {error}, stated {stated}");
+                } else {
+                    // By the sensor's reading, whose offset drifts by some tenths of a newton. What is stated is the noise of sensors alone.
+                    let near = (3.0 * stated).max(if sessions.near > 0.1 { sessions.near * size } else { 0.0 });
+                    assert!(*error < near, "{name} {joint}: {error} of {size}, stated {stated}");
                 }
             }
         }
