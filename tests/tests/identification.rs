@@ -6,7 +6,7 @@
 //! Always the arm's sessions; an iCub's where somebody has made them: in `icub_sessions` beside the URDF that `PROPRIO_ICUB_MODELS` has
 //! (`tests/oracle/README.md` says how).
 
-use proprio_estimator::config::{Config, ForceTorque};
+use proprio_estimator::config::{Config, ForceTorque, Presence};
 use proprio_estimator::model::Model;
 use proprio_estimator::offline::estimate;
 use proprio_estimator::setup::Setup;
@@ -116,9 +116,19 @@ impl Sessions {
         read(&self.folder.join(format!("{name}.csv")))
     }
 
-    /// With F/T offsets as they are in the middle of a session's drift, if one is named.
+    /// With F/T offsets as they are in the middle of a session's drift, if one is named. The hand is touched if that is declared.
     fn setup(&self, urdf: Urdf, offsets_of: Option<&str>) -> Setup {
+        self.setup_for(Presence::Possible, urdf, offsets_of)
+    }
+
+    /// The same, but with anything possible at the hand, always: torques beyond the sensor rest on its reading.
+    fn setup_touched(&self, urdf: Urdf, offsets_of: Option<&str>) -> Setup {
+        self.setup_for(Presence::Always, urdf, offsets_of)
+    }
+
+    fn setup_for(&self, hand: Presence, urdf: Urdf, offsets_of: Option<&str>) -> Setup {
         let mut config = Config::load(&self.folder.join("estimator.toml")).unwrap();
+        config.contact.last_mut().expect("the hand").presence = hand;
         if urdf == Urdf::True {
             config.model.clone_from(&self.urdf);
         }
@@ -357,6 +367,31 @@ fn with_noise_the_true_urdf_is_as_near_as_noise_explains_and_cad_is_not() {
                     assert!(*error < near, "{name} {joint}: {error} of {size}, stated {stated}");
                 }
             }
+        }
+    }
+}
+
+#[test]
+fn with_noise_and_the_hand_touched_torques_rest_on_the_reading() {
+    for sessions in robots() {
+        let log = sessions.log("validate");
+        let run = |urdf| {
+            let setup = sessions.setup_touched(urdf, Some("validate"));
+            scores(&sessions, "validate", &log, setup, |_| true)
+        };
+        let (exact, cad) = (run(Urdf::True), run(Urdf::Cad));
+        for joint in ["l_elbow", "l_wrist_prosup", "l_wrist_pitch", "l_wrist_yaw"] {
+            let Score { error, stated, .. } = &exact[joint];
+            println!(
+                "{joint}: {error:.4} Nm, stated {stated:.4}, CAD {:.4}",
+                cad[joint].error
+            );
+            assert!(*error < 3.0 * stated, "{joint}: {error}, stated {stated}");
+            let further = cad[joint].error / error;
+            assert!(
+                further > sessions.cad_further,
+                "{joint}: CAD {further} times further off"
+            );
         }
     }
 }
