@@ -207,6 +207,7 @@ impl Posterior {
         State {
             chart: self.chart.clone(),
             y: DVector::zeros(self.chart.scale.len()),
+            centred: f64::INFINITY,
         }
     }
 
@@ -221,29 +222,29 @@ impl Posterior {
         tolerance: f64,
     ) -> Result<Descent, PriorError> {
         let (mut current, mut iterations) = (weight, 0);
-        loop {
-            let newton = self.newton(state, current)?;
-            if newton.least > -OUTSIDE || current > 1e30 {
-                break;
-            }
-            current *= 100.0;
+        let mut newton = self.newton(state, current)?;
+        while newton.least < -OUTSIDE && current < 0.1 * state.centred {
+            current = (100.0 * current).min(0.1 * state.centred);
+            newton = self.newton(state, current)?;
         }
         loop {
             let is_last = current <= weight;
             let goal = if is_last { tolerance } else { CENTRED * current };
-            let (newton, is_converged) = loop {
-                let newton = self.newton(state, current)?;
-                let is_converged = newton.decrement <= goal + newton.rounding;
-                if is_converged || iterations >= NEWTON_STEPS {
-                    break (newton, is_converged);
+            let is_converged = loop {
+                if newton.decrement <= goal + newton.rounding {
+                    break true;
+                }
+                if iterations >= NEWTON_STEPS {
+                    break false;
                 }
                 let Some(t) = newton.length(current) else {
-                    let is_near = newton.decrement <= 1e-6 * current;
-                    break (newton, is_near);
+                    break newton.decrement <= 1e-6 * current;
                 };
                 state.y += &newton.step * t;
                 iterations += 1;
+                newton = self.newton(state, current)?;
             };
+            state.centred = current;
             if is_last || iterations >= NEWTON_STEPS {
                 return Ok(Descent {
                     factor: newton.factor,
@@ -253,6 +254,7 @@ impl Posterior {
                 });
             }
             current = (0.1 * current).max(weight);
+            newton = self.newton(state, current)?;
         }
     }
 
@@ -351,7 +353,7 @@ impl Posterior {
     }
 
     pub(in crate::identify) fn finish(&self, state: State, descent: Descent, tau: f64) -> Fit {
-        let State { chart, y } = state;
+        let State { chart, y, .. } = state;
         let u = chart.coordinates(&y);
         let links = self.centres.len();
         let mut x = DVector::zeros(u.len());
@@ -415,6 +417,8 @@ impl Posterior {
 pub(in crate::identify) struct State {
     chart: Chart,
     y: DVector<f64>,
+    /// The last weight that this was the minimum for, about; CAD is for an infinite one.
+    centred: f64,
 }
 
 impl State {
