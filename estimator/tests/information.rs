@@ -1,0 +1,705 @@
+//! The recursive triangle against batch least squares by another route (nalgebra's QR on all rows at once), and against what theory says of it.
+//!
+//! Real rows are read where `PROPRIO_DATA` names the folder of recorded logs.
+
+mod common;
+
+use std::path::Path;
+
+use common::Random;
+use nalgebra::{DMatrix, DVector};
+use proprio_estimator::identify::information::{
+    DirectionalForgetting, Information, InformationError, Panel, Posterior,
+};
+use proptest::prelude::*;
+
+/// Rows `[A | y]`, and what batch least squares makes of them.
+#[derive(Clone)]
+struct Rows {
+    a: DMatrix<f64>,
+    y: DVector<f64>,
+}
+
+impl Rows {
+    fn random(random: &mut Random, count: usize, unknowns: usize) -> Self {
+        Self {
+            a: DMatrix::from_fn(count, unknowns, |_, _| random.real(1.0)),
+            y: DVector::from_fn(count, |_, _| random.real(1.0)),
+        }
+    }
+
+    /// Condition `condition`, then columns of sizes `1 / sizes` to `sizes`; residuals so small that not they, times the square of the condition, decide
+    /// how far two exact methods may differ.
+    fn ill_conditioned(random: &mut Random, count: usize, unknowns: usize, condition: f64, sizes: f64) -> Self {
+        let left = Self::random(random, count, unknowns).a.qr().q();
+        let right = Self::random(random, unknowns, unknowns).a.qr().q();
+        let steps = unknowns.saturating_sub(1).max(1) as f64;
+        let spread = DMatrix::from_diagonal(&DVector::from_fn(unknowns, |k, _| condition.powf(-(k as f64) / steps)));
+        let mut a = left * spread * right;
+        let truth = DVector::from_fn(unknowns, |_, _| random.real(1.0));
+        let y = &a * truth + DVector::from_fn(count, |_, _| random.real(1e-8));
+        for mut column in a.column_iter_mut() {
+            column *= sizes.powf(random.real(1.0));
+        }
+        Self { a, y }
+    }
+
+    fn row(&self, i: usize) -> (Vec<f64>, f64) {
+        (self.a.row(i).iter().copied().collect(), self.y[i])
+    }
+
+    fn stacked(parts: &[&Self]) -> Self {
+        let unknowns = parts[0].a.ncols();
+        let rows: Vec<_> = parts
+            .iter()
+            .flat_map(|part| (0..part.a.nrows()).map(|i| part.row(i)))
+            .collect();
+        Self {
+            a: DMatrix::from_fn(rows.len(), unknowns, |i, j| rows[i].0[j]),
+            y: DVector::from_fn(rows.len(), |i, _| rows[i].1),
+        }
+    }
+
+    /// The same rows over some of the columns of more unknowns.
+    fn spread(&self, columns: &[usize], unknowns: usize) -> Self {
+        let mut a = DMatrix::zeros(self.a.nrows(), unknowns);
+        for (from, &to) in columns.iter().enumerate() {
+            a.set_column(to, &self.a.column(from));
+        }
+        Self { a, y: self.y.clone() }
+    }
+
+    /// Householder on all rows, columns scaled to norm one: the solution and the residual's square sum.
+    fn batch(&self) -> (DVector<f64>, f64) {
+        let scales: Vec<f64> = self.a.column_iter().map(|column| column.norm()).collect();
+        let mut scaled = self.a.clone();
+        scaled.column_iter_mut().zip(&scales).for_each(|(mut c, s)| c /= *s);
+        let qr = scaled.clone().qr();
+        let right = qr.q().transpose() * &self.y;
+        let x = qr.r().solve_upper_triangular(&right).expect("full rank");
+        let residual = (&scaled * &x - &self.y).norm_squared();
+        (DVector::from_fn(x.len(), |k, _| x[k] / scales[k]), residual)
+    }
+
+    /// Takes them all in, in panels that hold what `sizes` say, in turn.
+    fn into_information(&self, information: &mut Information, sizes: &[usize]) {
+        let largest = *sizes.iter().max().expect("a size");
+        let mut panel = Panel::new(self.a.ncols(), largest);
+        let mut sizes = sizes.iter().cycle();
+        let mut size = *sizes.next().expect("a size");
+        for i in 0..self.a.nrows() {
+            let (a, y) = self.row(i);
+            panel.push_row(&a, y).expect("room");
+            if panel.rows() == size {
+                information.absorb(&mut panel).expect("sizes");
+                size = *sizes.next().expect("a size");
+            }
+        }
+        information.absorb(&mut panel).expect("sizes");
+    }
+
+    fn information(&self, sizes: &[usize]) -> Information {
+        let mut information = Information::new(self.a.ncols());
+        self.into_information(&mut information, sizes);
+        information
+    }
+}
+
+fn solution(information: &Information) -> DVector<f64> {
+    let mut posterior = Posterior::new(information.unknowns());
+    posterior.update(information, None).expect("determined");
+    DVector::from_column_slice(posterior.estimate())
+}
+
+/// `R^T R`: what two triangles of the same rows agree in.
+fn gram(information: &Information) -> DMatrix<f64> {
+    let (root, _) = information.to_triangle();
+    root.transpose() * root
+}
+
+/// Of two vectors, relative to the second, each number in units of its column.
+fn difference(a: &DVector<f64>, b: &DVector<f64>, scales: &[f64]) -> f64 {
+    let scaled = |x: &DVector<f64>| DVector::from_fn(x.len(), |k, _| x[k] * scales[k]);
+    (scaled(a) - scaled(b)).norm() / scaled(b).norm()
+}
+
+fn scales(rows: &Rows) -> Vec<f64> {
+    rows.a.column_iter().map(|column| column.norm()).collect()
+}
+
+fn close(a: f64, b: f64, tolerance: f64) -> bool {
+    (a - b).abs() <= tolerance * a.abs().max(b.abs())
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(60))]
+
+    #[test]
+    fn any_blocking_is_batch(
+        seed in any::<u64>(), unknowns in 1_usize..50, more in 0_usize..80, sizes in prop::collection::vec(1_usize..40, 1..4),
+    ) {
+        let rows = Rows::random(&mut Random::new(seed), unknowns + 3 + more, unknowns);
+        let information = rows.information(&sizes);
+        let (x, residual) = rows.batch();
+        // A random square-like matrix may be ill-conditioned by chance: residual and right sides decide how far that counts.
+        let condition = information.excitation().condition();
+        prop_assert!(difference(&solution(&information), &x, &scales(&rows)) < 1e-14 * condition * condition.max(100.0));
+        prop_assert!(close(information.residual_square(), residual, 1e-10));
+        prop_assert_eq!(information.rows(), rows.a.nrows() as u64);
+        for k in 0..unknowns {
+            prop_assert!(information.row(k)[0] >= 0.0);
+        }
+    }
+
+    #[test]
+    fn zeros_are_no_shortcut(seed in any::<u64>(), unknowns in 2_usize..40, filled in 5_usize..95) {
+        let mut random = Random::new(seed);
+        let mut rows = Rows::random(&mut random, 3 * unknowns, unknowns);
+        rows.a.iter_mut().for_each(|value| if !random.chance(filled) { *value = 0.0 });
+        let information = rows.information(&[1, 7, 3]);
+        let expected = rows.a.transpose() * &rows.a;
+        prop_assert!((gram(&information) - &expected).norm() <= 1e-13 * expected.norm());
+    }
+
+    #[test]
+    fn merging_is_all_rows_together(seed in any::<u64>(), first in 1_usize..12, second in 1_usize..12) {
+        let mut random = Random::new(seed);
+        let unknowns = first + second;
+        let mut columns: Vec<usize> = (0..unknowns).collect();
+        random.shuffle(&mut columns);
+        let all = Rows::random(&mut random, 2 * unknowns, unknowns);
+        let (some, others) = (Rows::random(&mut random, first + 5, first), Rows::random(&mut random, 2, second));
+        let mut merged = all.information(&[4]);
+        merged.merge(&some.information(&[3]), &columns[..first]).expect("columns");
+        merged.merge(&others.information(&[2]), &columns[first..]).expect("columns");
+        let together = Rows::stacked(&[&all, &some.spread(&columns[..first], unknowns), &others.spread(&columns[first..], unknowns)]);
+        let (x, residual) = together.batch();
+        prop_assert!(difference(&solution(&merged), &x, &scales(&together)) < 1e-9);
+        prop_assert!(close(merged.residual_square(), residual, 1e-10));
+        prop_assert_eq!(merged.rows(), together.a.nrows() as u64);
+    }
+
+    #[test]
+    fn marginalising_is_the_schur_complement(seed in any::<u64>(), sessions in 1_usize..8, kept in 1_usize..12) {
+        let mut random = Random::new(seed);
+        let unknowns = sessions + kept;
+        let mut columns: Vec<usize> = (0..unknowns).collect();
+        random.shuffle(&mut columns);
+        let rows = Rows::random(&mut random, 3 * unknowns, unknowns);
+        let (gone, kept) = columns.split_at(sessions);
+        let information = rows.information(&[5]);
+        let full = rows.a.transpose() * &rows.a;
+        let pick = |a: &[usize], b: &[usize]| DMatrix::from_fn(a.len(), b.len(), |i, j| full[(a[i], b[j])]);
+        let inverse = pick(gone, gone).try_inverse().expect("full rank");
+        let expected = pick(kept, kept) - pick(kept, gone) * inverse * pick(gone, kept);
+        let (x, residual) = rows.batch();
+        let x = DVector::from_fn(kept.len(), |k, _| x[kept[k]]);
+
+        let mut forgotten = information.clone();
+        forgotten.marginalise(gone).expect("columns");
+        let found = gram(&forgotten);
+        let part = DMatrix::from_fn(kept.len(), kept.len(), |i, j| found[(kept[i], kept[j])]);
+        prop_assert!((part - &expected).norm() < 1e-11 * expected.norm());
+        for &column in gone {
+            prop_assert!(found.column(column).iter().all(|&value| value == 0.0));
+        }
+        prop_assert!(forgotten.residual_square() == information.residual_square());
+
+        let alone = information.marginal(kept).expect("columns");
+        prop_assert!((gram(&alone) - &expected).norm() < 1e-11 * expected.norm());
+        let scales = vec![1.0; kept.len()];
+        prop_assert!(difference(&solution(&alone), &x, &scales) < 1e-9);
+        prop_assert!(close(alone.residual_square(), residual, 1e-10));
+
+        // Nothing is lost when rows about the next session follow: the same as different unknowns from the beginning.
+        let next = Rows::random(&mut random, 2 * unknowns, unknowns);
+        next.into_information(&mut forgotten, &[6]);
+        let renamed: Vec<usize> = (0..unknowns).map(|c| gone.iter().position(|g| *g == c).map_or(c, |g| unknowns + g)).collect();
+        let two = Rows::stacked(&[
+            &rows.spread(&(0..unknowns).collect::<Vec<_>>(), unknowns + sessions),
+            &next.spread(&renamed, unknowns + sessions),
+        ]);
+        let (x, residual) = two.batch();
+        let x = DVector::from_fn(unknowns, |c, _| x[renamed[c]]);
+        prop_assert!(difference(&solution(&forgotten), &x, &vec![1.0; unknowns]) < 1e-8);
+        prop_assert!(close(forgotten.residual_square(), residual, 1e-9));
+    }
+
+    /// Every offset of every block as an unknown of its own, with rows for the steps of the walk between them.
+    #[test]
+    fn drifting_is_an_unknown_per_block(
+        seed in any::<u64>(), offsets in 1_usize..4, fixed in 1_usize..6, blocks in 2_usize..8, first in any::<bool>(), exponent in -3.0..3.0,
+    ) {
+        let mut random = Random::new(seed);
+        let unknowns = offsets + fixed;
+        let walking: Vec<usize> = (0..offsets).map(|o| if first { o } else { fixed + o }).collect();
+        let deviations: Vec<f64> = (0..offsets).map(|_| 10_f64.powf(exponent + random.real(0.5))).collect();
+        let mut information = Information::new(unknowns);
+        // Fixed unknowns, then the offsets of each block.
+        let all = fixed + blocks * offsets;
+        let mut parts = Vec::new();
+        for block in 0..blocks {
+            if block > 0 {
+                information.drift(&walking, &deviations).expect("a drift");
+                let mut steps = Rows { a: DMatrix::zeros(offsets, all), y: DVector::zeros(offsets) };
+                for o in 0..offsets {
+                    steps.a[(o, fixed + block * offsets + o)] = 1.0 / deviations[o];
+                    steps.a[(o, fixed + (block - 1) * offsets + o)] = -1.0 / deviations[o];
+                }
+                parts.push(steps);
+            }
+            let rows = Rows::random(&mut random, unknowns + 2, unknowns);
+            rows.into_information(&mut information, &[4]);
+            let place = |c: usize| match walking.iter().position(|w| *w == c) {
+                Some(o) => fixed + block * offsets + o,
+                None if first => c - offsets,
+                None => c,
+            };
+            parts.push(rows.spread(&(0..unknowns).map(place).collect::<Vec<_>>(), all));
+        }
+        let batch = Rows::stacked(&parts.iter().collect::<Vec<_>>());
+        let (x, residual) = batch.batch();
+        let last = |c: usize| match walking.iter().position(|w| *w == c) {
+            Some(o) => x[fixed + (blocks - 1) * offsets + o],
+            None => x[if first { c - offsets } else { c }],
+        };
+        let expected = DVector::from_fn(unknowns, |c, _| last(c));
+        prop_assert!(difference(&solution(&information), &expected, &vec![1.0; unknowns]) < 1e-8);
+        prop_assert!(close(information.residual_square(), residual, 1e-8));
+    }
+
+    #[test]
+    fn posterior_is_dense_algebra(seed in any::<u64>(), unknowns in 1_usize..30) {
+        let mut random = Random::new(seed);
+        // Fewer rows than unknowns: the prior decides the rest.
+        let rows = Rows::random(&mut random, unknowns.div_ceil(2), unknowns);
+        let prior = Rows::random(&mut random, 2 * unknowns + 3, unknowns);
+        let (information, of_prior) = (rows.information(&[3]), prior.information(&[8]));
+        let mut posterior = Posterior::new(unknowns);
+        posterior.update(&information, Some(&of_prior)).expect("determined");
+        let both = Rows::stacked(&[&rows, &prior]);
+        let (x, cost) = both.batch();
+        let full = both.a.transpose() * &both.a;
+        let covariance = full.clone().try_inverse().expect("full rank");
+        prop_assert!(difference(&DVector::from_column_slice(posterior.estimate()), &x, &scales(&both)) < 1e-9);
+        prop_assert!(close(posterior.cost(), cost, 1e-10));
+        prop_assert!((posterior.covariance() - &covariance).norm() < 1e-9 * covariance.norm());
+        let determinant = 2.0 * full.cholesky().expect("definite").l().diagonal().iter().map(|d| d.ln()).sum::<f64>();
+        prop_assert!((posterior.log_determinant() - determinant).abs() < 1e-9 * unknowns as f64);
+        let a = DVector::from_fn(unknowns, |_, _| random.real(3.0));
+        let expected = (a.transpose() * covariance * &a)[0].sqrt();
+        prop_assert!(close(posterior.deviation(a.as_slice()), expected, 1e-9));
+        prop_assert!(information.rows() == rows.a.nrows() as u64, "the prior is not in it");
+    }
+
+    /// Against the formula with dense matrices, direction by direction.
+    #[test]
+    fn forgetting_is_what_it_says(seed in any::<u64>(), unknowns in 2_usize..12, count in 1_usize..16, retention in 0.3..0.999, size in -3.0..2.0) {
+        let mut random = Random::new(seed);
+        let old = Rows::random(&mut random, 3 * unknowns, unknowns);
+        let mut new = Rows::random(&mut random, count, unknowns);
+        new.a *= 10_f64.powf(size);
+        let mut information = old.information(&[8]);
+        let (before, x, residual) = (gram(&information), solution(&information), information.residual_square());
+
+        let mut panel = Panel::new(unknowns, count);
+        for i in 0..count {
+            let (a, y) = new.row(i);
+            panel.push_row(&a, y).expect("room");
+        }
+        let mut forgetting = DirectionalForgetting::new(unknowns, count, retention).expect("a retention");
+        forgetting.absorb(&mut information, &mut panel).expect("sizes");
+
+        let covariance = before.clone().try_inverse().expect("full rank");
+        let eigen = (&new.a * &covariance * new.a.transpose()).symmetric_eigen();
+        let rotated = eigen.eigenvectors.transpose() * &new.a;
+        let mut kept = before.clone();
+        let mut moment = &before * &x + new.a.transpose() * &new.y;
+        for (i, &gain) in eigen.eigenvalues.iter().enumerate() {
+            if gain < 1e-11 {
+                continue; // rows beyond the unknowns: nothing in that direction
+            }
+            let a = rotated.row(i).transpose();
+            let let_go = gain.min(1.0 - retention) / gain;
+            kept -= &a * a.transpose() * let_go;
+            moment -= &a * (let_go * a.dot(&x));
+        }
+        let expected = &kept + new.a.transpose() * &new.a;
+        let exact = eigen.eigenvalues.max() < 900.0;
+        let found = gram(&information);
+        let tolerance = if exact { 1e-9 } else { 2e-3 }; // beyond a thousandfold gain nothing is forgotten
+        prop_assert!((&found - &expected).norm() < tolerance * expected.norm());
+        let solved = expected.clone().cholesky().expect("definite").solve(&moment);
+        if exact {
+            prop_assert!(difference(&solution(&information), &solved, &vec![1.0; unknowns]) < 1e-7);
+            // The residual: what is left of the square sums at the solution.
+            let of_kept = (x.clone() - &solved).dot(&(&kept * (x.clone() - &solved)));
+            let sum = residual + of_kept + (&new.a * &solved - &new.y).norm_squared();
+            prop_assert!(close(information.residual_square(), sum, 1e-7), "{} {}", information.residual_square(), sum);
+        }
+        // Information never decreases, and of the old at least the retention remains.
+        let least = (&found - &before).symmetric_eigenvalues().min();
+        prop_assert!(least > -1e-10 * found.norm());
+    }
+}
+
+#[test]
+fn recursive_is_batch_where_it_is_hard() {
+    let mut random = Random::new(7);
+    for unknowns in [3, 17, 44, 66] {
+        for condition in [1e2, 1e5, 1e7] {
+            for sizes in [1.0, 1e6] {
+                let rows = Rows::ill_conditioned(&mut random, 8 * unknowns, unknowns, condition, sizes);
+                let scales = scales(&rows);
+                let (x, residual) = rows.batch();
+                for panel in [1, 6, 24, 48, 8 * unknowns] {
+                    let information = rows.information(&[panel]);
+                    let apart = difference(&solution(&information), &x, &scales);
+                    assert!(
+                        apart < 1e-8,
+                        "{unknowns} unknowns, condition {condition:e}, sizes {sizes:e}, panels of {panel}: {apart:e}"
+                    );
+                    let found = information.residual_square();
+                    assert!(
+                        close(found, residual, 1e-6),
+                        "residual {found:e} instead of {residual:e}"
+                    );
+                }
+            }
+        }
+    }
+}
+
+/// Starts where 1e8 rows have left the triangle, goes on for 1e5 panels, and compares with a tree of merges, in which every row passes 17 steps, not 1e5.
+#[test]
+fn a_long_run_stays_accurate() {
+    let (unknowns, rows, panels) = (12, 6, 100_000_usize);
+    let mut random = Random::new(8);
+    let start = Rows::ill_conditioned(&mut random, 3 * unknowns, unknowns, 1e3, 1.0);
+    let start = Rows {
+        a: start.a * 1e4,
+        y: start.y * 1e4,
+    };
+    let mut information = start.information(&[12]);
+    let mut levels: Vec<Option<Information>> = vec![Some(information.clone())];
+    let identity: Vec<usize> = (0..unknowns).collect();
+    let mut panel = Panel::new(unknowns, rows);
+    let mut row = vec![0.0; unknowns];
+    let mut total = start.a.nrows() as u64;
+    for number in 0..panels {
+        let mut leaf = Information::new(unknowns);
+        let mut copy = Panel::new(unknowns, rows);
+        for _ in 0..rows {
+            row.iter_mut().for_each(|value| *value = random.real(1.0));
+            let y = row.iter().sum::<f64>() + random.real(0.1);
+            panel.push_row(&row, y).expect("room");
+            copy.push_row(&row, y).expect("room");
+            total += 1;
+        }
+        information.absorb(&mut panel).expect("sizes");
+        leaf.absorb(&mut copy).expect("sizes");
+        // As in binary counting: two of the same level make one of the next.
+        let mut level = 1;
+        let mut carried = leaf;
+        let mut bits = number;
+        while bits & 1 == 1 {
+            let other = levels[level].take().expect("a full level");
+            carried.merge(&other, &identity).expect("sizes");
+            bits >>= 1;
+            level += 1;
+        }
+        if levels.len() <= level {
+            levels.resize(level + 1, None);
+        }
+        levels[level] = Some(carried);
+    }
+    let mut reference = Information::new(unknowns);
+    for part in levels.iter().rev().flatten() {
+        reference.merge(part, &identity).expect("sizes");
+    }
+    assert_eq!((information.rows(), reference.rows()), (total, total));
+    let (found, expected) = (gram(&information), gram(&reference));
+    let apart = (&found - &expected).norm() / expected.norm();
+    let of_solution = difference(&solution(&information), &solution(&reference), &vec![1.0; unknowns]);
+    println!("after {panels} panels: information {apart:.1e}, solution {of_solution:.1e}");
+    // A biased rounding of one unit per panel would come to 1e5 * 1e-16 = 1e-11.
+    assert!(apart < 2e-12, "{apart:e}");
+    assert!(of_solution < 1e-10, "{of_solution:e}");
+    assert!(close(information.residual_square(), reference.residual_square(), 1e-11));
+}
+
+#[test]
+fn nothing_at_all_is_no_trouble() {
+    let mut information = Information::new(4);
+    let mut panel = Panel::new(4, 8);
+    information.absorb(&mut panel).expect("no rows");
+    information
+        .drift(&[0, 3], &[1.0, f64::INFINITY])
+        .expect("nothing to drift");
+    panel.push_row(&[0.0; 4], 3.0).expect("room");
+    panel.push_row(&[0.0, 2.0, 0.0, 0.0], 4.0).expect("room");
+    panel.push_row(&[1.0, 1.0, 0.0, 0.0], 5.0).expect("room");
+    information.absorb(&mut panel).expect("sizes");
+    assert_eq!(information.residual_square(), 9.0, "a row of zeros fits nothing");
+    let excitation = information.excitation();
+    assert_eq!((excitation.rank(1e-9), excitation.condition()), (2, f64::INFINITY));
+    let mut posterior = Posterior::new(4);
+    assert_eq!(
+        posterior.update(&information, None),
+        Err(InformationError::Undetermined { unknown: 2 })
+    );
+    // The same direction twice is still one.
+    for _ in 0..100 {
+        for _ in 0..8 {
+            panel.push_row(&[0.3, 0.1, 0.7, 1.4], 1.0).expect("room");
+        }
+        information.absorb(&mut panel).expect("sizes");
+    }
+    assert_eq!(information.excitation().rank(1e-9), 3);
+    assert_eq!(
+        posterior.update(&information, None),
+        Err(InformationError::Undetermined { unknown: 3 })
+    );
+    let weakest = information.excitation().weakest(0).expect("a direction");
+    let along = [0.0, 0.0, 2.0, -1.0];
+    let cosine = weakest.iter().zip(along).map(|(a, b)| a * b).sum::<f64>();
+    let size = weakest.iter().map(|a| a * a).sum::<f64>().sqrt() * 5.0_f64.sqrt();
+    assert!(cosine.abs() > (1.0 - 1e-9) * size, "{weakest:?}");
+}
+
+#[test]
+fn bad_rows_change_nothing() {
+    let rows = Rows::random(&mut Random::new(9), 12, 3);
+    let mut information = rows.information(&[5]);
+    let before = information.clone();
+    let mut panel = Panel::new(3, 2);
+    for value in [f64::NAN, f64::INFINITY, -f64::INFINITY, 1e121] {
+        let refused = |column| Err(InformationError::Value { column, value });
+        for column in 0..3 {
+            let mut row = [1.0; 3];
+            row[column] = value;
+            let answer = panel.push_row(&row, 0.0);
+            assert_eq!(format!("{answer:?}"), format!("{:?}", refused(column) as Result<(), _>));
+        }
+        let answer = panel.push_row(&[1.0; 3], value);
+        assert_eq!(format!("{answer:?}"), format!("{:?}", refused(3) as Result<(), _>));
+    }
+    assert!(panel.push_row(&[1.0; 2], 0.0).is_err());
+    assert_eq!(panel.rows(), 0);
+    information.absorb(&mut panel).expect("no rows");
+    assert_eq!(
+        (information.to_triangle(), information.rows()),
+        (before.to_triangle(), 12)
+    );
+
+    panel.push_row(&[1.0; 3], 0.0).expect("room");
+    panel.push_row(&[1.0; 3], 0.0).expect("room");
+    assert_eq!(
+        panel.push_row(&[1.0; 3], 0.0),
+        Err(InformationError::Full { capacity: 2 })
+    );
+    assert!(Information::new(4).absorb(&mut panel).is_err());
+    assert_eq!(panel.rows(), 2, "still waiting");
+    for deviation in [-1.0, f64::NAN] {
+        assert!(information.drift(&[0], &[deviation]).is_err());
+    }
+    assert!(information.drift(&[3], &[1.0]).is_err());
+    assert!(information.drift(&[0, 1], &[1.0]).is_err());
+    assert!(information.marginalise(&[1, 3]).is_err());
+    assert!(information.marginal(&[1, 1]).is_err());
+    assert!(information.merge(&before, &[0, 1, 3]).is_err());
+    assert!(information.merge(&before, &[0, 1]).is_err());
+    assert_eq!(information.to_triangle(), before.to_triangle());
+    for retention in [0.0, 1.1, f64::NAN] {
+        assert!(DirectionalForgetting::new(3, 2, retention).is_err());
+    }
+}
+
+#[test]
+fn drift_has_its_limits() {
+    let rows = Rows::random(&mut Random::new(10), 20, 5);
+    let information = rows.information(&[7]);
+    let after = |deviation: f64| {
+        let mut after = information.clone();
+        after.drift(&[1, 3], &[deviation; 2]).expect("a drift");
+        after
+    };
+    assert_eq!(after(0.0).to_triangle(), information.to_triangle());
+    assert_eq!(after(1e-310).to_triangle(), information.to_triangle());
+    let mut marginal = information.clone();
+    marginal.marginalise(&[1, 3]).expect("columns");
+    assert_eq!(after(f64::INFINITY).to_triangle(), marginal.to_triangle());
+    assert!((gram(&after(1e9)) - gram(&marginal)).norm() < 1e-12 * gram(&information).norm());
+    // Rows after the last column are not touched.
+    assert_eq!(after(1.0).row(4), information.row(4));
+    assert_eq!(
+        information.trailing(2).to_triangle(),
+        marginal_of(&information, &[2, 3, 4])
+    );
+}
+
+fn marginal_of(information: &Information, columns: &[usize]) -> (DMatrix<f64>, DVector<f64>) {
+    let (root, right) = information.to_triangle();
+    let first = columns[0];
+    let size = columns.len();
+    let corner = root.view((first, first), (size, size)).into_owned();
+    let alone = information.marginal(columns).expect("columns");
+    assert!((gram(&alone) - corner.transpose() * &corner).norm() < 1e-12 * corner.norm_squared());
+    (corner, right.rows(first, size).into_owned())
+}
+
+/// Standing still: one and the same row for ever.
+#[test]
+fn standing_still_forgets_nothing() {
+    let unknowns = 10;
+    let mut random = Random::new(11);
+    let mut information = Rows::random(&mut random, 500, unknowns).information(&[48]);
+    let (before, start) = (gram(&information), solution(&information));
+    let mut forgetting = DirectionalForgetting::new(unknowns, 6, 0.9).expect("a retention");
+    let mut panel = Panel::new(unknowns, 6);
+    let still = Rows::random(&mut random, 6, unknowns);
+    let mut settled = None;
+    for number in 0..20_000 {
+        for i in 0..6 {
+            panel.push_row(&still.row(i).0, still.y[i]).expect("room");
+        }
+        forgetting.absorb(&mut information, &mut panel).expect("sizes");
+        if number == 10_000 {
+            settled = Some(gram(&information));
+        }
+    }
+    let after = gram(&information);
+    // Whatever does not show in the rows has the information that it had.
+    let blind = still.a.clone().svd(false, true).v_t.expect("right vectors");
+    let seen = blind.rows(0, 6).into_owned();
+    let invisible = DMatrix::identity(unknowns, unknowns) - seen.transpose() * &seen;
+    let change = &invisible * (&after - &before) * &invisible;
+    assert!(
+        change.norm() < 1e-13 * before.norm(),
+        "{:e}",
+        change.norm() / before.norm()
+    );
+    // What shows ends at the information of 1 / (1 - retention) panels, and stays there.
+    assert!((&after - settled.expect("passed")).norm() < 1e-12 * after.norm());
+    let covariance = after.try_inverse().expect("full rank");
+    let seen = (&still.a * covariance * still.a.transpose()).symmetric_eigenvalues();
+    assert!(seen.iter().all(|gain| *gain < 0.100_001), "{seen:?}");
+    let found = &still.a * solution(&information);
+    assert!((found - &still.y).norm() < 1e-6, "the last thousand panels' word");
+    assert!((&still.a * start - &still.y).norm() > 0.1);
+}
+
+/// A payload is picked up: what is excited follows, what is not keeps its value.
+#[test]
+fn what_changes_is_followed() {
+    let unknowns = 8;
+    let mut random = Random::new(12);
+    let mut truth = DVector::from_fn(unknowns, |_, _| random.real(1.0));
+    let mut rows = Rows::random(&mut random, 60_000, unknowns);
+    rows.y = &rows.a * &truth + DVector::from_fn(rows.y.len(), |_, _| random.real(0.1));
+    let mut remembering = rows.information(&[12]);
+    let mut following = Information::new(unknowns);
+    let mut forgetting = DirectionalForgetting::new(unknowns, 12, 0.98).expect("a retention");
+    let mut panel = Panel::new(unknowns, 12);
+    for i in 0..rows.a.nrows() {
+        let (a, y) = rows.row(i);
+        panel.push_row(&a, y).expect("room");
+        if panel.rows() == 12 {
+            forgetting.absorb(&mut following, &mut panel).expect("sizes");
+        }
+    }
+    let before = solution(&following);
+    let uncertain = gram(&following).try_inverse().expect("full rank");
+    // From here on only the first five are excited, and two of them are others.
+    truth[1] += 1.0;
+    truth[4] -= 0.5;
+    truth[7] += 3.0; // without a row that shows it
+    for _ in 0..1500 {
+        let (mut again, mut row) = (Panel::new(unknowns, 12), vec![0.0; unknowns]);
+        for _ in 0..12 {
+            row[..5].iter_mut().for_each(|value| *value = random.real(1.0));
+            let y = row.iter().zip(&truth).map(|(a, x)| a * x).sum::<f64>() + random.real(0.1);
+            panel.push_row(&row, y).expect("room");
+            again.push_row(&row, y).expect("room");
+        }
+        forgetting.absorb(&mut following, &mut panel).expect("sizes");
+        remembering.absorb(&mut again).expect("sizes");
+    }
+    let (found, lagging) = (solution(&following), solution(&remembering));
+    for k in 0..5 {
+        assert!(
+            (found[k] - truth[k]).abs() < 0.02,
+            "unknown {k}: {} and {}",
+            found[k],
+            truth[k]
+        );
+    }
+    for k in 5..unknowns {
+        // They are slightly correlated with what moved.
+        assert!(
+            (found[k] - before[k]).abs() < 0.03,
+            "unknown {k}: {} and {}",
+            found[k],
+            before[k]
+        );
+    }
+    assert!(
+        (lagging[1] - truth[1]).abs() > 0.5,
+        "without forgetting it does not follow"
+    );
+}
+
+fn table(path: &Path) -> Option<DMatrix<f64>> {
+    let mut reader = csv::Reader::from_path(path).ok()?;
+    let rows: Vec<Vec<f64>> = reader
+        .records()
+        .map(|record| {
+            record
+                .expect("a row")
+                .iter()
+                .map(|cell| cell.parse().expect("a number"))
+                .collect()
+        })
+        .collect();
+    Some(DMatrix::from_fn(rows.len(), rows[0].len(), |i, j| rows[i][j]))
+}
+
+/// 176 postures of an iCub's arm, recorded by the paper's first author: eleven base parameters that gravity shows, and six offsets.
+#[test]
+fn recursive_is_batch_on_the_papers_arm() {
+    let Some(folder) = std::env::var_os("PROPRIO_DATA") else {
+        println!("skipped: PROPRIO_DATA (recorded logs) is not set");
+        return;
+    };
+    let file = |what: &str| Path::new(&folder).join(format!("paper_static_right_arm_{what}.csv"));
+    let (Some(a), Some(readings)) = (table(&file("regressor")), table(&file("ft"))) else {
+        println!("skipped: there is no {}", file("regressor").display());
+        return;
+    };
+    assert_eq!((a.shape(), readings.shape()), ((1056, 17), (176, 6)));
+    let mut rows = Rows {
+        y: DVector::from_fn(1056, |i, _| readings[(i / 6, i % 6)]),
+        a,
+    };
+    // Noise of the arm's sensor, robot still [N, Nm].
+    let noise = [0.0760, 0.0894, 0.1794, 0.00194, 0.00286, 0.00143];
+    for i in 0..1056 {
+        rows.a.row_mut(i).scale_mut(1.0 / noise[i % 6]);
+        rows.y[i] /= noise[i % 6];
+    }
+    let (x, residual) = rows.batch();
+    let scales = scales(&rows);
+    for panel in [1, 6, 24, 48, 96, 1056] {
+        let information = rows.information(&[panel]);
+        let apart = difference(&solution(&information), &x, &scales);
+        assert!(apart < 1e-8, "panels of {panel}: {apart:e}");
+        assert!(close(information.residual_square(), residual, 1e-10));
+        let excitation = information.excitation();
+        println!(
+            "panels of {panel}: {apart:.1e} apart, condition {:.0}, rank {}",
+            excitation.condition(),
+            excitation.rank(1e-9)
+        );
+        assert_eq!(excitation.rank(1e-9), 17);
+    }
+}
