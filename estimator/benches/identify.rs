@@ -56,7 +56,7 @@ impl Bench {
             information: Information::new(unknowns),
             posterior: Posterior::new(unknowns),
             panel: Panel::new(unknowns, ROWS * samples),
-            rows: (0..64 * ROWS).map(|_| random.reals(unknowns, 1.0)).collect(),
+            rows: (0..128 * ROWS).map(|_| random.reals(unknowns, 1.0)).collect(),
             turn: 0,
         };
         for _ in 0..2000 / samples {

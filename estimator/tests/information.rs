@@ -82,7 +82,7 @@ impl Rows {
     }
 
     /// Takes them all in, in panels that hold what `sizes` say, in turn.
-    fn into_information(&self, information: &mut Information, sizes: &[usize]) {
+    fn feed(&self, information: &mut Information, sizes: &[usize]) {
         let largest = *sizes.iter().max().expect("a size");
         let mut panel = Panel::new(self.a.ncols(), largest);
         let mut sizes = sizes.iter().cycle();
@@ -100,7 +100,7 @@ impl Rows {
 
     fn information(&self, sizes: &[usize]) -> Information {
         let mut information = Information::new(self.a.ncols());
-        self.into_information(&mut information, sizes);
+        self.feed(&mut information, sizes);
         information
     }
 }
@@ -213,7 +213,7 @@ proptest! {
 
         // Nothing is lost when rows about the next session follow: the same as different unknowns from the beginning.
         let next = Rows::random(&mut random, 2 * unknowns, unknowns);
-        next.into_information(&mut forgotten, &[6]);
+        next.feed(&mut forgotten, &[6]);
         let renamed: Vec<usize> = (0..unknowns).map(|c| gone.iter().position(|g| *g == c).map_or(c, |g| unknowns + g)).collect();
         let two = Rows::stacked(&[
             &rows.spread(&(0..unknowns).collect::<Vec<_>>(), unknowns + sessions),
@@ -242,14 +242,14 @@ proptest! {
             if block > 0 {
                 information.drift(&walking, &deviations).expect("a drift");
                 let mut steps = Rows { a: DMatrix::zeros(offsets, all), y: DVector::zeros(offsets) };
-                for o in 0..offsets {
-                    steps.a[(o, fixed + block * offsets + o)] = 1.0 / deviations[o];
-                    steps.a[(o, fixed + (block - 1) * offsets + o)] = -1.0 / deviations[o];
+                for (o, deviation) in deviations.iter().enumerate() {
+                    steps.a[(o, fixed + block * offsets + o)] = 1.0 / deviation;
+                    steps.a[(o, fixed + (block - 1) * offsets + o)] = -1.0 / deviation;
                 }
                 parts.push(steps);
             }
             let rows = Rows::random(&mut random, unknowns + 2, unknowns);
-            rows.into_information(&mut information, &[4]);
+            rows.feed(&mut information, &[4]);
             let place = |c: usize| match walking.iter().position(|w| *w == c) {
                 Some(o) => fixed + block * offsets + o,
                 None if first => c - offsets,
@@ -642,6 +642,10 @@ fn what_changes_is_followed() {
             found[k],
             before[k]
         );
+    }
+    let now = gram(&following).try_inverse().expect("full rank");
+    for k in 5..unknowns {
+        assert!(now[(k, k)] < 1.1 * uncertain[(k, k)], "no wind-up of unknown {k}");
     }
     assert!(
         (lagging[1] - truth[1]).abs() > 0.5,

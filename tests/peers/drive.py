@@ -28,6 +28,8 @@ ROWS = {
     "regressor_33": "regressor, base moving, 38 x 330",
     "regressor_39": "regressor, base moving, F/T joints kept, 38 x 390",
     "cycle": "full cycle: kinematics, 6 F/T readings to 7 contact wrenches and 32 torques",
+    "recursion_44": "recursive least squares, 44 unknowns, 6 rows a sample, solved at each sample; per sample",
+    "panels_44": "the same, absorbed and solved every 8 samples; per sample, square-root form",
 }
 # Name in the tables, command in the folder. What the others are compared with comes first and second.
 OURS_NATIVE, OURS_PORTABLE = "ours, native", "ours, portable"
@@ -38,9 +40,10 @@ PROGRAMS = {
     IDYNTREE: ["peers-idyntree", "robot.urdf", "states.txt"],
     "Pinocchio, native": ["peers-pinocchio", "pinocchio.txt", "states.txt"],
     "dynibo, native": ["dynibo/release/peers-dynibo", "folded.urdf", "states.txt"],
+    "Eigen, native": ["peers-eigen"],
 }
 # Which build of ours is built as a peer is: the ratio to that one compares libraries, and not compilers' flags.
-BUILT_LIKE = {IDYNTREE: OURS_PORTABLE, "Pinocchio, native": OURS_NATIVE, "dynibo, native": OURS_NATIVE}
+BUILT_LIKE = {IDYNTREE: OURS_PORTABLE, "Pinocchio, native": OURS_NATIVE, "dynibo, native": OURS_NATIVE, "Eigen, native": OURS_NATIVE}
 REFERENCE = OURS_PORTABLE
 TOLERANCE = 1e-9
 SHOWN_STATES = (0, 17, 63)

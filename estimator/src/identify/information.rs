@@ -713,8 +713,8 @@ impl DirectionalForgetting {
         })
     }
 
-    /// Takes in the panel's rows, lets go of what they replace, and leaves the panel empty. Costs about three times what absorbing alone does, and a
-    /// diagonalisation of the size of the panel: for panels of some tens of rows at most. Does not allocate.
+    /// Takes in the panel's rows, lets go of what they replace, and leaves the panel empty. Costs two to three times what absorbing alone does, and a
+    /// diagonalisation of the size of the panel, which grows with the cube of its rows: for panels of one or two samples. Does not allocate.
     ///
     /// The residual's square sum grows by the rows' innovations in units of their standard deviations, as without forgetting.
     ///

@@ -11,6 +11,7 @@ use proprio_estimator::dynamics::{
     ContactKind, ContactSet, ContactSpec, FrameMotion, InverseDynamics, JointState, Kinematics, Noise, SensorCut,
     Solver, Structure,
 };
+use proprio_estimator::identify::information::{Information, Panel, Posterior};
 use proprio_estimator::model::Model;
 use proprio_estimator::regressor::Regressor;
 use proprio_estimator::spatial::{Vec3, Wrench};
@@ -238,6 +239,85 @@ impl Bench for Cycle {
     }
 }
 
+/// Random rows of least squares, six per sample; as in ../../eigen.cpp.
+struct Samples {
+    rows: Vec<([f64; UNKNOWNS], f64)>,
+}
+
+const UNKNOWNS: usize = 44;
+const ROWS: usize = 6;
+const SAMPLES: usize = 8;
+const STATES: usize = 64;
+
+impl Samples {
+    fn new() -> Rc<Self> {
+        // SplitMix64, between -1 and 1.
+        let mut word = 44_u64;
+        let mut next = || {
+            word = word.wrapping_add(0x9E37_79B9_7F4A_7C15);
+            let mut z = word;
+            z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+            z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+            z ^= z >> 31;
+            (z >> 11) as f64 / 9_007_199_254_740_992.0 * 2.0 - 1.0
+        };
+        let mut row = || (std::array::from_fn(|_| next()), next());
+        Rc::new(Self {
+            rows: (0..STATES * ROWS).map(|_| row()).collect(),
+        })
+    }
+}
+
+/// Absorbs and solves whenever the panel is full.
+struct Recursion {
+    samples: Rc<Samples>,
+    information: Information,
+    panel: Panel,
+    posterior: Posterior,
+    last: usize,
+}
+
+impl Recursion {
+    /// Starts from the row x = 0 of every unknown.
+    fn new(samples: &Rc<Samples>, per_panel: usize) -> Self {
+        let (mut information, mut start) = (Information::new(UNKNOWNS), Panel::new(UNKNOWNS, UNKNOWNS));
+        for k in 0..UNKNOWNS {
+            let unit: [f64; UNKNOWNS] = std::array::from_fn(|i| f64::from(u8::from(i == k)));
+            must(start.push_row(&unit, 0.0));
+        }
+        must(information.absorb(&mut start));
+        Self {
+            samples: Rc::clone(samples),
+            information,
+            panel: Panel::new(UNKNOWNS, ROWS * per_panel),
+            posterior: Posterior::new(UNKNOWNS),
+            last: 0,
+        }
+    }
+}
+
+impl Bench for Recursion {
+    fn run(&mut self, state: usize) {
+        for (row, right) in &self.samples.rows[ROWS * state..ROWS * (state + 1)] {
+            must(self.panel.push_row(row, *right));
+        }
+        if self.panel.rows() == self.panel.capacity() {
+            must(self.information.absorb(&mut self.panel));
+            must(self.posterior.update(&self.information, None));
+        }
+        self.last = state;
+    }
+
+    /// What timing has taken in differs from program to program: the state's panels afresh.
+    fn show(&self, output: &mut Output) {
+        let mut fresh = Self::new(&self.samples, self.panel.capacity() / ROWS);
+        (0..(self.last / SAMPLES + 1) * SAMPLES).for_each(|state| fresh.run(state));
+        for (k, value) in fresh.posterior.estimate().iter().enumerate() {
+            output.add("unknown", &k.to_string(), *value);
+        }
+    }
+}
+
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let [urdf, states] = &arguments[..] else {
@@ -266,7 +346,11 @@ fn main() {
         robot: Rc::clone(&folded),
         kinematics: must(Kinematics::new(&folded.model, 0)),
     };
+    let samples = Samples::new();
     let count = folded.states.states.len();
+    if count != STATES {
+        fail("states.txt does not hold as many states as the recursions have samples");
+    }
     server::serve(
         count,
         &mut [
@@ -276,6 +360,8 @@ fn main() {
             ("regressor_33", Box::new(regression(&folded_floating))),
             ("regressor_39", Box::new(regression(&kept_floating))),
             ("cycle", Box::new(Cycle::new(&kept))),
+            ("recursion_44", Box::new(Recursion::new(&samples, 1))),
+            ("panels_44", Box::new(Recursion::new(&samples, SAMPLES))),
         ],
     );
 }
