@@ -25,6 +25,19 @@
 //! in loops over the panel's columns, which are contiguous, short, and stay in the first cache. Exact zeros are skipped: a column that is zero in the
 //! panel costs nothing until a reflection fills it. So rows about few unknowns are cheap, provided that their panel has no other rows.
 //!
+//! Six rows a sample, plain x86-64, `cargo bench -p proprio-estimator --bench identify` (two-core virtual machine, Intel Xeon, other work on it: fastest of
+//! 100), us per sample, solution once per panel:
+//!
+//! | unknowns | panels of 1 sample | 4 | 8 | 16 |
+//! |---|---|---|---|---|
+//! | 44 | 6.4 | 3.0 | 2.6 | 2.3 |
+//! | 66 | 13.2 | 6.2 | 5.4 | 4.8 |
+//! | 120 | 38.6 | 18.6 | 16.2 | 15.5 |
+//! | 426 | 472 | 218 | 196 | 190 |
+//!
+//! Rows about 56 of 426 unknowns that nothing links to the others, panels of 8: 8.9. A step of six walks among 44 unknowns: 0.8 us if they are the first,
+//! 6.4 if the last; of 36 among 426: 96 us and 1270.
+//!
 //! # Why it stays sound
 //! - Every step is an orthogonal transformation; each is backward stable column by column, whatever the scales of the columns (Higham, "Accuracy and Stability of
 //!   Numerical Algorithms", SIAM 2002, th. 19.13). A rank-deficient start is none of a problem: `R` may hold zeros.
