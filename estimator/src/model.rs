@@ -12,6 +12,7 @@
 //!
 //! The order is ours, and the root is only where this numbering starts: any body can be the base of the kinematics (see [`crate::dynamics`]).
 
+mod rewrite;
 mod urdf;
 
 use std::collections::HashMap;
@@ -312,6 +313,19 @@ impl Model {
         Ok(())
     }
 
+    /// The URDF's text with the inertia of every body replaced by that of `inertias`, in the order of the bodies that [`Model::from_urdf`] makes of it
+    /// with the same `keep`; everything else stays byte for byte. Read again, it gives these inertias but for rounding.
+    ///
+    /// A body of several links, joined by fixed joints, keeps them: each gets that share of the new inertia into which the one affine map that takes the old
+    /// body to the new one carries its old share. If the old body, or one of its links, cannot exist, the link on top gets all, and the others lose
+    /// their `<inertial>`. A body whose inertia is the URDF's, bit for bit, is left as it is written.
+    ///
+    /// # Errors
+    /// As [`Model::from_urdf`]; another number of inertias than bodies, or one that is not finite.
+    pub fn rewrite_urdf(text: &str, keep: &[&str], inertias: &[RigidInertia]) -> Result<String, ModelError> {
+        rewrite::rewrite(text, keep, inertias)
+    }
+
     /// Where the URDF link of this name is, whether it is a body of its own or was folded into one.
     pub fn frame(&self, name: &str) -> Option<Frame> {
         self.frames.get(name).copied()
@@ -480,6 +494,14 @@ pub enum ModelError {
     /// A number that no body has.
     #[error("there is no link {0}")]
     NoLink(usize),
+    /// Another number of inertias than the model has bodies.
+    #[error("{given} inertias given for {needed} links")]
+    InertiaCount {
+        /// How many were given.
+        given: usize,
+        /// How many are needed.
+        needed: usize,
+    },
     /// An inertia with NaN or infinity, for a body of the model.
     #[error("link {link}: the inertia given for it is not finite")]
     InertiaNotFinite {

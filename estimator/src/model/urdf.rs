@@ -89,6 +89,17 @@ pub(super) fn read(text: &str, keep: &[&str]) -> Result<Model, ModelError> {
     .fold(&tree, robot.name, sensors, warnings)
 }
 
+/// The links of a URDF with their own inertias, each about its own origin, in the order of the text.
+pub(super) fn link_inertias(text: &str) -> Result<Vec<(String, RigidInertia)>, ModelError> {
+    let document = roxmltree::Document::parse(text).map_err(|error| ModelError::Syntax(error.to_string()))?;
+    let mut warnings = Vec::new();
+    let with_inertial = check_numbers(&document)?;
+    let robot = urdf_rs::read_from_string(&dynamics_only(text, &document, &mut warnings))
+        .map_err(|error| ModelError::NotUrdf(error.to_string()))?;
+    let (links, _) = read_links(&robot, &with_inertial, &mut warnings)?;
+    Ok(links.into_iter().map(|link| (link.name, link.inertia)).collect())
+}
+
 // ---------------------------------------------------------------- numbers, as text
 
 /// Checks every number of `<inertial>`, `<origin>`, `<axis>` and `<limit>`, while their lines are known. Returns the links that have an `<inertial>`.
