@@ -17,14 +17,17 @@ use std::path::Path;
 
 use common::{Random, State};
 use divan::{Bencher, black_box};
+use nalgebra::DMatrix;
 use proprio_estimator::dynamics::{
     ContactKind, ContactSet, ContactSpec, FrameMotion, Kinematics, Noise, SensorCut, Solver, Structure,
 };
 use proprio_estimator::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
 use proprio_estimator::regressor::{
-    Actuator, EstimateRows, MotorRegressor, Regressor, StackedRegressor, Transmission, Weighting,
+    Actuator, Covariance, EstimateRows, MotorRegressor, Propagation, Regressor, StackedRegressor, Transmission,
+    Weighting,
 };
 use proprio_estimator::spatial::{Pose, Vec3, Wrench};
+use proprio_topics::Nanos;
 
 fn main() {
     divan::main();
@@ -270,6 +273,59 @@ fn f_rows_of_all_torques(bencher: Bencher<'_, '_>) {
             rows.torque_row(dof, row).expect("a row");
             black_box(row);
         }
+    });
+}
+
+/// What is uncertain: every link by itself, as in a URDF; parameters of the limbs beyond the sensors, and offsets, together, the others by themselves; or
+/// all together, as once all were identified.
+const UNCERTAIN: [&str; 3] = ["urdf", "limbs", "all"];
+
+/// Kinematics, solution, and the standard deviations of all torques and of seven full contact wrenches.
+#[divan::bench(args = UNCERTAIN)]
+fn h_deviations(bencher: Bencher<'_, '_>, uncertain: &str) {
+    let contacts = Bench::new(true).contacts();
+    deviations(bencher, uncertain, &contacts);
+}
+
+/// The same without contacts: torques from both sides of a joint rest on all of their sub-tree.
+#[divan::bench(args = UNCERTAIN)]
+fn i_deviations_without_contacts(bencher: Bencher<'_, '_>, uncertain: &str) {
+    deviations(bencher, uncertain, &ContactSet::EMPTY);
+}
+
+fn deviations(bencher: Bencher<'_, '_>, uncertain: &str, contacts: &ContactSet) {
+    let mut bench = Bench::new(true);
+    let mut solver = Solver::new(&bench.structure);
+    let readings = bench.readings();
+    let (links, sensors) = (bench.model.link_count(), readings.len());
+    let mut covariance = Covariance::exact(links, sensors);
+    let mut random = Random::new(426);
+    let mut root = |columns| DMatrix::from_fn(columns, columns, |_, _| random.real(0.01));
+    let (together, alone): (Vec<usize>, Vec<usize>) = (0..links).partition(|&link| match uncertain {
+        "urdf" => false,
+        "limbs" => bench.structure.subtree_of(link) != Some(0),
+        _ => true,
+    });
+    let offsets: Vec<usize> = (0..if uncertain == "urdf" { 0 } else { sensors }).collect();
+    let columns = 10 * together.len() + 6 * offsets.len();
+    covariance
+        .add(&together, &offsets, root(columns))
+        .expect("a covariance");
+    for link in alone {
+        covariance.add(&[link], &[], root(10)).expect("a covariance");
+    }
+    let mut propagation = Propagation::new(&bench.structure, &covariance).expect("the same structure");
+    bencher.bench_local(|| {
+        bench.next();
+        let (structure, kinematics) = (&bench.structure, &bench.kinematics);
+        solver
+            .solve(&bench.model, structure, kinematics, &readings, contacts, &[])
+            .expect("finite input");
+        solver.update_deviations(structure).expect("the same structure");
+        propagation
+            .update(structure, &solver, kinematics, Nanos::ZERO)
+            .expect("the same structure");
+        black_box(&propagation);
     });
 }
 

@@ -5,6 +5,7 @@
 //!            -> Regressor:              [wrench on the base; joint torques] = Y phi, any base, any serialization  eq. (11), (12)
 //!            -> StackedRegressor:       sub-tree by sub-tree, Y phi + O o - C x = what its F/T sensors read: identification is fed with it
 //! Kinematics, Solver -> EstimateRows:   what the solver's torques and contact wrenches owe to parameters and offsets: carries a covariance
+//!            -> Propagation:            the standard deviations that such a covariance gives them, all at once
 //! joints' rows of either -> MotorRegressor: torques of the motors, through coupled joints, with rotor inertia and friction
 //! Model, Regime -> Identifiable:        which combinations of phi and o can show in the rows of a Regressor or a StackedRegressor at all
 //! ```
@@ -49,11 +50,13 @@ mod estimate;
 pub mod identifiable;
 mod link;
 mod motor;
+mod propagate;
 mod subtree;
 mod tree;
 
 pub use estimate::EstimateRows;
 pub use link::link_regressor;
 pub use motor::{Actuator, Coupling, MotorError, MotorRegressor, MotorTerm, Transmission};
+pub use propagate::{Covariance, Propagation};
 pub use subtree::{PresentContact, StackedRegressor, SubTreeRegressor, Weighting};
 pub use tree::{Regressor, Serialization, SerializationError};

@@ -15,7 +15,8 @@ use proprio_estimator::dynamics::{
 use proprio_estimator::model::{self, Model};
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::regressor::{
-    Actuator, Coupling, EstimateRows, MotorRegressor, Regressor, StackedRegressor, Transmission, Weighting,
+    Actuator, Coupling, Covariance, EstimateRows, MotorRegressor, Propagation, Regressor, StackedRegressor,
+    Transmission, Weighting,
 };
 use proprio_estimator::setup::Setup;
 use proprio_estimator::spatial::{self, Motion, Pose, Vec3};
@@ -495,6 +496,15 @@ fn the_dynamics_allocate_nothing_after_construction() {
     let dofs = model.dof_count();
     let transmission = Transmission::new(dofs, &[coupled]).unwrap();
     let mut motors = MotorRegressor::new(regressor.column_count(), transmission, &vec![actuator; dofs]).unwrap();
+    let mut covariance = Covariance::exact(model.link_count(), sensors.len());
+    let sensor_numbers: Vec<usize> = (0..sensors.len()).collect();
+    let columns = 20 + 6 * sensors.len();
+    covariance
+        .add(&[0, 5], &sensor_numbers, matrix(columns, columns, 0.01))
+        .unwrap();
+    covariance.add(&[7], &[], matrix(10, 10, 0.01)).unwrap();
+    covariance.set_drift(0, [0.01; 6], Nanos::ZERO).unwrap();
+    let mut propagation = Propagation::new(structure, &covariance).unwrap();
     let mut torque = vec![f64::NAN; dofs];
     let mut jacobian = matrix(6, dofs, f64::NAN);
     let mut floating_jacobian = matrix(6, 6 + dofs, f64::NAN);
@@ -524,7 +534,10 @@ fn the_dynamics_allocate_nothing_after_construction() {
             allocates_nothing("solver", || {
                 solver.solve(model, structure, &kinematics, &readings, active, &external)
             });
-            allocates_nothing("deviations", || solver.update_deviations(structure));
+            allocates_nothing("deviations", || {
+                solver.update_deviations(structure)?;
+                propagation.update(structure, &solver, &kinematics, Nanos::from_millis(100))
+            });
             allocates_nothing("sides", || {
                 (0..dofs).try_for_each(|dof| solver.sides(structure, dof).map(drop))
             });
@@ -557,7 +570,14 @@ fn the_dynamics_allocate_nothing_after_construction() {
             });
         }
     }
-    let results = [inverse.torque(), solver.torque(), equation.bias_torque(), &torque, &row];
+    let results = [
+        inverse.torque(),
+        solver.torque(),
+        propagation.torque(),
+        equation.bias_torque(),
+        &torque,
+        &row,
+    ];
     assert!(results.into_iter().flatten().all(|x| x.is_finite()));
     let matrices = [
         jacobian.as_slice(),

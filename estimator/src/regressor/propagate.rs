@@ -1,0 +1,664 @@
+//! What the covariance of parameters and offsets comes to in the solver's results: a standard deviation for every torque and every component of a
+//! contact's wrench, at every instant.
+//!
+//! [`super::EstimateRows`] has the rows `T` for it: variance = `t P t^T`. Written out row by row that is a product with a large triangle per result. Here the
+//! triangle is multiplied once per sub-tree instead, with the six rows of wrenches, in base coordinates:
+//!
+//! ```text
+//! P = U^T U                                          U: the covariance's root in the sub-tree's columns, upper triangular
+//! G_l = U_l A_l^T          (rows x 6)                of each link, A_l its regressor; of each sensor likewise, A_s its offset's wrench
+//! W_l = sum of G below l   (rows x 6)                so that Cov(F_l, F_k) = W_l^T W_k, as F_l is the sum of wrenches below l
+//! var(tau_j) = |W_j s_j - W_b h_j|^2                 tau_j = s_j . F_j - h_j . b   (top of dynamics/solver.rs)
+//! var(x_i)   = |W_b k_i|^2                           x_i = k_i . b
+//! ```
+//!
+//! A link whose parameters are correlated with nothing else in its sub-tree needs no rows there: `C_l = G_l^T G_l` is six by six, and independent covariances add,
+//! `var(tau_j) = s_j^T C s_j - 2 s_j^T C h_j + h_j^T C_b h_j` with `C` summed over what is below `j`, `C_b` over all. So what is known from the URDF alone costs little.
+//!
+//! Columns are ordered sensors first, then links from the tips to the top: what lies below a joint has short columns in the triangle. `U` and `W` are
+//! single precision: a standard deviation needs three digits, and has them even where parameters cancel to a hundred-thousandth of what each would do.
+//!
+//! Measured on iCub V2.5 (39 bodies, 426 columns), kinematics, solution and all deviations of 32 torques and seven full contact wrenches, one core of a shared
+//! two-core virtual machine (Intel Xeon, busy), plain x86-64 build, fastest of 100, with contacts / without (`cargo bench -p proprio-estimator --bench regressor`): each
+//! link uncertain by itself 13.5 / 15.7 us; the limbs beyond the sensors and all offsets correlated 17.1 / 18.5 us; all 426 columns correlated 23.3 / 24.6 us.
+
+use std::ops::Range;
+
+use nalgebra::DMatrix;
+use proprio_topics::Nanos;
+use wide::f32x8;
+
+use super::link::{LinkRows, WIDTH, WITH_FORCE, link_rows};
+use crate::dynamics::{DynamicsError, Kinematics, Solver, Structure, check_size};
+use crate::spatial::{Motion, Pose};
+
+/// Rows that are computed together.
+const LANES: usize = 8;
+type Lanes = f32x8;
+
+/// Covariance `P` of inertial parameters and F/T offsets, in blocks that are independent of each other, each as a root `U`, `P = U^T U`.
+///
+/// What is in no block is known exactly.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Covariance {
+    blocks: Vec<Block>,
+    drifts: Vec<Drift>,
+    /// Which links and which sensors are in a block.
+    links: Vec<bool>,
+    sensors: Vec<bool>,
+}
+
+/// Links and sensors whose parameters and offsets are correlated.
+#[derive(Clone, Debug, PartialEq)]
+struct Block {
+    links: Vec<usize>,
+    sensors: Vec<usize>,
+    root: DMatrix<f64>,
+}
+
+/// How an offset wanders from what it was known to be.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Drift {
+    /// Variance that each channel [torque; force] gains per second [Nm^2/s, N^2/s].
+    rate: [f64; 6],
+    /// When it was known.
+    known: Nanos,
+}
+
+impl Covariance {
+    /// Of a model with so many links, cut at so many sensors: everything is known exactly.
+    pub fn exact(links: usize, sensors: usize) -> Self {
+        let still = Drift {
+            rate: [0.0; 6],
+            known: Nanos::ZERO,
+        };
+        Self {
+            blocks: Vec::new(),
+            drifts: vec![still; sensors],
+            links: vec![false; links],
+            sensors: vec![false; sensors],
+        }
+    }
+
+    /// Adds a block: columns ten per link, then six per sensor [torque; force], both in the order given; `root` is any matrix `U` with `U^T U` their
+    /// covariance.
+    ///
+    /// # Errors
+    /// A link or sensor that is not there or has a block already; a root of another width, or one that is not finite. Nothing is changed then.
+    pub fn add(&mut self, links: &[usize], sensors: &[usize], root: DMatrix<f64>) -> Result<(), DynamicsError> {
+        check_size(
+            "columns of a covariance",
+            root.ncols(),
+            WIDTH * links.len() + 6 * sensors.len(),
+        )?;
+        if let Some(index) = root.iter().position(|value| !value.is_finite()) {
+            return Err(DynamicsError::NotFinite {
+                what: "number of a covariance",
+                index,
+            });
+        }
+        let (mut with_links, mut with_sensors) = (self.links.clone(), self.sensors.clone());
+        mark("links without a covariance", links, &mut with_links)?;
+        mark("sensors without a covariance", sensors, &mut with_sensors)?;
+        (self.links, self.sensors) = (with_links, with_sensors);
+        self.blocks.push(Block {
+            links: links.to_vec(),
+            sensors: sensors.to_vec(),
+            root,
+        });
+        Ok(())
+    }
+
+    /// Says how fast a sensor's offset wanders from what it was known to be at `known`: standard deviations [torque; force] after one second
+    /// [Nm/s^½, N/s^½]. They grow with the square root of the time since, or until, then.
+    ///
+    /// # Errors
+    /// There is no such sensor, or a number is not finite or negative.
+    pub fn set_drift(&mut self, sensor: usize, rate: [f64; 6], known: Nanos) -> Result<(), DynamicsError> {
+        let count = self.drifts.len();
+        let place = self.drifts.get_mut(sensor).ok_or(DynamicsError::Index {
+            what: "sensors",
+            index: sensor,
+            count,
+        })?;
+        if let Some(index) = rate.iter().position(|rate| !(rate.is_finite() && *rate >= 0.0)) {
+            return Err(DynamicsError::NotFinite {
+                what: "rate of a drift",
+                index,
+            });
+        }
+        *place = Drift {
+            rate: rate.map(|rate| rate * rate),
+            known,
+        };
+        Ok(())
+    }
+
+    /// Whether something is said of a link's parameters.
+    pub fn has_link(&self, link: usize) -> bool {
+        self.links.get(link).is_some_and(|there| *there)
+    }
+
+    /// All of `P`, over `[10 per link | 6 per sensor]`, without what offsets have wandered.
+    pub fn dense(&self) -> DMatrix<f64> {
+        let (links, sensors) = (self.links.len(), self.sensors.len());
+        let mut all = DMatrix::zeros(WIDTH * links + 6 * sensors, WIDTH * links + 6 * sensors);
+        for block in &self.blocks {
+            let columns: Vec<usize> = block.model_columns(links).collect();
+            let covariance = block.root.transpose() * &block.root;
+            for (i, &row) in columns.iter().enumerate() {
+                for (j, &column) in columns.iter().enumerate() {
+                    all[(row, column)] = covariance[(i, j)];
+                }
+            }
+        }
+        all
+    }
+}
+
+fn mark(what: &'static str, numbers: &[usize], places: &mut [bool]) -> Result<(), DynamicsError> {
+    let count = places.len();
+    for &index in numbers {
+        match places.get_mut(index) {
+            Some(taken) if !*taken => *taken = true,
+            _ => return Err(DynamicsError::Index { what, index, count }),
+        }
+    }
+    Ok(())
+}
+
+impl Block {
+    /// Its columns among those of the whole model.
+    fn model_columns(&self, links: usize) -> impl Iterator<Item = usize> {
+        let of_links = self.links.iter().flat_map(|&l| WIDTH * l..WIDTH * (l + 1));
+        let of_sensors = self
+            .sensors
+            .iter()
+            .flat_map(move |&s| WIDTH * links + 6 * s..WIDTH * links + 6 * (s + 1));
+        of_links.chain(of_sensors)
+    }
+}
+
+/// The standard deviations that a [`Covariance`] gives the solver's results; holds them and all the room it needs.
+#[derive(Clone, Debug)]
+pub struct Propagation {
+    parts: Vec<Part>,
+    drifts: Vec<Drift>,
+    torque: Vec<f64>,
+    contacts: Vec<[f64; 6]>,
+}
+
+/// A sub-tree: its part of the root, and room for the wrenches' roots.
+#[derive(Clone, Debug)]
+struct Part {
+    /// Rows of all of it, in units of [`LANES`].
+    rows: usize,
+    links: Vec<Link>,
+    /// What is correlated.
+    pieces: Vec<Piece>,
+    /// Links that are correlated with nothing else here: number, place, and the rows of their roots, each from the diagonal on.
+    alone: Vec<(usize, usize, Box<Root>)>,
+    /// Per link, the covariance of the wrenches below it that `alone` makes.
+    below: Vec<Covariance6>,
+    /// Every sensor at its ends.
+    ends: Vec<End>,
+    /// `W` of each link: six columns of `rows` each.
+    wrenches: Vec<Lanes>,
+}
+
+type Root = [[f64; WIDTH]; WIDTH];
+/// Symmetric; [torque; force].
+type Covariance6 = [[f64; 6]; 6];
+
+/// A link of a sub-tree.
+#[derive(Clone, Debug)]
+struct Link {
+    link: usize,
+    /// Place of its parent in the sub-tree; its own for the top.
+    parent: usize,
+    /// The rows in which its `W` is not zero.
+    rows: Range<usize>,
+}
+
+/// The columns of a link or of a sensor's offset in the root: those rows that are not zero.
+#[derive(Clone, Debug)]
+struct Piece {
+    what: Member,
+    /// Place in the sub-tree of the link where it enters.
+    place: usize,
+    rows: Range<usize>,
+    columns: Vec<Lanes>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Member {
+    Link(usize),
+    /// A sensor and the sign with which its offset enters what the links need.
+    Sensor(usize, bool),
+}
+
+/// A sensor at an end of a sub-tree.
+#[derive(Clone, Copy, Debug)]
+struct End {
+    sensor: usize,
+    /// The link where it enters.
+    link: usize,
+    /// Whether its offset counts with a plus.
+    plus: bool,
+}
+
+impl Propagation {
+    /// For a structure.
+    ///
+    /// # Errors
+    /// The covariance is of another number of links or sensors.
+    pub fn new(structure: &Structure, covariance: &Covariance) -> Result<Self, DynamicsError> {
+        check_size(
+            "links of the covariance",
+            covariance.links.len(),
+            structure.link_count(),
+        )?;
+        check_size(
+            "sensors of the covariance",
+            covariance.sensors.len(),
+            structure.sensors().len(),
+        )?;
+        Ok(Self {
+            parts: (0..structure.subtrees().len())
+                .map(|number| Part::new(structure, number, covariance))
+                .collect(),
+            drifts: covariance.drifts.clone(),
+            torque: vec![0.0; structure.dof_count()],
+            contacts: vec![[0.0; 6]; structure.contacts().len()],
+        })
+    }
+
+    /// Computes all standard deviations, for the solver's last solution at instant `t`.
+    ///
+    /// # Errors
+    /// As [`super::EstimateRows::new`]. Nothing is changed then.
+    pub fn update(
+        &mut self,
+        structure: &Structure,
+        solver: &Solver,
+        kinematics: &Kinematics,
+        t: Nanos,
+    ) -> Result<(), DynamicsError> {
+        solver.check_structure(structure)?;
+        let links = structure.link_count();
+        check_size("links of the kinematics", kinematics.link_count(), links)?;
+        check_size("sub-trees", self.parts.len(), structure.subtrees().len())?;
+        check_size("degrees of freedom", self.torque.len(), structure.dof_count())?;
+        check_size("contacts", self.contacts.len(), structure.contacts().len())?;
+        check_size("sensors", self.drifts.len(), structure.sensors().len())?;
+        if !solver.is_solved(structure, kinematics) {
+            return Err(DynamicsError::NotSolved);
+        }
+        for (part, subtree) in self.parts.iter_mut().zip(structure.subtrees()) {
+            part.update(solver, kinematics);
+            let wandered = |motion: &dyn Fn(usize) -> Motion| -> f64 {
+                let of = |end: &End| {
+                    wander(&self.drifts[end.sensor], t, solver.sensor_pose(end.sensor), || {
+                        motion(end.link)
+                    })
+                };
+                part.ends.iter().map(of).sum()
+            };
+            for (place, link) in part.links.iter().enumerate().skip(1) {
+                let Some(dof) = structure.dof_of(link.link) else {
+                    continue;
+                };
+                let (axis, response) = solver.torque_motions(dof);
+                let below = structure.below(link.link);
+                let moved = wandered(&|other| {
+                    if below.contains(&other) {
+                        *axis - *response
+                    } else {
+                        -*response
+                    }
+                });
+                self.torque[dof] = (part.variance(place, axis, response) + moved).sqrt();
+            }
+            for contact in subtree.contacts.iter() {
+                let motions = solver.contact_motions(contact);
+                for (deviation, motion) in self.contacts[contact].iter_mut().zip(motions) {
+                    *deviation = (part.variance_of_all(motion) + wandered(&|_| *motion)).sqrt();
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Standard deviations of the torques [Nm or N], by degree of freedom. Zero where nothing uncertain enters.
+    pub fn torque(&self) -> &[f64] {
+        &self.torque
+    }
+
+    /// Standard deviations of the contacts' wrenches, `[fx fy fz tx ty tz]` [N, Nm], in the order of the structure's.
+    pub fn contacts(&self) -> &[[f64; 6]] {
+        &self.contacts
+    }
+}
+
+/// Variance that what an offset has wandered by `t` gives to a result that sees it with a motion.
+fn wander(drift: &Drift, t: Nanos, x_bm: &Pose, motion: impl Fn() -> Motion) -> f64 {
+    if drift.rate == [0.0; 6] {
+        return 0.0;
+    }
+    let seconds = t.saturating_sub(drift.known).seconds().abs();
+    let seen = x_bm.twist_back(&motion());
+    let squares = seen.angular.iter().chain(seen.linear.iter()).zip(&drift.rate);
+    seconds * squares.map(|(m, rate)| m * m * rate).sum::<f64>()
+}
+
+impl Part {
+    fn new(structure: &Structure, number: usize, covariance: &Covariance) -> Self {
+        let subtree = &structure.subtrees()[number];
+        let numbers: Vec<usize> = structure.links_of(number).collect();
+        let place_of = |link: usize| numbers.iter().position(|&other| other == link);
+        let ends: Vec<End> = subtree
+            .sensors
+            .iter()
+            .map(|sensor| {
+                let cut = &structure.sensors()[sensor];
+                let child = cut.joint() + 1;
+                let is_above = structure.subtree_of(child) == Some(number);
+                End {
+                    sensor,
+                    link: if is_above { child } else { structure.parent_of(child) },
+                    plus: is_above == (cut.sign() > 0.0),
+                }
+            })
+            .collect();
+        let (mut pieces, mut alone, mut rows) = (Vec::new(), Vec::new(), 0);
+        for block in &covariance.blocks {
+            // Where the columns of each link and sensor of this sub-tree are in the block's root.
+            let mut members = Vec::new();
+            for end in &ends {
+                if let Some(i) = block.sensors.iter().position(|&s| s == end.sensor) {
+                    let first = WIDTH * block.links.len() + 6 * i;
+                    members.push((Member::Sensor(end.sensor, end.plus), end.link, first..first + 6));
+                }
+            }
+            for &link in numbers.iter().rev() {
+                if let Some(i) = block.links.iter().position(|&l| l == link) {
+                    members.push((Member::Link(link), link, WIDTH * i..WIDTH * (i + 1)));
+                }
+            }
+            let wanted: Vec<usize> = members.iter().flat_map(|(_, _, columns)| columns.clone()).collect();
+            if wanted.is_empty() || block.root.nrows() == 0 {
+                continue;
+            }
+            let root = DMatrix::from_fn(block.root.nrows(), wanted.len(), |i, j| block.root[(i, wanted[j])]);
+            let root = root.qr().r();
+            if let [(Member::Link(number), link, _)] = members.as_slice() {
+                let at = |i, j| if i < root.nrows() && i <= j { root[(i, j)] } else { 0.0 };
+                let own = std::array::from_fn(|i| std::array::from_fn(|j| at(i, j)));
+                alone.push((*number, place_of(*link).unwrap_or(0), Box::new(own)));
+                continue;
+            }
+            let mut first = 0;
+            for (what, link, columns) in members {
+                let end = (first + columns.len()).min(root.nrows());
+                let count = end.div_ceil(LANES);
+                // Too large for single precision is infinite, and makes a deviation infinite.
+                #[allow(clippy::cast_possible_truncation, reason = "single precision suffices")]
+                let at = |row: usize, column: usize| if row < end { root[(row, column)] as f32 } else { 0.0 };
+                let lanes = (first..first + columns.len()).flat_map(|column| {
+                    (0..count).map(move |chunk| Lanes::new(std::array::from_fn(|i| at(LANES * chunk + i, column))))
+                });
+                pieces.push(Piece {
+                    what,
+                    place: place_of(link).unwrap_or(0),
+                    rows: rows..rows + count,
+                    columns: lanes.collect(),
+                });
+                first += columns.len();
+            }
+            rows += root.nrows().div_ceil(LANES);
+        }
+        let mut links: Vec<Link> = numbers
+            .iter()
+            .enumerate()
+            .map(|(place, &link)| Link {
+                link,
+                parent: if place == 0 {
+                    0
+                } else {
+                    place_of(structure.parent_of(link)).unwrap_or(0)
+                },
+                rows: 0..0,
+            })
+            .collect();
+        for piece in &pieces {
+            let link = &mut links[piece.place];
+            link.rows = hull(&link.rows, &piece.rows);
+        }
+        for place in (1..links.len()).rev() {
+            let (parent, below) = (links[place].parent, links[place].rows.clone());
+            links[parent].rows = hull(&links[parent].rows, &below);
+        }
+        Self {
+            wrenches: vec![Lanes::ZERO; 6 * rows * links.len()],
+            below: if alone.is_empty() {
+                Vec::new()
+            } else {
+                vec![[[0.0; 6]; 6]; links.len()]
+            },
+            rows,
+            links,
+            pieces,
+            alone,
+            ends,
+        }
+    }
+
+    /// Computes `W` of every link.
+    fn update(&mut self, solver: &Solver, kinematics: &Kinematics) {
+        let rows = self.rows;
+        for (link, wrenches) in self.links.iter().zip(self.wrenches.chunks_exact_mut((6 * rows).max(1))) {
+            for column in wrenches.chunks_exact_mut(rows.max(1)) {
+                column[link.rows.clone()].fill(Lanes::ZERO);
+            }
+        }
+        for piece in &self.pieces {
+            let out = &mut self.wrenches[6 * rows * piece.place..][..6 * rows];
+            match piece.what {
+                Member::Link(link) => {
+                    let coefficients = link_rows(kinematics.pose(link), kinematics.motion(link));
+                    add_link(out, rows, piece, &coefficients);
+                }
+                Member::Sensor(sensor, plus) => {
+                    add_offset(out, rows, piece, solver.sensor_pose(sensor), plus);
+                }
+            }
+        }
+        self.below.fill([[0.0; 6]; 6]);
+        for (link, place, root) in &self.alone {
+            let coefficients = link_rows(kinematics.pose(*link), kinematics.motion(*link));
+            add_alone(&mut self.below[*place], root, &coefficients);
+        }
+        for place in (1..self.below.len()).rev() {
+            let (below, parent) = (self.below[place], self.links[place].parent);
+            for (sums, values) in self.below[parent].iter_mut().zip(&below) {
+                sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
+            }
+        }
+        for place in (1..self.links.len()).rev() {
+            let Link {
+                parent, rows: range, ..
+            } = self.links[place].clone();
+            if range.is_empty() {
+                continue;
+            }
+            let (before, after) = self.wrenches.split_at_mut(6 * rows * place);
+            for axis in 0..6 {
+                let below = &after[axis * rows..][range.clone()];
+                let above = &mut before[6 * rows * parent + axis * rows..][range.clone()];
+                for (sum, value) in above.iter_mut().zip(below) {
+                    *sum += *value;
+                }
+            }
+        }
+    }
+
+    /// `|W_l s - W_b h|^2`, `l` being the link at `place`.
+    fn variance(&self, place: usize, axis: &Motion, response: &Motion) -> f64 {
+        self.correlated(place, axis, response) + self.independent(place, axis, response)
+    }
+
+    fn independent(&self, place: usize, axis: &Motion, response: &Motion) -> f64 {
+        let (Some(below), Some(all)) = (self.below.get(place), self.below.first()) else {
+            return 0.0;
+        };
+        let (s, h) = (numbers(axis), numbers(response));
+        if *response == Motion::zero() {
+            return form(&s, below, &s);
+        }
+        // Of a side where nothing is, rounding leaves a little, of either sign.
+        (form(&s, below, &s) - 2.0 * form(&s, below, &h) + form(&h, all, &h)).max(0.0)
+    }
+
+    fn correlated(&self, place: usize, axis: &Motion, response: &Motion) -> f64 {
+        let below = self.part_of(place);
+        let mut sum = Lanes::ZERO;
+        if *response == Motion::zero() {
+            let s = splat(axis);
+            for row in self.links[place].rows.clone() {
+                let y = along(below, self.rows, row, &s);
+                sum += y * y;
+            }
+        } else {
+            let (s, h, all) = (splat(axis), splat(response), self.part_of(0));
+            let own = &self.links[place].rows;
+            for row in self.links[0].rows.clone() {
+                let mut y = -along(all, self.rows, row, &h);
+                if own.contains(&row) {
+                    y += along(below, self.rows, row, &s);
+                }
+                sum += y * y;
+            }
+        }
+        f64::from(sum.reduce_add())
+    }
+
+    /// `|W_b k|^2`.
+    fn variance_of_all(&self, motion: &Motion) -> f64 {
+        if self.links.is_empty() || *motion == Motion::zero() {
+            return 0.0;
+        }
+        self.variance(0, motion, &Motion::zero())
+    }
+
+    fn part_of(&self, place: usize) -> &[Lanes] {
+        &self.wrenches[6 * self.rows * place..][..6 * self.rows]
+    }
+}
+
+fn hull(a: &Range<usize>, b: &Range<usize>) -> Range<usize> {
+    match (a.is_empty(), b.is_empty()) {
+        (true, _) => b.clone(),
+        (_, true) => a.clone(),
+        _ => a.start.min(b.start)..a.end.max(b.end),
+    }
+}
+
+fn numbers(motion: &Motion) -> [f64; 6] {
+    let (n, v) = (&motion.angular, &motion.linear);
+    [n.x, n.y, n.z, v.x, v.y, v.z]
+}
+
+#[allow(clippy::cast_possible_truncation, reason = "single precision suffices")]
+fn single(value: f64) -> Lanes {
+    Lanes::splat(value as f32)
+}
+
+fn splat(motion: &Motion) -> [Lanes; 6] {
+    numbers(motion).map(single)
+}
+
+/// `a^T C b`.
+#[inline(always)]
+fn form(a: &[f64; 6], covariance: &Covariance6, b: &[f64; 6]) -> f64 {
+    let mut product = [0.0; 6];
+    for (row, a) in covariance.iter().zip(a) {
+        for (sum, value) in product.iter_mut().zip(row) {
+            *sum += a * value;
+        }
+    }
+    product.iter().zip(b).map(|(x, y)| x * y).sum()
+}
+
+/// Adds `A P A^T` of a link, `P = U^T U`.
+fn add_alone(out: &mut Covariance6, root: &Root, coefficients: &LinkRows) {
+    let columns: [[f64; 6]; WIDTH] = std::array::from_fn(|c| std::array::from_fn(|axis| coefficients[axis][c]));
+    for (first, row) in root.iter().enumerate() {
+        let mut wrench = [0.0; 6];
+        for (u, column) in row.iter().zip(&columns).skip(first) {
+            for (sum, value) in wrench.iter_mut().zip(column) {
+                *sum += u * value;
+            }
+        }
+        for (sums, a) in out.iter_mut().zip(wrench) {
+            for (sum, b) in sums.iter_mut().zip(wrench) {
+                *sum += a * b;
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn along(wrenches: &[Lanes], rows: usize, row: usize, motion: &[Lanes; 6]) -> Lanes {
+    let mut sum = wrenches[row] * motion[0];
+    for axis in 1..6 {
+        sum += wrenches[axis * rows + row] * motion[axis];
+    }
+    sum
+}
+
+/// Adds `U_l A_l^T`.
+fn add_link(out: &mut [Lanes], rows: usize, piece: &Piece, coefficients: &LinkRows) {
+    let a: [[Lanes; 6]; WIDTH] = std::array::from_fn(|c| std::array::from_fn(|axis| single(coefficients[axis][c])));
+    let count = piece.rows.len();
+    for (i, row) in piece.rows.clone().enumerate() {
+        let mut sum: [Lanes; 6] = std::array::from_fn(|axis| out[axis * rows + row]);
+        for (column, a) in a.iter().enumerate() {
+            let u = piece.columns[column * count + i];
+            // The tensor of inertia makes no force.
+            let width = if column < WITH_FORCE { 6 } else { 3 };
+            for (sum, a) in sum.iter_mut().zip(a).take(width) {
+                *sum += u * *a;
+            }
+        }
+        for (axis, sum) in sum.into_iter().enumerate() {
+            out[axis * rows + row] = sum;
+        }
+    }
+}
+
+/// Adds `U_s A_s^T`: a sensor's offset as the wrench, in base coordinates, that the links need more because of it.
+fn add_offset(out: &mut [Lanes], rows: usize, piece: &Piece, x_bm: &Pose, plus: bool) {
+    let sign = if plus { 1.0 } else { -1.0 };
+    let turn = x_bm.rotation * sign;
+    let levered = x_bm.translation.cross_matrix() * turn;
+    let splat = |m: &crate::spatial::Mat3| -> [[Lanes; 3]; 3] {
+        std::array::from_fn(|i| std::array::from_fn(|j| single(m[(i, j)])))
+    };
+    let (turn, levered) = (splat(&turn), splat(&levered));
+    let count = piece.rows.len();
+    for (i, row) in piece.rows.clone().enumerate() {
+        for axis in 0..3 {
+            let (mut torque, mut force) = (out[axis * rows + row], out[(axis + 3) * rows + row]);
+            for channel in 0..3 {
+                let (n, f) = (
+                    piece.columns[channel * count + i],
+                    piece.columns[(channel + 3) * count + i],
+                );
+                torque += n * turn[axis][channel] + f * levered[axis][channel];
+                force += f * turn[axis][channel];
+            }
+            out[axis * rows + row] = torque;
+            out[(axis + 3) * rows + row] = force;
+        }
+    }
+}
