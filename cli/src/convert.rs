@@ -52,7 +52,7 @@ pub(crate) struct Estimate {
     /// estimator.toml
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// Identified parameters and offsets to use instead of the URDF's
+    /// Identified parameters and offsets (parameters.toml) to use instead of the URDF's, estimator.toml's, and those that it names
     #[arg(long, value_name = "FILE")]
     parameters: Option<PathBuf>,
     /// The table of samples; - for standard input
@@ -298,14 +298,7 @@ pub(crate) fn encode(args: &Encode) -> anyhow::Result<()> {
 
 /// Estimates from a table.
 pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
-    if let Some(parameters) = &args.parameters {
-        return Err(proprio_estimator::config::ConfigError {
-            file: parameters.clone(),
-            problem: "this version takes its parameters from the URDF and its offsets from estimator.toml alone".into(),
-        }
-        .into());
-    }
-    let (_, setup) = proprio_estimator::daemon::load(&args.config)?;
+    let (_, setup) = proprio_estimator::daemon::load(&args.config, args.parameters.as_deref())?;
     let log = input(&args.log)?;
     let mut out = Output::new(&args.out)?;
     let report = match proprio_estimator::offline::estimate(setup, log, out.writer()) {

@@ -26,7 +26,7 @@ pub struct Config {
     pub robot: String,
     /// The URDF, relative to this file.
     pub model: PathBuf,
-    /// Identified parameters and offsets to start from, relative to this file.
+    /// Identified parameters and offsets ([`crate::parameters`]), relative to this file: they win over the URDF's inertias and this file's offsets.
     pub parameters: Option<PathBuf>,
     /// How the estimator's thread is scheduled.
     pub realtime: Option<Realtime>,
@@ -142,6 +142,12 @@ pub struct ForceTorque {
     /// What it reads with no load: torques \[Nm\].
     #[serde(default)]
     pub offset_nm: [f64; 3],
+    /// Standard deviation of `offset_n` \[N\]; default: it is exact.
+    #[serde(default)]
+    pub offset_std_n: [f64; 3],
+    /// Standard deviation of `offset_nm` \[Nm\]; default: it is exact.
+    #[serde(default)]
+    pub offset_std_nm: [f64; 3],
 }
 
 const fn default_noise_n() -> [f64; 3] {
@@ -220,15 +226,27 @@ pub enum Presence {
 }
 
 /// `[identification]`.
-#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct Identification {
     /// Whether parameters are identified on-line.
-    #[serde(default)]
     pub enabled: bool,
     /// From which measurements.
-    #[serde(default)]
     pub inputs: Vec<IdentificationInput>,
+    /// How far the URDF's inertias may be off, where nothing was identified: the relative standard deviation of a link's mass, and likewise of its mass
+    /// distribution ([`crate::parameters::cad_root`]). Torques that rest on such links are as uncertain as this makes them. 0: they are exact.
+    pub model_std: f64,
+}
+
+impl Default for Identification {
+    fn default() -> Self {
+        // What CAD leaves out (cables, screws, motors' insides) is a tenth to a third of a link's mass.
+        Self {
+            enabled: false,
+            inputs: Vec::new(),
+            model_std: 0.2,
+        }
+    }
 }
 
 /// A measurement that parameters are identified from.
@@ -367,6 +385,10 @@ impl Config {
         self.output
             .max_torque_std_nm
             .map_or(Ok(()), |bound| positive("output.max_torque_std_nm", bound, f64::MAX))?;
+        let relative = self.identification.model_std;
+        if !(0.0..=2.0).contains(&relative) {
+            return Err(format!("identification.model_std = {relative} must be 0 to 2"));
+        }
         // What may come while an instant waits is kept: 32 samples of a channel beside those of its window, 256 instants.
         if !(self.output.max_wait_ms >= 0.0 && self.output.max_wait_ms <= 250.0) {
             return Err(format!(
@@ -402,6 +424,14 @@ impl Config {
                 if let Some(value) = noise.into_iter().find(|v| v.is_nan() || *v <= 0.0 || v.is_infinite()) {
                     return Err(format!(
                         "{} has the value {value}; a standard deviation must be above 0",
+                        at(key)
+                    ));
+                }
+            }
+            for (key, deviation) in [("offset_std_n", ft.offset_std_n), ("offset_std_nm", ft.offset_std_nm)] {
+                if let Some(value) = deviation.into_iter().find(|v| !(*v >= 0.0 && v.is_finite())) {
+                    return Err(format!(
+                        "{} has the value {value}; a standard deviation can not be negative",
                         at(key)
                     ));
                 }
@@ -478,6 +508,8 @@ mod tests {
         assert_eq!(config.contact[0].kind, ContactKind::Wrench);
         assert_eq!(config.contact[0].presence, Presence::Always);
         assert!(!config.identification.enabled);
+        assert_eq!(config.identification.model_std, 0.2);
+        assert_eq!(config.force_torque[0].offset_std_n, [0.0; 3]);
     }
 
     #[test]
@@ -503,6 +535,16 @@ mod tests {
                 "link = \"l_hand\"",
                 "link = \"l_hand\"\ndirection = [0.0, 0.0, 1.0]",
                 "belongs to kind = \"force_along\" only",
+            ),
+            (
+                "joint = \"ft_joint\"",
+                "joint = \"ft_joint\"\noffset_std_n = [0.1, -1.0, 0.1]",
+                "offset_std_n has the value -1",
+            ),
+            (
+                "[output]",
+                "[identification]\nmodel_std = -0.1\n[output]",
+                "identification.model_std = -0.1 must be 0 to 2",
             ),
             ("trigger = \"ft\"", "triger = \"ft\"", "unknown field `triger`"),
             (

@@ -11,6 +11,7 @@
 //! - [`dynamics`]: kinematics from any base, sub-trees cut at the F/T sensors, reordered recursive Newton-Euler.
 //! - [`regressor`]: wrenches and torques as linear functions of the inertial parameters, and which of these can be identified at all.
 //! - [`identify`]: the parameters themselves, from what the sensors measure while the robot moves.
+//! - [`parameters`]: what was identified, as a file, and as a URDF; how uncertain it is.
 //! - [`differentiate`]: position, velocity and acceleration at any instant from noisy, quantised samples; [`history`]: what
 //!   is used as measured.
 //! - [`pipeline`]: samples in, estimates out; no input, no output, no clock.
@@ -24,6 +25,7 @@ pub mod history;
 pub mod identify;
 pub mod model;
 pub mod offline;
+pub mod parameters;
 pub mod pipeline;
 pub mod regressor;
 pub mod setup;

@@ -4,7 +4,7 @@
 //! |---|---|
 //! | `t` | the instant, as in the log |
 //! | `torque/<joint>` | \[Nm\], by the parent link on the child link along the URDF axis |
-//! | `torque_std/<joint>` | its standard deviation |
+//! | `torque_std/<joint>` | its standard deviation: from F/T noise, and from what is uncertain of inertial parameters and F/T offsets |
 //! | `contact/<name>/fx fy fz tx ty tz` | \[N, Nm\], on the link by the environment, axes and origin of the frame that `link` names |
 //! | `contact/<name>/valid`, `contact/<name>/reason` | as below, of the contact |
 //! | `valid/<joint>` | 1 if it may be used, else 0 |

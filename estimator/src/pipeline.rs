@@ -8,10 +8,14 @@
 //!
 //! A channel stamped exactly T is used as it is, its velocity and acceleration too where it has them; otherwise they come
 //! from its adaptive window ([`crate::differentiate`]). Wrenches and proper accelerations lie on straight lines between samples.
+//!
+//! Standard deviations hold F/T noise and what is uncertain of inertial parameters and F/T offsets ([`crate::regressor::Propagation`]); not the errors of
+//! positions, velocities and accelerations.
 
 use crate::differentiate::{Unavailable, Window};
 use crate::dynamics::{Certainty, ContactSet, Dependence, FrameMotion, JointState, Kinematics, Solver};
 use crate::history::{Held, History};
+use crate::regressor::Propagation;
 use crate::setup::{BaseMotion, Setup, Use};
 use crate::spatial::{Vec3, Wrench};
 use proprio_topics::{
@@ -146,6 +150,8 @@ pub struct Pipeline {
     counts: Counts,
     kinematics: Kinematics,
     solver: Solver,
+    /// What is uncertain of the parameters, carried to the estimates.
+    propagation: Propagation,
     position: Vec<f64>,
     velocity: Vec<f64>,
     acceleration: Vec<f64>,
@@ -197,6 +203,7 @@ impl Pipeline {
             counts: Counts::default(),
             kinematics,
             solver: Solver::new(&setup.structure),
+            propagation: Propagation::new(&setup.structure, &setup.covariance).expect("the covariance is of the model"),
             position: setup.locked.iter().map(|q| if q.is_nan() { 0.0 } else { *q }).collect(),
             velocity: vec![0.0; dofs],
             acceleration: vec![0.0; dofs],
@@ -434,6 +441,7 @@ impl Pipeline {
                     .solve(model, structure, &self.kinematics, &self.readings, &active, &[])
             })
             .and_then(|()| self.solver.update_deviations(structure))
+            .and_then(|()| self.propagation.update(structure, &self.solver, &self.kinematics, t))
             .is_ok();
         if self.dependences.active != Some(active) {
             self.dependences.active = Some(active);
@@ -466,15 +474,16 @@ impl Pipeline {
             .torque()
             .iter()
             .zip(self.solver.torque_deviation())
+            .zip(self.propagation.torque())
             .zip(self.solver.torque_certainty());
         let places = self.estimate.torques.joints.iter_mut().zip(&self.dependences.torques);
-        for ((place, dependence), ((torque, deviation), certainty)) in places.zip(results) {
+        for ((place, dependence), (((torque, noise), model), certainty)) in places.zip(results) {
             let (mut reason, mut cause) = judge.verdict(dependence);
-            // Without a sensor in it a torque rests on the model alone, whose uncertainty is not known.
-            let deviation = if dependence.sensors.is_empty() {
+            // Without a sensor in it a torque rests on the model alone. If that is said to be exact, nothing is known of the torque's error.
+            let deviation = if dependence.sensors.is_empty() && *model == 0.0 {
                 f64::NAN
             } else {
-                *deviation
+                noise.hypot(*model)
             };
             if reason == Reason::None && *certainty == Certainty::Assumed {
                 reason = Reason::Undetermined;
@@ -482,7 +491,7 @@ impl Pipeline {
             if reason == Reason::None && deviation > self.setup.max_deviation {
                 reason = Reason::Uncertain;
             }
-            if !solved || !torque.is_finite() || deviation.is_infinite() {
+            if !solved || !torque.is_finite() || deviation.is_infinite() || model.is_nan() {
                 (reason, cause) = (Reason::NotFinite, NO_CAUSE);
             }
             // A number that rests on a channel nobody has seen is no number.
@@ -502,7 +511,8 @@ impl Pipeline {
             .contacts
             .iter_mut()
             .zip(&self.dependences.contacts);
-        for ((place, dependence), result) in places.zip(self.solver.contacts()).take(self.setup.contacts.len()) {
+        let results = self.solver.contacts().iter().zip(self.propagation.contacts());
+        for ((place, dependence), (result, model)) in places.zip(results).take(self.setup.contacts.len()) {
             let (mut reason, mut cause) = judge.verdict(dependence);
             match result.certainty {
                 Certainty::Absent => (reason, cause) = (Reason::Absent, NO_CAUSE),
@@ -521,7 +531,13 @@ impl Pipeline {
             *place = ContactWrench {
                 force: [fx, fy, fz],
                 torque: [tx, ty, tz],
-                standard_deviation: if known { result.deviation } else { [f64::NAN; 6] },
+                standard_deviation: std::array::from_fn(|i| {
+                    if known {
+                        result.deviation[i].hypot(model[i])
+                    } else {
+                        f64::NAN
+                    }
+                }),
                 valid: u32::from(reason == Reason::None),
                 reason,
                 cause,

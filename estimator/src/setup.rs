@@ -1,11 +1,14 @@
-//! estimator.toml and the URDF, checked against each other and resolved: what the rest of the estimator works with.
+//! estimator.toml, the URDF and what was identified, checked against each other and resolved: what the rest of the estimator works with.
 
 use crate::config::{Base, Config, ContactKind as KindWord, Differentiation, Direction, Foot, Presence, SensorFrame};
 use crate::differentiate::Settings;
 use crate::dynamics::{ContactKind, ContactSet, ContactSpec, FrameMotion, Noise, SensorCut, Structure, StructureError};
 use crate::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
+use crate::parameters::{Parameters, ParametersError, cad_root};
+use crate::regressor::Covariance;
 use crate::regressor::identifiable::{BaseRegime, Identifiable, JointMotion, Measured, Offsets, Regime, Scope};
-use crate::spatial::{Pose, Vec3, Wrench};
+use crate::spatial::{Pose, RigidInertia, Vec3, Wrench};
+use nalgebra::DMatrix;
 use proprio_topics::{Description, Entry, Kind, MAX_CONTACTS, MAX_JOINTS, Name, Nanos, Publisher, Role};
 use std::fmt;
 
@@ -103,8 +106,16 @@ pub struct Setup {
     pub joint_settings: Settings,
     /// How angular velocities are differentiated.
     pub gyro_settings: Settings,
+    /// How uncertain inertial parameters and offsets are.
+    pub covariance: Covariance,
     channels: Vec<Channel>,
     warnings: Vec<String>,
+    /// Inertias as the URDF has them.
+    cad: Vec<RigidInertia>,
+    /// Offsets as the configuration has them, and their standard deviations [torque; force].
+    configured: Vec<(Wrench, [f64; 6])>,
+    model_deviation: f64,
+    identified: Option<Parameters>,
 }
 
 impl Setup {
@@ -131,14 +142,10 @@ impl Setup {
     /// As [`Setup::new`].
     pub fn with_model(config: &Config, model: Model) -> Result<Self, String> {
         let mut warnings: Vec<String> = model.warnings().to_vec();
-        if config.parameters.is_some() {
-            return Err(
-                "parameters: this version takes its parameters from the URDF and its offsets from this file".into(),
-            );
-        }
         if config.identification.enabled {
-            warnings
-                .push("identification.enabled: this version does not identify; the URDF's parameters are used".into());
+            warnings.push(
+                "identification.enabled: this version does not identify on-line; parameters stay what they are".into(),
+            );
         }
         let dofs = model.dof_count();
         if dofs > MAX_JOINTS {
@@ -262,21 +269,21 @@ impl Setup {
             max_window: Nanos::from_seconds(max_window_ms * 1e-3),
             max_gap: max_silence,
         };
-        let vector = |v: [f64; 3]| Vec3::from(v);
-        Ok(Self {
+        let configured: Vec<(Wrench, [f64; 6])> = config
+            .force_torque
+            .iter()
+            .map(|f| {
+                let ([fx, fy, fz], [tx, ty, tz]) = (f.offset_std_n, f.offset_std_nm);
+                (Wrench::from_parts(f.offset_n, f.offset_nm), [tx, ty, tz, fx, fy, fz])
+            })
+            .collect();
+        let mut setup = Self {
             robot: config.robot.clone(),
             structure,
             base_link,
             base,
             locked,
-            offsets: config
-                .force_torque
-                .iter()
-                .map(|f| Wrench {
-                    torque: vector(f.offset_nm),
-                    force: vector(f.offset_n),
-                })
-                .collect(),
+            offsets: configured.iter().map(|(offset, _)| *offset).collect(),
             contacts,
             always,
             support,
@@ -286,9 +293,95 @@ impl Setup {
             max_deviation: config.output.max_torque_std_nm.unwrap_or(f64::INFINITY),
             joint_settings: settings(position_noise_rad),
             gyro_settings: settings(angular_velocity_noise_radps),
+            covariance: Covariance::exact(model.link_count(), configured.len()),
             channels,
             warnings,
+            cad: model.inertias().to_vec(),
+            configured,
+            model_deviation: config.identification.model_std,
+            identified: None,
             model,
+        };
+        setup.settle();
+        if let Some(file) = &config.parameters {
+            Parameters::load(file)
+                .and_then(|parameters| setup.apply(&parameters))
+                .map_err(|error| format!("parameters: {} {error}", file.display()))?;
+        }
+        Ok(setup)
+    }
+
+    /// Takes inertial parameters and F/T offsets from what was identified, where it was; elsewhere the URDF's and the configuration's stay.
+    ///
+    /// # Errors
+    /// They are another robot's, or were identified with another model. Nothing is changed then.
+    pub fn apply(&mut self, parameters: &Parameters) -> Result<(), ParametersError> {
+        parameters.check_setup(self)?;
+        self.identified = Some(parameters.clone());
+        self.settle();
+        Ok(())
+    }
+
+    /// Puts inertias, offsets and their covariance where the estimator reads them. What is given here was checked when it was made, so nothing is refused.
+    fn settle(&mut self) {
+        let (links, sensors) = (self.cad.len(), self.configured.len());
+        self.covariance = Covariance::exact(links, sensors);
+        self.offsets = self.configured.iter().map(|(offset, _)| *offset).collect();
+        for (link, cad) in self.cad.iter().enumerate() {
+            let identified = self.identified.as_ref().and_then(|parameters| parameters.inertia(link));
+            let _ = self.model.set_inertia(link, identified.unwrap_or(*cad));
+        }
+        let mut measured = Vec::new();
+        if let Some(parameters) = &self.identified {
+            for offset in parameters.offsets() {
+                let Some(sensor) = self.sensor(&offset.sensor) else {
+                    continue;
+                };
+                if let Some(place) = self.offsets.get_mut(sensor) {
+                    *place = offset.reading;
+                }
+                let ([fx, fy, fz], [tx, ty, tz]) = (offset.drift.force.into(), offset.drift.torque.into());
+                let _ = self
+                    .covariance
+                    .set_drift(sensor, [tx, ty, tz, fx, fy, fz], offset.known);
+                measured.push(sensor);
+            }
+            let identified: Vec<usize> = parameters.identified().collect();
+            let _ = self.covariance.add(&identified, &measured, parameters.root());
+        }
+        for (link, cad) in self.cad.iter().enumerate() {
+            if !self.covariance.has_link(link) && self.model_deviation > 0.0 {
+                let root = cad_root(cad, self.model_deviation);
+                let root = DMatrix::from_fn(10, 10, |i, j| root[(i, j)]);
+                let _ = self.covariance.add(&[link], &[], root);
+            }
+        }
+        for (sensor, (_, deviation)) in self.configured.iter().enumerate() {
+            if !measured.contains(&sensor) && *deviation != [0.0; 6] {
+                let root = DMatrix::from_fn(6, 6, |i, j| if i == j { deviation[i] } else { 0.0 });
+                let _ = self.covariance.add(&[], &[sensor], root);
+            }
+        }
+    }
+
+    /// Inertias of the links as the URDF has them, whatever was identified.
+    #[must_use]
+    pub fn cad(&self) -> &[RigidInertia] {
+        &self.cad
+    }
+
+    /// What was identified, if it is used.
+    #[must_use]
+    pub fn identified(&self) -> Option<&Parameters> {
+        self.identified.as_ref()
+    }
+
+    /// Number of the F/T sensor with this channel.
+    #[must_use]
+    pub fn sensor(&self, channel: &str) -> Option<usize> {
+        self.channels.iter().find_map(|c| match c.role {
+            Use::Sensor(number) if c.name == channel => Some(number),
+            _ => None,
         })
     }
 
@@ -328,13 +421,13 @@ impl Setup {
 
     /// Which torques rest on links that no F/T sensor measures the far side of alone: a sentence for people, empty if none.
     ///
-    /// A joint between the base and an F/T sensor has as its torque the sensor's reading and what the links in between weigh;
-    /// these links' parameters are the URDF's.
+    /// A joint between the base and an F/T sensor has as its torque the sensor's reading and what the links in between weigh:
+    /// figures of the URDF, as far as they were not identified. How uncertain these make it is in its standard deviation.
     #[must_use]
     pub fn upstream_note(&self) -> String {
         let mut parts = Vec::new();
         for sensor in self.structure.sensors() {
-            let mut joints = Vec::new();
+            let (mut joints, mut are_identified) = (Vec::new(), true);
             let mut joint = sensor.joint();
             // Up to the root, or to the next sensor: beyond that one, both sides are measured.
             let bounded = loop {
@@ -342,6 +435,7 @@ impl Setup {
                 if parent == 0 {
                     break false;
                 }
+                are_identified &= self.is_identified(parent);
                 joint = parent - 1;
                 if self.structure.sensors().iter().any(|s| s.joint() == joint) {
                     break true;
@@ -352,14 +446,65 @@ impl Setup {
             };
             if !joints.is_empty() && !bounded {
                 joints.reverse();
+                let whose = if are_identified {
+                    "identified parameters of the links in between"
+                } else {
+                    "the URDF's links in between"
+                };
                 parts.push(format!(
-                    "{} lies beyond {}: their torques also rest on the URDF's links in between.",
+                    "{} lies beyond {}: their torques also rest on {whose}.",
                     self.model.joint_name(sensor.joint()),
                     joints.join(", ")
                 ));
             }
         }
         parts.join(" ")
+    }
+
+    fn is_identified(&self, link: usize) -> bool {
+        let parameters = self.identified.as_ref();
+        parameters.is_some_and(|parameters| parameters.inertia(link).is_some())
+    }
+
+    /// Says which parameters are in force, and how certain they are.
+    fn tell_parameters(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let known = if self.model_deviation > 0.0 {
+            format!("taken as known to {} %", (1e6 * self.model_deviation).round() / 1e4)
+        } else {
+            "taken as exact".to_owned()
+        };
+        let Some(parameters) = &self.identified else {
+            return writeln!(f, "inertial parameters: the URDF's, {known} (identification.model_std)");
+        };
+        let provenance = parameters.provenance();
+        let logs: Vec<_> = provenance.logs.iter().map(|log| log.file.as_str()).collect();
+        let from = if logs.is_empty() {
+            String::new()
+        } else {
+            format!(" from {}", logs.join(", "))
+        };
+        let tau = provenance
+            .tau
+            .map_or(String::new(), |tau| format!(" (prior's weight tau = {tau})"));
+        let links = self.model.link_count();
+        writeln!(
+            f,
+            "inertial parameters: identified by {}{from}{tau}: {} of {links} links",
+            provenance.program,
+            parameters.identified().count()
+        )?;
+        let others = (0..links).filter(|&link| !self.is_identified(link));
+        let others: Vec<_> = others.map(|link| self.model.link_name(link)).collect();
+        if !others.is_empty() {
+            writeln!(f, "  the URDF's, {known}: {}", others.join(", "))?;
+        }
+        for (place, offset) in parameters.offsets().iter().enumerate() {
+            let deviation = parameters.offset_deviation(place).unwrap_or_default();
+            let numbers = offset.reading.force_first().into_iter().zip(deviation.force_first());
+            let numbers: Vec<_> = numbers.map(|(value, std)| format!("{value:.3} +- {std:.3}")).collect();
+            writeln!(f, "  offset of {} [N, Nm]: {}", offset.sensor, numbers.join(", "))?;
+        }
+        Ok(())
     }
 
     /// What can move while the estimator runs, for the question which parameters its sensors can see at all ([`Identifiable`]). A robot with several feet
@@ -720,6 +865,7 @@ impl fmt::Display for Setup {
                 writeln!(f, "  {sight}")?;
             }
         }
+        self.tell_parameters(f)?;
         let note = self.upstream_note();
         if !note.is_empty() {
             writeln!(f, "{note}")?;

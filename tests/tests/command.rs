@@ -1050,9 +1050,21 @@ fn what_is_no_log_at_all_is_told_and_leaves_no_file() {
         ])
         .fails(1, &["no/such/folder.csv: can not be written", "No such file"]);
     let parameters = ["--parameters", "p.toml", "--log", "empty", "--out", "new.csv"];
+    let with_parameters = [&["estimate", "--config", "estimator.toml"], &parameters[..]].concat();
     place
-        .run(&[&["estimate", "--config", "estimator.toml"], &parameters[..]].concat())
-        .fails(2, &["p.toml"]);
+        .run(&with_parameters)
+        .fails(2, &["estimator.toml: parameters: p.toml can not be read: No such file"]);
+    place.write("p.toml", "schema = 1\nrobot = \"icub_left_arm\"\n");
+    place
+        .run(&with_parameters)
+        .fails(2, &["p.toml is damaged", "missing field `provenance`"]);
+    place.write(
+        "p.toml",
+        &parameters_file().replacen("icub_left_arm", "icub_right_arm", 1),
+    );
+    place
+        .run(&with_parameters)
+        .fails(2, &["p.toml is of robot \"icub_right_arm\", not of \"icub_left_arm\""]);
     // An output that is full.
     if Path::new("/dev/full").exists() {
         place.write("good.csv", &oracle("icub_left_arm_mujoco.csv"));
@@ -1587,6 +1599,107 @@ fn estimates_from_files_are_those_of_other_libraries() {
             assert_eq!(compared, 201 * 13);
         }
     }
+}
+
+/// Parameters of the arm's hand, which weighs a kilogram more than in the URDF, and the sensor's offsets.
+fn parameters_file() -> String {
+    use proprio_estimator::parameters::{Offset, Parameters, Provenance};
+    use proprio_estimator::setup::Setup;
+    use proprio_estimator::spatial;
+    let robot = Robot::open("icub_left_arm").expect("the robot of the source tree");
+    let setup = Setup::new(&robot.config).expect("its model");
+    let (link, mut inertia) = (setup.cad().len() - 1, setup.cad()[setup.cad().len() - 1]);
+    inertia.mass += 1.0;
+    let offset = Offset {
+        sensor: "l_arm_ft_sensor".into(),
+        reading: spatial::Wrench::zero(),
+        drift: spatial::Wrench::zero(),
+        known: Nanos::ZERO,
+    };
+    let provenance = Provenance {
+        program: "proprio test".into(),
+        ..Provenance::default()
+    };
+    let mut parameters = Parameters::new(&setup, provenance);
+    // Nothing is uncertain of them.
+    let root = parameters.root().resize(0, 16, 0.0);
+    parameters
+        .set_identified(&[(link, inertia)], &[offset], &root)
+        .expect("a body that can exist");
+    parameters.to_string()
+}
+
+#[test]
+fn identified_parameters_take_the_place_of_the_urdfs() {
+    let place = Place::new();
+    place.write("log.csv", &oracle("icub_left_arm_mujoco.csv"));
+    place.write("p.toml", &parameters_file());
+    let estimate = |more: &[&str]| {
+        let args = [
+            "estimate",
+            "--config",
+            "estimator.toml",
+            "--log",
+            "log.csv",
+            "--out",
+            "e.csv",
+        ];
+        place.run(&[&args[..], more].concat()).good();
+        table(&place.read("e.csv"))
+    };
+    let mean = |estimates: &BTreeMap<String, Vec<f64>>, column: &str| {
+        estimates[column].iter().sum::<f64>() / estimates[column].len() as f64
+    };
+    let (plain, with) = (estimate(&[]), estimate(&["--parameters", "p.toml"]));
+    let force = |estimates: &BTreeMap<String, Vec<f64>>| {
+        let parts = ["fx", "fy", "fz"].map(|part| mean(estimates, &format!("contact/hand/{part}")));
+        parts.iter().map(|x| x * x).sum::<f64>().sqrt()
+    };
+    // The golden log has no offsets: with those of the file, zero, what the hand feels is a kilogram that it has not.
+    let felt = force(&with);
+    assert!((felt - 9.8).abs() < 1.5, "{felt}");
+    assert!(force(&plain) > 12.0, "the offsets of estimator.toml");
+    // The configuration may name them; the daemon says so.
+    place.change(
+        "estimator.toml",
+        "named.toml",
+        &[(
+            "model = \"model.urdf\"",
+            "model = \"model.urdf\"\nparameters = \"p.toml\"",
+        )],
+    );
+    let check = place
+        .run(&["estimator", "--config", "named.toml", "--check"])
+        .good()
+        .out;
+    assert!(
+        check.contains("inertial parameters: identified by proprio test: 1 of 9 links"),
+        "{check}"
+    );
+    assert!(check.contains("the URDF's, taken as known to 20 %: "), "{check}");
+    let check = place
+        .run(&["estimator", "--config", "estimator.toml", "--check"])
+        .good()
+        .out;
+    assert!(
+        check.contains("inertial parameters: the URDF's, taken as known to 20 %"),
+        "{check}"
+    );
+    place
+        .run(&[
+            "estimate",
+            "--config",
+            "named.toml",
+            "--log",
+            "log.csv",
+            "--out",
+            "named.csv",
+        ])
+        .good();
+    assert!(
+        place.read("named.csv") == place.read("e.csv"),
+        "the same as by --parameters"
+    );
 }
 
 // ---------------------------------------------------------------- processes

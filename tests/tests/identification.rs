@@ -131,6 +131,8 @@ impl Sessions {
         config.contact.last_mut().expect("the hand").presence = hand;
         if urdf == Urdf::True {
             config.model.clone_from(&self.urdf);
+            // Its figures are exact: what is stated is the noise of sensors alone.
+            config.identification.model_std = 0.0;
         }
         if let Some(name) = offsets_of {
             let offsets = &self.facts["sessions"][name]["offsets"];

@@ -1,0 +1,1011 @@
+//! What is identified, from the file to the torques' standard deviations: covariance carried to the estimates, by another route and by drawing parameters;
+//! parameters.toml read, written, cut and foreign; URDFs with other inertias.
+
+mod common;
+
+use common::{Random, RandomRobot, State, contact, gap, humanoid, motion, size};
+use nalgebra::{DMatrix, DVector, Matrix4, SMatrix};
+use proprio_estimator::config::Config;
+use proprio_estimator::dynamics::{
+    ContactKind, ContactSet, ContactSpec, DynamicsError, FrameMotion, Kinematics, Noise, SensorCut, Solver, Structure,
+};
+use proprio_estimator::model::{Frame, Model, ModelError};
+use proprio_estimator::offline;
+use proprio_estimator::parameters::{Friction, Offset, Parameters, ParametersError, Provenance, Span, cad_root};
+use proprio_estimator::regressor::{Covariance, EstimateRows, Propagation};
+use proprio_estimator::setup::Setup;
+use proprio_estimator::spatial::{Mat3, Pose, RigidInertia, Vec3, Wrench};
+use proprio_topics::Nanos;
+use proptest::prelude::*;
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+// ---------------------------------------------------------------- covariance to deviations
+
+/// A covariance of some links and sensors: one large block, blocks of single links, and what is exact.
+fn covariance(structure: &Structure, random: &mut Random) -> Covariance {
+    let (links, sensors) = (structure.link_count(), structure.sensors().len());
+    let mut covariance = Covariance::exact(links, sensors);
+    let mut root = |rows: usize, columns: usize| DMatrix::from_fn(rows, columns, |_, _| random.real(0.1));
+    let (mut correlated, mut with) = (Vec::new(), Vec::new());
+    for link in 0..links {
+        match link % 4 {
+            0 | 1 => correlated.push(link),
+            2 => covariance.add(&[link], &[], root(10, 10)).unwrap(),
+            _ => {}
+        }
+    }
+    for sensor in 0..sensors {
+        match sensor % 3 {
+            0 => with.push(sensor),
+            1 => covariance.add(&[], &[sensor], root(6, 6)).unwrap(),
+            _ => {}
+        }
+    }
+    // Given in any order; sometimes of lower rank than columns.
+    correlated.reverse();
+    let columns = 10 * correlated.len() + 6 * with.len();
+    let rows = if links.is_multiple_of(3) {
+        columns.div_ceil(2)
+    } else {
+        columns
+    };
+    covariance.add(&correlated, &with, root(rows, columns)).unwrap();
+    covariance
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    /// The same as `T P T^T`, row by row; whatever contacts are present.
+    #[test]
+    fn deviations_are_those_of_the_estimates_rows(links in 1..=24_usize, seed in any::<u64>()) {
+        let mut random = Random::new(seed);
+        let robot = RandomRobot::new(links, &mut random);
+        let model = robot.model();
+        let sensors = robot.sensors(&model, &mut random);
+        let contacts: Vec<ContactSpec> = (0..random.below(5)).map(|_| contact(&model, &mut random).0).collect();
+        let structure = Structure::new(&model, &sensors, &contacts, 0.1).unwrap();
+        let mut kinematics = Kinematics::new(&model, random.below(model.link_count())).unwrap();
+        kinematics.update(&model, State::new(&model, &mut random).get(), &motion(&mut random)).unwrap();
+        let readings: Vec<Wrench> = sensors.iter().map(|_| random.wrench()).collect();
+        let active: ContactSet = (0..contacts.len()).filter(|_| random.chance(60)).collect();
+        let mut solver = Solver::new(&structure);
+        solver.solve(&model, &structure, &kinematics, &readings, &active, &[]).unwrap();
+
+        let mut covariance = covariance(&structure, &mut random);
+        let mut all = covariance.dense();
+        // The first sensor's offset wandered for four seconds.
+        if !sensors.is_empty() {
+            let rate = [0.1, 0.2, 0.3, 1.0, 2.0, 3.0];
+            covariance.set_drift(0, rate, Nanos::from_seconds(7.0)).unwrap();
+            for (channel, rate) in rate.iter().enumerate() {
+                let column = 10 * model.link_count() + channel;
+                all[(column, column)] += 4.0 * rate * rate;
+            }
+        }
+        let mut propagation = Propagation::new(&structure, &covariance).unwrap();
+        propagation.update(&structure, &solver, &kinematics, Nanos::from_seconds(3.0)).unwrap();
+
+        let rows = EstimateRows::new(&structure, &solver, &kinematics).unwrap();
+        let deviation = |subtree: usize, write: &dyn Fn(&mut [f64])| {
+            let (mut own, mut row) = (vec![0.0; rows.column_count(subtree).unwrap()], vec![0.0; rows.stacked_column_count()]);
+            write(&mut own);
+            rows.expand(subtree, &own, &mut row).unwrap();
+            let row = DVector::from_vec(row);
+            // What rounding may leave of a sum that vanishes.
+            let scale = row.abs().dot(&(all.abs() * row.abs()));
+            (row.dot(&(&all * &row)), scale)
+        };
+        for dof in 0..model.dof_count() {
+            let (variance, scale) = deviation(rows.torque_subtree(dof).unwrap(), &|own| rows.torque_row(dof, own).unwrap());
+            let got = propagation.torque()[dof].powi(2);
+            // Single precision, of the deviation.
+            prop_assert!((got - variance).abs() < 1e-5 * variance + 1e-10 * (1.0 + scale), "dof {}: {} not {}", dof, got, variance);
+        }
+        for contact in 0..contacts.len() {
+            for (component, got) in [3, 4, 5, 0, 1, 2].into_iter().zip(propagation.contacts()[contact]) {
+                let (variance, scale) =
+                    deviation(rows.contact_subtree(contact).unwrap(), &|own| rows.contact_row(contact, component, own).unwrap());
+                prop_assert!((got.powi(2) - variance).abs() < 1e-5 * variance + 1e-10 * (1.0 + scale), "{}: {} not {}", component, got.powi(2), variance);
+            }
+        }
+    }
+}
+
+#[test]
+fn what_does_not_fit_is_refused() {
+    let (text, sensors) = humanoid();
+    let keep: Vec<&str> = sensors.iter().map(String::as_str).collect();
+    let model = Model::from_urdf(&text, &keep).unwrap();
+    let structure = Structure::new(&model, &[], &[], 0.1).unwrap();
+    let mut covariance = Covariance::exact(model.link_count(), 0);
+    let root = |columns| DMatrix::from_element(3, columns, 0.1);
+    assert!(covariance.add(&[0], &[], root(9)).is_err(), "another width");
+    assert!(covariance.add(&[39], &[], root(10)).is_err(), "no such link");
+    assert!(covariance.add(&[1, 1], &[], root(20)).is_err(), "twice");
+    assert!(covariance.add(&[], &[0], root(6)).is_err(), "no such sensor");
+    assert!(covariance.add(&[0], &[], root(10) * f64::NAN).is_err(), "not a number");
+    assert_eq!(
+        covariance,
+        Covariance::exact(model.link_count(), 0),
+        "and nothing is changed"
+    );
+    covariance.add(&[1], &[], root(10)).unwrap();
+    assert!(covariance.add(&[1], &[], root(10)).is_err(), "has one already");
+    assert!(covariance.has_link(1) && !covariance.has_link(0));
+    assert!(covariance.set_drift(0, [0.0; 6], Nanos::ZERO).is_err());
+    assert!(Propagation::new(&structure, &Covariance::exact(5, 0)).is_err());
+    let mut propagation = Propagation::new(&structure, &covariance).unwrap();
+    let (solver, kinematics) = (Solver::new(&structure), Kinematics::new(&model, 0).unwrap());
+    assert_eq!(
+        propagation.update(&structure, &solver, &kinematics, Nanos::ZERO),
+        Err(DynamicsError::NotSolved)
+    );
+}
+
+/// Draws of [phi; o] from `P` through the solver itself: their spread is what is stated.
+fn spread(
+    model: &Model,
+    structure: &Structure,
+    active: &ContactSet,
+    covariance: &Covariance,
+    random: &mut Random,
+    draws: usize,
+) {
+    let mut kinematics = Kinematics::new(model, 0).unwrap();
+    let (state, base) = (State::new(model, random), motion(random));
+    kinematics.update(model, state.get(), &base).unwrap();
+    let readings: Vec<Wrench> = structure.sensors().iter().map(|_| random.wrench()).collect();
+    let mut solver = Solver::new(structure);
+    solver
+        .solve(model, structure, &kinematics, &readings, active, &[])
+        .unwrap();
+    let mut propagation = Propagation::new(structure, covariance).unwrap();
+    // When the offsets are known: nothing has drifted.
+    propagation.update(structure, &solver, &kinematics, KNOWN).unwrap();
+    let stated: Vec<f64> = propagation
+        .torque()
+        .iter()
+        .copied()
+        .chain(propagation.contacts().iter().flatten().copied())
+        .collect();
+
+    let results = |solver: &Solver| -> Vec<f64> {
+        let contacts = solver
+            .contacts()
+            .iter()
+            .flat_map(|contact| contact.wrench.force_first());
+        solver.torque().iter().copied().chain(contacts).collect()
+    };
+    let mean = results(&solver);
+    // Any root does for drawing; this one is not the one that was used.
+    let eigen = covariance.dense().symmetric_eigen();
+    let root = &eigen.eigenvectors * DMatrix::from_diagonal(&eigen.eigenvalues.map(|value| value.max(0.0).sqrt()));
+    let mut squares = vec![0.0; mean.len()];
+    for _ in 0..draws {
+        // Normal enough: the sum of twelve uniform numbers.
+        let z = DVector::from_fn(root.ncols(), |_, _| (0..12).map(|_| random.real(0.5)).sum::<f64>());
+        let error = &root * z;
+        let mut other = model.clone();
+        for (link, inertia) in model.inertias().iter().enumerate() {
+            let mut phi = inertia.parameters();
+            phi.iter_mut().enumerate().for_each(|(i, p)| *p += error[10 * link + i]);
+            other.set_inertia(link, RigidInertia::from_parameters(&phi)).unwrap();
+        }
+        let first = 10 * model.link_count();
+        let shifted: Vec<Wrench> = readings
+            .iter()
+            .enumerate()
+            .map(|(sensor, reading)| {
+                let o = |i: usize| error[first + 6 * sensor + i];
+                *reading - Wrench::from_parts([o(3), o(4), o(5)], [o(0), o(1), o(2)])
+            })
+            .collect();
+        kinematics.update(&other, state.get(), &base).unwrap();
+        solver
+            .solve(&other, structure, &kinematics, &shifted, active, &[])
+            .unwrap();
+        let errors = results(&solver).into_iter().zip(&mean).map(|(a, b)| a - b);
+        squares
+            .iter_mut()
+            .zip(errors)
+            .for_each(|(sum, error)| *sum += error * error);
+    }
+    let mut compared = 0;
+    for (number, (sum, stated)) in squares.iter().zip(&stated).enumerate() {
+        let spread = (sum / draws as f64).sqrt();
+        assert!(
+            (spread - stated).abs() < 0.05 * stated + 1e-9,
+            "{number}: {spread}, stated {stated}"
+        );
+        compared += usize::from(*stated > 1e-6);
+    }
+    assert!(compared > mean.len() / 2, "{compared} of {}", mean.len());
+}
+
+/// When offsets were identified.
+const KNOWN: Nanos = Nanos::from_millis(1500);
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_owned()
+}
+
+fn arm_with(change: impl FnOnce(&mut Config)) -> Setup {
+    let mut config = Config::load(&root().join("config/icub_left_arm/estimator.toml")).unwrap();
+    change(&mut config);
+    Setup::new(&config).unwrap()
+}
+
+fn arm() -> Setup {
+    arm_with(|_| {})
+}
+
+#[test]
+fn parameters_drawn_from_the_covariance_spread_the_torques_as_stated() {
+    let mut random = Random::new(2015);
+    // The arm, as it comes: the URDF's links are uncertain; and with parameters that were identified.
+    let mut setup = arm();
+    let active = setup.always;
+    spread(
+        &setup.model,
+        &setup.structure,
+        &active,
+        &setup.covariance,
+        &mut random,
+        4000,
+    );
+    setup.apply(&identified(&setup, &mut random)).unwrap();
+    spread(
+        &setup.model,
+        &setup.structure,
+        &active,
+        &setup.covariance,
+        &mut random,
+        4000,
+    );
+    // The walker, whose torques come from both sides of a joint, in the air and on a foot.
+    let text = std::fs::read_to_string(root().join("tests/oracle/walker.urdf")).unwrap();
+    let elements = Model::from_urdf(&text, &[]).unwrap().sensors().to_vec();
+    let keep: Vec<&str> = elements.iter().map(|element| element.joint.as_str()).collect();
+    let model = Model::from_urdf(&text, &keep).unwrap();
+    let noise = Noise {
+        force: [0.1; 3],
+        torque: [0.003; 3],
+    };
+    let sensors: Vec<SensorCut> = elements
+        .iter()
+        .map(|s| SensorCut::new(&model, &s.joint, s.frame, s.direction, &s.pose, &noise).unwrap())
+        .collect();
+    let stand = ContactSpec {
+        frame: Frame {
+            link: model.link_count() - 1,
+            pose: Pose::identity(),
+        },
+        kind: ContactKind::Wrench,
+        position: Vec3::zeros(),
+    };
+    let structure = Structure::new(&model, &sensors, &[stand], 0.1).unwrap();
+    let covariance = covariance(&structure, &mut random);
+    for active in [ContactSet::EMPTY, ContactSet::first(1)] {
+        spread(&model, &structure, &active, &covariance, &mut random, 4000);
+    }
+}
+
+/// CAD's own uncertainty, by its definition and by what does not change it.
+#[test]
+fn the_uncertainty_of_a_urdf_is_relative_and_knows_no_frame() {
+    let relative = 0.2;
+    let body = RigidInertia::from_centroidal(
+        3.0,
+        &Vec3::new(0.1, -0.2, 0.3),
+        &Mat3::from_diagonal(&Vec3::new(0.02, 0.03, 0.04)),
+    );
+    let covariance = |body: &RigidInertia| {
+        let root = cad_root(body, relative);
+        root.transpose() * root
+    };
+    let p = covariance(&body);
+    assert!((p[(0, 0)].sqrt() - relative * 3.0).abs() < 1e-12, "the mass");
+    // Its quadratic form is that of the log-det divergence at CAD: d^T P^-1 d = tr((J^-1 dJ)^2) / relative^2.
+    let mut random = Random::new(4);
+    let inverse = body.pseudo_inertia().try_inverse().unwrap();
+    let form = p.try_inverse().unwrap();
+    for _ in 0..10 {
+        let d: [f64; 10] = std::array::from_fn(|_| random.real(1.0));
+        let change: Matrix4<f64> = inverse * RigidInertia::from_parameters(&d).pseudo_inertia();
+        let expected = (change * change).trace() / relative.powi(2);
+        let d = SMatrix::<f64, 10, 1>::from_row_slice(&d);
+        let got = d.dot(&(form * d));
+        assert!((got - expected).abs() < 1e-9 * expected, "{got} {expected}");
+    }
+    // Parameters go from frame to frame by a matrix; the covariance goes with it.
+    let pose = Pose::from_xyz_rpy([0.5, -0.4, 0.2], [0.3, 1.0, -2.0]);
+    let unit = |i: usize| RigidInertia::from_parameters(&std::array::from_fn(|j| f64::from(u8::from(i == j))));
+    let columns: Vec<_> = (0..10)
+        .map(|i| SMatrix::<f64, 10, 1>::from_row_slice(&unit(i).transformed(&pose).parameters()))
+        .collect();
+    let change = SMatrix::<f64, 10, 10>::from_columns(&columns);
+    let (moved, expected) = (covariance(&body.transformed(&pose)), change * p * change.transpose());
+    assert!((moved - expected).amax() < 1e-12 * expected.amax());
+    // A point mass, a frame without mass, a body that can not be: something finite, and not nothing.
+    for odd in [
+        RigidInertia::from_centroidal(1.0, &Vec3::new(0.1, 0.0, 0.0), &Mat3::zeros()),
+        RigidInertia::zero(),
+        RigidInertia::from_centroidal(1.0, &Vec3::zeros(), &Mat3::from_diagonal(&Vec3::new(0.1, 0.01, 0.01))),
+    ] {
+        let p = covariance(&odd);
+        assert!(p.iter().all(|x| x.is_finite()) && p.diagonal().iter().all(|x| *x > 0.0));
+        assert!(p.symmetric_eigenvalues().min() > -1e-15);
+    }
+}
+
+// ---------------------------------------------------------------- the setup and the pipeline
+
+/// Something identified of the links beyond the arm's sensor: each 10 % heavier, and the offsets.
+fn identified(setup: &Setup, random: &mut Random) -> Parameters {
+    let provenance = Provenance {
+        program: "proprio 0.0.0 \"test\"".into(),
+        tau: Some(0.58),
+        logs: vec![Span {
+            file: "a log.csv".into(),
+            start: Nanos(123_456_789_012_345),
+            end: Nanos(123_456_789_999_999),
+        }],
+    };
+    let mut parameters = Parameters::new(setup, provenance);
+    let top = setup.structure.subtrees().last().unwrap().top;
+    let links: Vec<(usize, RigidInertia)> = (top..setup.cad().len())
+        .rev()
+        .map(|link| {
+            let numbers = setup.cad()[link].parameters().map(|p| 1.1 * p);
+            (link, RigidInertia::from_parameters(&numbers))
+        })
+        .collect();
+    let offset = Offset {
+        sensor: "l_arm_ft_sensor".into(),
+        reading: Wrench::from_parts([1.0, 2.0, 3.0], [0.1, 0.2, 0.3]),
+        drift: Wrench::from_parts([0.01, 0.02, 0.03], [1e-3, 2e-3, 3e-3]),
+        known: KNOWN,
+    };
+    let columns = 10 * links.len() + 6;
+    // Masses known to grams, moments of inertia to a thousandth of that, offsets to centinewtons; all correlated.
+    let scale = |column: usize| match column % 10 {
+        _ if column >= 10 * links.len() => 0.02,
+        0 => 5e-3,
+        1..=3 => 1e-3,
+        _ => 1e-5,
+    };
+    let root = DMatrix::from_fn(columns, columns, |i, j| {
+        scale(j) * (random.real(0.3) + if i == j { 1.0 } else { 0.0 })
+    });
+    parameters.set_identified(&links, &[offset], &root).unwrap();
+    parameters
+        .set_friction(&[Friction {
+            joint: "l_elbow".into(),
+            coulomb: 0.4,
+            viscous: 1e-3,
+            offset: -0.25,
+        }])
+        .unwrap();
+    parameters
+}
+
+type Table = HashMap<String, Vec<f64>>;
+
+fn estimates(setup: Setup) -> Table {
+    let log = std::fs::read_to_string(root().join("tests/oracle/icub_left_arm_mujoco.csv")).unwrap();
+    let mut out = Vec::new();
+    offline::estimate(setup, log.as_bytes(), &mut out).unwrap();
+    let mut reader = csv::Reader::from_reader(out.as_slice());
+    let names: Vec<String> = reader.headers().unwrap().iter().map(str::to_owned).collect();
+    let mut columns: Table = names.iter().map(|n| (n.clone(), vec![])).collect();
+    for record in reader.records() {
+        for (name, cell) in names.iter().zip(record.unwrap().iter()) {
+            columns.get_mut(name).unwrap().push(cell.parse().unwrap_or(f64::NAN));
+        }
+    }
+    columns
+}
+
+#[test]
+fn identified_parameters_take_the_place_of_the_urdfs() {
+    let plain = arm();
+    let parameters = identified(&plain, &mut Random::new(3));
+    let mut setup = arm();
+    setup.apply(&parameters).unwrap();
+    let top = setup.structure.subtrees().last().unwrap().top;
+    for (link, (cad, now)) in setup.cad().iter().zip(setup.model.inertias()).enumerate() {
+        let factor = if link < top { 1.0 } else { 1.1 };
+        assert!((now.mass - factor * cad.mass).abs() < 1e-12, "{link}");
+        assert_eq!(parameters.inertia(link).is_some(), link >= top);
+    }
+    assert_eq!(
+        setup.offsets,
+        [Wrench::from_parts([1.0, 2.0, 3.0], [0.1, 0.2, 0.3])],
+        "the file wins"
+    );
+    let text = setup.to_string();
+    for expected in [
+        "identified by proprio 0.0.0 \"test\" from a log.csv (prior's weight tau = 0.58): 5 of 9 links",
+        "the URDF's, taken as known to 20 %: chest",
+        "offset of l_arm_ft_sensor",
+    ] {
+        assert!(text.contains(expected), "{expected}:\n{text}");
+    }
+    let text = plain.to_string();
+    let expected = "inertial parameters: the URDF's, taken as known to 20 % (identification.model_std)";
+    assert!(text.contains(expected), "{text}");
+
+    // Torques move where they must, and the better known links make them more certain. Twice applied is once applied.
+    setup.apply(&parameters).unwrap();
+    let (before, after) = (estimates(plain), estimates(setup));
+    let mean = |table: &Table, name: &str| table[name].iter().sum::<f64>() / table[name].len() as f64;
+    for joint in ["l_elbow", "l_wrist_pitch", "l_shoulder_pitch"] {
+        let moved = gap(&before[&format!("torque/{joint}")], &after[&format!("torque/{joint}")]);
+        assert!(moved > 1e-3, "{joint}");
+    }
+    let deviation = format!("torque_std/{}", "l_wrist_pitch");
+    assert!(mean(&after, &deviation) < 0.5 * mean(&before, &deviation));
+}
+
+/// A torque that rests on no F/T sensor has a deviation too: that of the URDF's figures.
+#[test]
+fn a_torque_without_a_sensor_is_as_uncertain_as_the_model() {
+    let contact_free = |model_std: f64| {
+        arm_with(|config| {
+            config.identification.model_std = model_std;
+            config.contact.retain(|c| c.name() != "hand");
+        })
+    };
+    let (loose, tight, exact) = (
+        estimates(contact_free(0.2)),
+        estimates(contact_free(0.1)),
+        estimates(contact_free(0.0)),
+    );
+    // Beyond the elbow: a free end, so the wrist's torques come from the links beyond it alone.
+    let name = "torque_std/l_wrist_yaw";
+    for row in 0..loose[name].len() {
+        let (loose, tight) = (loose[name][row], tight[name][row]);
+        assert!(
+            loose > 0.0 && (loose - 2.0 * tight).abs() < 1e-12 * loose,
+            "proportional"
+        );
+    }
+    assert!(
+        exact[name].iter().all(|x| x.is_nan()),
+        "nothing is known of what is said to be exact"
+    );
+    assert_eq!(loose["torque/l_wrist_yaw"], exact["torque/l_wrist_yaw"]);
+    // What rests on a sensor only gains by it.
+    let shoulder = "torque_std/l_shoulder_pitch";
+    assert!(
+        loose[shoulder]
+            .iter()
+            .zip(&exact[shoulder])
+            .all(|(loose, exact)| loose > exact && *exact > 0.0)
+    );
+}
+
+#[test]
+fn an_uncertain_offset_makes_torques_uncertain_and_drift_makes_them_more_so() {
+    let known = estimates(arm());
+    let unsure = estimates(arm_with(|config| config.force_torque[0].offset_std_nm = [3.0; 3]));
+    let shoulder = "torque_std/l_shoulder_pitch";
+    assert!(
+        known[shoulder]
+            .iter()
+            .zip(&unsure[shoulder])
+            .all(|(a, b)| b * b > a * a + 8.0)
+    );
+    // Known at 1.5 s: later, and earlier, it is less so.
+    let mut setup = arm();
+    let mut parameters = identified(&setup, &mut Random::new(3));
+    let mut offset = parameters.offsets()[0].clone();
+    offset.drift = Wrench::from_parts([1.0; 3], [1.0; 3]);
+    offset.known = Nanos::from_seconds(1.0);
+    let links: Vec<_> = parameters
+        .identified()
+        .map(|link| (link, parameters.inertia(link).unwrap()))
+        .collect();
+    let root = parameters.root();
+    parameters.set_identified(&links, &[offset], &root).unwrap();
+    setup.apply(&parameters).unwrap();
+    let table = estimates(setup);
+    let at = |t: f64| {
+        let row = table["t"].iter().position(|x| (x - t).abs() < 1e-6).unwrap();
+        table[shoulder][row]
+    };
+    assert!(at(1.0) < 0.9 * at(1.5) && at(1.5) < 0.9 * at(2.0) && at(0.5) > at(1.0));
+}
+
+// ---------------------------------------------------------------- the file
+
+#[test]
+fn a_file_reads_back_as_what_was_written() {
+    let setup = arm();
+    let parameters = identified(&setup, &mut Random::new(3));
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("parameters.toml");
+    parameters.save(&file).unwrap();
+    let read = Parameters::load(&file).unwrap();
+    assert_eq!(read, parameters);
+    let text = std::fs::read_to_string(&file).unwrap();
+    assert_eq!(read.to_string(), text, "and again");
+    assert_eq!(
+        std::fs::read_dir(folder.path()).unwrap().count(),
+        1,
+        "nothing else is left there"
+    );
+    // Nothing identified is a file too.
+    let nothing = Parameters::new(&setup, Provenance::default());
+    assert_eq!(Parameters::parse(&nothing.to_string()).unwrap(), nothing);
+    // The numbers that were given come out again: deviations to rounding, the covariance to a billionth of them.
+    let mut random = Random::new(3);
+    let columns = 10 * setup.cad().len();
+    let root = DMatrix::from_fn(columns, columns, |_, j| {
+        random.real(if j % 10 < 4 { 1e-2 } else { 1e-6 })
+    });
+    let links: Vec<_> = setup.cad().iter().copied().enumerate().collect();
+    let mut parameters = nothing;
+    parameters.set_identified(&links, &[], &root).unwrap();
+    let (expected, got) = (
+        root.transpose() * &root,
+        parameters.root().transpose() * parameters.root(),
+    );
+    for i in 0..columns {
+        let deviation = parameters.deviation(i / 10).unwrap()[i % 10];
+        assert!((deviation * deviation - expected[(i, i)]).abs() < 1e-12 * expected[(i, i)]);
+        for j in 0..columns {
+            let scale = (expected[(i, i)] * expected[(j, j)]).sqrt();
+            assert!((got[(i, j)] - expected[(i, j)]).abs() < 2e-8 * scale);
+        }
+    }
+}
+
+/// Nine digits are enough where it is hardest: a combination known a million times better than its parameters.
+#[test]
+fn the_file_keeps_what_is_known_of_combinations() {
+    let setup = arm();
+    let links: Vec<_> = setup.cad().iter().copied().enumerate().collect();
+    let columns = 10 * links.len();
+    let mut random = Random::new(8);
+    let direction = DVector::from_fn(columns, |_, _| random.real(1.0)).normalize();
+    let all = DMatrix::from_fn(columns, columns, |_, _| random.real(1.0));
+    let narrow = DMatrix::identity(columns, columns) - &direction * direction.transpose() * (1.0 - 1e-6);
+    let root = all.clone() * narrow;
+    let mut parameters = Parameters::new(&setup, Provenance::default());
+    parameters.set_identified(&links, &[], &root).unwrap();
+    let (got, expected) = ((parameters.root() * &direction).norm(), (root * &direction).norm());
+    assert!(expected < 2e-6 * (all * &direction).norm());
+    assert!((got - expected).abs() < 5e-3 * expected, "{got} {expected}");
+}
+
+#[test]
+fn an_icubs_file_is_less_than_a_megabyte() {
+    let (text, sensors) = humanoid();
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("model.urdf"), text).unwrap();
+    let mut config =
+        String::from("schema = 1\nrobot = \"r\"\nmodel = \"model.urdf\"\n[base]\nkind = \"fixed\"\nlink = \"link0\"\n");
+    for joint in &sensors {
+        config += &format!("[[force_torque]]\nsensor = \"{joint}\"\njoint = \"{joint}\"\n");
+    }
+    let file = folder.path().join("estimator.toml");
+    std::fs::write(&file, config).unwrap();
+    let mut config = Config::load(&file).unwrap();
+    let setup = Setup::new(&config).unwrap();
+    let mut parameters = Parameters::new(&setup, Provenance::default());
+    let links: Vec<_> = setup.cad().iter().copied().enumerate().collect();
+    let offsets: Vec<Offset> = sensors
+        .iter()
+        .map(|sensor| Offset {
+            sensor: sensor.clone(),
+            reading: Wrench::from_parts([1.0 / 3.0; 3], [1.0 / 7.0; 3]),
+            drift: Wrench::zero(),
+            known: Nanos::ZERO,
+        })
+        .collect();
+    let (columns, mut random) = (10 * links.len() + 6 * offsets.len(), Random::new(5));
+    assert_eq!(columns, 426);
+    let root = DMatrix::from_fn(columns, columns, |_, _| random.real(1e-3));
+    parameters.set_identified(&links, &offsets, &root).unwrap();
+    let written = folder.path().join("parameters.toml");
+    parameters.save(&written).unwrap();
+    let bytes = std::fs::metadata(&written).unwrap().len();
+    assert!(bytes < 1_000_000, "{bytes}");
+    config.parameters = Some(written);
+    assert_eq!(Setup::new(&config).unwrap().identified(), Some(&parameters));
+}
+
+#[test]
+fn a_file_that_is_cut_or_changed_is_refused_with_a_sentence() {
+    let setup = arm();
+    let text = identified(&setup, &mut Random::new(3)).to_string();
+    // Whatever is cut off, down to the last bracket.
+    let mut lengths: Vec<usize> = text
+        .match_indices('\n')
+        .map(|(at, _)| at + 1)
+        .filter(|&at| at < text.len())
+        .collect();
+    lengths.extend((0..text.len() - 2).step_by(997));
+    lengths.push(text.len() - 2);
+    for length in lengths {
+        let error = Parameters::parse(&text[..length]).unwrap_err();
+        let sentence = error.to_string();
+        assert!(matches!(error, ParametersError::Damaged(_)), "{length}: {sentence}");
+        assert!(
+            sentence.contains("identify again") && !sentence.contains('\n'),
+            "{sentence}"
+        );
+    }
+    let first_column = text.find("[1000000000]").unwrap();
+    let mut half = text.clone();
+    half.replace_range(first_column.."[1000000000]".len() + first_column, "[500000000]");
+    for (changed, expected) in [
+        (half, "correlation.root: column 0 has length 0.5, not 1"),
+        (text.replace("program =", "programme ="), "unknown field `programme`"),
+        (
+            text.replacen("identified = [", "identified = [nan, ", 1),
+            "11 numbers where 10 are needed",
+        ),
+        (text.replacen("std_n = [", "std_n = [-", 1), "correlation.root: column"),
+        (
+            text.replacen("coulomb_nm = 0.4", "coulomb_nm = inf", 1),
+            "joint l_elbow: a number is not finite",
+        ),
+        (
+            text.replacen("identified = [", "identified = [-", 1),
+            "no body has these ten parameters: its mass is -",
+        ),
+        (
+            text.replacen("name = \"l_elbow_1\"", "name = \"l_forearm\"", 1),
+            "link l_forearm is there twice",
+        ),
+        ("\u{0}\u{1}garbage".into(), "line 1"),
+        (String::new(), "missing field `schema`"),
+    ] {
+        match Parameters::parse(&changed) {
+            Err(error) => assert!(error.to_string().contains(expected), "{expected}: {error}"),
+            Ok(_) => assert!(changed == text, "nothing changed for {expected}"),
+        }
+    }
+    let schema = Parameters::parse("schema = 2\nnew = true\n").unwrap_err();
+    assert_eq!(
+        schema.to_string(),
+        "has schema = 2; this version reads schema = 1: identify again, or use the version that wrote it"
+    );
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("p.toml");
+    assert!(matches!(Parameters::load(&file), Err(ParametersError::Read(_))));
+    std::fs::write(&file, [0xff, 0xfe, 0x00]).unwrap();
+    assert!(matches!(Parameters::load(&file), Err(ParametersError::Damaged(_))));
+}
+
+#[test]
+fn what_belongs_to_another_robot_is_refused_and_the_first_difference_named() {
+    let setup = arm();
+    let parameters = identified(&setup, &mut Random::new(3));
+    let text = parameters.to_string();
+    let refused = |from: &str, to: &str| {
+        assert!(text.contains(from), "{from}");
+        let other = Parameters::parse(&text.replacen(from, to, 1)).unwrap();
+        let mut setup = setup.clone();
+        let error = setup.apply(&other).unwrap_err().to_string();
+        assert_eq!(
+            (setup.identified(), &setup.offsets),
+            (None, &arm().offsets),
+            "nothing is changed"
+        );
+        error
+    };
+    assert_eq!(
+        refused("robot = \"icub_left_arm\"", "robot = \"icub_right_arm\""),
+        "is of robot \"icub_right_arm\", not of \"icub_left_arm\": parameters belong to one robot"
+    );
+    let sensor = refused("name = \"l_arm_ft_sensor\"", "name = \"r_arm_ft_sensor\"");
+    assert!(
+        sensor.contains("has force/torque sensor \"r_arm_ft_sensor\", which the configuration has not"),
+        "{sensor}"
+    );
+    let joint = refused("[[joint]]\nname = \"l_elbow\"", "[[joint]]\nname = \"l_elbw\"");
+    assert!(joint.contains("has joint \"l_elbw\""), "{joint}");
+
+    // Another URDF: a heavier hand, a longer arm, a link more.
+    let urdf = std::fs::read_to_string(root().join("config/icub_left_arm/model.urdf")).unwrap();
+    let hand = setup.model.link_name(setup.cad().len() - 1).to_owned();
+    let mut inertias = setup.cad().to_vec();
+    inertias.last_mut().unwrap().mass *= 1.01;
+    let keep = ["l_arm_ft_sensor"];
+    let heavier = Model::rewrite_urdf(&urdf, &keep, &inertias).unwrap();
+    let joint = urdf.find("<joint name=\"l_elbow\"").unwrap();
+    let origin = joint + urdf[joint..].find("xyz=\"").unwrap() + 5;
+    let mut longer = urdf.clone();
+    longer.insert(origin, '1');
+    let more = urdf.replace(
+        "</robot>",
+        &format!(
+            "<link name=\"tip\"><inertial><mass value=\"1\"/><inertia ixx=\"1\" ixy=\"0\" ixz=\"0\" iyy=\"1\" iyz=\"0\" izz=\"1\"/></inertial></link>\
+             <joint name=\"j\" type=\"continuous\"><parent link=\"{hand}\"/><child link=\"tip\"/><axis xyz=\"0 0 1\"/></joint></robot>"
+        ),
+    );
+    for (urdf, expected) in [
+        (
+            heavier,
+            format!("link {hand} has other inertial parameters in its URDF"),
+        ),
+        (longer, "has another frame or axis there".into()),
+        (more, "the URDF has link tip, which it has not".into()),
+        (
+            urdf.replace("\"l_shoulder_2\"", "\"l_shoulder_two\""),
+            "where it has link l_shoulder_2, the URDF has l_shoulder_two".into(),
+        ),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("model.urdf");
+        std::fs::write(&file, urdf).unwrap();
+        let mut config = Config::load(&root().join("config/icub_left_arm/estimator.toml")).unwrap();
+        config.model = file;
+        if expected.contains("tip") {
+            config.locked.insert("j".into(), 0.0);
+        }
+        let mut other = Setup::new(&config).unwrap();
+        let error = other.apply(&parameters).unwrap_err().to_string();
+        assert!(
+            error.contains(&expected) && error.contains("use the URDF"),
+            "{expected}: {error}"
+        );
+    }
+}
+
+#[test]
+fn a_setup_says_which_file_it_could_not_use() {
+    let mut config = Config::load(&root().join("config/icub_left_arm/estimator.toml")).unwrap();
+    config.parameters = Some("nowhere/p.toml".into());
+    let problem = Setup::new(&config).unwrap_err();
+    assert!(
+        problem.starts_with("parameters: nowhere/p.toml can not be read: "),
+        "{problem}"
+    );
+}
+
+#[test]
+fn what_can_not_be_is_not_taken() {
+    let setup = arm();
+    let mut parameters = identified(&setup, &mut Random::new(3));
+    let before = parameters.clone();
+    let (good, root) = (setup.cad()[3], DMatrix::identity(10, 10));
+    let mut negative = good;
+    negative.mass = -1.0;
+    let mut no_number = root.clone();
+    no_number[(3, 3)] = f64::NAN;
+    let twice = DMatrix::identity(20, 20);
+    for (links, root, expected) in [
+        (vec![(3, negative)], &root, "no body has these"),
+        (
+            vec![(3, good)],
+            &twice,
+            "columns of the covariance's root: 20 given, 10 needed",
+        ),
+        (vec![(3, good), (3, good)], &twice, "link 3 is given twice"),
+        (
+            vec![(99, good)],
+            &root,
+            "link 99 is given twice, or is none of the 9 links",
+        ),
+        (vec![(3, good)], &no_number, "the covariance: a number is not finite"),
+    ] {
+        let error = parameters.set_identified(&links, &[], root).unwrap_err().to_string();
+        assert!(error.contains(expected), "{expected}: {error}");
+    }
+    let friction = Friction {
+        joint: "l_elbow".into(),
+        coulomb: f64::NAN,
+        viscous: 0.0,
+        offset: 0.0,
+    };
+    assert!(parameters.set_friction(&[friction]).is_err());
+    assert_eq!(parameters, before);
+}
+
+// ---------------------------------------------------------------- URDFs
+
+/// A body that can exist, near another one.
+fn near(inertia: &RigidInertia, random: &mut Random) -> RigidInertia {
+    let stretch = Matrix4::identity() + Matrix4::from_fn(|_, _| random.real(0.15));
+    let pseudo = stretch * inertia.pseudo_inertia() * stretch.transpose();
+    let sigma: Mat3 = pseudo.fixed_view::<3, 3>(0, 0).into_owned();
+    let sigma = (sigma + sigma.transpose()) / 2.0;
+    RigidInertia {
+        mass: pseudo[(3, 3)],
+        first_moment: pseudo.fixed_view::<3, 1>(0, 3).into_owned(),
+        inertia: Mat3::from_diagonal_element(sigma.trace()) - sigma,
+    }
+}
+
+fn check_same(urdf: &str, keep: &[&str], expected: &[RigidInertia]) {
+    let model = Model::from_urdf(urdf, keep).unwrap();
+    for (link, (got, expected)) in model.inertias().iter().zip(expected).enumerate() {
+        let (got, expected) = (got.parameters(), expected.parameters());
+        let gap = gap(&got, &expected);
+        assert!(gap < 1e-12 * size(&expected), "{}: {gap:e}", model.link_name(link));
+    }
+}
+
+/// The text without its inertias, to compare what must stay.
+fn without_inertials(text: &str) -> String {
+    let mut rest = text;
+    let mut kept = String::new();
+    while let Some(from) = rest.find("<inertial>") {
+        kept += &rest[..from];
+        rest = &rest[from + rest[from..].find("</inertial>").unwrap() + "</inertial>".len()..];
+    }
+    kept + rest
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    #[test]
+    fn a_urdf_with_other_inertias_says_just_these((links, seed) in (1..=20_usize, any::<u64>())) {
+        let mut random = Random::new(seed);
+        let robot = RandomRobot::new(links, &mut random);
+        let (text, model) = (robot.urdf(), robot.model());
+        let keep: Vec<&str> = robot.cuts.iter().map(String::as_str).collect();
+        let mut wanted = model.inertias().to_vec();
+        for inertia in &mut wanted {
+            if random.chance(70) {
+                *inertia = near(inertia, &mut random);
+            }
+        }
+        let new = Model::rewrite_urdf(&text, &keep, &wanted).unwrap();
+        check_same(&new, &keep, &wanted);
+        prop_assert_eq!(without_inertials(&new), without_inertials(&text));
+        // Every share is that of a body that can exist.
+        let read = urdf_rs::read_from_string(&new).unwrap();
+        for link in &read.links {
+            let (i, m) = (&link.inertial.inertia, link.inertial.mass.value);
+            let tensor = Mat3::new(i.ixx, i.ixy, i.ixz, i.ixy, i.iyy, i.iyz, i.ixz, i.iyz, i.izz);
+            prop_assert!(RigidInertia::from_centroidal(m, &Vec3::zeros(), &tensor).check(1e-9).is_ok(), "{}", link.name);
+        }
+        prop_assert_eq!(Model::rewrite_urdf(&text, &keep, model.inertias()).unwrap(), text, "nothing to change");
+    }
+}
+
+/// The forms in which an inertial may be there or not.
+#[test]
+fn everything_but_the_inertials_stays_byte_for_byte() {
+    let urdf = r#"<?xml version="1.0"?>
+<!-- a comment -->
+<robot name="r" xmlns:xacro="http://x">
+	<link name="base"/>
+  <joint name="fixed0" type="fixed"><parent link="base"/><child link="body"/></joint>
+    <link name="body">
+      <visual><geometry><box size="1 1 1"/></geometry></visual> <!-- stays -->
+      <inertial>
+        <origin xyz="0.1 0 0" rpy="0 0 1.5"/> <mass value="2"/>
+        <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.04"/>
+      </inertial>
+    </link>
+  <joint name="swing" type="continuous"><parent link="body"/><child link="frame"/><axis xyz="0 1 0"/></joint>
+  <link name="frame"> <!-- nothing --> </link>
+  <joint name="fixed1" type="fixed"><parent link="frame"/><child link="a"/><origin xyz="0 0 0.3" rpy="0.1 0 0"/></joint>
+  <link name="a"><inertial><mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
+  <joint name="fixed2" type="fixed"><parent link="a"/><child link="b"/><origin xyz="0.2 0 0"/></joint>
+  <link name="b"><inertial><mass value="0.5"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.002" iyz="0" izz="0.002"/></inertial></link>
+  <transmission name="t"><type>x</type></transmission>
+  <gazebo reference="b"><sensor type="camera" name="c"/></gazebo>
+</robot>
+"#;
+    let model = Model::from_urdf(urdf, &[]).unwrap();
+    let mut random = Random::new(1);
+    let wanted: Vec<RigidInertia> = model.inertias().iter().map(|i| near(i, &mut random)).collect();
+    let new = Model::rewrite_urdf(urdf, &[], &wanted).unwrap();
+    check_same(&new, &[], &wanted);
+    assert_eq!(without_inertials(&new), without_inertials(urdf));
+    assert_eq!(
+        new.matches("<inertial>").count(),
+        3,
+        "frames without mass stay what they are:\n{new}"
+    );
+    // In the style of what was there.
+    assert!(new.contains("\n      <inertial>\n        <origin xyz=\""), "{new}");
+    // Masses change by one factor within a body.
+    let read = urdf_rs::read_from_string(&new).unwrap();
+    let mass = |name: &str| read.links.iter().find(|l| l.name == name).unwrap().inertial.mass.value;
+    assert!((mass("a") / mass("b") - 2.0).abs() < 1e-12);
+
+    // A body that has weighed nothing, on a link that is written in one tag, in two, or with something in it.
+    for link in [
+        "<link name=\"tip\"/>",
+        "<link name=\"tip\"></link>",
+        "<link name=\"tip\"><visual/></link>",
+    ] {
+        let joint = "<joint name=\"j\" type=\"fixed\"><parent link=\"b\"/><child link=\"tip\"/></joint>";
+        let text = urdf.replace("</robot>", &format!("{joint}{link}</robot>"));
+        // Kept, it is a body of its own, whose inertial is missing: on top of something else it need not have one.
+        let text = text.replace(
+            "type=\"fixed\"><parent link=\"b\"/><child link=\"tip\"",
+            "type=\"fixed\"><parent link=\"b\"/><child link=\"tip2\"",
+        );
+        let text = text.replace(
+            "</robot>",
+            "<link name=\"tip2\"><inertial><mass value=\"0\"/><inertia ixx=\"0\" ixy=\"0\" ixz=\"0\" iyy=\"0\" iyz=\"0\" izz=\"0\"/></inertial></link>\
+             <joint name=\"k\" type=\"fixed\"><parent link=\"tip2\"/><child link=\"tip\"/></joint></robot>",
+        );
+        let model = Model::from_urdf(&text, &["j"]).unwrap();
+        let mut wanted = model.inertias().to_vec();
+        let body = model.frame("tip").unwrap().link;
+        wanted[body] = RigidInertia::from_centroidal(0.3, &Vec3::new(0.0, 0.1, 0.0), &(Mat3::identity() * 1e-3));
+        check_same(&Model::rewrite_urdf(&text, &["j"], &wanted).unwrap(), &["j"], &wanted);
+    }
+    // The root, which has no inertial on any link at first, in each way of writing it.
+    for link in [
+        "<link name=\"world\"/>",
+        "<link name=\"world\"></link>",
+        "<link name=\"world\"> <visual/></link>",
+    ] {
+        let text = urdf
+            .replace("<link name=\"base\"/>", &format!("<link name=\"base\"/>{link}<joint name=\"up\" type=\"continuous\"><parent link=\"world\"/><child link=\"base\"/></joint>"));
+        let model = Model::from_urdf(&text, &[]).unwrap();
+        let mut wanted = model.inertias().to_vec();
+        wanted[0] = wanted[1];
+        let new = Model::rewrite_urdf(&text, &[], &wanted).unwrap();
+        check_same(&new, &[], &wanted);
+        // A tag that closed itself is opened for it.
+        let plain =
+            |text: &str| without_inertials(text).replace("<link name=\"world\"></link>", "<link name=\"world\"/>");
+        assert_eq!(plain(&new), plain(&text));
+    }
+    // One whose figures no body has: all goes to the link on top that has mass, and the others lose theirs.
+    let broken = urdf.replace("ixx=\"0.001\"", "ixx=\"0.1\"");
+    let new = Model::rewrite_urdf(&broken, &[], &wanted).unwrap();
+    check_same(&new, &[], &wanted);
+    assert_eq!(
+        (
+            new.matches("<inertial>").count(),
+            new.contains("<link name=\"b\"></link>")
+        ),
+        (2, true),
+        "{new}"
+    );
+
+    let model = Model::from_urdf(urdf, &[]).unwrap();
+    assert_eq!(
+        Model::rewrite_urdf(urdf, &[], &model.inertias()[..1]),
+        Err(ModelError::InertiaCount { given: 1, needed: 2 })
+    );
+    let mut infinite = model.inertias().to_vec();
+    infinite[1].mass = f64::INFINITY;
+    assert!(Model::rewrite_urdf(urdf, &[], &infinite).is_err());
+    assert!(matches!(
+        Model::rewrite_urdf("<robot", &[], &[]),
+        Err(ModelError::Syntax(_))
+    ));
+}
+
+#[test]
+fn the_urdf_of_identified_parameters_is_loaded_again() {
+    let setup = arm();
+    let parameters = identified(&setup, &mut Random::new(3));
+    let text = std::fs::read_to_string(root().join("config/icub_left_arm/model.urdf")).unwrap();
+    let new = parameters.urdf(&text, &setup).unwrap();
+    let mut applied = arm();
+    applied.apply(&parameters).unwrap();
+    check_same(&new, &["l_arm_ft_sensor"], applied.model.inertias());
+    assert_eq!(without_inertials(&new), without_inertials(&text));
+    let base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.81));
+    let model = Model::from_urdf(&new, &["l_arm_ft_sensor"]).unwrap();
+    let still = vec![0.0; model.dof_count()];
+    let weigh = |model: &Model| {
+        let mut kinematics = Kinematics::new(model, 0).unwrap();
+        let state = proprio_estimator::dynamics::JointState {
+            position: &still,
+            velocity: &still,
+            acceleration: &still,
+        };
+        kinematics.update(model, state, &base).unwrap();
+        kinematics.net_wrenches().iter().map(|w| w.force.norm()).sum::<f64>()
+    };
+    assert!((weigh(&model) - weigh(&applied.model)).abs() < 1e-12 * weigh(&model));
+}
