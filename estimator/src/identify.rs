@@ -2,4 +2,5 @@
 
 pub mod consistent;
 pub mod information;
+pub mod instants;
 pub mod prior;

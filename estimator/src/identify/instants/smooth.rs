@@ -1,0 +1,462 @@
+//! A recorded signal and its derivatives at any instant, from the samples on both sides of it: the off-line counterpart of
+//! [`crate::differentiate`], which has only those before.
+//!
+//! Weighted least-squares polynomials of degree 3 and 5 around the instant (weights `1 - u^2`, `u = (time - instant) / h`: a sample
+//! comes into the window and leaves it gradually, so that the estimate does not jump), on the stamps as they are. Written on
+//! polynomials orthogonal under those weights (Forsythe's recurrence): one pass serves all degrees.
+//!
+//! How wide the window is and which degree, is decided for each derivative by itself and along the log, by the estimated risk
+//!
+//! ```text
+//! risk(h, d) = sigma^2 |c_d|^2 + max(0, mean over +-0.5 s of [(e_{d+2} - e_d)^2 - sigma^2 |c_{d+2} - c_d|^2])
+//! ```
+//!
+//! where `e_d = c_d . x` is the estimate by degree `d`: the first term is what the noise contributes, the second what the polynomial leaves out, as two degrees
+//! more show it, freed of the noise's share in it (an unbiased estimate, as Mallows' C_p and Stein's are). The mean over a second is what makes it a
+//! choice and not a lottery; from one choice to the next the estimate goes over little by little; the bound by 0 keeps short windows from looking better than their noise. sigma is the larger of quantum / sqrt 12 and of
+//! what is left over by quintics on 16 neighbours.
+//!
+//! # Measured
+//! RMS errors of velocity and acceleration \[deg/s, deg/s^2\] from positions, 0.3 s at both ends left out (the test
+//! `derivatives_are_far_better_than_with_the_past_alone` prints them):
+//!
+//! | signal | here | causal window of 128 samples |
+//! |---|---|---|
+//! | sine 20 deg, 0.5 Hz at 100 Hz, quantum 0.055 deg | 0.031, 0.55 | 0.61, 14 |
+//! | three sines to 0.83 Hz, 43 deg in all, the same | 0.051, 0.92 | 0.88, 28 |
+//! | the same, quantum 0.088 deg, stamps 5 to 17 ms apart | 0.073, 1.3 | 1.2, 35 |
+//! | the same at 1 kHz, quantum 0.000055 deg | 0.0008, 0.010 | 0.0022, 0.30 |
+//!
+//! In the last row the velocity's error is that of averaging five samples to one.
+
+use proprio_topics::Nanos;
+
+/// The degrees that are chosen from; each is judged by the one after it, the last by [`HIGHEST`].
+pub(super) const DEGREES: [usize; 2] = [3, 5];
+/// The highest degree fitted.
+const HIGHEST: usize = 7;
+/// Orthogonal polynomials kept: degrees 0 to [`HIGHEST`].
+const TERMS: usize = HIGHEST + 1;
+/// The widest window reaches this far to either side \[s\].
+const WIDEST: f64 = 0.8;
+/// Ratio of one window's width to that of the next narrower one.
+const WIDER: f64 = 1.3;
+/// Half of the narrowest window, in sample periods: 11 samples, enough to judge a quintic.
+const NARROWEST: f64 = 5.5;
+/// Fewest samples with weight in a window.
+const FEWEST: usize = TERMS + 1;
+/// Windows are chosen this often \[s\].
+const KNOT_SPACING: f64 = 0.05;
+/// Over how many knots to either side the bias is averaged: half a second.
+const AVERAGED: usize = 10;
+/// Samples closer together than this are averaged to one \[s\]: motion has no content there.
+const DENSE: f64 = 0.005;
+/// Neighbours whose scatter about a quintic tells the noise.
+const NEIGHBOURS: usize = 16;
+
+/// One number of a channel over time, split where samples are missing.
+#[derive(Debug, Clone)]
+pub(super) struct Smoother {
+    /// Stamps relative to `origin` \[s\] and values, thinned.
+    times: Vec<f64>,
+    values: Vec<f64>,
+    origin: Nanos,
+    /// Stretches without a gap: first and last sample.
+    segments: Vec<Segment>,
+    /// Windows to choose from: half-widths \[s\], growing.
+    widths: Vec<f64>,
+    /// Standard deviation of a (thinned) sample.
+    sigma: f64,
+}
+
+#[derive(Debug, Clone)]
+struct Segment {
+    first: usize,
+    /// One behind the last.
+    end: usize,
+    /// Per knot, every [`KNOT_SPACING`] from the first sample on: per derivative, the window (number, degree).
+    knots: Vec<[(usize, usize); 3]>,
+}
+
+/// What a fit tells: by degree 3, 5, 7 the estimates of the three derivatives; by degree 3, 5 their variances for sigma = 1, and those of the step to the next degree.
+#[derive(Debug, Clone, Copy, Default)]
+struct Fit {
+    estimate: [[f64; 3]; 3],
+    variance: [[f64; 3]; 2],
+    step: [[f64; 3]; 2],
+}
+
+impl Smoother {
+    /// Of a signal sampled at `stamps` (strictly increasing); samples further apart than `max_gap` are not joined.
+    pub(super) fn new(stamps: &[Nanos], values: &[f64], max_gap: Nanos) -> Self {
+        let origin = stamps.first().copied().unwrap_or(Nanos::ZERO);
+        let seconds: Vec<f64> = stamps.iter().map(|t| (*t - origin).seconds()).collect();
+        let (mut times, mut thinned) = (Vec::new(), Vec::new());
+        let mut segments = Vec::new();
+        let spacing = median(seconds.windows(2).map(|w| w[1] - w[0]).collect());
+        // Rounded up, so that a jittering stream is not thinned by turns.
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let together = if spacing > 0.0 {
+            ((DENSE / spacing).round() as usize).max(1)
+        } else {
+            1
+        };
+        let mut first = 0;
+        while first < stamps.len() {
+            let end = (first + 1..stamps.len())
+                .find(|&i| stamps[i] - stamps[i - 1] > max_gap)
+                .unwrap_or(stamps.len());
+            let start = times.len();
+            for block in (first..end).step_by(together) {
+                let block = block..(block + together).min(end);
+                let count = block.len() as f64;
+                times.push(seconds[block.clone()].iter().sum::<f64>() / count);
+                // Relative to one of them: no digits go to a constant.
+                let at = values[block.start];
+                thinned.push(at + values[block].iter().map(|v| v - at).sum::<f64>() / count);
+            }
+            segments.push(Segment {
+                first: start,
+                end: times.len(),
+                knots: Vec::new(),
+            });
+            first = end;
+        }
+        let period = median(times.windows(2).map(|w| w[1] - w[0]).collect());
+        let mut widths = Vec::new();
+        let mut width = NARROWEST * period;
+        while period > 0.0 && (width <= WIDEST || widths.is_empty()) {
+            widths.push(width);
+            width *= WIDER;
+        }
+        let mut smoother = Self {
+            times,
+            values: thinned,
+            origin,
+            segments,
+            widths,
+            sigma: 0.0,
+        };
+        smoother.sigma = smoother.noise(quantum(values) / 12.0_f64.sqrt() / (together as f64).sqrt());
+        smoother.choose();
+        smoother
+    }
+
+    /// Standard deviation of a sample; of samples that were averaged, of their mean.
+    #[cfg(test)]
+    pub(super) fn sigma(&self) -> f64 {
+        self.sigma
+    }
+
+    /// The signal's `derivative` (0, 1, 2) at `t`; none outside the samples, in a gap, or with less than `edge` \[s\] of samples on either side
+    /// (or than the window, where that is narrower).
+    pub(super) fn at(&self, t: Nanos, derivative: usize, edge: f64) -> Option<f64> {
+        let time = (t - self.origin).seconds();
+        let number = self
+            .segments
+            .partition_point(|s| self.times.get(s.first).is_some_and(|first| *first <= time));
+        let segment = self.segments.get(number.checked_sub(1)?)?;
+        let (first, last) = (*self.times.get(segment.first)?, *self.times.get(segment.end - 1)?);
+        if segment.knots.is_empty() {
+            return None;
+        }
+        let room = (time - first).min(last - time);
+        // The choice of a place that has that much room: nearer to an end there was none to choose from.
+        let whole = last - first;
+        let place = if whole > 2.0 * edge {
+            (time - first).clamp(edge, whole - edge)
+        } else {
+            0.5 * whole
+        };
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let knot = (place / KNOT_SPACING).floor() as usize;
+        let choice = |knot: usize| {
+            segment
+                .knots
+                .get(knot.min(segment.knots.len() - 1))
+                .map(|c| c[derivative])
+        };
+        let (before, after) = (choice(knot)?, choice(knot + 1)?);
+        let mut scratch = Scratch::default();
+        let mut by = |(window, degree): (usize, usize)| {
+            let width = *self.widths.get(window)?;
+            if room < edge.min(width) {
+                return None;
+            }
+            // Near an end the window is as wide as there is room to both sides.
+            let fit = self.fit(segment, time, width.min(room), DEGREES[degree], &mut scratch)?;
+            Some(fit.estimate[degree][derivative])
+        };
+        let estimate = by(before)?;
+        if after == before {
+            return Some(estimate);
+        }
+        // From one choice to the next little by little: a step in an acceleration would look like a blow.
+        let share = place / KNOT_SPACING - knot as f64;
+        Some(estimate + share * (by(after)? - estimate))
+    }
+
+    /// Fits to the samples of `segment` within `width` of `time`; the variances only if every degree is asked for.
+    fn fit(&self, segment: &Segment, time: f64, width: f64, degree: usize, scratch: &mut Scratch) -> Option<Fit> {
+        let times = &self.times[segment.first..segment.end];
+        let begin = times.partition_point(|t| *t <= time - width);
+        let end = times.partition_point(|t| *t < time + width);
+        if end < begin + FEWEST.min(degree + 2) {
+            return None;
+        }
+        let values = &self.values[segment.first + begin..segment.first + end];
+        scratch.fit(&times[begin..end], values, time, width, degree)
+    }
+
+    /// The larger of `floor` and of the scatter about quintics on [`NEIGHBOURS`] neighbours: the median over the log.
+    fn noise(&self, floor: f64) -> f64 {
+        let mut scratch = Scratch::default();
+        let mut variances = Vec::new();
+        for segment in &self.segments {
+            let places = (segment.end - segment.first) / NEIGHBOURS;
+            // At most a few thousand of them tell the median well enough.
+            for place in (0..places).step_by((places / 2000).max(1)) {
+                let begin = segment.first + place * NEIGHBOURS;
+                let range = begin..begin + NEIGHBOURS;
+                let (times, values) = (&self.times[range.clone()], &self.values[range]);
+                if let Some(left) = scratch.scatter(times, values) {
+                    variances.push(left / (NEIGHBOURS - 6) as f64);
+                }
+            }
+        }
+        // The median of chi^2 with 10 degrees of freedom is 9.34.
+        (median(variances) * 10.0 / 9.34).sqrt().max(floor)
+    }
+
+    /// Chooses the windows of every knot.
+    #[allow(
+        clippy::needless_range_loop,
+        reason = "a number here is knot, window, degree or derivative in several tables"
+    )]
+    fn choose(&mut self) {
+        let windows = self.widths.len();
+        let variance = self.sigma * self.sigma;
+        let mut scratch = Scratch::default();
+        for number in 0..self.segments.len() {
+            let segment = &self.segments[number];
+            let (first, last) = (self.times[segment.first], self.times[segment.end - 1]);
+            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+            let count = ((last - first) / KNOT_SPACING).ceil() as usize + 1;
+            // Per knot and window.
+            let mut fits = vec![None; count * windows];
+            for knot in 0..count {
+                let time = first + knot as f64 * KNOT_SPACING;
+                let room = (time - first).min(last - time);
+                for (window, width) in self.widths.iter().enumerate() {
+                    if *width <= room {
+                        fits[knot * windows + window] = self.fit(segment, time, *width, HIGHEST, &mut scratch);
+                    }
+                }
+            }
+            let mut knots = vec![[(0, 0); 3]; count];
+            for derivative in 0..3 {
+                let mut least = vec![f64::INFINITY; count];
+                for window in 0..windows {
+                    for degree in 0..DEGREES.len() {
+                        // Running sums of what the degree leaves out, and of how many there are.
+                        let mut sums = vec![(0.0, 0.0); count + 1];
+                        for knot in 0..count {
+                            let (sum, there) = sums[knot];
+                            let left_out = fits[knot * windows + window].map(|fit: Fit| {
+                                let step = fit.estimate[degree + 1][derivative] - fit.estimate[degree][derivative];
+                                step * step - variance * fit.step[degree][derivative]
+                            });
+                            sums[knot + 1] = left_out.map_or((sum, there), |b| (sum + b, there + 1.0));
+                        }
+                        for knot in 0..count {
+                            let Some(fit) = fits[knot * windows + window] else {
+                                continue;
+                            };
+                            let (low, high) = (knot.saturating_sub(AVERAGED), (knot + AVERAGED + 1).min(count));
+                            let mean = (sums[high].0 - sums[low].0) / (sums[high].1 - sums[low].1);
+                            let risk = variance * fit.variance[degree][derivative] + mean.max(0.0);
+                            if risk < least[knot] {
+                                least[knot] = risk;
+                                knots[knot][derivative] = (window, degree);
+                            }
+                        }
+                    }
+                }
+                // Near the ends no window fits: the choice of the nearest knot where one does.
+                let chosen: Vec<usize> = (0..count).filter(|&k| least[k].is_finite()).collect();
+                if let (Some(&low), Some(&high)) = (chosen.first(), chosen.last()) {
+                    for knot in 0..count {
+                        if least[knot].is_infinite() {
+                            let near = if knot < low {
+                                low
+                            } else if knot > high {
+                                high
+                            } else {
+                                chosen[chosen.partition_point(|&k| k < knot)]
+                            };
+                            knots[knot][derivative] = knots[near][derivative];
+                        }
+                    }
+                }
+            }
+            self.segments[number].knots = knots;
+        }
+    }
+}
+
+/// Room for one fit, used again and again.
+#[derive(Debug, Default)]
+struct Scratch {
+    scaled: Vec<f64>,
+    weights: Vec<f64>,
+    polynomials: [Vec<f64>; TERMS],
+}
+
+impl Scratch {
+    /// Sum of squares left over by a quintic, every sample counted alike.
+    fn scatter(&mut self, times: &[f64], values: &[f64]) -> Option<f64> {
+        let (begin, end) = (*times.first()?, *times.last()?);
+        let (middle, half) = (0.5 * (begin + end), 0.5 * (end - begin));
+        self.scaled.clear();
+        self.scaled.extend(times.iter().map(|t| (t - middle) / half));
+        self.weights.clear();
+        self.weights.resize(times.len(), 1.0);
+        let (norms, _) = self.orthogonal(5)?;
+        let mut left: Vec<f64> = values.iter().map(|v| v - values[0]).collect();
+        for (p, norm) in self.polynomials.iter().zip(norms).take(6) {
+            let coefficient = dot(p, &left) / norm;
+            left.iter_mut().zip(p).for_each(|(l, p)| *l -= coefficient * p);
+        }
+        Some(dot(&left, &left))
+    }
+
+    /// Polynomials orthogonal under the weights, up to `degree`: their squared norms, and their value, first and second derivative at 0.
+    fn orthogonal(&mut self, degree: usize) -> Option<([f64; TERMS], [[f64; 3]; TERMS])> {
+        let (mut norms, mut here) = ([0.0; TERMS], [[0.0; 3]; TERMS]);
+        let count = self.scaled.len();
+        self.polynomials[0].clear();
+        self.polynomials[0].resize(count, 1.0);
+        here[0] = [1.0, 0.0, 0.0];
+        for k in 0..=degree {
+            let (mut norm, mut moment) = (0.0, 0.0);
+            for ((p, w), u) in self.polynomials[k].iter().zip(&self.weights).zip(&self.scaled) {
+                let square = w * p * p;
+                norm += square;
+                moment += u * square;
+            }
+            // What is left of a polynomial that the samples can not tell from lower ones is rounding.
+            if norm.is_nan() || norm <= 1e-20 * count as f64 {
+                return None;
+            }
+            norms[k] = norm;
+            if k == degree {
+                break;
+            }
+            let a = moment / norm;
+            let b = if k > 0 { norm / norms[k - 1] } else { 0.0 };
+            let (done, next) = self.polynomials.split_at_mut(k + 1);
+            let next = &mut next[0];
+            next.clear();
+            if k == 0 {
+                next.extend(self.scaled.iter().map(|u| u - a));
+            } else {
+                let terms = self.scaled.iter().zip(&done[k]).zip(&done[k - 1]);
+                next.extend(terms.map(|((u, p), before)| (u - a) * p - b * before));
+            }
+            for m in 0..3 {
+                let inner = if m > 0 { m as f64 * here[k][m - 1] } else { 0.0 };
+                let before = if k > 0 { b * here[k - 1][m] } else { 0.0 };
+                here[k + 1][m] = inner - a * here[k][m] - before;
+            }
+        }
+        Some((norms, here))
+    }
+
+    #[allow(
+        clippy::needless_range_loop,
+        reason = "a number here is degree or derivative in several tables"
+    )]
+    fn fit(&mut self, times: &[f64], values: &[f64], time: f64, width: f64, degree: usize) -> Option<Fit> {
+        self.scaled.clear();
+        self.scaled.extend(times.iter().map(|t| (t - time) / width));
+        self.weights.clear();
+        self.weights.extend(self.scaled.iter().map(|u| (1.0 - u * u).max(0.0)));
+        let (norms, here) = self.orthogonal(degree)?;
+        let scale = [1.0, 1.0 / width, 1.0 / (width * width)];
+        let middle = values[values.len() / 2];
+        let mut fit = Fit::default();
+        // Of the coefficients: how much each polynomial's share counts in each derivative.
+        let mut gain = [[0.0; TERMS]; 3];
+        let mut sum = [middle, 0.0, 0.0];
+        for k in 0..=degree {
+            let coefficient = self.polynomials[k]
+                .iter()
+                .zip(&self.weights)
+                .zip(values)
+                .map(|((p, w), v)| w * p * (v - middle))
+                .sum::<f64>()
+                / norms[k];
+            for m in 0..3 {
+                gain[m][k] = here[k][m] * scale[m] / norms[k];
+                sum[m] += coefficient * here[k][m] * scale[m];
+            }
+            if k % 2 == 1 && k >= DEGREES[0] {
+                fit.estimate[(k - DEGREES[0]) / 2] = sum;
+            }
+        }
+        if degree == HIGHEST {
+            // The noise of sum_k gain_k sum_i w_i p_k(u_i) x_i.
+            let mut products = [[0.0; TERMS]; TERMS];
+            for j in 0..TERMS {
+                for k in 0..=j {
+                    let terms = self.polynomials[j].iter().zip(&self.polynomials[k]).zip(&self.weights);
+                    let product: f64 = terms.map(|((p, q), w)| w * w * p * q).sum();
+                    (products[j][k], products[k][j]) = (product, product);
+                }
+            }
+            let variance = |gain: &[f64; TERMS], from: usize, to: usize| -> f64 {
+                (from..=to)
+                    .map(|j| (from..=to).map(|k| gain[j] * products[j][k] * gain[k]).sum::<f64>())
+                    .sum()
+            };
+            for (d, degree) in DEGREES.into_iter().enumerate() {
+                for m in 0..3 {
+                    fit.variance[d][m] = variance(&gain[m], 0, degree);
+                    fit.step[d][m] = variance(&gain[m], degree + 1, degree + 2);
+                }
+            }
+        }
+        fit.estimate.iter().flatten().all(|e| e.is_finite()).then_some(fit)
+    }
+}
+
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+/// The median; 0 of nothing.
+pub(super) fn median(mut values: Vec<f64>) -> f64 {
+    let middle = values.len() / 2;
+    if values.is_empty() {
+        return 0.0;
+    }
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
+/// The step in which a signal changes: its least change, if all changes are multiples of it; else 0.
+pub(super) fn quantum(values: &[f64]) -> f64 {
+    let changes = || values.windows(2).map(|w| (w[1] - w[0]).abs()).filter(|d| *d > 0.0);
+    let least = changes().fold(f64::INFINITY, f64::min);
+    let (mut multiples, mut all) = (0, 0);
+    for change in changes() {
+        all += 1;
+        let steps = change / least;
+        multiples += usize::from((steps - steps.round()).abs() < 0.02 * steps.clamp(1.0, 10.0));
+    }
+    // Whoever changes in steps at all does so by few of them most of the time.
+    if all > 0 && multiples * 100 >= all * 95 {
+        least
+    } else {
+        0.0
+    }
+}
