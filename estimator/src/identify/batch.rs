@@ -1,8 +1,25 @@
 //! Several recorded logs to one set of parameters.
+//!
+//! 1. Each log becomes instants ([`super::instants`]), each instant rows ([`super::rows`]).
+//! 2. Rounds. With the noise that the last parameters leave: what each log tells of the parameters, its own unknowns eliminated ([`super::passes`]); logs added up; the most
+//!    probable bodies under the prior and its weight ([`super::prior`]). With these bodies: what is left, and from it the noise ([`super::noise`]). Until both stay.
+//! 3. A check on data held out: pieces of the logs are predicted from the others. The change from CAD is shrunk where it gains nothing ([`held_out`]).
+//! 4. Figures for every log ([`super::assess`]).
 
-use super::outcome::{Outcome, Role};
+use super::assess;
+use super::consistent;
+use super::information::Information;
+use super::instants::{Break, Defect, Instant, Recording, Settings, Severity as DefectSeverity, Signal};
+use super::outcome::{Finding, LeftOut, Outcome, Role, Severity, TimeOffsetOutcome, Verdict};
+use super::passes::{NoiseModel, Piece, Residuals, Told, leave, noise_of, tell};
+use super::prior::{Fit, Posterior, Prior};
+use super::rows::{Layout, RowMaker};
 use crate::config::IdentificationInput;
-use crate::setup::Setup;
+use crate::setup::{Setup, Use};
+use crate::spatial::{RigidInertia, Vec3, Wrench};
+use nalgebra::DVector;
+use proprio_topics::{Nanos, Reason};
+use std::collections::BTreeMap;
 use std::io::Read;
 
 /// A log to identify from, or to validate with.
@@ -51,21 +68,846 @@ pub enum IdentifyError {
     NoInputs(String),
 }
 
+/// An offset's walk follows nothing faster than this \[s\]: the motion that identifies is faster.
+const DRIFT_TIME: f64 = 1.0;
+
+/// Most rounds of noise and prior.
+const ROUNDS: usize = 14;
+
+/// Rounds end when the logarithm of no variance changes by more.
+const SETTLED: f64 = 0.03;
+
+/// Pieces of each log for the check on held-out data, and how many instants one has at least.
+const FOLDS: usize = 5;
+const LEAST_FOLD: usize = 50;
+
+/// Instants that noise, prior weight and the check on held-out data look at, at most, and in how many stretches of long logs.
+const SAMPLE: usize = 10_000;
+const SAMPLE_STRETCHES: usize = 10;
+
+/// Longer logs are taken in pieces, each with offsets that begin unknown, so that all cores have work.
+const LONG: usize = 10_000;
+
+/// A log, ready to be used.
+pub(super) struct Prepared {
+    pub file: String,
+    pub role: Role,
+    pub span: (Nanos, Nanos),
+    /// Samples per second of the log's rows.
+    pub rate: f64,
+    pub instants: Vec<Instant>,
+    pub breaks: Vec<Break>,
+    pub left_out: Vec<LeftOut>,
+    pub findings: Vec<Finding>,
+    pub time_offsets: Vec<TimeOffsetOutcome>,
+    pub refused: bool,
+    recording: Recording,
+}
+
+impl Prepared {
+    pub(super) fn piece(&self) -> Piece<'_> {
+        Piece {
+            instants: &self.instants,
+            breaks: &self.breaks,
+        }
+    }
+}
+
+/// What was identified, before figures are made of it.
+pub(super) struct Identified {
+    pub layout: Layout,
+    pub inputs: Vec<IdentificationInput>,
+    pub prior: Prior,
+    pub noise: NoiseModel,
+    pub information: Information,
+    pub fit: Fit,
+    /// Parameters less CAD, shrunk.
+    pub d: DVector<f64>,
+    /// The least share of the change from CAD that was kept.
+    pub shrink: f64,
+    pub gains: bool,
+    pub findings: Vec<Finding>,
+    /// Per piece of the training logs, the last one last.
+    pub told: Vec<Told>,
+}
+
 /// Identifies.
 ///
 /// # Errors
 /// [`IdentifyError`]: a log that can not be read or lacks a channel, no log at all, nothing measured that parameters could be identified from.
 pub fn identify(
-    _setup: &Setup,
+    setup: &Setup,
     logs: Vec<Log<'_>>,
-    _options: &Options,
-    _progress: &mut dyn FnMut(&Progress),
+    options: &Options,
+    progress: &mut dyn FnMut(&Progress),
 ) -> Result<Outcome, IdentifyError> {
     if !logs.iter().any(|log| log.role == Role::Train) {
         return Err(IdentifyError::NoLogs);
     }
-    // The work comes with the next commit; this one is for the types.
-    Err(IdentifyError::NoInputs(
-        "identification is not built into this version".into(),
-    ))
+    let mut tell_progress = |step: String, done: f64| progress(&Progress { step, done });
+    let inputs = if options.inputs.is_empty() {
+        vec![if setup.structure.sensors().is_empty() {
+            IdentificationInput::Torque
+        } else {
+            IdentificationInput::Wrench
+        }]
+    } else {
+        options.inputs.clone()
+    };
+    let count = logs.len() as f64;
+    let mut prepared = Vec::new();
+    for (number, log) in logs.into_iter().enumerate() {
+        tell_progress(format!("reading {}", log.file), 0.2 * number as f64 / count);
+        prepared.push(prepare(setup, log)?);
+    }
+    let training: Vec<&Prepared> = prepared
+        .iter()
+        .filter(|log| log.role == Role::Train && !log.refused)
+        .collect();
+    if training.is_empty() {
+        return Ok(assess::nothing(
+            setup,
+            &prepared,
+            "no log can be identified from: what is wrong with each is said there".into(),
+        ));
+    }
+    let all = training.iter().flat_map(|log| log.instants.iter());
+    let refuse = |e: crate::dynamics::DynamicsError| IdentifyError::NoInputs(e.to_string());
+    let maker = RowMaker::survey(setup, &inputs, all).map_err(refuse)?;
+    if maker.layout().links.is_empty() {
+        let what = match inputs.as_slice() {
+            [IdentificationInput::Torque] => {
+                "no joint torque was measured while nothing touched the links beyond the joint"
+            }
+            [IdentificationInput::Wrench] => {
+                "no part of the robot beyond or between F/T sensors was free of unknown contacts (and measured) at any instant"
+            }
+            _ => "no joint torque and no F/T sensor was measured where nothing unknown touched the robot",
+        };
+        return Ok(assess::nothing(
+            setup,
+            &prepared,
+            format!("nothing shows the links' parameters: {what}"),
+        ));
+    }
+    let wrong = wrong_signs(&maker, &training);
+    if !wrong.is_empty() {
+        let names: Vec<&str> = wrong.iter().map(|f| f.subject.as_str()).collect();
+        let mut outcome = assess::nothing(
+            setup,
+            &prepared,
+            format!(
+                "{}: mounted or configured the wrong way round; nothing was identified",
+                names.join(", ")
+            ),
+        );
+        outcome.findings.extend(wrong);
+        return Ok(outcome);
+    }
+    let identified = fit(setup, &maker, &training, inputs, &mut tell_progress)?;
+    tell_progress("figures".into(), 0.9);
+    for log in prepared.iter_mut().filter(|log| !log.refused) {
+        time_offsets(&maker, log, &identified);
+    }
+    let training: Vec<&Prepared> = prepared
+        .iter()
+        .filter(|log| log.role == Role::Train && !log.refused)
+        .collect();
+    let outcome = assess::outcome(setup, &maker, &prepared, &training, &identified);
+    tell_progress("done".into(), 1.0);
+    Ok(outcome)
+}
+
+/// Reads a log.
+fn prepare(setup: &Setup, log: Log<'_>) -> Result<Prepared, IdentifyError> {
+    let recording = Recording::read(setup, log.samples).map_err(|e| IdentifyError::Log {
+        file: log.file.clone(),
+        problem: e.to_string(),
+    })?;
+    Ok(usable(setup, log.file, log.role, recording))
+}
+
+/// How far each F/T stream is behind the encoders, against what the identified parameters predict: told, not removed, for what looks like a delay may be a model that is wrong.
+fn time_offsets(maker: &RowMaker<'_>, log: &mut Prepared, identified: &Identified) {
+    let layout = maker.layout();
+    let left = leave(
+        &mut maker.clone(),
+        log.piece(),
+        &identified.noise,
+        std::slice::from_ref(&identified.d),
+    );
+    let times: Vec<Nanos> = log.instants.iter().map(|i| i.t).collect();
+    for (place, &sensor) in layout.sensors.iter().enumerate() {
+        let mut predicted = vec![f64::NAN; 6 * times.len()];
+        for axis in 0..6 {
+            let channel = 6 * place + axis;
+            let offset = left.offset(layout, 0, channel);
+            for i in 0..times.len() {
+                predicted[6 * i + axis] = left.measured[channel][i] - left.noise[0][channel][i] - offset[i];
+            }
+        }
+        let Some(offset) = log.recording.time_offset(Signal::Wrench(sensor), &times, &predicted) else {
+            continue;
+        };
+        if offset.significant {
+            log.findings.push(Finding {
+                severity: Severity::Warning,
+                code: "time_offset",
+                subject: offset.channel.clone(),
+                text: format!(
+                    "{} seems to be stamped {:.1} ms {} the encoders (+- {:.1} ms); it was used as it is: compare the clocks, or the filters of the sensors",
+                    offset.channel,
+                    1e3 * offset.seconds.abs(),
+                    if offset.seconds > 0.0 { "behind" } else { "ahead of" },
+                    1e3 * offset.deviation
+                ),
+            });
+        }
+        log.time_offsets.push(TimeOffsetOutcome {
+            channel: offset.channel,
+            seconds: offset.seconds,
+            deviation: offset.deviation,
+            significant: offset.significant,
+            applied: false,
+        });
+    }
+}
+
+/// Keeps the instants at which motion is known.
+fn usable(setup: &Setup, file: String, role: Role, recording: Recording) -> Prepared {
+    let found = recording.instants(setup, &Settings::default());
+    let mut findings: Vec<Finding> = found.defects.iter().map(finding).collect();
+    let refused = found.defects.iter().any(|d| d.severity() == DefectSeverity::Fatal);
+    let span = match (found.instants.first(), found.instants.last()) {
+        (Some(first), Some(last)) => (first.t, last.t),
+        _ => (Nanos::ZERO, Nanos::ZERO),
+    };
+    let seconds = recording.duration().seconds();
+    let rate = if seconds > 0.0 {
+        recording.report().rows as f64 / seconds
+    } else {
+        f64::NAN
+    };
+    let mut reasons: BTreeMap<String, LeftOut> = BTreeMap::new();
+    let mut leave_out = |reason: String, t: Nanos| {
+        let entry = reasons.entry(reason.clone()).or_insert(LeftOut {
+            reason,
+            instants: 0,
+            first: t,
+            last: t,
+        });
+        entry.instants += 1;
+        entry.last = t;
+    };
+    let mut instants = Vec::new();
+    for mut instant in found.instants {
+        let t = instant.t;
+        if !instant.has_motion(setup.channels()) {
+            let cause = setup.channels().iter().zip(&instant.faults);
+            let cause = cause
+                .filter(|(c, _)| !matches!(c.role, Use::Sensor(_)))
+                .find(|(_, f)| **f != Reason::None);
+            leave_out(
+                match cause {
+                    Some((_, Reason::Starting)) => {
+                        "too close to the beginning, the end or a gap for accelerations".into()
+                    }
+                    Some((channel, fault)) => format!("{} of {}", fault.word(), channel.name),
+                    None => instant.base_fault.word().into(),
+                },
+                t,
+            );
+            continue;
+        }
+        for (channel, fault) in setup.channels().iter().zip(&instant.faults) {
+            if let Use::Sensor(sensor) = channel.role {
+                let outlier = instant.outliers.contains(sensor);
+                if *fault != Reason::None || outlier {
+                    let why = if outlier { "outlier" } else { fault.word() };
+                    leave_out(format!("{why} of {}", channel.name), t);
+                    instant.readings[sensor] = Wrench {
+                        torque: Vec3::repeat(f64::NAN),
+                        force: Vec3::repeat(f64::NAN),
+                    };
+                }
+            }
+        }
+        for contact in instant.active.difference(&setup.always).iter() {
+            let name = setup.contacts.get(contact).map_or("", |c| c.name.as_str());
+            leave_out(format!("contact declared: {name} (the links that it touches)"), t);
+        }
+        instants.push(instant);
+    }
+    if instants.len() < LEAST_FOLD && !refused {
+        findings.push(Finding {
+            severity: Severity::Refusal,
+            code: "too_short",
+            subject: String::new(),
+            text: format!(
+                "only {} instants can be used: nothing is identified from this log",
+                instants.len()
+            ),
+        });
+    }
+    Prepared {
+        file,
+        role,
+        span,
+        rate,
+        refused: refused || instants.len() < LEAST_FOLD,
+        instants,
+        breaks: found.breaks,
+        left_out: reasons.into_values().collect(),
+        findings,
+        time_offsets: Vec::new(),
+        recording,
+    }
+}
+
+fn finding(defect: &Defect) -> Finding {
+    let (code, subject) = match defect {
+        Defect::SkippedRows { .. } => ("skipped_rows", String::new()),
+        Defect::NeverSeen { channel } => ("never_seen", channel.clone()),
+        Defect::RepeatedRows { .. } => ("repeated_rows", String::new()),
+        Defect::Repeated { channel, .. } => ("repeated", channel.clone()),
+        Defect::Stamps { channel, .. } => ("stamps", channel.clone()),
+        Defect::Gaps { channel, .. } => ("gap", channel.clone()),
+        Defect::Frozen { channel, .. } => ("frozen", channel.clone()),
+        Defect::Still { channel } => ("still", channel.clone()),
+        Defect::Saturated { channel, .. } => ("saturated", channel.clone()),
+        Defect::WrongUnits { channels, .. } => ("wrong_units", channels.join(", ")),
+        Defect::Derivative { joint, .. } => ("derivative", joint.clone()),
+        Defect::NoMotion { .. } => ("no_motion", String::new()),
+        Defect::TooShort { .. } => ("too_short", String::new()),
+        Defect::Jump { channel, .. } => ("jump", channel.clone()),
+        Defect::Outliers { channel, .. } => ("outliers", channel.clone()),
+        Defect::WrongSign { sensor } => ("wrong_sign", sensor.clone()),
+        Defect::JointZero { joint, .. } => ("joint_zero", joint.clone()),
+    };
+    Finding {
+        severity: match defect.severity() {
+            DefectSeverity::Note => Severity::Note,
+            DefectSeverity::Warning => Severity::Warning,
+            DefectSeverity::Fatal => Severity::Refusal,
+        },
+        code,
+        subject,
+        text: defect.to_string(),
+    }
+}
+
+/// No variance is taken as less: a hundredth of the configured deviation of a sensor's channel, a ten thousandth of a newton metre of a torque.
+fn least_variances(setup: &Setup, layout: &Layout) -> Vec<f64> {
+    let mut least = Vec::new();
+    for &sensor in &layout.sensors {
+        let noise = setup.structure.sensors()[sensor].noise();
+        least.extend(noise.torque.iter().chain(&noise.force).map(|x| (0.01 * x).powi(2)));
+    }
+    least.resize(layout.channels(), 1e-8);
+    least
+}
+
+/// Runs a pass over several pieces, on all cores.
+fn over<'a, T: Send>(
+    maker: &RowMaker<'_>,
+    pieces: &[Piece<'a>],
+    pass: impl Fn(&mut RowMaker<'_>, usize, Piece<'a>) -> T + Sync,
+) -> Vec<T> {
+    let threads = std::thread::available_parallelism()
+        .map_or(1, usize::from)
+        .min(pieces.len().max(1));
+    let mut out: Vec<Option<T>> = pieces.iter().map(|_| None).collect();
+    let next = std::sync::atomic::AtomicUsize::new(0);
+    let results = std::sync::Mutex::new(&mut out);
+    std::thread::scope(|scope| {
+        for _ in 0..threads {
+            scope.spawn(|| {
+                let mut maker = maker.clone();
+                loop {
+                    let number = next.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+                    let Some(piece) = pieces.get(number) else { break };
+                    let result = pass(&mut maker, number, *piece);
+                    if let Ok(mut results) = results.lock() {
+                        results[number] = Some(result);
+                    }
+                }
+            });
+        }
+    });
+    out.into_iter().flatten().collect()
+}
+
+fn added(told: &[Told], unknowns: usize) -> Information {
+    let columns: Vec<usize> = (0..unknowns).collect();
+    let mut sum = Information::new(unknowns);
+    for part in told {
+        let _ = sum.merge(&part.information, &columns);
+    }
+    sum
+}
+
+fn posterior(
+    prior: &Prior,
+    layout: &Layout,
+    information: &Information,
+    precision: &[f64],
+) -> Result<Posterior, IdentifyError> {
+    let (r, z) = information.to_triangle();
+    Posterior::new(prior, &layout.links, &r, &z, precision).map_err(|e| IdentifyError::NoInputs(e.to_string()))
+}
+
+fn fit(
+    setup: &Setup,
+    maker: &RowMaker<'_>,
+    training: &[&Prepared],
+    inputs: Vec<IdentificationInput>,
+    progress: &mut dyn FnMut(String, f64),
+) -> Result<Identified, IdentifyError> {
+    let layout = maker.layout().clone();
+    let no = |e: super::prior::PriorError| IdentifyError::NoInputs(e.to_string());
+    let prior = Prior::new(setup.model.inertias()).map_err(no)?;
+    let least = least_variances(setup, &layout);
+    let bound = (super::passes::BLOCK / DRIFT_TIME).powi(2);
+    let pieces = chunks(training, LONG);
+    let sampled = sample(training);
+    let zero = DVector::zeros(layout.unknowns());
+    let mut noise = NoiseModel::unit(least.clone());
+    for _ in 0..3 {
+        let left = over(maker, &sampled, |maker, _, piece| {
+            leave(maker, piece, &noise, std::slice::from_ref(&zero))
+        });
+        noise = noise_of(&layout, &left, 0, bound, &least);
+    }
+    for round in 0..ROUNDS {
+        progress(format!("round {}", round + 1), 0.2 + 0.5 * round as f64 / ROUNDS as f64);
+        let told = over(maker, &sampled, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
+        let information = added(&told, layout.unknowns());
+        let fit = posterior(&prior, &layout, &information, &[])?.weigh().map_err(no)?;
+        let left = over(maker, &sampled, |maker, _, piece| {
+            leave(maker, piece, &noise, std::slice::from_ref(&fit.x))
+        });
+        let next = noise_of(&layout, &left, 0, bound, &least);
+        let change = next.change(&noise);
+        noise = next;
+        if change < SETTLED {
+            break;
+        }
+    }
+    let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
+    let information = added(&told, layout.unknowns());
+    let fit = posterior(&prior, &layout, &information, &[])?.weigh().map_err(no)?;
+    progress("held-out data".into(), 0.75);
+    let guard = held_out(maker, &prior, training, &noise, fit.tau)?;
+    let mut d = fit.x.clone();
+    for (place, share) in guard.share.iter().enumerate() {
+        d.rows_mut(10 * place, 10).scale_mut(*share);
+    }
+    let (least, greatest) = guard
+        .share
+        .iter()
+        .fold((1.0_f64, 0.0_f64), |(a, b), s| (a.min(*s), b.max(*s)));
+    Ok(Identified {
+        layout,
+        inputs,
+        prior,
+        noise,
+        information,
+        d,
+        shrink: least,
+        gains: greatest > 0.0,
+        findings: guard.findings,
+        fit,
+        told,
+    })
+}
+
+/// All instants of all logs, in pieces of at most so many.
+fn chunks<'a>(training: &[&'a Prepared], most: usize) -> Vec<Piece<'a>> {
+    let mut pieces = Vec::new();
+    for log in training {
+        let count = log.instants.len().div_ceil(most).max(1);
+        for number in 0..count {
+            let at = |k: usize| log.instants.len() * k / count;
+            pieces.push(Piece {
+                instants: &log.instants[at(number)..at(number + 1)],
+                breaks: &log.breaks,
+            });
+        }
+    }
+    pieces
+}
+
+/// All instants, or of long logs stretches spread over them: noise and the prior's weight need no more.
+fn sample<'a>(training: &[&'a Prepared]) -> Vec<Piece<'a>> {
+    let total: usize = training.iter().map(|log| log.instants.len()).sum();
+    if total <= SAMPLE {
+        return chunks(training, usize::MAX);
+    }
+    let pieces = chunks(training, total / SAMPLE_STRETCHES);
+    let length = SAMPLE / pieces.len();
+    pieces
+        .into_iter()
+        .map(|piece| Piece {
+            instants: &piece.instants[..piece.instants.len().min(length)],
+            ..piece
+        })
+        .collect()
+}
+
+/// What held-out data say of the change from CAD.
+struct Guard {
+    /// Per link of the layout.
+    share: Vec<f64>,
+    findings: Vec<Finding>,
+}
+
+/// Predicts each of [`FOLDS`] pieces of every log with parameters from all other pieces, offsets and friction fitted to the piece for CAD and for them alike, and chooses how much of
+/// the change from CAD is kept, group by group of links that no measured channel tells apart ([`RowMaker::groups`]).
+///
+/// What counts is the group's mean square error, all of its channels together, each in units of its noise, less than CAD's: a parabola in the share that is kept. Kept is the
+/// greatest of 1, 0.9, ... 0.1 whose gain is within a standard error of the best share's, if it is more than a standard error itself; else nothing. Errors are summed over blocks of a
+/// second, between which they count as independent. A channel which alone gets worse, by two standard errors, is named.
+fn held_out(
+    maker: &RowMaker<'_>,
+    prior: &Prior,
+    training: &[&Prepared],
+    noise: &NoiseModel,
+    tau: f64,
+) -> Result<Guard, IdentifyError> {
+    let layout = maker.layout();
+    let mut pieces = Vec::new();
+    for log in training {
+        let count = (log.instants.len() / LEAST_FOLD).clamp(1, FOLDS);
+        for fold in 0..count {
+            let at = |k: usize| log.instants.len() * k / count;
+            // Of a very long log, the beginning of each piece.
+            let end = at(fold + 1).min(at(fold) + SAMPLE / FOLDS);
+            pieces.push(Piece {
+                instants: &log.instants[at(fold)..end],
+                breaks: &log.breaks,
+            });
+        }
+    }
+    if pieces.len() < 2 {
+        return Ok(Guard {
+            share: vec![1.0; layout.links.len()],
+            findings: Vec::new(),
+        });
+    }
+    let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, noise, &[], &[]));
+    let columns: Vec<usize> = (0..layout.unknowns()).collect();
+    let mut sets = Vec::new();
+    for held in 0..pieces.len() {
+        let mut others = Information::new(layout.unknowns());
+        for (number, told) in told.iter().enumerate() {
+            if number != held {
+                let _ = others.merge(&told.information, &columns);
+            }
+        }
+        let fit = posterior(prior, layout, &others, &[])?.fit(tau);
+        sets.push(fit.map_err(|e| IdentifyError::NoInputs(e.to_string()))?.x);
+    }
+    let zero = DVector::zeros(layout.unknowns());
+    let left: Vec<Residuals> = over(maker, &pieces, |maker, number, piece| {
+        leave(maker, piece, noise, &[zero.clone(), sets[number].clone()])
+    });
+    // Per channel and block: sums of e0 (e0 - e1) and of (e0 - e1)^2.
+    let mut sums: Vec<Vec<(f64, f64)>> = vec![Vec::new(); layout.channels()];
+    for (piece, left) in pieces.iter().zip(&left) {
+        let mut start = 0;
+        for i in 1..=piece.instants.len() {
+            if i < piece.instants.len() && (piece.instants[i].t - piece.instants[start].t).seconds() < 1.0 {
+                continue;
+            }
+            for (channel, sums) in sums.iter_mut().enumerate() {
+                let (mut cross, mut square) = (0.0, 0.0);
+                for (e0, e1) in left.noise[0][channel][start..i]
+                    .iter()
+                    .zip(&left.noise[1][channel][start..i])
+                {
+                    if e0.is_finite() && e1.is_finite() {
+                        cross += e0 * (e0 - e1);
+                        square += (e0 - e1).powi(2);
+                    }
+                }
+                sums.push((cross, square));
+            }
+            start = i;
+        }
+    }
+    let gain = |values: &[f64]| {
+        let n = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / n;
+        let variance = values.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
+        (mean, (variance / n).sqrt())
+    };
+    let variances = noise.inflated();
+    let blocks = sums.first().map_or(0, Vec::len);
+    let (links, channels) = maker.groups();
+    let mut share = vec![0.0; layout.links.len()];
+    let mut findings = Vec::new();
+    let mut numbers: Vec<usize> = links.clone();
+    numbers.sort_unstable();
+    numbers.dedup();
+    for group in numbers {
+        let own: Vec<usize> = (0..layout.channels()).filter(|&c| channels[c] == group).collect();
+        let at = |share: f64, (cross, square): (f64, f64)| 2.0 * share * cross - share * share * square;
+        let total = |share: f64| {
+            let of = |block: usize| {
+                own.iter()
+                    .map(|&c| at(share, sums[c][block]) / variances[c])
+                    .sum::<f64>()
+            };
+            gain(&(0..blocks).map(of).collect::<Vec<f64>>())
+        };
+        let shares: Vec<f64> = (1..=10).rev().map(|tenth| f64::from(tenth) / 10.0).collect();
+        let best = shares
+            .iter()
+            .map(|s| total(*s))
+            .max_by(|a, b| a.0.total_cmp(&b.0))
+            .unwrap_or((0.0, 0.0));
+        let keeps = |share: &&f64| {
+            let (mean, error) = total(**share);
+            mean > error && mean >= best.0 - best.1
+        };
+        let kept = shares.iter().find(keeps).copied().unwrap_or(0.0);
+        let names = || {
+            let own = layout.links.iter().zip(&links).filter(|(_, g)| **g == group);
+            let names: Vec<&str> = own.map(|(link, _)| maker.setup().model.link_name(*link)).collect();
+            names.join(", ")
+        };
+        if kept < 1.0 {
+            findings.push(Finding {
+                severity: Severity::Warning,
+                code: "shrunk",
+                subject: names(),
+                text: if kept > 0.0 {
+                    format!(
+                        "the full change from CAD predicts held-out data less well than a part of it: {:.0} % of it is kept for {}",
+                        100.0 * kept,
+                        names()
+                    )
+                } else {
+                    format!(
+                        "identified parameters predict held-out data no better than CAD: {} stay as in the URDF; record more, and more different, motion",
+                        names()
+                    )
+                },
+            });
+        }
+        for &channel in &own {
+            let values: Vec<f64> = sums[channel].iter().map(|s| at(kept, *s)).collect();
+            let (mean, error) = gain(&values);
+            if mean < -2.0 * error {
+                let (name, _) = assess::channel_name(maker.setup(), layout, channel);
+                findings.push(Finding {
+                    severity: Severity::Note,
+                    code: "channel_worse",
+                    text: format!(
+                        "{name}: held-out data are predicted a little worse than by CAD, though all channels of these links together are predicted better"
+                    ),
+                    subject: name,
+                });
+            }
+        }
+        for (value, _) in share.iter_mut().zip(&links).filter(|(_, g)| **g == group) {
+            *value = kept;
+        }
+    }
+    Ok(Guard { share, findings })
+}
+
+/// Sensors whose readings go against what CAD predicts: with their sign free, masses would come out negative.
+fn wrong_signs(maker: &RowMaker<'_>, training: &[&Prepared]) -> Vec<Finding> {
+    let layout = maker.layout();
+    let zero = DVector::zeros(layout.unknowns());
+    let noise = NoiseModel::unit(least_variances(maker.setup(), layout));
+    let pieces: Vec<Piece<'_>> = training.iter().map(|log| log.piece()).collect();
+    let left = over(maker, &pieces, |maker, _, piece| {
+        leave(maker, piece, &noise, std::slice::from_ref(&zero))
+    });
+    let mut findings = Vec::new();
+    for (place, &sensor) in layout.sensors.iter().enumerate() {
+        let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
+        for part in &left {
+            for channel in 6 * place..6 * place + 6 {
+                let scale = if channel % 6 < 3 {
+                    1.0 / crate::dynamics::Structure::LENGTH_SCALE
+                } else {
+                    1.0
+                };
+                let pairs = part.predicted[channel].iter().zip(&part.measured[channel]);
+                let pairs: Vec<(f64, f64)> = pairs
+                    .filter(|(x, y)| x.is_finite() && y.is_finite())
+                    .map(|(x, y)| (x * scale, y * scale))
+                    .collect();
+                let n = pairs.len().max(1) as f64;
+                let (mx, my) = (
+                    pairs.iter().map(|p| p.0).sum::<f64>() / n,
+                    pairs.iter().map(|p| p.1).sum::<f64>() / n,
+                );
+                for (x, y) in pairs {
+                    xx += (x - mx).powi(2);
+                    xy += (x - mx) * (y - my);
+                    yy += (y - my).powi(2);
+                }
+            }
+        }
+        if xx > 0.0 && yy > 0.0 && xy / (xx * yy).sqrt() < -0.5 {
+            let channel = maker.setup().channels().iter().find(|c| c.role == Use::Sensor(sensor));
+            let name = channel.map_or(String::new(), |c| c.name.clone());
+            findings.push(Finding {
+                severity: Severity::Refusal,
+                code: "wrong_sign",
+                text: Defect::WrongSign { sensor: name.clone() }.to_string(),
+                subject: name,
+            });
+        }
+    }
+    findings
+}
+
+/// Joints whose zero is elsewhere than the model's: a constant error of the position that explains more than inertial parameters can, at the prior's weight.
+pub(super) fn joint_zeros(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Identified) -> Vec<Finding> {
+    /// A position is expected to be off by this much \[rad\], one standard deviation, before anything is measured.
+    const SPREAD: f64 = 0.1;
+    /// Half of the squared deviations that must be gained, for one in a thousand by chance: chi-square, one degree.
+    const GAIN: f64 = 10.83;
+    /// Less than this matters to nobody \[rad\].
+    const LEAST: f64 = 0.01;
+    /// Instants that are looked at.
+    const ENOUGH: usize = 2000;
+    let setup = maker.setup();
+    let layout = &identified.layout;
+    // Joints beyond which, or between which, everything is seen: an error of another one only tilts all of it, as a base that is not level does.
+    let turns = |dof: &usize| {
+        let joint = setup.model.dof_joint(*dof).map(|joint| setup.model.joints()[joint]);
+        joint.is_some_and(|j| {
+            let inside = setup.structure.subtree_of(j.parent) == setup.structure.subtree_of(j.child)
+                && layout.links.contains(&j.parent);
+            layout.links.contains(&j.child) && (inside || !layout.joints.is_empty())
+        })
+    };
+    let angles: Vec<usize> = (0..setup.model.dof_count())
+        .filter(|&dof| setup.locked[dof].is_nan())
+        .filter(turns)
+        .collect();
+    let mut parts = Vec::new();
+    for log in training {
+        let share = ENOUGH / training.len().max(1);
+        let count = log.instants.len().min(share);
+        // One stretch from the middle: offsets and noise need what follows each other.
+        let start = (log.instants.len() - count) / 2;
+        parts.push(Piece {
+            instants: &log.instants[start..start + count],
+            breaks: &log.breaks,
+        });
+    }
+    let told = over(maker, &parts, |maker, _, piece| {
+        tell(maker, piece, &identified.noise, &angles, identified.fit.x.as_slice())
+    });
+    let p = layout.unknowns();
+    let sum = added(&told, p + angles.len());
+    let cost = |columns: &[usize]| -> Option<(f64, Fit)> {
+        // Angles that are not asked for are known to be right: their columns are left out.
+        let (r, z) = sum.to_triangle();
+        let keep: Vec<usize> = (0..p).chain(columns.iter().map(|c| p + c)).collect();
+        let r = r.select_columns(&keep);
+        let precision = vec![SPREAD.powi(-2); columns.len()];
+        let fit = Posterior::new(&identified.prior, &layout.links, &r, &z, &precision)
+            .ok()?
+            .fit(identified.fit.tau)
+            .ok()?;
+        let extra: f64 = fit.x.rows(p, columns.len()).norm_squared() * SPREAD.powi(-2);
+        Some((fit.residual_square + fit.divergence / fit.tau.powi(2) + extra, fit))
+    };
+    let mut chosen: Vec<usize> = Vec::new();
+    let Some((mut before, _)) = cost(&[]) else {
+        return Vec::new();
+    };
+    let mut values = DVector::zeros(0);
+    // Greedy: the joint that explains the most, then what else remains.
+    while chosen.len() < angles.len() {
+        let tries = (0..angles.len())
+            .filter(|c| !chosen.contains(c))
+            .filter_map(|candidate| {
+                let columns: Vec<usize> = chosen.iter().copied().chain([candidate]).collect();
+                let (cost, fit) = cost(&columns)?;
+                Some((candidate, cost, fit))
+            });
+        let Some((candidate, cost, fit)) = tries.min_by(|a, b| a.1.total_cmp(&b.1)) else {
+            break;
+        };
+        if before - cost < GAIN {
+            break;
+        }
+        chosen.push(candidate);
+        before = cost;
+        values = fit.x.rows(p, chosen.len()).into_owned();
+    }
+    let mut findings = Vec::new();
+    for (value, &place) in values.iter().zip(&chosen) {
+        if value.abs() > LEAST {
+            let joint = setup.model.dof_name(angles[place]).to_owned();
+            findings.push(Finding {
+                severity: Severity::Warning,
+                code: "joint_zero",
+                text: Defect::JointZero {
+                    joint: joint.clone(),
+                    radians: *value,
+                }
+                .to_string(),
+                subject: joint,
+            });
+        }
+    }
+    findings
+}
+
+/// CAD moved by `d` in the columns of a layout: all links.
+pub(super) fn bodies(setup: &Setup, layout: &Layout, d: &DVector<f64>) -> Vec<RigidInertia> {
+    let mut bodies = setup.model.inertias().to_vec();
+    for (place, &link) in layout.links.iter().enumerate() {
+        let mut phi = bodies[link].parameters();
+        for (value, change) in phi.iter_mut().zip(d.rows(10 * place, 10).iter()) {
+            *value += change;
+        }
+        bodies[link] = RigidInertia::from_parameters(&phi);
+    }
+    bodies
+}
+
+/// Whether bodies exist that have what the data say.
+pub(super) fn feasibility(setup: &Setup, identified: &Identified) -> super::outcome::Consistency {
+    use super::outcome::Consistency;
+    let (r, z) = identified.information.to_triangle();
+    match consistent::nearest(&identified.prior, &identified.layout.links, &r, &z, &[]) {
+        Ok(nearest) => Consistency {
+            feasible: !matches!(nearest.verdict, consistent::Verdict::Infeasible(_)),
+            deviations: nearest.deviations(),
+            links: match &nearest.verdict {
+                consistent::Verdict::Infeasible(violations) => violations
+                    .iter()
+                    .map(|v| setup.model.link_name(v.link).to_owned())
+                    .collect(),
+                _ => Vec::new(),
+            },
+            text: nearest.describe(|link| setup.model.link_name(link)),
+        },
+        Err(e) => Consistency {
+            feasible: false,
+            deviations: f64::NAN,
+            links: Vec::new(),
+            text: e.to_string(),
+        },
+    }
+}
+
+/// The verdict, given the held-out check.
+pub(super) fn verdict(identified: &Identified) -> Verdict {
+    if identified.gains {
+        Verdict::Identified
+    } else {
+        Verdict::NoBetterThanCad
+    }
 }

@@ -1,0 +1,999 @@
+//! Figures: what is left of every log with CAD, with CAD and fitted offsets, and with the identified parameters; and what is known of the parameters, in numbers and words.
+
+use super::batch::{Identified, Prepared, bodies, feasibility, joint_zeros, verdict};
+use super::outcome::{
+    BaseParameterOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding, FrictionOutcome, JointOutcome,
+    LinkOutcome, LogOutcome, OffsetOutcome, Outcome, SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome,
+    Unknown, Verdict, WeakDirection,
+};
+use super::passes::{Residuals, dot, leave};
+use super::rows::{FRICTION, Layout, RowMaker, Rows, WIDTH};
+use crate::config::IdentificationInput;
+use crate::dynamics::Structure;
+use crate::regressor::identifiable::{Column, Identifiable, JointMotion, Measured, Offsets, Scope};
+use crate::setup::{Setup, Use};
+use crate::spatial::RigidInertia;
+use nalgebra::{DMatrix, DVector};
+use proprio_topics::Nanos;
+
+/// Points of a curve at the most.
+const POINTS: usize = 2000;
+
+/// Seconds at both ends of a log that do not count where torques are compared: filters and derivatives need them.
+const EDGE: f64 = 0.3;
+
+/// Logs with more rows per second hold raw torques: they are compared below [`CUT_OFF`].
+const RAW_RATE: f64 = 400.0;
+
+/// Of the fourth-order Butterworth filter, run forwards and backwards, for raw torques \[Hz\].
+const CUT_OFF: f64 = 5.0;
+
+/// A joint that moves less stands still \[rad\].
+const STILL: f64 = 0.01;
+
+const PARAMETERS: [&str; 10] = ["m", "h_x", "h_y", "h_z", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz"];
+const AXES: [&str; 6] = ["fx", "fy", "fz", "tx", "ty", "tz"];
+
+/// The channel of a sensor's quantity, given in the order of samples: channels have torques first.
+fn channel_of(sensor_place: usize, axis: usize) -> usize {
+    6 * sensor_place + (axis + 3) % 6
+}
+
+fn sensor_name(setup: &Setup, sensor: usize) -> String {
+    let channel = setup.channels().iter().find(|c| c.role == Use::Sensor(sensor));
+    channel.map_or(String::new(), |c| c.name.clone())
+}
+
+pub(super) fn channel_name(setup: &Setup, layout: &Layout, channel: usize) -> (String, &'static str) {
+    let wrenches = 6 * layout.sensors.len();
+    if channel < wrenches {
+        let axis = (channel % 6 + 3) % 6;
+        let name = sensor_name(setup, layout.sensors[channel / 6]);
+        (
+            format!("wrench/{name}/{}", AXES[axis]),
+            if axis < 3 { "N" } else { "Nm" },
+        )
+    } else {
+        let dof = layout.joints[channel - wrenches];
+        (format!("joint/{}/torque", setup.model.dof_name(dof)), "Nm")
+    }
+}
+
+fn rms(values: impl Iterator<Item = f64>) -> f64 {
+    let (mut sum, mut count) = (0.0, 0.0);
+    for value in values.filter(|x| x.is_finite()) {
+        sum += value * value;
+        count += 1.0;
+    }
+    if count > 0.0 { (sum / count).sqrt() } else { f64::NAN }
+}
+
+fn mean(values: &[f64]) -> f64 {
+    let finite = values.iter().filter(|x| x.is_finite());
+    let (sum, count) = finite.fold((0.0, 0.0), |(s, n), x| (s + x, n + 1.0));
+    sum / count
+}
+
+/// What there is to say where nothing was identified: CAD, and why.
+pub(super) fn nothing(setup: &Setup, prepared: &[Prepared], reason: String) -> Outcome {
+    let nan = Three {
+        cad: f64::NAN,
+        cad_fitted: f64::NAN,
+        identified: f64::NAN,
+    };
+    let logs = prepared.iter().map(|log| LogOutcome {
+        file: log.file.clone(),
+        role: log.role,
+        span: log.span,
+        used: 0,
+        left_out: log.left_out.clone(),
+        onset: None,
+        relative_error: nan,
+        joints: Vec::new(),
+        sensors: Vec::new(),
+        two_route: Vec::new(),
+        offsets: Vec::new(),
+        friction: Vec::new(),
+        time_offsets: Vec::new(),
+        findings: log.findings.clone(),
+        curves: Vec::new(),
+        spectra: Vec::new(),
+    });
+    Outcome {
+        robot: setup.robot.clone(),
+        links: setup
+            .model
+            .inertias()
+            .iter()
+            .enumerate()
+            .map(|(link, cad)| unseen(setup, link, cad))
+            .collect(),
+        covariance: CovarianceRoot {
+            columns: Vec::new(),
+            root: DMatrix::zeros(0, 0),
+        },
+        tau: f64::NAN,
+        shrink: 0.0,
+        unknowns: 0,
+        rank: 0,
+        structural_rank: 0,
+        effective: 0.0,
+        condition: f64::NAN,
+        singular_values: Vec::new(),
+        weakest: Vec::new(),
+        confused: Vec::new(),
+        base_parameters: Vec::new(),
+        channels: Vec::new(),
+        consistency: Consistency {
+            feasible: true,
+            deviations: 0.0,
+            links: Vec::new(),
+            text: "nothing was identified: the parameters are CAD's".into(),
+        },
+        logs: logs.collect(),
+        findings: vec![Finding {
+            severity: Severity::Refusal,
+            code: "nothing",
+            subject: String::new(),
+            text: reason.clone(),
+        }],
+        verdict: Verdict::Nothing(reason),
+    }
+}
+
+fn unseen(setup: &Setup, link: usize, cad: &RigidInertia) -> LinkOutcome {
+    LinkOutcome {
+        link,
+        name: setup.model.link_name(link).to_owned(),
+        cad: *cad,
+        floored: None,
+        identified: *cad,
+        deviation: [f64::NAN; 10],
+        significance: 0.0,
+        seen: false,
+    }
+}
+
+/// Everything there is to say.
+pub(super) fn outcome(
+    setup: &Setup,
+    maker: &RowMaker<'_>,
+    prepared: &[Prepared],
+    training: &[&Prepared],
+    identified: &Identified,
+) -> Outcome {
+    let layout = &identified.layout;
+    let p = layout.unknowns();
+    let narrow = identified.fit.covariance_root();
+    let root = widened(&narrow, &(&identified.fit.x - &identified.d));
+    let (scaled, spread) = scaled_information(identified);
+    let svd = scaled.svd(false, true);
+    let mut order: Vec<usize> = (0..svd.singular_values.len()).collect();
+    order.sort_by(|&a, &b| svd.singular_values[b].total_cmp(&svd.singular_values[a]));
+    let singular: Vec<f64> = order.iter().map(|&i| svd.singular_values[i]).collect();
+    let greatest = singular.first().copied().unwrap_or(0.0);
+    let rank = singular
+        .iter()
+        .filter(|s| **s > 1e-8 * greatest && greatest > 0.0)
+        .count();
+    let subspace = subspace(setup, training, identified);
+    let directions = svd.v_t.unwrap_or_else(|| DMatrix::zeros(0, p));
+    let weakest = order[..rank].iter().rev().take(5).map(|&i| {
+        let direction = directions.row(i).transpose();
+        let value = svd.singular_values[i];
+        WeakDirection {
+            expression: expression(setup, layout, &direction),
+            relative: value / greatest,
+            prior_share: 1.0 / (1.0 + value * value),
+        }
+    });
+    let (base_parameters, confused, structural_rank) = base_parameters(setup, identified, &root, subspace.as_ref());
+    let mut findings: Vec<Finding> = identified
+        .prior
+        .floors()
+        .iter()
+        .filter(|floor| layout.links.contains(&floor.link))
+        .map(|floor| Finding {
+            severity: Severity::Note,
+            code: "cad_floored",
+            subject: setup.model.link_name(floor.link).to_owned(),
+            text: floor.describe(setup.model.link_name(floor.link)),
+        })
+        .collect();
+    findings.extend(joint_zeros(maker, training, identified));
+    let consistency = feasibility(setup, identified);
+    if !consistency.feasible {
+        findings.push(Finding {
+            severity: Severity::Warning,
+            code: "not_physical",
+            subject: consistency.links.join(", "),
+            text: consistency.text.clone(),
+        });
+    }
+    findings.extend(identified.findings.iter().cloned());
+    let mut maker = maker.clone();
+    let logs = prepared
+        .iter()
+        .map(|log| log_outcome(&mut maker, log, identified, &root))
+        .collect();
+    Outcome {
+        robot: setup.robot.clone(),
+        verdict: verdict(identified),
+        links: links(setup, identified, &narrow, &root, &spread),
+        covariance: covariance(identified, &root),
+        tau: identified.fit.tau,
+        shrink: identified.shrink,
+        unknowns: p,
+        rank,
+        structural_rank,
+        effective: identified.fit.effective,
+        condition: if rank > 0 {
+            greatest / singular[rank - 1]
+        } else {
+            f64::NAN
+        },
+        singular_values: singular,
+        weakest: weakest.collect(),
+        confused,
+        base_parameters,
+        channels: channels(setup, identified, training),
+        consistency,
+        logs,
+        findings,
+    }
+}
+
+fn channels(setup: &Setup, identified: &Identified, training: &[&Prepared]) -> Vec<ChannelNoise> {
+    let noise = &identified.noise;
+    let seconds: f64 = training.iter().map(|log| (log.span.1 - log.span.0).seconds()).sum();
+    let instants: usize = training.iter().map(|log| log.instants.len()).sum();
+    let period = seconds / instants.max(1) as f64;
+    (0..identified.layout.channels())
+        .map(|channel| {
+            let (name, unit) = channel_name(setup, &identified.layout, channel);
+            ChannelNoise {
+                name,
+                unit,
+                deviation: noise.square[channel].sqrt(),
+                autocorrelation: noise.time[channel],
+                autocorrelation_seconds: noise.time[channel] * period,
+                drift: noise.drift[channel].sqrt(),
+            }
+        })
+        .collect()
+}
+
+/// `R` with columns in units of the prior's spread, and that spread: per link a matrix from such units to the ten parameters, `2 tau^2 M^-1 = spread spread^T`.
+fn scaled_information(identified: &Identified) -> (DMatrix<f64>, Vec<DMatrix<f64>>) {
+    let (r, _) = identified.information.to_triangle();
+    let mut scaled = r.clone();
+    let mut spreads = Vec::new();
+    for (place, &link) in identified.layout.links.iter().enumerate() {
+        let metric = identified.prior.metric(link);
+        let inverse = metric
+            .cholesky()
+            .and_then(|c| c.l().try_inverse())
+            .map(|l| l.transpose());
+        let spread = inverse.unwrap_or_default() * (2.0_f64.sqrt() * identified.fit.tau);
+        let spread = DMatrix::from_fn(WIDTH, WIDTH, |i, j| spread[(i, j)]);
+        let columns = r.columns(WIDTH * place, WIDTH).into_owned() * &spread;
+        scaled.columns_mut(WIDTH * place, WIDTH).copy_from(&columns);
+        spreads.push(spread);
+    }
+    (scaled, spreads)
+}
+
+/// A square root of a covariance with the square of `back` added: what was taken back of a change may be true all the same.
+fn widened(root: &DMatrix<f64>, back: &DVector<f64>) -> DMatrix<f64> {
+    let mut wide = root.clone().resize_horizontally(root.ncols() + 1, 0.0);
+    wide.set_column(root.ncols(), back);
+    wide
+}
+
+fn links(
+    setup: &Setup,
+    identified: &Identified,
+    root: &DMatrix<f64>,
+    wide: &DMatrix<f64>,
+    spread: &[DMatrix<f64>],
+) -> Vec<LinkOutcome> {
+    let layout = &identified.layout;
+    let moved = bodies(setup, layout, &identified.d);
+    // What the estimate would scatter by if CAD were right: P - P (prior's precision) P.
+    let mut weighed = root.clone();
+    for (place, spread) in spread.iter().enumerate() {
+        let inverse = spread
+            .clone()
+            .try_inverse()
+            .unwrap_or_else(|| DMatrix::zeros(WIDTH, WIDTH));
+        let rows = inverse * root.rows(WIDTH * place, WIDTH).into_owned();
+        weighed.rows_mut(WIDTH * place, WIDTH).copy_from(&rows);
+    }
+    // root root^T - (root weighed^T)(...)^T
+    let shrinking = root * weighed.transpose();
+    setup
+        .model
+        .inertias()
+        .iter()
+        .enumerate()
+        .map(|(link, cad)| {
+            let floored = identified.prior.floors().iter().any(|f| f.link == link);
+            let floored = floored.then(|| *identified.prior.reference(link));
+            let Ok(place) = layout.links.binary_search(&link) else {
+                let metric = identified.prior.metric(link).try_inverse().unwrap_or_default();
+                let mut deviation = [0.0; 10];
+                for (k, value) in deviation.iter_mut().enumerate() {
+                    *value = (2.0 * metric[(k, k)]).max(0.0).sqrt() * identified.fit.tau;
+                }
+                return LinkOutcome {
+                    floored,
+                    deviation,
+                    ..unseen(setup, link, cad)
+                };
+            };
+            let own = root.rows(WIDTH * place, WIDTH).into_owned();
+            let mut deviation = [0.0; 10];
+            for (k, value) in deviation.iter_mut().enumerate() {
+                *value = wide.row(WIDTH * place + k).norm();
+            }
+            let inverse = spread[place]
+                .clone()
+                .try_inverse()
+                .unwrap_or_else(|| DMatrix::zeros(WIDTH, WIDTH));
+            let shrink = shrinking.rows(WIDTH * place, WIDTH).into_owned();
+            let scatter = &own * own.transpose() - &shrink * shrink.transpose();
+            let scatter = &inverse * scatter * inverse.transpose();
+            let change = &inverse * identified.d.rows(WIDTH * place, WIDTH);
+            let eigen = ((&scatter + scatter.transpose()) * 0.5).symmetric_eigen();
+            let (mut square, mut degrees) = (0.0, 0.0);
+            for (value, vector) in eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()) {
+                // What is known to less than a tenth of the prior's spread is not counted.
+                if *value > 0.01 {
+                    square += vector.dot(&change).powi(2) / value;
+                    degrees += 1.0;
+                }
+            }
+            let significance = if degrees > 0.0 {
+                (2.0_f64 * square).sqrt() - (2.0_f64 * degrees - 1.0).sqrt()
+            } else {
+                0.0
+            };
+            LinkOutcome {
+                link,
+                name: setup.model.link_name(link).to_owned(),
+                cad: *cad,
+                floored,
+                identified: moved[link],
+                deviation,
+                significance: significance.max(0.0),
+                seen: true,
+            }
+        })
+        .collect()
+}
+
+/// Of the parameters and of the offsets at the end of the last training log, together.
+fn covariance(identified: &Identified, root: &DMatrix<f64>) -> CovarianceRoot {
+    let layout = &identified.layout;
+    let (p, s) = (layout.unknowns(), 6 * layout.sensors.len());
+    let mut columns = Vec::new();
+    for &link in &layout.links {
+        columns.extend((0..WIDTH).map(|parameter| Unknown::Inertial { link, parameter }));
+    }
+    for &sensor in &layout.sensors {
+        columns.extend((0..6).map(|component| Unknown::Offset { sensor, component }));
+    }
+    let wide = root.ncols();
+    let mut joint = DMatrix::zeros(p + s, wide + s);
+    joint.view_mut((0, 0), (p, wide)).copy_from(root);
+    if let Some(told) = identified.told.last() {
+        let slope = told.slope.rows(0, s).into_owned();
+        joint.view_mut((p, 0), (s, wide)).copy_from(&-(slope * root));
+        let own = told.covariance.view((0, 0), (s, s)).into_owned();
+        if let Some(factor) = own.cholesky() {
+            joint.view_mut((p, wide), (s, s)).copy_from(&factor.l());
+        }
+    }
+    CovarianceRoot {
+        columns,
+        root: upper(&joint),
+    }
+}
+
+/// The upper triangular `U` with `U U^T = M M^T`.
+fn upper(m: &DMatrix<f64>) -> DMatrix<f64> {
+    let n = m.nrows();
+    let flipped = DMatrix::from_fn(m.ncols(), n, |i, j| m[(n - 1 - j, i)]);
+    let r = flipped.qr().r();
+    DMatrix::from_fn(n, n, |i, j| if j < i { 0.0 } else { r[(n - 1 - j, n - 1 - i)] })
+}
+
+/// A direction, in units of the prior's spread, in words: the up to four greatest parts.
+fn expression(setup: &Setup, layout: &Layout, direction: &DVector<f64>) -> String {
+    let mut parts: Vec<(usize, f64)> = direction.iter().copied().enumerate().collect();
+    parts.sort_by(|a, b| b.1.abs().total_cmp(&a.1.abs()).then(a.0.cmp(&b.0)));
+    let lead = parts.first().map_or(1.0, |p| p.1);
+    let mut text = String::new();
+    for (number, (column, value)) in parts.iter().take(4).enumerate() {
+        let share = value / lead;
+        if share.abs() < 0.1 {
+            break;
+        }
+        let link = setup.model.link_name(layout.links[column / WIDTH]);
+        // Second moments and the like are mixed within a link; the unit that leads names it.
+        let name = format!("{link}.{}", PARAMETERS[column % WIDTH]);
+        match number {
+            0 => text.push_str(&name),
+            _ => text.push_str(&format!(
+                " {} {:.2} {name}",
+                if share < 0.0 { '-' } else { '+' },
+                share.abs()
+            )),
+        }
+    }
+    text
+}
+
+/// What can show at all with the joints that moved in the logs.
+fn subspace(setup: &Setup, training: &[&Prepared], identified: &Identified) -> Option<Identifiable> {
+    let mut regime = setup.regime();
+    for (dof, joint) in regime.joints.iter_mut().enumerate() {
+        let all = || training.iter().flat_map(|log| log.instants.iter());
+        let (low, high) = all().fold((f64::MAX, f64::MIN), |(a, b), i| {
+            (a.min(i.position[dof]), b.max(i.position[dof]))
+        });
+        if high - low < STILL {
+            *joint = JointMotion::Locked(0.5 * (low + high));
+        }
+    }
+    if identified.inputs == [IdentificationInput::Torque] {
+        return Identifiable::new(&setup.model, Scope::Tree, &regime, Measured::Torques, Offsets::Known).ok();
+    }
+    regime.contacts = setup.always;
+    let scope = Scope::SubTrees(&setup.structure);
+    Identifiable::new(&setup.model, scope, &regime, Measured::Wrench, Offsets::Unknown).ok()
+}
+
+fn base_parameters(
+    setup: &Setup,
+    identified: &Identified,
+    root: &DMatrix<f64>,
+    subspace: Option<&Identifiable>,
+) -> (Vec<BaseParameterOutcome>, Vec<String>, usize) {
+    let layout = &identified.layout;
+    let Some(subspace) = subspace else {
+        return (Vec::new(), Vec::new(), 0);
+    };
+    let moved = bodies(setup, layout, &identified.d);
+    let value_of = |bodies: &[RigidInertia]| -> Vec<f64> {
+        let columns = subspace.columns().iter();
+        columns
+            .map(|column| match column {
+                Column::Inertial { link, parameter } => bodies[*link].parameters()[*parameter],
+                Column::Offset { .. } => 0.0,
+            })
+            .collect()
+    };
+    let (cad, new) = (value_of(setup.model.inertias()), value_of(&moved));
+    let (mut out, mut confused, mut rank) = (Vec::new(), Vec::new(), 0);
+    for base in subspace.base_parameters() {
+        let is_inertial = |column: usize| matches!(subspace.columns()[column], Column::Inertial { .. });
+        let all = || std::iter::once(&base.kept).chain(&base.terms);
+        let inertial = all().filter(|t| is_inertial(t.column)).count();
+        let offsets = all().count() - inertial;
+        if offsets > 0 {
+            if inertial > 0 || offsets > 1 {
+                confused.push(format!("only as a sum: {base}"));
+            }
+            continue;
+        }
+        let mut row = DVector::zeros(layout.unknowns());
+        let mut seen = true;
+        for term in all() {
+            if let Column::Inertial { link, parameter } = subspace.columns()[term.column] {
+                match layout.links.binary_search(&link) {
+                    Ok(place) => row[WIDTH * place + parameter] += term.coefficient,
+                    Err(_) => seen = false,
+                }
+            }
+        }
+        rank += usize::from(seen);
+        let (Some(before), Some(after), true) = (base.value(&cad), base.value(&new), seen) else {
+            continue;
+        };
+        let unit = match subspace.columns()[base.kept.column] {
+            Column::Inertial { parameter: 0, .. } => "kg",
+            Column::Inertial { parameter: 1..=3, .. } => "kg m",
+            _ => "kg m^2",
+        };
+        out.push(BaseParameterOutcome {
+            expression: base.to_string(),
+            unit,
+            cad: before,
+            identified: after,
+            deviation: root.tr_mul(&row).norm(),
+        });
+    }
+    (out, confused, rank)
+}
+
+fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified, root: &DMatrix<f64>) -> LogOutcome {
+    let setup = maker.setup();
+    let layout = &identified.layout;
+    let zero = DVector::zeros(layout.unknowns());
+    let sets = [zero, identified.d.clone()];
+    let usable = !log.instants.is_empty() && !log.refused;
+    let instants = if usable { log.instants.as_slice() } else { &[] };
+    let left = leave(
+        maker,
+        super::passes::Piece {
+            instants,
+            breaks: &log.breaks,
+        },
+        &identified.noise,
+        &sets,
+    );
+    let times: Vec<f64> = instants.iter().map(|i| (i.t - log.span.0).seconds()).collect();
+    let filter = (log.rate > RAW_RATE)
+        .then(|| times.len() as f64 / (times.last().copied().unwrap_or(1.0) - times.first().copied().unwrap_or(0.0)));
+    let inner = |i: &usize| {
+        let (first, last) = (
+            times.first().copied().unwrap_or(0.0),
+            times.last().copied().unwrap_or(0.0),
+        );
+        times[*i] >= first + EDGE && times[*i] <= last - EDGE
+    };
+    let wrenches = 6 * layout.sensors.len();
+
+    // Torques: identified from, or the truth beside F/T sensors.
+    let mut joints = Vec::new();
+    let mut torque_share = Vec::new();
+    let mut torque_series: Vec<(usize, [Vec<f64>; 3], Vec<f64>)> = Vec::new();
+    if layout.joints.is_empty() {
+        let dofs = setup.model.dof_count();
+        let mut errors = [vec![Vec::new(); dofs], vec![Vec::new(); dofs]];
+        if instants.iter().any(|i| i.torque.iter().any(|x| x.is_finite())) {
+            for (set, errors) in sets.iter().zip(&mut errors) {
+                for instant in instants {
+                    let row = maker
+                        .torque_errors(instant, set.as_slice())
+                        .unwrap_or_else(|_| vec![f64::NAN; dofs]);
+                    errors.iter_mut().zip(row).for_each(|(e, x)| e.push(x));
+                }
+            }
+            for dof in 0..dofs {
+                if errors[0][dof].iter().any(|x| x.is_finite()) {
+                    let measured = instants.iter().map(|i| i.torque[dof]).collect();
+                    let cad = errors[0][dof].clone();
+                    torque_series.push((dof, [cad.clone(), cad, errors[1][dof].clone()], measured));
+                }
+            }
+        }
+    } else {
+        for (place, &dof) in layout.joints.iter().enumerate() {
+            let channel = wrenches + place;
+            let measured: Vec<f64> = instants.iter().map(|i| i.torque[dof]).collect();
+            let raw = left.measured[channel]
+                .iter()
+                .zip(&left.predicted[channel])
+                .map(|(m, p)| m - p)
+                .collect();
+            torque_series.push((
+                dof,
+                [raw, left.noise[0][channel].clone(), left.noise[1][channel].clone()],
+                measured,
+            ));
+        }
+    }
+    for (dof, errors, measured) in &torque_series {
+        let smooth = |x: &[f64]| match filter {
+            Some(rate) => zero_phase(x, rate),
+            None => x.to_vec(),
+        };
+        let keep = |x: &[f64]| -> Vec<f64> { (0..x.len()).filter(inner).map(|i| x[i]).collect() };
+        let [cad, fitted, own] = errors.each_ref().map(|e| keep(&smooth(e)));
+        let measured = keep(&smooth(measured));
+        let place = layout.joints.binary_search(dof).ok();
+        let coverage = place.map_or(f64::NAN, |place| {
+            covered(
+                maker,
+                instants,
+                &left.noise[1][wrenches + place],
+                wrenches + place,
+                identified,
+                root,
+            )
+        });
+        joints.push(JointOutcome {
+            name: setup.model.dof_name(*dof).to_owned(),
+            rms_nm: three([&cad, &fitted, &own].map(|x| rms(x.iter().copied()))),
+            measured_rms_nm: rms(measured.iter().copied()),
+            coverage,
+        });
+        torque_share.push(([cad, fitted, own], measured));
+    }
+
+    let mut sensors = Vec::new();
+    let mut wrench_share = Vec::new();
+    for (place, &sensor) in layout.sensors.iter().enumerate() {
+        let name = sensor_name(setup, sensor);
+        let configured = setup.offsets[sensor].force_first();
+        let mut values = [[f64::NAN; 6]; 3];
+        for axis in 0..6 {
+            let channel = channel_of(place, axis);
+            let raw: Vec<f64> = left.measured[channel]
+                .iter()
+                .zip(&left.predicted[channel])
+                .map(|(m, p)| m - p - configured[axis])
+                .collect();
+            let series = [&raw, &left.noise[0][channel], &left.noise[1][channel]];
+            for (value, series) in values.iter_mut().zip(series) {
+                value[axis] = rms(series.iter().copied());
+            }
+            let offset = left.offset(layout, 1, channel);
+            let scale = if axis < 3 { Structure::LENGTH_SCALE } else { 1.0 };
+            let load: Vec<f64> = left.measured[channel]
+                .iter()
+                .zip(&offset)
+                .map(|(m, o)| (m - o) * scale)
+                .collect();
+            let centre = mean(&load);
+            let raw_mean = mean(&raw);
+            let errors = [
+                raw.iter().map(|x| (x - raw_mean) * scale).collect::<Vec<_>>(),
+                left.noise[0][channel].iter().map(|x| x * scale).collect(),
+                left.noise[1][channel].iter().map(|x| x * scale).collect(),
+            ];
+            wrench_share.push((errors, load.iter().map(|x| x - centre).collect::<Vec<_>>()));
+        }
+        sensors.push(SensorOutcome {
+            name,
+            rms: three(values),
+        });
+    }
+    let share = if torque_share.is_empty() {
+        &wrench_share
+    } else {
+        &torque_share
+    };
+    let relative = |which: usize| {
+        let (mut above, mut below) = (0.0, 0.0);
+        for (errors, measured) in share {
+            for (e, m) in errors[which].iter().zip(measured) {
+                if e.is_finite() && m.is_finite() {
+                    above += e * e;
+                    below += m * m;
+                }
+            }
+        }
+        (above / below).sqrt()
+    };
+    LogOutcome {
+        file: log.file.clone(),
+        role: log.role,
+        span: log.span,
+        used: instants.len() as u64,
+        left_out: log.left_out.clone(),
+        onset: onset(instants),
+        relative_error: three([0, 1, 2].map(relative)),
+        joints,
+        sensors,
+        two_route: two_route(maker, instants, &left, &sets),
+        offsets: offsets(setup, layout, log, identified, &left),
+        friction: friction(setup, layout, &left),
+        time_offsets: log.time_offsets.clone(),
+        findings: log.findings.clone(),
+        curves: curves(maker, instants, &times, &left, identified, root, &torque_series),
+        spectra: spectra(setup, layout, &times, &left),
+    }
+}
+
+fn three<T: Copy>(values: [T; 3]) -> Three<T> {
+    Three {
+        cad: values[0],
+        cad_fitted: values[1],
+        identified: values[2],
+    }
+}
+
+/// When something first moves by more than [`STILL`] from where it was; none if it never does, or within the first half second.
+fn onset(instants: &[super::instants::Instant]) -> Option<Nanos> {
+    let first = instants.first()?;
+    let moved = instants.iter().find(|i| {
+        i.position
+            .iter()
+            .zip(&first.position)
+            .any(|(a, b)| (a - b).abs() > STILL)
+    })?;
+    ((moved.t - first.t).seconds() > 0.5).then_some(moved.t)
+}
+
+fn two_route(
+    maker: &mut RowMaker<'_>,
+    instants: &[super::instants::Instant],
+    left: &Residuals,
+    sets: &[DVector<f64>; 2],
+) -> Vec<TwoRouteOutcome> {
+    let setup = maker.setup();
+    let layout = maker.layout().clone();
+    let dofs = setup.model.dof_count();
+    let mut configured = vec![0.0; layout.session()];
+    for (place, &sensor) in layout.sensors.iter().enumerate() {
+        for (axis, value) in setup.offsets[sensor].force_first().into_iter().enumerate() {
+            configured[channel_of(place, axis)] = value;
+        }
+    }
+    let mut series = [vec![Vec::new(); dofs], vec![Vec::new(); dofs], vec![Vec::new(); dofs]];
+    let mut rows = Rows::new(&layout);
+    for (range, block) in left.ranges.iter().zip(&left.session) {
+        for instant in &instants[range.clone()] {
+            if layout.sensors.len() < 2 || maker.make(instant, &mut rows).is_err() {
+                continue;
+            }
+            let fitted = block.x.column(0).into_owned();
+            let own = block.x.column(1).into_owned();
+            let cases = [
+                (&sets[0], configured.as_slice()),
+                (&sets[0], fitted.as_slice()),
+                (&sets[1], own.as_slice()),
+            ];
+            for (series, (d, session)) in series.iter_mut().zip(cases) {
+                let apart = maker.imbalance(instant, d.as_slice(), session);
+                series
+                    .iter_mut()
+                    .zip(apart)
+                    .filter(|(_, x)| x.is_finite())
+                    .for_each(|(s, x)| s.push(x));
+            }
+        }
+    }
+    (0..dofs)
+        .filter(|&dof| !series[0][dof].is_empty())
+        .map(|dof| TwoRouteOutcome {
+            joint: setup.model.dof_name(dof).to_owned(),
+            rms_nm: three([0, 1, 2].map(|set| rms(series[set][dof].iter().copied()))),
+            rms_mean_removed_nm: three([0, 1, 2].map(|set| {
+                let centre = mean(&series[set][dof]);
+                rms(series[set][dof].iter().map(|x| x - centre))
+            })),
+        })
+        .collect()
+}
+
+fn offsets(
+    setup: &Setup,
+    layout: &Layout,
+    log: &Prepared,
+    identified: &Identified,
+    left: &Residuals,
+) -> Vec<OffsetOutcome> {
+    let (Some(first), Some(last)) = (left.session.first(), left.session.last()) else {
+        return Vec::new();
+    };
+    let of = |place: usize, value: &dyn Fn(usize) -> f64| std::array::from_fn(|axis| value(channel_of(place, axis)));
+    layout
+        .sensors
+        .iter()
+        .enumerate()
+        .map(|(place, &sensor)| OffsetOutcome {
+            sensor: sensor_name(setup, sensor),
+            start: of(place, &|channel| first.x[(channel, 1)]),
+            end: of(place, &|channel| last.x[(channel, 1)]),
+            deviation: of(place, &|channel| last.p[(channel, channel)].max(0.0).sqrt()),
+            rate: of(place, &|channel| identified.noise.drift[channel].sqrt()),
+            breaks: log.breaks.iter().filter(|b| b.sensor == sensor).map(|b| b.t).collect(),
+        })
+        .collect()
+}
+
+fn friction(setup: &Setup, layout: &Layout, left: &Residuals) -> Vec<FrictionOutcome> {
+    let Some(last) = left.session.last() else {
+        return Vec::new();
+    };
+    let first = 6 * layout.sensors.len();
+    let value = |place: usize, k: usize| last.x[(first + FRICTION * place + k, 1)];
+    let deviation = |place: usize, k: usize| {
+        let i = first + FRICTION * place + k;
+        last.p[(i, i)].max(0.0).sqrt()
+    };
+    layout
+        .joints
+        .iter()
+        .enumerate()
+        .map(|(place, &dof)| FrictionOutcome {
+            joint: setup.model.dof_name(dof).to_owned(),
+            coulomb_nm: value(place, 0),
+            viscous: value(place, 1),
+            offset_nm: value(place, 2),
+            deviation: [0, 1, 2].map(|k| deviation(place, k)),
+        })
+        .collect()
+}
+
+/// Standard deviation of what the parameters predict for a channel at an instant: `|P^(1/2)T a|`.
+fn predicted_deviations(
+    maker: &mut RowMaker<'_>,
+    instant: &super::instants::Instant,
+    identified: &Identified,
+    root: &DMatrix<f64>,
+) -> Vec<f64> {
+    let layout = maker.layout().clone();
+    let mut rows = Rows::new(&layout);
+    let variances = identified.noise.following();
+    let mut out = vec![f64::NAN; layout.channels()];
+    if maker.make(instant, &mut rows).is_err() {
+        return out;
+    }
+    rows.whiten(&variances);
+    let mut sums = vec![0.0; layout.channels()];
+    let mut e = vec![0.0; layout.channels()];
+    let mut white = Vec::new();
+    for column in root.column_iter() {
+        white.clear();
+        white.extend((0..rows.count).map(|row| dot(rows.a(row), column.as_slice())));
+        rows.channel_noise(&variances, &mut white, &mut e);
+        sums.iter_mut().zip(&e).for_each(|(sum, x)| *sum += x * x);
+    }
+    for (channel, out) in out.iter_mut().enumerate() {
+        if rows.has(channel) {
+            *out = sums[channel].sqrt();
+        }
+    }
+    out
+}
+
+/// Share of instants whose residual is within 1.96 standard deviations of parameters and noise together.
+fn covered(
+    maker: &mut RowMaker<'_>,
+    instants: &[super::instants::Instant],
+    errors: &[f64],
+    channel: usize,
+    identified: &Identified,
+    root: &DMatrix<f64>,
+) -> f64 {
+    let (mut inside, mut count) = (0.0, 0.0);
+    for i in (0..instants.len()).step_by((instants.len() / 200).max(1)) {
+        if !errors[i].is_finite() {
+            continue;
+        }
+        let own = predicted_deviations(maker, &instants[i], identified, root)[channel];
+        let deviation = own.hypot(identified.noise.square[channel].sqrt());
+        inside += f64::from(u8::from(errors[i].abs() <= 1.96 * deviation));
+        count += 1.0;
+    }
+    inside / count
+}
+
+fn curves(
+    maker: &mut RowMaker<'_>,
+    instants: &[super::instants::Instant],
+    times: &[f64],
+    left: &Residuals,
+    identified: &Identified,
+    root: &DMatrix<f64>,
+    torques: &[(usize, [Vec<f64>; 3], Vec<f64>)],
+) -> Vec<Curve> {
+    let setup = maker.setup();
+    let layout = maker.layout().clone();
+    let wrenches = 6 * layout.sensors.len();
+    let points: Vec<usize> = (0..instants.len())
+        .step_by(instants.len().div_ceil(POINTS).max(1))
+        .collect();
+    // Uncertainty changes slowly: a tenth of the points, held between.
+    let mut deviations: Vec<Vec<f64>> = Vec::new();
+    for (number, &i) in points.iter().enumerate() {
+        if number % 10 == 0 {
+            deviations.push(predicted_deviations(maker, &instants[i], identified, root));
+        }
+    }
+    let sigma = |channel: usize| -> Vec<f64> {
+        let noise = identified.noise.square[channel].sqrt();
+        (0..points.len())
+            .map(|number| deviations[number / 10][channel].hypot(noise))
+            .collect()
+    };
+    let t: Vec<f64> = points.iter().map(|&i| times[i]).collect();
+    let pick = |values: &dyn Fn(usize) -> f64| points.iter().map(|&i| values(i)).collect::<Vec<f64>>();
+    let mut out = Vec::new();
+    for (dof, errors, measured) in torques {
+        let place = layout.joints.binary_search(dof).ok();
+        out.push(Curve {
+            name: setup.model.dof_name(*dof).to_owned(),
+            unit: "Nm",
+            t: t.clone(),
+            measured: pick(&|i| measured[i]),
+            cad_fitted: pick(&|i| measured[i] - errors[1][i]),
+            identified: pick(&|i| measured[i] - errors[2][i]),
+            sigma: place.map_or_else(|| vec![f64::NAN; points.len()], |place| sigma(wrenches + place)),
+        });
+    }
+    for (place, &sensor) in layout.sensors.iter().enumerate() {
+        for (axis, word) in AXES.into_iter().enumerate() {
+            let channel = channel_of(place, axis);
+            let offset = left.offset(&layout, 1, channel);
+            let load = |i: usize| left.measured[channel][i] - offset[i];
+            out.push(Curve {
+                name: format!("{} {word}", sensor_name(setup, sensor)),
+                unit: if axis < 3 { "N" } else { "Nm" },
+                t: t.clone(),
+                measured: pick(&load),
+                cad_fitted: pick(&|i| load(i) - left.noise[0][channel][i]),
+                identified: pick(&|i| load(i) - left.noise[1][channel][i]),
+                sigma: sigma(channel),
+            });
+        }
+    }
+    out
+}
+
+/// Power spectra of the residuals: means over pieces of 256 instants, halves overlapping, each under a Hann window (Welch 1967).
+fn spectra(setup: &Setup, layout: &Layout, times: &[f64], left: &Residuals) -> Vec<Spectrum> {
+    const LENGTH: usize = 256;
+    if times.len() < LENGTH {
+        return Vec::new();
+    }
+    let rate = (times.len() - 1) as f64 / (times[times.len() - 1] - times[0]);
+    let window: Vec<f64> = (0..LENGTH)
+        .map(|i| (std::f64::consts::PI * (i as f64 + 0.5) / LENGTH as f64).sin().powi(2))
+        .collect();
+    let power: f64 = window.iter().map(|w| w * w).sum();
+    let density = |series: &[f64]| -> Vec<f64> {
+        let mut sums = vec![0.0; LENGTH / 2];
+        let mut pieces = 0.0;
+        for piece in series.windows(LENGTH).step_by(LENGTH / 2) {
+            if piece.iter().any(|x| !x.is_finite()) {
+                continue;
+            }
+            pieces += 1.0;
+            for (k, sum) in sums.iter_mut().enumerate() {
+                let turn = 2.0 * std::f64::consts::PI * (k + 1) as f64 / LENGTH as f64;
+                let (mut re, mut im) = (0.0, 0.0);
+                for (i, (x, w)) in piece.iter().zip(&window).enumerate() {
+                    let (s, c) = (turn * i as f64).sin_cos();
+                    re += x * w * c;
+                    im += x * w * s;
+                }
+                *sum += 2.0 * (re * re + im * im) / (power * rate);
+            }
+        }
+        sums.iter().map(|s| s / pieces).collect()
+    };
+    (0..layout.channels())
+        .map(|channel| Spectrum {
+            name: channel_name(setup, layout, channel).0,
+            frequency: (0..LENGTH / 2).map(|k| (k + 1) as f64 * rate / LENGTH as f64).collect(),
+            cad_fitted: density(&left.noise[0][channel]),
+            identified: density(&left.noise[1][channel]),
+        })
+        .collect()
+}
+
+/// Fourth-order Butterworth low pass, forwards and backwards; `rate` samples a second. The ends are continued by reflection.
+fn zero_phase(values: &[f64], rate: f64) -> Vec<f64> {
+    let pad = ((rate / CUT_OFF) as usize * 3).min(values.len().saturating_sub(1));
+    if pad == 0 || rate < 4.0 * CUT_OFF {
+        return values.to_vec();
+    }
+    let (first, last) = (values[0], values[values.len() - 1]);
+    let mut x: Vec<f64> = (1..=pad).rev().map(|i| 2.0 * first - values[i]).collect();
+    x.extend_from_slice(values);
+    x.extend((1..=pad).map(|i| 2.0 * last - values[values.len() - 1 - i]));
+    let k = (std::f64::consts::PI * CUT_OFF / rate).tan();
+    for _ in 0..2 {
+        for angle in [1.0, 3.0].map(|m| m * std::f64::consts::PI / 8.0) {
+            let q = 1.0 / (2.0 * f64::cos(angle));
+            let norm = 1.0 / (1.0 + k / q + k * k);
+            let (b, a1, a2) = (k * k * norm, 2.0 * (k * k - 1.0) * norm, (1.0 - k / q + k * k) * norm);
+            // In the steady state of its first value.
+            let (mut s1, mut s2) = (x[0] * (1.0 - b), x[0] * (b - a2));
+            for value in &mut x {
+                let y = b * *value + s1;
+                s1 = 2.0 * b * *value - a1 * y + s2;
+                s2 = b * *value - a2 * y;
+                *value = y;
+            }
+        }
+        x.reverse();
+    }
+    x[pad..pad + values.len()].to_vec()
+}

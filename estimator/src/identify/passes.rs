@@ -1,0 +1,402 @@
+//! Passes over a log's instants: what it tells of the parameters, and what is left when these are given.
+
+use super::information::{Information, Panel};
+use super::instants::{Break, Instant};
+use super::noise;
+use super::rows::{Layout, RowMaker, Rows};
+use super::session::{Block, Session, smooth};
+use nalgebra::{DMatrix, DVector};
+use std::ops::Range;
+
+/// Offsets are constant within blocks of this length \[s\]; between blocks they walk.
+pub(super) const BLOCK: f64 = 0.1;
+
+/// Variance of an offset before anything is measured [N^2 or Nm^2]: no F/T sensor is a thousand off. Of friction coefficients [Nm^2]: a hundred.
+const OFFSET_VARIANCE: f64 = 1e6;
+const FRICTION_VARIANCE: f64 = 1e4;
+
+/// Means over so many autocorrelation times count as independent; at most so many blocks are one.
+const INDEPENDENT: f64 = 4.0;
+const LONGEST: usize = 5;
+
+/// Rows that are absorbed at once.
+const PANEL: usize = 96;
+
+/// Consecutive instants of one log, with offsets and friction of their own.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Piece<'a> {
+    pub instants: &'a [Instant],
+    /// Where offsets start afresh.
+    pub breaks: &'a [Break],
+}
+
+/// Noise of all channels.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct NoiseModel {
+    /// Per channel: mean square of what is left when the walking offset is taken away.
+    pub square: Vec<f64>,
+    /// Per channel: its integrated autocorrelation time, in instants.
+    pub time: Vec<f64>,
+    /// Per channel: rate of the offset's random walk [unit^2/s].
+    pub drift: Vec<f64>,
+    /// Per channel: variance of a row that gives block means the variance beside the walk that they were found to have.
+    pub block: Vec<f64>,
+    /// Per channel: no variance is taken as less.
+    pub least: Vec<f64>,
+}
+
+impl NoiseModel {
+    /// Before anything is known.
+    pub(super) fn unit(least: Vec<f64>) -> Self {
+        let channels = least.len();
+        Self {
+            square: vec![1.0; channels],
+            time: vec![1.0; channels],
+            drift: vec![0.0; channels],
+            block: vec![1.0; channels],
+            least,
+        }
+    }
+
+    /// Variances of rows that count as independent though they are not: for what is said of parameters.
+    pub(super) fn inflated(&self) -> Vec<f64> {
+        let each = self.square.iter().zip(&self.time).zip(&self.block).zip(&self.least);
+        each.map(|(((square, time), block), least)| (square * time).max(*block).max(*least))
+            .collect()
+    }
+
+    /// Variances for following the offsets.
+    pub(super) fn following(&self) -> Vec<f64> {
+        self.block.iter().zip(&self.least).map(|(x, y)| x.max(*y)).collect()
+    }
+
+    /// The greatest relative change of a variance.
+    pub(super) fn change(&self, other: &Self) -> f64 {
+        let pairs = self.inflated().into_iter().zip(other.inflated());
+        pairs.map(|(x, y)| (x / y).ln().abs()).fold(0.0, f64::max)
+    }
+
+    fn steps(&self, layout: &Layout, seconds: f64) -> Vec<f64> {
+        let mut variances = vec![0.0; layout.session()];
+        for (channel, rate) in self.drift.iter().enumerate() {
+            variances[layout.offset_of(channel)] = rate * seconds;
+        }
+        variances
+    }
+}
+
+fn session_prior(layout: &Layout) -> Vec<f64> {
+    let mut prior = vec![OFFSET_VARIANCE; 6 * layout.sensors.len()];
+    prior.resize(layout.session(), FRICTION_VARIANCE);
+    prior
+}
+
+/// Blocks of instants, each with the sensors (places in the layout) that start afresh with it.
+fn blocks(layout: &Layout, piece: Piece<'_>) -> Vec<(Range<usize>, Vec<usize>)> {
+    let instants = piece.instants;
+    let mut out = Vec::new();
+    let mut start = 0;
+    let mut afresh = Vec::new();
+    for i in 1..=instants.len() {
+        let next: Vec<usize> = match instants.get(i) {
+            Some(instant) => piece
+                .breaks
+                .iter()
+                .filter(|b| instants[i - 1].t < b.t && b.t <= instant.t)
+                .filter_map(|b| layout.sensors.binary_search(&b.sensor).ok())
+                .collect(),
+            None => Vec::new(),
+        };
+        let ends = instants
+            .get(i)
+            .is_none_or(|instant| (instant.t - instants[start].t).seconds() >= BLOCK);
+        if ends || !next.is_empty() {
+            out.push((start..i, std::mem::replace(&mut afresh, next)));
+            start = i;
+        }
+    }
+    out
+}
+
+/// Lets time pass between blocks; what was added to the variances, infinite where an offset starts afresh.
+fn pass_time(session: &mut Session, steps: Vec<f64>, afresh: &[usize]) -> Vec<f64> {
+    let mut added = steps;
+    session.drift(&added);
+    for sensor in afresh {
+        for unknown in 6 * sensor..6 * sensor + 6 {
+            session.renew(unknown, OFFSET_VARIANCE);
+            added[unknown] = f64::INFINITY;
+        }
+    }
+    added
+}
+
+/// What a piece of a log tells of the parameters, and what it says of its own unknowns at its end.
+pub(super) struct Told {
+    /// Of `d`, offsets and friction eliminated.
+    pub information: Information,
+    /// At the end `s = estimate - slope d`, with this covariance.
+    pub slope: DMatrix<f64>,
+    pub covariance: DMatrix<f64>,
+}
+
+/// Tells what a piece says of the parameters. With `angles`, further columns: what a constant error of these joints' positions would do.
+pub(super) fn tell(
+    maker: &mut RowMaker<'_>,
+    piece: Piece<'_>,
+    noise: &NoiseModel,
+    angles: &[usize],
+    d: &[f64],
+) -> Told {
+    const ANGLE: f64 = 1e-5;
+    let layout = maker.layout().clone();
+    let links = layout.unknowns();
+    let p = links + angles.len();
+    let variances = noise.inflated();
+    let mut session = Session::new(&session_prior(&layout), p + 1);
+    let (mut rows, mut turned) = (Rows::new(&layout), Rows::new(&layout));
+    let mut information = Information::new(p);
+    let mut panel = Panel::new(p, PANEL);
+    let mut line = vec![0.0; p + 1];
+    let mut slopes = Vec::new();
+    let mut last = None;
+    for (range, afresh) in blocks(&layout, piece) {
+        let t = piece.instants[range.start].t;
+        if let Some(last) = last.replace(t) {
+            pass_time(&mut session, noise.steps(&layout, (t - last).seconds()), &afresh);
+        }
+        for instant in &piece.instants[range] {
+            if maker.make(instant, &mut rows).is_err() {
+                continue;
+            }
+            slopes.clear();
+            slopes.resize(rows.count * angles.len(), 0.0);
+            for (place, &dof) in angles.iter().enumerate() {
+                let mut other = instant.clone();
+                other.position[dof] += ANGLE;
+                if maker.make(&other, &mut turned).is_err() || turned.count != rows.count {
+                    continue;
+                }
+                for row in 0..rows.count {
+                    // The row holds at the true position, which is the measured one less the error. Offsets are in it with their own, small, change.
+                    let right = |r: &Rows| r.r(row) - dot(r.a(row), d);
+                    slopes[row * angles.len() + place] = -(right(&rows) - right(&turned)) / ANGLE;
+                }
+            }
+            rows.whiten_with(&variances, &mut slopes, angles.len());
+            for row in 0..rows.count {
+                line[..links].copy_from_slice(rows.a(row));
+                line[links..p].copy_from_slice(&slopes[row * angles.len()..][..angles.len()]);
+                line[p] = rows.r(row);
+                session.update(rows.g(row), &mut line);
+                if panel.rows() == panel.capacity() {
+                    let _ = information.absorb(&mut panel);
+                }
+                // A row that is not finite, of numbers beyond all bounds, tells nothing.
+                let _ = panel.push_row(&line[..p], line[p]);
+            }
+        }
+    }
+    let _ = information.absorb(&mut panel);
+    let estimates = session.estimates();
+    Told {
+        information,
+        slope: estimates.columns(0, links).into_owned(),
+        covariance: session.covariance(),
+    }
+}
+
+/// What is left of a piece of a log, for some sets of parameters.
+pub(super) struct Residuals {
+    /// Per set, per channel, per instant: noise; NaN where no row has it.
+    pub noise: Vec<Vec<Vec<f64>>>,
+    /// Per channel, per instant: what CAD says without offsets and friction: of an F/T sensor's reading, of a joint's torque.
+    pub predicted: Vec<Vec<f64>>,
+    /// The same of what was measured.
+    pub measured: Vec<Vec<f64>>,
+    /// Blocks of instants.
+    pub ranges: Vec<Range<usize>>,
+    /// Per block the session's unknowns, a column per set, given all of the piece.
+    pub session: Vec<Block>,
+}
+
+impl Residuals {
+    /// A sensor's offset in a channel, per instant.
+    pub(super) fn offset(&self, layout: &Layout, set: usize, channel: usize) -> Vec<f64> {
+        let mut out = vec![f64::NAN; self.measured.first().map_or(0, Vec::len)];
+        let unknown = layout.offset_of(channel);
+        for (range, block) in self.ranges.iter().zip(&self.session) {
+            out[range.clone()].fill(block.x[(unknown, set)]);
+        }
+        out
+    }
+}
+
+/// Takes parameters as given, fits offsets and friction, and gives what is left.
+pub(super) fn leave(
+    maker: &mut RowMaker<'_>,
+    piece: Piece<'_>,
+    noise: &NoiseModel,
+    sets: &[DVector<f64>],
+) -> Residuals {
+    let layout = maker.layout().clone();
+    let (k, channels, count) = (sets.len(), layout.channels(), piece.instants.len());
+    let variances = noise.following();
+    let mut session = Session::new(&session_prior(&layout), k);
+    let mut rows = Rows::new(&layout);
+    let (mut states, mut ranges) = (Vec::new(), Vec::new());
+    let mut line = vec![0.0; k];
+    let mut last = None;
+    for (range, afresh) in blocks(&layout, piece) {
+        let t = piece.instants[range.start].t;
+        let mut drift = vec![0.0; layout.session()];
+        if let Some(last) = last.replace(t) {
+            drift = pass_time(&mut session, noise.steps(&layout, (t - last).seconds()), &afresh);
+        }
+        for instant in &piece.instants[range.clone()] {
+            if maker.make(instant, &mut rows).is_err() {
+                continue;
+            }
+            rows.whiten(&variances);
+            for row in 0..rows.count {
+                for (value, set) in line.iter_mut().zip(sets) {
+                    *value = rows.r(row) - dot(rows.a(row), set.as_slice());
+                }
+                session.update(rows.g(row), &mut line);
+            }
+        }
+        states.push(Block {
+            x: session.estimates(),
+            p: session.covariance(),
+            drift,
+        });
+        ranges.push(range);
+    }
+    smooth(&mut states);
+    let mut left = vec![vec![vec![f64::NAN; count]; channels]; k];
+    let (mut predicted, mut measured) = (
+        vec![vec![f64::NAN; count]; channels],
+        vec![vec![f64::NAN; count]; channels],
+    );
+    let cad = maker.cad_of_layout();
+    let (mut white, mut e) = (Vec::new(), vec![0.0; channels]);
+    for (range, state) in ranges.iter().zip(&states) {
+        for i in range.clone() {
+            if maker.make(&piece.instants[i], &mut rows).is_err() {
+                continue;
+            }
+            rows.whiten(&variances);
+            let there: Vec<usize> = (0..channels).filter(|&channel| rows.has(channel)).collect();
+            let mut give = |value: &dyn Fn(usize) -> f64, out: &mut Vec<Vec<f64>>| {
+                white.clear();
+                white.extend((0..rows.count).map(value));
+                rows.channel_noise(&variances, &mut white, &mut e);
+                for &channel in &there {
+                    out[channel][i] = e[channel];
+                }
+            };
+            for (set, d) in sets.iter().enumerate() {
+                let s = state.x.column(set);
+                give(
+                    &|row| rows.r(row) - dot(rows.a(row), d.as_slice()) - dot(rows.g(row), s.as_slice()),
+                    &mut left[set],
+                );
+            }
+            give(&|row| dot(rows.a(row), &cad), &mut predicted);
+            give(&|row| rows.r(row) + dot(rows.a(row), &cad), &mut measured);
+        }
+    }
+    Residuals {
+        noise: left,
+        predicted,
+        measured,
+        ranges,
+        session: states,
+    }
+}
+
+pub(super) fn dot(x: &[f64], y: &[f64]) -> f64 {
+    x.iter().zip(y).map(|(a, b)| a * b).sum()
+}
+
+/// Means of so many blocks each.
+fn merge(means: &[f64], count: usize) -> Vec<f64> {
+    let mean = |values: &[f64]| {
+        let finite = values.iter().filter(|x| x.is_finite());
+        let (sum, count) = finite.fold((0.0, 0.0), |(sum, count), x| (sum + x, count + 1.0));
+        sum / count
+    };
+    means.chunks(count).map(mean).collect()
+}
+
+/// The noise of every channel, from what one set of parameters leaves of all pieces. `bound`: the greatest variance of a step of an offset's walk, relative to that of a block's noise.
+pub(super) fn noise_of(layout: &Layout, pieces: &[Residuals], set: usize, bound: f64, least: &[f64]) -> NoiseModel {
+    let mut model = NoiseModel {
+        least: least.to_vec(),
+        ..NoiseModel::default()
+    };
+    for channel in 0..layout.channels() {
+        let wanders = channel < 6 * layout.sensors.len();
+        let (mut step, mut variance) = (0.0, 0.0);
+        let mut left: Vec<Vec<f64>> = pieces.iter().map(|piece| piece.noise[set][channel].clone()).collect();
+        let mut per_block = 1.0;
+        if wanders {
+            // Offset and noise together are a random walk and what is beside it.
+            let mut means: Vec<noise::Blocks> = Vec::new();
+            let (mut used, mut filled) = (0usize, 0usize);
+            for (piece, left) in pieces.iter().zip(&mut left) {
+                for (x, offset) in left.iter_mut().zip(piece.offset(layout, set, channel)) {
+                    *x += offset;
+                }
+                let mean = |range: &Range<usize>| {
+                    let values = left[range.clone()].iter().filter(|x| x.is_finite());
+                    let (sum, count) = values.fold((0.0, 0usize), |(sum, count), x| (sum + x, count + 1));
+                    (sum / count as f64, count)
+                };
+                let blocks: Vec<(f64, usize)> = piece.ranges.iter().map(mean).collect();
+                used += blocks.iter().map(|b| b.1).sum::<usize>();
+                filled += blocks.iter().filter(|b| b.1 > 0).count();
+                // A new level after a break is no step of the walk: a piece of its own.
+                let mut walk = Vec::new();
+                for ((value, _), block) in blocks.iter().zip(&piece.session) {
+                    if block.drift[layout.offset_of(channel)].is_infinite() {
+                        means.push(std::mem::take(&mut walk));
+                    }
+                    walk.push(*value);
+                }
+                means.push(walk);
+            }
+            per_block = used as f64 / filled.max(1) as f64;
+            // Noise that is correlated over more than a block looks like a walk there: once its correlation time is known, longer blocks tell the two apart.
+            let totals = left.clone();
+            let mut merged = 1;
+            for _ in 0..2 {
+                let longer: Vec<noise::Blocks> = means.iter().map(|means| merge(means, merged)).collect();
+                let count = merged as f64;
+                (step, variance) = noise::random_walk(&longer, (bound * count * count).min(1.0));
+                (step, variance) = (step / count, variance * count);
+                let mut levels = means.iter().flat_map(|means| noise::levels(means, step, variance));
+                for ((piece, left), total) in pieces.iter().zip(&mut left).zip(&totals) {
+                    for range in &piece.ranges {
+                        let level = levels.next().unwrap_or(f64::NAN);
+                        for (x, total) in left[range.clone()].iter_mut().zip(&total[range.clone()]) {
+                            *x = total - level;
+                        }
+                    }
+                }
+                let slices: Vec<&[f64]> = left.iter().map(Vec::as_slice).collect();
+                let (_, time) = noise::autocorrelation_time(&slices);
+                merged = ((INDEPENDENT * time / per_block).round() as usize).clamp(1, LONGEST);
+            }
+        }
+        let slices: Vec<&[f64]> = left.iter().map(Vec::as_slice).collect();
+        let (square, time) = noise::autocorrelation_time(&slices);
+        model.square.push(square);
+        model.time.push(time);
+        model.drift.push(step / BLOCK);
+        model
+            .block
+            .push(if wanders { variance * per_block } else { square * time });
+    }
+    model
+}

@@ -1,0 +1,534 @@
+//! The rows of one instant: what its measurements say of the links' parameters and of the log's own unknowns, and through which noise.
+//!
+//! ```text
+//! A d + G s = r + N e
+//! ```
+//!
+//! - `d = phi - phi_CAD`: ten per link that any log can see ([`Layout::links`]);
+//! - `s`: the log's own unknowns: six offsets [torque; force] per F/T sensor that shows in a row; Coulomb, viscous and offset torque per joint whose torque is measured;
+//! - `r`: what was measured less what CAD predicts;
+//! - `e`: the noise of the *channels*, independent of each other: six per F/T sensor, one per joint torque.
+//!
+//! Two kinds of rows, one below the other. Those of F/T sensors are the balances of sub-trees, of which [`StackedRegressor::eliminate_contacts`] leaves the combinations that no present
+//! contact reaches: noise enters them as offsets do, `N = G`. Those of joint torques are rows of the whole tree's [`Regressor`], for joints beyond which, seen from the base, nothing touches
+//! the robot: there `N = 1` and `G = [tanh(dq / v0), dq, 1]`.
+
+use super::instants::Instant;
+use super::passes::dot;
+use crate::config::IdentificationInput;
+use crate::dynamics::{ContactSet, DynamicsError, JointState, Kinematics};
+use crate::regressor::{Regressor, StackedRegressor, Weighting};
+use crate::setup::Setup;
+use crate::spatial::{Vec3, Wrench};
+
+/// Speed over which the sign of Coulomb friction is smoothed [rad/s or m/s].
+pub(super) const COULOMB_SPEED: f64 = 0.02;
+
+/// Parameters of a link.
+pub(super) const WIDTH: usize = 10;
+
+/// Friction columns of a joint.
+pub(super) const FRICTION: usize = 3;
+
+/// What the columns of all rows stand for.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Layout {
+    /// Links that show in at least one row, ascending; ten columns of `A` each.
+    pub links: Vec<usize>,
+    /// F/T sensors that do, ascending; six columns of `G` and of `N` each, [torque; force].
+    pub sensors: Vec<usize>,
+    /// Degrees of freedom whose measured torque is used, ascending; three columns of `G` after those of the sensors, and one of `N`.
+    pub joints: Vec<usize>,
+}
+
+impl Layout {
+    /// Number of unknown parameters.
+    pub(super) fn unknowns(&self) -> usize {
+        WIDTH * self.links.len()
+    }
+
+    /// Number of the log's own unknowns.
+    pub(super) fn session(&self) -> usize {
+        6 * self.sensors.len() + FRICTION * self.joints.len()
+    }
+
+    /// Number of channels.
+    pub(super) fn channels(&self) -> usize {
+        6 * self.sensors.len() + self.joints.len()
+    }
+
+    /// The session's unknown that a channel's offset is.
+    pub(super) fn offset_of(&self, channel: usize) -> usize {
+        let wrenches = 6 * self.sensors.len();
+        if channel < wrenches {
+            channel
+        } else {
+            wrenches + FRICTION * (channel - wrenches) + 2
+        }
+    }
+}
+
+/// Rows of one instant; reusable room.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Rows {
+    pub count: usize,
+    unknowns: usize,
+    session: usize,
+    channels: usize,
+    a: Vec<f64>,
+    r: Vec<f64>,
+    g: Vec<f64>,
+    n: Vec<f64>,
+    /// Lower factor of `N V N^T`, row by row, once whitened.
+    factor: Vec<f64>,
+}
+
+impl Rows {
+    pub(super) fn new(layout: &Layout) -> Self {
+        Self {
+            unknowns: layout.unknowns(),
+            session: layout.session(),
+            channels: layout.channels(),
+            ..Self::default()
+        }
+    }
+
+    fn clear(&mut self) {
+        self.count = 0;
+        for part in [&mut self.a, &mut self.r, &mut self.g, &mut self.n, &mut self.factor] {
+            part.clear();
+        }
+    }
+
+    /// Another row, of zeros.
+    fn push(&mut self) -> (&mut [f64], &mut f64, &mut [f64], &mut [f64]) {
+        self.count += 1;
+        self.a.resize(self.unknowns * self.count, 0.0);
+        self.r.push(0.0);
+        self.g.resize(self.session * self.count, 0.0);
+        self.n.resize(self.channels * self.count, 0.0);
+        let last = self.count - 1;
+        (
+            &mut self.a[self.unknowns * last..],
+            &mut self.r[last],
+            &mut self.g[self.session * last..],
+            &mut self.n[self.channels * last..],
+        )
+    }
+
+    pub(super) fn a(&self, row: usize) -> &[f64] {
+        &self.a[self.unknowns * row..][..self.unknowns]
+    }
+
+    pub(super) fn r(&self, row: usize) -> f64 {
+        self.r[row]
+    }
+
+    pub(super) fn g(&self, row: usize) -> &[f64] {
+        &self.g[self.session * row..][..self.session]
+    }
+
+    pub(super) fn n(&self, row: usize) -> &[f64] {
+        &self.n[self.channels * row..][..self.channels]
+    }
+
+    /// Makes the noise of the rows independent and of unit variance, given the variances of the channels: `A`, `r`, `G` become `L^-1 A` ..., with
+    /// `L L^T = N diag(v) N^T`. Combinations that no channel's noise reaches get a floor, 1e-9 of the greatest variance, in place of certainty. `N` is left as it is.
+    pub(super) fn whiten(&mut self, variances: &[f64]) {
+        self.whiten_with(variances, &mut [], 0);
+    }
+
+    /// The same, and of further columns, `width` numbers for each row.
+    pub(super) fn whiten_with(&mut self, variances: &[f64], further: &mut [f64], width: usize) {
+        let m = self.count;
+        self.factor.clear();
+        self.factor.resize(m * m, 0.0);
+        for i in 0..m {
+            for j in 0..=i {
+                let pairs = self.n(i).iter().zip(self.n(j)).zip(variances);
+                let sum: f64 = pairs.map(|((x, y), v)| x * y * v).sum();
+                self.factor[i * m + j] = sum;
+            }
+        }
+        let greatest = (0..m).map(|i| self.factor[i * m + i]).fold(0.0, f64::max);
+        let floor = 1e-9 * greatest.max(f64::MIN_POSITIVE);
+        for i in 0..m {
+            for j in 0..=i {
+                let (above, own) = self.factor.split_at(i * m);
+                let other = if j == i { own } else { &above[j * m..] };
+                let dot: f64 = own[..j].iter().zip(&other[..j]).map(|(x, y)| x * y).sum();
+                let rest = self.factor[i * m + j] - dot;
+                self.factor[i * m + j] = if i == j {
+                    rest.max(floor).sqrt()
+                } else {
+                    rest / self.factor[j * m + j]
+                };
+            }
+        }
+        for (values, count) in [
+            (&mut self.a, self.unknowns),
+            (&mut self.r, 1),
+            (&mut self.g, self.session),
+        ] {
+            forward(&self.factor, m, values, count);
+        }
+        if width > 0 {
+            forward(&self.factor, m, further, width);
+        }
+    }
+
+    /// The most likely noise of each channel, given whitened residuals of all rows: `diag(v) N^T W^-1 rho` (Gauss, Markov); zero where no row has it.
+    pub(super) fn channel_noise(&self, variances: &[f64], whitened: &mut [f64], out: &mut [f64]) {
+        let m = self.count;
+        for i in (0..m).rev() {
+            let below: f64 = (i + 1..m).map(|k| self.factor[k * m + i] * whitened[k]).sum();
+            whitened[i] = (whitened[i] - below) / self.factor[i * m + i];
+        }
+        out.fill(0.0);
+        for (row, weight) in whitened.iter().enumerate() {
+            for (sum, entry) in out.iter_mut().zip(self.n(row)) {
+                *sum += weight * entry;
+            }
+        }
+        for (value, variance) in out.iter_mut().zip(variances) {
+            *value *= variance;
+        }
+    }
+
+    /// Whether any row has this channel's noise.
+    pub(super) fn has(&self, channel: usize) -> bool {
+        (0..self.count).any(|row| self.n(row)[channel] != 0.0)
+    }
+}
+
+/// `L^-1` from the left, `m` rows of `width` numbers.
+fn forward(factor: &[f64], m: usize, values: &mut [f64], width: usize) {
+    for i in 0..m {
+        let (above, own) = values.split_at_mut(i * width);
+        let own = &mut own[..width];
+        for j in 0..i {
+            let weight = factor[i * m + j];
+            if weight != 0.0 {
+                for (x, y) in own.iter_mut().zip(&above[j * width..][..width]) {
+                    *x -= weight * y;
+                }
+            }
+        }
+        let scale = 1.0 / factor[i * m + i];
+        own.iter_mut().for_each(|x| *x *= scale);
+    }
+}
+
+/// The representative of a node's set.
+fn root_of(parent: &mut [usize], mut node: usize) -> usize {
+    while parent[node] != node {
+        parent[node] = parent[parent[node]];
+        node = parent[node];
+    }
+    node
+}
+
+/// Makes rows of instants.
+#[derive(Clone)]
+pub(super) struct RowMaker<'a> {
+    setup: &'a Setup,
+    layout: Layout,
+    /// CAD's parameters of all links.
+    cad: Vec<f64>,
+    kinematics: Kinematics,
+    stacked: StackedRegressor,
+    tree: Regressor,
+    readings: Vec<Wrench>,
+    wrench: bool,
+    torque: bool,
+    /// Per link of the layout, and per channel: the group that it belongs to.
+    groups: (Vec<usize>, Vec<usize>),
+}
+
+impl<'a> RowMaker<'a> {
+    /// For these measurements; what the columns stand for is what shows in any of `instants`.
+    ///
+    /// # Errors
+    /// Instants of another robot.
+    pub(super) fn survey<'b>(
+        setup: &'a Setup,
+        inputs: &[IdentificationInput],
+        instants: impl Iterator<Item = &'b Instant>,
+    ) -> Result<Self, DynamicsError> {
+        let (links, sensors) = (setup.model.link_count(), setup.structure.sensors().len());
+        let all = Layout {
+            links: (0..links).collect(),
+            sensors: (0..sensors).collect(),
+            joints: (0..setup.model.dof_count()).collect(),
+        };
+        let mut maker = Self {
+            setup,
+            layout: all,
+            cad: setup.model.inertias().iter().flat_map(|i| i.parameters()).collect(),
+            kinematics: Kinematics::new(&setup.model, setup.base_link)?,
+            stacked: StackedRegressor::new(&setup.structure),
+            tree: Regressor::new(&setup.model),
+            readings: vec![Wrench::zero(); sensors],
+            wrench: inputs.contains(&IdentificationInput::Wrench),
+            torque: inputs.contains(&IdentificationInput::Torque),
+            groups: (Vec::new(), Vec::new()),
+        };
+        // Links and channels, joined wherever a row has both.
+        let channels = maker.layout.channels();
+        let mut parent: Vec<usize> = (0..links + channels).collect();
+        let mut rows = Rows::new(&maker.layout);
+        let (mut seen, mut heard) = (vec![false; links], vec![false; maker.layout.channels()]);
+        for instant in instants {
+            maker.make(instant, &mut rows)?;
+            for row in 0..rows.count {
+                let mut first = None;
+                let mut join = |node: usize| {
+                    let own = root_of(&mut parent, node);
+                    let with = root_of(&mut parent, *first.get_or_insert(own));
+                    parent[own.max(with)] = own.min(with);
+                };
+                for (link, seen) in seen.iter_mut().enumerate() {
+                    if rows.a(row)[WIDTH * link..][..WIDTH].iter().any(|x| *x != 0.0) {
+                        *seen = true;
+                        join(link);
+                    }
+                }
+                for (channel, (heard, entry)) in heard.iter_mut().zip(rows.n(row)).enumerate() {
+                    if *entry != 0.0 {
+                        *heard = true;
+                        join(links + channel);
+                    }
+                }
+            }
+        }
+        let numbers = |flags: &[bool]| (0..flags.len()).filter(|&i| flags[i]).collect();
+        let (wrenches, torques) = heard.split_at(6 * sensors);
+        let sensing: Vec<bool> = wrenches.chunks(6).map(|six| six.contains(&true)).collect();
+        maker.layout = Layout {
+            links: numbers(&seen),
+            sensors: numbers(&sensing),
+            joints: numbers(torques),
+        };
+        let layout = &maker.layout;
+        let wrench_channels = layout.sensors.iter().flat_map(|s| 6 * s..6 * s + 6);
+        let channels: Vec<usize> = wrench_channels
+            .chain(layout.joints.iter().map(|j| 6 * sensors + j))
+            .collect();
+        maker.groups = (
+            layout.links.iter().map(|&link| root_of(&mut parent, link)).collect(),
+            channels
+                .into_iter()
+                .map(|channel| root_of(&mut parent, links + channel))
+                .collect(),
+        );
+        Ok(maker)
+    }
+
+    pub(super) fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// Groups of links and channels: no row has two groups. Per link of the layout, and per channel, the group's number.
+    pub(super) fn groups(&self) -> (Vec<usize>, Vec<usize>) {
+        self.groups.clone()
+    }
+
+    /// CAD's parameters in the columns of the rows.
+    pub(super) fn cad_of_layout(&self) -> Vec<f64> {
+        let links = self.layout.links.iter();
+        links
+            .flat_map(|link| self.cad[WIDTH * link..][..WIDTH].iter().copied())
+            .collect()
+    }
+
+    /// Measured less predicted torque of every joint, for parameters `d` beside CAD; NaN where there is none, or a contact lies beyond.
+    ///
+    /// # Errors
+    /// As for [`RowMaker::make`].
+    pub(super) fn torque_errors(&mut self, instant: &Instant, d: &[f64]) -> Result<Vec<f64>, DynamicsError> {
+        let mut rows = Rows::new(&self.layout);
+        self.make(instant, &mut rows)?;
+        self.tree.update(&self.setup.model, &self.kinematics)?;
+        let blocked = self.blocked(&instant.active);
+        let error = |dof: usize| {
+            let Some(row) = self.tree.joint_row(dof).filter(|_| !blocked[dof]) else {
+                return f64::NAN;
+            };
+            let own = self
+                .layout
+                .links
+                .iter()
+                .enumerate()
+                .map(|(place, link)| dot(&row[WIDTH * link..][..WIDTH], &d[WIDTH * place..]));
+            instant.torque[dof] - dot(row, &self.cad) - own.sum::<f64>()
+        };
+        Ok((0..self.setup.model.dof_count()).map(error).collect())
+    }
+
+    pub(super) fn setup(&self) -> &'a Setup {
+        self.setup
+    }
+
+    /// The rows of an instant. Sub-trees with a reading that is not there, and torques that are not, give none.
+    ///
+    /// # Errors
+    /// The instant is of another robot, or a position, velocity or acceleration is not finite.
+    pub(super) fn make(&mut self, instant: &Instant, rows: &mut Rows) -> Result<(), DynamicsError> {
+        rows.clear();
+        if instant.base_link != self.kinematics.base() {
+            self.kinematics.set_base(&self.setup.model, instant.base_link)?;
+        }
+        let state = JointState {
+            position: &instant.position,
+            velocity: &instant.velocity,
+            acceleration: &instant.acceleration,
+        };
+        self.kinematics.update(&self.setup.model, state, &instant.base)?;
+        if self.wrench {
+            self.wrench_rows(instant, rows)?;
+        }
+        if self.torque {
+            self.torque_rows(instant, rows)?;
+        }
+        Ok(())
+    }
+
+    /// How far the two sides of each joint are apart: the imbalance of the joint's sub-tree along its axis, for these parameters and the log's own unknowns, after [`RowMaker::make`]. NaN
+    /// where there are not two sides with sensors and without contacts.
+    pub(super) fn imbalance(&self, instant: &Instant, d: &[f64], session: &[f64]) -> Vec<f64> {
+        let setup = self.setup;
+        let mut apart = vec![f64::NAN; setup.model.dof_count()];
+        for (number, subtree) in self.stacked.subtrees().iter().enumerate() {
+            let unread = |sensor: usize| instant.readings.get(sensor).is_none_or(|r| !r.is_finite());
+            if subtree.sensors().len() < 2 || subtree.sensors().any(unread) || !subtree.contacts().is_empty() {
+                continue;
+            }
+            let mut b = [0.0; 6];
+            for (row, sum) in b.iter_mut().enumerate() {
+                let (links, offsets) = subtree.row(row).split_at(subtree.offset_column());
+                for (values, link) in links.chunks_exact(WIDTH).zip(subtree.links()) {
+                    *sum += values
+                        .iter()
+                        .zip(&self.cad[WIDTH * link..])
+                        .map(|(x, y)| x * y)
+                        .sum::<f64>();
+                    if let Ok(place) = self.layout.links.binary_search(link) {
+                        *sum += values.iter().zip(&d[WIDTH * place..]).map(|(x, y)| x * y).sum::<f64>();
+                    }
+                }
+                for (values, sensor) in offsets.chunks_exact(6).zip(subtree.sensors()) {
+                    if let Ok(place) = self.layout.sensors.binary_search(&sensor) {
+                        *sum += values
+                            .iter()
+                            .zip(&session[6 * place..])
+                            .map(|(x, y)| x * y)
+                            .sum::<f64>();
+                    }
+                }
+                *sum -= subtree.measured()[row];
+            }
+            let balance = Wrench {
+                torque: Vec3::new(b[0], b[1], b[2]),
+                force: Vec3::new(b[3], b[4], b[5]),
+            };
+            let in_base = self.kinematics.pose(subtree.top()).wrench(&balance);
+            for joint in setup.model.joints() {
+                let inside = setup.structure.subtree_of(joint.child) == Some(number) && joint.child != subtree.top();
+                if let (Some(dof), true, Some(axis)) = (joint.dof, inside, self.kinematics.joint_axis(joint)) {
+                    apart[dof] = axis.dot(&in_base);
+                }
+            }
+        }
+        apart
+    }
+
+    fn wrench_rows(&mut self, instant: &Instant, rows: &mut Rows) -> Result<(), DynamicsError> {
+        for (reading, given) in self.readings.iter_mut().zip(&instant.readings) {
+            *reading = if given.is_finite() { *given } else { Wrench::zero() };
+        }
+        self.stacked
+            .update(&self.kinematics, &self.readings, &instant.active, &[])?;
+        self.stacked.eliminate_contacts(Weighting::Noise);
+        for subtree in self.stacked.subtrees() {
+            let unread = |sensor: usize| instant.readings.get(sensor).is_none_or(|r| !r.is_finite());
+            if subtree.sensors().len() == 0 || subtree.sensors().any(unread) {
+                continue;
+            }
+            for number in 0..subtree.remaining() {
+                let from = subtree.projected_row(number);
+                let (links, offsets) = from.split_at(subtree.offset_column());
+                let (a, r, g, n) = rows.push();
+                *r = subtree.projected_measured()[number];
+                for (values, link) in links.chunks_exact(WIDTH).zip(subtree.links()) {
+                    let cad = &self.cad[WIDTH * link..][..WIDTH];
+                    *r -= values.iter().zip(cad).map(|(x, y)| x * y).sum::<f64>();
+                    if let Ok(place) = self.layout.links.binary_search(link) {
+                        a[WIDTH * place..][..WIDTH].copy_from_slice(values);
+                    }
+                }
+                for (values, sensor) in offsets.chunks_exact(6).zip(subtree.sensors()) {
+                    if let Ok(place) = self.layout.sensors.binary_search(&sensor) {
+                        g[6 * place..][..6].copy_from_slice(values);
+                        n[6 * place..][..6].copy_from_slice(values);
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn torque_rows(&mut self, instant: &Instant, rows: &mut Rows) -> Result<(), DynamicsError> {
+        self.tree.update(&self.setup.model, &self.kinematics)?;
+        let wrenches = self.layout.sensors.len();
+        let blocked = self.blocked(&instant.active);
+        for (place, &dof) in self.layout.joints.iter().enumerate() {
+            let torque = instant.torque.get(dof).copied().unwrap_or(f64::NAN);
+            let Some(row) = self.tree.joint_row(dof) else { continue };
+            if !torque.is_finite() || blocked[dof] {
+                continue;
+            }
+            let (a, r, g, n) = rows.push();
+            *r = torque - row.iter().zip(&self.cad).map(|(x, y)| x * y).sum::<f64>();
+            for (to, link) in a.chunks_exact_mut(WIDTH).zip(&self.layout.links) {
+                to.copy_from_slice(&row[WIDTH * link..][..WIDTH]);
+            }
+            let velocity = instant.velocity[dof];
+            g[6 * wrenches + FRICTION * place..][..FRICTION].copy_from_slice(&[
+                (velocity / COULOMB_SPEED).tanh(),
+                velocity,
+                1.0,
+            ]);
+            n[6 * wrenches + place] = 1.0;
+        }
+        Ok(())
+    }
+
+    /// Per degree of freedom, whether a present contact lies beyond its joint, seen from the base: on the way from that contact's link to the base.
+    fn blocked(&self, active: &ContactSet) -> Vec<bool> {
+        let model = &self.setup.model;
+        let mut blocked = vec![false; model.dof_count()];
+        let to_root = |mut link: usize| {
+            let mut joints = Vec::new();
+            while link > 0 {
+                joints.push(link - 1);
+                link = model.joints()[link - 1].parent;
+            }
+            joints
+        };
+        let base = to_root(self.kinematics.base());
+        for contact in active.iter() {
+            let Some(spec) = self.setup.structure.contacts().get(contact) else {
+                continue;
+            };
+            let own = to_root(spec.frame.link);
+            let apart = own
+                .iter()
+                .filter(|j| !base.contains(j))
+                .chain(base.iter().filter(|j| !own.contains(j)));
+            for dof in apart.filter_map(|&joint| model.joints()[joint].dof) {
+                blocked[dof] = true;
+            }
+        }
+        blocked
+    }
+}

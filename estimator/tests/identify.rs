@@ -1,0 +1,514 @@
+//! Identification from recorded logs: on the logs of real robots (`PROPRIO_DATA`; without it these tests say that they skip), and on simulated ones where the truth is known.
+
+use nalgebra::Matrix4;
+use proprio_estimator::config::{Config, IdentificationInput};
+use proprio_estimator::dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
+use proprio_estimator::identify::{Log, LogOutcome, Options, Outcome, Role, Unknown, Verdict, identify};
+use proprio_estimator::model::Model;
+use proprio_estimator::regressor::Regressor;
+use proprio_estimator::setup::Setup;
+use proprio_estimator::spatial::{Mat3, RigidInertia, Vec3};
+use std::path::{Path, PathBuf};
+
+/// A recorded log's text, or nothing if it is not at hand.
+fn data(name: &str) -> Option<String> {
+    let Some(folder) = std::env::var_os("PROPRIO_DATA") else {
+        println!("skipped: PROPRIO_DATA (recorded logs) is not set");
+        return None;
+    };
+    let path = PathBuf::from(folder).join(name);
+    let text = std::fs::read_to_string(&path).ok();
+    if text.is_none() {
+        println!("skipped: there is no {}", path.display());
+    }
+    text
+}
+
+/// Rows of a log whose stamps are within `from..to` [s].
+fn between(log: &str, from: f64, to: f64) -> String {
+    let inside = |line: &&str| {
+        let t: Option<f64> = line.split(',').next().and_then(|t| t.parse().ok());
+        t.is_none_or(|t| (from..to).contains(&t))
+    };
+    log.lines().filter(inside).flat_map(|line| [line, "\n"]).collect()
+}
+
+fn run(setup: &Setup, logs: &[(&str, Role, &str)], inputs: &[IdentificationInput]) -> Outcome {
+    let clock = std::time::Instant::now();
+    let mut texts: Vec<&[u8]> = logs.iter().map(|log| log.2.as_bytes()).collect();
+    let logs = logs.iter().zip(&mut texts).map(|((file, role, _), samples)| Log {
+        file: (*file).to_owned(),
+        role: *role,
+        samples,
+    });
+    let options = Options {
+        inputs: inputs.to_vec(),
+    };
+    let outcome = identify(setup, logs.collect(), &options, &mut |_| {}).expect("an outcome");
+    describe(&outcome);
+    println!("took {:.2} s", clock.elapsed().as_secs_f64());
+    outcome
+}
+
+fn describe(o: &Outcome) {
+    println!(
+        "{:?}: tau {:.3} shrink {:.1} unknowns {} rank {} structural {} effective {:.1} condition {:.1e}; {}",
+        o.verdict, o.tau, o.shrink, o.unknowns, o.rank, o.structural_rank, o.effective, o.condition, o.consistency.text
+    );
+    for c in &o.channels {
+        println!(
+            "  {}: {:.4} {} iat {:.1} drift {:.5}",
+            c.name, c.deviation, c.unit, c.autocorrelation, c.drift
+        );
+    }
+    for link in o.links.iter().filter(|l| l.seen) {
+        println!(
+            "  link {} mass {:.3} -> {:.3} +- {:.3}; moved by {:.1} sigma",
+            link.name, link.cad.mass, link.identified.mass, link.deviation[0], link.significance
+        );
+    }
+    for w in &o.weakest {
+        println!("  weak: {} {:.2e} prior {:.3}", w.expression, w.relative, w.prior_share);
+    }
+    for c in o.confused.iter().take(8) {
+        println!("  confused: {c}");
+    }
+    for f in &o.findings {
+        println!("  {:?} {} {}: {}", f.severity, f.code, f.subject, f.text);
+    }
+    for log in &o.logs {
+        let e = &log.relative_error;
+        println!(
+            "  {} {:?}: used {} left out {:?}; relative error {:.4} {:.4} {:.4}",
+            log.file,
+            log.role,
+            log.used,
+            log.left_out
+                .iter()
+                .map(|l| (l.reason.as_str(), l.instants))
+                .collect::<Vec<_>>(),
+            e.cad,
+            e.cad_fitted,
+            e.identified
+        );
+        for j in &log.joints {
+            println!(
+                "    {}: {:.3} {:.3} {:.3} of {:.2} Nm, covered {:.3}",
+                j.name, j.rms_nm.cad, j.rms_nm.cad_fitted, j.rms_nm.identified, j.measured_rms_nm, j.coverage
+            );
+        }
+        for s in &log.sensors {
+            println!(
+                "    {}: {:.3?}\n      {:.3?}",
+                s.name, s.rms.cad_fitted, s.rms.identified
+            );
+        }
+        for r in &log.two_route {
+            println!(
+                "    two routes {}: {:.3} {:.3} {:.3}; mean removed {:.3} {:.3} {:.3}",
+                r.joint,
+                r.rms_nm.cad,
+                r.rms_nm.cad_fitted,
+                r.rms_nm.identified,
+                r.rms_mean_removed_nm.cad,
+                r.rms_mean_removed_nm.cad_fitted,
+                r.rms_mean_removed_nm.identified
+            );
+        }
+        for f in &log.findings {
+            println!("    {:?} {}: {}", f.severity, f.code, f.text);
+        }
+    }
+}
+
+fn kuka() -> Option<Setup> {
+    let model = PathBuf::from(std::env::var_os("PROPRIO_DATA")?).join("kuka_lwr4.urdf");
+    let text = format!(
+        "schema = 1\nrobot = \"kuka\"\nmodel = {model:?}\n[base]\nkind = \"fixed\"\nlink = \"box\"\n[input]\nmax_silence_ms = 100.0\n"
+    );
+    Some(Setup::new(&Config::parse(&text).expect("a configuration")).expect("it fits the model"))
+}
+
+const TORQUE: [IdentificationInput; 1] = [IdentificationInput::Torque];
+
+#[test]
+fn kuka_one_predicts_the_other() {
+    let (Some(one), Some(two), Some(setup)) = (data("kuka_lwr4_1.csv"), data("kuka_lwr4_2.csv"), kuka()) else {
+        return;
+    };
+    for (train, test) in [(&one, &two), (&two, &one)] {
+        let outcome = run(
+            &setup,
+            &[("train", Role::Train, train), ("test", Role::Validate, test)],
+            &TORQUE,
+        );
+        let error = &outcome.logs[1].relative_error;
+        assert!(error.identified < 0.024, "{error:?}");
+        assert!((0.055..0.075).contains(&error.cad_fitted), "{error:?}");
+    }
+}
+
+#[test]
+fn kuka_half_a_log_predicts_the_other_half() {
+    let (Some(one), Some(setup)) = (data("kuka_lwr4_1.csv"), kuka()) else {
+        return;
+    };
+    let (first, second) = (between(&one, -1.0, 12.5), between(&one, 12.5, 99.0));
+    for (train, test) in [(&first, &second), (&second, &first)] {
+        let outcome = run(
+            &setup,
+            &[("train", Role::Train, train), ("test", Role::Validate, test)],
+            &TORQUE,
+        );
+        let error = &outcome.logs[1].relative_error;
+        assert!(error.identified < 0.6 * error.cad_fitted, "{error:?}");
+    }
+}
+
+/// The iCub's leg between two sensors, beyond unknown forces on trunk and left leg.
+fn leg() -> Option<(Setup, String)> {
+    let table = data("icub_leg_24_44s.csv")?;
+    let Some(models) = std::env::var_os("PROPRIO_ICUB_MODELS") else {
+        println!("skipped: PROPRIO_ICUB_MODELS (robots of icub-models) is not set");
+        return None;
+    };
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/real_leg");
+    let mut config = Config::load(&folder.join("estimator.toml")).expect("the configuration");
+    config.model = PathBuf::from(models).join("iCubGenova02.urdf");
+    config.contact.retain(|contact| !contact.name().starts_with("right"));
+    Some((Setup::new(&config).expect("configuration and model fit"), table))
+}
+
+#[test]
+fn leg_torques_from_either_sensor_agree() {
+    let Some((setup, table)) = leg() else { return };
+    let (first, second) = (between(&table, 24.0, 34.0), between(&table, 34.0, 45.0));
+    let outcome = run(
+        &setup,
+        &[("first", Role::Train, &first), ("second", Role::Validate, &second)],
+        &[IdentificationInput::Wrench],
+    );
+    let log: &LogOutcome = &outcome.logs[1];
+    assert_eq!(log.two_route.len(), 4);
+    let knee = log.two_route.iter().find(|r| r.joint == "r_knee").expect("the knee");
+    assert!(knee.rms_nm.identified <= 0.15, "{knee:?}");
+    for route in &log.two_route {
+        let (cad, own) = (route.rms_nm.cad_fitted, route.rms_nm.identified);
+        assert!(own <= cad + (0.05 * cad).max(0.01), "{route:?}");
+    }
+}
+
+/// Normal deviates without a library: splitmix64 and Box, Muller.
+struct Noise(u64);
+
+impl Noise {
+    fn uniform(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
+    }
+
+    fn normal(&mut self) -> f64 {
+        let (u, v) = (self.uniform().max(1e-300), self.uniform());
+        (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
+    }
+}
+
+/// An arm: two joints, an F/T sensor, four joints with five links beyond it.
+const ARM_JOINTS: [&str; 6] = ["j1", "j2", "j3", "j4", "j5", "j6"];
+
+fn arm() -> Setup {
+    let axes = ["0 0 1", "1 0 0", "0 1 0", "1 0 0", "0 1 0", "0 0 1"];
+    let mut urdf = String::from("<robot name=\"arm\"><link name=\"base\"/>");
+    let link = |name: &str, mass: f64, long: f64| {
+        let (thick, slim) = (mass * long * long / 12.0 + mass * 0.0012, mass * 0.0024);
+        format!(
+            "<link name=\"{name}\"><inertial><origin xyz=\"0.01 -0.008 {}\" rpy=\"0 0 0\"/><mass value=\"{mass}\"/><inertia ixx=\"{thick}\" ixy=\"0\" ixz=\"0\" iyy=\"{thick}\" iyz=\"0\" izz=\"{slim}\"/></inertial></link>",
+            long / 2.0
+        )
+    };
+    let joint = |name: &str, kind: &str, parent: &str, child: &str, z: f64, axis: &str| {
+        let rest = if kind == "fixed" {
+            String::new()
+        } else {
+            format!("<axis xyz=\"{axis}\"/><limit lower=\"-3\" upper=\"3\" effort=\"100\" velocity=\"10\"/>")
+        };
+        format!(
+            "<joint name=\"{name}\" type=\"{kind}\"><parent link=\"{parent}\"/><child link=\"{child}\"/><origin xyz=\"0 0 {z}\" rpy=\"0 0 0\"/>{rest}</joint>"
+        )
+    };
+    let masses = [2.0, 1.6, 1.2, 1.0, 0.8, 0.5];
+    let mut parent = "base".to_owned();
+    for (number, name) in ARM_JOINTS.iter().enumerate() {
+        if number == 2 {
+            urdf += &link("beyond", 1.4, 0.12);
+            urdf += &joint("ft", "fixed", &parent, "beyond", 0.05, "");
+            parent = "beyond".into();
+        }
+        let child = format!("l{}", number + 1);
+        urdf += &link(&child, masses[number], 0.16);
+        urdf += &joint(name, "revolute", &parent, &child, 0.14, axes[number]);
+        parent = child;
+    }
+    urdf += "</robot>";
+    let config = "schema = 1\nrobot = \"arm\"\nmodel = \"arm.urdf\"\n[base]\nkind = \"fixed\"\nlink = \"base\"\n[[force_torque]]\nsensor = \"ft\"\njoint = \"ft\"\n";
+    let config = Config::parse(config).expect("a configuration");
+    let model = Model::from_urdf(&urdf, &["ft"]).expect("a model");
+    Setup::with_model(&config, model).expect("it fits")
+}
+
+/// Bodies that CAD is wrong about: masses and extents by some twenty per cent, centres of mass by a centimetre.
+fn wrong(cad: &RigidInertia, noise: &mut Noise) -> RigidInertia {
+    let pseudo = cad.pseudo_inertia();
+    let factor = Matrix4::from_fn(|i, j| {
+        f64::from(u8::from(i == j))
+            + if j == 3 && i < 3 {
+                0.012 * noise.normal()
+            } else {
+                0.08 * noise.normal() * f64::from(u8::from(i == j || (i < 3 && j < 3)))
+            }
+    });
+    let moved = factor * pseudo * factor.transpose();
+    let sigma = moved.fixed_view::<3, 3>(0, 0).into_owned();
+    RigidInertia {
+        mass: moved[(3, 3)],
+        first_moment: Vec3::new(moved[(0, 3)], moved[(1, 3)], moved[(2, 3)]),
+        inertia: Mat3::from_diagonal_element(sigma.trace()) - sigma,
+    }
+}
+
+/// Joint state of the arm on a sum of sines, at `t`.
+fn state(phase: &[f64], t: f64) -> ([f64; 6], [f64; 6], [f64; 6]) {
+    let mut out = ([0.0; 6], [0.0; 6], [0.0; 6]);
+    for joint in 0..6 {
+        for term in 0..3 {
+            let at = 3 * joint + term;
+            let rate = std::f64::consts::TAU * (0.17 + 0.31 * phase[at % phase.len()].fract());
+            let size = 0.5 / (1.0 + term as f64);
+            let (s, c) = (rate * t + 6.0 * phase[(at + 7) % phase.len()]).sin_cos();
+            out.0[joint] += size * s;
+            out.1[joint] += size * rate * c;
+            out.2[joint] -= size * rate * rate * s;
+        }
+    }
+    out
+}
+
+/// A log of the arm with these bodies: `seconds` at 100 Hz, noise of the sensor's configured size, correlated over `memory` samples.
+fn simulate(setup: &Setup, truth: &Model, seconds: f64, memory: f64, seed: u64) -> String {
+    let mut noise = Noise(seed);
+    let phase: Vec<f64> = (0..18).map(|_| noise.uniform()).collect();
+    let mut kinematics = Kinematics::new(truth, setup.base_link).expect("a base");
+    let mut dynamics = InverseDynamics::new(truth);
+    let cut = &setup.structure.sensors()[0];
+    let offset: Vec<f64> = (0..6)
+        .map(|axis| noise.normal() * if axis < 3 { 20.0 } else { 1.0 })
+        .collect();
+    let deviations: Vec<f64> = cut.noise().force.into_iter().chain(cut.noise().torque).collect();
+    let (keep, mut error) = ((-1.0 / memory).exp(), [0.0; 6]);
+    let mut text = String::from("t");
+    for joint in ARM_JOINTS {
+        text += &format!(",joint/{joint}/position,joint/{joint}/velocity,joint/{joint}/acceleration");
+    }
+    text += ",wrench/ft/fx,wrench/ft/fy,wrench/ft/fz,wrench/ft/tx,wrench/ft/ty,wrench/ft/tz\n";
+    for i in 0..(100.0 * seconds) as usize {
+        let t = i as f64 * 0.01;
+        let (q, dq, ddq) = state(&phase, t);
+        let joints = JointState {
+            position: &q,
+            velocity: &dq,
+            acceleration: &ddq,
+        };
+        let base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.80665));
+        kinematics.update(truth, joints, &base).expect("a state");
+        dynamics.update(truth, &kinematics, &[]).expect("a state");
+        let reading = cut
+            .reading(&dynamics.transmitted(&kinematics, cut.joint()))
+            .force_first();
+        text += &format!("{t}");
+        for joint in 0..6 {
+            text += &format!(",{},{},{}", q[joint], dq[joint], ddq[joint]);
+        }
+        for axis in 0..6 {
+            error[axis] = keep * error[axis] + (1.0 - keep * keep).sqrt() * noise.normal();
+            text += &format!(",{}", reading[axis] + offset[axis] + deviations[axis] * error[axis]);
+        }
+        text += "\n";
+    }
+    text
+}
+
+/// Errors of torques beyond the sensor on a trajectory of its own: RMS with CAD, RMS identified, share within 1.96 stated deviations, all stated deviations.
+fn torque_errors(setup: &Setup, truth: &Model, outcome: &Outcome, seed: u64) -> (f64, f64, f64, Vec<f64>) {
+    let mut noise = Noise(seed);
+    let phase: Vec<f64> = (0..18).map(|_| noise.uniform()).collect();
+    let mut kinematics = Kinematics::new(truth, setup.base_link).expect("a base");
+    let mut regressor = Regressor::new(truth);
+    let (mut cad, mut own, mut inside, mut deviations) = (0.0, 0.0, 0.0, Vec::new());
+    let inertial: Vec<(usize, usize, usize)> = outcome
+        .covariance
+        .columns
+        .iter()
+        .enumerate()
+        .filter_map(|(row, c)| match c {
+            Unknown::Inertial { link, parameter } => Some((row, *link, *parameter)),
+            Unknown::Offset { .. } => None,
+        })
+        .collect();
+    for i in 0..200 {
+        let (q, dq, ddq) = state(&phase, 0.1 * f64::from(i));
+        let joints = JointState {
+            position: &q,
+            velocity: &dq,
+            acceleration: &ddq,
+        };
+        let base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.80665));
+        kinematics.update(truth, joints, &base).expect("a state");
+        regressor.update(truth, &kinematics).expect("a state");
+        for dof in 2..6 {
+            let row = regressor.joint_row(dof).expect("a row");
+            let torque = |bodies: &dyn Fn(usize) -> RigidInertia| -> f64 {
+                (0..truth.link_count())
+                    .map(|l| {
+                        bodies(l)
+                            .parameters()
+                            .iter()
+                            .zip(&row[10 * l..])
+                            .map(|(a, b)| a * b)
+                            .sum::<f64>()
+                    })
+                    .sum()
+            };
+            let right = torque(&|l| truth.inertias()[l]);
+            let error = torque(&|l| outcome.links[l].identified) - right;
+            cad += (torque(&|l| outcome.links[l].cad) - right).powi(2);
+            own += error * error;
+            let mut scaled = vec![0.0; outcome.covariance.root.ncols()];
+            for &(at, link, parameter) in &inertial {
+                for (sum, entry) in scaled.iter_mut().zip(outcome.covariance.root.row(at).iter()) {
+                    *sum += row[10 * link + parameter] * entry;
+                }
+            }
+            let deviation = scaled.iter().map(|x| x * x).sum::<f64>().sqrt();
+            inside += f64::from(u8::from(error.abs() <= 1.96 * deviation));
+            deviations.push(deviation);
+        }
+    }
+    let count = deviations.len() as f64;
+    ((cad / count).sqrt(), (own / count).sqrt(), inside / count, deviations)
+}
+
+/// An arm whose bodies are not quite CAD's.
+fn real(setup: &Setup, seed: u64) -> Model {
+    let mut truth = setup.model.clone();
+    let mut noise = Noise(1000 + seed);
+    for link in 1..truth.link_count() {
+        let body = wrong(&truth.inertias()[link], &mut noise);
+        truth.set_inertia(link, body).expect("a body");
+    }
+    truth
+}
+
+/// A column of a log, changed.
+fn change(log: &str, column: &str, by: impl Fn(f64) -> f64) -> String {
+    let mut lines = log.lines();
+    let header = lines.next().expect("a header");
+    let place = header.split(',').position(|name| name == column).expect("a column");
+    let mut text = format!("{header}\n");
+    for line in lines {
+        let cells: Vec<String> = line
+            .split(',')
+            .enumerate()
+            .map(|(i, cell)| {
+                if i == place {
+                    format!("{}", by(cell.parse().expect("a number")))
+                } else {
+                    cell.to_owned()
+                }
+            })
+            .collect();
+        text += &cells.join(",");
+        text.push('\n');
+    }
+    text
+}
+
+#[test]
+fn sensor_the_wrong_way_round_is_named_and_nothing_identified() {
+    let setup = arm();
+    let mut log = simulate(&setup, &real(&setup, 3), 10.0, 0.01, 3);
+    for axis in ["fx", "fy", "fz", "tx", "ty", "tz"] {
+        log = change(&log, &format!("wrench/ft/{axis}"), |x| -x);
+    }
+    let outcome = run(&setup, &[("turned", Role::Train, &log)], &[]);
+    assert!(matches!(outcome.verdict, Verdict::Nothing(_)), "{:?}", outcome.verdict);
+    assert!(
+        outcome
+            .findings
+            .iter()
+            .any(|f| f.code == "wrong_sign" && f.subject == "ft"),
+        "{:?}",
+        outcome.findings
+    );
+    assert!(outcome.links.iter().all(|link| link.identified == link.cad));
+}
+
+#[test]
+fn joint_whose_zero_is_elsewhere_is_named() {
+    let setup = arm();
+    let log = simulate(&setup, &real(&setup, 3), 12.0, 0.01, 3);
+    let names = |log: &str| -> Vec<String> {
+        let outcome = run(&setup, &[("log", Role::Train, log)], &[]);
+        outcome
+            .findings
+            .into_iter()
+            .filter(|f| f.code == "joint_zero")
+            .map(|f| f.subject)
+            .collect()
+    };
+    assert!(names(&log).is_empty(), "none in a log where all are right");
+    let off = change(&log, "joint/j4/position", |q| q + 0.06);
+    assert_eq!(names(&off), ["j4"]);
+}
+
+#[test]
+fn simulated_arm_is_identified_and_its_uncertainty_is_true() {
+    for memory in [0.01, 8.0] {
+        let (mut covered, mut all, mut squares, mut gains) = (0.0, Vec::new(), 0.0, Vec::new());
+        let seeds = 20;
+        for seed in 0..seeds {
+            let setup = arm();
+            let truth = real(&setup, seed);
+            let log = simulate(&setup, &truth, 12.0, memory, seed);
+            let mut text = log.as_bytes();
+            let logs = vec![Log {
+                file: "arm".into(),
+                role: Role::Train,
+                samples: &mut text,
+            }];
+            let outcome = identify(&setup, logs, &Options::default(), &mut |_| {}).expect("an outcome");
+            assert_eq!(outcome.verdict, Verdict::Identified);
+            let (cad, own, inside, deviations) = torque_errors(&setup, &truth, &outcome, 500 + seed);
+            println!(
+                "memory {memory} seed {seed}: {cad:.4} -> {own:.4} Nm, covered {inside:.3}, tau {:.3} shrink {}",
+                outcome.tau, outcome.shrink
+            );
+            covered += inside / f64::from(u32::try_from(seeds).expect("small"));
+            squares += own * own / f64::from(u32::try_from(seeds).expect("small"));
+            gains.push(cad / own);
+            all.extend(deviations);
+        }
+        all.sort_by(f64::total_cmp);
+        gains.sort_by(f64::total_cmp);
+        let (median, rms) = (all[all.len() / 2], squares.sqrt());
+        println!(
+            "memory {memory}: covered {covered:.3}, median deviation {median:.5}, RMS error {rms:.5} Nm, least gain {:.1}",
+            gains[0]
+        );
+        assert!(gains[0] >= 5.0, "{gains:?}");
+        assert!((0.90..=0.99).contains(&covered), "{covered}");
+        assert!(median <= 3.0 * rms, "{median} {rms}");
+    }
+}
