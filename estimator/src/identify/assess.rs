@@ -517,6 +517,9 @@ fn base_parameters(
     (out, confused, rank)
 }
 
+/// A degree of freedom; what is left of its torque with CAD, with CAD and friction, with identified parameters and friction; what was measured.
+type TorqueSeries = (usize, [Vec<f64>; 3], Vec<f64>);
+
 fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified, root: &DMatrix<f64>) -> LogOutcome {
     let setup = maker.setup();
     let layout = &identified.layout;
@@ -548,7 +551,7 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
     // Torques: identified from, or the truth beside F/T sensors.
     let mut joints = Vec::new();
     let mut torque_share = Vec::new();
-    let mut torque_series: Vec<(usize, [Vec<f64>; 3], Vec<f64>)> = Vec::new();
+    let mut torque_series: Vec<TorqueSeries> = Vec::new();
     if layout.joints.is_empty() {
         let dofs = setup.model.dof_count();
         let mut errors = [vec![Vec::new(); dofs], vec![Vec::new(); dofs]];
@@ -561,11 +564,10 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
                     errors.iter_mut().zip(row).for_each(|(e, x)| e.push(x));
                 }
             }
-            for dof in 0..dofs {
-                if errors[0][dof].iter().any(|x| x.is_finite()) {
+            for (dof, cad) in errors[0].iter().enumerate() {
+                if cad.iter().any(|x| x.is_finite()) {
                     let measured = instants.iter().map(|i| i.torque[dof]).collect();
-                    let cad = errors[0][dof].clone();
-                    torque_series.push((dof, [cad.clone(), cad, errors[1][dof].clone()], measured));
+                    torque_series.push((dof, [cad.clone(), cad.clone(), errors[1][dof].clone()], measured));
                 }
             }
         }
@@ -871,7 +873,7 @@ fn curves(
     left: &Residuals,
     identified: &Identified,
     root: &DMatrix<f64>,
-    torques: &[(usize, [Vec<f64>; 3], Vec<f64>)],
+    torques: &[TorqueSeries],
 ) -> Vec<Curve> {
     let setup = maker.setup();
     let layout = maker.layout().clone();

@@ -498,6 +498,11 @@ fn fit(
     let fit = posterior(&prior, &layout, &information, &[])?.weigh().map_err(no)?;
     progress("held-out data".into(), 0.75);
     let guard = held_out(maker, &prior, training, &noise, fit.tau)?;
+    // Parameters have taken a part of the noise that they were fitted to, most of all where it is as slow as the motion.
+    let noise = guard.noise;
+    let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
+    let information = added(&told, layout.unknowns());
+    let fit = posterior(&prior, &layout, &information, &[])?.weigh().map_err(no)?;
     let mut d = fit.x.clone();
     for (place, share) in guard.share.iter().enumerate() {
         d.rows_mut(10 * place, 10).scale_mut(*share);
@@ -559,6 +564,8 @@ struct Guard {
     /// Per link of the layout.
     share: Vec<f64>,
     findings: Vec<Finding>,
+    /// Noise, corrected by what held-out data show of it.
+    noise: NoiseModel,
 }
 
 /// Predicts each of [`FOLDS`] pieces of every log with parameters from all other pieces, offsets and friction fitted to the piece for CAD and for them alike, and chooses how much of
@@ -592,6 +599,7 @@ fn held_out(
         return Ok(Guard {
             share: vec![1.0; layout.links.len()],
             findings: Vec::new(),
+            noise: noise.clone(),
         });
     }
     let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, noise, &[], &[]));
@@ -714,7 +722,12 @@ fn held_out(
             *value = kept;
         }
     }
-    Ok(Guard { share, findings })
+    let bound = (super::passes::BLOCK / DRIFT_TIME).powi(2);
+    Ok(Guard {
+        share,
+        findings,
+        noise: noise.midway(&noise_of(layout, &left, 1, bound, &noise.least)),
+    })
 }
 
 /// Sensors whose readings go against what CAD predicts: with their sign free, masses would come out negative.

@@ -16,8 +16,8 @@ const OFFSET_VARIANCE: f64 = 1e6;
 const FRICTION_VARIANCE: f64 = 1e4;
 
 /// Means over so many autocorrelation times count as independent; at most so many blocks are one.
-const INDEPENDENT: f64 = 4.0;
-const LONGEST: usize = 5;
+const INDEPENDENT: f64 = 8.0;
+const LONGEST: usize = 10;
 
 /// Rows that are absorbed at once.
 const PANEL: usize = 96;
@@ -68,6 +68,18 @@ impl NoiseModel {
     /// Variances for following the offsets.
     pub(super) fn following(&self) -> Vec<f64> {
         self.block.iter().zip(&self.least).map(|(x, y)| x.max(*y)).collect()
+    }
+
+    /// Half way between this model, from data that parameters were fitted to, and one from data held out: the first falls short of the noise by as much as the second, which has the
+    /// parameters' errors besides, exceeds it (to first order in the number of parameters). Walks as here.
+    pub(super) fn midway(&self, held_out: &Self) -> Self {
+        let mut midway = self.clone();
+        for (channel, time) in midway.time.iter_mut().enumerate() {
+            if self.square[channel] > 0.0 {
+                *time = 0.5 * (*time + held_out.square[channel] * held_out.time[channel] / self.square[channel]);
+            }
+        }
+        midway
     }
 
     /// The greatest relative change of a variance.
@@ -123,9 +135,9 @@ fn pass_time(session: &mut Session, steps: Vec<f64>, afresh: &[usize]) -> Vec<f6
     let mut added = steps;
     session.drift(&added);
     for sensor in afresh {
-        for unknown in 6 * sensor..6 * sensor + 6 {
-            session.renew(unknown, OFFSET_VARIANCE);
-            added[unknown] = f64::INFINITY;
+        for (axis, added) in added[6 * sensor..6 * sensor + 6].iter_mut().enumerate() {
+            session.renew(6 * sensor + axis, OFFSET_VARIANCE);
+            *added = f64::INFINITY;
         }
     }
     added

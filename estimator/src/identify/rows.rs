@@ -264,7 +264,12 @@ impl<'a> RowMaker<'a> {
         let mut maker = Self {
             setup,
             layout: all,
-            cad: setup.model.inertias().iter().flat_map(|i| i.parameters()).collect(),
+            cad: setup
+                .model
+                .inertias()
+                .iter()
+                .flat_map(crate::spatial::RigidInertia::parameters)
+                .collect(),
             kinematics: Kinematics::new(&setup.model, setup.base_link)?,
             stacked: StackedRegressor::new(&setup.structure),
             tree: Regressor::new(&setup.model),
