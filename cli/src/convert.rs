@@ -1,9 +1,11 @@
 //! The verbs that turn one file into another: decode, encode, estimate.
 
 use anyhow::{Context, bail};
+use proprio_estimator::config::ConfigError;
+use proprio_estimator::setup::Setup;
 use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
-use proprio_topics::csv::{Columns, Report};
+use proprio_topics::csv::{self, Columns, Report};
 use serde_json::json;
 use std::fs::File;
 use std::io::{BufReader, BufWriter, IsTerminal, Read, Write};
@@ -296,6 +298,28 @@ pub(crate) fn encode(args: &Encode) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Whether a table's header (its first line) has a column for every channel that an estimator reads.
+///
+/// # Errors
+/// A configuration that does not fit the log: the log is what it is.
+pub(crate) fn blame_columns(header: &[u8], log: &Path, config: &Path, setup: &Setup) -> anyhow::Result<()> {
+    let reader = csv::Reader::new(header).with_context(|| log.display().to_string())?;
+    let missing = proprio_estimator::offline::missing_channels(setup, reader.series());
+    if missing.is_empty() {
+        return Ok(());
+    }
+    let problem = format!(
+        "{}: {}",
+        log.display(),
+        proprio_estimator::offline::OfflineError::MissingChannels(missing)
+    );
+    Err(ConfigError {
+        file: config.to_owned(),
+        problem,
+    }
+    .into())
+}
+
 /// Estimates from a table.
 pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
     let (_, setup) = proprio_estimator::daemon::load(&args.config, args.parameters.as_deref())?;
@@ -306,7 +330,7 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
         Err(error @ proprio_estimator::offline::OfflineError::MissingChannels(_)) => {
             // The log is what it is: the configuration does not fit it.
             let problem = format!("{}: {error}", args.log.display());
-            return Err(proprio_estimator::config::ConfigError {
+            return Err(ConfigError {
                 file: args.config.clone(),
                 problem,
             }

@@ -1,12 +1,12 @@
 //! `proprio demo`: a simulated robot, the gateway and the estimator as three processes; what they tell is watched through
 //! shared memory like any consumer does, and compared with the simulator's truth at the end.
 
-use crate::report::{self, Curve};
+use crate::report::plot::{Axis, Ink, Plot, Series};
+use crate::report::{self, Table as ReportTable};
 use anyhow::{Context, anyhow, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use plotters::style::RGBColor;
 use proprio_estimator::config::ConfigError;
 use proprio_estimator::offline::Table;
 use proprio_estimator::pipeline::Estimate;
@@ -673,8 +673,11 @@ fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Tru
     latency.sort_by(f64::total_cmp);
 
     let mut errors = serde_json::Map::new();
-    let mut blocks = Vec::new();
-    let mut rows = String::from("<table><tr><th>joint</th><th>RMS error [Nm]</th><th>RMS torque [Nm]</th></tr>");
+    let mut plots = Vec::new();
+    let mut rows = ReportTable::new(
+        "Torques against the simulator's truth, from one second on",
+        &["joint", "RMS error [Nm]", "RMS torque [Nm]"],
+    );
     for (joint, name) in watched.joints.iter().enumerate() {
         let (mut square, mut truth_square, mut count) = (0.0, 0.0, 0_u32);
         let (mut estimated, mut real, mut error) = (vec![], vec![], vec![]);
@@ -699,36 +702,34 @@ fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Tru
         }
         let rms = (square / f64::from(count)).sqrt();
         errors.insert(name.clone(), json!(rms));
-        rows.push_str(&format!(
-            "<tr><td>{}</td><td class=\"n\">{rms:.4}</td><td class=\"n\">{:.3}</td></tr>",
-            report::escape(name),
-            (truth_square / f64::from(count)).sqrt()
-        ));
-        let curve = |name, colour, points| Curve {
-            name,
-            colour,
-            points: report::thin(points, 1500),
+        rows.row(vec![
+            name.as_str().into(),
+            rms.into(),
+            (truth_square / f64::from(count)).sqrt().into(),
+        ]);
+        let plot = |title: String, note: &str, series| Plot {
+            title,
+            note: note.to_owned(),
+            x: Axis::new("t [s]"),
+            y: Axis::new("torque [Nm]"),
+            series,
+            ..Plot::default()
         };
-        blocks.push(report::plot(
-            name,
-            "Nm",
-            &[
-                curve("truth", RGBColor(0, 0, 0), real),
-                curve("estimated", RGBColor(0, 130, 60), estimated),
+        plots.push(plot(
+            name.clone(),
+            "",
+            vec![
+                Series::line("truth", Ink::Measured, real),
+                Series::line("estimated", Ink::Identified, estimated),
             ],
-        )?);
-        blocks.push(report::plot(
-            "error",
-            "Nm",
-            &[curve("estimated - truth", RGBColor(200, 60, 30), error)],
-        )?);
+        ));
+        plots.push(plot(
+            name.clone(),
+            "error: estimated − truth",
+            vec![Series::line("", Ink::Cad, error)],
+        ));
     }
-    rows.push_str("</table>");
     let upstream = setup.upstream_note();
-    blocks.insert(
-        0,
-        format!("<h2>Joint torques</h2>{rows}<p>{}</p>", report::escape(&upstream)),
-    );
 
     let latency_us =
         json!({ "p50": quantile(&latency, 0.5), "p99": quantile(&latency, 0.99), "p999": quantile(&latency, 0.999) });
@@ -765,7 +766,16 @@ fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Tru
     ];
     fs::write(
         out.join("report.html"),
-        report::page(&format!("proprio demo: {}", setup.robot), &facts, &blocks),
+        report::page(
+            &format!("proprio demo: {}", setup.robot),
+            &[
+                report::facts(&facts),
+                report::section(
+                    "Joint torques",
+                    &[rows.html(), report::paragraph(&upstream), report::figures(&plots)],
+                ),
+            ],
+        ),
     )?;
 
     for (name, value) in &facts {

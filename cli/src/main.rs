@@ -19,6 +19,7 @@ macro_rules! say_part {
 mod convert;
 mod demo;
 mod doctor;
+mod identify;
 mod report;
 mod simulate;
 
@@ -56,6 +57,8 @@ enum Verb {
     Encode(convert::Encode),
     /// A table of samples to a table of joint torques and contact wrenches
     Estimate(convert::Estimate),
+    /// Recorded tables of samples to inertial parameters, with a report
+    Identify(identify::Args),
     /// What this machine lacks: CAN, rights, shared memory, buffers, real-time limits
     Doctor(doctor::Args),
 }
@@ -85,6 +88,7 @@ fn main() -> ExitCode {
         Verb::Decode(args) => convert::decode(&args),
         Verb::Encode(args) => convert::encode(&args),
         Verb::Estimate(args) => convert::estimate(&args),
+        Verb::Identify(args) => identify::run(&args),
         Verb::Doctor(args) => doctor::run(&args, &domain),
     };
     match result {

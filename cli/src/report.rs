@@ -1,103 +1,224 @@
-//! The demo's report: one self-contained HTML file with plots, readable on a phone.
+//! Parts of a report: one self-contained HTML file (no script, nothing from the network) with plots and tables, readable on a
+//! telephone and on a desk, by day and by night. `demo` and `identify` put their pages together from these.
 
-use plotters::prelude::*;
+pub(crate) mod plot;
+
 use std::fmt::Write as _;
 
-/// One curve.
-pub(crate) struct Curve<'a> {
-    /// Its name in the legend.
-    pub(crate) name: &'a str,
-    /// Its colour.
-    pub(crate) colour: RGBColor,
-    /// Points (t, y); a NaN breaks the line.
-    pub(crate) points: Vec<(f64, f64)>,
-}
+/// The style sheet. Colours: after Okabe and Ito, told apart by the colour-blind too.
+const STYLE: &str = include_str!("report/style.css");
 
-/// A plot of `curves` over time as SVG text.
-pub(crate) fn plot(title: &str, unit: &str, curves: &[Curve<'_>]) -> anyhow::Result<String> {
-    let finite = || {
-        curves
-            .iter()
-            .flat_map(|c| &c.points)
-            .filter(|(t, y)| t.is_finite() && y.is_finite())
-    };
-    let (mut x, mut y) = ((f64::MAX, f64::MIN), (f64::MAX, f64::MIN));
-    for (px, py) in finite() {
-        x = (x.0.min(*px), x.1.max(*px));
-        y = (y.0.min(*py), y.1.max(*py));
-    }
-    if x.0 >= x.1 {
-        return Ok(format!("<p>{}: no data</p>", escape(title)));
-    }
-    let margin = ((y.1 - y.0) * 0.06).max(1e-3);
-    let mut svg = String::new();
-    {
-        let area = SVGBackend::with_string(&mut svg, (720, 220)).into_drawing_area();
-        let mut chart = ChartBuilder::on(&area)
-            .margin(6)
-            .x_label_area_size(26)
-            .y_label_area_size(58)
-            .build_cartesian_2d(x.0..x.1, y.0 - margin..y.1 + margin)?;
-        chart
-            .configure_mesh()
-            .light_line_style(WHITE)
-            .x_desc("t [s]")
-            .y_desc(format!("{title} [{unit}]"))
-            .draw()?;
-        for curve in curves {
-            let style = curve.colour.stroke_width(1);
-            // A line series draws through gaps, so each run of numbers is a series of its own.
-            for (i, run) in curve
-                .points
-                .split(|(t, y)| !t.is_finite() || !y.is_finite())
-                .filter(|r| !r.is_empty())
-                .enumerate()
-            {
-                let series = chart.draw_series(LineSeries::new(run.iter().copied(), style))?;
-                if i == 0 {
-                    let colour = curve.colour;
-                    series
-                        .label(curve.name)
-                        .legend(move |(x, y)| PathElement::new([(x, y), (x + 14, y)], colour));
-                }
-            }
-        }
-        chart
-            .configure_series_labels()
-            .background_style(WHITE.mix(0.8))
-            .border_style(BLACK.mix(0.3))
-            .draw()?;
-        area.present()?;
-    }
-    // Scales with the page: a view box instead of a fixed size.
-    Ok(svg.replacen("width=\"720\" height=\"220\"", "width=\"100%\"", 1))
-}
-
-/// At most `most` points of `points`, evenly picked: a plot has 720 pixels.
-pub(crate) fn thin(points: Vec<(f64, f64)>, most: usize) -> Vec<(f64, f64)> {
-    let step = points.len().div_ceil(most.max(1)).max(1);
-    points.into_iter().step_by(step).collect()
-}
-
-/// The page: a title, rows of a table of facts, and blocks of HTML.
-pub(crate) fn page(title: &str, facts: &[(&str, String)], blocks: &[String]) -> String {
+/// A page from blocks of HTML.
+pub(crate) fn page(title: &str, blocks: &[String]) -> String {
     let mut html = format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width, \
-         initial-scale=1\"><title>{0}</title><style>body{{font:16px/1.5 system-ui,sans-serif;margin:1rem auto;padding:0 1rem;\
-         max-width:52rem}}table{{border-collapse:collapse}}td,th{{padding:.15rem .8rem .15rem 0;text-align:left;vertical-align:top}}\
-         td.n{{text-align:right;font-variant-numeric:tabular-nums}}svg{{height:auto}}</style></head><body><h1>{0}</h1><table>",
+         initial-scale=1\"><meta name=\"color-scheme\" content=\"light dark\"><title>{0}</title><style>{STYLE}</style></head>\n<body><main><h1>{0}</h1>\n",
         escape(title)
     );
-    for (name, value) in facts {
-        let _ = write!(html, "<tr><th>{}</th><td>{}</td></tr>", escape(name), escape(value));
-    }
-    html.push_str("</table>");
     for block in blocks {
         html.push_str(block);
         html.push('\n');
     }
-    html.push_str("</body></html>\n");
+    html.push_str("</main></body></html>\n");
     html
+}
+
+/// A heading with what follows it.
+pub(crate) fn section(title: &str, body: &[String]) -> String {
+    format!("<section><h2>{}</h2>\n{}</section>", escape(title), body.join("\n"))
+}
+
+/// A part that is unfolded by whoever wants it.
+pub(crate) fn folded(title: &str, open: bool, body: &[String]) -> String {
+    let open = if open { " open" } else { "" };
+    format!(
+        "<details{open}><summary>{}</summary>\n{}</details>",
+        escape(title),
+        body.join("\n")
+    )
+}
+
+/// A paragraph of plain text.
+pub(crate) fn paragraph(text: &str) -> String {
+    format!("<p>{}</p>", escape(text))
+}
+
+/// A list of plain texts; nothing if there is none.
+pub(crate) fn list<S: AsRef<str>>(items: impl IntoIterator<Item = S>) -> String {
+    let items: String = items
+        .into_iter()
+        .map(|item| format!("<li>{}</li>", escape(item.as_ref())))
+        .collect();
+    if items.is_empty() {
+        items
+    } else {
+        format!("<ul>{items}</ul>")
+    }
+}
+
+/// Figures side by side where the page is wide enough.
+pub(crate) fn figures<'a>(plots: impl IntoIterator<Item = &'a plot::Plot>) -> String {
+    let plots: String = plots.into_iter().map(plot::Plot::html).collect();
+    format!("<div class=\"figures\">{plots}</div>")
+}
+
+/// One cell of a table.
+#[derive(Debug, Clone)]
+pub(crate) enum Cell {
+    /// Words; those of the first column head their row.
+    Text(String),
+    /// A number, with three digits.
+    Number(f64),
+    /// A number that is written already, such as a percentage.
+    Written(String),
+    /// A written number with a bar behind it: the share of the cell that the bar covers, and its colour.
+    Bar(String, f64, plot::Ink),
+    /// A number and its standard deviation.
+    Uncertain(f64, f64),
+}
+
+impl From<&str> for Cell {
+    fn from(text: &str) -> Self {
+        Self::Text(text.to_owned())
+    }
+}
+
+impl From<String> for Cell {
+    fn from(text: String) -> Self {
+        Self::Text(text)
+    }
+}
+
+impl From<f64> for Cell {
+    fn from(number: f64) -> Self {
+        Self::Number(number)
+    }
+}
+
+/// A table, which scrolls sideways by itself where the page is too narrow for it.
+#[derive(Debug, Clone)]
+pub(crate) struct Table {
+    caption: String,
+    head: Vec<String>,
+    rows: Vec<Vec<Cell>>,
+}
+
+impl Table {
+    pub(crate) fn new(caption: &str, head: &[&str]) -> Self {
+        Self {
+            caption: caption.to_owned(),
+            head: head.iter().map(|h| (*h).to_owned()).collect(),
+            rows: vec![],
+        }
+    }
+
+    pub(crate) fn row(&mut self, cells: Vec<Cell>) {
+        self.rows.push(cells);
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.rows.is_empty()
+    }
+
+    /// Empty text for a table without rows.
+    pub(crate) fn html(&self) -> String {
+        let Some(first) = self.rows.first() else {
+            return String::new();
+        };
+        let mut html = String::new();
+        // Outside of what scrolls, so that it is as wide as the page and not as the table.
+        if !self.caption.is_empty() {
+            let _ = write!(html, "<p class=\"caption\">{}</p>", escape(&self.caption));
+        }
+        let _ = write!(
+            html,
+            "<div class=\"scroll\" tabindex=\"0\" role=\"region\" aria-label=\"{}\"><table>",
+            escape(&self.caption)
+        );
+        html.push_str("<thead><tr>");
+        for (i, head) in self.head.iter().enumerate() {
+            let class = if matches!(first.get(i), Some(Cell::Text(_)) | None) {
+                ""
+            } else {
+                " class=\"n\""
+            };
+            let _ = write!(html, "<th scope=\"col\"{class}>{}</th>", escape(head));
+        }
+        html.push_str("</tr></thead><tbody>");
+        for row in &self.rows {
+            html.push_str("<tr>");
+            for (i, cell) in row.iter().enumerate() {
+                let _ = match cell {
+                    Cell::Text(text) if i == 0 => write!(html, "<th scope=\"row\">{}</th>", escape(text)),
+                    Cell::Text(text) => write!(html, "<td>{}</td>", escape(text)),
+                    Cell::Number(value) => write!(html, "<td class=\"n\">{}</td>", number(*value)),
+                    Cell::Written(text) => write!(html, "<td class=\"n\">{}</td>", escape(text)),
+                    Cell::Bar(text, share, ink) => write!(
+                        html,
+                        "<td class=\"n bar\"><i class=\"{}\" style=\"width:{:.0}%\"></i><span>{}</span></td>",
+                        ink.class(),
+                        if share.is_finite() {
+                            share.clamp(0.0, 1.0) * 100.0
+                        } else {
+                            0.0
+                        },
+                        escape(text)
+                    ),
+                    Cell::Uncertain(value, deviation) => {
+                        write!(
+                            html,
+                            "<td class=\"n\">{} <small>± {}</small></td>",
+                            number(*value),
+                            short(*deviation)
+                        )
+                    }
+                };
+            }
+            html.push_str("</tr>");
+        }
+        html.push_str("</tbody></table></div>");
+        html
+    }
+}
+
+/// A table of facts: a name and what it is.
+pub(crate) fn facts(facts: &[(&str, String)]) -> String {
+    let rows: String = facts
+        .iter()
+        .map(|(name, value)| format!("<div><dt>{}</dt><dd>{}</dd></div>", escape(name), escape(value)))
+        .collect();
+    format!("<dl class=\"facts\">{rows}</dl>")
+}
+
+/// A number with three significant digits; a dash for NaN.
+pub(crate) fn number(value: f64) -> String {
+    digits(value, 3)
+}
+
+/// A number with two significant digits: of deviations.
+pub(crate) fn short(value: f64) -> String {
+    digits(value, 2)
+}
+
+fn digits(value: f64, count: i32) -> String {
+    if value == 0.0 {
+        return "0".into();
+    }
+    if value.is_nan() {
+        return "–".into();
+    }
+    if value.is_infinite() {
+        return if value > 0.0 { "∞".into() } else { "−∞".into() };
+    }
+    // Rounding first may make one digit more: 9.996 is 10.0.
+    let rounded: f64 = format!("{value:.*e}", (count - 1) as usize).parse().unwrap_or(value);
+    let power = rounded.abs().log10().floor() as i32;
+    let text = if (-4..=5).contains(&power) {
+        format!("{rounded:.*}", (count - 1 - power).max(0) as usize)
+    } else {
+        format!("{rounded:.*e}", (count - 1) as usize)
+    };
+    text.replace('-', "−")
 }
 
 /// Text that is safe in HTML.
@@ -106,4 +227,43 @@ pub(crate) fn escape(text: &str) -> String {
         .replace('<', "&lt;")
         .replace('>', "&gt;")
         .replace('"', "&quot;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_have_three_digits() {
+        for (value, text) in [
+            (0.0, "0"),
+            (9.996, "10.0"),
+            (-1.2345, "−1.23"),
+            (0.000_123_456, "0.000123"),
+            (123_456.0, "123000"),
+            (1.5e-7, "1.50e−7"),
+            (f64::NAN, "–"),
+            (f64::INFINITY, "∞"),
+        ] {
+            assert_eq!(number(value), text);
+        }
+    }
+
+    #[test]
+    fn names_from_files_can_not_break_the_page() {
+        let mut table = Table::new("a & b", &["<x>"]);
+        table.row(vec!["<script>".into(), f64::NAN.into()]);
+        let html = page(
+            "<b>",
+            &[section(
+                "\"",
+                &[table.html(), list(["<i>"]), facts(&[("<", ">".into())])],
+            )],
+        );
+        assert!(
+            !html.contains("<script>") && !html.contains("<x>") && !html.contains("<i>"),
+            "{html}"
+        );
+        assert!(html.contains("&lt;script&gt;"));
+    }
 }

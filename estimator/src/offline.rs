@@ -11,8 +11,8 @@
 //! | `reason/<joint>` | why not: a word, and the channel to blame behind a colon |
 
 use crate::pipeline::{Estimate, Pipeline};
-use crate::setup::Setup;
-use proprio_topics::csv::{Item, Reader, Report, Row, Value, What};
+use crate::setup::{Channel, Setup};
+use proprio_topics::csv::{Item, Reader, Report, Row, Series, Value, What};
 use proprio_topics::{ContactWrench, JointTorque, Kind, NO_CAUSE, Nanos, Reason};
 use std::io::{self, Read, Write};
 
@@ -56,22 +56,7 @@ pub fn estimate(setup: Setup, log: impl Read, out: impl Write) -> Result<Estimat
     let mut reader = Reader::new(log)?;
     let mut report = EstimateReport::default();
     let mut pipeline = Pipeline::new(setup);
-    let mut missing: Vec<String> = Vec::new();
-    for channel in pipeline.setup().channels() {
-        let there = reader
-            .series()
-            .iter()
-            .any(|s| s.what == What::Channel(channel.kind) && s.name == channel.name);
-        if !there {
-            let what = format!("{}/{}", channel.kind.word(), channel.name);
-            let hint = if channel.kind == Kind::Joint {
-                " (measure it, or lock it in [locked])"
-            } else {
-                ""
-            };
-            missing.push(format!("{what}{hint}"));
-        }
-    }
+    let missing = missing_channels(pipeline.setup(), reader.series());
     if !missing.is_empty() {
         return Err(OfflineError::MissingChannels(missing));
     }
@@ -127,6 +112,28 @@ pub fn estimate(setup: Setup, log: impl Read, out: impl Write) -> Result<Estimat
     report.dropped = [counts.late, counts.backward, counts.not_finite];
     report.log = reader.report().clone();
     Ok(report)
+}
+
+/// The channels that `setup` reads and a log with these columns does not have: each with what to do about it, in words.
+pub fn missing_channels(setup: &Setup, series: &[Series]) -> Vec<String> {
+    let there = |channel: &Channel| {
+        series
+            .iter()
+            .any(|s| s.what == What::Channel(channel.kind) && s.name == channel.name)
+    };
+    setup
+        .channels()
+        .iter()
+        .filter(|channel| !there(channel))
+        .map(|channel| {
+            let hint = if channel.kind == Kind::Joint {
+                " (measure it, or lock it in [locked])"
+            } else {
+                ""
+            };
+            format!("{}/{}{hint}", channel.kind.word(), channel.name)
+        })
+        .collect()
 }
 
 #[derive(Clone, Copy)]

@@ -1,0 +1,238 @@
+//! `proprio identify`: recorded logs to inertial parameters, with a report.
+//!
+//! Writes into one folder, each file whole or not at all: `summary.json` (for programs: [`summary`]), `parameters.toml`, `identified.urdf` and `report.html` (for
+//! people). Where nothing can be identified there are a summary and a report that say why, and no parameters.
+
+mod advice;
+#[cfg(test)]
+mod example;
+mod page;
+mod summary;
+
+use crate::convert::blame_columns;
+use advice::{Advice, findings, sentence};
+use anyhow::{Context, bail};
+use indicatif::{ProgressBar, ProgressStyle};
+use proprio_estimator::config::{Config, ConfigError};
+use proprio_estimator::identify::{self, IdentifyError, Log, Options, Outcome, Progress, Role, Severity, Verdict};
+use proprio_estimator::setup::Setup;
+use std::fs::{self, File};
+use std::io::{BufRead, BufReader, Cursor, IsTerminal, Read, Write};
+use std::path::{Path, PathBuf};
+
+/// `proprio identify`.
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    /// estimator.toml
+    #[arg(long, value_name = "FILE")]
+    config: PathBuf,
+    /// A table of samples to identify from; may be given several times
+    #[arg(long, value_name = "FILE", required = true)]
+    log: Vec<PathBuf>,
+    /// A table of samples to test the result on, kept out of the fit; may be given several times
+    #[arg(long, value_name = "FILE")]
+    validate: Vec<PathBuf>,
+    /// Where summary.json, parameters.toml, identified.urdf and report.html go
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Print the summary as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// What a run writes.
+const FILES: [&str; 4] = ["summary.json", "parameters.toml", "identified.urdf", "report.html"];
+
+/// Identifies.
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    let (config, setup) = load(&args.config)?;
+    let files: Vec<(&PathBuf, Role)> = args
+        .log
+        .iter()
+        .map(|f| (f, Role::Train))
+        .chain(args.validate.iter().map(|f| (f, Role::Validate)))
+        .collect();
+    let mut tables = Vec::new();
+    for (file, _) in &files {
+        tables.push(open(file, &args.config, &setup)?);
+    }
+    // Everything that is read is open: from here on, no result of an earlier run can be taken for one of this.
+    fs::create_dir_all(&args.out).with_context(|| format!("{}: can not be made", args.out.display()))?;
+    for name in FILES {
+        let file = args.out.join(name);
+        match fs::remove_file(&file) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                return Err(error).with_context(|| format!("{}: can not be replaced", file.display()));
+            }
+            _ => {}
+        }
+    }
+
+    let names = names(&files);
+    let logs = files
+        .iter()
+        .zip(&mut tables)
+        .zip(names)
+        .map(|(((_, role), table), file)| Log {
+            file,
+            role: *role,
+            samples: table,
+        })
+        .collect();
+    let options = Options {
+        inputs: config.identification.inputs.clone(),
+    };
+    let bar = progress_bar();
+    let result = identify::identify(&setup, logs, &options, &mut |progress: &Progress| {
+        bar.set_position((progress.done * 1000.0) as u64);
+        bar.set_message(progress.step.clone());
+    });
+    bar.finish_and_clear();
+    let outcome = result.map_err(|error| match error {
+        // Which measurements there are is the configuration's business.
+        IdentifyError::NoInputs(problem) => ConfigError {
+            file: args.config.clone(),
+            problem,
+        }
+        .into(),
+        error => anyhow::Error::from(error),
+    })?;
+
+    let advice = Advice::of(&outcome);
+    let json = summary::summary(&outcome, &advice);
+    let mut text = serde_json::to_string_pretty(&json)?;
+    text.push('\n');
+    // The summary comes last: where it is, the others are.
+    write(&args.out, "report.html", &page::page(&outcome, &advice))?;
+    write(&args.out, "summary.json", &text)?;
+    for (log, finding) in findings(&outcome).filter(|(_, f)| f.severity > Severity::Note) {
+        let place = log.map(|l| format!("{}: ", l.file)).unwrap_or_default();
+        eprintln!(
+            "{}: {place}{}",
+            summary::severity(finding.severity),
+            sentence(&finding.text)
+        );
+    }
+    if args.json {
+        say!("{json}");
+    } else {
+        tell(&outcome, &advice, &args.out);
+    }
+    if let Verdict::Nothing(reason) = &outcome.verdict {
+        bail!("nothing was identified: {}", reason.trim().trim_end_matches('.'));
+    }
+    Ok(())
+}
+
+/// The configuration, with the URDF's own parameters: those identified earlier are no part of what is identified now.
+fn load(file: &Path) -> anyhow::Result<(Config, Setup)> {
+    let mut config = Config::load(file)?;
+    config.parameters = None;
+    // Identification on-line is not asked for here.
+    config.identification.enabled = false;
+    let setup = Setup::new(&config).map_err(|problem| ConfigError {
+        file: file.to_owned(),
+        problem,
+    })?;
+    for warning in setup.warnings() {
+        tracing::warn!("{}: {warning}", file.display());
+    }
+    Ok((config, setup))
+}
+
+/// Opens a table, whose columns are checked before anything else is done.
+fn open(file: &Path, config: &Path, setup: &Setup) -> anyhow::Result<impl Read + Send + use<>> {
+    let mut table = BufReader::with_capacity(
+        1 << 18,
+        File::open(file).with_context(|| format!("{}: can not be read", file.display()))?,
+    );
+    let mut header = Vec::new();
+    // Blank lines before the header are none of its columns.
+    while header.trim_ascii().is_empty() {
+        let read = table
+            .read_until(b'\n', &mut header)
+            .with_context(|| format!("{}: can not be read", file.display()))?;
+        if read == 0 {
+            break;
+        }
+    }
+    blame_columns(&header, file, config, setup)?;
+    Ok(Cursor::new(header).chain(table))
+}
+
+/// What logs are called: their file names, with as many folders before them as tell them apart.
+fn names(files: &[(&PathBuf, Role)]) -> Vec<String> {
+    let short = |file: &Path, parts: usize| -> String {
+        let all: Vec<_> = file.components().map(|c| c.as_os_str().to_string_lossy()).collect();
+        all.get(all.len().saturating_sub(parts)..).unwrap_or_default().join("/")
+    };
+    files
+        .iter()
+        .map(|(file, _)| {
+            let most = file.components().count();
+            let alone = |parts: &usize| {
+                files
+                    .iter()
+                    .filter(|(f, _)| short(f, *parts) == short(file, *parts))
+                    .count()
+                    == 1
+            };
+            short(file, (1..=most).find(alone).unwrap_or(most))
+        })
+        .collect()
+}
+
+/// A bar where somebody looks.
+fn progress_bar() -> ProgressBar {
+    if !std::io::stderr().is_terminal() {
+        return ProgressBar::hidden();
+    }
+    ProgressBar::new(1000).with_style(
+        ProgressStyle::with_template("{bar:40} {percent} % {msg}").unwrap_or_else(|_| ProgressStyle::default_bar()),
+    )
+}
+
+/// Writes a file of the result; it gets its name when it is complete.
+fn write(folder: &Path, name: &str, text: &str) -> anyhow::Result<()> {
+    use std::os::unix::fs::PermissionsExt as _;
+    let told = || format!("{}: can not be written", folder.join(name).display());
+    let mut file = tempfile::NamedTempFile::new_in(folder)
+        .map_err(|e| std::io::Error::from(e.kind()))
+        .with_context(told)?;
+    file.write_all(text.as_bytes()).with_context(told)?;
+    file.as_file().sync_all().with_context(told)?;
+    // Temporary files are private; a result is for whoever may read the folder.
+    fs::set_permissions(file.path(), fs::Permissions::from_mode(0o644)).with_context(told)?;
+    file.persist(folder.join(name)).with_context(told)?;
+    Ok(())
+}
+
+/// The result in a few lines.
+fn tell(outcome: &Outcome, advice: &Advice, out: &Path) {
+    say!("{}: {}", outcome.robot, advice.grade.headline().to_lowercase());
+    for line in &advice.why {
+        say!("  {line}");
+    }
+    if !advice.next.is_empty() {
+        say!("next:");
+    }
+    for line in &advice.next {
+        say!("- {line}");
+    }
+    let written: Vec<&str> = FILES.into_iter().filter(|name| out.join(name).exists()).collect();
+    say!("{}: {}", out.display(), written.join(", "));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn logs_are_named_by_what_tells_them_apart() {
+        let files: Vec<PathBuf> = ["/a/one/x.csv", "/a/two/x.csv", "y.csv", "/a/two/y.csv"]
+            .map(PathBuf::from)
+            .to_vec();
+        let files: Vec<(&PathBuf, Role)> = files.iter().map(|f| (f, Role::Train)).collect();
+        assert_eq!(names(&files), ["one/x.csv", "two/x.csv", "y.csv", "two/y.csv"]);
+    }
+}

@@ -1,0 +1,270 @@
+//! What an outcome means, in plain words: whether to use the parameters, why, and what to do next.
+
+use proprio_estimator::identify::{Finding, LogOutcome, Outcome, Role, Severity, Three, Verdict};
+use std::collections::BTreeSet;
+
+/// Whether the identified parameters should be used.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Grade {
+    /// Yes.
+    Accept,
+    /// They are sound as far as they go, but somebody should look at what is said first.
+    Care,
+    /// No.
+    Reject,
+}
+
+impl Grade {
+    /// As a word for programs.
+    pub(crate) fn word(self) -> &'static str {
+        match self {
+            Self::Accept => "accept",
+            Self::Care => "care",
+            Self::Reject => "reject",
+        }
+    }
+
+    /// As a word for people.
+    pub(crate) fn headline(self) -> &'static str {
+        match self {
+            Self::Accept => "Accept",
+            Self::Care => "Accept with care",
+            Self::Reject => "Reject",
+        }
+    }
+}
+
+/// An outcome in plain words.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Advice {
+    /// Use it or not.
+    pub(crate) grade: Grade,
+    /// Why: sentences that make one paragraph.
+    pub(crate) why: Vec<String>,
+    /// What to do next, most important first.
+    pub(crate) next: Vec<String>,
+}
+
+/// A validation error so much larger than CAD's, relatively, is worse; so much smaller is better. Between the two they are equal.
+const NOTICEABLE: f64 = 0.02;
+
+impl Advice {
+    /// What `outcome` means.
+    pub(crate) fn of(outcome: &Outcome) -> Self {
+        let mut this = Self {
+            grade: Grade::Accept,
+            why: vec![],
+            next: vec![],
+        };
+        if let Verdict::Nothing(reason) = &outcome.verdict {
+            this.grade = Grade::Reject;
+            this.why.push(format!("Nothing was identified: {}", stop(reason)));
+            this.why
+                .push("No parameters were written; those in use stay as they are.".into());
+            this.look_at_findings(outcome);
+            return this;
+        }
+        this.say_errors(outcome);
+        if outcome.verdict == Verdict::NoBetterThanCad {
+            this.worsen(Grade::Care);
+            this.why.push(
+                "On stretches of the logs that were held back from the fit, the identified parameters did no better than the CAD's, so they were drawn back to these: \
+                 the offsets are worth having, the parameters are the CAD's."
+                    .into(),
+            );
+        }
+        if !outcome.consistency.feasible {
+            this.worsen(Grade::Reject);
+            this.why.push(format!(
+                "What the logs say can not be true of any physical bodies: {}",
+                sentence(&outcome.consistency.text)
+            ));
+            this.next.push("Check the F/T sensors' signs, frames and units, the joints' zero positions, and that no contact was left undeclared.".into());
+        }
+        this.look_at_findings(outcome);
+        this.say_excitation(outcome);
+        if this.grade != Grade::Reject {
+            if !outcome.logs.iter().any(|log| log.role == Role::Validate) {
+                this.next.push("Record another motion, unlike these, and give it with --validate: only that shows how good the parameters are where they were not fitted.".into());
+            }
+            this.next.push(
+                "To use the result, name it in estimator.toml, parameters = \"parameters.toml\"; other programs load identified.urdf.".into(),
+            );
+        }
+        this
+    }
+
+    fn worsen(&mut self, grade: Grade) {
+        if grade as u8 > self.grade as u8 {
+            self.grade = grade;
+        }
+    }
+
+    /// How far predictions are off: on the logs for validation, if there are any.
+    fn say_errors(&mut self, outcome: &Outcome) {
+        let validated = outcome.logs.iter().any(|log| log.role == Role::Validate);
+        let role = if validated { Role::Validate } else { Role::Train };
+        for log in outcome.logs.iter().filter(|log| log.role == role) {
+            let Three {
+                cad_fitted, identified, ..
+            } = log.relative_error;
+            if !(cad_fitted.is_finite() && identified.is_finite()) {
+                continue;
+            }
+            let how = if validated {
+                ", which was not used for the fit"
+            } else {
+                ""
+            };
+            self.why.push(format!(
+                "On {}{how}, {} predicted with the identified parameters are {} off, with the CAD's parameters {} (offsets and friction fitted for both alike).",
+                log.file,
+                predicted(log),
+                percent(identified),
+                percent(cad_fitted),
+            ));
+            if identified > cad_fitted * (1.0 + NOTICEABLE) {
+                if validated {
+                    self.worsen(Grade::Reject);
+                    self.why.push("That is worse than the CAD: the parameters do not hold outside the motion that they were fitted to.".into());
+                    self.next.push(format!(
+                        "Identify from richer motion: with {} among the training logs, or longer and faster ones.",
+                        log.file
+                    ));
+                } else {
+                    self.worsen(Grade::Care);
+                    self.why.push("That is worse than the CAD.".into());
+                }
+            } else if validated && identified > cad_fitted * (1.0 - NOTICEABLE) {
+                self.worsen(Grade::Care);
+                self.why.push("That is no better than the CAD.".into());
+            }
+        }
+        if !validated && !self.why.is_empty() {
+            self.why.push("No log was kept for validation.".into());
+        }
+    }
+
+    fn look_at_findings(&mut self, outcome: &Outcome) {
+        let all = || findings(outcome).map(|(_, finding)| finding);
+        let count = |severity| all().filter(|f| f.severity == severity).count();
+        let (refusals, warnings) = (count(Severity::Refusal), count(Severity::Warning));
+        if refusals + warnings == 0 {
+            return;
+        }
+        self.worsen(Grade::Care);
+        // What a fit to any motion would meet again; each once, although several logs may show it.
+        let mut said = BTreeSet::new();
+        for finding in all().filter(|f| matches!(f.code, "wrong_sign" | "joint_zero" | "units" | "wrong_units")) {
+            if finding.severity >= Severity::Warning && said.insert(finding.text.as_str()) {
+                self.next.push(sentence(&finding.text));
+            }
+        }
+        let total = refusals + warnings;
+        let what = if total == 1 {
+            "1 finding"
+        } else {
+            &format!("{total} findings")
+        };
+        self.next.push(format!(
+            "Look at the {what} listed under \"What was found\" before relying on the result."
+        ));
+    }
+
+    /// What the motion could not show.
+    fn say_excitation(&mut self, outcome: &Outcome) {
+        let (rank, all) = (outcome.rank, outcome.structural_rank);
+        let mut parts = Vec::new();
+        if rank < all {
+            parts.push(format!(
+                "the motion shows {rank} of the {all} combinations of parameters that could show"
+            ));
+        }
+        if outcome.effective.is_finite() && rank > 0 {
+            parts.push(format!(
+                "the logs rather than the CAD decide about {:.0}",
+                outcome.effective
+            ));
+        }
+        if !parts.is_empty() {
+            self.why.push(format!("{}.", capital(&parts.join("; "))));
+        }
+        // Links that the weakest directions are about, as they are named in them.
+        let mut links: Vec<&str> = Vec::new();
+        for weak in outcome.weakest.iter().filter(|w| w.prior_share > 0.9).take(5) {
+            for term in weak.expression.split_whitespace().filter(|t| t.contains('.')) {
+                let link = term.rsplit_once('.').map_or(term, |(link, _)| link);
+                let known = outcome.links.iter().any(|l| l.name == link);
+                if known && !links.contains(&link) {
+                    links.push(link);
+                }
+            }
+        }
+        links.truncate(4);
+        if !links.is_empty() {
+            self.next.push(format!(
+                "The logs say least about {}: motion that turns and shakes {} about more axes, and faster, would tell more.",
+                links.join(", "),
+                if links.len() == 1 { "it" } else { "them" }
+            ));
+        }
+    }
+}
+
+/// All findings, with the log that each is about.
+pub(crate) fn findings(outcome: &Outcome) -> impl Iterator<Item = (Option<&LogOutcome>, &Finding)> {
+    let of_logs = outcome
+        .logs
+        .iter()
+        .flat_map(|log| log.findings.iter().map(move |f| (Some(log), f)));
+    outcome.findings.iter().map(|f| (None, f)).chain(of_logs)
+}
+
+/// What a log lets be compared.
+fn predicted(log: &LogOutcome) -> &'static str {
+    match (log.joints.is_empty(), log.sensors.is_empty()) {
+        (false, true) => "joint torques",
+        (true, false) => "F/T readings",
+        _ => "joint torques and F/T readings",
+    }
+}
+
+/// A share in percent, with two or three digits.
+pub(crate) fn percent(share: f64) -> String {
+    if !share.is_finite() {
+        return "–".into();
+    }
+    let value = share * 100.0;
+    if value < 10.0 {
+        format!("{value:.2} %")
+    } else {
+        format!("{value:.1} %")
+    }
+}
+
+/// With a full stop.
+fn stop(text: &str) -> String {
+    let text = text.trim();
+    let stop = if text.ends_with(['.', '!', '?']) { "" } else { "." };
+    format!("{text}{stop}")
+}
+
+/// With a capital letter and a full stop.
+pub(crate) fn sentence(text: &str) -> String {
+    capital(&stop(text))
+}
+
+/// With a capital letter, unless it starts with a name (which has a capital, a digit or an underscore in it).
+fn capital(text: &str) -> String {
+    let first = text.split_whitespace().next().unwrap_or_default();
+    if first
+        .chars()
+        .any(|c| c == '_' || c == '.' || c == '/' || c.is_numeric())
+    {
+        return text.to_owned();
+    }
+    let mut letters = text.chars();
+    letters
+        .next()
+        .map_or_else(String::new, |c| c.to_uppercase().chain(letters).collect())
+}

@@ -1,0 +1,217 @@
+//! An outcome made by hand for tests: something in every part of it, long names, numbers that are not there.
+
+use proprio_estimator::identify::{
+    BaseParameterOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding, FrictionOutcome, JointOutcome,
+    LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, SensorOutcome, Severity, Spectrum, Three,
+    TimeOffsetOutcome, TwoRouteOutcome, Verdict, WeakDirection,
+};
+use proprio_estimator::spatial::RigidInertia;
+use proprio_topics::Nanos;
+
+const JOINTS: [&str; 3] = ["r_hip_yaw", "r_knee", "r_ankle_pitch_with_a_long_name"];
+const LINKS: [&str; 4] = ["r_upper_leg", "r_lower_leg", "r_ankle_1", "r_foot"];
+
+fn three<T>(cad: T, cad_fitted: T, identified: T) -> Three<T> {
+    Three {
+        cad,
+        cad_fitted,
+        identified,
+    }
+}
+
+fn at(seconds: f64) -> Nanos {
+    Nanos::from_millis(1_000_000 + (seconds * 1e3) as i64)
+}
+
+/// Numbers that look like noise, the same at every run.
+fn noise(i: usize) -> f64 {
+    (i as f64 * 12.9898).sin() * 43_758.547 % 1.0
+}
+
+fn curve(name: &str, unit: &'static str, n: usize) -> Curve {
+    let t: Vec<f64> = (0..1500).map(|i| i as f64 * 0.02).collect();
+    let moving = |t: f64| if t < 4.0 { 0.0 } else { (t - 4.0).min(1.0) };
+    let torque = |t: f64| 3.0 * (0.7 * t + n as f64).sin() * moving(t) + 2.0;
+    Curve {
+        name: name.into(),
+        unit,
+        // A gap.
+        measured: t
+            .iter()
+            .enumerate()
+            .map(|(i, t)| {
+                if (600..640).contains(&i) {
+                    f64::NAN
+                } else {
+                    torque(*t) + 0.05 * noise(i)
+                }
+            })
+            .collect(),
+        cad_fitted: t
+            .iter()
+            .map(|t| torque(*t) * 0.93 + 0.2 * (1.9 * t).cos() * moving(*t))
+            .collect(),
+        identified: t.iter().map(|t| torque(*t) * 0.995 + 0.04 * (1.9 * t).cos()).collect(),
+        sigma: t
+            .iter()
+            .map(|t| if *t < 4.0 { 3.0 } else { 0.05 + 0.4 / (t - 3.0) })
+            .collect(),
+        t,
+    }
+}
+
+fn log(file: &str, role: Role) -> LogOutcome {
+    LogOutcome {
+        file: file.into(),
+        role,
+        span: (at(0.0), at(30.0)),
+        used: 2700,
+        left_out: vec![
+            LeftOut { reason: "edge".into(), instants: 60, first: at(0.0), last: at(30.0) },
+            LeftOut { reason: "contact declared: right_foot".into(), instants: 240, first: at(12.0), last: at(14.4) },
+        ],
+        onset: Some(at(4.0)),
+        relative_error: three(f64::NAN, 0.064, 0.0235),
+        joints: JOINTS
+            .iter()
+            .map(|j| JointOutcome { name: (*j).into(), rms_nm: three(0.9, 0.2, 0.07), measured_rms_nm: 3.1, coverage: 0.946 })
+            .collect(),
+        sensors: vec![SensorOutcome {
+            name: "r_leg_ft_sensor".into(),
+            rms: three([f64::NAN; 6], [0.5, 2.9, 0.5, 0.22, 0.1, 0.04], [0.4, 0.9, 0.45, 0.1, 0.09, 0.04]),
+        }],
+        two_route: vec![TwoRouteOutcome {
+            joint: "r_knee".into(),
+            rms_nm: three(12.0, 0.138, 0.13),
+            rms_mean_removed_nm: three(0.2, 0.12, 0.11),
+        }],
+        offsets: vec![OffsetOutcome {
+            sensor: "r_leg_ft_sensor".into(),
+            start: [-290.1, 12.0, 3.0, 1.0, -2.0, 0.1],
+            end: [-289.0, 12.5, 3.1, 1.01, -2.1, 0.12],
+            deviation: [0.1, 0.1, 0.2, 0.01, 0.01, 0.01],
+            rate: [0.05, 0.04, 0.1, 0.002, 0.002, 0.001],
+            breaks: vec![at(17.3)],
+        }],
+        friction: vec![FrictionOutcome { joint: "r_knee".into(), coulomb_nm: 0.41, viscous: 0.08, offset_nm: -0.02, deviation: [0.01, 0.004, 0.02] }],
+        time_offsets: vec![TimeOffsetOutcome { channel: "r_leg_ft_sensor".into(), seconds: 0.0061, deviation: 0.0004, significant: true, applied: true }],
+        findings: vec![Finding {
+            severity: Severity::Warning,
+            code: "jump",
+            subject: "r_leg_ft_sensor".into(),
+            text: "r_leg_ft_sensor: fx jumps by 20.1 N at 17.30 s, which no motion explains (a cable, internal stress): its offset starts afresh there".into(),
+        }],
+        curves: JOINTS.iter().enumerate().map(|(i, j)| curve(j, "Nm", i)).chain([curve("r_leg_ft_sensor fx", "N", 7)]).collect(),
+        spectra: vec![Spectrum {
+            name: "joint/r_knee/torque".into(),
+            frequency: (0..200).map(|i| f64::from(i) * 0.25).collect(),
+            cad_fitted: (0..200).map(|i| 0.1 / (1.0 + f64::from(i).powi(2))).collect(),
+            identified: (0..200).map(|i| 0.01 / (1.0 + f64::from(i))).collect(),
+        }],
+    }
+}
+
+/// Everything is well, but for a jump in a log.
+pub(crate) fn outcome() -> Outcome {
+    let bodies = LINKS.iter().enumerate().map(|(i, name)| {
+        let size = i as f64 + 1.0;
+        let cad = [1.0 / size, 0.01, -0.02, 0.03, 0.004, 0.0001, 0.0, 0.005, 0.0002, 0.003];
+        let identified = cad.map(|p| p * 1.12);
+        LinkOutcome {
+            link: i + 1,
+            name: (*name).into(),
+            cad: RigidInertia::from_parameters(&cad),
+            floored: (i == 2).then(|| RigidInertia::from_parameters(&cad)),
+            identified: RigidInertia::from_parameters(&identified),
+            deviation: cad.map(|p| p.abs() * 0.03 + 1e-4),
+            significance: 4.2 / size,
+            seen: i > 0,
+        }
+    });
+    let base = (0..38).map(|i| {
+        let (unit, size) = match i {
+            0..4 => ("kg", 1.0),
+            4..16 => ("kg m", 0.05),
+            _ => ("kg m^2", 0.004),
+        };
+        BaseParameterOutcome {
+            expression: format!("r_lower_leg.I_xx + r_ankle_1.I_yy - 0.25 r_foot.h_{i} + 0.0221 r_foot.m"),
+            unit,
+            cad: size * noise(i),
+            identified: size * (noise(i) + 0.2 * noise(i + 50)),
+            deviation: size * 0.05 * (1.0 + noise(i + 7).abs()),
+        }
+    });
+    Outcome {
+        robot: "icub_legs".into(),
+        verdict: Verdict::Identified,
+        links: bodies.collect(),
+        covariance: CovarianceRoot { columns: vec![], root: Default::default() },
+        tau: 0.58,
+        shrink: 1.0,
+        unknowns: 40,
+        rank: 31,
+        structural_rank: 38,
+        effective: 14.3,
+        condition: 3.2e5,
+        singular_values: (0..31).map(|i| 300.0 * 10f64.powf(-f64::from(i) * 0.18)).collect(),
+        weakest: (0..20)
+            .map(|i| WeakDirection {
+                expression: format!("r_foot.I_zz - 0.4{i} r_lower_leg.h_z"),
+                relative: 1e-5 * f64::from(i + 1),
+                prior_share: 1.0 - 0.02 * f64::from(i),
+            })
+            .collect(),
+        confused: vec!["the offset of r_leg_ft_sensor along gravity and the mass of the leg: nothing turned about a horizontal axis".into()],
+        base_parameters: base.collect(),
+        channels: ["fx", "fy", "fz", "tx", "ty", "tz"]
+            .iter()
+            .map(|c| ChannelNoise {
+                name: format!("wrench/r_leg_ft_sensor/{c}"),
+                unit: if c.starts_with('f') { "N" } else { "Nm" },
+                deviation: 0.2,
+                autocorrelation: 12.0,
+                autocorrelation_seconds: 0.12,
+                drift: 0.01,
+            })
+            .collect(),
+        consistency: Consistency { feasible: true, deviations: 0.4, links: vec![], text: "bodies exist that have what the logs say".into() },
+        logs: vec![log("walk_1.csv", Role::Train), log("walk_2.csv", Role::Validate)],
+        findings: vec![Finding {
+            severity: Severity::Note,
+            code: "beyond",
+            subject: "r_upper_leg".into(),
+            text: "r_upper_leg lies above r_leg_ft_sensor: nothing measured tells its parameters".into(),
+        }],
+    }
+}
+
+/// A robot that stood still.
+pub(crate) fn nothing() -> Outcome {
+    let mut outcome = outcome();
+    outcome.verdict = Verdict::Nothing("no joint moved in any log".into());
+    (outcome.tau, outcome.rank, outcome.condition, outcome.effective) = (f64::NAN, 0, f64::NAN, 0.0);
+    outcome.singular_values.clear();
+    outcome.weakest.clear();
+    outcome.base_parameters.clear();
+    outcome.channels.clear();
+    for log in &mut outcome.logs {
+        log.used = 0;
+        log.relative_error = three(f64::NAN, f64::NAN, f64::NAN);
+        log.joints.clear();
+        log.sensors.clear();
+        log.two_route.clear();
+        log.curves.clear();
+        log.spectra.clear();
+        log.offsets.clear();
+        log.friction.clear();
+        log.time_offsets.clear();
+        log.findings = vec![Finding {
+            severity: Severity::Refusal,
+            code: "no_motion",
+            subject: String::new(),
+            text: "no joint moved by more than its noise: nothing but an offset can be told from this log; record the robot moving".into(),
+        }];
+    }
+    outcome
+}

@@ -1,0 +1,172 @@
+//! `summary.json`: an outcome for programs.
+//!
+//! A number that is not there (nothing to compare, not measured) is `null`. SI units; six numbers of an F/T sensor are in the order `fx fy fz tx ty tz` [N, Nm]; times within a log are
+//! seconds since its first stamp. Wherever three sets of parameters are compared, it is as {`cad`, `cad_fitted`, `identified`}: the CAD with the configured offsets, the CAD with
+//! offsets and friction fitted to that log, the identified parameters with offsets and friction fitted to that log.
+//!
+//! | key | what it is |
+//! |---|---|
+//! | `schema` | 1 |
+//! | `robot`, `version` | the robot's name, this program's version |
+//! | `verdict` | `identified`; `no_better_than_cad` (held-out data showed no gain: the parameters are the CAD's); `nothing` (no parameters at all) |
+//! | `reason` | why nothing was identified, in words; else `null` |
+//! | `advice` | {`grade`: `accept`, `care` or `reject`; `why`: sentences; `next`: what to do} |
+//! | `logs` | a list, in the order given on the command line: below |
+//! | `tau` | the prior's scale, chosen from the data: how far the CAD is from the robot, relatively; at most 1 |
+//! | `shrink` | which part of the change from CAD was kept after the held-out check, 0 to 1 |
+//! | `unknowns`, `structural_rank`, `rank`, `effective` | inertial parameters; combinations of them that the robot's structure lets show; those that the logs show; how many the logs rather than the prior decide |
+//! | `condition`, `singular_values` | of what the logs tell, columns scaled by the prior's spread |
+//! | `weakest` | worst first: {`expression`, `relative`: singular value over the greatest, `prior_share`: share of its variance that is the prior's} |
+//! | `confused` | what the motion of the logs can not tell apart, in words |
+//! | `time_offsets` | {`log`, `channel`, `seconds` (late is positive), `deviation`, `significant`, `applied`} |
+//! | `consistency` | {`feasible`: whether bodies exist that have what the logs say, `deviations`: by how many sigma not, `links`, `text`} |
+//! | `findings` | what is wrong, in words: {`log` or `null`, `severity`: `note`, `warning`, `refusal`; `code`: one word; `subject`: a channel, joint or link; `text`} |
+//! | `links` | {`name`, `seen`, `significance`, `cad`, `identified`, `deviation`: ten numbers each, m h_x h_y h_z I_xx I_xy I_xz I_yy I_yz I_zz about the link's origin} |
+//! | `base_parameters` | {`expression`, `unit`, `cad`, `identified`, `deviation`} |
+//! | `channels` | noise of each measured number: {`name`, `unit`, `deviation`, `autocorrelation_s`, `drift`: `unit` per square root of second} |
+//!
+//! A log:
+//!
+//! | key | what it is |
+//! |---|---|
+//! | `file`, `role` | its file name; `train` or `validate` |
+//! | `span_s`, `used`, `left_out` | its length; instants used; those not used: a list of {`reason`, `instants`, `first_s`, `last_s`} |
+//! | `onset_s` | when the robot began to move; `null`: from the start, or never |
+//! | `relative_error` | the three: norm of (predicted - measured) over norm of measured |
+//! | `joints` | {name: {`rms_nm`: the three, `measured_rms_nm`, `coverage`: share of instants within 1.96 sigma}}, of joints with a measured torque |
+//! | `sensors` | {name: {`rms`: the three, six numbers each}} |
+//! | `two_route_rms_nm`, `two_route_rms_mean_removed_nm` | {joint: the three}: RMS of the difference between the torque from one side's F/T sensor and from the other's, and the same without its mean |
+//! | `offsets` | {sensor: {`start`, `end`, `deviation`, `rate`: six numbers each, `breaks_s`}} |
+//! | `friction` | {joint: {`coulomb_nm`, `viscous`: Nm s/rad, `offset_nm`, `deviation`: of the three}} |
+
+use super::advice::{Advice, findings};
+use proprio_estimator::identify::{LogOutcome, Outcome, Role, Severity, Three, Verdict};
+use proprio_topics::Nanos;
+use serde_json::{Map, Value as Json, json};
+
+/// The outcome as JSON.
+pub(crate) fn summary(outcome: &Outcome, advice: &Advice) -> Json {
+    let (verdict, reason) = match &outcome.verdict {
+        Verdict::Identified => ("identified", None),
+        Verdict::NoBetterThanCad => ("no_better_than_cad", None),
+        Verdict::Nothing(reason) => ("nothing", Some(reason)),
+    };
+    let time_offsets: Vec<Json> = outcome
+        .logs
+        .iter()
+        .flat_map(|log| log.time_offsets.iter().map(move |offset| (log, offset)))
+        .map(|(log, o)| {
+            json!({ "log": log.file, "channel": o.channel, "seconds": o.seconds, "deviation": o.deviation, "significant": o.significant, "applied": o.applied })
+        })
+        .collect();
+    let found: Vec<Json> = findings(outcome)
+        .map(|(log, f)| {
+            json!({ "log": log.map(|l| &l.file), "severity": severity(f.severity), "code": f.code, "subject": f.subject, "text": f.text })
+        })
+        .collect();
+    let weakest: Vec<Json> = outcome
+        .weakest
+        .iter()
+        .map(|w| json!({ "expression": w.expression, "relative": w.relative, "prior_share": w.prior_share }))
+        .collect();
+    let links: Vec<Json> = outcome
+        .links
+        .iter()
+        .map(|l| {
+            json!({
+                "name": l.name, "seen": l.seen, "significance": l.significance,
+                "cad": l.cad.parameters(), "identified": l.identified.parameters(), "deviation": l.deviation,
+            })
+        })
+        .collect();
+    let base: Vec<Json> = outcome
+        .base_parameters
+        .iter()
+        .map(|b| json!({ "expression": b.expression, "unit": b.unit, "cad": b.cad, "identified": b.identified, "deviation": b.deviation }))
+        .collect();
+    let channels: Vec<Json> = outcome
+        .channels
+        .iter()
+        .map(|c| json!({ "name": c.name, "unit": c.unit, "deviation": c.deviation, "autocorrelation_s": c.autocorrelation_seconds, "drift": c.drift }))
+        .collect();
+    let c = &outcome.consistency;
+    json!({
+        "schema": 1, "robot": outcome.robot, "version": env!("CARGO_PKG_VERSION"),
+        "verdict": verdict, "reason": reason,
+        "advice": { "grade": advice.grade.word(), "why": advice.why, "next": advice.next },
+        "logs": outcome.logs.iter().map(log).collect::<Vec<_>>(),
+        "tau": outcome.tau, "shrink": outcome.shrink,
+        "unknowns": outcome.unknowns, "structural_rank": outcome.structural_rank, "rank": outcome.rank, "effective": outcome.effective,
+        "condition": outcome.condition, "singular_values": outcome.singular_values,
+        "weakest": weakest, "confused": outcome.confused, "time_offsets": time_offsets,
+        "consistency": { "feasible": c.feasible, "deviations": c.deviations, "links": c.links, "text": c.text },
+        "findings": found, "links": links, "base_parameters": base, "channels": channels,
+    })
+}
+
+fn log(log: &LogOutcome) -> Json {
+    let since = |t: Nanos| (t - log.span.0).seconds();
+    let left_out: Vec<Json> = log
+        .left_out
+        .iter()
+        .map(|l| json!({ "reason": l.reason, "instants": l.instants, "first_s": since(l.first), "last_s": since(l.last) }))
+        .collect();
+    let joints = object(&log.joints, |j| {
+        let rest = json!({ "rms_nm": three(&j.rms_nm), "measured_rms_nm": j.measured_rms_nm, "coverage": j.coverage });
+        (&j.name, rest)
+    });
+    let sensors = object(&log.sensors, |s| (&s.name, json!({ "rms": three(&s.rms) })));
+    let offsets = object(&log.offsets, |o| {
+        let breaks: Vec<f64> = o.breaks.iter().map(|t| since(*t)).collect();
+        (
+            &o.sensor,
+            json!({ "start": o.start, "end": o.end, "deviation": o.deviation, "rate": o.rate, "breaks_s": breaks }),
+        )
+    });
+    let friction = object(&log.friction, |f| {
+        (
+            &f.joint,
+            json!({ "coulomb_nm": f.coulomb_nm, "viscous": f.viscous, "offset_nm": f.offset_nm, "deviation": f.deviation }),
+        )
+    });
+    json!({
+        "file": log.file,
+        "role": role(log.role),
+        "span_s": since(log.span.1), "used": log.used, "left_out": left_out, "onset_s": log.onset.map(since),
+        "relative_error": three(&log.relative_error),
+        "joints": joints, "sensors": sensors,
+        "two_route_rms_nm": object(&log.two_route, |t| (&t.joint, three(&t.rms_nm))),
+        "two_route_rms_mean_removed_nm": object(&log.two_route, |t| (&t.joint, three(&t.rms_mean_removed_nm))),
+        "offsets": offsets, "friction": friction,
+    })
+}
+
+/// The three sets of parameters by name.
+fn three<T: serde::Serialize>(three: &Three<T>) -> Json {
+    json!({ "cad": three.cad, "cad_fitted": three.cad_fitted, "identified": three.identified })
+}
+
+fn object<'a, T>(items: &'a [T], entry: impl Fn(&'a T) -> (&'a String, Json)) -> Map<String, Json> {
+    items
+        .iter()
+        .map(|item| entry(item))
+        .map(|(name, value)| (name.clone(), value))
+        .collect()
+}
+
+/// A role's word.
+pub(crate) fn role(role: Role) -> &'static str {
+    match role {
+        Role::Train => "train",
+        Role::Validate => "validate",
+    }
+}
+
+/// A severity's word.
+pub(crate) fn severity(severity: Severity) -> &'static str {
+    match severity {
+        Severity::Note => "note",
+        Severity::Warning => "warning",
+        Severity::Refusal => "refusal",
+    }
+}

@@ -1,0 +1,621 @@
+//! Plots as SVG inside HTML, for a page that is read on a telephone and on a desk alike.
+//!
+//! Only the drawing is SVG, and it is stretched to the width of the page; everything that is read (ticks, legend, marks) is
+//! HTML placed over it in percent. So letters have the page's own size at any width, and colours come from the page's style sheet,
+//! which knows light and dark. Lines keep their width while they are stretched (`vector-effect`), dots are lines of no length with round
+//! ends. A drawing is made of integers between 0 and [`WIDE`], [`HIGH`], so that a curve costs some six bytes a point.
+
+use super::escape;
+use std::fmt::Write as _;
+
+/// Units of the drawing from left to right.
+const WIDE: f64 = 4000.0;
+/// Units of the drawing from top to bottom.
+const HIGH: f64 = 1500.0;
+/// About so many ticks on an axis.
+const TICKS: usize = 6;
+
+/// What a curve shows; its colour follows from it, the same in all plots of a page.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Ink {
+    /// What was measured, or the truth.
+    Measured,
+    /// The parameters of the CAD.
+    Cad,
+    /// The same with fitted offsets and friction.
+    Fitted,
+    /// The identified parameters.
+    Identified,
+}
+
+impl Ink {
+    /// Its class in the style sheet.
+    pub(crate) fn class(self) -> &'static str {
+        match self {
+            Self::Measured => "measured",
+            Self::Cad => "cad",
+            Self::Fitted => "fitted",
+            Self::Identified => "identified",
+        }
+    }
+}
+
+/// How something is drawn.
+#[derive(Debug, Clone)]
+pub(crate) enum Shape {
+    /// A line through points (x, y), ascending in x; a NaN breaks it.
+    Line(Vec<(f64, f64)>),
+    /// The area between two lines: (x, low, high).
+    Band(Vec<(f64, f64, f64)>),
+    /// Points with error bars: (x, y, low, high); without a bar where low or high is NaN.
+    Dots(Vec<(f64, f64, f64, f64)>),
+}
+
+/// One thing drawn.
+#[derive(Debug, Clone)]
+pub(crate) struct Series {
+    /// Its name in the legend; series without a name are not listed.
+    pub(crate) name: String,
+    /// Its colour.
+    pub(crate) ink: Ink,
+    /// How it is drawn.
+    pub(crate) shape: Shape,
+}
+
+impl Series {
+    pub(crate) fn line(name: &str, ink: Ink, points: Vec<(f64, f64)>) -> Self {
+        Self {
+            name: name.to_owned(),
+            ink,
+            shape: Shape::Line(points),
+        }
+    }
+
+    pub(crate) fn band(name: &str, ink: Ink, points: Vec<(f64, f64, f64)>) -> Self {
+        Self {
+            name: name.to_owned(),
+            ink,
+            shape: Shape::Band(points),
+        }
+    }
+
+    pub(crate) fn dots(name: &str, ink: Ink, points: Vec<(f64, f64, f64, f64)>) -> Self {
+        Self {
+            name: name.to_owned(),
+            ink,
+            shape: Shape::Dots(points),
+        }
+    }
+}
+
+/// How numbers lie on an axis.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) enum Scale {
+    #[default]
+    Linear,
+    /// Decades; what is not above 0 is not drawn.
+    Log,
+}
+
+/// One axis.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Axis {
+    /// What it counts, with its unit: `t [s]`.
+    pub(crate) label: String,
+    /// How.
+    pub(crate) scale: Scale,
+    /// From and to; none: from what is drawn.
+    pub(crate) range: Option<(f64, f64)>,
+}
+
+impl Axis {
+    pub(crate) fn new(label: &str) -> Self {
+        Self {
+            label: label.to_owned(),
+            ..Self::default()
+        }
+    }
+
+    pub(crate) fn log(label: &str) -> Self {
+        Self {
+            scale: Scale::Log,
+            ..Self::new(label)
+        }
+    }
+}
+
+/// A plot with its caption.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Plot {
+    /// What it is of.
+    pub(crate) title: String,
+    /// One sentence under the title; may be empty.
+    pub(crate) note: String,
+    /// Left to right.
+    pub(crate) x: Axis,
+    /// Bottom to top.
+    pub(crate) y: Axis,
+    /// What is drawn, the first undermost.
+    pub(crate) series: Vec<Series>,
+    /// Vertical lines: where, and what is there.
+    pub(crate) marks: Vec<(f64, String)>,
+    /// At most so many points of a line are drawn: peaks are kept.
+    pub(crate) most: usize,
+}
+
+impl Plot {
+    /// The plot as a `<figure>`.
+    pub(crate) fn html(&self) -> String {
+        let mut html = String::from("<figure><figcaption>");
+        let _ = write!(html, "<b>{}</b>", escape(&self.title));
+        if !self.note.is_empty() {
+            let _ = write!(html, " <span>{}</span>", escape(&self.note));
+        }
+        html.push_str("</figcaption>");
+        let Some((x, y)) = self.ranges() else {
+            html.push_str("<p class=\"none\">No data.</p></figure>");
+            return html;
+        };
+        let mut listed = self.series.iter().filter(|s| !s.name.is_empty()).peekable();
+        if listed.peek().is_some() {
+            html.push_str("<ul class=\"legend\">");
+            for series in listed {
+                let _ = write!(
+                    html,
+                    "<li class=\"{}{}\">{}</li>",
+                    series.ink.class(),
+                    series.shape.class(),
+                    escape(&series.name)
+                );
+            }
+            html.push_str("</ul>");
+        }
+        let _ = write!(
+            html,
+            "<div class=\"y-label\">{}</div><div class=\"plot\">",
+            y.label(&self.y.label)
+        );
+        let (x_ticks, y_ticks) = (x.ticks(TICKS), y.ticks(TICKS));
+        let _ = write!(
+            html,
+            "<svg viewBox=\"0 0 {WIDE} {HIGH}\" preserveAspectRatio=\"none\" role=\"img\" aria-label=\"{}\">",
+            escape(&self.title)
+        );
+        let mut grid = String::new();
+        for tick in &x_ticks {
+            let _ = write!(grid, "M{:.0} 0V{HIGH}", x.at(tick.0) * WIDE);
+        }
+        for tick in &y_ticks {
+            let _ = write!(grid, "M0 {:.0}H{WIDE}", (1.0 - y.at(tick.0)) * HIGH);
+        }
+        let _ = write!(html, "<path class=\"grid\" d=\"{grid}\"/>");
+        if y.from < 0.0 && y.to > 0.0 && y.scale == Scale::Linear {
+            let _ = write!(
+                html,
+                "<path class=\"axis\" d=\"M0 {:.0}H{WIDE}\"/>",
+                (1.0 - y.at(0.0)) * HIGH
+            );
+        }
+        for series in &self.series {
+            self.draw(series, &x, &y, &mut html);
+        }
+        for (at, _) in &self.marks {
+            if (x.from..=x.to).contains(at) {
+                let _ = write!(html, "<path class=\"mark\" d=\"M{:.0} 0V{HIGH}\"/>", x.at(*at) * WIDE);
+            }
+        }
+        html.push_str("</svg>");
+        for (value, text) in &y_ticks {
+            let _ = write!(
+                html,
+                "<span class=\"y\" style=\"top:{:.1}%\">{text}</span>",
+                (1.0 - y.at(*value)) * 100.0
+            );
+        }
+        for (value, text) in &x_ticks {
+            let _ = write!(
+                html,
+                "<span class=\"x\" style=\"left:{:.1}%\">{text}</span>",
+                x.at(*value) * 100.0
+            );
+        }
+        for (at, text) in &self.marks {
+            let place = x.at(*at);
+            if !(0.0..=1.0).contains(&place) {
+                continue;
+            }
+            // Above the plot, written towards its middle, so that it does not leave it.
+            let (side, percent) = if place > 0.5 {
+                ("right", 1.0 - place)
+            } else {
+                ("left", place)
+            };
+            let _ = write!(
+                html,
+                "<span class=\"m\" style=\"{side}:{:.1}%\">{}</span>",
+                percent * 100.0,
+                escape(text)
+            );
+        }
+        let _ = write!(
+            html,
+            "</div><div class=\"x-label\">{}</div></figure>",
+            x.label(&self.x.label)
+        );
+        html
+    }
+
+    /// The ranges of both axes; none if there is nothing to draw.
+    fn ranges(&self) -> Option<(Range, Range)> {
+        let (mut x, mut y) = (Extent::default(), Extent::default());
+        for series in &self.series {
+            match &series.shape {
+                Shape::Line(points) => {
+                    for &(px, py) in points {
+                        if px.is_finite() && py.is_finite() {
+                            x.see(px, self.x.scale);
+                            y.see(py, self.y.scale);
+                        }
+                    }
+                }
+                // A band may be so wide, before anything is known, that nothing else could be seen: it is cut by the plot.
+                Shape::Band(points) => {
+                    for &(px, low, high) in points {
+                        if px.is_finite() && low.is_finite() && high.is_finite() {
+                            x.see(px, self.x.scale);
+                        }
+                    }
+                }
+                Shape::Dots(points) => {
+                    for &(px, py, low, high) in points {
+                        if px.is_finite() && py.is_finite() {
+                            x.see(px, self.x.scale);
+                            for value in [py, low, high] {
+                                y.see(value, self.y.scale);
+                            }
+                        }
+                    }
+                }
+            }
+        }
+        Some((x.range(&self.x, 0.0)?, y.range(&self.y, 0.06)?))
+    }
+
+    fn draw(&self, series: &Series, x: &Range, y: &Range, html: &mut String) {
+        let class = series.ink.class();
+        let place = |px: f64, py: f64| (x.at(px) * WIDE, (1.0 - y.at(py)) * HIGH);
+        match &series.shape {
+            Shape::Line(points) => {
+                let points = thin(points, if self.most == 0 { 1000 } else { self.most });
+                let mut path = Path::default();
+                for (px, py) in points {
+                    if py.is_finite() && px.is_finite() && !(y.scale == Scale::Log && py <= 0.0) {
+                        path.to(place(px, py));
+                    } else {
+                        path.lift();
+                    }
+                }
+                let _ = write!(html, "<path class=\"line {class}\" d=\"{}\"/>", path.text);
+            }
+            Shape::Band(points) => {
+                let step = points
+                    .len()
+                    .div_ceil(if self.most == 0 { 400 } else { (self.most / 2).max(60) })
+                    .max(1);
+                let points: Vec<_> = points.iter().step_by(step).collect();
+                let mut path = Path::default();
+                for run in points.split(|(_, low, high)| !low.is_finite() || !high.is_finite()) {
+                    path.lift();
+                    run.iter().for_each(|(px, _, high)| path.to(place(*px, *high)));
+                    run.iter().rev().for_each(|(px, low, _)| path.to(place(*px, *low)));
+                    if !run.is_empty() {
+                        path.text.push('z');
+                    }
+                }
+                let _ = write!(html, "<path class=\"band {class}\" d=\"{}\"/>", path.text);
+            }
+            Shape::Dots(points) => {
+                let (mut bars, mut dots) = (String::new(), String::new());
+                for &(px, py, low, high) in points {
+                    if !px.is_finite() || !py.is_finite() || (y.scale == Scale::Log && py <= 0.0) {
+                        continue;
+                    }
+                    let (cx, cy) = place(px, py);
+                    let _ = write!(dots, "M{cx:.0} {cy:.0}h0");
+                    if low.is_finite() && high.is_finite() && low < high {
+                        let _ = write!(bars, "M{cx:.0} {:.0}V{:.0}", place(px, low).1, place(px, high).1);
+                    }
+                }
+                if !bars.is_empty() {
+                    let _ = write!(html, "<path class=\"line {class}\" d=\"{bars}\"/>");
+                }
+                let _ = write!(html, "<path class=\"dots {class}\" d=\"{dots}\"/>");
+            }
+        }
+    }
+}
+
+impl Shape {
+    fn class(&self) -> &'static str {
+        match self {
+            Self::Line(_) => "",
+            Self::Band(_) => " wide",
+            Self::Dots(_) => " round",
+        }
+    }
+}
+
+/// At most about `most` of `points`: of each stretch of x its lowest and its highest, in their order, so that no peak is lost.
+fn thin(points: &[(f64, f64)], most: usize) -> Vec<(f64, f64)> {
+    if points.len() <= most {
+        return points.to_vec();
+    }
+    let size = points.len().div_ceil((most / 2).max(1));
+    let mut thinned = Vec::with_capacity(most + 2);
+    for part in points.chunks(size) {
+        let mut ends: Option<(usize, usize)> = None;
+        for (i, (_, value)) in part.iter().enumerate() {
+            if !value.is_finite() {
+                continue;
+            }
+            let (low, high) = ends.unwrap_or((i, i));
+            let below = part.get(low).is_some_and(|p| *value < p.1);
+            let above = part.get(high).is_some_and(|p| *value > p.1);
+            ends = Some((if below { i } else { low }, if above { i } else { high }));
+        }
+        match ends {
+            Some((low, high)) => {
+                let (first, last) = (low.min(high), low.max(high));
+                thinned.extend(part.get(first));
+                // A gap between the two stays one.
+                if part
+                    .get(first..last)
+                    .is_some_and(|p| p.iter().any(|(_, y)| !y.is_finite()))
+                {
+                    thinned.push((f64::NAN, f64::NAN));
+                }
+                if last != first {
+                    thinned.extend(part.get(last));
+                }
+                if part.last().is_some_and(|(_, y)| !y.is_finite()) {
+                    thinned.push((f64::NAN, f64::NAN));
+                }
+            }
+            None => thinned.push((f64::NAN, f64::NAN)),
+        }
+    }
+    thinned
+}
+
+/// SVG path data of whole numbers: the first point of a run in full, the others as steps.
+#[derive(Default)]
+struct Path {
+    text: String,
+    last: Option<(i64, i64)>,
+}
+
+impl Path {
+    fn to(&mut self, (x, y): (f64, f64)) {
+        // Far outside is as good as just outside: the plot cuts it.
+        let next = (
+            x.clamp(-WIDE, 2.0 * WIDE).round() as i64,
+            y.clamp(-HIGH, 2.0 * HIGH).round() as i64,
+        );
+        let _ = match self.last {
+            None => write!(self.text, "M{} {}", next.0, next.1),
+            Some(last) if last == next => Ok(()),
+            Some(last) => write!(self.text, "l{} {}", next.0 - last.0, next.1 - last.1),
+        };
+        self.last = Some(next);
+    }
+
+    fn lift(&mut self) {
+        self.last = None;
+    }
+}
+
+/// The least and the greatest of numbers.
+struct Extent(f64, f64);
+
+impl Default for Extent {
+    fn default() -> Self {
+        Self(f64::INFINITY, f64::NEG_INFINITY)
+    }
+}
+
+impl Extent {
+    fn see(&mut self, value: f64, scale: Scale) {
+        if value.is_finite() && (scale == Scale::Linear || value > 0.0) {
+            *self = Self(self.0.min(value), self.1.max(value));
+        }
+    }
+
+    /// The axis' range, `margin` of it added at both ends.
+    fn range(&self, axis: &Axis, margin: f64) -> Option<Range> {
+        let (from, to) = match axis.range {
+            Some(range) => range,
+            None if self.0 > self.1 => return None,
+            None if axis.scale == Scale::Log => ((self.0.log10() - 0.1).floor(), (self.1.log10() + 0.1).ceil()),
+            None => {
+                // One value alone still has a place to be in.
+                let room = (self.1 - self.0).max(self.1.abs().max(self.0.abs()) * 1e-9).max(1e-9) * margin;
+                (self.0 - room, self.1 + room)
+            }
+        };
+        (from < to).then_some(Range {
+            from,
+            to,
+            scale: axis.scale,
+        })
+    }
+}
+
+/// From and to on an axis; decades on a logarithmic one.
+#[derive(Debug, Clone, Copy)]
+struct Range {
+    from: f64,
+    to: f64,
+    scale: Scale,
+}
+
+impl Range {
+    /// Where `value` lies: 0 at the start, 1 at the end.
+    fn at(&self, value: f64) -> f64 {
+        let value = if self.scale == Scale::Log { value.log10() } else { value };
+        (value - self.from) / (self.to - self.from)
+    }
+
+    /// About `count` round values with their texts.
+    fn ticks(&self, count: usize) -> Vec<(f64, String)> {
+        if self.scale == Scale::Log {
+            let step = ((self.to - self.from) / count as f64).ceil().max(1.0) as i64;
+            let (first, last) = (self.from.ceil() as i64, self.to.floor() as i64);
+            return (first..=last)
+                .filter(|decade| decade.rem_euclid(step) == 0)
+                .map(|decade| {
+                    (
+                        10f64.powi(decade as i32),
+                        format!("10<sup>{decade}</sup>").replace('-', "−"),
+                    )
+                })
+                .collect();
+        }
+        let step = self.step(count);
+        let (first, last) = ((self.from / step).ceil() as i64, (self.to / step).floor() as i64);
+        let unit = 10f64.powi(self.power());
+        let decimals = (-(step / unit).log10() - 1e-9).ceil().max(0.0) as usize;
+        (first..=last)
+            .map(|i| {
+                let value = i as f64 * step;
+                let text = if i == 0 {
+                    "0".into()
+                } else {
+                    format!("{:.decimals$}", value / unit).replace('-', "−")
+                };
+                (value, text)
+            })
+            .collect()
+    }
+
+    /// The step between about `count` round values.
+    fn step(&self, count: usize) -> f64 {
+        let rough = (self.to - self.from) / count as f64;
+        let decade = 10f64.powf(rough.log10().floor());
+        let steps = [1.0, 2.0, 5.0, 10.0].map(|m| m * decade);
+        steps.into_iter().find(|s| *s >= rough * 0.999).unwrap_or(decade)
+    }
+
+    /// The power of ten that all ticks are written in: 0 unless their texts would be long.
+    fn power(&self) -> i32 {
+        let largest = self.from.abs().max(self.to.abs());
+        if self.scale == Scale::Log || (self.step(TICKS) >= 1e-3 && largest < 1e5) {
+            0
+        } else {
+            largest.log10().floor() as i32
+        }
+    }
+
+    /// An axis' label in HTML, with the power of ten of its ticks.
+    fn label(&self, label: &str) -> String {
+        match self.power() {
+            0 => escape(label),
+            power => format!("{} · 10<sup>{power}</sup>", escape(label)).replace('-', "−"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn line(points: Vec<(f64, f64)>) -> Plot {
+        Plot {
+            title: "a < b".into(),
+            x: Axis::new("t [s]"),
+            y: Axis::new("Nm"),
+            series: vec![Series::line("s", Ink::Cad, points)],
+            ..Plot::default()
+        }
+    }
+
+    #[test]
+    fn a_line_goes_from_corner_to_corner_and_breaks_at_a_nan() {
+        let mut plot = line(vec![(0.0, 0.0), (1.0, 1.0), (2.0, f64::NAN), (3.0, 0.5), (4.0, 1.0)]);
+        plot.y.range = Some((0.0, 1.0));
+        let html = plot.html();
+        assert!(
+            html.contains("<path class=\"line cad\" d=\"M0 1500l1000 -1500M3000 750l1000 -750\"/>"),
+            "{html}"
+        );
+        assert!(html.contains("a &lt; b") && html.contains(">t [s]<"), "{html}");
+    }
+
+    #[test]
+    fn nothing_finite_is_said_in_words() {
+        for points in [vec![], vec![(0.0, f64::NAN)], vec![(1.0, 1.0)]] {
+            let html = line(points).html();
+            assert!(html.contains("No data.") && !html.contains("<svg"), "{html}");
+        }
+    }
+
+    #[test]
+    fn ticks_are_round_numbers_inside_the_range() {
+        let range = Range {
+            from: -0.013,
+            to: 0.027,
+            scale: Scale::Linear,
+        };
+        let texts: Vec<String> = range.ticks(5).into_iter().map(|t| t.1).collect();
+        assert_eq!(texts, ["−0.01", "0", "0.01", "0.02"]);
+        let range = Range {
+            from: -7.0,
+            to: 2.0,
+            scale: Scale::Log,
+        };
+        let texts: Vec<String> = range.ticks(5).into_iter().map(|t| t.1).collect();
+        assert_eq!(
+            texts,
+            [
+                "10<sup>−6</sup>",
+                "10<sup>−4</sup>",
+                "10<sup>−2</sup>",
+                "10<sup>0</sup>",
+                "10<sup>2</sup>"
+            ]
+        );
+        for decade in -9..9 {
+            for lead in [1.0, 1.7, 2.3, 4.9, 7.7] {
+                let to = lead * 10f64.powi(decade);
+                let ticks = Range {
+                    from: 0.0,
+                    to,
+                    scale: Scale::Linear,
+                }
+                .ticks(5);
+                assert!((3..=7).contains(&ticks.len()), "{to}: {ticks:?}");
+                assert!(
+                    ticks
+                        .iter()
+                        .all(|t| (0.0..=to).contains(&t.0) && t.1.chars().count() < 7),
+                    "{to}: {ticks:?}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn thinning_keeps_peaks_and_gaps() {
+        let mut points: Vec<(f64, f64)> = (0..10_000).map(|i| (f64::from(i), f64::from(i).sin())).collect();
+        points[4321].1 = 20.0;
+        points[7777].1 = -30.0;
+        for point in &mut points[5000..5600] {
+            point.1 = f64::NAN;
+        }
+        let thinned = thin(&points, 500);
+        assert!(thinned.len() <= 520, "{}", thinned.len());
+        assert!(thinned.contains(&(4321.0, 20.0)) && thinned.contains(&(7777.0, -30.0)));
+        let gap = thinned.windows(2).any(|w| w[0].0 < 5000.0 && w[1].0 > 5599.0);
+        assert!(!gap, "a line across the gap");
+        assert!(thinned.iter().map(|p| p.0).filter(|x| !x.is_nan()).is_sorted());
+    }
+}
