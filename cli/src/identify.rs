@@ -46,6 +46,9 @@ const FILES: [&str; 4] = ["summary.json", "parameters.toml", "identified.urdf", 
 /// Identifies.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let (config, setup) = load(&args.config)?;
+    // Now, because it may be a result of an earlier run.
+    let urdf =
+        fs::read_to_string(&config.model).with_context(|| format!("{}: can not be read", config.model.display()))?;
     let files: Vec<(&PathBuf, Role)> = args
         .log
         .iter()
@@ -102,6 +105,15 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let json = summary::summary(&outcome, &advice);
     let mut text = serde_json::to_string_pretty(&json)?;
     text.push('\n');
+    if !matches!(outcome.verdict, Verdict::Nothing(_)) {
+        let parameters = identify::parameters(&outcome, &setup, concat!("proprio ", env!("CARGO_PKG_VERSION")))?;
+        let file = args.out.join("parameters.toml");
+        parameters.save(&file).with_context(|| file.display().to_string())?;
+        let urdf = parameters
+            .urdf(&urdf, &setup)
+            .with_context(|| config.model.display().to_string())?;
+        write(&args.out, "identified.urdf", &urdf)?;
+    }
     // The summary comes last: where it is, the others are.
     write(&args.out, "report.html", &page::page(&outcome, &advice))?;
     write(&args.out, "summary.json", &text)?;

@@ -9,7 +9,7 @@
 //!     -> the most probable bodies under CAD's prior, and its weight                            prior
 //!     -> what is left -> noise of each channel -> again, until it stays                        noise
 //!     -> held-out data: what gains nothing is shrunk to CAD                                    batch
-//!     -> Outcome: parameters, covariance, figures per log, in words                            assess
+//!     -> Outcome: parameters, covariance, figures per log, in words                            assess, export
 //! ```
 //! [`identify`] does all of it. Parameters belong to the robot and are common to all logs; offsets and friction belong to a log.
 //!
@@ -26,6 +26,7 @@
 mod assess;
 mod batch;
 pub mod consistent;
+mod export;
 pub mod information;
 pub mod instants;
 mod noise;
@@ -36,6 +37,7 @@ mod rows;
 mod session;
 
 pub use batch::{IdentifyError, Log, Options, Progress, identify};
+pub use export::parameters;
 pub use outcome::{
     BaseParameterOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding, FrictionOutcome, JointOutcome,
     LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, SensorOutcome, Severity, Spectrum, Three,

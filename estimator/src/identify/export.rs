@@ -1,0 +1,264 @@
+//! What identification gives, as what the estimator starts from: an [`Outcome`] to [`Parameters`].
+
+use super::outcome::{LogOutcome, Outcome, Role, Unknown};
+use crate::parameters::{Friction, Offset, Parameters, ParametersError, Provenance, Span};
+use crate::setup::{Setup, Use};
+use crate::spatial::Wrench;
+use nalgebra::DMatrix;
+
+/// The identified parameters of `setup`'s robot: links that the logs reach, with their covariance; offsets and friction as they were at the end of the last training log. `program` is the
+/// name and version of what identified them.
+///
+/// # Errors
+/// The outcome is not of this setup's robot, or has a body that can not exist or numbers that are not finite.
+pub fn parameters(outcome: &Outcome, setup: &Setup, program: &str) -> Result<Parameters, ParametersError> {
+    let trained = || outcome.logs.iter().filter(|log| log.role == Role::Train);
+    let provenance = Provenance {
+        program: program.to_owned(),
+        tau: outcome.tau.is_finite().then_some(outcome.tau),
+        logs: trained()
+            .map(|log| Span {
+                file: log.file.clone(),
+                start: log.span.0,
+                end: log.span.1,
+            })
+            .collect(),
+    };
+    let mut parameters = Parameters::new(setup, provenance);
+
+    let columns = &outcome.covariance.columns;
+    let place = |unknown: Unknown| columns.iter().position(|column| *column == unknown);
+    let (mut inertias, mut offsets, mut places) = (Vec::new(), Vec::new(), Vec::new());
+    for link in &outcome.links {
+        let of_link = (0..10).filter_map(|parameter| {
+            place(Unknown::Inertial {
+                link: link.link,
+                parameter,
+            })
+        });
+        let of_link: Vec<usize> = of_link.collect();
+        if of_link.len() == 10 {
+            inertias.push((link.link, link.identified));
+            places.extend(of_link);
+        }
+    }
+    for channel in setup.channels() {
+        let Use::Sensor(sensor) = channel.role else { continue };
+        let of_sensor = (0..6).filter_map(|component| place(Unknown::Offset { sensor, component }));
+        let of_sensor: Vec<usize> = of_sensor.collect();
+        let last = trained()
+            .rev()
+            .find_map(|log| Some((log, log.offsets.iter().find(|o| o.sensor == channel.name)?)));
+        let (Some((log, offset)), 6) = (last, of_sensor.len()) else {
+            continue;
+        };
+        offsets.push(Offset {
+            sensor: channel.name.clone(),
+            reading: wrench(&offset.end),
+            drift: wrench(&offset.rate),
+            known: log.span.1,
+        });
+        places.extend(of_sensor);
+    }
+    // Of a covariance U U^T, rows of U stand for unknowns; of root^T root, columns do.
+    let upper = &outcome.covariance.root;
+    let root = DMatrix::from_fn(upper.ncols(), places.len(), |i, j| {
+        places
+            .get(j)
+            .and_then(|row| upper.get((*row, i)))
+            .copied()
+            .unwrap_or(f64::NAN)
+    });
+    parameters.set_identified(&inertias, &offsets, &root)?;
+
+    let friction: Vec<Friction> = trained()
+        .rev()
+        .find(|log| !log.friction.is_empty())
+        .map(frictions)
+        .unwrap_or_default();
+    parameters.set_friction(&friction)?;
+    Ok(parameters)
+}
+
+/// A wrench of `[fx fy fz tx ty tz]`.
+fn wrench([fx, fy, fz, tx, ty, tz]: &[f64; 6]) -> Wrench {
+    Wrench::from_parts([*fx, *fy, *fz], [*tx, *ty, *tz])
+}
+
+fn frictions(log: &LogOutcome) -> Vec<Friction> {
+    log.friction
+        .iter()
+        .map(|f| Friction {
+            joint: f.joint.clone(),
+            coulomb: f.coulomb_nm,
+            viscous: f.viscous,
+            offset: f.offset_nm,
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use crate::identify::{Consistency, CovarianceRoot, LinkOutcome, OffsetOutcome, Three, Verdict};
+    use crate::spatial::RigidInertia;
+    use proprio_topics::Nanos;
+    use std::path::Path;
+
+    fn setup() -> Setup {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/icub_left_arm/estimator.toml");
+        Setup::new(&Config::load(&file).unwrap()).unwrap()
+    }
+
+    /// Two links and the sensor of the arm, with any covariance.
+    fn outcome(setup: &Setup) -> Outcome {
+        let links = setup
+            .model
+            .inertias()
+            .iter()
+            .enumerate()
+            .map(|(link, cad)| LinkOutcome {
+                link,
+                name: setup.model.link_name(link).to_owned(),
+                cad: *cad,
+                floored: None,
+                identified: RigidInertia::from_parameters(&cad.parameters().map(|p| 1.1 * p)),
+                deviation: [0.0; 10],
+                significance: 0.0,
+                seen: link == 3 || link == 5,
+            });
+        // Offsets before links, and the later link before the earlier one: places are told by the columns alone.
+        let mut columns: Vec<Unknown> = (0..6)
+            .map(|component| Unknown::Offset { sensor: 0, component })
+            .collect();
+        for link in [5, 3] {
+            columns.extend((0..10).map(|parameter| Unknown::Inertial { link, parameter }));
+        }
+        let root = DMatrix::from_fn(26, 26, |i, j| {
+            if i <= j {
+                ((i * 31 + j * 17) as f64).sin() * 1e-3
+            } else {
+                0.0
+            }
+        });
+        let log = |file: &str, role, end| LogOutcome {
+            file: file.into(),
+            role,
+            span: (Nanos(1), Nanos(1_000_000_001)),
+            used: 1,
+            left_out: vec![],
+            onset: None,
+            relative_error: Three::default(),
+            joints: vec![],
+            sensors: vec![],
+            two_route: vec![],
+            offsets: vec![OffsetOutcome {
+                sensor: "l_arm_ft_sensor".into(),
+                start: [0.0; 6],
+                end,
+                deviation: [0.0; 6],
+                rate: [0.1, 0.2, 0.3, 0.01, 0.02, 0.03],
+                breaks: vec![],
+            }],
+            friction: vec![],
+            time_offsets: vec![],
+            findings: vec![],
+            curves: vec![],
+            spectra: vec![],
+        };
+        let consistency = Consistency {
+            feasible: true,
+            deviations: 0.0,
+            links: vec![],
+            text: String::new(),
+        };
+        Outcome {
+            robot: setup.robot.clone(),
+            verdict: Verdict::Identified,
+            links: links.collect(),
+            covariance: CovarianceRoot { columns, root },
+            tau: 0.5,
+            shrink: 1.0,
+            unknowns: 20,
+            rank: 9,
+            structural_rank: 9,
+            effective: 9.0,
+            condition: 1.0,
+            singular_values: vec![],
+            weakest: vec![],
+            confused: vec![],
+            base_parameters: vec![],
+            channels: vec![],
+            consistency,
+            logs: vec![
+                log("train.csv", Role::Train, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),
+                log("validate.csv", Role::Validate, [9.0; 6]),
+            ],
+            findings: vec![],
+        }
+    }
+
+    #[test]
+    fn what_is_identified_arrives_with_its_uncertainty() {
+        let setup = setup();
+        let outcome = outcome(&setup);
+        let given = parameters(&outcome, &setup, "a program 1").unwrap();
+        assert_eq!(given.identified().collect::<Vec<_>>(), [3, 5]);
+        assert_eq!(given.inertia(5), Some(outcome.links[5].identified));
+        let covariance = &outcome.covariance.root * outcome.covariance.root.transpose();
+        let close = |a: f64, b: f64| (a - b).abs() <= 1e-8 * b.abs();
+        for (link, first) in [(5, 6), (3, 16)] {
+            let deviation = given.deviation(link).expect("an identified link's");
+            for (i, d) in deviation.iter().enumerate() {
+                assert!(
+                    close(*d, covariance[(first + i, first + i)].sqrt()),
+                    "link {link}, {i}: {d}"
+                );
+            }
+        }
+        // Covariances too, between the two links and with the offset.
+        let root = given.root();
+        let got = root.transpose() * &root;
+        let place = |i: usize| {
+            if i < 10 {
+                16 + i
+            } else if i < 20 {
+                i - 4
+            } else {
+                i - 20
+            }
+        };
+        for i in 0..26 {
+            for j in 0..26 {
+                let scale = (covariance[(place(i), place(i))] * covariance[(place(j), place(j))]).sqrt();
+                assert!(
+                    (got[(i, j)] - covariance[(place(i), place(j))]).abs() < 1e-7 * scale,
+                    "{i}, {j}"
+                );
+            }
+        }
+        // Of the training log, force first in the outcome.
+        let [offset] = given.offsets() else {
+            panic!("one sensor")
+        };
+        assert_eq!(offset.reading, Wrench::from_parts([1.0, 2.0, 3.0], [4.0, 5.0, 6.0]));
+        assert_eq!(offset.drift, Wrench::from_parts([0.1, 0.2, 0.3], [0.01, 0.02, 0.03]));
+        assert_eq!(
+            (offset.sensor.as_str(), offset.known),
+            ("l_arm_ft_sensor", Nanos(1_000_000_001))
+        );
+        assert_eq!(given.provenance().logs.len(), 1);
+        // And it is this robot's: the text of the file reads back as the same.
+        given.check_setup(&setup).unwrap();
+        assert_eq!(Parameters::parse(&given.to_string()).unwrap(), given);
+    }
+
+    #[test]
+    fn numbers_that_are_not_are_refused() {
+        let setup = setup();
+        let mut outcome = outcome(&setup);
+        outcome.covariance.root[(2, 2)] = f64::NAN;
+        assert!(parameters(&outcome, &setup, "").is_err());
+    }
+}
