@@ -719,8 +719,8 @@ fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Tru
             name.clone(),
             "",
             vec![
-                Series::line("truth", Ink::Measured, real),
                 Series::line("estimated", Ink::Identified, estimated),
+                Series::line("truth", Ink::Measured, real),
             ],
         ));
         plots.push(plot(

@@ -185,7 +185,9 @@ impl Table {
 pub(crate) fn facts(facts: &[(&str, String)]) -> String {
     let rows: String = facts
         .iter()
-        .map(|(name, value)| format!("<div><dt>{}</dt><dd>{}</dd></div>", escape(name), escape(value)))
+        // A number and its unit stay on one line.
+        .map(|(name, value)| (escape(name), escape(value).replace(" %", "\u{a0}%")))
+        .map(|(name, value)| format!("<div><dt>{name}</dt><dd>{value}</dd></div>"))
         .collect();
     format!("<dl class=\"facts\">{rows}</dl>")
 }

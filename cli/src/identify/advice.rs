@@ -268,3 +268,104 @@ fn capital(text: &str) -> String {
         .next()
         .map_or_else(String::new, |c| c.to_uppercase().chain(letters).collect())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::example;
+    use super::*;
+
+    /// Nothing to complain of.
+    fn good() -> Outcome {
+        let mut outcome = example::outcome();
+        outcome.logs.iter_mut().for_each(|log| log.findings.clear());
+        outcome
+    }
+
+    #[test]
+    fn a_validated_result_without_findings_is_accepted() {
+        let advice = Advice::of(&good());
+        assert_eq!(advice.grade, Grade::Accept, "{advice:?}");
+        let why = advice.why.join(" ");
+        assert!(
+            why.starts_with("On walk_2.csv, which was not used for the fit, "),
+            "{why}"
+        );
+        assert!(why.contains("2.35 % off, with the CAD's parameters 6.40 %"), "{why}");
+        assert!(advice.next.iter().any(|n| n.contains("parameters.toml")));
+        assert!(
+            !advice.next.iter().any(|n| n.contains("--validate")),
+            "{:?}",
+            advice.next
+        );
+    }
+
+    #[test]
+    fn what_is_worse_than_cad_where_it_was_not_fitted_is_rejected() {
+        let mut outcome = good();
+        outcome.logs[1].relative_error.identified = 0.07;
+        let advice = Advice::of(&outcome);
+        assert_eq!(advice.grade, Grade::Reject);
+        assert!(
+            !advice.next.iter().any(|n| n.contains("parameters.toml")),
+            "{:?}",
+            advice.next
+        );
+        // No better is not good enough to be accepted without a word.
+        outcome.logs[1].relative_error.identified = 0.064;
+        assert_eq!(Advice::of(&outcome).grade, Grade::Care);
+    }
+
+    #[test]
+    fn without_validation_that_is_the_next_thing_to_do() {
+        let mut outcome = good();
+        outcome.logs.pop();
+        let advice = Advice::of(&outcome);
+        assert!(
+            advice.next.iter().any(|n| n.contains("--validate")),
+            "{:?}",
+            advice.next
+        );
+        assert!(advice.why.iter().any(|n| n.contains("No log was kept for validation")));
+    }
+
+    #[test]
+    fn impossible_bodies_findings_and_no_gain_each_lower_the_grade() {
+        let mut outcome = good();
+        outcome.consistency.feasible = false;
+        assert_eq!(Advice::of(&outcome).grade, Grade::Reject);
+        assert_eq!(Advice::of(&example::outcome()).grade, Grade::Care);
+        let mut outcome = good();
+        outcome.verdict = Verdict::NoBetterThanCad;
+        assert_eq!(Advice::of(&outcome).grade, Grade::Care);
+        let mut outcome = good();
+        outcome.findings.push(Finding {
+            severity: Severity::Warning,
+            code: "wrong_sign",
+            subject: "r_leg_ft_sensor".into(),
+            text: "r_leg_ft_sensor seems to be mounted the wrong way round".into(),
+        });
+        let advice = Advice::of(&outcome);
+        assert_eq!(advice.grade, Grade::Care);
+        assert!(
+            advice
+                .next
+                .iter()
+                .any(|n| n == "r_leg_ft_sensor seems to be mounted the wrong way round."),
+            "{advice:?}"
+        );
+    }
+
+    #[test]
+    fn nothing_is_a_rejection_that_says_why() {
+        let advice = Advice::of(&example::nothing());
+        assert_eq!(advice.grade, Grade::Reject);
+        assert_eq!(advice.why[0], "Nothing was identified: no joint moved in any log.");
+    }
+
+    #[test]
+    fn names_keep_their_letters() {
+        assert_eq!(sentence("l_hand.m is wrong"), "l_hand.m is wrong.");
+        assert_eq!(sentence("no motion "), "No motion.");
+        assert_eq!(sentence("Fine!"), "Fine!");
+    }
+}

@@ -149,7 +149,7 @@ fn three<T: serde::Serialize>(three: &Three<T>) -> Json {
 fn object<'a, T>(items: &'a [T], entry: impl Fn(&'a T) -> (&'a String, Json)) -> Map<String, Json> {
     items
         .iter()
-        .map(|item| entry(item))
+        .map(entry)
         .map(|(name, value)| (name.clone(), value))
         .collect()
 }
@@ -168,5 +168,82 @@ pub(crate) fn severity(severity: Severity) -> &'static str {
         Severity::Note => "note",
         Severity::Warning => "warning",
         Severity::Refusal => "refusal",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::example;
+    use super::*;
+
+    #[test]
+    fn the_keys_that_programs_rely_on_are_there_and_numbers_that_are_not_are_null() {
+        let outcome = example::outcome();
+        let json = summary(&outcome, &Advice::of(&outcome));
+        let text = json.to_string();
+        assert!(!text.contains("NaN") && serde_json::from_str::<Json>(&text).is_ok());
+        let log = &json["logs"][0];
+        assert_eq!((&log["file"], &log["role"]), (&json!("walk_1.csv"), &json!("train")));
+        assert_eq!(json["logs"][1]["role"], "validate");
+        assert_eq!(
+            log["relative_error"],
+            json!({ "cad": null, "cad_fitted": 0.064, "identified": 0.0235 })
+        );
+        assert_eq!(
+            log["joints"]["r_knee"]["rms_nm"],
+            json!({ "cad": 0.9, "cad_fitted": 0.2, "identified": 0.07 })
+        );
+        let rms = &log["sensors"]["r_leg_ft_sensor"]["rms"];
+        assert_eq!(rms["cad"], json!([null, null, null, null, null, null]));
+        assert_eq!(rms["identified"], json!([0.4, 0.9, 0.45, 0.1, 0.09, 0.04]));
+        assert_eq!(log["two_route_rms_nm"]["r_knee"]["identified"], 0.13);
+        assert_eq!(
+            (&json["tau"], &json["rank"], &json["condition"]),
+            (&json!(0.58), &json!(31), &json!(3.2e5))
+        );
+        assert_eq!(json["weakest"].as_array().map(Vec::len), Some(20));
+        assert_eq!(json["time_offsets"][0]["channel"], "r_leg_ft_sensor");
+        assert_eq!(json["consistency"]["feasible"], true);
+        assert_eq!(log["onset_s"], 4.0);
+        assert_eq!(
+            log["left_out"][1],
+            json!({ "reason": "contact declared: right_foot", "instants": 240, "first_s": 12.0, "last_s": 14.4 })
+        );
+        assert_eq!(json["findings"][0]["log"], Json::Null);
+        assert_eq!(json["findings"][1]["code"], "jump");
+    }
+
+    #[test]
+    fn every_key_is_documented() {
+        let text = include_str!("summary.rs");
+        let documented = |key: &str| {
+            text.lines()
+                .any(|line| line.starts_with("//!") && line.contains(&format!("`{key}`")))
+        };
+        let outcome = example::outcome();
+        let json = summary(&outcome, &Advice::of(&outcome));
+        let mut objects = vec![&json, &json["logs"][0]];
+        for list in [
+            "findings",
+            "links",
+            "base_parameters",
+            "channels",
+            "weakest",
+            "time_offsets",
+        ] {
+            objects.push(&json[list][0]);
+        }
+        objects.extend([&json["consistency"], &json["advice"], &json["logs"][0]["left_out"][0]]);
+        objects.extend([
+            &json["logs"][0]["offsets"]["r_leg_ft_sensor"],
+            &json["logs"][0]["friction"]["r_knee"],
+            &json["logs"][0]["joints"]["r_knee"],
+        ]);
+        for object in objects {
+            let object = object.as_object().expect("an object");
+            for key in object.keys() {
+                assert!(documented(key), "{key} is not documented");
+            }
+        }
     }
 }
