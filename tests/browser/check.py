@@ -6,7 +6,7 @@
 A report must log no error and ask the network for nothing, be no wider than the screen, be smaller than 2 MB; every figure must have a caption and
 something drawn; no text may leave its box, be smaller than 10 px, or lie upon another tick's text. Folded parts are unfolded first.
 
-Exits 0 if all is well, 1 if not (one line per fault), 3 without a browser: one of chromium-headless-shell, chromium, chromium-browser, google-chrome, or what
+Exits 0 if all is well, 1 if not (one line per fault), 4 if the browser fails, 3 without one: one of chromium-headless-shell, chromium, chromium-browser, google-chrome, or what
 CHROMIUM names. Needs nothing else: the browser is spoken to through its debugging pipe (file descriptors 3 and 4, messages end with a zero byte).
 """
 
@@ -39,21 +39,22 @@ LOOK = r"""
   if (!document.querySelector('h1')) faults.push('no heading');
   for (const figure of document.querySelectorAll('figure')) {
     const caption = figure.querySelector('figcaption');
-    if (!caption || !caption.textContent.trim()) faults.push('a figure without a caption');
+    const name = caption ? caption.textContent.trim() : '';
+    if (!name) faults.push('a figure without a caption');
     if (figure.querySelector('.none')) continue;
     const drawn = [...figure.querySelectorAll('svg path.line, svg path.dots')].filter(p => (p.getAttribute('d') || '').length > 3);
     const box = figure.querySelector('svg') && figure.querySelector('svg').getBoundingClientRect();
-    if (!drawn.length || !box || box.width < 100 || box.height < 80) faults.push(`figure ${caption && caption.textContent}: nothing is drawn`);
+    if (!drawn.length || !box || box.width < 100 || box.height < 80) faults.push(`figure ${name}: nothing is drawn`);
     for (const path of drawn) {
       const p = path.getBBox();
-      if (p.width <= 0 && p.height <= 0 && !path.classList.contains('dots')) faults.push(`figure ${caption.textContent}: an empty path`);
-      if (getComputedStyle(path).stroke === 'none') faults.push(`figure ${caption.textContent}: a line without a colour`);
+      if (p.width <= 0 && p.height <= 0 && !path.classList.contains('dots')) faults.push(`figure ${name}: an empty path`);
+      if (getComputedStyle(path).stroke === 'none') faults.push(`figure ${name}: a line without a colour`);
     }
     for (const kind of ['x', 'y', 'm']) {
       const ticks = [...figure.querySelectorAll(`.plot > span.${kind}`)].map(t => [t, t.getBoundingClientRect()]);
-      if (kind !== 'm' && ticks.length < 2) faults.push(`figure ${caption.textContent}: fewer than two ticks along ${kind}`);
+      if (kind !== 'm' && ticks.length < 2) faults.push(`figure ${name}: fewer than two ticks along ${kind}`);
       ticks.forEach(([t, a], i) => ticks.slice(i + 1).forEach(([u, b]) => {
-        if (a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom) faults.push(`figure ${caption.textContent}: ${what(t)} lies upon ${what(u)}`);
+        if (a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom) faults.push(`figure ${name}: ${what(t)} lies upon ${what(u)}`);
       }));
     }
   }
@@ -238,4 +239,8 @@ def main():
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except (OSError, RuntimeError) as error:
+        print(f"the browser could not be asked: {error}", file=sys.stderr)
+        sys.exit(4)

@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::thread;
 
-const VERBS: [&str; 8] = [
+const VERBS: [&str; 9] = [
     "demo",
     "gateway",
     "estimator",
@@ -26,6 +26,7 @@ const VERBS: [&str; 8] = [
     "decode",
     "encode",
     "estimate",
+    "identify",
     "doctor",
 ];
 
