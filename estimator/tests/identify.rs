@@ -34,7 +34,6 @@ fn between(log: &str, from: f64, to: f64) -> String {
 }
 
 fn run(setup: &Setup, logs: &[(&str, Role, &str)], inputs: &[IdentificationInput]) -> Outcome {
-    let clock = std::time::Instant::now();
     let mut texts: Vec<&[u8]> = logs.iter().map(|log| log.2.as_bytes()).collect();
     let logs = logs.iter().zip(&mut texts).map(|((file, role, _), samples)| Log {
         file: (*file).to_owned(),
@@ -46,7 +45,6 @@ fn run(setup: &Setup, logs: &[(&str, Role, &str)], inputs: &[IdentificationInput
     };
     let outcome = identify(setup, logs.collect(), &options, &mut |_| {}).expect("an outcome");
     describe(&outcome);
-    println!("took {:.2} s", clock.elapsed().as_secs_f64());
     outcome
 }
 
