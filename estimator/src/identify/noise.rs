@@ -185,7 +185,7 @@ mod tests {
                 level + 0.5 * n
             })
             .collect();
-        let (step, variance) = random_walk(&[series.clone()], 1.0);
+        let (step, variance) = random_walk(std::slice::from_ref(&series), 1.0);
         assert!((step.sqrt() / 0.05 - 1.0).abs() < 0.25, "{step}");
         assert!((variance.sqrt() / 0.5 - 1.0).abs() < 0.05, "{variance}");
         let (slow, rest) = random_walk(&[series], 1e-3);
