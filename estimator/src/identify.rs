@@ -13,6 +13,8 @@
 //! ```
 //! [`identify`] does all of it. Parameters belong to the robot and are common to all logs; offsets and friction belong to a log.
 //!
+//! The same while the robot works, once a second: [`online`], which the pipeline feeds.
+//!
 //! # What is known when
 //! Nothing is fitted to a validation log but its offsets and friction, for CAD and for the identified parameters alike. No weight is chosen by hand: noise comes from residuals, the
 //! prior's weight from the evidence ([`prior`]), and both are the same rules for every robot. What motion does not show stays as in CAD, and its uncertainty says so.
@@ -30,6 +32,7 @@ mod export;
 pub mod information;
 pub mod instants;
 mod noise;
+pub mod online;
 mod outcome;
 mod passes;
 pub mod prior;

@@ -446,6 +446,17 @@ impl Information {
         (root, DVector::from_iterator(n, self.triangle.right_sides()))
     }
 
+    /// Becomes what `other` is. Does not allocate.
+    ///
+    /// # Errors
+    /// The other is about another number of unknowns. Nothing is changed then.
+    pub fn copy_from(&mut self, other: &Self) -> Result<(), InformationError> {
+        check_size("unknowns of the other information", other.unknowns(), self.unknowns())?;
+        self.triangle.values.copy_from_slice(&other.triangle.values);
+        (self.residual, self.rows) = (other.residual, other.rows);
+        Ok(())
+    }
+
     /// Takes in the panel's rows and leaves the panel empty. Does not allocate.
     ///
     /// # Errors

@@ -1,0 +1,1256 @@
+//! Identification while the robot works: rows in at every instant, a solution once a second, on two sides of a wall that neither waits at.
+//!
+//! ```text
+//! Online::observe (data plane)   rows of each component -> block of 0.1 s -> gate -> [R | z]          fixed time, no allocation
+//! Online::take_job -> Job::run (any thread)   [R | z] + prior -> bodies, offsets, covariance, noise, changes
+//! Online::give_back, Online::apply            from the stamp (snapshot + 1 s) on, the solution is what is in force
+//! ```
+//!
+//! What a solution says, and from which instant on it is in force, depends on the stamps and values observed alone: live and replayed alike, provided
+//! that jobs come back before their stamp. Those that do not are applied later, and counted ([`Counts::late`]).
+//!
+//! # Components
+//! Sub-trees that can be free of contacts hang together by the F/T sensors that they share. Each such *component* has a square-root information of its own
+//! over `[offsets of its sensors | parameters of its links]`, relative to the configuration's offsets and to CAD. A sub-tree with unknown contacts gives the combinations
+//! of its six equations that these do not reach: none at all under a full wrench.
+//!
+//! # Noise
+//! Rows are whitened with *inflated* variances: a channel's residual variance times its integrated autocorrelation time, both found by every [`Job`] from the rows of the
+//! last second under the newest solution, and averaged over half a minute. Never less than the configured variance.
+//!
+//! # Gating
+//! A block goes in one block after it was gathered, and only if that and the next are clean: its mean innovation, whitened by the predictive covariance `P + R`, is
+//! tested against chi-square. What fails is a contact that nobody declared, an outlier, a jump of an offset, or another load: rows are kept aside, the component is
+//! [`Paused::Suspected`] and says so. If it lasts three seconds while the sensors tilt, the rows put aside are asked what they are. If the same information with offsets that
+//! start afresh explains them, the offsets do; if with new parameters of the outermost links it does, a load has changed; else it stays a contact.
+//! Offsets wander between blocks (random walks at a bounded rate), and stand still while a contact is declared or suspected.
+
+use std::sync::Arc;
+
+use nalgebra::DMatrix;
+use proprio_topics::{Nanos, Reason};
+
+use super::information::{Information, InformationError, Panel};
+use super::prior::{GREATEST_TAU, Posterior, Prior, PriorError};
+use crate::dynamics::{ContactSet, DofSet, DynamicsError, Kinematics, Structure};
+use crate::model::Model;
+use crate::regressor::{StackedRegressor, Weighting};
+use crate::spatial::{RigidInertia, Vec3, Wrench};
+
+/// Ten parameters per link.
+const WIDTH: usize = 10;
+/// How long rows are gathered before the gate judges them.
+const BLOCK: Nanos = Nanos::from_millis(100);
+/// How often there is a solution, and how long after its data it is in force.
+const SOLVE: Nanos = Nanos::from_millis(1000);
+/// The gate's level, in standard deviations of a normal distribution: one false alarm in millions of independent blocks.
+const GATE: f64 = 5.0;
+/// So many clean blocks end a suspicion.
+const CLEAN: u32 = 3;
+/// Innovations of one kind for so long, while the sensors tilt, are no contact but a change.
+const PERSISTENT: f64 = 3.0;
+/// Innovations that nothing explains are given in to after so long [s].
+const HOPELESS: f64 = 30.0;
+/// By how much sensors must tilt meanwhile, as the cosine of the angle: 20 degrees. A weight and a push can not be told apart at rest.
+const TILTED: f64 = 0.94;
+/// Mean square of what a change leaves of the rows' innovations, in units of inflated noise, up to which it explains them.
+const EXPLAINED: f64 = 2.0;
+/// Standard deviation of an offset before anything is known of it [Nm], [N]: no sensor is that far off.
+const OFFSET: [f64; 2] = [100.0, 1000.0];
+/// How far an offset wanders in a second, in standard deviations of its channel's noise.
+const WANDER: f64 = 0.1;
+/// How much the noise is inflated before it is known, and for how many instants' worth that counts.
+const INFLATION: f64 = 30.0;
+const INFLATION_WORTH: f64 = 300.0;
+/// How many instants the noise is averaged over.
+const MEMORY: f64 = 3000.0;
+/// Lags of autocorrelation that are looked at [instants].
+const LAGS: usize = 64;
+/// Window of the autocorrelation time, in such times (Sokal 1997).
+const SOKAL: f64 = 6.0;
+
+/// Why nothing can be identified on-line.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum OnlineError {
+    /// No sub-tree with an F/T sensor can ever be free of contacts.
+    #[error(
+        "nothing can be identified on-line: no part of the robot between F/T sensors can be free of contacts; give contacts that come and go presence = \"possible\""
+    )]
+    Nothing,
+    /// Sizes that do not go together.
+    #[error(transparent)]
+    Dynamics(#[from] DynamicsError),
+    /// CAD that is no starting point.
+    #[error(transparent)]
+    Prior(#[from] PriorError),
+    /// An earlier state that does not fit.
+    #[error(transparent)]
+    Information(#[from] InformationError),
+}
+
+/// All that is observed at one instant.
+#[derive(Clone, Copy, Debug)]
+pub struct Observation<'a> {
+    /// The instant; later than the last one.
+    pub t: Nanos,
+    /// Poses and motions of all links.
+    pub kinematics: &'a Kinematics,
+    /// F/T readings as they come, offsets not removed, in their measurement frames; finite also where a sensor is at fault.
+    pub readings: &'a [Wrench],
+    /// Contacts that are present.
+    pub active: &'a ContactSet,
+    /// What speaks against the motion of the base.
+    pub base: Reason,
+    /// What speaks against each joint's motion.
+    pub joints: &'a [Reason],
+    /// What speaks against each sensor's reading.
+    pub sensors: &'a [Reason],
+}
+
+/// Why a component learns nothing at present.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Paused {
+    /// It learns.
+    #[default]
+    No,
+    /// A contact is declared that leaves none of its equations.
+    Contact,
+    /// Its sensors read what neither noise nor its knowledge's uncertainty explains: a contact that nobody declared, an outlier, a change.
+    Suspected,
+    /// A channel that it needs is at fault.
+    Fault(Reason),
+}
+
+impl std::fmt::Display for Paused {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::No => write!(f, "identification goes on"),
+            Self::Contact => write!(f, "identification pauses: a contact is declared"),
+            Self::Suspected => write!(
+                f,
+                "identification pauses: the readings do not fit what is known; a contact that is not declared, or a change"
+            ),
+            Self::Fault(reason) => write!(f, "identification pauses: a channel is at fault ({reason:?})"),
+        }
+    }
+}
+
+/// A change that was found, and what was let go of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Change {
+    /// The sensors' offsets have jumped, and start afresh.
+    Offset,
+    /// The outermost links have another load, and their parameters start afresh.
+    Load,
+    /// For half a minute neither of these explained the readings, nor did anybody declare a contact: all starts afresh.
+    Unknown,
+}
+
+impl std::fmt::Display for Change {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Offset => "an F/T offset has jumped: offsets are learnt anew",
+            Self::Load => "the robot carries another load: the parameters of its outermost links are learnt anew",
+            Self::Unknown => "the readings have long not fitted what was known: everything is learnt anew",
+        })
+    }
+}
+
+/// What became of a component's instants.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Instants whose rows went in.
+    pub learnt: u64,
+    /// Instants left out under a declared contact.
+    pub contact: u64,
+    /// Instants left out because they did not fit.
+    pub suspected: u64,
+    /// Instants left out because of a channel.
+    pub fault: u64,
+    /// Changes found.
+    pub changes: u64,
+    /// Solutions that came after their stamp.
+    pub late: u64,
+    /// Solutions that could not be found.
+    pub failed: u64,
+}
+
+/// What is known of a component from some instant on.
+#[derive(Clone, Debug, Default)]
+pub struct ComponentSolution {
+    /// Its links.
+    pub links: Vec<usize>,
+    /// Their inertias: of bodies that can exist.
+    pub bodies: Vec<RigidInertia>,
+    /// Its sensors.
+    pub sensors: Vec<usize>,
+    /// Their offsets, raw reading less true one, in their measurement frames.
+    pub offsets: Vec<Wrench>,
+    /// A root `U` of the covariance `P = U^T U` over [ten per link | torque, force of each sensor's offset].
+    pub root: DMatrix<f64>,
+    /// How far each offset wanders in a second [Nm/s^½, N/s^½], [torque; force].
+    pub drift: Vec<[f64; 6]>,
+    /// The prior's weight; not a number before the first solution.
+    pub tau: f64,
+    /// How many parameters the data determine, rather than the prior.
+    pub effective: f64,
+    /// `[s | d]`, and a factor `F` of its covariance `F F^T`, column by column.
+    estimate: Vec<f64>,
+    factor: Vec<f64>,
+}
+
+/// What a job found.
+#[derive(Clone, Debug, Default)]
+pub struct Solution {
+    /// The stamp of the newest data in it.
+    pub data: Nanos,
+    /// Of each component.
+    pub components: Vec<ComponentSolution>,
+}
+
+/// Rows of some instants, whitened, over `[s | d | right side]`.
+#[derive(Clone, Debug)]
+struct Rows {
+    width: usize,
+    /// Rows that fit in.
+    room: usize,
+    values: Vec<f64>,
+    /// Of each row, the instant's number in the grid.
+    slots: Vec<i64>,
+}
+
+impl Rows {
+    fn new(width: usize, room: usize) -> Self {
+        Self {
+            width,
+            room,
+            values: Vec::with_capacity(width * room),
+            slots: Vec::with_capacity(room),
+        }
+    }
+
+    fn len(&self) -> usize {
+        self.slots.len()
+    }
+
+    fn clear(&mut self) {
+        self.values.clear();
+        self.slots.clear();
+    }
+
+    /// Adds a row if there is room.
+    fn push(&mut self, slot: i64, row: &[f64]) {
+        if self.len() < self.room {
+            self.values.extend_from_slice(row);
+            self.slots.push(slot);
+        }
+    }
+
+    fn take_from(&mut self, other: &Self) {
+        for (row, slot) in other.iter().zip(&other.slots) {
+            self.push(*slot, row);
+        }
+    }
+
+    fn iter(&self) -> impl Iterator<Item = &[f64]> {
+        self.values.chunks_exact(self.width)
+    }
+
+    fn instants(&self) -> u64 {
+        let new = self.slots.windows(2).filter(|two| two[0] != two[1]).count() as u64;
+        new + u64::from(!self.slots.is_empty())
+    }
+}
+
+/// Sub-trees that sensors join, and what is known of them.
+#[derive(Clone, Debug)]
+struct Component {
+    subtrees: Vec<usize>,
+    links: Vec<usize>,
+    sensors: Vec<usize>,
+    /// Joints whose motion its rows rest on.
+    dofs: DofSet,
+    /// Contacts on its links that come and go.
+    passing: ContactSet,
+    /// CAD and configured offsets, `[s | d]`.
+    reference: Vec<f64>,
+    /// Per sub-tree, the component's column of each of its columns.
+    columns: Vec<Vec<usize>>,
+    /// Columns of the links at the ends of its limbs.
+    outermost: Vec<usize>,
+    information: Information,
+    panel: Panel,
+    variances: Vec<f64>,
+    /// Standard deviations of a second of drift.
+    wander: Vec<f64>,
+    /// Columns of the offsets.
+    offsets: Vec<usize>,
+    deviations: Vec<f64>,
+    gathered: Rows,
+    pending: Rows,
+    /// For the next job: what went in, what was put aside.
+    learnt: Rows,
+    aside: Rows,
+    block_from: Nanos,
+    drifted: Nanos,
+    active: ContactSet,
+    is_suspected: bool,
+    clean: u32,
+    /// When the present suspicion began, and how the proper acceleration pointed then; the least cosine to it since.
+    since: Nanos,
+    direction: Vec3,
+    cosine: f64,
+    /// Whether what is in force can be trusted to judge rows.
+    judges: bool,
+    paused: Paused,
+    last_change: Option<Change>,
+    counts: Counts,
+    row: Vec<f64>,
+    scratch: Scratch,
+}
+
+/// Room for the rows of an instant, and for the gate.
+#[derive(Clone, Debug)]
+struct Scratch {
+    /// Rows over `[s | d | right side]`.
+    rows: Vec<f64>,
+    covariance: Vec<f64>,
+    mean: Vec<f64>,
+    projected: Vec<f64>,
+}
+
+/// Identification of a robot's inertial parameters and F/T offsets, on-line. See the [module](self).
+#[derive(Debug)]
+pub struct Online {
+    stacked: StackedRegressor,
+    components: Vec<Component>,
+    period: Nanos,
+    newest: Nanos,
+    job: Option<Box<Job>>,
+    /// When the job's snapshot was taken; none while nothing was observed.
+    snapshot: Option<Nanos>,
+    is_away: bool,
+    /// Whether the stamp of the job that is away has passed.
+    is_overdue: bool,
+    late: u64,
+    solution: Solution,
+}
+
+impl Online {
+    /// Nothing known but `cad`, one inertia per link, and `offsets`, one per sensor. One instant is expected per `period`. `always` are the contacts that are never absent.
+    ///
+    /// # Errors
+    /// [`OnlineError`].
+    pub fn new(
+        model: &Model,
+        structure: &Structure,
+        cad: &[RigidInertia],
+        offsets: &[Wrench],
+        always: &ContactSet,
+        base: usize,
+        period: Nanos,
+    ) -> Result<Self, OnlineError> {
+        let kinematics = Kinematics::new(model, base)?;
+        let mut stacked = StackedRegressor::new(structure);
+        let readings = vec![Wrench::zero(); structure.sensors().len()];
+        stacked.update(&kinematics, &readings, always, &[])?;
+        stacked.eliminate_contacts(Weighting::Noise);
+        // Sub-trees that can be free, and which of them share a sensor.
+        let is_free: Vec<bool> = stacked
+            .subtrees()
+            .iter()
+            .map(|subtree| subtree.remaining() > 0 && subtree.sensors().len() > 0)
+            .collect();
+        let mut group: Vec<usize> = (0..is_free.len()).collect();
+        for sensor in 0..structure.sensors().len() {
+            let sharing: Vec<usize> = (0..is_free.len())
+                .filter(|&k| is_free[k] && structure.subtrees()[k].sensors.contains(sensor))
+                .collect();
+            if let [a, b] = sharing[..] {
+                let (from, to) = (group[a].max(group[b]), group[a].min(group[b]));
+                group.iter_mut().filter(|g| **g == from).for_each(|g| *g = to);
+            }
+        }
+        let per_job = usize::try_from(2 * SOLVE.0 / period.0.max(1)).unwrap_or(0).max(1);
+        let per_block = usize::try_from(BLOCK.0 / period.0.max(1)).unwrap_or(0) + 2;
+        let components: Vec<Component> = (0..is_free.len())
+            .filter(|&k| is_free[k] && group[k] == k)
+            .map(|first| {
+                let subtrees = (0..is_free.len())
+                    .filter(|&k| is_free[k] && group[k] == first)
+                    .collect();
+                Component::new(
+                    model, &stacked, subtrees, cad, offsets, always, base, per_job, per_block,
+                )
+            })
+            .collect();
+        if components.is_empty() {
+            return Err(OnlineError::Nothing);
+        }
+        let prior = Arc::new(Prior::new(cad)?);
+        let solution = Solution {
+            data: Nanos::MIN,
+            components: components.iter().map(|c| c.unknown(cad, offsets)).collect(),
+        };
+        let job = Box::new(Job {
+            prior,
+            data: Nanos::MIN,
+            parts: components.iter().map(Part::new).collect(),
+            solution: solution.clone(),
+        });
+        Ok(Self {
+            stacked,
+            components,
+            period,
+            newest: Nanos::MIN,
+            job: Some(job),
+            snapshot: None,
+            is_away: false,
+            is_overdue: false,
+            late: 0,
+            solution,
+        })
+    }
+
+    /// Begins where earlier identification ended: these links have these inertias, `root^T root` being the covariance of their ten parameters each, in this order. Their errors are taken as
+    /// Gaussian about them; the prior about CAD stays, which they have heard once already: it counts twice, and little beside them.
+    ///
+    /// # Errors
+    /// The root has another width, or a covariance that is not positive definite in some component. Nothing is changed then in that component and those after it.
+    pub fn begin_with(
+        &mut self,
+        cad: &[RigidInertia],
+        links: &[(usize, RigidInertia)],
+        root: &DMatrix<f64>,
+    ) -> Result<(), OnlineError> {
+        let width = WIDTH * links.len();
+        if root.ncols() != width {
+            let (what, got, expected) = ("columns of the covariance's root", root.ncols(), width);
+            return Err(InformationError::Size { what, got, expected }.into());
+        }
+        for (component, known) in self.components.iter_mut().zip(&mut self.solution.components) {
+            let (session, unknowns) = (component.offsets.len(), component.information.unknowns());
+            // Columns in the component, columns of the root, and what the parameters are beside CAD.
+            let mut columns = Vec::new();
+            for (place, link) in component.links.iter().enumerate() {
+                let Some(at) = links.iter().position(|(number, _)| number == link) else {
+                    continue;
+                };
+                let (found, cad) = (links[at].1.parameters(), cad[*link].parameters());
+                columns.extend((0..WIDTH).map(|i| (session + WIDTH * place + i, WIDTH * at + i, found[i] - cad[i])));
+                known.bodies[place] = links[at].1;
+            }
+            if columns.is_empty() {
+                continue;
+            }
+            // U of these columns alone, by their deviations: P = S U^T U S, so that the whitened error is U^-T S^-1 (d - d_0).
+            let mut own = DMatrix::from_fn(root.nrows(), columns.len(), |i, j| root[(i, columns[j].1)]);
+            let deviations: Vec<f64> = own.column_iter().map(|column| column.norm()).collect();
+            for (mut column, deviation) in own.column_iter_mut().zip(&deviations) {
+                column /= *deviation;
+            }
+            let upper = own.qr().r();
+            let inverse = upper
+                .transpose()
+                .try_inverse()
+                .filter(|inverse| inverse.iter().all(|x| x.is_finite()));
+            let Some(inverse) = inverse.filter(|_| upper.nrows() == columns.len()) else {
+                return Err(InformationError::Undetermined { unknown: columns[0].0 }.into());
+            };
+            let mut panel = Panel::new(unknowns, columns.len());
+            for whitened in inverse.row_iter() {
+                let (mut row, mut right) = (vec![0.0; unknowns], 0.0);
+                for ((&(column, _, value), deviation), weight) in columns.iter().zip(&deviations).zip(whitened.iter()) {
+                    row[column] = weight / deviation;
+                    right += row[column] * value;
+                }
+                panel.push_row(&row, right)?;
+            }
+            component.information.absorb(&mut panel)?;
+            // In force from the beginning, offsets being unknown; if every link is among them.
+            if columns.len() == WIDTH * component.links.len() {
+                let total = columns.len() + session;
+                known.root = DMatrix::zeros(total, total);
+                for (j, deviation) in deviations.iter().enumerate() {
+                    for i in 0..=j {
+                        known.root[(i, j)] = upper[(i, j)] * deviation;
+                    }
+                }
+                for i in 0..session {
+                    known.root[(columns.len() + i, columns.len() + i)] = OFFSET[usize::from(i % 6 > 2)];
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Number of components.
+    pub fn component_count(&self) -> usize {
+        self.components.len()
+    }
+
+    /// Why a component learns nothing at present, and what became of its instants so far; none if there is no such component.
+    pub fn state(&self, component: usize) -> Option<(Paused, Counts)> {
+        let of = self.components.get(component)?;
+        Some((
+            of.paused,
+            Counts {
+                late: self.late,
+                ..of.counts
+            },
+        ))
+    }
+
+    /// How much a component's noise is inflated: variance of each channel [torque; force of each sensor] by the configured one. Empty if there is no such component.
+    pub fn inflation(&self, component: usize) -> Vec<f64> {
+        let of = self.components.get(component);
+        of.map_or(Vec::new(), |of| {
+            let least = of.wander.iter().map(|wander| (wander / WANDER).powi(2));
+            of.variances.iter().zip(least).map(|(v, least)| v / least).collect()
+        })
+    }
+
+    /// What is in force.
+    pub fn solution(&self) -> &Solution {
+        &self.solution
+    }
+
+    /// Takes in what is observed at an instant. Does not allocate.
+    ///
+    /// # Errors
+    /// Sizes, or numbers that are not finite; then nothing was taken in.
+    pub fn observe(&mut self, observation: &Observation<'_>) -> Result<(), DynamicsError> {
+        let Observation {
+            t,
+            kinematics,
+            readings,
+            active,
+            ..
+        } = *observation;
+        if t <= self.newest {
+            return Ok(());
+        }
+        self.stacked.update(kinematics, readings, active, &[])?;
+        self.stacked.eliminate_contacts(Weighting::Noise);
+        self.newest = t;
+        self.snapshot.get_or_insert(t);
+        let slot = t.0.div_euclid(self.period.0.max(1));
+        for (component, known) in self.components.iter_mut().zip(&self.solution.components) {
+            component.observe(observation, &self.stacked, known, slot);
+        }
+        Ok(())
+    }
+
+    /// Once a second a job to run; none while the last one has not come back or waits for its stamp. Does not allocate.
+    pub fn take_job(&mut self) -> Option<Box<Job>> {
+        let due = self.snapshot? + SOLVE;
+        if self.is_away || self.newest < due {
+            return None;
+        }
+        let mut job = self.job.take()?;
+        self.is_away = true;
+        self.snapshot = Some(self.newest);
+        job.data = self.newest;
+        for (part, component) in job.parts.iter_mut().zip(&mut self.components) {
+            // Made for the same unknowns.
+            let _ = part.information.copy_from(&component.information);
+            std::mem::swap(&mut part.learnt, &mut component.learnt);
+            std::mem::swap(&mut part.aside, &mut component.aside);
+            component.learnt.clear();
+            component.aside.clear();
+            part.is_suspected = component.is_suspected;
+            part.lasting = (self.newest - component.since).seconds();
+            part.cosine = component.cosine;
+            part.variances.copy_from_slice(&component.variances);
+        }
+        Some(job)
+    }
+
+    /// Gives a job back that has run.
+    pub fn give_back(&mut self, job: Box<Job>) {
+        self.job = Some(job);
+    }
+
+    /// Puts the job's solution in force if its stamp has come: whether something changed. Call it before [`Online::take_job`], after each instant. Does not allocate.
+    pub fn apply(&mut self) -> bool {
+        let Some(due) = self.snapshot.filter(|_| self.is_away).map(|snapshot| snapshot + SOLVE) else {
+            return false;
+        };
+        if self.newest < due {
+            return false;
+        }
+        let Some(job) = &mut self.job else {
+            self.is_overdue = true;
+            return false;
+        };
+        self.is_away = false;
+        self.late += u64::from(std::mem::take(&mut self.is_overdue));
+        std::mem::swap(&mut self.solution, &mut job.solution);
+        for (part, component) in job.parts.iter_mut().zip(&mut self.components) {
+            component.variances.copy_from_slice(&part.variances);
+            component.judges = !part.has_failed;
+            component.counts.failed += u64::from(part.has_failed);
+            if let Some((change, information)) = &mut part.change {
+                component.last_change = Some(*change);
+                std::mem::swap(information, &mut component.information);
+                // The solution in force is the one of before the change; the next one knows of it.
+                component.judges = false;
+                component.is_suspected = false;
+                component.paused = Paused::No;
+                component.counts.changes += 1;
+                component.pending.clear();
+                component.gathered.clear();
+            }
+        }
+        true
+    }
+
+    /// The last change that was found in a component ([`Counts::changes`] tells how many there were).
+    pub fn last_change(&self, component: usize) -> Option<Change> {
+        self.components.get(component)?.last_change
+    }
+}
+
+impl Component {
+    #[allow(clippy::too_many_arguments, reason = "one caller, which has them all")]
+    fn new(
+        model: &Model,
+        stacked: &StackedRegressor,
+        subtrees: Vec<usize>,
+        cad: &[RigidInertia],
+        offsets: &[Wrench],
+        always: &ContactSet,
+        base: usize,
+        per_job: usize,
+        per_block: usize,
+    ) -> Self {
+        let structure = stacked.structure();
+        let mut links: Vec<usize> = subtrees.iter().flat_map(|&k| structure.links_of(k)).collect();
+        let mut sensors: Vec<usize> = subtrees.iter().flat_map(|&k| stacked.subtrees()[k].sensors()).collect();
+        for list in [&mut links, &mut sensors] {
+            list.sort_unstable();
+            list.dedup();
+        }
+        let session = 6 * sensors.len();
+        let unknowns = session + WIDTH * links.len();
+        let place = |list: &[usize], of: usize| list.binary_search(&of).unwrap_or(0);
+        let columns: Vec<Vec<usize>> = subtrees
+            .iter()
+            .map(|&k| {
+                let subtree = &stacked.subtrees()[k];
+                let of_links = subtree.links().iter().flat_map(|&link| {
+                    let first = session + WIDTH * place(&links, link);
+                    first..first + WIDTH
+                });
+                let of_sensors = subtree.sensors().flat_map(|sensor| {
+                    let first = 6 * place(&sensors, sensor);
+                    first..first + 6
+                });
+                of_links.chain(of_sensors).collect()
+            })
+            .collect();
+        // The way from the base to each link, and back: a joint on both is crossed by neither.
+        let way = |mut link: usize| {
+            let mut dofs = DofSet::default();
+            while link > 0 {
+                let joint = &model.joints()[link - 1];
+                if let Some(dof) = joint.dof {
+                    dofs.insert(dof);
+                }
+                link = joint.parent;
+            }
+            dofs
+        };
+        let dofs = links.iter().fold(way(base), |dofs, &link| dofs.union(&way(link)));
+        let parents: Vec<usize> = model.joints().iter().map(|joint| joint.parent).collect();
+        let outermost = (links.iter().enumerate())
+            .filter(|(_, link)| !parents.contains(link))
+            .flat_map(|(place, _)| session + WIDTH * place..session + WIDTH * (place + 1))
+            .collect();
+        let mut reference: Vec<f64> = sensors.iter().flat_map(|&s| torque_first(&offsets[s])).collect();
+        reference.extend(links.iter().flat_map(|&link| cad[link].parameters()));
+        let noise: Vec<f64> = (sensors.iter())
+            .flat_map(|&s| {
+                let noise = structure.sensors()[s].noise();
+                torque_first(&Wrench::from_parts(noise.force, noise.torque))
+            })
+            .collect();
+        let passing = (subtrees.iter())
+            .fold(ContactSet::default(), |set, &k| {
+                set.union(&structure.subtrees()[k].contacts)
+            })
+            .difference(always);
+        let (width, most) = (unknowns + 1, 6 * subtrees.len());
+        Self {
+            dofs,
+            passing,
+            reference,
+            columns,
+            outermost,
+            information: Information::new(unknowns),
+            panel: Panel::new(unknowns, most * per_block),
+            variances: noise.iter().map(|sigma| INFLATION * sigma * sigma).collect(),
+            wander: noise.iter().map(|sigma| WANDER * sigma).collect(),
+            offsets: (0..session).collect(),
+            deviations: vec![0.0; session],
+            gathered: Rows::new(width, most * per_block),
+            pending: Rows::new(width, most * per_block),
+            learnt: Rows::new(width, most * per_job),
+            aside: Rows::new(width, most * per_job),
+            block_from: Nanos::MIN,
+            drifted: Nanos::MIN,
+            active: ContactSet::default(),
+            is_suspected: false,
+            clean: 0,
+            since: Nanos::MIN,
+            direction: Vec3::zeros(),
+            cosine: 1.0,
+            judges: false,
+            paused: Paused::No,
+            last_change: None,
+            counts: Counts::default(),
+            row: vec![0.0; width],
+            scratch: Scratch {
+                rows: Vec::with_capacity(most * width),
+                covariance: vec![0.0; most * most],
+                mean: vec![0.0; most * width],
+                projected: vec![0.0; most * unknowns],
+            },
+            subtrees,
+            links,
+            sensors,
+        }
+    }
+
+    /// A solution that says nothing.
+    fn unknown(&self, cad: &[RigidInertia], offsets: &[Wrench]) -> ComponentSolution {
+        ComponentSolution {
+            links: self.links.clone(),
+            bodies: self.links.iter().map(|&link| cad[link]).collect(),
+            sensors: self.sensors.clone(),
+            offsets: self.sensors.iter().map(|&sensor| offsets[sensor]).collect(),
+            root: DMatrix::zeros(0, WIDTH * self.links.len() + 6 * self.sensors.len()),
+            drift: self
+                .wander
+                .chunks_exact(6)
+                .map(|six| std::array::from_fn(|i| six[i]))
+                .collect(),
+            tau: f64::NAN,
+            ..ComponentSolution::default()
+        }
+    }
+
+    fn observe(&mut self, seen: &Observation<'_>, stacked: &StackedRegressor, known: &ComponentSolution, slot: i64) {
+        let t = seen.t;
+        if self.block_from == Nanos::MIN {
+            (self.block_from, self.drifted) = (t, t);
+        }
+        let passing = self.passing.intersection(seen.active);
+        if passing != self.active {
+            // Who declares a touch may be a little late, and who declares its end a little early.
+            self.counts.contact += self.gathered.instants() + self.pending.instants();
+            self.gathered.clear();
+            self.pending.clear();
+            self.active = passing;
+            (self.block_from, self.drifted) = (t, t);
+        }
+        if t - self.block_from >= BLOCK {
+            self.close(t, known);
+            self.block_from = t;
+        }
+        let of_sensors = self.sensors.iter().filter_map(|&s| seen.sensors.get(s));
+        let of_joints = self.dofs.iter().filter_map(|dof| seen.joints.get(dof));
+        let fault = std::iter::once(&seen.base).chain(of_sensors).chain(of_joints);
+        if let Some(reason) = fault.copied().find(|reason| *reason != Reason::None) {
+            self.paused = Paused::Fault(reason);
+            self.counts.fault += 1;
+            return;
+        }
+        let rows = self.rows_of(stacked);
+        if rows == 0 {
+            self.paused = Paused::Contact;
+            self.counts.contact += 1;
+            return;
+        }
+        self.paused = if self.is_suspected {
+            Paused::Suspected
+        } else {
+            Paused::No
+        };
+        if self.is_suspected {
+            let top = stacked.subtrees()[self.subtrees[0]].top();
+            let acceleration = seen.kinematics.motion(top).proper_acceleration;
+            let direction = acceleration / acceleration.norm().max(1e-3);
+            if self.direction == Vec3::zeros() {
+                self.direction = direction;
+            }
+            self.cosine = self.cosine.min(direction.dot(&self.direction));
+        }
+        for row in self.scratch.rows.chunks_exact(self.row.len()) {
+            self.gathered.push(slot, row);
+        }
+    }
+
+    /// Makes the whitened rows of the regressor's last update, in the scratch; how many.
+    fn rows_of(&mut self, stacked: &StackedRegressor) -> usize {
+        let width = self.row.len();
+        let session = self.offsets.len();
+        let Scratch { rows, covariance, .. } = &mut self.scratch;
+        rows.clear();
+        for (&number, columns) in self.subtrees.iter().zip(&self.columns) {
+            let subtree = &stacked.subtrees()[number];
+            for (index, measured) in subtree.projected_measured().iter().enumerate() {
+                self.row.fill(0.0);
+                let mut right = *measured;
+                for (&column, value) in columns.iter().zip(subtree.projected_row(index)) {
+                    self.row[column] = *value;
+                    right -= value * self.reference[column];
+                }
+                self.row[width - 1] = right;
+                rows.extend_from_slice(&self.row);
+            }
+        }
+        let count = rows.len() / width;
+        if rows.iter().any(|value| !value.is_finite()) {
+            rows.clear();
+            return 0;
+        }
+        // Noise enters as offsets do.
+        for i in 0..count {
+            for j in 0..=i {
+                let (a, b) = (&rows[i * width..][..session], &rows[j * width..][..session]);
+                let products = a.iter().zip(b).zip(&self.variances).map(|((x, y), v)| x * y * v);
+                covariance[i * count + j] = products.sum();
+            }
+        }
+        factorise(covariance, count);
+        forward(covariance, count, rows, width);
+        count
+    }
+
+    /// The end of a block: the gate judges, offsets wander, rows go in or aside.
+    fn close(&mut self, t: Nanos, known: &ComponentSolution) {
+        let elapsed = (t - self.drifted).seconds().clamp(0.0, 60.0);
+        self.drifted = t;
+        if self.gathered.len() > 0 && self.judges && self.is_odd(known) {
+            if !self.is_suspected {
+                self.is_suspected = true;
+                (self.since, self.cosine, self.direction) = (self.block_from, 1.0, Vec3::zeros());
+                self.counts.suspected += self.pending.instants();
+            }
+            self.clean = 0;
+            self.counts.suspected += self.gathered.instants();
+            self.aside.take_from(&self.gathered);
+            self.pending.clear();
+            self.gathered.clear();
+            return;
+        }
+        if self.gathered.len() > 0 && self.is_suspected {
+            self.clean += 1;
+            if self.clean < CLEAN {
+                self.counts.suspected += self.gathered.instants();
+                self.gathered.clear();
+                return;
+            }
+            self.is_suspected = false;
+        }
+        if self.active.is_empty() && !self.is_suspected {
+            for (to, wander) in self.deviations.iter_mut().zip(&self.wander) {
+                *to = wander * elapsed.sqrt();
+            }
+            let _ = self.information.drift(&self.offsets, &self.deviations);
+        }
+        if self.gathered.len() > 0 {
+            self.absorb();
+            std::mem::swap(&mut self.pending, &mut self.gathered);
+        }
+    }
+
+    /// Takes the pending block in.
+    fn absorb(&mut self) {
+        for row in self.pending.iter() {
+            let (a, y) = row.split_at(row.len() - 1);
+            // Finite, and there is room.
+            let _ = self.panel.push_row(a, y[0]);
+        }
+        let _ = self.information.absorb(&mut self.panel);
+        self.counts.learnt += self.pending.instants();
+        self.learnt.take_from(&self.pending);
+        self.pending.clear();
+    }
+
+    /// Whether the mean innovation of the gathered block is beyond what noise and the uncertainty of what is in force explain.
+    fn is_odd(&mut self, known: &ComponentSolution) -> bool {
+        let (width, unknowns) = (self.row.len(), self.row.len() - 1);
+        if known.factor.len() != unknowns * unknowns {
+            return false;
+        }
+        let Scratch {
+            mean,
+            projected,
+            covariance,
+            ..
+        } = &mut self.scratch;
+        // Instants of a block have equally many rows, made alike: their sum over the root of their number has unit noise.
+        let Some(first) = self.gathered.slots.first() else {
+            return false;
+        };
+        let m = self.gathered.slots.iter().take_while(|slot| *slot == first).count();
+        let instants = self.gathered.len() / m;
+        mean[..m * width].fill(0.0);
+        let scale = 1.0 / (instants as f64).sqrt();
+        for (number, row) in self.gathered.iter().take(m * instants).enumerate() {
+            let place = number % m;
+            add_multiple(&mut mean[place * width..][..width], scale, row);
+        }
+        for i in 0..m {
+            let row = &mean[i * width..][..unknowns];
+            for (k, factor) in known.factor.chunks_exact(unknowns).enumerate() {
+                projected[i * unknowns + k] = dot(row, factor);
+            }
+        }
+        for i in 0..m {
+            for j in 0..=i {
+                let product = dot(
+                    &projected[i * unknowns..][..unknowns],
+                    &projected[j * unknowns..][..unknowns],
+                );
+                covariance[i * m + j] = product + f64::from(u8::from(i == j));
+            }
+        }
+        factorise(covariance, m);
+        // Innovations, in the place of the first columns of the projections.
+        for i in 0..m {
+            let row = &mean[i * width..][..width];
+            projected[i] = row[unknowns] - dot(&row[..unknowns], &known.estimate);
+        }
+        forward(covariance, m, &mut projected[..m], 1);
+        let square: f64 = projected[..m].iter().map(|x| x * x).sum();
+        square > chi_square(m, GATE)
+    }
+}
+
+/// A component's share of a job.
+#[derive(Clone, Debug)]
+struct Part {
+    links: Vec<usize>,
+    sensors: Vec<usize>,
+    information: Information,
+    reference: Vec<f64>,
+    outermost: Vec<usize>,
+    learnt: Rows,
+    aside: Rows,
+    is_suspected: bool,
+    lasting: f64,
+    cosine: f64,
+    /// Configured, and inflated.
+    least: Vec<f64>,
+    variances: Vec<f64>,
+    noise: Vec<Autocorrelation>,
+    tau: f64,
+    has_failed: bool,
+    /// The same information with one thing started afresh, the rows put aside taken in, and how many.
+    hypotheses: Vec<(Change, Information, f64)>,
+    aside_rows: f64,
+    /// For how long [s].
+    asked: f64,
+    change: Option<(Change, Information)>,
+}
+
+/// Sums of products of a channel's residuals, by lag; old ones fade.
+#[derive(Clone, Debug)]
+struct Autocorrelation {
+    sums: [f64; LAGS],
+    pairs: [f64; LAGS],
+}
+
+impl Autocorrelation {
+    fn take(&mut self, series: &[f64]) {
+        let own = series.iter().filter(|value| value.is_finite()).count() as f64;
+        let keep = (1.0 - own / MEMORY).max(0.0);
+        for (lag, (sum, pairs)) in self.sums.iter_mut().zip(&mut self.pairs).enumerate() {
+            (*sum, *pairs) = (*sum * keep, *pairs * keep);
+            for (x, y) in series.iter().zip(series.iter().skip(lag)) {
+                if (x * y).is_finite() {
+                    *sum += x * y;
+                    *pairs += 1.0;
+                }
+            }
+        }
+    }
+
+    /// Variance times integrated autocorrelation time, and how many instants that rests on.
+    fn inflated(&self) -> (f64, f64) {
+        let count = self.pairs[0];
+        if count == 0.0 || self.sums[0] == 0.0 {
+            return (0.0, count);
+        }
+        let variance = self.sums[0] / count;
+        let mut time = 1.0;
+        for lag in 1..LAGS {
+            if lag as f64 > SOKAL * time || self.pairs[lag] == 0.0 {
+                break;
+            }
+            time += 2.0 * self.sums[lag] / self.pairs[lag] / variance;
+        }
+        (variance * time.max(1.0), count)
+    }
+}
+
+impl Part {
+    fn new(component: &Component) -> Self {
+        let none = Autocorrelation {
+            sums: [0.0; LAGS],
+            pairs: [0.0; LAGS],
+        };
+        Self {
+            links: component.links.clone(),
+            sensors: component.sensors.clone(),
+            information: component.information.clone(),
+            reference: component.reference.clone(),
+            outermost: component.outermost.clone(),
+            learnt: component.learnt.clone_room(),
+            aside: component.aside.clone_room(),
+            is_suspected: false,
+            lasting: 0.0,
+            cosine: 1.0,
+            least: component.variances.iter().map(|v| v / INFLATION).collect(),
+            variances: component.variances.clone(),
+            noise: vec![none; component.variances.len()],
+            tau: GREATEST_TAU,
+            has_failed: false,
+            hypotheses: Vec::new(),
+            aside_rows: 0.0,
+            asked: 0.0,
+            change: None,
+        }
+    }
+
+    fn run(&mut self, prior: &Prior, solution: &mut ComponentSolution) {
+        self.change = None;
+        self.weigh_change();
+        self.has_failed = self.solve(prior, solution).is_err();
+        if !self.has_failed {
+            self.take_noise(solution);
+        }
+    }
+
+    fn solve(&mut self, prior: &Prior, solution: &mut ComponentSolution) -> Result<(), PriorError> {
+        let (session, parameters) = (6 * self.sensors.len(), WIDTH * self.links.len());
+        let unknowns = session + parameters;
+        let (root, right) = self.information.to_triangle();
+        // [s | d] -> [d | s]
+        let from = |column: usize| {
+            if column < parameters {
+                session + column
+            } else {
+                column - parameters
+            }
+        };
+        let reordered = DMatrix::from_fn(unknowns, unknowns, |i, j| root[(i, from(j))]);
+        let precision: Vec<f64> = (0..session).map(|i| OFFSET[usize::from(i % 6 > 2)].powi(-2)).collect();
+        let posterior = Posterior::new(prior, &self.links, &reordered, &right, &precision)?;
+        // One round of the evidence a second: it settles while data come in.
+        let tau = posterior.fit(self.tau)?.next_tau();
+        let fit = posterior.fit(tau)?;
+        self.tau = tau;
+        let factor = fit.covariance_root();
+        solution.tau = tau;
+        solution.effective = fit.effective;
+        solution.bodies.clone_from(&fit.bodies);
+        solution.root = factor.transpose();
+        let to = |column: usize| {
+            if column < session {
+                parameters + column
+            } else {
+                column - session
+            }
+        };
+        solution.estimate = (0..unknowns).map(|column| fit.x[to(column)]).collect();
+        solution.factor = (0..unknowns)
+            .flat_map(|k| (0..unknowns).map(move |column| (column, k)))
+            .map(|(column, k)| factor[(to(column), k)])
+            .collect();
+        for (place, offset) in solution.offsets.iter_mut().enumerate() {
+            let six = |i: usize| self.reference[6 * place + i] + solution.estimate[6 * place + i];
+            *offset = Wrench::from_parts([six(3), six(4), six(5)], [six(0), six(1), six(2)]);
+        }
+        Ok(())
+    }
+
+    /// The channels' noise from the rows that went in, under the new solution: whitened residuals back to channels (Gauss, Markov).
+    fn take_noise(&mut self, solution: &ComponentSolution) {
+        let (Some(&first), Some(&last)) = (self.learnt.slots.first(), self.learnt.slots.last()) else {
+            return;
+        };
+        let unknowns = solution.estimate.len();
+        let instants = usize::try_from(last - first).unwrap_or(0) + 1;
+        if instants > 100 * self.learnt.room {
+            return;
+        }
+        let mut series = vec![f64::NAN; instants];
+        for channel in 0..self.variances.len() {
+            series.fill(f64::NAN);
+            for (row, slot) in self.learnt.iter().zip(&self.learnt.slots) {
+                if row[channel] == 0.0 {
+                    continue;
+                }
+                let Some(place) = usize::try_from(slot - first).ok().and_then(|i| series.get_mut(i)) else {
+                    continue;
+                };
+                let residual = row[unknowns] - dot(&row[..unknowns], &solution.estimate);
+                let share = self.variances[channel] * row[channel] * residual;
+                *place = if place.is_nan() { share } else { *place + share };
+            }
+            self.noise[channel].take(&series);
+        }
+        for ((variance, noise), least) in self.variances.iter_mut().zip(&self.noise).zip(&self.least) {
+            let (found, count) = noise.inflated();
+            let guess = INFLATION * least;
+            *variance = ((INFLATION_WORTH * guess + count * found) / (INFLATION_WORTH + count)).max(*least);
+        }
+    }
+
+    /// Asks the rows that were put aside what they are.
+    fn weigh_change(&mut self) {
+        if !self.is_suspected {
+            self.hypotheses.clear();
+            (self.aside_rows, self.asked) = (0.0, 0.0);
+            return;
+        }
+        let unknowns = self.information.unknowns();
+        if self.hypotheses.is_empty() {
+            let offsets: Vec<usize> = (0..6 * self.sensors.len()).collect();
+            let all: Vec<usize> = (0..unknowns).collect();
+            for (change, columns) in [
+                (Change::Offset, &offsets),
+                (Change::Load, &self.outermost),
+                (Change::Unknown, &all),
+            ] {
+                let mut fresh = self.information.clone();
+                if !columns.is_empty() && fresh.marginalise(columns).is_ok() {
+                    let before = fresh.residual_square();
+                    self.hypotheses.push((change, fresh, before));
+                }
+            }
+        }
+        let mut panel = Panel::new(unknowns, self.aside.len().max(1));
+        for (_, information, _) in &mut self.hypotheses {
+            for row in self.aside.iter() {
+                let _ = panel.push_row(&row[..unknowns], row[unknowns]);
+            }
+            let _ = information.absorb(&mut panel);
+        }
+        self.aside_rows += self.aside.len() as f64;
+        self.asked += SOLVE.seconds();
+        if self.asked < PERSISTENT || self.cosine > TILTED {
+            return;
+        }
+        let left = |(_, information, before): &(Change, Information, f64)| {
+            (information.residual_square() - before) / self.aside_rows
+        };
+        // The last explains anything: it is taken where the others have failed for long.
+        let explaining = |&at: &usize| match self.hypotheses[at].0 {
+            Change::Unknown => self.lasting >= HOPELESS,
+            _ => left(&self.hypotheses[at]) < EXPLAINED,
+        };
+        let best = (0..self.hypotheses.len()).filter(explaining).min_by(|&a, &b| {
+            let hopeless = |at: usize| self.hypotheses[at].0 == Change::Unknown;
+            let by_residual = left(&self.hypotheses[a]).total_cmp(&left(&self.hypotheses[b]));
+            hopeless(a).cmp(&hopeless(b)).then(by_residual)
+        });
+        if let Some(best) = best {
+            let (change, information, _) = self.hypotheses.swap_remove(best);
+            self.change = Some((change, information));
+        }
+        // A load that is being taken up is explained by nothing, but once it is, it is: what is not explained is asked anew with new rows.
+        self.hypotheses.clear();
+        (self.aside_rows, self.asked) = (0.0, 0.0);
+    }
+}
+
+impl Rows {
+    /// An empty one with as much room.
+    fn clone_room(&self) -> Self {
+        Self::new(self.width, self.room)
+    }
+}
+
+/// A snapshot of what was taken in, to be solved wherever there is time. Pure: what it finds depends on what it was given alone.
+#[derive(Debug)]
+pub struct Job {
+    prior: Arc<Prior>,
+    data: Nanos,
+    parts: Vec<Part>,
+    solution: Solution,
+}
+
+impl Job {
+    /// Solves: prior with its weight by evidence, bodies that can exist, covariance, noise, changes. Takes some tens of milliseconds, and allocates.
+    pub fn run(&mut self) {
+        self.solution.data = self.data;
+        for (part, solution) in self.parts.iter_mut().zip(&mut self.solution.components) {
+            part.run(&self.prior, solution);
+        }
+    }
+
+    /// What it found.
+    pub fn solution(&self) -> &Solution {
+        &self.solution
+    }
+}
+
+/// The number that a chi-square distribution with `freedom` degrees exceeds as often as a normal one exceeds `level` (Wilson, Hilferty 1931).
+fn chi_square(freedom: usize, level: f64) -> f64 {
+    let (n, spread) = (freedom as f64, 2.0 / (9.0 * freedom as f64));
+    n * (1.0 - spread + level * spread.sqrt()).powi(3)
+}
+
+/// Lower factor of a covariance, row by row in place; combinations without noise get 1e-9 of the greatest variance.
+fn factorise(covariance: &mut [f64], count: usize) {
+    let greatest = (0..count).map(|i| covariance[i * count + i]).fold(0.0, f64::max);
+    let floor = 1e-9 * greatest.max(f64::MIN_POSITIVE);
+    for i in 0..count {
+        for j in 0..=i {
+            let (above, own) = covariance.split_at(i * count);
+            let other = if j == i { own } else { &above[j * count..] };
+            let rest = own[j] - dot(&own[..j], &other[..j]);
+            covariance[i * count + j] = if i == j {
+                rest.max(floor).sqrt()
+            } else {
+                rest / covariance[j * count + j]
+            };
+        }
+    }
+}
+
+/// `L^-1` from the left on `count` rows of `width` numbers.
+fn forward(factor: &[f64], count: usize, values: &mut [f64], width: usize) {
+    for i in 0..count {
+        let (above, own) = values.split_at_mut(i * width);
+        let own = &mut own[..width];
+        for (weight, row) in factor[i * count..][..i].iter().zip(above.chunks_exact(width)) {
+            add_multiple(own, -weight, row);
+        }
+        let scale = 1.0 / factor[i * count + i];
+        own.iter_mut().for_each(|x| *x *= scale);
+    }
+}
+
+fn add_multiple(to: &mut [f64], factor: f64, from: &[f64]) {
+    for (to, from) in to.iter_mut().zip(from) {
+        *to += factor * from;
+    }
+}
+
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(x, y)| x * y).sum()
+}
+
+fn torque_first(wrench: &Wrench) -> [f64; 6] {
+    let (n, f) = (&wrench.torque, &wrench.force);
+    [n.x, n.y, n.z, f.x, f.y, f.z]
+}
