@@ -231,8 +231,10 @@ pub enum Presence {
 pub struct Identification {
     /// Whether parameters are identified on-line.
     pub enabled: bool,
-    /// From which measurements.
+    /// From which measurements; default: the force/torque sensors. On-line they alone are used.
     pub inputs: Vec<IdentificationInput>,
+    /// At how many instants a second on-line identification looks, at the most; the trigger's rate if that is less \[Hz\].
+    pub rate_hz: f64,
     /// How far the URDF's inertias may be off, where nothing was identified: the relative standard deviation of a link's mass, and likewise of its mass
     /// distribution ([`crate::parameters::cad_root`]). Torques that rest on such links are as uncertain as this makes them. 0: they are exact.
     pub model_std: f64,
@@ -244,6 +246,7 @@ impl Default for Identification {
         Self {
             enabled: false,
             inputs: Vec::new(),
+            rate_hz: 100.0,
             model_std: 0.2,
         }
     }
@@ -389,6 +392,10 @@ impl Config {
         if !(0.0..=2.0).contains(&relative) {
             return Err(format!("identification.model_std = {relative} must be 0 to 2"));
         }
+        let rate = self.identification.rate_hz;
+        if !(1.0..=1000.0).contains(&rate) {
+            return Err(format!("identification.rate_hz = {rate} must be 1 to 1000"));
+        }
         // What may come while an instant waits is kept: 32 samples of a channel beside those of its window, 256 instants.
         if !(self.output.max_wait_ms >= 0.0 && self.output.max_wait_ms <= 250.0) {
             return Err(format!(
@@ -509,6 +516,7 @@ mod tests {
         assert_eq!(config.contact[0].presence, Presence::Always);
         assert!(!config.identification.enabled);
         assert_eq!(config.identification.model_std, 0.2);
+        assert_eq!(config.identification.rate_hz, 100.0);
         assert_eq!(config.force_torque[0].offset_std_n, [0.0; 3]);
     }
 
@@ -545,6 +553,11 @@ mod tests {
                 "[output]",
                 "[identification]\nmodel_std = -0.1\n[output]",
                 "identification.model_std = -0.1 must be 0 to 2",
+            ),
+            (
+                "[output]",
+                "[identification]\nrate_hz = 0.1\n[output]",
+                "identification.rate_hz = 0.1 must be 1 to 1000",
             ),
             ("trigger = \"ft\"", "triger = \"ft\"", "unknown field `triger`"),
             (

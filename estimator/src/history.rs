@@ -2,8 +2,8 @@
 
 use proprio_topics::{Nanos, Quality};
 
-/// How many samples are kept: what a channel can send while an estimate waits for the others.
-const KEPT: usize = 256;
+/// How many samples are kept: what a channel can send while an estimate waits for the others, and what identification, which looks further back, needs.
+pub const KEPT: usize = 1024;
 
 /// The last samples of one channel. `D` numbers each; NaN where one is absent.
 #[derive(Debug, Clone)]
@@ -69,6 +69,15 @@ impl<const D: usize> History<D> {
             return None;
         }
         self.samples.get((self.count - 1 - age) % KEPT)
+    }
+
+    /// The samples stamped `from` to `to`, newest first; of those that are kept.
+    pub fn within(&self, from: Nanos, to: Nanos) -> impl Iterator<Item = (Nanos, &[f64; D], Quality)> {
+        (0..KEPT)
+            .map_while(|age| self.get(age))
+            .skip_while(move |entry| entry.t > to)
+            .take_while(move |entry| entry.t >= from)
+            .map(|entry| (entry.t, &entry.value, entry.quality))
     }
 
     /// What it says about `t`: the sample of that instant; else a straight line between the last before and the first after,

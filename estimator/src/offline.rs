@@ -48,6 +48,14 @@ pub struct EstimateReport {
     pub unused_channels: Vec<String>,
 }
 
+/// Identification's share, if it is on and it is time for it: at once, so that it is always in time.
+fn solve(pipeline: &mut Pipeline) {
+    if let Some(mut job) = pipeline.take_job() {
+        job.run();
+        pipeline.give_back(job);
+    }
+}
+
 /// Estimates for every trigger stamp of a log.
 ///
 /// # Errors
@@ -100,11 +108,13 @@ pub fn estimate(setup: Setup, log: impl Read, out: impl Write) -> Result<Estimat
         }
         while let Some(estimate) = pipeline.poll() {
             table.write(estimate, stamped)?;
+            solve(&mut pipeline);
         }
     }
     pipeline.finish();
     while let Some(estimate) = pipeline.poll() {
         table.write(estimate, stamped)?;
+        solve(&mut pipeline);
     }
     (report.estimates, report.withheld) = (table.rows, table.withheld);
     table.out.flush()?;

@@ -9,15 +9,24 @@
 //! A channel stamped exactly T is used as it is, its velocity and acceleration too where it has them; otherwise they come
 //! from its adaptive window ([`crate::differentiate`]). Wrenches and proper accelerations lie on straight lines between samples.
 //!
+//! With identification on ([`crate::identify::online`]), inertial parameters, offsets and their covariance are those of the last solution in force; who owns the pipeline runs its
+//! jobs ([`Pipeline::take_job`]), at once or in another thread.
+//!
 //! Standard deviations hold F/T noise and what is uncertain of inertial parameters and F/T offsets ([`crate::regressor::Propagation`]); not the errors of
 //! positions, velocities and accelerations.
+
+mod learning;
+
+pub use learning::Job;
 
 use crate::differentiate::{Unavailable, Window};
 use crate::dynamics::{Certainty, ContactSet, Dependence, FrameMotion, JointState, Kinematics, Solver};
 use crate::history::{Held, History};
+use crate::identify::online::{Online, OnlineError};
 use crate::regressor::Propagation;
 use crate::setup::{BaseMotion, Setup, Use};
 use crate::spatial::{Vec3, Wrench};
+use learning::Learning;
 use proprio_topics::{
     ContactEstimate, ContactWrench, Header, JointTorque, MAX_CONTACTS, MAX_JOINTS, NO_CAUSE, Nanos, Quality, Reading,
     Reason, TorqueEstimate,
@@ -157,6 +166,9 @@ pub struct Pipeline {
     acceleration: Vec<f64>,
     readings: Vec<Wrench>,
     dependences: Dependences,
+    learning: Option<Box<Learning>>,
+    /// Why there is none although it was asked for.
+    refusal: Option<OnlineError>,
     estimate: Box<Estimate>,
 }
 
@@ -191,6 +203,16 @@ impl Pipeline {
         let mut estimate = Box::new(Estimate::absent(Nanos::ZERO));
         estimate.torques.count = u32::try_from(dofs).unwrap_or(0);
         estimate.contacts.count = u32::try_from(setup.contacts.len()).unwrap_or(0);
+        let mut propagation =
+            Propagation::new(&setup.structure, &setup.covariance).expect("the covariance is of the model");
+        let (learning, refusal) = match setup.identifies.then(|| Learning::new(&setup)).transpose() {
+            Ok(learning) => (learning.map(Box::new), None),
+            Err(error) => (None, Some(error)),
+        };
+        let mut learning = learning;
+        if let Some(learning) = &mut learning {
+            learning.begin(&mut propagation);
+        }
         Self {
             tracks: tracks.collect(),
             faults: vec![Reason::NeverSeen; setup.channels().len()],
@@ -203,7 +225,7 @@ impl Pipeline {
             counts: Counts::default(),
             kinematics,
             solver: Solver::new(&setup.structure),
-            propagation: Propagation::new(&setup.structure, &setup.covariance).expect("the covariance is of the model"),
+            propagation,
             position: setup.locked.iter().map(|q| if q.is_nan() { 0.0 } else { *q }).collect(),
             velocity: vec![0.0; dofs],
             acceleration: vec![0.0; dofs],
@@ -213,8 +235,35 @@ impl Pipeline {
                 torques: vec![Dependence::default(); dofs],
                 contacts: vec![Dependence::default(); contacts],
             },
+            learning,
+            refusal,
             estimate,
             setup,
+        }
+    }
+
+    /// On-line identification, if it is on.
+    #[must_use]
+    pub fn identification(&self) -> Option<&Online> {
+        self.learning.as_ref().map(|learning| &learning.online)
+    }
+
+    /// Why nothing is identified on-line although the configuration wants it.
+    #[must_use]
+    pub fn identification_refused(&self) -> Option<&OnlineError> {
+        self.refusal.as_ref()
+    }
+
+    /// What identification has to compute, about once a second of stamps: run it and [`Pipeline::give_back`]. Ask after each estimate. If it is back before a
+    /// second of stamps has passed, estimates depend on samples alone; else they use it later, which is counted.
+    pub fn take_job(&mut self) -> Option<Job> {
+        self.learning.as_mut()?.take_job()
+    }
+
+    /// Gives back a job that was run.
+    pub fn give_back(&mut self, job: Job) {
+        if let Some(learning) = &mut self.learning {
+            learning.give_back(job);
         }
     }
 
@@ -339,8 +388,54 @@ impl Pipeline {
         }
         self.waiting.pop_front();
         self.released = t;
+        self.learn(t);
         self.compute(t);
         Some(&self.estimate)
+    }
+
+    /// Identification's turn.
+    fn learn(&mut self, t: Nanos) {
+        let Some(mut learning) = self.learning.take() else {
+            return;
+        };
+        if let Some(instant) = learning.instant(t) {
+            let active = self.active(instant);
+            let base = self.standing(&active);
+            learning.observe(instant, &self.setup, &self.tracks, &active, base);
+            learning.apply(&mut self.setup, &mut self.propagation);
+        }
+        self.learning = Some(learning);
+    }
+
+    /// The link where kinematics start, how it moves if no IMU tells, and what speaks against that.
+    fn standing(&self, active: &ContactSet) -> (usize, FrameMotion, Reason) {
+        let stances = match &self.setup.base {
+            BaseMotion::Standing(motion) => return (self.setup.base_link, *motion, Reason::None),
+            BaseMotion::Imu(_) => {
+                return (
+                    self.setup.base_link,
+                    FrameMotion::standing(&Vec3::zeros()),
+                    Reason::None,
+                );
+            }
+            BaseMotion::Stance(stances) => stances,
+        };
+        let standing = stances.iter().find(|stance| active.contains(stance.contact));
+        let fault = if standing.is_none() {
+            Reason::NoStance
+        } else {
+            Reason::None
+        };
+        standing.or(stances.first()).map_or_else(
+            || {
+                (
+                    self.setup.base_link,
+                    FrameMotion::standing(&Vec3::zeros()),
+                    Reason::NoStance,
+                )
+            },
+            |stance| (stance.link, stance.motion, fault),
+        )
     }
 
     /// The contacts present at `t`.
@@ -359,23 +454,12 @@ impl Pipeline {
 
     /// Starts kinematics at the link that stands still, if it is not an IMU that tells, and says how it moves: not at all.
     fn base_standing(&mut self, active: &ContactSet) -> FrameMotion {
-        self.base_fault = Reason::None;
-        let stances = match &self.setup.base {
-            BaseMotion::Standing(motion) => return *motion,
-            BaseMotion::Imu(_) => return FrameMotion::standing(&Vec3::zeros()),
-            BaseMotion::Stance(stances) => stances,
-        };
-        let standing = stances.iter().find(|stance| active.contains(stance.contact));
-        if standing.is_none() {
-            self.base_fault = Reason::NoStance;
-        }
-        let Some(stance) = standing.or(stances.first()) else {
-            return FrameMotion::standing(&Vec3::zeros());
-        };
-        if stance.link != self.kinematics.base() && self.kinematics.set_base(&self.setup.model, stance.link).is_err() {
+        let (link, motion, fault) = self.standing(active);
+        self.base_fault = fault;
+        if link != self.kinematics.base() && self.kinematics.set_base(&self.setup.model, link).is_err() {
             self.base_fault = Reason::NotFinite;
         }
-        stance.motion
+        motion
     }
 
     /// Brings every channel to `t` and estimates.

@@ -1,6 +1,8 @@
 //! estimator.toml, the URDF and what was identified, checked against each other and resolved: what the rest of the estimator works with.
 
-use crate::config::{Base, Config, ContactKind as KindWord, Differentiation, Direction, Foot, Presence, SensorFrame};
+use crate::config::{
+    Base, Config, ContactKind as KindWord, Differentiation, Direction, Foot, IdentificationInput, Presence, SensorFrame,
+};
 use crate::differentiate::Settings;
 use crate::dynamics::{ContactKind, ContactSet, ContactSpec, FrameMotion, Noise, SensorCut, Structure, StructureError};
 use crate::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
@@ -108,6 +110,10 @@ pub struct Setup {
     pub gyro_settings: Settings,
     /// How uncertain inertial parameters and offsets are.
     pub covariance: Covariance,
+    /// Whether parameters are identified on-line.
+    pub identifies: bool,
+    /// The time between two instants of on-line identification.
+    pub identification_period: Nanos,
     channels: Vec<Channel>,
     warnings: Vec<String>,
     /// Inertias as the URDF has them.
@@ -142,9 +148,10 @@ impl Setup {
     /// As [`Setup::new`].
     pub fn with_model(config: &Config, model: Model) -> Result<Self, String> {
         let mut warnings: Vec<String> = model.warnings().to_vec();
-        if config.identification.enabled {
+        let identification = &config.identification;
+        if identification.enabled && identification.inputs.contains(&IdentificationInput::Torque) {
             warnings.push(
-                "identification.enabled: this version does not identify on-line; parameters stay what they are".into(),
+                "identification.inputs: on-line, parameters are identified from the force/torque sensors alone; for joint torques use `proprio identify`".into(),
             );
         }
         let dofs = model.dof_count();
@@ -299,6 +306,8 @@ impl Setup {
             cad: model.inertias().to_vec(),
             configured,
             model_deviation: config.identification.model_std,
+            identifies: config.identification.enabled,
+            identification_period: Nanos::from_seconds(1.0 / config.identification.rate_hz),
             identified: None,
             model,
         };
@@ -349,19 +358,60 @@ impl Setup {
             let identified: Vec<usize> = parameters.identified().collect();
             let _ = self.covariance.add(&identified, &measured, parameters.root());
         }
+        let mut covariance = std::mem::replace(&mut self.covariance, Covariance::exact(0, 0));
+        self.fill(&mut covariance, &measured);
+        self.covariance = covariance;
+    }
+
+    /// Says of every link that has no covariance what the URDF is taken to be worth, and of every sensor that is not in `measured` what the configuration says.
+    fn fill(&self, covariance: &mut Covariance, measured: &[usize]) {
         for (link, cad) in self.cad.iter().enumerate() {
-            if !self.covariance.has_link(link) && self.model_deviation > 0.0 {
-                let root = cad_root(cad, self.model_deviation);
-                let root = DMatrix::from_fn(10, 10, |i, j| root[(i, j)]);
-                let _ = self.covariance.add(&[link], &[], root);
+            if !covariance.has_link(link) && self.model_deviation > 0.0 {
+                let _ = covariance.add(&[link], &[], own_root(cad, self.model_deviation));
             }
         }
         for (sensor, (_, deviation)) in self.configured.iter().enumerate() {
             if !measured.contains(&sensor) && *deviation != [0.0; 6] {
                 let root = DMatrix::from_fn(6, 6, |i, j| if i == j { deviation[i] } else { 0.0 });
-                let _ = self.covariance.add(&[], &[sensor], root);
+                let _ = covariance.add(&[], &[sensor], root);
             }
         }
+    }
+
+    /// The covariance where some links and sensors are identified on-line, known at instant `known`: of each group its links, its sensors, a root over
+    /// [ten per link | torque, force per sensor], and how far each offset wanders in a second. Without a root nothing is known yet: links are as uncertain as
+    /// identification's prior has them before any data, and offsets anything.
+    pub fn covariance_with<'a>(
+        &self,
+        known: Nanos,
+        groups: impl Iterator<Item = (&'a [usize], &'a [usize], Option<&'a DMatrix<f64>>, &'a [[f64; 6]])>,
+    ) -> Covariance {
+        /// Of an offset before anything is known of it [Nm], [N].
+        const ANYTHING: [f64; 6] = [100.0, 100.0, 100.0, 1000.0, 1000.0, 1000.0];
+        let mut covariance = Covariance::exact(self.cad.len(), self.configured.len());
+        let mut measured = Vec::new();
+        // Numbers are the model's own, and each is in one group only: nothing is refused.
+        for (links, sensors, root, drift) in groups {
+            measured.extend_from_slice(sensors);
+            if let Some(root) = root {
+                let _ = covariance.add(links, sensors, root.clone());
+                for (&sensor, rate) in sensors.iter().zip(drift) {
+                    let _ = covariance.set_drift(sensor, *rate, known);
+                }
+                continue;
+            }
+            for &link in links {
+                if let Some(cad) = self.cad.get(link) {
+                    let _ = covariance.add(&[link], &[], own_root(cad, 1.0));
+                }
+            }
+            for &sensor in sensors {
+                let root = DMatrix::from_fn(6, 6, |i, j| if i == j { ANYTHING[i] } else { 0.0 });
+                let _ = covariance.add(&[], &[sensor], root);
+            }
+        }
+        self.fill(&mut covariance, &measured);
+        covariance
     }
 
     /// Inertias of the links as the URDF has them, whatever was identified.
@@ -802,6 +852,11 @@ fn nearest<'a>(name: &str, names: impl Iterator<Item = &'a str>) -> String {
             )
         }
     }
+}
+
+fn own_root(cad: &RigidInertia, relative: f64) -> DMatrix<f64> {
+    let root = cad_root(cad, relative);
+    DMatrix::from_fn(10, 10, |i, j| root[(i, j)])
 }
 
 impl fmt::Display for Setup {

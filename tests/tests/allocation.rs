@@ -8,6 +8,7 @@
 #![allow(unsafe_code)]
 
 use proprio_drivers::{Claim, Frame, Id, Mode};
+use proprio_estimator::config::Presence;
 use proprio_estimator::dynamics::{
     ContactKind, ContactSet, ContactSpec, DynamicsError, EquationOfMotion, ExternalWrench, FrameMotion,
     InverseDynamics, JointState, Kinematics, Noise, SensorCut, Solver, Structure,
@@ -323,6 +324,59 @@ fn decoding_allocates_nothing() {
         frames.len() > 10_000 && samples > 5000,
         "{} frames, {samples} samples",
         frames.len()
+    );
+}
+
+#[test]
+fn identification_in_the_pipeline_allocates_nothing_but_in_its_jobs() {
+    let robot = robot();
+    let mut config = robot.config.clone();
+    config.identification.enabled = true;
+    // Or the hand, always touched, leaves nothing to identify.
+    config.contact.iter_mut().for_each(|contact| {
+        if contact.name() == "hand" {
+            contact.presence = Presence::Possible;
+        }
+    });
+    let setup = Setup::new(&config).unwrap();
+    let channels = robot.plan.channels.iter();
+    let channels: Vec<Option<usize>> = channels.map(|c| setup.channel(c.kind, &c.name)).collect();
+    let hand = setup.contact("hand").expect("the hand is a contact");
+    let mut decoders = decoders(&robot);
+    let mut samples = Vec::new();
+    for (bus, frame) in session(&robot, 8.0) {
+        decoders[bus].on_frame(&frame, |sample| samples.push(*sample));
+    }
+    let mut pipeline = Pipeline::new(setup);
+    assert!(pipeline.identification_refused().is_none());
+    let (mut allocated, mut jobs, mut job) = ((0, 0), 0, None);
+    for (number, sample) in samples.iter().enumerate() {
+        let Some(channel) = channels[sample.channel as usize] else {
+            continue;
+        };
+        let t = sample.header.acquired;
+        let one = counted(|| {
+            if number % 5000 == 0 {
+                pipeline.declare(hand, t, number % 10_000 == 0);
+            }
+            pipeline.push(channel, t, &sample.reading, sample.header.quality);
+            while pipeline.poll().is_some() {
+                job = pipeline.take_job().or(job.take());
+            }
+        });
+        allocated = (allocated.0 + one.0, allocated.1 + one.1);
+        if let Some(mut done) = job.take() {
+            done.run();
+            let one = counted(|| pipeline.give_back(done));
+            allocated = (allocated.0 + one.0, allocated.1 + one.1);
+            jobs += 1;
+        }
+    }
+    assert_eq!(allocated, (0, 0));
+    let counts = pipeline.identification().unwrap().state(0).unwrap().1;
+    assert!(
+        jobs >= 6 && counts.learnt > 100 && counts.contact > 100,
+        "{jobs} {counts:?}"
     );
 }
 

@@ -1,0 +1,669 @@
+//! Identification inside the pipeline: every channel brought to an instant in the past, where samples lie on both sides of it, and handed to
+//! [`Online`]; its solutions put in force.
+//!
+//! Torques want the newest instant; parameters do not care when they were learnt, but do about accelerations. So an identification instant lies [`DELAY`] behind the
+//! estimate that calls for it, and positions are differentiated by polynomials centred on it ([`Centred`]). F/T readings are averaged over the instant's share of time.
+//!
+//! A share is a cell of a grid of `period`; at most one estimate in each calls for an instant. So instants depend on stamps alone, as estimates do.
+
+use proprio_topics::{Nanos, Quality, Reason};
+
+use super::{OrReason, Track, UNTRUSTED_ENCODER, quality_reason};
+use crate::dynamics::{ContactSet, FrameMotion, JointState, Kinematics};
+use crate::history::{History, KEPT};
+use crate::identify::online::{Job as Solving, Observation, Online, OnlineError};
+use crate::regressor::{Covariance, Propagation};
+use crate::setup::{BaseMotion, Setup, Use};
+use crate::spatial::{RigidInertia, Vec3, Wrench};
+
+/// How far behind an estimate an identification instant lies, and how far the samples reach that it is differentiated from.
+pub(super) const DELAY: Nanos = Nanos::from_millis(250);
+
+/// Identification in a pipeline.
+pub(super) struct Learning {
+    pub(super) online: Online,
+    kinematics: Kinematics,
+    period: Nanos,
+    /// The grid's cell of the last instant.
+    cell: i64,
+    /// What is held, and what is found at the present instant.
+    held: Motion,
+    found: Motion,
+    /// Variance of the samples of each joint, then of nine numbers of the IMU; NaN where it has not shown.
+    noise: Vec<f64>,
+    readings: Vec<Wrench>,
+    joints: Vec<Reason>,
+    sensors: Vec<Reason>,
+    scratch: Box<Centred>,
+    /// What a job needs beside its own; at home while the job is.
+    room: Option<Box<Room>>,
+}
+
+/// What a job works with beside the data, and where it puts what the pipeline wants.
+struct Room {
+    setup: Setup,
+    propagation: Propagation,
+}
+
+/// A job of the pipeline: solve, and carry the covariance to where torques can use it. [`Job::run`] it in any thread, then [`super::Pipeline::give_back`].
+pub struct Job {
+    solving: Box<Solving>,
+    room: Box<Room>,
+}
+
+impl Job {
+    /// Takes some tens of milliseconds, and allocates. What it finds depends on the samples alone.
+    pub fn run(&mut self) {
+        self.solving.run();
+        let Room { setup, propagation } = &mut *self.room;
+        let covariance = covariance(setup, self.solving.solution());
+        // Of the same structure: it can not be refused.
+        if let Ok(new) = Propagation::new(&setup.structure, &covariance) {
+            *propagation = new;
+        }
+    }
+}
+
+/// What is uncertain under a solution, and of what it does not tell.
+fn covariance(setup: &Setup, solution: &crate::identify::online::Solution) -> Covariance {
+    let blocks = solution.components.iter().map(|component| {
+        let known = (component.root.nrows() > 0).then_some(&component.root);
+        (
+            &component.links[..],
+            &component.sensors[..],
+            known,
+            &component.drift[..],
+        )
+    });
+    setup.covariance_with(solution.data, blocks)
+}
+
+impl Learning {
+    pub(super) fn new(setup: &Setup) -> Result<Self, OnlineError> {
+        let period = setup.identification_period;
+        let mut online = Online::new(
+            &setup.model,
+            &setup.structure,
+            setup.cad(),
+            &setup.offsets,
+            &setup.always,
+            setup.base_link,
+            period,
+        )?;
+        if let Some(parameters) = setup.identified() {
+            let links: Vec<(usize, RigidInertia)> = parameters
+                .identified()
+                .filter_map(|link| Some((link, parameters.inertia(link)?)))
+                .collect();
+            let root = parameters.root();
+            let of_links = root.columns(0, 10 * links.len()).into_owned();
+            online.begin_with(setup.cad(), &links, &of_links)?;
+        }
+        let dofs = setup.model.dof_count();
+        let held = Motion {
+            position: setup.locked.iter().map(|q| if q.is_nan() { 0.0 } else { *q }).collect(),
+            velocity: vec![0.0; dofs],
+            acceleration: vec![0.0; dofs],
+            imu: FrameMotion::standing(&Vec3::zeros()),
+            errors: vec![0.0; 3 * dofs + 9],
+        };
+        let propagation = Propagation::new(&setup.structure, &covariance(setup, online.solution()))?;
+        Ok(Self {
+            kinematics: Kinematics::new(&setup.model, setup.base_link)?,
+            period,
+            cell: i64::MIN,
+            found: held.clone(),
+            noise: vec![f64::NAN; dofs + 9],
+            held,
+            readings: vec![Wrench::zero(); setup.structure.sensors().len()],
+            joints: vec![Reason::None; dofs],
+            sensors: vec![Reason::None; setup.structure.sensors().len()],
+            scratch: Box::default(),
+            room: Some(Box::new(Room {
+                setup: setup.clone(),
+                propagation,
+            })),
+            online,
+        })
+    }
+
+    /// Puts the deviations of before the first solution in force.
+    pub(super) fn begin(&mut self, propagation: &mut Propagation) {
+        if let Some(room) = &mut self.room {
+            std::mem::swap(propagation, &mut room.propagation);
+        }
+    }
+
+    /// The instant that an estimate at `t` calls for, if it does.
+    pub(super) fn instant(&mut self, t: Nanos) -> Option<Nanos> {
+        let cell = t.0.div_euclid(self.period.0);
+        (cell != std::mem::replace(&mut self.cell, cell)).then(|| t - DELAY)
+    }
+
+    /// Observes instant `t`. `base` is how its link moves, if that does not come from an IMU, and what speaks against it.
+    pub(super) fn observe(
+        &mut self,
+        t: Nanos,
+        setup: &Setup,
+        tracks: &[Track],
+        active: &ContactSet,
+        (base_link, mut base, mut base_fault): (usize, FrameMotion, Reason),
+    ) {
+        let (from, to) = (t - DELAY, t + DELAY);
+        let mut is_moved = false;
+        self.found.copy_from(&self.held);
+        for (track, channel) in tracks.iter().zip(setup.channels()) {
+            match (track, channel.role) {
+                (Track::Joint(history, _), Use::Joint(dof)) => {
+                    let places = (
+                        self.found.position.get_mut(dof),
+                        self.found.velocity.get_mut(dof),
+                        self.found.acceleration.get_mut(dof),
+                        self.joints.get_mut(dof),
+                    );
+                    let (Some(q), Some(dq), Some(ddq), Some(fault)) = places else {
+                        continue;
+                    };
+                    // Measured velocities and accelerations are used, and what is not measured is made of the highest that is.
+                    let gathered = self
+                        .scratch
+                        .gather(history, from, to, setup.max_silence, UNTRUSTED_ENCODER);
+                    *fault = gathered.err().unwrap_or(Reason::None);
+                    let highest = (0..3).rev().find(|&order| self.scratch.is_complete(order)).unwrap_or(0);
+                    let Some(noise) = self.noise.get_mut(dof) else { continue };
+                    let fit = self.scratch.fit(highest, t, noise);
+                    let exact = |order: usize| (self.scratch.value(order, t), 0.0);
+                    let values = match highest {
+                        0 => fit,
+                        1 => [exact(0), fit[0], fit[1]],
+                        _ => [exact(0), exact(1), fit[0]],
+                    };
+                    let errors = self.found.errors.chunks_exact_mut(3).nth(dof).unwrap_or_default();
+                    for ((place, (value, error)), old) in [&mut *q, dq, ddq].into_iter().zip(values).zip(errors) {
+                        is_moved |= differs((*place, *old), (value, error));
+                        (*place, *old) = (value, error);
+                    }
+                    if !(q.is_finite() && dq.is_finite() && ddq.is_finite()) {
+                        [*q, *dq, *ddq] = [0.0; 3];
+                        *fault = (*fault).or(Reason::NotFinite);
+                    }
+                }
+                (Track::Sensor(history), Use::Sensor(number)) => {
+                    let (Some(reading), Some(fault)) = (self.readings.get_mut(number), self.sensors.get_mut(number))
+                    else {
+                        continue;
+                    };
+                    let (mean, reason) = mean_reading(history, t, self.period, setup.max_silence);
+                    (*reading, *fault) = (mean, reason);
+                }
+                (Track::Imu(history, _), Use::Base) => {
+                    let gathered = self
+                        .scratch
+                        .gather(history, from, to, setup.max_silence, Quality::DEVICE_FAULT);
+                    base_fault = gathered.err().unwrap_or(Reason::None);
+                    let measured = &mut self.found.imu;
+                    let first = self.noise.len().saturating_sub(9);
+                    let mut noise = self.noise.iter_mut().skip(first);
+                    for axis in 0..3 {
+                        let mut none = f64::NAN;
+                        let mut next = || noise.next();
+                        let gyro = self.scratch.fit(3 + axis, t, next().unwrap_or(&mut none));
+                        let alpha = if self.scratch.is_complete(6 + axis) {
+                            self.scratch.fit(6 + axis, t, next().unwrap_or(&mut none))[0]
+                        } else {
+                            gyro[1]
+                        };
+                        let acceleration = self.scratch.fit(axis, t, next().unwrap_or(&mut none))[0];
+                        let errors = self.found.errors.iter_mut().rev().skip(3 * axis);
+                        for ((place, (value, error)), old) in [
+                            (&mut measured.proper_acceleration[axis], acceleration),
+                            (&mut measured.angular_velocity[axis], gyro[0]),
+                            (&mut measured.angular_acceleration[axis], alpha),
+                        ]
+                        .into_iter()
+                        .zip(errors)
+                        {
+                            is_moved |= differs((*place, *old), (value, error));
+                            (*place, *old) = (value, error);
+                        }
+                    }
+                    let numbers = [
+                        &measured.proper_acceleration,
+                        &measured.angular_velocity,
+                        &measured.angular_acceleration,
+                    ];
+                    if numbers.iter().any(|v| v.iter().any(|x| !x.is_finite())) {
+                        base_fault = base_fault.or(Reason::NotFinite);
+                        *measured = FrameMotion::standing(&Vec3::zeros());
+                    }
+                }
+                _ => {}
+            }
+        }
+        if is_moved {
+            self.held.copy_from(&self.found);
+        }
+        if let BaseMotion::Imu(pose) = &setup.base {
+            base = FrameMotion::of_link_from_imu(&self.held.imu, pose);
+        }
+        if base_link != self.kinematics.base() && self.kinematics.set_base(&setup.model, base_link).is_err() {
+            return;
+        }
+        let state = JointState {
+            position: &self.held.position,
+            velocity: &self.held.velocity,
+            acceleration: &self.held.acceleration,
+        };
+        if self.kinematics.update(&setup.model, state, &base).is_err() {
+            return;
+        }
+        // Sizes are those of the setup, numbers were looked at.
+        let _ = self.online.observe(&Observation {
+            t,
+            kinematics: &self.kinematics,
+            readings: &self.readings,
+            active,
+            base: base_fault,
+            joints: &self.joints,
+            sensors: &self.sensors,
+        });
+    }
+
+    /// Puts a solution in force whose stamp has come.
+    pub(super) fn apply(&mut self, setup: &mut Setup, propagation: &mut Propagation) -> bool {
+        // Where the job is, the room is.
+        if !self.online.apply() {
+            return false;
+        }
+        for component in &self.online.solution().components {
+            for (&link, body) in component.links.iter().zip(&component.bodies) {
+                // A link of the model, and finite: it is not refused.
+                let _ = setup.model.set_inertia(link, *body);
+            }
+            for (&sensor, offset) in component.sensors.iter().zip(&component.offsets) {
+                if let Some(place) = setup.offsets.get_mut(sensor) {
+                    *place = *offset;
+                }
+            }
+        }
+        if let Some(room) = &mut self.room {
+            std::mem::swap(propagation, &mut room.propagation);
+        }
+        true
+    }
+
+    pub(super) fn take_job(&mut self) -> Option<Job> {
+        self.room.as_ref()?;
+        let solving = self.online.take_job()?;
+        Some(Job {
+            solving,
+            room: self.room.take()?,
+        })
+    }
+
+    pub(super) fn give_back(&mut self, job: Job) {
+        self.online.give_back(job.solving);
+        self.room = Some(job.room);
+    }
+}
+
+/// By so many standard errors a number must differ from what it was held to be.
+const MOVED: f64 = 6.0;
+
+fn differs((held, error): (f64, f64), (value, new_error): (f64, f64)) -> bool {
+    let apart = (value - held).abs();
+    apart.is_nan() || apart > MOVED * error.hypot(new_error)
+}
+
+/// The motion that rows are made of: it stays what it was until some number of it differs from that by more than its own noise.
+///
+/// A robot that stands still has one state then, and all its rows are the same but for their right sides. Noise in the others would be motion that no force answers, of which
+/// some hundred rows would prove that the robot has no mass.
+#[derive(Clone)]
+struct Motion {
+    position: Vec<f64>,
+    velocity: Vec<f64>,
+    acceleration: Vec<f64>,
+    imu: FrameMotion,
+    /// Standard errors: three per joint, then nine of the IMU, its first axis' last.
+    errors: Vec<f64>,
+}
+
+impl Motion {
+    fn copy_from(&mut self, other: &Self) {
+        self.position.copy_from_slice(&other.position);
+        self.velocity.copy_from_slice(&other.velocity);
+        self.acceleration.copy_from_slice(&other.acceleration);
+        self.imu = other.imu;
+        self.errors.copy_from_slice(&other.errors);
+    }
+}
+
+/// The mean of a sensor's readings in the share of time about `t`; between two samples if there are none.
+fn mean_reading(history: &History<6>, t: Nanos, period: Nanos, max_silence: Nanos) -> (Wrench, Reason) {
+    let half = Nanos(period.0 / 2);
+    let (mut sum, mut count, mut quality) = ([0.0; 6], 0.0, Quality::GOOD);
+    for (_, value, q) in history.within(t - half, t + half) {
+        sum.iter_mut().zip(value).for_each(|(sum, x)| *sum += x);
+        count += 1.0;
+        quality |= q;
+    }
+    let mut stale = Reason::None;
+    if count == 0.0 {
+        let Some(held) = history.at(t, t + DELAY) else {
+            return (Wrench::zero(), Reason::NeverSeen);
+        };
+        (sum, count, quality) = (held.value, 1.0, held.quality);
+        if !held.interpolated || held.age > max_silence {
+            stale = Reason::Stale;
+        }
+    }
+    let [fx, fy, fz, tx, ty, tz] = sum.map(|x| x / count);
+    let reason = quality_reason(quality, Quality::DEVICE_FAULT).or(stale);
+    (Wrench::from_parts([fx, fy, fz], [tx, ty, tz]), reason)
+}
+
+/// Most points that a polynomial is fitted to: of more samples, neighbours are averaged.
+const POINTS: usize = 80;
+
+/// Windows: how far samples reach to both sides of the instant, as a share of [`DELAY`], and the polynomial's degree.
+const LONG: (f64, usize) = (1.0, 2);
+const MIDDLE: (f64, usize) = (0.6, 4);
+const SHORT: (f64, usize) = (0.32, 4);
+
+/// Least-squares polynomials about an instant, on the samples' own stamps, by polynomials orthogonal over these (Forsythe 1957): value and two derivatives.
+///
+/// Where a parabola over the whole window leaves no more than a quartic over its middle does, nothing much moves, and the parabola's derivatives are hardly noisy. Else
+/// the quartic over the shortest window follows: its error, for a sine of angular frequency `w` over `+-h`, goes with the fourth power of `w h`, and what it
+/// has of noise changes within a few instants. A bias would stay as long as the motion is alike, and weigh as much as many instants do.
+pub(super) struct Centred {
+    count: usize,
+    width: usize,
+    stamps: [Nanos; KEPT],
+    values: [[f64; KEPT]; 9],
+    points: usize,
+    times: [f64; POINTS],
+    signal: [f64; POINTS],
+    current: [f64; POINTS],
+    previous: [f64; POINTS],
+}
+
+impl Default for Centred {
+    fn default() -> Self {
+        Self {
+            count: 0,
+            width: 0,
+            stamps: [Nanos::ZERO; KEPT],
+            values: [[0.0; KEPT]; 9],
+            points: 0,
+            times: [0.0; POINTS],
+            signal: [0.0; POINTS],
+            current: [0.0; POINTS],
+            previous: [0.0; POINTS],
+        }
+    }
+}
+
+/// Fewest samples for a derivative.
+const FEWEST: usize = 5;
+/// Fewest samples more than a polynomial has coefficients, for what it leaves to tell of their noise.
+const SPARE: usize = 10;
+/// What one quiet instant adds to what is known of a number's noise.
+const LEARNT: f64 = 0.05;
+
+impl Centred {
+    /// Takes the samples of a channel between two instants.
+    ///
+    /// # Errors
+    /// Why they do not do.
+    fn gather<const D: usize>(
+        &mut self,
+        history: &History<D>,
+        from: Nanos,
+        to: Nanos,
+        max_silence: Nanos,
+        untrusted: Quality,
+    ) -> Result<(), Reason> {
+        (self.count, self.width) = (0, D);
+        let mut quality = Quality::GOOD;
+        let mut newest = to;
+        let mut gap = Nanos::ZERO;
+        for (t, value, q) in history.within(from, to) {
+            gap = gap.max(newest - t);
+            newest = t;
+            quality |= q;
+            if let Some(place) = self.stamps.get_mut(self.count) {
+                *place = t;
+            }
+            for (column, x) in self.values.iter_mut().zip(value) {
+                if let Some(place) = column.get_mut(self.count) {
+                    *place = *x;
+                }
+            }
+            self.count += 1;
+        }
+        gap = gap.max(newest - from);
+        match quality_reason(quality, untrusted) {
+            Reason::None if history.newest().is_none() => Err(Reason::NeverSeen),
+            Reason::None if self.count < FEWEST => Err(Reason::Starting),
+            // Both ends are near, and no hole is between.
+            Reason::None if gap > max_silence || gap.0 > (to - from).0 / 3 => Err(Reason::Stale),
+            Reason::None => Ok(()),
+            reason => Err(reason),
+        }
+    }
+
+    /// Whether a number is in every sample.
+    fn is_complete(&self, number: usize) -> bool {
+        let column = self.values.get(number).filter(|_| number < self.width);
+        let column = column.and_then(|column| column.get(..self.count));
+        column.is_some_and(|column| !column.is_empty() && column.iter().all(|x| x.is_finite()))
+    }
+
+    /// A number at an instant, on a straight line between its neighbours.
+    fn value(&self, number: usize, t: Nanos) -> f64 {
+        let (Some(column), stamps) = (self.values.get(number), &self.stamps) else {
+            return f64::NAN;
+        };
+        // Newest first.
+        let pairs = stamps.iter().zip(column).take(self.count);
+        let mut later: Option<(Nanos, f64)> = None;
+        for (&stamp, &value) in pairs {
+            if stamp <= t {
+                return later.map_or(value, |(after, next)| {
+                    value + (t - stamp).seconds() / (after - stamp).seconds() * (next - value)
+                });
+            }
+            later = Some((stamp, value));
+        }
+        f64::NAN
+    }
+
+    /// A number at `t`: value, first and second derivative, each with its standard error.
+    ///
+    /// `noise` is the variance of the number's samples, as far as it has shown where nothing moved: what a motion leaves of a polynomial is no noise. NaN: not
+    /// known yet, and taken as zero.
+    fn fit(&mut self, number: usize, t: Nanos, noise: &mut f64) -> [(f64, f64); 3] {
+        const NONE: (f64, f64) = (f64::NAN, 0.0);
+        if self.count < FEWEST || number >= self.values.len() {
+            return [NONE; 3];
+        }
+        self.condense(number, t);
+        let long = self.polynomial(LONG.0, LONG.1);
+        // What leaves few samples over seems exact by chance.
+        let middle = self
+            .polynomial(MIDDLE.0, MIDDLE.1)
+            .filter(|fit| fit.points > MIDDLE.1 + SPARE);
+        let short = self.polynomial(SHORT.0, SHORT.1).filter(|fit| fit.points > SHORT.1 + 3);
+        let is_quiet = match (&long, &middle) {
+            // Two standard deviations of the middle's variance.
+            (Some(long), Some(middle)) => {
+                long.variance <= middle.variance * (1.0 + 2.0 * (2.0 / middle.freedom).sqrt())
+            }
+            _ => false,
+        };
+        let chosen = if is_quiet { long } else { short.or(middle).or(long) };
+        if let (true, Some(long)) = (is_quiet, &long) {
+            let learnt = if noise.is_nan() { 1.0 } else { LEARNT };
+            *noise = if noise.is_nan() { 0.0 } else { *noise };
+            *noise += learnt * (long.variance - *noise);
+        }
+        let deviation = if noise.is_nan() { 0.0 } else { noise.sqrt() };
+        chosen.map_or([NONE; 3], |fit| {
+            std::array::from_fn(|i| (fit.at[i], fit.errors[i] * deviation))
+        })
+    }
+
+    /// Times relative to `t` in units of [`DELAY`], and values relative to the newest.
+    #[allow(
+        clippy::indexing_slicing,
+        reason = "count is at most the arrays' length, and so many points fit"
+    )]
+    fn condense(&mut self, number: usize, t: Nanos) {
+        let n = self.count.min(KEPT);
+        let share = n.div_ceil(POINTS).max(1);
+        self.points = 0;
+        let groups = self.stamps[..n]
+            .chunks(share)
+            .zip(self.values[number][..n].chunks(share));
+        for (stamps, values) in groups {
+            let of = 1.0 / stamps.len() as f64;
+            let time: f64 = stamps.iter().map(|stamp| (*stamp - t).seconds()).sum();
+            self.times[self.points] = time * of / DELAY.seconds();
+            self.signal[self.points] = values.iter().sum::<f64>() * of;
+            self.points += 1;
+        }
+    }
+
+    #[allow(clippy::indexing_slicing, reason = "as many points as were condensed")]
+    fn polynomial(&mut self, reach: f64, degree: usize) -> Option<Fitted> {
+        // Newest first.
+        let first = self.times[..self.points].iter().position(|u| *u <= reach)?;
+        let last = self.times[..self.points].iter().rposition(|u| *u >= -reach)?;
+        if last < first + degree {
+            return None;
+        }
+        let (times, values) = (&self.times[first..=last], &self.signal[first..=last]);
+        let n = times.len();
+        let (current, previous) = (&mut self.current[..n], &mut self.previous[..n]);
+        current.fill(1.0);
+        previous.fill(0.0);
+        // The polynomial and its first two derivatives at the instant, of this degree and of the one below.
+        let (mut at, mut below) = ([1.0, 0.0, 0.0], [0.0; 3]);
+        let (mut result, mut squares, mut norm_below) = ([0.0; 3], [0.0; 3], 1.0);
+        let level = values[0];
+        let mut left: f64 = values.iter().map(|x| (x - level) * (x - level)).sum();
+        for k in 0..=degree {
+            let (mut norm, mut moment, mut product) = (0.0, 0.0, 0.0);
+            for ((p, u), x) in current.iter().zip(times).zip(values) {
+                norm += p * p;
+                moment += u * p * p;
+                product += (x - level) * p;
+            }
+            if norm < 1e-14 * n as f64 {
+                return None;
+            }
+            left -= product * product / norm;
+            for ((sum, square), value) in result.iter_mut().zip(&mut squares).zip(at) {
+                *sum += product / norm * value;
+                *square += value * value / norm;
+            }
+            let (a, b) = (moment / norm, if k == 0 { 0.0 } else { norm / norm_below });
+            for ((p, old), u) in current.iter_mut().zip(previous.iter_mut()).zip(times) {
+                let next = (u - a) * *p - b * *old;
+                *old = std::mem::replace(p, next);
+            }
+            let next = [
+                -a * at[0] - b * below[0],
+                at[0] - a * at[1] - b * below[1],
+                2.0 * at[1] - a * at[2] - b * below[2],
+            ];
+            below = std::mem::replace(&mut at, next);
+            norm_below = norm;
+        }
+        let scale = DELAY.seconds();
+        let freedom = (n - degree - 1) as f64;
+        Some(Fitted {
+            at: [result[0] + level, result[1] / scale, result[2] / (scale * scale)],
+            errors: [
+                squares[0].sqrt(),
+                squares[1].sqrt() / scale,
+                squares[2].sqrt() / (scale * scale),
+            ],
+            // Rounding leaves something even of what fits exactly.
+            variance: left.max(1e-20 * n as f64) / freedom.max(1.0),
+            freedom: freedom.max(1.0),
+            points: n,
+        })
+    }
+}
+
+/// A polynomial at its instant, and what it leaves.
+#[derive(Clone, Copy, Debug)]
+struct Fitted {
+    at: [f64; 3],
+    /// Standard errors for points of unit variance.
+    errors: [f64; 3],
+    variance: f64,
+    freedom: f64,
+    points: usize,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_polynomial_of_degree_four_is_found_at_any_stamps() {
+        let mut history = History::<3>::default();
+        let signal = |t: f64| 0.3 - 0.5 * t + 2.0 * t * t - 3.0 * t.powi(3) + 4.0 * t.powi(4);
+        let centre = Nanos::from_seconds(0.7);
+        for k in 0..400 {
+            let t = Nanos::from_seconds(0.5 + 0.001 * f64::from(k) + 0.0003 * f64::from(k * k % 7));
+            history.push(t, [signal((t - centre).seconds()), f64::NAN, f64::NAN], Quality::GOOD);
+        }
+        let mut centred = Centred::default();
+        let mut noise_found = f64::NAN;
+        let silence = Nanos::from_millis(50);
+        centred
+            .gather(&history, centre - DELAY, centre + DELAY, silence, UNTRUSTED_ENCODER)
+            .unwrap();
+        assert!(centred.is_complete(0) && !centred.is_complete(1));
+        let found = centred.fit(0, centre, &mut noise_found);
+        for (found, expected) in found.iter().zip([0.3, -0.5, 4.0]) {
+            assert!((found.0 - expected).abs() < 1e-9, "{found:?}, not {expected}");
+        }
+    }
+
+    #[test]
+    fn a_sine_is_followed_rest_is_quiet_and_a_hole_is_seen() {
+        let silence = Nanos::from_millis(100);
+        let (w, centre) = (2.0 * std::f64::consts::PI, Nanos::from_seconds(1.25));
+        let mut random = 1u32;
+        let mut noise = || {
+            random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (f64::from(random) / f64::from(u32::MAX) - 0.5) * 2e-4
+        };
+        let mut centred = Centred::default();
+        let mut noise_found = f64::NAN;
+        for (size, bound) in [(1.0, 0.5), (0.0, 0.02)] {
+            let mut history = History::<3>::default();
+            for k in 0..250 {
+                let t = Nanos::from_millis(10 * k);
+                let value = size * (w * t.seconds()).sin() + noise();
+                history.push(t, [value, f64::NAN, f64::NAN], Quality::GOOD);
+            }
+            centred
+                .gather(&history, centre - DELAY, centre + DELAY, silence, UNTRUSTED_ENCODER)
+                .unwrap();
+            let [_, _, (acceleration, _)] = centred.fit(0, centre, &mut noise_found);
+            let error = (acceleration + size * w * w).abs();
+            // Of 39.5 rad/s^2: a quadratic over all of the window would lose 7.
+            assert!(error < bound, "{error}");
+            // The end of the samples is no middle.
+            let end = Nanos::from_millis(2490);
+            let refused = centred.gather(&history, end - DELAY, end + DELAY, silence, UNTRUSTED_ENCODER);
+            assert_eq!(refused, Err(Reason::Stale));
+        }
+    }
+}
