@@ -5,7 +5,8 @@
 //! killed and started again.
 
 use crate::config::{Config, ConfigError};
-use crate::pipeline::Pipeline;
+use crate::identify::online::Paused;
+use crate::pipeline::{Job, Pipeline};
 use crate::setup::Setup;
 use anyhow::{Context, anyhow};
 use proprio_topics::ipc::{Domain, DomainConfig, DomainError, PortError, Reader, Topic, Writer, monotonic};
@@ -148,6 +149,7 @@ struct DataPlane {
     health_writer: Writer<EstimatorHealth>,
     description_writer: Writer<Description>,
     health: EstimatorHealth,
+    identifier: Option<Identifier>,
     next_look: Nanos,
     next_health: Nanos,
     last_turn: Arc<AtomicI64>,
@@ -164,9 +166,18 @@ impl DataPlane {
         let contacts = Writer::create(&domain, robot, epoch)?;
         let now = monotonic();
         description_writer.send(&setup.description(), now)?;
+        let pipeline = Pipeline::new(setup);
+        if let Some(refusal) = pipeline.identification_refused() {
+            tracing::warn!("identification.enabled: {refusal}");
+        }
+        let identifier = pipeline
+            .identification()
+            .map(|online| Identifier::start(online.component_count()))
+            .transpose()?;
         Ok(Self {
             robot: robot.to_owned(),
-            pipeline: Pipeline::new(setup),
+            pipeline,
+            identifier,
             samples: None,
             inbox: Vec::with_capacity(INBOX),
             descriptions: None,
@@ -206,6 +217,13 @@ impl DataPlane {
                 look(&mut self.descriptions, &self.domain, &self.robot);
             }
             self.take_declarations();
+            if let Some(job) = self
+                .identifier
+                .as_ref()
+                .and_then(|identifier| identifier.done.try_recv().ok())
+            {
+                self.pipeline.give_back(job);
+            }
             let idle = !self.take_samples();
             if now >= self.next_health {
                 self.next_health = now + HEALTH_PERIOD;
@@ -255,6 +273,12 @@ impl DataPlane {
                 self.health.publish_failures += u64::from(!sent);
                 self.health.withheld += u64::from(estimate.torques.joints().iter().any(|j| j.valid != 1));
                 self.health.last_estimate = estimate.t;
+                if let Some(identifier) = &self.identifier
+                    && let Some(job) = self.pipeline.take_job()
+                {
+                    // There is one job, so there is room; a thread that ended has told why.
+                    let _ = identifier.jobs.try_send(job);
+                }
             }
         }
         !self.inbox.is_empty()
@@ -316,9 +340,56 @@ impl DataPlane {
             (counts.late, counts.backward, counts.not_finite);
         self.health.lost = self.samples.as_ref().map_or(0, Reader::lost);
         self.health.epochs = self.samples.as_ref().map_or(0, Reader::epochs);
+        if let (Some(identifier), Some(online)) = (&mut self.identifier, self.pipeline.identification()) {
+            for (component, (told, changes)) in identifier.told.iter_mut().enumerate() {
+                let Some((paused, counts)) = online.state(component) else {
+                    continue;
+                };
+                if std::mem::replace(told, paused) != paused {
+                    tracing::info!(component, "{paused}");
+                }
+                if std::mem::replace(changes, counts.changes) != counts.changes
+                    && let Some(change) = online.last_change(component)
+                {
+                    tracing::warn!(component, "{change}");
+                }
+            }
+        }
         // Who can not be reached now gets the next one.
         let _ = self.health_writer.send(&self.health, now);
         let _ = self.description_writer.update_connections();
+    }
+}
+
+/// The thread that solves for the parameters, and what was last told of it. The data plane never waits for it.
+struct Identifier {
+    jobs: mpsc::SyncSender<Job>,
+    done: mpsc::Receiver<Job>,
+    /// Per component: why it pauses, and how many changes it has seen.
+    told: Vec<(Paused, u64)>,
+}
+
+impl Identifier {
+    /// Starts the thread; it ends with this.
+    fn start(components: usize) -> anyhow::Result<Self> {
+        let (jobs, waiting) = mpsc::sync_channel::<Job>(1);
+        let (back, done) = mpsc::sync_channel(1);
+        std::thread::Builder::new()
+            .name("identify".into())
+            .spawn(move || {
+                while let Ok(mut job) = waiting.recv() {
+                    job.run();
+                    if back.send(job).is_err() {
+                        break;
+                    }
+                }
+            })
+            .context("cannot start a thread")?;
+        Ok(Self {
+            jobs,
+            done,
+            told: vec![(Paused::No, 0); components],
+        })
     }
 }
 
