@@ -235,6 +235,11 @@ pub struct Identification {
     pub inputs: Vec<IdentificationInput>,
     /// At how many instants a second on-line identification looks, at the most; the trigger's rate if that is less \[Hz\].
     pub rate_hz: f64,
+    /// Where what was identified on-line is kept between runs of the daemon, relative to this file; default: nowhere. It wins over
+    /// `parameters`. A file that does not fit is renamed, and identification begins without it.
+    pub state: Option<PathBuf>,
+    /// How often it is written \[s\]; at the end, too.
+    pub save_every_s: f64,
     /// How far the URDF's inertias may be off, where nothing was identified: the relative standard deviation of a link's mass, and likewise of its mass
     /// distribution ([`crate::parameters::cad_root`]). Torques that rest on such links are as uncertain as this makes them. 0: they are exact.
     pub model_std: f64,
@@ -247,6 +252,8 @@ impl Default for Identification {
             enabled: false,
             inputs: Vec::new(),
             rate_hz: 100.0,
+            state: None,
+            save_every_s: 60.0,
             model_std: 0.2,
         }
     }
@@ -338,6 +345,7 @@ impl Config {
         let folder = file.parent().unwrap_or(Path::new("."));
         config.model = folder.join(&config.model);
         config.parameters = config.parameters.map(|p| folder.join(p));
+        config.identification.state = config.identification.state.map(|p| folder.join(p));
         Ok(config)
     }
 
@@ -395,6 +403,10 @@ impl Config {
         let rate = self.identification.rate_hz;
         if !(1.0..=1000.0).contains(&rate) {
             return Err(format!("identification.rate_hz = {rate} must be 1 to 1000"));
+        }
+        let every = self.identification.save_every_s;
+        if !(1.0..=1e6).contains(&every) {
+            return Err(format!("identification.save_every_s = {every} must be 1 to 1000000"));
         }
         // What may come while an instant waits is kept: 32 samples of a channel beside those of its window, 256 instants.
         if !(self.output.max_wait_ms >= 0.0 && self.output.max_wait_ms <= 250.0) {
@@ -558,6 +570,11 @@ mod tests {
                 "[output]",
                 "[identification]\nrate_hz = 0.1\n[output]",
                 "identification.rate_hz = 0.1 must be 1 to 1000",
+            ),
+            (
+                "[output]",
+                "[identification]\nsave_every_s = 0\n[output]",
+                "identification.save_every_s = 0 must be 1 to",
             ),
             ("trigger = \"ft\"", "triger = \"ft\"", "unknown field `triger`"),
             (

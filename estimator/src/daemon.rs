@@ -5,7 +5,7 @@
 //! killed and started again.
 
 use crate::config::{Config, ConfigError};
-use crate::identify::online::Paused;
+use crate::identify::online::{Paused, state};
 use crate::pipeline::{Job, Pipeline};
 use crate::setup::Setup;
 use anyhow::{Context, anyhow};
@@ -16,7 +16,7 @@ use proprio_topics::{
 };
 use sd_notify::NotifyState;
 use std::io::Write as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::{Acquire, Relaxed, Release};
 use std::sync::atomic::{AtomicBool, AtomicI64};
@@ -87,11 +87,15 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
     let last_turn = Arc::new(AtomicI64::new(monotonic().0));
     let (ready, is_ready) = mpsc::channel();
     let (robot, realtime, domain) = (config.robot.clone(), config.realtime, domain.clone());
+    let kept = config.identification.state.clone().map(|file| Kept {
+        file,
+        every: Nanos::from_seconds(config.identification.save_every_s),
+    });
     let (stop_there, turn_there) = (Arc::clone(&stop), Arc::clone(&last_turn));
     let thread = std::thread::Builder::new()
         .name("estimate".into())
         .spawn(move || {
-            let mut plane = match DataPlane::open(&domain, &robot, setup, turn_there) {
+            let mut plane = match DataPlane::open(&domain, &robot, setup, kept, turn_there) {
                 Ok(plane) => plane,
                 Err(error) => return drop(ready.send(Err(error))),
             };
@@ -156,7 +160,13 @@ struct DataPlane {
 }
 
 impl DataPlane {
-    fn open(domain: &DomainConfig, robot: &str, setup: Setup, last_turn: Arc<AtomicI64>) -> anyhow::Result<Self> {
+    fn open(
+        domain: &DomainConfig,
+        robot: &str,
+        setup: Setup,
+        kept: Option<Kept>,
+        last_turn: Arc<AtomicI64>,
+    ) -> anyhow::Result<Self> {
         let domain = Domain::open(domain)?;
         let epoch = domain.epoch();
         // The health first: it admits one writer, which is how a second estimator of this robot finds out.
@@ -166,13 +176,16 @@ impl DataPlane {
         let contacts = Writer::create(&domain, robot, epoch)?;
         let now = monotonic();
         description_writer.send(&setup.description(), now)?;
-        let pipeline = Pipeline::new(setup);
+        let mut pipeline = Pipeline::new(setup);
+        if let Some(kept) = &kept {
+            kept.resume(&mut pipeline);
+        }
         if let Some(refusal) = pipeline.identification_refused() {
             tracing::warn!("identification.enabled: {refusal}");
         }
         let identifier = pipeline
             .identification()
-            .map(|online| Identifier::start(online.component_count()))
+            .map(|online| Identifier::start(online.component_count(), kept))
             .transpose()?;
         Ok(Self {
             robot: robot.to_owned(),
@@ -273,11 +286,11 @@ impl DataPlane {
                 self.health.publish_failures += u64::from(!sent);
                 self.health.withheld += u64::from(estimate.torques.joints().iter().any(|j| j.valid != 1));
                 self.health.last_estimate = estimate.t;
-                if let Some(identifier) = &self.identifier
+                if let Some(jobs) = self.identifier.as_ref().and_then(|identifier| identifier.jobs.as_ref())
                     && let Some(job) = self.pipeline.take_job()
                 {
                     // There is one job, so there is room; a thread that ended has told why.
-                    let _ = identifier.jobs.try_send(job);
+                    let _ = jobs.try_send(job);
                 }
             }
         }
@@ -361,35 +374,96 @@ impl DataPlane {
     }
 }
 
+/// Where what was identified is kept.
+struct Kept {
+    file: PathBuf,
+    every: Nanos,
+}
+
+impl Kept {
+    /// Goes on from the file, if it is there; one that does not fit is set aside.
+    fn resume(&self, pipeline: &mut Pipeline) {
+        let file = self.file.display();
+        let text = match std::fs::read(&self.file) {
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return,
+            Err(error) => {
+                return tracing::error!("{file}: can not be read: {error}; identification begins without it");
+            }
+            Ok(bytes) => String::from_utf8_lossy(&bytes).into_owned(),
+        };
+        match pipeline.resume(&text) {
+            Ok(()) => tracing::info!("{file}: identification goes on where it was"),
+            Err(error) => match state::set_aside(&self.file) {
+                Ok(aside) => tracing::error!(
+                    "{file}: {error}; renamed to {}, identification begins without it",
+                    aside.display()
+                ),
+                Err(other) => {
+                    tracing::error!("{file}: {error}; it can not be renamed ({other}), and will be overwritten");
+                }
+            },
+        }
+    }
+
+    fn write(&self, text: &str) {
+        if let Err(error) = state::write(&self.file, text) {
+            tracing::error!("{}: {error}", self.file.display());
+        }
+    }
+}
+
 /// The thread that solves for the parameters, and what was last told of it. The data plane never waits for it.
 struct Identifier {
-    jobs: mpsc::SyncSender<Job>,
+    jobs: Option<mpsc::SyncSender<Job>>,
     done: mpsc::Receiver<Job>,
+    thread: Option<std::thread::JoinHandle<()>>,
     /// Per component: why it pauses, and how many changes it has seen.
     told: Vec<(Paused, u64)>,
 }
 
 impl Identifier {
-    /// Starts the thread; it ends with this.
-    fn start(components: usize) -> anyhow::Result<Self> {
+    /// Starts the thread; it ends with this, and then keeps what it knows.
+    fn start(components: usize, kept: Option<Kept>) -> anyhow::Result<Self> {
         let (jobs, waiting) = mpsc::sync_channel::<Job>(1);
         let (back, done) = mpsc::sync_channel(1);
-        std::thread::Builder::new()
-            .name("identify".into())
-            .spawn(move || {
-                while let Ok(mut job) = waiting.recv() {
-                    job.run();
-                    if back.send(job).is_err() {
-                        break;
+        let work = move || {
+            let (mut unwritten, mut written) = (None, monotonic());
+            while let Ok(mut job) = waiting.recv() {
+                job.run();
+                if let Some(kept) = &kept {
+                    let text = job.state();
+                    if monotonic() - written >= kept.every {
+                        kept.write(&text);
+                        (unwritten, written) = (None, monotonic());
+                    } else {
+                        unwritten = Some(text);
                     }
                 }
-            })
+                // Who has ended needs no solution any more.
+                let _ = back.send(job);
+            }
+            if let (Some(kept), Some(text)) = (&kept, unwritten) {
+                kept.write(&text);
+            }
+        };
+        let thread = std::thread::Builder::new()
+            .name("identify".into())
+            .spawn(work)
             .context("cannot start a thread")?;
         Ok(Self {
-            jobs,
+            jobs: Some(jobs),
             done,
+            thread: Some(thread),
             told: vec![(Paused::No, 0); components],
         })
+    }
+}
+
+impl Drop for Identifier {
+    fn drop(&mut self) {
+        self.jobs = None;
+        // The job that is done takes the room of the channel: none is waited for longer than one takes.
+        let _ = self.thread.take().map(std::thread::JoinHandle::join);
     }
 }
 

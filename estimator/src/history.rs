@@ -150,11 +150,16 @@ mod tests {
     #[test]
     fn the_oldest_give_way() {
         let mut history = History::<1>::default();
-        for i in 0..1000 {
+        for i in 0..5000 {
             history.push(Nanos(i), [0.0], Quality::GOOD);
         }
-        assert_eq!(history.newest(), Some(Nanos(999)));
-        assert!(history.at(Nanos(1000 - 257), Nanos::MAX).is_none());
-        assert!(history.at(Nanos(1000 - 256), Nanos::MAX).is_some());
+        assert_eq!(history.newest(), Some(Nanos(4999)));
+        assert!(history.at(Nanos(5000 - 1025), Nanos::MAX).is_none());
+        assert!(history.at(Nanos(5000 - 1024), Nanos::MAX).is_some());
+        let within = history.within(Nanos(0), Nanos(4000));
+        assert_eq!(
+            within.map(|(t, ..)| t.0).collect::<Vec<_>>(),
+            (3976..=4000).rev().collect::<Vec<_>>()
+        );
     }
 }

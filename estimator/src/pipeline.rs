@@ -22,6 +22,7 @@ pub use learning::Job;
 use crate::differentiate::{Unavailable, Window};
 use crate::dynamics::{Certainty, ContactSet, Dependence, FrameMotion, JointState, Kinematics, Solver};
 use crate::history::{Held, History};
+use crate::identify::online::state::StateError;
 use crate::identify::online::{Online, OnlineError};
 use crate::regressor::Propagation;
 use crate::setup::{BaseMotion, Setup, Use};
@@ -252,6 +253,17 @@ impl Pipeline {
     #[must_use]
     pub fn identification_refused(&self) -> Option<&OnlineError> {
         self.refusal.as_ref()
+    }
+
+    /// Goes on with what an earlier run had identified ([`Job::state`]), before the first sample. Nothing happens where nothing is identified.
+    ///
+    /// # Errors
+    /// The state is damaged, or another robot's; then nothing is changed.
+    pub fn resume(&mut self, state: &str) -> Result<(), StateError> {
+        let Some(learning) = &mut self.learning else {
+            return Ok(());
+        };
+        learning.resume(state, &mut self.setup, &mut self.propagation)
     }
 
     /// What identification has to compute, about once a second of stamps: run it and [`Pipeline::give_back`]. Ask after each estimate. If it is back before a

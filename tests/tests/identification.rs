@@ -7,7 +7,7 @@
 //! (`tests/oracle/README.md` says how).
 
 use proprio_estimator::config::{Config, ForceTorque, Presence};
-use proprio_estimator::identify::online::{Change, Counts, Paused};
+use proprio_estimator::identify::online::{Change, Counts, Paused, state};
 use proprio_estimator::model::Model;
 use proprio_estimator::offline::estimate;
 use proprio_estimator::parameters::{Offset, Parameters, Provenance};
@@ -538,7 +538,17 @@ fn told_by(
     delay: usize,
     end: &mut Option<Pipeline>,
 ) -> (Vec<Estimate>, Vec<(f64, Paused)>, Counts, Vec<Change>) {
-    let mut pipeline = Pipeline::new(setup);
+    *end = Some(Pipeline::new(setup));
+    told_from(log, delay, end)
+}
+
+/// The same of a pipeline that is there.
+fn told_from(
+    log: &str,
+    delay: usize,
+    end: &mut Option<Pipeline>,
+) -> (Vec<Estimate>, Vec<(f64, Paused)>, Counts, Vec<Change>) {
+    let mut pipeline = end.take().expect("a pipeline");
     assert!(pipeline.identification_refused().is_none());
     let mut reader = Reader::new(log.as_bytes()).unwrap();
     let series: Vec<_> = reader.series().iter().map(|s| (s.what, s.name.clone())).collect();
@@ -710,6 +720,97 @@ fn identification_begins_where_the_session_before_ended() {
     let all = |scores: &BTreeMap<String, Score>| rms(sessions.distal.iter().map(|joint| scores[*joint].error));
     println!("{:.4} Nm, CAD {:.4}", all(&resumed), all(&cad));
     assert!(all(&resumed) < all(&cad) / 10.0);
+}
+
+#[test]
+fn a_state_is_resumed_and_one_that_does_not_fit_is_refused() {
+    let sessions = arm();
+    let mut end = None;
+    told_by(learning(&sessions), &sessions.log("train"), 0, &mut end);
+    let mut taught = end.unwrap();
+    // One more job, whose snapshot the state is of.
+    let mut at = Nanos::from_seconds(28.0);
+    let job = loop {
+        if let Some(job) = taught.take_job() {
+            break job;
+        }
+        at += Nanos::from_millis(20);
+        assert!(at < Nanos::from_seconds(40.0));
+        let trigger = taught.setup().trigger;
+        let reading = proprio_topics::Reading::Wrench(proprio_topics::Wrench {
+            force: [0.0; 3],
+            torque: [0.0; 3],
+        });
+        taught.push(trigger, at, &reading, proprio_topics::Quality::GOOD);
+        while taught.poll().is_some() {}
+    };
+    let text = job.state();
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("state");
+    state::write(&file, &text).unwrap();
+    assert_eq!(read(&file), text);
+
+    let mut resumed = Pipeline::new(learning(&sessions));
+    resumed.resume(&text).unwrap();
+    // Without offsets, which a restart may change, but the same bodies, to what the offsets told of them.
+    let known = |pipeline: &Pipeline| pipeline.identification().unwrap().solution().components[0].clone();
+    let (before, after) = (known(&taught), known(&resumed));
+    for (a, b) in before.bodies.iter().zip(&after.bodies) {
+        assert!(
+            (a.mass - b.mass).abs() < 0.02 * a.mass.max(0.1),
+            "{} {}",
+            a.mass,
+            b.mass
+        );
+    }
+    // And it is of use from the beginning of the next session.
+    let (begin, _) = sessions.moving("validate");
+    let log = sessions.log("validate");
+    let mut early = f64::NAN;
+    let joint = "l_elbow";
+    let truth = Table::new(&log);
+    let told = {
+        let mut end = Some(resumed);
+        told_from(&log, 0, &mut end).0
+    };
+    let errors: Vec<f64> = truth
+        .rows_with(&format!("joint/{joint}/torque"))
+        .into_iter()
+        .filter_map(|row| {
+            let t = truth.column("t")[row];
+            let at = told.iter().find(|e| (e.t.seconds() - t).abs() < 1e-6)?;
+            let is_early = t > begin + 0.5 && t < begin + 4.0;
+            is_early.then(|| at.torques.joints()[3].torque - truth.column(&format!("joint/{joint}/torque"))[row])
+        })
+        .collect();
+    if !errors.is_empty() {
+        early = rms(errors.into_iter());
+    }
+    println!("{early:.4} Nm");
+    assert!(early < 0.015, "{early}");
+
+    let refused = |text: &str| {
+        let mut pipeline = Pipeline::new(learning(&sessions));
+        pipeline.resume(text).unwrap_err().to_string()
+    };
+    assert!(refused("").contains("damaged"));
+    assert!(refused(&text[..text.len() / 2]).contains("damaged"));
+    let at = text.find("row").unwrap() + 10;
+    let other = if &text[at..=at] == "0" { "1" } else { "0" };
+    assert!(refused(&format!("{}{other}{}", &text[..at], &text[at + 1..])).contains("sum is not right"));
+    assert!(refused(&text.replacen("state 1", "state 2", 1)).contains("schema 2"));
+    let mut config = Config::load(&sessions.folder.join("estimator.toml")).unwrap();
+    config.identification.enabled = true;
+    config.contact.last_mut().unwrap().presence = Presence::Possible;
+    config.robot = "another".into();
+    let other = Pipeline::new(Setup::new(&config).unwrap()).resume(&text).unwrap_err();
+    assert!(other.to_string().contains("another robot"), "{other}");
+    config.robot = "icub_left_arm".into();
+    config.model.clone_from(&sessions.urdf);
+    let other = Pipeline::new(Setup::new(&config).unwrap()).resume(&text).unwrap_err();
+    assert!(other.to_string().contains("another model"), "{other}");
+    let aside = state::set_aside(&file).unwrap();
+    assert!(aside.ends_with("state.bad-1") && aside.exists() && !file.exists());
 }
 
 /// The part of a log before the robot moves, `times` times over, stamps going on.

@@ -25,6 +25,8 @@
 //! start afresh explains them, the offsets do; if with new parameters of the outermost links it does, a load has changed; else it stays a contact.
 //! Offsets wander between blocks (random walks at a bounded rate), and stand still while a contact is declared or suspected.
 
+pub mod state;
+
 use std::sync::Arc;
 
 use nalgebra::DMatrix;

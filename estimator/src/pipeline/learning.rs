@@ -11,6 +11,7 @@ use proprio_topics::{Nanos, Quality, Reason};
 use super::{OrReason, Track, UNTRUSTED_ENCODER, quality_reason};
 use crate::dynamics::{ContactSet, FrameMotion, JointState, Kinematics};
 use crate::history::{History, KEPT};
+use crate::identify::online::state::StateError;
 use crate::identify::online::{Job as Solving, Observation, Online, OnlineError};
 use crate::regressor::{Covariance, Propagation};
 use crate::setup::{BaseMotion, Setup, Use};
@@ -61,6 +62,12 @@ impl Job {
         if let Ok(new) = Propagation::new(&setup.structure, &covariance) {
             *propagation = new;
         }
+    }
+
+    /// What was known when it began, as text: for [`super::Pipeline::resume`].
+    #[must_use]
+    pub fn state(&self) -> String {
+        self.solving.state(&self.room.setup.robot)
     }
 }
 
@@ -275,6 +282,29 @@ impl Learning {
         if !self.online.apply() {
             return false;
         }
+        self.enforce(setup, propagation);
+        true
+    }
+
+    /// Goes on from an earlier state.
+    pub(super) fn resume(
+        &mut self,
+        text: &str,
+        setup: &mut Setup,
+        propagation: &mut Propagation,
+    ) -> Result<(), StateError> {
+        self.online.resume(&setup.robot, text)?;
+        if let Some(room) = &mut self.room
+            && let Ok(new) = Propagation::new(&setup.structure, &covariance(setup, self.online.solution()))
+        {
+            room.propagation = new;
+        }
+        self.enforce(setup, propagation);
+        Ok(())
+    }
+
+    /// Puts the last solution where the pipeline reads it.
+    fn enforce(&mut self, setup: &mut Setup, propagation: &mut Propagation) {
         for component in &self.online.solution().components {
             for (&link, body) in component.links.iter().zip(&component.bodies) {
                 // A link of the model, and finite: it is not refused.
@@ -289,7 +319,6 @@ impl Learning {
         if let Some(room) = &mut self.room {
             std::mem::swap(propagation, &mut room.propagation);
         }
-        true
     }
 
     pub(super) fn take_job(&mut self) -> Option<Job> {
@@ -618,8 +647,8 @@ mod tests {
         let mut history = History::<3>::default();
         let signal = |t: f64| 0.3 - 0.5 * t + 2.0 * t * t - 3.0 * t.powi(3) + 4.0 * t.powi(4);
         let centre = Nanos::from_seconds(0.7);
-        for k in 0..400 {
-            let t = Nanos::from_seconds(0.5 + 0.001 * f64::from(k) + 0.0003 * f64::from(k * k % 7));
+        for k in 0..70 {
+            let t = Nanos::from_seconds(0.4 + 0.01 * f64::from(k) + 0.0003 * f64::from(k * k % 7));
             history.push(t, [signal((t - centre).seconds()), f64::NAN, f64::NAN], Quality::GOOD);
         }
         let mut centred = Centred::default();
