@@ -12,7 +12,7 @@ use std::sync::OnceLock;
 use std::time::Duration;
 
 /// Long enough for anything that happens at all; never waited for where all is well.
-pub const PATIENCE: Nanos = Nanos::from_millis(30_000);
+pub const PATIENCE: Nanos = Nanos::from_millis(120_000);
 
 /// The clock that all stamps are of.
 #[must_use]
