@@ -1,5 +1,6 @@
 //! Variants of `config/icub_left_arm`: the same arm on other buses, at another pace, with another patience.
 
+use crate::uml;
 use proprio_simulator::Robot;
 use std::fs;
 use std::path::Path;
@@ -40,10 +41,15 @@ impl Arm {
         Self { gateway, estimator }
     }
 
-    /// A pace for a single slow processor: F/T every 10 ms, joints and IMU every 20 ms, and patience to go with it.
+    /// A pace for a single slow processor: F/T every 10 ms, joints and IMU every 20 ms, and patience to go with it. Half of that in user-mode Linux, where
+    /// some hosts take 10 ms to carry one frame through all processes: a board must still be heard in time to count as started.
     #[must_use]
     pub fn slow() -> Self {
-        let paced = Self::new().periods(10, 20, 20).patience(1000.0, 100.0);
+        let paced = if uml() {
+            Self::new().periods(20, 40, 40).patience(4000.0, 200.0)
+        } else {
+            Self::new().periods(10, 20, 20).patience(1000.0, 100.0)
+        };
         // The halves of a wrench, too, may come far apart where everything shares one processor.
         paced.each_device(|driver, device| {
             if driver == "icub_strain" {

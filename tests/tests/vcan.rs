@@ -543,9 +543,12 @@ fn floods_are_counted() {
         0
     );
 
+    let random = if uml() { 300 } else { 1500 };
     for (number, interface) in INTERFACES.iter().enumerate() {
         for kind in ["", "-e", "-R", "-e -R", "-f", "-m"] {
-            can::run(&format!("cangen {interface} -g 0 -p 100 -I r -L r -D r -n 1500 {kind}"));
+            can::run(&format!(
+                "cangen {interface} -g 0 -p 100 -I r -L r -D r -n {random} {kind}"
+            ));
         }
         for claim in claims(plan, number) {
             can::run(&format!(
