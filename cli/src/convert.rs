@@ -322,7 +322,12 @@ pub(crate) fn blame_columns(header: &[u8], log: &Path, config: &Path, setup: &Se
 
 /// Estimates from a table.
 pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
-    let (_, setup) = proprio_estimator::daemon::load(&args.config, args.parameters.as_deref())?;
+    let (_, setup) = proprio_estimator::daemon::load(&args.config, |config| {
+        // What the command line names counts.
+        if let Some(parameters) = &args.parameters {
+            config.parameters = Some(parameters.clone());
+        }
+    })?;
     let log = input(&args.log)?;
     let mut out = Output::new(&args.out)?;
     let report = match proprio_estimator::offline::estimate(setup, log, out.writer()) {

@@ -13,11 +13,11 @@ use crate::convert::blame_columns;
 use advice::{Advice, findings, sentence};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
-use proprio_estimator::config::{Config, ConfigError};
+use proprio_estimator::config::ConfigError;
 use proprio_estimator::identify::{self, IdentifyError, Log, Options, Outcome, Progress, Role, Severity, Verdict};
 use proprio_estimator::setup::Setup;
 use std::fs::{self, File};
-use std::io::{BufRead, BufReader, Cursor, IsTerminal, Read, Write};
+use std::io::{BufRead, BufReader, Cursor, IsTerminal, Read};
 use std::path::{Path, PathBuf};
 
 /// `proprio identify`.
@@ -45,7 +45,11 @@ const FILES: [&str; 4] = ["summary.json", "parameters.toml", "identified.urdf", 
 
 /// Identifies.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    let (config, setup) = load(&args.config)?;
+    let (config, setup) = proprio_estimator::daemon::load(&args.config, |config| {
+        // The URDF's own parameters: those identified earlier are no part of what is identified now. Nor is identification on-line asked for.
+        config.parameters = None;
+        config.identification.enabled = false;
+    })?;
     // Now, because it may be a result of an earlier run.
     let urdf =
         fs::read_to_string(&config.model).with_context(|| format!("{}: can not be read", config.model.display()))?;
@@ -136,22 +140,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The configuration, with the URDF's own parameters: those identified earlier are no part of what is identified now.
-fn load(file: &Path) -> anyhow::Result<(Config, Setup)> {
-    let mut config = Config::load(file)?;
-    config.parameters = None;
-    // Identification on-line is not asked for here.
-    config.identification.enabled = false;
-    let setup = Setup::new(&config).map_err(|problem| ConfigError {
-        file: file.to_owned(),
-        problem,
-    })?;
-    for warning in setup.warnings() {
-        tracing::warn!("{}: {warning}", file.display());
-    }
-    Ok((config, setup))
-}
-
 /// Opens a table, whose columns are checked before anything else is done.
 fn open(file: &Path, config: &Path, setup: &Setup) -> anyhow::Result<impl Read + Send + use<>> {
     let mut table = BufReader::with_capacity(
@@ -206,17 +194,9 @@ fn progress_bar() -> ProgressBar {
 
 /// Writes a file of the result; it gets its name when it is complete.
 fn write(folder: &Path, name: &str, text: &str) -> anyhow::Result<()> {
-    use std::os::unix::fs::PermissionsExt as _;
-    let told = || format!("{}: can not be written", folder.join(name).display());
-    let mut file = tempfile::NamedTempFile::new_in(folder)
-        .map_err(|e| std::io::Error::from(e.kind()))
-        .with_context(told)?;
-    file.write_all(text.as_bytes()).with_context(told)?;
-    file.as_file().sync_all().with_context(told)?;
-    // Temporary files are private; a result is for whoever may read the folder.
-    fs::set_permissions(file.path(), fs::Permissions::from_mode(0o644)).with_context(told)?;
-    file.persist(folder.join(name)).with_context(told)?;
-    Ok(())
+    let file = folder.join(name);
+    proprio_estimator::files::replace(&file, text, 0o644)
+        .with_context(|| format!("{}: can not be written", file.display()))
 }
 
 /// The result in a few lines.

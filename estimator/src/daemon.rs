@@ -40,7 +40,7 @@ const INBOX: usize = <Sample as Topic>::QUALITY.buffer * <Sample as Topic>::QUAL
 /// # Errors
 /// One chain that says what, where and what to do; [`ConfigError`] at its root is a wrong configuration.
 pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<()> {
-    let (config, setup) = load(config, None)?;
+    let (config, setup) = load(config, |_| {})?;
     if check {
         // Whoever reads it may stop early.
         let _ = write!(std::io::stdout(), "{setup}");
@@ -53,16 +53,13 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
     runtime.block_on(serve(&config, setup, domain))
 }
 
-/// Reads a configuration, its model, and identified parameters: those of `parameters`, if given, instead of those that the configuration names. Tells warnings to
-/// the log.
+/// Reads a configuration, changed by `adjust` before anything else is read, and what it names: model, identified parameters. Tells warnings to the log.
 ///
 /// # Errors
 /// [`ConfigError`].
-pub fn load(file: &Path, parameters: Option<&Path>) -> Result<(Config, Setup), ConfigError> {
+pub fn load(file: &Path, adjust: impl FnOnce(&mut Config)) -> Result<(Config, Setup), ConfigError> {
     let mut config = Config::load(file)?;
-    if let Some(parameters) = parameters {
-        config.parameters = Some(parameters.to_owned());
-    }
+    adjust(&mut config);
     let setup = Setup::new(&config).map_err(|problem| ConfigError {
         file: file.to_owned(),
         problem,

@@ -15,12 +15,14 @@
 //! - [`differentiate`]: position, velocity and acceleration at any instant from noisy, quantised samples; [`history`]: what
 //!   is used as measured.
 //! - [`pipeline`]: samples in, estimates out; no input, no output, no clock.
+//! - [`files`]: files that are replaced whole.
 //! - [`offline`]: a table of samples to a table of estimates; [`daemon`]: the same from and to shared memory.
 
 pub mod config;
 pub mod daemon;
 pub mod differentiate;
 pub mod dynamics;
+pub mod files;
 pub mod history;
 pub mod identify;
 pub mod model;

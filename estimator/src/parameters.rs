@@ -29,13 +29,15 @@
 
 use std::f64::consts::FRAC_1_SQRT_2;
 use std::fmt::{self, Write as _};
-use std::io::{self, Write as _};
-use std::path::{Path, PathBuf};
+use std::io;
+use std::path::Path;
 
 use nalgebra::{DMatrix, Matrix4, SMatrix};
 use proprio_topics::Nanos;
 use serde::Deserialize;
 
+use crate::files;
+use crate::identify::prior::{LEAST_MASS, LEAST_RADIUS};
 use crate::model::{JointKind, Model, ModelError};
 use crate::setup::Setup;
 use crate::spatial::{Mat3, RigidInertia, Vec3, Wrench};
@@ -456,29 +458,7 @@ impl Parameters {
     /// # Errors
     /// The system's; the old file is as it was then.
     pub fn save(&self, file: &Path) -> Result<(), ParametersError> {
-        self.prepare(file)?
-            .persist(file)
-            .map_err(|error| ParametersError::Write(error.error))?;
-        // The rename itself is on the disk when the folder is. Not every file system can say so.
-        let _ = std::fs::File::open(folder(file)).and_then(|folder| folder.sync_all());
-        Ok(())
-    }
-
-    /// The temporary file, whole and on the disk.
-    fn prepare(&self, file: &Path) -> Result<tempfile::NamedTempFile, ParametersError> {
-        use std::os::unix::fs::PermissionsExt as _;
-        let write = || -> io::Result<tempfile::NamedTempFile> {
-            let mut temporary = tempfile::Builder::new()
-                .prefix(".parameters-")
-                .tempfile_in(folder(file))?;
-            temporary.write_all(self.to_string().as_bytes())?;
-            // Temporary files are private; this is for whoever may read the folder.
-            let open = std::fs::Permissions::from_mode(0o644);
-            temporary.as_file().set_permissions(open)?;
-            temporary.as_file().sync_all()?;
-            Ok(temporary)
-        };
-        write().map_err(ParametersError::Write)
+        files::replace(file, &self.to_string(), 0o644).map_err(ParametersError::Write)
     }
 
     /// Says whether they are a setup's robot's: its name, its links and their frames, their inertias in the URDF, its sensors and joints.
@@ -611,11 +591,6 @@ fn triangle(root: DMatrix<f64>) -> DMatrix<f64> {
     upper
 }
 
-fn folder(file: &Path) -> PathBuf {
-    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty());
-    folder.unwrap_or(Path::new(".")).to_owned()
-}
-
 /// How uncertain a URDF's figures for a link are taken to be: ten rows `U` with `U^T U` the covariance of its ten parameters.
 ///
 /// With the pseudo-inertia `J = L L^T` of the link, its error is `L S L^T`, `S` symmetric with independent entries, of standard deviation
@@ -623,11 +598,9 @@ fn folder(file: &Path) -> PathBuf {
 /// deviation `relative`, and the centre of mass is uncertain by that share, over the root of two, of the body's radius of gyration; this does not depend on the frame.
 /// It is the quadratic form of the log-det divergence that identification has as its prior (Lee, Wensing, Park 2020): `d^T P^-1 d = tr((J^-1 dJ)^2) / relative^2`.
 /// So it is the prior of [`crate::identify::prior`] with `tau = relative / sqrt 2`, as far as that is quadratic.
-/// Bodies lighter than 0.02 kg or thinner than 0.02 m count as that, or a point mass would be known to sit exactly where it is.
+/// Bodies lighter than [`LEAST_MASS`] or thinner than [`LEAST_RADIUS`] count as that, or a point mass would be known to sit exactly where it is.
 #[must_use]
 pub fn cad_root(inertia: &RigidInertia, relative: f64) -> SMatrix<f64, 10, 10> {
-    const LEAST_MASS: f64 = 0.02;
-    const LEAST_RADIUS: f64 = 0.02;
     let centre = inertia.centre().unwrap_or_default();
     let sigma = Mat3::from_diagonal_element(inertia.inertia.trace() / 2.0) - inertia.inertia;
     let central = sigma - centre * inertia.first_moment.transpose();
@@ -925,7 +898,7 @@ mod tests {
     #[test]
     fn dies_before_the_rename() {
         if let Some(file) = std::env::var_os("PROPRIO_TEST_PARAMETERS") {
-            let _temporary = nothing("new").prepare(Path::new(&file)).unwrap();
+            let _temporary = files::prepare(Path::new(&file), &nothing("new").to_string(), 0o644).unwrap();
             std::process::abort();
         }
     }
@@ -943,7 +916,7 @@ mod tests {
             .status;
         assert!(!status.success());
         // It came as far as the new file, all of it, beside the old one.
-        let left: Vec<PathBuf> = std::fs::read_dir(folder.path())
+        let left: Vec<_> = std::fs::read_dir(folder.path())
             .unwrap()
             .map(|e| e.unwrap().path())
             .collect();

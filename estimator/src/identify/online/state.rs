@@ -15,7 +15,7 @@
 //! restarts do not count that twice.
 
 use std::fmt::Write as _;
-use std::io::{self, Write as _};
+use std::io;
 use std::path::{Path, PathBuf};
 
 use super::{Job, Online, Part, WIDTH};
@@ -187,12 +187,7 @@ impl Online {
 /// # Errors
 /// The file system's.
 pub fn write(file: &Path, text: &str) -> Result<(), StateError> {
-    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty());
-    let mut temporary = tempfile::NamedTempFile::new_in(folder.unwrap_or(Path::new(".")))?;
-    temporary.write_all(text.as_bytes())?;
-    temporary.as_file().sync_all()?;
-    temporary.persist(file).map_err(|error| error.error)?;
-    Ok(())
+    Ok(crate::files::replace(file, text, 0o600)?)
 }
 
 /// Renames a file that is no good to `<file>.bad-<n>`, the first that is free: which.
