@@ -44,5 +44,12 @@ pub use export::parameters;
 pub use outcome::{
     BaseParameterOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding, FrictionOutcome, JointOutcome,
     LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, SensorOutcome, Severity, Spectrum, Three,
-    TimeOffsetOutcome, TwoRouteOutcome, Unknown, Verdict, WeakDirection,
+    TimeOffsetOutcome, TwoRouteOutcome, Verdict, WeakDirection,
 };
+
+/// The axes of a wrench as samples have them, in words.
+const AXES: [&str; 6] = ["fx", "fy", "fz", "tx", "ty", "tz"];
+
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}

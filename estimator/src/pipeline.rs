@@ -689,9 +689,10 @@ impl OrReason for Reason {
 }
 
 /// What disqualifies a joint's position: one that is not calibrated tells no position.
-const UNTRUSTED_ENCODER: Quality = Quality(Quality::DEVICE_FAULT.0 | Quality::NOT_CALIBRATED.0);
+pub(crate) const UNTRUSTED_ENCODER: Quality = Quality(Quality::DEVICE_FAULT.0 | Quality::NOT_CALIBRATED.0);
 
-fn quality_reason(quality: Quality, faults: Quality) -> Reason {
+/// What a quality says against a value, given which faults disqualify it.
+pub(crate) fn quality_reason(quality: Quality, faults: Quality) -> Reason {
     if quality.intersects(Quality::SATURATED | Quality::FROZEN) {
         Reason::Saturated
     } else if quality.intersects(faults) {

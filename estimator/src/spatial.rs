@@ -241,6 +241,12 @@ impl Wrench {
         }
     }
 
+    /// The six components in the order of regressors' rows and offsets, `[tx ty tz fx fy fz]` [Nm, N].
+    pub fn torque_first(&self) -> [f64; 6] {
+        let (n, f) = (&self.torque, &self.force);
+        [n.x, n.y, n.z, f.x, f.y, f.z]
+    }
+
     /// The six components in the order of samples and logs, `[fx fy fz tx ty tz]` [N, Nm].
     pub fn force_first(&self) -> [f64; 6] {
         [

@@ -3,9 +3,10 @@
 use nalgebra::Matrix4;
 use proprio_estimator::config::{Config, IdentificationInput};
 use proprio_estimator::dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
-use proprio_estimator::identify::{Log, LogOutcome, Options, Outcome, Role, Unknown, Verdict, identify};
+use proprio_estimator::identify::{Log, LogOutcome, Options, Outcome, Role, Verdict, identify};
 use proprio_estimator::model::Model;
 use proprio_estimator::regressor::Regressor;
+use proprio_estimator::regressor::identifiable::Column;
 use proprio_estimator::setup::Setup;
 use proprio_estimator::spatial::{Mat3, RigidInertia, Vec3};
 use std::path::{Path, PathBuf};
@@ -351,8 +352,8 @@ fn torque_errors(setup: &Setup, truth: &Model, outcome: &Outcome, seed: u64) -> 
         .iter()
         .enumerate()
         .filter_map(|(row, c)| match c {
-            Unknown::Inertial { link, parameter } => Some((row, *link, *parameter)),
-            Unknown::Offset { .. } => None,
+            Column::Inertial { link, parameter } => Some((row, *link, *parameter)),
+            Column::Offset { .. } => None,
         })
         .collect();
     for i in 0..200 {

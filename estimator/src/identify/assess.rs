@@ -4,10 +4,11 @@ use super::batch::{Identified, Prepared, bodies, feasibility, joint_zeros, verdi
 use super::outcome::{
     BaseParameterOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding, FrictionOutcome, JointOutcome,
     LinkOutcome, LogOutcome, OffsetOutcome, Outcome, SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome,
-    Unknown, Verdict, WeakDirection,
+    Verdict, WeakDirection,
 };
-use super::passes::{Residuals, dot, leave};
+use super::passes::{Residuals, leave};
 use super::rows::{FRICTION, Layout, RowMaker, Rows, WIDTH};
+use super::{AXES, dot};
 use crate::config::IdentificationInput;
 use crate::dynamics::Structure;
 use crate::regressor::identifiable::{Column, Identifiable, JointMotion, Measured, Offsets, Scope};
@@ -32,14 +33,13 @@ const CUT_OFF: f64 = 5.0;
 const STILL: f64 = 0.01;
 
 const PARAMETERS: [&str; 10] = ["m", "h_x", "h_y", "h_z", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz"];
-const AXES: [&str; 6] = ["fx", "fy", "fz", "tx", "ty", "tz"];
 
 /// The channel of a sensor's quantity, given in the order of samples: channels have torques first.
 fn channel_of(sensor_place: usize, axis: usize) -> usize {
     6 * sensor_place + (axis + 3) % 6
 }
 
-fn sensor_name(setup: &Setup, sensor: usize) -> String {
+pub(super) fn sensor_name(setup: &Setup, sensor: usize) -> String {
     let channel = setup.channels().iter().find(|c| c.role == Use::Sensor(sensor));
     channel.map_or(String::new(), |c| c.name.clone())
 }
@@ -378,10 +378,10 @@ fn covariance(identified: &Identified, root: &DMatrix<f64>) -> CovarianceRoot {
     let (p, s) = (layout.unknowns(), 6 * layout.sensors.len());
     let mut columns = Vec::new();
     for &link in &layout.links {
-        columns.extend((0..WIDTH).map(|parameter| Unknown::Inertial { link, parameter }));
+        columns.extend((0..WIDTH).map(|parameter| Column::Inertial { link, parameter }));
     }
     for &sensor in &layout.sensors {
-        columns.extend((0..6).map(|component| Unknown::Offset { sensor, component }));
+        columns.extend((0..6).map(|component| Column::Offset { sensor, component }));
     }
     let wide = root.ncols();
     let mut joint = DMatrix::zeros(p + s, wide + s);

@@ -767,8 +767,7 @@ fn wrong_signs(maker: &RowMaker<'_>, training: &[&Prepared]) -> Vec<Finding> {
             }
         }
         if xx > 0.0 && yy > 0.0 && xy / (xx * yy).sqrt() < -0.5 {
-            let channel = maker.setup().channels().iter().find(|c| c.role == Use::Sensor(sensor));
-            let name = channel.map_or(String::new(), |c| c.name.clone());
+            let name = assess::sensor_name(maker.setup(), sensor);
             findings.push(Finding {
                 severity: Severity::Refusal,
                 code: "wrong_sign",

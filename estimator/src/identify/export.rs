@@ -1,7 +1,8 @@
 //! What identification gives, as what the estimator starts from: an [`Outcome`] to [`Parameters`].
 
-use super::outcome::{LogOutcome, Outcome, Role, Unknown};
+use super::outcome::{LogOutcome, Outcome, Role};
 use crate::parameters::{Friction, Offset, Parameters, ParametersError, Provenance, Span};
+use crate::regressor::identifiable::Column;
 use crate::setup::{Setup, Use};
 use crate::spatial::Wrench;
 use nalgebra::DMatrix;
@@ -27,11 +28,11 @@ pub fn parameters(outcome: &Outcome, setup: &Setup, program: &str) -> Result<Par
     let mut parameters = Parameters::new(setup, provenance);
 
     let columns = &outcome.covariance.columns;
-    let place = |unknown: Unknown| columns.iter().position(|column| *column == unknown);
+    let place = |unknown: Column| columns.iter().position(|column| *column == unknown);
     let (mut inertias, mut offsets, mut places) = (Vec::new(), Vec::new(), Vec::new());
     for link in &outcome.links {
         let of_link = (0..10).filter_map(|parameter| {
-            place(Unknown::Inertial {
+            place(Column::Inertial {
                 link: link.link,
                 parameter,
             })
@@ -44,7 +45,7 @@ pub fn parameters(outcome: &Outcome, setup: &Setup, program: &str) -> Result<Par
     }
     for channel in setup.channels() {
         let Use::Sensor(sensor) = channel.role else { continue };
-        let of_sensor = (0..6).filter_map(|component| place(Unknown::Offset { sensor, component }));
+        let of_sensor = (0..6).filter_map(|component| place(Column::Offset { sensor, component }));
         let of_sensor: Vec<usize> = of_sensor.collect();
         let last = trained()
             .rev()
@@ -129,11 +130,11 @@ mod tests {
                 seen: link == 3 || link == 5,
             });
         // Offsets before links, and the later link before the earlier one: places are told by the columns alone.
-        let mut columns: Vec<Unknown> = (0..6)
-            .map(|component| Unknown::Offset { sensor: 0, component })
+        let mut columns: Vec<Column> = (0..6)
+            .map(|component| Column::Offset { sensor: 0, component })
             .collect();
         for link in [5, 3] {
-            columns.extend((0..10).map(|parameter| Unknown::Inertial { link, parameter }));
+            columns.extend((0..10).map(|parameter| Column::Inertial { link, parameter }));
         }
         let root = DMatrix::from_fn(26, 26, |i, j| {
             if i <= j {

@@ -22,6 +22,7 @@ pub use defects::{Break, Defect, Severity, Units};
 pub use offset::{Signal, TimeOffset};
 
 use crate::dynamics::{ContactSet, FrameMotion, SensorSet};
+use crate::pipeline::{UNTRUSTED_ENCODER, quality_reason};
 use crate::setup::{BaseMotion, Channel, Setup, Use};
 use crate::spatial::{Vec3, Wrench};
 use proprio_topics::csv::{Item, Reader, Report, Row, Value, What};
@@ -152,19 +153,6 @@ pub struct Instants {
     pub defects: Vec<Defect>,
 }
 
-/// What disqualifies a joint's position: one that is not calibrated tells no position.
-const UNTRUSTED_ENCODER: Quality = Quality(Quality::DEVICE_FAULT.0 | Quality::NOT_CALIBRATED.0);
-
-fn reason_of(quality: Quality, faults: Quality) -> Reason {
-    if quality.intersects(Quality::SATURATED | Quality::FROZEN) {
-        Reason::Saturated
-    } else if quality.intersects(faults) {
-        Reason::DeviceFault
-    } else {
-        Reason::None
-    }
-}
-
 impl Recording {
     /// Reads a sample log (columns: [`proprio_topics::csv`]) and looks for what is wrong with it.
     ///
@@ -280,22 +268,26 @@ impl Recording {
         match (role, reading) {
             (Use::Joint(dof), Reading::Joint(j)) => {
                 let Some(track) = self.joints.get_mut(dof) else { return };
-                let fault = reason_of(quality, UNTRUSTED_ENCODER);
+                let fault = quality_reason(quality, UNTRUSTED_ENCODER);
                 track.position.push(t, [j.position], fault);
                 track.velocity.push(t, [j.velocity], fault);
                 track.acceleration.push(t, [j.acceleration], fault);
                 track
                     .torque
-                    .push(t, [j.torque], reason_of(quality, Quality::DEVICE_FAULT));
+                    .push(t, [j.torque], quality_reason(quality, Quality::DEVICE_FAULT));
             }
             (Use::Sensor(number), Reading::Wrench(w)) => {
                 let ([fx, fy, fz], [tx, ty, tz]) = (w.force, w.torque);
                 if let Some(stream) = self.sensors.get_mut(number) {
-                    stream.push(t, [fx, fy, fz, tx, ty, tz], reason_of(quality, Quality::DEVICE_FAULT));
+                    stream.push(
+                        t,
+                        [fx, fy, fz, tx, ty, tz],
+                        quality_reason(quality, Quality::DEVICE_FAULT),
+                    );
                 }
             }
             (Use::Base, Reading::Imu(i)) => {
-                let fault = reason_of(quality, Quality::DEVICE_FAULT);
+                let fault = quality_reason(quality, Quality::DEVICE_FAULT);
                 self.imu.proper_acceleration.push(t, i.proper_acceleration, fault);
                 self.imu.angular_velocity.push(t, i.angular_velocity, fault);
                 self.imu.angular_acceleration.push(t, i.angular_acceleration, fault);

@@ -32,6 +32,7 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 use proprio_topics::{Nanos, Reason};
 
+use super::dot;
 use super::information::{Information, InformationError, Panel};
 use super::prior::{GREATEST_TAU, Posterior, Prior, PriorError};
 use crate::dynamics::{ContactSet, DofSet, DynamicsError, Kinematics, Structure};
@@ -672,12 +673,12 @@ impl Component {
             .filter(|(_, link)| !parents.contains(link))
             .flat_map(|(place, _)| session + WIDTH * place..session + WIDTH * (place + 1))
             .collect();
-        let mut reference: Vec<f64> = sensors.iter().flat_map(|&s| torque_first(&offsets[s])).collect();
+        let mut reference: Vec<f64> = sensors.iter().flat_map(|&s| offsets[s].torque_first()).collect();
         reference.extend(links.iter().flat_map(|&link| cad[link].parameters()));
         let noise: Vec<f64> = (sensors.iter())
             .flat_map(|&s| {
                 let noise = structure.sensors()[s].noise();
-                torque_first(&Wrench::from_parts(noise.force, noise.torque))
+                Wrench::from_parts(noise.force, noise.torque).torque_first()
             })
             .collect();
         let passing = (subtrees.iter())
@@ -1246,13 +1247,4 @@ fn add_multiple(to: &mut [f64], factor: f64, from: &[f64]) {
     for (to, from) in to.iter_mut().zip(from) {
         *to += factor * from;
     }
-}
-
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(x, y)| x * y).sum()
-}
-
-fn torque_first(wrench: &Wrench) -> [f64; 6] {
-    let (n, f) = (&wrench.torque, &wrench.force);
-    [n.x, n.y, n.z, f.x, f.y, f.z]
 }

@@ -4,6 +4,7 @@
 //! F/T sensor is in the order of samples and logs, `[fx fy fz tx ty tz]` [N, Nm]; ten parameters of a link are `[m, h_x, h_y, h_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz]` about its origin
 //! ([`crate::spatial`]).
 
+use crate::regressor::identifiable::Column;
 use crate::spatial::RigidInertia;
 use nalgebra::DMatrix;
 use proprio_topics::Nanos;
@@ -85,30 +86,11 @@ pub struct LinkOutcome {
     pub seen: bool,
 }
 
-/// A column of a covariance.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Unknown {
-    /// An inertial parameter: link number and number among the ten.
-    Inertial {
-        /// Link of the model.
-        link: usize,
-        /// Number among the ten.
-        parameter: usize,
-    },
-    /// A component of an F/T sensor's offset, at the end of the last log used.
-    Offset {
-        /// Sensor of the structure.
-        sensor: usize,
-        /// Number among `[t_x, t_y, t_z, f_x, f_y, f_z]`.
-        component: usize,
-    },
-}
-
 /// Covariance of the identified parameters, and of the offsets at the end of the last log, as `U U^T`: inflated noise and prior included.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CovarianceRoot {
     /// What rows stand for: all links that are seen, ten parameters each, then six per sensor.
-    pub columns: Vec<Unknown>,
+    pub columns: Vec<Column>,
     /// `U`, square, upper triangular; the covariance is `U U^T`.
     pub root: DMatrix<f64>,
 }

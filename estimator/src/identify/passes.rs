@@ -1,5 +1,6 @@
 //! Passes over a log's instants: what it tells of the parameters, and what is left when these are given.
 
+use super::dot;
 use super::information::{Information, Panel};
 use super::instants::{Break, Instant};
 use super::noise;
@@ -325,10 +326,6 @@ pub(super) fn leave(
         ranges,
         session: states,
     }
-}
-
-pub(super) fn dot(x: &[f64], y: &[f64]) -> f64 {
-    x.iter().zip(y).map(|(a, b)| a * b).sum()
 }
 
 /// Means of so many blocks each.

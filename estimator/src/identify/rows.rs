@@ -13,8 +13,8 @@
 //! contact reaches: noise enters them as offsets do, `N = G`. Those of joint torques are rows of the whole tree's [`Regressor`], for joints beyond which, seen from the base, nothing touches
 //! the robot: there `N = 1` and `G = [tanh(dq / v0), dq, 1]`.
 
+use super::dot;
 use super::instants::Instant;
-use super::passes::dot;
 use crate::config::IdentificationInput;
 use crate::dynamics::{ContactSet, DynamicsError, JointState, Kinematics};
 use crate::regressor::{Regressor, StackedRegressor, Weighting};

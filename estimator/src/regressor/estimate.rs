@@ -7,7 +7,7 @@
 //! link `l` (or, with the other sign, below) are `m_l` seen from the sensor.
 
 use super::link::{WIDTH, in_link_axes, row_along};
-use super::subtree::{spread, torque_first};
+use super::subtree::spread;
 use crate::dynamics::{
     DynamicsError, ExternalWrench, Kinematics, Solver, Structure, check_external, check_readings, check_size,
 };
@@ -229,7 +229,7 @@ impl<'a> EstimateRows<'a> {
         let mut sum = 0.0;
         for sensor in self.structure.subtrees()[subtree].sensors.iter() {
             let row = self.offset_row(subtree, sensor, &motion);
-            let reading = torque_first(&readings[sensor]);
+            let reading = readings[sensor].torque_first();
             sum -= row.iter().zip(&reading).map(|(a, b)| a * b).sum::<f64>();
         }
         for known in external {

@@ -253,7 +253,7 @@ impl SubTreeRegressor {
         self.covariance = Matrix6::zeros();
         for (place, &(sensor, _)) in self.sensors.iter().enumerate() {
             let first = WIDTH * self.links.len() + 6 * place;
-            let reading = torque_first(&readings[sensor]);
+            let reading = readings[sensor].torque_first();
             for (channel, (value, variance)) in reading.iter().zip(&variances[sensor]).enumerate() {
                 let column = Vector6::from_fn(|row, _| self.values[row * self.stride + first + channel]);
                 for row in 0..6 {
@@ -266,7 +266,7 @@ impl SubTreeRegressor {
         for known in external {
             if structure.subtree_of(known.frame.link) == number {
                 let in_top = kinematics.pose(self.top).wrench_back(&known.in_base(kinematics));
-                for (sum, value) in self.measured.iter_mut().zip(torque_first(&in_top)) {
+                for (sum, value) in self.measured.iter_mut().zip(in_top.torque_first()) {
                     *sum += value;
                 }
             }
@@ -364,7 +364,9 @@ impl StackedRegressor {
                 .iter()
                 .map(|cut| {
                     let noise = cut.noise();
-                    torque_first(&Wrench::from_parts(noise.force, noise.torque)).map(|deviation| deviation * deviation)
+                    Wrench::from_parts(noise.force, noise.torque)
+                        .torque_first()
+                        .map(|deviation| deviation * deviation)
                 })
                 .collect(),
             structure: structure.clone(),
@@ -582,13 +584,8 @@ pub(super) fn spread(structure: &Structure, subtree: usize, row: &[f64], stacked
     sensors.iter().for_each(|sensor| put(offsets + 6 * sensor, 6));
 }
 
-pub(super) fn torque_first(wrench: &Wrench) -> [f64; 6] {
-    let (n, f) = (&wrench.torque, &wrench.force);
-    [n.x, n.y, n.z, f.x, f.y, f.z]
-}
-
 fn put(values: &mut [f64], stride: usize, column: usize, sign: f64, unit: &Wrench) {
-    for (row, value) in torque_first(unit).into_iter().enumerate() {
+    for (row, value) in unit.torque_first().into_iter().enumerate() {
         values[row * stride + column] = sign * value;
     }
 }

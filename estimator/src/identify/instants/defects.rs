@@ -13,6 +13,7 @@
 use super::smooth::{median, quantum};
 use super::{Instants, JointTrack, Recording, Stream};
 use crate::dynamics::{InverseDynamics, JointState, Kinematics, Structure};
+use crate::identify::AXES;
 use crate::setup::{Setup, Use};
 use proprio_topics::{Nanos, Reading, Reason};
 use std::fmt;
@@ -351,7 +352,6 @@ const LEAST_ROWS: u64 = 20;
 const FREEZE: Nanos = Nanos::from_millis(200);
 /// Motion that counts as such, beside a few steps of the encoder \[rad or m\].
 const MOTION: f64 = 0.01;
-const AXES: [&str; 6] = ["fx", "fy", "fz", "tx", "ty", "tz"];
 
 fn label(channel: &crate::setup::Channel) -> String {
     format!("{}/{}", channel.kind.word(), channel.name)

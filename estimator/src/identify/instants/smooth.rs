@@ -29,6 +29,7 @@
 //!
 //! In the last row the velocity's error is that of averaging five samples to one.
 
+use crate::identify::dot;
 use proprio_topics::Nanos;
 
 /// The degrees that are chosen from; each is judged by the one after it, the last by [`HIGHEST`].
@@ -428,10 +429,6 @@ impl Scratch {
         }
         fit.estimate.iter().flatten().all(|e| e.is_finite()).then_some(fit)
     }
-}
-
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
 /// The median; 0 of nothing.
