@@ -22,6 +22,9 @@ pub const TRUTH_PERIOD: Nanos = Nanos::from_millis(1);
 
 /// The longest that a bus thread waits: then it looks whether it should stop.
 const MOST_WAIT: Nanos = Nanos::from_millis(20);
+/// The most frames that are sent before the bus is listened to again. Where sending takes longer than the boards' periods something is always due, and neither a
+/// command nor the wish to stop would ever be heard.
+const MOST_AT_ONCE: usize = 16;
 /// How long a frame may wait for a full queue.
 const SEND_WITHIN: Nanos = Nanos::from_millis(20);
 
@@ -246,7 +249,8 @@ fn turn_until(
         if now >= end || stop.load(Relaxed) {
             break;
         }
-        while let Some(frame) = bus.poll(clock.now()) {
+        for _ in 0..MOST_AT_ONCE {
+            let Some(frame) = bus.poll(clock.now()) else { break };
             // The link counts what it could not send.
             let _ = link.send(&frame, clock.now() + SEND_WITHIN);
         }
@@ -304,4 +308,94 @@ fn source_text(source: &Source) -> String {
 fn create(path: &Path) -> anyhow::Result<BufWriter<File>> {
     let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
     Ok(BufWriter::new(file))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proprio_drivers::Frame;
+    use proprio_gateway::decoder::Decoder;
+    use proprio_gateway::link::{LinkCounters, SendError};
+    use proprio_gateway::status::BusStatus;
+    use proprio_topics::LinkState;
+    use std::collections::VecDeque;
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicI64, AtomicU64};
+
+    /// A clock that only a slow link moves.
+    #[derive(Clone, Default)]
+    struct Slow(Arc<AtomicI64>);
+
+    impl Clock for Slow {
+        fn now(&self) -> Nanos {
+            Nanos(self.0.load(Relaxed))
+        }
+    }
+
+    /// A bus on which one frame takes longer than all boards' periods, with a gateway's decoder at its other end.
+    struct SlowLink {
+        clock: Slow,
+        gateway: Decoder,
+        commands: VecDeque<Frame>,
+        sent: Arc<AtomicU64>,
+        stop: Arc<AtomicBool>,
+    }
+
+    impl Link for SlowLink {
+        fn recv(&mut self, deadline: Nanos) -> Received {
+            let now = self.clock.now();
+            let commands = &mut self.commands;
+            self.gateway
+                .poll_transmit(now, |command| commands.push_back(command.frame));
+            match self.commands.pop_front() {
+                Some(command) => Received::Frame(command),
+                None => {
+                    self.clock.0.fetch_max(deadline.0, Relaxed);
+                    Received::TimedOut
+                }
+            }
+        }
+
+        fn send(&mut self, frame: &Frame, _: Nanos) -> Result<(), SendError> {
+            let now = Nanos(self.clock.0.fetch_add(10_000_000, Relaxed));
+            self.gateway
+                .on_frame(&frame.at(now, proprio_topics::StampKind::Software), |_| {});
+            let sent = self.sent.fetch_add(1, Relaxed);
+            self.stop.store(sent >= 3000, Relaxed);
+            assert!(sent < 3100, "it does not hear that it should stop");
+            Ok(())
+        }
+
+        fn state(&self) -> LinkState {
+            LinkState::Up
+        }
+
+        fn counters(&self) -> LinkCounters {
+            LinkCounters::default()
+        }
+    }
+
+    #[test]
+    fn an_overloaded_bus_is_still_listened_to() {
+        let robot = Robot::open("icub_left_arm").unwrap();
+        let settings = Settings::default();
+        let clock = Slow::default();
+        let simulator = Simulator::new(&robot, &settings, clock.now()).unwrap();
+        for (bus, (plan, number)) in simulator.into_buses().into_iter().zip(robot.plan.buses.iter().zip(0..)) {
+            let status = Arc::new(BusStatus::new(number, plan));
+            let (sent, stop) = (Arc::new(AtomicU64::new(0)), Arc::new(AtomicBool::new(false)));
+            let link = SlowLink {
+                clock: clock.clone(),
+                gateway: Decoder::new(number, plan, None, Arc::clone(&status)).unwrap(),
+                commands: VecDeque::new(),
+                sent: Arc::clone(&sent),
+                stop: Arc::clone(&stop),
+            };
+            turn_until(bus, Box::new(link), &clock, Nanos::MAX, &stop);
+            assert!(
+                sent.load(Relaxed) >= 3000,
+                "every board was started, in spite of those that stream"
+            );
+        }
+    }
 }
