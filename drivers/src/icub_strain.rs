@@ -56,7 +56,8 @@ use crate::{
 };
 use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Gauges, Kind, Nanos, Quality, Reading, Saturation, StampKind, Temperature, Wrench};
-use serde::Deserialize;
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer};
 
 /// Types of the streams.
 mod kind {
@@ -111,13 +112,24 @@ impl Stream {
     }
 }
 
+/// Exactly three: an array alone takes the first ones of more.
+fn three<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<[f64; 3]>, D::Error> {
+    let numbers = alloc::vec::Vec::<f64>::deserialize(deserializer)?;
+    let three = <[f64; 3]>::try_from(numbers.as_slice());
+    three
+        .map(Some)
+        .map_err(|_| D::Error::invalid_length(numbers.len(), &"3 numbers"))
+}
+
 /// The keys of `driver = "icub_strain"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Full scale of fx fy fz \[N\]; default: what the board tells.
+    #[serde(deserialize_with = "three")]
     pub full_scale_n: Option<[f64; 3]>,
     /// Full scale of tx ty tz \[Nm\]; goes with `full_scale_n`.
+    #[serde(deserialize_with = "three")]
     pub full_scale_nm: Option<[f64; 3]>,
     /// Period \[ms\], 1 to 255; default 10.
     pub period_ms: u32,

@@ -12,7 +12,6 @@
 #[path = "../tests/common/mod.rs"]
 mod common;
 
-use std::fmt::Write as _;
 use std::path::Path;
 
 use common::{Random, State};
@@ -35,71 +34,9 @@ fn main() {
 
 const KEPT: [bool; 2] = [false, true];
 
-/// One link of a generated robot, on its joint.
-struct Link<'a> {
-    link: usize,
-    parent: Option<usize>,
-    kind: &'a str,
-}
-
-fn write_link(text: &mut String, Link { link, parent, kind }: &Link<'_>, [x, y, z]: [f64; 3]) {
-    let _ = write!(
-        text,
-        "<link name=\"link{link}\"><inertial><origin xyz=\"{x} {y} {z}\" rpy=\"0 0 0\"/><mass value=\"1\"/>\
-         <inertia ixx=\"0.01\" ixy=\"0\" ixz=\"0\" iyy=\"0.012\" iyz=\"0\" izz=\"0.015\"/></inertial></link>"
-    );
-    if let Some(parent) = parent {
-        let axis = ["1 0 0", "0 1 0", "0 0 -1"][link % 3];
-        let _ = write!(
-            text,
-            "<joint name=\"joint{link}\" type=\"{kind}\"><parent link=\"link{parent}\"/><child link=\"link{link}\"/>\
-             <origin xyz=\"{y} {z} {x}\" rpy=\"{x} {y} {z}\"/><axis xyz=\"{axis}\"/>\
-             <limit lower=\"-3\" upper=\"3\" effort=\"1\" velocity=\"1\"/></joint>"
-        );
-    }
-}
-
-/// Torso and head of three joints, arms of seven with a sensor after three, legs of six with sensors after three and at the foot.
-fn generated() -> (String, Vec<String>) {
-    let mut random = Random::new(2015);
-    let (mut text, mut sensors, mut links) = (String::from("<robot name=\"generated\">"), Vec::new(), 0);
-    let mut link = |text: &mut String, parent: Option<usize>, kind: &str| {
-        let link = Link {
-            link: links,
-            parent,
-            kind,
-        };
-        write_link(text, &link, random.triple(0.1));
-        links += 1;
-        links - 1
-    };
-    let root = link(&mut text, None, "");
-    let mut chest = root;
-    for _ in 0..3 {
-        chest = link(&mut text, Some(chest), "revolute");
-    }
-    for (from, joints, after) in [
-        (chest, 3, &[] as &[usize]),
-        (chest, 7, &[3]),
-        (chest, 7, &[3]),
-        (root, 6, &[3, 6]),
-        (root, 6, &[3, 6]),
-    ] {
-        let mut parent = from;
-        for joint in 1..=joints {
-            parent = link(&mut text, Some(parent), "revolute");
-            if after.contains(&joint) {
-                parent = link(&mut text, Some(parent), "fixed");
-                sensors.push(format!("joint{parent}"));
-            }
-        }
-    }
-    (text + "</robot>", sensors)
-}
-
 fn robot() -> (String, Vec<String>) {
     let Some(folder) = std::env::var_os("PROPRIO_ICUB_MODELS") else {
-        return generated();
+        return common::humanoid();
     };
     let text = std::fs::read_to_string(Path::new(&folder).join("iCubGazeboV2_5.urdf")).expect("the robot's file");
     let sensors = Model::from_urdf(&text, &[]).expect("the robot").sensors().to_vec();
@@ -362,7 +299,8 @@ fn g_motors(bencher: Bencher<'_, '_>) {
 /// Kinematics and the whole tree's regressor against the size of the robot. The dense regressor is `(6 + n) x 10 N_B`, of which an update writes six
 /// rows and one for each joint on the way to the base, per link: links times mean depth.
 mod scaling {
-    use super::{Bench, Bencher, Link, Regressor, StackedRegressor, black_box, write_link};
+    use super::common::write_link;
+    use super::{Bench, Bencher, Regressor, StackedRegressor, black_box};
 
     const SIZES: [usize; 4] = [8, 32, 128, 500];
 
@@ -373,7 +311,7 @@ mod scaling {
             let [x, y, z] = [1.0, 2.0, 3.0].map(|factor| 0.1 * (factor * link as f64).sin());
             let kind = if is_cut(link) { "fixed" } else { "revolute" };
             let parent = (link > 0).then(|| parent(link));
-            write_link(&mut text, &Link { link, parent, kind }, [x, y, z]);
+            write_link(&mut text, link, parent, kind, [x, y, z]);
             if is_cut(link) {
                 cuts.push(format!("joint{link}"));
             }

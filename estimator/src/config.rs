@@ -2,7 +2,8 @@
 //!
 //! [`crate::setup`] checks it against the model and resolves names; nothing after that sees this form.
 
-use serde::Deserialize;
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -74,7 +75,7 @@ pub enum Base {
         /// The link or folded frame.
         link: String,
         /// Physical gravity, pointing down, in the axes of `link` \[m/s^2\].
-        #[serde(default = "standard_gravity")]
+        #[serde(default = "standard_gravity", deserialize_with = "exactly")]
         gravity_mps2: [f64; 3],
     },
     /// One of several links stands still, which one changes: the feet of a walking robot.
@@ -89,10 +90,10 @@ pub enum Base {
         /// The link or folded frame it sits on.
         link: String,
         /// Its origin in that frame \[m\].
-        #[serde(default)]
+        #[serde(default, deserialize_with = "exactly")]
         xyz_m: [f64; 3],
         /// Its axes in that frame: roll, pitch, yaw about fixed axes, as URDF has it \[rad\].
-        #[serde(default)]
+        #[serde(default, deserialize_with = "exactly")]
         rpy_rad: [f64; 3],
     },
 }
@@ -104,10 +105,23 @@ pub struct Foot {
     /// The link or folded frame.
     pub link: String,
     /// Physical gravity, pointing down, in the axes of `link` while it stands \[m/s^2\].
-    #[serde(default = "standard_gravity")]
+    #[serde(default = "standard_gravity", deserialize_with = "exactly")]
     pub gravity_mps2: [f64; 3],
     /// The name of the contact, of kind `wrench` and on this link, that carries the robot there.
     pub contact: String,
+}
+
+/// Exactly so many numbers: an array alone takes the first ones of more.
+pub(crate) fn exactly<'de, D: Deserializer<'de>, const N: usize>(deserializer: D) -> Result<[f64; N], D::Error> {
+    let numbers = Vec::<f64>::deserialize(deserializer)?;
+    let given = numbers.len();
+    numbers
+        .try_into()
+        .map_err(|_| D::Error::custom(format!("{given} numbers where {N} are needed")))
+}
+
+fn exactly_if_given<'de, D: Deserializer<'de>, const N: usize>(deserializer: D) -> Result<Option<[f64; N]>, D::Error> {
+    exactly(deserializer).map(Some)
 }
 
 const fn standard_gravity() -> [f64; 3] {
@@ -127,26 +141,28 @@ pub struct ForceTorque {
     /// Whose wrench on whom it is; default: as the URDF's sensor element says, else `child_to_parent`.
     pub direction: Option<Direction>,
     /// With `frame = "sensor"`: the sensor's origin in the child link's frame \[m\].
+    #[serde(default, deserialize_with = "exactly_if_given")]
     pub xyz_m: Option<[f64; 3]>,
     /// With `frame = "sensor"`: the sensor's axes in the child link's frame: roll, pitch, yaw \[rad\].
+    #[serde(default, deserialize_with = "exactly_if_given")]
     pub rpy_rad: Option<[f64; 3]>,
     /// Standard deviation of its forces \[N\]. The default is an iCub arm's sensor, robot still.
-    #[serde(default = "default_noise_n")]
+    #[serde(default = "default_noise_n", deserialize_with = "exactly")]
     pub noise_n: [f64; 3],
     /// Standard deviation of its torques \[Nm\]. The default as above.
-    #[serde(default = "default_noise_nm")]
+    #[serde(default = "default_noise_nm", deserialize_with = "exactly")]
     pub noise_nm: [f64; 3],
     /// What it reads with no load: forces \[N\].
-    #[serde(default)]
+    #[serde(default, deserialize_with = "exactly")]
     pub offset_n: [f64; 3],
     /// What it reads with no load: torques \[Nm\].
-    #[serde(default)]
+    #[serde(default, deserialize_with = "exactly")]
     pub offset_nm: [f64; 3],
     /// Standard deviation of `offset_n` \[N\]; default: it is exact.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "exactly")]
     pub offset_std_n: [f64; 3],
     /// Standard deviation of `offset_nm` \[Nm\]; default: it is exact.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "exactly")]
     pub offset_std_nm: [f64; 3],
 }
 
@@ -192,9 +208,10 @@ pub struct Contact {
     #[serde(default)]
     pub kind: ContactKind,
     /// The direction of a `force_along`, in the frame's axes.
+    #[serde(default, deserialize_with = "exactly_if_given")]
     pub direction: Option<[f64; 3]>,
     /// Where it acts, in the frame's axes \[m\].
-    #[serde(default)]
+    #[serde(default, deserialize_with = "exactly")]
     pub position_m: [f64; 3],
     /// Whether it is always there.
     #[serde(default)]
@@ -512,6 +529,29 @@ mod tests {
         [output]
         trigger = "ft"
     "#;
+
+    #[test]
+    fn too_many_numbers_are_refused() {
+        for (key, place) in [
+            ("gravity_mps2", "[base]\n"),
+            ("noise_n", "[[force_torque]]\n"),
+            ("direction", "[[contact]]\n"),
+        ] {
+            for numbers in ["[0, 0]", "[0, 0, 0, 0]"] {
+                let text = ARM
+                    .replace(place, &format!("{place}{key} = {numbers}\n"))
+                    .replace("        ", "");
+                let error = Config::parse(&text).unwrap_err().to_string();
+                let given = numbers.matches('0').count();
+                assert!(
+                    error.contains(&format!("{given} numbers where 3 are needed")),
+                    "{error}"
+                );
+                // Where the kind decides what a table holds, TOML only knows which table.
+                assert!(error.contains(key) || error.contains("[base]"), "{error}");
+            }
+        }
+    }
 
     #[test]
     fn defaults_are_as_documented() {

@@ -36,6 +36,7 @@ use nalgebra::{DMatrix, Matrix4, SMatrix};
 use proprio_topics::Nanos;
 use serde::Deserialize;
 
+use crate::config::exactly;
 use crate::files;
 use crate::identify::prior::{LEAST_MASS, LEAST_RADIUS};
 use crate::model::{JointKind, Model, ModelError};
@@ -762,22 +763,9 @@ struct FileLink {
     std: Option<Numbers<10>>,
 }
 
-/// Exactly so many: an array takes the first ones of more.
 #[derive(Clone, Copy, Deserialize)]
-#[serde(try_from = "Vec<f64>")]
-struct Numbers<const N: usize>([f64; N]);
-
-impl<const N: usize> TryFrom<Vec<f64>> for Numbers<N> {
-    type Error = String;
-
-    fn try_from(numbers: Vec<f64>) -> Result<Self, String> {
-        let given = numbers.len();
-        let numbers = numbers
-            .try_into()
-            .map_err(|_| format!("{given} numbers where {N} are needed"))?;
-        Ok(Self(numbers))
-    }
-}
+#[serde(transparent)]
+struct Numbers<const N: usize>(#[serde(deserialize_with = "exactly")] [f64; N]);
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -168,27 +168,31 @@ impl RandomRobot {
     }
 }
 
+/// Writes link number `link`, of a kilogram, on a joint of this `kind` where it has a parent.
+pub(crate) fn write_link(text: &mut String, link: usize, parent: Option<usize>, kind: &str, [x, y, z]: [f64; 3]) {
+    let _ = write!(
+        text,
+        "<link name=\"link{link}\"><inertial><origin xyz=\"{x} {y} {z}\" rpy=\"0 0 0\"/><mass value=\"1\"/>\
+         <inertia ixx=\"0.01\" ixy=\"0\" ixz=\"0\" iyy=\"0.012\" iyz=\"0\" izz=\"0.015\"/></inertial></link>"
+    );
+    if let Some(parent) = parent {
+        let axis = ["1 0 0", "0 1 0", "0 0 -1"][link % 3];
+        let _ = write!(
+            text,
+            "<joint name=\"joint{link}\" type=\"{kind}\"><parent link=\"link{parent}\"/><child link=\"link{link}\"/>\
+             <origin xyz=\"{y} {z} {x}\" rpy=\"{x} {y} {z}\"/><axis xyz=\"{axis}\"/>\
+             <limit lower=\"-3\" upper=\"3\" effort=\"1\" velocity=\"1\"/></joint>"
+        );
+    }
+}
+
 /// An iCub's tree, 39 links and 32 joints, as text, and the joints of its six F/T sensors: torso and head of three joints, arms of seven with a sensor after
 /// three, legs of six with sensors after two and at the foot.
 pub(crate) fn humanoid() -> (String, Vec<String>) {
     let mut random = Random::new(2015);
     let (mut text, mut sensors, mut links) = (String::from("<robot name=\"generated\">"), Vec::new(), 0);
     let mut link = |text: &mut String, parent: Option<usize>, kind: &str| {
-        let [x, y, z] = random.triple(0.1);
-        let _ = write!(
-            text,
-            "<link name=\"link{links}\"><inertial><origin xyz=\"{x} {y} {z}\" rpy=\"0 0 0\"/><mass value=\"1\"/>\
-             <inertia ixx=\"0.01\" ixy=\"0\" ixz=\"0\" iyy=\"0.012\" iyz=\"0\" izz=\"0.015\"/></inertial></link>"
-        );
-        if let Some(parent) = parent {
-            let axis = ["1 0 0", "0 1 0", "0 0 -1"][links % 3];
-            let _ = write!(
-                text,
-                "<joint name=\"joint{links}\" type=\"{kind}\"><parent link=\"link{parent}\"/><child link=\"link{links}\"/>\
-                 <origin xyz=\"{y} {z} {x}\" rpy=\"{x} {y} {z}\"/><axis xyz=\"{axis}\"/>\
-                 <limit lower=\"-3\" upper=\"3\" effort=\"1\" velocity=\"1\"/></joint>"
-            );
-        }
+        write_link(text, links, parent, kind, random.triple(0.1));
         links += 1;
         links - 1
     };
