@@ -12,7 +12,8 @@ use anyhow::{Context, anyhow};
 use proprio_topics::ipc::{Domain, DomainConfig, DomainError, PortError, Reader, Topic, Writer, monotonic};
 use proprio_topics::realtime;
 use proprio_topics::{
-    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, Nanos, Publisher, Role, Sample, TorqueEstimate,
+    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, InertiaEstimate, Nanos, Publisher, Role, Sample,
+    TorqueEstimate,
 };
 use sd_notify::NotifyState;
 use std::io::Write as _;
@@ -147,6 +148,8 @@ struct DataPlane {
     mapped: u64,
     torques: Writer<TorqueEstimate>,
     contacts: Writer<ContactEstimate>,
+    /// Where something is identified.
+    inertias: Option<Writer<InertiaEstimate>>,
     health_writer: Writer<EstimatorHealth>,
     description_writer: Writer<Description>,
     health: EstimatorHealth,
@@ -184,6 +187,10 @@ impl DataPlane {
             .identification()
             .map(|online| Identifier::start(online.component_count(), kept))
             .transpose()?;
+        let inertias = match identifier {
+            Some(_) => Some(Writer::create(&domain, robot, epoch)?),
+            None => None,
+        };
         Ok(Self {
             robot: robot.to_owned(),
             pipeline,
@@ -203,6 +210,7 @@ impl DataPlane {
             mapped: 0,
             torques,
             contacts,
+            inertias,
             health_writer,
             description_writer,
             health: EstimatorHealth {
@@ -283,6 +291,11 @@ impl DataPlane {
                 self.health.publish_failures += u64::from(!sent);
                 self.health.withheld += u64::from(estimate.torques.joints().iter().any(|j| j.valid != 1));
                 self.health.last_estimate = estimate.t;
+                if let Some(inertias) = &mut self.inertias
+                    && let Some(inertia) = self.pipeline.inertia()
+                {
+                    self.health.publish_failures += u64::from(inertias.send(inertia, now).is_err());
+                }
                 if let Some(jobs) = self.identifier.as_ref().and_then(|identifier| identifier.jobs.as_ref())
                     && let Some(job) = self.pipeline.take_job()
                 {
@@ -368,6 +381,7 @@ impl DataPlane {
         // Who can not be reached now gets the next one.
         let _ = self.health_writer.send(&self.health, now);
         let _ = self.description_writer.update_connections();
+        let _ = self.inertias.as_mut().map(Writer::update_connections);
     }
 }
 

@@ -29,8 +29,8 @@ use crate::setup::{BaseMotion, Setup, Use};
 use crate::spatial::{Vec3, Wrench};
 use learning::Learning;
 use proprio_topics::{
-    ContactEstimate, ContactWrench, Header, JointTorque, MAX_CONTACTS, MAX_JOINTS, NO_CAUSE, Nanos, Quality, Reading,
-    Reason, TorqueEstimate,
+    ContactEstimate, ContactWrench, Header, InertiaEstimate, JointTorque, MAX_CONTACTS, MAX_JOINTS, NO_CAUSE, Nanos,
+    Quality, Reading, Reason, TorqueEstimate,
 };
 use std::collections::VecDeque;
 
@@ -270,6 +270,12 @@ impl Pipeline {
     /// second of stamps has passed, estimates depend on samples alone; else they use it later, which is counted.
     pub fn take_job(&mut self) -> Option<Job> {
         self.learning.as_mut()?.take_job()
+    }
+
+    /// What is identified on-line, once after each change of what is in force: about once a second, and where an earlier run's state was resumed. Ask after each
+    /// estimate, which is the first that rests on it. Only `acquired` of the header is set.
+    pub fn inertia(&mut self) -> Option<&InertiaEstimate> {
+        self.learning.as_mut()?.inertia()
     }
 
     /// Gives back a job that was run.

@@ -15,8 +15,8 @@ use proprio_estimator::parameters::{Offset, Parameters, Provenance};
 use proprio_estimator::pipeline::{Estimate, Job, Pipeline};
 use proprio_estimator::setup::Setup;
 use proprio_estimator::spatial::Wrench;
-use proprio_topics::Nanos;
 use proprio_topics::csv::{Item, Reader, Row, Value, What};
+use proprio_topics::{InertiaEstimate, Nanos};
 use serde_json::Value as Json;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -806,6 +806,82 @@ fn a_state_is_resumed_and_one_that_does_not_fit_is_refused() {
     assert!(other.to_string().contains("another model"), "{other}");
     let aside = state::set_aside(&file).unwrap();
     assert!(aside.ends_with("state.bad-1") && aside.exists() && !file.exists());
+}
+
+/// What a pipeline identifies of a log, each time that it says so, and the instant of the estimate after which it does.
+fn inertias(setup: Setup, log: &str) -> Vec<(Nanos, InertiaEstimate)> {
+    let mut pipeline = Pipeline::new(setup);
+    let mut reader = Reader::new(log.as_bytes()).unwrap();
+    let series: Vec<_> = reader.series().iter().map(|s| (s.what, s.name.clone())).collect();
+    let (mut row, mut told) = (Row::default(), vec![]);
+    while reader.next_row(&mut row).unwrap() {
+        for Item { series: number, value } in &row.items {
+            let (what, name) = &series[*number];
+            if let (What::Channel(kind), Value::Reading(reading, quality)) = (what, value)
+                && let Some(channel) = pipeline.setup().channel(*kind, name)
+            {
+                pipeline.push(channel, row.t.unwrap(), reading, *quality);
+            }
+        }
+        while let Some(estimate) = pipeline.poll() {
+            let t = estimate.t;
+            told.extend(pipeline.inertia().map(|inertia| (t, *inertia)));
+            if let Some(mut job) = pipeline.take_job() {
+                job.run();
+                pipeline.give_back(job);
+            }
+        }
+    }
+    told
+}
+
+#[test]
+fn what_is_identified_is_told_once_a_second_with_what_it_rests_on() {
+    let sessions = arm();
+    let (begin, end) = sessions.moving("train");
+    let told = inertias(learning(&sessions), &sessions.log("train"));
+    assert!(told.len() as f64 > end - 3.0, "{} in {end} s", told.len());
+    let setup = learning(&sessions);
+    let truth = sessions.setup(Urdf::True, None);
+    let (mut errors, mut motion) = (Vec::new(), 0.0);
+    for (at, inertia) in &told {
+        let data = inertia.header.acquired;
+        assert!((0.9..1.5).contains(&(*at - data).seconds()), "{at} {data}");
+        assert_eq!((inertia.links().len(), inertia.offsets().len()), (5, 1));
+        assert_eq!(inertia.offsets()[0].name.as_str(), "l_arm_ft_sensor");
+        let mut square = 0.0;
+        for link in inertia.links() {
+            assert_eq!((link.accepted, link.group), (1, 0));
+            assert!(link.standard_deviation.iter().all(|x| x.is_finite() && *x > 0.0));
+            assert!(link.motion >= motion && link.motion <= (data.seconds() - begin).max(0.0) + 0.1);
+            let number = (0..setup.model.link_count()).find(|n| setup.model.link_name(*n) == link.name.as_str());
+            let true_body = truth.model.inertias()[number.expect("a link of the model")];
+            let apart = true_body.parameters()[0] - link.parameters[0];
+            square += (apart / link.standard_deviation[0]).powi(2);
+        }
+        errors.push((square / 5.0).sqrt());
+        motion = inertia.links()[0].motion;
+    }
+    let (first, last) = (&told[0].1.links()[0], &told.last().unwrap().1.links()[0]);
+    assert!(
+        last.rows > 4 * first.rows && last.rows > 5000,
+        "{} {}",
+        first.rows,
+        last.rows
+    );
+    // Masses: within what is said of them, and better known than at first.
+    println!("{errors:.2?}, {motion} s");
+    assert!(motion > 0.6 * (end - begin), "{motion} of {} s", end - begin);
+    assert!(errors.iter().all(|error| *error < 3.0), "{errors:?}");
+    let total = |at: usize| {
+        told[at]
+            .1
+            .links()
+            .iter()
+            .map(|link| link.standard_deviation[0].powi(2))
+            .sum::<f64>()
+    };
+    assert!(total(told.len() - 1) < 0.5 * total(0));
 }
 
 /// The part of a log before the robot moves, `times` times over, stamps going on.

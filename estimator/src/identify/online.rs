@@ -107,6 +107,10 @@ pub struct Observation<'a> {
     pub base: Reason,
     /// What speaks against each joint's motion.
     pub joints: &'a [Reason],
+    /// The joints that have moved since the instant before, beyond their noise.
+    pub moved: &'a DofSet,
+    /// Whether the base has.
+    pub is_base_moved: bool,
     /// What speaks against each sensor's reading.
     pub sensors: &'a [Reason],
 }
@@ -200,6 +204,12 @@ pub struct ComponentSolution {
     pub tau: f64,
     /// How many parameters the data determine, rather than the prior.
     pub effective: f64,
+    /// For how long its links have moved in what was learnt from so far [s].
+    pub motion: f64,
+    /// How many rows were learnt from so far, in motion and at rest.
+    pub rows: u64,
+    /// Whether all this is found from the data up to [`Solution::data`]. Else nothing that can exist fitted these, and it is what was there before.
+    pub is_accepted: bool,
     /// `[s | d]`, and a factor `F` of its covariance `F F^T`, column by column.
     estimate: Vec<f64>,
     factor: Vec<f64>,
@@ -223,6 +233,8 @@ struct Rows {
     values: Vec<f64>,
     /// Of each row, the instant's number in the grid.
     slots: Vec<i64>,
+    /// How many of the instants something moved at.
+    moving: u64,
 }
 
 impl Rows {
@@ -232,6 +244,7 @@ impl Rows {
             room,
             values: Vec::with_capacity(width * room),
             slots: Vec::with_capacity(room),
+            moving: 0,
         }
     }
 
@@ -242,6 +255,7 @@ impl Rows {
     fn clear(&mut self) {
         self.values.clear();
         self.slots.clear();
+        self.moving = 0;
     }
 
     /// Adds a row if there is room.
@@ -311,6 +325,9 @@ struct Component {
     paused: Paused,
     last_change: Option<Change>,
     counts: Counts,
+    /// Instants and rows that were learnt from, the former as far as something moved.
+    moving: u64,
+    rows: u64,
     row: Vec<f64>,
     scratch: Scratch,
 }
@@ -401,7 +418,9 @@ impl Online {
         let job = Box::new(Job {
             prior,
             data: Nanos::MIN,
-            parts: components.iter().map(Part::new).collect(),
+            parts: (components.iter().zip(&solution.components))
+                .map(|(component, known)| Part::new(component, known.clone()))
+                .collect(),
             solution: solution.clone(),
         });
         Ok(Self {
@@ -487,6 +506,11 @@ impl Online {
                 }
             }
         }
+        if let Some(job) = &mut self.job {
+            for (part, known) in job.parts.iter_mut().zip(&self.solution.components) {
+                part.good.clone_from(known);
+            }
+        }
         Ok(())
     }
 
@@ -568,6 +592,8 @@ impl Online {
             part.lasting = (self.newest - component.since).seconds();
             part.cosine = component.cosine;
             part.variances.copy_from_slice(&component.variances);
+            part.motion = component.moving as f64 * self.period.seconds();
+            part.rows = component.rows;
         }
         Some(job)
     }
@@ -715,6 +741,8 @@ impl Component {
             paused: Paused::No,
             last_change: None,
             counts: Counts::default(),
+            moving: 0,
+            rows: 0,
             row: vec![0.0; width],
             scratch: Scratch {
                 rows: Vec::with_capacity(most * width),
@@ -795,6 +823,8 @@ impl Component {
         for row in self.scratch.rows.chunks_exact(self.row.len()) {
             self.gathered.push(slot, row);
         }
+        let is_moving = seen.is_base_moved || !seen.moved.intersection(&self.dofs).is_empty();
+        self.gathered.moving += u64::from(is_moving);
     }
 
     /// Makes the whitened rows of the regressor's last update, in the scratch; how many.
@@ -881,6 +911,8 @@ impl Component {
         }
         let _ = self.information.absorb(&mut self.panel);
         self.counts.learnt += self.pending.instants();
+        self.moving += self.pending.moving;
+        self.rows += self.pending.len() as u64;
         self.learnt.take_from(&self.pending);
         self.pending.clear();
     }
@@ -955,6 +987,10 @@ struct Part {
     noise: Vec<Autocorrelation>,
     tau: f64,
     has_failed: bool,
+    motion: f64,
+    rows: u64,
+    /// The last solution that was found.
+    good: ComponentSolution,
     /// The same information with one thing started afresh, the rows put aside taken in, and how many.
     hypotheses: Vec<(Change, Information, f64)>,
     aside_rows: f64,
@@ -1004,7 +1040,7 @@ impl Autocorrelation {
 }
 
 impl Part {
-    fn new(component: &Component) -> Self {
+    fn new(component: &Component, good: ComponentSolution) -> Self {
         let none = Autocorrelation {
             sums: [0.0; LAGS],
             pairs: [0.0; LAGS],
@@ -1025,6 +1061,9 @@ impl Part {
             noise: vec![none; component.variances.len()],
             tau: GREATEST_TAU,
             has_failed: false,
+            motion: 0.0,
+            rows: 0,
+            good,
             hypotheses: Vec::new(),
             aside_rows: 0.0,
             asked: 0.0,
@@ -1036,8 +1075,16 @@ impl Part {
         self.change = None;
         self.weigh_change();
         self.has_failed = self.solve(prior, solution).is_err();
-        if !self.has_failed {
+        if self.has_failed {
+            // What it holds is older than what is in force.
+            solution.clone_from(&self.good);
+        } else {
             self.take_noise(solution);
+        }
+        solution.is_accepted = !self.has_failed;
+        (solution.motion, solution.rows) = (self.motion, self.rows);
+        if !self.has_failed {
+            self.good.clone_from(solution);
         }
     }
 

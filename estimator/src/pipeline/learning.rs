@@ -6,13 +6,13 @@
 //!
 //! A share is a cell of a grid of `period`; at most one estimate in each calls for an instant. So instants depend on stamps alone, as estimates do.
 
-use proprio_topics::{Nanos, Quality, Reason};
+use proprio_topics::{InertiaEstimate, LinkInertia, Name, Nanos, Quality, Reason, SensorOffset};
 
 use super::{OrReason, Track, UNTRUSTED_ENCODER, quality_reason};
-use crate::dynamics::{ContactSet, FrameMotion, JointState, Kinematics};
+use crate::dynamics::{ContactSet, DofSet, FrameMotion, JointState, Kinematics};
 use crate::history::{History, KEPT};
 use crate::identify::online::state::StateError;
-use crate::identify::online::{Job as Solving, Observation, Online, OnlineError};
+use crate::identify::online::{Job as Solving, Observation, Online, OnlineError, Solution};
 use crate::regressor::{Covariance, Propagation};
 use crate::setup::{BaseMotion, Setup, Use};
 use crate::spatial::{RigidInertia, Vec3, Wrench};
@@ -34,16 +34,22 @@ pub(super) struct Learning {
     noise: Vec<f64>,
     readings: Vec<Wrench>,
     joints: Vec<Reason>,
+    /// Joints that move at the present instant.
+    moved: DofSet,
     sensors: Vec<Reason>,
     scratch: Box<Centred>,
     /// What a job needs beside its own; at home while the job is.
     room: Option<Box<Room>>,
+    /// What is in force, and whether that has been told.
+    inertia: Box<InertiaEstimate>,
+    is_told: bool,
 }
 
 /// What a job works with beside the data, and where it puts what the pipeline wants.
 struct Room {
     setup: Setup,
     propagation: Propagation,
+    inertia: Box<InertiaEstimate>,
 }
 
 /// A job of the pipeline: solve, and carry the covariance to where torques can use it. [`Job::run`] it in any thread, then [`super::Pipeline::give_back`].
@@ -56,12 +62,17 @@ impl Job {
     /// Takes some tens of milliseconds, and allocates. What it finds depends on the samples alone.
     pub fn run(&mut self) {
         self.solving.run();
-        let Room { setup, propagation } = &mut *self.room;
+        let Room {
+            setup,
+            propagation,
+            inertia,
+        } = &mut *self.room;
         let covariance = covariance(setup, self.solving.solution());
         // Of the same structure: it can not be refused.
         if let Ok(new) = Propagation::new(&setup.structure, &covariance) {
             *propagation = new;
         }
+        tell(setup, self.solving.solution(), inertia);
     }
 
     /// What was known when it began, as text: for [`super::Pipeline::resume`].
@@ -72,7 +83,7 @@ impl Job {
 }
 
 /// What is uncertain under a solution, and of what it does not tell.
-fn covariance(setup: &Setup, solution: &crate::identify::online::Solution) -> Covariance {
+fn covariance(setup: &Setup, solution: &Solution) -> Covariance {
     let blocks = solution.components.iter().map(|component| {
         let known = (component.root.nrows() > 0).then_some(&component.root);
         (
@@ -83,6 +94,55 @@ fn covariance(setup: &Setup, solution: &crate::identify::online::Solution) -> Co
         )
     });
     setup.covariance_with(solution.data, blocks)
+}
+
+/// A solution in the words of who reads it.
+fn tell(setup: &Setup, solution: &Solution, told: &mut InertiaEstimate) {
+    let name = |text: &str| Name::new(text).unwrap_or(Name::EMPTY);
+    told.header.acquired = solution.data;
+    let (mut links, mut offsets) = (0, 0);
+    for (component, group) in solution.components.iter().zip(0..) {
+        let parameters = 10 * component.links.len();
+        // P = U^T U over [ten per link | torque, force of each offset].
+        let root = &component.root;
+        let deviation = |column: usize| match root.nrows() {
+            0 => f64::NAN,
+            _ => root.column(column).norm(),
+        };
+        let accepted = u32::from(component.is_accepted);
+        for (place, (&link, body)) in component.links.iter().zip(&component.bodies).enumerate() {
+            let Some(to) = told.links.get_mut(links) else { break };
+            links += 1;
+            *to = LinkInertia {
+                name: name(setup.model.link_name(link)),
+                parameters: body.parameters(),
+                standard_deviation: std::array::from_fn(|i| deviation(10 * place + i)),
+                motion: component.motion,
+                rows: component.rows,
+                group,
+                accepted,
+            };
+        }
+        for (place, (&sensor, offset)) in component.sensors.iter().zip(&component.offsets).enumerate() {
+            let Some(to) = told.offsets.get_mut(offsets) else { break };
+            offsets += 1;
+            let channel = setup.channels().iter().find(|c| c.role == Use::Sensor(sensor));
+            let six = |i: usize| deviation(parameters + 6 * place + i);
+            *to = SensorOffset {
+                name: channel.map_or(Name::EMPTY, |channel| name(&channel.name)),
+                force: offset.force.into(),
+                torque: offset.torque.into(),
+                standard_deviation: [3, 4, 5, 0, 1, 2].map(six),
+                group,
+                accepted,
+            };
+        }
+    }
+    (told.link_count, told.offset_count) = (count(links), count(offsets));
+}
+
+fn count(number: usize) -> u32 {
+    u32::try_from(number).unwrap_or(0)
 }
 
 impl Learning {
@@ -124,12 +184,16 @@ impl Learning {
             held,
             readings: vec![Wrench::zero(); setup.structure.sensors().len()],
             joints: vec![Reason::None; dofs],
+            moved: DofSet::default(),
             sensors: vec![Reason::None; setup.structure.sensors().len()],
             scratch: Box::default(),
             room: Some(Box::new(Room {
                 setup: setup.clone(),
                 propagation,
+                inertia: Box::default(),
             })),
+            inertia: Box::default(),
+            is_told: true,
             online,
         })
     }
@@ -157,7 +221,8 @@ impl Learning {
         (base_link, mut base, mut base_fault): (usize, FrameMotion, Reason),
     ) {
         let (from, to) = (t - DELAY, t + DELAY);
-        let mut is_moved = false;
+        let mut is_base_moved = false;
+        self.moved = DofSet::default();
         self.found.copy_from(&self.held);
         for (track, channel) in tracks.iter().zip(setup.channels()) {
             match (track, channel.role) {
@@ -187,7 +252,9 @@ impl Learning {
                     };
                     let errors = self.found.errors.chunks_exact_mut(3).nth(dof).unwrap_or_default();
                     for ((place, (value, error)), old) in [&mut *q, dq, ddq].into_iter().zip(values).zip(errors) {
-                        is_moved |= differs((*place, *old), (value, error));
+                        if differs((*place, *old), (value, error)) {
+                            self.moved.insert(dof);
+                        }
                         (*place, *old) = (value, error);
                     }
                     if !(q.is_finite() && dq.is_finite() && ddq.is_finite()) {
@@ -230,7 +297,7 @@ impl Learning {
                         .into_iter()
                         .zip(errors)
                         {
-                            is_moved |= differs((*place, *old), (value, error));
+                            is_base_moved |= differs((*place, *old), (value, error));
                             (*place, *old) = (value, error);
                         }
                     }
@@ -247,7 +314,7 @@ impl Learning {
                 _ => {}
             }
         }
-        if is_moved {
+        if is_base_moved || !self.moved.is_empty() {
             self.held.copy_from(&self.found);
         }
         if let BaseMotion::Imu(pose) = &setup.base {
@@ -272,6 +339,8 @@ impl Learning {
             active,
             base: base_fault,
             joints: &self.joints,
+            moved: &self.moved,
+            is_base_moved,
             sensors: &self.sensors,
         });
     }
@@ -298,6 +367,7 @@ impl Learning {
             && let Ok(new) = Propagation::new(&setup.structure, &covariance(setup, self.online.solution()))
         {
             room.propagation = new;
+            tell(setup, self.online.solution(), &mut room.inertia);
         }
         self.enforce(setup, propagation);
         Ok(())
@@ -318,7 +388,14 @@ impl Learning {
         }
         if let Some(room) = &mut self.room {
             std::mem::swap(propagation, &mut room.propagation);
+            std::mem::swap(&mut self.inertia, &mut room.inertia);
+            self.is_told = false;
         }
+    }
+
+    /// What is in force, if it has not been told yet.
+    pub(super) fn inertia(&mut self) -> Option<&InertiaEstimate> {
+        (!std::mem::replace(&mut self.is_told, true)).then_some(&*self.inertia)
     }
 
     pub(super) fn take_job(&mut self) -> Option<Job> {

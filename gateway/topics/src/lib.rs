@@ -4,6 +4,7 @@
 //! - [`reading`]: what a device measured, in SI units: [`Reading`] and its variants.
 //! - [`sample`]: a reading with its channel and its [`Header`]: when, how well, which in the sequence.
 //! - [`estimate`]: joint torques and contact wrenches, each with its validity and the reason where it is not valid.
+//! - [`inertia`]: identified inertial parameters and F/T offsets, with their standard deviations and what they rest on.
 //! - [`description`]: what the channel, joint and contact numbers mean.
 //! - [`health`]: how gateway and estimator are doing.
 //! - [`time`]: instants as integer nanoseconds.
@@ -27,6 +28,7 @@ pub mod csv;
 pub mod description;
 pub mod estimate;
 pub mod health;
+pub mod inertia;
 #[cfg(feature = "ipc")]
 pub mod ipc;
 pub mod reading;
@@ -38,6 +40,7 @@ pub mod time;
 pub use description::{Description, Entry, Name, Publisher, Role};
 pub use estimate::{ContactDeclaration, ContactEstimate, ContactWrench, JointTorque, NO_CAUSE, Reason, TorqueEstimate};
 pub use health::{BusHealth, Counter, DeviceHealth, EstimatorHealth, GatewayHealth, LinkState};
+pub use inertia::{InertiaEstimate, LinkInertia, SensorOffset};
 pub use reading::{Actuator, Gauges, Imu, JointState, Kind, Reading, Temperature, Wrench};
 pub use sample::{Header, Quality, Sample, Saturation, StampKind};
 pub use time::Nanos;
@@ -48,5 +51,9 @@ pub const MAX_CHANNELS: usize = 128;
 pub const MAX_JOINTS: usize = 64;
 /// The most contacts one estimate holds.
 pub const MAX_CONTACTS: usize = 16;
+/// The most links one estimate of inertial parameters holds.
+pub const MAX_LINKS: usize = 128;
+/// The most F/T sensors whose offsets one estimate holds.
+pub const MAX_SENSORS: usize = 32;
 /// The most buses one gateway reads; also the most publishers of samples.
 pub const MAX_BUSES: usize = 16;

@@ -8,8 +8,8 @@ use proprio_topics::ipc::{
     Writer, monotonic,
 };
 use proprio_topics::{
-    ContactDeclaration, Description, Entry, EstimatorHealth, GatewayHealth, Header, JointState, JointTorque, Kind,
-    MAX_JOINTS, Name, Nanos, Publisher, Reading, Reason, Role, Sample, TorqueEstimate,
+    ContactDeclaration, Description, Entry, EstimatorHealth, GatewayHealth, Header, InertiaEstimate, JointState,
+    JointTorque, Kind, LinkInertia, MAX_JOINTS, Name, Nanos, Publisher, Reading, Reason, Role, Sample, TorqueEstimate,
 };
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
@@ -308,6 +308,41 @@ fn a_second_gateway_of_a_robot_is_refused() {
     let _its_estimator = Writer::<EstimatorHealth>::create(&second, "icub", 2).unwrap();
     drop(gateway);
     Writer::<GatewayHealth>::create(&second, "icub", 3).unwrap();
+}
+
+#[test]
+fn who_comes_late_finds_the_last_inertia_at_once() {
+    let (_base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    let mut writer = Writer::<InertiaEstimate>::create(&domain, "icub", 3).unwrap();
+    let mut estimate = Box::new(InertiaEstimate::default());
+    for second in 1..=20 {
+        estimate.header.acquired = Nanos::from_millis(1000 * second);
+        estimate.link_count = 1;
+        estimate.links[0] = LinkInertia {
+            name: Name::new("hand").unwrap(),
+            parameters: [second as f64; 10],
+            ..LinkInertia::ABSENT
+        };
+        writer.send(&estimate, Nanos(second)).unwrap();
+    }
+    let mut reader = Reader::<InertiaEstimate>::open(&domain, "icub").unwrap();
+    writer.update_connections().unwrap();
+    let got = reader.try_take().unwrap().unwrap();
+    assert_eq!(
+        (got.header.acquired, got.header.sequence),
+        (Nanos::from_millis(20_000), 19)
+    );
+    assert_eq!((got.links().len(), got.offsets().len()), (1, 0));
+    assert_eq!(
+        (got.links[0].name.as_str(), got.links[0].parameters),
+        ("hand", [20.0; 10])
+    );
+    assert!(reader.try_take().unwrap().is_none());
+    assert!(
+        Writer::<InertiaEstimate>::create(&domain, "icub", 4).is_err(),
+        "one estimator tells"
+    );
 }
 
 /// A later version of the sample, on the same service.

@@ -1,7 +1,8 @@
 //! The services: which payload travels under which name, and with which quality of service. Nowhere else.
 
 use crate::{
-    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth, Header, Sample, TorqueEstimate,
+    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth, Header, InertiaEstimate, Sample,
+    TorqueEstimate,
 };
 use core::fmt::Debug;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
@@ -101,6 +102,18 @@ topic!(
         nodes: NODES,
         buffer: 256,
         history: 0
+    }
+);
+// Once a second: who looks in every few seconds misses none; who comes late need not wait.
+topic!(
+    InertiaEstimate,
+    "estimate/inertia",
+    QualityOfService {
+        publishers: 1,
+        subscribers: 16,
+        nodes: NODES,
+        buffer: 8,
+        history: 1
     }
 );
 topic!(
