@@ -124,6 +124,7 @@ pub(crate) fn outcome() -> Outcome {
             floored: (i == 2).then(|| RigidInertia::from_parameters(&cad)),
             identified: RigidInertia::from_parameters(&identified),
             deviation: cad.map(|p| p.abs() * 0.03 + 1e-4),
+            kept: 1.0,
             significance: 4.2 / size,
             seen: i > 0,
         }

@@ -13,7 +13,7 @@
 //! | `advice` | {`grade`: `accept`, `care` or `reject`; `why`: sentences; `next`: what to do} |
 //! | `logs` | a list, in the order given on the command line: below |
 //! | `tau` | the prior's scale, chosen from the data: how far the CAD is from the robot, relatively; at most 1 |
-//! | `shrink` | which part of the change from CAD was kept after the held-out check, 0 to 1 |
+//! | `shrink` | the least share of the change from CAD that was kept of any link after the held-out check, 0 to 1 (`links`: of each) |
 //! | `unknowns`, `structural_rank`, `rank`, `effective` | inertial parameters; combinations of them that the robot's structure lets show; those that the logs show; how many the logs rather than the prior decide |
 //! | `condition`, `singular_values` | of what the logs tell, columns scaled by the prior's spread |
 //! | `weakest` | worst first: {`expression`, `relative`: singular value over the greatest, `prior_share`: share of its variance that is the prior's} |
@@ -21,7 +21,7 @@
 //! | `time_offsets` | {`log`, `channel`, `seconds` (late is positive), `deviation`, `significant`, `applied`} |
 //! | `consistency` | {`feasible`: whether bodies exist that have what the logs say, `deviations`: by how many sigma not, `links`, `text`} |
 //! | `findings` | what is wrong, in words: {`log` or `null`, `severity`: `note`, `warning`, `refusal`; `code`: one word; `subject`: a channel, joint or link; `text`} |
-//! | `links` | {`name`, `seen`, `significance`, `cad`, `identified`, `deviation`: ten numbers each, m h_x h_y h_z I_xx I_xy I_xz I_yy I_yz I_zz about the link's origin} |
+//! | `links` | {`name`, `seen`, `kept`: which share of the change from CAD was kept after the held-out check, `significance`, `cad`, `identified`, `deviation`: ten numbers each, m h_x h_y h_z I_xx I_xy I_xz I_yy I_yz I_zz about the link's origin} |
 //! | `base_parameters` | {`expression`, `unit`, `cad`, `identified`, `deviation`} |
 //! | `channels` | noise of each measured number: {`name`, `unit`, `deviation`, `autocorrelation_s`, `drift`: `unit` per square root of second} |
 //!
@@ -74,7 +74,7 @@ pub(crate) fn summary(outcome: &Outcome, advice: &Advice) -> Json {
         .iter()
         .map(|l| {
             json!({
-                "name": l.name, "seen": l.seen, "significance": l.significance,
+                "name": l.name, "seen": l.seen, "kept": l.kept, "significance": l.significance,
                 "cad": l.cad.parameters(), "identified": l.identified.parameters(), "deviation": l.deviation,
             })
         })

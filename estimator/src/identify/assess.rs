@@ -6,12 +6,14 @@ use super::outcome::{
     LinkOutcome, LogOutcome, OffsetOutcome, Outcome, SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome,
     Verdict, WeakDirection,
 };
-use super::passes::{Residuals, leave};
+use super::passes::{OFFSET_VARIANCE, Residuals, Told, leave, tell};
 use super::rows::{FRICTION, Layout, RowMaker, Rows, WIDTH};
 use super::{AXES, dot};
 use crate::config::IdentificationInput;
 use crate::dynamics::Structure;
-use crate::regressor::identifiable::{Column, Identifiable, JointMotion, Measured, Offsets, Scope};
+use crate::regressor::identifiable::{
+    BaseParameter, Column, Identifiable, JointMotion, Measured, Offsets, Scope, Term,
+};
 use crate::setup::{Setup, Use};
 use crate::spatial::RigidInertia;
 use nalgebra::{DMatrix, DVector};
@@ -29,8 +31,14 @@ const RAW_RATE: f64 = 400.0;
 /// Of the fourth-order Butterworth filter, run forwards and backwards, for raw torques \[Hz\].
 const CUT_OFF: f64 = 5.0;
 
+/// Missing samples over this \[s\] do not show below [`CUT_OFF`].
+const BRIDGED: f64 = 0.02;
+
 /// A joint that moves less stands still \[rad\].
 const STILL: f64 = 0.01;
+
+/// An offset with this variance has not been read.
+const UNREAD: f64 = 0.9 * OFFSET_VARIANCE;
 
 const PARAMETERS: [&str; 10] = ["m", "h_x", "h_y", "h_z", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz"];
 
@@ -149,6 +157,7 @@ fn unseen(setup: &Setup, link: usize, cad: &RigidInertia) -> LinkOutcome {
         floored: None,
         identified: *cad,
         deviation: [f64::NAN; 10],
+        kept: 0.0,
         significance: 0.0,
         seen: false,
     }
@@ -165,8 +174,8 @@ pub(super) fn outcome(
     let layout = &identified.layout;
     let p = layout.unknowns();
     let narrow = identified.fit.covariance_root();
-    let root = widened(&narrow, &(&identified.fit.x - &identified.d));
     let (scaled, spread) = scaled_information(identified);
+    let root = shrunk(&narrow, &spread, &identified.kept);
     let svd = scaled.svd(false, true);
     let mut order: Vec<usize> = (0..svd.singular_values.len()).collect();
     order.sort_by(|&a, &b| svd.singular_values[b].total_cmp(&svd.singular_values[a]));
@@ -182,7 +191,7 @@ pub(super) fn outcome(
         let direction = directions.row(i).transpose();
         let value = svd.singular_values[i];
         WeakDirection {
-            expression: expression(setup, layout, &direction),
+            expression: expression(setup, layout, &spread, &direction),
             relative: value / greatest,
             prior_share: 1.0 / (1.0 + value * value),
         }
@@ -222,7 +231,7 @@ pub(super) fn outcome(
         links: links(setup, identified, &narrow, &root, &spread),
         covariance: covariance(identified, &root),
         tau: identified.fit.tau,
-        shrink: identified.shrink,
+        shrink: identified.kept.iter().copied().fold(1.0, f64::min),
         unknowns: p,
         rank,
         structural_rank,
@@ -283,11 +292,24 @@ fn scaled_information(identified: &Identified) -> (DMatrix<f64>, Vec<DMatrix<f64
     (scaled, spreads)
 }
 
-/// A square root of a covariance with the square of `back` added: what was taken back of a change may be true all the same.
-fn widened(root: &DMatrix<f64>, back: &DVector<f64>) -> DMatrix<f64> {
-    let mut wide = root.clone().resize_horizontally(root.ncols() + 1, 0.0);
-    wide.set_column(root.ncols(), back);
-    wide
+/// A square root of the covariance of what is kept, `kept` of the change from CAD per link: `(1 - b^2) P + b^2 Q` with `b = 1 - kept`, `P = root root^T` and `Q` the prior's covariance.
+///
+/// The error is `kept` times that of the estimate and `b` times that of CAD; the estimate's error has covariance `P`, CAD's `Q`, and `P` is what they have in common, since what the
+/// estimate moved by tells nothing of what it is still off by. So with nothing kept it is the prior's. (No row has two groups of links, and within a group the same is kept.)
+fn shrunk(root: &DMatrix<f64>, spread: &[DMatrix<f64>], kept: &[f64]) -> DMatrix<f64> {
+    if kept.iter().all(|kept| *kept >= 1.0) {
+        return root.clone();
+    }
+    let narrow = root.ncols();
+    let mut wide = root.clone().resize_horizontally(narrow + WIDTH * kept.len(), 0.0);
+    for (place, (kept, spread)) in kept.iter().zip(spread).enumerate() {
+        let back = 1.0 - kept;
+        wide.view_mut((WIDTH * place, 0), (WIDTH, narrow))
+            .scale_mut((1.0 - back * back).sqrt());
+        wide.view_mut((WIDTH * place, narrow + WIDTH * place), (WIDTH, WIDTH))
+            .copy_from(&(spread * back));
+    }
+    upper(&wide)
 }
 
 fn links(
@@ -340,24 +362,11 @@ fn links(
                 .clone()
                 .try_inverse()
                 .unwrap_or_else(|| DMatrix::zeros(WIDTH, WIDTH));
-            let shrink = shrinking.rows(WIDTH * place, WIDTH).into_owned();
-            let scatter = &own * own.transpose() - &shrink * shrink.transpose();
-            let scatter = &inverse * scatter * inverse.transpose();
-            let change = &inverse * identified.d.rows(WIDTH * place, WIDTH);
-            let eigen = ((&scatter + scatter.transpose()) * 0.5).symmetric_eigen();
-            let (mut square, mut degrees) = (0.0, 0.0);
-            for (value, vector) in eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()) {
-                // What is known to less than a tenth of the prior's spread is not counted.
-                if *value > 0.01 {
-                    square += vector.dot(&change).powi(2) / value;
-                    degrees += 1.0;
-                }
-            }
-            let significance = if degrees > 0.0 {
-                (2.0_f64 * square).sqrt() - (2.0_f64 * degrees - 1.0).sqrt()
-            } else {
-                0.0
-            };
+            let significance = significance(
+                &(&inverse * own),
+                &(&inverse * shrinking.rows(WIDTH * place, WIDTH).into_owned()),
+                &(&inverse * identified.d.rows(WIDTH * place, WIDTH)),
+            );
             LinkOutcome {
                 link,
                 name: setup.model.link_name(link).to_owned(),
@@ -365,14 +374,44 @@ fn links(
                 floored,
                 identified: moved[link],
                 deviation,
-                significance: significance.max(0.0),
+                kept: identified.kept[place],
+                significance,
                 seen: true,
             }
         })
         .collect()
 }
 
-/// Of the parameters and of the offsets at the end of the last training log, together.
+/// How far a link's parameters moved, as standard normal deviates, from rows of the root of their posterior covariance `P`, of `P` times the root of the prior's precision, and from the
+/// change; all in units of the prior's spread.
+///
+/// Directions count of which the logs rather than the prior decide: less than half of the prior's variance is left. There the change is measured by the scatter that it would have if CAD
+/// were right, `P - P (prior's precision) P`; its square is a chi-square variable, made a deviate by Fisher's root.
+fn significance(root: &DMatrix<f64>, shrinking: &DMatrix<f64>, change: &DVector<f64>) -> f64 {
+    let svd = root.clone().svd(true, false);
+    let Some(axes) = svd.u else { return 0.0 };
+    let known: Vec<usize> = (0..svd.singular_values.len())
+        .filter(|&i| svd.singular_values[i].powi(2) < 0.5)
+        .collect();
+    if known.is_empty() {
+        return 0.0;
+    }
+    // Each direction in units of its own deviation: they differ by many orders of magnitude.
+    let scale = |i: usize| 1.0 / svd.singular_values[known[i]].max(f64::MIN_POSITIVE);
+    let axes = axes.select_columns(&known).transpose();
+    let (own, shrinking, change) = (&axes * root, &axes * shrinking, &axes * change);
+    let scatter = &own * own.transpose() - &shrinking * shrinking.transpose();
+    let scatter = DMatrix::from_fn(known.len(), known.len(), |i, j| scatter[(i, j)] * scale(i) * scale(j));
+    let change = DVector::from_fn(known.len(), |i, _| change[i] * scale(i));
+    let square = match scatter.cholesky() {
+        Some(factor) => change.dot(&factor.solve(&change)),
+        // Lost in rounding: as if it scattered by its whole uncertainty.
+        None => change.norm_squared(),
+    };
+    ((2.0 * square).sqrt() - (2.0 * known.len() as f64 - 1.0).sqrt()).max(0.0)
+}
+
+/// Of the parameters, and of the offsets at the end of the last piece of a training log in which each sensor was read, together.
 fn covariance(identified: &Identified, root: &DMatrix<f64>) -> CovarianceRoot {
     let layout = &identified.layout;
     let (p, s) = (layout.unknowns(), 6 * layout.sensors.len());
@@ -386,12 +425,27 @@ fn covariance(identified: &Identified, root: &DMatrix<f64>) -> CovarianceRoot {
     let wide = root.ncols();
     let mut joint = DMatrix::zeros(p + s, wide + s);
     joint.view_mut((0, 0), (p, wide)).copy_from(root);
-    if let Some(told) = identified.told.last() {
-        let slope = told.slope.rows(0, s).into_owned();
-        joint.view_mut((p, 0), (s, wide)).copy_from(&-(slope * root));
-        let own = told.covariance.view((0, 0), (s, s)).into_owned();
-        if let Some(factor) = own.cholesky() {
-            joint.view_mut((p, wide), (s, s)).copy_from(&factor.l());
+    // Given the parameters, offsets in different pieces have nothing in common.
+    let source = |place: usize| {
+        let read = |told: &Told| (0..6).any(|axis| told.covariance[(6 * place + axis, 6 * place + axis)] < UNREAD);
+        let last = identified.told.len().saturating_sub(1);
+        identified.told.iter().rposition(read).unwrap_or(last)
+    };
+    let sources: Vec<usize> = (0..layout.sensors.len()).map(source).collect();
+    for (number, told) in identified.told.iter().enumerate() {
+        let own = (0..s).filter(|unknown| sources[unknown / 6] == number);
+        let own: Vec<usize> = own.collect();
+        if own.is_empty() {
+            continue;
+        }
+        let moved = told.slope.select_rows(&own) * root;
+        let factor = told.covariance.select_rows(&own).select_columns(&own).cholesky();
+        for (i, unknown) in own.iter().enumerate() {
+            joint.view_mut((p + unknown, 0), (1, wide)).copy_from(&-moved.row(i));
+            for (j, column) in own.iter().enumerate() {
+                joint[(p + unknown, wide + column)] =
+                    factor.as_ref().map_or(0.0, |f| f.l_dirty()[(i, j)]) * f64::from(u8::from(j <= i));
+            }
         }
     }
     CovarianceRoot {
@@ -408,30 +462,38 @@ fn upper(m: &DMatrix<f64>) -> DMatrix<f64> {
     DMatrix::from_fn(n, n, |i, j| if j < i { 0.0 } else { r[(n - 1 - j, n - 1 - i)] })
 }
 
-/// A direction, in units of the prior's spread, in words: the up to four greatest parts.
-fn expression(setup: &Setup, layout: &Layout, direction: &DVector<f64>) -> String {
-    let mut parts: Vec<(usize, f64)> = direction.iter().copied().enumerate().collect();
-    parts.sort_by(|a, b| b.1.abs().total_cmp(&a.1.abs()).then(a.0.cmp(&b.0)));
-    let lead = parts.first().map_or(1.0, |p| p.1);
-    let mut text = String::new();
-    for (number, (column, value)) in parts.iter().take(4).enumerate() {
-        let share = value / lead;
-        if share.abs() < 0.1 {
-            break;
-        }
-        let link = setup.model.link_name(layout.links[column / WIDTH]);
-        // Second moments and the like are mixed within a link; the unit that leads names it.
-        let name = format!("{link}.{}", PARAMETERS[column % WIDTH]);
-        match number {
-            0 => text.push_str(&name),
-            _ => text.push_str(&format!(
-                " {} {:.2} {name}",
-                if share < 0.0 { '-' } else { '+' },
-                share.abs()
-            )),
+/// The combination of parameters that a direction `v`, in units of the prior's spread `S`, is: `v . S^-1 d`, in words. Up to four terms, those which weigh most by the prior's spread of
+/// each parameter; the factors are those of the parameters in their own units, the first one's 1.
+fn expression(setup: &Setup, layout: &Layout, spread: &[DMatrix<f64>], direction: &DVector<f64>) -> String {
+    let mut parts: Vec<(usize, f64, f64)> = Vec::new();
+    for (place, spread) in spread.iter().enumerate() {
+        let Some(inverse) = spread.clone().try_inverse() else {
+            continue;
+        };
+        let factors = inverse.tr_mul(&direction.rows(WIDTH * place, WIDTH).into_owned());
+        for (k, factor) in factors.iter().enumerate() {
+            parts.push((WIDTH * place + k, *factor, (factor * spread.row(k).norm()).abs()));
         }
     }
-    text
+    parts.sort_by(|a, b| b.2.total_cmp(&a.2).then(a.0.cmp(&b.0)));
+    let term = |&(column, factor, _): &(usize, f64, f64)| Term {
+        coefficient: factor / parts[0].1,
+        column,
+        name: format!(
+            "{}.{}",
+            setup.model.link_name(layout.links[column / WIDTH]),
+            PARAMETERS[column % WIDTH]
+        ),
+    };
+    let mut terms = parts.iter().take(4).filter(|part| part.2 >= 0.1 * parts[0].2).map(term);
+    let Some(kept) = terms.next() else {
+        return String::new();
+    };
+    BaseParameter {
+        kept,
+        terms: terms.collect(),
+    }
+    .to_string()
 }
 
 /// What can show at all with the joints that moved in the logs.
@@ -589,7 +651,7 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
     }
     for (dof, errors, measured) in &torque_series {
         let smooth = |x: &[f64]| match filter {
-            Some(rate) => zero_phase(x, rate),
+            Some(rate) => low_passed(x, rate),
             None => x.to_vec(),
         };
         let keep = |x: &[f64]| -> Vec<f64> { (0..x.len()).filter(inner).map(|i| x[i]).collect() };
@@ -615,38 +677,27 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         torque_share.push(([cad, fitted, own], measured));
     }
 
+    let compared = Compared::new(maker, instants, &left, identified, &sets);
     let mut sensors = Vec::new();
     let mut wrench_share = Vec::new();
     for (place, &sensor) in layout.sensors.iter().enumerate() {
         let name = sensor_name(setup, sensor);
-        let configured = setup.offsets[sensor].force_first();
         let mut values = [[f64::NAN; 6]; 3];
         for axis in 0..6 {
             let channel = channel_of(place, axis);
-            let raw: Vec<f64> = left.measured[channel]
-                .iter()
-                .zip(&left.predicted[channel])
-                .map(|(m, p)| m - p - configured[axis])
-                .collect();
-            let series = [&raw, &left.noise[0][channel], &left.noise[1][channel]];
-            for (value, series) in values.iter_mut().zip(series) {
-                value[axis] = rms(series.iter().copied());
+            let errors = compared.errors.each_ref().map(|set| &set[channel]);
+            for (value, errors) in values.iter_mut().zip(errors) {
+                value[axis] = rms(errors.iter().copied());
             }
-            let offset = left.offset(layout, 1, channel);
             let scale = if axis < 3 { Structure::LENGTH_SCALE } else { 1.0 };
-            let load: Vec<f64> = left.measured[channel]
-                .iter()
-                .zip(&offset)
-                .map(|(m, o)| (m - o) * scale)
-                .collect();
-            let centre = mean(&load);
-            let raw_mean = mean(&raw);
+            let load = &compared.load[channel];
+            let (centre, raw_mean) = (mean(load), mean(errors[0]));
             let errors = [
-                raw.iter().map(|x| (x - raw_mean) * scale).collect::<Vec<_>>(),
-                left.noise[0][channel].iter().map(|x| x * scale).collect(),
-                left.noise[1][channel].iter().map(|x| x * scale).collect(),
+                errors[0].iter().map(|x| (x - raw_mean) * scale).collect::<Vec<_>>(),
+                errors[1].iter().map(|x| x * scale).collect(),
+                errors[2].iter().map(|x| x * scale).collect(),
             ];
-            wrench_share.push((errors, load.iter().map(|x| x - centre).collect::<Vec<_>>()));
+            wrench_share.push((errors, load.iter().map(|x| (x - centre) * scale).collect::<Vec<_>>()));
         }
         sensors.push(SensorOutcome {
             name,
@@ -670,6 +721,7 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         }
         (above / below).sqrt()
     };
+    let deviations = session_deviations(maker, log, instants, identified, root);
     LogOutcome {
         file: log.file.clone(),
         role: log.role,
@@ -681,11 +733,11 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         joints,
         sensors,
         two_route: two_route(maker, instants, &left, &sets),
-        offsets: offsets(setup, layout, log, identified, &left),
-        friction: friction(setup, layout, &left),
+        offsets: offsets(setup, layout, log, identified, &left, &deviations),
+        friction: friction(setup, layout, &left, &deviations),
         time_offsets: log.time_offsets.clone(),
         findings: log.findings.clone(),
-        curves: curves(maker, instants, &times, &left, identified, root, &torque_series),
+        curves: curves(maker, instants, &times, &compared, identified, root, &torque_series),
         spectra: spectra(setup, layout, &times, &left),
     }
 }
@@ -719,12 +771,7 @@ fn two_route(
     let setup = maker.setup();
     let layout = maker.layout().clone();
     let dofs = setup.model.dof_count();
-    let mut configured = vec![0.0; layout.session()];
-    for (place, &sensor) in layout.sensors.iter().enumerate() {
-        for (axis, value) in setup.offsets[sensor].force_first().into_iter().enumerate() {
-            configured[channel_of(place, axis)] = value;
-        }
-    }
+    let configured = configured_session(setup, &layout);
     let mut series = [vec![Vec::new(); dofs], vec![Vec::new(); dofs], vec![Vec::new(); dofs]];
     let mut rows = Rows::new(&layout);
     for (range, block) in left.ranges.iter().zip(&left.session) {
@@ -762,12 +809,34 @@ fn two_route(
         .collect()
 }
 
+/// Standard deviations of the log's own unknowns at its end: what the rows leave uncertain of them for known parameters, and what the parameters' own uncertainty adds.
+fn session_deviations(
+    maker: &mut RowMaker<'_>,
+    log: &Prepared,
+    instants: &[super::instants::Instant],
+    identified: &Identified,
+    root: &DMatrix<f64>,
+) -> Vec<f64> {
+    // The last of them tell it: an offset walks, and a filter that begins there with nothing known errs on the safe side.
+    let piece = super::passes::Piece {
+        instants: &instants[instants.len().saturating_sub(super::batch::LONG)..],
+        breaks: &log.breaks,
+    };
+    let told = tell(maker, piece, &identified.noise, &[], &[]);
+    let moved = &told.slope * root;
+    (0..told.covariance.nrows())
+        .map(|i| (told.covariance[(i, i)].max(0.0) + moved.row(i).norm_squared()).sqrt())
+        .collect()
+}
+
+/// Offsets of the sensors that the log has, where rows could be made of them.
 fn offsets(
     setup: &Setup,
     layout: &Layout,
     log: &Prepared,
     identified: &Identified,
     left: &Residuals,
+    deviations: &[f64],
 ) -> Vec<OffsetOutcome> {
     let (Some(first), Some(last)) = (left.session.first(), left.session.last()) else {
         return Vec::new();
@@ -777,42 +846,146 @@ fn offsets(
         .sensors
         .iter()
         .enumerate()
+        .filter(|(place, _)| (0..6).any(|axis| left.hears(6 * place + axis)))
         .map(|(place, &sensor)| OffsetOutcome {
             sensor: sensor_name(setup, sensor),
             start: of(place, &|channel| first.x[(channel, 1)]),
             end: of(place, &|channel| last.x[(channel, 1)]),
-            deviation: of(place, &|channel| last.p[(channel, channel)].max(0.0).sqrt()),
+            deviation: of(place, &|channel| deviations[channel]),
             rate: of(place, &|channel| identified.noise.drift[channel].sqrt()),
             breaks: log.breaks.iter().filter(|b| b.sensor == sensor).map(|b| b.t).collect(),
         })
         .collect()
 }
 
-fn friction(setup: &Setup, layout: &Layout, left: &Residuals) -> Vec<FrictionOutcome> {
+/// Friction of the joints whose torque the log has.
+fn friction(setup: &Setup, layout: &Layout, left: &Residuals, deviations: &[f64]) -> Vec<FrictionOutcome> {
     let Some(last) = left.session.last() else {
         return Vec::new();
     };
     let first = 6 * layout.sensors.len();
     let value = |place: usize, k: usize| last.x[(first + FRICTION * place + k, 1)];
-    let deviation = |place: usize, k: usize| {
-        let i = first + FRICTION * place + k;
-        last.p[(i, i)].max(0.0).sqrt()
-    };
     layout
         .joints
         .iter()
         .enumerate()
+        .filter(|(place, _)| left.hears(first + place))
         .map(|(place, &dof)| FrictionOutcome {
             joint: setup.model.dof_name(dof).to_owned(),
             coulomb_nm: value(place, 0),
             viscous: value(place, 1),
             offset_nm: value(place, 2),
-            deviation: [0, 1, 2].map(|k| deviation(place, k)),
+            deviation: [0, 1, 2].map(|k| deviations[first + FRICTION * place + k]),
         })
         .collect()
 }
 
-/// Standard deviation of what the parameters predict for a channel at an instant: `|P^(1/2)T a|`.
+/// What each F/T sensor reads, beside what everything else predicts that it should: the links on its contact-free side, and what their other sensors read.
+///
+/// Noise is estimated from residuals that are shared out among the sensors of a sub-tree ([`Residuals`]); a comparison of one sensor's reading must not give a part of its error to
+/// another. So here all of it is laid to the one that is asked about ([`laid_to`]): of two sensors with a link between them, each is compared with the other.
+pub(super) struct Compared {
+    /// Per channel and instant: the reading less its fitted offset; NaN where it can not be compared.
+    pub load: Vec<Vec<f64>>,
+    /// The same less what is predicted: by CAD with the configured offsets, by CAD with fitted ones, by the identified parameters with fitted ones.
+    pub errors: [Vec<Vec<f64>>; 3],
+}
+
+impl Compared {
+    /// `sets`: CAD, the identified parameters; `left`: of these two.
+    pub(super) fn new(
+        maker: &mut RowMaker<'_>,
+        instants: &[super::instants::Instant],
+        left: &Residuals,
+        identified: &Identified,
+        sets: &[DVector<f64>; 2],
+    ) -> Self {
+        let layout = maker.layout().clone();
+        let configured = configured_session(maker.setup(), &layout);
+        let empty = || vec![vec![f64::NAN; instants.len()]; 6 * layout.sensors.len()];
+        let (mut load, mut errors) = (empty(), [empty(), empty(), empty()]);
+        let variances = identified.noise.following();
+        let mut rows = Rows::new(&layout);
+        for (range, block) in left.ranges.iter().zip(&left.session) {
+            let fitted = block.x.column(0).into_owned();
+            let own = block.x.column(1).into_owned();
+            let cases = [
+                (&sets[0], configured.as_slice()),
+                (&sets[0], fitted.as_slice()),
+                (&sets[1], own.as_slice()),
+            ];
+            for i in range.clone() {
+                if layout.sensors.is_empty() || maker.make(&instants[i], &mut rows).is_err() {
+                    continue;
+                }
+                let residuals = cases.map(|(d, s)| {
+                    DVector::from_fn(rows.count, |row, _| {
+                        rows.r(row) - dot(rows.a(row), d.as_slice()) - dot(rows.g(row), s)
+                    })
+                });
+                for (place, &sensor) in layout.sensors.iter().enumerate() {
+                    let Some(map) = laid_to(&rows, &variances, 6 * place..6 * place + 6) else {
+                        continue;
+                    };
+                    let reading = instants[i].readings[sensor];
+                    let off = residuals.each_ref().map(|residual| &map * residual);
+                    for (k, value) in reading.torque.iter().chain(&reading.force).enumerate() {
+                        let channel = 6 * place + k;
+                        if rows.has(channel) {
+                            load[channel][i] = value - own[channel];
+                            errors
+                                .iter_mut()
+                                .zip(&off)
+                                .for_each(|(errors, off)| errors[channel][i] = off[k]);
+                        }
+                    }
+                }
+            }
+        }
+        Self { load, errors }
+    }
+}
+
+/// The configured offsets, in the columns of the log's own unknowns.
+fn configured_session(setup: &Setup, layout: &Layout) -> Vec<f64> {
+    let mut configured = vec![0.0; layout.session()];
+    for (place, &sensor) in layout.sensors.iter().enumerate() {
+        for (axis, value) in setup.offsets[sensor].force_first().into_iter().enumerate() {
+            configured[channel_of(place, axis)] = value;
+        }
+    }
+    configured
+}
+
+/// The map from the residuals of rows (not whitened) to the noise of these channels that explains them, all other channels being taken to be exact: `V N^T (N V N^T)^-1`; none if no
+/// row has any of them.
+fn laid_to(rows: &Rows, variances: &[f64], channels: std::ops::Range<usize>) -> Option<DMatrix<f64>> {
+    /// Where several sub-trees disagree about the channels, the others take the rest, which must cost something.
+    const OTHERS: f64 = 1e-6;
+    let has = |row: &usize| rows.n(*row)[channels.clone()].iter().any(|x| *x != 0.0);
+    let own: Vec<usize> = (0..rows.count).filter(has).collect();
+    if own.is_empty() {
+        return None;
+    }
+    let variance = |c: usize| variances[c] * if channels.contains(&c) { 1.0 } else { OTHERS };
+    let n = DMatrix::from_fn(own.len(), variances.len(), |i, c| rows.n(own[i])[c]);
+    let scaled = DMatrix::from_fn(own.len(), variances.len(), |i, c| n[(i, c)] * variance(c));
+    let mut square = &scaled * n.transpose();
+    let least = 1e-12 * square.diagonal().max();
+    for i in 0..own.len() {
+        square[(i, i)] += least;
+    }
+    let solved = square
+        .cholesky()?
+        .solve(&scaled.columns_range(channels.clone()).into_owned());
+    let mut map = DMatrix::zeros(channels.len(), rows.count);
+    for (i, row) in own.iter().enumerate() {
+        map.set_column(*row, &solved.row(i).transpose());
+    }
+    Some(map)
+}
+
+/// Standard deviation of what is left of each channel at an instant: what the parameters' uncertainty and the noise of all channels that the prediction rests on make of it.
 fn predicted_deviations(
     maker: &mut RowMaker<'_>,
     instant: &super::instants::Instant,
@@ -821,24 +994,23 @@ fn predicted_deviations(
 ) -> Vec<f64> {
     let layout = maker.layout().clone();
     let mut rows = Rows::new(&layout);
-    let variances = identified.noise.following();
     let mut out = vec![f64::NAN; layout.channels()];
     if maker.make(instant, &mut rows).is_err() {
         return out;
     }
-    rows.whiten(&variances);
-    let mut sums = vec![0.0; layout.channels()];
-    let mut e = vec![0.0; layout.channels()];
-    let mut white = Vec::new();
-    for column in root.column_iter() {
-        white.clear();
-        white.extend((0..rows.count).map(|row| dot(rows.a(row), column.as_slice())));
-        rows.channel_noise(&variances, &mut white, &mut e);
-        sums.iter_mut().zip(&e).for_each(|(sum, x)| *sum += x * x);
-    }
-    for (channel, out) in out.iter_mut().enumerate() {
-        if rows.has(channel) {
-            *out = sums[channel].sqrt();
+    let a = DMatrix::from_fn(rows.count, layout.unknowns(), |i, j| rows.a(i)[j]) * root;
+    let noise = DMatrix::from_fn(rows.count, layout.channels(), |i, c| {
+        rows.n(i)[c] * identified.noise.square[c].sqrt()
+    });
+    let wrenches = 6 * layout.sensors.len();
+    let sensors = (0..layout.sensors.len()).map(|place| 6 * place..6 * place + 6);
+    for channels in sensors.chain((wrenches..layout.channels()).map(|c| c..c + 1)) {
+        let Some(map) = laid_to(&rows, &identified.noise.following(), channels.clone()) else {
+            continue;
+        };
+        let (parameters, noise) = (&map * &a, &map * &noise);
+        for (k, channel) in channels.enumerate().filter(|(_, channel)| rows.has(*channel)) {
+            out[channel] = parameters.row(k).norm().hypot(noise.row(k).norm());
         }
     }
     out
@@ -858,8 +1030,7 @@ fn covered(
         if !errors[i].is_finite() {
             continue;
         }
-        let own = predicted_deviations(maker, &instants[i], identified, root)[channel];
-        let deviation = own.hypot(identified.noise.square[channel].sqrt());
+        let deviation = predicted_deviations(maker, &instants[i], identified, root)[channel];
         inside += f64::from(u8::from(errors[i].abs() <= 1.96 * deviation));
         count += 1.0;
     }
@@ -870,7 +1041,7 @@ fn curves(
     maker: &mut RowMaker<'_>,
     instants: &[super::instants::Instant],
     times: &[f64],
-    left: &Residuals,
+    compared: &Compared,
     identified: &Identified,
     root: &DMatrix<f64>,
     torques: &[TorqueSeries],
@@ -889,9 +1060,8 @@ fn curves(
         }
     }
     let sigma = |channel: usize| -> Vec<f64> {
-        let noise = identified.noise.square[channel].sqrt();
         (0..points.len())
-            .map(|number| deviations[number / 10][channel].hypot(noise))
+            .map(|number| deviations[number / 10][channel])
             .collect()
     };
     let t: Vec<f64> = points.iter().map(|&i| times[i]).collect();
@@ -912,15 +1082,14 @@ fn curves(
     for (place, &sensor) in layout.sensors.iter().enumerate() {
         for (axis, word) in AXES.into_iter().enumerate() {
             let channel = channel_of(place, axis);
-            let offset = left.offset(&layout, 1, channel);
-            let load = |i: usize| left.measured[channel][i] - offset[i];
+            let load = &compared.load[channel];
             out.push(Curve {
                 name: format!("{} {word}", sensor_name(setup, sensor)),
                 unit: if axis < 3 { "N" } else { "Nm" },
                 t: t.clone(),
-                measured: pick(&load),
-                cad_fitted: pick(&|i| load(i) - left.noise[0][channel][i]),
-                identified: pick(&|i| load(i) - left.noise[1][channel][i]),
+                measured: pick(&|i| load[i]),
+                cad_fitted: pick(&|i| load[i] - compared.errors[1][channel][i]),
+                identified: pick(&|i| load[i] - compared.errors[2][channel][i]),
                 sigma: sigma(channel),
             });
         }
@@ -970,6 +1139,39 @@ fn spectra(setup: &Setup, layout: &Layout, times: &[f64], left: &Residuals) -> V
         .collect()
 }
 
+/// A series through [`zero_phase`], where numbers are missing (NaN). Gaps of up to [`BRIDGED`] are bridged by a line; longer ones are ends, and as at the ends of the log [`EDGE`] of
+/// what is there is not given. What is missing stays missing.
+fn low_passed(values: &[f64], rate: f64) -> Vec<f64> {
+    let samples = |seconds: f64| (seconds * rate).round() as usize;
+    let there: Vec<usize> = (0..values.len()).filter(|&i| values[i].is_finite()).collect();
+    let mut out = vec![f64::NAN; values.len()];
+    let mut rest = there.as_slice();
+    while let (Some(&first), false) = (rest.first(), rest.is_empty()) {
+        let end = rest.windows(2).position(|w| w[1] - w[0] > samples(BRIDGED) + 1);
+        let (run, behind) = rest.split_at(end.map_or(rest.len(), |i| i + 1));
+        rest = behind;
+        let last = run[run.len() - 1];
+        let mut line = Vec::with_capacity(last + 1 - first);
+        for pair in run.windows(2) {
+            let (a, b) = (values[pair[0]], values[pair[1]]);
+            let steps = (pair[1] - pair[0]) as f64;
+            line.extend((0..pair[1] - pair[0]).map(|k| a + (b - a) * k as f64 / steps));
+        }
+        line.push(values[last]);
+        let smooth = zero_phase(&line, rate);
+        let low = if first > 0 { first + samples(EDGE) } else { 0 };
+        let high = if last + 1 < values.len() {
+            last.saturating_sub(samples(EDGE))
+        } else {
+            last
+        };
+        for &i in run.iter().filter(|i| (low..=high).contains(i)) {
+            out[i] = smooth[i - first];
+        }
+    }
+    out
+}
+
 /// Fourth-order Butterworth low pass, forwards and backwards; `rate` samples a second. The ends are continued by reflection.
 fn zero_phase(values: &[f64], rate: f64) -> Vec<f64> {
     let pad = ((rate / CUT_OFF) as usize * 3).min(values.len().saturating_sub(1));
@@ -998,4 +1200,123 @@ fn zero_phase(values: &[f64], rate: f64) -> Vec<f64> {
         x.reverse();
     }
     x[pad..pad + values.len()].to_vec()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use std::path::Path;
+
+    fn setup() -> Setup {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/icub_left_arm/estimator.toml");
+        Setup::new(&Config::load(&file).unwrap()).unwrap()
+    }
+
+    /// One link whose directions are known from hardly at all to a ten thousandth of the prior's spread; moved by ten standard deviations in the best known one.
+    #[test]
+    fn what_is_known_best_counts_first_for_significance() {
+        let share: Vec<f64> = (0..10).map(|i| 10f64.powf(-0.9 * f64::from(i))).collect();
+        let root = DMatrix::from_diagonal(&DVector::from_fn(10, |i, _| share[i].sqrt()));
+        // With the prior's precision the unit matrix, P times its root is P.
+        let shrinking = &root * &root;
+        let moved = |direction: usize, deviations: f64| {
+            let mut change = DVector::zeros(10);
+            change[direction] = deviations * (share[direction] - share[direction].powi(2)).sqrt();
+            significance(&root, &shrinking, &change)
+        };
+        // Nine directions count: sqrt(2 x 100) - sqrt(2 x 9 - 1).
+        let expected = 200f64.sqrt() - 17f64.sqrt();
+        for direction in [3, 9] {
+            let found = moved(direction, 10.0);
+            assert!(
+                (found - expected).abs() < 1e-6 * expected,
+                "{direction}: {found} {expected}"
+            );
+        }
+        assert_eq!(moved(0, 10.0), 0.0, "the logs say nothing of it");
+        assert_eq!(moved(9, 1.0), 0.0, "chance");
+    }
+
+    /// The square that a covariance's root stands for.
+    fn squared(root: &DMatrix<f64>) -> DMatrix<f64> {
+        root * root.transpose()
+    }
+
+    #[test]
+    fn what_is_shrunk_to_cad_is_as_uncertain_as_cad() {
+        let mut state = 1.0_f64;
+        let mut next = || {
+            state = (state * 1.7 + 0.31).fract();
+            state - 0.5
+        };
+        // Two links that no row has together.
+        let mut narrow = DMatrix::zeros(20, 20);
+        for place in [0, 10] {
+            let own = DMatrix::from_fn(10, 10, |_, _| 0.01 * next());
+            narrow.view_mut((place, place), (10, 10)).copy_from(&own);
+        }
+        let spread: Vec<DMatrix<f64>> = (0..2).map(|_| DMatrix::from_fn(10, 10, |_, _| next())).collect();
+        let block = |m: &DMatrix<f64>, place: usize| m.view((10 * place, 10 * place), (10, 10)).into_owned();
+        let all = squared(&narrow);
+        for (kept, back) in [(1.0, 0.0), (0.0, 1.0), (0.7, 0.3)] {
+            let found = squared(&shrunk(&narrow, &spread, &[kept, 1.0]));
+            let expected = block(&all, 0) * (1.0 - back * back) + squared(&spread[0]) * f64::from(back * back);
+            assert!((block(&found, 0) - expected).amax() < 1e-12, "{kept}");
+            assert!(
+                (block(&found, 1) - block(&all, 1)).amax() < 1e-12,
+                "{kept}: the other link's"
+            );
+        }
+    }
+
+    #[test]
+    fn weak_directions_are_told_in_the_parameters_own_units() {
+        let setup = setup();
+        let layout = Layout {
+            links: vec![3, 5],
+            ..Layout::default()
+        };
+        // kg, kg m and kg m^2 are uncertain by 1, 0.1 and 0.01; m and h_x of the second link together besides.
+        let scale = |k: usize| [1.0, 0.1, 0.01][usize::from(k > 0) + usize::from(k > 3)];
+        let plain = DMatrix::from_diagonal(&DVector::from_fn(10, |k, _| scale(k)));
+        let mut mixed = plain.clone();
+        mixed[(1, 0)] = 0.05;
+        let mut direction = DVector::zeros(20);
+        (direction[0], direction[2], direction[4]) = (1.0, -0.5, 0.05);
+        let first = setup.model.link_name(3);
+        assert_eq!(
+            expression(&setup, &layout, &[plain.clone(), mixed.clone()], &direction),
+            // m / 1 - 0.5 h_y / 0.1, and too little of I_xx.
+            format!("{first}.m - 5 {first}.h_y")
+        );
+        // h_x / 0.1 of what h_x is beside its share of m: (h_x - 0.05 m) / 0.1.
+        let direction = DVector::from_fn(20, |k, _| f64::from(u8::from(k == 11)));
+        let second = setup.model.link_name(5);
+        assert_eq!(
+            expression(&setup, &layout, &[plain, mixed], &direction),
+            format!("{second}.h_x - 0.05 {second}.m")
+        );
+    }
+
+    #[test]
+    fn missing_samples_spoil_only_their_surroundings_of_a_filtered_curve() {
+        let rate = 1000.0;
+        let clean: Vec<f64> = (0..6000).map(|i| (6.0 * f64::from(i) / rate).sin()).collect();
+        let whole = zero_phase(&clean, rate);
+        let mut holed = clean.clone();
+        holed[1500] = f64::NAN;
+        holed[3000..3400].fill(f64::NAN);
+        let found = low_passed(&holed, rate);
+        let near = |i: usize, gap: std::ops::Range<usize>| i + 300 >= gap.start && i < gap.end + 300;
+        for (i, (found, whole)) in found.iter().zip(&whole).enumerate() {
+            if i == 1500 || near(i, 3000..3400) {
+                assert!(found.is_nan(), "{i}");
+            } else {
+                assert!((found - whole).abs() < 2e-3, "{i}: {found} {whole}");
+            }
+        }
+        assert_eq!(low_passed(&clean, rate), whole);
+        assert!(low_passed(&[f64::NAN; 10], rate).iter().all(|x| x.is_nan()));
+    }
 }

@@ -86,7 +86,7 @@ const SAMPLE: usize = 10_000;
 const SAMPLE_STRETCHES: usize = 10;
 
 /// Longer logs are taken in pieces, each with offsets that begin unknown, so that all cores have work.
-const LONG: usize = 10_000;
+pub(super) const LONG: usize = 10_000;
 
 /// A log, ready to be used.
 pub(super) struct Prepared {
@@ -123,9 +123,8 @@ pub(super) struct Identified {
     pub fit: Fit,
     /// Parameters less CAD, shrunk.
     pub d: DVector<f64>,
-    /// The least share of the change from CAD that was kept.
-    pub shrink: f64,
-    pub gains: bool,
+    /// Per link of the layout, the share of the change from CAD that was kept.
+    pub kept: Vec<f64>,
     pub findings: Vec<Finding>,
     /// Per piece of the training logs, the last one last.
     pub told: Vec<Told>,
@@ -507,10 +506,6 @@ fn fit(
     for (place, share) in guard.share.iter().enumerate() {
         d.rows_mut(10 * place, 10).scale_mut(*share);
     }
-    let (least, greatest) = guard
-        .share
-        .iter()
-        .fold((1.0_f64, 0.0_f64), |(a, b), s| (a.min(*s), b.max(*s)));
     Ok(Identified {
         layout,
         inputs,
@@ -518,8 +513,7 @@ fn fit(
         noise,
         information,
         d,
-        shrink: least,
-        gains: greatest > 0.0,
+        kept: guard.share,
         findings: guard.findings,
         fit,
         told,
@@ -917,7 +911,7 @@ pub(super) fn feasibility(setup: &Setup, identified: &Identified) -> super::outc
 
 /// The verdict, given the held-out check.
 pub(super) fn verdict(identified: &Identified) -> Verdict {
-    if identified.gains {
+    if identified.kept.iter().any(|kept| *kept > 0.0) {
         Verdict::Identified
     } else {
         Verdict::NoBetterThanCad

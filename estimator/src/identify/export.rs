@@ -7,7 +7,7 @@ use crate::setup::{Setup, Use};
 use crate::spatial::Wrench;
 use nalgebra::DMatrix;
 
-/// The identified parameters of `setup`'s robot: links that the logs reach, with their covariance; offsets and friction as they were at the end of the last training log. `program` is the
+/// The identified parameters of `setup`'s robot: links that the logs reach, with their covariance; offsets and friction as they were at the end of the last training log in which the sensor, or the joint's torque, was read. `program` is the
 /// name and version of what identified them.
 ///
 /// # Errors
@@ -72,11 +72,13 @@ pub fn parameters(outcome: &Outcome, setup: &Setup, program: &str) -> Result<Par
     });
     parameters.set_identified(&inertias, &offsets, &root)?;
 
-    let friction: Vec<Friction> = trained()
-        .rev()
-        .find(|log| !log.friction.is_empty())
-        .map(frictions)
-        .unwrap_or_default();
+    // Of each joint from the last log that has it.
+    let mut friction: Vec<Friction> = Vec::new();
+    for found in trained().rev().flat_map(frictions) {
+        if !friction.iter().any(|f| f.joint == found.joint) {
+            friction.push(found);
+        }
+    }
     parameters.set_friction(&friction)?;
     Ok(parameters)
 }
@@ -102,9 +104,10 @@ fn frictions(log: &LogOutcome) -> Vec<Friction> {
 mod tests {
     use super::*;
     use crate::config::Config;
-    use crate::identify::{Consistency, CovarianceRoot, LinkOutcome, OffsetOutcome, Three, Verdict};
+    use crate::identify::{Consistency, CovarianceRoot, FrictionOutcome, LinkOutcome, OffsetOutcome, Three, Verdict};
     use crate::spatial::RigidInertia;
     use proprio_topics::Nanos;
+    use std::collections::BTreeMap;
     use std::path::Path;
 
     fn setup() -> Setup {
@@ -126,6 +129,7 @@ mod tests {
                 floored: None,
                 identified: RigidInertia::from_parameters(&cad.parameters().map(|p| 1.1 * p)),
                 deviation: [0.0; 10],
+                kept: 1.0,
                 significance: 0.0,
                 seen: link == 3 || link == 5,
             });
@@ -253,6 +257,32 @@ mod tests {
         // And it is this robot's: the text of the file reads back as the same.
         given.check_setup(&setup).unwrap();
         assert_eq!(Parameters::parse(&given.to_string()).unwrap(), given);
+    }
+
+    /// A sensor that was dead in the last log, and a joint whose torque was not measured there: what the log before says of them.
+    #[test]
+    fn each_offset_and_friction_is_of_the_last_log_that_has_it() {
+        let setup = setup();
+        let mut outcome = outcome(&setup);
+        let mut later = outcome.logs[0].clone();
+        later.offsets.clear();
+        later.span = (Nanos(5_000_000_000), Nanos(6_000_000_000));
+        let friction = |joint: &str, coulomb_nm| FrictionOutcome {
+            joint: joint.into(),
+            coulomb_nm,
+            ..FrictionOutcome::default()
+        };
+        outcome.logs[0].friction = vec![friction("l_elbow", 0.1), friction("l_wrist_yaw", 0.2)];
+        later.friction = vec![friction("l_elbow", 0.3)];
+        outcome.logs.push(later);
+        let given = parameters(&outcome, &setup, "a program 1").unwrap();
+        let [offset] = given.offsets() else {
+            panic!("one sensor")
+        };
+        assert_eq!(offset.reading, Wrench::from_parts([1.0, 2.0, 3.0], [4.0, 5.0, 6.0]));
+        assert_eq!(offset.known, Nanos(1_000_000_001));
+        let coulomb: BTreeMap<&str, f64> = given.friction().iter().map(|f| (f.joint.as_str(), f.coulomb)).collect();
+        assert_eq!(coulomb, BTreeMap::from([("l_elbow", 0.3), ("l_wrist_yaw", 0.2)]));
     }
 
     #[test]

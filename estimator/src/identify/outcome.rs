@@ -77,16 +77,18 @@ pub struct LinkOutcome {
     pub floored: Option<RigidInertia>,
     /// Identified: always of a body that can exist. Equal to `cad` where the log can see nothing of the link.
     pub identified: RigidInertia,
-    /// Standard deviations of the ten identified parameters (those of the prior where the logs say nothing).
+    /// Standard deviations of the ten identified parameters (those of the prior where the logs say nothing, or were not believed).
     pub deviation: [f64; 10],
-    /// How far the identified parameters are from CAD's: the Mahalanobis distance, by the covariance of what the logs tell, of the part that they tell, expressed as standard normal
-    /// deviates (2 and less is nothing).
+    /// Which share of the change from CAD was kept after the check on held-out data: 1: all of it; 0: the parameters are CAD's (as they are of a link that no row reaches).
+    pub kept: f64,
+    /// How far the identified parameters are from CAD's: the Mahalanobis distance of those combinations of which the logs rather than the prior decide, by the scatter that they would have
+    /// if CAD were right, expressed as a standard normal deviate (2 and less is nothing).
     pub significance: f64,
     /// Whether the log's rows reach this link at all.
     pub seen: bool,
 }
 
-/// Covariance of the identified parameters, and of the offsets at the end of the last log, as `U U^T`: inflated noise and prior included.
+/// Covariance of the identified parameters, and of the offsets at the end of the last training log in which each sensor was read, as `U U^T`: inflated noise and prior included.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CovarianceRoot {
     /// What rows stand for: all links that are seen, ten parameters each, then six per sensor.
@@ -98,7 +100,7 @@ pub struct CovarianceRoot {
 /// A combination of parameters that the motion of the logs excites least.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WeakDirection {
-    /// In words: `right_hand.m - 0.41 right_forearm.h_z`.
+    /// In words, factors in the units of the parameters: `right_hand.m - 0.41 right_forearm.h_z`. Terms that weigh little by the prior's spread are left out.
     pub expression: String,
     /// Its singular value relative to the greatest, columns scaled to the prior's spread.
     pub relative: f64,

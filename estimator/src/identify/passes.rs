@@ -13,7 +13,7 @@ use std::ops::Range;
 pub(super) const BLOCK: f64 = 0.1;
 
 /// Variance of an offset before anything is measured [N^2 or Nm^2]: no F/T sensor is a thousand off. Of friction coefficients [Nm^2]: a hundred.
-const OFFSET_VARIANCE: f64 = 1e6;
+pub(super) const OFFSET_VARIANCE: f64 = 1e6;
 const FRICTION_VARIANCE: f64 = 1e4;
 
 /// Means over so many autocorrelation times count as independent; at most so many blocks are one.
@@ -234,6 +234,11 @@ pub(super) struct Residuals {
 }
 
 impl Residuals {
+    /// Whether any row had this channel.
+    pub(super) fn hears(&self, channel: usize) -> bool {
+        self.measured[channel].iter().any(|x| x.is_finite())
+    }
+
     /// A sensor's offset in a channel, per instant.
     pub(super) fn offset(&self, layout: &Layout, set: usize, channel: usize) -> Vec<f64> {
         let mut out = vec![f64::NAN; self.measured.first().map_or(0, Vec::len)];
