@@ -1,25 +1,28 @@
-//! `proprio demo`: a simulated robot, the gateway and the estimator as three processes; what they tell is watched through
+//! `proprio demo`: the experiment of the paper, without a robot. A simulated one, the gateway and the estimator run as three processes; what they tell is watched through
 //! shared memory like any consumer does, and compared with the simulator's truth at the end.
+//!
+//! The estimator gets a URDF that is deliberately wrong (`cad.urdf`), and identifies the robot's inertial parameters and its sensors' offsets while it works. The robot
+//! stands still first, so that there is nothing to learn from, and then moves. Beside it runs what the estimator would say without identification.
 
-use crate::report::plot::{Axis, Ink, Plot, Series};
-use crate::report::{self, Table as ReportTable};
+mod baseline;
+mod result;
+
 use anyhow::{Context, anyhow, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use proprio_estimator::config::ConfigError;
-use proprio_estimator::offline::Table;
-use proprio_estimator::pipeline::Estimate;
+use baseline::{Baseline, Readers};
+use proprio_estimator::config::{Config, ConfigError};
+use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
-use proprio_simulator::{Fault, Robot, Settings, Simulator};
-use proprio_topics::csv::{self, Value};
+use proprio_simulator::{Fault, Robot, Settings, Simulation, Simulator, wrong_urdf};
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, Topic, monotonic};
 use proprio_topics::{
-    ContactEstimate, ContactWrench, EstimatorHealth, GatewayHealth, JointTorque, Kind, Nanos, Reading, TorqueEstimate,
+    ContactEstimate, ContactWrench, EstimatorHealth, GatewayHealth, JointTorque, Nanos, TorqueEstimate,
 };
-use serde_json::{Value as Json, json};
+use serde_json::Value as Json;
 use std::fs::{self, File};
-use std::io::{BufReader, BufWriter, IsTerminal, Write};
+use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
@@ -33,16 +36,19 @@ pub(crate) struct Args {
     /// The robot: a folder in config/, or a path
     #[arg(long, value_name = "NAME", default_value = "icub_left_arm")]
     robot: String,
-    /// How long the robot moves [s]
-    #[arg(long, value_name = "N", default_value_t = 20.0, value_parser = seconds)]
+    /// How long it takes [s]: a quarter of it, 10 s at the most, the robot stands still, then it moves
+    #[arg(long, value_name = "N", default_value_t = 40.0, value_parser = seconds)]
     seconds: f64,
-    /// Where report.html, estimates.csv, summary.json and the processes' logs go
+    /// How far each inertial parameter of the URDF that the estimator gets is off, as a share of it
+    #[arg(long, value_name = "SHARE", default_value_t = 0.2, value_parser = share)]
+    cad_error: f64,
+    /// Where report.html, estimates.csv, summary.json, the wrong URDF, the estimator's configuration and the processes' logs go
     #[arg(long, value_name = "DIR", default_value = "proprio-demo")]
     out: PathBuf,
     /// CAN interfaces to use instead of virtual buses, one per bus of the robot; a single one takes all devices
     #[arg(long, value_name = "INTERFACE")]
     bus: Vec<String>,
-    /// The seed of trajectory and noise
+    /// The seed of trajectory, noise and what is wrong with the URDF
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// A fault of the robot, as `proprio simulate` takes it; may be repeated
@@ -57,10 +63,34 @@ fn seconds(text: &str) -> Result<f64, String> {
     }
 }
 
+fn share(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(s) if (0.0..=0.5).contains(&s) => Ok(s),
+        _ => Err("must be 0 to 0.5".into()),
+    }
+}
+
+impl Args {
+    /// How long the robot stands still [s].
+    fn still(&self) -> f64 {
+        (0.25 * self.seconds).min(10.0)
+    }
+
+    /// What the simulator is told.
+    fn settings(&self) -> Settings {
+        Settings {
+            seed: self.seed,
+            still: self.still(),
+            cycle: self.seconds,
+            ..Settings::default()
+        }
+    }
+}
+
 /// How long the processes may take to be ready, and to end.
 const PATIENCE: Nanos = Nanos::from_millis(10_000);
-/// Errors count from this long after the first estimate: the paper's definition of a settled estimate is later, not earlier.
-const SETTLE: Nanos = Nanos::from_millis(1000);
+/// What the robot is taken to be [Nm]: where its configuration bounds no torque's standard deviation, this does.
+const MOST_STD: f64 = 0.5;
 
 /// Runs the demonstration.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
@@ -103,16 +133,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let folder = private.path().join("robot");
     copy_robot(&original, &args.bus, &folder)?;
     let robot = Robot::load(&folder)?;
-    let setup = Setup::new(&robot.config).map_err(|problem| ConfigError {
-        file: folder.join("estimator.toml"),
-        problem,
-    })?;
+    let experiment = Experiment::prepare(args, &robot, &out)?;
 
     say!(
-        "robot {}: simulator, gateway and estimator as three processes; {} s",
+        "robot {}: simulator, gateway and estimator as three processes, {} s",
         robot.config.robot,
         args.seconds
     );
+    say!("{}", experiment.story(args));
     let mut processes = Processes {
         private: private.path().to_owned(),
         domain: domain.clone(),
@@ -120,7 +148,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         running: vec![],
         stop,
     };
-    let outcome = watch(args, &robot, &setup, &mut processes);
+    let outcome = watch(args, &robot, &experiment, &mut processes);
     let ended = processes.end();
     let removed = Domain::remove_if_unused(&domain);
     if !matches!(removed, Ok(true)) {
@@ -131,8 +159,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     }
     let watched = outcome.map_err(|error| processes.explain(error))?;
     ended?;
-    let truth = Truth::read(&private.path().join("truth.csv"), &watched.joints).context("the simulator's truth")?;
-    finish(args, &setup, &out, &watched, &truth)
+    result::finish(args, &experiment, &out, &watched, &private.path().join("truth.csv"))
 }
 
 /// Copies the robot's configuration to `to`, with the sources of its buses replaced by `buses`, if any are given.
@@ -186,10 +213,112 @@ fn copy_robot(robot: &Robot, buses: &[String], to: &Path) -> anyhow::Result<()> 
         .to_str()
         .with_context(|| format!("{} is not UTF-8", model.display()))?;
     estimator.insert("model".into(), model.into());
+    // What was identified of a real robot is not the simulated one's.
+    estimator.remove("parameters");
+    if let Some(identification) = estimator.get_mut("identification").and_then(toml::Value::as_table_mut) {
+        identification.remove("state");
+    }
     fs::create_dir_all(to)?;
     fs::write(to.join("gateway.toml"), gateway.to_string())?;
     fs::write(to.join("estimator.toml"), estimator.to_string())?;
     Ok(())
+}
+
+/// What the estimator is given, and what it would say without identification.
+struct Experiment {
+    /// The estimator's configuration, with the wrong URDF beside it.
+    config: PathBuf,
+    /// As the estimator has it at the start.
+    setup: Setup,
+    /// The same without identification, and without a bound.
+    baseline: Setup,
+    /// The contact that is pushed and declared, and from when until when [s] of the simulation.
+    pushed: Option<String>,
+    touched: Vec<(f64, f64)>,
+    /// The bound of torques' standard deviations [Nm].
+    most_std: f64,
+    /// Why nothing can be identified.
+    refused: Option<String>,
+}
+
+impl Experiment {
+    /// Writes `cad.urdf` and `estimator.toml` to `out`: the configuration of `robot` with identification on, with that URDF, and with the contact that the simulator
+    /// pushes and declares as one that comes and goes.
+    fn prepare(args: &Args, robot: &Robot, out: &Path) -> anyhow::Result<Self> {
+        let settings = args.settings();
+        fs::write(out.join("cad.urdf"), wrong_urdf(robot, &settings, args.cad_error)?)?;
+        let simulation = Simulation::new(robot, &settings)?;
+        let pushed = simulation.pushed();
+        let mut touched = vec![];
+        let mut next = simulation.next_touch(0.0);
+        while let Some(touch) = next.filter(|touch| touch.t < args.seconds) {
+            if touch.begins {
+                touched.push((touch.t, args.seconds));
+            } else if let Some((_, until)) = touched.last_mut() {
+                *until = touch.t;
+            }
+            next = simulation.next_touch(touch.t);
+        }
+        let mut table: toml::Table = fs::read_to_string(robot.folder.join("estimator.toml"))?.parse()?;
+        table.insert("model".into(), "cad.urdf".into());
+        let contacts = table.get_mut("contact").and_then(toml::Value::as_array_mut);
+        if let Some(contact) = pushed.and_then(|c| contacts?.get_mut(c)?.as_table_mut()) {
+            contact.insert("presence".into(), "possible".into());
+        }
+        let mut set = |section: &str, key: &str, value: toml::Value| {
+            let section = table.entry(section).or_insert_with(|| toml::Table::new().into());
+            if let Some(section) = section.as_table_mut() {
+                section.insert(key.into(), value);
+            }
+        };
+        set("identification", "enabled", true.into());
+        let most_std = robot.config.output.max_torque_std_nm.unwrap_or(MOST_STD);
+        set("output", "max_torque_std_nm", most_std.into());
+        let file = out.join("estimator.toml");
+        let head = "# The estimator's configuration of the demonstration: the robot's, with identification on and a URDF that is deliberately wrong.\n";
+        fs::write(&file, format!("{head}{table}"))?;
+        let mut config = Config::load(&file)?;
+        let setup = |config: &Config| {
+            Setup::new(config).map_err(|problem| ConfigError {
+                file: file.clone(),
+                problem,
+            })
+        };
+        let with = setup(&config)?;
+        config.identification.enabled = false;
+        config.output.max_torque_std_nm = None;
+        Ok(Self {
+            baseline: setup(&config)?,
+            pushed: simulation.contact_names().nth(pushed.unwrap_or(usize::MAX)).map(ToOwned::to_owned),
+            touched,
+            most_std,
+            refused: Pipeline::new(with.clone()).identification_refused().map(ToString::to_string),
+            setup: with,
+            config: file,
+        })
+    }
+
+    /// What happens, in words.
+    fn story(&self, args: &Args) -> String {
+        let error = 100.0 * args.cad_error;
+        let mut story = format!(
+            "The robot stands still for {} s, then it moves. The estimator's URDF is deliberately wrong: each inertial parameter by {error:.0} % (cad.urdf). ",
+            args.still()
+        );
+        match &self.refused {
+            None => story.push_str(&format!(
+                "From the F/T sensors it learns the right ones while the robot moves; a torque whose standard deviation is above {} Nm is withheld until then.",
+                self.most_std
+            )),
+            Some(why) => story.push_str(&format!("Nothing is learnt: {}.", why.trim_end_matches('.'))),
+        }
+        if let (Some(contact), Some((from, until))) = (&self.pushed, self.touched.first()) {
+            story.push_str(&format!(
+                " From {from} s to {until} s something pushes contact {contact:?} and is declared, as by a skin: meanwhile nothing is learnt."
+            ));
+        }
+        story
+    }
 }
 
 /// The processes of the demonstration. None outlives it.
@@ -302,6 +431,8 @@ impl Drop for Processes {
 struct Watched {
     joints: Vec<String>,
     estimates: Vec<Seen>,
+    /// What the CAD makes of the same samples.
+    baseline: Vec<(Nanos, Box<[f64]>)>,
     lost_estimates: u64,
     gateway: Box<GatewayHealth>,
     estimator: EstimatorHealth,
@@ -338,14 +469,14 @@ fn open<T: Topic>(domain: &Domain, robot: &str, processes: &mut Processes) -> an
 }
 
 /// Starts the processes and watches until the robot has stopped.
-fn watch(args: &Args, robot: &Robot, setup: &Setup, processes: &mut Processes) -> anyhow::Result<Watched> {
+fn watch(args: &Args, robot: &Robot, experiment: &Experiment, processes: &mut Processes) -> anyhow::Result<Watched> {
     let text = |p: &Path| {
         p.to_str()
             .map(ToOwned::to_owned)
             .with_context(|| format!("{} is not UTF-8", p.display()))
     };
     let truth = text(&processes.private.join("truth.csv"))?;
-    let (duration, seed) = (args.seconds.to_string(), args.seed.to_string());
+    let (duration, seed, still) = (args.seconds.to_string(), args.seed.to_string(), args.still().to_string());
     let folder = text(&robot.folder)?;
     let mut simulate = vec![
         "--robot",
@@ -354,6 +485,9 @@ fn watch(args: &Args, robot: &Robot, setup: &Setup, processes: &mut Processes) -
         &duration,
         "--seed",
         &seed,
+        "--still",
+        &still,
+        "--skin",
         "--truth",
         &truth,
         "--json",
@@ -361,7 +495,7 @@ fn watch(args: &Args, robot: &Robot, setup: &Setup, processes: &mut Processes) -
     args.fault.iter().for_each(|f| simulate.extend(["--fault", f.as_str()]));
     let (gateway_toml, estimator_toml) = (
         text(&robot.folder.join("gateway.toml"))?,
-        text(&robot.folder.join("estimator.toml"))?,
+        text(&experiment.config)?,
     );
     processes.start("gateway", &["--config", &gateway_toml])?;
     processes.start("estimator", &["--config", &estimator_toml])?;
@@ -374,13 +508,20 @@ fn watch(args: &Args, robot: &Robot, setup: &Setup, processes: &mut Processes) -
     let mut estimator_health: Reader<EstimatorHealth> = open(&domain, &name, processes)?;
     // The gateway tells its health once all its links are open: from then on no frame is lost.
     let gateway = Box::new(wait_for(&mut gateway_health, processes)?);
+    let readers = Readers {
+        samples: open(&domain, &name, processes)?,
+        descriptions: open(&domain, &name, processes)?,
+        declarations: open(&domain, &name, processes)?,
+    };
+    let mut baseline = Baseline::new(experiment.baseline.clone(), readers);
     processes.start("simulate", &simulate)?;
 
-    let joints: Vec<String> = setup.joint_names().map(ToOwned::to_owned).collect();
-    let mut screen = Screen::new(args.seconds, &joints);
+    let joints: Vec<String> = experiment.setup.joint_names().map(ToOwned::to_owned).collect();
+    let mut screen = Screen::new(args, &joints);
     let mut watched = Watched {
         joints,
         estimates: Vec::with_capacity((args.seconds * 1100.0) as usize),
+        baseline: vec![],
         lost_estimates: 0,
         gateway,
         estimator: EstimatorHealth::default(),
@@ -411,6 +552,7 @@ fn watch(args: &Args, robot: &Robot, setup: &Setup, processes: &mut Processes) -
                 seen.contacts = estimate.contacts().into();
             }
         }
+        baseline.turn()?;
         if let Some(health) = gateway_health.latest()? {
             *watched.gateway = health;
         }
@@ -437,6 +579,7 @@ fn watch(args: &Args, robot: &Robot, setup: &Setup, processes: &mut Processes) -
         std::thread::sleep(Duration::from_millis(2));
     }
     screen.end();
+    watched.baseline = baseline.finish();
     watched.lost_estimates = torques.lost();
     // The final counts: two more healths of each.
     let end = monotonic() + Nanos::from_millis(300);
@@ -475,16 +618,19 @@ struct Screen {
     terminal: bool,
     bar: ProgressBar,
     joints: Vec<String>,
+    /// When the robot begins to move [s].
+    still: f64,
+    has_told: bool,
     begin: Option<Nanos>,
     next: Nanos,
     lines: usize,
 }
 
 impl Screen {
-    fn new(seconds: f64, joints: &[String]) -> Self {
+    fn new(args: &Args, joints: &[String]) -> Self {
         let terminal = std::io::stdout().is_terminal();
         let bar = if terminal {
-            ProgressBar::new((seconds * 10.0) as u64)
+            ProgressBar::new((args.seconds * 10.0) as u64)
         } else {
             ProgressBar::hidden()
         };
@@ -493,6 +639,8 @@ impl Screen {
             terminal,
             bar,
             joints: joints.to_vec(),
+            still: args.still(),
+            has_told: false,
             begin: None,
             next: Nanos::ZERO,
             lines: 0,
@@ -512,7 +660,11 @@ impl Screen {
             };
         let elapsed = (now - begin).seconds();
         let of = |i: usize| last.joints.get(i);
+        let moves = elapsed >= self.still;
         if !self.terminal {
+            if moves && !std::mem::replace(&mut self.has_told, true) {
+                say!("{elapsed:5.1} s  the robot begins to move");
+            }
             let cells: Vec<_> = self
                 .joints
                 .iter()
@@ -547,250 +699,12 @@ impl Screen {
             let _ = std::io::stdout().flush();
         });
         self.lines = self.joints.len();
-        self.bar.set_message(format!("{elapsed:.1} s"));
+        let doing = if moves { "moving, learning" } else { "standing still" };
+        self.bar.set_message(format!("{elapsed:.1} s, {doing}"));
         self.bar.set_position((elapsed * 10.0) as u64);
     }
 
     fn end(&self) {
         self.bar.finish_and_clear();
     }
-}
-
-/// The simulator's truth: joint torques over time.
-struct Truth {
-    t: Vec<Nanos>,
-    /// Per joint, its torque at each of `t`.
-    torques: Vec<Vec<f64>>,
-}
-
-impl Truth {
-    fn read(file: &Path, joints: &[String]) -> anyhow::Result<Self> {
-        let mut reader = csv::Reader::new(BufReader::new(File::open(file)?))?;
-        let series: Vec<Option<usize>> = joints
-            .iter()
-            .map(|j| {
-                reader
-                    .series()
-                    .iter()
-                    .position(|s| s.what == csv::What::Channel(Kind::Joint) && s.name == *j)
-            })
-            .collect();
-        let mut this = Self {
-            t: vec![],
-            torques: vec![vec![]; joints.len()],
-        };
-        let mut row = csv::Row::default();
-        while reader.next_row(&mut row)? {
-            let Some(t) = row.t else { continue };
-            this.t.push(t);
-            for (torques, series) in this.torques.iter_mut().zip(&series) {
-                let torque = row
-                    .items
-                    .iter()
-                    .find(|i| Some(i.series) == *series)
-                    .and_then(|i| match i.value {
-                        Value::Reading(Reading::Joint(state), _) => Some(state.torque),
-                        _ => None,
-                    });
-                torques.push(torque.unwrap_or(f64::NAN));
-            }
-        }
-        Ok(this)
-    }
-
-    /// The torque of joint `joint` at `t`, on a straight line between two rows; NaN outside them.
-    fn torque(&self, joint: usize, t: Nanos) -> f64 {
-        let after = self.t.partition_point(|x| *x < t);
-        let row = |i: usize| Some((*self.t.get(i)?, *self.torques.get(joint)?.get(i)?));
-        match (row(after), after.checked_sub(1).and_then(row)) {
-            (Some((t1, y1)), _) if t1 == t => y1,
-            (Some((t1, y1)), Some((t0, y0))) => y0 + (y1 - y0) * ((t - t0).seconds() / (t1 - t0).seconds()),
-            _ => f64::NAN,
-        }
-    }
-}
-
-/// The q-quantile of sorted numbers.
-fn quantile(sorted: &[f64], q: f64) -> f64 {
-    let at = ((sorted.len() as f64 - 1.0) * q).round().max(0.0) as usize;
-    sorted.get(at).copied().unwrap_or(f64::NAN)
-}
-
-/// Writes estimates.csv, summary.json and report.html, and tells the result.
-fn finish(args: &Args, setup: &Setup, out: &Path, watched: &Watched, truth: &Truth) -> anyhow::Result<()> {
-    let file = |name: &str| -> anyhow::Result<_> {
-        Ok(BufWriter::new(
-            File::create(out.join(name)).with_context(|| out.join(name).display().to_string())?,
-        ))
-    };
-    let mut table = Table::new(file("estimates.csv")?, setup)?;
-    for seen in &watched.estimates {
-        let mut estimate = Estimate::absent(seen.t);
-        estimate
-            .torques
-            .joints
-            .iter_mut()
-            .zip(&seen.joints)
-            .for_each(|(to, from)| *to = *from);
-        estimate
-            .contacts
-            .contacts
-            .iter_mut()
-            .zip(&seen.contacts)
-            .for_each(|(to, from)| *to = *from);
-        estimate.torques.count = u32::try_from(seen.joints.len())?;
-        estimate.contacts.count = u32::try_from(seen.contacts.len())?;
-        table.write(&estimate, true)?;
-    }
-    table.into_inner().flush()?;
-
-    let sum = |f: fn(&proprio_topics::BusHealth) -> u64| watched.gateway.buses().iter().map(f).sum::<u64>();
-    let (frames, samples) = (sum(|b| b.frames), sum(|b| b.published));
-    // Bus by bus: what one has too many must not hide what another lost.
-    let (mut lost, mut foreign) = (watched.estimator.lost, 0);
-    for bus in watched.gateway.buses() {
-        let of_simulator = watched.simulator["buses"]
-            .as_array()
-            .into_iter()
-            .flatten()
-            .find(|b| b["name"] == bus.name.as_str());
-        let sent = of_simulator
-            .and_then(|b| b["sent"].as_u64())
-            .with_context(|| format!("the simulator's count of bus {}", bus.name))?;
-        lost += sent.saturating_sub(bus.frames);
-        foreign += bus.frames.saturating_sub(sent);
-    }
-    let first = watched.estimates.first().map_or(Nanos::ZERO, |s| s.t);
-    let last = watched.estimates.last().map_or(Nanos::ZERO, |s| s.t);
-    let rate = (watched.estimates.len() as f64 - 1.0) / (last - first).seconds();
-    let torques = || watched.estimates.iter().flat_map(|s| &s.joints);
-    let valid_share = torques().filter(|j| j.valid == 1).count() as f64 / torques().count() as f64;
-    let mut latency: Vec<f64> = watched
-        .estimates
-        .iter()
-        .map(|s| (s.published - s.t).seconds() * 1e6)
-        .collect();
-    latency.sort_by(f64::total_cmp);
-
-    let mut errors = serde_json::Map::new();
-    let mut plots = Vec::new();
-    let mut rows = ReportTable::new(
-        "Torques against the simulator's truth, from one second on",
-        &["joint", "RMS error [Nm]", "RMS torque [Nm]"],
-    );
-    for (joint, name) in watched.joints.iter().enumerate() {
-        let (mut square, mut truth_square, mut count) = (0.0, 0.0, 0_u32);
-        let (mut estimated, mut real, mut error) = (vec![], vec![], vec![]);
-        for seen in &watched.estimates {
-            let Some(torque) = seen.joints.get(joint) else { continue };
-            let right = truth.torque(joint, seen.t);
-            let t = (seen.t - first).seconds();
-            estimated.push((t, torque.torque));
-            real.push((t, right));
-            error.push((t, torque.torque - right));
-            // The last few estimates may be later than the truth's last row.
-            if seen.t - first >= SETTLE && !right.is_nan() {
-                square += (torque.torque - right).powi(2);
-                truth_square += right.powi(2);
-                count += 1;
-            }
-        }
-        if count == 0 {
-            bail!(
-                "no estimate of {name} can be compared with the truth: the motion was too short, or nothing came after its first second"
-            );
-        }
-        let rms = (square / f64::from(count)).sqrt();
-        errors.insert(name.clone(), json!(rms));
-        rows.row(vec![
-            name.as_str().into(),
-            rms.into(),
-            (truth_square / f64::from(count)).sqrt().into(),
-        ]);
-        let plot = |title: String, note: &str, series| Plot {
-            title,
-            note: note.to_owned(),
-            x: Axis::new("t [s]"),
-            y: Axis::new("torque [Nm]"),
-            series,
-            ..Plot::default()
-        };
-        plots.push(plot(
-            name.clone(),
-            "",
-            vec![
-                Series::line("estimated", Ink::Identified, estimated),
-                Series::line("truth", Ink::Measured, real),
-            ],
-        ));
-        plots.push(plot(
-            name.clone(),
-            "error: estimated − truth",
-            vec![Series::line("", Ink::Cad, error)],
-        ));
-    }
-    let upstream = setup.upstream_note();
-
-    let latency_us =
-        json!({ "p50": quantile(&latency, 0.5), "p99": quantile(&latency, 0.99), "p999": quantile(&latency, 0.999) });
-    let summary = json!({
-        "robot": setup.robot, "seconds": args.seconds, "seed": args.seed,
-        "frames": frames, "samples": samples, "lost": lost, "foreign": foreign, "estimates": watched.estimates.len(),
-        "lost_estimates": watched.lost_estimates, "late": watched.estimator.late,
-        "rate_hz": rate, "valid_share": valid_share, "latency_us": latency_us, "torque_rms_error_nm": errors,
-        "simulator": watched.simulator,
-    });
-    let mut text = serde_json::to_string_pretty(&summary)?;
-    text.push('\n');
-    fs::write(out.join("summary.json"), text)?;
-    let facts = [
-        ("robot", setup.robot.clone()),
-        ("motion", format!("{} s, seed {}", args.seconds, args.seed)),
-        ("frames", format!("{frames} received, {lost} lost")),
-        (
-            "estimates",
-            format!(
-                "{} at {rate:.1} Hz, {:.2} % of torques valid",
-                watched.estimates.len(),
-                valid_share * 100.0
-            ),
-        ),
-        (
-            "latency",
-            format!(
-                "{:.0} us median, {:.0} us at 99 %, from frame stamp to torque published",
-                quantile(&latency, 0.5),
-                quantile(&latency, 0.99)
-            ),
-        ),
-    ];
-    fs::write(
-        out.join("report.html"),
-        report::page(
-            &format!("proprio demo: {}", setup.robot),
-            &[
-                report::facts(&facts),
-                report::section(
-                    "Joint torques",
-                    &[rows.html(), report::paragraph(&upstream), report::figures(&plots)],
-                ),
-            ],
-        ),
-    )?;
-
-    for (name, value) in &facts {
-        say!("{name:<10} {value}");
-    }
-    say!("RMS error of the torques against the simulator's truth, from one second on:");
-    for (joint, error) in &errors {
-        say!("  {joint:<20} {:.4} Nm", error.as_f64().unwrap_or(f64::NAN));
-    }
-    if !upstream.is_empty() {
-        say!("{upstream}");
-    }
-    say!(
-        "{}: report.html, estimates.csv, summary.json and the processes' logs",
-        args.out.display()
-    );
-    Ok(())
 }

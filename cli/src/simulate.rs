@@ -2,7 +2,8 @@
 
 use anyhow::Context;
 use proprio_simulator::{Fault, Options, Robot, Settings, parse_bus};
-use proprio_topics::ipc::DomainConfig;
+use proprio_topics::ipc::{Domain, DomainConfig, Writer, monotonic};
+use proprio_topics::{ContactDeclaration, Header, Name, Nanos};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -22,6 +23,12 @@ pub(crate) struct Args {
     /// The seed of trajectory and noise
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// How long the robot stands still before it moves [s]
+    #[arg(long, value_name = "N", default_value_t = 1.0, value_parser = still)]
+    still: f64,
+    /// Declare touches of the robot on <robot>/contact/declared, as a skin does
+    #[arg(long)]
+    skin: bool,
     /// A fault: "lost:0.01", "silent:BOARD@3..4", "saturate:BOARD@5..5.5", "spike:BOARD@6", "late_half:BOARD@2..8"; may be repeated
     #[arg(long, value_name = "FAULT")]
     fault: Vec<String>,
@@ -31,6 +38,13 @@ pub(crate) struct Args {
     /// Print what became of the run as JSON
     #[arg(long)]
     json: bool,
+}
+
+fn still(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(s) if (0.0..=3600.0).contains(&s) => Ok(s),
+        _ => Err("must be 0 to 3600".into()),
+    }
 }
 
 /// Runs the simulated robot.
@@ -47,6 +61,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
         seconds: args.seconds,
         settings: Settings {
             seed: args.seed,
+            still: args.still,
             faults,
             ..Settings::default()
         },
@@ -56,11 +71,44 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot catch signals")?;
     }
-    let summary = proprio_simulator::run(&robot, &options, &stop)?;
+    let mut skin = args.skin.then(|| Skin::open(domain, &robot.config.robot)).transpose()?;
+    let mut tell = |contact: &str, at, active| {
+        if let Some(skin) = &mut skin {
+            skin.tell(contact, at, active);
+        }
+    };
+    let tell: Option<&mut dyn FnMut(&str, Nanos, bool)> = args.skin.then_some(&mut tell);
+    let summary = proprio_simulator::run_with_skin(&robot, &options, tell, &stop)?;
     if args.json {
         say!("{}", serde_json::to_string(&summary)?);
     } else {
         eprintln!("{} frames sent in {:.1} s", summary.sent, summary.seconds);
     }
     Ok(())
+}
+
+/// Tells who wants to know what touches the robot.
+struct Skin(Writer<ContactDeclaration>);
+
+impl Skin {
+    fn open(domain: &DomainConfig, robot: &str) -> anyhow::Result<Self> {
+        let domain = Domain::open(domain)?;
+        Ok(Self(Writer::create(&domain, robot, domain.epoch())?))
+    }
+
+    fn tell(&mut self, contact: &str, at: Nanos, active: bool) {
+        let header = Header {
+            acquired: at,
+            ..Header::default()
+        };
+        let declaration = ContactDeclaration {
+            header,
+            contact: Name::new(contact).unwrap_or(Name::EMPTY),
+            active: u32::from(active),
+            reserved: 0,
+        };
+        if let Err(error) = self.0.send(&declaration, monotonic()) {
+            tracing::warn!("a touch could not be declared: {error}");
+        }
+    }
 }

@@ -3,7 +3,7 @@
 use crate::record::write_truth;
 use crate::robot::Robot;
 use crate::simulator::{BusCounts, BusSimulator, Settings, Simulator};
-use crate::truth::Simulation;
+use crate::truth::{Simulation, Touch};
 use anyhow::Context as _;
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::config::Source;
@@ -16,6 +16,7 @@ use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::thread;
+use std::time::Duration;
 
 /// The truth is written with one row per millisecond.
 pub const TRUTH_PERIOD: Nanos = Nanos::from_millis(1);
@@ -25,6 +26,8 @@ const MOST_WAIT: Nanos = Nanos::from_millis(20);
 /// The most frames that are sent before the bus is listened to again. Where sending takes longer than the boards' periods something is always due, and neither a
 /// command nor the wish to stop would ever be heard.
 const MOST_AT_ONCE: usize = 16;
+/// How far ahead the skin tells of a touch.
+const AHEAD: Nanos = Nanos::from_millis(100);
 /// How long a frame may wait for a full queue.
 const SEND_WITHIN: Nanos = Nanos::from_millis(20);
 
@@ -134,6 +137,20 @@ pub struct BusSummary {
 /// One chain that says what, where and what to do: [`OptionsError`] and [`crate::SimulatorError`] at its root are wrong
 /// configurations ([`is_configuration`]); a bus that can not be opened; a file that can not be written.
 pub fn run(robot: &Robot, options: &Options, stop: &AtomicBool) -> anyhow::Result<Summary> {
+    run_with_skin(robot, options, None, stop)
+}
+
+/// As [`run`], with somebody who is told, as by a skin, what touches the robot: the contact's name, from when on, and whether it is touched then.
+/// He is told in this thread, a tenth of a second ahead.
+///
+/// # Errors
+/// As [`run`].
+pub fn run_with_skin(
+    robot: &Robot,
+    options: &Options,
+    skin: Option<&mut dyn FnMut(&str, Nanos, bool)>,
+    stop: &AtomicBool,
+) -> anyhow::Result<Summary> {
     let buses = sources(robot, options)?;
     let mut settings = options.settings.clone();
     if let Some(seconds) = options.seconds {
@@ -177,6 +194,9 @@ pub fn run(robot: &Robot, options: &Options, stop: &AtomicBool) -> anyhow::Resul
                     .spawn_scoped(scope, move || turn_until(bus, link, &clock, end, stop))
             })
             .collect();
+        if let (Some(skin), true) = (skin, threads.iter().all(Result::is_ok)) {
+            feel(&simulation, t0, skin, &clock, end, stop);
+        }
         for thread in threads {
             let thread = thread
                 .context("cannot start a thread")
@@ -264,6 +284,33 @@ fn turn_until(
         }
     }
     (bus.counts(), link.counters())
+}
+
+/// The loop of the skin, until nothing more will touch the robot.
+fn feel(
+    simulation: &Simulation,
+    t0: Nanos,
+    skin: &mut dyn FnMut(&str, Nanos, bool),
+    clock: &impl Clock,
+    end: Nanos,
+    stop: &AtomicBool,
+) {
+    let mut next = simulation.next_touch(0.0);
+    while let Some(Touch { t, contact, begins }) = next {
+        let at = t0 + Nanos::from_seconds(t);
+        if at >= end {
+            break;
+        }
+        while clock.now() < at - AHEAD {
+            if stop.load(Relaxed) {
+                return;
+            }
+            let wait = (at - AHEAD - clock.now()).clamp(Nanos::ZERO, MOST_WAIT);
+            thread::sleep(Duration::from_nanos(wait.0.unsigned_abs()));
+        }
+        skin(simulation.contact_names().nth(contact).unwrap_or_default(), at, begins);
+        next = simulation.next_touch(t);
+    }
 }
 
 fn sources(robot: &Robot, options: &Options) -> Result<Vec<Source>, OptionsError> {

@@ -23,6 +23,17 @@ const PUSH: (f64, f64) = (10.0, 0.3);
 /// When in a cycle it begins and ends, and what share of it each flank takes.
 const PUSH_TIME: (f64, f64, f64) = (0.4, 0.6, 0.25);
 
+/// Something begins or ceases to touch the robot.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Touch {
+    /// When: seconds since the simulation began.
+    pub t: f64,
+    /// The contact, by its number in estimator.toml.
+    pub contact: usize,
+    /// Whether it begins.
+    pub begins: bool,
+}
+
 /// What really happens at one instant.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Truth {
@@ -107,6 +118,22 @@ impl Push {
         let (from, until, flank) = PUSH_TIME;
         let x = ((t / self.cycle).rem_euclid(1.0) - from) / (until - from);
         self.wrench * (window(x / flank).0 * window((1.0 - x) / flank).0)
+    }
+
+    /// The first beginning or end later than `t`.
+    fn next_touch(&self, t: f64) -> Touch {
+        let (from, until, _) = PUSH_TIME;
+        let cycle = (t / self.cycle).floor();
+        // Rounding must not find the same one twice.
+        let later = |x: &f64| *x > t + 1e-9 * self.cycle;
+        let changes = [(cycle + from, true), (cycle + until, false), (cycle + 1.0 + from, true)];
+        let times = changes.map(|(x, begins)| (x * self.cycle, begins));
+        let (t, begins) = times.into_iter().find(|(x, _)| later(x)).unwrap_or((f64::INFINITY, false));
+        Touch {
+            t,
+            contact: self.contact,
+            begins,
+        }
     }
 }
 
@@ -275,6 +302,18 @@ impl Simulation {
     /// The contacts' names.
     pub fn contact_names(&self) -> impl Iterator<Item = &str> {
         self.contacts.iter().map(|(name, _)| name.as_str())
+    }
+
+    /// Which contact is pushed now and then, by its number in estimator.toml; `None` if nothing ever is.
+    #[must_use]
+    pub fn pushed(&self) -> Option<usize> {
+        self.push.map(|push| push.contact)
+    }
+
+    /// What begins or ceases to touch the robot next, later than `t` seconds; `None` if nothing ever does.
+    #[must_use]
+    pub fn next_touch(&self, t: f64) -> Option<Touch> {
+        self.push.map(|push| push.next_touch(t))
     }
 
     /// How joint `joint` moves at `t` seconds, without computing anything else; `None` if there is no such joint.
@@ -579,6 +618,23 @@ mod tests {
         for t in [5.0, 15.0] {
             assert!((force(t) - PUSH.0).abs() < 1e-9, "{t}");
         }
+        // What is told of it holds wherever there is a force, and for no longer.
+        let simulation = Simulation::new(
+            &robot(),
+            &Settings {
+                cycle: 10.0,
+                ..Settings::default()
+            },
+        )
+        .unwrap();
+        let mut touches = vec![simulation.next_touch(0.0).unwrap()];
+        for _ in 0..3 {
+            let last = touches.last().unwrap().t;
+            touches.push(simulation.next_touch(last).unwrap());
+        }
+        let told: Vec<_> = touches.iter().map(|t| (t.t, t.contact, t.begins)).collect();
+        assert_eq!(told, [(4.0, 1, true), (6.0, 1, false), (14.0, 1, true), (16.0, 1, false)]);
+        assert_eq!(simulation.pushed(), Some(1));
         // It comes and goes smoothly.
         let steepest = (0..2000)
             .map(|k| f64::from(k) * 1e-3 + 4.0)

@@ -324,6 +324,7 @@ fn pair(curve: &Curve, log: &LogOutcome, most: usize) -> [Plot; 2] {
         x: Axis::new("t [s]"),
         y: Axis::new(&format!("[{}]", curve.unit)),
         series,
+        shades: vec![],
         marks: log
             .onset
             .iter()

@@ -88,6 +88,25 @@ impl Series {
     }
 }
 
+/// What a stretch of a plot is shaded for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Shade {
+    /// An estimate is withheld.
+    Withheld,
+    /// Something touches the robot.
+    Touched,
+}
+
+impl Shade {
+    /// Its class in the style sheet, and what it is called in the legend.
+    fn words(self) -> (&'static str, &'static str) {
+        match self {
+            Self::Withheld => ("withheld", "withheld"),
+            Self::Touched => ("touched", "pushed"),
+        }
+    }
+}
+
 /// How numbers lie on an axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) enum Scale {
@@ -139,6 +158,8 @@ pub(crate) struct Plot {
     pub(crate) series: Vec<Series>,
     /// Vertical lines: where, and what is there.
     pub(crate) marks: Vec<(f64, String)>,
+    /// Stretches of x, shaded from top to bottom.
+    pub(crate) shades: Vec<(Shade, Vec<(f64, f64)>)>,
     /// At most so many points of a line are drawn: peaks are kept.
     pub(crate) most: usize,
 }
@@ -168,6 +189,12 @@ impl Plot {
                     escape(&series.name)
                 );
             }
+            for (shade, stretches) in &self.shades {
+                if !stretches.is_empty() {
+                    let (class, name) = shade.words();
+                    let _ = write!(html, "<li class=\"wide {class}\">{name}</li>");
+                }
+            }
             html.push_str("</ul>");
         }
         let _ = write!(
@@ -195,6 +222,16 @@ impl Plot {
                 "<path class=\"axis\" d=\"M0 {:.0}H{WIDE}\"/>",
                 (1.0 - y.at(0.0)) * HIGH
             );
+        }
+        for (shade, stretches) in &self.shades {
+            let mut path = String::new();
+            for (from, until) in stretches {
+                let [from, until] = [from, until].map(|t| (x.at(*t) * WIDE).clamp(0.0, WIDE));
+                let _ = write!(path, "M{from:.0} 0H{:.0}V{HIGH}H{from:.0}z", until.max(from + 4.0));
+            }
+            if !path.is_empty() {
+                let _ = write!(html, "<path class=\"shade {}\" d=\"{path}\"/>", shade.words().0);
+            }
         }
         for series in &self.series {
             self.draw(series, &x, &y, &mut html);

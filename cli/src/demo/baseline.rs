@@ -1,0 +1,99 @@
+//! What the estimator would say without identification: a second pipeline, with the CAD's parameters, fed with the samples of the running demonstration.
+
+use proprio_estimator::pipeline::Pipeline;
+use proprio_estimator::setup::Setup;
+use proprio_topics::ipc::{Reader, TakeError};
+use proprio_topics::{ContactDeclaration, Description, MAX_CHANNELS, Nanos, Publisher, Role, Sample};
+
+/// The second pipeline and what it reads.
+pub(super) struct Baseline {
+    pipeline: Pipeline,
+    samples: Reader<Sample>,
+    descriptions: Reader<Description>,
+    declarations: Reader<ContactDeclaration>,
+    /// Per channel number of the gateway: the pipeline's channel.
+    channels: Vec<Option<usize>>,
+    /// The gateway's epoch that `channels` belongs to.
+    epoch: u64,
+    inbox: Vec<Sample>,
+    /// As [`Baseline::finish`] gives them.
+    torques: Vec<(Nanos, Box<[f64]>)>,
+}
+
+impl Baseline {
+    pub(super) fn new(setup: Setup, readers: Readers) -> Self {
+        let Readers {
+            samples,
+            descriptions,
+            declarations,
+        } = readers;
+        Self {
+            pipeline: Pipeline::new(setup),
+            samples,
+            descriptions,
+            declarations,
+            channels: vec![],
+            epoch: 0,
+            inbox: vec![],
+            torques: vec![],
+        }
+    }
+
+    /// Takes what is waiting.
+    pub(super) fn turn(&mut self) -> Result<(), TakeError> {
+        while let Some(description) = self.descriptions.try_take()? {
+            if description.publisher == Publisher::Gateway {
+                self.channels = (0..MAX_CHANNELS)
+                    .map(|number| {
+                        let entry = description.find(Role::Channel, u32::try_from(number).ok()?)?;
+                        self.pipeline.setup().channel(entry.kind, entry.name.as_str())
+                    })
+                    .collect();
+                self.epoch = description.header.epoch;
+            }
+        }
+        while let Some(declared) = self.declarations.try_take()? {
+            if let Some(contact) = self.pipeline.setup().contact(declared.contact.as_str()) {
+                self.pipeline
+                    .declare(contact, declared.header.acquired, declared.active != 0);
+            }
+        }
+        while let Some(sample) = self.samples.try_take()? {
+            self.inbox.push(sample);
+        }
+        // Shared memory hands out all of one bus before the next one's; what comes too far behind others would be dropped.
+        self.inbox
+            .sort_unstable_by_key(|s| (s.header.acquired, s.header.bus, s.header.sequence));
+        for sample in std::mem::take(&mut self.inbox) {
+            let channel = self.channels.get(sample.channel as usize).copied().flatten();
+            if let Some(channel) = channel.filter(|_| sample.header.epoch == self.epoch) {
+                self.pipeline
+                    .push(channel, sample.header.acquired, &sample.reading, sample.header.quality);
+                self.keep();
+            }
+        }
+        Ok(())
+    }
+
+    /// Keeps what is estimated.
+    fn keep(&mut self) {
+        while let Some(estimate) = self.pipeline.poll() {
+            let torques = estimate.torques.joints().iter().map(|joint| joint.torque).collect();
+            self.torques.push((estimate.t, torques));
+        }
+    }
+
+    /// The instants, ascending, with the joints' torques \[Nm\]; NaN where a channel was never seen.
+    pub(super) fn finish(mut self) -> Vec<(Nanos, Box<[f64]>)> {
+        self.pipeline.finish();
+        self.keep();
+        self.torques
+    }
+}
+
+/// What a [`Baseline`] reads.
+pub(super) struct Readers {
+    pub(super) samples: Reader<Sample>,
+    pub(super) descriptions: Reader<Description>,
+    pub(super) declarations: Reader<ContactDeclaration>,
+}

@@ -1,0 +1,161 @@
+//! A CAD that is wrong: the robot's URDF with other masses, first moments and inertias, each still of a body that can exist. For whoever wants to see what identification is worth:
+//! the robot has the URDF's inertias, the estimator is given these.
+
+use crate::noise::Random;
+use crate::robot::{Robot, RobotError};
+use crate::simulator::Settings;
+use crate::truth::Simulation;
+use proprio_estimator::model::Model;
+use proprio_estimator::spatial::{Mat3, Pose, RigidInertia, Vec3};
+
+/// How many such URDFs are drawn, at the most, until one is wrong enough.
+const DRAWS: usize = 300;
+/// The RMS error of each joint's torque by a URDF that is wrong enough, by the RMS of the torque: errors of neighbouring links may cancel, and there would be nothing to see.
+const ENOUGH: f64 = 0.1;
+/// At so many instants of the motion torques are compared, so far apart \[s\].
+const INSTANTS: (u32, f64) = (25, 0.9);
+
+/// The URDF of `robot` with every inertia off by the share `relative` (0 to 0.5), drawn from `settings.seed`: of each body its mass, each component of its first moment and each
+/// principal second moment about its centre of mass, up or down, and its principal axes turned by about as many radians. Bodies joined by fixed joints are one body.
+///
+/// Drawn again until, in every joint, the torques of the motion that `settings` describes are off by a tenth of their RMS (by `relative / 2` if that is less).
+///
+/// # Errors
+/// [`RobotError`]: the robot can not be simulated, or its URDF not be read.
+pub fn wrong_urdf(robot: &Robot, settings: &Settings, relative: f64) -> Result<String, RobotError> {
+    let file = &robot.config.model;
+    let wrong = |cause| RobotError::Model {
+        file: file.clone(),
+        cause: Box::new(cause),
+    };
+    let text = std::fs::read_to_string(file).map_err(|e| robot.mismatch(format!("{}: {e}", file.display())))?;
+    let truth = torques(robot, settings)?;
+    let enough = ENOUGH.min(0.5 * relative);
+    let mut best: Option<(f64, Model)> = None;
+    for draw in 0..DRAWS {
+        let mut random = Random::new(settings.seed, "cad", draw);
+        let mut other = robot.clone();
+        for (link, inertia) in robot.model.inertias().iter().enumerate() {
+            let body = another_body(inertia, relative, &mut random);
+            other.model.set_inertia(link, body).map_err(wrong)?;
+        }
+        // Of the joint whose torque is least wrong.
+        let least = torques(&other, settings)?
+            .iter()
+            .zip(&truth)
+            .map(|(other, truth)| {
+                let off: f64 = other.iter().zip(truth).map(|(a, b)| (a - b).powi(2)).sum();
+                (off / truth.iter().map(|b| b * b).sum::<f64>()).sqrt()
+            })
+            .filter(|share| share.is_finite())
+            .fold(f64::INFINITY, f64::min);
+        if best.as_ref().is_none_or(|(share, _)| least > *share) {
+            best = Some((least, other.model));
+        }
+        if least > enough {
+            break;
+        }
+    }
+    let keep: Vec<&str> = robot.config.force_torque.iter().map(|ft| ft.joint.as_str()).collect();
+    let model = best.map_or_else(|| robot.model.clone(), |(_, model)| model);
+    Model::rewrite_urdf(&text, &keep, model.inertias()).map_err(wrong)
+}
+
+/// Per joint its torque at some instants of the motion, untouched.
+fn torques(robot: &Robot, settings: &Settings) -> Result<Vec<Vec<f64>>, RobotError> {
+    let settings = Settings {
+        push: false,
+        ..settings.clone()
+    };
+    let mut simulation = Simulation::new(robot, &settings)?;
+    let mut torques = vec![Vec::new(); simulation.joint_names().count()];
+    for instant in 0..INSTANTS.0 {
+        let truth = simulation.at(settings.still + f64::from(instant) * INSTANTS.1);
+        for (torques, joint) in torques.iter_mut().zip(&truth.joints) {
+            torques.push(joint.torque);
+        }
+    }
+    Ok(torques)
+}
+
+/// A body somewhat like this one, and as possible.
+fn another_body(body: &RigidInertia, relative: f64, random: &mut Random) -> RigidInertia {
+    let mut off = || if random.happens(0.5) { relative } else { -relative };
+    let Some(centre) = body.centre() else {
+        return *body;
+    };
+    let mass = body.mass * (1.0 + off());
+    let first_moment = body.first_moment.map(|h| h * (1.0 + off()));
+    let about_centre = body.inertia - (Mat3::from_diagonal_element(centre.dot(&centre)) - centre * centre.transpose()) * body.mass;
+    // Second moments of the mass, not moments of inertia: whatever positive numbers these are, they are a body's.
+    let spread = Mat3::from_diagonal_element(about_centre.trace() / 2.0) - about_centre;
+    let principal = spread.symmetric_eigen();
+    let extents: Vec3 = principal.eigenvalues.map(|extent| extent.max(0.0) * (1.0 + off()));
+    let turn = Pose::from_xyz_rpy([0.0; 3], [off(), off(), off()].map(|angle| angle / 3.0_f64.sqrt()));
+    let axes = turn.rotation * principal.eigenvectors;
+    let spread = axes * Mat3::from_diagonal(&extents) * axes.transpose();
+    let inertia = Mat3::from_diagonal_element(spread.trace()) - spread;
+    RigidInertia::from_centroidal(mass, &(first_moment / mass), &inertia)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn model(robot: &Robot, text: &str) -> Model {
+        let keep: Vec<&str> = robot.config.force_torque.iter().map(|ft| ft.joint.as_str()).collect();
+        Model::from_urdf(text, &keep).unwrap()
+    }
+
+    #[test]
+    fn the_wrong_urdf_is_of_bodies_that_exist_and_is_as_wrong_as_asked() {
+        let robot = Robot::open("icub_left_arm").unwrap();
+        let text = wrong_urdf(&robot, &Settings::default(), 0.2).unwrap();
+        let wrong = model(&robot, &text);
+        assert_eq!(wrong.link_count(), robot.model.link_count());
+        for (link, (body, truth)) in wrong.inertias().iter().zip(robot.model.inertias()).enumerate() {
+            let name = wrong.link_name(link);
+            if truth.mass == 0.0 {
+                assert_eq!(body, truth, "{name}");
+                continue;
+            }
+            body.check(1e-9).unwrap_or_else(|why| panic!("{name}: {why:?}"));
+            assert!(((body.mass / truth.mass - 1.0).abs() - 0.2).abs() < 1e-9, "{name}");
+            for (h, true_h) in body.first_moment.iter().zip(&truth.first_moment) {
+                assert!(((h - true_h).abs() - 0.2 * true_h.abs()).abs() < 1e-9, "{name}");
+            }
+            assert!((body.inertia - truth.inertia).norm() > 0.01 * truth.inertia.norm(), "{name}");
+        }
+        // Everything else is the robot's: geometry, limits, sensors.
+        assert_eq!(wrong.joints(), robot.model.joints());
+    }
+
+    #[test]
+    fn every_torque_is_off_and_the_seed_counts() {
+        let robot = Robot::open("icub_left_arm").unwrap();
+        for seed in [1, 2, 3] {
+            let settings = Settings {
+                seed,
+                ..Settings::default()
+            };
+            let text = wrong_urdf(&robot, &settings, 0.2).unwrap();
+            assert_eq!(text, wrong_urdf(&robot, &settings, 0.2).unwrap(), "the same seed, the same URDF");
+            let mut other = robot.clone();
+            other.model = model(&robot, &text);
+            let (wrong, truth) = (torques(&other, &settings).unwrap(), torques(&robot, &settings).unwrap());
+            for ((wrong, truth), joint) in wrong.iter().zip(&truth).zip(0..) {
+                let off: f64 = wrong.iter().zip(truth).map(|(a, b)| (a - b).powi(2)).sum();
+                let size: f64 = truth.iter().map(|b| b * b).sum();
+                assert!(off.sqrt() > 0.099 * size.sqrt() && off.sqrt() < 0.8 * size.sqrt(), "seed {seed}, joint {joint}");
+            }
+        }
+        let [one, two] = [1, 2].map(|seed| {
+            let settings = Settings {
+                seed,
+                ..Settings::default()
+            };
+            wrong_urdf(&robot, &settings, 0.2).unwrap()
+        });
+        assert_ne!(one, two);
+    }
+}
