@@ -32,6 +32,8 @@ pub(super) struct Learning {
     found: Motion,
     /// Variance of the samples of each joint, then of nine numbers of the IMU; NaN where it has not shown.
     noise: Vec<f64>,
+    /// Likewise of each joint's position and velocity, where they are used as they are measured.
+    raw_noise: Vec<f64>,
     readings: Vec<Wrench>,
     joints: Vec<Reason>,
     /// Joints that move at the present instant.
@@ -181,6 +183,7 @@ impl Learning {
             cell: i64::MIN,
             found: held.clone(),
             noise: vec![f64::NAN; dofs + 9],
+            raw_noise: vec![f64::NAN; 2 * dofs],
             held,
             readings: vec![Wrench::zero(); setup.structure.sensors().len()],
             joints: vec![Reason::None; dofs],
@@ -244,7 +247,11 @@ impl Learning {
                     let highest = (0..3).rev().find(|&order| self.scratch.is_complete(order)).unwrap_or(0);
                     let Some(noise) = self.noise.get_mut(dof) else { continue };
                     let fit = self.scratch.fit(highest, t, noise);
-                    let exact = |order: usize| (self.scratch.value(order, t), 0.0);
+                    let mut raw = self.raw_noise.iter_mut().skip(2 * dof);
+                    let mut exact = |order: usize| {
+                        let deviation = raw.next().map_or(0.0, |noise| self.scratch.deviation(order, t, noise));
+                        (self.scratch.value(order, t), deviation)
+                    };
                     let values = match highest {
                         0 => fit,
                         1 => [exact(0), fit[0], fit[1]],
@@ -618,6 +625,18 @@ impl Centred {
         chosen.map_or([NONE; 3], |fit| {
             std::array::from_fn(|i| (fit.at[i], fit.errors[i] * deviation))
         })
+    }
+
+    /// Standard deviation of a number's samples about `t`, as far as it has shown where nothing moved; `noise` as for [`Centred::fit`].
+    fn deviation(&mut self, number: usize, t: Nanos, noise: &mut f64) -> f64 {
+        self.fit(number, t, noise);
+        // What was fitted to are means of so many samples.
+        let share = self.count.div_ceil(POINTS).max(1);
+        if noise.is_nan() {
+            0.0
+        } else {
+            (*noise * share as f64).sqrt()
+        }
     }
 
     /// Times relative to `t` in units of [`DELAY`], and values relative to the newest.
