@@ -8,10 +8,10 @@ mod baseline;
 mod result;
 
 use anyhow::{Context, anyhow, bail};
+use baseline::{Baseline, Readers};
 use indicatif::{ProgressBar, ProgressStyle};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use baseline::{Baseline, Readers};
 use proprio_estimator::config::{Config, ConfigError};
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
@@ -289,10 +289,15 @@ impl Experiment {
         config.output.max_torque_std_nm = None;
         Ok(Self {
             baseline: setup(&config)?,
-            pushed: simulation.contact_names().nth(pushed.unwrap_or(usize::MAX)).map(ToOwned::to_owned),
+            pushed: simulation
+                .contact_names()
+                .nth(pushed.unwrap_or(usize::MAX))
+                .map(ToOwned::to_owned),
             touched,
             most_std,
-            refused: Pipeline::new(with.clone()).identification_refused().map(ToString::to_string),
+            refused: Pipeline::new(with.clone())
+                .identification_refused()
+                .map(ToString::to_string),
             setup: with,
             config: file,
         })
@@ -476,7 +481,11 @@ fn watch(args: &Args, robot: &Robot, experiment: &Experiment, processes: &mut Pr
             .with_context(|| format!("{} is not UTF-8", p.display()))
     };
     let truth = text(&processes.private.join("truth.csv"))?;
-    let (duration, seed, still) = (args.seconds.to_string(), args.seed.to_string(), args.still().to_string());
+    let (duration, seed, still) = (
+        args.seconds.to_string(),
+        args.seed.to_string(),
+        args.still().to_string(),
+    );
     let folder = text(&robot.folder)?;
     let mut simulate = vec![
         "--robot",
@@ -493,10 +502,7 @@ fn watch(args: &Args, robot: &Robot, experiment: &Experiment, processes: &mut Pr
         "--json",
     ];
     args.fault.iter().for_each(|f| simulate.extend(["--fault", f.as_str()]));
-    let (gateway_toml, estimator_toml) = (
-        text(&robot.folder.join("gateway.toml"))?,
-        text(&experiment.config)?,
-    );
+    let (gateway_toml, estimator_toml) = (text(&robot.folder.join("gateway.toml"))?, text(&experiment.config)?);
     processes.start("gateway", &["--config", &gateway_toml])?;
     processes.start("estimator", &["--config", &estimator_toml])?;
 

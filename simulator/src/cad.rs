@@ -86,7 +86,8 @@ fn another_body(body: &RigidInertia, relative: f64, random: &mut Random) -> Rigi
     };
     let mass = body.mass * (1.0 + off());
     let first_moment = body.first_moment.map(|h| h * (1.0 + off()));
-    let about_centre = body.inertia - (Mat3::from_diagonal_element(centre.dot(&centre)) - centre * centre.transpose()) * body.mass;
+    let about_centre =
+        body.inertia - (Mat3::from_diagonal_element(centre.dot(&centre)) - centre * centre.transpose()) * body.mass;
     // Second moments of the mass, not moments of inertia: whatever positive numbers these are, they are a body's.
     let spread = Mat3::from_diagonal_element(about_centre.trace() / 2.0) - about_centre;
     let principal = spread.symmetric_eigen();
@@ -124,7 +125,10 @@ mod tests {
             for (h, true_h) in body.first_moment.iter().zip(&truth.first_moment) {
                 assert!(((h - true_h).abs() - 0.2 * true_h.abs()).abs() < 1e-9, "{name}");
             }
-            assert!((body.inertia - truth.inertia).norm() > 0.01 * truth.inertia.norm(), "{name}");
+            assert!(
+                (body.inertia - truth.inertia).norm() > 0.01 * truth.inertia.norm(),
+                "{name}"
+            );
         }
         // Everything else is the robot's: geometry, limits, sensors.
         assert_eq!(wrong.joints(), robot.model.joints());
@@ -139,14 +143,21 @@ mod tests {
                 ..Settings::default()
             };
             let text = wrong_urdf(&robot, &settings, 0.2).unwrap();
-            assert_eq!(text, wrong_urdf(&robot, &settings, 0.2).unwrap(), "the same seed, the same URDF");
+            assert_eq!(
+                text,
+                wrong_urdf(&robot, &settings, 0.2).unwrap(),
+                "the same seed, the same URDF"
+            );
             let mut other = robot.clone();
             other.model = model(&robot, &text);
             let (wrong, truth) = (torques(&other, &settings).unwrap(), torques(&robot, &settings).unwrap());
             for ((wrong, truth), joint) in wrong.iter().zip(&truth).zip(0..) {
                 let off: f64 = wrong.iter().zip(truth).map(|(a, b)| (a - b).powi(2)).sum();
                 let size: f64 = truth.iter().map(|b| b * b).sum();
-                assert!(off.sqrt() > 0.099 * size.sqrt() && off.sqrt() < 0.8 * size.sqrt(), "seed {seed}, joint {joint}");
+                assert!(
+                    off.sqrt() > 0.099 * size.sqrt() && off.sqrt() < 0.8 * size.sqrt(),
+                    "seed {seed}, joint {joint}"
+                );
             }
         }
         let [one, two] = [1, 2].map(|seed| {

@@ -128,7 +128,10 @@ impl Push {
         let later = |x: &f64| *x > t + 1e-9 * self.cycle;
         let changes = [(cycle + from, true), (cycle + until, false), (cycle + 1.0 + from, true)];
         let times = changes.map(|(x, begins)| (x * self.cycle, begins));
-        let (t, begins) = times.into_iter().find(|(x, _)| later(x)).unwrap_or((f64::INFINITY, false));
+        let (t, begins) = times
+            .into_iter()
+            .find(|(x, _)| later(x))
+            .unwrap_or((f64::INFINITY, false));
         Touch {
             t,
             contact: self.contact,
@@ -633,7 +636,10 @@ mod tests {
             touches.push(simulation.next_touch(last).unwrap());
         }
         let told: Vec<_> = touches.iter().map(|t| (t.t, t.contact, t.begins)).collect();
-        assert_eq!(told, [(4.0, 1, true), (6.0, 1, false), (14.0, 1, true), (16.0, 1, false)]);
+        assert_eq!(
+            told,
+            [(4.0, 1, true), (6.0, 1, false), (14.0, 1, true), (16.0, 1, false)]
+        );
         assert_eq!(simulation.pushed(), Some(1));
         // It comes and goes smoothly.
         let steepest = (0..2000)

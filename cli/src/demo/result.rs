@@ -17,7 +17,7 @@
 //! Each of these three holds `cad` and `identified`: of each joint the RMS error \[Nm\] by the wrong URDF alone, and by what is identified on-line, numbers of withheld torques included;
 //! `valid_share`; and `within_2_sigma`, the share of the torques whose error is within twice the stated standard deviation.
 
-use super::{Args, Experiment, Watched, JointTorque};
+use super::{Args, Experiment, JointTorque, Watched};
 use crate::report::plot::{Axis, Ink, Plot, Series, Shade};
 use crate::report::{self, Cell, Table as ReportTable};
 use anyhow::{Context, bail};
@@ -138,7 +138,10 @@ impl Compared {
         let mut baseline = watched.baseline.iter().peekable();
         for seen in &watched.estimates {
             while baseline.next_if(|(t, _)| *t < seen.t).is_some() {}
-            let cad = baseline.peek().filter(|(t, _)| *t == seen.t).map(|(_, torques)| torques);
+            let cad = baseline
+                .peek()
+                .filter(|(t, _)| *t == seen.t)
+                .map(|(_, torques)| torques);
             for ((joint, instants), estimate) in joints.iter_mut().enumerate().zip(&seen.joints) {
                 instants.push(Instant {
                     t: seen.t,
@@ -165,7 +168,9 @@ impl Compared {
     fn phase(&self, from: Nanos, until: Nanos) -> Option<Phase> {
         let (mut phase, mut count, mut valid, mut within, mut known) = (Phase::default(), 0, 0, 0, 0);
         for instants in &self.joints {
-            let inside = instants.iter().filter(|i| i.t >= from && i.t < until && i.truth.is_finite());
+            let inside = instants
+                .iter()
+                .filter(|i| i.t >= from && i.t < until && i.truth.is_finite());
             let (mut cad, mut identified, mut size) = (Mean::default(), Mean::default(), Mean::default());
             for instant in inside {
                 count += 1;
@@ -260,10 +265,7 @@ fn torque_plots(name: &str, instants: &[Instant], compared: &Compared, touched: 
         y: Axis::new("torque [Nm]"),
         series,
         marks: vec![(compared.time(compared.moving), "onset of motion".to_owned())],
-        shades: vec![
-            (Shade::Withheld, withheld.clone()),
-            (Shade::Touched, touched.to_vec()),
-        ],
+        shades: vec![(Shade::Withheld, withheld.clone()), (Shade::Touched, touched.to_vec())],
         ..Plot::default()
     };
     let line = |of: &dyn Fn(&Instant) -> f64| -> Vec<(f64, f64)> {
@@ -272,8 +274,12 @@ fn torque_plots(name: &str, instants: &[Instant], compared: &Compared, touched: 
     // Where it is withheld there is no line and no band: nobody gets these numbers.
     let told = |i: &Instant, value: f64| if i.estimate.valid == 1 { value } else { f64::NAN };
     let band = |of: &dyn Fn(&Instant) -> f64| -> Vec<(f64, f64, f64)> {
-        let around = instants.iter().map(|i| (i, told(i, of(i)), 2.0 * i.estimate.standard_deviation));
-        around.map(|(i, value, two)| (compared.time(i.t), value - two, value + two)).collect()
+        let around = instants
+            .iter()
+            .map(|i| (i, told(i, of(i)), 2.0 * i.estimate.standard_deviation));
+        around
+            .map(|(i, value, two)| (compared.time(i.t), value - two, value + two))
+            .collect()
     };
     [
         plot(
@@ -366,9 +372,15 @@ pub(super) fn finish(
     let after = compared.phase(compared.settled, Nanos::MAX);
     let whole = compared.phase(start, Nanos::MAX);
     let Some(judged) = after.as_ref().or(whole.as_ref()) else {
-        bail!("no estimate can be compared with the truth: the motion was too short, or nothing came after its first second");
+        bail!(
+            "no estimate can be compared with the truth: the motion was too short, or nothing came after its first second"
+        );
     };
-    let since = if after.is_some() { "from 10 s of motion on" } else { "from one second on" };
+    let since = if after.is_some() {
+        "from 10 s of motion on"
+    } else {
+        "from one second on"
+    };
     let seconds = |t: Nanos| (t <= last).then(|| compared.time(t));
     let errors: serde_json::Map<_, _> = (watched.joints.iter().zip(&judged.identified))
         .map(|(name, error)| (name.clone(), json!(error)))
@@ -398,7 +410,12 @@ pub(super) fn finish(
         ("robot", setup.robot.clone()),
         (
             "motion",
-            format!("{} s, still for {} s of it, seed {}", args.seconds, args.still(), args.seed),
+            format!(
+                "{} s, still for {} s of it, seed {}",
+                args.seconds,
+                args.still(),
+                args.seed
+            ),
         ),
         ("frames", format!("{frames} received, {lost} lost")),
         ("estimates", format!("{} at {rate:.1} Hz", watched.estimates.len())),
@@ -407,7 +424,10 @@ pub(super) fn finish(
     if let Some(before) = &before {
         facts.push(("before motion", format!("{} valid", percent(before.valid_share))));
     }
-    facts.push(("errors within 2σ", format!("{} {since}", percent(judged.within_2_sigma))));
+    facts.push((
+        "errors within 2σ",
+        format!("{} {since}", percent(judged.within_2_sigma)),
+    ));
     facts.push((
         "latency",
         format!(
@@ -522,7 +542,14 @@ mod tests {
 
     #[test]
     fn stretches_begin_where_the_last_good_one_was_and_close_ones_are_one() {
-        let flags = [(0.0, false), (0.01, true), (0.02, false), (0.03, true), (0.2, false), (0.3, true)];
+        let flags = [
+            (0.0, false),
+            (0.01, true),
+            (0.02, false),
+            (0.03, true),
+            (0.2, false),
+            (0.3, true),
+        ];
         assert_eq!(stretches(flags.into_iter()), [(0.0, 0.03), (0.2, 0.3)]);
         assert_eq!(stretches([(1.0, true)].into_iter()), [(1.0, 1.0)]);
     }

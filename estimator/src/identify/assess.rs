@@ -1261,7 +1261,7 @@ mod tests {
         let all = squared(&narrow);
         for (kept, back) in [(1.0, 0.0), (0.0, 1.0), (0.7, 0.3)] {
             let found = squared(&shrunk(&narrow, &spread, &[kept, 1.0]));
-            let expected = block(&all, 0) * (1.0 - back * back) + squared(&spread[0]) * f64::from(back * back);
+            let expected = block(&all, 0) * (1.0 - back * back) + squared(&spread[0]) * (back * back);
             assert!((block(&found, 0) - expected).amax() < 1e-12, "{kept}");
             assert!(
                 (block(&found, 1) - block(&all, 1)).amax() < 1e-12,

@@ -82,7 +82,11 @@ impl Session {
         self.work.fill(0.0);
         self.work[..unknown].copy_from_slice(&self.u[unknown * n..][..unknown]);
         self.u[unknown * n..][..unknown].fill(0.0);
-        self.u[unknown * n..].iter_mut().skip(unknown + n).step_by(n).for_each(|u| *u = 0.0);
+        self.u[unknown * n..]
+            .iter_mut()
+            .skip(unknown + n)
+            .step_by(n)
+            .for_each(|u| *u = 0.0);
         if unknown > 0 {
             self.add(weight, unknown - 1);
         }
@@ -174,9 +178,7 @@ pub(super) fn smooth(blocks: &mut [Block]) {
         let inner = predicted.select_rows(&continues).select_columns(&continues);
         let Some(factor) = inner.cholesky() else { continue };
         // P (P + Q)^-1 as 1 - Q (P + Q)^-1: what hardly walks is known from the future to the last digit.
-        let mut gain = factor
-            .solve(&old.p.select_columns(&continues).transpose())
-            .transpose();
+        let mut gain = factor.solve(&old.p.select_columns(&continues).transpose()).transpose();
         let inverse = factor.inverse();
         for (place, &i) in continues.iter().enumerate() {
             for other in 0..continues.len() {
