@@ -13,12 +13,15 @@ use indicatif::{ProgressBar, ProgressStyle};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use proprio_estimator::config::{Config, ConfigError};
+use proprio_estimator::model::Model;
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
+use proprio_estimator::spatial::RigidInertia;
 use proprio_simulator::{Fault, Robot, Settings, Simulation, Simulator, wrong_urdf};
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, Topic, monotonic};
 use proprio_topics::{
-    ContactEstimate, ContactWrench, EstimatorHealth, GatewayHealth, JointTorque, Nanos, TorqueEstimate,
+    ContactEstimate, ContactWrench, EstimatorHealth, GatewayHealth, InertiaEstimate, JointTorque, LinkInertia, Nanos,
+    SensorOffset, TorqueEstimate,
 };
 use serde_json::Value as Json;
 use std::fs::{self, File};
@@ -89,8 +92,8 @@ impl Args {
 
 /// How long the processes may take to be ready, and to end.
 const PATIENCE: Nanos = Nanos::from_millis(10_000);
-/// What the robot is taken to be [Nm]: where its configuration bounds no torque's standard deviation, this does.
-const MOST_STD: f64 = 0.5;
+/// Where the robot's configuration bounds no torque's standard deviation, this does [Nm].
+const MOST_STD: f64 = 0.3;
 
 /// Runs the demonstration.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
@@ -224,6 +227,9 @@ fn copy_robot(robot: &Robot, buses: &[String], to: &Path) -> anyhow::Result<()> 
     Ok(())
 }
 
+/// A link's name and its ten inertial parameters.
+type Link = (String, [f64; 10]);
+
 /// What the estimator is given, and what it would say without identification.
 struct Experiment {
     /// The estimator's configuration, with the wrong URDF beside it.
@@ -235,6 +241,11 @@ struct Experiment {
     /// The contact that is pushed and declared, and from when until when [s] of the simulation.
     pushed: Option<String>,
     touched: Vec<(f64, f64)>,
+    /// Per link its inertial parameters, of the robot and of the CAD.
+    truth: Vec<Link>,
+    cad: Vec<Link>,
+    /// Per F/T sensor its true offset: fx fy fz tx ty tz [N, Nm].
+    offsets: Vec<(String, [f64; 6])>,
     /// The bound of torques' standard deviations [Nm].
     most_std: f64,
     /// Why nothing can be identified.
@@ -285,6 +296,10 @@ impl Experiment {
             })
         };
         let with = setup(&config)?;
+        let links = |model: &Model, inertias: &[RigidInertia]| -> Vec<Link> {
+            let named = inertias.iter().enumerate();
+            named.map(|(link, inertia)| (model.link_name(link).to_owned(), inertia.parameters())).collect()
+        };
         config.identification.enabled = false;
         config.output.max_torque_std_nm = None;
         Ok(Self {
@@ -294,6 +309,14 @@ impl Experiment {
                 .nth(pushed.unwrap_or(usize::MAX))
                 .map(ToOwned::to_owned),
             touched,
+            truth: links(&robot.model, robot.model.inertias()),
+            cad: links(&with.model, with.cad()),
+            offsets: (robot.config.force_torque.iter())
+                .map(|ft| {
+                    let ([fx, fy, fz], [tx, ty, tz]) = (ft.offset_n, ft.offset_nm);
+                    (ft.sensor.clone(), [fx, fy, fz, tx, ty, tz])
+                })
+                .collect(),
             most_std,
             refused: Pipeline::new(with.clone())
                 .identification_refused()
@@ -438,10 +461,19 @@ struct Watched {
     estimates: Vec<Seen>,
     /// What the CAD makes of the same samples.
     baseline: Vec<(Nanos, Box<[f64]>)>,
+    /// What was identified, solution by solution.
+    learnt: Vec<Learnt>,
     lost_estimates: u64,
     gateway: Box<GatewayHealth>,
     estimator: EstimatorHealth,
     simulator: Json,
+}
+
+/// What was identified from the data up to some instant.
+struct Learnt {
+    t: Nanos,
+    links: Box<[LinkInertia]>,
+    offsets: Box<[SensorOffset]>,
 }
 
 /// One estimate, as small as it can be kept.
@@ -510,6 +542,11 @@ fn watch(args: &Args, robot: &Robot, experiment: &Experiment, processes: &mut Pr
     let name = robot.config.robot.clone();
     let mut torques: Reader<TorqueEstimate> = open(&domain, &name, processes)?;
     let mut contacts: Reader<ContactEstimate> = open(&domain, &name, processes)?;
+    // Where nothing can be identified, nobody tells of it.
+    let mut inertias: Option<Reader<InertiaEstimate>> = match experiment.refused {
+        None => Some(open(&domain, &name, processes)?),
+        Some(_) => None,
+    };
     let mut gateway_health: Reader<GatewayHealth> = open(&domain, &name, processes)?;
     let mut estimator_health: Reader<EstimatorHealth> = open(&domain, &name, processes)?;
     // The gateway tells its health once all its links are open: from then on no frame is lost.
@@ -528,6 +565,7 @@ fn watch(args: &Args, robot: &Robot, experiment: &Experiment, processes: &mut Pr
         joints,
         estimates: Vec::with_capacity((args.seconds * 1100.0) as usize),
         baseline: vec![],
+        learnt: vec![],
         lost_estimates: 0,
         gateway,
         estimator: EstimatorHealth::default(),
@@ -556,6 +594,16 @@ fn watch(args: &Args, robot: &Robot, experiment: &Experiment, processes: &mut Pr
                 .find(|s| s.t == estimate.header.acquired);
             if let Some(seen) = seen {
                 seen.contacts = estimate.contacts().into();
+            }
+        }
+        while let Some(inertia) = inertias.as_mut().map_or(Ok(None), Reader::try_take)? {
+            // What is in force before the first solution is the CAD.
+            if inertia.links().iter().any(|link| link.accepted == 1) {
+                watched.learnt.push(Learnt {
+                    t: inertia.header.acquired,
+                    links: inertia.links().into(),
+                    offsets: inertia.offsets().into(),
+                });
             }
         }
         baseline.turn()?;

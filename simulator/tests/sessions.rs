@@ -8,7 +8,9 @@ use proprio_gateway::link::{Link, Received};
 use proprio_gateway::offline::decode;
 use proprio_gateway::status::BusStatus;
 use proprio_simulator::record::{record, write_truth};
-use proprio_simulator::{Options, OptionsError, Robot, Settings, Simulation, is_configuration, parse_bus, run};
+use proprio_simulator::{
+    Options, OptionsError, Robot, Settings, Simulation, is_configuration, parse_bus, run, run_with_skin,
+};
 use proprio_topics::csv::{Columns, Reader, Row, Value};
 use proprio_topics::{Counter, Nanos, Reading};
 use std::collections::HashMap;
@@ -207,6 +209,40 @@ fn it_ends_when_it_is_told_to() {
     };
     let summary = run(&robot(), &options, &AtomicBool::new(true)).unwrap();
     assert_eq!((summary.sent, summary.truth_rows), (0, 0));
+}
+
+#[test]
+fn the_skin_tells_of_each_touch_ahead_of_it() {
+    let options = Options {
+        domain: format!("skin-{}", std::process::id()),
+        seconds: Some(2.0),
+        ..Options::default()
+    };
+    let mut told = Vec::new();
+    let mut skin = |contact: &str, at: Nanos, touches: bool| {
+        told.push((contact.to_owned(), at, touches, Monotonic.now()));
+    };
+    let summary = run_with_skin(&robot(), &options, Some(&mut skin), &AtomicBool::new(false)).unwrap();
+    let told: Vec<_> = told
+        .iter()
+        .map(|(contact, at, touches, heard)| (contact.as_str(), *at - Nanos(summary.t0), *touches, *at - *heard))
+        .collect();
+    let [(_, from, ..), (_, until, ..)] = told[..] else {
+        panic!("{told:?}");
+    };
+    // The push of a run of 2 s, from 40 % to 60 % of it.
+    assert_eq!((from, until), (Nanos::from_millis(800), Nanos::from_millis(1200)));
+    assert!(told.iter().all(|(contact, ..)| *contact == "hand"), "{told:?}");
+    assert_eq!([told[0].2, told[1].2], [true, false]);
+    assert!(told.iter().all(|(.., ahead)| *ahead <= Nanos::from_millis(100)), "{told:?}");
+    // Whoever is told to stop meanwhile does.
+    let options = Options {
+        seconds: Some(60.0),
+        ..options
+    };
+    let mut skin = |_: &str, _, _| {};
+    let summary = run_with_skin(&robot(), &options, Some(&mut skin), &AtomicBool::new(true)).unwrap();
+    assert!(summary.seconds < 10.0);
 }
 
 #[test]

@@ -284,6 +284,8 @@ fn typing_mistakes_end_with_2_and_say_what_was_meant() {
         (&["estimate", "--config", "estimator.toml"], "--log <FILE>"),
         (&["demo", "--seconds", "0"], "must be 2 to 600"),
         (&["demo", "--seconds", "nan"], "must be 2 to 600"),
+        (&["demo", "--cad-error", "0.7"], "must be 0 to 0.5"),
+        (&["simulate", "--still", "nan"], "must be 0 to 3600"),
         (&["simulate", "--seed", "x"], "--seed"),
         (&["simulate", "--seconds", "-1"], "-1"),
         (&["doctor", "extra"], "extra"),
@@ -1851,6 +1853,8 @@ fn demo(place: &Place, seconds: f64, more: &[&str]) -> Json {
     for name in [
         "report.html",
         "estimates.csv",
+        "cad.urdf",
+        "estimator.toml",
         "gateway.log",
         "estimator.log",
         "simulate.log",
@@ -1930,17 +1934,61 @@ fn a_demonstration_ends_well_and_leaves_nothing_behind() {
     let summary = demo(&place, 3.0, &["--seed", "4"]);
     assert_eq!(summary["lost"], 0, "{summary}");
     assert_eq!(summary["seed"], 4);
-    assert!(summary["valid_share"].as_f64().unwrap() > 0.5, "{summary}");
+    // With a URDF that is wrong, and no time to learn: uncertain, and said so.
+    assert!(summary["valid_share"].as_f64().unwrap() > 0.2, "{summary}");
     for (joint, error) in summary["torque_rms_error_nm"].as_object().unwrap() {
-        assert!(error.as_f64().unwrap() < 0.15, "{joint}: {summary}");
+        assert!(error.as_f64().unwrap() < 2.0, "{joint}: {summary}");
     }
+    let identification = &summary["identification"];
+    assert!(identification["after"].is_null() && identification["settled_since_s"].is_null(), "{summary}");
+    assert!(identification["moving_since_s"].as_f64().unwrap() < 0.75, "{summary}");
+    assert_eq!(identification["learning"]["cad"].as_object().unwrap().len(), 7, "{summary}");
     assert!(
         reasons(&place)
             .keys()
-            .all(|r| r.starts_with("starting") || r.starts_with("stale")),
+            .all(|r| r.starts_with("starting") || r.starts_with("stale") || r == "uncertain"),
         "{:?}",
         reasons(&place)
     );
+}
+
+#[test]
+fn a_demonstration_learns_what_its_urdf_has_wrong() {
+    let place = Place::new();
+    let summary = demo(&place, 20.0, &[]);
+    let identification = &summary["identification"];
+    assert!(identification["refused"].is_null(), "{summary}");
+    assert!((identification["settled_since_s"].as_f64().unwrap() - 15.0).abs() < 1.0, "{summary}");
+    let share = |phase: &str, key: &str| identification[phase][key].as_f64().unwrap();
+    // Standing still it learns nothing, and says so: offsets and weight can not be told apart.
+    assert!(share("before", "valid_share") < 0.8, "{summary}");
+    assert!(share("before", "within_2_sigma") > 0.9, "{summary}");
+    assert!(summary["valid_share"].as_f64().unwrap() >= 0.95, "{summary}");
+    assert!(share("after", "valid_share") >= 0.95, "{summary}");
+    assert!(identification["solutions"].as_u64().unwrap() > 10, "{summary}");
+    let error = |phase: &str, whose: &str, joint: &str| identification[phase][whose][joint].as_f64().unwrap();
+    for joint in ["l_elbow", "l_wrist_prosup", "l_wrist_pitch", "l_wrist_yaw"] {
+        let (identified, cad) = (error("after", "identified", joint), error("after", "cad", joint));
+        assert!(identified < cad / 3.0, "{joint}: {summary}");
+        assert_eq!(identified, summary["torque_rms_error_nm"][joint]);
+    }
+    // Above the sensor it is the sensor that measures, as well with either.
+    for joint in ["l_shoulder_pitch", "l_shoulder_roll", "l_shoulder_yaw"] {
+        assert!(error("after", "identified", joint) < 0.1, "{joint}: {summary}");
+    }
+    // The report shows it, and the URDF is the robot's but for its inertias.
+    let report = place.read("d/report.html");
+    for part in ["onset of motion", "withheld", "pushed", "± 2σ", "What was learnt", "l_hand: "] {
+        assert!(report.contains(part), "{part}");
+    }
+    let (cad, urdf) = (place.read("d/cad.urdf"), place.read("model.urdf"));
+    assert_ne!(cad, urdf);
+    for part in ["<joint", "<origin", "<limit", "<sensor"] {
+        assert_eq!(cad.matches(part).count(), urdf.matches(part).count(), "{part}");
+    }
+    assert!(place.read("d/estimator.toml").contains("cad.urdf"));
+    // What it wrote is complete: the estimator runs with it.
+    place.run(&["estimator", "--config", "d/estimator.toml", "--check"]).good();
 }
 
 #[test]

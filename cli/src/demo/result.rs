@@ -14,7 +14,10 @@
 //! | `identification.learning` | of the first 10 s of motion; likewise |
 //! | `identification.after` | of the time from 10 s of motion on; likewise |
 //!
-//! Each of these three holds `cad` and `identified`: of each joint the RMS error \[Nm\] by the wrong URDF alone, and by what is identified on-line, numbers of withheld torques included;
+//! | `identification.solutions` | how many solutions were put in force |
+//! | `identification.parameters_within_2_sigma` | share of the identified links' parameters whose true value is within twice the stated standard deviation of the last solution; null without one |
+//!
+//! Each of the three phases holds `cad` and `identified`: of each joint the RMS error \[Nm\] by the wrong URDF alone, and by what is identified on-line, numbers of withheld torques included;
 //! `valid_share`; and `within_2_sigma`, the share of the torques whose error is within twice the stated standard deviation.
 
 use super::{Args, Experiment, JointTorque, Watched};
@@ -304,6 +307,160 @@ fn torque_plots(name: &str, instants: &[Instant], compared: &Compared, touched: 
     ]
 }
 
+/// Names and units of a link's ten parameters.
+const PARAMETERS: [(&str, &str); 10] = [
+    ("m", "kg"),
+    ("h_x", "kg m"),
+    ("h_y", "kg m"),
+    ("h_z", "kg m"),
+    ("I_xx", "kg m²"),
+    ("I_xy", "kg m²"),
+    ("I_xz", "kg m²"),
+    ("I_yy", "kg m²"),
+    ("I_yz", "kg m²"),
+    ("I_zz", "kg m²"),
+];
+/// Of the links' parameters so many are drawn: those that the data tell most of.
+const DRAWN: usize = 8;
+
+/// One number that is identified, over the solutions.
+struct Course {
+    title: String,
+    unit: &'static str,
+    /// Instant \[s\], value, standard deviation.
+    points: Vec<(f64, f64, f64)>,
+    cad: f64,
+    truth: f64,
+}
+
+impl Course {
+    /// By what share its standard deviation has become smaller.
+    fn told(&self) -> f64 {
+        match (self.points.first(), self.points.last()) {
+            (Some((_, _, first)), Some((_, _, last))) if *first > 0.0 => last / first,
+            _ => f64::INFINITY,
+        }
+    }
+
+    fn is_within_2_sigma(&self) -> bool {
+        self.points
+            .last()
+            .is_some_and(|(_, value, deviation)| (value - self.truth).abs() <= 2.0 * deviation)
+    }
+
+    fn plot(&self, compared: &Compared) -> Plot {
+        let ends = [self.points.first(), self.points.last()];
+        let level = |value: f64| ends.iter().flatten().map(|(t, ..)| (*t, value)).collect();
+        let band = self.points.iter().map(|(t, x, s)| (*t, x - 2.0 * s, x + 2.0 * s));
+        let line = self.points.iter().map(|(t, x, _)| (*t, *x));
+        let mut series = vec![Series::band("± 2σ", Ink::Identified, band.collect())];
+        if self.cad.is_finite() {
+            series.push(Series::line("CAD", Ink::Cad, level(self.cad)));
+        }
+        series.push(Series::line("truth", Ink::Measured, level(self.truth)));
+        series.push(Series::line("identified", Ink::Identified, line.collect()));
+        Plot {
+            title: self.title.clone(),
+            x: Axis::new("t [s]"),
+            y: Axis::new(&format!("[{}]", self.unit)),
+            series,
+            marks: vec![(compared.time(compared.moving), "onset of motion".to_owned())],
+            ..Plot::default()
+        }
+    }
+}
+
+/// The links' parameters and the sensors' offsets over the solutions.
+fn courses(experiment: &Experiment, watched: &Watched, compared: &Compared) -> (Vec<Course>, Vec<Course>) {
+    let (mut parameters, mut offsets) = (vec![], vec![]);
+    let Some(last) = watched.learnt.last() else {
+        return (parameters, offsets);
+    };
+    let find = |links: &[super::Link], name: &str| links.iter().find(|(n, _)| n == name).map(|(_, values)| *values);
+    for (place, link) in last.links.iter().enumerate() {
+        let name = link.name.as_str();
+        let (Some(truth), Some(cad)) = (find(&experiment.truth, name), find(&experiment.cad, name)) else {
+            continue;
+        };
+        for (i, ((symbol, unit), (truth, cad))) in PARAMETERS.into_iter().zip(truth.into_iter().zip(cad)).enumerate() {
+            let points = watched.learnt.iter().filter_map(|learnt| {
+                let link = learnt.links.get(place)?;
+                Some((compared.time(learnt.t), *link.parameters.get(i)?, *link.standard_deviation.get(i)?))
+            });
+            parameters.push(Course {
+                title: format!("{name}: {symbol}"),
+                unit,
+                points: points.collect(),
+                cad,
+                truth,
+            });
+        }
+    }
+    for (place, offset) in last.offsets.iter().enumerate() {
+        let name = offset.name.as_str();
+        let Some((_, truth)) = experiment.offsets.iter().find(|(n, _)| n == name) else {
+            continue;
+        };
+        for (i, (part, truth)) in ["fx", "fy", "fz", "tx", "ty", "tz"].into_iter().zip(truth).enumerate() {
+            let points = watched.learnt.iter().filter_map(|learnt| {
+                let offset = learnt.offsets.get(place)?;
+                let value = offset.force.iter().chain(&offset.torque).nth(i)?;
+                Some((compared.time(learnt.t), *value, *offset.standard_deviation.get(i)?))
+            });
+            offsets.push(Course {
+                title: format!("{name}: {part}"),
+                unit: if i < 3 { "N" } else { "Nm" },
+                points: points.collect(),
+                cad: f64::NAN,
+                truth: *truth,
+            });
+        }
+    }
+    (parameters, offsets)
+}
+
+/// Figure 4 of the paper: what was identified, and how it came about.
+fn learnt_section(parameters: &[Course], offsets: &[Course], compared: &Compared) -> String {
+    let Some(course) = parameters.first().or(offsets.first()) else {
+        return String::new();
+    };
+    let solutions = course.points.len();
+    let mut best: Vec<&Course> = parameters.iter().collect();
+    best.sort_by(|a, b| a.told().total_cmp(&b.told()));
+    best.truncate(DRAWN);
+    let mut masses = ReportTable::new(
+        "Masses of the links beyond the F/T sensor [kg]. Forces tell certain sums of neighbouring links' parameters much better than each of them, which is what its standard deviation says.",
+        &["link", "truth", "CAD", "identified"],
+    );
+    for mass in parameters.iter().step_by(PARAMETERS.len()) {
+        if let Some((_, value, deviation)) = mass.points.last() {
+            let name = mass.title.split(':').next().unwrap_or_default();
+            masses.row(vec![
+                name.into(),
+                mass.truth.into(),
+                mass.cad.into(),
+                Cell::Uncertain(*value, *deviation),
+            ]);
+        }
+    }
+    let plots = |courses: &[&Course]| -> Vec<Plot> { courses.iter().map(|course| course.plot(compared)).collect() };
+    report::section(
+        "What was learnt",
+        &[
+            report::paragraph(&format!(
+                "Inertial parameters and F/T offsets, {solutions} solutions, one a second: the parameters of which the data tell most, then the offsets of the sensors."
+            )),
+            report::figures(&plots(&best)),
+            masses.html(),
+            report::folded(
+                "The sensors' offsets",
+                false,
+                &[report::figures(&plots(&offsets.iter().collect::<Vec<_>>()))],
+            ),
+        ],
+    )
+}
+
 /// Writes estimates.csv, summary.json and report.html to `out`, and tells the result. The simulator's truth is in `truth`.
 pub(super) fn finish(
     args: &Args,
@@ -387,6 +544,8 @@ pub(super) fn finish(
         .collect();
     let latency_us =
         json!({ "p50": quantile(&latency, 0.5), "p99": quantile(&latency, 0.99), "p999": quantile(&latency, 0.999) });
+    let (parameters, offsets) = courses(experiment, watched, &compared);
+    let within = parameters.iter().filter(|course| course.is_within_2_sigma()).count();
     let summary = json!({
         "robot": setup.robot, "seconds": args.seconds, "seed": args.seed,
         "frames": frames, "samples": samples, "lost": lost, "foreign": foreign, "estimates": watched.estimates.len(),
@@ -395,6 +554,8 @@ pub(super) fn finish(
         "identification": {
             "cad_error": args.cad_error, "refused": experiment.refused, "max_torque_std_nm": experiment.most_std,
             "moving_since_s": seconds(compared.moving), "settled_since_s": seconds(compared.settled),
+            "solutions": watched.learnt.len(),
+            "parameters_within_2_sigma": (!parameters.is_empty()).then(|| ratio(within, parameters.len())),
             "before": Phase::json(before.as_ref(), &watched.joints),
             "learning": Phase::json(learning.as_ref(), &watched.joints),
             "after": Phase::json(after.as_ref(), &watched.joints),
@@ -474,6 +635,7 @@ pub(super) fn finish(
                     "Joint torques",
                     &[rows.html(), report::paragraph(&upstream), report::figures(&plots)],
                 ),
+                learnt_section(&parameters, &offsets, &compared),
             ],
         ),
     )?;
