@@ -298,7 +298,9 @@ impl Experiment {
         let with = setup(&config)?;
         let links = |model: &Model, inertias: &[RigidInertia]| -> Vec<Link> {
             let named = inertias.iter().enumerate();
-            named.map(|(link, inertia)| (model.link_name(link).to_owned(), inertia.parameters())).collect()
+            named
+                .map(|(link, inertia)| (model.link_name(link).to_owned(), inertia.parameters()))
+                .collect()
         };
         config.identification.enabled = false;
         config.output.max_torque_std_nm = None;

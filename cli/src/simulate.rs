@@ -71,14 +71,16 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot catch signals")?;
     }
-    let mut skin = args.skin.then(|| Skin::open(domain, &robot.config.robot)).transpose()?;
+    let mut skin = args
+        .skin
+        .then(|| Teller::open(domain, &robot.config.robot))
+        .transpose()?;
     let mut tell = |contact: &str, at, active| {
         if let Some(skin) = &mut skin {
             skin.tell(contact, at, active);
         }
     };
-    let tell: Option<&mut dyn FnMut(&str, Nanos, bool)> = args.skin.then_some(&mut tell);
-    let summary = proprio_simulator::run_with_skin(&robot, &options, tell, &stop)?;
+    let summary = proprio_simulator::run_with_skin(&robot, &options, args.skin.then_some(&mut tell), &stop)?;
     if args.json {
         say!("{}", serde_json::to_string(&summary)?);
     } else {
@@ -88,9 +90,9 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
 }
 
 /// Tells who wants to know what touches the robot.
-struct Skin(Writer<ContactDeclaration>);
+struct Teller(Writer<ContactDeclaration>);
 
-impl Skin {
+impl Teller {
     fn open(domain: &DomainConfig, robot: &str) -> anyhow::Result<Self> {
         let domain = Domain::open(domain)?;
         Ok(Self(Writer::create(&domain, robot, domain.epoch())?))

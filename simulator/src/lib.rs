@@ -26,6 +26,6 @@ pub mod truth;
 pub use cad::wrong_urdf;
 pub use fault::{Fault, FaultError};
 pub use robot::{Robot, RobotError};
-pub use run::{Options, OptionsError, Summary, is_configuration, parse_bus, run, run_with_skin};
+pub use run::{Options, OptionsError, Skin, Summary, is_configuration, parse_bus, run, run_with_skin};
 pub use simulator::{Settings, Simulator, SimulatorError};
 pub use truth::{Simulation, Touch, Truth};

@@ -140,15 +140,17 @@ pub fn run(robot: &Robot, options: &Options, stop: &AtomicBool) -> anyhow::Resul
     run_with_skin(robot, options, None, stop)
 }
 
-/// As [`run`], with somebody who is told, as by a skin, what touches the robot: the contact's name, from when on, and whether it is touched then.
-/// He is told in this thread, a tenth of a second ahead.
+/// Somebody who is told, as by a skin, what touches the robot: the contact's name, from when on, and whether it is touched then.
+pub type Skin<'a> = &'a mut dyn FnMut(&str, Nanos, bool);
+
+/// As [`run`], and `skin` is told of touches, in this thread, a tenth of a second ahead.
 ///
 /// # Errors
 /// As [`run`].
 pub fn run_with_skin(
     robot: &Robot,
     options: &Options,
-    skin: Option<&mut dyn FnMut(&str, Nanos, bool)>,
+    skin: Option<Skin<'_>>,
     stop: &AtomicBool,
 ) -> anyhow::Result<Summary> {
     let buses = sources(robot, options)?;
@@ -287,14 +289,7 @@ fn turn_until(
 }
 
 /// The loop of the skin, until nothing more will touch the robot.
-fn feel(
-    simulation: &Simulation,
-    t0: Nanos,
-    skin: &mut dyn FnMut(&str, Nanos, bool),
-    clock: &impl Clock,
-    end: Nanos,
-    stop: &AtomicBool,
-) {
+fn feel(simulation: &Simulation, t0: Nanos, skin: Skin<'_>, clock: &impl Clock, end: Nanos, stop: &AtomicBool) {
     let mut next = simulation.next_touch(0.0);
     while let Some(Touch { t, contact, begins }) = next {
         let at = t0 + Nanos::from_seconds(t);

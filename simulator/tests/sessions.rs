@@ -234,7 +234,10 @@ fn the_skin_tells_of_each_touch_ahead_of_it() {
     assert_eq!((from, until), (Nanos::from_millis(800), Nanos::from_millis(1200)));
     assert!(told.iter().all(|(contact, ..)| *contact == "hand"), "{told:?}");
     assert_eq!([told[0].2, told[1].2], [true, false]);
-    assert!(told.iter().all(|(.., ahead)| *ahead <= Nanos::from_millis(100)), "{told:?}");
+    assert!(
+        told.iter().all(|(.., ahead)| *ahead <= Nanos::from_millis(100)),
+        "{told:?}"
+    );
     // Whoever is told to stop meanwhile does.
     let options = Options {
         seconds: Some(60.0),

@@ -1940,9 +1940,16 @@ fn a_demonstration_ends_well_and_leaves_nothing_behind() {
         assert!(error.as_f64().unwrap() < 2.0, "{joint}: {summary}");
     }
     let identification = &summary["identification"];
-    assert!(identification["after"].is_null() && identification["settled_since_s"].is_null(), "{summary}");
+    assert!(
+        identification["after"].is_null() && identification["settled_since_s"].is_null(),
+        "{summary}"
+    );
     assert!(identification["moving_since_s"].as_f64().unwrap() < 0.75, "{summary}");
-    assert_eq!(identification["learning"]["cad"].as_object().unwrap().len(), 7, "{summary}");
+    assert_eq!(
+        identification["learning"]["cad"].as_object().unwrap().len(),
+        7,
+        "{summary}"
+    );
     assert!(
         reasons(&place)
             .keys()
@@ -1958,7 +1965,10 @@ fn a_demonstration_learns_what_its_urdf_has_wrong() {
     let summary = demo(&place, 20.0, &[]);
     let identification = &summary["identification"];
     assert!(identification["refused"].is_null(), "{summary}");
-    assert!((identification["settled_since_s"].as_f64().unwrap() - 15.0).abs() < 1.0, "{summary}");
+    assert!(
+        (identification["settled_since_s"].as_f64().unwrap() - 15.0).abs() < 1.0,
+        "{summary}"
+    );
     let share = |phase: &str, key: &str| identification[phase][key].as_f64().unwrap();
     // Standing still it learns nothing, and says so: offsets and weight can not be told apart.
     assert!(share("before", "valid_share") < 0.8, "{summary}");
@@ -1978,7 +1988,14 @@ fn a_demonstration_learns_what_its_urdf_has_wrong() {
     }
     // The report shows it, and the URDF is the robot's but for its inertias.
     let report = place.read("d/report.html");
-    for part in ["onset of motion", "withheld", "pushed", "± 2σ", "What was learnt", "l_hand: "] {
+    for part in [
+        "onset of motion",
+        "withheld",
+        "pushed",
+        "± 2σ",
+        "What was learnt",
+        "l_hand: ",
+    ] {
         assert!(report.contains(part), "{part}");
     }
     let (cad, urdf) = (place.read("d/cad.urdf"), place.read("model.urdf"));
@@ -1988,7 +2005,9 @@ fn a_demonstration_learns_what_its_urdf_has_wrong() {
     }
     assert!(place.read("d/estimator.toml").contains("cad.urdf"));
     // What it wrote is complete: the estimator runs with it.
-    place.run(&["estimator", "--config", "d/estimator.toml", "--check"]).good();
+    place
+        .run(&["estimator", "--config", "d/estimator.toml", "--check"])
+        .good();
 }
 
 #[test]

@@ -385,7 +385,11 @@ fn courses(experiment: &Experiment, watched: &Watched, compared: &Compared) -> (
         for (i, ((symbol, unit), (truth, cad))) in PARAMETERS.into_iter().zip(truth.into_iter().zip(cad)).enumerate() {
             let points = watched.learnt.iter().filter_map(|learnt| {
                 let link = learnt.links.get(place)?;
-                Some((compared.time(learnt.t), *link.parameters.get(i)?, *link.standard_deviation.get(i)?))
+                Some((
+                    compared.time(learnt.t),
+                    *link.parameters.get(i)?,
+                    *link.standard_deviation.get(i)?,
+                ))
             });
             parameters.push(Course {
                 title: format!("{name}: {symbol}"),
