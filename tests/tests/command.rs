@@ -1979,7 +1979,8 @@ fn a_demonstration_learns_what_its_urdf_has_wrong() {
     let error = |phase: &str, whose: &str, joint: &str| identification[phase][whose][joint].as_f64().unwrap();
     for joint in ["l_elbow", "l_wrist_prosup", "l_wrist_pitch", "l_wrist_yaw"] {
         let (identified, cad) = (error("after", "identified", joint), error("after", "cad", joint));
-        assert!(identified < cad / 3.0, "{joint}: {summary}");
+        // What differentiated positions have of noise is left, some thousandths of a newton metre.
+        assert!(identified < (cad / 3.0).max(0.006), "{joint}: {summary}");
         assert_eq!(identified, summary["torque_rms_error_nm"][joint]);
     }
     // Above the sensor it is the sensor that measures, as well with either.
