@@ -5,7 +5,7 @@ use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
 use proprio_simulator::record::record;
 use proprio_simulator::{Robot, Settings};
-use proprio_tests::Rig;
+use proprio_tests::{Rig, browse};
 use proprio_topics::Nanos;
 use proprio_topics::csv::Columns;
 use serde_json::Value as Json;
@@ -133,27 +133,6 @@ fn heavier(urdf: &str, links: &[&str], factor: f64) -> String {
 fn number(json: &Json, path: &[&str]) -> f64 {
     let found = path.iter().fold(json, |json, key| &json[*key]);
     found.as_f64().unwrap_or_else(|| panic!("{path:?} is {found}"))
-}
-
-/// Opens a report in a browser, if one is at hand.
-fn browse(report: &Path) {
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("browser/check.py");
-    let mut command = Command::new("python3");
-    command.arg(script).arg(report);
-    if let Some(pictures) = std::env::var_os("PROPRIO_SCREENSHOTS") {
-        let name = std::thread::current().name().unwrap_or("report").replace("::", "_");
-        command.arg("--screenshots").arg(Path::new(&pictures).join(name));
-    }
-    match command.output() {
-        Ok(ran) if ran.status.code() == Some(3) => println!("skipped: no browser"),
-        Ok(ran) => assert!(
-            ran.status.success(),
-            "{}{}",
-            String::from_utf8_lossy(&ran.stdout),
-            String::from_utf8_lossy(&ran.stderr)
-        ),
-        Err(error) => println!("skipped: python3: {error}"),
-    }
 }
 
 /// Asserts the shape that programs rely on.
