@@ -12,8 +12,8 @@ use anyhow::{Context, anyhow};
 use proprio_topics::ipc::{Domain, DomainConfig, DomainError, PortError, Reader, Topic, Writer, monotonic};
 use proprio_topics::realtime;
 use proprio_topics::{
-    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, InertiaEstimate, Nanos, Publisher, Role, Sample,
-    TorqueEstimate,
+    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, IdentificationHealth, InertiaEstimate, Nanos,
+    Publisher, Role, Sample, TorqueEstimate,
 };
 use sd_notify::NotifyState;
 use std::io::Write as _;
@@ -252,6 +252,9 @@ impl DataPlane {
             }
         }
         self.tell_health(monotonic());
+        if self.identifier.is_some() {
+            tracing::info!("instants of identification: {}", self.health.identification);
+        }
     }
 
     /// Takes what is waiting and publishes what it completes; whether there was anything.
@@ -364,10 +367,30 @@ impl DataPlane {
         self.health.lost = self.samples.as_ref().map_or(0, Reader::lost);
         self.health.epochs = self.samples.as_ref().map_or(0, Reader::epochs);
         if let (Some(identifier), Some(online)) = (&mut self.identifier, self.pipeline.identification()) {
+            let mut sum = IdentificationHealth {
+                groups: u32::try_from(identifier.told.len()).unwrap_or(0),
+                ..IdentificationHealth::default()
+            };
             for (component, (told, changes)) in identifier.told.iter_mut().enumerate() {
                 let Some((paused, counts)) = online.state(component) else {
                     continue;
                 };
+                sum.paused += u32::from(paused != Paused::No);
+                sum.learnt += counts.learnt;
+                sum.still += counts.still;
+                sum.contact += counts.contact;
+                sum.outlier += counts.outlier;
+                sum.suspected += counts.suspected;
+                sum.stale += counts.stale;
+                sum.saturated += counts.saturated;
+                sum.device_fault += counts.device_fault;
+                sum.unseen += counts.unseen;
+                sum.offset_changes += counts.offset_changes;
+                sum.load_changes += counts.load_changes;
+                sum.unknown_changes += counts.changes - counts.offset_changes - counts.load_changes;
+                // One for all of them.
+                sum.late = counts.late;
+                sum.failed += counts.failed;
                 if std::mem::replace(told, paused) != paused {
                     tracing::info!(component, "{paused}");
                 }
@@ -377,6 +400,7 @@ impl DataPlane {
                     tracing::warn!(component, "{change}");
                 }
             }
+            self.health.identification = sum;
         }
         // Who can not be reached now gets the next one.
         let _ = self.health_writer.send(&self.health, now);

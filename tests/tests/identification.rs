@@ -16,7 +16,7 @@ use proprio_estimator::pipeline::{Estimate, Job, Pipeline};
 use proprio_estimator::setup::Setup;
 use proprio_estimator::spatial::Wrench;
 use proprio_topics::csv::{Item, Reader, Row, Value, What};
-use proprio_topics::{InertiaEstimate, Nanos};
+use proprio_topics::{InertiaEstimate, Nanos, Quality, Reading};
 use serde_json::Value as Json;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -258,6 +258,8 @@ struct Score {
     size: f64,
     /// The median of the standard deviation that the estimator states [Nm]; NaN if it states none.
     stated: f64,
+    /// How often the error is within 1.96 of them.
+    covered: f64,
 }
 
 /// Scores of every joint over those instants of a session at which the truth is told and `counts` says so. The robot moves; the last half second, in
@@ -290,6 +292,11 @@ fn scores(
             error: rms(rows.iter().zip(&own).map(|(row, own)| hat[*own] - tau[*row])),
             size: rms(rows.iter().map(|row| tau[*row])),
             stated: median(own.iter().map(|own| stated[*own]).collect()),
+            covered: {
+                let within = |(row, own): (&usize, &usize)| (hat[*own] - tau[*row]).abs() < 1.96 * stated[*own];
+                let count = rows.iter().zip(&own).filter(|both| within((both.0, both.1))).count();
+                count as f64 / rows.len() as f64
+            },
         }
     };
     joints.iter().map(|joint| (joint.clone(), score(joint))).collect()
@@ -358,7 +365,9 @@ fn with_noise_the_true_urdf_is_as_near_as_noise_explains_and_cad_is_not() {
             let log = sessions.log(name);
             let [exact, cad] = [Urdf::True, Urdf::Cad].map(|urdf| own(name, urdf, &log, &|_| true));
             for (joint, score) in &exact {
-                let Score { error, size, stated } = score;
+                let Score {
+                    error, size, stated, ..
+                } = score;
                 if sessions.distal.contains(&joint.as_str()) {
                     println!(
                         "{name} {joint}: {error:.4} Nm of {size:.3}, CAD {:.4}",
@@ -487,11 +496,16 @@ fn learning(sessions: &Sessions) -> Setup {
 fn nearer(sessions: &Sessions, name: &str, log: &str, counts: impl Fn(f64) -> bool + Copy) -> (Vec<f64>, f64) {
     let learnt = scores(sessions, name, log, learning(sessions), counts);
     let cad = scores(sessions, name, log, sessions.setup(Urdf::Cad, Some(name)), counts);
+    let exact = scores(sessions, name, log, sessions.setup(Urdf::True, Some(name)), counts);
     let ratio = |joint: &&str| {
-        let Score { error, stated, .. } = &learnt[*joint];
+        let Score {
+            error, stated, covered, ..
+        } = &learnt[*joint];
         println!(
-            "{name} {joint}: {error:.4} Nm, stated {stated:.4}, CAD {:.4}",
-            cad[*joint].error
+            "{name} {joint}: {error:.4} Nm, stated {stated:.4} (95 % hold {:.0} %), CAD {:.4}, exact parameters {:.4}",
+            100.0 * covered,
+            cad[*joint].error,
+            exact[*joint].error
         );
         cad[*joint].error / error
     };
@@ -645,7 +659,7 @@ fn a_load_that_is_picked_up_is_noticed_and_learnt() {
     let log = sessions.log("payload");
     let (estimates, said, counts, changes) = told(learning(&sessions), &log, 0);
     assert_eq!(changes, [Change::Load], "{said:?}");
-    assert_eq!(counts.changes, 1);
+    assert_eq!((counts.changes, counts.load_changes), (1, 1));
     let from = sessions.facts["sessions"]["payload"]["payload"]["from"]
         .as_f64()
         .unwrap();
@@ -732,11 +746,11 @@ fn a_state_is_resumed_and_one_that_does_not_fit_is_refused() {
         at += Nanos::from_millis(20);
         assert!(at < Nanos::from_seconds(40.0));
         let trigger = taught.setup().trigger;
-        let reading = proprio_topics::Reading::Wrench(proprio_topics::Wrench {
+        let reading = Reading::Wrench(proprio_topics::Wrench {
             force: [0.0; 3],
             torque: [0.0; 3],
         });
-        taught.push(trigger, at, &reading, proprio_topics::Quality::GOOD);
+        taught.push(trigger, at, &reading, Quality::GOOD);
         while taught.poll().is_some() {}
     };
     let text = job.state();
@@ -808,8 +822,23 @@ fn a_state_is_resumed_and_one_that_does_not_fit_is_refused() {
     assert!(aside.ends_with("state.bad-1") && aside.exists() && !file.exists());
 }
 
-/// What a pipeline identifies of a log, each time that it says so, and the instant of the estimate after which it does.
-fn inertias(setup: Setup, log: &str) -> Vec<(Nanos, InertiaEstimate)> {
+/// What a pipeline identifies of a log, each time that it says so, and the instant of the estimate after which it does; and its counts at the end. `alter` may change each
+/// channel's sample, or keep it back.
+fn inertias(
+    setup: Setup,
+    log: &str,
+    alter: impl Fn(f64, &str, &mut Reading, &mut Quality) -> bool,
+) -> (Vec<(Nanos, InertiaEstimate)>, Counts) {
+    inertias_by(setup, log, alter, &mut None)
+}
+
+/// The same; the pipeline is left in `end`.
+fn inertias_by(
+    setup: Setup,
+    log: &str,
+    alter: impl Fn(f64, &str, &mut Reading, &mut Quality) -> bool,
+    end: &mut Option<Pipeline>,
+) -> (Vec<(Nanos, InertiaEstimate)>, Counts) {
     let mut pipeline = Pipeline::new(setup);
     let mut reader = Reader::new(log.as_bytes()).unwrap();
     let series: Vec<_> = reader.series().iter().map(|s| (s.what, s.name.clone())).collect();
@@ -820,7 +849,10 @@ fn inertias(setup: Setup, log: &str) -> Vec<(Nanos, InertiaEstimate)> {
             if let (What::Channel(kind), Value::Reading(reading, quality)) = (what, value)
                 && let Some(channel) = pipeline.setup().channel(*kind, name)
             {
-                pipeline.push(channel, row.t.unwrap(), reading, *quality);
+                let (t, mut reading, mut quality) = (row.t.unwrap(), *reading, *quality);
+                if alter(t.seconds(), name, &mut reading, &mut quality) {
+                    pipeline.push(channel, t, &reading, quality);
+                }
             }
         }
         while let Some(estimate) = pipeline.poll() {
@@ -832,14 +864,135 @@ fn inertias(setup: Setup, log: &str) -> Vec<(Nanos, InertiaEstimate)> {
             }
         }
     }
-    told
+    let counts = pipeline.identification().unwrap().state(0).unwrap().1;
+    *end = Some(pipeline);
+    (told, counts)
+}
+
+#[test]
+fn an_offset_that_wanders_is_followed_and_known_to_wander() {
+    let sessions = arm();
+    let log = sessions.log("train");
+    let noise = NOISE;
+    // One channel wanders at one to three times its noise in a second; the others as the session has it, hardly.
+    for (axis, rate) in [(0, 1.0), (2, 3.0)] {
+        let steps: Vec<f64> = {
+            let mut random = fastrand::Rng::with_seed(axis as u64 + 1);
+            // A sum of twelve uniform numbers is nearly normal.
+            let mut normal = || (0..12).map(|_| random.f64()).sum::<f64>() - 6.0;
+            let mut at = 0.0;
+            (0..3000)
+                .map(|_| {
+                    at += rate * noise[axis] * 0.1 * normal();
+                    at
+                })
+                .collect()
+        };
+        let wander = |t: f64| {
+            let (k, part) = ((t * 100.0) as usize, (t * 100.0).fract());
+            steps[k] + part * (steps[k + 1] - steps[k])
+        };
+        let alter = |t: f64, name: &str, reading: &mut Reading, _: &mut Quality| {
+            if let (Reading::Wrench(wrench), "l_arm_ft_sensor") = (reading, name) {
+                wrench.force[axis] += wander(t);
+            }
+            true
+        };
+        let mut end = None;
+        let (told, counts) = inertias_by(learning(&sessions), &log, alter, &mut end);
+        let pipeline = end.expect("the pipeline");
+        let drift = pipeline.identification().unwrap().solution().components[0].drift[0];
+        // [torque; force]
+        let found: Vec<f64> = (0..6).map(|i| drift[(i + 3) % 6] / noise[i]).collect();
+        println!("{found:.3?} {counts:?}");
+        assert!(found[axis] > 0.3 * rate && found[axis] < 3.0 * rate, "{found:?}");
+        assert!((0..6).all(|i| i == axis || found[i] < 0.3), "{found:?}");
+        assert_eq!(counts.changes, 0);
+        // And it is where it is said to be.
+        let (_, last) = told.last().unwrap();
+        let offset = last.offsets()[0];
+        let there = &sessions.facts["sessions"]["train"]["offsets"]["l_arm_ft_sensor"]["end"];
+        let expected = numbers(there)[axis] + wander(last.header.acquired.seconds());
+        let apart = (offset.force[axis] - expected).abs();
+        println!(
+            "{} +- {}, not {expected}",
+            offset.force[axis], offset.standard_deviation[axis]
+        );
+        assert!(
+            apart < 4.0 * offset.standard_deviation[axis].max(noise[axis] * rate * 0.5),
+            "{apart}"
+        );
+    }
+}
+
+#[test]
+fn why_instants_are_left_out_is_counted() {
+    let sessions = arm();
+    let log = sessions.log("train");
+    let run =
+        |alter: &dyn Fn(f64, &str, &mut Reading, &mut Quality) -> bool| inertias(learning(&sessions), &log, alter).1;
+    let untouched = run(&|_, _, _, _| true);
+    let lost = |c: &Counts| [c.contact, c.outlier, c.suspected, c.saturated, c.device_fault];
+    println!("{untouched:?}");
+    assert_eq!(lost(&untouched), [0; 5]);
+    // The last instants have no samples behind them.
+    assert!(untouched.stale < 20, "{untouched:?}");
+    // Five of 28 seconds the robot stands; what is left are moments between swings.
+    let instants = untouched.learnt as f64 / 28.0;
+    assert!(untouched.still as f64 > 4.0 * instants && (untouched.still as f64) < 12.0 * instants);
+    let during = |t: f64, from: f64, to: f64| (from..to).contains(&t);
+    let sensor = "l_arm_ft_sensor";
+    let counts = run(&|t, name, reading, quality| {
+        if name == sensor && during(t, 10.0, 10.5) {
+            *quality |= Quality::SATURATED;
+        }
+        if name == sensor && during(t, 12.0, 12.5) {
+            *quality |= Quality::DEVICE_FAULT;
+        }
+        // A cable that jerks, and is as it was; a push that lasts.
+        if let (Reading::Wrench(wrench), true) = (reading, name == sensor) {
+            if during(t, 16.0, 16.03) {
+                wrench.force[0] += 20.0;
+            }
+            if during(t, 20.0, 21.0) {
+                wrench.force[1] += 20.0;
+            }
+        }
+        !(name == "l_elbow" && during(t, 14.0, 14.6))
+    });
+    println!("{counts:?}");
+    let seconds = |count: u64| count as f64 / instants;
+    assert_eq!(counts.contact, 0);
+    assert!(
+        (0.4..1.1).contains(&seconds(counts.saturated)),
+        "{}",
+        seconds(counts.saturated)
+    );
+    assert!(
+        (0.4..1.1).contains(&seconds(counts.device_fault)),
+        "{}",
+        seconds(counts.device_fault)
+    );
+    let stale = seconds(counts.stale - untouched.stale);
+    assert!((0.3..1.2).contains(&stale), "{stale}");
+    assert!(
+        (0.05..1.5).contains(&seconds(counts.outlier)),
+        "{}",
+        seconds(counts.outlier)
+    );
+    assert!(
+        (0.7..2.0).contains(&seconds(counts.suspected)),
+        "{}",
+        seconds(counts.suspected)
+    );
+    assert_eq!((counts.changes, counts.offset_changes, counts.load_changes), (0, 0, 0));
 }
 
 #[test]
 fn what_is_identified_is_told_once_a_second_with_what_it_rests_on() {
     let sessions = arm();
     let (begin, end) = sessions.moving("train");
-    let told = inertias(learning(&sessions), &sessions.log("train"));
+    let (told, _) = inertias(learning(&sessions), &sessions.log("train"), |_, _, _, _| true);
     assert!(told.len() as f64 > end - 3.0, "{} in {end} s", told.len());
     let setup = learning(&sessions);
     let truth = sessions.setup(Urdf::True, None);
@@ -853,7 +1006,9 @@ fn what_is_identified_is_told_once_a_second_with_what_it_rests_on() {
         for link in inertia.links() {
             assert_eq!((link.accepted, link.group), (1, 0));
             assert!(link.standard_deviation.iter().all(|x| x.is_finite() && *x > 0.0));
-            assert!(link.motion >= motion && link.motion <= (data.seconds() - begin).max(0.0) + 0.1);
+            // To find itself at a posture, at first, is a motion of a block.
+            let most = (data.seconds() - begin).max(0.0) + 0.5;
+            assert!(link.motion >= motion && link.motion <= most, "{} {most}", link.motion);
             let number = (0..setup.model.link_count()).find(|n| setup.model.link_name(*n) == link.name.as_str());
             let true_body = truth.model.inertias()[number.expect("a link of the model")];
             let apart = true_body.parameters()[0] - link.parameters[0];

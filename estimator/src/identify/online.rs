@@ -23,15 +23,20 @@
 //! tested against chi-square. What fails is a contact that nobody declared, an outlier, a jump of an offset, or another load: rows are kept aside, the component is
 //! [`Paused::Suspected`] and says so. If it lasts three seconds while the sensors tilt, the rows put aside are asked what they are. If the same information with offsets that
 //! start afresh explains them, the offsets do; if with new parameters of the outermost links it does, a load has changed; else it stays a contact.
-//! Offsets wander between blocks (random walks at a bounded rate), and stand still while a contact is declared or suspected.
+//!
+//! # Offsets
+//! Offsets wander between blocks (random walks), and stand still while a contact is declared or suspected. How fast each wanders is found by the likelihood of what its channel
+//! reads in the mean from one second to the next ([`wander`]), between bounds, so that a slow push is not taken for one.
 
 pub mod state;
+mod wander;
 
 use std::sync::Arc;
 
 use nalgebra::DMatrix;
 use proprio_topics::{Nanos, Reason};
 
+use self::wander::Walk;
 use super::dot;
 use super::information::{Information, InformationError, Panel};
 use super::prior::{GREATEST_TAU, Posterior, Prior, PriorError};
@@ -60,8 +65,6 @@ const TILTED: f64 = 0.94;
 const EXPLAINED: f64 = 2.0;
 /// Standard deviation of an offset before anything is known of it [Nm], [N]: no sensor is that far off.
 const OFFSET: [f64; 2] = [100.0, 1000.0];
-/// How far an offset wanders in a second, in standard deviations of its channel's noise.
-const WANDER: f64 = 0.1;
 /// How much the noise is inflated before it is known, and for how many instants' worth that counts.
 const INFLATION: f64 = 30.0;
 const INFLATION_WORTH: f64 = 300.0;
@@ -171,14 +174,28 @@ impl std::fmt::Display for Change {
 pub struct Counts {
     /// Instants whose rows went in.
     pub learnt: u64,
+    /// Of these, those of blocks in which nothing moved: they teach a weight, once, and offsets.
+    pub still: u64,
     /// Instants left out under a declared contact.
     pub contact: u64,
-    /// Instants left out because they did not fit.
+    /// Instants left out because they did not fit, for no longer than a block: outliers, and how everything begins that does not fit.
+    pub outlier: u64,
+    /// Instants left out because they did not fit either: contacts that nobody declared, and changes until they are found.
     pub suspected: u64,
-    /// Instants left out because of a channel.
-    pub fault: u64,
-    /// Changes found.
+    /// Instants left out because a channel was silent.
+    pub stale: u64,
+    /// Instants left out because a sensor was saturated.
+    pub saturated: u64,
+    /// Instants left out because a device reported a fault.
+    pub device_fault: u64,
+    /// Instants left out because a channel was not seen yet, told too little, or nothing was known of the base.
+    pub unseen: u64,
+    /// Changes found: of all kinds, ...
     pub changes: u64,
+    /// ... of offsets, ...
+    pub offset_changes: u64,
+    /// ... and of loads.
+    pub load_changes: u64,
     /// Solutions that came after their stamp.
     pub late: u64,
     /// Solutions that could not be found.
@@ -233,8 +250,9 @@ struct Rows {
     values: Vec<f64>,
     /// Of each row, the instant's number in the grid.
     slots: Vec<i64>,
-    /// How many of the instants something moved at.
-    moving: u64,
+    /// How long they were gathered [s], and whether something moved meanwhile.
+    span: f64,
+    is_moving: bool,
 }
 
 impl Rows {
@@ -244,7 +262,8 @@ impl Rows {
             room,
             values: Vec::with_capacity(width * room),
             slots: Vec::with_capacity(room),
-            moving: 0,
+            span: 0.0,
+            is_moving: false,
         }
     }
 
@@ -255,7 +274,7 @@ impl Rows {
     fn clear(&mut self) {
         self.values.clear();
         self.slots.clear();
-        self.moving = 0;
+        (self.span, self.is_moving) = (0.0, false);
     }
 
     /// Adds a row if there is room.
@@ -301,6 +320,8 @@ struct Component {
     information: Information,
     panel: Panel,
     variances: Vec<f64>,
+    /// The configured ones.
+    least: Vec<f64>,
     /// Standard deviations of a second of drift.
     wander: Vec<f64>,
     /// Columns of the offsets.
@@ -315,6 +336,8 @@ struct Component {
     drifted: Nanos,
     active: ContactSet,
     is_suspected: bool,
+    /// Whether a second block did not fit, either.
+    lasts: bool,
     clean: u32,
     /// When the present suspicion began, and how the proper acceleration pointed then; the least cosine to it since.
     since: Nanos,
@@ -325,8 +348,8 @@ struct Component {
     paused: Paused,
     last_change: Option<Change>,
     counts: Counts,
-    /// Instants and rows that were learnt from, the former as far as something moved.
-    moving: u64,
+    /// What was learnt from: seconds in motion, rows.
+    motion: f64,
     rows: u64,
     row: Vec<f64>,
     scratch: Scratch,
@@ -419,7 +442,7 @@ impl Online {
             prior,
             data: Nanos::MIN,
             parts: (components.iter().zip(&solution.components))
-                .map(|(component, known)| Part::new(component, known.clone()))
+                .map(|(component, known)| Part::new(component, known.clone(), period))
                 .collect(),
             solution: solution.clone(),
         });
@@ -535,8 +558,7 @@ impl Online {
     pub fn inflation(&self, component: usize) -> Vec<f64> {
         let of = self.components.get(component);
         of.map_or(Vec::new(), |of| {
-            let least = of.wander.iter().map(|wander| (wander / WANDER).powi(2));
-            of.variances.iter().zip(least).map(|(v, least)| v / least).collect()
+            of.variances.iter().zip(&of.least).map(|(v, least)| v / least).collect()
         })
     }
 
@@ -592,7 +614,7 @@ impl Online {
             part.lasting = (self.newest - component.since).seconds();
             part.cosine = component.cosine;
             part.variances.copy_from_slice(&component.variances);
-            part.motion = component.moving as f64 * self.period.seconds();
+            part.motion = component.motion;
             part.rows = component.rows;
         }
         Some(job)
@@ -620,6 +642,7 @@ impl Online {
         std::mem::swap(&mut self.solution, &mut job.solution);
         for (part, component) in job.parts.iter_mut().zip(&mut self.components) {
             component.variances.copy_from_slice(&part.variances);
+            component.wander.copy_from_slice(&part.wander);
             component.judges = !part.has_failed;
             component.counts.failed += u64::from(part.has_failed);
             if let Some((change, information)) = &mut part.change {
@@ -630,6 +653,11 @@ impl Online {
                 component.is_suspected = false;
                 component.paused = Paused::No;
                 component.counts.changes += 1;
+                match change {
+                    Change::Offset => component.counts.offset_changes += 1,
+                    Change::Load => component.counts.load_changes += 1,
+                    Change::Unknown => {}
+                }
                 component.pending.clear();
                 component.gathered.clear();
             }
@@ -722,7 +750,8 @@ impl Component {
             information: Information::new(unknowns),
             panel: Panel::new(unknowns, most * per_block),
             variances: noise.iter().map(|sigma| INFLATION * sigma * sigma).collect(),
-            wander: noise.iter().map(|sigma| WANDER * sigma).collect(),
+            least: noise.iter().map(|sigma| sigma * sigma).collect(),
+            wander: noise.iter().map(|sigma| wander::GUESS * sigma).collect(),
             offsets: (0..session).collect(),
             deviations: vec![0.0; session],
             gathered: Rows::new(width, most * per_block),
@@ -733,6 +762,7 @@ impl Component {
             drifted: Nanos::MIN,
             active: ContactSet::default(),
             is_suspected: false,
+            lasts: false,
             clean: 0,
             since: Nanos::MIN,
             direction: Vec3::zeros(),
@@ -741,7 +771,7 @@ impl Component {
             paused: Paused::No,
             last_change: None,
             counts: Counts::default(),
-            moving: 0,
+            motion: 0.0,
             rows: 0,
             row: vec![0.0; width],
             scratch: Scratch {
@@ -797,7 +827,13 @@ impl Component {
         let fault = std::iter::once(&seen.base).chain(of_sensors).chain(of_joints);
         if let Some(reason) = fault.copied().find(|reason| *reason != Reason::None) {
             self.paused = Paused::Fault(reason);
-            self.counts.fault += 1;
+            let counts = &mut self.counts;
+            *match reason {
+                Reason::Stale => &mut counts.stale,
+                Reason::Saturated => &mut counts.saturated,
+                Reason::DeviceFault => &mut counts.device_fault,
+                _ => &mut counts.unseen,
+            } += 1;
             return;
         }
         let rows = self.rows_of(stacked);
@@ -823,8 +859,7 @@ impl Component {
         for row in self.scratch.rows.chunks_exact(self.row.len()) {
             self.gathered.push(slot, row);
         }
-        let is_moving = seen.is_base_moved || !seen.moved.intersection(&self.dofs).is_empty();
-        self.gathered.moving += u64::from(is_moving);
+        self.gathered.is_moving |= seen.is_base_moved || !seen.moved.intersection(&self.dofs).is_empty();
     }
 
     /// Makes the whitened rows of the regressor's last update, in the scratch; how many.
@@ -869,13 +904,14 @@ impl Component {
         let elapsed = (t - self.drifted).seconds().clamp(0.0, 60.0);
         self.drifted = t;
         if self.gathered.len() > 0 && self.judges && self.is_odd(known) {
+            self.lasts = self.is_suspected;
             if !self.is_suspected {
                 self.is_suspected = true;
                 (self.since, self.cosine, self.direction) = (self.block_from, 1.0, Vec3::zeros());
-                self.counts.suspected += self.pending.instants();
             }
             self.clean = 0;
-            self.counts.suspected += self.gathered.instants();
+            let instants = self.pending.instants() + self.gathered.instants();
+            self.leave_out(instants);
             self.aside.take_from(&self.gathered);
             self.pending.clear();
             self.gathered.clear();
@@ -884,7 +920,8 @@ impl Component {
         if self.gathered.len() > 0 && self.is_suspected {
             self.clean += 1;
             if self.clean < CLEAN {
-                self.counts.suspected += self.gathered.instants();
+                let instants = self.gathered.instants();
+                self.leave_out(instants);
                 self.gathered.clear();
                 return;
             }
@@ -898,8 +935,18 @@ impl Component {
         }
         if self.gathered.len() > 0 {
             self.absorb();
+            self.gathered.span = (t - self.block_from).seconds().min(2.0 * BLOCK.seconds());
             std::mem::swap(&mut self.pending, &mut self.gathered);
         }
+    }
+
+    /// Counts instants that do not fit, or stand too near to such.
+    fn leave_out(&mut self, instants: u64) {
+        *if self.lasts {
+            &mut self.counts.suspected
+        } else {
+            &mut self.counts.outlier
+        } += instants;
     }
 
     /// Takes the pending block in.
@@ -910,8 +957,13 @@ impl Component {
             let _ = self.panel.push_row(a, y[0]);
         }
         let _ = self.information.absorb(&mut self.panel);
-        self.counts.learnt += self.pending.instants();
-        self.moving += self.pending.moving;
+        let instants = self.pending.instants();
+        self.counts.learnt += instants;
+        if self.pending.is_moving {
+            self.motion += self.pending.span;
+        } else {
+            self.counts.still += instants;
+        }
         self.rows += self.pending.len() as u64;
         self.learnt.take_from(&self.pending);
         self.pending.clear();
@@ -985,6 +1037,9 @@ struct Part {
     least: Vec<f64>,
     variances: Vec<f64>,
     noise: Vec<Autocorrelation>,
+    walks: Vec<Walk>,
+    wander: Vec<f64>,
+    period: f64,
     tau: f64,
     has_failed: bool,
     motion: f64,
@@ -1040,7 +1095,7 @@ impl Autocorrelation {
 }
 
 impl Part {
-    fn new(component: &Component, good: ComponentSolution) -> Self {
+    fn new(component: &Component, good: ComponentSolution, period: Nanos) -> Self {
         let none = Autocorrelation {
             sums: [0.0; LAGS],
             pairs: [0.0; LAGS],
@@ -1056,9 +1111,12 @@ impl Part {
             is_suspected: false,
             lasting: 0.0,
             cosine: 1.0,
-            least: component.variances.iter().map(|v| v / INFLATION).collect(),
+            least: component.least.clone(),
             variances: component.variances.clone(),
             noise: vec![none; component.variances.len()],
+            walks: component.least.iter().map(|v| Walk::new(v.sqrt())).collect(),
+            wander: component.wander.clone(),
+            period: period.seconds(),
             tau: GREATEST_TAU,
             has_failed: false,
             motion: 0.0,
@@ -1112,6 +1170,9 @@ impl Part {
         solution.effective = fit.effective;
         solution.bodies.clone_from(&fit.bodies);
         solution.root = factor.transpose();
+        for (to, rates) in solution.drift.iter_mut().zip(self.wander.chunks_exact(6)) {
+            to.copy_from_slice(rates);
+        }
         let to = |column: usize| {
             if column < session {
                 parameters + column
@@ -1142,8 +1203,15 @@ impl Part {
             return;
         }
         let mut series = vec![f64::NAN; instants];
-        for channel in 0..self.variances.len() {
+        let session = self.variances.len();
+        let mut sensitivity = vec![0.0; unknowns - session];
+        // An offset that has jumped has not wandered there.
+        if self.change.is_some() {
+            self.walks.iter_mut().for_each(Walk::interrupt);
+        }
+        for channel in 0..session {
             series.fill(f64::NAN);
+            sensitivity.fill(0.0);
             for (row, slot) in self.learnt.iter().zip(&self.learnt.slots) {
                 if row[channel] == 0.0 {
                     continue;
@@ -1152,8 +1220,28 @@ impl Part {
                     continue;
                 };
                 let residual = row[unknowns] - dot(&row[..unknowns], &solution.estimate);
-                let share = self.variances[channel] * row[channel] * residual;
+                let weight = self.variances[channel] * row[channel];
+                let share = weight * residual;
                 *place = if place.is_nan() { share } else { *place + share };
+                add_multiple(&mut sensitivity, weight, &row[session..unknowns]);
+            }
+            // What the channel reads in the mean, less what the bodies explain; and how uncertain that is, by noise and by the bodies.
+            let seen: Vec<f64> = series.iter().copied().filter(|x| x.is_finite()).collect();
+            if !seen.is_empty() {
+                let count = seen.len() as f64;
+                let apparent = solution.estimate[channel] + seen.iter().sum::<f64>() / count;
+                let of_bodies: f64 = (solution.root.row_iter())
+                    .map(|row| {
+                        row.iter()
+                            .zip(&sensitivity)
+                            .map(|(u, g)| u * g / count)
+                            .sum::<f64>()
+                            .powi(2)
+                    })
+                    .sum();
+                let t = (first + last) as f64 / 2.0 * self.period;
+                self.walks[channel].take(t, apparent, self.variances[channel] / count + of_bodies);
+                self.wander[channel] = self.walks[channel].rate();
             }
             self.noise[channel].take(&series);
         }

@@ -1,5 +1,7 @@
 //! How gateway and estimator are doing: the payloads of `<robot>/health/gateway` and `<robot>/health/estimator`.
 
+use core::fmt;
+
 use crate::{Header, MAX_BUSES, MAX_CHANNELS, Name, Nanos};
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
@@ -193,10 +195,86 @@ impl GatewayHealth {
     }
 }
 
+/// What on-line identification has used and left out, and why, since the estimator started.
+///
+/// Counted are the instants of each group of links and sensors that is identified by itself: of two groups, one may pause while the other learns. There are at most
+/// `identification.rate_hz` instants a second.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ZeroCopySend)]
+pub struct IdentificationHealth {
+    /// How many groups there are; 0 if nothing is identified.
+    pub groups: u32,
+    /// How many of them learn nothing at present.
+    pub paused: u32,
+    /// Learnt from.
+    pub learnt: u64,
+    /// Of these, instants at which nothing moved, which teach little.
+    pub still: u64,
+    /// Left out: a contact was declared.
+    pub contact: u64,
+    /// Left out: readings did not fit what is known, but for no longer than an instant or a few.
+    pub outlier: u64,
+    /// Left out: readings did not fit what is known for longer: a contact that nobody declared, or a change.
+    pub suspected: u64,
+    /// Left out: a channel was silent.
+    pub stale: u64,
+    /// Left out: a sensor was saturated.
+    pub saturated: u64,
+    /// Left out: a device reported a fault.
+    pub device_fault: u64,
+    /// Left out: a channel was not seen yet, had too few samples, or nothing was known of how the base moves.
+    pub unseen: u64,
+    /// F/T offsets that have jumped and are learnt anew.
+    pub offset_changes: u64,
+    /// Loads taken up or put down.
+    pub load_changes: u64,
+    /// Changes that could not be explained, after which all is learnt anew.
+    pub unknown_changes: u64,
+    /// Solutions that came later than they should have.
+    pub late: u64,
+    /// Solutions that could not be found.
+    pub failed: u64,
+}
+
+impl IdentificationHealth {
+    /// Every count, with the word for it in tables and logs.
+    #[must_use]
+    pub const fn counts(&self) -> [(&'static str, u64); 14] {
+        [
+            ("learnt", self.learnt),
+            ("still", self.still),
+            ("contact", self.contact),
+            ("outlier", self.outlier),
+            ("suspected", self.suspected),
+            ("stale", self.stale),
+            ("saturated", self.saturated),
+            ("device_fault", self.device_fault),
+            ("unseen", self.unseen),
+            ("offset_changes", self.offset_changes),
+            ("load_changes", self.load_changes),
+            ("unknown_changes", self.unknown_changes),
+            ("late", self.late),
+            ("failed", self.failed),
+        ]
+    }
+}
+
+impl fmt::Display for IdentificationHealth {
+    /// The counts that are not zero.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut gap = "";
+        for (word, count) in self.counts().into_iter().filter(|(_, count)| *count > 0) {
+            write!(f, "{gap}{word} {count}")?;
+            gap = ", ";
+        }
+        Ok(())
+    }
+}
+
 /// How the estimator is doing, ten times a second.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ZeroCopySend)]
-#[type_name("proprio/EstimatorHealth/1")]
+#[type_name("proprio/EstimatorHealth/2")]
 pub struct EstimatorHealth {
     /// When.
     pub header: Header,
@@ -226,8 +304,11 @@ pub struct EstimatorHealth {
     pub last_turn: Nanos,
     /// The instant of the last estimate \[ns\]; 0 before the first.
     pub last_estimate: Nanos,
+    /// On-line identification.
+    pub identification: IdentificationHealth,
 }
 
 const _: () = assert!(size_of::<BusHealth>() == 64 + 13 * 8 && size_of::<DeviceHealth>() == 64 + 13 * 8 + 16);
 const _: () = assert!(size_of::<GatewayHealth>() == 64 + 168 * MAX_BUSES + 184 * MAX_CHANNELS);
-const _: () = assert!(size_of::<EstimatorHealth>() == 48 + 13 * 8);
+const _: () =
+    assert!(size_of::<IdentificationHealth>() == 15 * 8 && size_of::<EstimatorHealth>() == 48 + 13 * 8 + 15 * 8);

@@ -39,7 +39,7 @@ pub mod time;
 
 pub use description::{Description, Entry, Name, Publisher, Role};
 pub use estimate::{ContactDeclaration, ContactEstimate, ContactWrench, JointTorque, NO_CAUSE, Reason, TorqueEstimate};
-pub use health::{BusHealth, Counter, DeviceHealth, EstimatorHealth, GatewayHealth, LinkState};
+pub use health::{BusHealth, Counter, DeviceHealth, EstimatorHealth, GatewayHealth, IdentificationHealth, LinkState};
 pub use inertia::{InertiaEstimate, LinkInertia, SensorOffset};
 pub use reading::{Actuator, Gauges, Imu, JointState, Kind, Reading, Temperature, Wrench};
 pub use sample::{Header, Quality, Sample, Saturation, StampKind};
