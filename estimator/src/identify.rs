@@ -44,7 +44,7 @@ pub use export::parameters;
 pub use outcome::{
     BaseParameterOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding, FrictionOutcome, JointOutcome,
     LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, SensorOutcome, Severity, Spectrum, Three,
-    TimeOffsetOutcome, TwoRouteOutcome, Verdict, WeakDirection,
+    TwoRouteOutcome, Verdict, WeakDirection,
 };
 
 /// The axes of a wrench as samples have them, in words.

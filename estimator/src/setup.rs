@@ -350,9 +350,11 @@ impl Setup {
                     *place = offset.reading;
                 }
                 let ([fx, fy, fz], [tx, ty, tz]) = (offset.drift.force.into(), offset.drift.torque.into());
+                let log = parameters.provenance().logs.iter().find(|log| log.end == offset.known);
+                let first = log.map_or(offset.known, |log| log.start);
                 let _ = self
                     .covariance
-                    .set_drift(sensor, [tx, ty, tz, fx, fy, fz], offset.known);
+                    .set_drift_of_log(sensor, [tx, ty, tz, fx, fy, fz], (first, offset.known));
                 measured.push(sensor);
             }
             let identified: Vec<usize> = parameters.identified().collect();

@@ -215,10 +215,17 @@ impl Noise {
     }
 }
 
+const AXES: [&str; 6] = ["fx", "fy", "fz", "tx", "ty", "tz"];
+
 /// An arm: two joints, an F/T sensor, four joints with five links beyond it.
 const ARM_JOINTS: [&str; 6] = ["j1", "j2", "j3", "j4", "j5", "j6"];
 
 fn arm() -> Setup {
+    arm_with(&["ft"])
+}
+
+/// The arm with these of its sensors, `ft` before the third joint and `wrist` before the fifth.
+fn arm_with(sensors: &[&str]) -> Setup {
     let axes = ["0 0 1", "1 0 0", "0 1 0", "1 0 0", "0 1 0", "0 0 1"];
     let mut urdf = String::from("<robot name=\"arm\"><link name=\"base\"/>");
     let link = |name: &str, mass: f64, long: f64| {
@@ -246,15 +253,24 @@ fn arm() -> Setup {
             urdf += &joint("ft", "fixed", &parent, "beyond", 0.05, "");
             parent = "beyond".into();
         }
+        if number == 4 && sensors.contains(&"wrist") {
+            urdf += &link("cuff", 0.3, 0.06);
+            urdf += &joint("wrist", "fixed", &parent, "cuff", 0.03, "");
+            parent = "cuff".into();
+        }
         let child = format!("l{}", number + 1);
         urdf += &link(&child, masses[number], 0.16);
         urdf += &joint(name, "revolute", &parent, &child, 0.14, axes[number]);
         parent = child;
     }
     urdf += "</robot>";
-    let config = "schema = 1\nrobot = \"arm\"\nmodel = \"arm.urdf\"\n[base]\nkind = \"fixed\"\nlink = \"base\"\n[[force_torque]]\nsensor = \"ft\"\njoint = \"ft\"\n";
-    let config = Config::parse(config).expect("a configuration");
-    let model = Model::from_urdf(&urdf, &["ft"]).expect("a model");
+    let mut config =
+        String::from("schema = 1\nrobot = \"arm\"\nmodel = \"arm.urdf\"\n[base]\nkind = \"fixed\"\nlink = \"base\"\n");
+    for sensor in sensors {
+        config += &format!("[[force_torque]]\nsensor = \"{sensor}\"\njoint = \"{sensor}\"\n");
+    }
+    let config = Config::parse(&config).expect("a configuration");
+    let model = Model::from_urdf(&urdf, sensors).expect("a model");
     Setup::with_model(&config, model).expect("it fits")
 }
 
@@ -301,17 +317,26 @@ fn simulate(setup: &Setup, truth: &Model, seconds: f64, memory: f64, seed: u64) 
     let phase: Vec<f64> = (0..18).map(|_| noise.uniform()).collect();
     let mut kinematics = Kinematics::new(truth, setup.base_link).expect("a base");
     let mut dynamics = InverseDynamics::new(truth);
-    let cut = &setup.structure.sensors()[0];
-    let offset: Vec<f64> = (0..6)
-        .map(|axis| noise.normal() * if axis < 3 { 20.0 } else { 1.0 })
+    let cuts = setup.structure.sensors();
+    let names: Vec<&str> = cuts.iter().map(|cut| truth.joint_name(cut.joint())).collect();
+    let offset: Vec<f64> = (0..6 * cuts.len())
+        .map(|axis| noise.normal() * if axis % 6 < 3 { 20.0 } else { 1.0 })
         .collect();
-    let deviations: Vec<f64> = cut.noise().force.into_iter().chain(cut.noise().torque).collect();
-    let (keep, mut error) = ((-1.0 / memory).exp(), [0.0; 6]);
+    let deviations: Vec<f64> = cuts
+        .iter()
+        .flat_map(|cut| cut.noise().force.into_iter().chain(cut.noise().torque))
+        .collect();
+    let (keep, mut error) = ((-1.0 / memory).exp(), vec![0.0; 6 * cuts.len()]);
     let mut text = String::from("t");
     for joint in ARM_JOINTS {
         text += &format!(",joint/{joint}/position,joint/{joint}/velocity,joint/{joint}/acceleration");
     }
-    text += ",wrench/ft/fx,wrench/ft/fy,wrench/ft/fz,wrench/ft/tx,wrench/ft/ty,wrench/ft/tz\n";
+    for name in names {
+        for axis in AXES {
+            text += &format!(",wrench/{name}/{axis}");
+        }
+    }
+    text.push('\n');
     for i in 0..(100.0 * seconds) as usize {
         let t = i as f64 * 0.01;
         let (q, dq, ddq) = state(&phase, t);
@@ -323,18 +348,61 @@ fn simulate(setup: &Setup, truth: &Model, seconds: f64, memory: f64, seed: u64) 
         let base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.80665));
         kinematics.update(truth, joints, &base).expect("a state");
         dynamics.update(truth, &kinematics, &[]).expect("a state");
-        let reading = cut
-            .reading(&dynamics.transmitted(&kinematics, cut.joint()))
-            .force_first();
         text += &format!("{t}");
         for joint in 0..6 {
             text += &format!(",{},{},{}", q[joint], dq[joint], ddq[joint]);
         }
-        for axis in 0..6 {
+        let readings = cuts.iter().flat_map(|cut| {
+            cut.reading(&dynamics.transmitted(&kinematics, cut.joint()))
+                .force_first()
+        });
+        for (axis, reading) in readings.enumerate() {
             error[axis] = keep * error[axis] + (1.0 - keep * keep).sqrt() * noise.normal();
-            text += &format!(",{}", reading[axis] + offset[axis] + deviations[axis] * error[axis]);
+            text += &format!(",{}", reading + offset[axis] + deviations[axis] * error[axis]);
         }
         text += "\n";
+    }
+    text
+}
+
+/// A log of joint torques of the arm, with noise of this deviation, where `measured` of a joint and an instant says so.
+fn simulate_torques(
+    setup: &Setup,
+    truth: &Model,
+    seconds: f64,
+    deviation: f64,
+    seed: u64,
+    measured: impl Fn(usize, usize) -> bool,
+) -> String {
+    let mut noise = Noise(seed);
+    let phase: Vec<f64> = (0..18).map(|_| noise.uniform()).collect();
+    let mut kinematics = Kinematics::new(truth, setup.base_link).expect("a base");
+    let mut dynamics = InverseDynamics::new(truth);
+    let mut text = String::from("t");
+    for joint in ARM_JOINTS {
+        text +=
+            &format!(",joint/{joint}/position,joint/{joint}/velocity,joint/{joint}/acceleration,joint/{joint}/torque");
+    }
+    text.push('\n');
+    for i in 0..(100.0 * seconds) as usize {
+        let t = i as f64 * 0.01;
+        let (q, dq, ddq) = state(&phase, t);
+        let joints = JointState {
+            position: &q,
+            velocity: &dq,
+            acceleration: &ddq,
+        };
+        let base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.80665));
+        kinematics.update(truth, joints, &base).expect("a state");
+        dynamics.update(truth, &kinematics, &[]).expect("a state");
+        text += &format!("{t}");
+        for joint in 0..6 {
+            text += &format!(",{},{},{},", q[joint], dq[joint], ddq[joint]);
+            if measured(joint, i) {
+                text += &format!("{}", dynamics.torque()[joint] + deviation * noise.normal());
+            }
+        }
+        text.push('\n');
     }
     text
 }
@@ -438,7 +506,7 @@ fn change(log: &str, column: &str, by: impl Fn(f64) -> f64) -> String {
 fn sensor_the_wrong_way_round_is_named_and_nothing_identified() {
     let setup = arm();
     let mut log = simulate(&setup, &real(&setup, 3), 10.0, 0.01, 3);
-    for axis in ["fx", "fy", "fz", "tx", "ty", "tz"] {
+    for axis in AXES {
         log = change(&log, &format!("wrench/ft/{axis}"), |x| -x);
     }
     let outcome = run(&setup, &[("turned", Role::Train, &log)], &[]);
@@ -452,6 +520,146 @@ fn sensor_the_wrong_way_round_is_named_and_nothing_identified() {
         outcome.findings
     );
     assert!(outcome.links.iter().all(|link| link.identified == link.cad));
+}
+
+/// Between two sensors a turned one makes the balance wrong for both: the one that is turned is named, alone.
+#[test]
+fn of_two_sensors_the_turned_one_is_named() {
+    let setup = arm_with(&["ft", "wrist"]);
+    let log = simulate(&setup, &real(&setup, 3), 10.0, 0.01, 3);
+    for turned in [vec!["ft"], vec!["wrist"], vec!["ft", "wrist"]] {
+        let mut wrong = log.clone();
+        for sensor in &turned {
+            for axis in AXES {
+                wrong = change(&wrong, &format!("wrench/{sensor}/{axis}"), |x| -x);
+            }
+        }
+        let outcome = run(&setup, &[("turned", Role::Train, &wrong)], &[]);
+        assert!(matches!(outcome.verdict, Verdict::Nothing(_)), "{:?}", outcome.verdict);
+        let named: Vec<&str> = outcome
+            .findings
+            .iter()
+            .filter(|f| f.code == "wrong_sign")
+            .map(|f| f.subject.as_str())
+            .collect();
+        assert_eq!(named, turned);
+    }
+}
+
+/// Each of two sensors is compared with what the links between them and the other one say that it reads: with the reading itself, not with a part of the balance.
+#[test]
+fn readings_of_two_sensors_are_compared_as_they_are() {
+    let setup = arm_with(&["ft", "wrist"]);
+    let truth = real(&setup, 3);
+    let log = simulate(&setup, &truth, 12.0, 0.01, 3);
+    let outcome = run(&setup, &[("log", Role::Train, &log)], &[]);
+    assert_eq!(outcome.verdict, Verdict::Identified);
+    let table: Vec<Vec<f64>> = log
+        .lines()
+        .skip(1)
+        .map(|line| line.split(',').map(|cell| cell.parse().expect("a number")).collect())
+        .collect();
+    let header: Vec<&str> = log.lines().next().expect("a header").split(',').collect();
+    for (sensor, cut) in ["ft", "wrist"].iter().zip(setup.structure.sensors()) {
+        let own = &outcome.logs[0].sensors.iter().find(|s| s.name == *sensor).expect("it");
+        for (axis, word) in AXES.iter().enumerate() {
+            let place = header
+                .iter()
+                .position(|name| *name == format!("wrench/{sensor}/{word}"))
+                .expect("a column");
+            let curve = outcome.logs[0]
+                .curves
+                .iter()
+                .find(|curve| curve.name == format!("{sensor} {word}"))
+                .expect("a curve");
+            // What is measured is what was read, but for an offset: the difference hardly changes.
+            let first = table[0][0];
+            let mut apart = Vec::new();
+            for (t, measured) in curve.t.iter().zip(&curve.measured).filter(|(_, m)| m.is_finite()) {
+                let row = &table[((t + first) / 0.01).round() as usize];
+                apart.push(row[place] - measured);
+            }
+            let mean = apart.iter().sum::<f64>() / apart.len() as f64;
+            let noise = if axis < 3 {
+                cut.noise().force[axis]
+            } else {
+                cut.noise().torque[axis - 3]
+            };
+            let most = apart.iter().fold(0.0_f64, |most, x| most.max((x - mean).abs()));
+            assert!(most < noise, "{sensor} {word}: its offset wanders by {most}");
+            // And it is off by the noise of both, in full. (A torque is, besides, by what their distance makes of the other's force.)
+            let rms = own.rms.identified[axis];
+            let force = |axis: usize| -> f64 {
+                let squares = setup.structure.sensors().iter().map(|c| c.noise().force[axis].powi(2));
+                squares.sum::<f64>().sqrt()
+            };
+            assert!(
+                rms > 0.95 * noise && rms < own.rms.cad_fitted[axis],
+                "{sensor} {word}: {:?}",
+                own.rms
+            );
+            if axis < 3 {
+                assert!(rms < 1.3 * force(axis) + 0.02, "{sensor} {word}: {:?}", own.rms);
+            }
+        }
+        // Both are stamped as the encoders are.
+        let late = &outcome.logs[0].time_offsets;
+        assert!(late.iter().all(|late| !late.significant), "{late:?}");
+    }
+}
+
+/// Too little to hold anything back: nobody knows whether the parameters are better than CAD's, so they are CAD's.
+#[test]
+fn nothing_is_called_identified_that_was_not_checked() {
+    let setup = arm();
+    // 25 rows a second, for 3.6 s.
+    let log = simulate(&setup, &real(&setup, 3), 3.6, 0.01, 3);
+    let rows = log.lines().skip(1).step_by(4);
+    let short: String = log.lines().take(1).chain(rows).flat_map(|line| [line, "\n"]).collect();
+    let outcome = run(&setup, &[("short", Role::Train, &short)], &[]);
+    if matches!(outcome.verdict, Verdict::Nothing(_)) {
+        panic!("the log is too short for this test: {:?}", outcome.findings);
+    }
+    assert_eq!(outcome.verdict, Verdict::NoBetterThanCad);
+    assert!(
+        outcome.findings.iter().any(|f| f.code == "not_checked"),
+        "{:?}",
+        outcome.findings
+    );
+    for link in outcome.links.iter().filter(|link| link.seen) {
+        assert_eq!(link.kept, 0.0);
+        assert_eq!(link.identified, link.cad);
+        // As uncertain as the prior: by tau of its mass.
+        assert!(
+            link.deviation[0] > 0.1 * outcome.tau * link.cad.mass,
+            "{}: {:?}",
+            link.name,
+            link.deviation
+        );
+    }
+}
+
+/// A log longer than what noise is estimated from, and a joint's torque that was measured only where that does not look.
+#[test]
+fn noise_of_a_torque_that_was_seldom_measured_is_known() {
+    let setup = arm_with(&[]);
+    let truth = real(&setup, 3);
+    let log = simulate_torques(&setup, &truth, 125.0, 0.02, 3, |joint, i| {
+        joint != 5 || (1080..1240).contains(&i)
+    });
+    let outcome = run(&setup, &[("long", Role::Train, &log)], &TORQUE);
+    let of = |joint: &str| {
+        let name = format!("joint/{joint}/torque");
+        outcome
+            .channels
+            .iter()
+            .find(|c| c.name == name)
+            .expect("a channel")
+            .deviation
+    };
+    for joint in ["j5", "j6"] {
+        assert!((of(joint) / 0.02 - 1.0).abs() < 0.3, "{joint}: {}", of(joint));
+    }
 }
 
 #[test]

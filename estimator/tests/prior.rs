@@ -5,7 +5,7 @@ mod common;
 
 use common::{Random, RandomRobot, gap, humanoid};
 use nalgebra::{DMatrix, DVector, Matrix4};
-use proprio_estimator::identify::consistent::{self, Consistent, Lacking, Verdict, nearest, nearest_to_base};
+use proprio_estimator::identify::consistent::{self, Consistent, Lacking, Verdict, nearest};
 use proprio_estimator::identify::prior::{Fit, GREATEST_TAU, LEAST_MASS, LEAST_RADIUS, Posterior, Prior, PriorError};
 use proprio_estimator::model::Model;
 use proprio_estimator::regressor::identifiable::{Identifiable, Measured, Offsets, Regime, Scope};
@@ -509,6 +509,21 @@ fn inertia(model: &Model) -> Vec<RigidInertia> {
     model.inertias().to_vec()
 }
 
+/// The nearest bodies to what is known of base parameters `pi = B^T [phi | s]` of all links: `|R pi - z|^2`. What of further unknowns (offsets) the basis leaves out is held at zero.
+fn nearest_to_base(
+    prior: &Prior,
+    cad: &[RigidInertia],
+    basis: &DMatrix<f64>,
+    data: &DMatrix<f64>,
+    right: &DVector<f64>,
+) -> Consistent {
+    let further = basis.nrows() - 10 * cad.len();
+    let rows = data * basis.transpose();
+    let right = right - &rows * parameters(cad).insert_rows(10 * cad.len(), further, 0.0);
+    let precision = (rows.amax() * 1e-9).powi(2);
+    nearest(prior, &all(cad.len()), &rows, &right, &vec![precision; further]).unwrap()
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 30, failure_persistence: None, ..ProptestConfig::default() })]
 
@@ -525,7 +540,7 @@ proptest! {
         let wanted = basis.transpose() * parameters(&truth);
         let data = normals(wanted.len(), wanted.len(), random).qr().r() * 1e4;
         let right = &data * &wanted;
-        let found = nearest_to_base(&prior, &all(cad.len()), &basis, &data, &right).unwrap();
+        let found = nearest_to_base(&prior, &cad, &basis, &data, &right);
         prop_assert_eq!(&found.verdict, &Verdict::Feasible);
         prop_assert!(found.bodies.iter().all(is_body));
         let phi = parameters(&found.bodies);
@@ -608,7 +623,7 @@ fn impossible_bodies_are_named() {
     phi[10 * hand + 9] = -0.002;
     let data = DMatrix::identity(basis.ncols(), basis.ncols()) * 1e5;
     let right = &data * (basis.transpose() * &phi);
-    let found = nearest_to_base(&prior, &links, &basis, &data, &right).unwrap();
+    let found = nearest_to_base(&prior, &cad, &basis, &data, &right);
     let Verdict::Infeasible(violations) = &found.verdict else {
         panic!("{:?}", found.verdict)
     };
@@ -620,7 +635,7 @@ fn impossible_bodies_are_named() {
     // The same with noise that leaves it open: no verdict against it.
     let data = DMatrix::identity(basis.ncols(), basis.ncols()) * 1e3;
     let right = &data * (basis.transpose() * &phi);
-    let found = nearest_to_base(&prior, &links, &basis, &data, &right).unwrap();
+    let found = nearest_to_base(&prior, &cad, &basis, &data, &right);
     assert_eq!(found.verdict, Verdict::Feasible, "{}", found.deviations());
 }
 
@@ -679,7 +694,7 @@ fn nearest_takes_what_is_no_links() {
     let data = DMatrix::from_diagonal(&DVector::from_fn(wanted.len(), |_, _| {
         10_f64.powf(4.0 + random.real(1.0))
     }));
-    let found = nearest_to_base(&prior, &all(cad.len()), &basis, &data, &(&data * &wanted)).unwrap();
+    let found = nearest_to_base(&prior, &cad, &basis, &data, &(&data * &wanted));
     assert_eq!(found.verdict, Verdict::Feasible);
     let mut phi = parameters(&found.bodies).insert_rows(10 * cad.len(), 6, 0.0);
     phi.rows_mut(10 * cad.len(), 6)

@@ -67,13 +67,35 @@ impl Advice {
         this.say_errors(outcome);
         if outcome.verdict == Verdict::NoBetterThanCad {
             this.worsen(Grade::Care);
-            this.why.push(
-                "On stretches of the logs that were held back from the fit, the identified parameters did no better than the CAD's, so they were drawn back to these: \
-                 the offsets are worth having, the parameters are the CAD's."
-                    .into(),
-            );
+            let why = if findings(outcome).any(|(_, f)| f.code == "not_checked") {
+                "The logs are too short to hold a part of them back and see what the parameters are worth there, so these were drawn back to the CAD's"
+            } else {
+                "On stretches of the logs that were held back from the fit, the identified parameters did no better than the CAD's, so they were drawn back to these"
+            };
+            this.why.push(format!(
+                "{why}: the offsets are worth having, the parameters are the CAD's."
+            ));
+        } else {
+            let back: Vec<&str> = outcome
+                .links
+                .iter()
+                .filter(|link| link.seen && link.kept == 0.0)
+                .map(|link| link.name.as_str())
+                .collect();
+            if !back.is_empty() {
+                this.worsen(Grade::Care);
+                this.why.push(format!(
+                    "Of {} the logs show no better parameters than the CAD's: these stay.",
+                    back.join(", ")
+                ));
+            }
         }
-        if !outcome.consistency.feasible {
+        if outcome.consistency.feasible.is_none() {
+            this.worsen(Grade::Care);
+            this.why
+                .push("Whether bodies exist that have what the logs say was not decided.".into());
+        }
+        if outcome.consistency.feasible == Some(false) {
             // The parameters given are of bodies that can exist, the nearest; so it is what they are worth elsewhere that counts, if it is known.
             this.worsen(Grade::Care);
             this.why.push(
@@ -108,13 +130,20 @@ impl Advice {
     fn say_errors(&mut self, outcome: &Outcome) {
         let validated = outcome.logs.iter().any(|log| log.role == Role::Validate);
         let role = if validated { Role::Validate } else { Role::Train };
+        let mut compared = false;
         for log in outcome.logs.iter().filter(|log| log.role == role) {
             let Three {
                 cad_fitted, identified, ..
             } = log.relative_error;
             if !(cad_fitted.is_finite() && identified.is_finite()) {
+                if validated {
+                    self.worsen(Grade::Care);
+                    self.why
+                        .push(format!("{} could not be compared with any prediction.", log.file));
+                }
                 continue;
             }
+            compared = true;
             let how = if validated {
                 ", which was not used for the fit"
             } else {
@@ -144,7 +173,14 @@ impl Advice {
                 self.why.push("That is no better than the CAD.".into());
             }
         }
-        if !validated && !self.why.is_empty() {
+        if !compared {
+            self.worsen(Grade::Care);
+            self.why.push(
+                "Nothing that was measured could be compared with what the parameters predict, so nothing shows what they are worth."
+                    .into(),
+            );
+        }
+        if !validated {
             self.why.push("No log was kept for validation.".into());
         }
     }
@@ -335,7 +371,7 @@ mod tests {
     #[test]
     fn impossible_bodies_findings_and_no_gain_each_lower_the_grade() {
         let mut outcome = good();
-        outcome.consistency.feasible = false;
+        outcome.consistency.feasible = Some(false);
         let advice = Advice::of(&outcome);
         assert_eq!(advice.grade, Grade::Care);
         assert!(advice.next[0].starts_with("Check the signs"), "{advice:?}");
@@ -357,6 +393,43 @@ mod tests {
                 .next
                 .iter()
                 .any(|n| n == "r_leg_ft_sensor seems to be mounted the wrong way round."),
+            "{advice:?}"
+        );
+    }
+
+    #[test]
+    fn what_was_compared_with_nothing_is_not_accepted() {
+        let nowhere = Three {
+            cad: f64::NAN,
+            cad_fitted: f64::NAN,
+            identified: f64::NAN,
+        };
+        let mut outcome = good();
+        outcome.logs[1].relative_error = nowhere;
+        let advice = Advice::of(&outcome);
+        assert_eq!(advice.grade, Grade::Care, "the log for validation: {advice:?}");
+        outcome.logs.pop();
+        assert_eq!(Advice::of(&outcome).grade, Grade::Accept);
+        outcome.logs[0].relative_error = nowhere;
+        let advice = Advice::of(&outcome);
+        assert_eq!(advice.grade, Grade::Care);
+        assert!(
+            advice.why.iter().any(|n| n.starts_with("Nothing that was measured")),
+            "{advice:?}"
+        );
+    }
+
+    #[test]
+    fn what_is_not_decided_or_partly_kept_is_said() {
+        let mut outcome = good();
+        outcome.consistency.feasible = None;
+        assert_eq!(Advice::of(&outcome).grade, Grade::Care);
+        let mut outcome = good();
+        outcome.links[2].kept = 0.0;
+        let advice = Advice::of(&outcome);
+        assert_eq!(advice.grade, Grade::Care);
+        assert!(
+            advice.why.iter().any(|n| n.starts_with("Of r_ankle_1 the logs")),
             "{advice:?}"
         );
     }

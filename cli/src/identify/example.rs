@@ -1,9 +1,10 @@
 //! An outcome made by hand for tests: something in every part of it, long names, numbers that are not there.
 
+use proprio_estimator::identify::instants::{Signal, TimeOffset};
 use proprio_estimator::identify::{
     BaseParameterOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding, FrictionOutcome, JointOutcome,
     LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, SensorOutcome, Severity, Spectrum, Three,
-    TimeOffsetOutcome, TwoRouteOutcome, Verdict, WeakDirection,
+    TwoRouteOutcome, Verdict, WeakDirection,
 };
 use proprio_estimator::spatial::RigidInertia;
 use proprio_topics::Nanos;
@@ -67,7 +68,7 @@ fn log(file: &str, role: Role) -> LogOutcome {
         span: (at(0.0), at(30.0)),
         used: 2700,
         left_out: vec![
-            LeftOut { reason: "edge".into(), instants: 60, first: at(0.0), last: at(30.0) },
+            LeftOut { reason: "too close to the beginning, the end or a gap for accelerations".into(), instants: 60, first: at(0.0), last: at(30.0) },
             LeftOut { reason: "contact declared: right_foot".into(), instants: 240, first: at(12.0), last: at(14.4) },
         ],
         onset: Some(at(4.0)),
@@ -94,7 +95,7 @@ fn log(file: &str, role: Role) -> LogOutcome {
             breaks: vec![at(17.3)],
         }],
         friction: vec![FrictionOutcome { joint: "r_knee".into(), coulomb_nm: 0.41, viscous: 0.08, offset_nm: -0.02, deviation: [0.01, 0.004, 0.02] }],
-        time_offsets: vec![TimeOffsetOutcome { channel: "r_leg_ft_sensor".into(), seconds: 0.0061, deviation: 0.0004, significant: true, applied: true }],
+        time_offsets: vec![TimeOffset { signal: Signal::Wrench(0), channel: "wrench/r_leg_ft_sensor".into(), seconds: 0.0061, deviation: 0.0004, significant: true }],
         findings: vec![Finding {
             severity: Severity::Warning,
             code: "jump",
@@ -176,7 +177,7 @@ pub(crate) fn outcome() -> Outcome {
                 drift: 0.01,
             })
             .collect(),
-        consistency: Consistency { feasible: true, deviations: 0.4, links: vec![], text: "bodies exist that have what the logs say".into() },
+        consistency: Consistency { feasible: Some(true), deviations: 0.4, links: vec![], text: "bodies exist that have what the logs say".into() },
         logs: vec![log("walk_1.csv", Role::Train), log("walk_2.csv", Role::Validate)],
         findings: vec![Finding {
             severity: Severity::Note,

@@ -89,7 +89,11 @@ fn key_facts(outcome: &Outcome) -> String {
     if outcome.shrink < 1.0 {
         facts.push(("kept of the change from CAD".into(), percent(outcome.shrink)));
     }
-    let physical = if outcome.consistency.feasible { "yes" } else { "no" };
+    let physical = match outcome.consistency.feasible {
+        Some(true) => "yes",
+        Some(false) => "no",
+        None => "not decided",
+    };
     facts.push(("physical bodies fit the logs".into(), physical.into()));
     let facts: Vec<(&str, String)> = facts
         .iter()
@@ -687,7 +691,7 @@ fn sessions(outcome: &Outcome) -> Option<String> {
     let mut body = Vec::new();
     let mut times = Table::new(
         "Time offset of each stream against the encoders; late is positive",
-        &["log", "channel", "offset [ms]", "", "removed"],
+        &["log", "channel", "offset [ms]", ""],
     );
     for log in &outcome.logs {
         for o in &log.time_offsets {
@@ -701,7 +705,6 @@ fn sessions(outcome: &Outcome) -> Option<String> {
                     "may be chance"
                 }
                 .into(),
-                if o.applied { "yes" } else { "no" }.into(),
             ]);
         }
     }

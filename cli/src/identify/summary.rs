@@ -18,8 +18,8 @@
 //! | `condition`, `singular_values` | of what the logs tell, columns scaled by the prior's spread |
 //! | `weakest` | worst first: {`expression`, `relative`: singular value over the greatest, `prior_share`: share of its variance that is the prior's} |
 //! | `confused` | what the motion of the logs can not tell apart, in words |
-//! | `time_offsets` | {`log`, `channel`, `seconds` (late is positive), `deviation`, `significant`, `applied`} |
-//! | `consistency` | {`feasible`: whether bodies exist that have what the logs say, `deviations`: by how many sigma not, `links`, `text`} |
+//! | `time_offsets` | {`log`, `channel`, `seconds` (late is positive), `deviation`, `significant`}: told, not removed |
+//! | `consistency` | {`feasible`: whether bodies exist that have what the logs say (`null`: not decided), `deviations`: by how many sigma not, `links`, `text`} |
 //! | `findings` | what is wrong, in words: {`log` or `null`, `severity`: `note`, `warning`, `refusal`; `code`: one word; `subject`: a channel, joint or link; `text`} |
 //! | `links` | {`name`, `seen`, `kept`: which share of the change from CAD was kept after the held-out check, `significance`, `cad`, `identified`, `deviation`: ten numbers each, m h_x h_y h_z I_xx I_xy I_xz I_yy I_yz I_zz about the link's origin} |
 //! | `base_parameters` | {`expression`, `unit`, `cad`, `identified`, `deviation`} |
@@ -56,7 +56,7 @@ pub(crate) fn summary(outcome: &Outcome, advice: &Advice) -> Json {
         .iter()
         .flat_map(|log| log.time_offsets.iter().map(move |offset| (log, offset)))
         .map(|(log, o)| {
-            json!({ "log": log.file, "channel": o.channel, "seconds": o.seconds, "deviation": o.deviation, "significant": o.significant, "applied": o.applied })
+            json!({ "log": log.file, "channel": o.channel, "seconds": o.seconds, "deviation": o.deviation, "significant": o.significant })
         })
         .collect();
     let found: Vec<Json> = findings(outcome)
@@ -202,7 +202,7 @@ mod tests {
             (&json!(0.58), &json!(31), &json!(3.2e5))
         );
         assert_eq!(json["weakest"].as_array().map(Vec::len), Some(20));
-        assert_eq!(json["time_offsets"][0]["channel"], "r_leg_ft_sensor");
+        assert_eq!(json["time_offsets"][0]["channel"], "wrench/r_leg_ft_sensor");
         assert_eq!(json["consistency"]["feasible"], true);
         assert_eq!(log["onset_s"], 4.0);
         assert_eq!(

@@ -133,7 +133,7 @@ pub(super) fn nothing(setup: &Setup, prepared: &[Prepared], reason: String) -> O
         base_parameters: Vec::new(),
         channels: Vec::new(),
         consistency: Consistency {
-            feasible: true,
+            feasible: None,
             deviations: 0.0,
             links: Vec::new(),
             text: "nothing was identified: the parameters are CAD's".into(),
@@ -211,10 +211,14 @@ pub(super) fn outcome(
         .collect();
     findings.extend(joint_zeros(maker, training, identified));
     let consistency = feasibility(setup, identified);
-    if !consistency.feasible {
+    if consistency.feasible != Some(true) {
         findings.push(Finding {
             severity: Severity::Warning,
-            code: "not_physical",
+            code: if consistency.feasible.is_none() {
+                "undecided"
+            } else {
+                "not_physical"
+            },
             subject: consistency.links.join(", "),
             text: consistency.text.clone(),
         });

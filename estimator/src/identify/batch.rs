@@ -9,12 +9,15 @@
 use super::assess;
 use super::consistent;
 use super::information::Information;
-use super::instants::{Break, Defect, Instant, Recording, Settings, Severity as DefectSeverity, Signal};
-use super::outcome::{Finding, LeftOut, Outcome, Role, Severity, TimeOffsetOutcome, Verdict};
-use super::passes::{NoiseModel, Piece, Residuals, Told, leave, noise_of, tell};
-use super::prior::{Fit, Posterior, Prior};
-use super::rows::{Layout, RowMaker};
+use super::instants::{Break, Defect, Instant, Recording, Settings, Signal, TimeOffset};
+use super::outcome::{Finding, LeftOut, Outcome, Role, Severity, Verdict};
+use super::passes::{NoiseModel, OFFSET_VARIANCE, Piece, Residuals, Told, leave, noise_of, session_prior, tell};
+use super::prior::{Fit, Posterior, Prior, PriorError};
+use super::rows::{Layout, RowMaker, Rows};
+use super::session::Session;
 use crate::config::IdentificationInput;
+use crate::dynamics::{DynamicsError, Structure};
+use crate::model::JointKind;
 use crate::setup::{Setup, Use};
 use crate::spatial::{RigidInertia, Vec3, Wrench};
 use nalgebra::DVector;
@@ -66,6 +69,12 @@ pub enum IdentifyError {
     /// Nothing to identify from is configured or measured.
     #[error("{0}")]
     NoInputs(String),
+    /// The recorded motion can not be put into the model.
+    #[error("no rows can be made of the logs: {0}")]
+    Dynamics(#[from] DynamicsError),
+    /// The most probable bodies can not be computed.
+    #[error("no bodies can be fitted to the logs: {0}")]
+    Fit(#[from] PriorError),
 }
 
 /// An offset's walk follows nothing faster than this \[s\]: the motion that identifies is faster.
@@ -99,7 +108,7 @@ pub(super) struct Prepared {
     pub breaks: Vec<Break>,
     pub left_out: Vec<LeftOut>,
     pub findings: Vec<Finding>,
-    pub time_offsets: Vec<TimeOffsetOutcome>,
+    pub time_offsets: Vec<TimeOffset>,
     pub refused: bool,
     recording: Recording,
 }
@@ -133,7 +142,7 @@ pub(super) struct Identified {
 /// Identifies.
 ///
 /// # Errors
-/// [`IdentifyError`]: a log that can not be read or lacks a channel, no log at all, nothing measured that parameters could be identified from.
+/// [`IdentifyError`]: a log that can not be read or lacks a channel, no log at all, nothing measured that parameters could be identified from, numbers that nothing can be computed from.
 pub fn identify(
     setup: &Setup,
     logs: Vec<Log<'_>>,
@@ -171,8 +180,7 @@ pub fn identify(
         ));
     }
     let all = training.iter().flat_map(|log| log.instants.iter());
-    let refuse = |e: crate::dynamics::DynamicsError| IdentifyError::NoInputs(e.to_string());
-    let maker = RowMaker::survey(setup, &inputs, all).map_err(refuse)?;
+    let maker = RowMaker::survey(setup, &inputs, all)?;
     if maker.layout().links.is_empty() {
         let what = match inputs.as_slice() {
             [IdentificationInput::Torque] => {
@@ -229,20 +237,17 @@ fn prepare(setup: &Setup, log: Log<'_>) -> Result<Prepared, IdentifyError> {
 /// How far each F/T stream is behind the encoders, against what the identified parameters predict: told, not removed, for what looks like a delay may be a model that is wrong.
 fn time_offsets(maker: &RowMaker<'_>, log: &mut Prepared, identified: &Identified) {
     let layout = maker.layout();
-    let left = leave(
-        &mut maker.clone(),
-        log.piece(),
-        &identified.noise,
-        std::slice::from_ref(&identified.d),
-    );
+    let sets = [DVector::zeros(layout.unknowns()), identified.d.clone()];
+    let left = leave(&mut maker.clone(), log.piece(), &identified.noise, &sets);
+    let compared = assess::Compared::new(&mut maker.clone(), &log.instants, &left, identified, &sets);
     let times: Vec<Nanos> = log.instants.iter().map(|i| i.t).collect();
     for (place, &sensor) in layout.sensors.iter().enumerate() {
         let mut predicted = vec![f64::NAN; 6 * times.len()];
         for axis in 0..6 {
             let channel = 6 * place + axis;
-            let offset = left.offset(layout, 0, channel);
-            for i in 0..times.len() {
-                predicted[6 * i + axis] = left.measured[channel][i] - left.noise[0][channel][i] - offset[i];
+            let pairs = compared.load[channel].iter().zip(&compared.errors[2][channel]);
+            for (i, (load, error)) in pairs.enumerate() {
+                predicted[6 * i + axis] = load - error;
             }
         }
         let Some(offset) = log.recording.time_offset(Signal::Wrench(sensor), &times, &predicted) else {
@@ -262,13 +267,7 @@ fn time_offsets(maker: &RowMaker<'_>, log: &mut Prepared, identified: &Identifie
                 ),
             });
         }
-        log.time_offsets.push(TimeOffsetOutcome {
-            channel: offset.channel,
-            seconds: offset.seconds,
-            deviation: offset.deviation,
-            significant: offset.significant,
-            applied: false,
-        });
+        log.time_offsets.push(offset);
     }
 }
 
@@ -276,7 +275,7 @@ fn time_offsets(maker: &RowMaker<'_>, log: &mut Prepared, identified: &Identifie
 fn usable(setup: &Setup, file: String, role: Role, recording: Recording) -> Prepared {
     let found = recording.instants(setup, &Settings::default());
     let mut findings: Vec<Finding> = found.defects.iter().map(finding).collect();
-    let refused = found.defects.iter().any(|d| d.severity() == DefectSeverity::Fatal);
+    let refused = found.defects.iter().any(|d| d.severity() == Severity::Refusal);
     let span = match (found.instants.first(), found.instants.last()) {
         (Some(first), Some(last)) => (first.t, last.t),
         _ => (Nanos::ZERO, Nanos::ZERO),
@@ -384,11 +383,7 @@ fn finding(defect: &Defect) -> Finding {
         Defect::JointZero { joint, .. } => ("joint_zero", joint.clone()),
     };
     Finding {
-        severity: match defect.severity() {
-            DefectSeverity::Note => Severity::Note,
-            DefectSeverity::Warning => Severity::Warning,
-            DefectSeverity::Fatal => Severity::Refusal,
-        },
+        severity: defect.severity(),
         code,
         subject,
         text: defect.to_string(),
@@ -452,7 +447,7 @@ fn posterior(
     precision: &[f64],
 ) -> Result<Posterior, IdentifyError> {
     let (r, z) = information.to_triangle();
-    Posterior::new(prior, &layout.links, &r, &z, precision).map_err(|e| IdentifyError::NoInputs(e.to_string()))
+    Ok(Posterior::new(prior, &layout.links, &r, &z, precision)?)
 }
 
 fn fit(
@@ -463,12 +458,11 @@ fn fit(
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<Identified, IdentifyError> {
     let layout = maker.layout().clone();
-    let no = |e: super::prior::PriorError| IdentifyError::NoInputs(e.to_string());
-    let prior = Prior::new(setup.model.inertias()).map_err(no)?;
+    let prior = Prior::new(setup.model.inertias())?;
     let least = least_variances(setup, &layout);
     let bound = (super::passes::BLOCK / DRIFT_TIME).powi(2);
     let pieces = chunks(training, LONG);
-    let sampled = sample(training);
+    let sampled = sample(maker, training);
     let zero = DVector::zeros(layout.unknowns());
     let mut noise = NoiseModel::unit(least.clone());
     for _ in 0..3 {
@@ -477,16 +471,17 @@ fn fit(
         });
         noise = noise_of(&layout, &left, 0, bound, &least);
     }
+    let mut change = f64::INFINITY;
     for round in 0..ROUNDS {
         progress(format!("round {}", round + 1), 0.2 + 0.5 * round as f64 / ROUNDS as f64);
         let told = over(maker, &sampled, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
         let information = added(&told, layout.unknowns());
-        let fit = posterior(&prior, &layout, &information, &[])?.weigh().map_err(no)?;
+        let fit = posterior(&prior, &layout, &information, &[])?.weigh()?;
         let left = over(maker, &sampled, |maker, _, piece| {
             leave(maker, piece, &noise, std::slice::from_ref(&fit.x))
         });
         let next = noise_of(&layout, &left, 0, bound, &least);
-        let change = next.change(&noise);
+        change = next.change(&noise);
         noise = next;
         if change < SETTLED {
             break;
@@ -494,14 +489,15 @@ fn fit(
     }
     let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
     let information = added(&told, layout.unknowns());
-    let fit = posterior(&prior, &layout, &information, &[])?.weigh().map_err(no)?;
+    let fit = posterior(&prior, &layout, &information, &[])?.weigh()?;
     progress("held-out data".into(), 0.75);
-    let guard = held_out(maker, &prior, training, &noise, fit.tau)?;
+    let mut guard = held_out(maker, &prior, training, &noise, fit.tau)?;
+    guard.findings.extend(unsettled(change));
     // Parameters have taken a part of the noise that they were fitted to, most of all where it is as slow as the motion.
     let noise = guard.noise;
     let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
     let information = added(&told, layout.unknowns());
-    let fit = posterior(&prior, &layout, &information, &[])?.weigh().map_err(no)?;
+    let fit = posterior(&prior, &layout, &information, &[])?.weigh()?;
     let mut d = fit.x.clone();
     for (place, share) in guard.share.iter().enumerate() {
         d.rows_mut(10 * place, 10).scale_mut(*share);
@@ -517,6 +513,19 @@ fn fit(
         findings: guard.findings,
         fit,
         told,
+    })
+}
+
+/// Says that rounds ended before noise and prior's weight stayed, if the last one still changed a variance by more than a tenth.
+fn unsettled(change: f64) -> Option<Finding> {
+    (change > 0.1).then(|| Finding {
+        severity: Severity::Warning,
+        code: "unsettled",
+        subject: String::new(),
+        text: format!(
+            "noise and the prior's weight had not settled after {ROUNDS} rounds: the last one still changed a variance by {:.0} %, and stated deviations are as uncertain as that; longer logs settle",
+            100.0 * change.exp_m1()
+        ),
     })
 }
 
@@ -536,21 +545,56 @@ fn chunks<'a>(training: &[&'a Prepared], most: usize) -> Vec<Piece<'a>> {
     pieces
 }
 
-/// All instants, or of long logs stretches spread over them: noise and the prior's weight need no more.
-fn sample<'a>(training: &[&'a Prepared]) -> Vec<Piece<'a>> {
+/// All instants, or of long logs stretches spread over them, and others where these lack a channel: noise and the prior's weight need no more.
+fn sample<'a>(maker: &RowMaker<'_>, training: &[&'a Prepared]) -> Vec<Piece<'a>> {
     let total: usize = training.iter().map(|log| log.instants.len()).sum();
     if total <= SAMPLE {
         return chunks(training, usize::MAX);
     }
     let pieces = chunks(training, total / SAMPLE_STRETCHES);
     let length = SAMPLE / pieces.len();
-    pieces
-        .into_iter()
-        .map(|piece| Piece {
-            instants: &piece.instants[..piece.instants.len().min(length)],
-            ..piece
-        })
-        .collect()
+    let stretch = |piece: &Piece<'a>, start: usize| Piece {
+        instants: &piece.instants[start..piece.instants.len().min(start + length)],
+        ..*piece
+    };
+    let mut sampled: Vec<Piece<'a>> = pieces.iter().map(|piece| stretch(piece, 0)).collect();
+    // How often each channel shows, as far as it matters: without any of it, its noise would be taken to be nothing.
+    let (mut maker, mut rows) = (maker.clone(), Rows::new(maker.layout()));
+    let mut heard = vec![0; maker.layout().channels()];
+    let mut listen = |instant: &Instant, heard: &mut [usize]| -> bool {
+        let made = maker.make(instant, &mut rows).is_ok();
+        let mut lacked = false;
+        for (channel, heard) in heard.iter_mut().enumerate() {
+            if made && rows.has(channel) {
+                lacked |= *heard < LEAST_FOLD;
+                *heard += 1;
+            }
+        }
+        lacked
+    };
+    for piece in &sampled {
+        for instant in piece.instants {
+            if heard.iter().all(|heard| *heard >= LEAST_FOLD) {
+                return sampled;
+            }
+            listen(instant, &mut heard);
+        }
+    }
+    for piece in &pieces {
+        let mut i = length;
+        while i < piece.instants.len() && heard.iter().any(|heard| *heard < LEAST_FOLD) {
+            if listen(&piece.instants[i], &mut heard) {
+                let further = stretch(piece, i);
+                for instant in &further.instants[1..] {
+                    listen(instant, &mut heard);
+                }
+                i += further.instants.len() - 1;
+                sampled.push(further);
+            }
+            i += 1;
+        }
+    }
+    sampled
 }
 
 /// What held-out data say of the change from CAD.
@@ -591,8 +635,16 @@ fn held_out(
     }
     if pieces.len() < 2 {
         return Ok(Guard {
-            share: vec![1.0; layout.links.len()],
-            findings: Vec::new(),
+            share: vec![0.0; layout.links.len()],
+            findings: vec![Finding {
+                severity: Severity::Warning,
+                code: "not_checked",
+                subject: String::new(),
+                text: format!(
+                    "the logs are too short to hold a part back and see whether identified parameters predict it: all links stay as in the URDF; record at least {} instants that can be used",
+                    2 * LEAST_FOLD
+                ),
+            }],
             noise: noise.clone(),
         });
     }
@@ -606,8 +658,7 @@ fn held_out(
                 let _ = others.merge(&told.information, &columns);
             }
         }
-        let fit = posterior(prior, layout, &others, &[])?.fit(tau);
-        sets.push(fit.map_err(|e| IdentifyError::NoInputs(e.to_string()))?.x);
+        sets.push(posterior(prior, layout, &others, &[])?.fit(tau)?.x);
     }
     let zero = DVector::zeros(layout.unknowns());
     let left: Vec<Residuals> = over(maker, &pieces, |maker, number, piece| {
@@ -724,75 +775,123 @@ fn held_out(
     })
 }
 
-/// Sensors whose readings go against what CAD predicts: with their sign free, masses would come out negative.
+/// Sensors whose readings fit CAD only with their sign turned: with the sign free, masses would come out negative.
+///
+/// What is asked is by how much CAD and constant offsets miss all rows if this sensor is turned, or that one: where a sub-tree has two sensors, turning the right one makes all well.
+/// The one that helps the most is taken, as long as it leaves less than a third, which is what a correlation of -1/2 is; then the next.
 fn wrong_signs(maker: &RowMaker<'_>, training: &[&Prepared]) -> Vec<Finding> {
     let layout = maker.layout();
-    let zero = DVector::zeros(layout.unknowns());
-    let noise = NoiseModel::unit(least_variances(maker.setup(), layout));
-    let pieces: Vec<Piece<'_>> = training.iter().map(|log| log.piece()).collect();
-    let left = over(maker, &pieces, |maker, _, piece| {
-        leave(maker, piece, &noise, std::slice::from_ref(&zero))
-    });
-    let mut findings = Vec::new();
-    for (place, &sensor) in layout.sensors.iter().enumerate() {
-        let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
-        for part in &left {
-            for channel in 6 * place..6 * place + 6 {
-                let scale = if channel % 6 < 3 {
-                    1.0 / crate::dynamics::Structure::LENGTH_SCALE
-                } else {
-                    1.0
-                };
-                let pairs = part.predicted[channel].iter().zip(&part.measured[channel]);
-                let pairs: Vec<(f64, f64)> = pairs
-                    .filter(|(x, y)| x.is_finite() && y.is_finite())
-                    .map(|(x, y)| (x * scale, y * scale))
-                    .collect();
-                let n = pairs.len().max(1) as f64;
-                let (mx, my) = (
-                    pairs.iter().map(|p| p.0).sum::<f64>() / n,
-                    pairs.iter().map(|p| p.1).sum::<f64>() / n,
-                );
-                for (x, y) in pairs {
-                    xx += (x - mx).powi(2);
-                    xy += (x - mx) * (y - my);
-                    yy += (y - my).powi(2);
+    let count = layout.sensors.len();
+    let pieces = sample(maker, training);
+    // A force counts as much as its torque on an arm of this length.
+    let mut variances = vec![1.0; layout.channels()];
+    for torque in (0..count).flat_map(|place| 6 * place..6 * place + 3) {
+        variances[torque] = Structure::LENGTH_SCALE.powi(2);
+    }
+    let misfits = |turned: &[Vec<bool>]| -> Vec<f64> {
+        let parts = over(maker, &pieces, |maker, _, piece| {
+            let mut misfits = vec![0.0; turned.len()];
+            let mut session = Session::new(&session_prior(layout), turned.len());
+            let mut rows = Rows::new(layout);
+            let (mut lines, mut last) = (Vec::new(), None);
+            for instant in piece.instants {
+                let t = last.replace(instant.t).unwrap_or(instant.t);
+                for broken in piece.breaks.iter().filter(|b| t < b.t && b.t <= instant.t) {
+                    if let Ok(place) = layout.sensors.binary_search(&broken.sensor) {
+                        (6 * place..6 * place + 6).for_each(|unknown| session.renew(unknown, OFFSET_VARIANCE));
+                    }
+                }
+                if maker.make(instant, &mut rows).is_err() {
+                    continue;
+                }
+                lines.clear();
+                for row in 0..rows.count {
+                    // What each reading has in the right side.
+                    let shares: Vec<f64> = layout
+                        .sensors
+                        .iter()
+                        .zip(rows.g(row).chunks_exact(6))
+                        .map(|(&sensor, g)| {
+                            let reading = &instant.readings[sensor];
+                            let values = reading.torque.iter().chain(&reading.force);
+                            g.iter()
+                                .zip(values)
+                                .filter(|(g, _)| **g != 0.0)
+                                .map(|(g, x)| g * x)
+                                .sum()
+                        })
+                        .collect();
+                    for turned in turned {
+                        let wrong = turned.iter().zip(&shares).filter(|(turned, _)| **turned);
+                        lines.push(rows.r(row) - 2.0 * wrong.map(|(_, share)| share).sum::<f64>());
+                    }
+                }
+                rows.whiten_with(&variances, &mut lines, turned.len());
+                for (row, line) in lines.chunks_exact_mut(turned.len()).enumerate() {
+                    session.update(rows.g(row), line);
+                    misfits.iter_mut().zip(line).for_each(|(sum, x)| *sum += *x * *x);
                 }
             }
+            misfits
+        });
+        (0..turned.len())
+            .map(|k| parts.iter().map(|part| part[k]).sum())
+            .collect()
+    };
+    let mut turned = vec![false; count];
+    let mut order = Vec::new();
+    while order.len() < count {
+        let tries: Vec<usize> = (0..count).filter(|place| !turned[*place]).collect();
+        let mut cases = vec![turned.clone()];
+        for &place in &tries {
+            let mut case = turned.clone();
+            case[place] = true;
+            cases.push(case);
         }
-        if xx > 0.0 && yy > 0.0 && xy / (xx * yy).sqrt() < -0.5 {
-            let name = assess::sensor_name(maker.setup(), sensor);
-            findings.push(Finding {
-                severity: Severity::Refusal,
-                code: "wrong_sign",
-                text: Defect::WrongSign { sensor: name.clone() }.to_string(),
-                subject: name,
-            });
-        }
+        let found = misfits(&cases);
+        let best = tries.iter().zip(&found[1..]).min_by(|a, b| a.1.total_cmp(b.1));
+        let Some((&place, _)) = best.filter(|(_, misfit)| **misfit < found[0] / 3.0) else {
+            break;
+        };
+        turned[place] = true;
+        order.push(place);
     }
-    findings
+    order.sort_unstable();
+    let finding = |place: usize| {
+        let name = assess::sensor_name(maker.setup(), layout.sensors[place]);
+        Finding {
+            severity: Severity::Refusal,
+            code: "wrong_sign",
+            text: Defect::WrongSign { sensor: name.clone() }.to_string(),
+            subject: name,
+        }
+    };
+    order.into_iter().map(finding).collect()
 }
 
 /// Joints whose zero is elsewhere than the model's: a constant error of the position that explains more than inertial parameters can, at the prior's weight.
 pub(super) fn joint_zeros(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Identified) -> Vec<Finding> {
     /// A position is expected to be off by this much \[rad\], one standard deviation, before anything is measured.
     const SPREAD: f64 = 0.1;
-    /// Half of the squared deviations that must be gained, for one in a thousand by chance: chi-square, one degree.
+    /// Squared deviations that must be gained: one joint in a thousand gains more by chance (chi-square, one degree).
     const GAIN: f64 = 10.83;
     /// Less than this matters to nobody \[rad\].
     const LEAST: f64 = 0.01;
-    /// Instants that are looked at.
+    /// Instants that are looked at, in stretches of every log: offsets and noise need what follows each other, and each stretch pays for offsets of its own.
     const ENOUGH: usize = 2000;
+    const STRETCHES: usize = 4;
     let setup = maker.setup();
     let layout = &identified.layout;
     // Joints beyond which, or between which, everything is seen: an error of another one only tilts all of it, as a base that is not level does.
     let turns = |dof: &usize| {
         let joint = setup.model.dof_joint(*dof).map(|joint| setup.model.joints()[joint]);
-        joint.is_some_and(|j| {
-            let inside = setup.structure.subtree_of(j.parent) == setup.structure.subtree_of(j.child)
-                && layout.links.contains(&j.parent);
-            layout.links.contains(&j.child) && (inside || !layout.joints.is_empty())
-        })
+        joint
+            .filter(|j| matches!(j.kind, JointKind::Revolute(_)))
+            .is_some_and(|j| {
+                let inside = setup.structure.subtree_of(j.parent) == setup.structure.subtree_of(j.child)
+                    && layout.links.contains(&j.parent);
+                layout.links.contains(&j.child) && (inside || !layout.joints.is_empty())
+            })
     };
     let angles: Vec<usize> = (0..setup.model.dof_count())
         .filter(|&dof| setup.locked[dof].is_nan())
@@ -801,13 +900,16 @@ pub(super) fn joint_zeros(maker: &RowMaker<'_>, training: &[&Prepared], identifi
     let mut parts = Vec::new();
     for log in training {
         let share = ENOUGH / training.len().max(1);
-        let count = log.instants.len().min(share);
-        // One stretch from the middle: offsets and noise need what follows each other.
-        let start = (log.instants.len() - count) / 2;
-        parts.push(Piece {
-            instants: &log.instants[start..start + count],
-            breaks: &log.breaks,
-        });
+        let stretches = if log.instants.len() > share { STRETCHES } else { 1 };
+        let count = log.instants.len().min(share) / stretches;
+        for number in 0..stretches {
+            // From the first to the last.
+            let start = (log.instants.len() - count) * number / (stretches - 1).max(1);
+            parts.push(Piece {
+                instants: &log.instants[start..start + count],
+                breaks: &log.breaks,
+            });
+        }
     }
     let told = over(maker, &parts, |maker, _, piece| {
         tell(maker, piece, &identified.noise, &angles, identified.fit.x.as_slice())
@@ -889,7 +991,11 @@ pub(super) fn feasibility(setup: &Setup, identified: &Identified) -> super::outc
     let (r, z) = identified.information.to_triangle();
     match consistent::nearest(&identified.prior, &identified.layout.links, &r, &z, &[]) {
         Ok(nearest) => Consistency {
-            feasible: !matches!(nearest.verdict, consistent::Verdict::Infeasible(_)),
+            feasible: match &nearest.verdict {
+                consistent::Verdict::Feasible => Some(true),
+                consistent::Verdict::Infeasible(_) => Some(false),
+                consistent::Verdict::Undecided => None,
+            },
             deviations: nearest.deviations(),
             links: match &nearest.verdict {
                 consistent::Verdict::Infeasible(violations) => violations
@@ -901,7 +1007,7 @@ pub(super) fn feasibility(setup: &Setup, identified: &Identified) -> super::outc
             text: nearest.describe(|link| setup.model.link_name(link)),
         },
         Err(e) => Consistency {
-            feasible: false,
+            feasible: None,
             deviations: f64::NAN,
             links: Vec::new(),
             text: e.to_string(),

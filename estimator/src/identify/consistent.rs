@@ -1,7 +1,7 @@
 //! From what the data alone say, without any prior, to the nearest set of bodies that can exist; and whether there is one at all.
 //!
 //! Least squares knows nothing of bodies: its base parameters may ask for a negative mass somewhere in every choice of the parameters that it leaves open. Given the
-//! data's information `[R | z]` over the links' parameters, of any rank (of base parameters `pi = B^T phi`: [`nearest_to_base`]), this finds
+//! data's information `[R | z]` over the links' parameters, of any rank (information about base parameters `pi = B^T phi` is `R = R_pi B^T`), this finds
 //!
 //! ```text
 //! min 1/2 |R d - z|^2    over all sets of bodies, J_l positive semidefinite
@@ -156,40 +156,6 @@ pub fn nearest(
     let padded = right.clone().resize_vertically(right.len() + further, 0.0);
     let posterior = Posterior::new(prior, links, &stacked, &padded, &vec![0.0; further])?;
     follow(&posterior, further)
-}
-
-/// The nearest bodies to base parameters `pi = B^T [phi | s]` with information `[R | z]` over `pi`: `|R pi - z|^2`. The rows of the basis are ten per link of `links`, then
-/// those of further unknowns (offsets), as in [`crate::regressor::identifiable::Identifiable::basis`].
-///
-/// # Errors
-/// As for [`nearest`].
-pub fn nearest_to_base(
-    prior: &Prior,
-    links: &[usize],
-    basis: &DMatrix<f64>,
-    data: &DMatrix<f64>,
-    right: &DVector<f64>,
-) -> Result<Consistent, PriorError> {
-    let further = basis.nrows().saturating_sub(10 * links.len());
-    for (what, found, expected) in [
-        ("basis rows", basis.nrows(), 10 * links.len() + further),
-        ("base parameters", data.ncols(), basis.ncols()),
-        ("right sides", right.len(), data.nrows()),
-    ] {
-        if found != expected {
-            return Err(PriorError::Size { what, found, expected });
-        }
-    }
-    let rows = data * basis.transpose();
-    let mut cad = DVector::zeros(basis.nrows());
-    for (position, &link) in links.iter().enumerate() {
-        cad.rows_mut(10 * position, 10)
-            .copy_from_slice(prior.cad(link)?.as_slice());
-    }
-    let right = right - &rows * cad;
-    // Combinations of offsets and parameters that the basis leaves out are not determined: a vanishing precision holds them at zero, as it holds the rest at CAD.
-    let scale = rows.amax() * 1e-9;
-    nearest(prior, links, &rows, &right, &vec![scale * scale; further])
 }
 
 /// Lowers the prior's weight until what it may still add to the misfit is nothing.

@@ -173,7 +173,7 @@ mod tests {
             spectra: vec![],
         };
         let consistency = Consistency {
-            feasible: true,
+            feasible: Some(true),
             deviations: 0.0,
             links: vec![],
             text: String::new(),

@@ -18,7 +18,7 @@ mod defects;
 mod offset;
 mod smooth;
 
-pub use defects::{Break, Defect, Severity, Units};
+pub use defects::{Break, Defect, Units};
 pub use offset::{Signal, TimeOffset};
 
 use crate::dynamics::{ContactSet, FrameMotion, SensorSet};

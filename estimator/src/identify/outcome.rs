@@ -4,6 +4,7 @@
 //! F/T sensor is in the order of samples and logs, `[fx fy fz tx ty tz]` [N, Nm]; ten parameters of a link are `[m, h_x, h_y, h_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz]` about its origin
 //! ([`crate::spatial`]).
 
+use super::instants::TimeOffset;
 use crate::regressor::identifiable::Column;
 use crate::spatial::RigidInertia;
 use nalgebra::DMatrix;
@@ -45,7 +46,7 @@ pub enum Severity {
 pub struct Finding {
     /// How serious it is.
     pub severity: Severity,
-    /// One word for a program: `jump`, `gap`, `no_motion`, `wrong_sign`, `joint_zero`, `not_physical`, ...
+    /// One word for a program: `jump`, `gap`, `no_motion`, `wrong_sign`, `joint_zero`, `not_physical`, `shrunk`, `not_checked`, ...
     pub code: &'static str,
     /// What it is about: the name of a channel, joint, link; empty if about everything.
     pub subject: String,
@@ -56,9 +57,10 @@ pub struct Finding {
 /// Whether anything was identified.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Verdict {
-    /// The parameters are better than CAD on data that they were not fitted to, in at least one channel, and worse in none.
+    /// The parameters of at least one group of links predict data that they were not fitted to better than CAD, its channels together. Links of other groups stay as in CAD:
+    /// [`LinkOutcome::kept`].
     Identified,
-    /// No better than CAD on data that they were not fitted to: the parameters were shrunk to CAD.
+    /// Of no link were they shown to be better than CAD on data that they were not fitted to (or there were too few to hold any back): all stay as in CAD.
     NoBetterThanCad,
     /// Nothing can be said of the parameters, and they are CAD's: the reason, in words.
     Nothing(String),
@@ -143,29 +145,14 @@ pub struct ChannelNoise {
 /// Whether bodies exist that have what the logs say.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Consistency {
-    /// They do, within the uncertainty of the data.
-    pub feasible: bool,
+    /// Whether they do, within the uncertainty of the data; none if that was not decided.
+    pub feasible: Option<bool>,
     /// By how many standard deviations the data disagree with the nearest bodies (0: not at all).
     pub deviations: f64,
     /// Links on the edge of what can exist, by name.
     pub links: Vec<String>,
     /// In words.
     pub text: String,
-}
-
-/// Time offset between two streams of a log.
-#[derive(Clone, Debug, PartialEq)]
-pub struct TimeOffsetOutcome {
-    /// The channel that is late (positive) or early against the encoders.
-    pub channel: String,
-    /// By how much \[s\].
-    pub seconds: f64,
-    /// Standard deviation \[s\].
-    pub deviation: f64,
-    /// Whether it is more than chance.
-    pub significant: bool,
-    /// Whether it was removed before identification.
-    pub applied: bool,
 }
 
 /// Offset of one F/T sensor through a log.
@@ -268,7 +255,7 @@ pub struct Spectrum {
 /// A span that was left out, and why.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LeftOut {
-    /// Why, in a few words: `edge`, `contact declared: hand`, `contact suspected`, `r_leg_ft_sensor jumped`, `stale: knee`.
+    /// Why, in a few words: `contact declared: hand (the links that it touches)`, `outlier of r_leg_ft_sensor`, `stale of knee`, or that it is too close to an end or a gap for accelerations.
     pub reason: String,
     /// How many instants.
     pub instants: u64,
@@ -308,8 +295,8 @@ pub struct LogOutcome {
     pub offsets: Vec<OffsetOutcome>,
     /// Friction, per joint with a measured torque.
     pub friction: Vec<FrictionOutcome>,
-    /// Time offsets between streams.
-    pub time_offsets: Vec<TimeOffsetOutcome>,
+    /// How late each F/T stream is against what encoders (and, between two sensors, the other sensor) predict: told, not removed.
+    pub time_offsets: Vec<TimeOffset>,
     /// What is wrong with the log.
     pub findings: Vec<Finding>,
     /// For plots: joint torques (measured, or from the other side), then F/T channels.
@@ -331,13 +318,14 @@ pub struct Outcome {
     pub covariance: CovarianceRoot,
     /// The prior's scale, chosen by evidence: how far, relatively, CAD is from the robot (bounded at 1).
     pub tau: f64,
-    /// By how much the identified change of the parameters was multiplied after the held-out check: 1: all of it; 0: CAD.
+    /// The least [`LinkOutcome::kept`] of the links that are seen: 1: all of every change from CAD; 0: at least one group of links stays as in CAD.
     pub shrink: f64,
     /// Number of unknown inertial parameters.
     pub unknowns: usize,
     /// Number of combinations of them that show in the logs (singular values above rounding).
     pub rank: usize,
-    /// Number of combinations that show whatever the motion, from the structure of the robot alone.
+    /// Number of combinations that rich enough motion of those joints which move in the logs would show, from the structure of the robot alone; not those that show only in a sum with an
+    /// offset.
     pub structural_rank: usize,
     /// Effective number of parameters: how many combinations the logs rather than the prior decide.
     pub effective: f64,

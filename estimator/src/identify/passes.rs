@@ -76,7 +76,8 @@ impl NoiseModel {
     pub(super) fn midway(&self, held_out: &Self) -> Self {
         let mut midway = self.clone();
         for (channel, time) in midway.time.iter_mut().enumerate() {
-            if self.square[channel] > 0.0 {
+            // What was not among the data held out says nothing of it.
+            if self.square[channel] > 0.0 && held_out.square[channel] > 0.0 {
                 *time = 0.5 * (*time + held_out.square[channel] * held_out.time[channel] / self.square[channel]);
             }
         }
@@ -98,7 +99,8 @@ impl NoiseModel {
     }
 }
 
-fn session_prior(layout: &Layout) -> Vec<f64> {
+/// Variances of a log's own unknowns before anything is measured.
+pub(super) fn session_prior(layout: &Layout) -> Vec<f64> {
     let mut prior = vec![OFFSET_VARIANCE; 6 * layout.sensors.len()];
     prior.resize(layout.session(), FRICTION_VARIANCE);
     prior

@@ -250,13 +250,6 @@ impl Prior {
         self.centres[link].whiten.transpose() * self.centres[link].whiten
     }
 
-    /// CAD's ten parameters of a link as they were given.
-    pub(super) fn cad(&self, link: usize) -> Result<&Vector10, PriorError> {
-        let count = self.centres.len();
-        let centre = self.centres.get(link).ok_or(PriorError::NoLink { link, count })?;
-        Ok(&centre.cad)
-    }
-
     /// `U`, for `J = C (1 + U) C^T`.
     fn stretch(&self, link: usize, phi: &[f64; 10]) -> Matrix4<f64> {
         let centre = &self.centres[link];

@@ -62,7 +62,30 @@ struct Drift {
     /// Variance that each channel [torque; force] gains per second [Nm^2/s, N^2/s].
     rate: [f64; 6],
     /// When it was known.
-    known: Nanos,
+    known: Known,
+}
+
+/// When an offset was known.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Known {
+    /// By the clock that is running.
+    At(Nanos),
+    /// At the end of a log, from its first stamp to its last, whose clock may have been another one.
+    InLog(Nanos, Nanos),
+}
+
+impl Known {
+    /// For how long an offset may have wandered by `t`, when the first instant of this run was `begun` \[s\].
+    fn elapsed(self, t: Nanos, begun: Nanos) -> f64 {
+        let between = |a: Nanos, b: Nanos| a.saturating_sub(b).seconds().abs();
+        match self {
+            Self::At(known) => between(t, known),
+            // A clock that has not come so far yet is another one, and what it shows is no measure of what has passed.
+            Self::InLog(first, _) if t < first => between(t, begun),
+            // It may be the same, or another that has come about as far: not less than since the run began.
+            Self::InLog(_, last) => between(t, last).max(between(t, begun)),
+        }
+    }
 }
 
 impl Covariance {
@@ -70,7 +93,7 @@ impl Covariance {
     pub fn exact(links: usize, sensors: usize) -> Self {
         let still = Drift {
             rate: [0.0; 6],
-            known: Nanos::ZERO,
+            known: Known::At(Nanos::ZERO),
         };
         Self {
             blocks: Vec::new(),
@@ -109,12 +132,31 @@ impl Covariance {
         Ok(())
     }
 
-    /// Says how fast a sensor's offset wanders from what it was known to be at `known`: standard deviations [torque; force] after one second
-    /// [Nm/s^½, N/s^½]. They grow with the square root of the time since, or until, then.
+    /// Says how fast a sensor's offset wanders from what it was known to be at `known`, by the clock that is running: standard deviations [torque; force] after one
+    /// second [Nm/s^½, N/s^½]. They grow with the square root of the time since, or until, then.
     ///
     /// # Errors
     /// There is no such sensor, or a number is not finite or negative.
     pub fn set_drift(&mut self, sensor: usize, rate: [f64; 6], known: Nanos) -> Result<(), DynamicsError> {
+        self.drift(sensor, rate, Known::At(known))
+    }
+
+    /// The same of an offset that was known at the end of a log, given its first and last stamp. Its clock need not be the one that is running (another machine, or the same after a
+    /// restart): time counts from the first instant that [`Propagation::update`] is given, or from the end of the log, whichever is longer ago; and from the first instant alone where the
+    /// running clock is before the log's first stamp, which it would not be if it were the same.
+    ///
+    /// # Errors
+    /// As for [`Covariance::set_drift`].
+    pub fn set_drift_of_log(
+        &mut self,
+        sensor: usize,
+        rate: [f64; 6],
+        (first, last): (Nanos, Nanos),
+    ) -> Result<(), DynamicsError> {
+        self.drift(sensor, rate, Known::InLog(first, last))
+    }
+
+    fn drift(&mut self, sensor: usize, rate: [f64; 6], known: Known) -> Result<(), DynamicsError> {
         let count = self.drifts.len();
         let place = self.drifts.get_mut(sensor).ok_or(DynamicsError::Index {
             what: "sensors",
@@ -184,6 +226,8 @@ impl Block {
 pub struct Propagation {
     parts: Vec<Part>,
     drifts: Vec<Drift>,
+    /// The first instant that was computed.
+    begun: Option<Nanos>,
     torque: Vec<f64>,
     contacts: Vec<[f64; 6]>,
 }
@@ -268,6 +312,7 @@ impl Propagation {
                 .map(|number| Part::new(structure, number, covariance))
                 .collect(),
             drifts: covariance.drifts.clone(),
+            begun: None,
             torque: vec![0.0; structure.dof_count()],
             contacts: vec![[0.0; 6]; structure.contacts().len()],
         })
@@ -294,13 +339,17 @@ impl Propagation {
         if !solver.is_solved(structure, kinematics) {
             return Err(DynamicsError::NotSolved);
         }
+        let begun = *self.begun.get_or_insert(t);
         for (part, subtree) in self.parts.iter_mut().zip(structure.subtrees()) {
             part.update(solver, kinematics);
             let wandered = |motion: &dyn Fn(usize) -> Motion| -> f64 {
                 let of = |end: &End| {
-                    wander(&self.drifts[end.sensor], t, solver.sensor_pose(end.sensor), || {
-                        motion(end.link)
-                    })
+                    wander(
+                        &self.drifts[end.sensor],
+                        (t, begun),
+                        solver.sensor_pose(end.sensor),
+                        || motion(end.link),
+                    )
                 };
                 part.ends.iter().map(of).sum()
             };
@@ -340,12 +389,12 @@ impl Propagation {
     }
 }
 
-/// Variance that what an offset has wandered by `t` gives to a result that sees it with a motion.
-fn wander(drift: &Drift, t: Nanos, x_bm: &Pose, motion: impl Fn() -> Motion) -> f64 {
+/// Variance that what an offset has wandered by `t` gives to a result that sees it with a motion; the run began at `begun`.
+fn wander(drift: &Drift, (t, begun): (Nanos, Nanos), x_bm: &Pose, motion: impl Fn() -> Motion) -> f64 {
     if drift.rate == [0.0; 6] {
         return 0.0;
     }
-    let seconds = t.saturating_sub(drift.known).seconds().abs();
+    let seconds = drift.known.elapsed(t, begun);
     let seen = x_bm.twist_back(&motion());
     let squares = seen.angular.iter().chain(seen.linear.iter()).zip(&drift.rate);
     seconds * squares.map(|(m, rate)| m * m * rate).sum::<f64>()

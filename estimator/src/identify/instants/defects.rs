@@ -13,21 +13,10 @@
 use super::smooth::{median, quantum};
 use super::{Instants, JointTrack, Recording, Stream};
 use crate::dynamics::{InverseDynamics, JointState, Kinematics, Structure};
-use crate::identify::AXES;
+use crate::identify::{AXES, Severity};
 use crate::setup::{Setup, Use};
 use proprio_topics::{Nanos, Reading, Reason};
 use std::fmt;
-
-/// How much a defect matters.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Severity {
-    /// Worth knowing; nothing need be wrong.
-    Note,
-    /// A part of the log was left out, or is to be doubted.
-    Warning,
-    /// Nothing should be identified from this log.
-    Fatal,
-}
 
 /// What units a channel seems to have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -209,7 +198,7 @@ impl Defect {
     pub fn severity(&self) -> Severity {
         match self {
             Self::Still { .. } => Severity::Note,
-            Self::NoMotion { .. } | Self::TooShort { .. } | Self::WrongUnits { .. } => Severity::Fatal,
+            Self::NoMotion { .. } | Self::TooShort { .. } | Self::WrongUnits { .. } => Severity::Refusal,
             _ => Severity::Warning,
         }
     }
@@ -1148,7 +1137,7 @@ const LEVER: f64 = Structure::LENGTH_SCALE;
 /// Looks at what the sensors read beyond what the model says: marks outliers, finds jumps.
 pub(super) fn inspect_readings(recording: &Recording, setup: &Setup, instants: &mut Instants) {
     // Of a log in other units, or without motion, the model says nothing.
-    if !recording.stamped || instants.defects.iter().any(|d| d.severity() == Severity::Fatal) {
+    if !recording.stamped || instants.defects.iter().any(|d| d.severity() == Severity::Refusal) {
         return;
     }
     let spacings: Vec<f64> = instants

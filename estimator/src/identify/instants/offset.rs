@@ -6,12 +6,17 @@
 //!
 //! Both sides lose what varies more slowly than about a second (a moving average is taken off), so that sensor offsets and most of what is wrong with the model's weights
 //! go; the gain of each axis takes up the rest of a wrong weight. The offset maximises the likelihood with the noise of every axis unknown (sum over axes of
-//! `n/2 log` of what is left over). It is the prediction that is moved, not the measurement: moving noisy samples between their stamps would smooth them
-//! most half-way, and the half-way would look best. The standard deviation is that of a linear fit at the best offset, with the noise variance multiplied by
-//! its integrated autocorrelation time.
+//! `n/2 log` of what is left over). Moving samples between their stamps smooths their noise, most half-way, and the half-way would look best: a prediction has noise too, that of
+//! accelerations from encoders or of another sensor. So both sides are smoothed alike first, over a few samples, so that neither has anything left that moving could smooth away.
+//!
+//! The standard deviation is that of a linear fit at the best offset. What is left over there is mostly model error, not noise: as slow as the motion, as the slope of the prediction is, and
+//! common to all axes. Its autocorrelation time does not show it (without its slow part a series has next to none, whatever happens at the frequencies of the motion). So what each
+//! stretch of the log wants the offset moved by is looked at: their scatter is what the offset is uncertain by, `sqrt(sum s_b^2) / I` for scores `s_b` of the stretches and the
+//! information `I` (the sandwich estimator; White 1980, in blocks: Liang, Zeger 1986), if that is more than what noise gives with its autocorrelation time.
 
 use super::{Recording, Stream};
 use proprio_topics::Nanos;
+use std::collections::BTreeMap;
 
 /// Offsets are looked for within this \[s\].
 const WITHIN: f64 = 0.15;
@@ -19,6 +24,10 @@ const WITHIN: f64 = 0.15;
 const STEP: f64 = 0.005;
 /// Half of the moving average that is taken off \[s\].
 const SLOW: f64 = 0.5;
+/// Stretches of this length \[s\] count as independent in what they want the offset to be.
+const STRETCH: f64 = 2.0;
+/// Standard deviation of the smoothing of both sides, in samples of the one that has fewer.
+const SMOOTH: f64 = 2.0;
 /// Significant is what exceeds this many standard deviations ...
 const DEVIATIONS: f64 = 4.0;
 /// ... and this \[s\]: less than that does no harm and is not worth moving a stream for.
@@ -132,14 +141,17 @@ fn estimate<const D: usize>(
         return None;
     }
     let block_times: Vec<f64> = blocks.iter().map(|(t, _)| *t).collect();
+    let spacings = |t: &[f64]| super::smooth::median(t.windows(2).map(|w| w[1] - w[0]).collect());
+    let width = SMOOTH * spacings(&block_times).max(spacings(&at));
     let axes: Vec<Axis> = (0..D)
         .map(|k| {
             let values: Vec<f64> = blocks.iter().map(|(_, v)| v[k]).collect();
+            let values = smoothed(&block_times, &values, width);
             let slow = Slow::new(&block_times, &values);
-            let measured = blocks.iter().zip(&used).filter(|(_, used)| **used);
+            let measured = block_times.iter().zip(&values).zip(&used).filter(|(_, used)| **used);
             Axis {
                 measured: measured
-                    .map(|((t, v), _)| (v[k] - slow.mean(t - SLOW, t + SLOW), *t))
+                    .map(|((t, v), _)| (v - slow.mean(t - SLOW, t + SLOW), *t))
                     .collect(),
             }
         })
@@ -148,6 +160,7 @@ fn estimate<const D: usize>(
     let columns: Vec<Vec<f64>> = (0..D)
         .map(|k| {
             let column: Vec<f64> = rows.iter().map(|(_, row)| row[k]).collect();
+            let column = smoothed(&at, &column, width);
             let slow = Slow::new(&at, &column);
             at.iter()
                 .zip(&column)
@@ -203,7 +216,8 @@ fn estimate<const D: usize>(
         }
         step *= 0.3;
     }
-    let mut information = 0.0;
+    let (mut information, mut plain) = (0.0, 0.0);
+    let mut scores: BTreeMap<i64, f64> = BTreeMap::new();
     for (k, axis) in axes.iter().enumerate() {
         let (mut xx, mut xy) = (0.0, 0.0);
         let model: Vec<[f64; 2]> = axis
@@ -235,12 +249,22 @@ fn estimate<const D: usize>(
             ss += slope * slope;
             sx += slope * x;
         }
-        let variance = inflated_variance(&residual);
+        let variance = residual.iter().map(|v| v * v).sum::<f64>() / count;
         if variance > 0.0 {
-            information += gain * gain * (ss - sx * sx / xx).max(0.0) / variance;
+            let told = gain * gain * (ss - sx * sx / xx).max(0.0);
+            information += told / inflated_variance(&residual);
+            plain += told / variance;
+            for (([x, slope], (_, t)), e) in model.iter().zip(&axis.measured).zip(&residual) {
+                #[allow(clippy::cast_possible_truncation)]
+                let stretch = (t / STRETCH).floor() as i64;
+                *scores.entry(stretch).or_default() += gain * (slope - sx / xx * x) * e / variance;
+            }
         }
     }
-    let deviation = information.sqrt().recip();
+    // One is spent on the offset itself.
+    let stretches = scores.len() as f64;
+    let scatter = scores.values().map(|s| s * s).sum::<f64>() * stretches / (stretches - 1.0).max(0.5);
+    let deviation = information.sqrt().recip().max(scatter.sqrt() / plain);
     (deviation < 0.02).then_some((offset, deviation))
 }
 
@@ -257,6 +281,35 @@ fn inflated_variance(series: &[f64]) -> f64 {
         }
     }
     variance * time.max(1.0)
+}
+
+/// A series smoothed by lines fitted around each sample, weighted by a Gaussian curve of this standard deviation \[s\].
+fn smoothed(at: &[f64], values: &[f64], width: f64) -> Vec<f64> {
+    let mut low = 0;
+    at.iter()
+        .enumerate()
+        .map(|(i, centre)| {
+            while at[low] < centre - 3.0 * width {
+                low += 1;
+            }
+            let (mut w0, mut w1, mut w2, mut y0, mut y1) = (0.0, 0.0, 0.0, 0.0, 0.0);
+            for (t, y) in at[low..].iter().zip(&values[low..]) {
+                let x = (t - centre) / width;
+                if x > 3.0 {
+                    break;
+                }
+                let w = (-0.5 * x * x).exp();
+                (w0, w1, w2) = (w0 + w, w1 + w * x, w2 + w * x * x);
+                (y0, y1) = (y0 + w * y, y1 + w * x * y);
+            }
+            let determinant = w0 * w2 - w1 * w1;
+            if determinant > 1e-9 * w0 * w0 {
+                (w2 * y0 - w1 * y1) / determinant
+            } else {
+                values[i]
+            }
+        })
+        .collect()
 }
 
 /// The four-point cubic (Lagrange) through the samples around sample interval `i - 1` to `i`, at `t`; a line at the ends.

@@ -11,6 +11,7 @@ use super::*;
 use crate::config::Config;
 use crate::differentiate::{Settings as WindowSettings, Window};
 use crate::dynamics::{InverseDynamics, JointState, Kinematics};
+use crate::identify::Severity;
 use crate::model::Model;
 use std::path::{Path, PathBuf};
 
