@@ -12,7 +12,7 @@ use serde_json::Value as Json;
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Output;
 
 const FILES: [&str; 4] = ["identified.urdf", "parameters.toml", "report.html", "summary.json"];
 const THREE: [&str; 3] = ["cad", "cad_fitted", "identified"];
