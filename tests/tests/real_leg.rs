@@ -257,14 +257,16 @@ fn live_is_replay(buses: [&str; 2], play: impl Fn(&Rig, &str) -> Box<dyn FnMut()
     }
 }
 
-/// A configuration whose times in ms are so many times longer.
+/// A configuration whose times in ms are so many times longer, but for the wait, which is as long as it may be.
 fn slow_motion(text: &str, slower: i64) -> String {
     let line = |line: &str| match line.split_once(" = ") {
-        Some((key, value)) if key.ends_with("_ms") => match (value.parse::<i64>(), value.parse::<f64>()) {
-            (Ok(whole), _) => format!("{key} = {}\n", whole * slower),
-            (_, Ok(number)) => format!("{key} = {:?}\n", number * slower as f64),
-            _ => panic!("{line} is not a number"),
-        },
+        Some((key, value)) if key.ends_with("_ms") && key != "max_wait_ms" => {
+            match (value.parse::<i64>(), value.parse::<f64>()) {
+                (Ok(whole), _) => format!("{key} = {}\n", whole * slower),
+                (_, Ok(number)) => format!("{key} = {:?}\n", number * slower as f64),
+                _ => panic!("{line} is not a number"),
+            }
+        }
         _ => format!("{line}\n"),
     };
     text.lines().map(line).collect()
