@@ -464,7 +464,7 @@ fn fit(
     let pieces = chunks(training, LONG);
     let sampled = sample(maker, training);
     let zero = DVector::zeros(layout.unknowns());
-    let mut noise = NoiseModel::unit(least.clone());
+    let mut noise = NoiseModel::unknown(least.clone());
     for _ in 0..3 {
         let left = over(maker, &sampled, |maker, _, piece| {
             leave(maker, piece, &noise, std::slice::from_ref(&zero))

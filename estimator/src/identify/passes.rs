@@ -20,6 +20,9 @@ const FRICTION_VARIANCE: f64 = 1e4;
 const INDEPENDENT: f64 = 8.0;
 const LONGEST: usize = 10;
 
+/// A channel of whose noise less than this shows among that of others is not judged by it.
+const LEAST_SHARE: f64 = 1e-3;
+
 /// Rows that are absorbed at once.
 const PANEL: usize = 96;
 
@@ -47,14 +50,15 @@ pub(super) struct NoiseModel {
 }
 
 impl NoiseModel {
-    /// Before anything is known.
-    pub(super) fn unit(least: Vec<f64>) -> Self {
+    /// Before anything is known: far more than the least, in its proportions.
+    pub(super) fn unknown(least: Vec<f64>) -> Self {
         let channels = least.len();
+        let start: Vec<f64> = least.iter().map(|least| 1e6 * least).collect();
         Self {
-            square: vec![1.0; channels],
+            square: start.clone(),
             time: vec![1.0; channels],
             drift: vec![0.0; channels],
-            block: vec![1.0; channels],
+            block: start,
             least,
         }
     }
@@ -233,6 +237,10 @@ pub(super) struct Residuals {
     pub ranges: Vec<Range<usize>>,
     /// Per block the session's unknowns, a column per set, given all of the piece.
     pub session: Vec<Block>,
+    /// How what shows is shared among channels ([`Rows::add_shares`]): the mean over instants, a row per channel.
+    pub shares: DMatrix<f64>,
+    /// Per channel, at how many instants any row has it.
+    pub seen: Vec<f64>,
 }
 
 impl Residuals {
@@ -241,14 +249,30 @@ impl Residuals {
         self.measured[channel].iter().any(|x| x.is_finite())
     }
 
-    /// A sensor's offset in a channel, per instant.
-    pub(super) fn offset(&self, layout: &Layout, set: usize, channel: usize) -> Vec<f64> {
-        let mut out = vec![f64::NAN; self.measured.first().map_or(0, Vec::len)];
-        let unknown = layout.offset_of(channel);
-        for (range, block) in self.ranges.iter().zip(&self.session) {
-            out[range.clone()].fill(block.x[(unknown, set)]);
+    /// What a channel's offset does beside its mean since it last started afresh, per block; of what walks of several sensors that rows mix, each sensor's has the share that its noise has.
+    /// (Given to whoever is thought to walk most, it would all be thought that one's.)
+    fn walk(&self, layout: &Layout, set: usize, channel: usize) -> Vec<f64> {
+        let mut sum = vec![0.0; self.session.len()];
+        for other in 0..6 * layout.sensors.len() {
+            let share = self.shares[(channel, other)];
+            if share == 0.0 {
+                continue;
+            }
+            let unknown = layout.offset_of(other);
+            let mut start = 0;
+            for end in 1..=self.session.len() {
+                if end < self.session.len() && self.session[end].drift[unknown].is_finite() {
+                    continue;
+                }
+                let own = &self.session[start..end];
+                let mean = own.iter().map(|block| block.x[(unknown, set)]).sum::<f64>() / own.len() as f64;
+                for (sum, block) in sum[start..end].iter_mut().zip(own) {
+                    *sum += share * (block.x[(unknown, set)] - mean);
+                }
+                start = end;
+            }
         }
-        out
+        sum
     }
 }
 
@@ -300,6 +324,7 @@ pub(super) fn leave(
     );
     let cad = maker.cad_of_layout();
     let (mut white, mut e) = (Vec::new(), vec![0.0; channels]);
+    let (mut shares, mut seen) = (vec![0.0; channels * channels], vec![0.0_f64; channels]);
     for (range, state) in ranges.iter().zip(&states) {
         for i in range.clone() {
             if maker.make(&piece.instants[i], &mut rows).is_err() {
@@ -307,6 +332,8 @@ pub(super) fn leave(
             }
             rows.whiten(&variances);
             let there: Vec<usize> = (0..channels).filter(|&channel| rows.has(channel)).collect();
+            rows.add_shares(&variances, &mut shares);
+            there.iter().for_each(|&channel| seen[channel] += 1.0);
             let mut give = |value: &dyn Fn(usize) -> f64, out: &mut Vec<Vec<f64>>| {
                 white.clear();
                 white.extend((0..rows.count).map(value));
@@ -332,6 +359,8 @@ pub(super) fn leave(
         measured,
         ranges,
         session: states,
+        shares: DMatrix::from_fn(channels, channels, |i, j| shares[i * channels + j] / seen[i].max(1.0)),
+        seen,
     }
 }
 
@@ -346,6 +375,10 @@ fn merge(means: &[f64], count: usize) -> Vec<f64> {
 }
 
 /// The noise of every channel, from what one set of parameters leaves of all pieces. `bound`: the greatest variance of a step of an offset's walk, relative to that of a block's noise.
+///
+/// Where rows mix channels (a sub-tree between two sensors shows the sum of both), what is left is the *most likely* noise of each, which varies less than the noise: its variance is the
+/// channel's less the posterior one, `v - (V - V N^T W^-1 N V)_cc`, a share of `v` that is known. What is found is divided by that share. Where it stays, the variances are those of the
+/// greatest likelihood, as with the EM algorithm, which adds the posterior variance instead and comes there in many more rounds.
 pub(super) fn noise_of(layout: &Layout, pieces: &[Residuals], set: usize, bound: f64, least: &[f64]) -> NoiseModel {
     let mut model = NoiseModel {
         least: least.to_vec(),
@@ -361,8 +394,8 @@ pub(super) fn noise_of(layout: &Layout, pieces: &[Residuals], set: usize, bound:
             let mut means: Vec<noise::Blocks> = Vec::new();
             let (mut used, mut filled) = (0usize, 0usize);
             for (piece, left) in pieces.iter().zip(&mut left) {
-                for (x, offset) in left.iter_mut().zip(piece.offset(layout, set, channel)) {
-                    *x += offset;
+                for (range, offset) in piece.ranges.iter().zip(piece.walk(layout, set, channel)) {
+                    left[range.clone()].iter_mut().for_each(|x| *x += offset);
                 }
                 let mean = |range: &Range<usize>| {
                     let values = left[range.clone()].iter().filter(|x| x.is_finite());
@@ -407,12 +440,179 @@ pub(super) fn noise_of(layout: &Layout, pieces: &[Residuals], set: usize, bound:
         }
         let slices: Vec<&[f64]> = left.iter().map(Vec::as_slice).collect();
         let (square, time) = noise::autocorrelation_time(&slices);
-        model.square.push(square);
+        let seen: f64 = pieces.iter().map(|piece| piece.seen[channel]).sum();
+        let shown: f64 = pieces
+            .iter()
+            .map(|p| p.shares[(channel, channel)] * p.seen[channel])
+            .sum();
+        let share = if seen > 0.0 {
+            (shown / seen).clamp(LEAST_SHARE, 1.0)
+        } else {
+            1.0
+        };
+        model.square.push(square / share);
         model.time.push(time);
-        model.drift.push(step / BLOCK);
-        model
-            .block
-            .push(if wanders { variance * per_block } else { square * time });
+        model.drift.push(step / BLOCK / share);
+        let block = if wanders { variance * per_block } else { square * time };
+        model.block.push(block / share);
     }
     model
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Config, IdentificationInput};
+    use crate::dynamics::{FrameMotion, SensorSet};
+    use crate::model::Model;
+    use crate::setup::Setup;
+    use crate::spatial::{Vec3, Wrench};
+    use nalgebra::{Matrix6, Vector6};
+    use proprio_topics::{Nanos, Reason};
+
+    /// Three links between two F/T sensors, a foot beyond that stands on something: the readings of both sensors are in the same six equations.
+    fn between_two_sensors() -> Setup {
+        let link = |name: &str| {
+            format!(
+                "<link name=\"{name}\"><inertial><origin xyz=\"0.02 -0.01 0.1\" rpy=\"0 0 0\"/><mass value=\"1.5\"/><inertia ixx=\"0.01\" ixy=\"0\" ixz=\"0\" iyy=\"0.012\" iyz=\"0\" izz=\"0.005\"/></inertial></link>"
+            )
+        };
+        let joint = |name: &str, parent: &str, child: &str, rest: &str| {
+            let kind = if rest.is_empty() { "fixed" } else { "revolute" };
+            format!(
+                "<joint name=\"{name}\" type=\"{kind}\"><parent link=\"{parent}\"/><child link=\"{child}\"/><origin xyz=\"0 0.03 0.2\" rpy=\"0.3 0.1 0\"/>{rest}</joint>"
+            )
+        };
+        let turns =
+            |axis: &str| format!("<axis xyz=\"{axis}\"/><limit lower=\"-3\" upper=\"3\" effort=\"9\" velocity=\"9\"/>");
+        let urdf = ["base", "thigh", "knee", "shank", "foot"].map(link).concat()
+            + &joint("hip_ft", "base", "thigh", "")
+            + &joint("j1", "thigh", "knee", &turns("1 0 0"))
+            + &joint("j2", "knee", "shank", &turns("0 1 0"))
+            + &joint("foot_ft", "shank", "foot", "");
+        let urdf = format!("<robot name=\"leg\">{urdf}</robot>");
+        let config = "schema = 1\nrobot = \"leg\"\nmodel = \"leg.urdf\"\n[base]\nkind = \"fixed\"\nlink = \"base\"\n\
+            [[force_torque]]\nsensor = \"hip\"\njoint = \"hip_ft\"\n[[force_torque]]\nsensor = \"foot\"\njoint = \"foot_ft\"\n\
+            [[contact]]\nname = \"floor\"\nlink = \"foot\"\n";
+        let model = Model::from_urdf(&urdf, &["hip_ft", "foot_ft"]).expect("a model");
+        Setup::with_model(&Config::parse(config).expect("a configuration"), model).expect("it fits")
+    }
+
+    /// What both sensors read at 100 Hz while CAD is right, with these deviations of their channels and of their offsets' steps, [torque; force] of both.
+    fn readings(setup: &Setup, count: usize, noise: &[f64; 12], walk: &[f64; 12]) -> Vec<Instant> {
+        let mut state = 7_u64;
+        let mut uniform = || {
+            state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+            let mut z = state;
+            z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+            z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+            ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
+        };
+        let mut normal = || (-2.0 * uniform().max(1e-300).ln()).sqrt() * (std::f64::consts::TAU * uniform()).cos();
+        let zero = Wrench::zero();
+        let mut instants: Vec<Instant> = (0..count)
+            .map(|k| {
+                let t = 0.01 * k as f64;
+                let angles = [(1.3, 2.1, 0.4), (1.1, 1.4, 1.9)].map(|(size, rate, phase): (f64, f64, f64)| {
+                    let (s, c) = (rate * t + phase).sin_cos();
+                    [size * s, size * rate * c, -size * rate * rate * s]
+                });
+                Instant {
+                    t: Nanos::from_seconds(t),
+                    position: angles.iter().map(|a| a[0]).collect(),
+                    velocity: angles.iter().map(|a| a[1]).collect(),
+                    acceleration: angles.iter().map(|a| a[2]).collect(),
+                    torque: vec![f64::NAN; 2],
+                    base_link: setup.base_link,
+                    base: FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.80665)),
+                    readings: vec![zero; 2],
+                    active: setup.always,
+                    faults: vec![Reason::None; setup.channels().len()],
+                    base_fault: Reason::None,
+                    outliers: SensorSet::default(),
+                }
+            })
+            .collect();
+        let mut maker = RowMaker::survey(setup, &[IdentificationInput::Wrench], instants.iter()).expect("rows");
+        let mut rows = Rows::new(maker.layout());
+        let mut offset = [0.0; 12];
+        for instant in &mut instants {
+            // r = 0 for G m + r(0) = 0: the foot's reading is chosen, the hip's follows.
+            maker.make(instant, &mut rows).expect("rows");
+            assert_eq!(rows.count, 6);
+            let g = |first: usize| Matrix6::from_fn(|i, j| rows.g(i)[first + j]);
+            let foot = Vector6::new(0.5, -0.3, 0.2, 3.0, -2.0, 20.0);
+            let hip = g(0).try_inverse().expect("a transform") * (-Vector6::from_fn(|i, _| rows.r(i)) - g(6) * foot);
+            for (i, offset) in offset.iter_mut().enumerate() {
+                *offset += walk[i] * normal();
+            }
+            let mut noisy = |exact: &Vector6<f64>, first: usize| {
+                let value: [f64; 6] =
+                    std::array::from_fn(|i| exact[i] + offset[first + i] + noise[first + i] * normal());
+                Wrench::from_parts([value[3], value[4], value[5]], [value[0], value[1], value[2]])
+            };
+            instant.readings = vec![noisy(&hip, 0), noisy(&foot, 6)];
+        }
+        instants
+    }
+
+    fn noise_found(setup: &Setup, instants: &[Instant], rounds: usize) -> NoiseModel {
+        let mut maker = RowMaker::survey(setup, &[IdentificationInput::Wrench], instants.iter()).expect("rows");
+        let layout = maker.layout().clone();
+        assert_eq!((layout.sensors.len(), layout.channels()), (2, 12));
+        let least: Vec<f64> = (0..12)
+            .map(|channel| if channel % 6 < 3 { 1e-10 } else { 1e-8 })
+            .collect();
+        let mut noise = NoiseModel::unknown(least.clone());
+        let piece = Piece { instants, breaks: &[] };
+        let zero = DVector::zeros(layout.unknowns());
+        for _ in 0..rounds {
+            let left = leave(&mut maker, piece, &noise, std::slice::from_ref(&zero));
+            noise = noise_of(&layout, std::slice::from_ref(&left), 0, 0.01, &least);
+        }
+        noise
+    }
+
+    const HIP_AND_FOOT: [f64; 12] = [0.02, 0.03, 0.015, 0.4, 0.3, 0.5, 0.004, 0.006, 0.003, 0.1, 0.08, 0.15];
+
+    #[test]
+    fn the_noise_of_two_sensors_is_told_apart() {
+        let setup = between_two_sensors();
+        let instants = readings(&setup, 6000, &HIP_AND_FOOT, &[0.0; 12]);
+        let noise = noise_found(&setup, &instants, 12);
+        // Forces are told apart by their lever arms; torques, by how the sensors turn against each other alone, hardly: but as a whole they are known.
+        let is_torque = |channel: &usize| channel % 6 < 3;
+        for channel in (0..12).filter(|channel| !is_torque(channel)) {
+            let ratio = noise.square[channel].sqrt() / HIP_AND_FOOT[channel];
+            println!(
+                "channel {channel}: {ratio:.3}, time {:.2}, drift {:.2e}",
+                noise.time[channel], noise.drift[channel]
+            );
+            assert!((ratio - 1.0).abs() < 0.05, "channel {channel}: {ratio}");
+        }
+        let of_torques = |square: &dyn Fn(usize) -> f64| (0..12).filter(is_torque).map(square).sum::<f64>();
+        let ratio = of_torques(&|channel| noise.square[channel]) / of_torques(&|channel| HIP_AND_FOOT[channel].powi(2));
+        assert!((ratio - 1.0).abs() < 0.1, "{ratio}");
+    }
+
+    /// Which of two offsets wanders can not be told where rows show their sum alone; how far both together wander can.
+    #[test]
+    fn the_walk_of_two_offsets_is_found_as_a_whole() {
+        let setup = between_two_sensors();
+        let mut walk = [0.0; 12];
+        walk[3..6].fill(0.003);
+        walk[9..12].fill(0.003);
+        let instants = readings(&setup, 6000, &HIP_AND_FOOT, &walk);
+        let noise = noise_found(&setup, &instants, 12);
+        for (channel, (square, expected)) in noise.square.iter().zip(HIP_AND_FOOT).enumerate() {
+            println!(
+                "channel {channel}: {:.3}, drift {:.2e}",
+                square.sqrt() / expected,
+                noise.drift[channel]
+            );
+        }
+        let whole: f64 = [3, 4, 5, 9, 10, 11].map(|channel| noise.drift[channel]).iter().sum();
+        let expected = 6.0 * 0.003 * 0.003 / 0.01;
+        assert!((0.5..2.0).contains(&(whole / expected)), "{whole}, not {expected}");
+    }
 }

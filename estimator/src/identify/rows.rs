@@ -195,6 +195,22 @@ impl Rows {
         }
     }
 
+    /// Adds `diag(v) N^T W^-1 N` to `sum`, channels by channels, row by row: how [`Rows::channel_noise`] shares what the rows show among the channels. Its diagonal is the share of each channel's
+    /// variance that its most likely noise has, `(v - posterior variance) / v`: one if the rows tell the channel from all others, less where they only show it mixed with others.
+    pub(super) fn add_shares(&self, variances: &[f64], sum: &mut [f64]) {
+        let (m, channels) = (self.count, self.channels);
+        let mut white = self.n.clone();
+        forward(&self.factor, m, &mut white, channels);
+        for row in white.chunks_exact(channels.max(1)) {
+            for ((own, variance), sums) in row.iter().zip(variances).zip(sum.chunks_exact_mut(channels)) {
+                if *own != 0.0 {
+                    let weight = own * variance;
+                    sums.iter_mut().zip(row).for_each(|(sum, other)| *sum += weight * other);
+                }
+            }
+        }
+    }
+
     /// Whether any row has this channel's noise.
     pub(super) fn has(&self, channel: usize) -> bool {
         (0..self.count).any(|row| self.n(row)[channel] != 0.0)
