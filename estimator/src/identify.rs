@@ -7,7 +7,8 @@
 //!     -> offsets and friction s eliminated, by a filter on all columns at once                 session, passes
 //!     -> [R | z], what all logs tell of d = phi - phi_CAD                                      information
 //!     -> the most probable bodies under CAD's prior, and its weight                            prior
-//!     -> what is left -> noise of each channel -> again, until it stays                        noise
+//!     -> what is left -> noise of each channel -> again, until it stays                        noise, passes
+//!     -> undeclared contacts, another load: left out, and again, until it stays                gate
 //!     -> held-out data: what gains nothing is shrunk to CAD                                    batch
 //!     -> Outcome: parameters, covariance, figures per log, in words                            assess, export
 //! ```
@@ -23,12 +24,13 @@
 //! What is left of a channel is mostly model error, not noise of the sensor: correlated in time, and larger when the robot moves. As white noise it would be believed far too much, and the
 //! evidence would let the data overrule CAD where they know nothing. So its variance is multiplied by its integrated autocorrelation time, or taken from the scatter of block means,
 //! whichever is more. An F/T sensor's offset walks besides; how fast is found by the likelihood of the block means, within a bound: it follows nothing faster than a second, or it would swallow
-//! motion and touch. Where a contact is declared the rows that it reaches are gone, and with them all influence on parameters and offsets.
+//! motion and touch. Where a contact is declared, or found though nobody declared it, the rows that it reaches are gone, and with them all influence on parameters and offsets.
 
 mod assess;
 mod batch;
 pub mod consistent;
 mod export;
+mod gate;
 pub mod information;
 pub mod instants;
 mod noise;
@@ -41,6 +43,7 @@ mod session;
 
 pub use batch::{IdentifyError, Log, Options, Progress, identify};
 pub use export::parameters;
+pub use gate::UnitSet;
 pub use outcome::{
     BaseParameterOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding, FrictionOutcome, JointOutcome,
     LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, SensorOutcome, Severity, Spectrum, Three,

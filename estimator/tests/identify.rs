@@ -144,6 +144,7 @@ fn kuka_one_predicts_the_other() {
         let error = &outcome.logs[1].relative_error;
         assert!(error.identified < 0.024, "{error:?}");
         assert!((0.055..0.075).contains(&error.cad_fitted), "{error:?}");
+        nothing_is_suspected(&outcome);
     }
 }
 
@@ -162,6 +163,58 @@ fn kuka_half_a_log_predicts_the_other_half() {
         let error = &outcome.logs[1].relative_error;
         assert!(error.identified < 0.6 * error.cad_fitted, "{error:?}");
     }
+}
+
+/// A hand on a real arm, for three seconds, that nobody declared: found, and nothing but it; and what is identified is hardly worse than without.
+#[test]
+fn kuka_touched_is_identified_all_the_same() {
+    let (Some(one), Some(two), Some(setup)) = (data("kuka_lwr4_1.csv"), data("kuka_lwr4_2.csv"), kuka()) else {
+        return;
+    };
+    let header: Vec<&str> = one.lines().next().expect("a header").split(',').collect();
+    let torques: Vec<usize> = (0..header.len()).filter(|&i| header[i].ends_with("/torque")).collect();
+    let push = |line: &str| {
+        let t: Option<f64> = line.split(',').next().and_then(|t| t.parse().ok());
+        if !t.is_some_and(|t| (10.0..13.0).contains(&t)) {
+            return format!("{line}\n");
+        }
+        let by = |i: usize| {
+            torques
+                .iter()
+                .position(|at| *at == i)
+                .map(|joint| [8.0, 18.0, -5.0, -12.0, 3.0, 1.5, 0.0][joint])
+        };
+        let cell = |(i, cell): (usize, &str)| match (by(i), cell.parse::<f64>()) {
+            (Some(by), Ok(value)) => format!("{}", value + by),
+            _ => cell.to_owned(),
+        };
+        line.split(',').enumerate().map(cell).collect::<Vec<_>>().join(",") + "\n"
+    };
+    let touched: String = one.lines().map(push).collect();
+    let outcome = run(
+        &setup,
+        &[("touched", Role::Train, &touched), ("test", Role::Validate, &two)],
+        &TORQUE,
+    );
+    let error = &outcome.logs[1].relative_error;
+    assert!(error.identified < 0.024, "{error:?}");
+    let mut suspected = outcome.logs[0]
+        .left_out
+        .iter()
+        .filter(|out| out.reason.contains("suspected"));
+    let span = suspected.next().expect("a contact");
+    assert!(suspected.next().is_none());
+    let (first, last) = (span.first.seconds(), span.last.seconds());
+    assert!((9.5..10.1).contains(&first) && (12.9..13.5).contains(&last), "{span:?}");
+}
+
+/// Nothing undeclared acts on the robots of the recorded logs: nothing of them may be thought a contact, whatever CAD has wrong and however the structure shakes.
+fn nothing_is_suspected(outcome: &Outcome) {
+    let left_out = outcome.logs.iter().flat_map(|log| &log.left_out);
+    let suspected: Vec<_> = left_out
+        .filter(|out| out.reason.contains("suspected") || out.reason.contains("load"))
+        .collect();
+    assert!(suspected.is_empty(), "{suspected:?}");
 }
 
 /// The iCub's leg between two sensors, beyond unknown forces on trunk and left leg.
@@ -187,6 +240,7 @@ fn leg_torques_from_either_sensor_agree() {
         &[("first", Role::Train, &first), ("second", Role::Validate, &second)],
         &[IdentificationInput::Wrench],
     );
+    nothing_is_suspected(&outcome);
     let log: &LogOutcome = &outcome.logs[1];
     assert_eq!(log.two_route.len(), 4);
     let knee = log.two_route.iter().find(|r| r.joint == "r_knee").expect("the knee");

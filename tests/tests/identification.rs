@@ -1253,6 +1253,43 @@ fn declared_pushes_do_no_harm() {
     }
 }
 
+/// What is said of something undeclared.
+fn suspicions(outcome: &Outcome) -> Vec<(&'static str, String)> {
+    let findings = outcome.logs.iter().flat_map(|log| &log.findings);
+    let about = findings.filter(|finding| ["contact_suspected", "load_changed"].contains(&finding.code));
+    about.map(|finding| (finding.code, finding.text.clone())).collect()
+}
+
+#[test]
+fn undeclared_pushes_do_no_harm() {
+    for sessions in robots() {
+        let log = undeclared(&sessions.log("contact"));
+        let outcome = identified(&sessions, &[("contact.csv", &log, Role::Train)]);
+        println!("{:?} {:?}", suspicions(&outcome), outcome.logs[0].left_out);
+        must_be_good("pushes, undeclared", &sessions, &outcome);
+        let said = suspicions(&outcome);
+        assert!(said.len() == 1 && said[0].0 == "contact_suspected", "{said:?}");
+        // All of every push but its soft beginning and end is left out, and little else.
+        let pushed: f64 = sessions.pushes("contact").iter().map(|(from, to)| to - from).sum();
+        let (begin, end) = outcome.logs[0].span;
+        let seconds = (end - begin).seconds();
+        let left_out = &outcome.logs[0].left_out;
+        let suspected = left_out
+            .iter()
+            .find(|out| out.reason.contains("suspected"))
+            .expect("a reason");
+        let share = suspected.instants as f64 / outcome.logs[0].used as f64;
+        assert!(
+            share * seconds > pushed - 0.8,
+            "{share} of {seconds} s, pushed for {pushed} s"
+        );
+        assert!(
+            share * seconds < pushed + 3.0,
+            "{share} of {seconds} s, pushed for {pushed} s"
+        );
+    }
+}
+
 /// The lines of a log in a span of time \[s\].
 fn part(log: &str, from: f64, to: f64) -> String {
     let within = |line: &&str| {
@@ -1309,5 +1346,39 @@ fn a_payload_is_identified() {
             ],
         );
         must_be_good("before the payload", &sessions, &before);
+    }
+}
+
+#[test]
+fn a_payload_picked_up_within_a_log_is_noticed_and_told() {
+    for sessions in robots() {
+        let (train, log) = (sessions.log("train"), sessions.log("payload"));
+        let facts = &sessions.facts["sessions"]["payload"]["payload"];
+        let [from, all_from, mass] = ["from", "all_from", "mass"].map(|what| facts[what].as_f64().unwrap());
+        let centre = numbers(&facts["centre"]);
+        let alone: &[(&str, &str, Role)] = &[("payload.csv", &log, Role::Train)];
+        let both: &[(&str, &str, Role)] = &[("train.csv", &train, Role::Train), ("payload.csv", &log, Role::Train)];
+        for logs in [alone, both] {
+            let outcome = identified(&sessions, logs);
+            must_be_good("payload, undeclared", &sessions, &outcome);
+            let said = suspicions(&outcome);
+            println!("{said:?}");
+            assert!(said.len() == 1 && said[0].0 == "load_changed", "{said:?}");
+            let left_out = &outcome.logs.last().expect("a log").left_out;
+            let load = left_out
+                .iter()
+                .find(|out| out.reason == "another load: l_hand")
+                .expect("a reason");
+            let (first, last) = (load.first.seconds(), load.last.seconds());
+            assert!(first > from - 0.5 && first < all_from && last > 23.0, "{load:?}");
+            // `... +0.501 +- 0.001 kg, first moment -0.0008, +0.0027, +0.0296 +- ...`
+            let (before, after) = said[0].1.split_once(" kg, first moment ").expect("a body");
+            let told = |text: &str| text.trim().parse::<f64>().unwrap_or_else(|e| panic!("{text}: {e}"));
+            let own = told(before.split(": ").last().unwrap().split(" +- ").next().unwrap());
+            assert!((own - mass).abs() < 0.01, "{own} kg, not {mass}");
+            for (part, centre) in after.split(" +- ").next().unwrap().split(", ").zip(&centre) {
+                assert!((told(part) - mass * centre).abs() < 0.001, "{part} kg m of {centre} m");
+            }
+        }
     }
 }

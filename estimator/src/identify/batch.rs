@@ -3,11 +3,13 @@
 //! 1. Each log becomes instants ([`super::instants`]), each instant rows ([`super::rows`]).
 //! 2. Rounds. With the noise that the last parameters leave: what each log tells of the parameters, its own unknowns eliminated ([`super::passes`]); logs added up; the most
 //!    probable bodies under the prior and its weight ([`super::prior`]). With these bodies: what is left, and from it the noise ([`super::noise`]). Until both stay.
-//! 3. A check on data held out: pieces of the logs are predicted from the others. The change from CAD is shrunk where it gains nothing ([`held_out`]).
-//! 4. Figures for every log ([`super::assess`]).
+//! 3. What this fit says that something undeclared acted on is left out, and the rounds repeated, until that stays ([`super::gate`]).
+//! 4. A check on data held out: pieces of the logs are predicted from the others. The change from CAD is shrunk where it gains nothing ([`held_out`]).
+//! 5. Figures for every log ([`super::assess`]).
 
 use super::assess;
 use super::consistent;
+use super::gate::{self, Load, UnitSet};
 use super::information::Information;
 use super::instants::{Break, Defect, Instant, Recording, Settings, Signal, TimeOffset};
 use super::outcome::{Finding, LeftOut, Outcome, Role, Severity, Verdict};
@@ -79,6 +81,14 @@ pub enum IdentifyError {
 
 /// An offset's walk follows nothing faster than this \[s\]: the motion that identifies is faster.
 const DRIFT_TIME: f64 = 1.0;
+
+/// Fits after which something else may be left out; loads that are looked for; those that turned out to be none, after which no more are.
+const GATES: usize = 12;
+const LOADS: usize = 4;
+const REFUSED: usize = 2;
+
+/// A load is believed if without its side of the log the noise is less, by this factor of the variances (geometric mean over the channels).
+const QUIETER: f64 = 2.0;
 
 /// Most rounds of noise and prior.
 const ROUNDS: usize = 14;
@@ -168,10 +178,7 @@ pub fn identify(
         tell_progress(format!("reading {}", log.file), 0.2 * number as f64 / count);
         prepared.push(prepare(setup, log)?);
     }
-    let training: Vec<&Prepared> = prepared
-        .iter()
-        .filter(|log| log.role == Role::Train && !log.refused)
-        .collect();
+    let training = used(&prepared);
     if training.is_empty() {
         return Ok(assess::nothing(
             setup,
@@ -211,18 +218,23 @@ pub fn identify(
         outcome.findings.extend(wrong);
         return Ok(outcome);
     }
-    let identified = fit(setup, &maker, &training, inputs, &mut tell_progress)?;
+    let settled = gated(setup, &maker, &mut prepared, &mut tell_progress)?;
+    let training = used(&prepared);
+    let identified = fit(&maker, &training, inputs, settled, &mut tell_progress)?;
     tell_progress("figures".into(), 0.9);
     for log in prepared.iter_mut().filter(|log| !log.refused) {
         time_offsets(&maker, log, &identified);
     }
-    let training: Vec<&Prepared> = prepared
-        .iter()
-        .filter(|log| log.role == Role::Train && !log.refused)
-        .collect();
+    let training = used(&prepared);
     let outcome = assess::outcome(setup, &maker, &prepared, &training, &identified);
     tell_progress("done".into(), 1.0);
     Ok(outcome)
+}
+
+/// The logs to train on.
+fn used(prepared: &[Prepared]) -> Vec<&Prepared> {
+    let is_used = |log: &&Prepared| log.role == Role::Train && !log.refused;
+    prepared.iter().filter(is_used).collect()
 }
 
 /// Reads a log.
@@ -402,7 +414,7 @@ fn least_variances(setup: &Setup, layout: &Layout) -> Vec<f64> {
 }
 
 /// Runs a pass over several pieces, on all cores.
-fn over<'a, T: Send>(
+pub(super) fn over<'a, T: Send>(
     maker: &RowMaker<'_>,
     pieces: &[Piece<'a>],
     pass: impl Fn(&mut RowMaker<'_>, usize, Piece<'a>) -> T + Sync,
@@ -450,43 +462,259 @@ fn posterior(
     Ok(Posterior::new(prior, &layout.links, &r, &z, precision)?)
 }
 
-fn fit(
+/// Noise, prior and its weight, after rounds that settled.
+struct Settled {
+    prior: Prior,
+    noise: NoiseModel,
+    fit: Fit,
+    information: Information,
+    /// By how much the last round still changed a variance.
+    change: f64,
+}
+
+/// Rounds of noise and fit, until both stay, from the noise that a fit to nearly the same data left, if there is one.
+fn settle(
     setup: &Setup,
     maker: &RowMaker<'_>,
     training: &[&Prepared],
-    inputs: Vec<IdentificationInput>,
+    from: Option<NoiseModel>,
     progress: &mut dyn FnMut(String, f64),
-) -> Result<Identified, IdentifyError> {
+) -> Result<Settled, IdentifyError> {
     let layout = maker.layout().clone();
     let prior = Prior::new(setup.model.inertias())?;
     let least = least_variances(setup, &layout);
     let bound = (super::passes::BLOCK / DRIFT_TIME).powi(2);
-    let pieces = chunks(training, LONG);
     let sampled = sample(maker, training);
-    let zero = DVector::zeros(layout.unknowns());
-    let mut noise = NoiseModel::unknown(least.clone());
-    for _ in 0..3 {
+    let noise_left = |noise: &NoiseModel, d: &DVector<f64>| {
         let left = over(maker, &sampled, |maker, _, piece| {
-            leave(maker, piece, &noise, std::slice::from_ref(&zero))
+            leave(maker, piece, noise, std::slice::from_ref(d))
         });
-        noise = noise_of(&layout, &left, 0, bound, &least);
-    }
-    let mut change = f64::INFINITY;
-    for round in 0..ROUNDS {
+        noise_of(&layout, &left, 0, bound, &least)
+    };
+    let mut noise = from.unwrap_or_else(|| {
+        let zero = DVector::zeros(layout.unknowns());
+        let unknown = NoiseModel::unknown(least.clone());
+        (0..3).fold(unknown, |noise, _| noise_left(&noise, &zero))
+    });
+    let mut round = 0;
+    loop {
         progress(format!("round {}", round + 1), 0.2 + 0.5 * round as f64 / ROUNDS as f64);
         let told = over(maker, &sampled, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
         let information = added(&told, layout.unknowns());
         let fit = posterior(&prior, &layout, &information, &[])?.weigh()?;
-        let left = over(maker, &sampled, |maker, _, piece| {
-            leave(maker, piece, &noise, std::slice::from_ref(&fit.x))
-        });
-        let next = noise_of(&layout, &left, 0, bound, &least);
-        change = next.change(&noise);
+        let next = noise_left(&noise, &fit.x);
+        let change = next.change(&noise);
         noise = next;
-        if change < SETTLED {
-            break;
+        round += 1;
+        if change < SETTLED || round == ROUNDS {
+            return Ok(Settled {
+                prior,
+                noise,
+                fit,
+                information,
+                change,
+            });
         }
     }
+}
+
+/// Fits, leaves out what something undeclared acted on, and fits again, until that stays; says in the logs what was left out.
+fn gated(
+    setup: &Setup,
+    maker: &RowMaker<'_>,
+    prepared: &mut [Prepared],
+    progress: &mut dyn FnMut(String, f64),
+) -> Result<Settled, IdentifyError> {
+    let mut settled = settle(setup, maker, &used(prepared), None, progress)?;
+    let mut loads: Vec<Load> = Vec::new();
+    let mut contacts: Vec<Vec<UnitSet>> = used(prepared)
+        .iter()
+        .map(|log| vec![UnitSet::default(); log.instants.len()])
+        .collect();
+    let mut refused = 0;
+    for _ in 0..GATES {
+        progress("undeclared contacts".into(), 0.7);
+        let training = used(prepared);
+        let load = (refused < REFUSED && loads.len() < LOADS)
+            .then(|| gate::load(maker, &settled.prior, &training, &settled.noise, settled.fit.tau))
+            .flatten();
+        if let Some(load) = load {
+            loads.push(load);
+            suspect(prepared, &loads, &contacts);
+            let without = settle(setup, maker, &used(prepared), Some(settled.noise.clone()), progress)?;
+            if without.noise.quieter(&settled.noise) > QUIETER {
+                settled = without;
+                continue;
+            }
+            loads.pop();
+            refused += 1;
+            suspect(prepared, &loads, &contacts);
+        }
+        let found = gate::contacts(maker, &used(prepared), &loads, &settled.noise, &settled.fit.x);
+        if found == contacts {
+            break;
+        }
+        contacts = found;
+        suspect(prepared, &loads, &contacts);
+        settled = settle(setup, maker, &used(prepared), Some(settled.noise), progress)?;
+    }
+    let training = used(prepared);
+    let bodies: Vec<Option<gate::Added>> = loads
+        .iter()
+        .map(|load| {
+            gate::added(
+                maker,
+                &settled.prior,
+                &training,
+                load,
+                &settled.noise,
+                &settled.information,
+                settled.fit.tau,
+            )
+        })
+        .collect();
+    tell_suspicions(maker, prepared, &loads, &bodies, &contacts);
+    Ok(settled)
+}
+
+/// Marks the instants of the training logs.
+fn suspect(prepared: &mut [Prepared], loads: &[Load], contacts: &[Vec<UnitSet>]) {
+    let training = prepared
+        .iter_mut()
+        .filter(|log| log.role == Role::Train && !log.refused);
+    for (number, (log, contacts)) in training.zip(contacts).enumerate() {
+        for (instant, contact) in log.instants.iter_mut().zip(contacts) {
+            let carries = |load: &&Load| load.log == number && load.has(instant.t);
+            instant.suspected = loads
+                .iter()
+                .filter(carries)
+                .fold(*contact, |set, load| set.union(&load.units));
+        }
+    }
+}
+
+/// Says what was left out because of something undeclared.
+fn tell_suspicions(
+    maker: &RowMaker<'_>,
+    prepared: &mut [Prepared],
+    loads: &[Load],
+    bodies: &[Option<gate::Added>],
+    contacts: &[Vec<UnitSet>],
+) {
+    let setup = maker.setup();
+    let part = |unit: usize| match setup.structure.subtrees().get(unit) {
+        Some(subtree) => {
+            let sensors: Vec<String> = subtree.sensors.iter().map(|s| assess::sensor_name(setup, s)).collect();
+            format!("the links at {}", sensors.join(", "))
+        }
+        None => "the links whose joint torques are measured".to_owned(),
+    };
+    let training = prepared
+        .iter_mut()
+        .filter(|log| log.role == Role::Train && !log.refused);
+    for (number, (log, contacts)) in training.zip(contacts).enumerate() {
+        let begin = log.span.0;
+        let since = |t: Nanos| (t - begin).seconds();
+        let mut units = UnitSet::default();
+        contacts.iter().for_each(|set| units = units.union(set));
+        for unit in units.iter() {
+            let handed = |i: usize| {
+                let of_load = |load: &Load| load.log == number && load.units.contains(unit);
+                loads
+                    .iter()
+                    .any(|load| of_load(load) && load.has_nearly(log.instants[i].t))
+            };
+            let touched: Vec<usize> = (0..contacts.len())
+                .filter(|&i| contacts[i].contains(unit) && !handed(i))
+                .collect();
+            let (Some(&first), Some(&last)) = (touched.first(), touched.last()) else {
+                continue;
+            };
+            let times = 1 + touched.windows(2).filter(|two| two[1] > two[0] + 1).count();
+            let share = touched.len() as f64 / contacts.len() as f64;
+            log.left_out.push(LeftOut {
+                reason: format!("contact suspected: {}", part(unit)),
+                instants: touched.len() as u64,
+                first: log.instants[first].t,
+                last: log.instants[last].t,
+            });
+            log.findings.push(Finding {
+                severity: Severity::Warning,
+                code: "contact_suspected",
+                subject: part(unit),
+                text: format!(
+                    "something that nobody declared acted on {}, {times} time{} between {:.1} and {:.1} s after the log's start: {:.1} % of the log {} left out there",
+                    part(unit),
+                    if times == 1 { "" } else { "s" },
+                    since(log.instants[first].t),
+                    since(log.instants[last].t),
+                    100.0 * share,
+                    if times == 1 { "was" } else { "were" }
+                ),
+            });
+        }
+        for (load, body) in loads.iter().zip(bodies).filter(|(load, _)| load.log == number) {
+            let link = setup.model.link_name(maker.layout().links[load.place]);
+            let is_out = |(instant, contact): &(&Instant, &UnitSet)| {
+                let touched = !contact.intersection(&load.units).is_empty();
+                load.has(instant.t) || touched && load.has_nearly(instant.t)
+            };
+            let out: Vec<Nanos> = (log.instants.iter().zip(contacts))
+                .filter(is_out)
+                .map(|(instant, _)| instant.t)
+                .collect();
+            let (Some(&first), Some(&last)) = (out.first(), out.last()) else {
+                continue;
+            };
+            log.left_out.push(LeftOut {
+                reason: format!("another load: {link}"),
+                instants: out.len() as u64,
+                first,
+                last,
+            });
+            let (when, at) = if load.is_after {
+                ("From", first)
+            } else {
+                ("Up to", last)
+            };
+            let what = body.as_ref().map_or(String::new(), |body| {
+                let p = &body.parameters;
+                let sigma = |i: usize| body.covariance[(i, i)].sqrt();
+                format!(
+                    ": {:+.3} +- {:.3} kg, first moment {:+.4}, {:+.4}, {:+.4} +- {:.4} kg m in the axes and about the origin of {link}",
+                    p[0],
+                    sigma(0),
+                    p[1],
+                    p[2],
+                    p[3],
+                    (1..4).map(sigma).fold(0.0, f64::max)
+                )
+            });
+            log.findings.push(Finding {
+                severity: Severity::Warning,
+                code: "load_changed",
+                subject: link.to_owned(),
+                text: format!(
+                    "{when} about {:.1} s after the log's start, {link} carried another load than in the rest of what was used{what}. That part was left out: parameters are those without it",
+                    since(at)
+                ),
+            });
+        }
+    }
+}
+
+fn fit(
+    maker: &RowMaker<'_>,
+    training: &[&Prepared],
+    inputs: Vec<IdentificationInput>,
+    settled: Settled,
+    progress: &mut dyn FnMut(String, f64),
+) -> Result<Identified, IdentifyError> {
+    let layout = maker.layout().clone();
+    let pieces = chunks(training, LONG);
+    let Settled {
+        prior, noise, change, ..
+    } = settled;
     let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
     let information = added(&told, layout.unknowns());
     let fit = posterior(&prior, &layout, &information, &[])?.weigh()?;

@@ -21,6 +21,7 @@ mod smooth;
 pub use defects::{Break, Defect, Units};
 pub use offset::{Signal, TimeOffset};
 
+use super::gate::UnitSet;
 use crate::dynamics::{ContactSet, FrameMotion, SensorSet};
 use crate::pipeline::{UNTRUSTED_ENCODER, quality_reason};
 use crate::setup::{BaseMotion, Channel, Setup, Use};
@@ -140,6 +141,8 @@ pub struct Instant {
     pub base_fault: Reason,
     /// F/T sensors whose reading no motion explains, and that is not the beginning of another level either: a blow, a glitch.
     pub outliers: SensorSet,
+    /// Sub-trees, by number, and measured joint torques, by [`Instant::TORQUES`], that something undeclared was found to act on: a contact, another load. None before a fit.
+    pub suspected: UnitSet,
 }
 
 /// A log's instants.
@@ -407,6 +410,7 @@ impl Recording {
                 faults: vec![Reason::None; self.channels.len()],
                 base_fault: Reason::None,
                 outliers: SensorSet::default(),
+                suspected: UnitSet::default(),
             };
             instant.stand(setup);
             for (channel, fault) in self.channels.iter().zip(&mut instant.faults) {
@@ -556,6 +560,9 @@ enum Target {
 }
 
 impl Instant {
+    /// Stands for all measured joint torques among numbers of sub-trees.
+    pub const TORQUES: usize = UnitSet::CAPACITY - 1;
+
     /// Starts kinematics at the link that stands still, unless an IMU tells how the base moves.
     fn stand(&mut self, setup: &Setup) {
         match &setup.base {

@@ -94,6 +94,13 @@ impl NoiseModel {
         pairs.map(|(x, y)| (x / y).ln().abs()).fold(0.0, f64::max)
     }
 
+    /// By how much the variances are less than those of another model: the geometric mean over the channels.
+    pub(super) fn quieter(&self, other: &Self) -> f64 {
+        let (own, others) = (self.inflated(), other.inflated());
+        let sum: f64 = own.iter().zip(&others).map(|(own, other)| (other / own).ln()).sum();
+        (sum / own.len().max(1) as f64).exp()
+    }
+
     fn steps(&self, layout: &Layout, seconds: f64) -> Vec<f64> {
         let mut variances = vec![0.0; layout.session()];
         for (channel, rate) in self.drift.iter().enumerate() {
@@ -111,7 +118,7 @@ pub(super) fn session_prior(layout: &Layout) -> Vec<f64> {
 }
 
 /// Blocks of instants, each with the sensors (places in the layout) that start afresh with it.
-fn blocks(layout: &Layout, piece: Piece<'_>) -> Vec<(Range<usize>, Vec<usize>)> {
+pub(super) fn blocks(layout: &Layout, piece: Piece<'_>) -> Vec<(Range<usize>, Vec<usize>)> {
     let instants = piece.instants;
     let mut out = Vec::new();
     let mut start = 0;
@@ -461,6 +468,7 @@ pub(super) fn noise_of(layout: &Layout, pieces: &[Residuals], set: usize, bound:
 
 #[cfg(test)]
 mod tests {
+    use super::super::gate::UnitSet;
     use super::*;
     use crate::config::{Config, IdentificationInput};
     use crate::dynamics::{FrameMotion, SensorSet};
@@ -530,6 +538,7 @@ mod tests {
                     faults: vec![Reason::None; setup.channels().len()],
                     base_fault: Reason::None,
                     outliers: SensorSet::default(),
+                    suspected: UnitSet::default(),
                 }
             })
             .collect();

@@ -79,6 +79,8 @@ pub(super) struct Rows {
     r: Vec<f64>,
     g: Vec<f64>,
     n: Vec<f64>,
+    /// Per row, which unit's it is: a sub-tree's, or [`Instant::TORQUES`].
+    units: Vec<usize>,
     /// Lower factor of `N V N^T`, row by row, once whitened.
     factor: Vec<f64>,
 }
@@ -95,14 +97,16 @@ impl Rows {
 
     fn clear(&mut self) {
         self.count = 0;
+        self.units.clear();
         for part in [&mut self.a, &mut self.r, &mut self.g, &mut self.n, &mut self.factor] {
             part.clear();
         }
     }
 
-    /// Another row, of zeros.
-    fn push(&mut self) -> (&mut [f64], &mut f64, &mut [f64], &mut [f64]) {
+    /// Another row of a unit, of zeros.
+    fn push(&mut self, unit: usize) -> (&mut [f64], &mut f64, &mut [f64], &mut [f64]) {
         self.count += 1;
+        self.units.push(unit);
         self.a.resize(self.unknowns * self.count, 0.0);
         self.r.push(0.0);
         self.g.resize(self.session * self.count, 0.0);
@@ -114,6 +118,18 @@ impl Rows {
             &mut self.g[self.session * last..],
             &mut self.n[self.channels * last..],
         )
+    }
+
+    /// Puts the rows of one unit into `out`, not whitened.
+    pub(super) fn copy_unit(&self, unit: usize, out: &mut Self) {
+        out.clear();
+        for row in (0..self.count).filter(|&row| self.units[row] == unit) {
+            let (a, r, g, n) = out.push(unit);
+            a.copy_from_slice(self.a(row));
+            *r = self.r(row);
+            g.copy_from_slice(self.g(row));
+            n.copy_from_slice(self.n(row));
+        }
     }
 
     pub(super) fn a(&self, row: usize) -> &[f64] {
@@ -257,6 +273,8 @@ pub(super) struct RowMaker<'a> {
     readings: Vec<Wrench>,
     wrench: bool,
     torque: bool,
+    /// Whether rows are made of units that something undeclared acts on, too.
+    disregards: bool,
     /// Per link of the layout, and per channel: the group that it belongs to.
     groups: (Vec<usize>, Vec<usize>),
 }
@@ -292,6 +310,7 @@ impl<'a> RowMaker<'a> {
             readings: vec![Wrench::zero(); sensors],
             wrench: inputs.contains(&IdentificationInput::Wrench),
             torque: inputs.contains(&IdentificationInput::Torque),
+            disregards: false,
             groups: (Vec::new(), Vec::new()),
         };
         // Links and channels, joined wherever a row has both.
@@ -354,6 +373,11 @@ impl<'a> RowMaker<'a> {
         self.groups.clone()
     }
 
+    /// From now on rows are made of [`Instant::suspected`] units, too; or not any more.
+    pub(super) fn disregard_suspicions(&mut self, disregards: bool) {
+        self.disregards = disregards;
+    }
+
     /// CAD's parameters in the columns of the rows.
     pub(super) fn cad_of_layout(&self) -> Vec<f64> {
         let links = self.layout.links.iter();
@@ -362,7 +386,8 @@ impl<'a> RowMaker<'a> {
             .collect()
     }
 
-    /// Measured less predicted torque of every joint, for parameters `d` beside CAD; NaN where there is none, or a contact lies beyond.
+    /// Measured less predicted torque of every joint, for parameters `d` beside CAD; NaN where there is none, a contact lies beyond, or
+    /// something undeclared acts on the links around it.
     ///
     /// # Errors
     /// As for [`RowMaker::make`].
@@ -371,8 +396,16 @@ impl<'a> RowMaker<'a> {
         self.make(instant, &mut rows)?;
         self.tree.update(&self.setup.model, &self.kinematics)?;
         let blocked = self.blocked(&instant.active);
+        let structure = &self.setup.structure;
         let error = |dof: usize| {
-            let Some(row) = self.tree.joint_row(dof).filter(|_| !blocked[dof]) else {
+            let child = self
+                .setup
+                .model
+                .dof_joint(dof)
+                .map(|joint| self.setup.model.joints()[joint].child);
+            let unit = child.and_then(|child| structure.subtree_of(child));
+            let is_suspected = unit.is_some_and(|unit| instant.suspected.contains(unit));
+            let Some(row) = self.tree.joint_row(dof).filter(|_| !blocked[dof] && !is_suspected) else {
                 return f64::NAN;
             };
             let own = self
@@ -390,7 +423,7 @@ impl<'a> RowMaker<'a> {
         self.setup
     }
 
-    /// The rows of an instant. Sub-trees with a reading that is not there, and torques that are not, give none.
+    /// The rows of an instant. Sub-trees with a reading that is not there, torques that are not, and what something undeclared acts on ([`Instant::suspected`]) give none.
     ///
     /// # Errors
     /// The instant is of another robot, or a position, velocity or acceleration is not finite.
@@ -470,15 +503,16 @@ impl<'a> RowMaker<'a> {
         self.stacked
             .update(&self.kinematics, &self.readings, &instant.active, &[])?;
         self.stacked.eliminate_contacts(Weighting::Noise);
-        for subtree in self.stacked.subtrees() {
+        for (unit, subtree) in self.stacked.subtrees().iter().enumerate() {
             let unread = |sensor: usize| instant.readings.get(sensor).is_none_or(|r| !r.is_finite());
-            if subtree.sensors().len() == 0 || subtree.sensors().any(unread) {
+            let is_suspected = !self.disregards && instant.suspected.contains(unit);
+            if is_suspected || subtree.sensors().len() == 0 || subtree.sensors().any(unread) {
                 continue;
             }
             for number in 0..subtree.remaining() {
                 let from = subtree.projected_row(number);
                 let (links, offsets) = from.split_at(subtree.offset_column());
-                let (a, r, g, n) = rows.push();
+                let (a, r, g, n) = rows.push(unit);
                 *r = subtree.projected_measured()[number];
                 for (values, link) in links.chunks_exact(WIDTH).zip(subtree.links()) {
                     let cad = &self.cad[WIDTH * link..][..WIDTH];
@@ -499,6 +533,9 @@ impl<'a> RowMaker<'a> {
     }
 
     fn torque_rows(&mut self, instant: &Instant, rows: &mut Rows) -> Result<(), DynamicsError> {
+        if !self.disregards && instant.suspected.contains(Instant::TORQUES) {
+            return Ok(());
+        }
         self.tree.update(&self.setup.model, &self.kinematics)?;
         let wrenches = self.layout.sensors.len();
         let blocked = self.blocked(&instant.active);
@@ -508,7 +545,7 @@ impl<'a> RowMaker<'a> {
             if !torque.is_finite() || blocked[dof] {
                 continue;
             }
-            let (a, r, g, n) = rows.push();
+            let (a, r, g, n) = rows.push(Instant::TORQUES);
             *r = torque - row.iter().zip(&self.cad).map(|(x, y)| x * y).sum::<f64>();
             for (to, link) in a.chunks_exact_mut(WIDTH).zip(&self.layout.links) {
                 to.copy_from_slice(&row[WIDTH * link..][..WIDTH]);
