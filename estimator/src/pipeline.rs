@@ -12,10 +12,11 @@
 //! With identification on ([`crate::identify::online`]), inertial parameters, offsets and their covariance are those of the last solution in force; who owns the pipeline runs its
 //! jobs ([`Pipeline::take_job`]), at once or in another thread.
 //!
-//! Standard deviations hold F/T noise and what is uncertain of inertial parameters and F/T offsets ([`crate::regressor::Propagation`]); not the errors of
-//! positions, velocities and accelerations.
+//! Standard deviations hold F/T noise, what is uncertain of inertial parameters and F/T offsets ([`crate::regressor::Propagation`]), and of accelerations that are
+//! differentiated; not the errors of positions and velocities, nor the noise of the IMU's proper acceleration.
 
 mod learning;
+mod motion;
 
 pub use learning::Job;
 
@@ -28,6 +29,7 @@ use crate::regressor::Propagation;
 use crate::setup::{BaseMotion, Setup, Use};
 use crate::spatial::{Vec3, Wrench};
 use learning::Learning;
+use motion::{Instant, MotionErrors};
 use proprio_topics::{
     ContactEstimate, ContactWrench, Header, InertiaEstimate, JointTorque, MAX_CONTACTS, MAX_JOINTS, NO_CAUSE, Nanos,
     Quality, Reading, Reason, TorqueEstimate,
@@ -162,6 +164,8 @@ pub struct Pipeline {
     solver: Solver,
     /// What is uncertain of the parameters, carried to the estimates.
     propagation: Propagation,
+    /// What is uncertain of accelerations, likewise.
+    motion: Box<MotionErrors>,
     position: Vec<f64>,
     velocity: Vec<f64>,
     acceleration: Vec<f64>,
@@ -201,6 +205,7 @@ impl Pipeline {
         });
         let kinematics = Kinematics::new(&setup.model, setup.base_link).expect("the base is a link of the model");
         let (dofs, contacts) = (setup.model.dof_count(), setup.structure.contacts().len());
+        let motion = MotionErrors::new(&setup.model, &setup.structure, setup.base_link);
         let mut estimate = Box::new(Estimate::absent(Nanos::ZERO));
         estimate.torques.count = u32::try_from(dofs).unwrap_or(0);
         estimate.contacts.count = u32::try_from(setup.contacts.len()).unwrap_or(0);
@@ -227,6 +232,7 @@ impl Pipeline {
             kinematics,
             solver: Solver::new(&setup.structure),
             propagation,
+            motion: Box::new(motion.expect("the base is a link of the model")),
             position: setup.locked.iter().map(|q| if q.is_nan() { 0.0 } else { *q }).collect(),
             velocity: vec![0.0; dofs],
             acceleration: vec![0.0; dofs],
@@ -486,12 +492,17 @@ impl Pipeline {
         let until = t + Nanos(self.setup.max_wait.0 / 2);
         let active = self.active(t);
         let mut base = self.base_standing(&active);
+        let mut imu = None;
+        self.motion.acceleration.fill(0.0);
         for ((track, channel), fault) in self.tracks.iter().zip(self.setup.channels()).zip(&mut self.faults) {
             *fault = match (track, channel.role) {
                 (Track::Joint(history, window), Use::Joint(dof)) => match history.at(t, until) {
                     None => Reason::NeverSeen,
                     Some(held) => {
-                        let (state, reason) = joint_at(t, until, &held, window, self.setup.max_silence);
+                        let (state, deviation, reason) = joint_at(t, until, &held, window, self.setup.max_silence);
+                        if let Some(place) = self.motion.acceleration.get_mut(dof) {
+                            *place = deviation;
+                        }
                         let places = (
                             self.position.get_mut(dof),
                             self.velocity.get_mut(dof),
@@ -518,10 +529,13 @@ impl Pipeline {
                 (Track::Imu(history, window), Use::Base) => match history.at(t, until) {
                     None => Reason::NeverSeen,
                     Some(held) => {
-                        let (measured, reason) = imu_at(t, until, &held, window, self.setup.max_silence);
+                        let (measured, deviation, reason) = imu_at(t, until, &held, window, self.setup.max_silence);
                         if let BaseMotion::Imu(pose) = &self.setup.base {
                             base = FrameMotion::of_link_from_imu(&measured, pose);
+                            imu = Some((measured, *pose));
                         }
+                        let places = self.motion.acceleration.iter_mut().rev();
+                        places.zip(deviation.iter().rev()).for_each(|(to, from)| *to = *from);
                         quality_reason(held.quality, Quality::DEVICE_FAULT).or(reason)
                     }
                 },
@@ -544,6 +558,19 @@ impl Pipeline {
             })
             .and_then(|()| self.solver.update_deviations(structure))
             .and_then(|()| self.propagation.update(structure, &self.solver, &self.kinematics, t))
+            .and_then(|()| {
+                self.motion.update(&Instant {
+                    model,
+                    structure,
+                    state,
+                    base: &base,
+                    imu: imu.as_ref().map(|(measured, pose)| (measured, pose)),
+                    readings: &self.readings,
+                    active: &active,
+                    solver: &self.solver,
+                    base_link: self.kinematics.base(),
+                })
+            })
             .is_ok();
         if self.dependences.active != Some(active) {
             self.dependences.active = Some(active);
@@ -577,15 +604,16 @@ impl Pipeline {
             .iter()
             .zip(self.solver.torque_deviation())
             .zip(self.propagation.torque())
-            .zip(self.solver.torque_certainty());
+            .zip(self.solver.torque_certainty())
+            .zip(self.motion.torques());
         let places = self.estimate.torques.joints.iter_mut().zip(&self.dependences.torques);
-        for ((place, dependence), (((torque, noise), model), certainty)) in places.zip(results) {
+        for ((place, dependence), ((((torque, noise), model), certainty), motion)) in places.zip(results) {
             let (mut reason, mut cause) = judge.verdict(dependence);
             // Without a sensor in it a torque rests on the model alone. If that is said to be exact, nothing is known of the torque's error.
             let deviation = if dependence.sensors.is_empty() && *model == 0.0 {
                 f64::NAN
             } else {
-                noise.hypot(*model)
+                noise.hypot(*model).hypot(*motion)
             };
             if reason == Reason::None && *certainty == Certainty::Assumed {
                 reason = Reason::Undetermined;
@@ -614,7 +642,8 @@ impl Pipeline {
             .iter_mut()
             .zip(&self.dependences.contacts);
         let results = self.solver.contacts().iter().zip(self.propagation.contacts());
-        for ((place, dependence), (result, model)) in places.zip(results).take(self.setup.contacts.len()) {
+        let results = results.zip(self.motion.contacts());
+        for ((place, dependence), ((result, model), motion)) in places.zip(results).take(self.setup.contacts.len()) {
             let (mut reason, mut cause) = judge.verdict(dependence);
             match result.certainty {
                 Certainty::Absent => (reason, cause) = (Reason::Absent, NO_CAUSE),
@@ -635,7 +664,8 @@ impl Pipeline {
                 torque: [tx, ty, tz],
                 standard_deviation: std::array::from_fn(|i| {
                     if known {
-                        result.deviation[i].hypot(model[i])
+                        let motion = motion.get(i).copied().unwrap_or(0.0);
+                        result.deviation[i].hypot(model[i]).hypot(motion)
                     } else {
                         f64::NAN
                     }
@@ -717,11 +747,11 @@ fn stale<const D: usize>(held: &Held<D>, max_silence: Nanos) -> Reason {
     }
 }
 
-/// Position, velocity and acceleration of a joint at `t`, and what speaks against them.
-fn joint_at(t: Nanos, until: Nanos, held: &Held<3>, window: &Window<1>, max_silence: Nanos) -> ([f64; 3], Reason) {
+/// Position, velocity and acceleration of a joint at `t`, the standard deviation of the last, and what speaks against them.
+fn joint_at(t: Nanos, until: Nanos, held: &Held<3>, window: &Window<1>, max_silence: Nanos) -> ([f64; 3], f64, Reason) {
     let [position, velocity, acceleration] = held.value;
     if held.exact && velocity.is_finite() && acceleration.is_finite() {
-        return ([position, velocity, acceleration], Reason::None);
+        return ([position, velocity, acceleration], 0.0, Reason::None);
     }
     // A channel stamped exactly t needs no later sample.
     let until = if held.exact { t } else { until };
@@ -735,21 +765,38 @@ fn joint_at(t: Nanos, until: Nanos, held: &Held<3>, window: &Window<1>, max_sile
                     estimated
                 }
             };
+            let deviation = if given(acceleration, f64::NAN).is_nan() {
+                uncertainty(estimate.second_std[0])
+            } else {
+                0.0
+            };
             (
                 [
                     given(position, value),
                     given(velocity, first),
                     given(acceleration, second),
                 ],
+                deviation,
                 stale(held, max_silence),
             )
         }
-        Err(unavailable) => ([position, 0.0, 0.0], why(unavailable, held, max_silence)),
+        Err(unavailable) => ([position, 0.0, 0.0], 0.0, why(unavailable, held, max_silence)),
     }
 }
 
-/// Motion of the IMU at `t`, and what speaks against it.
-fn imu_at(t: Nanos, until: Nanos, held: &Held<9>, window: &Window<3>, max_silence: Nanos) -> (FrameMotion, Reason) {
+/// A standard deviation that can be reckoned with.
+fn uncertainty(deviation: f64) -> f64 {
+    if deviation.is_finite() { deviation } else { 0.0 }
+}
+
+/// Motion of the IMU at `t`, standard deviations of its angular acceleration, and what speaks against it.
+fn imu_at(
+    t: Nanos,
+    until: Nanos,
+    held: &Held<9>,
+    window: &Window<3>,
+    max_silence: Nanos,
+) -> (FrameMotion, [f64; 3], Reason) {
     let [ax, ay, az, gx, gy, gz, bx, by, bz] = held.value;
     let mut motion = FrameMotion {
         angular_velocity: Vec3::new(gx, gy, gz),
@@ -757,7 +804,7 @@ fn imu_at(t: Nanos, until: Nanos, held: &Held<9>, window: &Window<3>, max_silenc
         proper_acceleration: Vec3::new(ax, ay, az),
     };
     if held.exact && motion.angular_acceleration.iter().all(|x| x.is_finite()) {
-        return (motion, Reason::None);
+        return (motion, [0.0; 3], Reason::None);
     }
     let until = if held.exact { t } else { until };
     match window.at_using(t, until) {
@@ -766,11 +813,11 @@ fn imu_at(t: Nanos, until: Nanos, held: &Held<9>, window: &Window<3>, max_silenc
                 motion.angular_velocity = Vec3::from(estimate.value);
             }
             motion.angular_acceleration = Vec3::from(estimate.first);
-            (motion, stale(held, max_silence))
+            (motion, estimate.first_std.map(uncertainty), stale(held, max_silence))
         }
         Err(unavailable) => {
             motion.angular_acceleration = Vec3::zeros();
-            (motion, why(unavailable, held, max_silence))
+            (motion, [0.0; 3], why(unavailable, held, max_silence))
         }
     }
 }

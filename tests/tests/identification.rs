@@ -531,6 +531,22 @@ fn on_line_the_torques_become_five_times_better_than_those_of_cad() {
 }
 
 #[test]
+fn what_is_stated_on_line_covers_the_errors_of_motion_too() {
+    let sessions = arm();
+    for name in ["train", "validate"] {
+        let (begin, _) = sessions.moving(name);
+        let learnt = scores(&sessions, name, &sessions.log(name), learning(&sessions), |t| t > begin + 12.0);
+        for joint in &sessions.distal {
+            let Score {
+                error, stated, covered, ..
+            } = learnt[*joint];
+            println!("{name} {joint}: {error:.4} Nm, stated {stated:.4}, 95 % hold {:.0} %", 100.0 * covered);
+            assert!(covered > 0.85 && stated < 3.0 * error, "{name} {joint}: {covered} {stated} {error}");
+        }
+    }
+}
+
+#[test]
 fn pushes_do_no_harm_to_what_is_learnt_on_line_declared_or_not() {
     let sessions = arm();
     let log = sessions.log("contact");
