@@ -707,3 +707,82 @@ fn recursive_is_batch_on_the_papers_arm() {
         assert_eq!(excitation.rank(1e-9), 17);
     }
 }
+
+/// Standing still: the same rows over and over, while offsets wander. They tell how far the offset and the weight together are, and nothing else; a million blocks of them
+/// leave what was known as it was, and add no more than one exact look would.
+#[test]
+fn a_million_blocks_of_one_posture_neither_forget_nor_pile_up() {
+    const OFFSETS: usize = 6;
+    const UNKNOWNS: usize = 16;
+    let mut random = Random::new(26);
+    let columns: Vec<usize> = (0..OFFSETS).collect();
+    let deviations = [0.01; OFFSETS];
+    let mut information = Information::new(UNKNOWNS);
+    let mut panel = Panel::new(UNKNOWNS, 600);
+    // Some motion: offsets with every row, as in [I | Y].
+    let truth = random.reals(UNKNOWNS, 1.0);
+    let row = |k: usize, random: &mut Random| -> Vec<f64> {
+        let offset = (0..OFFSETS).map(|i| f64::from(u8::from(i == k % OFFSETS)));
+        offset.chain(random.reals(UNKNOWNS - OFFSETS, 1.0)).collect()
+    };
+    let product = |row: &[f64]| -> f64 { row.iter().zip(&truth).map(|(a, x)| a * x).sum() };
+    for k in 0..600 {
+        let a = row(k, &mut random);
+        let y = product(&a) + random.real(1.7);
+        panel.push_row(&a, y).unwrap();
+    }
+    information.absorb(&mut panel).unwrap();
+    let known = |information: &Information| {
+        let (root, _) = information.trailing(OFFSETS).to_triangle();
+        root.transpose() * root
+    };
+    let moved = known(&information);
+    let posture: Vec<Vec<f64>> = (0..OFFSETS).map(|k| row(k, &mut random)).collect();
+    // What an exact look at y = G d + s could add, before s wanders: with s = y - G d, (G - D^-1 C)^T D (G - D^-1 C), where D is what is known of s and C of both.
+    let seen = DMatrix::from_fn(OFFSETS, UNKNOWNS - OFFSETS, |i, j| posture[i][OFFSETS + j]);
+    let (root, _) = information.to_triangle();
+    let joint = root.transpose() * root;
+    let of_offsets = joint.view((0, 0), (OFFSETS, OFFSETS)).into_owned();
+    let of_both = joint.view((0, OFFSETS), (OFFSETS, UNKNOWNS - OFFSETS)).into_owned();
+    let apart = seen - of_offsets.clone().cholesky().expect("known").solve(&of_both);
+    let most = apart.transpose() * of_offsets * apart;
+    let (mut soon, mut blocks) = (None, 0_u32);
+    while blocks < 1_000_000 {
+        information.drift(&columns, &deviations).unwrap();
+        for a in &posture {
+            panel.push_row(a, product(a)).unwrap();
+        }
+        information.absorb(&mut panel).unwrap();
+        blocks += 1;
+        if blocks == 5000 {
+            soon = Some(known(&information));
+        }
+    }
+    let (stood, soon) = (known(&information), soon.unwrap());
+    let scale = moved.norm();
+    // Nothing is lost, in no direction, ...
+    let least = (&stood - &moved).symmetric_eigenvalues().min();
+    assert!(least > -1e-9 * scale, "lost {least} of {scale}");
+    // ... no more is gained than there is, ...
+    let over = (&moved + &most - &stood).symmetric_eigenvalues().min();
+    assert!(over > -1e-9 * scale, "gained {over} too much, of {scale}");
+    // ... and that at once: after some thousand blocks nothing grows any more.
+    let growth = (&stood - &soon).norm() / scale;
+    println!("least {least:e}, over {over:e}, growth {growth:e}");
+    assert!(growth < 1e-9, "{growth}");
+    // What is known of all of it together stays, too, and the sum of squares is that of rows which fit.
+    let mut posterior = Posterior::new(UNKNOWNS);
+    posterior.update(&information, None).unwrap();
+    assert!(
+        posterior
+            .estimate()
+            .iter()
+            .zip(&truth)
+            .all(|(x, truth)| (x - truth).abs() < 0.5)
+    );
+    assert!(
+        information.residual_square() < 1000.0,
+        "{}",
+        information.residual_square()
+    );
+}
