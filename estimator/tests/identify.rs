@@ -662,6 +662,49 @@ fn readings_of_two_sensors_are_compared_as_they_are() {
     }
 }
 
+/// A sensor that is dead in the last log: its offset, and how sure that is, are what the log before says.
+#[test]
+fn the_offset_of_a_sensor_is_of_the_last_log_that_reads_it() {
+    let setup = arm_with(&["ft", "wrist"]);
+    let truth = real(&setup, 3);
+    let whole = simulate(&setup, &truth, 12.0, 0.01, 3);
+    let second = simulate(&setup, &truth, 12.0, 0.01, 4);
+    let dead: Vec<bool> = second
+        .lines()
+        .next()
+        .expect("a header")
+        .split(',')
+        .map(|name| name.starts_with("wrench/wrist"))
+        .collect();
+    let without: String = second
+        .lines()
+        .enumerate()
+        .map(|(row, line)| {
+            let cells = line.split(',').zip(&dead);
+            let cells = cells.map(|(cell, dead)| if *dead && row > 0 { "" } else { cell });
+            cells.collect::<Vec<_>>().join(",") + "\n"
+        })
+        .collect();
+    let logs = [("whole", Role::Train, &*whole), ("without", Role::Train, &*without)];
+    let outcome = run(&setup, &logs, &[]);
+    let named = |log: usize| -> Vec<&str> { outcome.logs[log].offsets.iter().map(|o| o.sensor.as_str()).collect() };
+    assert_eq!(named(0), ["ft", "wrist"]);
+    // Beyond `ft` there is the dead one, so nothing tells what `ft` reads either.
+    assert!(named(1).is_empty(), "{:?}", named(1));
+    let covariance = &outcome.covariance;
+    for (row, column) in covariance.columns.iter().enumerate() {
+        if let Column::Offset { sensor, component } = column {
+            let deviation = covariance.root.row(row).norm();
+            assert!(deviation < 1.0, "{sensor} {component}: {deviation}");
+        }
+    }
+    let parameters = proprio_estimator::identify::parameters(&outcome, &setup, "a program 1").expect("parameters");
+    assert_eq!(parameters.offsets().len(), 2);
+    for (offset, told) in parameters.offsets().iter().zip(&outcome.logs[0].offsets) {
+        assert_eq!(offset.reading.force_first(), told.end);
+    }
+}
+
 /// Too little to hold anything back: nobody knows whether the parameters are better than CAD's, so they are CAD's.
 #[test]
 fn nothing_is_called_identified_that_was_not_checked() {

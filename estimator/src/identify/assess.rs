@@ -1,6 +1,6 @@
 //! Figures: what is left of every log with CAD, with CAD and fitted offsets, and with the identified parameters; and what is known of the parameters, in numbers and words.
 
-use super::batch::{Identified, Prepared, bodies, feasibility, joint_zeros, verdict};
+use super::batch::{Identified, Prepared, bodies, feasibility, joint_zeros, time_offsets, verdict};
 use super::outcome::{
     BaseParameterOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding, FrictionOutcome, JointOutcome,
     LinkOutcome, LogOutcome, OffsetOutcome, Outcome, SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome,
@@ -726,6 +726,11 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         (above / below).sqrt()
     };
     let deviations = session_deviations(maker, log, instants, identified, root);
+    let (late, found) = if usable {
+        time_offsets(layout, log, &compared)
+    } else {
+        Default::default()
+    };
     LogOutcome {
         file: log.file.clone(),
         role: log.role,
@@ -739,8 +744,8 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         two_route: two_route(maker, instants, &left, &sets),
         offsets: offsets(setup, layout, log, identified, &left, &deviations),
         friction: friction(setup, layout, &left, &deviations),
-        time_offsets: log.time_offsets.clone(),
-        findings: log.findings.clone(),
+        time_offsets: late,
+        findings: log.findings.iter().cloned().chain(found).collect(),
         curves: curves(maker, instants, &times, &compared, identified, root, &torque_series),
         spectra: spectra(setup, layout, &times, &left),
     }

@@ -118,7 +118,6 @@ pub(super) struct Prepared {
     pub breaks: Vec<Break>,
     pub left_out: Vec<LeftOut>,
     pub findings: Vec<Finding>,
-    pub time_offsets: Vec<TimeOffset>,
     pub refused: bool,
     recording: Recording,
 }
@@ -222,10 +221,6 @@ pub fn identify(
     let training = used(&prepared);
     let identified = fit(&maker, &training, inputs, settled, &mut tell_progress)?;
     tell_progress("figures".into(), 0.9);
-    for log in prepared.iter_mut().filter(|log| !log.refused) {
-        time_offsets(&maker, log, &identified);
-    }
-    let training = used(&prepared);
     let outcome = assess::outcome(setup, &maker, &prepared, &training, &identified);
     tell_progress("done".into(), 1.0);
     Ok(outcome)
@@ -247,12 +242,13 @@ fn prepare(setup: &Setup, log: Log<'_>) -> Result<Prepared, IdentifyError> {
 }
 
 /// How far each F/T stream is behind the encoders, against what the identified parameters predict: told, not removed, for what looks like a delay may be a model that is wrong.
-fn time_offsets(maker: &RowMaker<'_>, log: &mut Prepared, identified: &Identified) {
-    let layout = maker.layout();
-    let sets = [DVector::zeros(layout.unknowns()), identified.d.clone()];
-    let left = leave(&mut maker.clone(), log.piece(), &identified.noise, &sets);
-    let compared = assess::Compared::new(&mut maker.clone(), &log.instants, &left, identified, &sets);
+pub(super) fn time_offsets(
+    layout: &Layout,
+    log: &Prepared,
+    compared: &assess::Compared,
+) -> (Vec<TimeOffset>, Vec<Finding>) {
     let times: Vec<Nanos> = log.instants.iter().map(|i| i.t).collect();
+    let (mut offsets, mut findings) = (Vec::new(), Vec::new());
     for (place, &sensor) in layout.sensors.iter().enumerate() {
         let mut predicted = vec![f64::NAN; 6 * times.len()];
         for axis in 0..6 {
@@ -266,7 +262,7 @@ fn time_offsets(maker: &RowMaker<'_>, log: &mut Prepared, identified: &Identifie
             continue;
         };
         if offset.significant {
-            log.findings.push(Finding {
+            findings.push(Finding {
                 severity: Severity::Warning,
                 code: "time_offset",
                 subject: offset.channel.clone(),
@@ -279,8 +275,9 @@ fn time_offsets(maker: &RowMaker<'_>, log: &mut Prepared, identified: &Identifie
                 ),
             });
         }
-        log.time_offsets.push(offset);
+        offsets.push(offset);
     }
+    (offsets, findings)
 }
 
 /// Keeps the instants at which motion is known.
@@ -369,7 +366,6 @@ fn usable(setup: &Setup, file: String, role: Role, recording: Recording) -> Prep
         breaks: found.breaks,
         left_out: reasons.into_values().collect(),
         findings,
-        time_offsets: Vec::new(),
         recording,
     }
 }
