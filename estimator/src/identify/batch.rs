@@ -122,15 +122,6 @@ pub(super) struct Prepared {
     recording: Recording,
 }
 
-impl Prepared {
-    pub(super) fn piece(&self) -> Piece<'_> {
-        Piece {
-            instants: &self.instants,
-            breaks: &self.breaks,
-        }
-    }
-}
-
 /// What was identified, before figures are made of it.
 pub(super) struct Identified {
     pub layout: Layout,
