@@ -10,6 +10,7 @@
 //!     -> what is left -> noise of each channel -> again, until it stays                        noise, passes
 //!     -> undeclared contacts, another load: left out, and again, until it stays                gate
 //!     -> held-out data: what gains nothing is shrunk to CAD                                    batch
+//!     -> motion that only other F/T sensors feel, taken off; all of the fit again              shaking
 //!     -> Outcome: parameters, covariance, figures per log, in words                            assess, export
 //! ```
 //! [`identify`] does all of it. Parameters belong to the robot and are common to all logs; offsets and friction belong to a log.
@@ -40,6 +41,7 @@ mod passes;
 pub mod prior;
 mod rows;
 mod session;
+mod shaking;
 
 pub use batch::{IdentifyError, Log, Options, Progress, identify};
 pub use export::parameters;

@@ -17,6 +17,7 @@ use super::passes::{NoiseModel, OFFSET_VARIANCE, Piece, Residuals, Told, leave, 
 use super::prior::{Fit, Posterior, Prior, PriorError};
 use super::rows::{Layout, RowMaker, Rows};
 use super::session::Session;
+use super::shaking::Shaking;
 use crate::config::IdentificationInput;
 use crate::dynamics::{DynamicsError, Structure};
 use crate::model::JointKind;
@@ -210,7 +211,20 @@ pub fn identify(
     }
     let settled = gated(setup, &maker, &mut prepared, &mut tell_progress)?;
     let training = used(&prepared);
-    let identified = fit(&maker, &training, inputs, settled, &mut tell_progress)?;
+    let mut identified = fit(&maker, &training, inputs.clone(), settled, &mut tell_progress)?;
+    tell_progress("shaking".into(), 0.8);
+    if let Some(shaking) = Shaking::find(&maker, &sample(&maker, &training), &identified.noise, &identified.d) {
+        for log in &mut prepared {
+            shaking.apply(&maker, &mut log.instants, &log.breaks);
+        }
+        // Once more, what encoders do not show taken off; it has been told how far along this is.
+        let mut again = |step: String, _| tell_progress(format!("{step}, without shaking"), 0.8);
+        let training = used(&prepared);
+        let settled = settle(setup, &maker, &training, Some(identified.noise), &mut again)?;
+        identified = fit(&maker, &training, inputs, settled, &mut again)?;
+        identified.findings.extend(shaken(&maker, &shaking));
+    }
+    let training = used(&prepared);
     tell_progress("figures".into(), 0.9);
     let outcome = assess::outcome(setup, &maker, &prepared, &training, &identified);
     tell_progress("done".into(), 1.0);
@@ -221,6 +235,30 @@ pub fn identify(
 fn used(prepared: &[Prepared]) -> Vec<&Prepared> {
     let is_used = |log: &&Prepared| log.role == Role::Train && !log.refused;
     prepared.iter().filter(is_used).collect()
+}
+
+/// What was found of motion that encoders do not show.
+fn shaken(maker: &RowMaker<'_>, shaking: &Shaking) -> Vec<Finding> {
+    let setup = maker.setup();
+    let names = |sensors: &[usize]| -> String {
+        let names: Vec<String> = sensors.iter().map(|s| assess::sensor_name(setup, *s)).collect();
+        names.join(" and ")
+    };
+    let own = maker.sensors_of_subtrees();
+    let parts = shaking.parts.iter();
+    parts
+        .map(|part| Finding {
+            severity: Severity::Note,
+            code: "shaking",
+            subject: names(&own[part.subtree]),
+            text: format!(
+                "the robot shakes in a way that its encoders do not show: {:.0} % of what is quick in the imbalance at {} can be told from {}, and is taken off",
+                100.0 * part.explained,
+                names(&own[part.subtree]),
+                names(&part.sensors)
+            ),
+        })
+        .collect()
 }
 
 /// Reads a log.

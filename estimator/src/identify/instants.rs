@@ -143,6 +143,9 @@ pub struct Instant {
     pub outliers: SensorSet,
     /// Sub-trees, by number, and measured joint torques, by [`Instant::TORQUES`], that something undeclared was found to act on: a contact, another load. None before a fit.
     pub suspected: UnitSet,
+    /// What sub-trees need for a motion that their encoders do not show, where that is known: the sub-tree's number in the structure, and the wrench by all that it is attached to, about its
+    /// top link's origin and in that link's axes. As read from a log: nothing.
+    pub shaking: Vec<(usize, Wrench)>,
 }
 
 /// A log's instants.
@@ -411,6 +414,7 @@ impl Recording {
                 base_fault: Reason::None,
                 outliers: SensorSet::default(),
                 suspected: UnitSet::default(),
+                shaking: Vec::new(),
             };
             instant.stand(setup);
             for (channel, fault) in self.channels.iter().zip(&mut instant.faults) {

@@ -238,7 +238,7 @@ pub(super) struct Residuals {
     pub noise: Vec<Vec<Vec<f64>>>,
     /// Per channel, per instant: what CAD says without offsets and friction: of an F/T sensor's reading, of a joint's torque.
     pub predicted: Vec<Vec<f64>>,
-    /// The same of what was measured.
+    /// The same of what was measured, less what is known of shaking.
     pub measured: Vec<Vec<f64>>,
     /// Blocks of instants.
     pub ranges: Vec<Range<usize>>,
@@ -539,6 +539,7 @@ mod tests {
                     base_fault: Reason::None,
                     outliers: SensorSet::default(),
                     suspected: UnitSet::default(),
+                    shaking: Vec::new(),
                 }
             })
             .collect();

@@ -19,7 +19,7 @@ use crate::config::IdentificationInput;
 use crate::dynamics::{ContactSet, DynamicsError, JointState, Kinematics};
 use crate::regressor::{Regressor, StackedRegressor, Weighting};
 use crate::setup::Setup;
-use crate::spatial::{Vec3, Wrench};
+use crate::spatial::{Motion, Vec3, Wrench};
 
 /// Speed over which the sign of Coulomb friction is smoothed [rad/s or m/s].
 pub(super) const COULOMB_SPEED: f64 = 0.02;
@@ -251,6 +251,12 @@ fn forward(factor: &[f64], m: usize, values: &mut [f64], width: usize) {
     }
 }
 
+/// What a sub-tree needs for a motion that its encoders do not show: [torque; force], zero where nothing is known of any.
+fn shaking_of(instant: &Instant, subtree: usize) -> [f64; 6] {
+    let known = instant.shaking.iter().find(|(number, _)| *number == subtree);
+    known.map_or([0.0; 6], |(_, wrench)| wrench.torque_first())
+}
+
 /// The representative of a node's set.
 fn root_of(parent: &mut [usize], mut node: usize) -> usize {
     while parent[node] != node {
@@ -453,37 +459,11 @@ impl<'a> RowMaker<'a> {
         let setup = self.setup;
         let mut apart = vec![f64::NAN; setup.model.dof_count()];
         for (number, subtree) in self.stacked.subtrees().iter().enumerate() {
-            let unread = |sensor: usize| instant.readings.get(sensor).is_none_or(|r| !r.is_finite());
-            if subtree.sensors().len() < 2 || subtree.sensors().any(unread) || !subtree.contacts().is_empty() {
+            if subtree.sensors().len() < 2 {
                 continue;
             }
-            let mut b = [0.0; 6];
-            for (row, sum) in b.iter_mut().enumerate() {
-                let (links, offsets) = subtree.row(row).split_at(subtree.offset_column());
-                for (values, link) in links.chunks_exact(WIDTH).zip(subtree.links()) {
-                    *sum += values
-                        .iter()
-                        .zip(&self.cad[WIDTH * link..])
-                        .map(|(x, y)| x * y)
-                        .sum::<f64>();
-                    if let Ok(place) = self.layout.links.binary_search(link) {
-                        *sum += values.iter().zip(&d[WIDTH * place..]).map(|(x, y)| x * y).sum::<f64>();
-                    }
-                }
-                for (values, sensor) in offsets.chunks_exact(6).zip(subtree.sensors()) {
-                    if let Ok(place) = self.layout.sensors.binary_search(&sensor) {
-                        *sum += values
-                            .iter()
-                            .zip(&session[6 * place..])
-                            .map(|(x, y)| x * y)
-                            .sum::<f64>();
-                    }
-                }
-                *sum -= subtree.measured()[row];
-            }
-            let balance = Wrench {
-                torque: Vec3::new(b[0], b[1], b[2]),
-                force: Vec3::new(b[3], b[4], b[5]),
+            let Some(balance) = self.balance(instant, d, session, number) else {
+                continue;
             };
             let in_base = self.kinematics.pose(subtree.top()).wrench(&balance);
             for joint in setup.model.joints() {
@@ -494,6 +474,66 @@ impl<'a> RowMaker<'a> {
             }
         }
         apart
+    }
+
+    /// What a sub-tree needs for its motion less what its sensors measure, for these parameters and the log's own unknowns, after [`RowMaker::make`]: about its top link's origin, in that link's
+    /// axes. None if a sensor was not read, or an unknown contact touches it.
+    pub(super) fn balance(&self, instant: &Instant, d: &[f64], session: &[f64], number: usize) -> Option<Wrench> {
+        let subtree = self.stacked.subtrees().get(number)?;
+        let unread = |sensor: usize| instant.readings.get(sensor).is_none_or(|r| !r.is_finite());
+        let is_suspected = !self.disregards && instant.suspected.contains(number);
+        if is_suspected
+            || subtree.sensors().len() == 0
+            || subtree.sensors().any(unread)
+            || !subtree.contacts().is_empty()
+        {
+            return None;
+        }
+        let mut b = shaking_of(instant, number);
+        for (row, sum) in b.iter_mut().enumerate() {
+            let (links, offsets) = subtree.row(row).split_at(subtree.offset_column());
+            for (values, link) in links.chunks_exact(WIDTH).zip(subtree.links()) {
+                *sum += dot(values, &self.cad[WIDTH * link..]);
+                if let Ok(place) = self.layout.links.binary_search(link) {
+                    *sum += dot(values, &d[WIDTH * place..]);
+                }
+            }
+            for (values, sensor) in offsets.chunks_exact(6).zip(subtree.sensors()) {
+                if let Ok(place) = self.layout.sensors.binary_search(&sensor) {
+                    *sum += dot(values, &session[6 * place..]);
+                }
+            }
+            *sum -= subtree.measured()[row];
+        }
+        Some(Wrench {
+            torque: Vec3::new(b[0], b[1], b[2]),
+            force: Vec3::new(b[3], b[4], b[5]),
+        })
+    }
+
+    /// The sensors around each sub-tree.
+    pub(super) fn sensors_of_subtrees(&self) -> Vec<Vec<usize>> {
+        let each = self.stacked.subtrees().iter();
+        each.map(|subtree| subtree.sensors().collect()).collect()
+    }
+
+    /// What a sub-tree needs for accelerating as if its joints were locked, by CAD, after [`RowMaker::make`]: for a unit of each of [angular; linear], about its top link's origin and in that
+    /// link's axes, the wrench.
+    pub(super) fn inertia_of_subtree(&self, number: usize) -> Option<[Wrench; 6]> {
+        let subtree = self.stacked.subtrees().get(number)?;
+        let to_top = self.kinematics.pose(subtree.top()).inverse();
+        let mut wrenches = [Wrench::zero(); 6];
+        for &link in subtree.links() {
+            let body = self.setup.model.inertias()[link].transformed(&(to_top * *self.kinematics.pose(link)));
+            for (k, sum) in wrenches.iter_mut().enumerate() {
+                let unit = |first: usize| Vec3::from_fn(|i, _| f64::from(u8::from(first + i == k)));
+                *sum += body.momentum(&Motion {
+                    angular: unit(0),
+                    linear: unit(3),
+                });
+            }
+        }
+        Some(wrenches)
     }
 
     fn wrench_rows(&mut self, instant: &Instant, rows: &mut Rows) -> Result<(), DynamicsError> {
@@ -509,11 +549,12 @@ impl<'a> RowMaker<'a> {
             if is_suspected || subtree.sensors().len() == 0 || subtree.sensors().any(unread) {
                 continue;
             }
+            let shaking = shaking_of(instant, unit);
             for number in 0..subtree.remaining() {
                 let from = subtree.projected_row(number);
                 let (links, offsets) = from.split_at(subtree.offset_column());
                 let (a, r, g, n) = rows.push(unit);
-                *r = subtree.projected_measured()[number];
+                *r = subtree.projected_measured()[number] - dot(subtree.projection(number), &shaking);
                 for (values, link) in links.chunks_exact(WIDTH).zip(subtree.links()) {
                     let cad = &self.cad[WIDTH * link..][..WIDTH];
                     *r -= values.iter().zip(cad).map(|(x, y)| x * y).sum::<f64>();
