@@ -535,13 +535,21 @@ fn what_is_stated_on_line_covers_the_errors_of_motion_too() {
     let sessions = arm();
     for name in ["train", "validate"] {
         let (begin, _) = sessions.moving(name);
-        let learnt = scores(&sessions, name, &sessions.log(name), learning(&sessions), |t| t > begin + 12.0);
+        let learnt = scores(&sessions, name, &sessions.log(name), learning(&sessions), |t| {
+            t > begin + 12.0
+        });
         for joint in &sessions.distal {
             let Score {
                 error, stated, covered, ..
             } = learnt[*joint];
-            println!("{name} {joint}: {error:.4} Nm, stated {stated:.4}, 95 % hold {:.0} %", 100.0 * covered);
-            assert!(covered > 0.85 && stated < 3.0 * error, "{name} {joint}: {covered} {stated} {error}");
+            println!(
+                "{name} {joint}: {error:.4} Nm, stated {stated:.4}, 95 % hold {:.0} %",
+                100.0 * covered
+            );
+            assert!(
+                covered > 0.85 && stated < 3.0 * error,
+                "{name} {joint}: {covered} {stated} {error}"
+            );
         }
     }
 }
