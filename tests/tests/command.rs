@@ -1960,6 +1960,61 @@ fn a_demonstration_ends_well_and_leaves_nothing_behind() {
     );
 }
 
+/// Its boards measure velocities, and positions that jitter by what gears leave: no motion that says anything of masses.
+#[test]
+fn an_arm_that_stands_still_learns_nothing_of_its_masses() {
+    let place = Place::new();
+    let settings = Settings {
+        still: 20.0,
+        push: false,
+        ..Settings::default()
+    };
+    place.write("still.log", &session(10.0, &settings));
+    place
+        .run(&[
+            "decode",
+            "--config",
+            "gateway.toml",
+            "--log",
+            "still.log",
+            "--out",
+            "still.csv",
+        ])
+        .good();
+    let hand = "link = \"l_hand\"\n";
+    place.change(
+        "estimator.toml",
+        "learning.toml",
+        &[(
+            hand,
+            &format!("{hand}presence = \"possible\"\n[identification]\nenabled = true\n"),
+        )],
+    );
+    place
+        .run(&[
+            "estimate",
+            "--config",
+            "learning.toml",
+            "--log",
+            "still.csv",
+            "--out",
+            "e.csv",
+        ])
+        .good();
+    let estimates = table(&place.read("e.csv"));
+    let at = |column: &str, t: f64| {
+        let row = estimates["t"].iter().position(|x| *x > T0.seconds() + t).unwrap();
+        estimates[column][row]
+    };
+    for joint in ["l_elbow", "l_wrist_pitch", "l_shoulder_roll"] {
+        let (torque, deviation) = (format!("torque/{joint}"), format!("torque_std/{joint}"));
+        let (early, late) = (at(&deviation, 3.0), at(&deviation, 9.5));
+        assert!(late > 0.8 * early, "{joint}: {early} {late}");
+        let change = at(&torque, 9.5) - at(&torque, 3.0);
+        assert!(change.abs() < 0.1 * late, "{joint}: {change}");
+    }
+}
+
 #[test]
 fn a_demonstration_learns_what_its_urdf_has_wrong() {
     let place = Place::new();
