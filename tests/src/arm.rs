@@ -53,7 +53,7 @@ impl Arm {
         // The halves of a wrench, too, may come far apart where everything shares one processor.
         paced.each_device(|driver, device| {
             if driver == "icub_strain" {
-                device.insert("pair_timeout_ms".into(), (if uml() { 2000.0 } else { 500.0 }).into());
+                device.insert("pair_timeout_ms".into(), (if uml() { 1000.0 } else { 500.0 }).into());
             }
         })
     }
