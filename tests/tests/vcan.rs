@@ -765,7 +765,11 @@ fn skewed_buses_are_not_mixed_up() {
     // Periods of F/T, IMU and joints, how long an estimate waits, and the skew [ms]. In the first case each estimate has all
     // channels; in the second the joints are later, and rarer, than an estimate waits. The wait ends as far before a stamp of
     // the trigger as it can: what is released then does not depend on which bus's thread runs first.
+    // All of it in slow motion in user-mode Linux, which stalls for tens of milliseconds; 250 ms is the longest wait there is.
+    let slower = if uml() { 3 } else { 1 };
     for (periods, max_wait, skew) in [([10, 20, 20], 250.0, 0.5), ([20, 20, 80], 41.0, 60.0)] {
+        let periods = periods.map(|period| slower * period);
+        let (max_wait, skew) = (250.0_f64.min(max_wait * slower as f64), skew * slower as f64);
         // A machine that stalls for longer than the wait makes samples late: then the next attempt is due.
         let mut outcome = Ok(());
         for _ in 0..5 {
@@ -792,7 +796,14 @@ fn skewed_buses([force_torque, imu, motors]: [i64; 3], max_wait: f64, skew: Nano
     let arm = arm.write(&rig.path("robot"));
     let log = rig.path("session.log");
     let out = BufWriter::new(File::create(&log).expect("a log"));
-    record::record(&arm.robot, &Settings::default(), 3.0, Nanos(1_000_000_000), out).expect("a session");
+    record::record(
+        &arm.robot,
+        &Settings::default(),
+        if uml() { 6.0 } else { 3.0 },
+        Nanos(1_000_000_000),
+        out,
+    )
+    .expect("a session");
 
     let (mut gateway, mut estimator) = (gateway(&rig, &arm), estimator(&rig, &arm));
     let domain = rig.open();
