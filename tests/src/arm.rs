@@ -41,12 +41,12 @@ impl Arm {
         Self { gateway, estimator }
     }
 
-    /// A pace for a single slow processor: F/T every 10 ms, joints and IMU every 20 ms, and patience to go with it. Half of that in user-mode Linux, where
-    /// some hosts take 10 ms to carry one frame through all processes: a board must still be heard in time to count as started.
+    /// A pace for a single slow processor: F/T every 10 ms, joints and IMU every 20 ms, and patience to go with it. A sixth of that in user-mode Linux: on
+    /// some hosts it takes up to a millisecond for a system call, and a frame that goes through all processes costs ten.
     #[must_use]
     pub fn slow() -> Self {
         let paced = if uml() {
-            Self::new().periods(20, 40, 40).patience(4000.0, 200.0)
+            Self::new().periods(60, 120, 120).patience(5000.0, 250.0)
         } else {
             Self::new().periods(10, 20, 20).patience(1000.0, 100.0)
         };
