@@ -20,12 +20,32 @@
 
 #define XSTATE_BV 512 /* where the XSAVE area says which components it holds (Intel SDM 1, 13.4.2) */
 
+/* The components that end beyond `length` bytes. Asked of the processor once: in a virtual machine each CPUID is a call
+ * to the hypervisor, and sixty of them at every switch of a process make everything inside a hundred times slower.
+ */
+static unsigned long beyond(size_t length)
+{
+    static unsigned long end[63]; /* of each component; 0: none */
+    static int asked;
+    unsigned long those = 0;
+    unsigned size, offset, c, d;
+
+    for (unsigned i = 2; !asked && i < 63; i++) {
+        __cpuid_count(0xd, i, size, offset, c, d);
+        end[i] = size == 0 ? 0 : (unsigned long)offset + size;
+    }
+    asked = 1;
+    for (unsigned i = 2; i < 63; i++)
+        if (end[i] > length)
+            those |= 1UL << i;
+    return those;
+}
+
 static long complete_write(pid_t pid, void *type, const struct iovec *given)
 {
     static unsigned char whole[65536] __attribute__((aligned(64)));
     struct iovec iov = {whole, sizeof whole};
     unsigned long components;
-    unsigned a, size, offset, d;
 
     /* A read of the whole state tells how long it is, and fills what the caller does not give. */
     if (syscall(SYS_ptrace, PTRACE_GETREGSET, pid, type, &iov) < 0)
@@ -35,11 +55,7 @@ static long complete_write(pid_t pid, void *type, const struct iovec *given)
 
     memcpy(whole, given->iov_base, given->iov_len);
     memcpy(&components, whole + XSTATE_BV, sizeof components);
-    for (unsigned i = 2; i < 63; i++) {
-        __cpuid_count(0xd, i, size, offset, a, d);
-        if (size != 0 && (unsigned long)offset + size > given->iov_len)
-            components &= ~(1UL << i);
-    }
+    components &= ~beyond(given->iov_len);
     memcpy(whole + XSTATE_BV, &components, sizeof components);
     return syscall(SYS_ptrace, PTRACE_SETREGSET, pid, type, &iov);
 }
