@@ -1,6 +1,5 @@
 //! Variants of `config/icub_left_arm`: the same arm on other buses, at another pace, with another patience.
 
-use crate::uml;
 use proprio_simulator::Robot;
 use std::fs;
 use std::path::Path;
@@ -41,19 +40,14 @@ impl Arm {
         Self { gateway, estimator }
     }
 
-    /// A pace for a single slow processor: F/T every 10 ms, joints and IMU every 20 ms, and patience to go with it. A sixth of that in user-mode Linux: on
-    /// some hosts it takes up to a millisecond for a system call, and a frame that goes through all processes costs ten.
+    /// A pace for a single slow processor: F/T every 10 ms, joints and IMU every 20 ms, and patience to go with it.
     #[must_use]
     pub fn slow() -> Self {
-        let paced = if uml() {
-            Self::new().periods(60, 120, 120).patience(5000.0, 250.0)
-        } else {
-            Self::new().periods(10, 20, 20).patience(1000.0, 100.0)
-        };
+        let paced = Self::new().periods(10, 20, 20).patience(1000.0, 100.0);
         // The halves of a wrench, too, may come far apart where everything shares one processor.
         paced.each_device(|driver, device| {
             if driver == "icub_strain" {
-                device.insert("pair_timeout_ms".into(), (if uml() { 1000.0 } else { 500.0 }).into());
+                device.insert("pair_timeout_ms".into(), 500.0.into());
             }
         })
     }
