@@ -20,7 +20,7 @@ pub fn now() -> Nanos {
     monotonic()
 }
 
-/// Whether this is user-mode Linux, where system calls take some ten times as long: `tests/vcan/README.md`.
+/// Whether this is user-mode Linux, where system calls take ten times as long or more: `tests/vcan/README.md`.
 #[must_use]
 pub fn uml() -> bool {
     static UML: OnceLock<bool> = OnceLock::new();
