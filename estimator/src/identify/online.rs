@@ -579,14 +579,16 @@ impl Online {
             active,
             ..
         } = *observation;
-        if t <= self.newest {
+        let period = self.period.0.max(1);
+        let slot = t.0.div_euclid(period);
+        // A block has room for one instant in each slot.
+        if t <= self.newest || slot == self.newest.0.div_euclid(period) {
             return Ok(());
         }
         self.stacked.update(kinematics, readings, active, &[])?;
         self.stacked.eliminate_contacts(Weighting::Noise);
         self.newest = t;
         self.snapshot.get_or_insert(t);
-        let slot = t.0.div_euclid(self.period.0.max(1));
         for (component, known) in self.components.iter_mut().zip(&self.solution.components) {
             component.observe(observation, &self.stacked, known, slot);
         }

@@ -210,8 +210,10 @@ impl Learning {
 
     /// The instant that an estimate at `t` calls for, if it does.
     pub(super) fn instant(&mut self, t: Nanos) -> Option<Nanos> {
+        // One in each slot of its own time, not of the estimate's.
+        let t = t - DELAY;
         let cell = t.0.div_euclid(self.period.0);
-        (cell != std::mem::replace(&mut self.cell, cell)).then(|| t - DELAY)
+        (cell != std::mem::replace(&mut self.cell, cell)).then_some(t)
     }
 
     /// Observes instant `t`. `base` is how its link moves, if that does not come from an IMU, and what speaks against it.
