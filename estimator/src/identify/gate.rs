@@ -335,7 +335,7 @@ impl Normal {
     fn add_prior(&mut self, prior: &Prior, layout: &Layout, tau: f64) {
         for (place, &link) in layout.links.iter().enumerate() {
             let mut own = self.matrix.fixed_view_mut::<WIDTH, WIDTH>(WIDTH * place, WIDTH * place);
-            own += prior.metric(link) / (tau * tau);
+            own += prior.metric(link) / (2.0 * tau * tau);
         }
     }
 }
@@ -352,7 +352,7 @@ fn body(
     let cross = some.matrix.fixed_columns::<WIDTH>(WIDTH * place).into_owned();
     let own = cross.fixed_rows::<WIDTH>(WIDTH * place).into_owned();
     // The body is no less known than to three times the link's own size.
-    let weak = prior.metric(layout.links[place]) / 9.0;
+    let weak = prior.metric(layout.links[place]) / 18.0;
     let rest = own + weak - cross.transpose() * factor.solve(&cross);
     let misfit = some.right.fixed_rows::<WIDTH>(WIDTH * place).into_owned() - cross.transpose() * x;
     let covariance = rest.cholesky()?.inverse();
