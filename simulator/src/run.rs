@@ -359,7 +359,7 @@ mod tests {
     use proprio_gateway::decoder::Decoder;
     use proprio_gateway::link::{LinkCounters, SendError};
     use proprio_gateway::status::BusStatus;
-    use proprio_topics::LinkState;
+    use proprio_topics::{Counter, LinkState};
     use std::collections::VecDeque;
     use std::sync::Arc;
     use std::sync::atomic::{AtomicI64, AtomicU64};
@@ -434,10 +434,10 @@ mod tests {
                 stop: Arc::clone(&stop),
             };
             turn_until(bus, Box::new(link), &clock, Nanos::MAX, &stop);
-            assert!(
-                sent.load(Relaxed) >= 3000,
-                "every board was started, in spite of those that stream"
-            );
+            // Every board was started, in spite of those that stream.
+            for device in status.devices() {
+                assert!(device.counters[Counter::Frames as usize] > 0, "{device:?}");
+            }
         }
     }
 }

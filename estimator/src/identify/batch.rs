@@ -3,9 +3,11 @@
 //! 1. Each log becomes instants ([`super::instants`]), each instant rows ([`super::rows`]).
 //! 2. Rounds. With the noise that the last parameters leave: what each log tells of the parameters, its own unknowns eliminated ([`super::passes`]); logs added up; the most
 //!    probable bodies under the prior and its weight ([`super::prior`]). With these bodies: what is left, and from it the noise ([`super::noise`]). Until both stay.
+//!    Before the first of them: a sensor that is mounted the wrong way round is refused.
 //! 3. What this fit says that something undeclared acted on is left out, and the rounds repeated, until that stays ([`super::gate`]).
 //! 4. A check on data held out: pieces of the logs are predicted from the others. The change from CAD is shrunk where it gains nothing ([`held_out`]).
-//! 5. Figures for every log ([`super::assess`]).
+//! 5. Shaking that encoders do not show ([`super::shaking`]), where other sensors tell of it, is taken off; then 2 and 4 once more.
+//! 6. Figures for every log ([`super::assess`]).
 
 use super::assess;
 use super::consistent;
