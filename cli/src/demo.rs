@@ -42,7 +42,7 @@ pub(crate) struct Args {
     /// How long it takes [s]: a quarter of it, 10 s at the most, the robot stands still, then it moves
     #[arg(long, value_name = "N", default_value_t = 40.0, value_parser = seconds)]
     seconds: f64,
-    /// How far each inertial parameter of the URDF that the estimator gets is off, as a share of it
+    /// How far masses and first moments of the URDF that the estimator gets are off, as a share of them; moments of inertia by about as much
     #[arg(long, value_name = "SHARE", default_value_t = 0.2, value_parser = share)]
     cad_error: f64,
     /// Where report.html, estimates.csv, summary.json, the wrong URDF, the estimator's configuration and the processes' logs go
@@ -332,7 +332,7 @@ impl Experiment {
     fn story(&self, args: &Args) -> String {
         let error = 100.0 * args.cad_error;
         let mut story = format!(
-            "The robot stands still for {} s, then it moves. The estimator's URDF is deliberately wrong: each inertial parameter by {error:.0} % (cad.urdf). ",
+            "The robot stands still for {} s, then it moves. The estimator's URDF is deliberately wrong: masses and first moments by {error:.0} %, moments of inertia by about as much (cad.urdf). ",
             args.still()
         );
         match &self.refused {

@@ -6,16 +6,18 @@
 //! |---|---|
 //! | `torque_rms_error_nm` | of each joint, estimated less true torque, RMS \[Nm\]: from 10 s of motion on; in a run too short for that, from 1 s after the first estimate on |
 //! | `valid_share` | share of the torques that were not withheld, in that same time |
-//! | `identification.cad_error` | how far each inertial parameter of `cad.urdf` is off, as a share of it |
+//! | `identification.cad_error` | how far masses and first moments of `cad.urdf` are off, as a share of them; moments of inertia by about as much |
 //! | `identification.refused` | why nothing was identified; null if something was |
 //! | `identification.max_torque_std_nm` | the bound of the standard deviation beyond which a torque is withheld \[Nm\] |
 //! | `identification.moving_since_s`, `.settled_since_s` | when the motion began, and 10 s later; \[s\] after the first estimate; null if the run ended before |
 //! | `identification.before` | of the time in which the robot stood still (from 1 s after the first estimate on); null where nothing can be said |
 //! | `identification.learning` | of the first 10 s of motion; likewise |
 //! | `identification.after` | of the time from 10 s of motion on; likewise |
-//!
 //! | `identification.solutions` | how many solutions were put in force |
 //! | `identification.parameters_within_2_sigma` | share of the identified links' parameters whose true value is within twice the stated standard deviation of the last solution; null without one |
+//! | `rate_hz` | estimates per second |
+//! | `late`, `lost_estimates`, `foreign` | samples too late for their estimate; estimates that this program missed; frames received beyond those that the simulated robot sent |
+//! | `simulator` | what `proprio simulate --json` says |
 //!
 //! Each of the three phases holds `cad` and `identified`: of each joint the RMS error \[Nm\] by the wrong URDF alone, and by what is identified on-line, numbers of withheld torques included;
 //! `valid_share`; and `within_2_sigma`, the share of the torques whose error is within twice the stated standard deviation.

@@ -8,7 +8,7 @@
 //! |---|---|
 //! | `schema` | 1 |
 //! | `robot`, `version` | the robot's name, this program's version |
-//! | `verdict` | `identified`; `no_better_than_cad` (held-out data showed no gain: the parameters are the CAD's); `nothing` (no parameters at all) |
+//! | `verdict` | `identified`; `no_better_than_cad` (held-out data showed no gain, or there was too little to hold any back: the parameters are the CAD's); `nothing` (no parameters at all) |
 //! | `reason` | why nothing was identified, in words; else `null` |
 //! | `advice` | {`grade`: `accept`, `care` or `reject`; `why`: sentences; `next`: what to do} |
 //! | `logs` | a list, in the order given on the command line: below |
