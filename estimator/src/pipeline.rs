@@ -560,6 +560,7 @@ impl Pipeline {
             .and_then(|()| self.propagation.update(structure, &self.solver, &self.kinematics, t))
             .and_then(|()| {
                 self.motion.update(&Instant {
+                    t,
                     model,
                     structure,
                     state,

@@ -6,15 +6,20 @@
 //! ```
 //!
 //! with sigma as [`crate::differentiate`] states it, errors of different channels being independent. Forces are linear in accelerations, so a column of S is the difference
-//! that one unit of acceleration makes. S follows the posture alone: one column is found anew with each estimate, in turn, and all of them when contacts or base
-//! change. Errors of positions and velocities are smaller by orders of magnitude, and left out; so is the noise of the IMU's proper acceleration.
+//! that one unit of acceleration makes. S follows the posture alone: it is found anew with the first estimate of each tenth of a second, and when contacts or base
+//! change. By stamps, so that a replay which begins elsewhere finds the same. Errors of positions and velocities are smaller by orders of magnitude, and left out; so is the noise of the IMU's proper acceleration.
 
 use crate::dynamics::{ContactSet, DynamicsError, FrameMotion, JointState, Kinematics, Solver, Structure};
 use crate::model::Model;
 use crate::spatial::{Pose, Wrench};
+use proprio_topics::Nanos;
+
+/// How long a posture counts as the same.
+const CELL: Nanos = Nanos::from_millis(100);
 
 /// All that an estimate is made of.
 pub(super) struct Instant<'a> {
+    pub(super) t: Nanos,
     pub(super) model: &'a Model,
     pub(super) structure: &'a Structure,
     pub(super) state: JointState<'a>,
@@ -38,8 +43,7 @@ pub(super) struct MotionErrors {
     sensitivity: Vec<f64>,
     is_known: Vec<bool>,
     /// What the columns belong to.
-    of: Option<(ContactSet, usize)>,
-    turn: usize,
+    of: Option<(ContactSet, usize, i64)>,
     perturbed: Vec<f64>,
     /// Of each torque, then of `[fx fy fz tx ty tz]` of each contact.
     deviation: Vec<f64>,
@@ -57,7 +61,6 @@ impl MotionErrors {
             sensitivity: vec![0.0; columns * rows],
             is_known: vec![false; columns],
             of: None,
-            turn: 0,
             perturbed: vec![0.0; dofs],
             deviation: vec![0.0; rows],
             dofs,
@@ -73,7 +76,7 @@ impl MotionErrors {
         if self.acceleration.iter().all(|sigma| *sigma == 0.0) {
             return Ok(());
         }
-        let of = Some((*instant.active, instant.base_link));
+        let of = Some((*instant.active, instant.base_link, instant.t.0.div_euclid(CELL.0)));
         if self.of != of {
             self.is_known.fill(false);
             if self.kinematics.base() != instant.base_link {
@@ -81,11 +84,10 @@ impl MotionErrors {
             }
             self.of = of;
         }
-        self.turn = (self.turn + 1) % self.is_known.len();
         for column in 0..self.is_known.len() {
             let matters = self.acceleration.get(column).is_some_and(|sigma| *sigma > 0.0);
             let is_known = self.is_known.get(column).is_some_and(|known| *known);
-            if matters && (!is_known || column == self.turn) {
+            if matters && !is_known {
                 self.probe(column, instant)?;
             }
         }
