@@ -26,7 +26,7 @@ pub(crate) struct Args {
     /// How long the robot stands still before it moves [s]
     #[arg(long, value_name = "N", default_value_t = 1.0, value_parser = still)]
     still: f64,
-    /// Declare touches of the robot on <robot>/contact/declared, as a skin does
+    /// Declare touches of the robot on ROBOT/contact/declared, as a skin does
     #[arg(long)]
     skin: bool,
     /// A fault: "lost:0.01", "silent:BOARD@3..4", "saturate:BOARD@5..5.5", "spike:BOARD@6", "late_half:BOARD@2..8"; may be repeated
