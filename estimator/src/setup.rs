@@ -380,20 +380,27 @@ impl Setup {
         }
     }
 
-    /// The covariance where some links and sensors are identified on-line, known at instant `known`: of each group its links, its sensors, a root over
-    /// [ten per link | torque, force per sensor], and how far each offset wanders in a second. Without a root nothing is known yet: links are as uncertain as
+    /// The covariance where some links and sensors are identified on-line: of each group its links, its sensors, a root over
+    /// [ten per link | torque, force per sensor], how far each offset wanders in a second, and since when. Without a root nothing is known yet: links are as uncertain as
     /// identification's prior has them before any data, and offsets anything.
     pub fn covariance_with<'a>(
         &self,
-        known: Nanos,
-        groups: impl Iterator<Item = (&'a [usize], &'a [usize], Option<&'a DMatrix<f64>>, &'a [[f64; 6]])>,
+        groups: impl Iterator<
+            Item = (
+                &'a [usize],
+                &'a [usize],
+                Option<&'a DMatrix<f64>>,
+                &'a [[f64; 6]],
+                Nanos,
+            ),
+        >,
     ) -> Covariance {
         /// Of an offset before anything is known of it [Nm], [N].
         const ANYTHING: [f64; 6] = [100.0, 100.0, 100.0, 1000.0, 1000.0, 1000.0];
         let mut covariance = Covariance::exact(self.cad.len(), self.configured.len());
         let mut measured = Vec::new();
         // Numbers are the model's own, and each is in one group only: nothing is refused.
-        for (links, sensors, root, drift) in groups {
+        for (links, sensors, root, drift, known) in groups {
             measured.extend_from_slice(sensors);
             if let Some(root) = root {
                 let _ = covariance.add(links, sensors, root.clone());

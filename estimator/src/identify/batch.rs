@@ -553,6 +553,8 @@ fn gated(
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<Settled, IdentifyError> {
     let mut settled = settle(setup, maker, &used(prepared), None, progress)?;
+    // It has been told how far along this is.
+    let mut progress = |step: String, _| progress(step, 0.7);
     let mut loads: Vec<Load> = Vec::new();
     let mut contacts: Vec<Vec<UnitSet>> = used(prepared)
         .iter()
@@ -568,7 +570,13 @@ fn gated(
         if let Some(load) = load {
             loads.push(load);
             suspect(prepared, &loads, &contacts);
-            let without = settle(setup, maker, &used(prepared), Some(settled.noise.clone()), progress)?;
+            let without = settle(
+                setup,
+                maker,
+                &used(prepared),
+                Some(settled.noise.clone()),
+                &mut progress,
+            )?;
             if without.noise.quieter(&settled.noise) > QUIETER {
                 settled = without;
                 continue;
@@ -583,7 +591,7 @@ fn gated(
         }
         contacts = found;
         suspect(prepared, &loads, &contacts);
-        settled = settle(setup, maker, &used(prepared), Some(settled.noise), progress)?;
+        settled = settle(setup, maker, &used(prepared), Some(settled.noise), &mut progress)?;
     }
     let training = used(prepared);
     let bodies: Vec<Option<gate::Added>> = loads

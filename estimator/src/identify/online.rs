@@ -26,7 +26,7 @@
 //!
 //! # Offsets
 //! Offsets wander between blocks (random walks), and stand still while a contact is declared or suspected. How fast each wanders is found by the likelihood of what its channel
-//! reads in the mean from one second to the next ([`wander`]), between bounds, so that a slow push is not taken for one.
+//! reads in the mean from one second to the next (`wander`), between bounds, so that a slow push is not taken for one.
 
 pub mod state;
 mod wander;
@@ -217,6 +217,8 @@ pub struct ComponentSolution {
     pub root: DMatrix<f64>,
     /// How far each offset wanders in a second [Nm/s^½, N/s^½], [torque; force].
     pub drift: Vec<[f64; 6]>,
+    /// The stamp of the newest data that this is found from.
+    pub data: Nanos,
     /// The prior's weight; not a number before the first solution.
     pub tau: f64,
     /// How many parameters the data determine, rather than the prior.
@@ -235,7 +237,7 @@ pub struct ComponentSolution {
 /// What a job found.
 #[derive(Clone, Debug, Default)]
 pub struct Solution {
-    /// The stamp of the newest data in it.
+    /// The stamp of the newest data that it was looked for in.
     pub data: Nanos,
     /// Of each component.
     pub components: Vec<ComponentSolution>,
@@ -339,8 +341,7 @@ struct Component {
     /// Whether a second block did not fit, either.
     lasts: bool,
     clean: u32,
-    /// When the present suspicion began, and how the proper acceleration pointed then; the least cosine to it since.
-    since: Nanos,
+    /// How the proper acceleration pointed when the present suspicion began; the least cosine to it since.
     direction: Vec3,
     cosine: f64,
     /// Whether what is in force can be trusted to judge rows.
@@ -613,7 +614,6 @@ impl Online {
             component.learnt.clear();
             component.aside.clear();
             part.is_suspected = component.is_suspected;
-            part.lasting = (self.newest - component.since).seconds();
             part.cosine = component.cosine;
             part.variances.copy_from_slice(&component.variances);
             part.motion = component.motion;
@@ -766,7 +766,6 @@ impl Component {
             is_suspected: false,
             lasts: false,
             clean: 0,
-            since: Nanos::MIN,
             direction: Vec3::zeros(),
             cosine: 1.0,
             judges: false,
@@ -909,7 +908,7 @@ impl Component {
             self.lasts = self.is_suspected;
             if !self.is_suspected {
                 self.is_suspected = true;
-                (self.since, self.cosine, self.direction) = (self.block_from, 1.0, Vec3::zeros());
+                (self.cosine, self.direction) = (1.0, Vec3::zeros());
             }
             self.clean = 0;
             let instants = self.pending.instants() + self.gathered.instants();
@@ -1033,6 +1032,7 @@ struct Part {
     learnt: Rows,
     aside: Rows,
     is_suspected: bool,
+    /// For how long rows have been put aside in the present suspicion [s].
     lasting: f64,
     cosine: f64,
     /// Configured, and inflated.
@@ -1131,7 +1131,7 @@ impl Part {
         }
     }
 
-    fn run(&mut self, prior: &Prior, solution: &mut ComponentSolution) {
+    fn run(&mut self, prior: &Prior, data: Nanos, solution: &mut ComponentSolution) {
         self.change = None;
         self.weigh_change();
         self.has_failed = self.solve(prior, solution).is_err();
@@ -1140,6 +1140,7 @@ impl Part {
             solution.clone_from(&self.good);
         } else {
             self.take_noise(solution);
+            solution.data = data;
         }
         solution.is_accepted = !self.has_failed;
         (solution.motion, solution.rows) = (self.motion, self.rows);
@@ -1258,9 +1259,14 @@ impl Part {
     fn weigh_change(&mut self) {
         if !self.is_suspected {
             self.hypotheses.clear();
-            (self.aside_rows, self.asked) = (0.0, 0.0);
+            (self.aside_rows, self.asked, self.lasting) = (0.0, 0.0, 0.0);
             return;
         }
+        // Under a declared contact, or without a sensor, nothing is put aside: that time says nothing.
+        if self.aside.len() == 0 {
+            return;
+        }
+        self.lasting += SOLVE.seconds();
         let unknowns = self.information.unknowns();
         if self.hypotheses.is_empty() {
             let offsets: Vec<usize> = (0..6 * self.sensors.len()).collect();
@@ -1333,7 +1339,7 @@ impl Job {
     pub fn run(&mut self) {
         self.solution.data = self.data;
         for (part, solution) in self.parts.iter_mut().zip(&mut self.solution.components) {
-            part.run(&self.prior, solution);
+            part.run(&self.prior, self.data, solution);
         }
     }
 

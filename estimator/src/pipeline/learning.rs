@@ -93,9 +93,10 @@ fn covariance(setup: &Setup, solution: &Solution) -> Covariance {
             &component.sensors[..],
             known,
             &component.drift[..],
+            component.data,
         )
     });
-    setup.covariance_with(solution.data, blocks)
+    setup.covariance_with(blocks)
 }
 
 /// A solution in the words of who reads it.
@@ -286,17 +287,19 @@ impl Learning {
                     base_fault = gathered.err().unwrap_or(Reason::None);
                     let measured = &mut self.found.imu;
                     let first = self.noise.len().saturating_sub(9);
-                    let mut noise = self.noise.iter_mut().skip(first);
                     for axis in 0..3 {
-                        let mut none = f64::NAN;
-                        let mut next = || noise.next();
-                        let gyro = self.scratch.fit(3 + axis, t, next().unwrap_or(&mut none));
+                        // Places of their own: angular acceleration may come and go.
+                        let mut none = [f64::NAN; 3];
+                        let own = self.noise.get_mut(first + 3 * axis..first + 3 * axis + 3);
+                        let [of_rate, of_angular, of_linear]: &mut [f64; 3] =
+                            own.and_then(|own| own.try_into().ok()).unwrap_or(&mut none);
+                        let gyro = self.scratch.fit(3 + axis, t, of_rate);
                         let alpha = if self.scratch.is_complete(6 + axis) {
-                            self.scratch.fit(6 + axis, t, next().unwrap_or(&mut none))[0]
+                            self.scratch.fit(6 + axis, t, of_angular)[0]
                         } else {
                             gyro[1]
                         };
-                        let acceleration = self.scratch.fit(axis, t, next().unwrap_or(&mut none))[0];
+                        let acceleration = self.scratch.fit(axis, t, of_linear)[0];
                         let errors = self.found.errors.iter_mut().rev().skip(3 * axis);
                         for ((place, (value, error)), old) in [
                             (&mut measured.proper_acceleration[axis], acceleration),
