@@ -58,3 +58,55 @@ const AXES: [&str; 6] = ["fx", "fy", "fz", "tx", "ty", "tz"];
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
+
+/// Lower factor of a covariance, row by row in place; combinations without noise get 1e-9 of the greatest variance.
+fn factorise(covariance: &mut [f64], count: usize) {
+    let greatest = (0..count).map(|i| covariance[i * count + i]).fold(0.0, f64::max);
+    let floor = 1e-9 * greatest.max(f64::MIN_POSITIVE);
+    for i in 0..count {
+        for j in 0..=i {
+            let (above, own) = covariance.split_at(i * count);
+            let other = if j == i { own } else { &above[j * count..] };
+            let rest = own[j] - dot(&own[..j], &other[..j]);
+            covariance[i * count + j] = if i == j {
+                rest.max(floor).sqrt()
+            } else {
+                rest / covariance[j * count + j]
+            };
+        }
+    }
+}
+
+/// `L^-1` from the left, `count` rows of `width` numbers.
+fn forward(factor: &[f64], count: usize, values: &mut [f64], width: usize) {
+    for i in 0..count {
+        let (above, own) = values.split_at_mut(i * width);
+        let own = &mut own[..width];
+        for j in 0..i {
+            let weight = factor[i * count + j];
+            if weight != 0.0 {
+                for (x, y) in own.iter_mut().zip(&above[j * width..][..width]) {
+                    *x -= weight * y;
+                }
+            }
+        }
+        let scale = 1.0 / factor[i * count + i];
+        own.iter_mut().for_each(|x| *x *= scale);
+    }
+}
+
+/// Normal deviates: splitmix64 and Box, Muller.
+#[cfg(test)]
+fn normals(seed: u64, count: usize) -> Vec<f64> {
+    let mut state = seed;
+    let mut uniform = || {
+        state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = state;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
+    };
+    (0..count)
+        .map(|_| (-2.0 * uniform().max(1e-300).ln()).sqrt() * (std::f64::consts::TAU * uniform()).cos())
+        .collect()
+}

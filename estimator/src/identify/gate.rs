@@ -516,22 +516,8 @@ pub(super) fn added(
 
 #[cfg(test)]
 mod tests {
+    use super::super::normals;
     use super::*;
-
-    /// Normal deviates: splitmix64 and Box, Muller.
-    fn normals(seed: u64, count: usize) -> Vec<f64> {
-        let mut state = seed;
-        let mut uniform = || {
-            state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-            let mut z = state;
-            z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-            z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-            ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
-        };
-        (0..count)
-            .map(|_| (-2.0 * uniform().max(1e-300).ln()).sqrt() * (std::f64::consts::TAU * uniform()).cos())
-            .collect()
-    }
 
     /// Six channels of a robot that stands, moves slowly, moves fast, by turns, and leaves the more the faster it moves; offsets that drift and, once, become others.
     fn usual_log(seed: u64) -> (Vec<Vec<f64>>, Vec<usize>, Vec<f64>) {

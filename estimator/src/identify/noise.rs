@@ -137,22 +137,8 @@ pub(super) fn levels(piece: &[f64], step: f64, noise: f64) -> Vec<f64> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::normals;
     use super::*;
-
-    /// Normal deviates: splitmix64 and Box, Muller.
-    fn normals(seed: u64, count: usize) -> Vec<f64> {
-        let mut state = seed;
-        let mut uniform = || {
-            state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-            let mut z = state;
-            z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-            z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-            ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
-        };
-        (0..count)
-            .map(|_| (-2.0 * uniform().max(1e-300).ln()).sqrt() * (std::f64::consts::TAU * uniform()).cos())
-            .collect()
-    }
 
     #[test]
     fn autocorrelation_time_is_that_of_an_autoregression() {

@@ -37,9 +37,9 @@ use nalgebra::DMatrix;
 use proprio_topics::{Nanos, Reason};
 
 use self::wander::Walk;
-use super::dot;
 use super::information::{Information, InformationError, Panel};
 use super::prior::{GREATEST_TAU, Posterior, Prior, PriorError};
+use super::{dot, factorise, forward};
 use crate::dynamics::{ContactSet, DofSet, DynamicsError, Kinematics, Structure};
 use crate::model::Model;
 use crate::regressor::{StackedRegressor, Weighting};
@@ -1353,37 +1353,6 @@ impl Job {
 fn chi_square(freedom: usize, level: f64) -> f64 {
     let (n, spread) = (freedom as f64, 2.0 / (9.0 * freedom as f64));
     n * (1.0 - spread + level * spread.sqrt()).powi(3)
-}
-
-/// Lower factor of a covariance, row by row in place; combinations without noise get 1e-9 of the greatest variance.
-fn factorise(covariance: &mut [f64], count: usize) {
-    let greatest = (0..count).map(|i| covariance[i * count + i]).fold(0.0, f64::max);
-    let floor = 1e-9 * greatest.max(f64::MIN_POSITIVE);
-    for i in 0..count {
-        for j in 0..=i {
-            let (above, own) = covariance.split_at(i * count);
-            let other = if j == i { own } else { &above[j * count..] };
-            let rest = own[j] - dot(&own[..j], &other[..j]);
-            covariance[i * count + j] = if i == j {
-                rest.max(floor).sqrt()
-            } else {
-                rest / covariance[j * count + j]
-            };
-        }
-    }
-}
-
-/// `L^-1` from the left on `count` rows of `width` numbers.
-fn forward(factor: &[f64], count: usize, values: &mut [f64], width: usize) {
-    for i in 0..count {
-        let (above, own) = values.split_at_mut(i * width);
-        let own = &mut own[..width];
-        for (weight, row) in factor[i * count..][..i].iter().zip(above.chunks_exact(width)) {
-            add_multiple(own, -weight, row);
-        }
-        let scale = 1.0 / factor[i * count + i];
-        own.iter_mut().for_each(|x| *x *= scale);
-    }
 }
 
 fn add_multiple(to: &mut [f64], factor: f64, from: &[f64]) {

@@ -469,6 +469,7 @@ pub(super) fn noise_of(layout: &Layout, pieces: &[Residuals], set: usize, bound:
 #[cfg(test)]
 mod tests {
     use super::super::gate::UnitSet;
+    use super::super::normals;
     use super::*;
     use crate::config::{Config, IdentificationInput};
     use crate::dynamics::{FrameMotion, SensorSet};
@@ -508,15 +509,9 @@ mod tests {
 
     /// What both sensors read at 100 Hz while CAD is right, with these deviations of their channels and of their offsets' steps, [torque; force] of both.
     fn readings(setup: &Setup, count: usize, noise: &[f64; 12], walk: &[f64; 12]) -> Vec<Instant> {
-        let mut state = 7_u64;
-        let mut uniform = || {
-            state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-            let mut z = state;
-            z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-            z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-            ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
-        };
-        let mut normal = || (-2.0 * uniform().max(1e-300).ln()).sqrt() * (std::f64::consts::TAU * uniform()).cos();
+        // Of each of twelve channels, a step of its offset and its noise.
+        let mut deviates = normals(7, 24 * count).into_iter();
+        let mut normal = || deviates.next().expect("enough");
         let zero = Wrench::zero();
         let mut instants: Vec<Instant> = (0..count)
             .map(|k| {

@@ -13,8 +13,8 @@
 //! contact reaches: noise enters them as offsets do, `N = G`. Those of joint torques are rows of the whole tree's [`Regressor`], for joints beyond which, seen from the base, nothing touches
 //! the robot: there `N = 1` and `G = [tanh(dq / v0), dq, 1]`.
 
-use super::dot;
 use super::instants::Instant;
+use super::{dot, factorise, forward};
 use crate::config::IdentificationInput;
 use crate::dynamics::{ContactSet, DynamicsError, JointState, Kinematics};
 use crate::regressor::{Regressor, StackedRegressor, Weighting};
@@ -166,21 +166,7 @@ impl Rows {
                 self.factor[i * m + j] = sum;
             }
         }
-        let greatest = (0..m).map(|i| self.factor[i * m + i]).fold(0.0, f64::max);
-        let floor = 1e-9 * greatest.max(f64::MIN_POSITIVE);
-        for i in 0..m {
-            for j in 0..=i {
-                let (above, own) = self.factor.split_at(i * m);
-                let other = if j == i { own } else { &above[j * m..] };
-                let dot: f64 = own[..j].iter().zip(&other[..j]).map(|(x, y)| x * y).sum();
-                let rest = self.factor[i * m + j] - dot;
-                self.factor[i * m + j] = if i == j {
-                    rest.max(floor).sqrt()
-                } else {
-                    rest / self.factor[j * m + j]
-                };
-            }
-        }
+        factorise(&mut self.factor, m);
         for (values, count) in [
             (&mut self.a, self.unknowns),
             (&mut self.r, 1),
@@ -230,24 +216,6 @@ impl Rows {
     /// Whether any row has this channel's noise.
     pub(super) fn has(&self, channel: usize) -> bool {
         (0..self.count).any(|row| self.n(row)[channel] != 0.0)
-    }
-}
-
-/// `L^-1` from the left, `m` rows of `width` numbers.
-fn forward(factor: &[f64], m: usize, values: &mut [f64], width: usize) {
-    for i in 0..m {
-        let (above, own) = values.split_at_mut(i * width);
-        let own = &mut own[..width];
-        for j in 0..i {
-            let weight = factor[i * m + j];
-            if weight != 0.0 {
-                for (x, y) in own.iter_mut().zip(&above[j * width..][..width]) {
-                    *x -= weight * y;
-                }
-            }
-        }
-        let scale = 1.0 / factor[i * m + i];
-        own.iter_mut().for_each(|x| *x *= scale);
     }
 }
 

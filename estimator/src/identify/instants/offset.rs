@@ -55,7 +55,7 @@ pub struct TimeOffset {
     pub seconds: f64,
     /// Its standard deviation \[s\].
     pub deviation: f64,
-    /// Whether it is surely not zero, and large enough to matter: then [`Recording::shift`] and make the instants anew.
+    /// Whether it is surely not zero, and large enough to matter.
     pub significant: bool,
 }
 
