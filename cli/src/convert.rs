@@ -2,6 +2,7 @@
 
 use anyhow::{Context, bail};
 use proprio_estimator::config::ConfigError;
+use proprio_estimator::files;
 use proprio_estimator::setup::Setup;
 use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
@@ -89,7 +90,7 @@ fn input(path: &Path) -> anyhow::Result<Box<dyn Read>> {
 /// that is also the output is not destroyed before it is read.
 struct Output {
     writer: Option<BufWriter<Marked>>,
-    temporary: Option<(tempfile::TempPath, PathBuf)>,
+    new: Option<(tempfile::NamedTempFile, PathBuf)>,
 }
 
 /// Why an output could not be written, kept apart from why an input could not be read.
@@ -132,27 +133,20 @@ fn blame(error: offline::OfflineError, input: &Path, output: &Path) -> anyhow::E
 impl Output {
     fn new(path: &Path) -> anyhow::Result<Self> {
         let special = std::fs::metadata(path).is_ok_and(|m| !m.is_file());
-        let (writer, temporary): (Box<dyn Write>, _) = if path == Path::new("-") {
+        let unwritable = || format!("{}: can not be written", path.display());
+        let (writer, new): (Box<dyn Write>, _) = if path == Path::new("-") {
             (Box::new(std::io::stdout().lock()), None)
         } else if special {
             // A pipe or /dev/null: nothing to replace.
-            let file = File::create(path).with_context(|| format!("{}: can not be written", path.display()))?;
-            (Box::new(file), None)
+            (Box::new(File::create(path).with_context(unwritable)?), None)
         } else {
-            let folder = path
-                .parent()
-                .filter(|p| !p.as_os_str().is_empty())
-                .unwrap_or(Path::new("."));
-            // tempfile names its own file in the error, which means nothing to whoever named another one.
-            let (file, temporary) = std::fs::metadata(folder)
-                .and_then(|_| tempfile::NamedTempFile::new_in(folder).map_err(|error| error.kind().into()))
-                .with_context(|| format!("{}: can not be written", path.display()))?
-                .into_parts();
-            (Box::new(file), Some((temporary, path.to_owned())))
+            let new = files::begin(path).with_context(unwritable)?;
+            let writer = new.as_file().try_clone().with_context(unwritable)?;
+            (Box::new(writer), Some((new, path.to_owned())))
         };
         Ok(Self {
             writer: Some(BufWriter::with_capacity(1 << 18, Marked(writer))),
-            temporary,
+            new,
         })
     }
 
@@ -167,13 +161,9 @@ impl Output {
         if let Some(mut writer) = self.writer.take() {
             writer.flush().context("can not be written")?;
         }
-        if let Some((temporary, path)) = self.temporary.take() {
-            use std::os::unix::fs::PermissionsExt as _;
-            // Temporary files are private; a result is for whoever may read the folder.
-            std::fs::set_permissions(&temporary, std::fs::Permissions::from_mode(0o644))?;
-            temporary
-                .persist(&path)
-                .with_context(|| format!("{}: can not be written", path.display()))?;
+        if let Some((new, path)) = self.new.take() {
+            // A result is for whoever may read the folder.
+            files::end(new, &path, 0o644).with_context(|| format!("{}: can not be written", path.display()))?;
         }
         Ok(())
     }

@@ -11,21 +11,31 @@ use tempfile::NamedTempFile;
 /// # Errors
 /// The system's; the old file is as it was then.
 pub fn replace(file: &Path, text: &str, mode: u32) -> io::Result<()> {
-    prepare(file, text, mode)?.persist(file).map_err(|error| error.error)?;
+    let mut new = begin(file)?;
+    new.write_all(text.as_bytes())?;
+    end(new, file, mode)
+}
+
+/// A file beside `file`, to be written and then put in its place by [`end`]; without that it is gone when dropped.
+///
+/// # Errors
+/// The system's: there is no such folder, or nobody may write there.
+pub fn begin(file: &Path) -> io::Result<NamedTempFile> {
+    // tempfile names its own file in the error, which means nothing to whoever named another one.
+    NamedTempFile::with_prefix_in(".proprio-", folder(file)).map_err(|error| io::Error::from(error.kind()))
+}
+
+/// Puts what [`begin`] began, written by now, in the place of `file`, once it is on the disk.
+///
+/// # Errors
+/// The system's; the old file is as it was then.
+pub fn end(new: NamedTempFile, file: &Path, mode: u32) -> io::Result<()> {
+    new.as_file().set_permissions(Permissions::from_mode(mode))?;
+    new.as_file().sync_all()?;
+    new.persist(file).map_err(|error| error.error)?;
     // The rename itself is on the disk when the folder is. Not every file system can say so.
     let _ = File::open(folder(file)).and_then(|folder| folder.sync_all());
     Ok(())
-}
-
-/// The temporary file, whole and on the disk.
-pub(crate) fn prepare(file: &Path, text: &str, mode: u32) -> io::Result<NamedTempFile> {
-    // tempfile names its own file in the error, which means nothing to whoever named another one.
-    let temporary = NamedTempFile::with_prefix_in(".proprio-", folder(file));
-    let mut temporary = temporary.map_err(|error| io::Error::from(error.kind()))?;
-    temporary.write_all(text.as_bytes())?;
-    temporary.as_file().set_permissions(Permissions::from_mode(mode))?;
-    temporary.as_file().sync_all()?;
-    Ok(temporary)
 }
 
 fn folder(file: &Path) -> &Path {

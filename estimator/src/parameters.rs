@@ -886,7 +886,8 @@ mod tests {
     #[test]
     fn dies_before_the_rename() {
         if let Some(file) = std::env::var_os("PROPRIO_TEST_PARAMETERS") {
-            let _temporary = files::prepare(Path::new(&file), &nothing("new").to_string(), 0o644).unwrap();
+            let mut new = files::begin(Path::new(&file)).unwrap();
+            std::io::Write::write_all(&mut new, nothing("new").to_string().as_bytes()).unwrap();
             std::process::abort();
         }
     }
