@@ -309,8 +309,8 @@ struct Component {
     subtrees: Vec<usize>,
     links: Vec<usize>,
     sensors: Vec<usize>,
-    /// Joints whose motion its rows rest on.
-    dofs: DofSet,
+    /// Joints whose motion its rows rest on, by the link that kinematics start at.
+    dofs: Vec<DofSet>,
     /// Contacts on its links that come and go.
     passing: ContactSet,
     /// CAD and configured offsets, `[s | d]`.
@@ -426,9 +426,7 @@ impl Online {
                 let subtrees = (0..is_free.len())
                     .filter(|&k| is_free[k] && group[k] == first)
                     .collect();
-                Component::new(
-                    model, &stacked, subtrees, cad, offsets, always, base, per_job, per_block,
-                )
+                Component::new(model, &stacked, subtrees, cad, offsets, always, per_job, per_block)
             })
             .collect();
         if components.is_empty() {
@@ -682,7 +680,6 @@ impl Component {
         cad: &[RigidInertia],
         offsets: &[Wrench],
         always: &ContactSet,
-        base: usize,
         per_job: usize,
         per_block: usize,
     ) -> Self {
@@ -711,8 +708,7 @@ impl Component {
                 of_links.chain(of_sensors).collect()
             })
             .collect();
-        // The way from the base to each link, and back: a joint on both is crossed by neither.
-        let way = |mut link: usize| {
+        let to_root = |mut link: usize| {
             let mut dofs = DofSet::default();
             while link > 0 {
                 let joint = &model.joints()[link - 1];
@@ -723,7 +719,15 @@ impl Component {
             }
             dofs
         };
-        let dofs = links.iter().fold(way(base), |dofs, &link| dofs.union(&way(link)));
+        let to_root: Vec<DofSet> = (0..model.link_count()).map(to_root).collect();
+        // From a base to a link: a joint on the way of both to the root is crossed by neither.
+        let crossed = |base: &DofSet| {
+            links.iter().fold(DofSet::default(), |dofs, &link| {
+                let (there, back) = (to_root[link].difference(base), base.difference(&to_root[link]));
+                dofs.union(&there).union(&back)
+            })
+        };
+        let dofs = to_root.iter().map(crossed).collect();
         let parents: Vec<usize> = model.joints().iter().map(|joint| joint.parent).collect();
         let outermost = (links.iter().enumerate())
             .filter(|(_, link)| !parents.contains(link))
@@ -824,7 +828,8 @@ impl Component {
             self.block_from = t;
         }
         let of_sensors = self.sensors.iter().filter_map(|&s| seen.sensors.get(s));
-        let of_joints = self.dofs.iter().filter_map(|dof| seen.joints.get(dof));
+        let base = seen.kinematics.base();
+        let of_joints = self.dofs[base].iter().filter_map(|dof| seen.joints.get(dof));
         let fault = std::iter::once(&seen.base).chain(of_sensors).chain(of_joints);
         if let Some(reason) = fault.copied().find(|reason| *reason != Reason::None) {
             self.paused = Paused::Fault(reason);
@@ -860,7 +865,7 @@ impl Component {
         for row in self.scratch.rows.chunks_exact(self.row.len()) {
             self.gathered.push(slot, row);
         }
-        self.gathered.is_moving |= seen.is_base_moved || !seen.moved.intersection(&self.dofs).is_empty();
+        self.gathered.is_moving |= seen.is_base_moved || !seen.moved.intersection(&self.dofs[base]).is_empty();
     }
 
     /// Makes the whitened rows of the regressor's last update, in the scratch; how many.
