@@ -603,8 +603,7 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         &sets,
     );
     let times: Vec<f64> = instants.iter().map(|i| (i.t - log.span.0).seconds()).collect();
-    let filter = (log.rate > RAW_RATE)
-        .then(|| times.len() as f64 / (times.last().copied().unwrap_or(1.0) - times.first().copied().unwrap_or(0.0)));
+    let filter = (log.rate > RAW_RATE).then(|| Grid::new(&times)).flatten();
     let inner = |i: &usize| {
         let (first, last) = (
             times.first().copied().unwrap_or(0.0),
@@ -654,8 +653,8 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         }
     }
     for (dof, errors, measured) in &torque_series {
-        let smooth = |x: &[f64]| match filter {
-            Some(rate) => low_passed(x, rate),
+        let smooth = |x: &[f64]| match &filter {
+            Some(grid) => grid.low_passed(x),
             None => x.to_vec(),
         };
         let keep = |x: &[f64]| -> Vec<f64> { (0..x.len()).filter(inner).map(|i| x[i]).collect() };
@@ -1148,6 +1147,36 @@ fn spectra(setup: &Setup, layout: &Layout, times: &[f64], left: &Residuals) -> V
         .collect()
 }
 
+/// Where instants are among equally spaced ones: a filter must see the time that passes where a log has none.
+struct Grid {
+    places: Vec<usize>,
+    /// \[Hz\].
+    rate: f64,
+}
+
+impl Grid {
+    /// Of ascending times \[s\], spaced by their median distance; none if there is no such distance.
+    fn new(times: &[f64]) -> Option<Self> {
+        let mut steps: Vec<f64> = times.windows(2).map(|two| two[1] - two[0]).collect();
+        steps.sort_by(f64::total_cmp);
+        let period = *steps.get(steps.len() / 2).filter(|period| **period > 0.0)?;
+        let place = |t: &f64| ((t - times[0]) / period).round() as usize;
+        Some(Self {
+            places: times.iter().map(place).collect(),
+            rate: 1.0 / period,
+        })
+    }
+
+    fn low_passed(&self, values: &[f64]) -> Vec<f64> {
+        let mut series = vec![f64::NAN; self.places.last().map_or(0, |last| last + 1)];
+        for (&place, &value) in self.places.iter().zip(values) {
+            series[place] = value;
+        }
+        let smooth = low_passed(&series, self.rate);
+        self.places.iter().map(|&place| smooth[place]).collect()
+    }
+}
+
 /// A series through [`zero_phase`], where numbers are missing (NaN). Gaps of up to [`BRIDGED`] are bridged by a line; longer ones are ends, and as at the ends of the log [`EDGE`] of
 /// what is there is not given. What is missing stays missing.
 fn low_passed(values: &[f64], rate: f64) -> Vec<f64> {
@@ -1326,6 +1355,15 @@ mod tests {
             }
         }
         assert_eq!(low_passed(&clean, rate), whole);
+        // A log without these rows tells the same where it has any.
+        let there: Vec<usize> = (0..6000).filter(|i| !(3000..3400).contains(i)).collect();
+        let times: Vec<f64> = there.iter().map(|&i| i as f64 / rate).collect();
+        let values: Vec<f64> = there.iter().map(|&i| holed[i]).collect();
+        let closed = Grid::new(&times).expect("a period").low_passed(&values);
+        for (&i, value) in there.iter().zip(closed) {
+            let same = (value - found[i]).abs() < 1e-9 || value.is_nan() && found[i].is_nan();
+            assert!(same, "{i}: {value} {}", found[i]);
+        }
         assert!(low_passed(&[f64::NAN; 10], rate).iter().all(|x| x.is_nan()));
     }
 }
