@@ -211,7 +211,7 @@ pub fn identify(
         outcome.findings.extend(wrong);
         return Ok(outcome);
     }
-    let settled = gated(setup, &maker, &mut prepared, &mut tell_progress)?;
+    let (settled, restless) = gated(setup, &maker, &mut prepared, &mut tell_progress)?;
     let training = used(&prepared);
     let mut identified = fit(&maker, &training, inputs.clone(), settled, &mut tell_progress)?;
     tell_progress("shaking".into(), 0.8);
@@ -226,6 +226,7 @@ pub fn identify(
         identified = fit(&maker, &training, inputs, settled, &mut again)?;
         identified.findings.extend(shaken(&maker, &shaking));
     }
+    identified.findings.extend(restless);
     let training = used(&prepared);
     tell_progress("figures".into(), 0.9);
     let outcome = assess::outcome(setup, &maker, &prepared, &training, &identified);
@@ -545,13 +546,13 @@ fn settle(
     }
 }
 
-/// Fits, leaves out what something undeclared acted on, and fits again, until that stays; says in the logs what was left out.
+/// Fits, leaves out what something undeclared acted on, and fits again, until that stays; says in the logs what was left out, and to the caller if it did not stay.
 fn gated(
     setup: &Setup,
     maker: &RowMaker<'_>,
     prepared: &mut [Prepared],
     progress: &mut dyn FnMut(String, f64),
-) -> Result<Settled, IdentifyError> {
+) -> Result<(Settled, Option<Finding>), IdentifyError> {
     let mut settled = settle(setup, maker, &used(prepared), None, progress)?;
     // It has been told how far along this is.
     let mut progress = |step: String, _| progress(step, 0.7);
@@ -561,6 +562,7 @@ fn gated(
         .map(|log| vec![UnitSet::default(); log.instants.len()])
         .collect();
     let mut refused = 0;
+    let mut stays = false;
     for _ in 0..GATES {
         progress("undeclared contacts".into(), 0.7);
         let training = used(prepared);
@@ -586,7 +588,8 @@ fn gated(
             suspect(prepared, &loads, &contacts);
         }
         let found = gate::contacts(maker, &used(prepared), &loads, &settled.noise, &settled.fit.x);
-        if found == contacts {
+        stays = found == contacts;
+        if stays {
             break;
         }
         contacts = found;
@@ -609,7 +612,15 @@ fn gated(
         })
         .collect();
     tell_suspicions(maker, prepared, &loads, &bodies, &contacts);
-    Ok(settled)
+    let restless = (!stays).then(|| Finding {
+        severity: Severity::Warning,
+        code: "contact_unsettled",
+        subject: String::new(),
+        text: format!(
+            "after {GATES} fits, what is left out because something undeclared acted there had not come to stay: look at what the logs leave out, and declare contacts where they were"
+        ),
+    });
+    Ok((settled, restless))
 }
 
 /// Marks the instants of the training logs.

@@ -79,10 +79,11 @@ impl NoiseModel {
     /// parameters' errors besides, exceeds it (to first order in the number of parameters). Walks as here.
     pub(super) fn midway(&self, held_out: &Self) -> Self {
         let mut midway = self.clone();
+        let (own, others) = (self.inflated(), held_out.inflated());
         for (channel, time) in midway.time.iter_mut().enumerate() {
             // What was not among the data held out says nothing of it.
             if self.square[channel] > 0.0 && held_out.square[channel] > 0.0 {
-                *time = 0.5 * (*time + held_out.square[channel] * held_out.time[channel] / self.square[channel]);
+                *time = 0.5 * (own[channel] + others[channel]) / self.square[channel];
             }
         }
         midway
