@@ -165,6 +165,48 @@ fn kuka_half_a_log_predicts_the_other_half() {
     }
 }
 
+/// Trained where a joint is on one side of its median, tested where it is on the other: postures that the training has not seen.
+#[test]
+fn kuka_one_region_predicts_the_other() {
+    let (Some(one), Some(setup)) = (data("kuka_lwr4_1.csv"), kuka()) else {
+        return;
+    };
+    let mut lines = one.lines();
+    let header = lines.next().expect("a header");
+    let rows: Vec<&str> = lines.collect();
+    // All joints move to and fro together, some of them with half the period.
+    for joint in setup.joint_names().take(2) {
+        let column = format!("joint/{joint}/position");
+        let place = header.split(',').position(|name| name == column).expect("a position");
+        let position = |row: &str| {
+            row.split(',')
+                .nth(place)
+                .and_then(|x| x.parse::<f64>().ok())
+                .expect("a number")
+        };
+        let mut sorted: Vec<f64> = rows.iter().map(|row| position(row)).collect();
+        sorted.sort_by(f64::total_cmp);
+        let median = sorted[sorted.len() / 2];
+        let side = |is_above: bool| {
+            let within = rows.iter().filter(|row| (position(row) > median) == is_above);
+            within.fold(header.to_owned() + "\n", |text, row| text + row + "\n")
+        };
+        let (below, above) = (side(false), side(true));
+        for (train, test) in [(&below, &above), (&above, &below)] {
+            let outcome = run(
+                &setup,
+                &[("train", Role::Train, train), ("test", Role::Validate, test)],
+                &TORQUE,
+            );
+            let error = &outcome.logs[1].relative_error;
+            assert!(
+                error.identified < 0.04 && error.identified < error.cad_fitted,
+                "{joint}: {error:?}"
+            );
+        }
+    }
+}
+
 /// A hand on a real arm, for three seconds, that nobody declared: found, and nothing but it; and what is identified is hardly worse than without.
 #[test]
 fn kuka_touched_is_identified_all_the_same() {
