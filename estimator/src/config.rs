@@ -250,6 +250,8 @@ pub struct Identification {
     pub enabled: bool,
     /// From which measurements; default: the force/torque sensors. On-line they alone are used.
     pub inputs: Vec<IdentificationInput>,
+    /// Where joint torques are measured that parameters are identified from; default: beyond the gears.
+    pub torque_side: TorqueSide,
     /// At how many instants a second on-line identification looks, at the most; the trigger's rate if that is less \[Hz\].
     pub rate_hz: f64,
     /// Where what was identified on-line is kept between runs of the daemon, relative to this file; default: nowhere. It wins over
@@ -268,6 +270,7 @@ impl Default for Identification {
         Self {
             enabled: false,
             inputs: Vec::new(),
+            torque_side: TorqueSide::Link,
             rate_hz: 100.0,
             state: None,
             save_every_s: 60.0,
@@ -284,6 +287,18 @@ pub enum IdentificationInput {
     Wrench,
     /// Measured joint torques.
     Torque,
+}
+
+/// Where joint torques are measured.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum TorqueSide {
+    /// Between gear and link: by a joint torque sensor. Without the rotor's inertia.
+    #[default]
+    Link,
+    /// At the motor, by its current, times torque constant and gear ratio: so the rotor's inertia is in it, and is identified, one number per joint (each is taken to have a motor
+    /// of its own). As torque of the joint \[Nm; N if it slides\], like the other.
+    Motor,
 }
 
 /// `[differentiation]`: velocities and accelerations from samples, by adaptive windows.

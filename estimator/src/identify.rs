@@ -48,8 +48,8 @@ pub use export::parameters;
 pub use gate::UnitSet;
 pub use outcome::{
     BaseParameterOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding, FrictionOutcome, JointOutcome,
-    LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, SensorOutcome, Severity, Spectrum, Three,
-    TwoRouteOutcome, Verdict, WeakDirection,
+    LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, RotorOutcome, SensorOutcome, Severity, Spectrum,
+    Three, TwoRouteOutcome, Verdict, WeakDirection,
 };
 
 /// The axes of a wrench as samples have them, in words.

@@ -1,7 +1,8 @@
 //! estimator.toml, the URDF and what was identified, checked against each other and resolved: what the rest of the estimator works with.
 
 use crate::config::{
-    Base, Config, ContactKind as KindWord, Differentiation, Direction, Foot, IdentificationInput, Presence, SensorFrame,
+    Base, Config, ContactKind as KindWord, Differentiation, Direction, Foot, IdentificationInput, Presence,
+    SensorFrame, TorqueSide,
 };
 use crate::differentiate::Settings;
 use crate::dynamics::{ContactKind, ContactSet, ContactSpec, FrameMotion, Noise, SensorCut, Structure, StructureError};
@@ -114,6 +115,8 @@ pub struct Setup {
     pub identifies: bool,
     /// The time between two instants of on-line identification.
     pub identification_period: Nanos,
+    /// Where joint torques are measured that parameters are identified from.
+    pub torque_side: TorqueSide,
     channels: Vec<Channel>,
     warnings: Vec<String>,
     /// Inertias as the URDF has them.
@@ -308,6 +311,7 @@ impl Setup {
             model_deviation: config.identification.model_std,
             identifies: config.identification.enabled,
             identification_period: Nanos::from_seconds(1.0 / config.identification.rate_hz),
+            torque_side: config.identification.torque_side,
             identified: None,
             model,
         };

@@ -1,7 +1,7 @@
 //! Identification from recorded logs: on the logs of real robots (`PROPRIO_DATA`; without it these tests say that they skip), and on simulated ones where the truth is known.
 
 use nalgebra::Matrix4;
-use proprio_estimator::config::{Config, IdentificationInput};
+use proprio_estimator::config::{Config, IdentificationInput, TorqueSide};
 use proprio_estimator::dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
 use proprio_estimator::identify::{Finding, Log, LogOutcome, Options, Outcome, Role, Verdict, identify};
 use proprio_estimator::model::Model;
@@ -65,6 +65,9 @@ fn describe(o: &Outcome) {
             "  link {} mass {:.3} -> {:.3} +- {:.3}; moved by {:.1} sigma",
             link.name, link.cad.mass, link.identified.mass, link.deviation[0], link.significance
         );
+    }
+    for r in &o.rotors {
+        println!("  rotor of {}: {:.4} +- {:.4}", r.joint, r.inertia, r.deviation);
     }
     for w in &o.weakest {
         println!("  weak: {} {:.2e} prior {:.3}", w.expression, w.relative, w.prior_share);
@@ -814,6 +817,81 @@ fn noise_of_a_torque_that_was_seldom_measured_is_known() {
     };
     for joint in ["j5", "j6"] {
         assert!((of(joint) / 0.02 - 1.0).abs() < 0.3, "{joint}: {}", of(joint));
+    }
+}
+
+/// Inertia of the arm's rotors, reflected [kg m^2]: about that of the links that each joint turns.
+const ROTORS: [f64; 6] = [0.6, 0.5, 0.25, 0.2, 0.05, 0.02];
+
+/// Torques as the motors measure them, friction and offset besides, the same for all joints but for their size.
+fn at_the_motors(log: &str, rotors: &[f64; 6], friction: f64) -> String {
+    let mut lines = log.lines();
+    let header = lines.next().expect("a header");
+    let place = |name: &str| header.split(',').position(|own| own == name).expect("a column");
+    let columns = ARM_JOINTS
+        .map(|joint| ["velocity", "acceleration", "torque"].map(|what| place(&format!("joint/{joint}/{what}"))));
+    let mut text = format!("{header}\n");
+    for line in lines {
+        let mut cells: Vec<f64> = line.split(',').map(|cell| cell.parse().expect("a number")).collect();
+        for ([dq, ddq, torque], rotor) in columns.iter().zip(rotors) {
+            let (dq, ddq) = (cells[*dq], cells[*ddq]);
+            cells[*torque] += rotor * ddq + friction * ((dq / 0.02).tanh() + 0.6 * dq + 0.3);
+        }
+        let cells: Vec<String> = cells.iter().map(f64::to_string).collect();
+        text += &cells.join(",");
+        text.push('\n');
+    }
+    text
+}
+
+/// Motors' torques: rotors as large as what they turn are identified, from two logs with different friction; taken for torques beyond the gears, the same logs give worse parameters.
+#[test]
+fn rotors_are_identified_from_torques_of_motors() {
+    let mut setup = arm_with(&[]);
+    let truth = real(&setup, 5);
+    let log = |seed, friction| {
+        let log = simulate_torques(&setup, &truth, 15.0, 0.05, seed, |_, _| true);
+        at_the_motors(&log, &ROTORS, friction)
+    };
+    let logs = [log(5, 0.5), log(6, 1.5), log(7, 1.0)];
+    let roles = [Role::Train, Role::Train, Role::Validate];
+    let given: Vec<(&str, Role, &str)> = logs
+        .iter()
+        .zip(roles)
+        .map(|(log, role)| ("log", role, &**log))
+        .collect();
+    let wrong = run(&setup, &given, &TORQUE);
+    assert!(wrong.rotors.is_empty());
+    setup.torque_side = TorqueSide::Motor;
+    let outcome = run(&setup, &given, &TORQUE);
+    assert_eq!(outcome.verdict, Verdict::Identified);
+    assert_eq!(outcome.rotors.len(), 6);
+    for (rotor, truth) in outcome.rotors.iter().zip(ROTORS) {
+        let error = rotor.inertia - truth;
+        assert!(error.abs() < 3.0 * rotor.deviation, "{rotor:?}, not {truth}");
+        // The first joint of the arm turns all of it about one axis: its rotor is told from the links by CAD alone.
+        let known = if rotor.joint == "j1" { 0.5 } else { 0.05 };
+        assert!(rotor.deviation < known * truth.max(0.1), "{rotor:?}");
+    }
+    let error = |outcome: &Outcome| outcome.logs[2].relative_error;
+    let (right, wrong) = (error(&outcome), error(&wrong));
+    assert!(3.0 * right.identified < wrong.identified, "{right:?} {wrong:?}");
+    // CAD is not blamed for rotors.
+    assert!(2.0 * right.cad_fitted < wrong.cad_fitted, "{right:?} {wrong:?}");
+    let (cad, own, inside, _) = torque_errors(&setup, &truth, &outcome, 77);
+    println!("torques of the links: {cad:.4} -> {own:.4} Nm, covered {inside:.3}");
+    assert!(5.0 * own < cad && inside > 0.85, "{cad} {own} {inside}");
+    for (log, friction) in outcome.logs.iter().zip([0.5, 1.5, 1.0]) {
+        for joint in &log.friction {
+            let off = [
+                joint.coulomb_nm - friction,
+                joint.viscous - 0.6 * friction,
+                joint.offset_nm - 0.3 * friction,
+            ];
+            for (off, deviation) in off.iter().zip(joint.deviation) {
+                assert!(off.abs() < 4.0 * deviation, "{joint:?} of {friction}");
+            }
+        }
     }
 }
 

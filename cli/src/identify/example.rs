@@ -149,6 +149,7 @@ pub(crate) fn outcome() -> Outcome {
         verdict: Verdict::Identified,
         links: bodies.collect(),
         covariance: CovarianceRoot { columns: vec![], root: Default::default() },
+        rotors: vec![],
         tau: 0.58,
         shrink: 1.0,
         unknowns: 40,

@@ -1,13 +1,13 @@
 //! Figures: what is left of every log with CAD, with CAD and fitted offsets, and with the identified parameters; and what is known of the parameters, in numbers and words.
 
-use super::batch::{Identified, Prepared, bodies, feasibility, joint_zeros, time_offsets, verdict};
+use super::batch::{Identified, Prepared, bodies, feasibility, joint_zeros, per_column, time_offsets, verdict};
 use super::outcome::{
     BaseParameterOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding, FrictionOutcome, JointOutcome,
-    LinkOutcome, LogOutcome, OffsetOutcome, Outcome, SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome,
-    Verdict, WeakDirection,
+    LinkOutcome, LogOutcome, OffsetOutcome, Outcome, RotorOutcome, SensorOutcome, Severity, Spectrum, Three,
+    TwoRouteOutcome, Verdict, WeakDirection,
 };
 use super::passes::{OFFSET_VARIANCE, Residuals, Told, leave, tell};
-use super::rows::{FRICTION, Layout, RowMaker, Rows, WIDTH};
+use super::rows::{FRICTION, Further, Layout, RowMaker, Rows, WIDTH};
 use super::{AXES, dot};
 use crate::config::IdentificationInput;
 use crate::dynamics::Structure;
@@ -120,6 +120,7 @@ pub(super) fn nothing(setup: &Setup, prepared: &[Prepared], reason: String) -> O
             columns: Vec::new(),
             root: DMatrix::zeros(0, 0),
         },
+        rotors: Vec::new(),
         tau: f64::NAN,
         shrink: 0.0,
         unknowns: 0,
@@ -172,10 +173,15 @@ pub(super) fn outcome(
     identified: &Identified,
 ) -> Outcome {
     let layout = &identified.layout;
-    let p = layout.unknowns();
+    let p = layout.inertial();
     let narrow = identified.fit.covariance_root();
     let (scaled, spread) = scaled_information(identified);
-    let root = shrunk(&narrow, &spread, &identified.kept);
+    let root = if identified.kept.iter().all(|kept| *kept >= 1.0) {
+        narrow.clone()
+    } else {
+        let kept = per_column(layout, &identified.kept);
+        shrunk(&narrow, &cad_root(identified, &spread), &kept)
+    };
     let svd = scaled.svd(false, true);
     let mut order: Vec<usize> = (0..svd.singular_values.len()).collect();
     order.sort_by(|&a, &b| svd.singular_values[b].total_cmp(&svd.singular_values[a]));
@@ -235,7 +241,11 @@ pub(super) fn outcome(
         links: links(setup, identified, &narrow, &root, &spread),
         covariance: covariance(identified, &root),
         tau: identified.fit.tau,
-        shrink: identified.kept.iter().copied().fold(1.0, f64::min),
+        shrink: identified.kept[..layout.links.len()]
+            .iter()
+            .copied()
+            .fold(1.0, f64::min),
+        rotors: rotors(setup, identified, &root),
         unknowns: p,
         rank,
         structural_rank,
@@ -254,6 +264,20 @@ pub(super) fn outcome(
         logs,
         findings,
     }
+}
+
+/// Inertias of the rotors whose motors' torques were measured.
+fn rotors(setup: &Setup, identified: &Identified, root: &DMatrix<f64>) -> Vec<RotorOutcome> {
+    let layout = &identified.layout;
+    let rotor = |(further, column): (&Further, usize)| {
+        let Further::RotorInertia(dof) = *further;
+        RotorOutcome {
+            joint: setup.model.dof_name(dof).to_owned(),
+            inertia: identified.d[column],
+            deviation: root.row(column).norm(),
+        }
+    };
+    layout.further.iter().zip(layout.inertial()..).map(rotor).collect()
 }
 
 fn channels(setup: &Setup, identified: &Identified, training: &[&Prepared]) -> Vec<ChannelNoise> {
@@ -276,9 +300,10 @@ fn channels(setup: &Setup, identified: &Identified, training: &[&Prepared]) -> V
         .collect()
 }
 
-/// `R` with columns in units of the prior's spread, and that spread: per link a matrix from such units to the ten parameters, `2 tau^2 M^-1 = spread spread^T`.
+/// `R` of the links' parameters, whatever the further unknowns are, with columns in units of the prior's spread, and that spread: per link a matrix from such units to the ten parameters,
+/// `2 tau^2 M^-1 = spread spread^T`.
 fn scaled_information(identified: &Identified) -> (DMatrix<f64>, Vec<DMatrix<f64>>) {
-    let (r, _) = identified.information.to_triangle();
+    let r = of_links(identified);
     let mut scaled = r.clone();
     let mut spreads = Vec::new();
     for (place, &link) in identified.layout.links.iter().enumerate() {
@@ -296,22 +321,79 @@ fn scaled_information(identified: &Identified) -> (DMatrix<f64>, Vec<DMatrix<f64
     (scaled, spreads)
 }
 
-/// A square root of the covariance of what is kept, `kept` of the change from CAD per link: `(1 - b^2) P + b^2 Q` with `b = 1 - kept`, `P = root root^T` and `Q` the prior's covariance.
+/// What the data tell of the links' parameters if nothing but these data is known of the further unknowns (where CAD says something of them, its word too): the triangle of
+/// `[R_further | R_links]`, below and right of what the further ones take.
+fn of_links(identified: &Identified) -> DMatrix<f64> {
+    let (r, _) = identified.information.to_triangle();
+    let (links, further) = (identified.layout.inertial(), identified.layout.further.len());
+    if further == 0 {
+        return r;
+    }
+    let rows = r.nrows();
+    let order: Vec<usize> = (links..links + further).chain(0..links).collect();
+    let mut all = r.select_columns(&order).resize_vertically(rows + further, 0.0);
+    let layout = &identified.layout;
+    for (place, (precision, own)) in layout.precision().into_iter().zip(&layout.further).enumerate() {
+        all[(rows + place, place)] = if own.lacks_cad() { 0.0 } else { precision.sqrt() };
+    }
+    all.qr().r().view((further, further), (links, links)).into_owned()
+}
+
+/// A square root `F` of the covariance `F F^T` of CAD's errors: the prior's spread of each link, the prior of further unknowns that CAD says are zero; and of those of which it says nothing, which
+/// were fitted to the data with CAD's bodies ([`Identified::cad`]), what these errors and noise make of them.
+fn cad_root(identified: &Identified, spread: &[DMatrix<f64>]) -> DMatrix<f64> {
+    let layout = &identified.layout;
+    let count = layout.unknowns();
+    let fitted = layout.beside_cad();
+    let given: Vec<usize> = (0..count).filter(|column| !fitted.contains(column)).collect();
+    let precision = layout.precision();
+    let mut root = DMatrix::zeros(count, count);
+    for (place, spread) in spread.iter().enumerate() {
+        root.view_mut((WIDTH * place, WIDTH * place), (WIDTH, WIDTH))
+            .copy_from(spread);
+    }
+    for (precision, column) in precision.iter().zip(layout.inertial()..) {
+        root[(column, column)] = 1.0 / precision.sqrt();
+    }
+    if fitted.is_empty() {
+        return root;
+    }
+    let (r, _) = identified.information.to_triangle();
+    let own = r.select_columns(&fitted);
+    let mut square = own.tr_mul(&own);
+    for (place, &column) in fitted.iter().enumerate() {
+        square[(place, place)] += precision[column - layout.inertial()];
+        root[(column, column)] = 0.0;
+    }
+    let Some(factor) = square.cholesky() else {
+        return root;
+    };
+    // (R_f^T R_f + prior)^-1 [-R_f^T R_c (error of c) + noise], the noise of covariance R_f^T R_f + prior.
+    let moved = factor.solve(&own.tr_mul(&(r.select_columns(&given) * root.select_rows(&given))));
+    let noise = factor.l().transpose().try_inverse();
+    for (place, &column) in fitted.iter().enumerate() {
+        root.row_mut(column).copy_from(&-moved.row(place));
+        for (other, &at) in fitted.iter().enumerate() {
+            root[(column, at)] += noise.as_ref().map_or(0.0, |noise| noise[(place, other)]);
+        }
+    }
+    root
+}
+
+/// A square root of the covariance of what is kept, `kept` of the change from CAD per column: `(1 - b^2) P + b^2 Q` with `b = 1 - kept`, `P = root root^T` and `Q = cad cad^T` the covariance of
+/// CAD's errors.
 ///
 /// The error is `kept` times that of the estimate and `b` times that of CAD; the estimate's error has covariance `P`, CAD's `Q`, and `P` is what they have in common, since what the
-/// estimate moved by tells nothing of what it is still off by. So with nothing kept it is the prior's. (No row has two groups of links, and within a group the same is kept.)
-fn shrunk(root: &DMatrix<f64>, spread: &[DMatrix<f64>], kept: &[f64]) -> DMatrix<f64> {
-    if kept.iter().all(|kept| *kept >= 1.0) {
-        return root.clone();
-    }
+/// estimate moved by tells nothing of what it is still off by. So with nothing kept it is the prior's. (No row has two groups of unknowns, and within a group the same is kept.)
+fn shrunk(root: &DMatrix<f64>, cad: &DMatrix<f64>, kept: &[f64]) -> DMatrix<f64> {
     let narrow = root.ncols();
-    let mut wide = root.clone().resize_horizontally(narrow + WIDTH * kept.len(), 0.0);
-    for (place, (kept, spread)) in kept.iter().zip(spread).enumerate() {
+    let mut wide = root.clone().resize_horizontally(narrow + cad.ncols(), 0.0);
+    for (row, kept) in kept.iter().enumerate() {
         let back = 1.0 - kept;
-        wide.view_mut((WIDTH * place, 0), (WIDTH, narrow))
-            .scale_mut((1.0 - back * back).sqrt());
-        wide.view_mut((WIDTH * place, narrow + WIDTH * place), (WIDTH, WIDTH))
-            .copy_from(&(spread * back));
+        let scale = (1.0 - back * back).sqrt();
+        wide.view_mut((row, 0), (1, narrow)).scale_mut(scale);
+        wide.view_mut((row, narrow), (1, cad.ncols()))
+            .copy_from(&(cad.row(row) * back));
     }
     upper(&wide)
 }
@@ -334,6 +416,9 @@ fn links(
             .unwrap_or_else(|| DMatrix::zeros(WIDTH, WIDTH));
         let rows = inverse * root.rows(WIDTH * place, WIDTH).into_owned();
         weighed.rows_mut(WIDTH * place, WIDTH).copy_from(&rows);
+    }
+    for (precision, row) in layout.precision().into_iter().zip(layout.inertial()..) {
+        weighed.row_mut(row).scale_mut(precision.sqrt());
     }
     // root root^T - (root weighed^T)(...)^T
     let shrinking = root * weighed.transpose();
@@ -418,7 +503,7 @@ fn significance(root: &DMatrix<f64>, shrinking: &DMatrix<f64>, change: &DVector<
 /// Of the parameters, and of the offsets at the end of the last piece of a training log in which each sensor was read, together.
 fn covariance(identified: &Identified, root: &DMatrix<f64>) -> CovarianceRoot {
     let layout = &identified.layout;
-    let (p, s) = (layout.unknowns(), 6 * layout.sensors.len());
+    let (links, p, s) = (layout.inertial(), layout.unknowns(), 6 * layout.sensors.len());
     let mut columns = Vec::new();
     for &link in &layout.links {
         columns.extend((0..WIDTH).map(|parameter| Column::Inertial { link, parameter }));
@@ -452,6 +537,12 @@ fn covariance(identified: &Identified, root: &DMatrix<f64>) -> CovarianceRoot {
             }
         }
     }
+    // Whatever the further unknowns are.
+    let joint = if links < p {
+        joint.remove_rows(links, p - links)
+    } else {
+        joint
+    };
     CovarianceRoot {
         columns,
         root: upper(&joint),
@@ -589,8 +680,7 @@ type TorqueSeries = (usize, [Vec<f64>; 3], Vec<f64>);
 fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified, root: &DMatrix<f64>) -> LogOutcome {
     let setup = maker.setup();
     let layout = &identified.layout;
-    let zero = DVector::zeros(layout.unknowns());
-    let sets = [zero, identified.d.clone()];
+    let sets = [identified.cad.clone(), identified.d.clone()];
     let usable = !log.instants.is_empty() && !log.refused;
     let instants = if usable { log.instants.as_slice() } else { &[] };
     let left = leave(
@@ -1295,10 +1385,14 @@ mod tests {
             narrow.view_mut((place, place), (10, 10)).copy_from(&own);
         }
         let spread: Vec<DMatrix<f64>> = (0..2).map(|_| DMatrix::from_fn(10, 10, |_, _| next())).collect();
+        let mut cad = DMatrix::zeros(20, 20);
+        for (place, spread) in spread.iter().enumerate() {
+            cad.view_mut((10 * place, 10 * place), (10, 10)).copy_from(spread);
+        }
         let block = |m: &DMatrix<f64>, place: usize| m.view((10 * place, 10 * place), (10, 10)).into_owned();
         let all = squared(&narrow);
         for (kept, back) in [(1.0, 0.0), (0.0, 1.0), (0.7, 0.3)] {
-            let found = squared(&shrunk(&narrow, &spread, &[kept, 1.0]));
+            let found = squared(&shrunk(&narrow, &cad, &[[kept; 10], [1.0; 10]].concat()));
             let expected = block(&all, 0) * (1.0 - back * back) + squared(&spread[0]) * (back * back);
             assert!((block(&found, 0) - expected).amax() < 1e-12, "{kept}");
             assert!(

@@ -17,7 +17,7 @@ use super::instants::{Break, Defect, Instant, Recording, Settings, Signal, TimeO
 use super::outcome::{Finding, LeftOut, Outcome, Role, Severity, Verdict};
 use super::passes::{NoiseModel, OFFSET_VARIANCE, Piece, Residuals, Told, leave, noise_of, session_prior, tell};
 use super::prior::{Fit, Posterior, Prior, PriorError};
-use super::rows::{Layout, RowMaker, Rows};
+use super::rows::{Further, Groups, Layout, RowMaker, Rows};
 use super::session::Session;
 use super::shaking::Shaking;
 use crate::config::IdentificationInput;
@@ -135,7 +135,9 @@ pub(super) struct Identified {
     pub fit: Fit,
     /// Parameters less CAD, shrunk.
     pub d: DVector<f64>,
-    /// Per link of the layout, the share of the change from CAD that was kept.
+    /// CAD's parameters less themselves: zero but for unknowns of which CAD says nothing, which have the values that go best with its bodies ([`beside_cad`]).
+    pub cad: DVector<f64>,
+    /// Per link of the layout, then per further unknown, the share of the change from CAD that was kept.
     pub kept: Vec<f64>,
     pub findings: Vec<Finding>,
     /// Per piece of the training logs, the last one last.
@@ -480,14 +482,91 @@ fn added(told: &[Told], unknowns: usize) -> Information {
     sum
 }
 
-fn posterior(
+fn posterior(prior: &Prior, layout: &Layout, information: &Information) -> Result<Posterior, IdentifyError> {
+    let (r, z) = information.to_triangle();
+    Ok(Posterior::new(prior, &layout.links, &r, &z, &layout.precision())?)
+}
+
+/// CAD's bodies, and of what CAD says nothing ([`Further::lacks_cad`]) the values that go best with them, by their priors and by what these data tell. (Not from the log that CAD is compared on:
+/// these belong to the robot.)
+fn beside_cad(layout: &Layout, information: &Information) -> DVector<f64> {
+    let mut x = DVector::zeros(layout.unknowns());
+    let columns = layout.beside_cad();
+    if columns.is_empty() {
+        return x;
+    }
+    let (r, z) = information.to_triangle();
+    let rows = r.nrows();
+    let mut own = r.select_columns(&columns).resize_vertically(rows + columns.len(), 0.0);
+    let precision = layout.precision();
+    for (place, &column) in columns.iter().enumerate() {
+        own[(rows + place, place)] = precision[column - layout.inertial()].sqrt();
+    }
+    let qr = own.qr();
+    let right = qr.q().tr_mul(&z.resize_vertically(rows + columns.len(), 0.0));
+    if let Some(values) = qr.r().solve_upper_triangular(&right) {
+        columns
+            .iter()
+            .zip(&values)
+            .for_each(|(&column, value)| x[column] = *value);
+    }
+    x
+}
+
+/// The most probable parameters of which no rotor's inertia is negative: what comes out negative is held at zero, and the rest fitted again.
+fn without_negative_rotors(
     prior: &Prior,
     layout: &Layout,
     information: &Information,
-    precision: &[f64],
-) -> Result<Posterior, IdentifyError> {
+    fit: &Fit,
+) -> Result<DVector<f64>, IdentifyError> {
+    let rotors: Vec<usize> = layout
+        .further
+        .iter()
+        .zip(layout.inertial()..)
+        .filter(|(further, _)| matches!(further, Further::RotorInertia(_)))
+        .map(|(_, column)| column)
+        .collect();
+    let mut x = fit.x.clone();
+    let mut keep: Vec<usize> = (0..layout.unknowns()).collect();
     let (r, z) = information.to_triangle();
-    Ok(Posterior::new(prior, &layout.links, &r, &z, precision)?)
+    while rotors.iter().any(|&column| x[column] < 0.0) {
+        keep.retain(|column| !(rotors.contains(column) && x[*column] < 0.0));
+        let precision = layout.precision();
+        let of_kept = keep.iter().filter(|column| **column >= layout.inertial());
+        let precision: Vec<f64> = of_kept.map(|column| precision[column - layout.inertial()]).collect();
+        let own = Posterior::new(prior, &layout.links, &r.select_columns(&keep), &z, &precision)?.fit(fit.tau)?;
+        x = DVector::zeros(layout.unknowns());
+        keep.iter().zip(&own.x).for_each(|(&column, value)| x[column] = *value);
+    }
+    Ok(x)
+}
+
+/// Rotors whose inertia comes out negative, and not by chance.
+fn negative_rotors(setup: &Setup, layout: &Layout, fit: &Fit) -> Vec<Finding> {
+    /// Standard deviations: one in seven hundred is farther below zero by chance.
+    const DEVIATIONS: f64 = 3.0;
+    if layout.further.is_empty() {
+        return Vec::new();
+    }
+    let root = fit.covariance_root();
+    let mut findings = Vec::new();
+    for (further, column) in layout.further.iter().zip(layout.inertial()..) {
+        let Further::RotorInertia(dof) = *further;
+        let (value, deviation) = (fit.x[column], root.row(column).norm());
+        if value < -DEVIATIONS * deviation {
+            let joint = setup.model.dof_name(dof).to_owned();
+            findings.push(Finding {
+                severity: Severity::Warning,
+                code: "negative_rotor",
+                text: format!(
+                    "{joint}: the inertia of its rotor comes out as {value:.4} +- {deviation:.4}, and no rotor has less than nothing; it was taken as 0. The sign of its torque, velocity or acceleration is wrong, or its torque is stamped otherwise than its encoder, or torques are not measured at the motors (identification.torque_side)"
+                ),
+                subject: joint,
+            });
+        }
+    }
+    findings
 }
 
 /// Noise, prior and its weight, after rounds that settled.
@@ -519,17 +598,25 @@ fn settle(
         });
         noise_of(&layout, &left, 0, bound, &least)
     };
+    let has_cad = layout.beside_cad().is_empty();
     let mut noise = from.unwrap_or_else(|| {
-        let zero = DVector::zeros(layout.unknowns());
         let unknown = NoiseModel::unknown(least.clone());
-        (0..3).fold(unknown, |noise, _| noise_left(&noise, &zero))
+        (0..3).fold(unknown, |noise, _| {
+            let cad = if has_cad {
+                DVector::zeros(layout.unknowns())
+            } else {
+                let told = over(maker, &sampled, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
+                beside_cad(&layout, &added(&told, layout.unknowns()))
+            };
+            noise_left(&noise, &cad)
+        })
     });
     let mut round = 0;
     loop {
         progress(format!("round {}", round + 1), 0.2 + 0.5 * round as f64 / ROUNDS as f64);
         let told = over(maker, &sampled, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
         let information = added(&told, layout.unknowns());
-        let fit = posterior(&prior, &layout, &information, &[])?.weigh()?;
+        let fit = posterior(&prior, &layout, &information)?.weigh()?;
         let next = noise_left(&noise, &fit.x);
         let change = next.change(&noise);
         noise = next;
@@ -763,7 +850,7 @@ fn fit(
     } = settled;
     let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
     let information = added(&told, layout.unknowns());
-    let fit = posterior(&prior, &layout, &information, &[])?.weigh()?;
+    let fit = posterior(&prior, &layout, &information)?.weigh()?;
     progress("held-out data".into(), 0.75);
     let mut guard = held_out(maker, &prior, training, &noise, fit.tau)?;
     guard.findings.extend(unsettled(change));
@@ -771,10 +858,12 @@ fn fit(
     let noise = guard.noise;
     let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
     let information = added(&told, layout.unknowns());
-    let fit = posterior(&prior, &layout, &information, &[])?.weigh()?;
-    let mut d = fit.x.clone();
-    for (place, share) in guard.share.iter().enumerate() {
-        d.rows_mut(10 * place, 10).scale_mut(*share);
+    let fit = posterior(&prior, &layout, &information)?.weigh()?;
+    guard.findings.extend(negative_rotors(maker.setup(), &layout, &fit));
+    let cad = beside_cad(&layout, &information);
+    let mut d = without_negative_rotors(&prior, &layout, &information, &fit)?;
+    for (column, share) in per_column(&layout, &guard.share).into_iter().enumerate() {
+        d[column] = cad[column] + share * (d[column] - cad[column]);
     }
     Ok(Identified {
         layout,
@@ -783,11 +872,19 @@ fn fit(
         noise,
         information,
         d,
+        cad,
         kept: guard.share,
         findings: guard.findings,
         fit,
         told,
     })
+}
+
+/// What there is per link of the layout and per further unknown, for each column.
+pub(super) fn per_column(layout: &Layout, values: &[f64]) -> Vec<f64> {
+    let (links, further) = values.split_at(layout.links.len());
+    let of_links = links.iter().flat_map(|value| [*value; 10]);
+    of_links.chain(further.iter().copied()).collect()
 }
 
 /// Says that rounds ended before noise and prior's weight stayed, if the last one still changed a variance by more than a tenth.
@@ -873,7 +970,7 @@ fn sample<'a>(maker: &RowMaker<'_>, training: &[&'a Prepared]) -> Vec<Piece<'a>>
 
 /// What held-out data say of the change from CAD.
 struct Guard {
-    /// Per link of the layout.
+    /// Per link of the layout, then per further unknown.
     share: Vec<f64>,
     findings: Vec<Finding>,
     /// Noise, corrected by what held-out data show of it.
@@ -909,7 +1006,7 @@ fn held_out(
     }
     if pieces.len() < 2 {
         return Ok(Guard {
-            share: vec![0.0; layout.links.len()],
+            share: vec![0.0; layout.links.len() + layout.further.len()],
             findings: vec![Finding {
                 severity: Severity::Warning,
                 code: "not_checked",
@@ -932,11 +1029,11 @@ fn held_out(
                 let _ = others.merge(&told.information, &columns);
             }
         }
-        sets.push(posterior(prior, layout, &others, &[])?.fit(tau)?.x);
+        let own = posterior(prior, layout, &others)?.fit(tau)?.x;
+        sets.push([beside_cad(layout, &others), own]);
     }
-    let zero = DVector::zeros(layout.unknowns());
     let left: Vec<Residuals> = over(maker, &pieces, |maker, number, piece| {
-        leave(maker, piece, noise, &[zero.clone(), sets[number].clone()])
+        leave(maker, piece, noise, &sets[number])
     });
     // Per channel and block: sums of e0 (e0 - e1) and of (e0 - e1)^2.
     let mut sums: Vec<Vec<(f64, f64)>> = vec![Vec::new(); layout.channels()];
@@ -970,8 +1067,12 @@ fn held_out(
     };
     let variances = noise.inflated();
     let blocks = sums.first().map_or(0, Vec::len);
-    let (links, channels) = maker.groups();
-    let mut share = vec![0.0; layout.links.len()];
+    let Groups {
+        links,
+        further,
+        channels,
+    } = maker.groups();
+    let mut share = vec![0.0; links.len() + further.len()];
     let mut findings = Vec::new();
     let mut numbers: Vec<usize> = links.clone();
     numbers.sort_unstable();
@@ -999,7 +1100,7 @@ fn held_out(
         };
         let kept = shares.iter().find(keeps).copied().unwrap_or(0.0);
         let names = || {
-            let own = layout.links.iter().zip(&links).filter(|(_, g)| **g == group);
+            let own = layout.links.iter().zip(links).filter(|(_, g)| **g == group);
             let names: Vec<&str> = own.map(|(link, _)| maker.setup().model.link_name(*link)).collect();
             names.join(", ")
         };
@@ -1037,7 +1138,8 @@ fn held_out(
                 });
             }
         }
-        for (value, _) in share.iter_mut().zip(&links).filter(|(_, g)| **g == group) {
+        let all = share.iter_mut().zip(links.iter().chain(further));
+        for (value, _) in all.filter(|(_, g)| **g == group) {
             *value = kept;
         }
     }
@@ -1195,12 +1297,14 @@ pub(super) fn joint_zeros(maker: &RowMaker<'_>, training: &[&Prepared], identifi
         let (r, z) = sum.to_triangle();
         let keep: Vec<usize> = (0..p).chain(columns.iter().map(|c| p + c)).collect();
         let r = r.select_columns(&keep);
-        let precision = vec![SPREAD.powi(-2); columns.len()];
+        let mut precision = layout.precision();
+        precision.resize(layout.further.len() + columns.len(), SPREAD.powi(-2));
         let fit = Posterior::new(&identified.prior, &layout.links, &r, &z, &precision)
             .ok()?
             .fit(identified.fit.tau)
             .ok()?;
-        let extra: f64 = fit.x.rows(p, columns.len()).norm_squared() * SPREAD.powi(-2);
+        let own = fit.x.iter().skip(layout.inertial());
+        let extra: f64 = own.zip(&precision).map(|(x, precision)| x * x * precision).sum();
         Some((fit.residual_square + fit.divergence / fit.tau.powi(2) + extra, fit))
     };
     let mut chosen: Vec<usize> = Vec::new();
@@ -1263,7 +1367,13 @@ pub(super) fn bodies(setup: &Setup, layout: &Layout, d: &DVector<f64>) -> Vec<Ri
 pub(super) fn feasibility(setup: &Setup, identified: &Identified) -> super::outcome::Consistency {
     use super::outcome::Consistency;
     let (r, z) = identified.information.to_triangle();
-    match consistent::nearest(&identified.prior, &identified.layout.links, &r, &z, &[]) {
+    match consistent::nearest(
+        &identified.prior,
+        &identified.layout.links,
+        &r,
+        &z,
+        &identified.layout.precision(),
+    ) {
         Ok(nearest) => Consistency {
             feasible: match &nearest.verdict {
                 consistent::Verdict::Feasible => Some(true),

@@ -183,6 +183,7 @@ mod tests {
             verdict: Verdict::Identified,
             links: links.collect(),
             covariance: CovarianceRoot { columns, root },
+            rotors: vec![],
             tau: 0.5,
             shrink: 1.0,
             unknowns: 20,

@@ -337,6 +337,9 @@ impl Normal {
             let mut own = self.matrix.fixed_view_mut::<WIDTH, WIDTH>(WIDTH * place, WIDTH * place);
             own += prior.metric(link) / (2.0 * tau * tau);
         }
+        for (precision, column) in layout.precision().into_iter().zip(layout.inertial()..) {
+            self.matrix[(column, column)] += precision;
+        }
     }
 }
 
@@ -458,9 +461,9 @@ pub(super) fn load(
     let last = pieces[left_out.end - 1].instants.last()?.t;
     // All units whose rows have links or channels in common with that link's.
     let structure = &maker.setup().structure;
-    let (groups, _) = maker.groups();
+    let groups = &maker.groups().links;
     let mut units = UnitSet::default();
-    for (other, group) in layout.links.iter().zip(&groups) {
+    for (other, group) in layout.links.iter().zip(groups) {
         if *group == groups[place] {
             units.insert(structure.subtree_of(*other).unwrap_or(0));
             if !layout.joints.is_empty() {

@@ -19,7 +19,7 @@ pub enum Role {
     Validate,
 }
 
-/// The same quantity for three sets of parameters.
+/// The same quantity for three sets of parameters. Of the inertia of motors' rotors ([`RotorOutcome`]) CAD says nothing: with its parameters it is what goes best with them in the training logs.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Three<T> {
     /// CAD as it is, with the offsets that the configuration states and without friction.
@@ -187,6 +187,18 @@ pub struct FrictionOutcome {
     pub deviation: [f64; 3],
 }
 
+/// Inertia of the rotor of a joint's motor. It belongs to the robot, not to a log; only where the measured torques are the motors' ([`crate::config::TorqueSide`]).
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RotorOutcome {
+    /// The joint's name.
+    pub joint: String,
+    /// Reflected to the joint: the rotor's inertia times the square of the gear ratio \[kg m^2; kg if the joint slides\]. Never negative where its links were identified; where they stay as in CAD
+    /// ([`LinkOutcome::kept`] is 0), the value that goes best with CAD's bodies.
+    pub inertia: f64,
+    /// Its standard deviation. Large where the motion tells it from no link's inertia: of the first joint of a fixed base, which turns all links about one axis alone.
+    pub deviation: f64,
+}
+
 /// One joint of a log: how far its measured torque and the predicted one are apart (only where joint torque is measured).
 #[derive(Clone, Debug, PartialEq)]
 pub struct JointOutcome {
@@ -317,6 +329,8 @@ pub struct Outcome {
     pub links: Vec<LinkOutcome>,
     /// Covariance of the parameters of those that are seen, and of offsets.
     pub covariance: CovarianceRoot,
+    /// Rotor inertias, per joint whose motor's torque was measured while it accelerated.
+    pub rotors: Vec<RotorOutcome>,
     /// The prior's scale, chosen by evidence: how far, relatively, CAD is from the robot (bounded at 1).
     pub tau: f64,
     /// The least [`LinkOutcome::kept`] of the links that are seen: 1: all of every change from CAD; 0: at least one group of links stays as in CAD.

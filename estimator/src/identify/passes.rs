@@ -237,7 +237,7 @@ pub(super) fn tell(
 pub(super) struct Residuals {
     /// Per set, per channel, per instant: noise; NaN where no row has it.
     pub noise: Vec<Vec<Vec<f64>>>,
-    /// Per channel, per instant: what CAD says without offsets and friction: of an F/T sensor's reading, of a joint's torque.
+    /// Per channel, per instant: what the first set says without offsets and friction: of an F/T sensor's reading, of a joint's torque.
     pub predicted: Vec<Vec<f64>>,
     /// The same of what was measured, less what is known of shaking.
     pub measured: Vec<Vec<f64>>,
@@ -330,6 +330,10 @@ pub(super) fn leave(
         vec![vec![f64::NAN; count]; channels],
         vec![vec![f64::NAN; count]; channels],
     );
+    let mut first = maker.cad_of_layout();
+    if let Some(set) = sets.first() {
+        first.iter_mut().zip(set).for_each(|(value, change)| *value += change);
+    }
     let cad = maker.cad_of_layout();
     let (mut white, mut e) = (Vec::new(), vec![0.0; channels]);
     let (mut shares, mut seen) = (vec![0.0; channels * channels], vec![0.0_f64; channels]);
@@ -357,7 +361,7 @@ pub(super) fn leave(
                     &mut left[set],
                 );
             }
-            give(&|row| dot(rows.a(row), &cad), &mut predicted);
+            give(&|row| dot(rows.a(row), &first), &mut predicted);
             give(&|row| rows.r(row) + dot(rows.a(row), &cad), &mut measured);
         }
     }

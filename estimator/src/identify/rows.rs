@@ -4,18 +4,18 @@
 //! A d + G s = r + N e
 //! ```
 //!
-//! - `d = phi - phi_CAD`: ten per link that any log can see ([`Layout::links`]);
+//! - `d = phi - phi_CAD`: ten per link that any log can see ([`Layout::links`]), then whatever else belongs to the robot and not to a log ([`Layout::further`]);
 //! - `s`: the log's own unknowns: six offsets [torque; force] per F/T sensor that shows in a row; Coulomb, viscous and offset torque per joint whose torque is measured;
 //! - `r`: what was measured less what CAD predicts;
 //! - `e`: the noise of the *channels*, independent of each other: six per F/T sensor, one per joint torque.
 //!
 //! Two kinds of rows, one below the other. Those of F/T sensors are the balances of sub-trees, of which [`StackedRegressor::eliminate_contacts`] leaves the combinations that no present
 //! contact reaches: noise enters them as offsets do, `N = G`. Those of joint torques are rows of the whole tree's [`Regressor`], for joints beyond which, seen from the base, nothing touches
-//! the robot: there `N = 1` and `G = [tanh(dq / v0), dq, 1]`.
+//! the robot: there `N = 1` and `G = [tanh(dq / v0), dq, 1]`. If torques are measured at the motors' side, `A` has the joint's acceleration beside them: it times the inertia of the motor's rotor.
 
 use super::instants::Instant;
 use super::{dot, factorise, forward};
-use crate::config::IdentificationInput;
+use crate::config::{IdentificationInput, TorqueSide};
 use crate::dynamics::{ContactSet, DynamicsError, JointState, Kinematics};
 use crate::regressor::{Regressor, StackedRegressor, Weighting};
 use crate::setup::Setup;
@@ -30,11 +30,39 @@ pub(super) const WIDTH: usize = 10;
 /// Friction columns of a joint.
 pub(super) const FRICTION: usize = 3;
 
+/// Precision of the prior of a rotor's inertia about zero [1/(kg m^2)^2]: none is known to be larger than a hundred.
+const ROTOR_PRECISION: f64 = 1e-4;
+
+/// An unknown of the robot beside its links' parameters: one column of `A`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Further {
+    /// Inertia of the rotor that drives a degree of freedom, reflected to it: rotor inertia times the square of the gear ratio [kg m^2, kg].
+    RotorInertia(usize),
+}
+
+impl Further {
+    /// Precision of its Gaussian prior about zero.
+    fn precision(self) -> f64 {
+        match self {
+            Self::RotorInertia(_) => ROTOR_PRECISION,
+        }
+    }
+
+    /// Whether CAD says nothing of it, rather than that it is zero: then CAD is compared with the value that goes best with its bodies.
+    pub(super) fn lacks_cad(self) -> bool {
+        match self {
+            Self::RotorInertia(_) => true,
+        }
+    }
+}
+
 /// What the columns of all rows stand for.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Layout {
     /// Links that show in at least one row, ascending; ten columns of `A` each.
     pub links: Vec<usize>,
+    /// What else of the robot shows in at least one row: a column of `A` each, after those of the links.
+    pub further: Vec<Further>,
     /// F/T sensors that do, ascending; six columns of `G` and of `N` each, [torque; force].
     pub sensors: Vec<usize>,
     /// Degrees of freedom whose measured torque is used, ascending; three columns of `G` after those of the sensors, and one of `N`.
@@ -42,9 +70,33 @@ pub(super) struct Layout {
 }
 
 impl Layout {
-    /// Number of unknown parameters.
-    pub(super) fn unknowns(&self) -> usize {
+    /// Number of the links' unknown parameters: of the first columns of `A`.
+    pub(super) fn inertial(&self) -> usize {
         WIDTH * self.links.len()
+    }
+
+    /// Number of the robot's unknowns: of columns of `A`.
+    pub(super) fn unknowns(&self) -> usize {
+        self.inertial() + self.further.len()
+    }
+
+    /// Precision of the prior of each further unknown, for [`super::prior::Posterior`].
+    pub(super) fn precision(&self) -> Vec<f64> {
+        self.further.iter().map(|further| further.precision()).collect()
+    }
+
+    /// The column of a further unknown, if it shows.
+    pub(super) fn column(&self, further: Further) -> Option<usize> {
+        let place = self.further.iter().position(|own| *own == further)?;
+        Some(self.inertial() + place)
+    }
+
+    /// Columns of the unknowns of which CAD says nothing.
+    pub(super) fn beside_cad(&self) -> Vec<usize> {
+        let each = self.further.iter().zip(self.inertial()..);
+        each.filter(|(further, _)| further.lacks_cad())
+            .map(|(_, column)| column)
+            .collect()
     }
 
     /// Number of the log's own unknowns.
@@ -234,6 +286,17 @@ fn root_of(parent: &mut [usize], mut node: usize) -> usize {
     node
 }
 
+/// Of each unknown and channel, the number of the group that it belongs to: no row has two groups.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Groups {
+    /// Per link of the layout.
+    pub links: Vec<usize>,
+    /// Per further unknown.
+    pub further: Vec<usize>,
+    /// Per channel.
+    pub channels: Vec<usize>,
+}
+
 /// Makes rows of instants.
 #[derive(Clone)]
 pub(super) struct RowMaker<'a> {
@@ -249,8 +312,7 @@ pub(super) struct RowMaker<'a> {
     torque: bool,
     /// Whether rows are made of units that something undeclared acts on, too.
     disregards: bool,
-    /// Per link of the layout, and per channel: the group that it belongs to.
-    groups: (Vec<usize>, Vec<usize>),
+    groups: Groups,
 }
 
 impl<'a> RowMaker<'a> {
@@ -264,10 +326,22 @@ impl<'a> RowMaker<'a> {
         instants: impl Iterator<Item = &'b Instant>,
     ) -> Result<Self, DynamicsError> {
         let (links, sensors) = (setup.model.link_count(), setup.structure.sensors().len());
+        let (wrench, torque) = (
+            inputs.contains(&IdentificationInput::Wrench),
+            inputs.contains(&IdentificationInput::Torque),
+        );
+        let dofs = 0..setup.model.dof_count();
+        let has_rotors = torque && setup.torque_side == TorqueSide::Motor;
+        let further: Vec<Further> = if has_rotors {
+            dofs.clone().map(Further::RotorInertia).collect()
+        } else {
+            Vec::new()
+        };
         let all = Layout {
             links: (0..links).collect(),
+            further,
             sensors: (0..sensors).collect(),
-            joints: (0..setup.model.dof_count()).collect(),
+            joints: dofs.collect(),
         };
         let mut maker = Self {
             setup,
@@ -282,16 +356,16 @@ impl<'a> RowMaker<'a> {
             stacked: StackedRegressor::new(&setup.structure),
             tree: Regressor::new(&setup.model),
             readings: vec![Wrench::zero(); sensors],
-            wrench: inputs.contains(&IdentificationInput::Wrench),
-            torque: inputs.contains(&IdentificationInput::Torque),
+            wrench,
+            torque,
             disregards: false,
-            groups: (Vec::new(), Vec::new()),
+            groups: Groups::default(),
         };
-        // Links and channels, joined wherever a row has both.
-        let channels = maker.layout.channels();
-        let mut parent: Vec<usize> = (0..links + channels).collect();
+        // Links, further unknowns and channels, joined wherever a row has both.
+        let (channels, unknowns) = (maker.layout.channels(), links + maker.layout.further.len());
+        let mut parent: Vec<usize> = (0..unknowns + channels).collect();
         let mut rows = Rows::new(&maker.layout);
-        let (mut seen, mut heard) = (vec![false; links], vec![false; maker.layout.channels()]);
+        let (mut seen, mut heard) = (vec![false; unknowns], vec![false; channels]);
         for instant in instants {
             maker.make(instant, &mut rows)?;
             for row in 0..rows.count {
@@ -301,16 +375,18 @@ impl<'a> RowMaker<'a> {
                     let with = root_of(&mut parent, *first.get_or_insert(own));
                     parent[own.max(with)] = own.min(with);
                 };
-                for (link, seen) in seen.iter_mut().enumerate() {
-                    if rows.a(row)[WIDTH * link..][..WIDTH].iter().any(|x| *x != 0.0) {
+                let (of_links, of_further) = rows.a(row).split_at(WIDTH * links);
+                let columns = of_links.chunks_exact(WIDTH).chain(of_further.chunks_exact(1));
+                for (node, (seen, columns)) in seen.iter_mut().zip(columns).enumerate() {
+                    if columns.iter().any(|x| *x != 0.0) {
                         *seen = true;
-                        join(link);
+                        join(node);
                     }
                 }
                 for (channel, (heard, entry)) in heard.iter_mut().zip(rows.n(row)).enumerate() {
                     if *entry != 0.0 {
                         *heard = true;
-                        join(links + channel);
+                        join(unknowns + channel);
                     }
                 }
             }
@@ -318,8 +394,11 @@ impl<'a> RowMaker<'a> {
         let numbers = |flags: &[bool]| (0..flags.len()).filter(|&i| flags[i]).collect();
         let (wrenches, torques) = heard.split_at(6 * sensors);
         let sensing: Vec<bool> = wrenches.chunks(6).map(|six| six.contains(&true)).collect();
+        let (seen, shows) = seen.split_at(links);
+        let shown = numbers(shows);
         maker.layout = Layout {
-            links: numbers(&seen),
+            links: numbers(seen),
+            further: shown.iter().map(|&place| maker.layout.further[place]).collect(),
             sensors: numbers(&sensing),
             joints: numbers(torques),
         };
@@ -328,13 +407,13 @@ impl<'a> RowMaker<'a> {
         let channels: Vec<usize> = wrench_channels
             .chain(layout.joints.iter().map(|j| 6 * sensors + j))
             .collect();
-        maker.groups = (
-            layout.links.iter().map(|&link| root_of(&mut parent, link)).collect(),
-            channels
-                .into_iter()
-                .map(|channel| root_of(&mut parent, links + channel))
-                .collect(),
-        );
+        let mut groups_of =
+            |nodes: &mut dyn Iterator<Item = usize>| nodes.map(|node| root_of(&mut parent, node)).collect();
+        maker.groups = Groups {
+            links: groups_of(&mut layout.links.iter().copied()),
+            further: groups_of(&mut shown.into_iter().map(|place| links + place)),
+            channels: groups_of(&mut channels.into_iter().map(|channel| unknowns + channel)),
+        };
         Ok(maker)
     }
 
@@ -342,9 +421,9 @@ impl<'a> RowMaker<'a> {
         &self.layout
     }
 
-    /// Groups of links and channels: no row has two groups. Per link of the layout, and per channel, the group's number.
-    pub(super) fn groups(&self) -> (Vec<usize>, Vec<usize>) {
-        self.groups.clone()
+    /// Groups of unknowns and channels: no row has two groups.
+    pub(super) fn groups(&self) -> &Groups {
+        &self.groups
     }
 
     /// From now on rows are made of [`Instant::suspected`] units, too; or not any more.
@@ -352,12 +431,11 @@ impl<'a> RowMaker<'a> {
         self.disregards = disregards;
     }
 
-    /// CAD's parameters in the columns of the rows.
+    /// CAD's parameters in the columns of the rows; zero of further unknowns.
     pub(super) fn cad_of_layout(&self) -> Vec<f64> {
         let links = self.layout.links.iter();
-        links
-            .flat_map(|link| self.cad[WIDTH * link..][..WIDTH].iter().copied())
-            .collect()
+        let of_links = links.flat_map(|link| self.cad[WIDTH * link..][..WIDTH].iter().copied());
+        of_links.chain(self.layout.further.iter().map(|_| 0.0)).collect()
     }
 
     /// Measured less predicted torque of every joint, for parameters `d` beside CAD; NaN where there is none, a contact lies beyond, or
@@ -558,6 +636,9 @@ impl<'a> RowMaker<'a> {
             *r = torque - row.iter().zip(&self.cad).map(|(x, y)| x * y).sum::<f64>();
             for (to, link) in a.chunks_exact_mut(WIDTH).zip(&self.layout.links) {
                 to.copy_from_slice(&row[WIDTH * link..][..WIDTH]);
+            }
+            if let Some(column) = self.layout.column(Further::RotorInertia(dof)) {
+                a[column] = instant.acceleration[dof];
             }
             let velocity = instant.velocity[dof];
             g[6 * wrenches + FRICTION * place..][..FRICTION].copy_from_slice(&[
