@@ -887,7 +887,7 @@ mod tests {
     fn dies_before_the_rename() {
         if let Some(file) = std::env::var_os("PROPRIO_TEST_PARAMETERS") {
             let mut new = files::begin(Path::new(&file)).unwrap();
-            std::io::Write::write_all(&mut new, nothing("new").to_string().as_bytes()).unwrap();
+            io::Write::write_all(&mut new, nothing("new").to_string().as_bytes()).unwrap();
             std::process::abort();
         }
     }
