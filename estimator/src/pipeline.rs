@@ -20,7 +20,7 @@ mod motion;
 
 pub use learning::Job;
 
-use crate::differentiate::{Unavailable, Window};
+use crate::differentiate::{Grid, Unavailable, Window};
 use crate::dynamics::{Certainty, ContactSet, Dependence, FrameMotion, JointState, Kinematics, Solver};
 use crate::history::{Held, History};
 use crate::identify::online::state::StateError;
@@ -150,6 +150,8 @@ impl Declarations {
 pub struct Pipeline {
     setup: Setup,
     tracks: Vec<Track>,
+    /// What channels of the same stamps share, from one to the next.
+    grid: Box<Grid>,
     /// Per channel at the present instant: what speaks against it.
     faults: Vec<Reason>,
     /// What speaks against the motion of the base, if no channel tells it.
@@ -221,6 +223,7 @@ impl Pipeline {
         }
         Self {
             tracks: tracks.collect(),
+            grid: Box::default(),
             faults: vec![Reason::NeverSeen; setup.channels().len()],
             base_fault: Reason::None,
             declarations: vec![Declarations::default(); setup.contacts.len()],
@@ -499,7 +502,8 @@ impl Pipeline {
                 (Track::Joint(history, window), Use::Joint(dof)) => match history.at(t, until) {
                     None => Reason::NeverSeen,
                     Some(held) => {
-                        let (state, deviation, reason) = joint_at(t, until, &held, window, self.setup.max_silence);
+                        let (state, deviation, reason) =
+                            joint_at(t, until, &held, (window, &mut self.grid), self.setup.max_silence);
                         if let Some(place) = self.motion.acceleration.get_mut(dof) {
                             *place = deviation;
                         }
@@ -529,7 +533,8 @@ impl Pipeline {
                 (Track::Imu(history, window), Use::Base) => match history.at(t, until) {
                     None => Reason::NeverSeen,
                     Some(held) => {
-                        let (measured, deviation, reason) = imu_at(t, until, &held, window, self.setup.max_silence);
+                        let (measured, deviation, reason) =
+                            imu_at(t, until, &held, (window, &mut self.grid), self.setup.max_silence);
                         if let BaseMotion::Imu(pose) = &self.setup.base {
                             base = FrameMotion::of_link_from_imu(&measured, pose);
                             imu = Some((measured, *pose));
@@ -749,14 +754,20 @@ fn stale<const D: usize>(held: &Held<D>, max_silence: Nanos) -> Reason {
 }
 
 /// Position, velocity and acceleration of a joint at `t`, the standard deviation of the last, and what speaks against them.
-fn joint_at(t: Nanos, until: Nanos, held: &Held<3>, window: &Window<1>, max_silence: Nanos) -> ([f64; 3], f64, Reason) {
+fn joint_at(
+    t: Nanos,
+    until: Nanos,
+    held: &Held<3>,
+    (window, grid): (&Window<1>, &mut Grid),
+    max_silence: Nanos,
+) -> ([f64; 3], f64, Reason) {
     let [position, velocity, acceleration] = held.value;
     if held.exact && velocity.is_finite() && acceleration.is_finite() {
         return ([position, velocity, acceleration], 0.0, Reason::None);
     }
     // A channel stamped exactly t needs no later sample.
     let until = if held.exact { t } else { until };
-    match window.at_using(t, until) {
+    match window.at_sharing(t, until, grid) {
         Ok(estimate) => {
             let ([value], [first], [second]) = (estimate.value, estimate.first, estimate.second);
             let given = |measured: f64, estimated: f64| {
@@ -795,7 +806,7 @@ fn imu_at(
     t: Nanos,
     until: Nanos,
     held: &Held<9>,
-    window: &Window<3>,
+    (window, grid): (&Window<3>, &mut Grid),
     max_silence: Nanos,
 ) -> (FrameMotion, [f64; 3], Reason) {
     let [ax, ay, az, gx, gy, gz, bx, by, bz] = held.value;
@@ -808,7 +819,7 @@ fn imu_at(
         return (motion, [0.0; 3], Reason::None);
     }
     let until = if held.exact { t } else { until };
-    match window.at_using(t, until) {
+    match window.at_sharing(t, until, grid) {
         Ok(estimate) => {
             if !held.exact {
                 motion.angular_velocity = Vec3::from(estimate.value);

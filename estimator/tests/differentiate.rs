@@ -2,8 +2,9 @@
 //!
 //! Angles are in degrees here, as in the figures of the module's head: the window has no unit of its own.
 
+use nalgebra::{DMatrix, DVector};
 use proprio_estimator::differentiate::{
-    Estimate, MAX_SAMPLES, Pushed, Refused, Settings, SettingsError, Unavailable, Window,
+    Estimate, Grid, MAX_SAMPLES, Pushed, Refused, Settings, SettingsError, Unavailable, Window,
 };
 use proprio_topics::Nanos;
 use proptest::prelude::*;
@@ -322,6 +323,74 @@ proptest! {
                 prop_assert!(e.samples.iter().all(|n| (3..=MAX_SAMPLES).contains(n)));
             }
         }
+    }
+
+    /// What is told is the least-squares polynomial of the samples that it is said to be of, of the degree whose windows may be that long: by a decomposition of the plain
+    /// matrix of powers. And what neighbours share of their stamps, of the same or others, changes not a bit.
+    #[test]
+    fn estimates_are_least_squares_polynomials_of_the_samples_named(
+        start in -1_000_000_000_000_000_000_i64..1_000_000_000_000_000_000,
+        step in 500_i64..8_000,
+        jitter in prop::collection::vec(0.6..1.4_f64, 130),
+        errors in prop::collection::vec(-1.0..1.0_f64, 130),
+        noise in 1e-6..1e-2_f64,
+        hertz in 0.1..4.0_f64,
+        ahead in -1.0..1.0_f64,
+        capacity in 20_usize..=MAX_SAMPLES,
+    ) {
+        let intervals: Vec<i64> = jitter.iter().map(|j| (step as f64 * j) as i64).collect();
+        let stamps = stamps(start, &intervals);
+        let settings = Settings { capacity, ..Settings::new(noise) };
+        let [mut window, mut other] = [(); 2].map(|()| Window::<1>::new(settings).unwrap());
+        let mut samples = Vec::new();
+        for (t, error) in stamps.iter().zip(&errors) {
+            let value = sine(0.5, hertz, 1.0, (*t - stamps[0]).seconds())[0] + noise * error;
+            window.push(*t, [value]).unwrap();
+            other.push(*t, [error * 7.0 * noise]).unwrap();
+            samples.push(((*t - *stamps.last().unwrap()).seconds(), value));
+        }
+        let last = *stamps.last().unwrap();
+        let t = last + Nanos::from_micros((ahead * step as f64) as i64).min(Nanos::ZERO);
+        let estimate = window.at_using(t, last).unwrap();
+        let newest = last + estimate.ahead + (t - last);
+        let skipped = stamps.iter().filter(|stamp| **stamp > newest).count();
+        let at = (t - newest).seconds();
+        for (m, (([got, std], length), gain)) in
+            channels(&estimate).into_iter().zip(estimate.samples).zip([1.0, 10.0, 100.0]).enumerate()
+        {
+            let used = &samples[samples.len() - skipped - length..samples.len() - skipped];
+            let span = (used[length - 1].0 - used[0].0).max(1e-9);
+            let shift = used[length - 1].0;
+            let fits = (2..=4.min(length - 1)).map(|degree| {
+                let powers = DMatrix::from_fn(length, degree + 1, |i, k| {
+                    (1.0 + 2.0 * (used[i].0 - shift) / span).powi(i32::try_from(k).unwrap())
+                });
+                let values = DVector::from_fn(length, |i, _| used[i].1);
+                let c = powers.svd(true, true).solve(&values, 1e-14).unwrap();
+                let v = 1.0 + 2.0 * at / span;
+                let falling = |k: usize| (0..m).map(|j| k as f64 - j as f64).product::<f64>();
+                let sum: f64 = (m..=degree)
+                    .map(|k| c[k] * falling(k) * v.powi(i32::try_from(k - m).unwrap()))
+                    .sum();
+                sum * (2.0 / span).powi(i32::try_from(m).unwrap())
+            });
+            let nearest = fits.map(|fit| (fit - got).abs()).fold(f64::INFINITY, f64::min);
+            let allowed = 1e-9 * gain / span.powi(i32::try_from(m).unwrap());
+            prop_assert!(nearest <= allowed, "{m}: off by {nearest}, allowed {allowed}, of {length} samples, std {std}");
+        }
+        let mut grid = Grid::new();
+        prop_assert!(other.at_sharing(t, last, &mut grid).is_ok());
+        prop_assert_eq!(window.at_sharing(t, last, &mut grid), Ok(estimate));
+        prop_assert_eq!(other.at_sharing(stamps[100], last, &mut grid), other.at_using(stamps[100], last));
+        prop_assert_eq!(window.at_sharing(t, last, &mut grid), Ok(estimate));
+        // One stamp is another, and the number is the same.
+        other.clear();
+        for (number, (t, error)) in stamps.iter().zip(&errors).enumerate() {
+            let late = Nanos(i64::from(number + 5 + skipped == stamps.len()));
+            other.push(*t + late, [*error * noise]).unwrap();
+        }
+        prop_assert_eq!(other.at_sharing(t, last, &mut grid), other.at_using(t, last));
+        prop_assert_eq!(window.at_sharing(t, last, &mut grid), Ok(estimate));
     }
 
     /// Three components in one window are three windows of one.
