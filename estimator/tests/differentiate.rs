@@ -381,7 +381,15 @@ proptest! {
         let mut grid = Grid::new();
         prop_assert!(other.at_sharing(t, last, &mut grid).is_ok());
         prop_assert_eq!(window.at_sharing(t, last, &mut grid), Ok(estimate));
-        prop_assert_eq!(other.at_sharing(stamps[100], last, &mut grid), other.at_using(stamps[100], last));
+        // The same stamps, and another instant; an instant with other samples; fewer samples.
+        prop_assert_eq!(window.at_sharing(last, last, &mut grid), window.at_using(last, last));
+        prop_assert_eq!(window.at_sharing(stamps[100], last, &mut grid), window.at_using(stamps[100], last));
+        prop_assert_eq!(window.at_sharing(t, last, &mut grid), Ok(estimate));
+        let mut shorter = Window::<1>::new(Settings { capacity: capacity - 7, ..settings }).unwrap();
+        for (t, error) in stamps.iter().zip(&errors) {
+            shorter.push(*t, [error * noise]).unwrap();
+        }
+        prop_assert_eq!(shorter.at_sharing(t, last, &mut grid), shorter.at_using(t, last));
         prop_assert_eq!(window.at_sharing(t, last, &mut grid), Ok(estimate));
         // One stamp is another, and the number is the same.
         other.clear();
