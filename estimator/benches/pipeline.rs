@@ -5,8 +5,8 @@
 //! An item is a second of the robot's time: 100 ms of it are 10 % of a core. The robot is iCub V2.5 where `PROPRIO_ICUB_MODELS` names the folder with iCubGazeboV2_5.urdf (of the
 //! PyPI package icub-models 3.2.0), else a generated one of as many joints and sensors. Readings are the robot's own, with noise, so that the gate lets them pass.
 //!
-//! `Standing`: on a fixed base that carries it, so that the trunk tells nothing, and limbs are identified each by itself. `Free`: hanging in the air by nothing, so to say,
-//! kinematics from an IMU: all of it is one group of 426 unknowns, the most there can be.
+//! `Standing`: on a fixed base that carries it, so that the trunk tells nothing, and limbs are identified each by itself. `Free`: balancing on one foot beyond its F/T sensor,
+//! kinematics from an IMU: all of it is one group of 426 unknowns, the most there can be. The links are a tenth heavier or lighter than CAD has them.
 
 #[path = "../tests/common/mod.rs"]
 mod common;
@@ -15,11 +15,11 @@ use common::Random;
 use divan::Bencher;
 use divan::counter::ItemsCount;
 use proprio_estimator::config::Config;
-use proprio_estimator::dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
-use proprio_estimator::model::Model;
+use proprio_estimator::dynamics::{ExternalWrench, FrameMotion, InverseDynamics, JointState, Kinematics};
+use proprio_estimator::model::{Frame, Model};
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::{Setup, Use};
-use proprio_estimator::spatial::{Vec3, Wrench};
+use proprio_estimator::spatial::{Pose, RigidInertia, Vec3, Wrench};
 use proprio_topics::{Imu, JointState as Encoder, Nanos, Quality, Reading, Wrench as ForceTorque};
 use std::path::Path;
 
@@ -90,7 +90,24 @@ fn setup(base: Base, rate_hz: Option<f64>) -> Setup {
 impl Bench {
     fn new(base: Base, rate_hz: Option<f64>) -> Self {
         let setup = setup(base, rate_hz);
-        let (model, mut random) = (&setup.model, Random::new(1));
+        let (mut model, mut random) = (setup.model.clone(), Random::new(1));
+        for link in 0..model.link_count() {
+            let factor = 1.0 + random.real(0.1);
+            let body = RigidInertia::from_parameters(&model.inertias()[link].parameters().map(|p| factor * p));
+            model.set_inertia(link, body).expect("a body");
+        }
+        let model = &model;
+        // The foot: the outermost of the links that follow a sensor.
+        let depth = |mut link: usize| {
+            let mut depth = 0;
+            while link > 0 {
+                (link, depth) = (model.joints()[link - 1].parent, depth + 1);
+            }
+            depth
+        };
+        let sensors = setup.structure.sensors();
+        let stance = (0..sensors.len()).max_by_key(|&number| depth(sensors[number].joint() + 1));
+        let stance = stance.filter(|_| matches!(base, Base::Free));
         let mut kinematics = Kinematics::new(model, setup.base_link).expect("the base");
         let mut inverse = InverseDynamics::new(model);
         let dofs = model.dof_count();
@@ -121,6 +138,20 @@ impl Bench {
                 let motion = FrameMotion::standing(&down);
                 kinematics.update(model, state, &motion).expect("a state");
                 inverse.update(model, &kinematics, &[]).expect("no wrenches");
+                if let Some(number) = stance {
+                    // What would carry the base carries the foot instead.
+                    let link = sensors[number].joint() + 1;
+                    let in_world = kinematics.pose(kinematics.base()).wrench(&inverse.base_wrench());
+                    let carried = ExternalWrench {
+                        frame: Frame {
+                            link,
+                            pose: Pose::identity(),
+                        },
+                        wrench: kinematics.pose(link).wrench_back(&in_world),
+                    };
+                    inverse.update(model, &kinematics, &[carried]).expect("a wrench");
+                    assert!(inverse.base_wrench().force.norm() < 1e-6);
+                }
                 let reading = |role: Use| match role {
                     Use::Joint(dof) => Reading::Joint(Encoder {
                         position: position[dof],
@@ -144,8 +175,14 @@ impl Bench {
                 setup.channels().iter().map(|channel| reading(channel.role)).collect()
             })
             .collect();
+        let touch = stance.and_then(|number| setup.contact(&format!("touch{number}")));
+        assert_eq!(touch.is_some(), stance.is_some());
+        let mut pipeline = Pipeline::new(setup);
+        if let Some(contact) = touch {
+            pipeline.declare(contact, Nanos::ZERO, true);
+        }
         let mut bench = Self {
-            pipeline: Pipeline::new(setup),
+            pipeline,
             readings,
             random,
             now: 1,

@@ -55,8 +55,30 @@ pub use outcome::{
 /// The axes of a wrench as samples have them, in words.
 const AXES: [&str; 6] = ["fx", "fy", "fz", "tx", "ty", "tz"];
 
+/// Lanes that inner products work in: one sum would wait for itself at every step.
+const LANES: usize = 4;
+
+#[inline(always)]
 fn dot(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
+    let ((a8, a), (b8, b)) = (a.as_chunks::<{ 2 * LANES }>(), b.as_chunks::<{ 2 * LANES }>());
+    let mut sum = [0.0; 2 * LANES];
+    for (x, y) in a8.iter().zip(b8) {
+        for lane in 0..2 * LANES {
+            sum[lane] += x[lane] * y[lane];
+        }
+    }
+    let mut four = [0.0; LANES];
+    for lane in 0..LANES {
+        four[lane] = sum[lane] + sum[lane + LANES];
+    }
+    let ((a4, a), (b4, b)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
+    for (x, y) in a4.iter().zip(b4) {
+        for lane in 0..LANES {
+            four[lane] += x[lane] * y[lane];
+        }
+    }
+    let rest: f64 = a.iter().zip(b).map(|(x, y)| x * y).sum();
+    (four[0] + four[2]) + (four[1] + four[3]) + rest
 }
 
 /// Lower factor of a covariance, row by row in place; combinations without noise get 1e-9 of the greatest variance.

@@ -47,6 +47,8 @@
 
 use nalgebra::{DMatrix, DVector};
 
+use super::{LANES, dot};
+
 /// Why rows were refused, or why nothing can be solved.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -111,16 +113,13 @@ fn check_size(what: &'static str, got: usize, expected: usize) -> Result<(), Inf
 /// Of a column's norm: a diagonal element of `R` below this is rounding, not information.
 const ROUNDING: f64 = 1e-12;
 
-/// Lanes that loops over a panel's column work in; columns are padded with zeros to a multiple.
-const LANES: usize = 4;
-
 /// Whitened rows `[a | y]` on their way into an [`Information`]. A buffer for reuse: absorbing empties it.
 #[derive(Clone, Debug)]
 pub struct Panel {
     unknowns: usize,
     capacity: usize,
     rows: usize,
-    /// Distance of columns.
+    /// Distance of columns, which are padded with zeros to a multiple of the lanes.
     stride: usize,
     /// Column by column, the right side last.
     values: Vec<f64>,
@@ -199,29 +198,6 @@ impl Panel {
         }
         padded
     }
-}
-
-#[inline(always)]
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    let ((a8, a), (b8, b)) = (a.as_chunks::<{ 2 * LANES }>(), b.as_chunks::<{ 2 * LANES }>());
-    let mut sum = [0.0; 2 * LANES];
-    for (x, y) in a8.iter().zip(b8) {
-        for lane in 0..2 * LANES {
-            sum[lane] += x[lane] * y[lane];
-        }
-    }
-    let mut four = [0.0; LANES];
-    for lane in 0..LANES {
-        four[lane] = sum[lane] + sum[lane + LANES];
-    }
-    let ((a4, a), (b4, b)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
-    for (x, y) in a4.iter().zip(b4) {
-        for lane in 0..LANES {
-            four[lane] += x[lane] * y[lane];
-        }
-    }
-    let rest: f64 = a.iter().zip(b).map(|(x, y)| x * y).sum();
-    (four[0] + four[2]) + (four[1] + four[3]) + rest
 }
 
 /// `to += factor * from`.

@@ -72,6 +72,11 @@ const INFLATION_WORTH: f64 = 300.0;
 const MEMORY: f64 = 3000.0;
 /// Lags of autocorrelation that are looked at [instants].
 const LAGS: usize = 64;
+/// The squared Newton decrement down to which bodies are sought to find the prior's weight, and to tell of them: a hundredth and a ten-thousandth of a standard deviation.
+const NEAR: f64 = 1e-4;
+const NEAREST: f64 = 1e-8;
+/// By how much, as a logarithm, the prior's weight may be off what the evidence says.
+const SETTLED: f64 = 1e-3;
 /// Window of the autocorrelation time, in such times (Sokal 1997).
 const SOKAL: f64 = 6.0;
 
@@ -1166,33 +1171,43 @@ impl Part {
                 column - parameters
             }
         };
-        let reordered = DMatrix::from_fn(unknowns, unknowns, |i, j| root[(i, from(j))]);
+        let mut reordered = DMatrix::zeros(unknowns, unknowns);
+        for (j, mut column) in reordered.column_iter_mut().enumerate() {
+            column.copy_from(&root.column(from(j)));
+        }
         let precision: Vec<f64> = (0..session).map(|i| OFFSET[usize::from(i % 6 > 2)].powi(-2)).collect();
         let posterior = Posterior::new(prior, &self.links, &reordered, &right, &precision)?;
-        // One round of the evidence a second: it settles while data come in.
-        let tau = posterior.fit(self.tau)?.next_tau();
-        let fit = posterior.fit(tau)?;
-        self.tau = tau;
+        // One round of the evidence a second: it settles while data come in. Where it has, and from one second to the next, bodies are near where they were.
+        let last: Vec<f64> = match self.good.estimate.split_at_checked(session) {
+            Some((offsets, bodies)) => bodies.iter().chain(offsets).copied().collect(),
+            None => vec![0.0; unknowns],
+        };
+        let mut fit = posterior.fit_from(&last, self.tau, NEAR)?;
+        let tau = fit.next_tau();
+        if (tau / self.tau).ln().abs() > SETTLED || fit.decrement > NEAREST {
+            fit = posterior.fit_from(fit.x.as_slice(), tau, NEAREST)?;
+        }
+        self.tau = fit.tau;
         let factor = fit.covariance_root();
-        solution.tau = tau;
+        solution.tau = fit.tau;
         solution.effective = fit.effective;
         solution.bodies.clone_from(&fit.bodies);
         solution.root = factor.transpose();
         for (to, rates) in solution.drift.iter_mut().zip(self.wander.chunks_exact(6)) {
             to.copy_from_slice(rates);
         }
-        let to = |column: usize| {
-            if column < session {
-                parameters + column
-            } else {
-                column - session
-            }
+        // [d | s] -> [s | d]
+        let turned = |values: &[f64], to: &mut Vec<f64>| {
+            let (bodies, offsets) = values.split_at(parameters.min(values.len()));
+            to.extend_from_slice(offsets);
+            to.extend_from_slice(bodies);
         };
-        solution.estimate = (0..unknowns).map(|column| fit.x[to(column)]).collect();
-        solution.factor = (0..unknowns)
-            .flat_map(|k| (0..unknowns).map(move |column| (column, k)))
-            .map(|(column, k)| factor[(to(column), k)])
-            .collect();
+        solution.estimate.clear();
+        turned(fit.x.as_slice(), &mut solution.estimate);
+        solution.factor.clear();
+        for column in factor.as_slice().chunks_exact(unknowns) {
+            turned(column, &mut solution.factor);
+        }
         for (place, offset) in solution.offsets.iter_mut().enumerate() {
             let six = |i: usize| self.reference[6 * place + i] + solution.estimate[6 * place + i];
             *offset = Wrench::from_parts([six(3), six(4), six(5)], [six(0), six(1), six(2)]);
@@ -1217,17 +1232,19 @@ impl Part {
         if self.change.is_some() {
             self.walks.iter_mut().for_each(Walk::interrupt);
         }
+        let residuals: Vec<f64> = (self.learnt.iter())
+            .map(|row| row[unknowns] - dot(&row[..unknowns], &solution.estimate))
+            .collect();
         for channel in 0..session {
             series.fill(f64::NAN);
             sensitivity.fill(0.0);
-            for (row, slot) in self.learnt.iter().zip(&self.learnt.slots) {
+            for ((row, slot), residual) in self.learnt.iter().zip(&self.learnt.slots).zip(&residuals) {
                 if row[channel] == 0.0 {
                     continue;
                 }
                 let Some(place) = usize::try_from(slot - first).ok().and_then(|i| series.get_mut(i)) else {
                     continue;
                 };
-                let residual = row[unknowns] - dot(&row[..unknowns], &solution.estimate);
                 let weight = self.variances[channel] * row[channel];
                 let share = weight * residual;
                 *place = if place.is_nan() { share } else { *place + share };
@@ -1238,14 +1255,8 @@ impl Part {
             if !seen.is_empty() {
                 let count = seen.len() as f64;
                 let apparent = solution.estimate[channel] + seen.iter().sum::<f64>() / count;
-                let of_bodies: f64 = (solution.root.row_iter())
-                    .map(|row| {
-                        row.iter()
-                            .zip(&sensitivity)
-                            .map(|(u, g)| u * g / count)
-                            .sum::<f64>()
-                            .powi(2)
-                    })
+                let of_bodies: f64 = (solution.factor.chunks_exact(unknowns))
+                    .map(|column| (dot(&column[session..], &sensitivity) / count).powi(2))
                     .sum();
                 let t = (first + last) as f64 / 2.0 * self.period;
                 self.walks[channel].take(t, apparent, self.variances[channel] / count + of_bodies);

@@ -45,6 +45,7 @@
 //! One round grades, `O(n^3)` once, and takes some five Newton steps of a matrix product and a Cholesky factorization each. To measure: `cargo bench -p
 //! proprio-estimator --bench prior`.
 
+mod blocked;
 mod posterior;
 
 use nalgebra::{Matrix4, SMatrix, SVector, SymmetricEigen};

@@ -4,8 +4,8 @@ use nalgebra::linalg::Cholesky;
 use nalgebra::{DMatrix, DVector, DVectorView, Dyn, Matrix4, Vector4};
 
 use super::{
-    Centre, GREATEST_TAU, Matrix10, Prior, PriorError, Vector10, body_of, check_finite, congruence, divergence, pack,
-    stationary_tau, unpack,
+    Centre, GREATEST_TAU, Matrix10, Prior, PriorError, Vector10, blocked, body_of, check_finite, congruence,
+    divergence, pack, stationary_tau, unpack,
 };
 use crate::spatial::RigidInertia;
 
@@ -163,6 +163,39 @@ impl Posterior {
         Ok(self.finish(state, end, tau))
     }
 
+    /// The same from near where the minimum is to be expected, unknowns as in [`Fit::x`], and as near as the square of the Newton decrement says: by half as much the
+    /// cost may be above its least, which is one half at a standard deviation. From CAD where these are no bodies.
+    pub(in crate::identify) fn fit_from(&self, x: &[f64], tau: f64, decrement: f64) -> Result<Fit, PriorError> {
+        if !(tau.is_finite() && tau > 0.0) {
+            return self.fit(tau);
+        }
+        let mut state = self.start();
+        if let Some(u) = self.place(x) {
+            state.y = &self.chart.t * u;
+        }
+        let weight = 0.5 / (tau * tau);
+        let end = self.descend(&mut state, weight, decrement.max(1e-13 * weight))?;
+        Ok(self.finish(state, end, tau))
+    }
+
+    /// Coordinates about CAD of these unknowns; none if they are no bodies.
+    fn place(&self, x: &[f64]) -> Option<DVector<f64>> {
+        if x.len() != self.data.ncols() {
+            return None;
+        }
+        let mut u = DVector::from_column_slice(x);
+        for (link, centre) in self.centres.iter().enumerate() {
+            let of_cad = centre.cad - Vector10::from(centre.reference.parameters());
+            let own = centre.whiten * (of_cad + u.fixed_rows::<10>(10 * link));
+            (Matrix4::identity() + unpack(&own)).cholesky()?;
+            u.fixed_rows_mut::<10>(10 * link).copy_from(&own);
+        }
+        for (value, &(unit, _)) in u.iter_mut().skip(10 * self.centres.len()).zip(&self.further) {
+            *value /= unit;
+        }
+        Some(u)
+    }
+
     /// The same for the weight that the data choose: [`Fit::next_tau`] until it stays, from [`GREATEST_TAU`] on.
     ///
     /// # Errors
@@ -247,6 +280,7 @@ impl Posterior {
             state.centred = current;
             if is_last || iterations >= NEWTON_STEPS {
                 return Ok(Descent {
+                    decrement: newton.decrement,
                     factor: newton.factor,
                     prior_rows: newton.prior_rows,
                     iterations,
@@ -270,7 +304,7 @@ impl Posterior {
         let residual = chart.scale.component_mul(&state.y) - &chart.right;
         let mut slope = DVector::zeros(count);
         let mut prior_rows = chart.v.clone();
-        let mut roots = Vec::with_capacity(links);
+        let (mut roots, mut maps) = (Vec::with_capacity(links), Vec::with_capacity(links));
         for link in 0..links {
             // A step stops at nine tenths of the way out of the cone of bodies, and charts move in time: there is a root.
             let body = (Matrix4::identity() + block(&u, link)).cholesky();
@@ -278,9 +312,15 @@ impl Posterior {
             slope
                 .fixed_rows_mut::<10>(10 * link)
                 .copy_from(&(pack(&(chart.gram[link] - root.transpose() * root)) * weight));
-            let rows = congruence(&root) * weight.sqrt() * prior_rows.fixed_rows::<10>(10 * link).into_owned();
-            prior_rows.fixed_rows_mut::<10>(10 * link).copy_from(&rows);
+            maps.push(congruence(&root) * weight.sqrt());
             roots.push(root);
+        }
+        // Column by column: rows of a link lie far apart.
+        for mut column in prior_rows.column_iter_mut() {
+            for (link, map) in maps.iter().enumerate() {
+                let mapped = map * column.fixed_rows::<10>(10 * link).into_owned();
+                column.fixed_rows_mut::<10>(10 * link).copy_from(&mapped);
+            }
         }
         for (index, &(_, has_prior)) in self.further.iter().enumerate() {
             let row = 10 * links + index;
@@ -290,11 +330,11 @@ impl Posterior {
                 prior_rows.row_mut(row).fill(0.0);
             }
         }
-        let mut hessian = prior_rows.transpose() * &prior_rows;
+        let mut hessian = blocked::gram(&prior_rows);
         for index in 0..count {
             hessian[(index, index)] += chart.scale[index] * chart.scale[index];
         }
-        let factor = Cholesky::new(hessian).ok_or(PriorError::Undetermined)?;
+        let factor = blocked::cholesky(hessian).ok_or(PriorError::Undetermined)?;
         let gradient = chart.scale.component_mul(&residual) + &chart.v_transposed * &slope;
         let step = -factor.solve(&gradient);
         let change = &chart.v * &step;
@@ -385,9 +425,9 @@ impl Posterior {
             x[10 * links + index] = value * unit;
         }
         // gamma = 10 L - tr(posterior covariance x prior precision), over the links' part.
-        let mut prior_rows = descent.prior_rows.rows(0, 10 * links).into_owned().transpose();
-        descent.factor.l_dirty().solve_lower_triangular_mut(&mut prior_rows);
-        let effective = (10.0 * links as f64 - prior_rows.norm_squared()).max(0.0);
+        let prior_rows = descent.prior_rows.rows(0, 10 * links).into_owned().transpose();
+        let inverse = blocked::inverse(descent.factor.l_dirty());
+        let effective = (10.0 * links as f64 - (&inverse * prior_rows).norm_squared()).max(0.0);
         let residual_square = self.residual_square + chart.excess(&y);
         let mut maps = Vec::with_capacity(links);
         for (centre, l) in self.centres.iter().zip(&chart.stretch) {
@@ -404,11 +444,13 @@ impl Posterior {
             residual_square,
             iterations: descent.iterations,
             is_converged: descent.is_converged,
+            decrement: descent.decrement,
             inverses,
             maps,
             units: self.further.iter().map(|&(unit, _)| unit).collect(),
             chart,
             factor: descent.factor,
+            inverse,
         }
     }
 }
@@ -463,6 +505,7 @@ impl Newton {
 
 /// How a descent ended.
 pub(in crate::identify) struct Descent {
+    decrement: f64,
     factor: Cholesky<f64, Dyn>,
     prior_rows: DMatrix<f64>,
     pub(in crate::identify) iterations: usize,
@@ -569,10 +612,11 @@ impl Graded {
         let mut scale = DVector::zeros(count);
         let mut rank = 0;
         let mut reflector = vec![0.0; rows];
+        // Of what is left of each column.
+        let mut squares: Vec<f64> = data.column_iter().map(|column| column.norm_squared()).collect();
         for step in 0..rows.min(count) {
-            let norm = |column: usize| data.column(column).rows_range(step..).norm_squared();
             let (pivot, square) = (step..count).fold((step, -1.0), |best, column| {
-                let square = norm(column);
+                let square = squares[column];
                 if square > best.1 { (column, square) } else { best }
             });
             let length = square.sqrt();
@@ -582,6 +626,7 @@ impl Graded {
             rank = step + 1;
             data.swap_columns(step, pivot);
             order.swap(step, pivot);
+            squares.swap(step, pivot);
             let reflector = &mut reflector[step..];
             let (head, tail) = data.as_mut_slice().split_at_mut((step + 1) * rows);
             let column = &mut head[step * rows + step..];
@@ -597,8 +642,10 @@ impl Graded {
                     *value -= factor * v;
                 }
             };
-            for other in tail.chunks_exact_mut(rows) {
+            for (other, square) in tail.chunks_exact_mut(rows).zip(&mut squares[step + 1..]) {
                 reflect(&mut other[step..]);
+                let left = &other[step + 1..];
+                *square = DVectorView::from_slice(left, left.len()).norm_squared();
             }
             reflect(&mut right.as_mut_slice()[step..]);
             column[0] = -sign * length;
@@ -623,21 +670,9 @@ impl Graded {
         }
     }
 
-    /// `T^-1`, upper triangular, by columns.
+    /// `T^-1`, upper triangular.
     fn inverse(&self) -> DMatrix<f64> {
-        let count = self.t.ncols();
-        let mut inverse = DMatrix::identity(count, count);
-        for column in 0..count {
-            let target = &mut inverse.as_mut_slice()[column * count..(column + 1) * count];
-            for pivot in (1..=column).rev() {
-                let factor = target[pivot];
-                let source = &self.t.as_slice()[pivot * count..pivot * count + pivot];
-                for (value, t) in target.iter_mut().zip(source) {
-                    *value -= factor * t;
-                }
-            }
-        }
-        inverse
+        blocked::inverse(&self.t.transpose()).transpose()
     }
 }
 
@@ -665,6 +700,8 @@ pub struct Fit {
     pub iterations: usize,
     /// Whether these were enough.
     pub is_converged: bool,
+    /// Square of the Newton decrement that was left.
+    pub(in crate::identify) decrement: f64,
     /// `(1 + U)^-1`, relative to CAD: the multipliers of consistency, over the prior's weight.
     pub(in crate::identify) inverses: Vec<Matrix4<f64>>,
     /// `u -> phi` and back, for each link.
@@ -672,7 +709,9 @@ pub struct Fit {
     /// Units of the further unknowns.
     units: Vec<f64>,
     chart: Chart,
+    /// Of the Hessian by the chart's `y`: `L`, and its inverse.
     factor: Cholesky<f64, Dyn>,
+    inverse: DMatrix<f64>,
 }
 
 impl Fit {
@@ -683,13 +722,13 @@ impl Fit {
 
     /// A square root of the posterior covariance of `x`: `F` with `F F^T` the covariance. The variance of `a^T x` is `|F^T a|^2`.
     pub fn covariance_root(&self) -> DMatrix<f64> {
-        // F = (u -> d) V A^-1/2: solve with the factor's transpose from the right.
-        let mut half = self.chart.v_transposed.clone();
-        self.factor.l_dirty().solve_lower_triangular_mut(&mut half);
-        let mut root = half.transpose();
-        for (link, (map, _)) in self.maps.iter().enumerate() {
-            let rows = map * root.fixed_rows::<10>(10 * link).into_owned();
-            root.fixed_rows_mut::<10>(10 * link).copy_from(&rows);
+        // F = (u -> d) V A^-1/2: the factor's inverse, transposed, from the right.
+        let mut root = &self.chart.v * self.inverse.transpose();
+        for mut column in root.column_iter_mut() {
+            for (link, (map, _)) in self.maps.iter().enumerate() {
+                let mapped = map * column.fixed_rows::<10>(10 * link).into_owned();
+                column.fixed_rows_mut::<10>(10 * link).copy_from(&mapped);
+            }
         }
         for (index, unit) in self.units.iter().enumerate() {
             let mut row = root.row_mut(10 * self.maps.len() + index);

@@ -1,0 +1,109 @@
+//! Factors of matrices of some hundred rows, made of matrix products on blocks: nalgebra's products are several times as fast as its loops over columns.
+//!
+//! Every block is an owned matrix, copied: products with strided views go wrong.
+
+use nalgebra::linalg::Cholesky;
+use nalgebra::{DMatrix, Dyn};
+
+/// Rows and columns of a block. Smaller: products do not get going; larger: more is done by loops.
+const BLOCK: usize = 48;
+
+/// First rows of the blocks, and their lengths.
+fn blocks(count: usize) -> impl DoubleEndedIterator<Item = (usize, usize)> {
+    (0..count.div_ceil(BLOCK)).map(move |number| (number * BLOCK, BLOCK.min(count - number * BLOCK)))
+}
+
+/// The lower triangle of `A^T A`; what stands above the diagonal blocks is zero.
+pub(super) fn gram(a: &DMatrix<f64>) -> DMatrix<f64> {
+    let count = a.ncols();
+    let transposed = a.transpose();
+    let mut gram = DMatrix::zeros(count, count);
+    for (first, length) in blocks(count) {
+        let product = transposed.rows(first, count - first).into_owned() * a.columns(first, length).into_owned();
+        gram.view_mut((first, first), (count - first, length))
+            .copy_from(&product);
+    }
+    gram
+}
+
+/// The Cholesky factorization of a positive definite matrix, of which the lower triangle counts; none if it is not positive definite to rounding.
+pub(super) fn cholesky(mut matrix: DMatrix<f64>) -> Option<Cholesky<f64, Dyn>> {
+    let count = matrix.nrows();
+    for (first, length) in blocks(count) {
+        let own = Cholesky::new(matrix.view((first, first), (length, length)).into_owned())?.unpack();
+        matrix.view_mut((first, first), (length, length)).copy_from(&own);
+        let (next, below) = (first + length, count - first - length);
+        if below == 0 {
+            break;
+        }
+        let inverse = own.solve_lower_triangular(&DMatrix::identity(length, length))?;
+        let panel = matrix.view((next, first), (below, length)).into_owned() * inverse.transpose();
+        matrix.view_mut((next, first), (below, length)).copy_from(&panel);
+        let transposed = panel.transpose();
+        for (start, width) in blocks(below) {
+            let product = panel.rows(start, below - start).into_owned() * transposed.columns(start, width).into_owned();
+            let mut target = matrix.view_mut((next + start, next + start), (below - start, width));
+            target -= product;
+        }
+    }
+    // Lower triangle and diagonal are what a factorization looks at.
+    Some(Cholesky::pack_dirty(matrix))
+}
+
+/// `L^-1` of a lower triangular matrix without zeros on its diagonal; what stands above the diagonal does not count.
+pub(super) fn inverse(l: &DMatrix<f64>) -> DMatrix<f64> {
+    let count = l.nrows();
+    let mut inverse = DMatrix::zeros(count, count);
+    for (first, length) in blocks(count) {
+        let own = l.view((first, first), (length, length)).into_owned();
+        let own = own
+            .solve_lower_triangular(&DMatrix::identity(length, length))
+            .unwrap_or_else(|| DMatrix::zeros(length, length));
+        if first > 0 {
+            // [L11 0; L21 L22]^-1 = [L11^-1 0; -L22^-1 L21 L11^-1  L22^-1]
+            let left = l.view((first, 0), (length, first)).into_owned();
+            let above = inverse.view((0, 0), (first, first)).into_owned();
+            let product = -(&own * (left * above));
+            inverse.view_mut((first, 0), (length, first)).copy_from(&product);
+        }
+        inverse.view_mut((first, first), (length, length)).copy_from(&own);
+    }
+    inverse
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::identify::normals;
+
+    #[test]
+    fn blocks_give_what_columns_give() {
+        for count in [1, 7, 47, 48, 49, 96, 131, 200] {
+            let values = normals(count as u64, (count + 3) * count);
+            let a = DMatrix::from_vec(count + 3, count, values);
+            let expected = a.transpose() * &a;
+            let found = gram(&a);
+            let lower = |matrix: &DMatrix<f64>| matrix.lower_triangle();
+            let scale = expected.norm();
+            assert!((lower(&found) - lower(&expected)).norm() <= 1e-14 * scale, "{count}");
+            // What is above the diagonal does not count.
+            let mut spoilt = found;
+            spoilt.fill_upper_triangle(f64::NAN, 1);
+            let factor = cholesky(spoilt).unwrap();
+            let l = factor.l();
+            assert!((&l * l.transpose() - &expected).norm() <= 1e-13 * scale, "{count}");
+            let mut dirty = factor.l_dirty().clone();
+            dirty.fill_upper_triangle(f64::NAN, 1);
+            let inverse = inverse(&dirty);
+            assert_eq!(inverse, inverse.lower_triangle());
+            assert!(
+                (inverse * &l - DMatrix::identity(count, count)).norm() <= 1e-10,
+                "{count}"
+            );
+            // The last pivot alone is not positive.
+            let mut indefinite = expected;
+            indefinite[(count - 1, count - 1)] = -1.0;
+            assert!(cholesky(indefinite).is_none());
+        }
+    }
+}
