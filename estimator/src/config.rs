@@ -2,6 +2,8 @@
 //!
 //! [`crate::setup`] checks it against the model and resolves names; nothing after that sees this form.
 
+use crate::calibration::{Calibration, gain_from_force_first};
+use crate::spatial::Wrench;
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
 use std::collections::BTreeMap;
@@ -146,7 +148,7 @@ pub struct ForceTorque {
     /// With `frame = "sensor"`: the sensor's axes in the child link's frame: roll, pitch, yaw \[rad\].
     #[serde(default, deserialize_with = "exactly_if_given")]
     pub rpy_rad: Option<[f64; 3]>,
-    /// Standard deviation of its forces \[N\]. The default is an iCub arm's sensor, robot still.
+    /// Standard deviation of its forces, `gain` applied \[N\]. The default is an iCub arm's sensor, robot still.
     #[serde(default = "default_noise_n", deserialize_with = "exactly")]
     pub noise_n: [f64; 3],
     /// Standard deviation of its torques \[Nm\]. The default as above.
@@ -164,6 +166,28 @@ pub struct ForceTorque {
     /// Standard deviation of `offset_nm` \[Nm\]; default: it is exact.
     #[serde(default, deserialize_with = "exactly")]
     pub offset_std_nm: [f64; 3],
+    /// What its readings are multiplied with before everything else, beyond what its board does ([`crate::calibration`]): 36 numbers row by row, rows and columns
+    /// `fx fy fz tx ty tz`, or the 6 of a diagonal; default: nothing.
+    #[serde(default, deserialize_with = "gain_numbers")]
+    pub gain: Option<Vec<f64>>,
+    /// By how much its forces change per kelvin that its board is warmer than `reference_celsius` [N/K]: that is taken off. Default: not at all.
+    #[serde(default, deserialize_with = "exactly")]
+    pub temperature_n_per_k: [f64; 3],
+    /// By how much its torques do [Nm/K].
+    #[serde(default, deserialize_with = "exactly")]
+    pub temperature_nm_per_k: [f64; 3],
+    /// The temperature that its offset belongs to \[degrees Celsius\]; where temperature is identified and this is not given: the training logs' mean.
+    pub reference_celsius: Option<f64>,
+}
+
+fn gain_numbers<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Vec<f64>>, D::Error> {
+    let numbers = Vec::<f64>::deserialize(deserializer)?;
+    match numbers.len() {
+        6 | 36 => Ok(Some(numbers)),
+        given => Err(D::Error::custom(format!(
+            "{given} numbers where 6 (a diagonal) or 36 (row by row) are needed"
+        ))),
+    }
 }
 
 const fn default_noise_n() -> [f64; 3] {
@@ -262,6 +286,27 @@ pub struct Identification {
     /// How far the URDF's inertias may be off, where nothing was identified: the relative standard deviation of a link's mass, and likewise of its mass
     /// distribution ([`crate::parameters::cad_root`]). Torques that rest on such links are as uncertain as this makes them. 0: they are exact.
     pub model_std: f64,
+    /// Whether `proprio identify` also finds out how far the gain of each force/torque sensor is off, and which entries.
+    pub gain: Gain,
+    /// How far a gain may be off before anything is measured: relative standard deviation of a channel. Of what one force reads of another, or one torque of another, the same; of
+    /// what a force reads of a torque, this divided by the sensor's length, and of what a torque reads of a force, times that length: the ratio of its RMS `noise_nm` to its RMS `noise_n`,
+    /// which is about the ratio of its full scales.
+    pub gain_std: f64,
+    /// Whether `proprio identify` also finds out how readings change with the temperature of the sensor's board, where that was recorded.
+    pub temperature: bool,
+}
+
+/// Which entries of a gain are found out.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Gain {
+    /// None: the workbench's gain is right.
+    #[default]
+    None,
+    /// One for each channel.
+    Diagonal,
+    /// All 36.
+    Full,
 }
 
 impl Default for Identification {
@@ -275,6 +320,9 @@ impl Default for Identification {
             state: None,
             save_every_s: 60.0,
             model_std: 0.2,
+            gain: Gain::None,
+            gain_std: 0.05,
+            temperature: false,
         }
     }
 }
@@ -440,6 +488,7 @@ impl Config {
         if !(1.0..=1e6).contains(&every) {
             return Err(format!("identification.save_every_s = {every} must be 1 to 1000000"));
         }
+        positive("identification.gain_std", self.identification.gain_std, 1.0)?;
         // What may come while an instant waits is kept: 32 samples of a channel beside those of its window, 256 instants.
         if !(self.output.max_wait_ms >= 0.0 && self.output.max_wait_ms <= 250.0) {
             return Err(format!(
@@ -487,6 +536,22 @@ impl Config {
                     ));
                 }
             }
+            if let Some(numbers) = &ft.gain {
+                finite(&at("gain"), numbers)?;
+                if gain_from_force_first(numbers).is_none_or(|gain| !gain.is_invertible()) {
+                    return Err(format!("{} is singular: some wrench would never show", at("gain")));
+                }
+            }
+            finite(&at("temperature_n_per_k"), &ft.temperature_n_per_k)?;
+            finite(&at("temperature_nm_per_k"), &ft.temperature_nm_per_k)?;
+            finite(&at("reference_celsius"), ft.reference_celsius.as_slice())?;
+            let drifts = ft.temperature_n_per_k != [0.0; 3] || ft.temperature_nm_per_k != [0.0; 3];
+            if drifts && ft.reference_celsius.is_none() {
+                return Err(format!(
+                    "{} is missing: temperature_n_per_k and temperature_nm_per_k count from it",
+                    at("reference_celsius")
+                ));
+            }
             finite(&at("offset_n"), &ft.offset_n)?;
             finite(&at("offset_nm"), &ft.offset_nm)?;
             finite(&at("xyz_m"), &ft.xyz_m.unwrap_or_default())?;
@@ -513,6 +578,19 @@ impl Config {
             }
         }
         Ok(())
+    }
+}
+
+impl ForceTorque {
+    /// How its readings are corrected.
+    #[must_use]
+    pub fn calibration(&self) -> Calibration {
+        let gain = self.gain.as_deref().and_then(gain_from_force_first);
+        Calibration::new(
+            gain.unwrap_or_else(nalgebra::Matrix6::identity),
+            Wrench::from_parts(self.temperature_n_per_k, self.temperature_nm_per_k),
+            self.reference_celsius,
+        )
     }
 }
 
@@ -584,6 +662,10 @@ mod tests {
         assert!(!config.identification.enabled);
         assert_eq!(config.identification.model_std, 0.2);
         assert_eq!(config.identification.rate_hz, 100.0);
+        assert_eq!(config.identification.gain, Gain::None);
+        assert_eq!(config.identification.gain_std, 0.05);
+        assert!(!config.identification.temperature);
+        assert_eq!(config.force_torque[0].calibration(), Calibration::default());
         assert_eq!(config.force_torque[0].offset_std_n, [0.0; 3]);
     }
 
@@ -625,6 +707,31 @@ mod tests {
                 "[output]",
                 "[identification]\nrate_hz = 0.1\n[output]",
                 "identification.rate_hz = 0.1 must be 1 to 1000",
+            ),
+            (
+                "joint = \"ft_joint\"",
+                "joint = \"ft_joint\"\ngain = [1, 1, 1]",
+                "3 numbers where 6 (a diagonal) or 36 (row by row) are needed",
+            ),
+            (
+                "joint = \"ft_joint\"",
+                "joint = \"ft_joint\"\ngain = [1, 1, 0, 1, 1, 1]",
+                "gain is singular",
+            ),
+            (
+                "joint = \"ft_joint\"",
+                "joint = \"ft_joint\"\ntemperature_n_per_k = [0, 0, 0.1]",
+                "reference_celsius is missing",
+            ),
+            (
+                "[output]",
+                "[identification]\ngain = \"some\"\n[output]",
+                "unknown variant `some`, expected one of `none`, `diagonal`, `full`",
+            ),
+            (
+                "[output]",
+                "[identification]\ngain_std = 0.0\n[output]",
+                "identification.gain_std = 0 must be above 0, at most 1",
             ),
             (
                 "[output]",

@@ -6,6 +6,7 @@
 //! ```
 //!
 //! - [`config`]: estimator.toml, as typed; [`setup`]: the same, checked against the URDF and resolved.
+//! - [`calibration`]: gain and temperature of an F/T sensor, before its offset.
 //! - [`spatial`]: motion and force vectors, rigid transforms, rigid-body inertia; the notation page of the crate.
 //! - [`model`]: an undirected tree of links from a URDF; massless frames folded; F/T joints kept.
 //! - [`dynamics`]: kinematics from any base, sub-trees cut at the F/T sensors, reordered recursive Newton-Euler.
@@ -18,6 +19,7 @@
 //! - [`files`]: files that are replaced whole.
 //! - [`offline`]: a table of samples to a table of estimates; [`daemon`]: the same from and to shared memory.
 
+pub mod calibration;
 pub mod config;
 pub mod daemon;
 pub mod differentiate;

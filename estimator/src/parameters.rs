@@ -15,6 +15,8 @@
 //! | `[[link]]` | every body of the model, in its order: `name`; `joint`, `parent`, `placement` (translation \[m\], rotation row by row), `axis`, which place its frame; `cad`: its ten parameters in the URDF |
 //! | | if it was identified: `identified`: the ten parameters of a body that can exist; `std`: their standard deviations |
 //! | `[[sensor]]` | `name` of its channel; `offset_n`, `offset_nm`: what it reads with no load, at instant `known_ns`; `std_n`, `std_nm`; `drift_n`, `drift_nm`: standard deviations of how far it wanders in one second, in s^-½ |
+//! | | if its calibration was identified, too ([`crate::calibration`]; these win over estimator.toml's): `gain`, 36 numbers row by row, rows and columns `fx fy fz tx ty tz`; `temperature_n_per_k`, `temperature_nm_per_k`, `reference_celsius`; |
+//! | | and where they are uncertain: `gain_std`, 36 numbers or the 6 of a diagonal: of `E`, with the true wrench (1 + E) times the one read; `temperature_std_n_per_k`, `temperature_std_nm_per_k` |
 //! | `[[joint]]` | `name`, `coulomb_nm`, `viscous_nms`, `offset_nm`: friction of a joint whose torque was measured (N and Ns if it slides) |
 //! | `[correlation]` | `root`: see below |
 //!
@@ -22,7 +24,7 @@
 //! ([`crate::spatial`]). Numbers are written with the shortest text that reads back the same, so that a file read and written again is the same file.
 //!
 //! # The covariance
-//! Columns: ten per identified link, then six per sensor [torque; force], both in the order of the file. `P = U^T U`, `U` upper triangular, and `U = root diag(std)`: the columns of `root` have
+//! Columns: ten per identified link, then six per sensor [torque; force], then what is unknown of each sensor's calibration ([`crate::calibration::Kind::unknowns`]), all in the order of the file. `P = U^T U`, `U` upper triangular, and `U = root diag(std)`: the columns of `root` have
 //! unit length and are written one by one, from the top down to the diagonal, in units of 1e-9. So a number's rounding is half a billionth of its parameter's own standard deviation. A torque's deviation
 //! comes out wrong by at most that times the sum of what all parameters would give it if they were independent; and even a combination a million times better known than its
 //! parameters keeps three digits. An iCub (39 links, six sensors: 426 columns, 91 000 numbers) takes less than 1 MB.
@@ -36,7 +38,8 @@ use nalgebra::{DMatrix, Matrix4, SMatrix};
 use proprio_topics::Nanos;
 use serde::Deserialize;
 
-use crate::config::exactly;
+use crate::calibration::{Calibration, Kind, gain_from_force_first, swapped};
+use crate::config::{Gain, exactly};
 use crate::files;
 use crate::identify::prior::{LEAST_MASS, LEAST_RADIUS};
 use crate::model::{JointKind, Model, ModelError};
@@ -121,6 +124,17 @@ pub struct Offset {
     pub drift: Wrench,
     /// When it was so, in the clock of the log.
     pub known: Nanos,
+    /// How its readings are corrected before this is taken off, if that was identified; else as configured.
+    pub calibrated: Option<Calibrated>,
+}
+
+/// How a sensor's readings are corrected, and what of that was identified and is uncertain.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Calibrated {
+    /// All of it: what was found on top of what was configured.
+    pub calibration: Calibration,
+    /// What was identified: these have columns in the covariance, relative to the corrected reading.
+    pub kind: Kind,
 }
 
 /// Friction of a joint, and what its torque sensor reads with no load: measured torque = torque + coulomb tanh(dq / v0) + viscous dq + offset.
@@ -252,7 +266,7 @@ impl Parameters {
     }
 
     /// Sets what was identified: the inertias of some links by number, the offsets of some sensors, and how certain they are: `root` is any matrix with `root^T root` the covariance of
-    /// [ten parameters per link | torque and force offset per sensor], in the order given. (With `R^T R` the inverse of the covariance, it is `R^-T`.)
+    /// [ten parameters per link | torque and force offset per sensor | what was identified of each sensor's calibration], in the order given. (With `R^T R` the inverse of the covariance, it is `R^-T`.)
     ///
     /// # Errors
     /// A link that is not there or given twice, a body that can not exist, a root of another width, numbers that are not finite. Nothing is changed then.
@@ -262,7 +276,7 @@ impl Parameters {
         offsets: &[Offset],
         root: &DMatrix<f64>,
     ) -> Result<(), ParametersError> {
-        let columns = 10 * inertias.len() + 6 * offsets.len();
+        let columns = 10 * inertias.len() + 6 * offsets.len() + calibration_columns(offsets);
         if root.ncols() != columns {
             return Err(ParametersError::Size {
                 what: "columns of the covariance's root",
@@ -365,7 +379,7 @@ impl Parameters {
             .map(|(number, _)| number)
     }
 
-    /// Offsets of the F/T sensors: their columns come last in the covariance, six each.
+    /// Offsets of the F/T sensors, and their calibrations: their columns come last in the covariance, six each, then those of the calibrations.
     #[must_use]
     pub fn offsets(&self) -> &[Offset] {
         &self.sensors
@@ -377,6 +391,15 @@ impl Parameters {
         let first = 10 * self.identified().count() + 6 * place;
         let [tx, ty, tz, fx, fy, fz] = self.deviations.get(first..first + 6)?.try_into().ok()?;
         Some(Wrench::from_parts([fx, fy, fz], [tx, ty, tz]))
+    }
+
+    /// Standard deviations of what was identified of a sensor's calibration, by its place in [`Parameters::offsets`]: in the order of [`Kind::unknowns`].
+    #[must_use]
+    pub fn calibration_deviation(&self, place: usize) -> &[f64] {
+        let before = self.sensors.get(..place).map_or(0, calibration_columns);
+        let count = self.sensors.get(place..=place).map_or(0, calibration_columns);
+        let first = 10 * self.identified().count() + 6 * self.sensors.len() + before;
+        self.deviations.get(first..first + count).unwrap_or_default()
     }
 
     /// Friction of the joints whose torque was measured.
@@ -563,6 +586,15 @@ impl Parameters {
             new_name(&at())?;
             finite(&at, &sensor.reading.force_first())?;
             finite(&at, &sensor.drift.force_first().map(f64::sqrt))?;
+            if let Some(Calibrated { calibration, kind }) = &sensor.calibrated {
+                finite(&at, &calibration.gain_force_first())?;
+                finite(&at, &calibration.per_kelvin().force_first())?;
+                finite(&at, calibration.reference().as_slice())?;
+                let counts = kind.temperature || *calibration.per_kelvin() != Wrench::zero();
+                if counts && calibration.reference().is_none() {
+                    return Err(ParametersError::Damaged(format!("{}: reference_celsius is missing", at())));
+                }
+            }
         }
         for joint in &self.joints {
             let at = || format!("joint {}", joint.joint);
@@ -572,6 +604,21 @@ impl Parameters {
         // Of a negative number the root is none.
         let roots: Vec<f64> = self.deviations.iter().map(|d| d.sqrt()).collect();
         finite(&|| "a standard deviation".into(), &roots)
+    }
+}
+
+/// How many columns the calibrations of sensors have.
+fn calibration_columns(sensors: &[Offset]) -> usize {
+    let calibrated = sensors.iter().filter_map(|sensor| sensor.calibrated.as_ref());
+    calibrated.map(|found| found.kind.count()).sum()
+}
+
+/// Deviations of a gain's error as the file has them, [force; torque], from those in the order of their columns; and back, which is the same.
+fn gain_swapped(deviations: &[f64]) -> Vec<f64> {
+    let at = |i: usize| deviations.get(i).copied().unwrap_or(f64::NAN);
+    match deviations.len() {
+        36 => (0..36).map(|i| at(6 * swapped(i / 6) + swapped(i % 6))).collect(),
+        count => (0..count).map(|i| at(swapped(i))).collect(),
     }
 }
 
@@ -702,6 +749,35 @@ impl fmt::Display for Parameters {
                 moment(&sensor.drift),
                 sensor.known.0
             )?;
+            let Some(Calibrated { calibration, kind }) = &sensor.calibrated else {
+                continue;
+            };
+            writeln!(f, "gain = {:?}", calibration.gain_force_first())?;
+            let gains = kind.count() - 6 * usize::from(kind.temperature);
+            let (gains, kelvins) = self
+                .calibration_deviation(place)
+                .split_at_checked(gains)
+                .unwrap_or_default();
+            if kind.gain != Gain::None {
+                writeln!(f, "gain_std = {:?}", gain_swapped(gains))?;
+            }
+            if let Some(reference) = calibration.reference() {
+                let per_kelvin = calibration.per_kelvin();
+                writeln!(
+                    f,
+                    "temperature_n_per_k = {:?}\ntemperature_nm_per_k = {:?}\nreference_celsius = {reference:?}",
+                    force(per_kelvin),
+                    moment(per_kelvin)
+                )?;
+            }
+            if let [tx, ty, tz, fx, fy, fz] = kelvins {
+                writeln!(
+                    f,
+                    "temperature_std_n_per_k = {:?}\ntemperature_std_nm_per_k = {:?}",
+                    [fx, fy, fz],
+                    [tx, ty, tz]
+                )?;
+            }
         }
         for joint in &self.joints {
             writeln!(
@@ -779,6 +855,60 @@ struct FileSensor {
     drift_nm: Numbers<3>,
     #[serde(with = "nanoseconds", rename = "known_ns")]
     known: Nanos,
+    gain: Option<Vec<f64>>,
+    gain_std: Option<Vec<f64>>,
+    temperature_n_per_k: Option<Numbers<3>>,
+    temperature_nm_per_k: Option<Numbers<3>>,
+    temperature_std_n_per_k: Option<Numbers<3>>,
+    temperature_std_nm_per_k: Option<Numbers<3>>,
+    reference_celsius: Option<f64>,
+}
+
+impl FileSensor {
+    /// How its readings are corrected, and the deviations of what is uncertain of it, in the order of their columns.
+    fn calibrated(&self) -> Result<(Option<Calibrated>, Vec<f64>), ParametersError> {
+        let damaged = |what: &str| Err(ParametersError::Damaged(format!("sensor {}: {what}", self.name)));
+        let drifts = self.temperature_n_per_k.is_some();
+        let stds = self.temperature_std_n_per_k.is_some();
+        if drifts != self.temperature_nm_per_k.is_some()
+            || drifts != self.reference_celsius.is_some()
+            || stds != self.temperature_std_nm_per_k.is_some()
+            || stds && !drifts
+        {
+            return damaged("what is said of temperature goes together");
+        }
+        let Some(gain) = &self.gain else {
+            return match drifts || self.gain_std.is_some() {
+                true => damaged("gain is missing"),
+                false => Ok((None, Vec::new())),
+            };
+        };
+        let Some(gain) = gain_from_force_first(gain) else {
+            return damaged("gain has not 36 numbers, nor the 6 of a diagonal");
+        };
+        let gain_std = self.gain_std.as_deref().unwrap_or_default();
+        let kind = match gain_std.len() {
+            0 => Gain::None,
+            6 => Gain::Diagonal,
+            36 => Gain::Full,
+            _ => return damaged("gain_std has not 36 numbers, nor the 6 of a diagonal"),
+        };
+        let numbers = |given: &Option<Numbers<3>>| given.as_ref().map_or([0.0; 3], |numbers| numbers.0);
+        let mut deviations = gain_swapped(gain_std);
+        if stds {
+            deviations.extend(numbers(&self.temperature_std_nm_per_k));
+            deviations.extend(numbers(&self.temperature_std_n_per_k));
+        }
+        let per_kelvin = Wrench::from_parts(numbers(&self.temperature_n_per_k), numbers(&self.temperature_nm_per_k));
+        let calibrated = Calibrated {
+            calibration: Calibration::new(gain, per_kelvin, self.reference_celsius),
+            kind: Kind {
+                gain: kind,
+                temperature: stds,
+            },
+        };
+        Ok((Some(calibrated), deviations))
+    }
 }
 
 #[derive(Deserialize)]
@@ -804,6 +934,12 @@ impl File {
         }
         for sensor in &self.sensor {
             deviations.extend(sensor.std_nm.0.iter().chain(&sensor.std_n.0));
+        }
+        let mut calibrations = Vec::new();
+        for sensor in &self.sensor {
+            let (calibrated, own) = sensor.calibrated()?;
+            calibrations.push(calibrated);
+            deviations.extend(own);
         }
         let root = &self.correlation.root;
         let whole =
@@ -846,7 +982,9 @@ impl File {
             sensors: self
                 .sensor
                 .into_iter()
-                .map(|sensor| Offset {
+                .zip(calibrations)
+                .map(|(sensor, calibrated)| Offset {
+                    calibrated,
                     sensor: sensor.name,
                     reading: Wrench::from_parts(sensor.offset_n.0, sensor.offset_nm.0),
                     drift: Wrench::from_parts(sensor.drift_n.0, sensor.drift_nm.0),

@@ -8,6 +8,8 @@
 //!
 //! A channel stamped exactly T is used as it is, its velocity and acceleration too where it has them; otherwise they come
 //! from its adaptive window ([`crate::differentiate`]). Wrenches and proper accelerations lie on straight lines between samples.
+//! Wrenches are corrected first ([`crate::calibration`]), by the last temperature of their board stamped before T - wait/2, however old: it changes slowly. Before the first one the
+//! board is taken to be at its reference temperature.
 //!
 //! With identification on ([`crate::identify::online`]), inertial parameters, offsets and their covariance are those of the last solution in force; who owns the pipeline runs its
 //! jobs ([`Pipeline::take_job`]), at once or in another thread.
@@ -95,8 +97,8 @@ pub struct Counts {
 enum Track {
     /// Position, velocity, acceleration; the latter two NaN if not measured.
     Joint(History<3>, Box<Window<1>>),
-    /// Force and torque.
-    Sensor(History<6>),
+    /// Force and torque; temperature of the board.
+    Sensor(History<6>, History<1>),
     /// Proper acceleration, angular velocity, angular acceleration (NaN if not measured).
     Imu(History<9>, Box<Window<3>>),
 }
@@ -105,7 +107,7 @@ impl Track {
     fn newest(&self) -> Option<Nanos> {
         match self {
             Self::Joint(h, _) => h.newest(),
-            Self::Sensor(h) => h.newest(),
+            Self::Sensor(h, _) => h.newest(),
             Self::Imu(h, _) => h.newest(),
         }
     }
@@ -199,7 +201,7 @@ impl Pipeline {
                 History::default(),
                 Box::new(Window::new(setup.joint_settings).expect("settings were checked")),
             ),
-            Use::Sensor(_) => Track::Sensor(History::default()),
+            Use::Sensor(_) => Track::Sensor(History::default(), History::default()),
             Use::Base => Track::Imu(
                 History::default(),
                 Box::new(Window::new(setup.gyro_settings).expect("settings were checked")),
@@ -340,7 +342,21 @@ impl Pipeline {
                 }
                 whole
             }
-            (Track::Sensor(history), Reading::Wrench(w)) => {
+            (Track::Sensor(_, temperatures), Reading::Temperature(temperature)) => {
+                let late = t < self.released.saturating_sub(Nanos(self.setup.max_wait.0 / 2));
+                match temperature.celsius.is_finite() {
+                    false => self.counts.not_finite += 1,
+                    true if temperatures.newest().is_some_and(|newest| t <= newest) => self.counts.backward += 1,
+                    true => {
+                        temperatures.push(t, [temperature.celsius], quality);
+                        self.counts.taken += 1;
+                        // Taken, but an instant was told without it that a replay tells with it.
+                        self.counts.late += u64::from(late);
+                    }
+                }
+                return;
+            }
+            (Track::Sensor(history, _), Reading::Wrench(w)) => {
                 let ([fx, fy, fz], [tx, ty, tz]) = (w.force, w.torque);
                 let value = [fx, fy, fz, tx, ty, tz];
                 let whole = all_finite(&value);
@@ -518,14 +534,21 @@ impl Pipeline {
                         quality_reason(held.quality, UNTRUSTED_ENCODER).or(reason)
                     }
                 },
-                (Track::Sensor(history), Use::Sensor(number)) => match history.at(t, until) {
+                (Track::Sensor(history, temperatures), Use::Sensor(number)) => match history.at(t, until) {
                     None => Reason::NeverSeen,
                     Some(held) => {
                         let [fx, fy, fz, tx, ty, tz] = held.value;
-                        if let (Some(place), Some(offset)) =
-                            (self.readings.get_mut(number), self.setup.offsets.get(number))
-                        {
-                            *place = Wrench::from_parts([fx, fy, fz], [tx, ty, tz]) - *offset;
+                        if let (Some(place), Some(offset), Some(calibration)) = (
+                            self.readings.get_mut(number),
+                            self.setup.offsets.get(number),
+                            self.setup.calibrations.get(number),
+                        ) {
+                            let celsius = temperature_at(temperatures, t, self.setup.max_wait);
+                            let corrected =
+                                calibration.apply(&Wrench::from_parts([fx, fy, fz], [tx, ty, tz]), celsius);
+                            self.propagation
+                                .set_reading(number, &corrected, calibration.warmth(celsius));
+                            *place = corrected - *offset;
                         }
                         stale(&held, self.setup.max_silence).or(quality_reason(held.quality, Quality::DEVICE_FAULT))
                     }
@@ -742,6 +765,13 @@ pub(crate) fn quality_reason(quality: Quality, faults: Quality) -> Reason {
     } else {
         Reason::None
     }
+}
+
+/// The temperature of a sensor's board at `t` \[degrees Celsius\]: the last one stamped before `t` less half of what an estimate waits, however old; NaN if there is none. So old that
+/// whatever counts has come when `t` is released, though nobody waits for it.
+fn temperature_at(temperatures: &History<1>, t: Nanos, max_wait: Nanos) -> f64 {
+    let before = t.saturating_sub(Nanos(max_wait.0 / 2 + 1));
+    temperatures.at(before, before).map_or(f64::NAN, |held| held.value[0])
 }
 
 fn stale<const D: usize>(held: &Held<D>, max_silence: Nanos) -> Reason {

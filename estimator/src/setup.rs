@@ -1,8 +1,9 @@
 //! estimator.toml, the URDF and what was identified, checked against each other and resolved: what the rest of the estimator works with.
 
+use crate::calibration::{self, Calibration};
 use crate::config::{
-    Base, Config, ContactKind as KindWord, Differentiation, Direction, Foot, IdentificationInput, Presence,
-    SensorFrame, TorqueSide,
+    Base, Config, ContactKind as KindWord, Differentiation, Direction, Foot, ForceTorque, Gain, IdentificationInput,
+    Presence, SensorFrame, TorqueSide,
 };
 use crate::differentiate::Settings;
 use crate::dynamics::{ContactKind, ContactSet, ContactSpec, FrameMotion, Noise, SensorCut, Structure, StructureError};
@@ -89,8 +90,14 @@ pub struct Setup {
     pub base: BaseMotion,
     /// Per degree of freedom, where it is locked; NaN if it is measured.
     pub locked: Vec<f64>,
-    /// Per F/T sensor, what it reads with no load.
+    /// Per F/T sensor, what its corrected reading is with no load.
     pub offsets: Vec<Wrench>,
+    /// Per F/T sensor, how its readings are corrected.
+    pub calibrations: Vec<Calibration>,
+    /// What of the sensors' calibrations is identified from recorded logs.
+    pub calibrated: calibration::Kind,
+    /// How far a gain may be off, relative ([`crate::config::Identification::gain_std`]).
+    pub gain_deviation: f64,
     /// The contacts that are published. The structure may have one more, the last: what a fixed base stands on.
     pub contacts: Vec<NamedContact>,
     /// The contacts present when nobody declares anything.
@@ -123,6 +130,8 @@ pub struct Setup {
     cad: Vec<RigidInertia>,
     /// Offsets as the configuration has them, and their standard deviations [torque; force].
     configured: Vec<(Wrench, [f64; 6])>,
+    /// Calibrations as the configuration has them.
+    workbench: Vec<Calibration>,
     model_deviation: f64,
     identified: Option<Parameters>,
 }
@@ -287,7 +296,15 @@ impl Setup {
                 (Wrench::from_parts(f.offset_n, f.offset_nm), [tx, ty, tz, fx, fy, fz])
             })
             .collect();
+        let workbench: Vec<Calibration> = config.force_torque.iter().map(ForceTorque::calibration).collect();
         let mut setup = Self {
+            calibrations: workbench.clone(),
+            workbench,
+            calibrated: calibration::Kind {
+                gain: identification.gain,
+                temperature: identification.temperature,
+            },
+            gain_deviation: identification.gain_std,
             robot: config.robot.clone(),
             structure,
             base_link,
@@ -340,11 +357,12 @@ impl Setup {
         let (links, sensors) = (self.cad.len(), self.configured.len());
         self.covariance = Covariance::exact(links, sensors);
         self.offsets = self.configured.iter().map(|(offset, _)| *offset).collect();
+        self.calibrations.clone_from(&self.workbench);
         for (link, cad) in self.cad.iter().enumerate() {
             let identified = self.identified.as_ref().and_then(|parameters| parameters.inertia(link));
             let _ = self.model.set_inertia(link, identified.unwrap_or(*cad));
         }
-        let mut measured = Vec::new();
+        let (mut measured, mut calibrated) = (Vec::new(), Vec::new());
         if let Some(parameters) = &self.identified {
             for offset in parameters.offsets() {
                 let Some(sensor) = self.sensor(&offset.sensor) else {
@@ -352,6 +370,10 @@ impl Setup {
                 };
                 if let Some(place) = self.offsets.get_mut(sensor) {
                     *place = offset.reading;
+                }
+                if let (Some(place), Some(found)) = (self.calibrations.get_mut(sensor), &offset.calibrated) {
+                    *place = found.calibration;
+                    calibrated.push((sensor, found.kind));
                 }
                 let ([fx, fy, fz], [tx, ty, tz]) = (offset.drift.force.into(), offset.drift.torque.into());
                 let log = parameters.provenance().logs.iter().find(|log| log.end == offset.known);
@@ -362,7 +384,9 @@ impl Setup {
                 measured.push(sensor);
             }
             let identified: Vec<usize> = parameters.identified().collect();
-            let _ = self.covariance.add(&identified, &measured, parameters.root());
+            let _ = self
+                .covariance
+                .add_calibrated(&identified, &measured, &calibrated, parameters.root());
         }
         let mut covariance = std::mem::replace(&mut self.covariance, Covariance::exact(0, 0));
         self.fill(&mut covariance, &measured);
@@ -425,6 +449,12 @@ impl Setup {
         }
         self.fill(&mut covariance, &measured);
         covariance
+    }
+
+    /// Calibrations of the F/T sensors as the configuration has them, whatever was identified.
+    #[must_use]
+    pub fn workbench(&self) -> &[Calibration] {
+        &self.workbench
     }
 
     /// Inertias of the links as the URDF has them, whatever was identified.
@@ -566,6 +596,17 @@ impl Setup {
             let numbers = offset.reading.force_first().into_iter().zip(deviation.force_first());
             let numbers: Vec<_> = numbers.map(|(value, std)| format!("{value:.3} +- {std:.3}")).collect();
             writeln!(f, "  offset of {} [N, Nm]: {}", offset.sensor, numbers.join(", "))?;
+            if let Some(found) = &offset.calibrated {
+                let of = |values: [f64; 6]| values.map(|value| format!("{value:.4}")).join(", ");
+                if found.kind.gain != Gain::None {
+                    let diagonal: [f64; 6] = std::array::from_fn(|i| found.calibration.gain_force_first()[7 * i]);
+                    writeln!(f, "  gain of {}, diagonal: {}", offset.sensor, of(diagonal))?;
+                }
+                if let (true, Some(reference)) = (found.kind.temperature, found.calibration.reference()) {
+                    let per_kelvin = of(found.calibration.per_kelvin().force_first());
+                    writeln!(f, "  per kelvin beyond {reference} C, {} [N/K, Nm/K]: {per_kelvin}", offset.sensor)?;
+                }
+            }
         }
         Ok(())
     }

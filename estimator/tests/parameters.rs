@@ -4,14 +4,15 @@
 mod common;
 
 use common::{Random, RandomRobot, State, contact, gap, humanoid, motion, size};
-use nalgebra::{DMatrix, DVector, Matrix4, SMatrix};
-use proprio_estimator::config::Config;
+use nalgebra::{DMatrix, DVector, Matrix4, Matrix6, SMatrix};
+use proprio_estimator::calibration::{Calibration, Kind, Unknown};
+use proprio_estimator::config::{Config, Gain};
 use proprio_estimator::dynamics::{
     ContactKind, ContactSet, ContactSpec, DynamicsError, FrameMotion, Kinematics, Noise, SensorCut, Solver, Structure,
 };
 use proprio_estimator::model::{Frame, Model, ModelError};
 use proprio_estimator::offline;
-use proprio_estimator::parameters::{Friction, Offset, Parameters, ParametersError, Provenance, Span, cad_root};
+use proprio_estimator::parameters::{Calibrated, Friction, Offset, Parameters, ParametersError, Provenance, Span, cad_root};
 use proprio_estimator::regressor::{Covariance, EstimateRows, Propagation};
 use proprio_estimator::setup::Setup;
 use proprio_estimator::spatial::{Mat3, Pose, RigidInertia, Vec3, Wrench};
@@ -113,6 +114,78 @@ proptest! {
     }
 }
 
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(32))]
+
+    /// An unknown of a calibration is as an offset, by as much as is read: the same as if its columns of the root were added to those of the offset.
+    #[test]
+    fn an_uncertain_calibration_is_an_offset_by_what_is_read(links in 2..=16_usize, seed in any::<u64>()) {
+        let mut random = Random::new(seed);
+        let robot = RandomRobot::new(links, &mut random);
+        let model = robot.model();
+        let sensors = robot.sensors(&model, &mut random);
+        let contacts: Vec<ContactSpec> = (0..random.below(4)).map(|_| contact(&model, &mut random).0).collect();
+        let structure = Structure::new(&model, &sensors, &contacts, 0.1).unwrap();
+        let mut kinematics = Kinematics::new(&model, random.below(model.link_count())).unwrap();
+        kinematics.update(&model, State::new(&model, &mut random).get(), &motion(&mut random)).unwrap();
+        let readings: Vec<Wrench> = sensors.iter().map(|_| random.wrench()).collect();
+        let mut solver = Solver::new(&structure);
+        solver.solve(&model, &structure, &kinematics, &readings, &(0..contacts.len()).collect(), &[]).unwrap();
+
+        let all: Vec<usize> = (0..model.link_count()).filter(|_| random.chance(70)).collect();
+        let with: Vec<usize> = (0..sensors.len()).collect();
+        let gains = [Gain::None, Gain::Diagonal, Gain::Full];
+        let kinds: Vec<(usize, Kind)> = with
+            .iter()
+            .rev()
+            .map(|&sensor| (sensor, Kind { gain: gains[random.below(3)], temperature: random.chance(50) }))
+            .collect();
+        let plain = 10 * all.len() + 6 * with.len();
+        let columns = plain + kinds.iter().map(|(_, kind)| kind.count()).sum::<usize>();
+        let root = DMatrix::from_fn(columns, columns, |_, _| random.real(0.1));
+        let kelvin = random.real(20.0);
+        let mut together = root.columns(0, plain).into_owned();
+        let mut column = plain;
+        for (sensor, kind) in &kinds {
+            for unknown in kind.unknowns() {
+                let read = readings[*sensor].torque_first();
+                // true = (1 + E) r - k (T - T0) - o.
+                let factor = match unknown {
+                    Unknown::Gain { of, .. } => -read[of],
+                    Unknown::Temperature { .. } => kelvin,
+                };
+                let own = root.column(column) * factor;
+                let mut sum = together.column_mut(10 * all.len() + 6 * sensor + unknown.channel());
+                sum += own;
+                column += 1;
+            }
+        }
+        let exact = || Covariance::exact(model.link_count(), sensors.len());
+        let (mut calibrated, mut expected) = (exact(), exact());
+        calibrated.add_calibrated(&all, &with, &kinds, root).unwrap();
+        expected.add(&all, &with, together).unwrap();
+        let mut got = Propagation::new(&structure, &calibrated).unwrap();
+        let mut want = Propagation::new(&structure, &expected).unwrap();
+        // What was read before is forgotten.
+        for (sensor, _) in readings.iter().enumerate() {
+            got.set_reading(sensor, &random.wrench(), 3.0);
+        }
+        for (sensor, reading) in readings.iter().enumerate() {
+            got.set_reading(sensor, reading, kelvin);
+        }
+        for propagation in [&mut got, &mut want] {
+            propagation.update(&structure, &solver, &kinematics, Nanos::ZERO).unwrap();
+        }
+        let most = want.torque().iter().fold(0.0, |most: f64, x| most.max(*x));
+        for (got, want) in got.torque().iter().zip(want.torque()) {
+            prop_assert!((got - want).abs() <= 1e-4 * want + 1e-5 * most, "{} not {}", got, want);
+        }
+        for (got, want) in got.contacts().iter().flatten().zip(want.contacts().iter().flatten()) {
+            prop_assert!((got - want).abs() < 1e-3 * (want + 1e-3), "{} not {}", got, want);
+        }
+    }
+}
+
 #[test]
 fn what_does_not_fit_is_refused() {
     let (text, sensors) = humanoid();
@@ -133,6 +206,14 @@ fn what_does_not_fit_is_refused() {
     );
     covariance.add(&[1], &[], root(10)).unwrap();
     assert!(covariance.add(&[1], &[], root(10)).is_err(), "has one already");
+    let kind = Kind {
+        gain: Gain::Diagonal,
+        temperature: false,
+    };
+    assert!(
+        covariance.add_calibrated(&[2], &[], &[(0, kind)], root(16)).is_err(),
+        "a calibration without an offset"
+    );
     assert!(covariance.has_link(1) && !covariance.has_link(0));
     assert!(covariance.set_drift(0, [0.0; 6], Nanos::ZERO).is_err());
     assert!(Propagation::new(&structure, &Covariance::exact(5, 0)).is_err());
@@ -367,6 +448,7 @@ fn identified(setup: &Setup, random: &mut Random) -> Parameters {
         reading: Wrench::from_parts([1.0, 2.0, 3.0], [0.1, 0.2, 0.3]),
         drift: Wrench::from_parts([0.01, 0.02, 0.03], [1e-3, 2e-3, 3e-3]),
         known: KNOWN,
+        calibrated: None,
     };
     let columns = 10 * links.len() + 6;
     // Masses known to grams, moments of inertia to a thousandth of that, offsets to centinewtons; all correlated.
@@ -585,6 +667,119 @@ fn a_file_reads_back_as_what_was_written() {
     }
 }
 
+/// The same with a calibration of the sensor, known to per cents.
+fn with_calibration(setup: &Setup, kind: Kind) -> Parameters {
+    let plain = identified(setup, &mut Random::new(3));
+    let gain = Matrix6::from_fn(|i, j| if i == j { 1.05 } else { 0.01 * i as f64 - 0.02 * j as f64 });
+    let per_kelvin = Wrench::from_parts([0.05, -0.02, 0.1], [1e-3, 2e-3, -3e-3]);
+    let per_kelvin = if kind.temperature { per_kelvin } else { Wrench::zero() };
+    let mut offset = plain.offsets()[0].clone();
+    offset.calibrated = Some(Calibrated {
+        calibration: Calibration::new(gain, per_kelvin, kind.temperature.then_some(31.5)),
+        kind,
+    });
+    let links: Vec<_> = plain.identified().map(|link| (link, plain.inertia(link).unwrap())).collect();
+    let (before, mut random) = (plain.root(), Random::new(4));
+    let columns = before.ncols() + kind.count();
+    let root = DMatrix::from_fn(columns, columns, |i, j| {
+        if i < before.nrows() && j < before.ncols() {
+            before[(i, j)]
+        } else if j >= before.ncols() {
+            0.01 * (1.0 + j as f64) * random.real(0.1)
+        } else {
+            0.0
+        }
+    });
+    let mut parameters = Parameters::new(setup, plain.provenance().clone());
+    parameters.set_identified(&links, &[offset], &root).unwrap();
+    parameters
+}
+
+#[test]
+fn a_calibration_reads_back_and_is_used() {
+    for (gain, temperature) in [
+        (Gain::None, true),
+        (Gain::Diagonal, false),
+        (Gain::Diagonal, true),
+        (Gain::Full, true),
+    ] {
+        let mut setup = arm_with(|config| {
+            config.force_torque[0].gain = Some(vec![2.0; 6]);
+        });
+        let kind = Kind { gain, temperature };
+        let parameters = with_calibration(&setup, kind);
+        let text = parameters.to_string();
+        let read = Parameters::parse(&text).unwrap();
+        assert_eq!(read, parameters);
+        assert_eq!(read.to_string(), text);
+        let deviations = read.calibration_deviation(0);
+        assert_eq!(deviations.len(), kind.count());
+        // In the file channels are in the order of logs: what the z force reads of itself is the last of the first three.
+        let table: toml::Table = text.parse().unwrap();
+        let sensor = &table["sensor"][0];
+        let number = |key: &str, at: usize| sensor[key][at].as_float().unwrap();
+        assert!((number("gain", 14) - 1.05).abs() < 1e-15);
+        assert_eq!(number("gain", 3), -0.0 + 0.03, "fx of tx: internal row 3, column 0");
+        match gain {
+            Gain::None => assert!(sensor.get("gain_std").is_none()),
+            Gain::Diagonal => assert_eq!(number("gain_std", 2), deviations[5]),
+            Gain::Full => assert_eq!(number("gain_std", 3), deviations[6 * 3]),
+        }
+        if temperature {
+            assert_eq!(number("temperature_std_n_per_k", 0), deviations[deviations.len() - 3]);
+            assert_eq!(sensor["reference_celsius"].as_float(), Some(31.5));
+        }
+        // It wins over the configuration.
+        let calibration = parameters.offsets()[0].calibrated.unwrap().calibration;
+        assert_ne!(setup.calibrations[0], calibration);
+        setup.apply(&parameters).unwrap();
+        assert_eq!(setup.calibrations[0], calibration);
+        assert_eq!(setup.workbench()[0].gain_force_first()[0], 2.0);
+        // And its uncertainty reaches the torques.
+        let certain = {
+            let plain = identified(&setup, &mut Random::new(3));
+            let mut certain = arm();
+            certain.apply(&plain).unwrap();
+            certain.calibrations[0] = calibration;
+            estimates(certain)
+        };
+        let unsure = estimates(setup);
+        let shoulder = "torque_std/l_shoulder_pitch";
+        let grown = certain[shoulder].iter().zip(&unsure[shoulder]).filter(|(a, b)| **b > 1.01 * **a);
+        let expected = if gain == Gain::None { 0 } else { certain[shoulder].len() };
+        assert_eq!(grown.count(), expected, "{kind:?}: without a temperature there is nothing to be unsure of");
+        assert_eq!(certain["torque/l_shoulder_pitch"], unsure["torque/l_shoulder_pitch"]);
+    }
+}
+
+#[test]
+fn half_a_calibration_is_refused() {
+    let text = with_calibration(
+        &arm(),
+        Kind {
+            gain: Gain::Diagonal,
+            temperature: true,
+        },
+    )
+    .to_string();
+    for (key, expected) in [
+        ("gain", "gain is missing"),
+        ("reference_celsius", "what is said of temperature goes together"),
+        ("temperature_nm_per_k", "what is said of temperature goes together"),
+        ("temperature_std_n_per_k", "what is said of temperature goes together"),
+        ("gain_std", "correlation.root has not the"),
+    ] {
+        let cut: String = text
+            .lines()
+            .filter(|line| !line.starts_with(&format!("{key} = ")))
+            .map(|line| format!("{line}\n"))
+            .collect();
+        assert_ne!(cut, text, "{key}");
+        let error = Parameters::parse(&cut).unwrap_err().to_string();
+        assert!(error.contains(expected), "{key}: {error}");
+    }
+}
+
 /// Nine digits are enough where it is hardest: a combination known a million times better than its parameters.
 #[test]
 fn the_file_keeps_what_is_known_of_combinations() {
@@ -626,6 +821,7 @@ fn an_icubs_file_is_less_than_a_megabyte() {
             reading: Wrench::from_parts([1.0 / 3.0; 3], [1.0 / 7.0; 3]),
             drift: Wrench::zero(),
             known: Nanos::ZERO,
+            calibrated: None,
         })
         .collect();
     let (columns, mut random) = (10 * links.len() + 6 * offsets.len(), Random::new(5));

@@ -1,10 +1,12 @@
 //! The pipeline on a robot whose truth three other libraries agree about, and its rules: stamps alone decide, what is
 //! missing withholds only what depends on it, bad samples are counted and lose nothing else.
 
+use proprio_estimator::calibration::Calibration;
 use proprio_estimator::config::Config;
 use proprio_estimator::offline;
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
+use proprio_estimator::spatial::Wrench as Wrench6;
 use proprio_topics::csv::{Reader, Row, Value, What};
 use proprio_topics::{JointState, Kind, Nanos, Quality, Reading, Reason, Wrench};
 use std::collections::HashMap;
@@ -91,6 +93,121 @@ fn estimates_from_a_file_are_those_of_other_libraries() {
             }
         }
     }
+}
+
+/// The arm's log as a sensor with cross-talk, whose board warms up, would have sent it; and how to put that right.
+fn miscalibrated(log: &str, change: &Calibration) -> (String, Vec<f64>) {
+    let inverse = change.gain().try_inverse().unwrap();
+    let mut reader = csv::Reader::from_reader(log.as_bytes());
+    let names: Vec<String> = reader.headers().unwrap().iter().map(str::to_owned).collect();
+    let parts = ["fx", "fy", "fz", "tx", "ty", "tz"].map(|part| format!("wrench/l_arm_ft_sensor/{part}"));
+    let places = parts.map(|part| names.iter().position(|name| *name == part).unwrap());
+    let mut text = format!("{},wrench/l_arm_ft_sensor/temperature\n", names.join(","));
+    let (mut temperatures, mut last) = (Vec::new(), change.reference().unwrap());
+    for (row, record) in reader.records().enumerate() {
+        let mut cells: Vec<String> = record.unwrap().iter().map(str::to_owned).collect();
+        let [fx, fy, fz, tx, ty, tz] = places.map(|place| cells[place].parse::<f64>().unwrap());
+        let warm = Wrench6::from_parts([fx, fy, fz], [tx, ty, tz]) + *change.per_kelvin() * change.warmth(last);
+        let raw = inverse * nalgebra::Vector6::from(warm.torque_first());
+        for (place, axis) in places.into_iter().zip([3, 4, 5, 0, 1, 2]) {
+            cells[place] = raw[axis].to_string();
+        }
+        // Every tenth row has a temperature, which holds from the next row on.
+        let now = 25.0 + 0.05 * row as f64;
+        let cell = if row % 10 == 0 { now.to_string() } else { String::new() };
+        temperatures.push(last);
+        last = if row % 10 == 0 { now } else { last };
+        text += &format!("{},{cell}\n", cells.join(","));
+    }
+    (text, temperatures)
+}
+
+fn calibration() -> Calibration {
+    let gain = nalgebra::Matrix6::from_fn(|i, j| if i == j { 1.0 + 0.02 * i as f64 } else { 0.003 * (i as f64 - j as f64) });
+    Calibration::new(gain, Wrench6::from_parts([0.3, -0.2, 0.5], [0.01, -0.02, 0.005]), Some(24.0))
+}
+
+/// As configured: the gain row by row, [force; torque].
+fn calibrate(config: &mut Config, change: &Calibration) {
+    let ft = &mut config.force_torque[0];
+    ft.gain = Some(change.gain_force_first().to_vec());
+    ft.temperature_n_per_k = change.per_kelvin().force.into();
+    ft.temperature_nm_per_k = change.per_kelvin().torque.into();
+    ft.reference_celsius = change.reference();
+}
+
+#[test]
+fn corrected_readings_give_the_estimates_of_right_ones() {
+    let log = golden("icub_left_arm_mujoco_contact.csv");
+    let change = calibration();
+    let (wrong, temperatures) = miscalibrated(&log, &change);
+    assert!(temperatures.last().unwrap() - temperatures[0] > 9.0);
+    let run = |setup: Setup, text: &str| {
+        let mut out = Vec::new();
+        offline::estimate(setup, text.as_bytes(), &mut out).unwrap();
+        table(std::str::from_utf8(&out).unwrap())
+    };
+    let right = run(setup(|_| {}), &log);
+    let corrected = run(setup(|config| calibrate(config, &change)), &wrong);
+    let uncorrected = run(setup(|_| {}), &wrong);
+    let mut off: f64 = 0.0;
+    for column in ["torque/l_shoulder_pitch", "torque/l_elbow", "contact/hand/fz", "torque_std/l_elbow"] {
+        for ((right, corrected), uncorrected) in right[column].iter().zip(&corrected[column]).zip(&uncorrected[column]) {
+            let number = |s: &String| s.parse::<f64>().unwrap();
+            assert!((number(right) - number(corrected)).abs() < 1e-9, "{column}: {right} {corrected}");
+            off = off.max((number(right) - number(uncorrected)).abs());
+        }
+    }
+    assert!(off > 1.0, "{off}");
+    // Not a bit changes where there is nothing to correct, temperatures or not.
+    let with_temperatures: String = log.lines().zip(wrong.lines()).fold(String::new(), |text, (line, other)| {
+        text + line + "," + other.rsplit_once(',').unwrap().1 + "\n"
+    });
+    assert_eq!(run(setup(|_| {}), &with_temperatures), right);
+}
+
+/// A temperature may come later than the wrench that is stamped after it, by half the wait, and nothing changes; live is a replay.
+#[test]
+fn temperatures_count_by_their_stamps() {
+    let change = calibration();
+    let (log, _) = miscalibrated(&golden("icub_left_arm_mujoco_contact.csv"), &change);
+    let run = |delay: Nanos| {
+        let mut pipeline = Pipeline::new(setup(|config| {
+            calibrate(config, &change);
+            config.output.max_wait_ms = 40.0;
+        }));
+        let mut reader = Reader::new(log.as_bytes()).unwrap();
+        let series: Vec<_> = reader.series().to_vec();
+        let (mut row, mut samples) = (Row::default(), Vec::new());
+        while reader.next_row(&mut row).unwrap() {
+            for item in &row.items {
+                let of = &series[item.series];
+                if let (What::Channel(kind), Value::Reading(reading, quality)) = (of.what, &item.value)
+                    && let Some(channel) = pipeline.setup().channel(kind, &of.name)
+                {
+                    let late = matches!(reading, Reading::Temperature(_));
+                    let arrival = row.t.unwrap() + if late { delay } else { Nanos::ZERO };
+                    samples.push((arrival, row.t.unwrap(), channel, *reading, *quality));
+                }
+            }
+        }
+        samples.sort_by_key(|(arrival, ..)| *arrival);
+        let mut torques = Vec::new();
+        for (_, t, channel, reading, quality) in samples {
+            pipeline.push(channel, t, &reading, quality);
+            while let Some(estimate) = pipeline.poll() {
+                torques.push((estimate.t, estimate.torques.joints()[0].torque.to_bits()));
+            }
+        }
+        (torques, pipeline.counts().late)
+    };
+    let (prompt, late) = run(Nanos::ZERO);
+    assert_eq!((prompt.len(), late), (201, 0));
+    assert_eq!(run(Nanos::from_millis(20)), (prompt.clone(), 0));
+    // Later than that it is counted.
+    let (other, late) = run(Nanos::from_millis(80));
+    assert!(late > 10, "{late}");
+    assert_ne!(other, prompt);
 }
 
 #[test]

@@ -735,6 +735,7 @@ fn identification_begins_where_the_session_before_ended() {
         reading: known.offsets[0],
         drift: Wrench::zero(),
         known: Nanos::ZERO,
+        calibrated: None,
     };
     parameters.set_identified(&inertias, &[offset], &known.root).unwrap();
     setup.apply(&parameters).unwrap();

@@ -58,6 +58,7 @@ pub fn parameters(outcome: &Outcome, setup: &Setup, program: &str) -> Result<Par
             reading: wrench(&offset.end),
             drift: wrench(&offset.rate),
             known: log.span.1,
+            calibrated: None,
         });
         places.extend(of_sensor);
     }

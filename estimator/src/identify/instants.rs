@@ -12,7 +12,7 @@
 //! - What speaks against a channel at an instant is told beside it: silent for too long, saturated, at fault, too close to the log's end for a derivative.
 //!   An F/T reading that lies far off what the model and its own neighbours say is marked as an outlier.
 //!
-//! Readings are as measured: configured offsets are not taken off, since identification determines what a sensor reads with no load.
+//! Readings are corrected as configured ([`crate::calibration`]), but configured offsets are not taken off, since identification determines what a sensor reads with no load.
 
 mod defects;
 mod offset;
@@ -102,6 +102,8 @@ pub struct Recording {
     /// By degree of freedom; empty where it is locked.
     joints: Vec<JointTrack>,
     sensors: Vec<Stream<6>>,
+    /// Per F/T sensor, of its board [degrees Celsius]: as they came, until they are put in order.
+    temperatures: Vec<Vec<(Nanos, f64)>>,
     imu: ImuTrack,
     /// Per contact, from when on it is said to be present or not.
     declared: Vec<Vec<(Nanos, bool)>>,
@@ -131,7 +133,7 @@ pub struct Instant {
     pub base_link: usize,
     /// Its motion.
     pub base: FrameMotion,
-    /// Per F/T sensor what it reads, offset included, in its measurement frame; NaN where there is nothing.
+    /// Per F/T sensor what it reads, corrected as configured, offset included, in its measurement frame; NaN where there is nothing.
     pub readings: Vec<Wrench>,
     /// The contacts that are present, as declared.
     pub active: ContactSet,
@@ -139,6 +141,8 @@ pub struct Instant {
     pub faults: Vec<Reason>,
     /// What speaks against the motion of the base, where no channel tells it.
     pub base_fault: Reason,
+    /// Per F/T sensor, how warm its board is \[degrees Celsius\], on the straight line between two samples, the first and the last one held; NaN where none was recorded.
+    pub temperatures: Vec<f64>,
     /// F/T sensors whose reading no motion explains, and that is not the beginning of another level either: a blow, a glitch.
     pub outliers: SensorSet,
     /// Sub-trees, by number, and measured joint torques, by [`Instant::TORQUES`], that something undeclared was found to act on: a contact, another load. None before a fit.
@@ -172,6 +176,7 @@ impl Recording {
             channels: setup.channels().to_vec(),
             joints: vec![JointTrack::default(); setup.model.dof_count()],
             sensors: vec![Stream::default(); setup.structure.sensors().len()],
+            temperatures: vec![Vec::new(); setup.structure.sensors().len()],
             imu: ImuTrack::default(),
             declared: vec![Vec::new(); setup.contacts.len()],
             stamped: true,
@@ -222,6 +227,7 @@ impl Recording {
         }
         recording.report = reader.report().clone();
         recording.declared.iter_mut().for_each(|d| d.sort_by_key(|(t, _)| *t));
+        recording.temperatures.iter_mut().for_each(|t| t.sort_by_key(|(t, _)| *t));
         defects::settle(&mut recording, setup, repeats);
         recording.span();
         for channel in &recording.channels {
@@ -290,6 +296,12 @@ impl Recording {
                         [fx, fy, fz, tx, ty, tz],
                         quality_reason(quality, Quality::DEVICE_FAULT),
                     );
+                }
+            }
+            (Use::Sensor(number), Reading::Temperature(temperature)) => {
+                let is_good = temperature.celsius.is_finite() && !quality.intersects(Quality::DEVICE_FAULT);
+                if let Some(own) = self.temperatures.get_mut(number).filter(|_| is_good) {
+                    own.push((t, temperature.celsius));
                 }
             }
             (Use::Base, Reading::Imu(i)) => {
@@ -412,6 +424,7 @@ impl Recording {
                 active: self.active(setup, t),
                 faults: vec![Reason::None; self.channels.len()],
                 base_fault: Reason::None,
+                temperatures: self.temperatures.iter().map(|own| temperature_at(own, t)).collect(),
                 outliers: SensorSet::default(),
                 suspected: UnitSet::default(),
                 shaking: Vec::new(),
@@ -427,7 +440,10 @@ impl Recording {
                     }
                     Use::Sensor(sensor) => match sensors[sensor][number] {
                         Ok([fx, fy, fz, tx, ty, tz]) => {
-                            instant.readings[sensor] = Wrench::from_parts([fx, fy, fz], [tx, ty, tz]);
+                            instant.readings[sensor] = setup.calibrations[sensor].apply(
+                                &Wrench::from_parts([fx, fy, fz], [tx, ty, tz]),
+                                instant.temperatures[sensor],
+                            );
                             Reason::None
                         }
                         Err(reason) => reason,
@@ -589,6 +605,18 @@ impl Instant {
     pub fn has_motion(&self, channels: &[Channel]) -> bool {
         let known = |(c, fault): (&Channel, &Reason)| matches!(c.role, Use::Sensor(_)) || *fault == Reason::None;
         self.base_fault == Reason::None && channels.iter().zip(&self.faults).all(known)
+    }
+}
+
+/// A temperature at `t`, of samples in the order of their stamps.
+fn temperature_at(samples: &[(Nanos, f64)], t: Nanos) -> f64 {
+    let after = samples.partition_point(|(stamp, _)| *stamp <= t);
+    match (after.checked_sub(1).and_then(|i| samples.get(i)), samples.get(after)) {
+        (Some((from, before)), Some((to, next))) => {
+            before + (t - *from).seconds() / (*to - *from).seconds() * (next - before)
+        }
+        (Some((_, only)), None) | (None, Some((_, only))) => *only,
+        (None, None) => f64::NAN,
     }
 }
 

@@ -537,6 +537,7 @@ mod tests {
                     active: setup.always,
                     faults: vec![Reason::None; setup.channels().len()],
                     base_fault: Reason::None,
+                    temperatures: Vec::new(),
                     outliers: SensorSet::default(),
                     suspected: UnitSet::default(),
                     shaking: Vec::new(),

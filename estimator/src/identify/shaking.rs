@@ -420,6 +420,7 @@ mod tests {
             active: ContactSet::default(),
             faults: Vec::new(),
             base_fault: Reason::None,
+            temperatures: Vec::new(),
             outliers: SensorSet::default(),
             suspected: UnitSet::default(),
             shaking: Vec::new(),

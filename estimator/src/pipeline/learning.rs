@@ -8,7 +8,7 @@
 
 use proprio_topics::{InertiaEstimate, LinkInertia, Name, Nanos, Quality, Reason, SensorOffset};
 
-use super::{OrReason, Track, UNTRUSTED_ENCODER, quality_reason};
+use super::{OrReason, Track, UNTRUSTED_ENCODER, quality_reason, temperature_at};
 use crate::dynamics::{ContactSet, DofSet, FrameMotion, JointState, Kinematics};
 use crate::history::{History, KEPT};
 use crate::identify::online::state::StateError;
@@ -272,13 +272,16 @@ impl Learning {
                         *fault = (*fault).or(Reason::NotFinite);
                     }
                 }
-                (Track::Sensor(history), Use::Sensor(number)) => {
+                (Track::Sensor(history, temperatures), Use::Sensor(number)) => {
                     let (Some(reading), Some(fault)) = (self.readings.get_mut(number), self.sensors.get_mut(number))
                     else {
                         continue;
                     };
                     let (mean, reason) = mean_reading(history, t, self.period, setup.max_silence);
-                    (*reading, *fault) = (mean, reason);
+                    let celsius = temperature_at(temperatures, t, setup.max_wait);
+                    let calibration = setup.calibrations.get(number);
+                    *reading = calibration.map_or(mean, |calibration| calibration.apply(&mean, celsius));
+                    *fault = reason;
                 }
                 (Track::Imu(history, _), Use::Base) => {
                     let gathered = self

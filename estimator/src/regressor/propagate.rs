@@ -15,6 +15,9 @@
 //! A link whose parameters are correlated with nothing else in its sub-tree needs no rows there: `C_l = G_l^T G_l` is six by six, and independent covariances add,
 //! `var(tau_j) = s_j^T C s_j - 2 s_j^T C h_j + h_j^T C_b h_j` with `C` summed over what is below `j`, `C_b` over all. So what is known from the URDF alone costs little.
 //!
+//! Where a sensor's calibration is uncertain, too ([`crate::calibration`]), its columns `U_c` count as its offset's by what it reads: `U_s` becomes `U_s - U_E r + U_k (T - T0)` at each
+//! instant ([`Propagation::set_reading`]).
+//!
 //! Columns are ordered sensors first, then links from the tips to the top: what lies below a joint has short columns in the triangle. `U` and `W` are
 //! single precision: a standard deviation needs three digits, and has them even where parameters cancel to a hundred-thousandth of what each would do.
 //!
@@ -29,8 +32,9 @@ use proprio_topics::Nanos;
 use wide::f32x8;
 
 use super::link::{LinkRows, WIDTH, WITH_FORCE, link_rows};
+use crate::calibration::{Kind, Unknown};
 use crate::dynamics::{DynamicsError, Kinematics, Solver, Structure, check_size};
-use crate::spatial::{Motion, Pose};
+use crate::spatial::{Motion, Pose, Wrench};
 
 /// Rows that are computed together.
 const LANES: usize = 8;
@@ -53,6 +57,7 @@ pub struct Covariance {
 struct Block {
     links: Vec<usize>,
     sensors: Vec<usize>,
+    calibrations: Vec<(usize, Kind)>,
     root: DMatrix<f64>,
 }
 
@@ -109,11 +114,33 @@ impl Covariance {
     /// # Errors
     /// A link or sensor that is not there or has a block already; a root of another width, or one that is not finite. Nothing is changed then.
     pub fn add(&mut self, links: &[usize], sensors: &[usize], root: DMatrix<f64>) -> Result<(), DynamicsError> {
+        self.add_calibrated(links, sensors, &[], root)
+    }
+
+    /// The same where calibrations of some of these sensors are uncertain, too: after the offsets' columns those of [`Kind::unknowns`], sensor by sensor as given.
+    ///
+    /// # Errors
+    /// As [`Covariance::add`]; a calibration of a sensor that is not among `sensors`.
+    pub fn add_calibrated(
+        &mut self,
+        links: &[usize],
+        sensors: &[usize],
+        calibrations: &[(usize, Kind)],
+        root: DMatrix<f64>,
+    ) -> Result<(), DynamicsError> {
+        let of_calibrations: usize = calibrations.iter().map(|(_, kind)| kind.count()).sum();
         check_size(
             "columns of a covariance",
             root.ncols(),
-            WIDTH * links.len() + 6 * sensors.len(),
+            WIDTH * links.len() + 6 * sensors.len() + of_calibrations,
         )?;
+        if let Some((sensor, _)) = calibrations.iter().find(|(sensor, _)| !sensors.contains(sensor)) {
+            return Err(DynamicsError::Index {
+                what: "sensors with an offset in the same covariance",
+                index: *sensor,
+                count: sensors.len(),
+            });
+        }
         if let Some(index) = root.iter().position(|value| !value.is_finite()) {
             return Err(DynamicsError::NotFinite {
                 what: "number of a covariance",
@@ -127,6 +154,7 @@ impl Covariance {
         self.blocks.push(Block {
             links: links.to_vec(),
             sensors: sensors.to_vec(),
+            calibrations: calibrations.to_vec(),
             root,
         });
         Ok(())
@@ -181,7 +209,7 @@ impl Covariance {
         self.links.get(link).is_some_and(|there| *there)
     }
 
-    /// All of `P`, over `[10 per link | 6 per sensor]`, without what offsets have wandered.
+    /// All of `P`, over `[10 per link | 6 per sensor]`, without what offsets have wandered and without calibrations.
     pub fn dense(&self) -> DMatrix<f64> {
         let (links, sensors) = (self.links.len(), self.sensors.len());
         let mut all = DMatrix::zeros(WIDTH * links + 6 * sensors, WIDTH * links + 6 * sensors);
@@ -272,10 +300,35 @@ struct Piece {
     place: usize,
     rows: Range<usize>,
     columns: Vec<Lanes>,
+    /// Of a sensor whose calibration is uncertain, too. Then `columns` hold both, for what it reads.
+    calibration: Option<Box<Calibrated>>,
+}
+
+/// The root's columns of an offset alone, and of what is unknown of its sensor's calibration, in the rows of the offset's.
+#[derive(Clone, Debug)]
+struct Calibrated {
+    offset: Vec<Lanes>,
+    unknowns: Vec<(Unknown, Vec<Lanes>)>,
+}
+
+impl Piece {
+    /// Puts the columns of offset and calibration together: an unknown of the calibration is as an offset, by so much as is read.
+    fn calibrate(&mut self, corrected: &[f64; 6], kelvin: f64) {
+        let Some(calibration) = &self.calibration else { return };
+        self.columns.copy_from_slice(&calibration.offset);
+        let count = self.rows.len();
+        for (unknown, own) in &calibration.unknowns {
+            let factor = single(unknown.as_offset(corrected, kelvin));
+            let sums = self.columns.iter_mut().skip(count * unknown.channel());
+            sums.zip(own).for_each(|(sum, value)| *sum += factor * *value);
+        }
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Member {
+    /// What is unknown of a sensor's calibration: before its offset, so that this has as many rows as it.
+    Calibration,
     Link(usize),
     /// A sensor and the sign with which its offset enters what the links need.
     Sensor(usize, bool),
@@ -316,6 +369,16 @@ impl Propagation {
             torque: vec![0.0; structure.dof_count()],
             contacts: vec![[0.0; 6]; structure.contacts().len()],
         })
+    }
+
+    /// Says what a sensor reads, corrected but with its offset, and how far its board is from the reference temperature \[K\]: what an uncertain calibration comes to. Before any: nothing.
+    pub fn set_reading(&mut self, sensor: usize, corrected: &Wrench, kelvin: f64) {
+        let corrected = corrected.torque_first();
+        for piece in self.parts.iter_mut().flat_map(|part| &mut part.pieces) {
+            if matches!(piece.what, Member::Sensor(own, _) if own == sensor) {
+                piece.calibrate(&corrected, kelvin);
+            }
+        }
     }
 
     /// Computes all standard deviations, for the solver's last solution at instant `t`.
@@ -426,6 +489,13 @@ impl Part {
             for end in &ends {
                 if let Some(i) = block.sensors.iter().position(|&s| s == end.sensor) {
                     let first = WIDTH * block.links.len() + 6 * i;
+                    let mut own = WIDTH * block.links.len() + 6 * block.sensors.len();
+                    for (sensor, kind) in &block.calibrations {
+                        if *sensor == end.sensor {
+                            members.push((Member::Calibration, end.link, own..own + kind.count()));
+                        }
+                        own += kind.count();
+                    }
                     members.push((Member::Sensor(end.sensor, end.plus), end.link, first..first + 6));
                 }
             }
@@ -447,22 +517,39 @@ impl Part {
                 continue;
             }
             let mut first = 0;
+            let mut calibration: Vec<Vec<Lanes>> = Vec::new();
             for (what, link, columns) in members {
                 let end = (first + columns.len()).min(root.nrows());
                 let count = end.div_ceil(LANES);
                 // Too large for single precision is infinite, and makes a deviation infinite.
                 #[allow(clippy::cast_possible_truncation, reason = "single precision suffices")]
                 let at = |row: usize, column: usize| if row < end { root[(row, column)] as f32 } else { 0.0 };
-                let lanes = (first..first + columns.len()).flat_map(|column| {
+                let lanes_of = |column: usize| {
                     (0..count).map(move |chunk| Lanes::new(std::array::from_fn(|i| at(LANES * chunk + i, column))))
-                });
+                };
+                let lanes = first..first + columns.len();
+                first += columns.len();
+                if what == Member::Calibration {
+                    calibration = lanes.map(|column| lanes_of(column).collect()).collect();
+                    continue;
+                }
+                let lanes: Vec<Lanes> = lanes.flat_map(lanes_of).collect();
+                let own = std::mem::take(&mut calibration);
+                let kind = block.calibrations.iter().find(
+                    |(sensor, _)| matches!(what, Member::Sensor(own, _) if own == *sensor),
+                );
                 pieces.push(Piece {
                     what,
                     place: place_of(link).unwrap_or(0),
                     rows: rows..rows + count,
-                    columns: lanes.collect(),
+                    calibration: kind.map(|(_, kind)| {
+                        Box::new(Calibrated {
+                            offset: lanes.clone(),
+                            unknowns: kind.unknowns().zip(own).collect(),
+                        })
+                    }),
+                    columns: lanes,
                 });
-                first += columns.len();
             }
             rows += root.nrows().div_ceil(LANES);
         }
@@ -520,6 +607,8 @@ impl Part {
                 Member::Sensor(sensor, plus) => {
                     add_offset(out, rows, piece, solver.sensor_pose(sensor), plus);
                 }
+                // Part of its sensor's.
+                Member::Calibration => {}
             }
         }
         self.below.fill([[0.0; 6]; 6]);

@@ -15,6 +15,7 @@ use super::{Instants, JointTrack, Recording, Stream};
 use crate::dynamics::{InverseDynamics, JointState, Kinematics, Structure};
 use crate::identify::{AXES, Severity};
 use crate::setup::{Setup, Use};
+use crate::spatial::Wrench;
 use proprio_topics::{Nanos, Reading, Reason};
 use std::fmt;
 
@@ -1063,7 +1064,12 @@ fn units(recording: &Recording, setup: &Setup, found: &mut Vec<Defect>) {
             }
             Use::Sensor(number) => {
                 let norm = |from: usize| {
-                    let of = |v: &[f64; 6]| v[from..from + 3].iter().map(|x| x * x).sum::<f64>().sqrt();
+                    // A configured gain may be what makes newtons of counts.
+                    let corrected = |[fx, fy, fz, tx, ty, tz]: &[f64; 6]| {
+                        let raw = Wrench::from_parts([*fx, *fy, *fz], [*tx, *ty, *tz]);
+                        setup.calibrations[number].apply(&raw, f64::NAN).force_first()
+                    };
+                    let of = |v: &[f64; 6]| corrected(v)[from..from + 3].iter().map(|x| x * x).sum::<f64>().sqrt();
                     median(recording.sensors[number].value.iter().map(of).collect())
                 };
                 let (force, torque) = (norm(0), norm(3));
