@@ -562,7 +562,7 @@ fn watch(args: &Args, robot: &Robot, experiment: &Experiment, processes: &mut Pr
     processes.start("simulate", &simulate)?;
 
     let joints: Vec<String> = experiment.setup.joint_names().map(ToOwned::to_owned).collect();
-    let mut screen = Screen::new(args, &joints);
+    let mut screen = Screen::new(args, &joints, experiment.refused.is_none());
     let mut watched = Watched {
         joints,
         estimates: Vec::with_capacity((args.seconds * 1100.0) as usize),
@@ -676,6 +676,8 @@ struct Screen {
     joints: Vec<String>,
     /// When the robot begins to move [s].
     still: f64,
+    /// Whether there is something that can be learnt.
+    learns: bool,
     has_told: bool,
     begin: Option<Nanos>,
     next: Nanos,
@@ -683,7 +685,7 @@ struct Screen {
 }
 
 impl Screen {
-    fn new(args: &Args, joints: &[String]) -> Self {
+    fn new(args: &Args, joints: &[String], learns: bool) -> Self {
         let terminal = std::io::stdout().is_terminal();
         let bar = if terminal {
             ProgressBar::new((args.seconds * 10.0) as u64)
@@ -696,6 +698,7 @@ impl Screen {
             bar,
             joints: joints.to_vec(),
             still: args.still(),
+            learns,
             has_told: false,
             begin: None,
             next: Nanos::ZERO,
@@ -755,7 +758,11 @@ impl Screen {
             let _ = std::io::stdout().flush();
         });
         self.lines = self.joints.len();
-        let doing = if moves { "moving, learning" } else { "standing still" };
+        let doing = match (moves, self.learns) {
+            (false, _) => "standing still",
+            (true, true) => "moving, learning",
+            (true, false) => "moving",
+        };
         self.bar.set_message(format!("{elapsed:.1} s, {doing}"));
         self.bar.set_position((elapsed * 10.0) as u64);
     }

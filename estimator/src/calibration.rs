@@ -205,8 +205,18 @@ mod tests {
     use super::*;
 
     fn any() -> Calibration {
-        let gain = Matrix6::from_fn(|i, j| if i == j { 1.1 } else { 0.01 * (i as f64 - 2.0 * j as f64) });
-        Calibration::new(gain, Wrench::from_parts([0.05, -0.02, 0.1], [1e-3, 2e-3, -3e-3]), Some(25.0))
+        let gain = Matrix6::from_fn(|i, j| {
+            if i == j {
+                1.1
+            } else {
+                0.01 * (i as f64 - 2.0 * j as f64)
+            }
+        });
+        Calibration::new(
+            gain,
+            Wrench::from_parts([0.05, -0.02, 0.1], [1e-3, 2e-3, -3e-3]),
+            Some(25.0),
+        )
     }
 
     #[test]
@@ -283,7 +293,10 @@ mod tests {
                 let expected = -1e-3 * unknown.as_offset(&corrected.torque_first(), base.warmth(31.0));
                 for (channel, value) in change.into_iter().enumerate() {
                     let expected = if channel == unknown.channel() { expected } else { 0.0 };
-                    assert!((value - expected).abs() < 1e-12, "{unknown:?}, {channel}: {value} {expected}");
+                    assert!(
+                        (value - expected).abs() < 1e-12,
+                        "{unknown:?}, {channel}: {value} {expected}"
+                    );
                 }
             }
         }

@@ -592,7 +592,10 @@ impl Parameters {
                 finite(&at, calibration.reference().as_slice())?;
                 let counts = kind.temperature || *calibration.per_kelvin() != Wrench::zero();
                 if counts && calibration.reference().is_none() {
-                    return Err(ParametersError::Damaged(format!("{}: reference_celsius is missing", at())));
+                    return Err(ParametersError::Damaged(format!(
+                        "{}: reference_celsius is missing",
+                        at()
+                    )));
                 }
             }
         }

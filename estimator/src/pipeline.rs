@@ -544,8 +544,7 @@ impl Pipeline {
                             self.setup.calibrations.get(number),
                         ) {
                             let celsius = temperature_at(temperatures, t, self.setup.max_wait);
-                            let corrected =
-                                calibration.apply(&Wrench::from_parts([fx, fy, fz], [tx, ty, tz]), celsius);
+                            let corrected = calibration.apply(&Wrench::from_parts([fx, fy, fz], [tx, ty, tz]), celsius);
                             self.propagation
                                 .set_reading(number, &corrected, calibration.warmth(celsius));
                             *place = corrected - *offset;

@@ -604,7 +604,11 @@ impl Setup {
                 }
                 if let (true, Some(reference)) = (found.kind.temperature, found.calibration.reference()) {
                     let per_kelvin = of(found.calibration.per_kelvin().force_first());
-                    writeln!(f, "  per kelvin beyond {reference} C, {} [N/K, Nm/K]: {per_kelvin}", offset.sensor)?;
+                    writeln!(
+                        f,
+                        "  per kelvin beyond {reference} C, {} [N/K, Nm/K]: {per_kelvin}",
+                        offset.sensor
+                    )?;
                 }
             }
         }

@@ -12,7 +12,9 @@ use proprio_estimator::dynamics::{
 };
 use proprio_estimator::model::{Frame, Model, ModelError};
 use proprio_estimator::offline;
-use proprio_estimator::parameters::{Calibrated, Friction, Offset, Parameters, ParametersError, Provenance, Span, cad_root};
+use proprio_estimator::parameters::{
+    Calibrated, Friction, Offset, Parameters, ParametersError, Provenance, Span, cad_root,
+};
 use proprio_estimator::regressor::{Covariance, EstimateRows, Propagation};
 use proprio_estimator::setup::Setup;
 use proprio_estimator::spatial::{Mat3, Pose, RigidInertia, Vec3, Wrench};
@@ -670,7 +672,13 @@ fn a_file_reads_back_as_what_was_written() {
 /// The same with a calibration of the sensor, known to per cents.
 fn with_calibration(setup: &Setup, kind: Kind) -> Parameters {
     let plain = identified(setup, &mut Random::new(3));
-    let gain = Matrix6::from_fn(|i, j| if i == j { 1.05 } else { 0.01 * i as f64 - 0.02 * j as f64 });
+    let gain = Matrix6::from_fn(|i, j| {
+        if i == j {
+            1.05
+        } else {
+            0.01 * i as f64 - 0.02 * j as f64
+        }
+    });
     let per_kelvin = Wrench::from_parts([0.05, -0.02, 0.1], [1e-3, 2e-3, -3e-3]);
     let per_kelvin = if kind.temperature { per_kelvin } else { Wrench::zero() };
     let mut offset = plain.offsets()[0].clone();
@@ -678,7 +686,10 @@ fn with_calibration(setup: &Setup, kind: Kind) -> Parameters {
         calibration: Calibration::new(gain, per_kelvin, kind.temperature.then_some(31.5)),
         kind,
     });
-    let links: Vec<_> = plain.identified().map(|link| (link, plain.inertia(link).unwrap())).collect();
+    let links: Vec<_> = plain
+        .identified()
+        .map(|link| (link, plain.inertia(link).unwrap()))
+        .collect();
     let (before, mut random) = (plain.root(), Random::new(4));
     let columns = before.ncols() + kind.count();
     let root = DMatrix::from_fn(columns, columns, |i, j| {
@@ -745,9 +756,16 @@ fn a_calibration_reads_back_and_is_used() {
         };
         let unsure = estimates(setup);
         let shoulder = "torque_std/l_shoulder_pitch";
-        let grown = certain[shoulder].iter().zip(&unsure[shoulder]).filter(|(a, b)| **b > 1.01 * **a);
+        let grown = certain[shoulder]
+            .iter()
+            .zip(&unsure[shoulder])
+            .filter(|(a, b)| **b > 1.01 * **a);
         let expected = if gain == Gain::None { 0 } else { certain[shoulder].len() };
-        assert_eq!(grown.count(), expected, "{kind:?}: without a temperature there is nothing to be unsure of");
+        assert_eq!(
+            grown.count(),
+            expected,
+            "{kind:?}: without a temperature there is nothing to be unsure of"
+        );
         assert_eq!(certain["torque/l_shoulder_pitch"], unsure["torque/l_shoulder_pitch"]);
     }
 }

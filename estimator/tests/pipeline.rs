@@ -123,8 +123,18 @@ fn miscalibrated(log: &str, change: &Calibration) -> (String, Vec<f64>) {
 }
 
 fn calibration() -> Calibration {
-    let gain = nalgebra::Matrix6::from_fn(|i, j| if i == j { 1.0 + 0.02 * i as f64 } else { 0.003 * (i as f64 - j as f64) });
-    Calibration::new(gain, Wrench6::from_parts([0.3, -0.2, 0.5], [0.01, -0.02, 0.005]), Some(24.0))
+    let gain = nalgebra::Matrix6::from_fn(|i, j| {
+        if i == j {
+            1.0 + 0.02 * i as f64
+        } else {
+            0.003 * (i as f64 - j as f64)
+        }
+    });
+    Calibration::new(
+        gain,
+        Wrench6::from_parts([0.3, -0.2, 0.5], [0.01, -0.02, 0.005]),
+        Some(24.0),
+    )
 }
 
 /// As configured: the gain row by row, [force; torque].
@@ -151,18 +161,30 @@ fn corrected_readings_give_the_estimates_of_right_ones() {
     let corrected = run(setup(|config| calibrate(config, &change)), &wrong);
     let uncorrected = run(setup(|_| {}), &wrong);
     let mut off: f64 = 0.0;
-    for column in ["torque/l_shoulder_pitch", "torque/l_elbow", "contact/hand/fz", "torque_std/l_elbow"] {
-        for ((right, corrected), uncorrected) in right[column].iter().zip(&corrected[column]).zip(&uncorrected[column]) {
+    for column in [
+        "torque/l_shoulder_pitch",
+        "torque/l_elbow",
+        "contact/hand/fz",
+        "torque_std/l_elbow",
+    ] {
+        for ((right, corrected), uncorrected) in right[column].iter().zip(&corrected[column]).zip(&uncorrected[column])
+        {
             let number = |s: &String| s.parse::<f64>().unwrap();
-            assert!((number(right) - number(corrected)).abs() < 1e-9, "{column}: {right} {corrected}");
+            assert!(
+                (number(right) - number(corrected)).abs() < 1e-9,
+                "{column}: {right} {corrected}"
+            );
             off = off.max((number(right) - number(uncorrected)).abs());
         }
     }
     assert!(off > 1.0, "{off}");
     // Not a bit changes where there is nothing to correct, temperatures or not.
-    let with_temperatures: String = log.lines().zip(wrong.lines()).fold(String::new(), |text, (line, other)| {
-        text + line + "," + other.rsplit_once(',').unwrap().1 + "\n"
-    });
+    let with_temperatures: String = log
+        .lines()
+        .zip(wrong.lines())
+        .fold(String::new(), |text, (line, other)| {
+            text + line + "," + other.rsplit_once(',').unwrap().1 + "\n"
+        });
     assert_eq!(run(setup(|_| {}), &with_temperatures), right);
 }
 

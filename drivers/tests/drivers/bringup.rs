@@ -1,7 +1,7 @@
 //! Bring-up of each family against its own board: what is sent, what a loss does, silence, restart, refusal, stop.
 
 use crate::rig::{Rig, decode, frame, listener, options, spec};
-use proprio_drivers::{Mode, Refusal, SpecError, State};
+use proprio_drivers::{Mode, Options, Refusal, SpecError, State};
 use proprio_topics::{Counter, Imu, JointState, Nanos, Quality, Reading, Wrench};
 
 const SCALES: &str = "full_scale_n = [1804, 1804, 1804]\nfull_scale_nm = [31, 31, 31]\n";
@@ -446,6 +446,11 @@ fn configurations_that_can_not_work_are_named() {
         ),
         "full_scale_n = 0 must be above 0 and at most 65535"
     );
+    for keys in ["full_scale_n = [1, 2]", "full_scale_n = [1, 2, 3, 4]"] {
+        let table: toml::Table = keys.parse().expect("test keys are TOML");
+        let error = format!("{:?}", Options::deserialize("icub_strain", table));
+        assert!(error.contains("expected 3 numbers"), "{keys}: {error}");
+    }
     assert!(
         error("icub_imu", "quantities = [\"status\"]", 1, &[])
             .starts_with("quantities must be a list with at least one")

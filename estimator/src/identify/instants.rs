@@ -227,7 +227,10 @@ impl Recording {
         }
         recording.report = reader.report().clone();
         recording.declared.iter_mut().for_each(|d| d.sort_by_key(|(t, _)| *t));
-        recording.temperatures.iter_mut().for_each(|t| t.sort_by_key(|(t, _)| *t));
+        recording
+            .temperatures
+            .iter_mut()
+            .for_each(|t| t.sort_by_key(|(t, _)| *t));
         defects::settle(&mut recording, setup, repeats);
         recording.span();
         for channel in &recording.channels {

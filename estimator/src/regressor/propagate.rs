@@ -535,9 +535,10 @@ impl Part {
                 }
                 let lanes: Vec<Lanes> = lanes.flat_map(lanes_of).collect();
                 let own = std::mem::take(&mut calibration);
-                let kind = block.calibrations.iter().find(
-                    |(sensor, _)| matches!(what, Member::Sensor(own, _) if own == *sensor),
-                );
+                let kind = block
+                    .calibrations
+                    .iter()
+                    .find(|(sensor, _)| matches!(what, Member::Sensor(own, _) if own == *sensor));
                 pieces.push(Piece {
                     what,
                     place: place_of(link).unwrap_or(0),
