@@ -471,7 +471,7 @@ fn configurations_that_can_not_work_are_named() {
     for driver in proprio_drivers::DRIVERS {
         let table: toml::Table = "full_scale = 3".parse().unwrap();
         assert!(
-            proprio_drivers::Options::deserialize(driver, table).is_err(),
+            Options::deserialize(driver, table).is_err(),
             "{driver}"
         );
     }
