@@ -60,6 +60,7 @@ const LANES: usize = 4;
 
 #[inline(always)]
 fn dot(a: &[f64], b: &[f64]) -> f64 {
+    debug_assert_eq!(a.len(), b.len());
     let ((a8, a), (b8, b)) = (a.as_chunks::<{ 2 * LANES }>(), b.as_chunks::<{ 2 * LANES }>());
     let mut sum = [0.0; 2 * LANES];
     for (x, y) in a8.iter().zip(b8) {

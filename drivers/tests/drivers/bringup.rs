@@ -470,9 +470,6 @@ fn configurations_that_can_not_work_are_named() {
     // Unknown keys are errors.
     for driver in proprio_drivers::DRIVERS {
         let table: toml::Table = "full_scale = 3".parse().unwrap();
-        assert!(
-            Options::deserialize(driver, table).is_err(),
-            "{driver}"
-        );
+        assert!(Options::deserialize(driver, table).is_err(), "{driver}");
     }
 }

@@ -539,14 +539,14 @@ impl<'a> RowMaker<'a> {
         for (row, sum) in b.iter_mut().enumerate() {
             let (links, offsets) = subtree.row(row).split_at(subtree.offset_column());
             for (values, link) in links.chunks_exact(WIDTH).zip(subtree.links()) {
-                *sum += dot(values, &self.cad[WIDTH * link..]);
+                *sum += dot(values, &self.cad[WIDTH * link..][..WIDTH]);
                 if let Ok(place) = self.layout.links.binary_search(link) {
-                    *sum += dot(values, &d[WIDTH * place..]);
+                    *sum += dot(values, &d[WIDTH * place..][..WIDTH]);
                 }
             }
             for (values, sensor) in offsets.chunks_exact(6).zip(subtree.sensors()) {
                 if let Ok(place) = self.layout.sensors.binary_search(&sensor) {
-                    *sum += dot(values, &session[6 * place..]);
+                    *sum += dot(values, &session[6 * place..][..6]);
                 }
             }
             *sum -= subtree.measured()[row];
