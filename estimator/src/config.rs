@@ -345,7 +345,7 @@ pub enum TorqueSide {
     #[default]
     Link,
     /// At the motor, by its current, times torque constant and gear ratio: so the rotor's inertia is in it, and is identified, one number per joint (each is taken to have a motor
-    /// of its own). As torque of the joint \[Nm; N if it slides\], like the other.
+    /// of its own). As torque of the joint \[Nm; N if it slides\], like the other. Where torques are no input of identification, they are compared as they are.
     Motor,
 }
 

@@ -17,7 +17,8 @@
 //! | `[[sensor]]` | `name` of its channel; `offset_n`, `offset_nm`: what it reads with no load, at instant `known_ns`; `std_n`, `std_nm`; `drift_n`, `drift_nm`: standard deviations of how far it wanders in one second, in s^-½ |
 //! | | if its calibration was identified, too ([`crate::calibration`]; these win over estimator.toml's): `gain`, 36 numbers row by row, rows and columns `fx fy fz tx ty tz`; `temperature_n_per_k`, `temperature_nm_per_k`, `reference_celsius`; |
 //! | | and where they are uncertain: `gain_std`, 36 numbers or the 6 of a diagonal: of `E`, with the true wrench (1 + E) times the one read; `temperature_std_n_per_k`, `temperature_std_nm_per_k` |
-//! | `[[joint]]` | `name`, `coulomb_nm`, `viscous_nms`, `offset_nm`: friction of a joint whose torque was measured (N and Ns if it slides) |
+//! | `[[joint]]` | `name`, `coulomb_nm`, `viscous_nms`, `offset_nm`: friction of a joint whose torque was measured (N and Ns if it slides); |
+//! | | of one whose motor's torque was: `rotor_inertia_kgm2`, inertia of the rotor times the square of the gear ratio (kg if the joint slides), `rotor_inertia_std_kgm2` |
 //! | `[correlation]` | `root`: see below |
 //!
 //! Ten parameters are `[m, h_x, h_y, h_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz]` \[kg, kg m, kg m^2\] about the origin and in the axes of the link
@@ -137,22 +138,28 @@ pub struct Calibrated {
     pub kind: Kind,
 }
 
-/// Friction of a joint, and what its torque sensor reads with no load: measured torque = torque + coulomb tanh(dq / v0) + viscous dq + offset.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
+/// Friction of a joint, and what its torque sensor reads with no load: measured torque = torque + coulomb tanh(dq / v0) + viscous dq + offset (+ rotor inertia ddq).
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Friction {
     /// The joint.
-    #[serde(rename = "name")]
     pub joint: String,
     /// Coulomb friction \[Nm or N\].
-    #[serde(rename = "coulomb_nm")]
     pub coulomb: f64,
     /// Viscous friction \[Nm s/rad or N s/m\].
-    #[serde(rename = "viscous_nms")]
     pub viscous: f64,
     /// What is measured without load and motion \[Nm or N\].
-    #[serde(rename = "offset_nm")]
     pub offset: f64,
+    /// The rotor of its motor, where that motor's torque was measured.
+    pub rotor: Option<Rotor>,
+}
+
+/// Inertia of a motor's rotor, reflected to its joint: times the square of the gear ratio.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rotor {
+    /// The inertia \[kg m^2; kg if the joint slides\].
+    pub inertia: f64,
+    /// Its standard deviation.
+    pub deviation: f64,
 }
 
 /// Why parameters can not be read, written or used.
@@ -603,6 +610,10 @@ impl Parameters {
             let at = || format!("joint {}", joint.joint);
             new_name(&at())?;
             finite(&at, &[joint.coulomb, joint.viscous, joint.offset])?;
+            if let Some(rotor) = joint.rotor {
+                // Of a negative number the root is none.
+                finite(&at, &[rotor.inertia, rotor.deviation.sqrt()])?;
+            }
         }
         // Of a negative number the root is none.
         let roots: Vec<f64> = self.deviations.iter().map(|d| d.sqrt()).collect();
@@ -791,6 +802,12 @@ impl fmt::Display for Parameters {
                 joint.viscous,
                 joint.offset
             )?;
+            if let Some(Rotor { inertia, deviation }) = joint.rotor {
+                writeln!(
+                    f,
+                    "rotor_inertia_kgm2 = {inertia:?}\nrotor_inertia_std_kgm2 = {deviation:?}"
+                )?;
+            }
         }
         f.write_str("\n[correlation]\nroot = [\n")?;
         let mut numbers = self.correlation.as_slice();
@@ -824,7 +841,7 @@ struct File {
     #[serde(default)]
     sensor: Vec<FileSensor>,
     #[serde(default)]
-    joint: Vec<Friction>,
+    joint: Vec<FileJoint>,
     // The last of the file: without it the rest is cut off.
     correlation: Correlation,
 }
@@ -916,6 +933,39 @@ impl FileSensor {
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
+struct FileJoint {
+    name: String,
+    coulomb_nm: f64,
+    viscous_nms: f64,
+    offset_nm: f64,
+    rotor_inertia_kgm2: Option<f64>,
+    rotor_inertia_std_kgm2: Option<f64>,
+}
+
+impl FileJoint {
+    fn friction(self) -> Result<Friction, ParametersError> {
+        let rotor = match (self.rotor_inertia_kgm2, self.rotor_inertia_std_kgm2) {
+            (Some(inertia), Some(deviation)) => Some(Rotor { inertia, deviation }),
+            (None, None) => None,
+            _ => {
+                return Err(ParametersError::Damaged(format!(
+                    "joint {}: rotor_inertia_kgm2 and rotor_inertia_std_kgm2 go together",
+                    self.name
+                )));
+            }
+        };
+        Ok(Friction {
+            joint: self.name,
+            coulomb: self.coulomb_nm,
+            viscous: self.viscous_nms,
+            offset: self.offset_nm,
+            rotor,
+        })
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
 struct Correlation {
     root: Vec<Vec<i32>>,
 }
@@ -994,7 +1044,11 @@ impl File {
                     known: sensor.known,
                 })
                 .collect(),
-            joints: self.joint,
+            joints: self
+                .joint
+                .into_iter()
+                .map(FileJoint::friction)
+                .collect::<Result<_, _>>()?,
             correlation: self.correlation.root.concat(),
             deviations,
         };

@@ -13,7 +13,7 @@ use proprio_estimator::dynamics::{
 use proprio_estimator::model::{Frame, Model, ModelError};
 use proprio_estimator::offline;
 use proprio_estimator::parameters::{
-    Calibrated, Friction, Offset, Parameters, ParametersError, Provenance, Span, cad_root,
+    Calibrated, Friction, Offset, Parameters, ParametersError, Provenance, Rotor, Span, cad_root,
 };
 use proprio_estimator::regressor::{Covariance, EstimateRows, Propagation};
 use proprio_estimator::setup::Setup;
@@ -470,6 +470,10 @@ fn identified(setup: &Setup, random: &mut Random) -> Parameters {
             coulomb: 0.4,
             viscous: 1e-3,
             offset: -0.25,
+            rotor: Some(Rotor {
+                inertia: 0.07,
+                deviation: 2e-3,
+            }),
         }])
         .unwrap();
     parameters
@@ -643,6 +647,15 @@ fn a_file_reads_back_as_what_was_written() {
         1,
         "nothing else is left there"
     );
+    // A file from before rotors were identified.
+    let older: String = text
+        .lines()
+        .filter(|line| !line.starts_with("rotor_inertia"))
+        .flat_map(|line| [line, "\n"])
+        .collect();
+    assert!(older.len() < text.len());
+    let older = Parameters::parse(&older).unwrap();
+    assert_eq!((older.friction()[0].rotor, older.friction()[0].coulomb), (None, 0.4));
     // Nothing identified is a file too.
     let nothing = Parameters::new(&setup, Provenance::default());
     assert_eq!(Parameters::parse(&nothing.to_string()).unwrap(), nothing);
@@ -891,6 +904,10 @@ fn a_file_that_is_cut_or_changed_is_refused_with_a_sentence() {
             "joint l_elbow: a number is not finite",
         ),
         (
+            text.replacen("rotor_inertia_std_kgm2 = 0.002", "", 1),
+            "joint l_elbow: rotor_inertia_kgm2 and rotor_inertia_std_kgm2 go together",
+        ),
+        (
             text.replacen("identified = [", "identified = [-", 1),
             "no body has these ten parameters: its mass is -",
         ),
@@ -1037,8 +1054,17 @@ fn what_can_not_be_is_not_taken() {
     let friction = Friction {
         joint: "l_elbow".into(),
         coulomb: f64::NAN,
-        viscous: 0.0,
-        offset: 0.0,
+        ..Friction::default()
+    };
+    assert!(parameters.set_friction(&[friction]).is_err());
+    let rotor = Rotor {
+        inertia: 0.1,
+        deviation: -1.0,
+    };
+    let friction = Friction {
+        joint: "l_elbow".into(),
+        rotor: Some(rotor),
+        ..Friction::default()
     };
     assert!(parameters.set_friction(&[friction]).is_err());
     assert_eq!(parameters, before);

@@ -3,8 +3,8 @@
 use proprio_estimator::identify::instants::{Signal, TimeOffset};
 use proprio_estimator::identify::{
     BaseParameterOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding, FrictionOutcome, JointOutcome,
-    LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, SensorOutcome, Severity, Spectrum, Three,
-    TwoRouteOutcome, Verdict, WeakDirection,
+    LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, RotorOutcome, SensorOutcome, Severity, Spectrum,
+    Three, TwoRouteOutcome, Verdict, WeakDirection,
 };
 use proprio_estimator::spatial::RigidInertia;
 use proprio_topics::Nanos;
@@ -149,7 +149,7 @@ pub(crate) fn outcome() -> Outcome {
         verdict: Verdict::Identified,
         links: bodies.collect(),
         covariance: CovarianceRoot { columns: vec![], root: Default::default() },
-        rotors: vec![],
+        rotors: vec![RotorOutcome { joint: "r_knee".into(), inertia: 0.052, deviation: 0.003 }],
         tau: 0.58,
         shrink: 1.0,
         unknowns: 40,
@@ -198,6 +198,7 @@ pub(crate) fn nothing() -> Outcome {
     outcome.weakest.clear();
     outcome.base_parameters.clear();
     outcome.channels.clear();
+    outcome.rotors.clear();
     for log in &mut outcome.logs {
         log.used = 0;
         log.relative_error = three(f64::NAN, f64::NAN, f64::NAN);

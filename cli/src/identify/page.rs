@@ -250,14 +250,6 @@ fn curves(outcome: &Outcome) -> Vec<String> {
             ));
         }
         if !body.is_empty() {
-            let note = if log.joints.is_empty() && !log.two_route.is_empty() {
-                "No joint torque was measured: “measured” is the torque from the other side's F/T sensor."
-            } else {
-                ""
-            };
-            if !note.is_empty() {
-                body.insert(0, report::paragraph(note));
-            }
             sections.push(report::section(
                 &format!("Predicted and measured: {} ({})", log.file, role_words(log.role)),
                 &body,
@@ -268,7 +260,7 @@ fn curves(outcome: &Outcome) -> Vec<String> {
 }
 
 fn is_torque(curve: &Curve, log: &LogOutcome) -> bool {
-    log.joints.iter().any(|j| j.name == curve.name) || log.two_route.iter().any(|t| t.joint == curve.name)
+    log.joints.iter().any(|j| j.name == curve.name)
 }
 
 fn joint_table(log: &LogOutcome) -> Vec<String> {
@@ -709,6 +701,16 @@ fn sessions(outcome: &Outcome) -> Option<String> {
         }
     }
     body.push(times.html());
+    let mut rotors = Table::new(
+        "Inertia of the motors' rotors, reflected to the joints: measured torque = torque + rotor inertia · acceleration + friction; the robot's, the same in all logs",
+        &["joint", "rotor inertia [kg m²]"],
+    );
+    for r in &outcome.rotors {
+        rotors.row(vec![r.joint.as_str().into(), Cell::Uncertain(r.inertia, r.deviation)]);
+    }
+    if !rotors.is_empty() {
+        body.push(rotors.html());
+    }
     for log in &outcome.logs {
         let mut offsets = Table::new(
             &format!("{}: offsets of the F/T sensors: what they read with no load", log.file),

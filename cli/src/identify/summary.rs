@@ -23,6 +23,7 @@
 //! | `findings` | what is wrong, in words: {`log` or `null`, `severity`: `note`, `warning`, `refusal`; `code`: one word; `subject`: a channel, joint or link; `text`} |
 //! | `links` | {`name`, `seen`, `kept`: which share of the change from CAD was kept after the held-out check, `significance`, `cad`, `identified`, `deviation`: ten numbers each, m h_x h_y h_z I_xx I_xy I_xz I_yy I_yz I_zz about the link's origin} |
 //! | `base_parameters` | {`expression`, `unit`, `cad`, `identified`, `deviation`} |
+//! | `rotor_inertia` | {joint: {`kgm2`: of the rotor, times the square of the gear ratio (kg if the joint slides), `deviation`}}, of joints whose motors' torques were measured |
 //! | `channels` | noise of each measured number: {`name`, `unit`, `deviation`, `autocorrelation_s`, `drift`: `unit` per square root of second} |
 //!
 //! A log:
@@ -89,6 +90,9 @@ pub(crate) fn summary(outcome: &Outcome, advice: &Advice) -> Json {
         .iter()
         .map(|c| json!({ "name": c.name, "unit": c.unit, "deviation": c.deviation, "autocorrelation_s": c.autocorrelation_seconds, "drift": c.drift }))
         .collect();
+    let rotors = object(&outcome.rotors, |r| {
+        (&r.joint, json!({ "kgm2": r.inertia, "deviation": r.deviation }))
+    });
     let c = &outcome.consistency;
     json!({
         "schema": 1, "robot": outcome.robot, "version": env!("CARGO_PKG_VERSION"),
@@ -100,7 +104,7 @@ pub(crate) fn summary(outcome: &Outcome, advice: &Advice) -> Json {
         "condition": outcome.condition, "singular_values": outcome.singular_values,
         "weakest": weakest, "confused": outcome.confused, "time_offsets": time_offsets,
         "consistency": { "feasible": c.feasible, "deviations": c.deviations, "links": c.links, "text": c.text },
-        "findings": found, "links": links, "base_parameters": base, "channels": channels,
+        "findings": found, "links": links, "base_parameters": base, "rotor_inertia": rotors, "channels": channels,
     })
 }
 
@@ -237,6 +241,7 @@ mod tests {
         objects.extend([
             &json["logs"][0]["offsets"]["r_leg_ft_sensor"],
             &json["logs"][0]["friction"]["r_knee"],
+            &json["rotor_inertia"]["r_knee"],
             &json["logs"][0]["joints"]["r_knee"],
         ]);
         for object in objects {

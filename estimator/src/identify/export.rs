@@ -1,13 +1,13 @@
 //! What identification gives, as what the estimator starts from: an [`Outcome`] to [`Parameters`].
 
 use super::outcome::{LogOutcome, Outcome, Role};
-use crate::parameters::{Friction, Offset, Parameters, ParametersError, Provenance, Span};
+use crate::parameters::{Friction, Offset, Parameters, ParametersError, Provenance, Rotor, Span};
 use crate::regressor::identifiable::Column;
 use crate::setup::{Setup, Use};
 use crate::spatial::Wrench;
 use nalgebra::DMatrix;
 
-/// The identified parameters of `setup`'s robot: links that the logs reach, with their covariance; offsets and friction as they were at the end of the last training log in which the sensor, or the joint's torque, was read. `program` is the
+/// The identified parameters of `setup`'s robot: links that the logs reach, with their covariance; offsets and friction as they were at the end of the last training log in which the sensor, or the joint's torque, was read; rotor inertias. `program` is the
 /// name and version of what identified them.
 ///
 /// # Errors
@@ -75,8 +75,13 @@ pub fn parameters(outcome: &Outcome, setup: &Setup, program: &str) -> Result<Par
 
     // Of each joint from the last log that has it.
     let mut friction: Vec<Friction> = Vec::new();
-    for found in trained().rev().flat_map(frictions) {
+    for mut found in trained().rev().flat_map(frictions) {
         if !friction.iter().any(|f| f.joint == found.joint) {
+            let own = outcome.rotors.iter().find(|rotor| rotor.joint == found.joint);
+            found.rotor = own.map(|rotor| Rotor {
+                inertia: rotor.inertia,
+                deviation: rotor.deviation,
+            });
             friction.push(found);
         }
     }
@@ -97,6 +102,7 @@ fn frictions(log: &LogOutcome) -> Vec<Friction> {
             coulomb: f.coulomb_nm,
             viscous: f.viscous,
             offset: f.offset_nm,
+            rotor: None,
         })
         .collect()
 }
@@ -105,7 +111,9 @@ fn frictions(log: &LogOutcome) -> Vec<Friction> {
 mod tests {
     use super::*;
     use crate::config::Config;
-    use crate::identify::{Consistency, CovarianceRoot, FrictionOutcome, LinkOutcome, OffsetOutcome, Three, Verdict};
+    use crate::identify::{
+        Consistency, CovarianceRoot, FrictionOutcome, LinkOutcome, OffsetOutcome, RotorOutcome, Three, Verdict,
+    };
     use crate::spatial::RigidInertia;
     use proprio_topics::Nanos;
     use std::collections::BTreeMap;
@@ -276,6 +284,11 @@ mod tests {
         };
         outcome.logs[0].friction = vec![friction("l_elbow", 0.1), friction("l_wrist_yaw", 0.2)];
         later.friction = vec![friction("l_elbow", 0.3)];
+        outcome.rotors = vec![RotorOutcome {
+            joint: "l_elbow".into(),
+            inertia: 0.25,
+            deviation: 0.01,
+        }];
         outcome.logs.push(later);
         let given = parameters(&outcome, &setup, "a program 1").unwrap();
         let [offset] = given.offsets() else {
@@ -283,6 +296,15 @@ mod tests {
         };
         assert_eq!(offset.reading, Wrench::from_parts([1.0, 2.0, 3.0], [4.0, 5.0, 6.0]));
         assert_eq!(offset.known, Nanos(1_000_000_001));
+        let rotors: Vec<Option<Rotor>> = given.friction().iter().map(|f| f.rotor).collect();
+        let rotor = Rotor {
+            inertia: 0.25,
+            deviation: 0.01,
+        };
+        assert!(
+            rotors.contains(&Some(rotor)) && rotors.contains(&None),
+            "each joint its own: {rotors:?}"
+        );
         let coulomb: BTreeMap<&str, f64> = given.friction().iter().map(|f| (f.joint.as_str(), f.coulomb)).collect();
         assert_eq!(coulomb, BTreeMap::from([("l_elbow", 0.3), ("l_wrist_yaw", 0.2)]));
     }
