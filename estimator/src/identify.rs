@@ -3,6 +3,7 @@
 //! # The way of the data
 //! ```text
 //! log -> Recording, Instants: all channels at common instants, derivatives, what is wrong      instants
+//!     -> joint torques that are none (sign, units, dead) taken out                             torques
 //!     -> rows of each instant: A d + G s = r + N e                                             rows
 //!     -> offsets and friction s eliminated, by a filter on all columns at once                 session, passes
 //!     -> [R | z], what all logs tell of d = phi - phi_CAD                                      information
@@ -42,6 +43,7 @@ pub mod prior;
 mod rows;
 mod session;
 mod shaking;
+mod torques;
 
 pub use batch::{IdentifyError, Log, Options, Progress, identify};
 pub use export::parameters;

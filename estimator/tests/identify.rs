@@ -145,6 +145,14 @@ fn kuka_one_predicts_the_other() {
             &TORQUE,
         );
         let error = &outcome.logs[1].relative_error;
+        let codes = ["wrong_sign", "wrong_units", "frozen", "outliers", "time_offset"];
+        let found = outcome
+            .logs
+            .iter()
+            .flat_map(|log| &log.findings)
+            .chain(&outcome.findings);
+        let found: Vec<_> = found.filter(|f| codes.contains(&f.code)).collect();
+        assert!(found.is_empty(), "the torques are as they should be: {found:?}");
         assert!(error.identified < 0.024, "{error:?}");
         assert!((0.055..0.075).contains(&error.cad_fitted), "{error:?}");
         nothing_is_suspected(&outcome);
@@ -892,6 +900,184 @@ fn rotors_are_identified_from_torques_of_motors() {
                 assert!(off.abs() < 4.0 * deviation, "{joint:?} of {friction}");
             }
         }
+    }
+}
+
+/// A rotor that would have to be negative is no rotor: it is taken as none, and said.
+#[test]
+fn a_negative_rotor_is_named() {
+    let mut setup = arm_with(&[]);
+    setup.torque_side = TorqueSide::Motor;
+    let truth = real(&setup, 5);
+    let log = simulate_torques(&setup, &truth, 12.0, 0.05, 5, |_, _| true);
+    let rotors = [0.3, 0.2, 0.1, -0.1, 0.05, 0.0];
+    let outcome = run(
+        &setup,
+        &[("log", Role::Train, &at_the_motors(&log, &rotors, 0.5))],
+        &TORQUE,
+    );
+    let of = |joint: &str| outcome.rotors.iter().find(|r| r.joint == joint).expect("a rotor");
+    assert_eq!(of("j4").inertia, 0.0);
+    // One that is not there is not negative either, but by chance.
+    let none = of("j6");
+    assert!((0.0..3.0 * none.deviation).contains(&none.inertia), "{none:?}");
+    let named: Vec<&str> = outcome
+        .findings
+        .iter()
+        .filter(|f| f.code == "negative_rotor")
+        .map(|f| f.subject.as_str())
+        .collect();
+    assert_eq!(named, ["j4"]);
+}
+
+/// F/T sensor and motors' torques together: the joints before the sensor are identified from their torques, the links beyond it from both.
+#[test]
+fn rotors_are_identified_beside_a_force_torque_sensor() {
+    let mut setup = arm();
+    setup.torque_side = TorqueSide::Motor;
+    let truth = real(&setup, 8);
+    let log = |seed| {
+        let wrenches = simulate(&setup, &truth, 15.0, 0.01, seed);
+        let torques = simulate_torques(&setup, &truth, 15.0, 0.05, seed, |_, _| true);
+        let header: Vec<&str> = torques.lines().next().expect("a header").split(',').collect();
+        let is_torque: Vec<bool> = header.iter().map(|name| name.ends_with("/torque")).collect();
+        let rows = wrenches.lines().zip(torques.lines()).map(|(row, torques)| {
+            let own = torques.split(',').zip(&is_torque).filter(|(_, is)| **is);
+            own.fold(row.to_owned(), |row, (cell, _)| row + "," + cell) + "\n"
+        });
+        at_the_motors(&rows.collect::<String>(), &ROTORS, 0.8)
+    };
+    let both = [IdentificationInput::Wrench, IdentificationInput::Torque];
+    let outcome = run(&setup, &[("log", Role::Train, &log(8))], &both);
+    assert_eq!(outcome.verdict, Verdict::Identified);
+    assert_eq!(outcome.rotors.len(), 6);
+    for (rotor, truth) in outcome.rotors.iter().zip(ROTORS) {
+        let error = rotor.inertia - truth;
+        assert!(error.abs() < 3.0 * rotor.deviation, "{rotor:?}, not {truth}");
+    }
+    let (cad, own, inside, _) = torque_errors(&setup, &truth, &outcome, 78);
+    println!("torques of the links: {cad:.4} -> {own:.4} Nm, covered {inside:.3}");
+    assert!(5.0 * own < cad && inside > 0.85, "{cad} {own} {inside}");
+}
+
+/// A column of a log, changed row by row.
+fn change_rows(log: &str, column: &str, mut by: impl FnMut(usize, f64) -> f64) -> String {
+    let mut row = 0;
+    let by = std::cell::RefCell::new(&mut by);
+    let row = std::cell::RefCell::new(&mut row);
+    change(log, column, |x| {
+        let (mut row, mut by) = (row.borrow_mut(), by.borrow_mut());
+        **row += 1;
+        by(**row - 1, x)
+    })
+}
+
+/// Joint torques with each of the faults that torque channels have: named, and what is wrong left out, so that the rest is identified as well as without it.
+#[test]
+fn torques_that_can_not_be_are_named_and_left_out() {
+    let setup = arm_with(&[]);
+    let truth = real(&setup, 9);
+    let good = simulate_torques(&setup, &truth, 12.0, 0.05, 9, |_, _| true);
+    let codes = [
+        "wrong_sign",
+        "wrong_units",
+        "frozen",
+        "outliers",
+        "time_offset",
+        "negative_rotor",
+    ];
+    let named = |log: &str| {
+        let outcome = run(&setup, &[("log", Role::Train, log)], &TORQUE);
+        let found = outcome.findings.iter().chain(&outcome.logs[0].findings);
+        let found = found.filter(|f| codes.contains(&f.code));
+        let names: Vec<String> = found.map(|f| format!("{} {}", f.code, f.subject)).collect();
+        (outcome, names)
+    };
+    let (outcome, names) = named(&good);
+    assert!(names.is_empty(), "{names:?} in a log in which nothing is wrong");
+    let (cad, best, ..) = torque_errors(&setup, &truth, &outcome, 79);
+    let torque = |joint: &str| format!("joint/{joint}/torque");
+    let cases = [
+        (change(&good, &torque("j3"), |x| -x), "wrong_sign joint/j3/torque"),
+        (
+            change(&good, &torque("j2"), |x| 1000.0 * x),
+            "wrong_units joint/j2/torque",
+        ),
+        (
+            change_rows(&good, &torque("j4"), |i, _| 0.37 + 1e-3 * (i as f64 * 0.7).sin()),
+            "wrong_units joint/j4/torque",
+        ),
+        (change(&good, &torque("j4"), |_| 0.37), "frozen joint/j4/torque"),
+        (
+            {
+                let mut held = 0.0;
+                change_rows(&good, &torque("j3"), |i, x| {
+                    if !(400..700).contains(&i) {
+                        held = x;
+                    }
+                    held
+                })
+            },
+            "frozen joint/j3/torque",
+        ),
+        (
+            change_rows(&good, &torque("j5"), |i, x| if i % 190 == 77 { x + 40.0 } else { x }),
+            "outliers joint/j5",
+        ),
+    ];
+    for (log, expected) in &cases {
+        let (outcome, names) = named(log);
+        assert_eq!(names, [*expected]);
+        assert_eq!(outcome.verdict, Verdict::Identified, "{expected}");
+        let (_, own, inside, _) = torque_errors(&setup, &truth, &outcome, 79);
+        println!("{expected}: {cad:.4} -> {own:.4} Nm, {best:.4} without it, covered {inside:.3}");
+        assert!(3.0 * own < cad && inside > 0.8, "{expected}: {cad} {own} {inside}");
+    }
+    // Late by three rows.
+    let mut late = good.clone();
+    for joint in ARM_JOINTS {
+        let mut before = std::collections::VecDeque::new();
+        late = change_rows(&late, &torque(joint), |_, x| {
+            before.push_back(x);
+            if before.len() > 4 {
+                before.pop_front();
+            }
+            if before.len() == 4 { before[0] } else { x }
+        });
+    }
+    let (outcome, names) = named(&late);
+    assert_eq!(names, ["time_offset joint torques"]);
+    let finding = outcome.findings.iter().find(|f| f.code == "time_offset").expect("it");
+    println!("{}", finding.text);
+    let words: Vec<&str> = finding.text.split(' ').collect();
+    let at = words.iter().position(|word| *word == "stamped").expect("how late");
+    let late: f64 = words[at + 1].parse().expect("milliseconds");
+    assert!(
+        (25.0..35.0).contains(&late) && words[at + 3] == "behind",
+        "{}",
+        finding.text
+    );
+}
+
+/// Where links stay as in CAD because nothing could be checked, rotors are what goes best with CAD, and as uncertain as it.
+#[test]
+fn rotors_beside_links_that_stay_as_in_cad_are_as_uncertain_as_these() {
+    let mut setup = arm_with(&[]);
+    setup.torque_side = TorqueSide::Motor;
+    let truth = real(&setup, 4);
+    let log = simulate_torques(&setup, &truth, 3.6, 0.05, 4, |_, _| true);
+    let log = at_the_motors(&log, &ROTORS, 0.5);
+    let rows = log.lines().skip(1).step_by(4);
+    let short: String = log.lines().take(1).chain(rows).flat_map(|line| [line, "\n"]).collect();
+    let outcome = run(&setup, &[("short", Role::Train, &short)], &TORQUE);
+    assert_eq!(outcome.verdict, Verdict::NoBetterThanCad);
+    assert!(outcome.links.iter().all(|link| link.identified == link.cad));
+    for (rotor, truth) in outcome.rotors.iter().zip(ROTORS) {
+        assert!(
+            (rotor.inertia - truth).abs() < 3.0 * rotor.deviation,
+            "{rotor:?}, not {truth}"
+        );
+        assert!(rotor.deviation > 1e-3, "{rotor:?}");
     }
 }
 

@@ -8,7 +8,7 @@ use super::outcome::{
 };
 use super::passes::{OFFSET_VARIANCE, Residuals, Told, leave, tell};
 use super::rows::{FRICTION, Further, Layout, RowMaker, Rows, WIDTH};
-use super::{AXES, dot};
+use super::{AXES, dot, torques};
 use crate::config::IdentificationInput;
 use crate::dynamics::Structure;
 use crate::regressor::identifiable::{
@@ -180,7 +180,8 @@ pub(super) fn outcome(
         narrow.clone()
     } else {
         let kept = per_column(layout, &identified.kept);
-        shrunk(&narrow, &cad_root(identified, &spread), &kept)
+        let (r, _) = identified.information.to_triangle();
+        shrunk(&narrow, &cad_root(layout, &r, &spread), &kept)
     };
     let svd = scaled.svd(false, true);
     let mut order: Vec<usize> = (0..svd.singular_values.len()).collect();
@@ -202,7 +203,10 @@ pub(super) fn outcome(
             prior_share: 1.0 / (1.0 + value * value),
         }
     });
-    let (base_parameters, confused, structural_rank) = base_parameters(setup, identified, &root, subspace.as_ref());
+    let (base_parameters, mut confused, structural_rank) = base_parameters(setup, identified, &root, subspace.as_ref());
+    let sums = confused_rotors(setup, identified, &spread);
+    let structural_rank = structural_rank.saturating_sub(sums.len());
+    confused.extend(sums);
     let mut findings: Vec<Finding> = identified
         .prior
         .floors()
@@ -216,6 +220,7 @@ pub(super) fn outcome(
         })
         .collect();
     findings.extend(joint_zeros(maker, training, identified));
+    findings.extend(torques::late(maker, training, identified));
     let consistency = feasibility(setup, identified);
     if consistency.feasible != Some(true) {
         findings.push(Finding {
@@ -264,6 +269,40 @@ pub(super) fn outcome(
         logs,
         findings,
     }
+}
+
+/// Rotors whose inertia only CAD tells from that of links: what the data say of one is what they say of some combination of the others and of the links' parameters.
+fn confused_rotors(setup: &Setup, identified: &Identified, spread: &[DMatrix<f64>]) -> Vec<String> {
+    let layout = &identified.layout;
+    let fitted = layout.beside_cad();
+    if fitted.is_empty() {
+        return Vec::new();
+    }
+    let (mut r, _) = identified.information.to_triangle();
+    for (place, spread) in spread.iter().enumerate() {
+        let columns = r.columns(WIDTH * place, WIDTH).into_owned() * spread;
+        r.columns_mut(WIDTH * place, WIDTH).copy_from(&columns);
+    }
+    let mut sums = Vec::new();
+    for &column in &fitted {
+        let Further::RotorInertia(dof) = layout.further[column - layout.inertial()];
+        let own = r.column(column).normalize();
+        let svd = r.clone().remove_column(column).svd(true, false);
+        let greatest = svd.singular_values.max();
+        let mut rest = own.clone();
+        for (axis, size) in svd.u.iter().flat_map(|u| u.column_iter()).zip(&svd.singular_values) {
+            if *size > 1e-10 * greatest {
+                rest.axpy(-axis.dot(&own), &axis, 1.0);
+            }
+        }
+        if rest.norm() < 1e-5 {
+            sums.push(format!(
+                "only as a sum: the inertia of the rotor of {0}, and that of the links that {0} turns, about its axis",
+                setup.model.dof_name(dof)
+            ));
+        }
+    }
+    sums
 }
 
 /// Inertias of the rotors whose motors' torques were measured.
@@ -341,8 +380,7 @@ fn of_links(identified: &Identified) -> DMatrix<f64> {
 
 /// A square root `F` of the covariance `F F^T` of CAD's errors: the prior's spread of each link, the prior of further unknowns that CAD says are zero; and of those of which it says nothing, which
 /// were fitted to the data with CAD's bodies ([`Identified::cad`]), what these errors and noise make of them.
-fn cad_root(identified: &Identified, spread: &[DMatrix<f64>]) -> DMatrix<f64> {
-    let layout = &identified.layout;
+fn cad_root(layout: &Layout, r: &DMatrix<f64>, spread: &[DMatrix<f64>]) -> DMatrix<f64> {
     let count = layout.unknowns();
     let fitted = layout.beside_cad();
     let given: Vec<usize> = (0..count).filter(|column| !fitted.contains(column)).collect();
@@ -358,7 +396,6 @@ fn cad_root(identified: &Identified, spread: &[DMatrix<f64>]) -> DMatrix<f64> {
     if fitted.is_empty() {
         return root;
     }
-    let (r, _) = identified.information.to_triangle();
     let own = r.select_columns(&fitted);
     let mut square = own.tr_mul(&own);
     for (place, &column) in fitted.iter().enumerate() {
@@ -920,7 +957,7 @@ fn session_deviations(
         instants: &instants[instants.len().saturating_sub(super::batch::LONG)..],
         breaks: &log.breaks,
     };
-    let told = tell(maker, piece, &identified.noise, &[], &[]);
+    let told = tell(maker, piece, &identified.noise);
     let moved = &told.slope * root;
     (0..told.covariance.nrows())
         .map(|i| (told.covariance[(i, i)].max(0.0) + moved.row(i).norm_squared()).sqrt())
@@ -1400,6 +1437,42 @@ mod tests {
                 "{kept}: the other link's"
             );
         }
+    }
+
+    /// CAD's bodies are off by the prior's spread; what was fitted with them is off by what they make of that, and by noise.
+    #[test]
+    fn what_is_fitted_with_cads_bodies_has_their_errors() {
+        let mut state = 0.7_f64;
+        let mut next = || {
+            state = (state * 1.9 + 0.37).fract();
+            state - 0.5
+        };
+        let layout = Layout {
+            links: vec![2],
+            further: vec![Further::RotorInertia(0), Further::RotorInertia(1)],
+            ..Layout::default()
+        };
+        let r = DMatrix::from_fn(12, 12, |_, _| 3.0 * next());
+        let spread = DMatrix::from_fn(10, 10, |_, _| next());
+        let found = squared(&cad_root(&layout, &r, std::slice::from_ref(&spread)));
+        let (links, rotors) = (r.columns(0, 10).into_owned(), r.columns(10, 2).into_owned());
+        let mut precision = rotors.transpose() * &rotors;
+        for (place, own) in layout.precision().into_iter().enumerate() {
+            precision[(place, place)] += own;
+        }
+        let inverse = precision.try_inverse().expect("known");
+        let slope = &inverse * rotors.transpose() * links;
+        let bodies = squared(&spread);
+        let close = |name: &str, found: DMatrix<f64>, expected: DMatrix<f64>| {
+            assert!(
+                (&found - &expected).amax() < 1e-9 * expected.amax(),
+                "{name}: {found} {expected}"
+            );
+        };
+        close("bodies", found.view((0, 0), (10, 10)).into_owned(), bodies.clone());
+        close("both", found.view((10, 0), (2, 10)).into_owned(), -(&slope * &bodies));
+        let own = &slope * &bodies * slope.transpose() + inverse;
+        close("rotors", found.view((10, 10), (2, 2)).into_owned(), own);
     }
 
     #[test]

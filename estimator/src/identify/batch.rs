@@ -15,11 +15,14 @@ use super::gate::{self, Load, UnitSet};
 use super::information::Information;
 use super::instants::{Break, Defect, Instant, Recording, Settings, Signal, TimeOffset};
 use super::outcome::{Finding, LeftOut, Outcome, Role, Severity, Verdict};
-use super::passes::{NoiseModel, OFFSET_VARIANCE, Piece, Residuals, Told, leave, noise_of, session_prior, tell};
+use super::passes::{
+    NoiseModel, OFFSET_VARIANCE, Piece, Residuals, Told, leave, noise_of, session_prior, tell, tell_angles,
+};
 use super::prior::{Fit, Posterior, Prior, PriorError};
 use super::rows::{Further, Groups, Layout, RowMaker, Rows};
 use super::session::Session;
 use super::shaking::Shaking;
+use super::torques;
 use crate::config::IdentificationInput;
 use crate::dynamics::{DynamicsError, Structure};
 use crate::model::JointKind;
@@ -171,7 +174,9 @@ pub fn identify(
     let mut prepared = Vec::new();
     for (number, log) in logs.into_iter().enumerate() {
         tell_progress(format!("reading {}", log.file), 0.2 * number as f64 / count);
-        prepared.push(prepare(setup, log)?);
+        let mut log = prepare(setup, log)?;
+        torques::check(setup, &mut log)?;
+        prepared.push(log);
     }
     let training = used(&prepared);
     if training.is_empty() {
@@ -473,7 +478,7 @@ pub(super) fn over<'a, T: Send>(
     out.into_iter().flatten().collect()
 }
 
-fn added(told: &[Told], unknowns: usize) -> Information {
+pub(super) fn added(told: &[Told], unknowns: usize) -> Information {
     let columns: Vec<usize> = (0..unknowns).collect();
     let mut sum = Information::new(unknowns);
     for part in told {
@@ -605,7 +610,7 @@ fn settle(
             let cad = if has_cad {
                 DVector::zeros(layout.unknowns())
             } else {
-                let told = over(maker, &sampled, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
+                let told = over(maker, &sampled, |maker, _, piece| tell(maker, piece, &noise));
                 beside_cad(&layout, &added(&told, layout.unknowns()))
             };
             noise_left(&noise, &cad)
@@ -614,7 +619,7 @@ fn settle(
     let mut round = 0;
     loop {
         progress(format!("round {}", round + 1), 0.2 + 0.5 * round as f64 / ROUNDS as f64);
-        let told = over(maker, &sampled, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
+        let told = over(maker, &sampled, |maker, _, piece| tell(maker, piece, &noise));
         let information = added(&told, layout.unknowns());
         let fit = posterior(&prior, &layout, &information)?.weigh()?;
         let next = noise_left(&noise, &fit.x);
@@ -848,7 +853,7 @@ fn fit(
     let Settled {
         prior, noise, change, ..
     } = settled;
-    let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
+    let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, &noise));
     let information = added(&told, layout.unknowns());
     let fit = posterior(&prior, &layout, &information)?.weigh()?;
     progress("held-out data".into(), 0.75);
@@ -856,7 +861,7 @@ fn fit(
     guard.findings.extend(unsettled(change));
     // Parameters have taken a part of the noise that they were fitted to, most of all where it is as slow as the motion.
     let noise = guard.noise;
-    let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, &noise, &[], &[]));
+    let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, &noise));
     let information = added(&told, layout.unknowns());
     let fit = posterior(&prior, &layout, &information)?.weigh()?;
     guard.findings.extend(negative_rotors(maker.setup(), &layout, &fit));
@@ -917,7 +922,7 @@ fn chunks<'a>(training: &[&'a Prepared], most: usize) -> Vec<Piece<'a>> {
 }
 
 /// All instants, or of long logs stretches spread over them, and others where these lack a channel: noise and the prior's weight need no more.
-fn sample<'a>(maker: &RowMaker<'_>, training: &[&'a Prepared]) -> Vec<Piece<'a>> {
+pub(super) fn sample<'a>(maker: &RowMaker<'_>, training: &[&'a Prepared]) -> Vec<Piece<'a>> {
     let total: usize = training.iter().map(|log| log.instants.len()).sum();
     if total <= SAMPLE {
         return chunks(training, usize::MAX);
@@ -1019,7 +1024,7 @@ fn held_out(
             noise: noise.clone(),
         });
     }
-    let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, noise, &[], &[]));
+    let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, noise));
     let columns: Vec<usize> = (0..layout.unknowns()).collect();
     let mut sets = Vec::new();
     for held in 0..pieces.len() {
@@ -1288,7 +1293,7 @@ pub(super) fn joint_zeros(maker: &RowMaker<'_>, training: &[&Prepared], identifi
         }
     }
     let told = over(maker, &parts, |maker, _, piece| {
-        tell(maker, piece, &identified.noise, &angles, identified.fit.x.as_slice())
+        tell_angles(maker, piece, &identified.noise, &angles, identified.fit.x.as_slice())
     });
     let p = layout.unknowns();
     let sum = added(&told, p + angles.len());

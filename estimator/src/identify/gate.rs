@@ -407,9 +407,7 @@ pub(super) fn load(
         }
         of_log.push(first..pieces.len());
     }
-    let told = over(maker, &pieces, |maker, _, piece| {
-        tell(maker, piece, noise, &[], &[]).information
-    });
+    let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, noise).information);
     let mut all = Normal::new(layout.unknowns());
     told.iter().for_each(|told| all.add(told));
     all.add_prior(prior, layout, tau);
@@ -502,7 +500,7 @@ pub(super) fn added(
         instants: &log.instants[first..first + count],
         breaks: &log.breaks,
     };
-    let told = tell(&mut maker, piece, noise, &[], &[]);
+    let told = tell(&mut maker, piece, noise);
     let layout = maker.layout();
     let mut some = Normal::new(layout.unknowns());
     some.add(&told.information);

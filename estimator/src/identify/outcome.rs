@@ -195,7 +195,8 @@ pub struct RotorOutcome {
     /// Reflected to the joint: the rotor's inertia times the square of the gear ratio \[kg m^2; kg if the joint slides\]. Never negative where its links were identified; where they stay as in CAD
     /// ([`LinkOutcome::kept`] is 0), the value that goes best with CAD's bodies.
     pub inertia: f64,
-    /// Its standard deviation. Large where the motion tells it from no link's inertia: of the first joint of a fixed base, which turns all links about one axis alone.
+    /// Its standard deviation. Where the motion does not tell it from the inertia of links ([`Outcome::confused`]: of the first joints of a fixed base, which turn all links about one axis
+    /// alone), it is as uncertain as that is in CAD.
     pub deviation: f64,
 }
 
@@ -241,7 +242,7 @@ pub struct Curve {
     pub unit: &'static str,
     /// Seconds since the log's first stamp.
     pub t: Vec<f64>,
-    /// What was measured. Of an F/T channel: with its (fitted) offset removed. Of a joint without torque sensor: from the other side's sensor.
+    /// What was measured. Of an F/T channel: with its (fitted) offset removed.
     pub measured: Vec<f64>,
     /// Predicted by CAD with fitted offsets and friction.
     pub cad_fitted: Vec<f64>,
@@ -312,7 +313,7 @@ pub struct LogOutcome {
     pub time_offsets: Vec<TimeOffset>,
     /// What is wrong with the log.
     pub findings: Vec<Finding>,
-    /// For plots: joint torques (measured, or from the other side), then F/T channels.
+    /// For plots: measured joint torques, then F/T channels.
     pub curves: Vec<Curve>,
     /// For plots: of the residuals.
     pub spectra: Vec<Spectrum>,

@@ -167,8 +167,13 @@ pub(super) struct Told {
     pub covariance: DMatrix<f64>,
 }
 
-/// Tells what a piece says of the parameters. With `angles`, further columns: what a constant error of these joints' positions would do.
-pub(super) fn tell(
+/// Tells what a piece says of the parameters.
+pub(super) fn tell(maker: &mut RowMaker<'_>, piece: Piece<'_>, noise: &NoiseModel) -> Told {
+    tell_with(maker, piece, noise, 0, &mut |_, _, _, _| ())
+}
+
+/// The same with further columns: what a constant error of these joints' positions would do.
+pub(super) fn tell_angles(
     maker: &mut RowMaker<'_>,
     piece: Piece<'_>,
     noise: &NoiseModel,
@@ -176,12 +181,38 @@ pub(super) fn tell(
     d: &[f64],
 ) -> Told {
     const ANGLE: f64 = 1e-5;
+    let mut turned = Rows::new(maker.layout());
+    let mut columns = |maker: &mut RowMaker<'_>, number: usize, rows: &Rows, slopes: &mut [f64]| {
+        for (place, &dof) in angles.iter().enumerate() {
+            let mut other = piece.instants[number].clone();
+            other.position[dof] += ANGLE;
+            if maker.make(&other, &mut turned).is_err() || turned.count != rows.count {
+                continue;
+            }
+            for row in 0..rows.count {
+                // The row holds at the true position, which is the measured one less the error. Offsets are in it with their own, small, change.
+                let right = |r: &Rows| r.r(row) - dot(r.a(row), d);
+                slopes[row * angles.len() + place] = -(right(rows) - right(&turned)) / ANGLE;
+            }
+        }
+    };
+    tell_with(maker, piece, noise, angles.len(), &mut columns)
+}
+
+/// The same with `width` further columns of whatever kind, after those of `d`; `columns` writes them, row by row, for an instant given by its number and for its rows.
+pub(super) fn tell_with(
+    maker: &mut RowMaker<'_>,
+    piece: Piece<'_>,
+    noise: &NoiseModel,
+    width: usize,
+    columns: &mut dyn FnMut(&mut RowMaker<'_>, usize, &Rows, &mut [f64]),
+) -> Told {
     let layout = maker.layout().clone();
     let links = layout.unknowns();
-    let p = links + angles.len();
+    let p = links + width;
     let variances = noise.inflated();
     let mut session = Session::new(&session_prior(&layout), p + 1);
-    let (mut rows, mut turned) = (Rows::new(&layout), Rows::new(&layout));
+    let mut rows = Rows::new(&layout);
     let mut information = Information::new(p);
     let mut panel = Panel::new(p, PANEL);
     let mut line = vec![0.0; p + 1];
@@ -192,28 +223,17 @@ pub(super) fn tell(
         if let Some(last) = last.replace(t) {
             pass_time(&mut session, noise.steps(&layout, (t - last).seconds()), &afresh);
         }
-        for instant in &piece.instants[range] {
-            if maker.make(instant, &mut rows).is_err() {
+        for number in range {
+            if maker.make(&piece.instants[number], &mut rows).is_err() {
                 continue;
             }
             slopes.clear();
-            slopes.resize(rows.count * angles.len(), 0.0);
-            for (place, &dof) in angles.iter().enumerate() {
-                let mut other = instant.clone();
-                other.position[dof] += ANGLE;
-                if maker.make(&other, &mut turned).is_err() || turned.count != rows.count {
-                    continue;
-                }
-                for row in 0..rows.count {
-                    // The row holds at the true position, which is the measured one less the error. Offsets are in it with their own, small, change.
-                    let right = |r: &Rows| r.r(row) - dot(r.a(row), d);
-                    slopes[row * angles.len() + place] = -(right(&rows) - right(&turned)) / ANGLE;
-                }
-            }
-            rows.whiten_with(&variances, &mut slopes, angles.len());
+            slopes.resize(rows.count * width, 0.0);
+            columns(maker, number, &rows, &mut slopes);
+            rows.whiten_with(&variances, &mut slopes, width);
             for row in 0..rows.count {
                 line[..links].copy_from_slice(rows.a(row));
-                line[links..p].copy_from_slice(&slopes[row * angles.len()..][..angles.len()]);
+                line[links..p].copy_from_slice(&slopes[row * width..][..width]);
                 line[p] = rows.r(row);
                 session.update(rows.g(row), &mut line);
                 if panel.rows() == panel.capacity() {
@@ -582,6 +602,45 @@ mod tests {
             noise = noise_of(&layout, std::slice::from_ref(&left), 0, 0.01, &least);
         }
         noise
+    }
+
+    /// Something undeclared on the foot acts on every joint between it and the base; something on the base on none. Where it is on a sub-tree nobody knows, so it may be beyond all joints there.
+    #[test]
+    fn torques_are_not_taken_where_something_undeclared_may_act_beyond() {
+        let setup = between_two_sensors();
+        let mut instants = readings(&setup, 3, &[0.1; 12], &[0.0; 12]);
+        for instant in &mut instants {
+            instant.active = crate::dynamics::ContactSet::default();
+            instant.torque = vec![1.0, 2.0];
+        }
+        let inputs = [IdentificationInput::Wrench, IdentificationInput::Torque];
+        let mut maker = RowMaker::survey(&setup, &inputs, instants.iter()).expect("rows");
+        let zero = vec![0.0; maker.layout().unknowns()];
+        let of_link = |name: &str| {
+            let link = (0..setup.model.link_count()).find(|&link| setup.model.link_name(link) == name);
+            link.and_then(|link| setup.structure.subtree_of(link))
+                .expect("a sub-tree")
+        };
+        let mut rows = Rows::new(maker.layout());
+        for (suspected, expected) in [
+            (None, 2),
+            (Some(of_link("base")), 2),
+            (Some(of_link("knee")), 0),
+            (Some(of_link("foot")), 0),
+            (Some(Instant::TORQUES), 0),
+        ] {
+            let mut instant = instants[1].clone();
+            suspected.into_iter().for_each(|unit| instant.suspected.insert(unit));
+            maker.make(&instant, &mut rows).expect("rows");
+            let mut own = Rows::new(maker.layout());
+            rows.copy_unit(Instant::TORQUES, &mut own);
+            assert_eq!(own.count, expected, "rows with {suspected:?}");
+            if suspected != Some(Instant::TORQUES) {
+                let errors = maker.torque_errors(&instant, &zero).expect("errors");
+                let there = errors.iter().filter(|x| x.is_finite()).count();
+                assert_eq!(there, expected, "compared with {suspected:?}");
+            }
+        }
     }
 
     const HIP_AND_FOOT: [f64; 12] = [0.02, 0.03, 0.015, 0.4, 0.3, 0.5, 0.004, 0.006, 0.003, 0.1, 0.08, 0.15];

@@ -16,7 +16,7 @@
 use super::instants::Instant;
 use super::{dot, factorise, forward};
 use crate::config::{IdentificationInput, TorqueSide};
-use crate::dynamics::{ContactSet, DynamicsError, JointState, Kinematics};
+use crate::dynamics::{DynamicsError, JointState, Kinematics};
 use crate::regressor::{Regressor, StackedRegressor, Weighting};
 use crate::setup::Setup;
 use crate::spatial::{Motion, Vec3, Wrench};
@@ -439,7 +439,7 @@ impl<'a> RowMaker<'a> {
     }
 
     /// Measured less predicted torque of every joint, for parameters `d` beside CAD; NaN where there is none, a contact lies beyond, or
-    /// something undeclared acts on the links around it.
+    /// something undeclared may act beyond.
     ///
     /// # Errors
     /// As for [`RowMaker::make`].
@@ -447,17 +447,9 @@ impl<'a> RowMaker<'a> {
         let mut rows = Rows::new(&self.layout);
         self.make(instant, &mut rows)?;
         self.tree.update(&self.setup.model, &self.kinematics)?;
-        let blocked = self.blocked(&instant.active);
-        let structure = &self.setup.structure;
+        let blocked = self.blocked(instant);
         let error = |dof: usize| {
-            let child = self
-                .setup
-                .model
-                .dof_joint(dof)
-                .map(|joint| self.setup.model.joints()[joint].child);
-            let unit = child.and_then(|child| structure.subtree_of(child));
-            let is_suspected = unit.is_some_and(|unit| instant.suspected.contains(unit));
-            let Some(row) = self.tree.joint_row(dof).filter(|_| !blocked[dof] && !is_suspected) else {
+            let Some(row) = self.tree.joint_row(dof).filter(|_| !blocked[dof]) else {
                 return f64::NAN;
             };
             let own = self
@@ -625,7 +617,7 @@ impl<'a> RowMaker<'a> {
         }
         self.tree.update(&self.setup.model, &self.kinematics)?;
         let wrenches = self.layout.sensors.len();
-        let blocked = self.blocked(&instant.active);
+        let blocked = self.blocked(instant);
         for (place, &dof) in self.layout.joints.iter().enumerate() {
             let torque = instant.torque.get(dof).copied().unwrap_or(f64::NAN);
             let Some(row) = self.tree.joint_row(dof) else { continue };
@@ -651,8 +643,9 @@ impl<'a> RowMaker<'a> {
         Ok(())
     }
 
-    /// Per degree of freedom, whether a present contact lies beyond its joint, seen from the base: on the way from that contact's link to the base.
-    fn blocked(&self, active: &ContactSet) -> Vec<bool> {
+    /// Per degree of freedom, whether a present contact lies beyond its joint, seen from the base: on the way from that contact's link to the base. Where something undeclared acts on a sub-tree,
+    /// nobody knows on which of its links: it may be any.
+    fn blocked(&self, instant: &Instant) -> Vec<bool> {
         let model = &self.setup.model;
         let mut blocked = vec![false; model.dof_count()];
         let to_root = |mut link: usize| {
@@ -664,11 +657,21 @@ impl<'a> RowMaker<'a> {
             joints
         };
         let base = to_root(self.kinematics.base());
-        for contact in active.iter() {
-            let Some(spec) = self.setup.structure.contacts().get(contact) else {
-                continue;
-            };
-            let own = to_root(spec.frame.link);
+        let structure = &self.setup.structure;
+        let declared = instant
+            .active
+            .iter()
+            .filter_map(|contact| structure.contacts().get(contact));
+        let mut touched: Vec<usize> = declared.map(|spec| spec.frame.link).collect();
+        if !self.disregards {
+            let subtrees = instant
+                .suspected
+                .iter()
+                .filter(|unit| *unit < structure.subtrees().len());
+            touched.extend(subtrees.flat_map(|unit| structure.links_of(unit)));
+        }
+        for link in touched {
+            let own = to_root(link);
             let apart = own
                 .iter()
                 .filter(|j| !base.contains(j))

@@ -602,7 +602,7 @@ impl Recording {
     }
 }
 
-/// Puts every stream in order: stamps, repeated readings, frozen stretches, spikes of encoders and gyroscopes.
+/// Puts every stream in order: stamps, repeated readings, frozen stretches, spikes of encoders, joint torques and gyroscopes.
 pub(super) fn settle(recording: &mut Recording, setup: &Setup, mut repeats: Repeats) {
     let channels = recording.channels.clone();
     let max_silence = setup.max_silence;
@@ -654,14 +654,28 @@ pub(super) fn settle(recording: &mut Recording, setup: &Setup, mut repeats: Repe
                 });
                 recording.joints[dof].each(|s| s.retain_outside(from, to));
             }
-            if let Some((samples, largest, t)) = recording.joints[dof].position.despike(0) {
-                found.push(Defect::Outliers {
-                    channel: name,
-                    axis: "position",
-                    samples,
-                    largest,
-                    t,
+            for (from, to) in dead(&recording.joints[dof]) {
+                found.push(Defect::Frozen {
+                    channel: format!("{name}/torque"),
+                    from,
+                    to,
                 });
+                // All of it, the first sample too: nobody knows when it was measured.
+                let stamps = &recording.joints[dof].torque.t;
+                let drop: Vec<bool> = stamps.iter().map(|t| (from..=to).contains(t)).collect();
+                recording.joints[dof].torque.retain(|i| !drop[i]);
+            }
+            let track = &mut recording.joints[dof];
+            for (axis, stream) in [("position", &mut track.position), ("torque", &mut track.torque)] {
+                if let Some((samples, largest, t)) = stream.despike(0) {
+                    found.push(Defect::Outliers {
+                        channel: name.clone(),
+                        axis,
+                        samples,
+                        largest,
+                        t,
+                    });
+                }
             }
         }
         if channel.role == Use::Base {
@@ -828,6 +842,41 @@ fn stopped(position: &Stream<1>) -> Option<(Nanos, Nanos)> {
         i += 1;
     }
     None
+}
+
+/// Where a joint's torque repeats itself for longer than chance, coarse steps or a standstill make it do, while the joint moves.
+fn dead(track: &JointTrack) -> Vec<(Nanos, Nanos)> {
+    /// How likely a stretch that is called dead may be in a torque whose repeats are chance.
+    const CHANCE: f64 = 1e-9;
+    let (t, x) = (&track.torque.t, track.torque.column(0));
+    // Stretches of equal samples, from the first to the last.
+    let mut stretches: Vec<(usize, usize)> = Vec::new();
+    for i in 0..x.len() {
+        match stretches.last_mut() {
+            Some((begin, end)) if x[*begin].to_bits() == x[i].to_bits() => *end = i,
+            _ => stretches.push((i, i)),
+        }
+    }
+    let is_long = |(begin, end): &(usize, usize)| t[*end] - t[*begin] >= FREEZE;
+    let steps = |some: &mut dyn Iterator<Item = &(usize, usize)>| some.map(|(begin, end)| end - begin).sum::<usize>();
+    // Of two samples after each other that are not in a long stretch, how often they are equal.
+    let (all, long) = (
+        x.len().saturating_sub(1),
+        steps(&mut stretches.iter().filter(|s| is_long(s))),
+    );
+    let equal = steps(&mut stretches.iter()) - long;
+    let often = (equal as f64 + 1.0) / ((all - long) as f64 + 2.0);
+    let dead = |stretch: &&(usize, usize)| {
+        let (begin, end) = **stretch;
+        is_long(stretch) && often.powf((end - begin) as f64) < CHANCE && track.range(t[begin], t[end]) > MOTION
+    };
+    // One value from beginning to end leaves nothing to compare with.
+    let all_equal = stretches.len() == 1 && stretches.iter().any(|s| is_long(s));
+    stretches
+        .iter()
+        .filter(|stretch| dead(stretch) || all_equal && track.range(t[stretch.0], t[stretch.1]) > MOTION)
+        .map(|(begin, end)| (t[*begin], t[*end]))
+        .collect()
 }
 
 /// Looks at the channels one by one.

@@ -81,7 +81,10 @@ impl Recording {
         }?;
         Some(TimeOffset {
             signal,
-            channel: format!("{}/{}", channel.kind.word(), channel.name),
+            channel: match signal {
+                Signal::Torque(_) => format!("{}/{}/torque", channel.kind.word(), channel.name),
+                _ => format!("{}/{}", channel.kind.word(), channel.name),
+            },
             seconds,
             deviation,
             significant: seconds.abs() > DEVIATIONS * deviation && seconds.abs() > LEAST,

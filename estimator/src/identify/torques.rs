@@ -1,0 +1,321 @@
+//! Whether what a log gives as joint torques are these joints' torques: in newton metres, along the axis, alive. Asked before anything is fitted.
+//!
+//! What CAD says of a joint's torque is roughly right, however wrong its masses are. From both, measured `y` and predicted `x`, everything is taken off that friction and an offset may be (and a
+//! rotor's inertia, where torques are the motors'), and they are compared:
+//!
+//! - `|y + x|^2 < |y - x|^2 / 3` (a correlation of -1/2 and less if they are of one size): the sign is turned;
+//! - `|y| > 30 |x|` while the two go together (correlation above 0.7 either way), or `|y|` more than a hundred times any joint's prediction: counts, or thousandths of newton metres;
+//! - `|y| < |x| / 30`: thousands of newton metres, or nothing at all.
+//!
+//! No CAD is wrong by thirty times. Such a torque is left out of its log, and said.
+//!
+//! And after the fit: whether all torques are stamped late against the encoders ([`late`]). Asked of one joint alone, friction that is not as the model has it looks the same (a real arm with
+//! joint torque sensors: 10 to 95 ms, each joint its own, where together they say none); and friction and masses that were fitted to late torques hide most of it. So it is asked of all torques
+//! together, as one more unknown of the fit.
+
+use super::batch::{Identified, Prepared, added, over, sample};
+use super::outcome::{Finding, LeftOut, Severity};
+use super::passes::{Residuals, leave, tell_with};
+use super::prior::Posterior;
+use super::rows::{FRICTION, RowMaker, Rows};
+use crate::config::{IdentificationInput, TorqueSide};
+use crate::dynamics::DynamicsError;
+use crate::setup::Setup;
+use nalgebra::{DMatrix, DVector};
+
+/// Instants that are looked at, at most and at least.
+const ENOUGH: usize = 2000;
+const LEAST: usize = 50;
+
+/// A torque so many times what CAD says, or as many times less, is none in newton metres.
+const FACTOR: f64 = 30.0;
+
+/// ... and one so many times what CAD says of any joint, whatever it does.
+const BEYOND: f64 = 100.0;
+
+/// Predictions less than this share of the greatest joint's are mostly what CAD has wrong.
+const SMALL: f64 = 0.01;
+
+/// What is wrong with a torque.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Fault {
+    Sign,
+    TooLarge(f64),
+    TooSmall(f64),
+}
+
+/// One joint's measurements and predictions.
+#[derive(Default)]
+struct Pairs {
+    measured: Vec<f64>,
+    predicted: Vec<f64>,
+    /// Friction's columns and the acceleration, row by row.
+    nuisance: Vec<f64>,
+}
+
+impl Pairs {
+    const WIDTH: usize = FRICTION + 1;
+
+    /// Root mean squares of what is measured, what is predicted, their sum and their difference, without what friction and offset may be (of a motor, the rotor's inertia, too); and
+    /// how the first two go together, -1 to 1.
+    fn compare(&self, side: TorqueSide) -> Option<Compared> {
+        let count = self.measured.len();
+        if count < LEAST {
+            return None;
+        }
+        let width = match side {
+            TorqueSide::Link => FRICTION,
+            TorqueSide::Motor => Self::WIDTH,
+        };
+        let nuisance = DMatrix::from_fn(count, width, |i, j| self.nuisance[Self::WIDTH * i + j]);
+        let svd = nuisance.svd(true, false);
+        let greatest = svd.singular_values.max();
+        let axes = svd.u?;
+        let rest = |values: &[f64]| {
+            let mut rest = DVector::from_column_slice(values);
+            for (axis, size) in axes.column_iter().zip(&svd.singular_values) {
+                if *size > 1e-9 * greatest {
+                    let share = axis.dot(&rest);
+                    rest.axpy(-share, &axis, 1.0);
+                }
+            }
+            rest
+        };
+        let (y, x) = (rest(&self.measured), rest(&self.predicted));
+        let rms = |v: &DVector<f64>| (v.norm_squared() / count as f64).sqrt();
+        Some(Compared {
+            measured: rms(&y),
+            predicted: rms(&x),
+            sum: rms(&(&y + &x)),
+            difference: rms(&(&y - &x)),
+            correlation: y.dot(&x) / (y.norm() * x.norm()).max(f64::MIN_POSITIVE),
+            raw: rms(&DVector::from_column_slice(&self.measured)),
+            raw_predicted: rms(&DVector::from_column_slice(&self.predicted)),
+        })
+    }
+}
+
+struct Compared {
+    measured: f64,
+    predicted: f64,
+    sum: f64,
+    difference: f64,
+    correlation: f64,
+    /// As measured, and as predicted.
+    raw: f64,
+    raw_predicted: f64,
+}
+
+impl Compared {
+    /// `greatest`: of all joints, what is predicted without friction's part; and as predicted.
+    fn fault(&self, greatest: f64, greatest_raw: f64) -> Option<Fault> {
+        let tells = self.predicted > SMALL * greatest && self.predicted > 0.0;
+        let ratio = self.measured / self.predicted;
+        if greatest_raw > 0.0 && self.raw > BEYOND * greatest_raw {
+            Some(Fault::TooLarge(self.raw / greatest_raw))
+        } else if tells && ratio > FACTOR && self.correlation.abs() > 0.7 {
+            Some(Fault::TooLarge(ratio))
+        } else if tells && ratio < 1.0 / FACTOR {
+            Some(Fault::TooSmall(1.0 / ratio))
+        } else if tells && 3.0 * self.sum.powi(2) < self.difference.powi(2) {
+            Some(Fault::Sign)
+        } else {
+            None
+        }
+    }
+}
+
+/// Takes torques out of a log that are none, and says so there.
+///
+/// # Errors
+/// Instants of another robot.
+pub(super) fn check(setup: &Setup, log: &mut Prepared) -> Result<(), DynamicsError> {
+    let measured = |dof: &usize| {
+        log.instants
+            .iter()
+            .any(|i| i.torque.get(*dof).is_some_and(|x| x.is_finite()))
+    };
+    if log.refused || !(0..setup.model.dof_count()).any(|dof| measured(&dof)) {
+        return Ok(());
+    }
+    let step = log.instants.len().div_ceil(ENOUGH).max(1);
+    let some = || log.instants.iter().step_by(step);
+    let mut maker = RowMaker::survey(setup, &[IdentificationInput::Torque], some())?;
+    let joints = maker.layout().joints.clone();
+    let mut pairs: Vec<Pairs> = joints.iter().map(|_| Pairs::default()).collect();
+    let mut rows = Rows::new(maker.layout());
+    for instant in some() {
+        maker.make(instant, &mut rows)?;
+        for row in 0..rows.count {
+            let Some(place) = rows.n(row).iter().position(|x| *x != 0.0) else {
+                continue;
+            };
+            let (torque, own) = (instant.torque[joints[place]], &mut pairs[place]);
+            own.measured.push(torque);
+            own.predicted.push(torque - rows.r(row));
+            own.nuisance.extend(&rows.g(row)[FRICTION * place..][..FRICTION]);
+            own.nuisance.push(instant.acceleration[joints[place]]);
+        }
+    }
+    let compared: Vec<Option<Compared>> = pairs.iter().map(|pairs| pairs.compare(setup.torque_side)).collect();
+    let greatest = |of: &dyn Fn(&Compared) -> f64| compared.iter().flatten().map(of).fold(0.0, f64::max);
+    let (predicted, raw) = (greatest(&|c| c.predicted), greatest(&|c| c.raw_predicted));
+    for (dof, compared) in joints.iter().zip(&compared) {
+        if let Some(fault) = compared.as_ref().and_then(|c| c.fault(predicted, raw)) {
+            leave_out(log, *dof, setup.model.dof_name(*dof), fault);
+        }
+    }
+    Ok(())
+}
+
+fn leave_out(log: &mut Prepared, dof: usize, joint: &str, fault: Fault) {
+    let (code, reason, text) = match fault {
+        Fault::Sign => (
+            "wrong_sign",
+            "sign",
+            format!(
+                "joint/{joint}/torque is turned: it goes against what the masses of the URDF ask for. It was left out; a torque along the joint's axis, by the parent on the child, is positive: check its sign, that of the encoder, and gravity_mps2"
+            ),
+        ),
+        Fault::TooLarge(times) => (
+            "wrong_units",
+            "units",
+            format!(
+                "joint/{joint}/torque is about {times:.0} times what the masses of the URDF ask for: it is in counts or thousandths. It was left out; convert it to Nm"
+            ),
+        ),
+        Fault::TooSmall(times) => (
+            "wrong_units",
+            "units",
+            format!(
+                "joint/{joint}/torque hardly follows the motion: what the masses of the URDF ask for is about {times:.0} times as much. It was left out; its channel is dead, or it is in thousands: convert it to Nm"
+            ),
+        ),
+    };
+    let mut out: Option<LeftOut> = None;
+    for instant in &mut log.instants {
+        if instant.torque.get(dof).is_some_and(|x| x.is_finite()) {
+            instant.torque[dof] = f64::NAN;
+            let entry = out.get_or_insert(LeftOut {
+                reason: format!("{reason} of the torque of {joint}"),
+                instants: 0,
+                first: instant.t,
+                last: instant.t,
+            });
+            (entry.instants, entry.last) = (entry.instants + 1, instant.t);
+        }
+    }
+    log.left_out.extend(out);
+    log.findings.push(Finding {
+        severity: Severity::Warning,
+        code,
+        subject: format!("joint/{joint}/torque"),
+        text,
+    });
+}
+
+/// Whether what parameters were identified from is stamped otherwise than the encoders: all joint torques, by the same time. The torque that is predicted at `t` is measured at `t + delay`, so rows
+/// get one more column, less the rate at which the prediction changes; the fit with it says how long it is and how sure that is.
+pub(super) fn late(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Identified) -> Option<Finding> {
+    /// A delay is expected to be so long \[s\], one standard deviation, before anything is measured.
+    const SPREAD: f64 = 0.05;
+    /// It is said if it is so many standard deviations long, and so long \[s\].
+    const DEVIATIONS: f64 = 4.0;
+    const LEAST_DELAY: f64 = 2e-3;
+    /// Rates are taken over this time before and after \[s\]: friction changes its sign at once.
+    const REACH: f64 = 0.03;
+    let layout = &identified.layout;
+    if layout.joints.is_empty() {
+        return None;
+    }
+    let (first, p) = (6 * layout.sensors.len(), layout.unknowns());
+    let pieces = sample(maker, training);
+    let told = over(maker, &pieces, |maker, _, piece| {
+        let left: Residuals = leave(maker, piece, &identified.noise, std::slice::from_ref(&identified.d));
+        let count = piece.instants.len();
+        let rate = |place: usize, number: usize| -> f64 {
+            let t = |i: usize| (piece.instants[i].t - piece.instants[number].t).seconds();
+            let before = (0..number).rev().take_while(|&i| t(i) >= -REACH).last();
+            let after = (number + 1..count).take_while(|&i| t(i) <= REACH).last();
+            // A log with rows farther apart: the next ones.
+            let (low, high) = (
+                before.unwrap_or(number.saturating_sub(1)),
+                after.unwrap_or((number + 1).min(count - 1)),
+            );
+            let predicted = |i: usize| piece.instants[i].torque[layout.joints[place]] - left.noise[0][first + place][i];
+            let span = t(high) - t(low);
+            let rate = (predicted(high) - predicted(low)) / span;
+            if rate.is_finite() && span < 0.2 { rate } else { 0.0 }
+        };
+        let mut columns = |_: &mut RowMaker<'_>, number: usize, rows: &Rows, slopes: &mut [f64]| {
+            for (row, slope) in slopes.iter_mut().enumerate() {
+                if let Some(place) = rows.n(row)[first..].iter().position(|x| *x != 0.0) {
+                    *slope = -rate(place, number);
+                }
+            }
+        };
+        tell_with(maker, piece, &identified.noise, 1, &mut columns)
+    });
+    let (r, z) = added(&told, p + 1).to_triangle();
+    let mut precision = layout.precision();
+    precision.push(SPREAD.powi(-2));
+    let fit = Posterior::new(&identified.prior, &layout.links, &r, &z, &precision)
+        .ok()?
+        .fit(identified.fit.tau)
+        .ok()?;
+    let (seconds, deviation) = (fit.x[p], fit.covariance_root().row(p).norm());
+    (seconds.abs() > LEAST_DELAY.max(DEVIATIONS * deviation)).then(|| Finding {
+        severity: Severity::Warning,
+        code: "time_offset",
+        subject: "joint torques".into(),
+        text: format!(
+            "the joint torques seem to be stamped {:.1} ms {} the encoders (+- {:.1} ms); they were used as they are, and friction and parameters have taken up a part of it: compare the clocks, or the filters of the sensors, and correct the stamps",
+            1e3 * seconds.abs(),
+            if seconds > 0.0 { "behind" } else { "ahead of" },
+            1e3 * deviation
+        ),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::normals;
+    use super::*;
+
+    /// A joint whose torque is `scale` times what CAD says, which itself is wrong by `wrong` of another motion, with friction and noise.
+    fn found(scale: f64, wrong: f64, noise: f64) -> Option<Fault> {
+        let deviates = normals(3, 1000);
+        let mut pairs = Pairs::default();
+        for (i, deviate) in deviates.iter().enumerate() {
+            let t = 0.05 * i as f64;
+            let (dq, ddq) = ((1.1 * t).cos(), -1.1 * (1.1 * t).sin());
+            let (x, other) = (8.0 * (0.9 * t).sin() + ddq, 8.0 * (1.7 * t + 1.0).sin());
+            let friction = [(dq / 0.02).tanh(), dq, 1.0];
+            pairs.predicted.push(x);
+            let torque = x + wrong * other + 4.0 * friction[0] + 3.0 * friction[1] - 2.0 + noise * deviate;
+            pairs.measured.push(scale * torque);
+            pairs.nuisance.extend(friction);
+            pairs.nuisance.push(ddq);
+        }
+        let compared = pairs.compare(TorqueSide::Link)?;
+        compared.fault(compared.predicted, compared.raw_predicted)
+    }
+
+    #[test]
+    fn torques_that_are_none_are_told_from_a_wrong_model() {
+        for (wrong, noise) in [(0.0, 0.01), (0.5, 1.0), (1.5, 4.0)] {
+            assert_eq!(found(1.0, wrong, noise), None, "{wrong} {noise}");
+        }
+        assert_eq!(found(-1.0, 0.4, 1.0), Some(Fault::Sign));
+        let Some(Fault::TooLarge(times)) = found(1000.0, 0.3, 1.0) else {
+            panic!("thousandths")
+        };
+        assert!((700.0..1500.0).contains(&times), "{times}");
+        assert!(matches!(found(-1000.0, 0.3, 1.0), Some(Fault::TooLarge(_))));
+        let Some(Fault::TooSmall(times)) = found(0.001, 0.3, 1.0) else {
+            panic!("thousands")
+        };
+        assert!((700.0..1500.0).contains(&times), "{times}");
+        assert!(matches!(found(0.0, 0.0, 0.0), Some(Fault::TooSmall(_))));
+    }
+}
