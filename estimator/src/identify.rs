@@ -60,6 +60,7 @@ const AXES: [&str; 6] = ["fx", "fy", "fz", "tx", "ty", "tz"];
 /// Lanes that inner products work in: one sum would wait for itself at every step.
 const LANES: usize = 4;
 
+/// The inner product of two slices of one length.
 #[inline(always)]
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     debug_assert_eq!(a.len(), b.len());

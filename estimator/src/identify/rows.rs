@@ -457,7 +457,7 @@ impl<'a> RowMaker<'a> {
                 .links
                 .iter()
                 .enumerate()
-                .map(|(place, link)| dot(&row[WIDTH * link..][..WIDTH], &d[WIDTH * place..]));
+                .map(|(place, link)| dot(&row[WIDTH * link..][..WIDTH], &d[WIDTH * place..][..WIDTH]));
             instant.torque[dof] - dot(row, &self.cad) - own.sum::<f64>()
         };
         Ok((0..self.setup.model.dof_count()).map(error).collect())
