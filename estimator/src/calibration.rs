@@ -112,6 +112,16 @@ pub fn gain_from_force_first(numbers: &[f64]) -> Option<Matrix6<f64>> {
     }
 }
 
+/// Numbers of six channels, or of 36 pairs of them row by row, in the other order: [torque; force] to [force; torque] and back.
+#[must_use]
+pub fn force_first(numbers: &[f64]) -> Vec<f64> {
+    let at = |i: usize| numbers.get(i).copied().unwrap_or(f64::NAN);
+    match numbers.len() {
+        36 => (0..36).map(|i| at(6 * swapped(i / 6) + swapped(i % 6))).collect(),
+        count => (0..count).map(|i| at(swapped(i))).collect(),
+    }
+}
+
 /// The other half of six channels: [torque; force] to [force; torque] and back.
 #[must_use]
 pub fn swapped(channel: usize) -> usize {

@@ -49,9 +49,9 @@ pub use batch::{IdentifyError, Log, Options, Progress, identify};
 pub use export::parameters;
 pub use gate::UnitSet;
 pub use outcome::{
-    BaseParameterOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding, FrictionOutcome, JointOutcome,
-    LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, RotorOutcome, SensorOutcome, Severity, Spectrum,
-    Three, TwoRouteOutcome, Verdict, WeakDirection,
+    BaseParameterOutcome, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
+    FrictionOutcome, JointOutcome, LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, RotorOutcome,
+    SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome, Verdict, WeakDirection,
 };
 
 /// The axes of a wrench as samples have them, in words.

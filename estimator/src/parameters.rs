@@ -39,7 +39,7 @@ use nalgebra::{DMatrix, Matrix4, SMatrix};
 use proprio_topics::Nanos;
 use serde::Deserialize;
 
-use crate::calibration::{Calibration, Kind, gain_from_force_first, swapped};
+use crate::calibration::{Calibration, Kind, force_first, gain_from_force_first};
 use crate::config::{Gain, exactly};
 use crate::files;
 use crate::identify::prior::{LEAST_MASS, LEAST_RADIUS};
@@ -627,15 +627,6 @@ fn calibration_columns(sensors: &[Offset]) -> usize {
     calibrated.map(|found| found.kind.count()).sum()
 }
 
-/// Deviations of a gain's error as the file has them, [force; torque], from those in the order of their columns; and back, which is the same.
-fn gain_swapped(deviations: &[f64]) -> Vec<f64> {
-    let at = |i: usize| deviations.get(i).copied().unwrap_or(f64::NAN);
-    match deviations.len() {
-        36 => (0..36).map(|i| at(6 * swapped(i / 6) + swapped(i % 6))).collect(),
-        count => (0..count).map(|i| at(swapped(i))).collect(),
-    }
-}
-
 /// The upper triangle with the same covariance, with a diagonal that is not negative.
 fn triangle(root: DMatrix<f64>) -> DMatrix<f64> {
     let columns = root.ncols();
@@ -773,7 +764,7 @@ impl fmt::Display for Parameters {
                 .split_at_checked(gains)
                 .unwrap_or_default();
             if kind.gain != Gain::None {
-                writeln!(f, "gain_std = {:?}", gain_swapped(gains))?;
+                writeln!(f, "gain_std = {:?}", force_first(gains))?;
             }
             if let Some(reference) = calibration.reference() {
                 let per_kelvin = calibration.per_kelvin();
@@ -914,7 +905,7 @@ impl FileSensor {
             _ => return damaged("gain_std has not 36 numbers, nor the 6 of a diagonal"),
         };
         let numbers = |given: &Option<Numbers<3>>| given.as_ref().map_or([0.0; 3], |numbers| numbers.0);
-        let mut deviations = gain_swapped(gain_std);
+        let mut deviations = force_first(gain_std);
         if stds {
             deviations.extend(numbers(&self.temperature_std_nm_per_k));
             deviations.extend(numbers(&self.temperature_std_n_per_k));

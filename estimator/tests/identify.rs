@@ -1,14 +1,18 @@
 //! Identification from recorded logs: on the logs of real robots (`PROPRIO_DATA`; without it these tests say that they skip), and on simulated ones where the truth is known.
 
-use nalgebra::Matrix4;
-use proprio_estimator::config::{Config, IdentificationInput, TorqueSide};
+use nalgebra::{Matrix4, Matrix6, Vector6};
+use proprio_estimator::calibration::{Calibration, Unknown};
+use proprio_estimator::config::{Config, Gain, IdentificationInput, TorqueSide};
 use proprio_estimator::dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
-use proprio_estimator::identify::{Finding, Log, LogOutcome, Options, Outcome, Role, Verdict, identify};
+use proprio_estimator::identify::{Finding, Log, LogOutcome, Options, Outcome, Role, Verdict, identify, parameters};
 use proprio_estimator::model::Model;
+use proprio_estimator::offline;
+use proprio_estimator::parameters::Parameters;
 use proprio_estimator::regressor::Regressor;
 use proprio_estimator::regressor::identifiable::Column;
 use proprio_estimator::setup::Setup;
-use proprio_estimator::spatial::{Mat3, RigidInertia, Vec3};
+use proprio_estimator::spatial::{Mat3, RigidInertia, Vec3, Wrench};
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 /// A recorded log's text, or nothing if it is not at hand.
@@ -767,7 +771,7 @@ fn the_offset_of_a_sensor_is_of_the_last_log_that_reads_it() {
             assert!(deviation < 1.0, "{sensor} {component}: {deviation}");
         }
     }
-    let parameters = proprio_estimator::identify::parameters(&outcome, &setup, "a program 1").expect("parameters");
+    let parameters = parameters(&outcome, &setup, "a program 1").expect("parameters");
     assert_eq!(parameters.offsets().len(), 2);
     for (offset, told) in parameters.offsets().iter().zip(&outcome.logs[0].offsets) {
         assert_eq!(offset.reading.force_first(), told.end);
@@ -1079,6 +1083,268 @@ fn rotors_beside_links_that_stay_as_in_cad_are_as_uncertain_as_these() {
         );
         assert!(rotor.deviation > 1e-3, "{rotor:?}");
     }
+}
+
+/// The arm's log as a sensor would have sent it that this calibration puts right, its board warming up from 25 by 15 degrees.
+fn miscalibrated(log: &str, right: &Calibration) -> String {
+    let inverse = right.gain().try_inverse().expect("a gain");
+    let mut lines = log.lines();
+    let header = lines.next().expect("a header");
+    let place = |axis: &str| header.split(',').position(|name| name == format!("wrench/ft/{axis}"));
+    let places = AXES.map(|axis| place(axis).expect("a column"));
+    let rows: Vec<&str> = lines.collect();
+    let mut text = format!("{header},wrench/ft/temperature\n");
+    for (number, row) in rows.iter().enumerate() {
+        let mut cells: Vec<String> = row.split(',').map(str::to_owned).collect();
+        let [fx, fy, fz, tx, ty, tz] = places.map(|place| cells[place].parse::<f64>().expect("a number"));
+        let share = number as f64 / rows.len() as f64;
+        let celsius = 25.0 + 15.0 * (1.0 - (-3.0 * share).exp());
+        let warm = Wrench::from_parts([fx, fy, fz], [tx, ty, tz]) + *right.per_kelvin() * right.warmth(celsius);
+        let sent = inverse * Vector6::from(warm.torque_first());
+        for (place, axis) in places.into_iter().zip([3, 4, 5, 0, 1, 2]) {
+            cells[place] = sent[axis].to_string();
+        }
+        // Once a second.
+        let told = if number % 100 == 0 {
+            celsius.to_string()
+        } else {
+            String::new()
+        };
+        text += &format!("{},{told}\n", cells.join(","));
+    }
+    text
+}
+
+/// An arm of which the bodies beyond its sensor are not CAD's.
+fn real_beyond(setup: &Setup, seed: u64) -> Model {
+    let mut truth = real(setup, seed);
+    for name in ["l1", "l2"] {
+        let link = truth.frame(name).expect("a link").link;
+        truth.set_inertia(link, setup.model.inertias()[link]).expect("a body");
+    }
+    truth
+}
+
+/// RMS error of the torques before the sensor that the pipeline gives on this log with these parameters, the share within 1.96 stated deviations, and the mean of these.
+fn before_the_sensor(setup: &Setup, parameters: &Parameters, truth: &Model, log: &str) -> (f64, f64, f64) {
+    let mut setup = setup.clone();
+    setup.apply(parameters).expect("its own parameters");
+    let mut out = Vec::new();
+    offline::estimate(setup.clone(), log.as_bytes(), &mut out).expect("estimates");
+    let table = |bytes: &[u8]| -> HashMap<String, Vec<f64>> {
+        let mut reader = csv::Reader::from_reader(bytes);
+        let names: Vec<String> = reader.headers().expect("a header").iter().map(str::to_owned).collect();
+        let mut columns: HashMap<String, Vec<f64>> = HashMap::new();
+        for record in reader.records() {
+            for (name, cell) in names.iter().zip(record.expect("a row").iter()) {
+                columns
+                    .entry(name.clone())
+                    .or_default()
+                    .push(cell.parse().unwrap_or(f64::NAN));
+            }
+        }
+        columns
+    };
+    let (log, got) = (table(log.as_bytes()), table(&out));
+    let mut kinematics = Kinematics::new(truth, setup.base_link).expect("a base");
+    let mut dynamics = InverseDynamics::new(truth);
+    let (mut square, mut inside, mut sum, mut count) = (0.0, 0.0, 0.0, 0.0);
+    for row in 0..log["t"].len() {
+        let of = |what: &str| ARM_JOINTS.map(|joint| log[&format!("joint/{joint}/{what}")][row]);
+        let (q, dq, ddq) = (of("position"), of("velocity"), of("acceleration"));
+        let joints = JointState {
+            position: &q,
+            velocity: &dq,
+            acceleration: &ddq,
+        };
+        let base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.80665));
+        kinematics.update(truth, joints, &base).expect("a state");
+        dynamics.update(truth, &kinematics, &[]).expect("a state");
+        let error = got["torque/j2"][row] - dynamics.torque()[1];
+        let deviation = got["torque_std/j2"][row];
+        square += error * error;
+        inside += f64::from(u8::from(error.abs() <= 1.96 * deviation));
+        sum += deviation;
+        count += 1.0;
+    }
+    ((square / count).sqrt(), inside / count, sum / count)
+}
+
+/// What was found of the only sensor's calibration, in units of its stated deviation; prints it.
+fn calibration_errors(outcome: &Outcome, right: &Calibration) -> Vec<f64> {
+    let [found] = outcome.calibrations.as_slice() else {
+        panic!("one sensor")
+    };
+    let each = found
+        .kind
+        .unknowns()
+        .zip(&found.error)
+        .zip(&found.deviation)
+        .zip(&found.prior);
+    each.map(|(((unknown, error), deviation), prior)| {
+        let truth = match unknown {
+            Unknown::Gain { channel, of } => right.gain()[(channel, of)] - f64::from(u8::from(channel == of)),
+            Unknown::Temperature { channel } => right.per_kelvin().torque_first()[channel],
+        };
+        println!("  {unknown:?}: {error:.5} +- {deviation:.5}, in truth {truth:.5}; before {prior:.5}");
+        (error - truth) / deviation
+    })
+    .collect()
+}
+
+#[test]
+fn gains_of_a_sensor_are_identified() {
+    let mut setup = arm();
+    let truth = real_beyond(&setup, 1);
+    let gain = Matrix6::from_diagonal(&Vector6::new(1.07, 0.92, 1.05, 1.06, 0.93, 1.04));
+    let right = Calibration::new(gain, Wrench::zero(), None);
+    let log = miscalibrated(&simulate(&setup, &truth, 50.0, 3.0, 11), &right);
+    let (train, rest) = (between(&log, -1.0, 40.0), between(&log, 40.0, 99.0));
+    let wrench = [IdentificationInput::Wrench];
+    let mut found = |gain: Gain| {
+        setup.calibrated.gain = gain;
+        let logs = [("train", Role::Train, train.as_str()), ("rest", Role::Validate, &rest)];
+        let outcome = run(&setup, &logs, &wrench);
+        let parameters = parameters(&outcome, &setup, "a test").expect("parameters");
+        let torques = before_the_sensor(&setup, &parameters, &truth, &rest);
+        println!("{gain:?}: torque before the sensor {torques:?}");
+        (outcome, parameters, torques)
+    };
+    let (without, file, (rough, missed, _)) = found(Gain::None);
+    assert!(without.calibrations.is_empty() && !file.to_string().contains("\ngain"));
+    let (with, file, (fine, inside, deviation)) = found(Gain::Diagonal);
+    let errors = calibration_errors(&with, &right);
+    assert!(errors.iter().all(|error| error.abs() < 3.0), "{errors:?}");
+    // What a force has in common with the others is told from mass by the prior alone, and that is said; how they differ is known much better.
+    assert!(
+        with.findings.iter().any(|f| f.code == "gain_or_mass"),
+        "{:?}",
+        with.findings
+    );
+    let of_force = |i: usize| with.calibrations[0].error[i] - gain[(i, i)];
+    for (a, b) in [(3, 4), (4, 5)] {
+        assert!(
+            (of_force(a) - of_force(b)).abs() < 0.01,
+            "{} {}",
+            of_force(a),
+            of_force(b)
+        );
+    }
+    // What is left of the torque before the sensor is what all gains have in common, and it is stated.
+    assert!(fine < 0.75 * rough, "{fine} {rough}");
+    assert!(inside > 0.9 && missed < 0.7, "{inside} {missed}");
+    assert!(deviation < 3.0 * fine, "{deviation} {fine}");
+    // Held-out data are predicted better.
+    let rms = |outcome: &Outcome| outcome.logs[1].relative_error.identified;
+    assert!(rms(&with) < 0.5 * rms(&without), "{} {}", rms(&with), rms(&without));
+    // And the file says it all again.
+    assert_eq!(Parameters::parse(&file.to_string()).expect("a file"), file);
+    assert_eq!(file.calibration_deviation(0).len(), 6);
+    let pairs = file
+        .calibration_deviation(0)
+        .iter()
+        .zip(&with.calibrations[0].deviation);
+    for (file, told) in pairs {
+        assert!((file - told).abs() < 1e-9, "{file} {told}");
+    }
+}
+
+#[test]
+fn cross_talk_of_a_sensor_is_identified() {
+    let mut setup = arm();
+    let truth = real_beyond(&setup, 2);
+    let mut noise = Noise(77);
+    let length = 0.018;
+    let gain = Matrix6::from_fn(|i, j| {
+        let unit = match (i < 3, j < 3) {
+            (true, false) => length,
+            (false, true) => 1.0 / length,
+            _ => 1.0,
+        };
+        f64::from(u8::from(i == j)) + 0.03 * unit * noise.normal()
+    });
+    let right = Calibration::new(gain, Wrench::zero(), None);
+    let log = miscalibrated(&simulate(&setup, &truth, 60.0, 3.0, 12), &right);
+    let (train, rest) = (between(&log, -1.0, 50.0), between(&log, 50.0, 99.0));
+    let wrench = [IdentificationInput::Wrench];
+    let mut found = |gain: Gain| {
+        setup.calibrated.gain = gain;
+        let logs = [("train", Role::Train, train.as_str()), ("rest", Role::Validate, &rest)];
+        let outcome = run(&setup, &logs, &wrench);
+        let parameters = parameters(&outcome, &setup, "a test").expect("parameters");
+        let torques = before_the_sensor(&setup, &parameters, &truth, &rest);
+        println!("{gain:?}: torque before the sensor {torques:?}");
+        (outcome, torques)
+    };
+    let (without, (rough, ..)) = found(Gain::None);
+    let (with, (fine, inside, _)) = found(Gain::Full);
+    let errors = calibration_errors(&with, &right);
+    assert_eq!(errors.len(), 36);
+    let beyond = |bound: f64| errors.iter().filter(|error| error.abs() > bound).count();
+    assert!(beyond(4.0) == 0 && beyond(2.0) <= 5, "{errors:?}");
+    assert!(fine < 0.5 * rough && inside > 0.85, "{fine} {rough} {inside}");
+    let rms = |outcome: &Outcome| outcome.logs[1].relative_error.identified;
+    assert!(rms(&with) < 0.3 * rms(&without), "{} {}", rms(&with), rms(&without));
+}
+
+#[test]
+fn the_drift_of_a_sensor_with_temperature_is_identified() {
+    let mut setup = arm();
+    let truth = real_beyond(&setup, 3);
+    let per_kelvin = Wrench::from_parts([0.05, -0.05, 0.05], [0.001, -0.002, 0.003]);
+    let right = Calibration::new(Matrix6::identity(), per_kelvin, Some(35.0));
+    let plain = simulate(&setup, &truth, 60.0, 3.0, 13);
+    let log = miscalibrated(&plain, &right);
+    let wrench = [IdentificationInput::Wrench];
+    // Not asked for, a temperature changes nothing.
+    let text = |log: &str, setup: &Setup| {
+        let outcome = run(setup, &[("train", Role::Train, log)], &wrench);
+        parameters(&outcome, setup, "a test").expect("parameters").to_string()
+    };
+    let cold = miscalibrated(&plain, &Calibration::default());
+    let without_temperature: String = cold
+        .lines()
+        .map(|line| line.rsplit_once(',').expect("cells").0.to_owned() + "\n")
+        .collect();
+    assert_eq!(text(&cold, &setup), text(&without_temperature, &setup));
+
+    setup.calibrated.temperature = true;
+    let outcome = run(&setup, &[("train", Role::Train, &log)], &wrench);
+    let errors = calibration_errors(&outcome, &right);
+    assert_eq!(errors.len(), 6);
+    assert!(errors.iter().all(|error| error.abs() < 3.0), "{errors:?}");
+    let found = &outcome.calibrations[0];
+    for (deviation, truth) in found.deviation.iter().zip(per_kelvin.torque_first()) {
+        assert!(*deviation < 0.4 * truth.abs(), "{deviation} of {truth}");
+    }
+    // Without a word from the configuration it counts from the mean, and the offset is that of there.
+    let reference = found.identified.reference().expect("a reference");
+    assert!((34.0..37.0).contains(&reference), "{reference}");
+    // Where no temperature was recorded that is said, and nothing else changes.
+    let blind = run(&setup, &[("train", Role::Train, &without_temperature)], &wrench);
+    assert!(blind.calibrations.is_empty());
+    assert!(
+        blind
+            .findings
+            .iter()
+            .any(|f| f.code == "no_temperature" && f.subject == "ft")
+    );
+}
+
+/// A workbench that is trusted to a two-thousandth: no log tells more, and that is said.
+#[test]
+fn a_gain_that_no_motion_tells_stays_the_workbenchs() {
+    let mut setup = arm();
+    let truth = real_beyond(&setup, 4);
+    let log = simulate(&setup, &truth, 12.0, 3.0, 14);
+    setup.calibrated.gain = Gain::Diagonal;
+    setup.gain_deviation = 5e-4;
+    let outcome = run(&setup, &[("train", Role::Train, &log)], &[IdentificationInput::Wrench]);
+    let found = &outcome.calibrations[0];
+    assert!(found.error.iter().all(|error| error.abs() < 1e-3), "{found:?}");
+    let finding = outcome.findings.iter().find(|f| f.code == "calibration_unseen");
+    let text = &finding.expect("a finding").text;
+    assert!(text.contains("the gain of fz"), "{text}");
 }
 
 #[test]

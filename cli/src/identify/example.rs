@@ -1,12 +1,14 @@
 //! An outcome made by hand for tests: something in every part of it, long names, numbers that are not there.
 
+use proprio_estimator::calibration::{Calibration, Kind, Unknown, force_first, gain_from_force_first};
+use proprio_estimator::config::Gain;
 use proprio_estimator::identify::instants::{Signal, TimeOffset};
 use proprio_estimator::identify::{
-    BaseParameterOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding, FrictionOutcome, JointOutcome,
-    LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, RotorOutcome, SensorOutcome, Severity, Spectrum,
-    Three, TwoRouteOutcome, Verdict, WeakDirection,
+    BaseParameterOutcome, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
+    FrictionOutcome, JointOutcome, LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, RotorOutcome,
+    SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome, Verdict, WeakDirection,
 };
-use proprio_estimator::spatial::RigidInertia;
+use proprio_estimator::spatial::{RigidInertia, Wrench};
 use proprio_topics::Nanos;
 
 const JOINTS: [&str; 3] = ["r_hip_yaw", "r_knee", "r_ankle_pitch_with_a_long_name"];
@@ -148,8 +150,9 @@ pub(crate) fn outcome() -> Outcome {
         robot: "icub_legs".into(),
         verdict: Verdict::Identified,
         links: bodies.collect(),
-        covariance: CovarianceRoot { columns: vec![], root: Default::default() },
+        covariance: CovarianceRoot { columns: vec![], calibrations: vec![], root: Default::default() },
         rotors: vec![RotorOutcome { joint: "r_knee".into(), inertia: 0.052, deviation: 0.003 }],
+        calibrations: vec![calibration()],
         tau: 0.58,
         shrink: 1.0,
         unknowns: 40,
@@ -189,6 +192,35 @@ pub(crate) fn outcome() -> Outcome {
     }
 }
 
+/// A gain of each channel, and a change per kelvin.
+fn calibration() -> CalibrationOutcome {
+    let kind = Kind {
+        gain: Gain::Diagonal,
+        temperature: true,
+    };
+    let error: Vec<f64> = (0..12).map(|i| 0.05 * noise(i)).collect();
+    let gain: Vec<f64> = force_first(&error[..6]).iter().map(|x| 1.0 + x).collect();
+    let per_kelvin = Wrench::from_parts([error[9], error[10], error[11]], [error[6], error[7], error[8]]);
+    CalibrationOutcome {
+        sensor: "r_leg_ft_sensor".into(),
+        workbench: Calibration::default(),
+        identified: Calibration::new(gain_from_force_first(&gain).unwrap(), per_kelvin, Some(31.2)),
+        kind,
+        deviation: error.iter().map(|x| 0.1 * x.abs() + 1e-4).collect(),
+        prior: kind
+            .unknowns()
+            .map(|unknown| {
+                if matches!(unknown, Unknown::Gain { .. }) {
+                    0.05
+                } else {
+                    10.0
+                }
+            })
+            .collect(),
+        error,
+    }
+}
+
 /// A robot that stood still.
 pub(crate) fn nothing() -> Outcome {
     let mut outcome = outcome();
@@ -197,6 +229,7 @@ pub(crate) fn nothing() -> Outcome {
     outcome.singular_values.clear();
     outcome.weakest.clear();
     outcome.base_parameters.clear();
+    outcome.calibrations.clear();
     outcome.channels.clear();
     outcome.rotors.clear();
     for log in &mut outcome.logs {

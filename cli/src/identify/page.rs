@@ -4,8 +4,9 @@ use super::advice::{Advice, Grade, findings, percent, sentence};
 use super::summary::{role, severity};
 use crate::report::plot::{Axis, Ink, Plot, Series};
 use crate::report::{self, Cell, Table, escape, number, short};
+use proprio_estimator::calibration::{Unknown, swapped};
 use proprio_estimator::identify::{
-    BaseParameterOutcome, Curve, LogOutcome, Outcome, Role, Severity, Spectrum, Three, Verdict,
+    BaseParameterOutcome, CalibrationOutcome, Curve, LogOutcome, Outcome, Role, Severity, Spectrum, Three, Verdict,
 };
 use proprio_topics::Nanos;
 
@@ -679,6 +680,45 @@ fn excitation(outcome: &Outcome) -> Option<String> {
 }
 
 /// What belongs to a log and not to the robot: offsets, friction, time.
+/// What was found of a sensor's calibration: a row for each number.
+fn calibration(c: &CalibrationOutcome) -> Table {
+    let since = c.identified.reference().map_or(String::new(), |celsius| {
+        format!("; the change per kelvin counts from {celsius:.1} °C")
+    });
+    let mut table = Table::new(
+        &format!(
+            "{}: calibration in place: the wrench is (1 + error) times the reading as the workbench corrects it{since}",
+            c.sensor
+        ),
+        &["what", "found", "± before any log"],
+    );
+    let word = |channel: usize| WRENCH[swapped(channel)].0;
+    for (((unknown, error), deviation), prior) in c.kind.unknowns().zip(&c.error).zip(&c.deviation).zip(&c.prior) {
+        let (what, factor) = match unknown {
+            Unknown::Gain { channel, of } if channel == of => {
+                (format!("error of the gain of {} [%]", word(channel)), 100.0)
+            }
+            Unknown::Gain { channel, of } => {
+                let unit = |channel: usize| WRENCH[swapped(channel)].1;
+                (
+                    format!("{} of {} [{}/{}]", word(channel), word(of), unit(channel), unit(of)),
+                    1.0,
+                )
+            }
+            Unknown::Temperature { channel } => (
+                format!("{} by temperature [{}/K]", word(channel), WRENCH[swapped(channel)].1),
+                1.0,
+            ),
+        };
+        table.row(vec![
+            what.into(),
+            Cell::Uncertain(factor * error, factor * deviation),
+            (factor * prior).into(),
+        ]);
+    }
+    table
+}
+
 fn sessions(outcome: &Outcome) -> Option<String> {
     let mut body = Vec::new();
     let mut times = Table::new(
@@ -710,6 +750,9 @@ fn sessions(outcome: &Outcome) -> Option<String> {
     }
     if !rotors.is_empty() {
         body.push(rotors.html());
+    }
+    for c in &outcome.calibrations {
+        body.push(calibration(c).html());
     }
     for log in &outcome.logs {
         let mut offsets = Table::new(

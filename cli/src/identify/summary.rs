@@ -24,6 +24,7 @@
 //! | `links` | {`name`, `seen`, `kept`: which share of the change from CAD was kept after the held-out check, `significance`, `cad`, `identified`, `deviation`: ten numbers each, m h_x h_y h_z I_xx I_xy I_xz I_yy I_yz I_zz about the link's origin} |
 //! | `base_parameters` | {`expression`, `unit`, `cad`, `identified`, `deviation`} |
 //! | `rotor_inertia` | {joint: {`kgm2`: of the rotor, times the square of the gear ratio (kg if the joint slides), `deviation`}}, of joints whose motors' torques were measured |
+//! | `calibration` | {sensor: {`gain`: all of it, 36 numbers row by row, rows and columns fx fy fz tx ty tz; `gain_error`: what was found wrong with the workbench's, relative to what that corrects, 6 numbers (a diagonal) or 36, `gain_deviation`, `gain_prior_deviation`: before any log; `per_kelvin`: six numbers, `per_kelvin_deviation`, `reference_celsius`}}, where it was asked for |
 //! | `channels` | noise of each measured number: {`name`, `unit`, `deviation`, `autocorrelation_s`, `drift`: `unit` per square root of second} |
 //!
 //! A log:
@@ -41,9 +42,11 @@
 //! | `friction` | {joint: {`coulomb_nm`, `viscous`: Nm s/rad, `offset_nm`, `deviation`: of the three}} |
 
 use super::advice::{Advice, findings};
-use proprio_estimator::identify::{LogOutcome, Outcome, Role, Severity, Three, Verdict};
+use proprio_estimator::calibration::force_first;
+use proprio_estimator::identify::{CalibrationOutcome, LogOutcome, Outcome, Role, Severity, Three, Verdict};
 use proprio_topics::Nanos;
 use serde_json::{Map, Value as Json, json};
+use std::ops::Range;
 
 /// The outcome as JSON.
 pub(crate) fn summary(outcome: &Outcome, advice: &Advice) -> Json {
@@ -93,6 +96,7 @@ pub(crate) fn summary(outcome: &Outcome, advice: &Advice) -> Json {
     let rotors = object(&outcome.rotors, |r| {
         (&r.joint, json!({ "kgm2": r.inertia, "deviation": r.deviation }))
     });
+    let calibration = object(&outcome.calibrations, |c| (&c.sensor, calibration(c)));
     let c = &outcome.consistency;
     json!({
         "schema": 1, "robot": outcome.robot, "version": env!("CARGO_PKG_VERSION"),
@@ -104,7 +108,20 @@ pub(crate) fn summary(outcome: &Outcome, advice: &Advice) -> Json {
         "condition": outcome.condition, "singular_values": outcome.singular_values,
         "weakest": weakest, "confused": outcome.confused, "time_offsets": time_offsets,
         "consistency": { "feasible": c.feasible, "deviations": c.deviations, "links": c.links, "text": c.text },
-        "findings": found, "links": links, "base_parameters": base, "rotor_inertia": rotors, "channels": channels,
+        "findings": found, "links": links, "base_parameters": base, "rotor_inertia": rotors, "calibration": calibration, "channels": channels,
+    })
+}
+
+fn calibration(c: &CalibrationOutcome) -> Json {
+    let gains = c.kind.count() - 6 * usize::from(c.kind.temperature);
+    let part = |values: &[f64], range: Range<usize>| force_first(values.get(range).unwrap_or_default());
+    let of_gain = |values: &[f64]| part(values, 0..gains);
+    let of_temperature = |values: &[f64]| part(values, gains..values.len());
+    json!({
+        "gain": c.identified.gain_force_first().to_vec(),
+        "gain_error": of_gain(&c.error), "gain_deviation": of_gain(&c.deviation), "gain_prior_deviation": of_gain(&c.prior),
+        "per_kelvin": c.identified.per_kelvin().force_first(), "per_kelvin_deviation": of_temperature(&c.deviation),
+        "reference_celsius": c.identified.reference(),
     })
 }
 
@@ -239,6 +256,7 @@ mod tests {
         }
         objects.extend([&json["consistency"], &json["advice"], &json["logs"][0]["left_out"][0]]);
         objects.extend([
+            &json["calibration"]["r_leg_ft_sensor"],
             &json["logs"][0]["offsets"]["r_leg_ft_sensor"],
             &json["logs"][0]["friction"]["r_knee"],
             &json["rotor_inertia"]["r_knee"],

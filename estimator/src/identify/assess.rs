@@ -2,21 +2,22 @@
 
 use super::batch::{Identified, Prepared, bodies, feasibility, joint_zeros, per_column, time_offsets, verdict};
 use super::outcome::{
-    BaseParameterOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding, FrictionOutcome, JointOutcome,
-    LinkOutcome, LogOutcome, OffsetOutcome, Outcome, RotorOutcome, SensorOutcome, Severity, Spectrum, Three,
-    TwoRouteOutcome, Verdict, WeakDirection,
+    BaseParameterOutcome, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
+    FrictionOutcome, JointOutcome, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, RotorOutcome, SensorOutcome,
+    Severity, Spectrum, Three, TwoRouteOutcome, Verdict, WeakDirection,
 };
 use super::passes::{OFFSET_VARIANCE, Residuals, Told, leave, tell};
 use super::rows::{FRICTION, Further, Layout, RowMaker, Rows, WIDTH};
 use super::{AXES, dot, torques};
-use crate::config::IdentificationInput;
+use crate::calibration::{Kind, Unknown, swapped};
+use crate::config::{Gain, IdentificationInput};
 use crate::dynamics::Structure;
 use crate::regressor::identifiable::{
     BaseParameter, Column, Identifiable, JointMotion, Measured, Offsets, Scope, Term,
 };
 use crate::setup::{Setup, Use};
-use crate::spatial::RigidInertia;
-use nalgebra::{DMatrix, DVector};
+use crate::spatial::{RigidInertia, Wrench};
+use nalgebra::{DMatrix, DVector, Matrix6};
 use proprio_topics::Nanos;
 
 /// Points of a curve at the most.
@@ -118,9 +119,11 @@ pub(super) fn nothing(setup: &Setup, prepared: &[Prepared], reason: String) -> O
             .collect(),
         covariance: CovarianceRoot {
             columns: Vec::new(),
+            calibrations: Vec::new(),
             root: DMatrix::zeros(0, 0),
         },
         rotors: Vec::new(),
+        calibrations: Vec::new(),
         tau: f64::NAN,
         shrink: 0.0,
         unknowns: 0,
@@ -235,6 +238,8 @@ pub(super) fn outcome(
         });
     }
     findings.extend(identified.findings.iter().cloned());
+    let (calibrations, told) = calibrations(setup, maker, identified, &root);
+    findings.extend(told);
     let mut maker = maker.clone();
     let logs = prepared
         .iter()
@@ -251,6 +256,7 @@ pub(super) fn outcome(
             .copied()
             .fold(1.0, f64::min),
         rotors: rotors(setup, identified, &root),
+        calibrations,
         unknowns: p,
         rank,
         structural_rank,
@@ -285,7 +291,9 @@ fn confused_rotors(setup: &Setup, identified: &Identified, spread: &[DMatrix<f64
     }
     let mut sums = Vec::new();
     for &column in &fitted {
-        let Further::RotorInertia(dof) = layout.further[column - layout.inertial()];
+        let Further::RotorInertia(dof) = layout.further[column - layout.inertial()] else {
+            continue;
+        };
         let own = r.column(column).normalize();
         let svd = r.clone().remove_column(column).svd(true, false);
         let greatest = svd.singular_values.max();
@@ -309,14 +317,142 @@ fn confused_rotors(setup: &Setup, identified: &Identified, spread: &[DMatrix<f64
 fn rotors(setup: &Setup, identified: &Identified, root: &DMatrix<f64>) -> Vec<RotorOutcome> {
     let layout = &identified.layout;
     let rotor = |(further, column): (&Further, usize)| {
-        let Further::RotorInertia(dof) = *further;
-        RotorOutcome {
+        let Further::RotorInertia(dof) = *further else {
+            return None;
+        };
+        Some(RotorOutcome {
             joint: setup.model.dof_name(dof).to_owned(),
             inertia: identified.d[column],
             deviation: root.row(column).norm(),
-        }
+        })
     };
-    layout.further.iter().zip(layout.inertial()..).map(rotor).collect()
+    layout
+        .further
+        .iter()
+        .zip(layout.inertial()..)
+        .filter_map(rotor)
+        .collect()
+}
+
+/// Share of the prior's standard deviation from which on the logs are said to tell nothing.
+const TOLD_NOTHING: f64 = 0.8;
+
+/// Calibrations of the sensors of which something was to be identified, and what is to be said of them.
+fn calibrations(
+    setup: &Setup,
+    maker: &RowMaker<'_>,
+    identified: &Identified,
+    root: &DMatrix<f64>,
+) -> (Vec<CalibrationOutcome>, Vec<Finding>) {
+    let layout = &identified.layout;
+    let (mut outcomes, mut findings) = (Vec::new(), Vec::new());
+    if setup.calibrated.is_empty() {
+        return (outcomes, findings);
+    }
+    let precision = layout.precision();
+    for &sensor in &layout.sensors {
+        let name = sensor_name(setup, sensor);
+        let own: Vec<(usize, Unknown, f64)> = (layout.further.iter().zip(layout.inertial()..).zip(&precision))
+            .filter_map(|((further, column), precision)| match *further {
+                Further::Calibration(other, unknown) if other == sensor => {
+                    Some((column, unknown, precision.sqrt().recip()))
+                }
+                _ => None,
+            })
+            .collect();
+        let (mut e, mut kelvin) = (Matrix6::zeros(), [0.0; 6]);
+        for (column, unknown, _) in &own {
+            match *unknown {
+                Unknown::Gain { channel, of } => e[(channel, of)] = identified.d[*column],
+                Unknown::Temperature { channel } => kelvin[channel] = identified.d[*column],
+            }
+        }
+        let is_gain = |unknown: &Unknown| matches!(unknown, Unknown::Gain { .. });
+        let kind = Kind {
+            gain: if own.iter().any(|(_, unknown, _)| is_gain(unknown)) {
+                setup.calibrated.gain
+            } else {
+                Gain::None
+            },
+            temperature: own.iter().any(|(_, unknown, _)| !is_gain(unknown)),
+        };
+        if setup.calibrated.temperature && !kind.temperature {
+            findings.push(Finding {
+                severity: Severity::Warning,
+                code: "no_temperature",
+                subject: name.clone(),
+                text: format!(
+                    "{name}: how it changes with temperature is not identified, for no log has its temperature (column wrench/{name}/temperature), or it never changed"
+                ),
+            });
+        }
+        if kind.is_empty() {
+            continue;
+        }
+        let [tx, ty, tz, fx, fy, fz] = kelvin;
+        let more = Wrench::from_parts([fx, fy, fz], [tx, ty, tz]);
+        let reference = maker.reference(sensor).filter(|_| kind.temperature);
+        let deviation: Vec<f64> = own.iter().map(|(column, ..)| root.row(*column).norm()).collect();
+        let prior: Vec<f64> = own.iter().map(|(.., prior)| *prior).collect();
+        // What the logs hardly tell, in the words of samples.
+        let mut vague: Vec<String> = Vec::new();
+        for ((_, unknown, prior), deviation) in own.iter().zip(&deviation) {
+            let word = |channel: usize| AXES[swapped(channel)];
+            if *deviation > TOLD_NOTHING * prior {
+                vague.push(match *unknown {
+                    Unknown::Gain { channel, of } if channel == of => format!("the gain of {}", word(channel)),
+                    Unknown::Gain { channel, of } => format!("{} of {}", word(channel), word(of)),
+                    Unknown::Temperature { channel } => format!("{} by temperature", word(channel)),
+                });
+            }
+        }
+        if !vague.is_empty() {
+            findings.push(Finding {
+                severity: Severity::Note,
+                code: "calibration_unseen",
+                text: format!(
+                    "{name}: the logs tell next to nothing of {} of the {} numbers of its calibration, which stay about as the workbench has them: {}. Motion that loads these channels more would tell",
+                    vague.len(),
+                    own.len(),
+                    vague.join(", ")
+                ),
+                subject: name.clone(),
+            });
+        }
+        // All forces too large by some share, and all masses beyond: the same readings.
+        let forces = own.iter().filter(
+            |(_, unknown, _)| matches!(unknown, Unknown::Gain { channel, of } if channel == of && *channel >= 3),
+        );
+        let forces: Vec<usize> = forces.map(|(column, ..)| *column).collect();
+        if forces.len() == 3 {
+            let common: f64 = forces.iter().map(|&column| identified.d[column]).sum::<f64>() / 3.0;
+            let sum = forces.iter().map(|&column| root.row(column).into_owned());
+            let spread = sum.reduce(|a, b| a + b).map_or(f64::NAN, |sum| sum.norm() / 3.0);
+            let before = setup.gain_deviation / 3.0_f64.sqrt();
+            if spread > 0.5 * before {
+                findings.push(Finding {
+                    severity: Severity::Note,
+                    code: "gain_or_mass",
+                    text: format!(
+                        "{name}: gains that are all too small look as masses beyond it that are all too small, so what its forces have in common, {:+.1} +- {:.1} %, is told from mass by the prior alone: how far the workbench may be off (identification.gain_std) against how far CAD seems to be. Hang a known mass on it, or weigh a link and put that in the URDF, to tell them apart",
+                        100.0 * common,
+                        100.0 * spread
+                    ),
+                    subject: name.clone(),
+                });
+            }
+        }
+        outcomes.push(CalibrationOutcome {
+            sensor: name,
+            workbench: setup.calibrations[sensor],
+            identified: setup.calibrations[sensor].then(&e, &more, reference),
+            kind,
+            error: own.iter().map(|(column, ..)| identified.d[*column]).collect(),
+            deviation,
+            prior,
+        });
+    }
+    (outcomes, findings)
 }
 
 fn channels(setup: &Setup, identified: &Identified, training: &[&Prepared]) -> Vec<ChannelNoise> {
@@ -574,14 +710,18 @@ fn covariance(identified: &Identified, root: &DMatrix<f64>) -> CovarianceRoot {
             }
         }
     }
-    // Whatever the further unknowns are.
-    let joint = if links < p {
-        joint.remove_rows(links, p - links)
-    } else {
-        joint
-    };
+    // Whatever the other further unknowns are.
+    let (mut rows, mut calibrations): (Vec<usize>, Vec<_>) = ((0..links).chain(p..p + s).collect(), Vec::new());
+    for (further, row) in layout.further.iter().zip(links..) {
+        if let Further::Calibration(sensor, unknown) = *further {
+            rows.push(row);
+            calibrations.push((sensor, unknown));
+        }
+    }
+    let joint = joint.select_rows(&rows);
     CovarianceRoot {
         columns,
+        calibrations,
         root: upper(&joint),
     }
 }

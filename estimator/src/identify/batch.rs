@@ -5,6 +5,7 @@
 //!    probable bodies under the prior and its weight ([`super::prior`]). With these bodies: what is left, and from it the noise ([`super::noise`]). Until both stay.
 //!    Before the first of them: a sensor that is mounted the wrong way round is refused.
 //! 3. What this fit says that something undeclared acted on is left out, and the rounds repeated, until that stays ([`super::gate`]).
+//!    Then, where gains of sensors are asked for, fits with these unknown, too.
 //! 4. A check on data held out: pieces of the logs are predicted from the others. The change from CAD is shrunk where it gains nothing ([`held_out`]).
 //! 5. Shaking that encoders do not show ([`super::shaking`]), where other sensors tell of it, is taken off; then 2 and 4 once more.
 //! 6. Figures for every log ([`super::assess`]).
@@ -23,7 +24,8 @@ use super::rows::{Further, Groups, Layout, RowMaker, Rows};
 use super::session::Session;
 use super::shaking::Shaking;
 use super::torques;
-use crate::config::IdentificationInput;
+use crate::calibration::Kind;
+use crate::config::{Gain, IdentificationInput};
 use crate::dynamics::{DynamicsError, Structure};
 use crate::model::JointKind;
 use crate::setup::{Setup, Use};
@@ -187,7 +189,7 @@ pub fn identify(
         ));
     }
     let all = training.iter().flat_map(|log| log.instants.iter());
-    let maker = RowMaker::survey(setup, &inputs, all)?;
+    let mut maker = RowMaker::survey(setup, &inputs, all)?;
     if maker.layout().links.is_empty() {
         let what = match inputs.as_slice() {
             [IdentificationInput::Torque] => {
@@ -218,7 +220,16 @@ pub fn identify(
         outcome.findings.extend(wrong);
         return Ok(outcome);
     }
-    let (settled, restless) = gated(setup, &maker, &mut prepared, &mut tell_progress)?;
+    let of_temperature = Kind {
+        gain: Gain::None,
+        ..setup.calibrated
+    };
+    maker.calibrate(of_temperature, training.iter().flat_map(|log| log.instants.iter()));
+    let (mut settled, restless) = gated(setup, &maker, &mut prepared, &mut tell_progress)?;
+    if setup.calibrated.gain != Gain::None {
+        settled = with_gains(setup, &mut maker, &mut prepared, settled, &mut tell_progress)?;
+    }
+    let maker = maker;
     let training = used(&prepared);
     let mut identified = fit(&maker, &training, inputs.clone(), settled, &mut tell_progress)?;
     tell_progress("shaking".into(), 0.8);
@@ -557,7 +568,9 @@ fn negative_rotors(setup: &Setup, layout: &Layout, fit: &Fit) -> Vec<Finding> {
     let root = fit.covariance_root();
     let mut findings = Vec::new();
     for (further, column) in layout.further.iter().zip(layout.inertial()..) {
-        let Further::RotorInertia(dof) = *further;
+        let Further::RotorInertia(dof) = *further else {
+            continue;
+        };
         let (value, deviation) = (fit.x[column], root.row(column).norm());
         if value < -DEVIATIONS * deviation {
             let joint = setup.model.dof_name(dof).to_owned();
@@ -713,6 +726,68 @@ fn gated(
         ),
     });
     Ok((settled, restless))
+}
+
+/// Gains of the sensors, too: what a gain multiplies is what the fit before says that was there to be read ([`super::rows`]); until that stays.
+fn with_gains(
+    setup: &Setup,
+    maker: &mut RowMaker<'_>,
+    prepared: &mut [Prepared],
+    mut settled: Settled,
+    progress: &mut dyn FnMut(String, f64),
+) -> Result<Settled, IdentifyError> {
+    /// Fits at the most: each makes the error of a gain less by about as much as the gain was off, twenty times say. And what of the prior's standard deviation is little.
+    const FITS: usize = 6;
+    const LITTLE: f64 = 1e-3;
+    let mut progress = |step: String, _| progress(format!("{step}, with gains"), 0.7);
+    read_as_fitted(maker, prepared, &settled);
+    let instants = used(prepared);
+    maker.calibrate(setup.calibrated, instants.iter().flat_map(|log| log.instants.iter()));
+    let mut last: Option<Vec<f64>> = None;
+    for _ in 0..FITS {
+        settled = settle(setup, maker, &used(prepared), Some(settled.noise), &mut progress)?;
+        read_as_fitted(maker, prepared, &settled);
+        let layout = maker.layout();
+        let own = layout.precision().into_iter().zip(layout.inertial()..);
+        let now: Vec<f64> = own
+            .map(|(precision, column)| settled.fit.x[column] * precision.sqrt())
+            .collect();
+        let stays = |last: &Vec<f64>| last.iter().zip(&now).all(|(a, b)| (a - b).abs() < LITTLE);
+        if last.as_ref().is_some_and(stays) {
+            break;
+        }
+        last = Some(now);
+    }
+    Ok(settled)
+}
+
+/// Says in the training logs what the sensors would have read without noise, by this fit.
+fn read_as_fitted(maker: &RowMaker<'_>, prepared: &mut [Prepared], settled: &Settled) {
+    let layout = maker.layout();
+    let training = used(prepared);
+    let pieces = chunks(&training, LONG);
+    let left = over(maker, &pieces, |maker, _, piece| {
+        leave(maker, piece, &settled.noise, std::slice::from_ref(&settled.fit.x))
+    });
+    let mut fitted = Vec::new();
+    for (piece, left) in pieces.iter().zip(&left) {
+        for (i, instant) in piece.instants.iter().enumerate() {
+            let mut readings = vec![Wrench::from_parts([f64::NAN; 3], [f64::NAN; 3]); instant.readings.len()];
+            for (place, &sensor) in layout.sensors.iter().enumerate() {
+                let [tx, ty, tz, fx, fy, fz] = std::array::from_fn(|axis| left.noise[0][6 * place + axis][i]);
+                readings[sensor] = instant.readings[sensor] - Wrench::from_parts([fx, fy, fz], [tx, ty, tz]);
+            }
+            fitted.push(readings);
+        }
+    }
+    // In the order of the pieces, which is that of the logs.
+    let mut fitted = fitted.into_iter();
+    let training = prepared
+        .iter_mut()
+        .filter(|log| log.role == Role::Train && !log.refused);
+    for instant in training.flat_map(|log| &mut log.instants) {
+        instant.fitted = fitted.next().unwrap_or_default();
+    }
 }
 
 /// Marks the instants of the training logs.

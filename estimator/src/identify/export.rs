@@ -1,7 +1,7 @@
 //! What identification gives, as what the estimator starts from: an [`Outcome`] to [`Parameters`].
 
 use super::outcome::{LogOutcome, Outcome, Role};
-use crate::parameters::{Friction, Offset, Parameters, ParametersError, Provenance, Rotor, Span};
+use crate::parameters::{Calibrated, Friction, Offset, Parameters, ParametersError, Provenance, Rotor, Span};
 use crate::regressor::identifiable::Column;
 use crate::setup::{Setup, Use};
 use crate::spatial::Wrench;
@@ -29,7 +29,7 @@ pub fn parameters(outcome: &Outcome, setup: &Setup, program: &str) -> Result<Par
 
     let columns = &outcome.covariance.columns;
     let place = |unknown: Column| columns.iter().position(|column| *column == unknown);
-    let (mut inertias, mut offsets, mut places) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut inertias, mut offsets, mut places, mut calibrations) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for link in &outcome.links {
         let of_link = (0..10).filter_map(|parameter| {
             place(Column::Inertial {
@@ -53,15 +53,28 @@ pub fn parameters(outcome: &Outcome, setup: &Setup, program: &str) -> Result<Par
         let (Some((log, offset)), 6) = (last, of_sensor.len()) else {
             continue;
         };
+        let calibration = outcome.calibrations.iter().find(|own| own.sensor == channel.name);
+        let of_calibration = (0..outcome.covariance.calibrations.len()).filter(|&place| {
+            outcome
+                .covariance
+                .calibrations
+                .get(place)
+                .is_some_and(|(own, _)| *own == sensor)
+        });
+        calibrations.extend(of_calibration.map(|place| columns.len() + place));
         offsets.push(Offset {
             sensor: channel.name.clone(),
             reading: wrench(&offset.end),
             drift: wrench(&offset.rate),
             known: log.span.1,
-            calibrated: None,
+            calibrated: calibration.map(|own| Calibrated {
+                calibration: own.identified,
+                kind: own.kind,
+            }),
         });
         places.extend(of_sensor);
     }
+    places.extend(calibrations);
     // Of a covariance U U^T, rows of U stand for unknowns; of root^T root, columns do.
     let upper = &outcome.covariance.root;
     let root = DMatrix::from_fn(upper.ncols(), places.len(), |i, j| {
@@ -191,8 +204,13 @@ mod tests {
             robot: setup.robot.clone(),
             verdict: Verdict::Identified,
             links: links.collect(),
-            covariance: CovarianceRoot { columns, root },
+            covariance: CovarianceRoot {
+                columns,
+                calibrations: vec![],
+                root,
+            },
             rotors: vec![],
+            calibrations: vec![],
             tau: 0.5,
             shrink: 1.0,
             unknowns: 20,

@@ -143,6 +143,8 @@ pub struct Instant {
     pub base_fault: Reason,
     /// Per F/T sensor, how warm its board is \[degrees Celsius\], on the straight line between two samples, the first and the last one held; NaN where none was recorded.
     pub temperatures: Vec<f64>,
+    /// Per F/T sensor what it would have read without noise, as [`Instant::readings`], by a fit that there was before; not finite where that says nothing. As read from a log: empty.
+    pub fitted: Vec<Wrench>,
     /// F/T sensors whose reading no motion explains, and that is not the beginning of another level either: a blow, a glitch.
     pub outliers: SensorSet,
     /// Sub-trees, by number, and measured joint torques, by [`Instant::TORQUES`], that something undeclared was found to act on: a contact, another load. None before a fit.
@@ -428,6 +430,7 @@ impl Recording {
                 faults: vec![Reason::None; self.channels.len()],
                 base_fault: Reason::None,
                 temperatures: self.temperatures.iter().map(|own| temperature_at(own, t)).collect(),
+                fitted: Vec::new(),
                 outliers: SensorSet::default(),
                 suspected: UnitSet::default(),
                 shaking: Vec::new(),

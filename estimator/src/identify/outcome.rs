@@ -5,6 +5,7 @@
 //! ([`crate::spatial`]).
 
 use super::instants::TimeOffset;
+use crate::calibration::{Calibration, Kind, Unknown};
 use crate::regressor::identifiable::Column;
 use crate::spatial::RigidInertia;
 use nalgebra::DMatrix;
@@ -95,6 +96,8 @@ pub struct LinkOutcome {
 pub struct CovarianceRoot {
     /// What rows stand for: all links that are seen, ten parameters each, then six per sensor.
     pub columns: Vec<Column>,
+    /// What the rows after those stand for: the sensor's number, and what of its calibration.
+    pub calibrations: Vec<(usize, Unknown)>,
     /// `U`, square, upper triangular; the covariance is `U U^T`.
     pub root: DMatrix<f64>,
 }
@@ -153,6 +156,25 @@ pub struct Consistency {
     pub links: Vec<String>,
     /// In words.
     pub text: String,
+}
+
+/// Calibration of one F/T sensor, the robot's: the same in all logs.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CalibrationOutcome {
+    /// The sensor's channel name.
+    pub sensor: String,
+    /// As configured, and as [`Three::cad`] and [`Three::cad_fitted`] have it.
+    pub workbench: Calibration,
+    /// All of it, with what was found: offsets and [`Three::identified`] are of readings corrected by it.
+    pub identified: Calibration,
+    /// What was to be found.
+    pub kind: Kind,
+    /// What was found, in the order of [`Kind::unknowns`]: how far the workbench's gain is off, relative to the readings that it corrects, and the change per kelvin beside the configured one.
+    pub error: Vec<f64>,
+    /// Standard deviation of each.
+    pub deviation: Vec<f64>,
+    /// Standard deviation of each before any log.
+    pub prior: Vec<f64>,
 }
 
 /// Offset of one F/T sensor through a log.
@@ -332,6 +354,8 @@ pub struct Outcome {
     pub covariance: CovarianceRoot,
     /// Rotor inertias, per joint whose motor's torque was measured while it accelerated.
     pub rotors: Vec<RotorOutcome>,
+    /// Calibrations of F/T sensors, where these were to be identified.
+    pub calibrations: Vec<CalibrationOutcome>,
     /// The prior's scale, chosen by evidence: how far, relatively, CAD is from the robot (bounded at 1).
     pub tau: f64,
     /// The least [`LinkOutcome::kept`] of the links that are seen: 1: all of every change from CAD; 0: at least one group of links stays as in CAD.

@@ -558,6 +558,7 @@ mod tests {
                     faults: vec![Reason::None; setup.channels().len()],
                     base_fault: Reason::None,
                     temperatures: Vec::new(),
+                    fitted: Vec::new(),
                     outliers: SensorSet::default(),
                     suspected: UnitSet::default(),
                     shaking: Vec::new(),

@@ -12,9 +12,14 @@
 //! Two kinds of rows, one below the other. Those of F/T sensors are the balances of sub-trees, of which [`StackedRegressor::eliminate_contacts`] leaves the combinations that no present
 //! contact reaches: noise enters them as offsets do, `N = G`. Those of joint torques are rows of the whole tree's [`Regressor`], for joints beyond which, seen from the base, nothing touches
 //! the robot: there `N = 1` and `G = [tanh(dq / v0), dq, 1]`. If torques are measured at the motors' side, `A` has the joint's acceleration beside them: it times the inertia of the motor's rotor.
+//!
+//! Where calibrations of F/T sensors are unknown, too ([`crate::calibration`]), so that a sensor measures `(1 + E) r - k (T - T0) - o`, `A` has columns of `E` and `k` beside those that `G` has of `o`: times
+//! `-r`, or the temperature. There `r` is what the sensor would have read without noise, by an earlier fit ([`Instant::fitted`]). For with the noise in it, a gain of nothing and bodies without mass
+//! would leave nothing of any row: mass and gain grow together, so that only priors would speak against it, and noise, of which there is the more the longer a log is, for it.
 
 use super::instants::Instant;
 use super::{dot, factorise, forward};
+use crate::calibration::{Kind, Unknown};
 use crate::config::{IdentificationInput, TorqueSide};
 use crate::dynamics::{DynamicsError, JointState, Kinematics};
 use crate::regressor::{Regressor, StackedRegressor, Weighting};
@@ -38,13 +43,30 @@ const ROTOR_PRECISION: f64 = 1e-4;
 pub(super) enum Further {
     /// Inertia of the rotor that drives a degree of freedom, reflected to it: rotor inertia times the square of the gear ratio [kg m^2, kg].
     RotorInertia(usize),
+    /// What is wrong with the calibration of an F/T sensor, by its number.
+    Calibration(usize, Unknown),
 }
 
+/// Precision of the prior of a reading's change per kelvin about zero [1/(N/K)^2, 1/(Nm/K)^2]: none is known to be larger than ten.
+const TEMPERATURE_PRECISION: f64 = 1e-2;
+
 impl Further {
-    /// Precision of its Gaussian prior about zero.
-    fn precision(self) -> f64 {
+    /// Precision of its Gaussian prior about zero. Of a gain: as [`crate::config::Identification::gain_std`] says, whatever the units.
+    fn precision(self, setup: &Setup) -> f64 {
         match self {
             Self::RotorInertia(_) => ROTOR_PRECISION,
+            Self::Calibration(_, Unknown::Temperature { .. }) => TEMPERATURE_PRECISION,
+            Self::Calibration(sensor, Unknown::Gain { channel, of }) => {
+                let noise = setup.structure.sensors()[sensor].noise();
+                let norm = |three: [f64; 3]| Vec3::from(three).norm();
+                let length = norm(noise.torque) / norm(noise.force);
+                let unit = match (channel < 3, of < 3) {
+                    (true, false) => length,
+                    (false, true) => 1.0 / length,
+                    _ => 1.0,
+                };
+                (setup.gain_deviation * unit).powi(-2)
+            }
         }
     }
 
@@ -52,17 +74,21 @@ impl Further {
     pub(super) fn lacks_cad(self) -> bool {
         match self {
             Self::RotorInertia(_) => true,
+            // The workbench's calibration is right, as far as CAD knows.
+            Self::Calibration(..) => false,
         }
     }
 }
 
 /// What the columns of all rows stand for.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Layout {
     /// Links that show in at least one row, ascending; ten columns of `A` each.
     pub links: Vec<usize>,
     /// What else of the robot shows in at least one row: a column of `A` each, after those of the links.
     pub further: Vec<Further>,
+    /// Precision of the prior of each of these.
+    pub precision: Vec<f64>,
     /// F/T sensors that do, ascending; six columns of `G` and of `N` each, [torque; force].
     pub sensors: Vec<usize>,
     /// Degrees of freedom whose measured torque is used, ascending; three columns of `G` after those of the sensors, and one of `N`.
@@ -82,7 +108,7 @@ impl Layout {
 
     /// Precision of the prior of each further unknown, for [`super::prior::Posterior`].
     pub(super) fn precision(&self) -> Vec<f64> {
-        self.further.iter().map(|further| further.precision()).collect()
+        self.precision.clone()
     }
 
     /// The column of a further unknown, if it shows.
@@ -308,6 +334,10 @@ pub(super) struct RowMaker<'a> {
     stacked: StackedRegressor,
     tree: Regressor,
     readings: Vec<Wrench>,
+    /// Per sensor, what is unknown of its calibration: columns of `A`.
+    calibrations: Vec<Vec<(usize, Unknown)>>,
+    /// Per sensor, the temperature from which its change per kelvin counts \[degrees Celsius\]; NaN if none was recorded.
+    references: Vec<f64>,
     wrench: bool,
     torque: bool,
     /// Whether rows are made of units that something undeclared acts on, too.
@@ -339,6 +369,7 @@ impl<'a> RowMaker<'a> {
         };
         let all = Layout {
             links: (0..links).collect(),
+            precision: further.iter().map(|further| further.precision(setup)).collect(),
             further,
             sensors: (0..sensors).collect(),
             joints: dofs.collect(),
@@ -356,6 +387,8 @@ impl<'a> RowMaker<'a> {
             stacked: StackedRegressor::new(&setup.structure),
             tree: Regressor::new(&setup.model),
             readings: vec![Wrench::zero(); sensors],
+            calibrations: vec![Vec::new(); sensors],
+            references: vec![f64::NAN; sensors],
             wrench,
             torque,
             disregards: false,
@@ -395,10 +428,11 @@ impl<'a> RowMaker<'a> {
         let (wrenches, torques) = heard.split_at(6 * sensors);
         let sensing: Vec<bool> = wrenches.chunks(6).map(|six| six.contains(&true)).collect();
         let (seen, shows) = seen.split_at(links);
-        let shown = numbers(shows);
+        let shown: Vec<usize> = numbers(shows);
         maker.layout = Layout {
             links: numbers(seen),
             further: shown.iter().map(|&place| maker.layout.further[place]).collect(),
+            precision: shown.iter().map(|&place| maker.layout.precision[place]).collect(),
             sensors: numbers(&sensing),
             joints: numbers(torques),
         };
@@ -415,6 +449,74 @@ impl<'a> RowMaker<'a> {
             channels: groups_of(&mut channels.into_iter().map(|channel| unknowns + channel)),
         };
         Ok(maker)
+    }
+
+    /// From now on this of the calibrations of the sensors that show is unknown, too, and nothing else of them. Of a gain all of a sensor's entries; a change per kelvin where its temperature changed in these instants. The
+    /// temperature from which that counts is the configured one, else the mean.
+    pub(super) fn calibrate<'b>(&mut self, wanted: Kind, instants: impl Iterator<Item = &'b Instant>) {
+        /// A board whose temperature varies less tells nothing [K].
+        const LEAST: f64 = 0.1;
+        let setup = self.setup;
+        // They come last.
+        let others = self.layout.further.iter();
+        let others = others
+            .filter(|further| !matches!(further, Further::Calibration(..)))
+            .count();
+        self.layout.further.truncate(others);
+        self.layout.precision.truncate(others);
+        self.groups.further.truncate(others);
+        self.calibrations.iter_mut().for_each(Vec::clear);
+        let mut temperatures = vec![Vec::new(); self.references.len()];
+        for instant in instants {
+            let measured = temperatures.iter_mut().zip(&instant.temperatures);
+            for (own, celsius) in measured.filter(|(_, celsius)| celsius.is_finite()) {
+                own.push(*celsius);
+            }
+        }
+        for (place, &sensor) in self.layout.sensors.iter().enumerate() {
+            let own = &temperatures[sensor];
+            let (low, high) = own
+                .iter()
+                .fold((f64::MAX, f64::MIN), |(low, high), x| (low.min(*x), high.max(*x)));
+            let mean = own.iter().sum::<f64>() / own.len() as f64;
+            self.references[sensor] = setup.calibrations[sensor].reference().unwrap_or(mean);
+            let kind = Kind {
+                temperature: wanted.temperature && high - low > LEAST,
+                ..wanted
+            };
+            for unknown in kind.unknowns() {
+                let further = Further::Calibration(sensor, unknown);
+                self.calibrations[sensor].push((WIDTH * self.layout.links.len() + self.layout.further.len(), unknown));
+                self.layout.further.push(further);
+                self.layout.precision.push(further.precision(setup));
+                self.groups.further.push(self.groups.channels[6 * place]);
+            }
+        }
+    }
+
+    /// The temperature from which a sensor's change per kelvin counts \[degrees Celsius\], if one was recorded or configured.
+    pub(super) fn reference(&self, sensor: usize) -> Option<f64> {
+        self.references
+            .get(sensor)
+            .copied()
+            .filter(|celsius| celsius.is_finite())
+    }
+
+    /// Columns that a sensor's calibration has in a row, and their entries, where its offset has `values` in it: an unknown of the calibration is as an offset of so much as is read.
+    fn calibration<'b>(
+        &'b self,
+        instant: &'b Instant,
+        sensor: usize,
+        values: &'b [f64],
+    ) -> impl Iterator<Item = (usize, f64)> + 'b {
+        let celsius = instant.temperatures.get(sensor).copied().unwrap_or(f64::NAN);
+        let kelvin = Some(celsius - self.references[sensor]).filter(|kelvin| kelvin.is_finite());
+        let fitted = instant.fitted.get(sensor).filter(|fitted| fitted.is_finite());
+        let corrected = fitted.unwrap_or(&self.readings[sensor]).torque_first();
+        self.calibrations[sensor].iter().map(move |&(column, unknown)| {
+            let as_offset = unknown.as_offset(&corrected, kelvin.unwrap_or(0.0));
+            (column, values[unknown.channel()] * as_offset)
+        })
     }
 
     pub(super) fn layout(&self) -> &Layout {
@@ -540,6 +642,10 @@ impl<'a> RowMaker<'a> {
                 if let Ok(place) = self.layout.sensors.binary_search(&sensor) {
                     *sum += dot(values, &session[6 * place..][..6]);
                 }
+                *sum += self
+                    .calibration(instant, sensor, values)
+                    .map(|(column, entry)| entry * d[column])
+                    .sum::<f64>();
             }
             *sum -= subtree.measured()[row];
         }
@@ -604,6 +710,9 @@ impl<'a> RowMaker<'a> {
                     if let Ok(place) = self.layout.sensors.binary_search(&sensor) {
                         g[6 * place..][..6].copy_from_slice(values);
                         n[6 * place..][..6].copy_from_slice(values);
+                    }
+                    for (column, entry) in self.calibration(instant, sensor, values) {
+                        a[column] = entry;
                     }
                 }
             }

@@ -421,6 +421,7 @@ mod tests {
             faults: Vec::new(),
             base_fault: Reason::None,
             temperatures: Vec::new(),
+            fitted: Vec::new(),
             outliers: SensorSet::default(),
             suspected: UnitSet::default(),
             shaking: Vec::new(),
