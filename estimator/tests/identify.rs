@@ -11,7 +11,7 @@ use proprio_estimator::parameters::Parameters;
 use proprio_estimator::regressor::Regressor;
 use proprio_estimator::regressor::identifiable::Column;
 use proprio_estimator::setup::Setup;
-use proprio_estimator::spatial::{Mat3, RigidInertia, Vec3, Wrench};
+use proprio_estimator::spatial::{Mat3, Pose, RigidInertia, Vec3, Wrench};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
@@ -647,6 +647,70 @@ fn sensor_the_wrong_way_round_is_named_and_nothing_identified() {
         outcome.findings
     );
     assert!(outcome.links.iter().all(|link| link.identified == link.cad));
+}
+
+/// The log of a sensor whose readings are in another frame than the configuration says, and what the configuration should have said.
+#[test]
+fn a_sensor_in_another_frame_is_named_with_the_right_one() {
+    let setup = arm();
+    let log = simulate(&setup, &real(&setup, 3), 12.0, 0.01, 3);
+    let turned = |pose: &Pose, sign: f64| {
+        let mut lines = log.lines();
+        let header = lines.next().expect("a header");
+        let places = AXES.map(|axis| {
+            header
+                .split(',')
+                .position(|name| name == format!("wrench/ft/{axis}"))
+                .expect("a column")
+        });
+        let mut text = format!("{header}\n");
+        for line in lines {
+            let mut cells: Vec<String> = line.split(',').map(str::to_owned).collect();
+            let [fx, fy, fz, tx, ty, tz] = places.map(|place| cells[place].parse::<f64>().expect("a number"));
+            let there = pose.wrench_back(&Wrench::from_parts([fx, fy, fz], [tx, ty, tz])) * sign;
+            for (place, value) in places.into_iter().zip(there.force_first()) {
+                cells[place] = value.to_string();
+            }
+            text += &format!("{}\n", cells.join(","));
+        }
+        text
+    };
+    // The sensor's joint is a translation by 5 cm along z: the parent's frame has its origin below.
+    let parent = Pose::from_xyz_rpy([0.0, 0.0, -0.05], [0.0; 3]);
+    let quarter = Pose::from_xyz_rpy([0.0; 3], [0.0, 0.0, std::f64::consts::FRAC_PI_2]);
+    let upside_down = Pose::from_xyz_rpy([0.0; 3], [std::f64::consts::PI, 0.0, 0.0]);
+    for (pose, sign, expected) in [
+        (
+            quarter,
+            1.0,
+            "rpy_rad = [0, 0, 1.5708], direction = \"child_to_parent\"",
+        ),
+        (
+            upside_down,
+            1.0,
+            "rpy_rad = [3.1416, 0, 0], direction = \"child_to_parent\"",
+        ),
+        (
+            quarter,
+            -1.0,
+            "rpy_rad = [0, 0, 1.5708], direction = \"parent_to_child\"",
+        ),
+    ] {
+        let outcome = run(&setup, &[("turned", Role::Train, &turned(&pose, sign))], &[]);
+        assert!(matches!(outcome.verdict, Verdict::Nothing(_)), "{:?}", outcome.verdict);
+        let found = outcome.findings.iter().find(|f| f.code == "wrong_frame");
+        let found = found.expect("a finding");
+        assert_eq!(found.subject, "ft");
+        assert!(found.text.contains(expected), "{}", found.text);
+    }
+    // An origin that is off by no more than bodies are is no frame's.
+    let outcome = run(&setup, &[("moved", Role::Train, &turned(&parent, 1.0))], &[]);
+    assert!(
+        outcome
+            .findings
+            .iter()
+            .all(|f| f.code != "wrong_frame" && f.code != "wrong_sign")
+    );
 }
 
 /// Between two sensors a turned one makes the balance wrong for both: the one that is turned is named, alone.

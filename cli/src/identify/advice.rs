@@ -195,7 +195,12 @@ impl Advice {
         self.worsen(Grade::Care);
         // What a fit to any motion would meet again; each once, although several logs may show it.
         let mut said = BTreeSet::new();
-        for finding in all().filter(|f| matches!(f.code, "wrong_sign" | "joint_zero" | "units" | "wrong_units")) {
+        for finding in all().filter(|f| {
+            matches!(
+                f.code,
+                "wrong_sign" | "wrong_frame" | "joint_zero" | "units" | "wrong_units"
+            )
+        }) {
             if finding.severity >= Severity::Warning && said.insert(finding.text.as_str()) {
                 self.next.push(sentence(&finding.text));
             }

@@ -3,7 +3,7 @@
 //! 1. Each log becomes instants ([`super::instants`]), each instant rows ([`super::rows`]).
 //! 2. Rounds. With the noise that the last parameters leave: what each log tells of the parameters, its own unknowns eliminated ([`super::passes`]); logs added up; the most
 //!    probable bodies under the prior and its weight ([`super::prior`]). With these bodies: what is left, and from it the noise ([`super::noise`]). Until both stay.
-//!    Before the first of them: a sensor that is mounted the wrong way round is refused.
+//!    Before the first of them: a sensor that is mounted the wrong way is refused ([`super::mounting`]).
 //! 3. What this fit says that something undeclared acted on is left out, and the rounds repeated, until that stays ([`super::gate`]).
 //!    Then, where gains of sensors are asked for, fits with these unknown, too.
 //! 4. A check on data held out: pieces of the logs are predicted from the others. The change from CAD is shrunk where it gains nothing ([`held_out`]).
@@ -15,18 +15,16 @@ use super::consistent;
 use super::gate::{self, Load, UnitSet};
 use super::information::Information;
 use super::instants::{Break, Defect, Instant, Recording, Settings, Signal, TimeOffset};
+use super::mounting;
 use super::outcome::{Finding, LeftOut, Outcome, Role, Severity, Verdict};
-use super::passes::{
-    NoiseModel, OFFSET_VARIANCE, Piece, Residuals, Told, leave, noise_of, session_prior, tell, tell_angles,
-};
+use super::passes::{NoiseModel, Piece, Residuals, Told, leave, noise_of, tell, tell_angles};
 use super::prior::{Fit, Posterior, Prior, PriorError};
 use super::rows::{Further, Groups, Layout, RowMaker, Rows};
-use super::session::Session;
 use super::shaking::Shaking;
 use super::torques;
 use crate::calibration::Kind;
 use crate::config::{Gain, IdentificationInput};
-use crate::dynamics::{DynamicsError, Structure};
+use crate::dynamics::DynamicsError;
 use crate::model::JointKind;
 use crate::setup::{Setup, Use};
 use crate::spatial::{RigidInertia, Vec3, Wrench};
@@ -206,14 +204,14 @@ pub fn identify(
             format!("nothing shows the links' parameters: {what}"),
         ));
     }
-    let wrong = wrong_signs(&maker, &training);
+    let wrong = mounting::wrong(&maker, &training);
     if !wrong.is_empty() {
         let names: Vec<&str> = wrong.iter().map(|f| f.subject.as_str()).collect();
         let mut outcome = assess::nothing(
             setup,
             &prepared,
             format!(
-                "{}: mounted or configured the wrong way round; nothing was identified",
+                "{}: mounted or configured the wrong way; nothing was identified",
                 names.join(", ")
             ),
         );
@@ -420,7 +418,7 @@ fn usable(setup: &Setup, file: String, role: Role, recording: Recording) -> Prep
     }
 }
 
-fn finding(defect: &Defect) -> Finding {
+pub(super) fn finding(defect: &Defect) -> Finding {
     let (code, subject) = match defect {
         Defect::SkippedRows { .. } => ("skipped_rows", String::new()),
         Defect::NeverSeen { channel } => ("never_seen", channel.clone()),
@@ -438,6 +436,7 @@ fn finding(defect: &Defect) -> Finding {
         Defect::Jump { channel, .. } => ("jump", channel.clone()),
         Defect::Outliers { channel, .. } => ("outliers", channel.clone()),
         Defect::WrongSign { sensor } => ("wrong_sign", sensor.clone()),
+        Defect::WrongFrame { sensor, .. } => ("wrong_frame", sensor.clone()),
         Defect::JointZero { joint, .. } => ("joint_zero", joint.clone()),
     };
     Finding {
@@ -1229,100 +1228,6 @@ fn held_out(
         findings,
         noise: noise.midway(&noise_of(layout, &left, 1, bound, &noise.least)),
     })
-}
-
-/// Sensors whose readings fit CAD only with their sign turned: with the sign free, masses would come out negative.
-///
-/// What is asked is by how much CAD and constant offsets miss all rows if this sensor is turned, or that one: where a sub-tree has two sensors, turning the right one makes all well.
-/// The one that helps the most is taken, as long as it leaves less than a third, which is what a correlation of -1/2 is; then the next.
-fn wrong_signs(maker: &RowMaker<'_>, training: &[&Prepared]) -> Vec<Finding> {
-    let layout = maker.layout();
-    let count = layout.sensors.len();
-    let pieces = sample(maker, training);
-    // A force counts as much as its torque on an arm of this length.
-    let mut variances = vec![1.0; layout.channels()];
-    for torque in (0..count).flat_map(|place| 6 * place..6 * place + 3) {
-        variances[torque] = Structure::LENGTH_SCALE.powi(2);
-    }
-    let misfits = |turned: &[Vec<bool>]| -> Vec<f64> {
-        let parts = over(maker, &pieces, |maker, _, piece| {
-            let mut misfits = vec![0.0; turned.len()];
-            let mut session = Session::new(&session_prior(layout), turned.len());
-            let mut rows = Rows::new(layout);
-            let (mut lines, mut last) = (Vec::new(), None);
-            for instant in piece.instants {
-                let t = last.replace(instant.t).unwrap_or(instant.t);
-                for broken in piece.breaks.iter().filter(|b| t < b.t && b.t <= instant.t) {
-                    if let Ok(place) = layout.sensors.binary_search(&broken.sensor) {
-                        (6 * place..6 * place + 6).for_each(|unknown| session.renew(unknown, OFFSET_VARIANCE));
-                    }
-                }
-                if maker.make(instant, &mut rows).is_err() {
-                    continue;
-                }
-                lines.clear();
-                for row in 0..rows.count {
-                    // What each reading has in the right side.
-                    let shares: Vec<f64> = layout
-                        .sensors
-                        .iter()
-                        .zip(rows.g(row).chunks_exact(6))
-                        .map(|(&sensor, g)| {
-                            let reading = &instant.readings[sensor];
-                            let values = reading.torque.iter().chain(&reading.force);
-                            g.iter()
-                                .zip(values)
-                                .filter(|(g, _)| **g != 0.0)
-                                .map(|(g, x)| g * x)
-                                .sum()
-                        })
-                        .collect();
-                    for turned in turned {
-                        let wrong = turned.iter().zip(&shares).filter(|(turned, _)| **turned);
-                        lines.push(rows.r(row) - 2.0 * wrong.map(|(_, share)| share).sum::<f64>());
-                    }
-                }
-                rows.whiten_with(&variances, &mut lines, turned.len());
-                for (row, line) in lines.chunks_exact_mut(turned.len()).enumerate() {
-                    session.update(rows.g(row), line);
-                    misfits.iter_mut().zip(line).for_each(|(sum, x)| *sum += *x * *x);
-                }
-            }
-            misfits
-        });
-        (0..turned.len())
-            .map(|k| parts.iter().map(|part| part[k]).sum())
-            .collect()
-    };
-    let mut turned = vec![false; count];
-    let mut order = Vec::new();
-    while order.len() < count {
-        let tries: Vec<usize> = (0..count).filter(|place| !turned[*place]).collect();
-        let mut cases = vec![turned.clone()];
-        for &place in &tries {
-            let mut case = turned.clone();
-            case[place] = true;
-            cases.push(case);
-        }
-        let found = misfits(&cases);
-        let best = tries.iter().zip(&found[1..]).min_by(|a, b| a.1.total_cmp(b.1));
-        let Some((&place, _)) = best.filter(|(_, misfit)| **misfit < found[0] / 3.0) else {
-            break;
-        };
-        turned[place] = true;
-        order.push(place);
-    }
-    order.sort_unstable();
-    let finding = |place: usize| {
-        let name = assess::sensor_name(maker.setup(), layout.sensors[place]);
-        Finding {
-            severity: Severity::Refusal,
-            code: "wrong_sign",
-            text: Defect::WrongSign { sensor: name.clone() }.to_string(),
-            subject: name,
-        }
-    };
-    order.into_iter().map(finding).collect()
 }
 
 /// Joints whose zero is elsewhere than the model's: a constant error of the position that explains more than inertial parameters can, at the prior's weight.

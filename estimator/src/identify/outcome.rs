@@ -47,7 +47,7 @@ pub enum Severity {
 pub struct Finding {
     /// How serious it is.
     pub severity: Severity,
-    /// One word for a program: `jump`, `gap`, `no_motion`, `wrong_sign`, `joint_zero`, `not_physical`, `shrunk`, `not_checked`, ...
+    /// One word for a program: `jump`, `gap`, `no_motion`, `wrong_sign`, `wrong_frame`, `joint_zero`, `not_physical`, `shrunk`, `not_checked`, ...
     pub code: &'static str,
     /// What it is about: the name of a channel, joint, link; empty if about everything.
     pub subject: String,

@@ -184,6 +184,13 @@ pub enum Defect {
         /// The channel.
         sensor: String,
     },
+    /// An F/T sensor whose readings fit the model only in another frame.
+    WrongFrame {
+        /// The channel.
+        sensor: String,
+        /// What the configuration should say.
+        instead: String,
+    },
     /// A joint whose zero is elsewhere than the model's.
     JointZero {
         /// The joint.
@@ -326,6 +333,10 @@ impl fmt::Display for Defect {
             Self::WrongSign { sensor } => write!(
                 f,
                 "wrench/{sensor} fits only with its sign turned (masses come out negative): check `direction` and `frame` in the configuration"
+            ),
+            Self::WrongFrame { sensor, instead } => write!(
+                f,
+                "wrench/{sensor} does not fit the links beyond it in the frame that the configuration says, but would with {instead}: check how it is mounted, and `frame` and `direction` in its [[force_torque]]"
             ),
             Self::JointZero { joint, radians } => write!(
                 f,
