@@ -337,6 +337,9 @@ fn rotors(setup: &Setup, identified: &Identified, root: &DMatrix<f64>) -> Vec<Ro
 /// Share of the prior's standard deviation from which on the logs are said to tell nothing.
 const TOLD_NOTHING: f64 = 0.8;
 
+/// So many of these are named; all are in the table.
+const NAMED: usize = 8;
+
 /// Calibrations of the sensors of which something was to be identified, and what is to be said of them.
 fn calibrations(
     setup: &Setup,
@@ -407,14 +410,16 @@ fn calibrations(
             }
         }
         if !vague.is_empty() {
+            let (count, more) = (vague.len(), if vague.len() > NAMED { ", ..." } else { "" });
+            vague.truncate(NAMED);
             findings.push(Finding {
                 severity: Severity::Note,
                 code: "calibration_unseen",
                 text: format!(
                     "{name}: the logs tell next to nothing of {} of the {} numbers of its calibration, which stay about as the workbench has them: {}. Motion that loads these channels more would tell",
-                    vague.len(),
+                    count,
                     own.len(),
-                    vague.join(", ")
+                    vague.join(", ") + more
                 ),
                 subject: name.clone(),
             });
