@@ -199,13 +199,16 @@ pub(super) fn tell_angles(
     tell_with(maker, piece, noise, angles.len(), &mut columns)
 }
 
-/// The same with `width` further columns of whatever kind, after those of `d`; `columns` writes them, row by row, for an instant given by its number and for its rows.
+/// Writes further columns of an instant's rows, row by row, given the instant's number in the piece and its rows.
+type Columns<'a> = dyn FnMut(&mut RowMaker<'_>, usize, &Rows, &mut [f64]) + 'a;
+
+/// The same with `width` further columns of whatever kind, after those of `d`.
 pub(super) fn tell_with(
     maker: &mut RowMaker<'_>,
     piece: Piece<'_>,
     noise: &NoiseModel,
     width: usize,
-    columns: &mut dyn FnMut(&mut RowMaker<'_>, usize, &Rows, &mut [f64]),
+    columns: &mut Columns<'_>,
 ) -> Told {
     let layout = maker.layout().clone();
     let links = layout.unknowns();

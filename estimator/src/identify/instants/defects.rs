@@ -882,7 +882,7 @@ fn dead(track: &JointTrack) -> Vec<(Nanos, Nanos)> {
         is_long(stretch) && often.powf((end - begin) as f64) < CHANCE && track.range(t[begin], t[end]) > MOTION
     };
     // One value from beginning to end leaves nothing to compare with.
-    let all_equal = stretches.len() == 1 && stretches.iter().any(|s| is_long(s));
+    let all_equal = stretches.len() == 1 && stretches.iter().any(is_long);
     stretches
         .iter()
         .filter(|stretch| dead(stretch) || all_equal && track.range(t[stretch.0], t[stretch.1]) > MOTION)
