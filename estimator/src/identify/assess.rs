@@ -1388,22 +1388,25 @@ fn spectra(setup: &Setup, layout: &Layout, times: &[f64], left: &Residuals) -> V
         .map(|i| (std::f64::consts::PI * (i as f64 + 0.5) / LENGTH as f64).sin().powi(2))
         .collect();
     let power: f64 = window.iter().map(|w| w * w).sum();
+    // e^(-2 pi i k / LENGTH)
+    let roots: Vec<[f64; 2]> = (0..LENGTH / 2)
+        .map(|k| (-2.0 * std::f64::consts::PI * k as f64 / LENGTH as f64).sin_cos())
+        .map(|(sine, cosine)| [cosine, sine])
+        .collect();
     let density = |series: &[f64]| -> Vec<f64> {
         let mut sums = vec![0.0; LENGTH / 2];
         let mut pieces = 0.0;
+        let mut values = vec![[0.0; 2]; LENGTH];
         for piece in series.windows(LENGTH).step_by(LENGTH / 2) {
             if piece.iter().any(|x| !x.is_finite()) {
                 continue;
             }
             pieces += 1.0;
-            for (k, sum) in sums.iter_mut().enumerate() {
-                let turn = 2.0 * std::f64::consts::PI * (k + 1) as f64 / LENGTH as f64;
-                let (mut re, mut im) = (0.0, 0.0);
-                for (i, (x, w)) in piece.iter().zip(&window).enumerate() {
-                    let (s, c) = (turn * i as f64).sin_cos();
-                    re += x * w * c;
-                    im += x * w * s;
-                }
+            for ((value, x), w) in values.iter_mut().zip(piece).zip(&window) {
+                *value = [x * w, 0.0];
+            }
+            fourier(&mut values, &roots);
+            for (sum, [re, im]) in sums.iter_mut().zip(&values[1..]) {
                 *sum += 2.0 * (re * re + im * im) / (power * rate);
             }
         }
@@ -1446,6 +1449,31 @@ impl Grid {
         }
         let smooth = low_passed(&series, self.rate);
         self.places.iter().map(|&place| smooth[place]).collect()
+    }
+}
+
+/// The discrete Fourier transform of a power of two of complex numbers, in place (Cooley, Tukey 1965). `roots`: `e^(-2 pi i k / n)` for `k < n / 2`.
+fn fourier(values: &mut [[f64; 2]], roots: &[[f64; 2]]) {
+    let count = values.len();
+    let unused = usize::BITS - count.trailing_zeros();
+    for i in 0..count {
+        let mirrored = i.reverse_bits().checked_shr(unused).unwrap_or(0);
+        if i < mirrored {
+            values.swap(i, mirrored);
+        }
+    }
+    let mut half = 1;
+    while half < count {
+        let stride = count / (2 * half);
+        for pair in values.chunks_exact_mut(2 * half) {
+            let (even, odd) = pair.split_at_mut(half);
+            for ((a, b), [cosine, sine]) in even.iter_mut().zip(odd).zip(roots.iter().step_by(stride)) {
+                let turned = [b[0] * cosine - b[1] * sine, b[0] * sine + b[1] * cosine];
+                *b = [a[0] - turned[0], a[1] - turned[1]];
+                *a = [a[0] + turned[0], a[1] + turned[1]];
+            }
+        }
+        half *= 2;
     }
 }
 
@@ -1524,6 +1552,31 @@ mod tests {
     }
 
     /// One link whose directions are known from hardly at all to a ten thousandth of the prior's spread; moved by ten standard deviations in the best known one.
+    #[test]
+    fn the_fourier_transform_is_the_sum_that_it_stands_for() {
+        for count in [1_usize, 2, 8, 64] {
+            let turn = |k: usize| {
+                let (s, c) = (-2.0 * std::f64::consts::PI * (k % count) as f64 / count as f64).sin_cos();
+                [c, s]
+            };
+            let roots: Vec<[f64; 2]> = (0..count / 2).map(turn).collect();
+            let numbers = crate::identify::normals(3, 2 * count);
+            let before: Vec<[f64; 2]> = numbers.chunks_exact(2).map(|two| [two[0], two[1]]).collect();
+            let mut after = before.clone();
+            fourier(&mut after, &roots);
+            for (k, found) in after.iter().enumerate() {
+                let sum = before.iter().enumerate().fold([0.0; 2], |sum, (i, [re, im])| {
+                    let [c, s] = turn(i * k);
+                    [sum[0] + re * c - im * s, sum[1] + re * s + im * c]
+                });
+                assert!(
+                    (sum[0] - found[0]).abs() + (sum[1] - found[1]).abs() < 1e-12,
+                    "{count}, {k}"
+                );
+            }
+        }
+    }
+
     #[test]
     fn what_is_known_best_counts_first_for_significance() {
         let share: Vec<f64> = (0..10).map(|i| 10f64.powf(-0.9 * f64::from(i))).collect();

@@ -33,7 +33,7 @@ mod wander;
 
 use std::sync::Arc;
 
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, DMatrixView};
 use proprio_topics::{Nanos, Reason};
 
 use self::wander::Walk;
@@ -1227,7 +1227,12 @@ impl Part {
         }
         let mut series = vec![f64::NAN; instants];
         let session = self.variances.len();
-        let mut sensitivity = vec![0.0; unknowns - session];
+        // What each channel's share, summed, says of the unknowns: its column of rows^T x weights.
+        let rows = DMatrixView::from_slice(&self.learnt.values, unknowns + 1, self.learnt.len());
+        let weights = DMatrix::from_fn(self.learnt.len(), session, |row, channel| {
+            self.variances[channel] * rows[(channel, row)]
+        });
+        let sensitivities = rows * weights;
         // An offset that has jumped has not wandered there.
         if self.change.is_some() {
             self.walks.iter_mut().for_each(Walk::interrupt);
@@ -1237,7 +1242,6 @@ impl Part {
             .collect();
         for channel in 0..session {
             series.fill(f64::NAN);
-            sensitivity.fill(0.0);
             for ((row, slot), residual) in self.learnt.iter().zip(&self.learnt.slots).zip(&residuals) {
                 if row[channel] == 0.0 {
                     continue;
@@ -1245,18 +1249,17 @@ impl Part {
                 let Some(place) = usize::try_from(slot - first).ok().and_then(|i| series.get_mut(i)) else {
                     continue;
                 };
-                let weight = self.variances[channel] * row[channel];
-                let share = weight * residual;
+                let share = self.variances[channel] * row[channel] * residual;
                 *place = if place.is_nan() { share } else { *place + share };
-                add_multiple(&mut sensitivity, weight, &row[session..unknowns]);
             }
             // What the channel reads in the mean, less what the bodies explain; and how uncertain that is, by noise and by the bodies.
             let seen: Vec<f64> = series.iter().copied().filter(|x| x.is_finite()).collect();
             if !seen.is_empty() {
                 let count = seen.len() as f64;
                 let apparent = solution.estimate[channel] + seen.iter().sum::<f64>() / count;
+                let sensitivity = &sensitivities.as_slice()[channel * (unknowns + 1)..][session..unknowns];
                 let of_bodies: f64 = (solution.factor.chunks_exact(unknowns))
-                    .map(|column| (dot(&column[session..], &sensitivity) / count).powi(2))
+                    .map(|column| (dot(&column[session..], sensitivity) / count).powi(2))
                     .sum();
                 let t = (first + last) as f64 / 2.0 * self.period;
                 self.walks[channel].take(t, apparent, self.variances[channel] / count + of_bodies);

@@ -13,15 +13,35 @@ fn blocks(count: usize) -> impl DoubleEndedIterator<Item = (usize, usize)> {
     (0..count.div_ceil(BLOCK)).map(move |number| (number * BLOCK, BLOCK.min(count - number * BLOCK)))
 }
 
+/// A copy of `rows` by `columns` numbers from `(row, column)` on. (A view's own copy goes number by number.)
+fn copied(from: &DMatrix<f64>, (row, column): (usize, usize), (rows, columns): (usize, usize)) -> DMatrix<f64> {
+    let mut to = DMatrix::zeros(rows, columns);
+    let height = from.nrows();
+    let sources = from.as_slice().chunks_exact(height.max(1)).skip(column);
+    for (to, from) in to.as_mut_slice().chunks_exact_mut(rows.max(1)).zip(sources) {
+        to.copy_from_slice(&from[row..row + rows]);
+    }
+    to
+}
+
+/// Puts a block where it belongs.
+fn put(to: &mut DMatrix<f64>, (row, column): (usize, usize), block: &DMatrix<f64>) {
+    let (rows, height) = (block.nrows(), to.nrows());
+    let targets = to.as_mut_slice().chunks_exact_mut(height.max(1)).skip(column);
+    for (from, to) in block.as_slice().chunks_exact(rows.max(1)).zip(targets) {
+        to[row..row + rows].copy_from_slice(from);
+    }
+}
+
 /// The lower triangle of `A^T A`; what stands above the diagonal blocks is zero.
 pub(super) fn gram(a: &DMatrix<f64>) -> DMatrix<f64> {
     let count = a.ncols();
     let transposed = a.transpose();
     let mut gram = DMatrix::zeros(count, count);
     for (first, length) in blocks(count) {
-        let product = transposed.rows(first, count - first).into_owned() * a.columns(first, length).into_owned();
-        gram.view_mut((first, first), (count - first, length))
-            .copy_from(&product);
+        let left = copied(&transposed, (first, 0), (count - first, a.nrows()));
+        let product = left * copied(a, (0, first), (a.nrows(), length));
+        put(&mut gram, (first, first), &product);
     }
     gram
 }
@@ -30,18 +50,19 @@ pub(super) fn gram(a: &DMatrix<f64>) -> DMatrix<f64> {
 pub(super) fn cholesky(mut matrix: DMatrix<f64>) -> Option<Cholesky<f64, Dyn>> {
     let count = matrix.nrows();
     for (first, length) in blocks(count) {
-        let own = Cholesky::new(matrix.view((first, first), (length, length)).into_owned())?.unpack();
-        matrix.view_mut((first, first), (length, length)).copy_from(&own);
+        let own = Cholesky::new(copied(&matrix, (first, first), (length, length)))?.unpack();
+        put(&mut matrix, (first, first), &own);
         let (next, below) = (first + length, count - first - length);
         if below == 0 {
             break;
         }
         let inverse = own.solve_lower_triangular(&DMatrix::identity(length, length))?;
-        let panel = matrix.view((next, first), (below, length)).into_owned() * inverse.transpose();
-        matrix.view_mut((next, first), (below, length)).copy_from(&panel);
+        let panel = copied(&matrix, (next, first), (below, length)) * inverse.transpose();
+        put(&mut matrix, (next, first), &panel);
         let transposed = panel.transpose();
         for (start, width) in blocks(below) {
-            let product = panel.rows(start, below - start).into_owned() * transposed.columns(start, width).into_owned();
+            let left = copied(&panel, (start, 0), (below - start, length));
+            let product = left * copied(&transposed, (0, start), (length, width));
             let mut target = matrix.view_mut((next + start, next + start), (below - start, width));
             target -= product;
         }
@@ -55,18 +76,16 @@ pub(super) fn inverse(l: &DMatrix<f64>) -> DMatrix<f64> {
     let count = l.nrows();
     let mut inverse = DMatrix::zeros(count, count);
     for (first, length) in blocks(count) {
-        let own = l.view((first, first), (length, length)).into_owned();
-        let own = own
+        let own = copied(l, (first, first), (length, length))
             .solve_lower_triangular(&DMatrix::identity(length, length))
             .unwrap_or_else(|| DMatrix::zeros(length, length));
         if first > 0 {
             // [L11 0; L21 L22]^-1 = [L11^-1 0; -L22^-1 L21 L11^-1  L22^-1]
-            let left = l.view((first, 0), (length, first)).into_owned();
-            let above = inverse.view((0, 0), (first, first)).into_owned();
-            let product = -(&own * (left * above));
-            inverse.view_mut((first, 0), (length, first)).copy_from(&product);
+            let left = copied(l, (first, 0), (length, first));
+            let product = -(&own * (left * copied(&inverse, (0, 0), (first, first))));
+            put(&mut inverse, (first, 0), &product);
         }
-        inverse.view_mut((first, first), (length, length)).copy_from(&own);
+        put(&mut inverse, (first, first), &own);
     }
     inverse
 }

@@ -763,3 +763,40 @@ impl Fit {
         triangle
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::identify::normals;
+
+    /// From anywhere, bodies or not, the same minimum, as near as was asked for; from near it, in fewer steps.
+    #[test]
+    fn a_fit_from_elsewhere_is_the_fit() {
+        let body = |mass: f64| {
+            let [m, c, i] = [mass, 0.05 * mass, 0.01 * mass];
+            RigidInertia::from_parameters(&[m, c, 0.3 * c, -c, i, 0.1 * i, 0.0, 1.2 * i, 0.0, 0.9 * i])
+        };
+        let cad = [body(1.0), body(2.5), body(0.4)];
+        let prior = Prior::new(&cad).unwrap();
+        let columns = 10 * cad.len() + 2;
+        let rows = 24;
+        let data = DMatrix::from_vec(rows, columns, normals(4, rows * columns)) * 30.0;
+        let right = DVector::from_vec(normals(5, rows)) * 10.0;
+        let posterior = Posterior::new(&prior, &[0, 1, 2], &data, &right, &[1.0, 0.0]).unwrap();
+        let fit = posterior.fit(0.4).unwrap();
+        let precision = fit.precision_root();
+        let mut impossible = fit.x.clone();
+        impossible[10] = -100.0;
+        let other = posterior.fit(0.3).unwrap();
+        for (x, most) in [(&fit.x, 1), (&other.x, fit.iterations), (&impossible, fit.iterations)] {
+            let found = posterior.fit_from(x.as_slice(), 0.4, 1e-8).unwrap();
+            // In standard deviations.
+            let off = (&precision * (&found.x - &fit.x)).norm();
+            assert!(off < 2e-4, "{off}");
+            assert!(found.is_converged && found.decrement <= 1e-8 && found.iterations <= most);
+            assert!((found.effective - fit.effective).abs() < 1e-3 * fit.effective);
+        }
+        assert!(posterior.fit_from(&[0.0; 3], 0.4, 1e-8).is_ok());
+        assert!(posterior.fit_from(fit.x.as_slice(), -1.0, 1e-8).is_err());
+    }
+}
