@@ -461,6 +461,35 @@ impl Information {
         Ok(())
     }
 
+    /// The same as [`Information::merge`], and `other` knows nothing afterwards. Does not allocate: `work` is any panel about these unknowns, empty before and after, and `row` has room for one.
+    ///
+    /// # Errors
+    /// As for [`Information::merge`], and if panel or row do not fit.
+    pub(super) fn take(
+        &mut self,
+        other: &mut Self,
+        columns: &[usize],
+        work: &mut Panel,
+        row: &mut [f64],
+    ) -> Result<(), InformationError> {
+        check_size("columns of the other information", columns.len(), other.unknowns())?;
+        check_columns(columns, self.unknowns())?;
+        check_size("unknowns of the panel", work.unknowns, self.unknowns())?;
+        check_size("numbers of a row", row.len(), self.unknowns())?;
+        self.residual
+            .add(self.triangle.add(&other.triangle, columns, work, row));
+        self.residual.add(other.residual.get());
+        self.rows += other.rows;
+        other.clear();
+        Ok(())
+    }
+
+    /// Knows nothing any more.
+    pub(super) fn clear(&mut self) {
+        self.triangle.values.fill(0.0);
+        (self.residual, self.rows) = (Sum::default(), 0);
+    }
+
     /// One step of a random walk: unknown `columns[i]` becomes `x + w`, `w` normal with the standard deviation `deviation[i]`, independent of
     /// everything. From here on the unknown is the one after the step. Zero changes nothing; with infinity the unknown starts afresh, and what was known of
     /// the others remains. Exact; does not allocate; rows after the column are not touched.

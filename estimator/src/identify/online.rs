@@ -14,6 +14,9 @@
 //! over `[offsets of its sensors | parameters of its links]`, relative to the configuration's offsets and to CAD. A sub-tree with unknown contacts gives the combinations
 //! of its six equations that these do not reach: none at all under a full wrench.
 //!
+//! A large component's rows of a limb tell of that limb and its sensors alone. They are gathered in a triangle of their own, and join the others' once a second: a tenth of the work. What
+//! offsets wander is reckoned as often, for each step of a walk is one of all that hangs together. (Small components: ten times a second.)
+//!
 //! # Noise
 //! Rows are whitened with *inflated* variances: a channel's residual variance times its integrated autocorrelation time, both found by every [`Job`] from the rows of the
 //! last second under the newest solution, and averaged over half a minute. Never less than the configured variance.
@@ -51,6 +54,10 @@ const WIDTH: usize = 10;
 const BLOCK: Nanos = Nanos::from_millis(100);
 /// How often there is a solution, and how long after its data it is in force.
 const SOLVE: Nanos = Nanos::from_millis(1000);
+/// A component of so many unknowns gathers limb by limb what is about at most half of them.
+const LARGE: usize = 150;
+/// How long these gather before they join [s].
+const GATHERED: f64 = 1.0;
 /// The gate's level, in standard deviations of a normal distribution: one false alarm in millions of independent blocks.
 const GATE: f64 = 5.0;
 /// So many clean blocks end a suspicion.
@@ -308,10 +315,50 @@ impl Rows {
     }
 }
 
+/// Information about some of a component's unknowns alone.
+#[derive(Clone, Debug)]
+struct Limb {
+    /// The unknowns, ascending, and whether each of the component's is among them.
+    columns: Vec<usize>,
+    is_own: Vec<bool>,
+    information: Information,
+    panel: Panel,
+    row: Vec<f64>,
+}
+
+impl Limb {
+    fn new(columns: Vec<usize>, unknowns: usize, rows: usize) -> Self {
+        Self {
+            is_own: (0..unknowns).map(|column| columns.contains(&column)).collect(),
+            information: Information::new(columns.len()),
+            panel: Panel::new(columns.len(), rows),
+            row: vec![0.0; columns.len()],
+            columns,
+        }
+    }
+
+    /// Takes a row if it is about these unknowns alone.
+    fn takes(&mut self, a: &[f64], y: f64) -> bool {
+        if !a
+            .iter()
+            .zip(&self.is_own)
+            .all(|(value, is_own)| *is_own || *value == 0.0)
+        {
+            return false;
+        }
+        for (to, &column) in self.row.iter_mut().zip(&self.columns) {
+            *to = a[column];
+        }
+        self.panel.push_row(&self.row, y).is_ok()
+    }
+}
+
 /// Sub-trees that sensors join, and what is known of them.
 #[derive(Clone, Debug)]
 struct Component {
     subtrees: Vec<usize>,
+    /// The link that tells how its sensors are tilted.
+    top: usize,
     links: Vec<usize>,
     sensors: Vec<usize>,
     /// Joints whose motion its rows rest on, by the link that kinematics start at.
@@ -326,6 +373,11 @@ struct Component {
     outermost: Vec<usize>,
     information: Information,
     panel: Panel,
+    /// Of a large component, what its limbs' rows told since they last joined the information.
+    limbs: Vec<Limb>,
+    /// For how long offsets have wandered since they last did in the information, and how long they may [s].
+    wandered: f64,
+    stride: f64,
     variances: Vec<f64>,
     /// The configured ones.
     least: Vec<f64>,
@@ -610,6 +662,7 @@ impl Online {
         self.snapshot = Some(self.newest);
         job.data = self.newest;
         for (part, component) in job.parts.iter_mut().zip(&mut self.components) {
+            component.join();
             // Made for the same unknowns.
             let _ = part.information.copy_from(&component.information);
             std::mem::swap(&mut part.learnt, &mut component.learnt);
@@ -653,6 +706,8 @@ impl Online {
             if let Some((change, information)) = &mut part.change {
                 component.last_change = Some(*change);
                 std::mem::swap(information, &mut component.information);
+                // As old as what it replaces.
+                component.limbs.iter_mut().for_each(|limb| limb.information.clear());
                 // The solution in force is the one of before the change; the next one knows of it.
                 component.judges = false;
                 component.is_suspected = false;
@@ -681,13 +736,14 @@ impl Component {
     fn new(
         model: &Model,
         stacked: &StackedRegressor,
-        subtrees: Vec<usize>,
+        mut subtrees: Vec<usize>,
         cad: &[RigidInertia],
         offsets: &[Wrench],
         always: &ContactSet,
         per_job: usize,
         per_block: usize,
     ) -> Self {
+        let top = stacked.subtrees()[subtrees[0]].top();
         let structure = stacked.structure();
         let mut links: Vec<usize> = subtrees.iter().flat_map(|&k| structure.links_of(k)).collect();
         let mut sensors: Vec<usize> = subtrees.iter().flat_map(|&k| stacked.subtrees()[k].sensors()).collect();
@@ -698,6 +754,16 @@ impl Component {
         let session = 6 * sensors.len();
         let unknowns = session + WIDTH * links.len();
         let place = |list: &[usize], of: usize| list.binary_search(&of).unwrap_or(0);
+        if unknowns >= LARGE {
+            // Whitened rows have the unknowns of rows before them: the trunk's come last.
+            let size = |&k: &usize| {
+                (
+                    stacked.subtrees()[k].sensors().len(),
+                    stacked.subtrees()[k].links().len(),
+                )
+            };
+            subtrees.sort_by_key(size);
+        }
         let columns: Vec<Vec<usize>> = subtrees
             .iter()
             .map(|&k| {
@@ -752,7 +818,15 @@ impl Component {
             })
             .difference(always);
         let (width, most) = (unknowns + 1, 6 * subtrees.len());
+        let limbs: Vec<Limb> = (told_of(stacked, &subtrees, &columns).into_iter())
+            .filter(|own| unknowns >= LARGE && 2 * own.len() <= unknowns)
+            .map(|own| Limb::new(own, unknowns, most * per_block))
+            .collect();
         Self {
+            top,
+            stride: if limbs.is_empty() { 0.0 } else { GATHERED },
+            wandered: 0.0,
+            limbs,
             dofs,
             passing,
             reference,
@@ -859,8 +933,7 @@ impl Component {
             Paused::No
         };
         if self.is_suspected {
-            let top = stacked.subtrees()[self.subtrees[0]].top();
-            let acceleration = seen.kinematics.motion(top).proper_acceleration;
+            let acceleration = seen.kinematics.motion(self.top).proper_acceleration;
             let direction = acceleration / acceleration.norm().max(1e-3);
             if self.direction == Vec3::zeros() {
                 self.direction = direction;
@@ -939,9 +1012,14 @@ impl Component {
             self.is_suspected = false;
         }
         if self.active.is_empty() && !self.is_suspected {
+            self.wandered += elapsed;
+        }
+        if self.wandered > 0.0 && self.wandered >= self.stride {
+            self.join();
             for (to, wander) in self.deviations.iter_mut().zip(&self.wander) {
-                *to = wander * elapsed.sqrt();
+                *to = wander * self.wandered.sqrt();
             }
+            self.wandered = 0.0;
             let _ = self.information.drift(&self.offsets, &self.deviations);
         }
         if self.gathered.len() > 0 {
@@ -960,14 +1038,31 @@ impl Component {
         } += instants;
     }
 
+    /// What limbs gathered joins the rest.
+    fn join(&mut self) {
+        let width = self.row.len();
+        for limb in &mut self.limbs {
+            if limb.information.rows() > 0 {
+                let row = &mut self.row[..width - 1];
+                // Made for each other.
+                let _ = (self.information).take(&mut limb.information, &limb.columns, &mut self.panel, row);
+            }
+        }
+    }
+
     /// Takes the pending block in.
     fn absorb(&mut self) {
         for row in self.pending.iter() {
             let (a, y) = row.split_at(row.len() - 1);
-            // Finite, and there is room.
-            let _ = self.panel.push_row(a, y[0]);
+            if !self.limbs.iter_mut().any(|limb| limb.takes(a, y[0])) {
+                // Finite, and there is room.
+                let _ = self.panel.push_row(a, y[0]);
+            }
         }
         let _ = self.information.absorb(&mut self.panel);
+        for limb in &mut self.limbs {
+            let _ = limb.information.absorb(&mut limb.panel);
+        }
         let instants = self.pending.instants();
         self.counts.learnt += instants;
         if self.pending.is_moving {
@@ -1368,6 +1463,33 @@ impl Job {
     }
 }
 
+/// The unknowns that whitened rows of each sub-tree can tell of, ascending: its own, and those of the sub-trees before it that noise of common sensors joins to it.
+fn told_of(stacked: &StackedRegressor, subtrees: &[usize], columns: &[Vec<usize>]) -> Vec<Vec<usize>> {
+    let mut told: Vec<Vec<usize>> = Vec::new();
+    // Those so far that hang together have the number of the last of them.
+    let mut group: Vec<usize> = Vec::new();
+    for (number, &k) in subtrees.iter().enumerate() {
+        let sensors: Vec<usize> = stacked.subtrees()[k].sensors().collect();
+        for earlier in 0..number {
+            let shares = stacked.subtrees()[subtrees[earlier]]
+                .sensors()
+                .any(|s| sensors.contains(&s));
+            let of = group[earlier];
+            if shares && of != number {
+                group.iter_mut().filter(|g| **g == of).for_each(|g| *g = number);
+            }
+        }
+        group.push(number);
+        let joined = (0..number).filter(|&earlier| group[earlier] == number);
+        let mut own: Vec<usize> = joined.flat_map(|earlier| told[earlier].iter().copied()).collect();
+        own.extend(&columns[number]);
+        own.sort_unstable();
+        own.dedup();
+        told.push(own);
+    }
+    told
+}
+
 /// The number that a chi-square distribution with `freedom` degrees exceeds as often as a normal one exceeds `level` (Wilson, Hilferty 1931).
 fn chi_square(freedom: usize, level: f64) -> f64 {
     let (n, spread) = (freedom as f64, 2.0 / (9.0 * freedom as f64));
@@ -1377,5 +1499,137 @@ fn chi_square(freedom: usize, level: f64) -> f64 {
 fn add_multiple(to: &mut [f64], factor: f64, from: &[f64]) {
     for (to, from) in to.iter_mut().zip(from) {
         *to += factor * from;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dynamics::{FrameMotion, JointState, Noise, SensorCut};
+    use crate::identify::normals;
+    use crate::model::{MeasurementDirection, MeasurementFrame};
+    use crate::spatial::Pose;
+    use std::fmt::Write as _;
+
+    /// A trunk of four links and four limbs of as many behind a sensor each; the first limb ends in a foot behind another sensor.
+    fn robot() -> (Model, Vec<String>) {
+        let (mut text, mut sensors, mut links) = (String::from("<robot name=\"r\">"), Vec::new(), 0);
+        let mut link = |parent: Option<usize>, is_sensor: bool| {
+            let _ = write!(
+                text,
+                "<link name=\"l{links}\"><inertial><origin xyz=\"0.01 0.02 0.05\"/><mass value=\"1\"/>\
+                 <inertia ixx=\"0.01\" ixy=\"0\" ixz=\"0\" iyy=\"0.012\" iyz=\"0\" izz=\"0.015\"/></inertial></link>"
+            );
+            if let Some(parent) = parent {
+                let kind = if is_sensor { "fixed" } else { "continuous" };
+                let axis = ["1 0 0", "0 1 0", "0 0 1"][links % 3];
+                let _ = write!(
+                    text,
+                    "<joint name=\"j{links}\" type=\"{kind}\"><parent link=\"l{parent}\"/><child link=\"l{links}\"/>\
+                     <origin xyz=\"0.05 0.02 0.1\" rpy=\"0.3 {parent} 0\"/><axis xyz=\"{axis}\"/></joint>"
+                );
+                if is_sensor {
+                    sensors.push(format!("j{links}"));
+                }
+            }
+            links += 1;
+            links - 1
+        };
+        let trunk = (0..4).fold(None, |parent, _| Some(link(parent, false)));
+        for limb in 0..4 {
+            let end = (0..4).fold(trunk, |parent, place| Some(link(parent, place == 0)));
+            if limb == 0 {
+                link(end, true);
+            }
+        }
+        let text = text + "</robot>";
+        let keep: Vec<&str> = sensors.iter().map(String::as_str).collect();
+        let model = Model::from_urdf(&text, &keep).unwrap();
+        (model, sensors)
+    }
+
+    fn online(model: &Model, structure: &Structure) -> Online {
+        let offsets = vec![Wrench::zero(); structure.sensors().len()];
+        let none = ContactSet::default();
+        let period = Nanos::from_millis(10);
+        Online::new(model, structure, model.inertias(), &offsets, &none, 0, period).unwrap()
+    }
+
+    /// Limb by limb or all together, the same is known; and limbs' rows do go limb by limb.
+    #[test]
+    fn limbs_tell_the_same_by_themselves() {
+        let (model, sensors) = robot();
+        let noise = Noise {
+            force: [0.1, 0.2, 0.3],
+            torque: [0.01, 0.02, 0.03],
+        };
+        let (frame, direction) = (MeasurementFrame::Child, MeasurementDirection::ChildToParent);
+        let cuts: Vec<SensorCut> = (sensors.iter())
+            .map(|joint| SensorCut::new(&model, joint, frame, direction, &Pose::identity(), &noise).unwrap())
+            .collect();
+        let structure = Structure::new(&model, &cuts, &[], Structure::LENGTH_SCALE).unwrap();
+        let [mut apart, mut together] = [(); 2].map(|()| online(&model, &structure));
+        assert_eq!((apart.components.len(), apart.components[0].limbs.len()), (1, 5));
+        together.components[0].limbs.clear();
+        let mut kinematics = Kinematics::new(&model, 0).unwrap();
+        let (dofs, count) = (model.dof_count(), sensors.len());
+        let (joints, fine) = (vec![Reason::None; dofs], vec![Reason::None; count]);
+        for instant in 0..260_i64 {
+            let numbers = normals(instant as u64, 3 * dofs + 6 * count + 9);
+            let (of_joints, rest) = numbers.split_at(3 * dofs);
+            let [position, velocity, acceleration] = [0, 1, 2].map(|m| &of_joints[m * dofs..(m + 1) * dofs]);
+            let state = JointState {
+                position,
+                velocity,
+                acceleration,
+            };
+            let motion = FrameMotion {
+                angular_velocity: Vec3::new(rest[0], rest[1], rest[2]),
+                angular_acceleration: Vec3::new(rest[3], rest[4], rest[5]),
+                proper_acceleration: Vec3::new(rest[6], rest[7], 9.81 + rest[8]),
+            };
+            kinematics.update(&model, state, &motion).unwrap();
+            let six = |six: &[f64]| Wrench::from_parts([six[0], six[1], six[2]], [six[3], six[4], six[5]]);
+            let readings: Vec<Wrench> = rest[9..].chunks_exact(6).map(six).collect();
+            for online in [&mut apart, &mut together] {
+                let observation = Observation {
+                    t: Nanos::from_millis(10 * instant),
+                    kinematics: &kinematics,
+                    readings: &readings,
+                    active: &ContactSet::default(),
+                    base: Reason::None,
+                    joints: &joints,
+                    moved: &DofSet::default(),
+                    is_base_moved: true,
+                    sensors: &fine,
+                };
+                online.observe(&observation).unwrap();
+            }
+        }
+        // Thirty of 36 rows of an instant, of those since the last full second.
+        let component = &mut apart.components[0];
+        let by_limbs: u64 = component.limbs.iter().map(|limb| limb.information.rows()).sum();
+        let (all, rows) = (together.components[0].information.rows(), component.information.rows());
+        assert!(
+            by_limbs > 0 && 36 * (by_limbs + rows) == 36 * all && by_limbs % 30 == 0,
+            "{by_limbs} of {all}"
+        );
+        component.join();
+        assert!(component.limbs.iter().all(|limb| limb.information.rows() == 0));
+        let (found, expected) = (&component.information, &together.components[0].information);
+        assert_eq!(found.rows(), expected.rows());
+        let square = |information: &Information| {
+            let (r, z) = information.to_triangle();
+            (r.transpose() * &r, r.transpose() * &z)
+        };
+        let ((a, b), (c, d)) = (square(found), square(expected));
+        assert!((&a - &c).norm() < 1e-12 * c.norm() && (b - &d).norm() < 1e-12 * d.norm());
+        // Where rows tell nothing of a direction, what stands beside it on the right is what nothing explains.
+        let unexplained = |information: &Information| {
+            let (_, z) = information.to_triangle();
+            z.norm_squared() + information.residual_square()
+        };
+        let (found, expected) = (unexplained(found), unexplained(expected));
+        assert!((found - expected).abs() < 1e-10 * expected);
     }
 }
