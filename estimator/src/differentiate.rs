@@ -806,14 +806,14 @@ impl<const D: usize> Values<D> {
         let (values, moments) = (&self.values[component], &self.moments[component]);
         let (mut fitting, mut widest) = (0, None);
         let (mut last, mut seen, mut bound) = ([0.0; N], 0, 0.0_f64);
-        for number in 0..grid.tried {
+        for (number, moments) in moments.iter().enumerate().take(grid.tried) {
             let samples = grid.lengths[number];
             let basis = &mut grid.bases[number];
             if samples < N {
                 continue;
             }
             if basis.reaches(N - 1, samples) {
-                let polynomial = basis.polynomial::<N>(&moments[number]);
+                let polynomial = basis.polynomial::<N>(moments);
                 let largest = |from: usize, to: usize| {
                     let values = values.get(from..to).unwrap_or_default();
                     let powers = grid.powers.get(from..to).unwrap_or_default();

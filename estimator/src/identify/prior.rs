@@ -42,8 +42,8 @@
 //! data that say nothing leave tau at 1, the weakest claim, where D / gamma would be nothing by nothing.
 //!
 //! # Speed
-//! One round grades, `O(n^3)` once, and takes some five Newton steps of a matrix product and a Cholesky factorization each. To measure: `cargo bench -p
-//! proprio-estimator --bench prior`.
+//! One round grades, `O(n^3)` once, and takes some five Newton steps of a matrix product and a Cholesky factorization each; from where the last solution was, one or two. All factors are
+//! made of matrix products on blocks. To measure: `cargo bench -p proprio-estimator --bench prior`.
 
 mod blocked;
 mod posterior;
