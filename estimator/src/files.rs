@@ -22,6 +22,7 @@ pub fn replace(file: &Path, text: &str, mode: u32) -> io::Result<()> {
 /// The system's: there is no such folder, or nobody may write there.
 pub fn begin(file: &Path) -> io::Result<NamedTempFile> {
     // tempfile names its own file in the error, which means nothing to whoever named another one.
+    std::fs::metadata(folder(file))?;
     NamedTempFile::with_prefix_in(".proprio-", folder(file)).map_err(|error| io::Error::from(error.kind()))
 }
 

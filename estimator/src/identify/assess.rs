@@ -1618,6 +1618,7 @@ mod tests {
         let layout = Layout {
             links: vec![2],
             further: vec![Further::RotorInertia(0), Further::RotorInertia(1)],
+            precision: vec![0.5, 2.0],
             ..Layout::default()
         };
         let r = DMatrix::from_fn(12, 12, |_, _| 3.0 * next());
