@@ -1256,24 +1256,32 @@ fn calibration_errors(outcome: &Outcome, right: &Calibration) -> Vec<f64> {
     .collect()
 }
 
+/// Identifies from the first of two logs, these entries of the gain too; what becomes of the torques before the sensor on the second.
+fn with_gain(
+    setup: &Setup,
+    gain: Gain,
+    truth: &Model,
+    (train, rest): (&str, &str),
+) -> (Outcome, Parameters, (f64, f64, f64)) {
+    let mut setup = setup.clone();
+    setup.calibrated.gain = gain;
+    let logs = [("train", Role::Train, train), ("rest", Role::Validate, rest)];
+    let outcome = run(&setup, &logs, &[IdentificationInput::Wrench]);
+    let parameters = parameters(&outcome, &setup, "a test").expect("parameters");
+    let torques = before_the_sensor(&setup, &parameters, truth, rest);
+    println!("{gain:?}: torque before the sensor {torques:?}");
+    (outcome, parameters, torques)
+}
+
 #[test]
 fn gains_of_a_sensor_are_identified() {
-    let mut setup = arm();
+    let setup = arm();
     let truth = real_beyond(&setup, 1);
     let gain = Matrix6::from_diagonal(&Vector6::new(1.07, 0.92, 1.05, 1.06, 0.93, 1.04));
     let right = Calibration::new(gain, Wrench::zero(), None);
     let log = miscalibrated(&simulate(&setup, &truth, 50.0, 3.0, 11), &right);
     let (train, rest) = (between(&log, -1.0, 40.0), between(&log, 40.0, 99.0));
-    let wrench = [IdentificationInput::Wrench];
-    let mut found = |gain: Gain| {
-        setup.calibrated.gain = gain;
-        let logs = [("train", Role::Train, train.as_str()), ("rest", Role::Validate, &rest)];
-        let outcome = run(&setup, &logs, &wrench);
-        let parameters = parameters(&outcome, &setup, "a test").expect("parameters");
-        let torques = before_the_sensor(&setup, &parameters, &truth, &rest);
-        println!("{gain:?}: torque before the sensor {torques:?}");
-        (outcome, parameters, torques)
-    };
+    let found = |gain: Gain| with_gain(&setup, gain, &truth, (&train, &rest));
     let (without, file, (rough, missed, _)) = found(Gain::None);
     assert!(without.calibrations.is_empty() && !file.to_string().contains("\ngain"));
     let (with, file, (fine, inside, deviation)) = found(Gain::Diagonal);
@@ -1315,7 +1323,7 @@ fn gains_of_a_sensor_are_identified() {
 
 #[test]
 fn cross_talk_of_a_sensor_is_identified() {
-    let mut setup = arm();
+    let setup = arm();
     let truth = real_beyond(&setup, 2);
     let mut noise = Noise(77);
     let length = 0.018;
@@ -1330,18 +1338,9 @@ fn cross_talk_of_a_sensor_is_identified() {
     let right = Calibration::new(gain, Wrench::zero(), None);
     let log = miscalibrated(&simulate(&setup, &truth, 60.0, 3.0, 12), &right);
     let (train, rest) = (between(&log, -1.0, 50.0), between(&log, 50.0, 99.0));
-    let wrench = [IdentificationInput::Wrench];
-    let mut found = |gain: Gain| {
-        setup.calibrated.gain = gain;
-        let logs = [("train", Role::Train, train.as_str()), ("rest", Role::Validate, &rest)];
-        let outcome = run(&setup, &logs, &wrench);
-        let parameters = parameters(&outcome, &setup, "a test").expect("parameters");
-        let torques = before_the_sensor(&setup, &parameters, &truth, &rest);
-        println!("{gain:?}: torque before the sensor {torques:?}");
-        (outcome, torques)
-    };
-    let (without, (rough, ..)) = found(Gain::None);
-    let (with, (fine, inside, _)) = found(Gain::Full);
+    let found = |gain: Gain| with_gain(&setup, gain, &truth, (&train, &rest));
+    let (without, _, (rough, ..)) = found(Gain::None);
+    let (with, _, (fine, inside, _)) = found(Gain::Full);
     let errors = calibration_errors(&with, &right);
     assert_eq!(errors.len(), 36);
     let beyond = |bound: f64| errors.iter().filter(|error| error.abs() > bound).count();
