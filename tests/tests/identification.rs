@@ -49,6 +49,8 @@ struct Sessions {
     near: f64,
     /// With noise, those of CAD are at least so many times further off, in every joint of `distal`.
     cad_further: f64,
+    /// A joint whose torque CAD has nearly right though the links are wrong: their errors cancel.
+    lucky: Option<&'static str>,
 }
 
 fn arm() -> Sessions {
@@ -86,12 +88,12 @@ fn icub() -> Option<Sessions> {
         "r_ankle_pitch",
         "r_ankle_roll",
     ];
-    Some(Sessions::new(
-        folder,
-        Path::new(&models).join("iCubGazeboV2_5.urdf"),
-        distal,
-        (0.15, 1.5),
-    ))
+    let urdf = Path::new(&models).join("iCubGazeboV2_5.urdf");
+    Some(Sessions {
+        // Of the leg that it stands on, which moves little: 0.008 Nm where its neighbours are ten times as far off.
+        lucky: Some("l_ankle_pitch"),
+        ..Sessions::new(folder, urdf, distal, (0.15, 1.5))
+    })
 }
 
 /// The robots whose sessions are at hand.
@@ -117,6 +119,7 @@ impl Sessions {
             distal,
             near,
             cad_further,
+            lucky: None,
         }
     }
 
@@ -1181,7 +1184,7 @@ fn must_be_good(what: &str, sessions: &Sessions, outcome: &Outcome) {
         } else {
             let stated = score.stated;
             assert!(
-                noisy <= 1.05 * off + 1e-3 || error <= 3.0 * stated,
+                noisy <= 1.05 * off + 1e-3 || sessions.lucky == Some(joint) && error <= 3.0 * stated,
                 "{what}: {joint}: {noisy} Nm, CAD {off}; without noise {error} +- {stated}"
             );
         }

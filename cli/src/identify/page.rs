@@ -679,7 +679,6 @@ fn excitation(outcome: &Outcome) -> Option<String> {
     (!body.is_empty()).then(|| report::section("What the motion shows", &body))
 }
 
-/// What belongs to a log and not to the robot: offsets, friction, time.
 /// What was found of a sensor's calibration: a row for each number.
 fn calibration(c: &CalibrationOutcome) -> Table {
     let since = c.identified.reference().map_or(String::new(), |celsius| {
@@ -719,6 +718,7 @@ fn calibration(c: &CalibrationOutcome) -> Table {
     table
 }
 
+/// What is no link's: time, rotors and calibrations, which are the robot's; offsets and friction, which belong to a log.
 fn sessions(outcome: &Outcome) -> Option<String> {
     let mut body = Vec::new();
     let mut times = Table::new(
@@ -743,7 +743,7 @@ fn sessions(outcome: &Outcome) -> Option<String> {
     body.push(times.html());
     let mut rotors = Table::new(
         "Inertia of the motors' rotors, reflected to the joints: measured torque = torque + rotor inertia · acceleration + friction; the robot's, the same in all logs",
-        &["joint", "rotor inertia [kg m²]"],
+        &["joint", "rotor inertia [kg m², kg where it slides]"],
     );
     for r in &outcome.rotors {
         rotors.row(vec![r.joint.as_str().into(), Cell::Uncertain(r.inertia, r.deviation)]);

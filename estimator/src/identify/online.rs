@@ -82,7 +82,7 @@ const LAGS: usize = 64;
 /// The squared Newton decrement down to which bodies are sought to find the prior's weight, and to tell of them: a hundredth and a ten-thousandth of a standard deviation.
 const NEAR: f64 = 1e-4;
 const NEAREST: f64 = 1e-8;
-/// By how much, as a logarithm, the prior's weight may be off what the evidence says.
+/// A step of the prior's weight, as a logarithm, that is worth no second fit at once: the next second begins with it.
 const SETTLED: f64 = 1e-3;
 /// Window of the autocorrelation time, in such times (Sokal 1997).
 const SOKAL: f64 = 6.0;
@@ -1287,7 +1287,7 @@ impl Part {
         if (tau / self.tau).ln().abs() > SETTLED || fit.decrement > NEAREST {
             fit = posterior.fit_from(fit.x.as_slice(), tau, NEAREST)?;
         }
-        self.tau = fit.tau;
+        self.tau = tau;
         let factor = fit.covariance_root();
         solution.tau = fit.tau;
         solution.effective = fit.effective;

@@ -61,7 +61,7 @@ pub struct Job {
 }
 
 impl Job {
-    /// Takes some tens of milliseconds, and allocates. What it finds depends on the samples alone.
+    /// Takes a millisecond or two for each limb by itself, a tenth of a second where all of a large robot hangs together, and allocates. What it finds depends on the samples alone.
     pub fn run(&mut self) {
         self.solving.run();
         let Room {
