@@ -1,6 +1,6 @@
 //! estimator.toml, the URDF and what was identified, checked against each other and resolved: what the rest of the estimator works with.
 
-use crate::calibration::{self, Calibration};
+use crate::calibration::{self, Calibration, Kind as Calibrated, Unknown};
 use crate::config::{
     Base, Config, ContactKind as KindWord, Differentiation, Direction, Foot, ForceTorque, Gain, IdentificationInput,
     Presence, SensorFrame, TorqueSide,
@@ -8,7 +8,7 @@ use crate::config::{
 use crate::differentiate::Settings;
 use crate::dynamics::{ContactKind, ContactSet, ContactSpec, FrameMotion, Noise, SensorCut, Structure, StructureError};
 use crate::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
-use crate::parameters::{Parameters, ParametersError, cad_root};
+use crate::parameters::{Offset, Parameters, ParametersError, cad_root};
 use crate::regressor::Covariance;
 use crate::regressor::identifiable::{BaseRegime, Identifiable, JointMotion, Measured, Offsets, Regime, Scope};
 use crate::spatial::{Pose, RigidInertia, Vec3, Wrench};
@@ -134,6 +134,23 @@ pub struct Setup {
     workbench: Vec<Calibration>,
     model_deviation: f64,
     identified: Option<Parameters>,
+}
+
+/// What is known on-line of links and sensors that hang together.
+#[derive(Debug, Clone, Copy)]
+pub struct Learnt<'a> {
+    /// The links.
+    pub links: &'a [usize],
+    /// The F/T sensors.
+    pub sensors: &'a [usize],
+    /// The root `U` of the covariance `U^T U` over [ten per link | torque, force per sensor], if there is one yet.
+    pub root: Option<&'a DMatrix<f64>>,
+    /// Per sensor its offset.
+    pub offsets: &'a [Wrench],
+    /// Per sensor how far its offset wanders in a second [torque; force].
+    pub drift: &'a [[f64; 6]],
+    /// Since when.
+    pub known: Nanos,
 }
 
 impl Setup {
@@ -401,50 +418,70 @@ impl Setup {
             }
         }
         for (sensor, (_, deviation)) in self.configured.iter().enumerate() {
-            if !measured.contains(&sensor) && *deviation != [0.0; 6] {
-                let root = DMatrix::from_fn(6, 6, |i, j| if i == j { deviation[i] } else { 0.0 });
-                let _ = covariance.add(&[], &[sensor], root);
+            if !measured.contains(&sensor) {
+                self.add_offset(covariance, sensor, deviation);
             }
         }
     }
 
-    /// The covariance where some links and sensors are identified on-line: of each group its links, its sensors, a root over
-    /// [ten per link | torque, force per sensor], how far each offset wanders in a second, and since when. Without a root nothing is known yet: links are as uncertain as
+    /// Says how uncertain a sensor's offset is, and the calibration that was identified of it.
+    fn add_offset(&self, covariance: &mut Covariance, sensor: usize, deviation: &[f64; 6]) {
+        let calibrated = self.calibrated_among(&[sensor]);
+        let known: Vec<f64> = deviation
+            .iter()
+            .chain(calibrated.iter().flat_map(|(_, d)| *d))
+            .copied()
+            .collect();
+        if known.iter().any(|deviation| *deviation != 0.0) {
+            let kinds: Vec<(usize, Calibrated)> = calibrated.iter().map(|(kind, _)| *kind).collect();
+            let root = DMatrix::from_fn(known.len(), known.len(), |i, j| if i == j { known[i] } else { 0.0 });
+            let _ = covariance.add_calibrated(&[], &[sensor], &kinds, root);
+        }
+    }
+
+    /// Those of these sensors whose calibration was identified: what of it, and its standard deviations.
+    fn calibrated_among(&self, sensors: &[usize]) -> Vec<((usize, Calibrated), &[f64])> {
+        let Some(parameters) = &self.identified else {
+            return Vec::new();
+        };
+        let of = |(place, offset): (usize, &Offset)| {
+            let sensor = self.sensor(&offset.sensor).filter(|sensor| sensors.contains(sensor))?;
+            let kind = offset.calibrated.as_ref()?.kind;
+            Some(((sensor, kind), parameters.calibration_deviation(place)))
+        };
+        parameters.offsets().iter().enumerate().filter_map(of).collect()
+    }
+
+    /// The covariance where some links and sensors are identified on-line. Where a group has no root nothing is known of it yet: links are as uncertain as
     /// identification's prior has them before any data, and offsets anything.
-    pub fn covariance_with<'a>(
-        &self,
-        groups: impl Iterator<
-            Item = (
-                &'a [usize],
-                &'a [usize],
-                Option<&'a DMatrix<f64>>,
-                &'a [[f64; 6]],
-                Nanos,
-            ),
-        >,
-    ) -> Covariance {
+    ///
+    /// Calibrations are not identified on-line. Those that were identified before stay as uncertain as they were found to be, independent of the rest but for this: an offset that is
+    /// found on-line was found with the gain as it is, and takes up what the gain's error `E` makes of the offset itself. What is left is its share of the load, `E (r - o)`.
+    pub fn covariance_with<'a>(&self, groups: impl Iterator<Item = Learnt<'a>>) -> Covariance {
         /// Of an offset before anything is known of it [Nm], [N].
         const ANYTHING: [f64; 6] = [100.0, 100.0, 100.0, 1000.0, 1000.0, 1000.0];
         let mut covariance = Covariance::exact(self.cad.len(), self.configured.len());
         let mut measured = Vec::new();
         // Numbers are the model's own, and each is in one group only: nothing is refused.
-        for (links, sensors, root, drift, known) in groups {
-            measured.extend_from_slice(sensors);
-            if let Some(root) = root {
-                let _ = covariance.add(links, sensors, root.clone());
-                for (&sensor, rate) in sensors.iter().zip(drift) {
-                    let _ = covariance.set_drift(sensor, *rate, known);
+        for group in groups {
+            measured.extend_from_slice(group.sensors);
+            if let Some(root) = group.root {
+                let calibrated = self.calibrated_among(group.sensors);
+                let kinds: Vec<(usize, Calibrated)> = calibrated.iter().map(|(kind, _)| *kind).collect();
+                let root = with_calibrations(&group, root, &calibrated);
+                let _ = covariance.add_calibrated(group.links, group.sensors, &kinds, root);
+                for (&sensor, rate) in group.sensors.iter().zip(group.drift) {
+                    let _ = covariance.set_drift(sensor, *rate, group.known);
                 }
                 continue;
             }
-            for &link in links {
+            for &link in group.links {
                 if let Some(cad) = self.cad.get(link) {
                     let _ = covariance.add(&[link], &[], own_root(cad, 1.0));
                 }
             }
-            for &sensor in sensors {
-                let root = DMatrix::from_fn(6, 6, |i, j| if i == j { ANYTHING[i] } else { 0.0 });
-                let _ = covariance.add(&[], &[sensor], root);
+            for &sensor in group.sensors {
+                self.add_offset(&mut covariance, sensor, &ANYTHING);
             }
         }
         self.fill(&mut covariance, &measured);
@@ -910,6 +947,33 @@ fn nearest<'a>(name: &str, names: impl Iterator<Item = &'a str>) -> String {
             )
         }
     }
+}
+
+/// A group's root with the columns of its sensors' calibrations after its own, and a row for each.
+fn with_calibrations(
+    group: &Learnt<'_>,
+    root: &DMatrix<f64>,
+    calibrated: &[((usize, Calibrated), &[f64])],
+) -> DMatrix<f64> {
+    let more: usize = calibrated.iter().map(|((_, kind), _)| kind.count()).sum();
+    let (rows, columns) = root.shape();
+    let mut all = DMatrix::zeros(rows + more, columns + more);
+    all.view_mut((0, 0), (rows, columns)).copy_from(root);
+    let mut next = 0;
+    for ((sensor, kind), deviations) in calibrated {
+        let place = group.sensors.iter().position(|other| other == sensor).unwrap_or(0);
+        let offset = group.offsets.get(place).map_or([0.0; 6], Wrench::torque_first);
+        for (unknown, deviation) in kind.unknowns().zip(*deviations) {
+            all[(rows + next, columns + next)] = *deviation;
+            if let Unknown::Gain { channel, .. } = unknown {
+                // While nothing but the offset is read, what is wrong is in the offset already.
+                let column = 10 * group.links.len() + 6 * place + channel;
+                all[(rows + next, column)] = -deviation * unknown.as_offset(&offset, 0.0);
+            }
+            next += 1;
+        }
+    }
+    all
 }
 
 fn own_root(cad: &RigidInertia, relative: f64) -> DMatrix<f64> {

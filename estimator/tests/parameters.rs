@@ -16,7 +16,7 @@ use proprio_estimator::parameters::{
     Calibrated, Friction, Offset, Parameters, ParametersError, Provenance, Rotor, Span, cad_root,
 };
 use proprio_estimator::regressor::{Covariance, EstimateRows, Propagation};
-use proprio_estimator::setup::Setup;
+use proprio_estimator::setup::{Learnt, Setup};
 use proprio_estimator::spatial::{Mat3, Pose, RigidInertia, Vec3, Wrench};
 use proprio_topics::Nanos;
 use proptest::prelude::*;
@@ -780,6 +780,110 @@ fn a_calibration_reads_back_and_is_used() {
             "{kind:?}: without a temperature there is nothing to be unsure of"
         );
         assert_eq!(certain["torque/l_shoulder_pitch"], unsure["torque/l_shoulder_pitch"]);
+    }
+}
+
+/// What is learnt on-line says nothing of the calibration, which stays as uncertain as it was found to be.
+#[test]
+fn an_uncertain_calibration_stays_uncertain_while_parameters_are_learnt() {
+    let mut setup = arm_with(|config| config.identification.enabled = true);
+    let plain = identified(&setup, &mut Random::new(3));
+    let kind = Kind {
+        gain: Gain::Diagonal,
+        temperature: false,
+    };
+    let mut known = plain.offsets()[0].clone();
+    known.calibrated = Some(Calibrated {
+        calibration: Calibration::default(),
+        kind,
+    });
+    let links: Vec<_> = plain
+        .identified()
+        .map(|link| (link, plain.inertia(link).unwrap()))
+        .collect();
+    let before = plain.root();
+    let columns = before.ncols() + kind.count();
+    let root = DMatrix::from_fn(columns, columns, |i, j| {
+        match (i < before.nrows(), j < before.ncols()) {
+            (true, true) => before[(i, j)],
+            _ if i == j => 0.03,
+            _ => 0.0,
+        }
+    });
+    let mut parameters = Parameters::new(&setup, plain.provenance().clone());
+    parameters.set_identified(&links, &[known], &root).unwrap();
+    setup.apply(&parameters).unwrap();
+    // A group that has learnt something and one as it begins, with an offset as large as an iCub's.
+    let offset = [Wrench::from_parts([200.0, -100.0, 50.0], [3.0, 2.0, 1.0])];
+    let load = Wrench::from_parts([10.0, 20.0, -30.0], [1.0, 2.0, -0.5]);
+    let root = DMatrix::from_diagonal_element(6, 6, 1e-3);
+    let mut kinematics = Kinematics::new(&setup.model, setup.base_link).unwrap();
+    let zeros = vec![0.0; setup.model.dof_count()];
+    let state = proprio_estimator::dynamics::JointState {
+        position: &zeros,
+        velocity: &zeros,
+        acceleration: &zeros,
+    };
+    kinematics
+        .update(&setup.model, state, &FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.81)))
+        .unwrap();
+    let mut solver = Solver::new(&setup.structure);
+    solver
+        .solve(&setup.model, &setup.structure, &kinematics, &[load], &setup.always, &[])
+        .unwrap();
+    let torques = |covariance: &Covariance| {
+        let mut propagation = Propagation::new(&setup.structure, covariance).unwrap();
+        propagation.set_reading(0, &(load + offset[0]), 0.0);
+        propagation
+            .update(&setup.structure, &solver, &kinematics, Nanos::ZERO)
+            .unwrap();
+        propagation.torque().to_vec()
+    };
+    let group = Learnt {
+        links: &[],
+        sensors: &[0],
+        root: Some(&root),
+        offsets: &offset,
+        drift: &[[0.0; 6]],
+        known: Nanos::ZERO,
+    };
+    let links: Vec<usize> = (0..setup.cad().len()).collect();
+    let exact = DMatrix::zeros(1, 10 * links.len());
+    let expected = |of: &dyn Fn(usize) -> f64| {
+        let mut covariance = Covariance::exact(links.len(), 1);
+        covariance.add(&links, &[], exact.clone()).unwrap();
+        covariance
+            .add(
+                &[],
+                &[0],
+                DMatrix::from_fn(6, 6, |i, j| if i == j { of(i) } else { 0.0 }),
+            )
+            .unwrap();
+        torques(&covariance)
+    };
+    // Beside a group of exact links, so that only the sensor counts.
+    let got = |group: Learnt<'_>| {
+        let others = Learnt {
+            links: &links,
+            sensors: &[],
+            root: Some(&exact),
+            offsets: &[],
+            drift: &[],
+            known: Nanos::ZERO,
+        };
+        torques(&setup.covariance_with([others, group].into_iter()))
+    };
+    let of_load = |i: usize| (0.03 * load.torque_first()[i]).hypot(1e-3);
+    let raw = (load + offset[0]).torque_first();
+    let of_nothing = |i: usize| (0.03 * raw[i]).hypot(if i < 3 { 100.0 } else { 1000.0 });
+    for (got, expected) in [
+        (got(group), expected(&of_load)),
+        (got(Learnt { root: None, ..group }), expected(&of_nothing)),
+    ] {
+        assert!(expected.iter().any(|deviation| *deviation > 0.05));
+        for (got, expected) in got.iter().zip(&expected) {
+            assert!((got - expected).abs() <= 1e-4 * expected, "{got} {expected}");
+        }
     }
 }
 

@@ -14,7 +14,7 @@ use crate::history::{History, KEPT};
 use crate::identify::online::state::StateError;
 use crate::identify::online::{Job as Solving, Observation, Online, OnlineError, Solution};
 use crate::regressor::{Covariance, Propagation};
-use crate::setup::{BaseMotion, Setup, Use};
+use crate::setup::{BaseMotion, Learnt, Setup, Use};
 use crate::spatial::{RigidInertia, Vec3, Wrench};
 
 /// How far behind an estimate an identification instant lies, and how far the samples reach that it is differentiated from.
@@ -86,15 +86,13 @@ impl Job {
 
 /// What is uncertain under a solution, and of what it does not tell.
 fn covariance(setup: &Setup, solution: &Solution) -> Covariance {
-    let blocks = solution.components.iter().map(|component| {
-        let known = (component.root.nrows() > 0).then_some(&component.root);
-        (
-            &component.links[..],
-            &component.sensors[..],
-            known,
-            &component.drift[..],
-            component.data,
-        )
+    let blocks = solution.components.iter().map(|component| Learnt {
+        links: &component.links,
+        sensors: &component.sensors,
+        root: (component.root.nrows() > 0).then_some(&component.root),
+        offsets: &component.offsets,
+        drift: &component.drift,
+        known: component.data,
     });
     setup.covariance_with(blocks)
 }
