@@ -2,7 +2,7 @@
 //! missing withholds only what depends on it, bad samples are counted and lose nothing else.
 
 use proprio_estimator::calibration::Calibration;
-use proprio_estimator::config::Config;
+use proprio_estimator::config::{Config, Direction, Presence, SensorFrame};
 use proprio_estimator::offline;
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
@@ -230,6 +230,60 @@ fn temperatures_count_by_their_stamps() {
     let (other, late) = run(Nanos::from_millis(80));
     assert!(late > 10, "{late}");
     assert_ne!(other, prompt);
+}
+
+/// A triangle that was learnt through one gain says nothing true of what is read through another.
+#[test]
+fn what_was_learnt_with_sensors_that_measured_otherwise_is_not_resumed() {
+    let learning = |change: &dyn Fn(&mut Config)| {
+        Pipeline::new(setup(|config| {
+            config.identification.enabled = true;
+            config.contact.last_mut().unwrap().presence = Presence::Possible;
+            change(config);
+        }))
+    };
+    let mut pipeline = learning(&|_| {});
+    let events = recording(pipeline.setup(), 3.0);
+    let mut state = None;
+    for (channel, t, reading, quality) in events {
+        pipeline.push(channel, t, &reading, quality);
+        while pipeline.poll().is_some() {
+            if let Some(job) = pipeline.take_job() {
+                state = Some(job.state());
+                pipeline.give_back(job);
+            }
+        }
+    }
+    let state = state.expect("a job within three seconds");
+    learning(&|_| {}).resume(&state).unwrap();
+    // Offsets are not of it: a restart may change them.
+    learning(&|config| config.force_torque[0].offset_n = [5.0, 0.0, 0.0])
+        .resume(&state)
+        .unwrap();
+    let other: [&dyn Fn(&mut Config); 4] = [
+        &|config| config.force_torque[0].gain = Some(vec![1.07, 1.0, 1.0, 1.0, 1.0, 1.0]),
+        &|config| {
+            config.force_torque[0].temperature_n_per_k = [0.0, 0.05, 0.0];
+            config.force_torque[0].reference_celsius = Some(25.0);
+        },
+        &|config| {
+            config.force_torque[0].direction = match config.force_torque[0].direction {
+                Some(Direction::ChildToParent) => Some(Direction::ParentToChild),
+                _ => Some(Direction::ChildToParent),
+            }
+        },
+        &|config| config.force_torque[0].frame = Some(SensorFrame::Parent),
+    ];
+    for (number, change) in other.into_iter().enumerate() {
+        let mut pipeline = learning(change);
+        let fresh = pipeline.identification().unwrap().solution().components[0]
+            .bodies
+            .clone();
+        let error = pipeline.resume(&state).unwrap_err().to_string();
+        assert!(error.contains("mounting or calibration"), "{number}: {error}");
+        let after = &pipeline.identification().unwrap().solution().components[0].bodies;
+        assert_eq!(after, &fresh);
+    }
 }
 
 #[test]
@@ -639,7 +693,7 @@ fn what_carries_a_fixed_base_can_not_be_declared_away() {
 fn whoever_repeats_a_declaration_says_nothing_new() {
     let setup = setup(|config| {
         for contact in config.contact.iter_mut().filter(|c| c.name() == "hand") {
-            contact.presence = proprio_estimator::config::Presence::Possible;
+            contact.presence = Presence::Possible;
         }
         config.output.max_wait_ms = 20.0;
     });
@@ -672,7 +726,7 @@ fn whoever_repeats_a_declaration_says_nothing_new() {
 fn a_possible_contact_is_absent_unless_declared() {
     let possible = |config: &mut Config| {
         for contact in config.contact.iter_mut().filter(|c| c.name() == "hand") {
-            contact.presence = proprio_estimator::config::Presence::Possible;
+            contact.presence = Presence::Possible;
         }
     };
     let setup = setup(possible);

@@ -835,7 +835,7 @@ fn a_state_is_resumed_and_one_that_does_not_fit_is_refused() {
     let at = text.find("row").unwrap() + 10;
     let other = if &text[at..=at] == "0" { "1" } else { "0" };
     assert!(refused(&format!("{}{other}{}", &text[..at], &text[at + 1..])).contains("sum is not right"));
-    assert!(refused(&text.replacen("state 1", "state 2", 1)).contains("schema 2"));
+    assert!(refused(&text.replacen("state 2", "state 3", 1)).contains("schema 3"));
     let mut config = Config::load(&sessions.folder.join("estimator.toml")).unwrap();
     config.identification.enabled = true;
     config.contact.last_mut().unwrap().presence = Presence::Possible;

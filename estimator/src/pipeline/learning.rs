@@ -11,7 +11,7 @@ use proprio_topics::{InertiaEstimate, LinkInertia, Name, Nanos, Quality, Reason,
 use super::{OrReason, Track, UNTRUSTED_ENCODER, quality_reason, temperature_at};
 use crate::dynamics::{ContactSet, DofSet, FrameMotion, JointState, Kinematics};
 use crate::history::{History, KEPT};
-use crate::identify::online::state::StateError;
+use crate::identify::online::state::{Measuring, StateError};
 use crate::identify::online::{Job as Solving, Observation, Online, OnlineError, Solution};
 use crate::regressor::{Covariance, Propagation};
 use crate::setup::{BaseMotion, Learnt, Setup, Use};
@@ -80,8 +80,14 @@ impl Job {
     /// What was known when it began, as text: for [`super::Pipeline::resume`].
     #[must_use]
     pub fn state(&self) -> String {
-        self.solving.state(&self.room.setup.robot)
+        let setup = &self.room.setup;
+        self.solving.state(&setup.robot, &measuring(setup))
     }
+}
+
+/// How the sensors measure that it learns from.
+fn measuring(setup: &Setup) -> Measuring {
+    Measuring::new(&setup.structure, &setup.calibrations)
 }
 
 /// What is uncertain under a solution, and of what it does not tell.
@@ -375,7 +381,7 @@ impl Learning {
         setup: &mut Setup,
         propagation: &mut Propagation,
     ) -> Result<(), StateError> {
-        self.online.resume(&setup.robot, text)?;
+        self.online.resume(&setup.robot, &measuring(setup), text)?;
         if let Some(room) = &mut self.room
             && let Ok(new) = Propagation::new(&setup.structure, &covariance(setup, self.online.solution()))
         {

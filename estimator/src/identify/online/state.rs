@@ -1,9 +1,10 @@
 //! What identification knows, in a file: what a robot was taught survives a restart.
 //!
 //! ```text
-//! proprio identification state 1
+//! proprio identification state 2
 //! robot <name>
 //! model <hash of the links, the sensors and CAD>
+//! sensors <hash of how each is mounted and calibrated>
 //! component <unknowns> <tau>
 //! noise <variance of each F/T channel>
 //! row <R_kk ... R_kn z_k>                     one line per parameter
@@ -12,17 +13,21 @@
 //! ```
 //!
 //! Numbers are the hexadecimal digits of their bits. The triangle is that of the parameters alone: an F/T offset may be another one after a restart. It holds no prior, so that
-//! restarts do not count that twice.
+//! restarts do not count that twice. What it knows was read by the sensors as they were calibrated then: a gain of 7 % more would have made everything 7 % heavier.
 
 use std::fmt::Write as _;
 use std::io;
 use std::path::{Path, PathBuf};
 
 use super::{Job, Online, Part, WIDTH};
+use crate::calibration::Calibration;
+use crate::dynamics::Structure;
 use crate::identify::information::{Information, Panel};
 
 const TITLE: &str = "proprio identification state";
-const SCHEMA: &str = "1";
+const SCHEMA: &str = "2";
+/// What differs, in words.
+const SENSORS: &str = "mounting or calibration of its force/torque sensors";
 
 /// Why a state can not be resumed.
 #[derive(Debug, thiserror::Error)]
@@ -37,7 +42,7 @@ pub enum StateError {
     /// Another version wrote it.
     #[error("the state of identification has schema {0}; this version reads {SCHEMA}")]
     Schema(String),
-    /// It is of another robot, or of another model of it.
+    /// It is of another robot, or of another model of it, or of other sensors.
     #[error("the state of identification is of another {what}: {found}, not {expected}")]
     Foreign {
         /// What differs.
@@ -47,6 +52,30 @@ pub enum StateError {
         /// What there is.
         expected: String,
     },
+}
+
+/// How sensors measure: what the numbers of a state hang on beside the model.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Measuring(String);
+
+impl Measuring {
+    /// Of the structure's sensors, with these calibrations in the same order: where each sits, its measurement frame, its sign, its gain and what temperature does.
+    pub fn new(structure: &Structure, calibrations: &[Calibration]) -> Self {
+        let mut bytes = Vec::new();
+        for cut in structure.sensors() {
+            bytes.extend((cut.joint() as u64).to_le_bytes());
+            let pose = cut.pose();
+            let numbers = pose.rotation.iter().chain(pose.translation.iter()).copied();
+            bytes.extend(numbers.chain([cut.sign()]).flat_map(|x| x.to_bits().to_le_bytes()));
+        }
+        for calibration in calibrations {
+            let per_kelvin = calibration.per_kelvin().torque_first();
+            let reference = calibration.reference().unwrap_or(f64::NAN);
+            let numbers = calibration.gain().iter().copied().chain(per_kelvin).chain([reference]);
+            bytes.extend(numbers.flat_map(|x| x.to_bits().to_le_bytes()));
+        }
+        Self(format!("{:016x}", hash(bytes.into_iter())))
+    }
 }
 
 /// FNV-1a.
@@ -91,8 +120,9 @@ fn numbers(line: Option<&str>, word: &str, count: usize) -> Result<Vec<f64>, Sta
 impl Job {
     /// What was known at the job's snapshot, as text, for [`Online::resume`].
     #[must_use]
-    pub fn state(&self, robot: &str) -> String {
-        let mut text = format!("{TITLE} {SCHEMA}\nrobot {robot}\nmodel {}\n", model(&self.parts));
+    pub fn state(&self, robot: &str, sensors: &Measuring) -> String {
+        let (model, sensors) = (model(&self.parts), &sensors.0);
+        let mut text = format!("{TITLE} {SCHEMA}\nrobot {robot}\nmodel {model}\nsensors {sensors}\n");
         for part in &self.parts {
             let parameters = part.information.trailing(6 * part.sensors.len());
             let _ = write!(text, "component {}", parameters.unknowns());
@@ -113,7 +143,7 @@ impl Online {
     ///
     /// # Errors
     /// [`StateError`]. Nothing is changed then.
-    pub fn resume(&mut self, robot: &str, text: &str) -> Result<(), StateError> {
+    pub fn resume(&mut self, robot: &str, sensors: &Measuring, text: &str) -> Result<(), StateError> {
         let Some(job) = &mut self.job else {
             return Err(StateError::Damaged("a job is away"));
         };
@@ -129,8 +159,12 @@ impl Online {
         if u64::from_str_radix(sum, 16) != Ok(own) {
             return Err(StateError::Damaged("its sum is not right"));
         }
-        for (what, expected) in [("robot", robot.to_owned()), ("model", model(&job.parts))] {
-            let found = lines.next().and_then(|line| line.strip_prefix(what)).map(str::trim);
+        for (word, what, expected) in [
+            ("robot", "robot", robot.to_owned()),
+            ("model", "model", model(&job.parts)),
+            ("sensors", SENSORS, sensors.0.clone()),
+        ] {
+            let found = lines.next().and_then(|line| line.strip_prefix(word)).map(str::trim);
             let found = found.ok_or(StateError::Damaged("a line is missing"))?.to_owned();
             if found != expected {
                 return Err(StateError::Foreign { what, found, expected });
