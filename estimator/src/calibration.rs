@@ -67,6 +67,12 @@ impl Calibration {
         self.reference
     }
 
+    /// Whether what a board's temperature is makes any difference.
+    #[must_use]
+    pub fn depends_on_temperature(&self) -> bool {
+        self.has_temperature
+    }
+
     /// How far a temperature is from the reference \[K\]; 0 if either is not known.
     #[must_use]
     pub fn warmth(&self, celsius: f64) -> f64 {

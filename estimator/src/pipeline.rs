@@ -308,8 +308,8 @@ impl Pipeline {
         self.counts
     }
 
-    /// Takes a sample of channel number `channel` (see [`Setup::channel`]), acquired at `t`. Readings that are not the channel's
-    /// main one are ignored. Call [`Pipeline::poll`] until it gives nothing before the next.
+    /// Takes a sample of channel number `channel` (see [`Setup::channel`]), acquired at `t`. Of an F/T sensor the temperature of
+    /// its board is taken, too, where its calibration depends on it and the board does not distrust it; other readings that are not the channel's main one are ignored. Call [`Pipeline::poll`] until it gives nothing before the next.
     pub fn push(&mut self, channel: usize, t: Nanos, reading: &Reading, quality: Quality) {
         let Some(track) = self.tracks.get_mut(channel) else {
             return;
@@ -343,6 +343,9 @@ impl Pipeline {
                 whole
             }
             (Track::Sensor(_, temperatures), Reading::Temperature(temperature)) => {
+                if !self.setup.depends_on_temperature(channel) || quality.intersects(Quality::DEVICE_FAULT) {
+                    return;
+                }
                 let late = t < self.released.saturating_sub(Nanos(self.setup.max_wait.0 / 2));
                 match temperature.celsius.is_finite() {
                     false => self.counts.not_finite += 1,

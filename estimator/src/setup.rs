@@ -527,6 +527,17 @@ impl Setup {
         self.channels.iter().position(|c| c.kind == kind && c.name == name)
     }
 
+    /// Whether channel number `channel` is of an F/T sensor whose calibration depends on the temperature of its board.
+    #[must_use]
+    pub fn depends_on_temperature(&self, channel: usize) -> bool {
+        let role = self.channels.get(channel).map(|channel| channel.role);
+        let calibration = match role {
+            Some(Use::Sensor(number)) => self.calibrations.get(number),
+            _ => None,
+        };
+        calibration.is_some_and(Calibration::depends_on_temperature)
+    }
+
     /// The number of a contact that is published.
     #[must_use]
     pub fn contact(&self, name: &str) -> Option<usize> {

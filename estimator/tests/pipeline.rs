@@ -232,6 +232,52 @@ fn temperatures_count_by_their_stamps() {
     assert_ne!(other, prompt);
 }
 
+fn temperature(celsius: f64) -> Reading {
+    Reading::Temperature(proprio_topics::Temperature { celsius })
+}
+
+/// Of what a board says of its temperature, what is of no use leaves no trace.
+#[test]
+fn temperatures_count_only_where_they_can_be_trusted_and_are_wanted() {
+    let change = calibration();
+    let wanting = || setup(|config| calibrate(config, &change));
+    let plain = setup(|_| {});
+    let sensor = plain.channel(Kind::Wrench, "l_arm_ft_sensor").unwrap();
+    let events = recording(&plain, 0.5);
+    let with = |said: &[(f64, f64, Quality)]| {
+        let said = said.iter();
+        let said = said.map(|(t, celsius, quality)| (sensor, Nanos::from_seconds(*t), temperature(*celsius), *quality));
+        // As they come: each before what is stamped as late as it.
+        let mut all = events.clone();
+        for one in said {
+            all.insert(all.partition_point(|other| other.1 < one.1), one);
+        }
+        all
+    };
+    // Where nothing depends on it, not even what is wrong with it is counted.
+    let odd = with(&[
+        (0.1, 30.0, Quality::GOOD),
+        (0.1, 30.0, Quality::GOOD),
+        (0.2, f64::NAN, Quality::GOOD),
+    ]);
+    let ((without, before), (got, after)) = (run(plain.clone(), &events), run(plain, &odd));
+    assert_eq!(bits(&got), bits(&without));
+    assert_eq!(after.counts(), before.counts());
+    // Where it does, it is.
+    let (_, pipeline) = run(wanting(), &odd);
+    let (taken, counts) = (before.counts().taken, pipeline.counts());
+    assert_eq!((counts.taken, counts.backward, counts.not_finite), (taken + 1, 1, 1));
+    // What the board distrusts itself is not taken.
+    let good = (0.1, 26.0, Quality::GOOD);
+    let faulty = (0.2, 900.0, Quality::DEVICE_FAULT);
+    let (right, _) = run(wanting(), &with(&[good]));
+    let (got, pipeline) = run(wanting(), &with(&[good, faulty]));
+    assert_eq!(bits(&got), bits(&right));
+    assert_eq!(pipeline.counts().taken, taken + 1);
+    let (wrong, _) = run(wanting(), &with(&[good, (0.2, 900.0, Quality::GOOD)]));
+    assert_ne!(bits(&wrong), bits(&right));
+}
+
 /// A triangle that was learnt through one gain says nothing true of what is read through another.
 #[test]
 fn what_was_learnt_with_sensors_that_measured_otherwise_is_not_resumed() {
