@@ -17,6 +17,7 @@
 use crate::config::Gain;
 use crate::spatial::Wrench;
 use nalgebra::{Matrix6, Vector6};
+use proprio_topics::Nanos;
 
 /// What turns a sensor's reading into a wrench with an offset.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -71,6 +72,18 @@ impl Calibration {
     #[must_use]
     pub fn depends_on_temperature(&self) -> bool {
         self.has_temperature
+    }
+
+    /// Variance of each channel [torque; force] [Nm^2, N^2] by what is not known of the board's temperature, which was told so long ago; `None`: never. A temperature holds for a minute,
+    /// then is a kelvin less certain with every minute, up to 10 K: as much as boards warm up by within hours (an iCub's: 14 K).
+    #[must_use]
+    pub fn temperature_variance(&self, age: Option<Nanos>) -> [f64; 6] {
+        const MOST: f64 = 10.0;
+        if !self.has_temperature {
+            return [0.0; 6];
+        }
+        let kelvin = age.map_or(MOST, |age| (age.seconds() / 60.0 - 1.0).clamp(0.0, MOST));
+        self.per_kelvin.torque_first().map(|k| (k * kelvin).powi(2))
     }
 
     /// How far a temperature is from the reference \[K\]; 0 if either is not known.

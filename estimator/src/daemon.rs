@@ -31,6 +31,8 @@ const NAP: Duration = Duration::from_micros(100);
 const LOOK: Nanos = Nanos::from_millis(50);
 /// How often health is sent.
 const HEALTH_PERIOD: Nanos = Nanos::from_millis(100);
+/// For how many of these a temperature must have been missing before that is worth a line: boards send it every few seconds at the best.
+const COLD: u32 = 100;
 /// A data plane that has not turned for so long is stuck.
 const STUCK: Nanos = Nanos::from_millis(500);
 /// How many samples are taken at once, at the most: as many as may wait from all buses (6 MB).
@@ -142,6 +144,8 @@ struct DataPlane {
     descriptions: Option<Reader<Description>>,
     declarations: Reader<ContactDeclaration>,
     told_of_contact: bool,
+    /// For how many healths in a row a sensor has been without the temperature that its calibration wants.
+    cold: u32,
     /// Per channel number of the gateway: the pipeline's channel.
     map: Vec<Option<usize>>,
     /// The gateway's epoch that `map` belongs to.
@@ -206,6 +210,7 @@ impl DataPlane {
                 reader
             },
             told_of_contact: false,
+            cold: 0,
             map: Vec::with_capacity(proprio_topics::MAX_CHANNELS),
             mapped: 0,
             torques,
@@ -360,7 +365,27 @@ impl DataPlane {
         }
     }
 
+    /// Says once that a sensor's temperature is missing, and once that none is any more.
+    fn tell_temperatures(&mut self) {
+        if self.pipeline.without_temperature().next().is_none() {
+            if std::mem::replace(&mut self.cold, 0) >= COLD {
+                tracing::info!("the temperatures that calibrations want are there again");
+            }
+            return;
+        }
+        self.cold = self.cold.saturating_add(1);
+        if self.cold == COLD {
+            for sensor in self.pipeline.without_temperature() {
+                tracing::warn!(
+                    sensor,
+                    "its calibration wants the temperature of its board, which has not been told yet, or not for a minute: torques that rest on it are less certain; have the board send it"
+                );
+            }
+        }
+    }
+
     fn tell_health(&mut self, now: Nanos) {
+        self.tell_temperatures();
         let counts = self.pipeline.counts();
         (self.health.late, self.health.backward, self.health.not_finite) =
             (counts.late, counts.backward, counts.not_finite);

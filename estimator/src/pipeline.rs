@@ -9,7 +9,7 @@
 //! A channel stamped exactly T is used as it is, its velocity and acceleration too where it has them; otherwise they come
 //! from its adaptive window ([`crate::differentiate`]). Wrenches and proper accelerations lie on straight lines between samples.
 //! Wrenches are corrected first ([`crate::calibration`]), by the last temperature of their board stamped before T - wait/2, however old: it changes slowly. Before the first one the
-//! board is taken to be at its reference temperature.
+//! board is taken to be at its reference temperature. While there is none, or it is older than a minute, the offset is as much less certain ([`Calibration::temperature_variance`]).
 //!
 //! With identification on ([`crate::identify::online`]), inertial parameters, offsets and their covariance are those of the last solution in force; who owns the pipeline runs its
 //! jobs ([`Pipeline::take_job`]), at once or in another thread.
@@ -174,6 +174,8 @@ pub struct Pipeline {
     velocity: Vec<f64>,
     acceleration: Vec<f64>,
     readings: Vec<Wrench>,
+    /// Per F/T sensor, whether its calibration wants a temperature that was not told lately.
+    without_temperature: Vec<bool>,
     dependences: Dependences,
     learning: Option<Box<Learning>>,
     /// Why there is none although it was asked for.
@@ -242,6 +244,7 @@ impl Pipeline {
             velocity: vec![0.0; dofs],
             acceleration: vec![0.0; dofs],
             readings: vec![Wrench::zero(); setup.structure.sensors().len()],
+            without_temperature: vec![false; setup.structure.sensors().len()],
             dependences: Dependences {
                 active: None,
                 torques: vec![Dependence::default(); dofs],
@@ -306,6 +309,15 @@ impl Pipeline {
     #[must_use]
     pub fn counts(&self) -> Counts {
         self.counts
+    }
+
+    /// The F/T sensors whose readings can not be corrected for the temperature of their boards as they should be, at the last estimate: none was told, or the last more than a minute before.
+    pub fn without_temperature(&self) -> impl Iterator<Item = &str> {
+        let channels = self.setup.channels().iter();
+        channels.filter_map(|channel| match channel.role {
+            Use::Sensor(number) if self.without_temperature.get(number) == Some(&true) => Some(channel.name.as_str()),
+            _ => None,
+        })
     }
 
     /// Takes a sample of channel number `channel` (see [`Setup::channel`]), acquired at `t`. Of an F/T sensor the temperature of
@@ -546,7 +558,12 @@ impl Pipeline {
                             self.setup.offsets.get(number),
                             self.setup.calibrations.get(number),
                         ) {
-                            let celsius = temperature_at(temperatures, t, self.setup.max_wait);
+                            let (celsius, age) = temperature_at(temperatures, t, self.setup.max_wait);
+                            let unknown = calibration.temperature_variance(age);
+                            self.propagation.set_widened(number, unknown);
+                            if let Some(place) = self.without_temperature.get_mut(number) {
+                                *place = unknown != [0.0; 6];
+                            }
                             let corrected = calibration.apply(&Wrench::from_parts([fx, fy, fz], [tx, ty, tz]), celsius);
                             self.propagation
                                 .set_reading(number, &corrected, calibration.warmth(celsius));
@@ -769,11 +786,12 @@ pub(crate) fn quality_reason(quality: Quality, faults: Quality) -> Reason {
     }
 }
 
-/// The temperature of a sensor's board at `t` \[degrees Celsius\]: the last one stamped before `t` less half of what an estimate waits, however old; NaN if there is none. So old that
+/// The temperature of a sensor's board at `t` \[degrees Celsius\], and how long ago it was told: the last one stamped before `t` less half of what an estimate waits, however old; NaN if there is none. So old that
 /// whatever counts has come when `t` is released, though nobody waits for it.
-fn temperature_at(temperatures: &History<1>, t: Nanos, max_wait: Nanos) -> f64 {
+fn temperature_at(temperatures: &History<1>, t: Nanos, max_wait: Nanos) -> (f64, Option<Nanos>) {
     let before = t.saturating_sub(Nanos(max_wait.0 / 2 + 1));
-    temperatures.at(before, before).map_or(f64::NAN, |held| held.value[0])
+    let held = temperatures.at(before, before);
+    held.map_or((f64::NAN, None), |held| (held.value[0], Some(held.age)))
 }
 
 fn stale<const D: usize>(held: &Held<D>, max_silence: Nanos) -> Reason {

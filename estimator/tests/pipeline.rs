@@ -167,8 +167,9 @@ fn corrected_readings_give_the_estimates_of_right_ones() {
         "contact/hand/fz",
         "torque_std/l_elbow",
     ] {
-        for ((right, corrected), uncorrected) in right[column].iter().zip(&corrected[column]).zip(&uncorrected[column])
-        {
+        // Before the first row nothing was told of the temperature.
+        let rows = right[column].iter().zip(&corrected[column]).zip(&uncorrected[column]);
+        for ((right, corrected), uncorrected) in rows.skip(usize::from(column.contains("std"))) {
             let number = |s: &String| s.parse::<f64>().unwrap();
             assert!(
                 (number(right) - number(corrected)).abs() < 1e-9,
@@ -276,6 +277,57 @@ fn temperatures_count_only_where_they_can_be_trusted_and_are_wanted() {
     assert_eq!(pipeline.counts().taken, taken + 1);
     let (wrong, _) = run(wanting(), &with(&[good, (0.2, 900.0, Quality::GOOD)]));
     assert_ne!(bits(&wrong), bits(&right));
+}
+
+/// Torques say it when nobody knows how warm a board is: as if the offset were as uncertain.
+#[test]
+fn without_a_temperature_torques_are_less_certain() {
+    let change = calibration();
+    // All channels at rest at one instant, and a temperature so long before.
+    let log = golden("icub_left_arm_mujoco.csv");
+    let std = |age: Option<f64>, kelvin: f64| {
+        let mut pipeline = Pipeline::new(setup(|config| {
+            calibrate(config, &change);
+            let ft = &mut config.force_torque[0];
+            ft.offset_std_n = ft.temperature_n_per_k.map(|k| (k * kelvin).abs());
+            ft.offset_std_nm = ft.temperature_nm_per_k.map(|k| (k * kelvin).abs());
+        }));
+        let t = Nanos::from_seconds(10_000.0);
+        if let Some(age) = age {
+            let sensor = pipeline.setup().channel(Kind::Wrench, "l_arm_ft_sensor").unwrap();
+            pipeline.push(sensor, t - Nanos::from_seconds(age), &temperature(27.0), Quality::GOOD);
+        }
+        let mut reader = Reader::new(log.as_bytes()).unwrap();
+        let series: Vec<_> = reader.series().to_vec();
+        let mut row = Row::default();
+        assert!(reader.next_row(&mut row).unwrap());
+        for item in &row.items {
+            let of = &series[item.series];
+            if let (What::Channel(kind), Value::Reading(reading, quality)) = (of.what, &item.value)
+                && let Some(channel) = pipeline.setup().channel(kind, &of.name)
+            {
+                pipeline.push(channel, t, reading, *quality);
+            }
+        }
+        pipeline.finish();
+        let torques = pipeline.poll().unwrap().torques;
+        let told: Vec<&str> = pipeline.without_temperature().collect();
+        let deviations: Vec<f64> = torques.joints().iter().map(|j| j.standard_deviation).collect();
+        (deviations, told == ["l_arm_ft_sensor"])
+    };
+    let known = std(Some(30.0), 0.0);
+    assert!(!known.1);
+    assert_eq!(std(Some(59.0), 0.0), known);
+    for (age, kelvin) in [(Some(180.0), 2.0), (Some(5000.0), 10.0), (None, 10.0)] {
+        let (found, is_told) = std(age, 0.0);
+        let (expected, _) = std(Some(30.0), kelvin);
+        assert!(is_told, "{age:?}");
+        for ((found, expected), known) in found.iter().zip(&expected).zip(&known.0) {
+            // The temperature is told as it was half of the wait before.
+            assert!((found / expected - 1.0).abs() < 1e-3, "{age:?}: {found} {expected}");
+            assert!(found > known, "{age:?}: {found} {known}");
+        }
+    }
 }
 
 /// A triangle that was learnt through one gain says nothing true of what is read through another.

@@ -282,7 +282,7 @@ impl Learning {
                         continue;
                     };
                     let (mean, reason) = mean_reading(history, t, self.period, setup.max_silence);
-                    let celsius = temperature_at(temperatures, t, setup.max_wait);
+                    let (celsius, _) = temperature_at(temperatures, t, setup.max_wait);
                     let calibration = setup.calibrations.get(number);
                     *reading = calibration.map_or(mean, |calibration| calibration.apply(&mean, celsius));
                     *fault = reason;

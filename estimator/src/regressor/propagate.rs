@@ -254,6 +254,8 @@ impl Block {
 pub struct Propagation {
     parts: Vec<Part>,
     drifts: Vec<Drift>,
+    /// Per sensor, what else each channel [torque; force] of its offset is uncertain by at present: a variance.
+    widened: Vec<[f64; 6]>,
     /// The first instant that was computed.
     begun: Option<Nanos>,
     torque: Vec<f64>,
@@ -365,6 +367,7 @@ impl Propagation {
                 .map(|number| Part::new(structure, number, covariance))
                 .collect(),
             drifts: covariance.drifts.clone(),
+            widened: vec![[0.0; 6]; covariance.drifts.len()],
             begun: None,
             torque: vec![0.0; structure.dof_count()],
             contacts: vec![[0.0; 6]; structure.contacts().len()],
@@ -378,6 +381,13 @@ impl Propagation {
             if matches!(piece.what, Member::Sensor(own, _) if own == sensor) {
                 piece.calibrate(&corrected, kelvin);
             }
+        }
+    }
+
+    /// Says what, at present, a sensor's offset is uncertain by beyond the covariance: a variance of each channel [torque; force] [Nm^2, N^2], independent of all else. Before any: none.
+    pub fn set_widened(&mut self, sensor: usize, variance: [f64; 6]) {
+        if let Some(place) = self.widened.get_mut(sensor) {
+            *place = variance;
         }
     }
 
@@ -408,7 +418,7 @@ impl Propagation {
             let wandered = |motion: &dyn Fn(usize) -> Motion| -> f64 {
                 let of = |end: &End| {
                     wander(
-                        &self.drifts[end.sensor],
+                        (&self.drifts[end.sensor], &self.widened[end.sensor]),
                         (t, begun),
                         solver.sensor_pose(end.sensor),
                         || motion(end.link),
@@ -452,15 +462,21 @@ impl Propagation {
     }
 }
 
-/// Variance that what an offset has wandered by `t` gives to a result that sees it with a motion; the run began at `begun`.
-fn wander(drift: &Drift, (t, begun): (Nanos, Nanos), x_bm: &Pose, motion: impl Fn() -> Motion) -> f64 {
-    if drift.rate == [0.0; 6] {
+/// Variance that what an offset has wandered by `t`, and is uncertain by beside, gives to a result that sees it with a motion; the run began at `begun`.
+fn wander(
+    (drift, widened): (&Drift, &[f64; 6]),
+    (t, begun): (Nanos, Nanos),
+    x_bm: &Pose,
+    motion: impl Fn() -> Motion,
+) -> f64 {
+    if drift.rate == [0.0; 6] && *widened == [0.0; 6] {
         return 0.0;
     }
     let seconds = drift.known.elapsed(t, begun);
     let seen = x_bm.twist_back(&motion());
-    let squares = seen.angular.iter().chain(seen.linear.iter()).zip(&drift.rate);
-    seconds * squares.map(|(m, rate)| m * m * rate).sum::<f64>()
+    let variances = drift.rate.iter().zip(widened).map(|(rate, more)| seconds * rate + more);
+    let squares = seen.angular.iter().chain(seen.linear.iter()).zip(variances);
+    squares.map(|(m, variance)| m * m * variance).sum()
 }
 
 impl Part {
