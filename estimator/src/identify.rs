@@ -39,6 +39,7 @@ mod mounting;
 mod noise;
 pub mod online;
 mod outcome;
+mod parallel;
 mod passes;
 pub mod prior;
 mod rows;

@@ -17,6 +17,7 @@ use super::information::Information;
 use super::instants::{Break, Defect, Instant, Recording, Settings, Signal, TimeOffset};
 use super::mounting;
 use super::outcome::{Finding, LeftOut, Outcome, Role, Severity, Verdict};
+use super::parallel;
 use super::passes::{NoiseModel, Piece, Residuals, Told, leave, noise_of, tell, tell_angles};
 use super::prior::{Fit, Posterior, Prior, PriorError};
 use super::rows::{Further, Groups, Layout, RowMaker, Rows};
@@ -464,28 +465,11 @@ pub(super) fn over<'a, T: Send>(
     pieces: &[Piece<'a>],
     pass: impl Fn(&mut RowMaker<'_>, usize, Piece<'a>) -> T + Sync,
 ) -> Vec<T> {
-    let threads = std::thread::available_parallelism()
-        .map_or(1, usize::from)
-        .min(pieces.len().max(1));
-    let mut out: Vec<Option<T>> = pieces.iter().map(|_| None).collect();
-    let next = std::sync::atomic::AtomicUsize::new(0);
-    let results = std::sync::Mutex::new(&mut out);
-    std::thread::scope(|scope| {
-        for _ in 0..threads {
-            scope.spawn(|| {
-                let mut maker = maker.clone();
-                loop {
-                    let number = next.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
-                    let Some(piece) = pieces.get(number) else { break };
-                    let result = pass(&mut maker, number, *piece);
-                    if let Ok(mut results) = results.lock() {
-                        results[number] = Some(result);
-                    }
-                }
-            });
-        }
-    });
-    out.into_iter().flatten().collect()
+    parallel::map_with(
+        pieces.len(),
+        || maker.clone(),
+        |maker, number| pass(maker, number, pieces[number]),
+    )
 }
 
 pub(super) fn added(told: &[Told], unknowns: usize) -> Information {

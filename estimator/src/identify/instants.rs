@@ -22,13 +22,14 @@ pub use defects::{Break, Defect, Units};
 pub use offset::{Signal, TimeOffset};
 
 use super::gate::UnitSet;
+use super::parallel;
 use crate::dynamics::{ContactSet, FrameMotion, SensorSet};
 use crate::pipeline::{UNTRUSTED_ENCODER, quality_reason};
 use crate::setup::{BaseMotion, Channel, Setup, Use};
 use crate::spatial::{Vec3, Wrench};
 use proprio_topics::csv::{Item, Reader, Report, Row, Value, What};
 use proprio_topics::{Kind, Nanos, Quality, Reading, Reason};
-use smooth::Smoother;
+use smooth::{Scratch, Smoother};
 use std::io::Read;
 
 /// Why a log can not be used at all.
@@ -409,14 +410,10 @@ impl Recording {
         let times = self.times(setup, period);
         let joints = self.joint_columns(&times, period, settings);
         let imu = self.imu_column(setup, &times, period, settings);
-        let sensors: Vec<Vec<Result<Values<6>, Reason>>> = self
-            .sensors
-            .iter()
-            .map(|stream| times.iter().map(|t| stream.mean(*t, period)).collect())
-            .collect();
         let dofs = setup.model.dof_count();
         let at_rest: Vec<f64> = setup.locked.iter().map(|q| if q.is_nan() { 0.0 } else { *q }).collect();
-        let instants = times.iter().enumerate().map(|(number, &t)| {
+        let at = |number: usize| {
+            let t = times[number];
             let mut instant = Instant {
                 t,
                 position: at_rest.clone(),
@@ -444,7 +441,7 @@ impl Recording {
                         instant.torque[dof] = state.torque;
                         state.fault
                     }
-                    Use::Sensor(sensor) => match sensors[sensor][number] {
+                    Use::Sensor(sensor) => match self.sensors[sensor].mean(t, period) {
                         Ok([fx, fy, fz, tx, ty, tz]) => {
                             instant.readings[sensor] = setup.calibrations[sensor].apply(
                                 &Wrench::from_parts([fx, fy, fz], [tx, ty, tz]),
@@ -461,9 +458,9 @@ impl Recording {
                 };
             }
             instant
-        });
+        };
         let mut instants = Instants {
-            instants: instants.collect(),
+            instants: parallel::in_pieces(times.len(), |range| range.map(at).collect()),
             breaks: Vec::new(),
             defects: self.defects.clone(),
         };
@@ -517,19 +514,9 @@ impl Recording {
 
     /// Per degree of freedom and instant; on all cores, since each joint is by itself.
     fn joint_columns(&self, times: &[Nanos], period: Nanos, settings: &Settings) -> Vec<Vec<JointAt>> {
-        let threads = std::thread::available_parallelism().map_or(1, usize::from);
-        let share = self.joints.len().div_ceil(threads).max(1);
-        let mut columns: Vec<Vec<JointAt>> = vec![Vec::new(); self.joints.len()];
-        std::thread::scope(|scope| {
-            for (tracks, columns) in self.joints.chunks(share).zip(columns.chunks_mut(share)) {
-                scope.spawn(move || {
-                    for (track, column) in tracks.iter().zip(columns) {
-                        *column = track.at_all(times, period, settings);
-                    }
-                });
-            }
-        });
-        columns
+        parallel::map(self.joints.len(), |dof| {
+            self.joints[dof].at_all(times, period, settings)
+        })
     }
 
     fn imu_column(
@@ -552,15 +539,16 @@ impl Recording {
         } else {
             Vec::new()
         };
-        let at = |t: Nanos| -> Result<FrameMotion, Reason> {
+        let mut scratch = Scratch::default();
+        let mut at = |t: Nanos| -> Result<FrameMotion, Reason> {
             let (omega, alpha) = if smoothers.is_empty() {
                 (angular_velocity.mean(t, period)?, angular_acceleration.mean(t, period)?)
             } else {
                 angular_velocity.mean(t, period)?;
                 let (mut omega, mut alpha) = ([0.0; 3], [0.0; 3]);
                 for (axis, smoother) in smoothers.iter().enumerate() {
-                    omega[axis] = smoother.at(t, 0, settings.edge.seconds()).ok_or(Reason::Starting)?;
-                    alpha[axis] = smoother.at(t, 1, settings.edge.seconds()).ok_or(Reason::Starting)?;
+                    let both = smoother.at(t, 0..=1, settings.edge.seconds(), &mut scratch);
+                    [omega[axis], alpha[axis], _] = both.ok_or(Reason::Starting)?;
                 }
                 (omega, alpha)
             };
@@ -643,30 +631,32 @@ impl JointTrack {
         let of_position = self.velocity.t.is_empty().then(|| self.position.smoother(0));
         let of_velocity =
             (!self.velocity.t.is_empty() && self.acceleration.t.is_empty()).then(|| self.velocity.smoother(0));
-        let derivative = |smoother: &Option<Smoother>, t, order| {
-            smoother
-                .as_ref()
-                .and_then(|s| s.at(t, order, edge))
-                .ok_or(Reason::Starting)
-        };
-        let motion = |t: Nanos| -> Result<[f64; 3], Reason> {
+        let mut scratch = Scratch::default();
+        let mut derivatives =
+            |smoother: &Smoother, t, orders| smoother.at(t, orders, edge, &mut scratch).ok_or(Reason::Starting);
+        let mut motion = |t: Nanos| -> Result<[f64; 3], Reason> {
             let [mut position] = self.position.mean(t, period)?;
-            let velocity = if of_position.is_some() {
-                position = derivative(&of_position, t, 0)?;
-                derivative(&of_position, t, 1)?
+            let is_given = !self.acceleration.t.is_empty();
+            let (velocity, mut acceleration) = if let Some(smoother) = &of_position {
+                let orders = if is_given || of_velocity.is_some() {
+                    0..=1
+                } else {
+                    0..=2
+                };
+                let [of_0, of_1, of_2] = derivatives(smoother, t, orders)?;
+                position = of_0;
+                (of_1, of_2)
             } else {
-                self.velocity.mean(t, period)?[0]
+                (self.velocity.mean(t, period)?[0], 0.0)
             };
-            let acceleration = if !self.acceleration.t.is_empty() {
-                self.acceleration.mean(t, period)?[0]
-            } else if of_velocity.is_some() {
-                derivative(&of_velocity, t, 1)?
-            } else {
-                derivative(&of_position, t, 2)?
-            };
+            if is_given {
+                acceleration = self.acceleration.mean(t, period)?[0];
+            } else if let Some(smoother) = &of_velocity {
+                acceleration = derivatives(smoother, t, 1..=1)?[1];
+            }
             Ok([position, velocity, acceleration])
         };
-        let at = |&t: &Nanos| {
+        let mut at = |&t: &Nanos| {
             let torque = self.torque.mean(t, period).map_or(f64::NAN, |[torque]| torque);
             match motion(t) {
                 Ok(motion) => JointAt {
@@ -681,7 +671,7 @@ impl JointTrack {
                 },
             }
         };
-        times.iter().map(at).collect()
+        times.iter().map(&mut at).collect()
     }
 }
 

@@ -13,7 +13,7 @@
 use super::smooth::{median, quantum};
 use super::{Instants, JointTrack, Recording, Stream};
 use crate::dynamics::{InverseDynamics, JointState, Kinematics, Structure};
-use crate::identify::{AXES, Severity};
+use crate::identify::{AXES, Severity, parallel};
 use crate::setup::{Setup, Use};
 use crate::spatial::Wrench;
 use proprio_topics::{Nanos, Reading, Reason};
@@ -1227,62 +1227,57 @@ pub(super) fn inspect_readings(recording: &Recording, setup: &Setup, instants: &
         let mut jumps: Vec<(f64, Nanos, &'static str, f64)> = Vec::new();
         let free = free_of_contact(setup, instants, sensor, &predicted);
         let runs = runs(instants, &free, period);
-        for (axis, (word, floor)) in AXES.into_iter().zip(floors).enumerate() {
-            let series = |range: &std::ops::Range<usize>| -> (Vec<f64>, Vec<[f64; 6]>) {
+        let expected = Expected::new(&runs, |i| predicted[i][sensor], period);
+        let found = parallel::map(AXES.len(), |axis| {
+            let series = |range: &std::ops::Range<usize>| -> Vec<f64> {
                 range
                     .clone()
-                    .map(|i| {
-                        let reading = instants.instants[i].readings[sensor].force_first();
-                        let model = predicted[i][sensor];
-                        // A centre of mass that is elsewhere makes torques of forces, not forces of torques.
-                        let [fx, fy, fz, tx, ty, tz] = model;
-                        let of = if axis < 3 {
-                            [fx, fy, fz, 0.0, 0.0, 0.0]
-                        } else {
-                            [LEVER * fx, LEVER * fy, LEVER * fz, tx, ty, tz]
-                        };
-                        (reading[axis] - model[axis], of)
-                    })
-                    .unzip()
+                    .map(|i| instants.instants[i].readings[sensor].force_first()[axis] - predicted[i][sensor][axis])
+                    .collect()
             };
+            let runs = runs.iter().zip(&expected[axis / 3]);
             let runs: Vec<_> = runs
-                .iter()
-                .map(|r| (r.clone(), series(r)))
-                .map(|(r, (x, p))| Residual::new(r, x, p, period))
+                .map(|(r, e)| Residual::new(r.clone(), series(r), e, period))
                 .collect();
             let usual = median(runs.iter().flat_map(|r| r.off.iter().map(|d| d.abs())).collect()) * 1.4826;
-            let (mut count, mut worst) = (0, (0.0_f64, Nanos::ZERO));
+            let (mut outliers, mut jumps) = (Vec::new(), Vec::new());
             for mut run in runs {
                 let scatter: Vec<f64> = run
                     .around(&run.off, period)
                     .into_iter()
-                    .map(|s| s.max(usual).max(floor))
+                    .map(|s| s.max(usual).max(floors[axis]))
                     .collect();
                 for i in run.outliers(&scatter) {
-                    let (off, t) = (run.off[i], instants.instants[run.range.start + i].t);
-                    count += 1;
-                    if off.abs() > worst.0.abs() {
-                        worst = (off, t);
-                    }
-                    outliers.push((run.range.start + i, sensor));
+                    outliers.push((run.range.start + i, run.off[i]));
                     // What is found out about is not asked again.
-                    run.values[i] -= off;
+                    run.values[i] -= run.off[i];
                 }
                 for test in [SHARP, SLIDE] {
-                    for (at, size, excess) in run.jumps(test, &scatter, period) {
-                        jumps.push((excess, instants.instants[run.range.start + at].t, word, size));
-                    }
+                    let found = run.jumps(test, &scatter, period).into_iter();
+                    jumps.extend(found.map(|(at, size, excess)| (run.range.start + at, size, excess)));
                 }
             }
-            if count > 0 {
+            (outliers, jumps)
+        });
+        for (word, (of_axis, found)) in AXES.into_iter().zip(found) {
+            let mut worst = (0.0_f64, Nanos::ZERO);
+            for &(i, off) in &of_axis {
+                if off.abs() > worst.0.abs() {
+                    worst = (off, instants.instants[i].t);
+                }
+                outliers.push((i, sensor));
+            }
+            if !of_axis.is_empty() {
                 instants.defects.push(Defect::Outliers {
                     channel: label(channel),
                     axis: word,
-                    samples: count,
+                    samples: of_axis.len(),
                     largest: worst.0,
                     t: worst.1,
                 });
             }
+            let found = found.into_iter();
+            jumps.extend(found.map(|(i, size, excess)| (excess, instants.instants[i].t, word, size)));
         }
         // Of what several axes and both tests say within a second, the clearest.
         jumps.sort_by(|a, b| b.0.total_cmp(&a.0));
@@ -1313,32 +1308,34 @@ pub(super) fn inspect_readings(recording: &Recording, setup: &Setup, instants: &
 fn predict(setup: &Setup, instants: &Instants) -> Vec<Vec<[f64; 6]>> {
     let sensors = setup.structure.sensors();
     let nothing = vec![[f64::NAN; 6]; sensors.len()];
-    let Ok(mut kinematics) = Kinematics::new(&setup.model, setup.base_link) else {
-        return vec![nothing; instants.instants.len()];
-    };
-    let mut dynamics = InverseDynamics::new(&setup.model);
-    let of_instant = instants.instants.iter().map(|instant| {
-        let state = JointState {
-            position: &instant.position,
-            velocity: &instant.velocity,
-            acceleration: &instant.acceleration,
+    parallel::in_pieces(instants.instants.len(), |range| {
+        let Ok(mut kinematics) = Kinematics::new(&setup.model, setup.base_link) else {
+            return vec![nothing.clone(); range.len()];
         };
-        let based =
-            instant.base_link == kinematics.base() || kinematics.set_base(&setup.model, instant.base_link).is_ok();
-        let done = instant.has_motion(setup.channels())
-            && based
-            && kinematics.update(&setup.model, state, &instant.base).is_ok()
-            && dynamics.update(&setup.model, &kinematics, &[]).is_ok();
-        if !done {
-            return nothing.clone();
-        }
-        let reading = |cut: &crate::dynamics::SensorCut| {
-            cut.reading(&dynamics.transmitted(&kinematics, cut.joint()))
-                .force_first()
-        };
-        sensors.iter().map(reading).collect()
-    });
-    of_instant.collect()
+        let mut dynamics = InverseDynamics::new(&setup.model);
+        let of_instant = instants.instants[range].iter().map(|instant| {
+            let state = JointState {
+                position: &instant.position,
+                velocity: &instant.velocity,
+                acceleration: &instant.acceleration,
+            };
+            let based =
+                instant.base_link == kinematics.base() || kinematics.set_base(&setup.model, instant.base_link).is_ok();
+            let done = instant.has_motion(setup.channels())
+                && based
+                && kinematics.update(&setup.model, state, &instant.base).is_ok()
+                && dynamics.update(&setup.model, &kinematics, &[]).is_ok();
+            if !done {
+                return nothing.clone();
+            }
+            let reading = |cut: &crate::dynamics::SensorCut| {
+                cut.reading(&dynamics.transmitted(&kinematics, cut.joint()))
+                    .force_first()
+            };
+            sensors.iter().map(reading).collect()
+        });
+        of_instant.collect()
+    })
 }
 
 /// Per instant, whether the sensor's reading is there and nothing but the model's links pulls at it on the side away from the base.
@@ -1397,51 +1394,91 @@ fn runs(instants: &Instants, free: &[bool], period: f64) -> Vec<std::ops::Range<
     runs
 }
 
-/// One axis of what a sensor reads beyond the model's prediction, over one stretch.
-struct Residual {
-    range: std::ops::Range<usize>,
-    values: Vec<f64>,
-    /// Off the running median.
-    off: Vec<f64>,
-    /// How far the model's prediction is off its own, at the most nearby.
-    model_off: Vec<f64>,
-    /// What the model predicts, as far as it matters to this axis.
-    predicted: Vec<[f64; 6]>,
-}
-
 fn samples(seconds: f64, period: f64) -> usize {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     let count = (seconds / period).round() as usize;
     count.max(1)
 }
 
-impl Residual {
-    fn new(range: std::ops::Range<usize>, values: Vec<f64>, predicted: Vec<[f64; 6]>, period: f64) -> Self {
-        let half = samples(MEDIAN, period).max(3);
-        let count = values.len();
-        let off_median = |value: &dyn Fn(usize) -> f64| -> Vec<f64> {
-            let off = |i: usize| {
-                // As much on either side.
-                let half = half.min(i).min(count - 1 - i);
-                value(i) - median((i - half..=i + half).map(value).collect())
+/// How far to either side of an instant medians are taken, in instants.
+fn median_reach(period: f64) -> usize {
+    samples(MEDIAN, period).max(3)
+}
+
+/// Numbers less their running median, which takes as much on either side.
+fn off_median(values: &[f64], half: usize) -> Vec<f64> {
+    let (count, mut window) = (values.len(), Vec::new());
+    (0..count)
+        .map(|i| {
+            let half = half.min(i).min(count - 1 - i);
+            window.clear();
+            window.extend_from_slice(&values[i - half..=i + half]);
+            values[i] - *window.select_nth_unstable_by(half, f64::total_cmp).1
+        })
+        .collect()
+}
+
+/// What the model predicts over one stretch, as far as it matters to an axis.
+struct Expected {
+    values: Vec<[f64; 6]>,
+    /// How far it is off its running median, at the most nearby.
+    off: Vec<f64>,
+}
+
+impl Expected {
+    /// For forces and for torques, of each stretch, given the prediction at an instant.
+    fn new(
+        runs: &[std::ops::Range<usize>],
+        predicted: impl Fn(usize) -> [f64; 6] + Sync,
+        period: f64,
+    ) -> [Vec<Self>; 2] {
+        let half = median_reach(period);
+        let off: Vec<Vec<Vec<f64>>> = parallel::map(AXES.len(), |k| {
+            let of_run = |run: &std::ops::Range<usize>| {
+                let values: Vec<f64> = run.clone().map(|i| predicted(i)[k]).collect();
+                off_median(&values, half)
             };
-            (0..count).map(off).collect()
-        };
-        let off = off_median(&|i| values[i]);
-        let of_model = [0, 1, 2, 3, 4, 5].map(|k| off_median(&|i| predicted[i][k]));
-        let norm = |i: usize| of_model.iter().map(|off| off[i] * off[i]).sum::<f64>().sqrt();
-        // The most nearby: what a wrong model leaves over need not be in phase with what it predicts.
-        let norms: Vec<f64> = (0..count).map(norm).collect();
-        let near = |i: usize| &norms[i.saturating_sub(2 * half)..(i + 2 * half + 1).min(count)];
-        let model_off = (0..count)
-            .map(|i| near(i).iter().copied().fold(0.0, f64::max))
-            .collect();
+            runs.iter().map(of_run).collect()
+        });
+        // A centre of mass that is elsewhere makes torques of forces, not forces of torques.
+        [[1.0, 1.0, 1.0, 0.0, 0.0, 0.0], [LEVER, LEVER, LEVER, 1.0, 1.0, 1.0]].map(|shares| {
+            let of_run = |(number, run): (usize, &std::ops::Range<usize>)| {
+                let share_of = |value: &dyn Fn(usize) -> f64| std::array::from_fn(|k| shares[k] * value(k));
+                let norm = |i: usize| {
+                    let off: [f64; 6] = share_of(&|k| off[k][number][i]);
+                    off.iter().map(|off| off * off).sum::<f64>().sqrt()
+                };
+                // The most nearby: what a wrong model leaves over need not be in phase with what it predicts.
+                let norms: Vec<f64> = (0..run.len()).map(norm).collect();
+                let near = |i: usize| &norms[i.saturating_sub(2 * half)..(i + 2 * half + 1).min(norms.len())];
+                let most = |i: usize| near(i).iter().copied().fold(0.0, f64::max);
+                Self {
+                    values: run.clone().map(|i| share_of(&|k| predicted(i)[k])).collect(),
+                    off: (0..run.len()).map(most).collect(),
+                }
+            };
+            runs.iter().enumerate().map(of_run).collect()
+        })
+    }
+}
+
+/// One axis of what a sensor reads beyond the model's prediction, over one stretch.
+struct Residual<'a> {
+    range: std::ops::Range<usize>,
+    values: Vec<f64>,
+    /// Off the running median.
+    off: Vec<f64>,
+    expected: &'a Expected,
+}
+
+impl<'a> Residual<'a> {
+    fn new(range: std::ops::Range<usize>, values: Vec<f64>, expected: &'a Expected, period: f64) -> Self {
+        let off = off_median(&values, median_reach(period));
         Self {
             range,
             values,
             off,
-            model_off,
-            predicted,
+            expected,
         }
     }
 
@@ -1457,7 +1494,7 @@ impl Residual {
     }
 
     fn outliers(&self, scatter: &[f64]) -> Vec<usize> {
-        let far = |i: usize, times: f64| self.off[i].abs() > (times * scatter[i]).max(MODEL * self.model_off[i]);
+        let far = |i: usize, times: f64| self.off[i].abs() > (times * scatter[i]).max(MODEL * self.expected.off[i]);
         let mut marked = vec![false; self.off.len()];
         for i in (0..self.off.len()).filter(|i| far(*i, OUTLIER)) {
             marked[i] = true;
@@ -1517,7 +1554,7 @@ impl Residual {
                 excess = excess.min(size / (JUMP * around(i).max(f64::MIN_POSITIVE)));
             }
             if excess >= 1.0 {
-                let of_model: f64 = (0..6).map(|k| miss(&|j| self.predicted[j][k], i).powi(2)).sum();
+                let of_model: f64 = (0..6).map(|k| miss(&|j| self.expected.values[j][k], i).powi(2)).sum();
                 excess = excess.min(size / (MODEL * of_model.sqrt()).max(f64::MIN_POSITIVE));
             }
             excess

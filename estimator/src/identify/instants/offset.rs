@@ -15,6 +15,7 @@
 //! information `I` (the sandwich estimator; White 1980, in blocks: Liang, Zeger 1986), if that is more than what noise gives with its autocorrelation time.
 
 use super::{Recording, Stream};
+use crate::identify::{dot, parallel};
 use proprio_topics::Nanos;
 use std::collections::BTreeMap;
 
@@ -92,12 +93,6 @@ impl Recording {
     }
 }
 
-/// One axis over one stretch: measured at the stream's stamps, the prediction on a grid of its own.
-struct Axis {
-    /// Per measurement: what is left without the slow part, and its stamp \[s\].
-    measured: Vec<(f64, f64)>,
-}
-
 fn estimate<const D: usize>(
     stream: &Stream<D>,
     order: [usize; D],
@@ -105,103 +100,81 @@ fn estimate<const D: usize>(
     predicted: &[f64],
 ) -> Option<(f64, f64)> {
     let origin = *times.first()?;
-    let rows: Vec<(f64, &[f64])> = times
+    let (rows, _) = predicted.as_chunks::<D>();
+    let (at, rows): (Vec<f64>, Vec<[f64; D]>) = times
         .iter()
-        .zip(predicted.chunks_exact(D))
+        .zip(rows)
         .filter(|(_, row)| row.iter().all(|v| v.is_finite()))
-        .map(|(t, row)| ((*t - origin).seconds(), row))
-        .collect();
+        .map(|(t, row)| ((*t - origin).seconds(), *row))
+        .unzip();
     let stamps: Vec<f64> = stream.t.iter().map(|t| (*t - origin).seconds()).collect();
     if rows.len() < 100 || stamps.len() < 100 {
         return None;
     }
-    // Where measurement and prediction are both there without a gap, far enough from their ends for every shift tried.
-    let at: Vec<f64> = rows.iter().map(|(t, _)| *t).collect();
+    // Where measurement and prediction are both there without a gap, far enough from their ends for every shift tried: how many gaps there are until each row tells.
+    let mut gaps = vec![0_usize];
+    gaps.extend(at.windows(2).scan(0, |gaps, w| {
+        *gaps += usize::from(w[1] - w[0] > 0.05);
+        Some(*gaps)
+    }));
     let whole = |low: f64, high: f64| {
         let (begin, end) = (at.partition_point(|t| *t <= low), at.partition_point(|t| *t < high));
-        begin > 0 && end < at.len() && at[begin - 1..=end].windows(2).all(|w| w[1] - w[0] <= 0.05)
+        begin > 0 && end < at.len() && gaps[end] == gaps[begin - 1]
     };
     // At most 100 a second count: more tell nothing new about motion.
     let spacing = stream.spacing.seconds().max(1e-6);
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     let thin = ((0.01 / spacing).round() as usize).max(1);
-    let blocks: Vec<(f64, Vec<f64>)> = (0..stamps.len() / thin)
-        .map(|b| {
-            let range = b * thin..(b + 1) * thin;
-            let n = thin as f64;
-            let mean = |k: usize| stream.value[range.clone()].iter().map(|v| v[k]).sum::<f64>() / n;
-            (
-                stamps[range.clone()].iter().sum::<f64>() / n,
-                order.iter().map(|k| mean(*k)).collect(),
-            )
-        })
+    let n = thin as f64;
+    let block_times: Vec<f64> = stamps.chunks_exact(thin).map(|t| t.iter().sum::<f64>() / n).collect();
+    let blocks: Vec<[f64; D]> = stream
+        .value
+        .chunks_exact(thin)
+        .map(|values| order.map(|k| values.iter().map(|v| v[k]).sum::<f64>() / n))
         .collect();
-    let used: Vec<bool> = blocks
+    let used: Vec<bool> = block_times
         .iter()
-        .map(|(t, _)| whole(t - SLOW - WITHIN, t + SLOW + WITHIN))
+        .map(|t| whole(t - SLOW - WITHIN, t + SLOW + WITHIN))
         .collect();
     if used.iter().filter(|u| **u).count() < 100 {
         return None;
     }
-    let block_times: Vec<f64> = blocks.iter().map(|(t, _)| *t).collect();
     let spacings = |t: &[f64]| super::smooth::median(t.windows(2).map(|w| w[1] - w[0]).collect());
     let width = SMOOTH * spacings(&block_times).max(spacings(&at));
-    let axes: Vec<Axis> = (0..D)
-        .map(|k| {
-            let values: Vec<f64> = blocks.iter().map(|(_, v)| v[k]).collect();
-            let values = smoothed(&block_times, &values, width);
-            let slow = Slow::new(&block_times, &values);
-            let measured = block_times.iter().zip(&values).zip(&used).filter(|(_, used)| **used);
-            Axis {
-                measured: measured
-                    .map(|((t, v), _)| (v - slow.mean(t - SLOW, t + SLOW), *t))
-                    .collect(),
-            }
-        })
+    // Both without their slow part: what was measured with its stamps; the prediction at its own instants, and between them.
+    let measured: Vec<(f64, [f64; D])> = quick(&block_times, &blocks, width)
+        .into_iter()
+        .zip(&block_times)
+        .zip(&used)
+        .filter(|(_, used)| **used)
+        .map(|((y, t), _)| (*t, y))
         .collect();
-    // The prediction without its slow part, at its own instants and between them.
-    let columns: Vec<Vec<f64>> = (0..D)
-        .map(|k| {
-            let column: Vec<f64> = rows.iter().map(|(_, row)| row[k]).collect();
-            let column = smoothed(&at, &column, width);
-            let slow = Slow::new(&at, &column);
-            at.iter()
-                .zip(&column)
-                .map(|(t, v)| v - slow.mean(t - SLOW, t + SLOW))
-                .collect()
-        })
-        .collect();
-    let model = |k: usize, t: f64| {
-        let i = at.partition_point(|s| *s <= t).clamp(1, at.len() - 1);
-        cubic(&at, &columns[k], i, t)
-    };
-    let count = axes.first()?.measured.len() as f64;
+    let columns = quick(&at, &rows, width);
+    let count = measured.len() as f64;
     // Half the deviance: what all axes leave over at an offset.
     let left = |offset: f64| -> f64 {
-        axes.iter()
-            .enumerate()
-            .map(|(k, axis)| {
-                let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
-                for (y, t) in &axis.measured {
-                    let x = model(k, t - offset);
-                    xx += x * x;
-                    xy += x * y;
-                    yy += y * y;
-                }
-                // An axis on which nothing happens, or nothing is predicted, says nothing.
-                if xx <= 0.0 || yy <= 0.0 {
-                    0.0
-                } else {
-                    0.5 * count * ((yy - xy * xy / xx) / yy).max(1e-12).ln()
-                }
-            })
+        let mut model = Model::new(&at, &columns);
+        let (mut xx, mut xy, mut yy) = ([0.0; D], [0.0; D], [0.0; D]);
+        for (t, y) in &measured {
+            let x = model.at(t - offset);
+            for k in 0..D {
+                xx[k] += x[k] * x[k];
+                xy[k] += x[k] * y[k];
+                yy[k] += y[k] * y[k];
+            }
+        }
+        (0..D)
+            // An axis on which nothing happens, or nothing is predicted, says nothing.
+            .filter(|&k| xx[k] > 0.0 && yy[k] > 0.0)
+            .map(|k| 0.5 * count * ((yy[k] - xy[k] * xy[k] / xx[k]) / yy[k]).max(1e-12).ln())
             .sum()
     };
     #[allow(clippy::cast_possible_truncation)]
     let steps = (WITHIN / STEP).floor() as i32 - 1;
+    let tried: Vec<i32> = (-steps..=steps).collect();
+    let values = parallel::map(tried.len(), |number| left(f64::from(tried[number]) * STEP));
     let (mut best, mut least) = (0, f64::INFINITY);
-    for step in -steps..=steps {
-        let value = left(f64::from(step) * STEP);
+    for (step, value) in tried.into_iter().zip(values) {
         if value < least {
             (best, least) = (step, value);
         }
@@ -219,45 +192,42 @@ fn estimate<const D: usize>(
         }
         step *= 0.3;
     }
+    // The prediction there, and its slope.
+    let mut models = [-1e-3, 0.0, 1e-3].map(|by| (by, Model::new(&at, &columns)));
+    let model: Vec<[[f64; 2]; D]> = measured
+        .iter()
+        .map(|(t, _)| {
+            let [before, here, after] = models.each_mut().map(|(by, model)| model.at(t - offset + *by));
+            std::array::from_fn(|k| [here[k], (after[k] - before[k]) / 2e-3])
+        })
+        .collect();
     let (mut information, mut plain) = (0.0, 0.0);
     let mut scores: BTreeMap<i64, f64> = BTreeMap::new();
-    for (k, axis) in axes.iter().enumerate() {
+    for k in 0..D {
         let (mut xx, mut xy) = (0.0, 0.0);
-        let model: Vec<[f64; 2]> = axis
-            .measured
-            .iter()
-            .map(|(_, t)| {
-                [
-                    model(k, t - offset),
-                    (model(k, t - offset + 1e-3) - model(k, t - offset - 1e-3)) / 2e-3,
-                ]
-            })
-            .collect();
-        for ([x, _], (y, _)) in model.iter().zip(&axis.measured) {
-            xx += x * x;
-            xy += x * y;
+        for (x, (_, y)) in model.iter().zip(&measured) {
+            xx += x[k][0] * x[k][0];
+            xy += x[k][0] * y[k];
         }
         if xx <= 0.0 {
             continue;
         }
         let gain = xy / xx;
-        let residual: Vec<f64> = model
-            .iter()
-            .zip(&axis.measured)
-            .map(|([x, _], (y, _))| y - gain * x)
-            .collect();
+        let each = model.iter().zip(&measured);
+        let residual: Vec<f64> = each.map(|(x, (_, y))| y[k] - gain * x[k][0]).collect();
         // A shift changes the signal by its slope; what of that looks like a change of the gain does not count.
         let (mut ss, mut sx) = (0.0, 0.0);
-        for [x, slope] in &model {
+        for [x, slope] in model.iter().map(|x| x[k]) {
             ss += slope * slope;
             sx += slope * x;
         }
-        let variance = residual.iter().map(|v| v * v).sum::<f64>() / count;
+        let variance = dot(&residual, &residual) / count;
         if variance > 0.0 {
             let told = gain * gain * (ss - sx * sx / xx).max(0.0);
             information += told / inflated_variance(&residual);
             plain += told / variance;
-            for (([x, slope], (_, t)), e) in model.iter().zip(&axis.measured).zip(&residual) {
+            for ((x, (t, _)), e) in model.iter().zip(&measured).zip(&residual) {
+                let [x, slope] = x[k];
                 #[allow(clippy::cast_possible_truncation)]
                 let stretch = (t / STRETCH).floor() as i64;
                 *scores.entry(stretch).or_default() += gain * (slope - sx / xx * x) * e / variance;
@@ -274,10 +244,10 @@ fn estimate<const D: usize>(
 /// The variance of a series times its integrated autocorrelation time, `1 + 2 sum rho_k`, summed until `k` exceeds six times it.
 fn inflated_variance(series: &[f64]) -> f64 {
     let n = series.len() as f64;
-    let variance = series.iter().map(|v| v * v).sum::<f64>() / n;
+    let variance = dot(series, series) / n;
     let mut time = 1.0;
     for lag in 1..series.len() / 4 {
-        let product: f64 = series.iter().zip(&series[lag..]).map(|(a, b)| a * b).sum();
+        let product = dot(&series[..series.len() - lag], &series[lag..]);
         time += 2.0 * product / (n * variance);
         if lag as f64 > 6.0 * time {
             break;
@@ -286,8 +256,15 @@ fn inflated_variance(series: &[f64]) -> f64 {
     variance * time.max(1.0)
 }
 
-/// A series smoothed by lines fitted around each sample, weighted by a Gaussian curve of this standard deviation \[s\].
-fn smoothed(at: &[f64], values: &[f64], width: f64) -> Vec<f64> {
+/// Sums of all columns at once: where a sample is and what it weighs is the same for each.
+fn plus<const D: usize>(sum: &mut [f64; D], weight: f64, values: &[f64; D]) {
+    sum.iter_mut()
+        .zip(values)
+        .for_each(|(sum, value)| *sum += weight * value);
+}
+
+/// Series smoothed by lines fitted around each sample, weighted by a Gaussian curve of this standard deviation \[s\].
+fn smoothed<const D: usize>(at: &[f64], values: &[[f64; D]], width: f64) -> Vec<[f64; D]> {
     let mut low = 0;
     at.iter()
         .enumerate()
@@ -295,7 +272,7 @@ fn smoothed(at: &[f64], values: &[f64], width: f64) -> Vec<f64> {
             while at[low] < centre - 3.0 * width {
                 low += 1;
             }
-            let (mut w0, mut w1, mut w2, mut y0, mut y1) = (0.0, 0.0, 0.0, 0.0, 0.0);
+            let (mut w0, mut w1, mut w2, mut y0, mut y1) = (0.0, 0.0, 0.0, [0.0; D], [0.0; D]);
             for (t, y) in at[low..].iter().zip(&values[low..]) {
                 let x = (t - centre) / width;
                 if x > 3.0 {
@@ -303,11 +280,12 @@ fn smoothed(at: &[f64], values: &[f64], width: f64) -> Vec<f64> {
                 }
                 let w = (-0.5 * x * x).exp();
                 (w0, w1, w2) = (w0 + w, w1 + w * x, w2 + w * x * x);
-                (y0, y1) = (y0 + w * y, y1 + w * x * y);
+                plus(&mut y0, w, y);
+                plus(&mut y1, w * x, y);
             }
             let determinant = w0 * w2 - w1 * w1;
             if determinant > 1e-9 * w0 * w0 {
-                (w2 * y0 - w1 * y1) / determinant
+                std::array::from_fn(|k| (w2 * y0[k] - w1 * y1[k]) / determinant)
             } else {
                 values[i]
             }
@@ -315,50 +293,94 @@ fn smoothed(at: &[f64], values: &[f64], width: f64) -> Vec<f64> {
         .collect()
 }
 
-/// The four-point cubic (Lagrange) through the samples around sample interval `i - 1` to `i`, at `t`; a line at the ends.
-fn cubic(at: &[f64], values: &[f64], i: usize, t: f64) -> f64 {
-    if i < 2 || i + 1 >= at.len() {
-        let share = (t - at[i - 1]) / (at[i] - at[i - 1]);
-        return values[i - 1] + share * (values[i] - values[i - 1]);
+/// Series smoothed over this \[s\], less their means over [`SLOW`] to either side.
+fn quick<const D: usize>(at: &[f64], values: &[[f64; D]], width: f64) -> Vec<[f64; D]> {
+    let values = smoothed(at, values, width);
+    // Integrals from the first sample to each.
+    let mut integral = vec![[0.0; D]];
+    for (i, (t, v)) in at.windows(2).zip(values.windows(2)).enumerate() {
+        let mut sum = integral[i];
+        plus(&mut sum, 0.5 * (t[1] - t[0]), &v[0]);
+        plus(&mut sum, 0.5 * (t[1] - t[0]), &v[1]);
+        integral.push(sum);
     }
-    let (x, y) = (&at[i - 2..i + 2], &values[i - 2..i + 2]);
-    let d = [t - x[0], t - x[1], t - x[2], t - x[3]];
-    y[0] * d[1] * d[2] * d[3] / ((x[0] - x[1]) * (x[0] - x[2]) * (x[0] - x[3]))
-        + y[1] * d[0] * d[2] * d[3] / ((x[1] - x[0]) * (x[1] - x[2]) * (x[1] - x[3]))
-        + y[2] * d[0] * d[1] * d[3] / ((x[2] - x[0]) * (x[2] - x[1]) * (x[2] - x[3]))
-        + y[3] * d[0] * d[1] * d[2] / ((x[3] - x[0]) * (x[3] - x[1]) * (x[3] - x[2]))
+    let until = |place: &mut Place<'_>, t: f64| -> [f64; D] {
+        let i = place.of(t);
+        let (dt, span) = (t - at[i - 1], at[i] - at[i - 1]);
+        let mut sum = integral[i - 1];
+        plus(&mut sum, dt - 0.5 * dt * dt / span, &values[i - 1]);
+        plus(&mut sum, 0.5 * dt * dt / span, &values[i]);
+        sum
+    };
+    let (mut low, mut high) = (Place::new(at), Place::new(at));
+    at.iter()
+        .zip(&values)
+        .map(|(t, value)| {
+            let mut out = *value;
+            plus(&mut out, -0.5 / SLOW, &until(&mut high, t + SLOW));
+            plus(&mut out, 0.5 / SLOW, &until(&mut low, t - SLOW));
+            out
+        })
+        .collect()
 }
 
-/// Integrals of a sampled signal.
-struct Slow<'a> {
+/// Finds the interval of stamps that a time is in, for times that go forward.
+struct Place<'a> {
     at: &'a [f64],
-    values: Vec<f64>,
-    /// From the first sample to each.
-    integral: Vec<f64>,
+    behind: usize,
 }
 
-impl<'a> Slow<'a> {
-    fn new(at: &'a [f64], values: &[f64]) -> Self {
-        let mut integral = vec![0.0];
-        for i in 1..at.len() {
-            integral.push(integral[i - 1] + 0.5 * (values[i] + values[i - 1]) * (at[i] - at[i - 1]));
+impl<'a> Place<'a> {
+    fn new(at: &'a [f64]) -> Self {
+        Self { at, behind: 1 }
+    }
+
+    /// The number of the stamp behind `t`; of times before all or behind all, the first interval's or the last one's.
+    fn of(&mut self, t: f64) -> usize {
+        while self.behind + 1 < self.at.len() && self.at[self.behind] <= t {
+            self.behind += 1;
         }
+        self.behind
+    }
+}
+
+/// Series between their samples, at times that go forward.
+struct Model<'a, const D: usize> {
+    at: &'a [f64],
+    values: &'a [[f64; D]],
+    place: Place<'a>,
+}
+
+impl<'a, const D: usize> Model<'a, D> {
+    fn new(at: &'a [f64], values: &'a [[f64; D]]) -> Self {
         Self {
             at,
-            values: values.to_vec(),
-            integral,
+            values,
+            place: Place::new(at),
         }
     }
 
-    fn until(&self, t: f64) -> f64 {
-        let i = self.at.partition_point(|s| *s <= t).clamp(1, self.at.len() - 1);
-        let (dt, span) = (t - self.at[i - 1], self.at[i] - self.at[i - 1]);
-        let slope = (self.values[i] - self.values[i - 1]) / span;
-        self.integral[i - 1] + dt * (self.values[i - 1] + 0.5 * slope * dt)
-    }
-
-    /// The mean from `low` to `high`.
-    fn mean(&self, low: f64, high: f64) -> f64 {
-        (self.until(high) - self.until(low)) / (high - low)
+    /// The four-point cubic (Lagrange) through the samples around `t`; a line at the ends.
+    fn at(&mut self, t: f64) -> [f64; D] {
+        let (at, i) = (self.at, self.place.of(t));
+        let mut sum = [0.0; D];
+        if i < 2 || i + 1 >= at.len() {
+            let share = (t - at[i - 1]) / (at[i] - at[i - 1]);
+            plus(&mut sum, 1.0 - share, &self.values[i - 1]);
+            plus(&mut sum, share, &self.values[i]);
+            return sum;
+        }
+        let x = [at[i - 2], at[i - 1], at[i], at[i + 1]];
+        let d = x.map(|x| t - x);
+        let weights = [
+            d[1] * d[2] * d[3] / ((x[0] - x[1]) * (x[0] - x[2]) * (x[0] - x[3])),
+            d[0] * d[2] * d[3] / ((x[1] - x[0]) * (x[1] - x[2]) * (x[1] - x[3])),
+            d[0] * d[1] * d[3] / ((x[2] - x[0]) * (x[2] - x[1]) * (x[2] - x[3])),
+            d[0] * d[1] * d[2] / ((x[3] - x[0]) * (x[3] - x[1]) * (x[3] - x[2])),
+        ];
+        for (weight, values) in weights.iter().zip(&self.values[i - 2..i + 2]) {
+            plus(&mut sum, *weight, values);
+        }
+        sum
     }
 }

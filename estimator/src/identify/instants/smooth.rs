@@ -31,6 +31,7 @@
 
 use crate::identify::dot;
 use proprio_topics::Nanos;
+use std::ops::RangeInclusive;
 
 /// The degrees that are chosen from; each is judged by the one after it, the last by [`HIGHEST`].
 pub(super) const DEGREES: [usize; 2] = [3, 5];
@@ -149,9 +150,15 @@ impl Smoother {
         self.sigma
     }
 
-    /// The signal's `derivative` (0, 1, 2) at `t`; none outside the samples, in a gap, or with less than `edge` \[s\] of samples on either side
+    /// The signal's `derivatives` (of 0, 1, 2) at `t`, the others 0; none outside the samples, in a gap, or with less than `edge` \[s\] of samples on either side
     /// (or than the window, where that is narrower).
-    pub(super) fn at(&self, t: Nanos, derivative: usize, edge: f64) -> Option<f64> {
+    pub(super) fn at(
+        &self,
+        t: Nanos,
+        derivatives: RangeInclusive<usize>,
+        edge: f64,
+        scratch: &mut Scratch,
+    ) -> Option<[f64; 3]> {
         let time = (t - self.origin).seconds();
         let number = self
             .segments
@@ -171,30 +178,41 @@ impl Smoother {
         };
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let knot = (place / KNOT_SPACING).floor() as usize;
-        let choice = |knot: usize| {
-            segment
-                .knots
-                .get(knot.min(segment.knots.len() - 1))
-                .map(|c| c[derivative])
-        };
-        let (before, after) = (choice(knot)?, choice(knot + 1)?);
-        let mut scratch = Scratch::default();
-        let mut by = |(window, degree): (usize, usize)| {
-            let width = *self.widths.get(window)?;
+        let choice = |knot: usize| segment.knots.get(knot.min(segment.knots.len() - 1));
+        // One fit tells all derivatives, by its own degree and lower ones.
+        let mut fits: [Option<(usize, usize, Option<Fit>)>; 6] = [None; 6];
+        let choices = derivatives
+            .clone()
+            .filter_map(|d| Some([choice(knot)?[d], choice(knot + 1)?[d]]));
+        for (window, degree) in choices.flatten() {
+            let same = |fit: &&mut Option<_>| fit.as_ref().is_none_or(|(other, _, _)| *other == window);
+            if let Some(place) = fits.iter_mut().find(same) {
+                let highest = place.as_ref().map_or(degree, |(_, other, _)| degree.max(*other));
+                *place = Some((window, highest, None));
+            }
+        }
+        for (window, degree, fit) in fits.iter_mut().flatten() {
+            let width = *self.widths.get(*window)?;
             if room < edge.min(width) {
                 return None;
             }
             // Near an end the window is as wide as there is room to both sides.
-            let fit = self.fit(segment, time, width.min(room), DEGREES[degree], &mut scratch)?;
-            Some(fit.estimate[degree][derivative])
-        };
-        let estimate = by(before)?;
-        if after == before {
-            return Some(estimate);
+            *fit = Some(self.fit(segment, time, width.min(room), DEGREES[*degree], scratch)?);
         }
-        // From one choice to the next little by little: a step in an acceleration would look like a blow.
-        let share = place / KNOT_SPACING - knot as f64;
-        Some(estimate + share * (by(after)? - estimate))
+        let by = |(window, degree): (usize, usize), derivative: usize| {
+            let mut fits = fits.iter().flatten();
+            let (_, _, fit) = fits.find(|(other, _, _)| *other == window)?;
+            Some(fit.as_ref()?.estimate[degree][derivative])
+        };
+        let mut out = [0.0; 3];
+        for derivative in derivatives {
+            let (before, after) = (choice(knot)?[derivative], choice(knot + 1)?[derivative]);
+            let estimate = by(before, derivative)?;
+            // From one choice to the next little by little: a step in an acceleration would look like a blow.
+            let share = place / KNOT_SPACING - knot as f64;
+            out[derivative] = estimate + share * (by(after, derivative)? - estimate);
+        }
+        Some(out)
     }
 
     /// Fits to the samples of `segment` within `width` of `time`; the variances only if every degree is asked for.
@@ -307,10 +325,16 @@ impl Smoother {
 
 /// Room for one fit, used again and again.
 #[derive(Debug, Default)]
-struct Scratch {
+pub(super) struct Scratch {
     scaled: Vec<f64>,
     weights: Vec<f64>,
+    /// Values less the one in the middle.
+    values: Vec<f64>,
     polynomials: [Vec<f64>; TERMS],
+    /// These times the weights.
+    weighted: [Vec<f64>; TERMS],
+    /// One of them times the place.
+    raised: Vec<f64>,
 }
 
 impl Scratch {
@@ -339,12 +363,14 @@ impl Scratch {
         self.polynomials[0].resize(count, 1.0);
         here[0] = [1.0, 0.0, 0.0];
         for k in 0..=degree {
-            let (mut norm, mut moment) = (0.0, 0.0);
-            for ((p, w), u) in self.polynomials[k].iter().zip(&self.weights).zip(&self.scaled) {
-                let square = w * p * p;
-                norm += square;
-                moment += u * square;
-            }
+            let polynomial = &self.polynomials[k];
+            self.weighted[k].clear();
+            self.weighted[k].extend(polynomial.iter().zip(&self.weights).map(|(p, w)| w * p));
+            self.raised.clear();
+            self.raised
+                .extend(polynomial.iter().zip(&self.scaled).map(|(p, u)| u * p));
+            let norm = dot(&self.weighted[k], polynomial);
+            let moment = dot(&self.weighted[k], &self.raised);
             // What is left of a polynomial that the samples can not tell from lower ones is rounding.
             if norm.is_nan() || norm <= 1e-20 * count as f64 {
                 return None;
@@ -359,10 +385,10 @@ impl Scratch {
             let next = &mut next[0];
             next.clear();
             if k == 0 {
-                next.extend(self.scaled.iter().map(|u| u - a));
+                next.extend(self.raised.iter().map(|u| u - a));
             } else {
-                let terms = self.scaled.iter().zip(&done[k]).zip(&done[k - 1]);
-                next.extend(terms.map(|((u, p), before)| (u - a) * p - b * before));
+                let terms = self.raised.iter().zip(&done[k]).zip(&done[k - 1]);
+                next.extend(terms.map(|((up, p), before)| up - a * p - b * before));
             }
             for m in 0..3 {
                 let inner = if m > 0 { m as f64 * here[k][m - 1] } else { 0.0 };
@@ -385,18 +411,14 @@ impl Scratch {
         let (norms, here) = self.orthogonal(degree)?;
         let scale = [1.0, 1.0 / width, 1.0 / (width * width)];
         let middle = values[values.len() / 2];
+        self.values.clear();
+        self.values.extend(values.iter().map(|v| v - middle));
         let mut fit = Fit::default();
         // Of the coefficients: how much each polynomial's share counts in each derivative.
         let mut gain = [[0.0; TERMS]; 3];
         let mut sum = [middle, 0.0, 0.0];
         for k in 0..=degree {
-            let coefficient = self.polynomials[k]
-                .iter()
-                .zip(&self.weights)
-                .zip(values)
-                .map(|((p, w), v)| w * p * (v - middle))
-                .sum::<f64>()
-                / norms[k];
+            let coefficient = dot(&self.weighted[k], &self.values) / norms[k];
             for m in 0..3 {
                 gain[m][k] = here[k][m] * scale[m] / norms[k];
                 sum[m] += coefficient * here[k][m] * scale[m];
@@ -410,8 +432,7 @@ impl Scratch {
             let mut products = [[0.0; TERMS]; TERMS];
             for j in 0..TERMS {
                 for k in 0..=j {
-                    let terms = self.polynomials[j].iter().zip(&self.polynomials[k]).zip(&self.weights);
-                    let product: f64 = terms.map(|((p, q), w)| w * w * p * q).sum();
+                    let product = dot(&self.weighted[j], &self.weighted[k]);
                     (products[j][k], products[k][j]) = (product, product);
                 }
             }

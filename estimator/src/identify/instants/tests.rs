@@ -6,7 +6,7 @@
     reason = "a joint's number counts in several tables; changes of a log are one expression each"
 )]
 
-use super::smooth::Smoother;
+use super::smooth::{Scratch, Smoother};
 use super::*;
 use crate::config::Config;
 use crate::differentiate::{Settings as WindowSettings, Window};
@@ -194,6 +194,7 @@ fn against_causal(stamps: &[f64], quantum: f64, signal: impl Fn(f64) -> [f64; 3]
         .map(|t| (signal(*t)[0] / quantum).round() * quantum)
         .collect();
     let smoother = Smoother::new(&nanos, &values, Nanos::from_millis(50));
+    let mut scratch = Scratch::default();
     let mut window = Window::<1>::new(WindowSettings::new(0.5 * quantum)).unwrap();
     let (mut ours, mut causal) = ([Vec::new(), Vec::new()], [Vec::new(), Vec::new()]);
     for (t, value) in nanos.iter().zip(&values) {
@@ -203,8 +204,9 @@ fn against_causal(stamps: &[f64], quantum: f64, signal: impl Fn(f64) -> [f64; 3]
             causal[0].push(estimate.first[0] - truth[1]);
             causal[1].push(estimate.second[0] - truth[2]);
         }
-        for m in 0..2 {
-            ours[m].extend(smoother.at(*t, m + 1, 0.3).map(|e| e - truth[m + 1]));
+        if let Some(estimate) = smoother.at(*t, 1..=2, 0.3, &mut scratch) {
+            ours[0].push(estimate[1] - truth[1]);
+            ours[1].push(estimate[2] - truth[2]);
         }
     }
     assert!(ours[0].len() > stamps.len() / 2 && causal[0].len() > stamps.len() / 2);
@@ -284,17 +286,21 @@ fn a_quintic_is_reproduced_on_any_stamps() {
     let values: Vec<f64> = stamps.iter().map(|t| of(t.seconds())[0]).collect();
     let smoother = Smoother::new(&stamps, &values, Nanos::from_millis(50));
     assert!(smoother.sigma() < 1e-9);
+    let scratch = &mut Scratch::default();
     for i in 0..20 {
         let t = Nanos::from_seconds(0.5 + 0.07 * f64::from(i));
+        let estimates = smoother.at(t, 0..=2, 0.3, scratch).unwrap();
         for (m, tolerance) in [(0, 1e-9), (1, 1e-7), (2, 1e-5)] {
-            let (estimate, exact) = (smoother.at(t, m, 0.3).unwrap(), of(t.seconds())[m]);
+            let (estimate, exact) = (estimates[m], of(t.seconds())[m]);
+            // Alone as well as with the others.
+            assert_eq!(smoother.at(t, m..=m, 0.3, scratch).unwrap()[m], estimate);
             assert!(
                 (estimate - exact).abs() < tolerance,
                 "derivative {m} at {t}: {estimate} instead of {exact}"
             );
         }
     }
-    assert_eq!(smoother.at(Nanos::from_seconds(0.02), 2, 0.3), None);
+    assert_eq!(smoother.at(Nanos::from_seconds(0.02), 2..=2, 0.3, scratch), None);
 }
 
 #[test]
