@@ -8,7 +8,7 @@ use super::outcome::{
 };
 use super::passes::{OFFSET_VARIANCE, Residuals, Told, leave, tell};
 use super::rows::{FRICTION, Further, Layout, RowMaker, Rows, WIDTH};
-use super::{AXES, dot, torques};
+use super::{AXES, dot, parallel, torques};
 use crate::calibration::{Kind, Unknown, swapped};
 use crate::config::{Gain, IdentificationInput};
 use crate::dynamics::Structure;
@@ -39,6 +39,9 @@ const BRIDGED: f64 = 0.02;
 
 /// Samples of a spectrum's window.
 const SPECTRUM: usize = 256;
+
+/// Blocks of instants that one thread takes at a time.
+const TOGETHER: usize = 64;
 
 /// A joint that moves less stands still \[rad\].
 const STILL: f64 = 0.01;
@@ -1190,41 +1193,60 @@ impl Compared {
         let empty = || vec![vec![f64::NAN; instants.len()]; 6 * layout.sensors.len()];
         let (mut load, mut errors) = (empty(), [empty(), empty(), empty()]);
         let variances = identified.noise.following();
-        let mut rows = Rows::new(&layout);
-        for (range, block) in left.ranges.iter().zip(&left.session) {
-            let fitted = block.x.column(0).into_owned();
-            let own = block.x.column(1).into_owned();
-            let cases = [
-                (&sets[0], configured.as_slice()),
-                (&sets[0], fitted.as_slice()),
-                (&sets[1], own.as_slice()),
-            ];
-            for i in range.clone() {
-                if layout.sensors.is_empty() || maker.make(&instants[i], &mut rows).is_err() {
-                    continue;
-                }
-                let residuals = cases.map(|(d, s)| {
-                    DVector::from_fn(rows.count, |row, _| {
-                        rows.r(row) - dot(rows.a(row), d.as_slice()) - dot(rows.g(row), s)
-                    })
-                });
-                for (place, &sensor) in layout.sensors.iter().enumerate() {
-                    let Some(map) = laid_to(&rows, &variances, 6 * place..6 * place + 6) else {
-                        continue;
-                    };
-                    let reading = instants[i].readings[sensor];
-                    let off = residuals.each_ref().map(|residual| &map * residual);
-                    for (k, value) in reading.torque.iter().chain(&reading.force).enumerate() {
-                        let channel = 6 * place + k;
-                        if rows.has(channel) {
-                            load[channel][i] = value - own[channel];
-                            errors
-                                .iter_mut()
-                                .zip(&off)
-                                .for_each(|(errors, off)| errors[channel][i] = off[k]);
+        let maker: &RowMaker<'_> = maker;
+        let channels = 6 * layout.sensors.len();
+        let parts = parallel::map_with(
+            left.ranges.len().div_ceil(TOGETHER),
+            || (maker.clone(), Rows::new(&layout)),
+            |(maker, rows), part| {
+                let blocks = part * TOGETHER..left.ranges.len().min((part + 1) * TOGETHER);
+                let mut out = Vec::new();
+                for (range, block) in left.ranges[blocks.clone()].iter().zip(&left.session[blocks]) {
+                    let fitted = block.x.column(0).into_owned();
+                    let own = block.x.column(1).into_owned();
+                    let cases = [
+                        (&sets[0], configured.as_slice()),
+                        (&sets[0], fitted.as_slice()),
+                        (&sets[1], own.as_slice()),
+                    ];
+                    for instant in &instants[range.clone()] {
+                        let start = out.len();
+                        out.resize(start + channels, [f64::NAN; 4]);
+                        if channels == 0 || maker.make(instant, rows).is_err() {
+                            continue;
+                        }
+                        let residuals = cases.map(|(d, s)| {
+                            DVector::from_fn(rows.count, |row, _| {
+                                rows.r(row) - dot(rows.a(row), d.as_slice()) - dot(rows.g(row), s)
+                            })
+                        });
+                        for (place, &sensor) in layout.sensors.iter().enumerate() {
+                            let Some(map) = laid_to(rows, &variances, 6 * place..6 * place + 6) else {
+                                continue;
+                            };
+                            let reading = instant.readings[sensor];
+                            let [cad, cad_fitted, identified] = residuals.each_ref().map(|residual| &map * residual);
+                            for (k, value) in reading.torque.iter().chain(&reading.force).enumerate() {
+                                let channel = 6 * place + k;
+                                if rows.has(channel) {
+                                    out[start + channel] = [value - own[channel], cad[k], cad_fitted[k], identified[k]];
+                                }
+                            }
                         }
                     }
                 }
+                out
+            },
+        );
+        let places = left.ranges.iter().cloned().flatten();
+        let each = parts.iter().flat_map(|part| part.chunks_exact(channels.max(1)));
+        for (i, values) in places.zip(each) {
+            for (channel, [own, off @ ..]) in values.iter().enumerate() {
+                load[channel][i] = *own;
+                errors
+                    .iter_mut()
+                    .zip(off)
+                    .for_each(|(errors, off)| errors[channel][i] = *off);
             }
         }
         Self { load, errors }

@@ -1,8 +1,16 @@
 //! The same work for each of many things, on all cores. What comes out is in the order of the things, and the same bits whatever number of cores there is.
+//!
+//! Work that itself is such work is done one after the other: all cores are taken already.
 
+use std::cell::Cell;
 use std::ops::Range;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
+
+thread_local! {
+    /// Whether this thread is one of those at work.
+    static AT_WORK: Cell<bool> = const { Cell::new(false) };
+}
 
 /// `work` of each number below `count`.
 pub(super) fn map<T: Send>(count: usize, work: impl Fn(usize) -> T + Sync) -> Vec<T> {
@@ -16,13 +24,14 @@ pub(super) fn map_with<S, T: Send>(
     work: impl Fn(&mut S, usize) -> T + Sync,
 ) -> Vec<T> {
     let threads = std::thread::available_parallelism().map_or(1, usize::from).min(count);
-    if threads < 2 {
+    if threads < 2 || AT_WORK.get() {
         let mut own = make();
         return (0..count).map(|number| work(&mut own, number)).collect();
     }
     let results: Vec<Mutex<Option<T>>> = (0..count).map(|_| Mutex::new(None)).collect();
     let next = AtomicUsize::new(0);
     let run = || {
+        AT_WORK.set(true);
         let mut own = make();
         loop {
             let number = next.fetch_add(1, Ordering::Relaxed);
@@ -38,6 +47,7 @@ pub(super) fn map_with<S, T: Send>(
             scope.spawn(run);
         }
         run();
+        AT_WORK.set(false);
     });
     let taken = results.into_iter().filter_map(|result| result.into_inner().ok());
     taken.flatten().collect()
@@ -72,6 +82,17 @@ mod tests {
             let squares = map(count, |number| number * number);
             assert_eq!(squares, (0..count).map(|n| n * n).collect::<Vec<_>>());
         }
+    }
+
+    #[test]
+    fn work_within_work_is_done_by_the_same_thread() {
+        let threads = map(8, |_| {
+            let own = std::thread::current().id();
+            map(8, |_| std::thread::current().id()).iter().all(|id| *id == own)
+        });
+        assert_eq!(threads, [true; 8]);
+        // Afterwards all cores are free again.
+        assert!(!AT_WORK.get());
     }
 
     #[test]

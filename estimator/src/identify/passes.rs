@@ -4,6 +4,7 @@ use super::dot;
 use super::information::{Information, Panel};
 use super::instants::{Break, Instant};
 use super::noise;
+use super::parallel;
 use super::rows::{Layout, RowMaker, Rows};
 use super::session::{Block, Session, smooth};
 use nalgebra::{DMatrix, DVector};
@@ -25,6 +26,10 @@ const LEAST_SHARE: f64 = 1e-3;
 
 /// Rows that are absorbed at once.
 const PANEL: usize = 96;
+
+/// Blocks of instants that one thread takes at a time, and how many times that rows are kept of.
+const TOGETHER: usize = 16;
+const AT_ONCE: usize = 32;
 
 /// Consecutive instants of one log, with offsets and friction of their own.
 #[derive(Clone, Copy, Debug)]
@@ -308,86 +313,112 @@ impl Residuals {
 }
 
 /// Takes parameters as given, fits offsets and friction, and gives what is left.
-pub(super) fn leave(
-    maker: &mut RowMaker<'_>,
-    piece: Piece<'_>,
-    noise: &NoiseModel,
-    sets: &[DVector<f64>],
-) -> Residuals {
+pub(super) fn leave(maker: &RowMaker<'_>, piece: Piece<'_>, noise: &NoiseModel, sets: &[DVector<f64>]) -> Residuals {
     let layout = maker.layout().clone();
     let (k, channels, count) = (sets.len(), layout.channels(), piece.instants.len());
     let variances = noise.following();
     let mut session = Session::new(&session_prior(&layout), k);
-    let mut rows = Rows::new(&layout);
+    let make = || (maker.clone(), Rows::new(&layout));
     let (mut states, mut ranges) = (Vec::new(), Vec::new());
-    let mut line = vec![0.0; k];
     let mut last = None;
-    for (range, afresh) in blocks(&layout, piece) {
-        let t = piece.instants[range.start].t;
-        let mut drift = vec![0.0; layout.session()];
-        if let Some(last) = last.replace(t) {
-            drift = pass_time(&mut session, noise.steps(&layout, (t - last).seconds()), &afresh);
-        }
-        for instant in &piece.instants[range.clone()] {
-            if maker.make(instant, &mut rows).is_err() {
-                continue;
-            }
-            rows.whiten(&variances);
-            for row in 0..rows.count {
-                for (value, set) in line.iter_mut().zip(sets) {
-                    *value = rows.r(row) - dot(rows.a(row), set.as_slice());
+    let blocks = blocks(&layout, piece);
+    for some in blocks.chunks(AT_ONCE * TOGETHER) {
+        // Per row what every set leaves of it, and how offsets and friction are in it.
+        let width = k + layout.session();
+        let shares: Vec<_> = some.chunks(TOGETHER).collect();
+        let lines = parallel::map_with(shares.len(), make, |(maker, rows), number| -> Vec<Vec<f64>> {
+            let of_block = |(range, _): &(Range<usize>, Vec<usize>)| {
+                let mut lines = Vec::new();
+                for instant in &piece.instants[range.clone()] {
+                    if maker.make(instant, rows).is_err() {
+                        continue;
+                    }
+                    rows.whiten(&variances);
+                    for row in 0..rows.count {
+                        lines.extend(sets.iter().map(|set| rows.r(row) - dot(rows.a(row), set.as_slice())));
+                        lines.extend_from_slice(rows.g(row));
+                    }
                 }
-                session.update(rows.g(row), &mut line);
-            }
-        }
-        states.push(Block {
-            x: session.estimates(),
-            p: session.covariance(),
-            drift,
+                lines
+            };
+            shares[number].iter().map(of_block).collect()
         });
-        ranges.push(range);
+        for ((range, afresh), mut lines) in some.iter().zip(lines.into_iter().flatten()) {
+            let t = piece.instants[range.start].t;
+            let mut drift = vec![0.0; layout.session()];
+            if let Some(last) = last.replace(t) {
+                drift = pass_time(&mut session, noise.steps(&layout, (t - last).seconds()), afresh);
+            }
+            for line in lines.chunks_exact_mut(width) {
+                let (values, g) = line.split_at_mut(k);
+                session.update(g, values);
+            }
+            states.push(Block {
+                x: session.estimates(),
+                p: session.covariance(),
+                drift,
+            });
+            ranges.push(range.clone());
+        }
     }
     smooth(&mut states);
-    let mut left = vec![vec![vec![f64::NAN; count]; channels]; k];
-    let (mut predicted, mut measured) = (
-        vec![vec![f64::NAN; count]; channels],
-        vec![vec![f64::NAN; count]; channels],
-    );
     let mut first = maker.cad_of_layout();
     if let Some(set) = sets.first() {
         first.iter_mut().zip(set).for_each(|(value, change)| *value += change);
     }
     let cad = maker.cad_of_layout();
-    let (mut white, mut e) = (Vec::new(), vec![0.0; channels]);
-    let (mut shares, mut seen) = (vec![0.0; channels * channels], vec![0.0_f64; channels]);
-    for (range, state) in ranges.iter().zip(&states) {
-        for i in range.clone() {
-            if maker.make(&piece.instants[i], &mut rows).is_err() {
-                continue;
-            }
-            rows.whiten(&variances);
-            let there: Vec<usize> = (0..channels).filter(|&channel| rows.has(channel)).collect();
-            rows.add_shares(&variances, &mut shares);
-            there.iter().for_each(|&channel| seen[channel] += 1.0);
-            let mut give = |value: &dyn Fn(usize) -> f64, out: &mut Vec<Vec<f64>>| {
-                white.clear();
-                white.extend((0..rows.count).map(value));
-                rows.channel_noise(&variances, &mut white, &mut e);
-                for &channel in &there {
-                    out[channel][i] = e[channel];
+    let number = |at: usize| at * TOGETHER..ranges.len().min((at + 1) * TOGETHER);
+    // Of some blocks: per instant and channel, what each set leaves, what the first predicts, what was measured; sums of shares; where channels are seen.
+    let parts = parallel::map_with(ranges.len().div_ceil(TOGETHER), make, |(maker, rows), at| {
+        let (mut white, mut e) = (Vec::new(), vec![0.0; channels]);
+        let (mut shares, mut seen) = (vec![0.0; channels * channels], vec![0.0_f64; channels]);
+        let mut values = Vec::new();
+        for (range, state) in ranges[number(at)].iter().zip(&states[number(at)]) {
+            for instant in &piece.instants[range.clone()] {
+                let start = values.len();
+                values.resize(start + (k + 2) * channels, f64::NAN);
+                if maker.make(instant, rows).is_err() {
+                    continue;
                 }
-            };
-            for (set, d) in sets.iter().enumerate() {
-                let s = state.x.column(set);
-                give(
-                    &|row| rows.r(row) - dot(rows.a(row), d.as_slice()) - dot(rows.g(row), s.as_slice()),
-                    &mut left[set],
-                );
+                rows.whiten(&variances);
+                rows.add_shares(&variances, &mut shares);
+                let there: Vec<usize> = (0..channels).filter(|&channel| rows.has(channel)).collect();
+                there.iter().for_each(|&channel| seen[channel] += 1.0);
+                let mut give = |value: &dyn Fn(usize) -> f64, out: usize| {
+                    white.clear();
+                    white.extend((0..rows.count).map(value));
+                    rows.channel_noise(&variances, &mut white, &mut e);
+                    for &channel in &there {
+                        values[start + out * channels + channel] = e[channel];
+                    }
+                };
+                for (set, d) in sets.iter().enumerate() {
+                    let s = state.x.column(set);
+                    give(
+                        &|row| rows.r(row) - dot(rows.a(row), d.as_slice()) - dot(rows.g(row), s.as_slice()),
+                        set,
+                    );
+                }
+                give(&|row| dot(rows.a(row), &first), k);
+                give(&|row| rows.r(row) + dot(rows.a(row), &cad), k + 1);
             }
-            give(&|row| dot(rows.a(row), &first), &mut predicted);
-            give(&|row| rows.r(row) + dot(rows.a(row), &cad), &mut measured);
         }
+        (values, shares, seen)
+    });
+    let mut left = vec![vec![vec![f64::NAN; count]; channels]; k + 2];
+    let (mut shares, mut seen) = (vec![0.0; channels * channels], vec![0.0_f64; channels]);
+    let mut i = 0;
+    for (values, of_part, seen_there) in parts {
+        for values in values.chunks_exact((k + 2) * channels) {
+            let columns = left.iter_mut().flatten();
+            columns.zip(values).for_each(|(column, value)| column[i] = *value);
+            i += 1;
+        }
+        shares.iter_mut().zip(of_part).for_each(|(sum, share)| *sum += share);
+        seen.iter_mut().zip(seen_there).for_each(|(sum, seen)| *sum += seen);
     }
+    let measured = left.pop().unwrap_or_default();
+    let predicted = left.pop().unwrap_or_default();
     Residuals {
         noise: left,
         predicted,
@@ -592,7 +623,7 @@ mod tests {
     }
 
     fn noise_found(setup: &Setup, instants: &[Instant], rounds: usize) -> NoiseModel {
-        let mut maker = RowMaker::survey(setup, &[IdentificationInput::Wrench], instants.iter()).expect("rows");
+        let maker = RowMaker::survey(setup, &[IdentificationInput::Wrench], instants.iter()).expect("rows");
         let layout = maker.layout().clone();
         assert_eq!((layout.sensors.len(), layout.channels()), (2, 12));
         let least: Vec<f64> = (0..12)
@@ -602,7 +633,7 @@ mod tests {
         let piece = Piece { instants, breaks: &[] };
         let zero = DVector::zeros(layout.unknowns());
         for _ in 0..rounds {
-            let left = leave(&mut maker, piece, &noise, std::slice::from_ref(&zero));
+            let left = leave(&maker, piece, &noise, std::slice::from_ref(&zero));
             noise = noise_of(&layout, std::slice::from_ref(&left), 0, 0.01, &least);
         }
         noise
