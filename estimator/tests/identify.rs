@@ -998,6 +998,42 @@ fn a_negative_rotor_is_named() {
     assert_eq!(named, ["j4"]);
 }
 
+/// A log of both the arm's F/T sensors and its joint torques, from a log of each.
+fn with_torques(wrenches: &str, torques: &str) -> String {
+    let header: Vec<&str> = torques.lines().next().expect("a header").split(',').collect();
+    let is_torque: Vec<bool> = header.iter().map(|name| name.ends_with("/torque")).collect();
+    let rows = wrenches.lines().zip(torques.lines()).map(|(row, torques)| {
+        let own = torques.split(',').zip(&is_torque).filter(|(_, is)| **is);
+        own.fold(row.to_owned(), |row, (cell, _)| row + "," + cell) + "\n"
+    });
+    rows.collect()
+}
+
+/// Joint torques that CAD has far more wrong than what the sensor reads: the sensor that is turned is found all the same.
+#[test]
+fn joint_torques_do_not_hide_a_turned_sensor() {
+    let setup = arm();
+    let truth = real(&setup, 3);
+    let mut log = with_torques(
+        &simulate(&setup, &truth, 10.0, 0.01, 3),
+        &simulate_torques(&setup, &truth, 10.0, 0.05, 3, |_, _| true),
+    );
+    for (number, joint) in ARM_JOINTS.into_iter().enumerate() {
+        let rate = 0.031 + 0.007 * number as f64;
+        log = change_rows(&log, &format!("joint/{joint}/torque"), |i, x| {
+            x + 40.0 * (rate * i as f64).sin()
+        });
+    }
+    for axis in AXES {
+        log = change(&log, &format!("wrench/ft/{axis}"), |x| -x);
+    }
+    let both = [IdentificationInput::Wrench, IdentificationInput::Torque];
+    let outcome = run(&setup, &[("turned", Role::Train, &log)], &both);
+    assert!(matches!(outcome.verdict, Verdict::Nothing(_)), "{:?}", outcome.verdict);
+    let found: Vec<_> = outcome.findings.iter().filter(|f| f.code == "wrong_sign").collect();
+    assert!(found.len() == 1 && found[0].subject == "ft", "{:?}", outcome.findings);
+}
+
 /// F/T sensor and motors' torques together: the joints before the sensor are identified from their torques, the links beyond it from both.
 #[test]
 fn rotors_are_identified_beside_a_force_torque_sensor() {
@@ -1007,13 +1043,7 @@ fn rotors_are_identified_beside_a_force_torque_sensor() {
     let log = |seed| {
         let wrenches = simulate(&setup, &truth, 15.0, 0.01, seed);
         let torques = simulate_torques(&setup, &truth, 15.0, 0.05, seed, |_, _| true);
-        let header: Vec<&str> = torques.lines().next().expect("a header").split(',').collect();
-        let is_torque: Vec<bool> = header.iter().map(|name| name.ends_with("/torque")).collect();
-        let rows = wrenches.lines().zip(torques.lines()).map(|(row, torques)| {
-            let own = torques.split(',').zip(&is_torque).filter(|(_, is)| **is);
-            own.fold(row.to_owned(), |row, (cell, _)| row + "," + cell) + "\n"
-        });
-        at_the_motors(&rows.collect::<String>(), &ROTORS, 0.8)
+        at_the_motors(&with_torques(&wrenches, &torques), &ROTORS, 0.8)
     };
     let both = [IdentificationInput::Wrench, IdentificationInput::Torque];
     let outcome = run(&setup, &[("log", Role::Train, &log(8))], &both);

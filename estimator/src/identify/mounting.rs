@@ -1,6 +1,6 @@
 //! F/T sensors that are mounted, or configured, otherwise than their configuration says: the wrong way round, or with the axes or the origin of another frame.
 //!
-//! What is asked is by how much CAD and constant offsets miss all rows as they are, and if what this sensor reads, or that one, were in another frame: where a sub-tree has two sensors, putting the right
+//! What is asked is by how much CAD and constant offsets miss all rows of F/T sensors as they are, and if what this sensor reads, or that one, were in another frame: where a sub-tree has two sensors, putting the right
 //! one right makes all well. The change that helps the most is taken, as long as it leaves less than a third of the squares, which is what a correlation of -1/2 is; then the next.
 //!
 //! A sign is tried always: masses would come out negative. Frames are tried only where the readings hardly follow CAD at all ([`STRANGE`]), and believed only if they do then: bodies that differ from
@@ -146,6 +146,7 @@ fn misfits(maker: &RowMaker<'_>, training: &[&Prepared], cases: &[Case]) -> (Vec
                 let pairs = g.iter().zip(values).filter(|(g, _)| **g != 0.0);
                 pairs.map(|(g, x)| g * x).sum()
             };
+            let of_joints = 6 * layout.sensors.len();
             lines.clear();
             for row in 0..rows.count {
                 let g = || rows.g(row).chunks_exact(6);
@@ -153,12 +154,14 @@ fn misfits(maker: &RowMaker<'_>, training: &[&Prepared], cases: &[Case]) -> (Vec
                     let changed = g().zip(case).filter_map(|(g, change)| Some(share(g, change.as_ref()?)));
                     lines.push(rows.r(row) + changed.sum::<f64>());
                 }
-                let is_torque = rows.n(row).iter().skip(6 * layout.sensors.len()).any(|n| *n != 0.0);
-                let all: f64 = g().zip(&readings).map(|(g, reading)| share(g, reading)).sum();
-                lines.push(if is_torque { rows.r(row) } else { all });
+                lines.push(g().zip(&readings).map(|(g, reading)| share(g, reading)).sum());
             }
             rows.whiten_with(&variances, &mut lines, count);
             for (row, line) in lines.chunks_exact_mut(count).enumerate() {
+                // A joint's torque does not change with how a sensor is mounted, and what CAD has wrong of it would hide what does. (Its row shares no noise with a sensor's.)
+                if rows.n(row)[of_joints..].iter().any(|n| *n != 0.0) {
+                    continue;
+                }
                 session.update(rows.g(row), line);
                 misfits.iter_mut().zip(line).for_each(|(sum, x)| *sum += *x * *x);
             }
