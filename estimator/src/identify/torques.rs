@@ -4,7 +4,8 @@
 //! rotor's inertia, where torques are the motors'), and they are compared:
 //!
 //! - `|y + x|^2 < |y - x|^2 / 3` (a correlation of -1/2 and less if they are of one size): the sign is turned;
-//! - `|y| > 30 |x|` while the two go together (correlation above 0.7 either way), or `|y|` more than a hundred times any joint's prediction: counts, or thousandths of newton metres;
+//! - `|y| > 30 |x|` while the two go together (correlation above 0.7 either way), or `|y|` more than a hundred times any prediction for a joint of its kind (one that turns, one that slides): counts, or
+//!   thousandths of newton metres;
 //! - `|y| < |x| / 30`: thousands of newton metres, or nothing at all.
 //!
 //! No CAD is wrong by thirty times. Such a torque is left out of its log, and said.
@@ -20,6 +21,7 @@ use super::prior::Posterior;
 use super::rows::{FRICTION, RowMaker, Rows};
 use crate::config::{IdentificationInput, TorqueSide};
 use crate::dynamics::DynamicsError;
+use crate::model::JointKind;
 use crate::setup::Setup;
 use nalgebra::{DMatrix, DVector};
 
@@ -30,10 +32,10 @@ const LEAST: usize = 50;
 /// A torque so many times what CAD says, or as many times less, is none in newton metres.
 const FACTOR: f64 = 30.0;
 
-/// ... and one so many times what CAD says of any joint, whatever it does.
+/// ... and one so many times what CAD says of any joint of its kind, whatever it does.
 const BEYOND: f64 = 100.0;
 
-/// Predictions less than this share of the greatest joint's are mostly what CAD has wrong.
+/// Predictions less than this share of the greatest joint's of its kind are mostly what CAD has wrong.
 const SMALL: f64 = 0.01;
 
 /// What is wrong with a torque.
@@ -89,7 +91,6 @@ impl Pairs {
             sum: rms(&(&y + &x)),
             difference: rms(&(&y - &x)),
             correlation: y.dot(&x) / (y.norm() * x.norm()).max(f64::MIN_POSITIVE),
-            raw: rms(&DVector::from_column_slice(&self.measured)),
             raw_predicted: rms(&DVector::from_column_slice(&self.predicted)),
         })
     }
@@ -101,18 +102,18 @@ struct Compared {
     sum: f64,
     difference: f64,
     correlation: f64,
-    /// As measured, and as predicted.
-    raw: f64,
+    /// With what friction and offset may be.
     raw_predicted: f64,
 }
 
 impl Compared {
-    /// `greatest`: of all joints, what is predicted without friction's part; and as predicted.
+    /// `greatest`: of all joints of its kind, what is predicted without friction's part; and as predicted. What is measured has friction and offset taken off: a joint that carries next to nothing may
+    /// need any amount for these.
     fn fault(&self, greatest: f64, greatest_raw: f64) -> Option<Fault> {
         let tells = self.predicted > SMALL * greatest && self.predicted > 0.0;
         let ratio = self.measured / self.predicted;
-        if greatest_raw > 0.0 && self.raw > BEYOND * greatest_raw {
-            Some(Fault::TooLarge(self.raw / greatest_raw))
+        if greatest_raw > 0.0 && self.measured > BEYOND * greatest_raw {
+            Some(Fault::TooLarge(self.measured / greatest_raw))
         } else if tells && ratio > FACTOR && self.correlation.abs() > 0.7 {
             Some(Fault::TooLarge(ratio))
         } else if tells && ratio < 1.0 / FACTOR {
@@ -123,6 +124,24 @@ impl Compared {
             None
         }
     }
+}
+
+/// What is wrong with each of these torques; `sliding`: of a joint that slides, whose are forces. Newtons are compared with newtons, newton metres with newton metres.
+fn faults(compared: &[Option<Compared>], sliding: &[bool]) -> Vec<Option<Fault>> {
+    let greatest = |slides: bool, of: &dyn Fn(&Compared) -> f64| {
+        let own = compared.iter().zip(sliding).filter(|(_, own)| **own == slides);
+        own.filter_map(|(compared, _)| compared.as_ref())
+            .map(of)
+            .fold(0.0, f64::max)
+    };
+    let [turning, slides] =
+        [false, true].map(|kind| (greatest(kind, &|c| c.predicted), greatest(kind, &|c| c.raw_predicted)));
+    let all = compared.iter().zip(sliding);
+    all.map(|(compared, own)| {
+        let (predicted, raw) = if *own { slides } else { turning };
+        compared.as_ref()?.fault(predicted, raw)
+    })
+    .collect()
 }
 
 /// Takes torques out of a log that are none, and says so there.
@@ -158,17 +177,25 @@ pub(super) fn check(setup: &Setup, log: &mut Prepared) -> Result<(), DynamicsErr
         }
     }
     let compared: Vec<Option<Compared>> = pairs.iter().map(|pairs| pairs.compare(setup.torque_side)).collect();
-    let greatest = |of: &dyn Fn(&Compared) -> f64| compared.iter().flatten().map(of).fold(0.0, f64::max);
-    let (predicted, raw) = (greatest(&|c| c.predicted), greatest(&|c| c.raw_predicted));
-    for (dof, compared) in joints.iter().zip(&compared) {
-        if let Some(fault) = compared.as_ref().and_then(|c| c.fault(predicted, raw)) {
-            leave_out(log, *dof, setup.model.dof_name(*dof), fault);
+    let slides = |dof: &usize| {
+        let joint = setup.model.dof_joint(*dof).map(|joint| setup.model.joints()[joint]);
+        joint.is_some_and(|joint| matches!(joint.kind, JointKind::Prismatic(_)))
+    };
+    let sliding: Vec<bool> = joints.iter().map(slides).collect();
+    for ((dof, slides), fault) in joints.iter().zip(&sliding).zip(faults(&compared, &sliding)) {
+        if let Some(fault) = fault {
+            leave_out(log, *dof, setup.model.dof_name(*dof), *slides, fault);
         }
     }
     Ok(())
 }
 
-fn leave_out(log: &mut Prepared, dof: usize, joint: &str, fault: Fault) {
+fn leave_out(log: &mut Prepared, dof: usize, joint: &str, slides: bool, fault: Fault) {
+    let (unit, units) = if slides {
+        ("N", "newtons")
+    } else {
+        ("Nm", "newton metres")
+    };
     let (code, reason, text) = match fault {
         Fault::Sign => (
             "wrong_sign",
@@ -181,14 +208,14 @@ fn leave_out(log: &mut Prepared, dof: usize, joint: &str, fault: Fault) {
             "wrong_units",
             "units",
             format!(
-                "joint/{joint}/torque is about {times:.0} times what the masses of the URDF ask for: it is in counts or thousandths. It was left out; convert it to Nm"
+                "joint/{joint}/torque is about {times:.0} times what the masses of the URDF ask for: it is in counts or thousandths of {units}. It was left out; convert it to {unit}"
             ),
         ),
         Fault::TooSmall(times) => (
             "wrong_units",
             "units",
             format!(
-                "joint/{joint}/torque hardly follows the motion: what the masses of the URDF ask for is about {times:.0} times as much. It was left out; its channel is dead, or it is in thousands: convert it to Nm"
+                "joint/{joint}/torque hardly follows the motion: what the masses of the URDF ask for is about {times:.0} times as much. It was left out; its channel is dead, or it is in thousands of {units}: convert it to {unit}"
             ),
         ),
     };
@@ -282,23 +309,56 @@ mod tests {
     use super::super::normals;
     use super::*;
 
-    /// A joint whose torque is `scale` times what CAD says, which itself is wrong by `wrong` of another motion, with friction and noise.
-    fn found(scale: f64, wrong: f64, noise: f64) -> Option<Fault> {
+    /// A joint of which CAD says `size` times a few newton metres and which needs `friction` times as many against friction; its torque is `scale` times that, and CAD is wrong by `wrong` of another
+    /// motion; with noise.
+    fn joint(size: f64, friction: f64, scale: f64, wrong: f64, noise: f64) -> Option<Compared> {
         let deviates = normals(3, 1000);
         let mut pairs = Pairs::default();
         for (i, deviate) in deviates.iter().enumerate() {
             let t = 0.05 * i as f64;
             let (dq, ddq) = ((1.1 * t).cos(), -1.1 * (1.1 * t).sin());
             let (x, other) = (8.0 * (0.9 * t).sin() + ddq, 8.0 * (1.7 * t + 1.0).sin());
-            let friction = [(dq / 0.02).tanh(), dq, 1.0];
-            pairs.predicted.push(x);
-            let torque = x + wrong * other + 4.0 * friction[0] + 3.0 * friction[1] - 2.0 + noise * deviate;
+            let nuisance = [(dq / 0.02).tanh(), dq, 1.0];
+            pairs.predicted.push(size * x);
+            let lost = 4.0 * nuisance[0] + 3.0 * nuisance[1] - 2.0;
+            let torque = size * (x + wrong * other) + friction * lost + noise * deviate;
             pairs.measured.push(scale * torque);
-            pairs.nuisance.extend(friction);
+            pairs.nuisance.extend(nuisance);
             pairs.nuisance.push(ddq);
         }
-        let compared = pairs.compare(TorqueSide::Link)?;
-        compared.fault(compared.predicted, compared.raw_predicted)
+        pairs.compare(TorqueSide::Link)
+    }
+
+    /// What is found of such a joint if there is no other.
+    fn found(scale: f64, wrong: f64, noise: f64) -> Option<Fault> {
+        faults(&[joint(1.0, 1.0, scale, wrong, noise)], &[false])[0]
+    }
+
+    /// A gantry that carries a wrist: what is wrong with a wrist's torque is found beside forces of a thousand newtons, and these are not too large for any torque.
+    #[test]
+    fn forces_of_joints_that_slide_hide_no_torques() {
+        let all = |wrist: f64| {
+            [
+                joint(200.0, 1.0, 1.0, 0.2, 1.0),
+                joint(0.2, 0.2, wrist, 0.2, 0.01),
+                joint(0.2, 0.2, 1.0, 0.2, 0.01),
+            ]
+        };
+        let sliding = [true, false, false];
+        assert_eq!(faults(&all(1.0), &sliding), [None; 3]);
+        assert_eq!(faults(&all(-1.0), &sliding), [None, Some(Fault::Sign), None]);
+        assert!(matches!(
+            faults(&all(0.001), &sliding)[..],
+            [None, Some(Fault::TooSmall(_)), None]
+        ));
+    }
+
+    /// The first joint of an arm whose axes are upright carries nothing: its torque is friction, however much.
+    #[test]
+    fn friction_alone_is_no_count() {
+        assert_eq!(faults(&[joint(0.01, 3.0, 1.0, 0.2, 0.05)], &[false]), [None]);
+        let counts = faults(&[joint(0.01, 3.0, 1000.0, 0.2, 0.05)], &[false]);
+        assert!(matches!(counts[..], [Some(Fault::TooLarge(_))]), "{counts:?}");
     }
 
     #[test]
