@@ -19,8 +19,9 @@ use crate::setup::{Setup, Use};
 use crate::spatial::{RigidInertia, Wrench};
 use nalgebra::{DMatrix, DVector, Matrix6};
 use proprio_topics::Nanos;
-use rustfft::FftPlanner;
 use rustfft::num_complex::Complex;
+use rustfft::{Fft, FftPlanner};
+use std::sync::Arc;
 
 /// Points of a curve at the most.
 const POINTS: usize = 2000;
@@ -28,7 +29,7 @@ const POINTS: usize = 2000;
 /// Seconds at both ends of a log that do not count where torques are compared: filters and derivatives need them.
 const EDGE: f64 = 0.3;
 
-/// Logs with more rows per second hold raw torques: they are compared below [`CUT_OFF`].
+/// Torques with more samples per second are raw: they are compared below [`CUT_OFF`].
 const RAW_RATE: f64 = 400.0;
 
 /// Of the fourth-order Butterworth filter, run forwards and backwards, for raw torques \[Hz\].
@@ -883,7 +884,8 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         &sets,
     );
     let times: Vec<f64> = instants.iter().map(|i| (i.t - log.span.0).seconds()).collect();
-    let filter = (log.rate > RAW_RATE).then(|| Grid::new(&times)).flatten();
+    let places = Places::new(&times);
+    let filter = places.as_ref().filter(|_| log.torque_rate > RAW_RATE);
     let inner = |i: &usize| {
         let (first, last) = (
             times.first().copied().unwrap_or(0.0),
@@ -934,7 +936,7 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
     }
     for (dof, errors, measured) in &torque_series {
         let smooth = |x: &[f64]| match &filter {
-            Some(grid) => grid.low_passed(x),
+            Some(places) => places.low_passed(x),
             None => x.to_vec(),
         };
         let keep = |x: &[f64]| -> Vec<f64> { (0..x.len()).filter(inner).map(|i| x[i]).collect() };
@@ -1026,7 +1028,7 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         time_offsets: late,
         findings: log.findings.iter().cloned().chain(found).collect(),
         curves: curves(maker, instants, &times, &compared, identified, root, &torque_series),
-        spectra: spectra(setup, layout, &times, &left),
+        spectra: spectra(setup, layout, places.as_ref(), &left),
     }
 }
 
@@ -1405,80 +1407,111 @@ fn curves(
 }
 
 /// Power spectra of the residuals: means over pieces of 256 instants, halves overlapping, each under a Hann window (Welch 1967).
-fn spectra(setup: &Setup, layout: &Layout, times: &[f64], left: &Residuals) -> Vec<Spectrum> {
-    if times.len() < SPECTRUM {
+fn spectra(setup: &Setup, layout: &Layout, places: Option<&Places>, left: &Residuals) -> Vec<Spectrum> {
+    let Some(places) = places.filter(|places| places.at.len() >= SPECTRUM) else {
         return Vec::new();
-    }
-    let rate = (times.len() - 1) as f64 / (times[times.len() - 1] - times[0]);
+    };
+    let (rate, welch) = (places.rate, Welch::new());
+    let density = |values: &[f64]| welch.density(&places.spread(values), rate);
     (0..layout.channels())
         .map(|channel| Spectrum {
             name: channel_name(setup, layout, channel).0,
             frequency: (1..=SPECTRUM / 2).map(|k| k as f64 * rate / SPECTRUM as f64).collect(),
-            cad_fitted: welch(&left.noise[0][channel], rate),
-            identified: welch(&left.noise[1][channel], rate),
+            cad_fitted: density(&left.noise[0][channel]),
+            identified: density(&left.noise[1][channel]),
         })
         .collect()
 }
 
-/// One-sided power spectral density \[unit^2/Hz\] of a series with so many samples a second, at the multiples 1 to [`SPECTRUM`] / 2 of `rate / SPECTRUM`: the mean over Hann windows
-/// that overlap by half (Welch 1967), without those in which a sample is missing.
-fn welch(series: &[f64], rate: f64) -> Vec<f64> {
-    let turn = std::f64::consts::PI / SPECTRUM as f64;
-    let window: Vec<f64> = (0..SPECTRUM).map(|i| (turn * (i as f64 + 0.5)).sin().powi(2)).collect();
-    let power: f64 = window.iter().map(|w| w * w).sum();
-    let transform = FftPlanner::new().plan_fft_forward(SPECTRUM);
-    let (mut sums, mut pieces) = (vec![0.0; SPECTRUM / 2], 0.0);
-    let mut values = vec![Complex::default(); SPECTRUM];
-    for piece in series.windows(SPECTRUM).step_by(SPECTRUM / 2) {
-        if piece.iter().any(|x| !x.is_finite()) {
-            continue;
-        }
-        pieces += 1.0;
-        for ((value, x), w) in values.iter_mut().zip(piece).zip(&window) {
-            *value = Complex::from(x * w);
-        }
-        transform.process(&mut values);
-        for (sum, value) in sums.iter_mut().zip(&values[1..]) {
-            *sum += 2.0 * value.norm_sqr() / (power * rate);
-        }
-    }
-    sums.iter().map(|sum| sum / pieces).collect()
+/// Power spectral densities as means over Hann windows of [`SPECTRUM`] samples that overlap by half (Welch 1967).
+struct Welch {
+    window: Vec<f64>,
+    transform: Arc<dyn Fft<f64>>,
 }
 
-/// Where instants are among equally spaced ones: a filter must see the time that passes where a log has none.
-struct Grid {
-    places: Vec<usize>,
+impl Welch {
+    fn new() -> Self {
+        let turn = std::f64::consts::PI / SPECTRUM as f64;
+        Self {
+            window: (0..SPECTRUM).map(|i| (turn * (i as f64 + 0.5)).sin().powi(2)).collect(),
+            transform: FftPlanner::new().plan_fft_forward(SPECTRUM),
+        }
+    }
+
+    /// One-sided density \[unit^2/Hz\] of a series with so many samples a second, at the multiples 1 to [`SPECTRUM`] / 2 of `rate / SPECTRUM`, without the windows in which a sample is
+    /// missing; NaN if that is all of them.
+    fn density(&self, series: &[f64], rate: f64) -> Vec<f64> {
+        let power: f64 = self.window.iter().map(|w| w * w).sum();
+        let (mut sums, mut pieces) = (vec![0.0; SPECTRUM / 2], 0.0);
+        let mut values = vec![Complex::default(); SPECTRUM];
+        for piece in series.windows(SPECTRUM).step_by(SPECTRUM / 2) {
+            if piece.iter().any(|x| !x.is_finite()) {
+                continue;
+            }
+            pieces += 1.0;
+            for ((value, x), w) in values.iter_mut().zip(piece).zip(&self.window) {
+                *value = Complex::from(x * w);
+            }
+            self.transform.process(&mut values);
+            for (sum, value) in sums.iter_mut().zip(&values[1..]) {
+                *sum += 2.0 * value.norm_sqr() / (power * rate);
+            }
+        }
+        sums.iter().map(|sum| sum / pieces).collect()
+    }
+}
+
+/// Where instants are among equally spaced ones: a filter or a spectrum must see that time passes where a log has none.
+struct Places {
+    at: Vec<usize>,
     /// \[Hz\].
     rate: f64,
 }
 
-impl Grid {
-    /// Of ascending times \[s\], spaced by their median distance; none if there is no such distance.
+impl Places {
+    /// Of ascending times \[s\], spaced by about their median distance; none if there is no such distance. Of a longer gap no more is kept than shows that there is one.
     fn new(times: &[f64]) -> Option<Self> {
-        let mut steps: Vec<f64> = times.windows(2).map(|two| two[1] - two[0]).collect();
-        steps.sort_by(f64::total_cmp);
-        let period = *steps.get(steps.len() / 2).filter(|period| **period > 0.0)?;
-        let place = |t: &f64| ((t - times[0]) / period).round() as usize;
-        Some(Self {
-            places: times.iter().map(place).collect(),
-            rate: 1.0 / period,
-        })
+        let steps: Vec<f64> = times.windows(2).map(|two| two[1] - two[0]).collect();
+        let mut sorted = steps.clone();
+        sorted.sort_by(f64::total_cmp);
+        let median = *sorted.get(sorted.len() / 2).filter(|period| **period > 0.0)?;
+        // Stamps may be as coarse as a tenth of their distance: the mean of what is about one distance is finer than the median.
+        let near = || steps.iter().filter(|step| (0.5..1.5).contains(&(**step / median)));
+        let rate = near().count() as f64 / near().sum::<f64>();
+        let longest = samples(BRIDGED, rate) + 2;
+        let mut at = vec![0];
+        for step in &steps {
+            // From the one before, so that stamps may wander against the clock.
+            let places = ((step * rate).round() as usize).clamp(1, longest);
+            at.push(at[at.len() - 1] + places);
+        }
+        Some(Self { at, rate })
+    }
+
+    /// Values of the instants among equally spaced ones, NaN where there is no instant.
+    fn spread(&self, values: &[f64]) -> Vec<f64> {
+        let mut series = vec![f64::NAN; self.at.last().map_or(0, |last| last + 1)];
+        for (&place, &value) in self.at.iter().zip(values) {
+            series[place] = value;
+        }
+        series
     }
 
     fn low_passed(&self, values: &[f64]) -> Vec<f64> {
-        let mut series = vec![f64::NAN; self.places.last().map_or(0, |last| last + 1)];
-        for (&place, &value) in self.places.iter().zip(values) {
-            series[place] = value;
-        }
-        let smooth = low_passed(&series, self.rate);
-        self.places.iter().map(|&place| smooth[place]).collect()
+        let smooth = low_passed(&self.spread(values), self.rate);
+        self.at.iter().map(|&place| smooth[place]).collect()
     }
+}
+
+/// So many samples are that long \[s\].
+fn samples(seconds: f64, rate: f64) -> usize {
+    (seconds * rate).round() as usize
 }
 
 /// A series through [`zero_phase`], where numbers are missing (NaN). Gaps of up to [`BRIDGED`] are bridged by a line; longer ones are ends, and as at the ends of the log [`EDGE`] of
 /// what is there is not given. What is missing stays missing.
 fn low_passed(values: &[f64], rate: f64) -> Vec<f64> {
-    let samples = |seconds: f64| (seconds * rate).round() as usize;
+    let samples = |seconds: f64| samples(seconds, rate);
     let there: Vec<usize> = (0..values.len()).filter(|&i| values[i].is_finite()).collect();
     let mut out = vec![f64::NAN; values.len()];
     let mut rest = there.as_slice();
@@ -1549,7 +1582,6 @@ mod tests {
         Setup::new(&Config::load(&file).unwrap()).unwrap()
     }
 
-    /// One link whose directions are known from hardly at all to a ten thousandth of the prior's spread; moved by ten standard deviations in the best known one.
     /// Its integral is the variance (Parseval), it is flat for white noise, and a wave stands where its frequency is.
     #[test]
     fn a_spectrum_shares_out_the_variance() {
@@ -1558,7 +1590,7 @@ mod tests {
         let mut series: Vec<f64> = crate::identify::normals(3, 50_000);
         series.iter_mut().enumerate().for_each(|(i, x)| *x += wave(i));
         series[7000] = f64::NAN;
-        let density = welch(&series, rate);
+        let density = Welch::new().density(&series, rate);
         let step = rate / SPECTRUM as f64;
         // The wave's is spread by the window over two neighbours.
         let peak = (12.5 / step) as usize - 1;
@@ -1569,6 +1601,7 @@ mod tests {
         assert!((rest.sum::<f64>() * step - 0.96).abs() < 0.05);
     }
 
+    /// One link whose directions are known from hardly at all to a ten thousandth of the prior's spread; moved by ten standard deviations in the best known one.
     #[test]
     fn what_is_known_best_counts_first_for_significance() {
         let share: Vec<f64> = (0..10).map(|i| 10f64.powf(-0.9 * f64::from(i))).collect();
@@ -1695,6 +1728,44 @@ mod tests {
         );
     }
 
+    /// A log with gaps, stamped to a millisecond: a wave is where it is in time, and as narrow, in spite of all that is missing.
+    #[test]
+    fn a_spectrum_knows_of_gaps() {
+        let period = 0.0103;
+        let bursts = (0..20_000).filter(|i| i % 1000 < 350);
+        let times: Vec<f64> = bursts.map(|i| (1e3 * period * f64::from(i)).round() / 1e3).collect();
+        let places = Places::new(&times).expect("a period");
+        assert!((places.rate * period - 1.0).abs() < 1e-3, "{}", places.rate);
+        let wave = |t: &f64| (std::f64::consts::TAU * 12.5 * t).sin();
+        let values: Vec<f64> = times.iter().map(wave).collect();
+        let density = Welch::new().density(&places.spread(&values), places.rate);
+        let step = places.rate / SPECTRUM as f64;
+        let peak = (12.5 / step).round() as usize - 1;
+        let share: f64 = density[peak - 2..=peak + 2].iter().sum::<f64>() * step;
+        assert!((share - 0.5).abs() < 0.02, "{share}");
+        let all: f64 = density.iter().sum::<f64>() * step;
+        assert!((all - 0.5).abs() < 0.02, "{all}");
+    }
+
+    /// A gap of days takes no more room than one of a second, and is a gap all the same.
+    #[test]
+    fn places_of_a_gap_of_days_are_few() {
+        let times = |gap: f64| -> Vec<f64> {
+            let after = |i: u32| if i < 500 { 0.0 } else { gap };
+            (0..1000).map(|i| 0.01 * f64::from(i) + after(i)).collect()
+        };
+        let places = |gap| Places::new(&times(gap)).expect("a period");
+        let days = places(1e6);
+        assert!(days.at[999] < 1010, "{}", days.at[999]);
+        let values: Vec<f64> = (0..1000).map(|i| (0.02 * f64::from(i)).sin()).collect();
+        let (days, second) = (days.low_passed(&values), places(1.0).low_passed(&values));
+        for (days, second) in days.iter().zip(&second) {
+            let same = (days - second).abs() < 1e-6 || days.is_nan() && second.is_nan();
+            assert!(same, "{days} {second}");
+        }
+        assert!(days[499].is_nan() && days[500].is_nan() && days[400].is_finite());
+    }
+
     #[test]
     fn missing_samples_spoil_only_their_surroundings_of_a_filtered_curve() {
         let rate = 1000.0;
@@ -1717,7 +1788,7 @@ mod tests {
         let there: Vec<usize> = (0..6000).filter(|i| !(3000..3400).contains(i)).collect();
         let times: Vec<f64> = there.iter().map(|&i| i as f64 / rate).collect();
         let values: Vec<f64> = there.iter().map(|&i| holed[i]).collect();
-        let closed = Grid::new(&times).expect("a period").low_passed(&values);
+        let closed = Places::new(&times).expect("a period").low_passed(&values);
         for (&i, value) in there.iter().zip(closed) {
             let same = (value - found[i]).abs() < 1e-5 || value.is_nan() && found[i].is_nan();
             assert!(same, "{i}: {value} {}", found[i]);

@@ -119,8 +119,8 @@ pub(super) struct Prepared {
     pub file: String,
     pub role: Role,
     pub span: (Nanos, Nanos),
-    /// Samples per second of the log's rows.
-    pub rate: f64,
+    /// [`Recording::torque_rate`].
+    pub torque_rate: f64,
     pub instants: Vec<Instant>,
     pub breaks: Vec<Break>,
     pub left_out: Vec<LeftOut>,
@@ -338,12 +338,7 @@ fn usable(setup: &Setup, file: String, role: Role, recording: Recording) -> Prep
         (Some(first), Some(last)) => (first.t, last.t),
         _ => (Nanos::ZERO, Nanos::ZERO),
     };
-    let seconds = recording.duration().seconds();
-    let rate = if seconds > 0.0 {
-        recording.report().rows as f64 / seconds
-    } else {
-        f64::NAN
-    };
+    let torque_rate = recording.torque_rate();
     let mut reasons: BTreeMap<String, LeftOut> = BTreeMap::new();
     let mut leave_out = |reason: String, t: Nanos| {
         let entry = reasons.entry(reason.clone()).or_insert(LeftOut {
@@ -409,7 +404,7 @@ fn usable(setup: &Setup, file: String, role: Role, recording: Recording) -> Prep
         file,
         role,
         span,
-        rate,
+        torque_rate,
         refused: refused || instants.len() < LEAST_FOLD,
         instants,
         breaks: found.breaks,

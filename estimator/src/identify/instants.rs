@@ -387,6 +387,13 @@ impl Recording {
         self.joints.get(dof).is_some_and(|j| !j.torque.t.is_empty())
     }
 
+    /// Samples of joint torques per second while there are any, by the median distance of their stamps: the fastest joint's \[Hz\]; 0 if there is none. Gaps do not count.
+    #[must_use]
+    pub fn torque_rate(&self) -> f64 {
+        let spacings = self.joints.iter().map(|joint| joint.torque.spacing.seconds());
+        spacings.filter(|s| *s > 0.0).map(f64::recip).fold(0.0, f64::max)
+    }
+
     /// Puts a channel's stamps where its samples belong: takes `offset.seconds` off them.
     pub fn shift(&mut self, offset: &TimeOffset) {
         let by = Nanos::from_seconds(offset.seconds);

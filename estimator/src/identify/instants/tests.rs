@@ -181,6 +181,31 @@ fn log_of(
     }
 }
 
+/// Of a log of which most is missing, and whose torques have rows of their own, the rate is that of the torques while they are there.
+#[test]
+fn torques_rate_is_that_while_they_are_there() {
+    let setup = setup("");
+    let table = |period: i64| Table {
+        header: [COLUMNS[0], COLUMNS[1], "joint/shoulder/torque"]
+            .map(str::to_owned)
+            .to_vec(),
+        rows: (0..20_000_i64)
+            .filter(|i| i % 5000 < 1750)
+            .flat_map(|i| {
+                let q = motion(0, 1e-9 * (i * period) as f64)[0];
+                let encoders = (i * period, vec![q, 0.5 * q, f64::NAN]);
+                [encoders, (i * period + 300_000, vec![f64::NAN, f64::NAN, 3.0 * q])]
+            })
+            .collect(),
+    };
+    for (period, expected) in [(1_000_000, 1000.0), (4_000_000, 250.0)] {
+        let found = table(period).recording(&setup).torque_rate();
+        assert!((found / expected - 1.0).abs() < 1e-3, "{found}");
+    }
+    let none = log(&setup, 2.0, 1000.0, 0.0, 0.0, 1).recording(&setup).torque_rate();
+    assert_eq!(none, 0.0);
+}
+
 fn rms(errors: impl Iterator<Item = f64>) -> f64 {
     let (sum, count) = errors.fold((0.0, 0.0), |(s, n), e| (s + e * e, n + 1.0));
     (sum / count).sqrt()
