@@ -1440,6 +1440,31 @@ fn a_gain_that_no_motion_tells_stays_the_workbenchs() {
     assert!(text.contains("the gain of fz"), "{text}");
 }
 
+/// What is asked for of measurements that nothing is identified from is said to be asked in vain, and nothing else is.
+#[test]
+fn what_is_asked_for_in_vain_is_said() {
+    let mut setup = arm();
+    let truth = real(&setup, 6);
+    let log = with_torques(
+        &simulate(&setup, &truth, 6.0, 0.01, 6),
+        &simulate_torques(&setup, &truth, 6.0, 0.05, 6, |_, _| true),
+    );
+    setup.torque_side = TorqueSide::Motor;
+    setup.calibrated.gain = Gain::Diagonal;
+    let wrench = [IdentificationInput::Wrench];
+    for (inputs, expected) in [
+        (&TORQUE[..], &["no_calibration identification.gain"][..]),
+        (&wrench, &["no_rotors identification.torque_side"]),
+        (&[IdentificationInput::Wrench, IdentificationInput::Torque], &[]),
+    ] {
+        let outcome = run(&setup, &[("log", Role::Train, &log)], inputs);
+        let notes = outcome.findings.iter();
+        let notes = notes.filter(|f| ["no_calibration", "no_rotors"].contains(&f.code));
+        let notes: Vec<String> = notes.map(|f| format!("{} {}", f.code, f.subject)).collect();
+        assert_eq!(notes, expected, "{inputs:?}");
+    }
+}
+
 #[test]
 fn joint_whose_zero_is_elsewhere_is_named() {
     let setup = arm();

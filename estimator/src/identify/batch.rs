@@ -24,7 +24,7 @@ use super::rows::{Further, Groups, Layout, RowMaker, Rows};
 use super::shaking::Shaking;
 use super::torques;
 use crate::calibration::Kind;
-use crate::config::{Gain, IdentificationInput};
+use crate::config::{Gain, IdentificationInput, TorqueSide};
 use crate::dynamics::DynamicsError;
 use crate::model::JointKind;
 use crate::setup::{Setup, Use};
@@ -244,11 +244,43 @@ pub fn identify(
         identified.findings.extend(shaken(&maker, &shaking));
     }
     identified.findings.extend(restless);
+    identified.findings.extend(asked_in_vain(setup, &identified.inputs));
     let training = used(&prepared);
     tell_progress("figures".into(), 0.9);
     let outcome = assess::outcome(setup, &maker, &prepared, &training, &identified);
     tell_progress("done".into(), 1.0);
     Ok(outcome)
+}
+
+/// What the configuration asks for that nothing can be said of, for lack of the measurements that it is about among those that are identified from.
+fn asked_in_vain(setup: &Setup, inputs: &[IdentificationInput]) -> Vec<Finding> {
+    let note = |code, key: &str, text: String| Finding {
+        severity: Severity::Note,
+        code,
+        subject: key.to_owned(),
+        text,
+    };
+    let mut notes = Vec::new();
+    if !setup.calibrated.is_empty() && !inputs.contains(&IdentificationInput::Wrench) {
+        let asked = [
+            (setup.calibrated.gain != Gain::None, "identification.gain"),
+            (setup.calibrated.temperature, "identification.temperature"),
+        ];
+        let asked: Vec<&str> = asked.iter().filter(|(is, _)| *is).map(|(_, key)| *key).collect();
+        let asked = asked.join(" and ");
+        let text = format!(
+            "{asked} asked for in vain: no F/T sensor is identified from here, so none is calibrated; add \"wrench\" to the inputs"
+        );
+        notes.push(note("no_calibration", &asked, text));
+    }
+    if setup.torque_side == TorqueSide::Motor && !inputs.contains(&IdentificationInput::Torque) {
+        let key = "identification.torque_side";
+        let text = format!(
+            "{key} = \"motor\" asked for in vain: no joint torque is identified from here, so no rotor's inertia is; add \"torque\" to the inputs"
+        );
+        notes.push(note("no_rotors", key, text));
+    }
+    notes
 }
 
 /// The logs to train on.
