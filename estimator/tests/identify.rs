@@ -1037,6 +1037,40 @@ fn joint_torques_do_not_hide_a_turned_sensor() {
 /// F/T sensor and motors' torques together: the joints before the sensor are identified from their torques, the links beyond it from both.
 #[test]
 fn rotors_are_identified_beside_a_force_torque_sensor() {
+/// Where links stay as in CAD, no rotor beside them is negative either.
+#[test]
+fn no_rotor_beside_cads_links_is_negative() {
+    let mut setup = arm_with(&[]);
+    setup.torque_side = TorqueSide::Motor;
+    let truth = real(&setup, 4);
+    let log = simulate_torques(&setup, &truth, 3.6, 0.05, 4, |_, _| true);
+    let log = at_the_motors(&log, &[0.3, 0.2, 0.1, -0.3, 0.05, 0.02], 0.5);
+    let rows = log.lines().skip(1).step_by(4);
+    let short: String = log.lines().take(1).chain(rows).flat_map(|line| [line, "\n"]).collect();
+    let outcome = run(&setup, &[("short", Role::Train, &short)], &TORQUE);
+    assert_eq!(outcome.verdict, Verdict::NoBetterThanCad);
+    let inertias: Vec<f64> = outcome.rotors.iter().map(|rotor| rotor.inertia).collect();
+    assert!(inertias.iter().all(|inertia| *inertia >= 0.0), "{inertias:?}");
+    assert_eq!(inertias[3], 0.0);
+}
+
+/// What is held out is predicted with the parameters that are given out: where a rotor would have to be negative and is taken as none, links do not get worse than CAD, nor are they called certain.
+#[test]
+fn a_negative_rotor_is_no_help_on_held_out_data() {
+    let mut setup = arm_with(&[]);
+    setup.torque_side = TorqueSide::Motor;
+    let truth = real(&setup, 5);
+    for (seed, negative) in [(5, 0.3), (5, 1.0), (6, 0.3)] {
+        let log = simulate_torques(&setup, &truth, 12.0, 0.05, seed, |_, _| true);
+        let log = at_the_motors(&log, &[0.3, 0.2, 0.1, -negative, 0.05, 0.02], 0.5);
+        let outcome = run(&setup, &[("log", Role::Train, &log)], &TORQUE);
+        let (cad, own, inside, _) = torque_errors(&setup, &truth, &outcome, 77);
+        println!("torques of the links: {cad:.4} -> {own:.4} Nm, covered {inside:.3}");
+        assert!(own <= cad && inside > 0.8, "{seed} {negative}: {cad} {own} {inside}");
+        assert!(outcome.rotors.iter().all(|rotor| rotor.inertia >= 0.0));
+    }
+}
+
     let mut setup = arm();
     setup.torque_side = TorqueSide::Motor;
     let truth = real(&setup, 8);

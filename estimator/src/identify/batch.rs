@@ -513,28 +513,35 @@ fn posterior(prior: &Prior, layout: &Layout, information: &Information) -> Resul
     Ok(Posterior::new(prior, &layout.links, &r, &z, &layout.precision())?)
 }
 
-/// CAD's bodies, and of what CAD says nothing ([`Further::lacks_cad`]) the values that go best with them, by their priors and by what these data tell. (Not from the log that CAD is compared on:
-/// these belong to the robot.)
+/// CAD's bodies, and of what CAD says nothing ([`Further::lacks_cad`]) the values that go best with them, by their priors and by what these data tell; no rotor's inertia is negative. (Not from the log
+/// that CAD is compared on: these belong to the robot.)
 fn beside_cad(layout: &Layout, information: &Information) -> DVector<f64> {
     let mut x = DVector::zeros(layout.unknowns());
-    let columns = layout.beside_cad();
-    if columns.is_empty() {
-        return x;
-    }
+    let mut columns = layout.beside_cad();
     let (r, z) = information.to_triangle();
-    let rows = r.nrows();
-    let mut own = r.select_columns(&columns).resize_vertically(rows + columns.len(), 0.0);
-    let precision = layout.precision();
-    for (place, &column) in columns.iter().enumerate() {
-        own[(rows + place, place)] = precision[column - layout.inertial()].sqrt();
-    }
-    let qr = own.qr();
-    let right = qr.q().tr_mul(&z.resize_vertically(rows + columns.len(), 0.0));
-    if let Some(values) = qr.r().solve_upper_triangular(&right) {
-        columns
-            .iter()
-            .zip(&values)
-            .for_each(|(&column, value)| x[column] = *value);
+    let (rows, precision) = (r.nrows(), layout.precision());
+    while !columns.is_empty() {
+        let mut own = r.select_columns(&columns).resize_vertically(rows + columns.len(), 0.0);
+        for (place, &column) in columns.iter().enumerate() {
+            own[(rows + place, place)] = precision[column - layout.inertial()].sqrt();
+        }
+        let qr = own.qr();
+        let right = qr.q().tr_mul(&z.clone().resize_vertically(rows + columns.len(), 0.0));
+        let Some(values) = qr.r().solve_upper_triangular(&right) else {
+            break;
+        };
+        let is_negative = |column: usize, value: f64| value < 0.0 && is_rotor(layout, column);
+        let found = columns.iter().copied().zip(values.iter().copied());
+        let kept: Vec<usize> = found
+            .clone()
+            .filter(|(column, value)| !is_negative(*column, *value))
+            .map(|(column, _)| column)
+            .collect();
+        if kept.len() == columns.len() {
+            found.for_each(|(column, value)| x[column] = value);
+            break;
+        }
+        columns = kept;
     }
     x
 }
@@ -546,18 +553,19 @@ fn without_negative_rotors(
     information: &Information,
     fit: &Fit,
 ) -> Result<DVector<f64>, IdentifyError> {
-    let rotors: Vec<usize> = layout
-        .further
-        .iter()
-        .zip(layout.inertial()..)
-        .filter(|(further, _)| matches!(further, Further::RotorInertia(_)))
-        .map(|(_, column)| column)
-        .collect();
     let mut x = fit.x.clone();
     let mut keep: Vec<usize> = (0..layout.unknowns()).collect();
+fn is_rotor(layout: &Layout, column: usize) -> bool {
+    let further = column
+        .checked_sub(layout.inertial())
+        .and_then(|k| layout.further.get(k));
+    matches!(further, Some(Further::RotorInertia(_)))
+}
+
     let (r, z) = information.to_triangle();
-    while rotors.iter().any(|&column| x[column] < 0.0) {
-        keep.retain(|column| !(rotors.contains(column) && x[*column] < 0.0));
+    let is_negative = |x: &DVector<f64>, column: usize| x[column] < 0.0 && is_rotor(layout, column);
+    while keep.iter().any(|&column| is_negative(&x, column)) {
+        keep.retain(|&column| !is_negative(&x, column));
         let precision = layout.precision();
         let of_kept = keep.iter().filter(|column| **column >= layout.inertial());
         let precision: Vec<f64> = of_kept.map(|column| precision[column - layout.inertial()]).collect();
@@ -1119,7 +1127,9 @@ fn held_out(
                 let _ = others.merge(&told.information, &columns);
             }
         }
-        let own = posterior(prior, layout, &others)?.fit(tau)?.x;
+        let own = posterior(prior, layout, &others)?.fit(tau)?;
+        // As they are given out.
+        let own = without_negative_rotors(prior, layout, &others, &own)?;
         sets.push([beside_cad(layout, &others), own]);
     }
     let left: Vec<Residuals> = over(maker, &pieces, |maker, number, piece| {
