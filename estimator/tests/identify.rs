@@ -4,7 +4,9 @@ use nalgebra::{Matrix4, Matrix6, Vector6};
 use proprio_estimator::calibration::{Calibration, Unknown};
 use proprio_estimator::config::{Config, Gain, IdentificationInput, TorqueSide};
 use proprio_estimator::dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
-use proprio_estimator::identify::{Finding, Log, LogOutcome, Options, Outcome, Role, Verdict, identify, parameters};
+use proprio_estimator::identify::{
+    Finding, Log, LogOutcome, Options, Outcome, Role, Severity, Verdict, identify, parameters,
+};
 use proprio_estimator::model::Model;
 use proprio_estimator::offline;
 use proprio_estimator::parameters::Parameters;
@@ -649,6 +651,43 @@ fn sensor_the_wrong_way_round_is_named_and_nothing_identified() {
     assert!(outcome.links.iter().all(|link| link.identified == link.cad));
 }
 
+/// A sensor that was mounted the wrong way round in one log of three, or in the one for validation: that log is refused, with the finding on it, and the others are used.
+#[test]
+fn a_log_with_a_sensor_turned_is_refused_alone() {
+    let setup = arm();
+    let truth = real(&setup, 3);
+    let log = |seed, is_turned| {
+        let log = simulate(&setup, &truth, 8.0, 0.01, seed);
+        let turned = |log: String, axis| change(&log, &format!("wrench/ft/{axis}"), |x| -x);
+        if is_turned {
+            AXES.into_iter().fold(log, turned)
+        } else {
+            log
+        }
+    };
+    let logs = [log(3, false), log(4, true), log(5, false), log(6, true), log(7, false)];
+    let roles = [Role::Train, Role::Train, Role::Train, Role::Validate, Role::Validate];
+    let given: Vec<(&str, Role, &str)> = logs
+        .iter()
+        .zip(roles)
+        .map(|(log, role)| ("log", role, &**log))
+        .collect();
+    let outcome = run(&setup, &given, &[]);
+    assert_eq!(outcome.verdict, Verdict::Identified);
+    for (log, is_turned) in outcome.logs.iter().zip([false, true, false, true, false]) {
+        let found: Vec<&Finding> = log.findings.iter().filter(|f| f.code == "wrong_sign").collect();
+        assert_eq!(found.len(), usize::from(is_turned), "{:?}", log.findings);
+        assert!(
+            found
+                .iter()
+                .all(|f| f.subject == "ft" && f.severity == Severity::Refusal)
+        );
+        assert_eq!(log.used == 0, is_turned);
+    }
+    let (cad, own, inside, _) = torque_errors(&setup, &truth, &outcome, 77);
+    assert!(5.0 * own < cad && inside > 0.85, "{cad} {own} {inside}");
+}
+
 /// The log of a sensor whose readings are in another frame than the configuration says, and what the configuration should have said.
 #[test]
 fn a_sensor_in_another_frame_is_named_with_the_right_one() {
@@ -998,6 +1037,40 @@ fn a_negative_rotor_is_named() {
     assert_eq!(named, ["j4"]);
 }
 
+/// Where links stay as in CAD, no rotor beside them is negative either.
+#[test]
+fn no_rotor_beside_cads_links_is_negative() {
+    let mut setup = arm_with(&[]);
+    setup.torque_side = TorqueSide::Motor;
+    let truth = real(&setup, 4);
+    let log = simulate_torques(&setup, &truth, 3.6, 0.05, 4, |_, _| true);
+    let log = at_the_motors(&log, &[0.3, 0.2, 0.1, -0.3, 0.05, 0.02], 0.5);
+    let rows = log.lines().skip(1).step_by(4);
+    let short: String = log.lines().take(1).chain(rows).flat_map(|line| [line, "\n"]).collect();
+    let outcome = run(&setup, &[("short", Role::Train, &short)], &TORQUE);
+    assert_eq!(outcome.verdict, Verdict::NoBetterThanCad);
+    let inertias: Vec<f64> = outcome.rotors.iter().map(|rotor| rotor.inertia).collect();
+    assert!(inertias.iter().all(|inertia| *inertia >= 0.0), "{inertias:?}");
+    assert_eq!(inertias[3], 0.0);
+}
+
+/// What is held out is predicted with the parameters that are given out: where a rotor would have to be negative and is taken as none, links do not get worse than CAD, nor are they called certain.
+#[test]
+fn a_negative_rotor_is_no_help_on_held_out_data() {
+    let mut setup = arm_with(&[]);
+    setup.torque_side = TorqueSide::Motor;
+    let truth = real(&setup, 5);
+    for (seed, negative) in [(5, 0.3), (5, 1.0), (6, 0.3)] {
+        let log = simulate_torques(&setup, &truth, 12.0, 0.05, seed, |_, _| true);
+        let log = at_the_motors(&log, &[0.3, 0.2, 0.1, -negative, 0.05, 0.02], 0.5);
+        let outcome = run(&setup, &[("log", Role::Train, &log)], &TORQUE);
+        let (cad, own, inside, _) = torque_errors(&setup, &truth, &outcome, 77);
+        println!("torques of the links: {cad:.4} -> {own:.4} Nm, covered {inside:.3}");
+        assert!(own <= cad && inside > 0.8, "{seed} {negative}: {cad} {own} {inside}");
+        assert!(outcome.rotors.iter().all(|rotor| rotor.inertia >= 0.0));
+    }
+}
+
 /// A log of both the arm's F/T sensors and its joint torques, from a log of each.
 fn with_torques(wrenches: &str, torques: &str) -> String {
     let header: Vec<&str> = torques.lines().next().expect("a header").split(',').collect();
@@ -1037,40 +1110,6 @@ fn joint_torques_do_not_hide_a_turned_sensor() {
 /// F/T sensor and motors' torques together: the joints before the sensor are identified from their torques, the links beyond it from both.
 #[test]
 fn rotors_are_identified_beside_a_force_torque_sensor() {
-/// Where links stay as in CAD, no rotor beside them is negative either.
-#[test]
-fn no_rotor_beside_cads_links_is_negative() {
-    let mut setup = arm_with(&[]);
-    setup.torque_side = TorqueSide::Motor;
-    let truth = real(&setup, 4);
-    let log = simulate_torques(&setup, &truth, 3.6, 0.05, 4, |_, _| true);
-    let log = at_the_motors(&log, &[0.3, 0.2, 0.1, -0.3, 0.05, 0.02], 0.5);
-    let rows = log.lines().skip(1).step_by(4);
-    let short: String = log.lines().take(1).chain(rows).flat_map(|line| [line, "\n"]).collect();
-    let outcome = run(&setup, &[("short", Role::Train, &short)], &TORQUE);
-    assert_eq!(outcome.verdict, Verdict::NoBetterThanCad);
-    let inertias: Vec<f64> = outcome.rotors.iter().map(|rotor| rotor.inertia).collect();
-    assert!(inertias.iter().all(|inertia| *inertia >= 0.0), "{inertias:?}");
-    assert_eq!(inertias[3], 0.0);
-}
-
-/// What is held out is predicted with the parameters that are given out: where a rotor would have to be negative and is taken as none, links do not get worse than CAD, nor are they called certain.
-#[test]
-fn a_negative_rotor_is_no_help_on_held_out_data() {
-    let mut setup = arm_with(&[]);
-    setup.torque_side = TorqueSide::Motor;
-    let truth = real(&setup, 5);
-    for (seed, negative) in [(5, 0.3), (5, 1.0), (6, 0.3)] {
-        let log = simulate_torques(&setup, &truth, 12.0, 0.05, seed, |_, _| true);
-        let log = at_the_motors(&log, &[0.3, 0.2, 0.1, -negative, 0.05, 0.02], 0.5);
-        let outcome = run(&setup, &[("log", Role::Train, &log)], &TORQUE);
-        let (cad, own, inside, _) = torque_errors(&setup, &truth, &outcome, 77);
-        println!("torques of the links: {cad:.4} -> {own:.4} Nm, covered {inside:.3}");
-        assert!(own <= cad && inside > 0.8, "{seed} {negative}: {cad} {own} {inside}");
-        assert!(outcome.rotors.iter().all(|rotor| rotor.inertia >= 0.0));
-    }
-}
-
     let mut setup = arm();
     setup.torque_side = TorqueSide::Motor;
     let truth = real(&setup, 8);

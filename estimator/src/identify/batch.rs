@@ -3,7 +3,7 @@
 //! 1. Each log becomes instants ([`super::instants`]), each instant rows ([`super::rows`]).
 //! 2. Rounds. With the noise that the last parameters leave: what each log tells of the parameters, its own unknowns eliminated ([`super::passes`]); logs added up; the most
 //!    probable bodies under the prior and its weight ([`super::prior`]). With these bodies: what is left, and from it the noise ([`super::noise`]). Until both stay.
-//!    Before the first of them: a sensor that is mounted the wrong way is refused ([`super::mounting`]).
+//!    Before the first of them: a sensor that is mounted the wrong way is refused, or the log in which alone it is ([`super::mounting`]).
 //! 3. What this fit says that something undeclared acted on is left out, and the rounds repeated, until that stays ([`super::gate`]).
 //!    Then, where gains of sensors are asked for, fits with these unknown, too.
 //! 4. A check on data held out: pieces of the logs are predicted from the others. The change from CAD is shrunk where it gains nothing ([`held_out`]).
@@ -85,6 +85,9 @@ pub enum IdentifyError {
     #[error("no bodies can be fitted to the logs: {0}")]
     Fit(#[from] PriorError),
 }
+
+/// Why nothing can be said.
+const NO_LOG: &str = "no log can be identified from: what is wrong with each is said there";
 
 /// An offset's walk follows nothing faster than this \[s\]: the motion that identifies is faster.
 const DRIFT_TIME: f64 = 1.0;
@@ -181,11 +184,7 @@ pub fn identify(
     }
     let training = used(&prepared);
     if training.is_empty() {
-        return Ok(assess::nothing(
-            setup,
-            &prepared,
-            "no log can be identified from: what is wrong with each is said there".into(),
-        ));
+        return Ok(assess::nothing(setup, &prepared, NO_LOG.into()));
     }
     let all = training.iter().flat_map(|log| log.instants.iter());
     let mut maker = RowMaker::survey(setup, &inputs, all)?;
@@ -218,6 +217,23 @@ pub fn identify(
         );
         outcome.findings.extend(wrong);
         return Ok(outcome);
+    }
+    // Not mounted alike in all logs?
+    let found = mounting::wrong_alone(&maker, &training, &prepared);
+    let apart = found.iter().any(|found| !found.is_empty());
+    for (log, found) in prepared.iter_mut().zip(found) {
+        log.refused |= !found.is_empty();
+        log.findings.extend(found);
+    }
+    let training = used(&prepared);
+    if apart {
+        if training.is_empty() {
+            return Ok(assess::nothing(setup, &prepared, NO_LOG.into()));
+        }
+        maker = RowMaker::survey(setup, &inputs, training.iter().flat_map(|log| log.instants.iter()))?;
+        if maker.layout().links.is_empty() {
+            return Ok(assess::nothing(setup, &prepared, NO_LOG.into()));
+        }
     }
     let of_temperature = Kind {
         gain: Gain::None,
@@ -546,6 +562,13 @@ fn beside_cad(layout: &Layout, information: &Information) -> DVector<f64> {
     x
 }
 
+fn is_rotor(layout: &Layout, column: usize) -> bool {
+    let further = column
+        .checked_sub(layout.inertial())
+        .and_then(|k| layout.further.get(k));
+    matches!(further, Some(Further::RotorInertia(_)))
+}
+
 /// The most probable parameters of which no rotor's inertia is negative: what comes out negative is held at zero, and the rest fitted again.
 fn without_negative_rotors(
     prior: &Prior,
@@ -555,13 +578,6 @@ fn without_negative_rotors(
 ) -> Result<DVector<f64>, IdentifyError> {
     let mut x = fit.x.clone();
     let mut keep: Vec<usize> = (0..layout.unknowns()).collect();
-fn is_rotor(layout: &Layout, column: usize) -> bool {
-    let further = column
-        .checked_sub(layout.inertial())
-        .and_then(|k| layout.further.get(k));
-    matches!(further, Some(Further::RotorInertia(_)))
-}
-
     let (r, z) = information.to_triangle();
     let is_negative = |x: &DVector<f64>, column: usize| x[column] < 0.0 && is_rotor(layout, column);
     while keep.iter().any(|&column| is_negative(&x, column)) {

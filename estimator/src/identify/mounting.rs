@@ -29,6 +29,9 @@ const LEFT: f64 = 1.0 / 3.0;
 /// Of changes that leave nearly the same the simplest is meant.
 const ALIKE: f64 = 1.5;
 
+/// A log tells by itself how sensors were mounted if what they read in it changes by this share, of squares, of what it does in others: where little is moved, what CAD has wrong looks like a wrong frame.
+const ALONE: f64 = 1.0 / 9.0;
+
 /// Another frame that a sensor's readings may be in.
 struct Candidate {
     /// What the configuration should say; none: the other direction, all else as it is.
@@ -89,6 +92,25 @@ pub(super) fn wrong(maker: &RowMaker<'_>, training: &[&Prepared]) -> Vec<Finding
         })
     });
     told.collect()
+}
+
+/// The same of each log alone, those for validation too, where all together fit: a sensor that was mounted otherwise in the minority of them. Nothing of one that is refused already.
+pub(super) fn wrong_alone(maker: &RowMaker<'_>, training: &[&Prepared], logs: &[Prepared]) -> Vec<Vec<Finding>> {
+    let others = change(maker, training);
+    let found = logs.iter().map(|log| {
+        let is_all = training.len() == 1 && std::ptr::eq(training[0], log);
+        if log.refused || is_all || change(maker, &[log]) < ALONE * others {
+            return Vec::new();
+        }
+        wrong(maker, &[log])
+    });
+    found.collect()
+}
+
+/// Mean square of what the sensors read at an instant, less constant offsets.
+fn change(maker: &RowMaker<'_>, logs: &[&Prepared]) -> f64 {
+    let instants: usize = sample(maker, logs).iter().map(|piece| piece.instants.len()).sum();
+    misfits(maker, logs, &[]).1 / instants.max(1) as f64
 }
 
 /// What each sensor's readings are changed by.
