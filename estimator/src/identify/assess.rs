@@ -361,10 +361,10 @@ fn calibrations(
     if setup.calibrated.is_empty() {
         return (outcomes, findings);
     }
-    let precision = layout.precision();
+    let precision = &layout.precision;
     for &sensor in &layout.sensors {
         let name = sensor_name(setup, sensor);
-        let own: Vec<(usize, Unknown, f64)> = (layout.further.iter().zip(layout.inertial()..).zip(&precision))
+        let own: Vec<(usize, Unknown, f64)> = (layout.further.iter().zip(layout.inertial()..).zip(precision))
             .filter_map(|((further, column), precision)| match *further {
                 Further::Calibration(other, unknown) if other == sensor => {
                     Some((column, unknown, precision.sqrt().recip()))
@@ -522,7 +522,7 @@ fn of_links(identified: &Identified) -> DMatrix<f64> {
     let order: Vec<usize> = (links..links + further).chain(0..links).collect();
     let mut all = r.select_columns(&order).resize_vertically(rows + further, 0.0);
     let layout = &identified.layout;
-    for (place, (precision, own)) in layout.precision().into_iter().zip(&layout.further).enumerate() {
+    for (place, (precision, own)) in layout.precision.iter().copied().zip(&layout.further).enumerate() {
         all[(rows + place, place)] = if own.lacks_cad() { 0.0 } else { precision.sqrt() };
     }
     all.qr().r().view((further, further), (links, links)).into_owned()
@@ -534,7 +534,7 @@ fn cad_root(layout: &Layout, r: &DMatrix<f64>, spread: &[DMatrix<f64>]) -> DMatr
     let count = layout.unknowns();
     let fitted = layout.beside_cad();
     let given: Vec<usize> = (0..count).filter(|column| !fitted.contains(column)).collect();
-    let precision = layout.precision();
+    let precision = &layout.precision;
     let mut root = DMatrix::zeros(count, count);
     for (place, spread) in spread.iter().enumerate() {
         root.view_mut((WIDTH * place, WIDTH * place), (WIDTH, WIDTH))
@@ -604,7 +604,7 @@ fn links(
         let rows = inverse * root.rows(WIDTH * place, WIDTH).into_owned();
         weighed.rows_mut(WIDTH * place, WIDTH).copy_from(&rows);
     }
-    for (precision, row) in layout.precision().into_iter().zip(layout.inertial()..) {
+    for (precision, row) in layout.precision.iter().copied().zip(layout.inertial()..) {
         weighed.row_mut(row).scale_mut(precision.sqrt());
     }
     // root root^T - (root weighed^T)(...)^T
@@ -1681,7 +1681,7 @@ mod tests {
         let found = squared(&cad_root(&layout, &r, std::slice::from_ref(&spread)));
         let (links, rotors) = (r.columns(0, 10).into_owned(), r.columns(10, 2).into_owned());
         let mut precision = rotors.transpose() * &rotors;
-        for (place, own) in layout.precision().into_iter().enumerate() {
+        for (place, own) in layout.precision.iter().copied().enumerate() {
             precision[(place, place)] += own;
         }
         let inverse = precision.try_inverse().expect("known");

@@ -526,7 +526,7 @@ pub(super) fn added(told: &[Told], unknowns: usize) -> Information {
 
 fn posterior(prior: &Prior, layout: &Layout, information: &Information) -> Result<Posterior, IdentifyError> {
     let (r, z) = information.to_triangle();
-    Ok(Posterior::new(prior, &layout.links, &r, &z, &layout.precision())?)
+    Ok(Posterior::new(prior, &layout.links, &r, &z, &layout.precision)?)
 }
 
 /// CAD's bodies, and of what CAD says nothing ([`Further::lacks_cad`]) the values that go best with them, by their priors and by what these data tell; no rotor's inertia is negative. (Not from the log
@@ -535,7 +535,7 @@ fn beside_cad(layout: &Layout, information: &Information) -> DVector<f64> {
     let mut x = DVector::zeros(layout.unknowns());
     let mut columns = layout.beside_cad();
     let (r, z) = information.to_triangle();
-    let (rows, precision) = (r.nrows(), layout.precision());
+    let (rows, precision) = (r.nrows(), &layout.precision);
     while !columns.is_empty() {
         let mut own = r.select_columns(&columns).resize_vertically(rows + columns.len(), 0.0);
         for (place, &column) in columns.iter().enumerate() {
@@ -582,7 +582,7 @@ fn without_negative_rotors(
     let is_negative = |x: &DVector<f64>, column: usize| x[column] < 0.0 && is_rotor(layout, column);
     while keep.iter().any(|&column| is_negative(&x, column)) {
         keep.retain(|&column| !is_negative(&x, column));
-        let precision = layout.precision();
+        let precision = &layout.precision;
         let of_kept = keep.iter().filter(|column| **column >= layout.inertial());
         let precision: Vec<f64> = of_kept.map(|column| precision[column - layout.inertial()]).collect();
         let own = Posterior::new(prior, &layout.links, &r.select_columns(&keep), &z, &precision)?.fit(fit.tau)?;
@@ -782,7 +782,7 @@ fn with_gains(
         settled = settle(setup, maker, &used(prepared), Some(settled.noise), &mut progress)?;
         read_as_fitted(maker, prepared, &settled);
         let layout = maker.layout();
-        let own = layout.precision().into_iter().zip(layout.inertial()..);
+        let own = layout.precision.iter().copied().zip(layout.inertial()..);
         let now: Vec<f64> = own
             .map(|(precision, column)| settled.fit.x[column] * precision.sqrt())
             .collect();
@@ -1319,7 +1319,7 @@ pub(super) fn joint_zeros(maker: &RowMaker<'_>, training: &[&Prepared], identifi
         let (r, z) = sum.to_triangle();
         let keep: Vec<usize> = (0..p).chain(columns.iter().map(|c| p + c)).collect();
         let r = r.select_columns(&keep);
-        let mut precision = layout.precision();
+        let mut precision = layout.precision.clone();
         precision.resize(layout.further.len() + columns.len(), SPREAD.powi(-2));
         let fit = Posterior::new(&identified.prior, &layout.links, &r, &z, &precision)
             .ok()?
@@ -1394,7 +1394,7 @@ pub(super) fn feasibility(setup: &Setup, identified: &Identified) -> super::outc
         &identified.layout.links,
         &r,
         &z,
-        &identified.layout.precision(),
+        &identified.layout.precision,
     ) {
         Ok(nearest) => Consistency {
             feasible: match &nearest.verdict {

@@ -337,7 +337,7 @@ impl Normal {
             let mut own = self.matrix.fixed_view_mut::<WIDTH, WIDTH>(WIDTH * place, WIDTH * place);
             own += prior.metric(link) / (2.0 * tau * tau);
         }
-        for (precision, column) in layout.precision().into_iter().zip(layout.inertial()..) {
+        for (precision, column) in layout.precision.iter().copied().zip(layout.inertial()..) {
             self.matrix[(column, column)] += precision;
         }
     }

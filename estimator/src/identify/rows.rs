@@ -87,7 +87,7 @@ pub(super) struct Layout {
     pub links: Vec<usize>,
     /// What else of the robot shows in at least one row: a column of `A` each, after those of the links.
     pub further: Vec<Further>,
-    /// Precision of the prior of each of these.
+    /// Precision of the prior of each of these, for [`super::prior::Posterior`].
     pub precision: Vec<f64>,
     /// F/T sensors that do, ascending; six columns of `G` and of `N` each, [torque; force].
     pub sensors: Vec<usize>,
@@ -104,11 +104,6 @@ impl Layout {
     /// Number of the robot's unknowns: of columns of `A`.
     pub(super) fn unknowns(&self) -> usize {
         self.inertial() + self.further.len()
-    }
-
-    /// Precision of the prior of each further unknown, for [`super::prior::Posterior`].
-    pub(super) fn precision(&self) -> Vec<f64> {
-        self.precision.clone()
     }
 
     /// The column of a further unknown, if it shows.

@@ -284,7 +284,7 @@ pub(super) fn late(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Id
         tell_with(maker, piece, &identified.noise, 1, &mut columns)
     });
     let (r, z) = added(&told, p + 1).to_triangle();
-    let mut precision = layout.precision();
+    let mut precision = layout.precision.clone();
     precision.push(SPREAD.powi(-2));
     let fit = Posterior::new(&identified.prior, &layout.links, &r, &z, &precision)
         .ok()?
