@@ -1094,7 +1094,7 @@ fn joint_torques_do_not_hide_a_turned_sensor() {
     for (number, joint) in ARM_JOINTS.into_iter().enumerate() {
         let rate = 0.031 + 0.007 * number as f64;
         log = change_rows(&log, &format!("joint/{joint}/torque"), |i, x| {
-            x + 40.0 * (rate * i as f64).sin()
+            x + 300.0 * (rate * i as f64).sin()
         });
     }
     for axis in AXES {
