@@ -148,8 +148,7 @@ pub fn swapped(channel: usize) -> usize {
 }
 
 fn wrench(torque_first: &Vector6<f64>) -> Wrench {
-    let [tx, ty, tz, fx, fy, fz] = (*torque_first).into();
-    Wrench::from_parts([fx, fy, fz], [tx, ty, tz])
+    Wrench::from_torque_first((*torque_first).into())
 }
 
 /// What of a sensor's calibration is unknown, and identified.

@@ -396,8 +396,8 @@ impl Parameters {
     #[must_use]
     pub fn offset_deviation(&self, place: usize) -> Option<Wrench> {
         let first = 10 * self.identified().count() + 6 * place;
-        let [tx, ty, tz, fx, fy, fz] = self.deviations.get(first..first + 6)?.try_into().ok()?;
-        Some(Wrench::from_parts([fx, fy, fz], [tx, ty, tz]))
+        let deviations = self.deviations.get(first..first + 6)?.try_into().ok()?;
+        Some(Wrench::from_torque_first(deviations))
     }
 
     /// Standard deviations of what was identified of a sensor's calibration, by its place in [`Parameters::offsets`]: in the order of [`Kind::unknowns`].

@@ -241,6 +241,11 @@ impl Wrench {
         }
     }
 
+    /// The inverse of [`Wrench::torque_first`].
+    pub fn from_torque_first([tx, ty, tz, fx, fy, fz]: [f64; 6]) -> Self {
+        Self::from_parts([fx, fy, fz], [tx, ty, tz])
+    }
+
     /// The six components in the order of regressors' rows and offsets, `[tx ty tz fx fy fz]` [Nm, N].
     pub fn torque_first(&self) -> [f64; 6] {
         let (n, f) = (&self.torque, &self.force);

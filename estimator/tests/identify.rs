@@ -440,6 +440,17 @@ fn state(phase: &[f64], t: f64) -> ([f64; 6], [f64; 6], [f64; 6]) {
     out
 }
 
+/// Kinematics of the arm at positions, velocities and accelerations, its base upright and at rest.
+fn move_to(kinematics: &mut Kinematics, arm: &Model, (q, dq, ddq): &([f64; 6], [f64; 6], [f64; 6])) {
+    let joints = JointState {
+        position: q,
+        velocity: dq,
+        acceleration: ddq,
+    };
+    let base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.80665));
+    kinematics.update(arm, joints, &base).expect("a state");
+}
+
 /// A log of the arm with these bodies: `seconds` at 100 Hz, noise of the sensor's configured size, correlated over `memory` samples.
 fn simulate(setup: &Setup, truth: &Model, seconds: f64, memory: f64, seed: u64) -> String {
     let mut noise = Noise(seed);
@@ -469,13 +480,7 @@ fn simulate(setup: &Setup, truth: &Model, seconds: f64, memory: f64, seed: u64) 
     for i in 0..(100.0 * seconds) as usize {
         let t = i as f64 * 0.01;
         let (q, dq, ddq) = state(&phase, t);
-        let joints = JointState {
-            position: &q,
-            velocity: &dq,
-            acceleration: &ddq,
-        };
-        let base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.80665));
-        kinematics.update(truth, joints, &base).expect("a state");
+        move_to(&mut kinematics, truth, &(q, dq, ddq));
         dynamics.update(truth, &kinematics, &[]).expect("a state");
         text += &format!("{t}");
         for joint in 0..6 {
@@ -516,13 +521,7 @@ fn simulate_torques(
     for i in 0..(100.0 * seconds) as usize {
         let t = i as f64 * 0.01;
         let (q, dq, ddq) = state(&phase, t);
-        let joints = JointState {
-            position: &q,
-            velocity: &dq,
-            acceleration: &ddq,
-        };
-        let base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.80665));
-        kinematics.update(truth, joints, &base).expect("a state");
+        move_to(&mut kinematics, truth, &(q, dq, ddq));
         dynamics.update(truth, &kinematics, &[]).expect("a state");
         text += &format!("{t}");
         for joint in 0..6 {
@@ -555,13 +554,7 @@ fn torque_errors(setup: &Setup, truth: &Model, outcome: &Outcome, seed: u64) -> 
         .collect();
     for i in 0..200 {
         let (q, dq, ddq) = state(&phase, 0.1 * f64::from(i));
-        let joints = JointState {
-            position: &q,
-            velocity: &dq,
-            acceleration: &ddq,
-        };
-        let base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.80665));
-        kinematics.update(truth, joints, &base).expect("a state");
+        move_to(&mut kinematics, truth, &(q, dq, ddq));
         regressor.update(truth, &kinematics).expect("a state");
         for dof in 2..6 {
             let row = regressor.joint_row(dof).expect("a row");
@@ -1319,13 +1312,7 @@ fn before_the_sensor(setup: &Setup, parameters: &Parameters, truth: &Model, log:
     for row in 0..log["t"].len() {
         let of = |what: &str| ARM_JOINTS.map(|joint| log[&format!("joint/{joint}/{what}")][row]);
         let (q, dq, ddq) = (of("position"), of("velocity"), of("acceleration"));
-        let joints = JointState {
-            position: &q,
-            velocity: &dq,
-            acceleration: &ddq,
-        };
-        let base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.80665));
-        kinematics.update(truth, joints, &base).expect("a state");
+        move_to(&mut kinematics, truth, &(q, dq, ddq));
         dynamics.update(truth, &kinematics, &[]).expect("a state");
         let error = got["torque/j2"][row] - dynamics.torque()[1];
         let deviation = got["torque_std/j2"][row];

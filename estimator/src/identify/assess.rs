@@ -8,6 +8,7 @@ use super::outcome::{
 };
 use super::passes::{OFFSET_VARIANCE, Residuals, Told, leave, tell};
 use super::rows::{FRICTION, Further, Layout, RowMaker, Rows, WIDTH};
+use super::session::Block;
 use super::{AXES, dot, parallel, torques};
 use crate::calibration::{Kind, Unknown, swapped};
 use crate::config::{Gain, IdentificationInput};
@@ -401,8 +402,7 @@ fn calibrations(
         if kind.is_empty() {
             continue;
         }
-        let [tx, ty, tz, fx, fy, fz] = kelvin;
-        let more = Wrench::from_parts([fx, fy, fz], [tx, ty, tz]);
+        let more = Wrench::from_torque_first(kelvin);
         let reference = maker.reference(sensor).filter(|_| kind.temperature);
         let deviation: Vec<f64> = own.iter().map(|(column, ..)| root.row(*column).norm()).collect();
         let prior: Vec<f64> = own.iter().map(|(.., prior)| *prior).collect();
@@ -1052,6 +1052,16 @@ fn onset(instants: &[super::instants::Instant]) -> Option<Nanos> {
     ((moved.t - first.t).seconds() > 0.5).then_some(moved.t)
 }
 
+/// What is compared in a block: parameters, and the log's own unknowns with them. CAD with what is configured, CAD with what was fitted, what was identified.
+fn cases<'a>(
+    sets: &'a [DVector<f64>; 2],
+    configured: &'a [f64],
+    block: &'a Block,
+) -> [(&'a DVector<f64>, &'a [f64]); 3] {
+    let (fitted, own) = block.x.as_slice().split_at(block.x.nrows());
+    [(&sets[0], configured), (&sets[0], fitted), (&sets[1], own)]
+}
+
 fn two_route(
     maker: &mut RowMaker<'_>,
     instants: &[super::instants::Instant],
@@ -1065,17 +1075,11 @@ fn two_route(
     let mut series = [vec![Vec::new(); dofs], vec![Vec::new(); dofs], vec![Vec::new(); dofs]];
     let mut rows = Rows::new(&layout);
     for (range, block) in left.ranges.iter().zip(&left.session) {
+        let cases = cases(sets, &configured, block);
         for instant in &instants[range.clone()] {
             if layout.sensors.len() < 2 || maker.make(instant, &mut rows).is_err() {
                 continue;
             }
-            let fitted = block.x.column(0).into_owned();
-            let own = block.x.column(1).into_owned();
-            let cases = [
-                (&sets[0], configured.as_slice()),
-                (&sets[0], fitted.as_slice()),
-                (&sets[1], own.as_slice()),
-            ];
             for (series, (d, session)) in series.iter_mut().zip(cases) {
                 let apart = maker.imbalance(instant, d.as_slice(), session);
                 series
@@ -1184,7 +1188,7 @@ pub(super) struct Compared {
 impl Compared {
     /// `sets`: CAD, the identified parameters; `left`: of these two.
     pub(super) fn new(
-        maker: &mut RowMaker<'_>,
+        maker: &RowMaker<'_>,
         instants: &[super::instants::Instant],
         left: &Residuals,
         identified: &Identified,
@@ -1195,7 +1199,6 @@ impl Compared {
         let empty = || vec![vec![f64::NAN; instants.len()]; 6 * layout.sensors.len()];
         let (mut load, mut errors) = (empty(), [empty(), empty(), empty()]);
         let variances = identified.noise.following();
-        let maker: &RowMaker<'_> = maker;
         let channels = 6 * layout.sensors.len();
         let parts = parallel::map_with(
             left.ranges.len().div_ceil(TOGETHER),
@@ -1204,13 +1207,8 @@ impl Compared {
                 let blocks = part * TOGETHER..left.ranges.len().min((part + 1) * TOGETHER);
                 let mut out = Vec::new();
                 for (range, block) in left.ranges[blocks.clone()].iter().zip(&left.session[blocks]) {
-                    let fitted = block.x.column(0).into_owned();
-                    let own = block.x.column(1).into_owned();
-                    let cases = [
-                        (&sets[0], configured.as_slice()),
-                        (&sets[0], fitted.as_slice()),
-                        (&sets[1], own.as_slice()),
-                    ];
+                    let cases = cases(sets, &configured, block);
+                    let (_, own) = cases[2];
                     for instant in &instants[range.clone()] {
                         let start = out.len();
                         out.resize(start + channels, [f64::NAN; 4]);

@@ -808,8 +808,8 @@ fn read_as_fitted(maker: &RowMaker<'_>, prepared: &mut [Prepared], settled: &Set
         for (i, instant) in piece.instants.iter().enumerate() {
             let mut readings = vec![Wrench::from_parts([f64::NAN; 3], [f64::NAN; 3]); instant.readings.len()];
             for (place, &sensor) in layout.sensors.iter().enumerate() {
-                let [tx, ty, tz, fx, fy, fz] = std::array::from_fn(|axis| left.noise[0][6 * place + axis][i]);
-                readings[sensor] = instant.readings[sensor] - Wrench::from_parts([fx, fy, fz], [tx, ty, tz]);
+                let noise = std::array::from_fn(|axis| left.noise[0][6 * place + axis][i]);
+                readings[sensor] = instant.readings[sensor] - Wrench::from_torque_first(noise);
             }
             fitted.push(readings);
         }

@@ -13,7 +13,6 @@ use super::outcome::{Finding, Severity};
 use super::passes::{OFFSET_VARIANCE, session_prior};
 use super::rows::{RowMaker, Rows};
 use super::session::Session;
-use crate::calibration::swapped;
 use crate::dynamics::{SensorCut, Structure};
 use crate::model::{MeasurementDirection, MeasurementFrame};
 use crate::setup::Setup;
@@ -247,9 +246,8 @@ fn frames(setup: &Setup, sensor: usize) -> Vec<Candidate> {
         for (text, pose) in &poses {
             let change = Matrix6::from_columns(&std::array::from_fn::<_, 6, _>(|channel| {
                 let mut unit = [0.0; 6];
-                unit[swapped(channel)] = sign;
-                let [fx, fy, fz, tx, ty, tz] = unit;
-                let in_child = pose.wrench(&Wrench::from_parts([fx, fy, fz], [tx, ty, tz]));
+                unit[channel] = sign;
+                let in_child = pose.wrench(&Wrench::from_torque_first(unit));
                 Vector6::from(configured.wrench_back(&in_child).torque_first())
             }));
             let is_new = |other: &Matrix6<f64>| (change - other).amax() > 1e-6;

@@ -1310,7 +1310,7 @@ impl Part {
         }
         for (place, offset) in solution.offsets.iter_mut().enumerate() {
             let six = |i: usize| self.reference[6 * place + i] + solution.estimate[6 * place + i];
-            *offset = Wrench::from_parts([six(3), six(4), six(5)], [six(0), six(1), six(2)]);
+            *offset = Wrench::from_torque_first(std::array::from_fn(six));
         }
         Ok(())
     }
