@@ -35,6 +35,7 @@ mod export;
 mod gate;
 pub mod information;
 pub mod instants;
+mod lanes;
 mod mounting;
 mod noise;
 pub mod online;

@@ -22,21 +22,21 @@
 //!
 //! # Where the speed comes from
 //! A panel is absorbed column by column by Householder reflections of the panel's column and one number of `R`: 2 m n^2 operations for `m` rows, all of them
-//! in loops over the panel's columns, which are contiguous, short, and stay in the first cache. Exact zeros are skipped: a column that is zero in the
-//! panel costs nothing until a reflection fills it. So rows about few unknowns are cheap, provided that their panel has no other rows.
+//! in loops over the panel's columns, which are contiguous, short, and stay in the first cache. Four reflections are applied together, to eight columns at a time, in the widest instructions of the processor
+//! ([`super::lanes`]). Exact zeros are skipped: a column that is zero in the panel costs little until a reflection fills it. So rows about few unknowns are cheap, provided that their panel has no other rows.
 //!
-//! Six rows a sample, plain x86-64, `cargo bench -p proprio-estimator --bench identify` (two-core virtual machine, Intel Xeon, other work on it: fastest of
+//! Six rows a sample, plain x86-64, `cargo bench -p proprio-estimator --bench identify` (two-core virtual machine, AMD EPYC with AVX-512: fastest of
 //! 100), us per sample, solution once per panel:
 //!
 //! | unknowns | panels of 1 sample | 4 | 8 | 16 |
 //! |---|---|---|---|---|
-//! | 44 | 6.4 | 3.0 | 2.6 | 2.3 |
-//! | 66 | 13.2 | 6.2 | 5.4 | 4.8 |
-//! | 120 | 38.6 | 18.6 | 16.2 | 15.5 |
-//! | 426 | 472 | 218 | 196 | 190 |
+//! | 44 | 5.0 | 1.8 | 1.3 | 1.0 |
+//! | 66 | 9.5 | 3.5 | 2.5 | 2.0 |
+//! | 120 | 27 | 7.9 | 5.4 | 4.1 |
+//! | 426 | 317 | 112 | 80 | 65 |
 //!
-//! Rows about 56 of 426 unknowns that nothing links to the others, panels of 8: 8.9. A step of six walks among 44 unknowns: 0.8 us if they are the first,
-//! 6.4 if the last; of 36 among 426: 96 us and 1270.
+//! Rows about 56 of 426 unknowns that nothing links to the others, panels of 8: 6.1. A step of six walks among 44 unknowns: 0.6 us if they are the first,
+//! 5.5 if the last; of 36 among 426: 92 us and 1200.
 //!
 //! # Why it stays sound
 //! - Every step is an orthogonal transformation; each is backward stable column by column, whatever the scales of the columns (Higham, "Accuracy and Stability of
@@ -46,8 +46,10 @@
 //!   equal rows.
 
 use nalgebra::{DMatrix, DVector};
+use pulp::{Arch, Simd, WithSimd};
 
-use super::{LANES, dot};
+use super::dot;
+use super::lanes::{self, LANES, TOGETHER};
 
 /// Why rows were refused, or why nothing can be solved.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -208,6 +210,168 @@ fn add_multiple(to: &mut [f64], factor: f64, from: &[f64]) {
     }
 }
 
+/// Columns that reflections are applied to together.
+const COLUMNS: usize = 8;
+
+/// A Householder reflection of a panel's column `v` and the diagonal element of `R` in the same column, `[alpha; v] -> [beta; 0]`.
+#[derive(Clone, Copy, Default)]
+struct Reflection {
+    column: usize,
+    /// `beta - alpha`.
+    delta: f64,
+    per_beta: f64,
+    per_delta: f64,
+    /// `v . v_i` with those of the reflections before it that are applied together with it.
+    products: [f64; TOGETHER],
+}
+
+/// Reflects the rows of a panel into the triangle `[R | z]` of so many unknowns. Of the panel's right side there remains what nothing explains.
+struct Reflect<'a> {
+    unknowns: usize,
+    triangle: &'a mut [f64],
+    /// Of the panel, with those that it is padded with; and the distance of its columns.
+    rows: usize,
+    stride: usize,
+    panel: &'a mut [f64],
+    filled: &'a mut [bool],
+}
+
+impl WithSimd for Reflect<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self {
+            unknowns,
+            triangle,
+            rows,
+            stride,
+            panel,
+            filled,
+        } = self;
+        let width = unknowns + 1;
+        let (mut pending, mut count) = ([Reflection::default(); TOGETHER], 0);
+        for k in 0..width {
+            let (before, own) = panel.split_at_mut(k * stride);
+            let own = &mut own[..rows];
+            for reflection in &pending[..count] {
+                let r = &mut triangle[reflection.column * width + k];
+                if filled[k] || *r != 0.0 {
+                    filled[k] = true;
+                    let v = &before[reflection.column * stride..][..rows];
+                    let growth = (lanes::inner(simd, v, own) - reflection.delta * *r) * reflection.per_beta;
+                    *r += growth;
+                    lanes::add(simd, own, -(growth * reflection.per_delta), v);
+                }
+            }
+            if k == unknowns || !filled[k] {
+                continue;
+            }
+            let diagonal = &mut triangle[k * width + k];
+            // It keeps the sign of alpha: R is then corrected, by delta = beta - alpha on the diagonal, written such that nothing cancels (Parlett 1971; Higham 2002, sect. 19.1).
+            let (alpha, sigma) = (*diagonal, lanes::inner(simd, own, own));
+            if sigma <= 1e-40 * alpha * alpha + 1e-280 {
+                continue; // far below rounding
+            }
+            let delta = sigma / (alpha + (alpha * alpha + sigma).sqrt());
+            *diagonal = alpha + delta;
+            let mut products = [0.0; TOGETHER];
+            for (product, other) in products.iter_mut().zip(&pending[..count]) {
+                *product = lanes::inner(simd, own, &before[other.column * stride..][..rows]);
+            }
+            pending[count] = Reflection {
+                column: k,
+                delta,
+                per_beta: 1.0 / *diagonal,
+                per_delta: 1.0 / delta,
+                products,
+            };
+            count += 1;
+            if count == TOGETHER {
+                let (before, after) = panel.split_at_mut((k + 1) * stride);
+                let four = pending.map(|reflection| &before[reflection.column * stride..][..rows]);
+                let columns = after
+                    .chunks_mut(COLUMNS * stride)
+                    .zip(filled[k + 1..].chunks_mut(COLUMNS));
+                for (number, (columns, filled)) in columns.enumerate() {
+                    let first = k + 1 + number * COLUMNS;
+                    let rows_above = pending.map(|reflection| reflection.column * width + first);
+                    apply(
+                        simd,
+                        (&pending, four),
+                        (&mut *triangle, rows_above),
+                        (columns, stride),
+                        filled,
+                    );
+                }
+                count = 0;
+            }
+        }
+    }
+}
+
+/// Applies four reflections, one after the other in effect, to some columns of the panel and to the triangle's numbers above them. With `c` a column, `r_j` the triangle's number in the row of
+/// reflection `j`, and `c + sum_{i < j} f_i v_i` what reflection `j` finds: `r_j` grows by `g_j = (v_j . c + sum_{i < j} f_i v_j . v_i - delta_j r_j) / beta_j`, and `f_j = -g_j / delta_j`.
+#[inline(always)]
+fn apply<S: Simd>(
+    simd: S,
+    (reflections, four): (&[Reflection; TOGETHER], [&[f64]; TOGETHER]),
+    (triangle, places): (&mut [f64], [usize; TOGETHER]),
+    (columns, stride): (&mut [f64], usize),
+    filled: &mut [bool],
+) {
+    let (count, rows) = (filled.len(), four[0].len());
+    let mut above = [[0.0; COLUMNS]; TOGETHER];
+    for (above, place) in above.iter_mut().zip(places) {
+        above[..count].copy_from_slice(&triangle[place..][..count]);
+    }
+    let mut is_any = false;
+    for (place, filled) in filled.iter_mut().enumerate() {
+        for above in &above {
+            *filled |= above[place] != 0.0;
+        }
+        is_any |= *filled;
+    }
+    if !is_any {
+        return;
+    }
+    // What is not filled is zero, and stays it.
+    let mut factors = [[0.0; COLUMNS]; TOGETHER];
+    for (place, column) in columns.chunks(stride).enumerate() {
+        for (products, product) in factors
+            .iter_mut()
+            .zip(lanes::inner_of_four(simd, four, &column[..rows]))
+        {
+            products[place] = product;
+        }
+    }
+    for (j, reflection) in reflections.iter().enumerate() {
+        let (earlier, own) = factors.split_at_mut(j);
+        for (earlier, product) in earlier.iter().zip(&reflection.products) {
+            for place in 0..COLUMNS {
+                own[0][place] += earlier[place] * product;
+            }
+        }
+        for place in 0..COLUMNS {
+            let growth = (own[0][place] - reflection.delta * above[j][place]) * reflection.per_beta;
+            above[j][place] += growth;
+            own[0][place] = -(growth * reflection.per_delta);
+        }
+    }
+    for (above, place) in above.iter().zip(places) {
+        triangle[place..][..count].copy_from_slice(&above[..count]);
+    }
+    for (place, column) in columns.chunks_mut(stride).enumerate() {
+        let own = [
+            factors[0][place],
+            factors[1][place],
+            factors[2][place],
+            factors[3][place],
+        ];
+        lanes::add_four(simd, &mut column[..rows], own, four);
+    }
+}
+
 /// `[R | z]`, row by row; below the diagonal zeros.
 #[derive(Clone, Debug, PartialEq)]
 struct Triangle {
@@ -236,41 +400,22 @@ impl Triangle {
 
     /// Takes the panel's rows in and leaves it empty. Returns by how much the residual's square sum grows.
     fn absorb(&mut self, panel: &mut Panel) -> f64 {
-        let (width, stride, rows) = (self.unknowns + 1, panel.stride, panel.pad());
+        let rows = panel.pad();
         if rows == 0 {
             return 0.0;
         }
-        for k in 0..self.unknowns {
-            if !panel.filled[k] {
-                continue;
-            }
-            let (head, tail) = panel.values.split_at_mut((k + 1) * stride);
-            let v = &head[k * stride..k * stride + rows];
-            let Some((diagonal, right_of_it)) = self.values[k * width + k..(k + 1) * width].split_first_mut() else {
-                continue;
-            };
-            // The reflection that takes [alpha; v] to [beta; 0], beta = |[alpha; v]|. It keeps the sign of alpha: R is then corrected, by
-            // delta = beta - alpha on the diagonal, written such that nothing cancels (Parlett 1971; Higham 2002, sect. 19.1).
-            let (alpha, sigma) = (*diagonal, dot(v, v));
-            if sigma <= 1e-40 * alpha * alpha + 1e-280 {
-                continue; // far below rounding
-            }
-            let delta = sigma / (alpha + (alpha * alpha + sigma).sqrt());
-            *diagonal = alpha + delta;
-            let (per_beta, per_delta) = (1.0 / *diagonal, 1.0 / delta);
-            let columns = tail.chunks_exact_mut(stride).zip(right_of_it);
-            for ((column, r), filled) in columns.zip(&mut panel.filled[k + 1..]) {
-                if !*filled && *r == 0.0 {
-                    continue;
-                }
-                *filled = true;
-                let column = &mut column[..rows];
-                let correction = (dot(v, column) - delta * *r) * per_beta;
-                *r += correction;
-                add_multiple(column, -(correction * per_delta), v);
-            }
-        }
-        let right = &panel.values[self.unknowns * stride..self.unknowns * stride + rows];
+        let Panel {
+            stride, values, filled, ..
+        } = &mut *panel;
+        Arch::new().dispatch(Reflect {
+            unknowns: self.unknowns,
+            triangle: &mut self.values,
+            rows,
+            stride: *stride,
+            panel: values,
+            filled,
+        });
+        let right = &panel.values[self.unknowns * panel.stride..][..rows];
         let residual = dot(right, right);
         panel.clear();
         residual

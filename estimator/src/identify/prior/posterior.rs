@@ -1,12 +1,14 @@
 //! Data beside a prior: the graded coordinates, Newton's method on the cost in them, and what it ends with. The page is that of [`super`].
 
 use nalgebra::linalg::Cholesky;
-use nalgebra::{DMatrix, DVector, DVectorView, Dyn, Matrix4, Vector4};
+use nalgebra::{DMatrix, DVector, Dyn, Matrix4, Vector4};
+use pulp::{Arch, Simd, WithSimd};
 
 use super::{
     Centre, GREATEST_TAU, Matrix10, Prior, PriorError, Vector10, blocked, body_of, check_finite, congruence,
     divergence, pack, stationary_tau, unpack,
 };
+use crate::identify::lanes;
 use crate::spatial::RigidInertia;
 
 /// No body that is handed out is thinner in any direction than this, by CAD's measure and squared; the pseudo-inertia stays positive definite when rounded.
@@ -424,10 +426,15 @@ impl Posterior {
         for (index, (value, &(unit, _))) in chart.further(&u).iter().zip(&self.further).enumerate() {
             x[10 * links + index] = value * unit;
         }
-        // gamma = 10 L - tr(posterior covariance x prior precision), over the links' part.
-        let prior_rows = descent.prior_rows.rows(0, 10 * links).into_owned().transpose();
+        // gamma = 10 L - tr(H^-1 K), K the links' part of the prior's. With H = S^2 + K + K_f, S the data's diagonal, K_f the further unknowns': of that trace what S and K_f leave.
         let inverse = blocked::inverse(descent.factor.l_dirty());
-        let effective = (10.0 * links as f64 - (&inverse * prior_rows).norm_squared()).max(0.0);
+        let of_data = inverse.column_iter().zip(chart.scale.iter());
+        let of_data: f64 = of_data
+            .map(|(column, scale)| scale * scale * column.norm_squared())
+            .sum();
+        let further = descent.prior_rows.rows(10 * links, self.further.len()).transpose();
+        let of_further = self.further.len() as f64 - (&inverse * further).norm_squared();
+        let effective = (of_data - of_further).max(0.0);
         let residual_square = self.residual_square + chart.excess(&y);
         let mut maps = Vec::with_capacity(links);
         for (centre, l) in self.centres.iter().zip(&chart.stretch) {
@@ -627,27 +634,20 @@ impl Graded {
             data.swap_columns(step, pivot);
             order.swap(step, pivot);
             squares.swap(step, pivot);
-            let reflector = &mut reflector[step..];
             let (head, tail) = data.as_mut_slice().split_at_mut((step + 1) * rows);
             let column = &mut head[step * rows + step..];
-            reflector.copy_from_slice(column);
             let sign = if column[0] < 0.0 { -1.0 } else { 1.0 };
+            let reflector = &mut reflector[step..];
+            reflector.copy_from_slice(column);
             reflector[0] += sign * length;
-            // |v|^2 / 2
-            let half = length * (length + sign * column[0]);
-            let reflect = |target: &mut [f64]| {
-                let v = DVectorView::from_slice(reflector, reflector.len());
-                let factor = v.dot(&DVectorView::from_slice(target, target.len())) / half;
-                for (value, v) in target.iter_mut().zip(reflector.iter()) {
-                    *value -= factor * v;
-                }
-            };
-            for (other, square) in tail.chunks_exact_mut(rows).zip(&mut squares[step + 1..]) {
-                reflect(&mut other[step..]);
-                let left = &other[step + 1..];
-                *square = DVectorView::from_slice(left, left.len()).norm_squared();
-            }
-            reflect(&mut right.as_mut_slice()[step..]);
+            Arch::new().dispatch(Reflect {
+                reflector,
+                per_half: 1.0 / (length * (length + sign * column[0])),
+                columns: tail,
+                rows,
+                squares: &mut squares[step + 1..],
+                right: &mut right.as_mut_slice()[step..],
+            });
             column[0] = -sign * length;
             column[1..].fill(0.0);
             scale[step] = length;
@@ -673,6 +673,38 @@ impl Graded {
     /// `T^-1`, upper triangular.
     fn inverse(&self) -> DMatrix<f64> {
         blocked::inverse(&self.t.transpose()).transpose()
+    }
+}
+
+/// Reflects the rows from that of the pivot on of the columns after it, and of the right side; and leaves the square norms of what is below that row.
+struct Reflect<'a> {
+    reflector: &'a [f64],
+    /// Two over the reflector's square norm.
+    per_half: f64,
+    columns: &'a mut [f64],
+    rows: usize,
+    squares: &'a mut [f64],
+    right: &'a mut [f64],
+}
+
+impl WithSimd for Reflect<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Some((first, below)) = self.reflector.split_first() else {
+            return;
+        };
+        let step = self.rows - self.reflector.len();
+        for (column, square) in self.columns.chunks_exact_mut(self.rows).zip(self.squares) {
+            if let Some((own_first, own)) = column[step..].split_first_mut() {
+                let factor = -self.per_half * (first * *own_first + lanes::inner(simd, below, own));
+                *own_first += factor * first;
+                *square = lanes::add_and_square(simd, own, factor, below);
+            }
+        }
+        let factor = -self.per_half * lanes::inner(simd, self.reflector, self.right);
+        lanes::add(simd, self.right, factor, self.reflector);
     }
 }
 

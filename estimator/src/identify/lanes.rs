@@ -1,0 +1,107 @@
+//! Inner loops over long slices in the widest instructions of the processor that runs them, in a portable build too ([`pulp`]). To be called within [`pulp::Arch::dispatch`]: without closures in between,
+//! which would be compiled for any processor.
+
+use pulp::Simd;
+
+/// Vectors that go together where there are many: nothing then waits for a single sum.
+pub(super) const TOGETHER: usize = 4;
+
+/// A multiple of the numbers in a vector of any processor.
+pub(super) const LANES: usize = 8;
+
+/// The inner product of two slices of one length.
+#[inline(always)]
+pub(super) fn inner<S: Simd>(simd: S, a: &[f64], b: &[f64]) -> f64 {
+    let ((a, a_rest), (b, b_rest)) = (S::as_simd_f64s(a), S::as_simd_f64s(b));
+    let mut sum = simd.splat_f64s(0.0);
+    for (a, b) in a.iter().zip(b) {
+        sum = simd.mul_add_e_f64s(*a, *b, sum);
+    }
+    let mut total = simd.reduce_sum_f64s(sum);
+    for (a, b) in a_rest.iter().zip(b_rest) {
+        total += a * b;
+    }
+    total
+}
+
+/// The inner products of four slices with one, whose length is a multiple of [`LANES`].
+#[inline(always)]
+pub(super) fn inner_of_four<S: Simd>(simd: S, four: [&[f64]; TOGETHER], c: &[f64]) -> [f64; TOGETHER] {
+    let [a, b, d, e] = vectors::<S>(four);
+    let mut sums = [simd.splat_f64s(0.0); TOGETHER];
+    for ((((c, a), b), d), e) in S::as_simd_f64s(c).0.iter().zip(a).zip(b).zip(d).zip(e) {
+        sums[0] = simd.mul_add_e_f64s(*a, *c, sums[0]);
+        sums[1] = simd.mul_add_e_f64s(*b, *c, sums[1]);
+        sums[2] = simd.mul_add_e_f64s(*d, *c, sums[2]);
+        sums[3] = simd.mul_add_e_f64s(*e, *c, sums[3]);
+    }
+    let [a, b, d, e] = sums;
+    [
+        simd.reduce_sum_f64s(a),
+        simd.reduce_sum_f64s(b),
+        simd.reduce_sum_f64s(d),
+        simd.reduce_sum_f64s(e),
+    ]
+}
+
+/// `c += f v`.
+#[inline(always)]
+pub(super) fn add<S: Simd>(simd: S, c: &mut [f64], factor: f64, v: &[f64]) {
+    let ((c, c_rest), (v, v_rest)) = (S::as_mut_simd_f64s(c), S::as_simd_f64s(v));
+    let splat = simd.splat_f64s(factor);
+    for (c, v) in c.iter_mut().zip(v) {
+        *c = simd.mul_add_e_f64s(splat, *v, *c);
+    }
+    for (c, v) in c_rest.iter_mut().zip(v_rest) {
+        *c += factor * v;
+    }
+}
+
+/// `c += f v`, and then `c . c`.
+#[inline(always)]
+pub(super) fn add_and_square<S: Simd>(simd: S, c: &mut [f64], factor: f64, v: &[f64]) -> f64 {
+    let ((c, c_rest), (v, v_rest)) = (S::as_mut_simd_f64s(c), S::as_simd_f64s(v));
+    let (splat, mut sum) = (simd.splat_f64s(factor), simd.splat_f64s(0.0));
+    for (c, v) in c.iter_mut().zip(v) {
+        *c = simd.mul_add_e_f64s(splat, *v, *c);
+        sum = simd.mul_add_e_f64s(*c, *c, sum);
+    }
+    let mut total = simd.reduce_sum_f64s(sum);
+    for (c, v) in c_rest.iter_mut().zip(v_rest) {
+        *c += factor * v;
+        total += *c * *c;
+    }
+    total
+}
+
+/// `c += sum f_j v_j`.
+#[inline(always)]
+pub(super) fn add_four<S: Simd>(simd: S, c: &mut [f64], factors: [f64; TOGETHER], four: [&[f64]; TOGETHER]) {
+    let mut splat = [simd.splat_f64s(0.0); TOGETHER];
+    for (splat, factor) in splat.iter_mut().zip(factors) {
+        *splat = simd.splat_f64s(factor);
+    }
+    let [a, b, d, e] = vectors::<S>(four);
+    let (c, rest) = S::as_mut_simd_f64s(c);
+    let done = four[0].len() - rest.len();
+    for ((((c, a), b), d), e) in c.iter_mut().zip(a).zip(b).zip(d).zip(e) {
+        let half = simd.mul_add_e_f64s(splat[1], *b, simd.mul_add_e_f64s(splat[0], *a, *c));
+        *c = simd.add_f64s(half, simd.mul_add_e_f64s(splat[3], *e, simd.mul_f64s(splat[2], *d)));
+    }
+    for (i, c) in rest.iter_mut().enumerate() {
+        for (factor, v) in factors.iter().zip(four) {
+            *c += factor * v[done + i];
+        }
+    }
+}
+
+#[inline(always)]
+fn vectors<S: Simd>(four: [&[f64]; TOGETHER]) -> [&[S::f64s]; TOGETHER] {
+    let [a, b, d, e] = four;
+    [
+        S::as_simd_f64s(a).0,
+        S::as_simd_f64s(b).0,
+        S::as_simd_f64s(d).0,
+        S::as_simd_f64s(e).0,
+    ]
+}
