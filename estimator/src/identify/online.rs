@@ -31,6 +31,7 @@
 //! Offsets wander between blocks (random walks), and stand still while a contact is declared or suspected. How fast each wanders is found by the likelihood of what its channel
 //! reads in the mean from one second to the next (`wander`), between bounds, so that a slow push is not taken for one.
 
+mod rows;
 pub mod state;
 mod wander;
 
@@ -39,8 +40,12 @@ use std::sync::Arc;
 use nalgebra::{DMatrix, DMatrixView};
 use proprio_topics::{Nanos, Reason};
 
+use pulp::{Arch, Simd, WithSimd};
+
+use self::rows::{Instant, Kinds, Rows, spread};
 use self::wander::Walk;
 use super::information::{Information, InformationError, Panel};
+use super::lanes::{self, TOGETHER};
 use super::prior::{GREATEST_TAU, Posterior, Prior, PriorError};
 use super::{dot, factorise, forward};
 use crate::dynamics::{ContactSet, DofSet, DynamicsError, Kinematics, Structure};
@@ -84,6 +89,10 @@ const NEAR: f64 = 1e-4;
 const NEAREST: f64 = 1e-8;
 /// A step of the prior's weight, as a logarithm, that is worth no second fit at once: the next second begins with it.
 const SETTLED: f64 = 1e-3;
+/// Half of the memory that is kept for jobs \[B\]; glibc follows up to 32 MiB.
+const KEPT: usize = 24 << 20;
+/// A series of residuals that is longer has holes that nothing explains [instants].
+const LONGEST: usize = 100_000;
 /// Window of the autocorrelation time, in such times (Sokal 1997).
 const SOKAL: f64 = 6.0;
 
@@ -241,9 +250,8 @@ pub struct ComponentSolution {
     pub rows: u64,
     /// Whether all this is found from the data up to [`Solution::data`]. Else nothing that can exist fitted these, and it is what was there before.
     pub is_accepted: bool,
-    /// `[s | d]`, and a factor `F` of its covariance `F F^T`, column by column.
+    /// `[s | d]`.
     estimate: Vec<f64>,
-    factor: Vec<f64>,
 }
 
 /// What a job found.
@@ -255,108 +263,27 @@ pub struct Solution {
     pub components: Vec<ComponentSolution>,
 }
 
-/// Rows of some instants, whitened, over `[s | d | right side]`.
-#[derive(Clone, Debug)]
-struct Rows {
-    width: usize,
-    /// Rows that fit in.
-    room: usize,
-    values: Vec<f64>,
-    /// Of each row, the instant's number in the grid.
-    slots: Vec<i64>,
-    /// How long they were gathered [s], and whether something moved meanwhile.
-    span: f64,
-    is_moving: bool,
-}
-
-impl Rows {
-    fn new(width: usize, room: usize) -> Self {
-        Self {
-            width,
-            room,
-            values: Vec::with_capacity(width * room),
-            slots: Vec::with_capacity(room),
-            span: 0.0,
-            is_moving: false,
-        }
-    }
-
-    fn len(&self) -> usize {
-        self.slots.len()
-    }
-
-    fn clear(&mut self) {
-        self.values.clear();
-        self.slots.clear();
-        (self.span, self.is_moving) = (0.0, false);
-    }
-
-    /// Adds a row if there is room.
-    fn push(&mut self, slot: i64, row: &[f64]) {
-        if self.len() < self.room {
-            self.values.extend_from_slice(row);
-            self.slots.push(slot);
-        }
-    }
-
-    fn take_from(&mut self, other: &Self) {
-        for (row, slot) in other.iter().zip(&other.slots) {
-            self.push(*slot, row);
-        }
-    }
-
-    fn iter(&self) -> impl Iterator<Item = &[f64]> {
-        self.values.chunks_exact(self.width)
-    }
-
-    fn instants(&self) -> u64 {
-        let new = self.slots.windows(2).filter(|two| two[0] != two[1]).count() as u64;
-        new + u64::from(!self.slots.is_empty())
-    }
-}
-
 /// Information about some of a component's unknowns alone.
 #[derive(Clone, Debug)]
 struct Limb {
-    /// The unknowns, ascending, and whether each of the component's is among them.
     columns: Vec<usize>,
-    is_own: Vec<bool>,
     information: Information,
     panel: Panel,
-    row: Vec<f64>,
 }
 
 impl Limb {
-    fn new(columns: Vec<usize>, unknowns: usize, rows: usize) -> Self {
+    fn new(columns: Vec<usize>, rows: usize) -> Self {
         Self {
-            is_own: (0..unknowns).map(|column| columns.contains(&column)).collect(),
             information: Information::new(columns.len()),
             panel: Panel::new(columns.len(), rows),
-            row: vec![0.0; columns.len()],
             columns,
         }
-    }
-
-    /// Takes a row if it is about these unknowns alone.
-    fn takes(&mut self, a: &[f64], y: f64) -> bool {
-        if !a
-            .iter()
-            .zip(&self.is_own)
-            .all(|(value, is_own)| *is_own || *value == 0.0)
-        {
-            return false;
-        }
-        for (to, &column) in self.row.iter_mut().zip(&self.columns) {
-            *to = a[column];
-        }
-        self.panel.push_row(&self.row, y).is_ok()
     }
 }
 
 /// Sub-trees that sensors join, and what is known of them.
 #[derive(Clone, Debug)]
 struct Component {
-    subtrees: Vec<usize>,
     /// The link that tells how its sensors are tilted.
     top: usize,
     links: Vec<usize>,
@@ -367,14 +294,15 @@ struct Component {
     passing: ContactSet,
     /// CAD and configured offsets, `[s | d]`.
     reference: Vec<f64>,
-    /// Per sub-tree, the component's column of each of its columns.
-    columns: Vec<Vec<usize>>,
+    kinds: Arc<Kinds>,
     /// Columns of the links at the ends of its limbs.
     outermost: Vec<usize>,
     information: Information,
     panel: Panel,
     /// Of a large component, what its limbs' rows told since they last joined the information.
     limbs: Vec<Limb>,
+    /// Which of these the rows of each kind go to, if to any.
+    limb_of: Vec<Option<usize>>,
     /// For how long offsets have wandered since they last did in the information, and how long they may [s].
     wandered: f64,
     stride: f64,
@@ -409,18 +337,19 @@ struct Component {
     /// What was learnt from: seconds in motion, rows.
     motion: f64,
     rows: u64,
+    /// The rows of the present instant.
+    instant: Instant,
     row: Vec<f64>,
     scratch: Scratch,
 }
 
-/// Room for the rows of an instant, and for the gate.
+/// Room for the gate.
 #[derive(Clone, Debug)]
 struct Scratch {
-    /// Rows over `[s | d | right side]`.
-    rows: Vec<f64>,
     covariance: Vec<f64>,
     mean: Vec<f64>,
     projected: Vec<f64>,
+    innovations: Vec<f64>,
 }
 
 /// Identification of a robot's inertial parameters and F/T offsets, on-line. See the [module](self).
@@ -488,6 +417,13 @@ impl Online {
             .collect();
         if components.is_empty() {
             return Err(OnlineError::Nothing);
+        }
+        // Matrices of a large component are of a size that glibc gets from the system, and gives back, one by one: a tenth of a job's time. Once it has freed a larger block, it keeps as much.
+        if components
+            .iter()
+            .any(|component| component.information.unknowns() >= LARGE)
+        {
+            drop(std::hint::black_box(Vec::<u8>::with_capacity(KEPT)));
         }
         let prior = Arc::new(Prior::new(cad)?);
         let solution = Solution {
@@ -817,20 +753,25 @@ impl Component {
                 set.union(&structure.subtrees()[k].contacts)
             })
             .difference(always);
-        let (width, most) = (unknowns + 1, 6 * subtrees.len());
-        let limbs: Vec<Limb> = (told_of(stacked, &subtrees, &columns).into_iter())
-            .filter(|own| unknowns >= LARGE && 2 * own.len() <= unknowns)
-            .map(|own| Limb::new(own, unknowns, most * per_block))
-            .collect();
+        let kinds = Arc::new(Kinds::new(stacked, &subtrees, &columns, (session, unknowns)));
+        let (mut limbs, mut limb_of) = (Vec::new(), Vec::new());
+        for kind in kinds.iter() {
+            let is_limb = unknowns >= LARGE && 2 * kind.columns.len() <= unknowns;
+            limb_of.push(is_limb.then_some(limbs.len()));
+            if is_limb {
+                limbs.push(Limb::new(kind.columns.clone(), 6 * per_block));
+            }
+        }
+        let most = kinds.most();
         Self {
             top,
             stride: if limbs.is_empty() { 0.0 } else { GATHERED },
             wandered: 0.0,
             limbs,
+            limb_of,
             dofs,
             passing,
             reference,
-            columns,
             outermost,
             information: Information::new(unknowns),
             panel: Panel::new(unknowns, most * per_block),
@@ -839,10 +780,10 @@ impl Component {
             wander: noise.iter().map(|sigma| wander::GUESS * sigma).collect(),
             offsets: (0..session).collect(),
             deviations: vec![0.0; session],
-            gathered: Rows::new(width, most * per_block),
-            pending: Rows::new(width, most * per_block),
-            learnt: Rows::new(width, most * per_job),
-            aside: Rows::new(width, most * per_job),
+            gathered: Rows::new(&kinds, per_block),
+            pending: Rows::new(&kinds, per_block),
+            learnt: Rows::new(&kinds, per_job),
+            aside: Rows::new(&kinds, per_job),
             block_from: Nanos::MIN,
             drifted: Nanos::MIN,
             active: ContactSet::default(),
@@ -857,14 +798,15 @@ impl Component {
             counts: Counts::default(),
             motion: 0.0,
             rows: 0,
-            row: vec![0.0; width],
+            instant: Instant::new(&kinds),
+            row: vec![0.0; unknowns],
             scratch: Scratch {
-                rows: Vec::with_capacity(most * width),
                 covariance: vec![0.0; most * most],
-                mean: vec![0.0; most * width],
+                mean: vec![0.0; unknowns + 1],
                 projected: vec![0.0; most * unknowns],
+                innovations: vec![0.0; most],
             },
-            subtrees,
+            kinds,
             links,
             sensors,
         }
@@ -921,8 +863,14 @@ impl Component {
             } += 1;
             return;
         }
-        let rows = self.rows_of(stacked);
-        if rows == 0 {
+        for (deviation, variance) in self.deviations.iter_mut().zip(&self.variances) {
+            *deviation = variance.sqrt();
+        }
+        if self
+            .instant
+            .make(&self.kinds, stacked, &self.reference, &self.deviations)
+            == 0
+        {
             self.paused = Paused::Contact;
             self.counts.contact += 1;
             return;
@@ -940,54 +888,15 @@ impl Component {
             }
             self.cosine = self.cosine.min(direction.dot(&self.direction));
         }
-        for row in self.scratch.rows.chunks_exact(self.row.len()) {
-            self.gathered.push(slot, row);
-        }
+        self.gathered.push(slot, &self.instant);
         self.gathered.is_moving |= seen.is_base_moved || !seen.moved.intersection(&self.dofs[base]).is_empty();
-    }
-
-    /// Makes the whitened rows of the regressor's last update, in the scratch; how many.
-    fn rows_of(&mut self, stacked: &StackedRegressor) -> usize {
-        let width = self.row.len();
-        let session = self.offsets.len();
-        let Scratch { rows, covariance, .. } = &mut self.scratch;
-        rows.clear();
-        for (&number, columns) in self.subtrees.iter().zip(&self.columns) {
-            let subtree = &stacked.subtrees()[number];
-            for (index, measured) in subtree.projected_measured().iter().enumerate() {
-                self.row.fill(0.0);
-                let mut right = *measured;
-                for (&column, value) in columns.iter().zip(subtree.projected_row(index)) {
-                    self.row[column] = *value;
-                    right -= value * self.reference[column];
-                }
-                self.row[width - 1] = right;
-                rows.extend_from_slice(&self.row);
-            }
-        }
-        let count = rows.len() / width;
-        if rows.iter().any(|value| !value.is_finite()) {
-            rows.clear();
-            return 0;
-        }
-        // Noise enters as offsets do.
-        for i in 0..count {
-            for j in 0..=i {
-                let (a, b) = (&rows[i * width..][..session], &rows[j * width..][..session]);
-                let products = a.iter().zip(b).zip(&self.variances).map(|((x, y), v)| x * y * v);
-                covariance[i * count + j] = products.sum();
-            }
-        }
-        factorise(covariance, count);
-        forward(covariance, count, rows, width);
-        count
     }
 
     /// The end of a block: the gate judges, offsets wander, rows go in or aside.
     fn close(&mut self, t: Nanos, known: &ComponentSolution) {
         let elapsed = (t - self.drifted).seconds().clamp(0.0, 60.0);
         self.drifted = t;
-        if self.gathered.len() > 0 && self.judges && self.is_odd(known) {
+        if !self.gathered.is_empty() && self.judges && self.is_odd(known) {
             self.lasts = self.is_suspected;
             if !self.is_suspected {
                 self.is_suspected = true;
@@ -1001,7 +910,7 @@ impl Component {
             self.gathered.clear();
             return;
         }
-        if self.gathered.len() > 0 && self.is_suspected {
+        if !self.gathered.is_empty() && self.is_suspected {
             self.clean += 1;
             if self.clean < CLEAN {
                 let instants = self.gathered.instants();
@@ -1022,7 +931,7 @@ impl Component {
             self.wandered = 0.0;
             let _ = self.information.drift(&self.offsets, &self.deviations);
         }
-        if self.gathered.len() > 0 {
+        if !self.gathered.is_empty() {
             self.absorb();
             self.gathered.span = (t - self.block_from).seconds().min(2.0 * BLOCK.seconds());
             std::mem::swap(&mut self.pending, &mut self.gathered);
@@ -1040,23 +949,29 @@ impl Component {
 
     /// What limbs gathered joins the rest.
     fn join(&mut self) {
-        let width = self.row.len();
         for limb in &mut self.limbs {
             if limb.information.rows() > 0 {
-                let row = &mut self.row[..width - 1];
                 // Made for each other.
-                let _ = (self.information).take(&mut limb.information, &limb.columns, &mut self.panel, row);
+                let (panel, row) = (&mut self.panel, &mut self.row);
+                let _ = (self.information).take(&mut limb.information, &limb.columns, panel, row);
             }
         }
     }
 
     /// Takes the pending block in.
     fn absorb(&mut self) {
-        for row in self.pending.iter() {
-            let (a, y) = row.split_at(row.len() - 1);
-            if !self.limbs.iter_mut().any(|limb| limb.takes(a, y[0])) {
-                // Finite, and there is room.
-                let _ = self.panel.push_row(a, y[0]);
+        // Finite, and there is room.
+        for ((kind, rows), limb) in self.kinds.iter().zip(self.pending.iter()).zip(&self.limb_of) {
+            let mut limb = limb.and_then(|limb| self.limbs.get_mut(limb));
+            for (a, y, _) in rows.iter() {
+                if let Some(limb) = &mut limb {
+                    let _ = limb.panel.push_row(a, y);
+                } else if a.len() == self.row.len() {
+                    let _ = self.panel.push_row(a, y);
+                } else {
+                    spread(kind, a, &mut self.row);
+                    let _ = self.panel.push_row(&self.row, y);
+                }
             }
         }
         let _ = self.information.absorb(&mut self.panel);
@@ -1077,63 +992,110 @@ impl Component {
 
     /// Whether the mean innovation of the gathered block is beyond what noise and the uncertainty of what is in force explain.
     fn is_odd(&mut self, known: &ComponentSolution) -> bool {
-        let (width, unknowns, session) = (self.row.len(), self.row.len() - 1, self.offsets.len());
-        if known.factor.len() != unknowns * unknowns {
+        let unknowns = self.kinds.unknowns();
+        if known.estimate.len() != unknowns || known.root.shape() != (unknowns, unknowns) {
             return false;
         }
         let Scratch {
             mean,
             projected,
             covariance,
-            ..
+            innovations,
         } = &mut self.scratch;
-        // Instants of a block have equally many rows, made alike: their sum over the root of their number has unit noise.
-        let Some(first) = self.gathered.slots.first() else {
-            return false;
-        };
-        let m = self.gathered.slots.iter().take_while(|slot| *slot == first).count();
-        let instants = self.gathered.len() / m;
-        mean[..m * width].fill(0.0);
-        let scale = 1.0 / (instants as f64).sqrt();
-        for (number, row) in self.gathered.iter().take(m * instants).enumerate() {
-            let place = number % m;
-            add_multiple(&mut mean[place * width..][..width], scale, row);
-        }
-        for i in 0..m {
-            let row = &mean[i * width..][..unknowns];
-            // Of a limb's row all else is zero.
-            let (offsets, bodies) = row.split_at(session);
-            let from = bodies.iter().position(|x| *x != 0.0).unwrap_or(bodies.len());
-            let to = bodies.iter().rposition(|x| *x != 0.0).map_or(from, |last| last + 1);
-            for (k, factor) in known.factor.chunks_exact(unknowns).enumerate() {
-                let (of_offsets, of_bodies) = factor.split_at(session);
-                projected[i * unknowns + k] = dot(offsets, of_offsets) + dot(&bodies[from..to], &of_bodies[from..to]);
+        let mut m = 0;
+        for (kind, rows) in self.kinds.iter().zip(self.gathered.iter()) {
+            // Instants of a block have equally many rows, made alike: their sum over the root of their number has unit noise.
+            let Some(first) = rows.slots().first() else { continue };
+            let own = rows.slots().iter().take_while(|slot| *slot == first).count();
+            let instants = rows.slots().len() / own;
+            let scale = 1.0 / (instants as f64).sqrt();
+            let width = kind.columns.len() + 1;
+            let mean = &mut mean[..width];
+            for index in 0..own {
+                mean.fill(0.0);
+                for row in rows
+                    .values()
+                    .chunks_exact(width)
+                    .skip(index)
+                    .step_by(own)
+                    .take(instants)
+                {
+                    add_multiple(mean, scale, row);
+                }
+                let (row, right) = mean.split_at(kind.columns.len());
+                let estimate = kind.columns.iter().map(|&column| known.estimate[column]);
+                innovations[m] = right[0] - estimate.zip(row).map(|(x, a)| x * a).sum::<f64>();
+                // U a: the columns of U are [d | s].
+                Arch::new().dispatch(Project {
+                    root: &known.root,
+                    session: self.offsets.len(),
+                    columns: &kind.columns,
+                    row,
+                    to: &mut projected[m * unknowns..][..unknowns],
+                });
+                m += 1;
             }
         }
         for i in 0..m {
             for j in 0..=i {
-                let product = dot(
-                    &projected[i * unknowns..][..unknowns],
-                    &projected[j * unknowns..][..unknowns],
-                );
-                covariance[i * m + j] = product + f64::from(u8::from(i == j));
+                let (a, b) = (&projected[i * unknowns..], &projected[j * unknowns..]);
+                covariance[i * m + j] = dot(&a[..unknowns], &b[..unknowns]) + f64::from(u8::from(i == j));
             }
         }
         factorise(covariance, m);
-        // Innovations, in the place of the first columns of the projections.
-        for i in 0..m {
-            let row = &mean[i * width..][..width];
-            projected[i] = row[unknowns] - dot(&row[..unknowns], &known.estimate);
-        }
-        forward(covariance, m, &mut projected[..m], 1);
-        let square: f64 = projected[..m].iter().map(|x| x * x).sum();
+        forward(covariance, m, &mut innovations[..m], 1);
+        let square: f64 = innovations[..m].iter().map(|x| x * x).sum();
         square > chi_square(m, GATE)
+    }
+}
+
+/// `U a` of a row over some unknowns of `[s | d]`, `U` over `[d | s]`.
+struct Project<'a> {
+    root: &'a DMatrix<f64>,
+    session: usize,
+    columns: &'a [usize],
+    row: &'a [f64],
+    to: &'a mut [f64],
+}
+
+impl WithSimd for Project<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let (rows, parameters) = (self.root.nrows(), self.root.ncols() - self.session);
+        let root = self.root.as_slice();
+        self.to.fill(0.0);
+        let (columns, rest) = self.columns.as_chunks::<TOGETHER>();
+        let (values, values_left) = self.row.as_chunks::<TOGETHER>();
+        for (columns, values) in columns.iter().zip(values) {
+            let mut four: [&[f64]; TOGETHER] = [&[]; TOGETHER];
+            for (own, &column) in four.iter_mut().zip(columns) {
+                *own = &root[rows * turned(column, self.session, parameters)..][..rows];
+            }
+            lanes::add_four(simd, self.to, *values, four);
+        }
+        for (&column, &value) in rest.iter().zip(values_left) {
+            let own = &root[rows * turned(column, self.session, parameters)..][..rows];
+            lanes::add(simd, self.to, value, own);
+        }
+    }
+}
+
+/// A column of `[s | d]` among those of `[d | s]`.
+#[inline(always)]
+fn turned(column: usize, session: usize, parameters: usize) -> usize {
+    if column < session {
+        parameters + column
+    } else {
+        column - session
     }
 }
 
 /// A component's share of a job.
 #[derive(Clone, Debug)]
 struct Part {
+    kinds: Arc<Kinds>,
     links: Vec<usize>,
     sensors: Vec<usize>,
     information: Information,
@@ -1213,6 +1175,7 @@ impl Part {
             pairs: [0.0; LAGS],
         };
         Self {
+            kinds: component.kinds.clone(),
             links: component.links.clone(),
             sensors: component.sensors.clone(),
             information: component.information.clone(),
@@ -1288,26 +1251,18 @@ impl Part {
             fit = posterior.fit_from(fit.x.as_slice(), tau, NEAREST)?;
         }
         self.tau = tau;
-        let factor = fit.covariance_root();
         solution.tau = fit.tau;
         solution.effective = fit.effective;
         solution.bodies.clone_from(&fit.bodies);
-        solution.root = factor.transpose();
+        solution.root = fit.covariance_root().transpose();
         for (to, rates) in solution.drift.iter_mut().zip(self.wander.chunks_exact(6)) {
             to.copy_from_slice(rates);
         }
         // [d | s] -> [s | d]
-        let turned = |values: &[f64], to: &mut Vec<f64>| {
-            let (bodies, offsets) = values.split_at(parameters.min(values.len()));
-            to.extend_from_slice(offsets);
-            to.extend_from_slice(bodies);
-        };
+        let (bodies, offsets) = fit.x.as_slice().split_at(parameters);
         solution.estimate.clear();
-        turned(fit.x.as_slice(), &mut solution.estimate);
-        solution.factor.clear();
-        for column in factor.as_slice().chunks_exact(unknowns) {
-            turned(column, &mut solution.factor);
-        }
+        solution.estimate.extend_from_slice(offsets);
+        solution.estimate.extend_from_slice(bodies);
         for (place, offset) in solution.offsets.iter_mut().enumerate() {
             let six = |i: usize| self.reference[6 * place + i] + solution.estimate[6 * place + i];
             *offset = Wrench::from_torque_first(std::array::from_fn(six));
@@ -1317,50 +1272,72 @@ impl Part {
 
     /// The channels' noise from the rows that went in, under the new solution: whitened residuals back to channels (Gauss, Markov).
     fn take_noise(&mut self, solution: &ComponentSolution) {
-        let (Some(&first), Some(&last)) = (self.learnt.slots.first(), self.learnt.slots.last()) else {
+        let slots = || {
+            self.learnt
+                .iter()
+                .flat_map(|rows| [rows.slots().first(), rows.slots().last()])
+                .flatten()
+        };
+        let (Some(&first), Some(&last)) = (slots().min(), slots().max()) else {
             return;
         };
-        let unknowns = solution.estimate.len();
+        let (session, unknowns) = (self.variances.len(), solution.estimate.len());
         let instants = usize::try_from(last - first).unwrap_or(0) + 1;
-        if instants > 100 * self.learnt.room {
+        if instants > LONGEST {
             return;
         }
         let mut series = vec![f64::NAN; instants];
-        let session = self.variances.len();
-        // What each channel's share, summed, says of the unknowns: its column of rows^T x weights.
-        let rows = DMatrixView::from_slice(&self.learnt.values, unknowns + 1, self.learnt.len());
-        let weights = DMatrix::from_fn(self.learnt.len(), session, |row, channel| {
-            self.variances[channel] * rows[(channel, row)]
-        });
-        let sensitivities = rows * weights;
+        // What each channel's share, summed, says of the bodies: its column of rows^T x weights.
+        let mut sensitivities = DMatrix::zeros(unknowns - session, session);
+        let mut residuals = Vec::with_capacity(self.learnt.len());
+        for (kind, rows) in self.kinds.iter().zip(self.learnt.iter()) {
+            let (width, count) = (kind.columns.len() + 1, rows.slots().len());
+            let all = DMatrixView::from_slice(rows.values(), width, count);
+            let weights = DMatrix::from_fn(count, kind.offsets, |row, place| {
+                self.variances[kind.columns[place]] * all[(place, row)]
+            });
+            let own = all * weights;
+            for (place, column) in own.column_iter().enumerate() {
+                let bodies = kind.columns.iter().zip(column.iter()).skip(kind.offsets);
+                bodies.for_each(|(at, value)| sensitivities[(at - session, kind.columns[place])] += value);
+            }
+            residuals.extend(rows.iter().map(|(row, right, _)| {
+                let estimate = kind.columns.iter().map(|&column| solution.estimate[column]);
+                right - estimate.zip(row).map(|(x, a)| x * a).sum::<f64>()
+            }));
+        }
+        // Per channel, the standard deviation that this has by the bodies: |U s|.
+        let of_bodies = solution.root.columns(0, unknowns - session) * sensitivities;
         // An offset that has jumped has not wandered there.
         if self.change.is_some() {
             self.walks.iter_mut().for_each(Walk::interrupt);
         }
-        let residuals: Vec<f64> = (self.learnt.iter())
-            .map(|row| row[unknowns] - dot(&row[..unknowns], &solution.estimate))
-            .collect();
         for channel in 0..session {
             series.fill(f64::NAN);
-            for ((row, slot), residual) in self.learnt.iter().zip(&self.learnt.slots).zip(&residuals) {
-                if row[channel] == 0.0 {
-                    continue;
-                }
-                let Some(place) = usize::try_from(slot - first).ok().and_then(|i| series.get_mut(i)) else {
+            let mut residuals = residuals.as_slice();
+            for (kind, rows) in self.kinds.iter().zip(self.learnt.iter()) {
+                let (own, rest) = residuals.split_at(rows.slots().len());
+                residuals = rest;
+                let Ok(at) = kind.columns[..kind.offsets].binary_search(&channel) else {
                     continue;
                 };
-                let share = self.variances[channel] * row[channel] * residual;
-                *place = if place.is_nan() { share } else { *place + share };
+                for ((row, _, slot), residual) in rows.iter().zip(own) {
+                    if row[at] == 0.0 {
+                        continue;
+                    }
+                    let Some(place) = usize::try_from(slot - first).ok().and_then(|i| series.get_mut(i)) else {
+                        continue;
+                    };
+                    let share = self.variances[channel] * row[at] * residual;
+                    *place = if place.is_nan() { share } else { *place + share };
+                }
             }
             // What the channel reads in the mean, less what the bodies explain; and how uncertain that is, by noise and by the bodies.
             let seen: Vec<f64> = series.iter().copied().filter(|x| x.is_finite()).collect();
             if !seen.is_empty() {
                 let count = seen.len() as f64;
                 let apparent = solution.estimate[channel] + seen.iter().sum::<f64>() / count;
-                let sensitivity = &sensitivities.as_slice()[channel * (unknowns + 1)..][session..unknowns];
-                let of_bodies: f64 = (solution.factor.chunks_exact(unknowns))
-                    .map(|column| (dot(&column[session..], sensitivity) / count).powi(2))
-                    .sum();
+                let of_bodies = of_bodies.column(channel).norm_squared() / (count * count);
                 let t = (first + last) as f64 / 2.0 * self.period;
                 self.walks[channel].take(t, apparent, self.variances[channel] / count + of_bodies);
                 self.wander[channel] = self.walks[channel].rate();
@@ -1382,7 +1359,7 @@ impl Part {
             return;
         }
         // Under a declared contact, or without a sensor, nothing is put aside: that time says nothing.
-        if self.aside.len() == 0 {
+        if self.aside.is_empty() {
             return;
         }
         self.lasting += SOLVE.seconds();
@@ -1402,10 +1379,13 @@ impl Part {
                 }
             }
         }
-        let mut panel = Panel::new(unknowns, self.aside.len().max(1));
+        let (mut panel, mut dense) = (Panel::new(unknowns, self.aside.len().max(1)), vec![0.0; unknowns]);
         for (_, information, _) in &mut self.hypotheses {
-            for row in self.aside.iter() {
-                let _ = panel.push_row(&row[..unknowns], row[unknowns]);
+            for (kind, rows) in self.kinds.iter().zip(self.aside.iter()) {
+                for (row, right, _) in rows.iter() {
+                    spread(kind, row, &mut dense);
+                    let _ = panel.push_row(&dense, right);
+                }
             }
             let _ = information.absorb(&mut panel);
         }
@@ -1437,13 +1417,6 @@ impl Part {
     }
 }
 
-impl Rows {
-    /// An empty one with as much room.
-    fn clone_room(&self) -> Self {
-        Self::new(self.width, self.room)
-    }
-}
-
 /// A snapshot of what was taken in, to be solved wherever there is time. Pure: what it finds depends on what it was given alone.
 #[derive(Debug)]
 pub struct Job {
@@ -1467,33 +1440,6 @@ impl Job {
     pub fn solution(&self) -> &Solution {
         &self.solution
     }
-}
-
-/// The unknowns that whitened rows of each sub-tree can tell of, ascending: its own, and those of the sub-trees before it that noise of common sensors joins to it.
-fn told_of(stacked: &StackedRegressor, subtrees: &[usize], columns: &[Vec<usize>]) -> Vec<Vec<usize>> {
-    let mut told: Vec<Vec<usize>> = Vec::new();
-    // Those so far that hang together have the number of the last of them.
-    let mut group: Vec<usize> = Vec::new();
-    for (number, &k) in subtrees.iter().enumerate() {
-        let sensors: Vec<usize> = stacked.subtrees()[k].sensors().collect();
-        for earlier in 0..number {
-            let shares = stacked.subtrees()[subtrees[earlier]]
-                .sensors()
-                .any(|s| sensors.contains(&s));
-            let of = group[earlier];
-            if shares && of != number {
-                group.iter_mut().filter(|g| **g == of).for_each(|g| *g = number);
-            }
-        }
-        group.push(number);
-        let joined = (0..number).filter(|&earlier| group[earlier] == number);
-        let mut own: Vec<usize> = joined.flat_map(|earlier| told[earlier].iter().copied()).collect();
-        own.extend(&columns[number]);
-        own.sort_unstable();
-        own.dedup();
-        told.push(own);
-    }
-    told
 }
 
 /// The number that a chi-square distribution with `freedom` degrees exceeds as often as a normal one exceeds `level` (Wilson, Hilferty 1931).
