@@ -18,27 +18,29 @@
 //! Where a sensor's calibration is uncertain, too ([`crate::calibration`]), its columns `U_c` count as its offset's by what it reads: `U_s` becomes `U_s - U_E r + U_k (T - T0)` at each
 //! instant ([`Propagation::set_reading`]).
 //!
+//! Loops over rows use the widest instructions of the processor, in a portable build too.
+//!
 //! Columns are ordered sensors first, then links from the tips to the top: what lies below a joint has short columns in the triangle. `U` and `W` are
 //! single precision: a standard deviation needs three digits, and has them even where parameters cancel to a hundred-thousandth of what each would do.
 //!
-//! Measured on iCub V2.5 (39 bodies, 426 columns), kinematics, solution and all deviations of 32 torques and seven full contact wrenches, one core of a shared
-//! two-core virtual machine (Intel Xeon, busy), plain x86-64 build, fastest of 100, with contacts / without (`cargo bench -p proprio-estimator --bench regressor`): each
-//! link uncertain by itself 13.5 / 15.7 us; the limbs beyond the sensors and all offsets correlated 17.1 / 18.5 us; all 426 columns correlated 23.3 / 24.6 us.
+//! Measured on iCub V2.5 (39 bodies, 426 columns), kinematics, solution and all deviations of 32 torques and seven full contact wrenches, one core of a
+//! two-core virtual machine (AMD EPYC with AVX-512), plain x86-64 build, fastest of 100, with contacts / without (`cargo bench -p proprio-estimator --bench regressor`): each
+//! link uncertain by itself 9.4 / 12.0 us; the limbs beyond the sensors and all offsets correlated 14.2 / 14.9 us; all 426 columns correlated 15.6 / 17.1 us.
 
 use std::ops::Range;
 
-use nalgebra::DMatrix;
+use nalgebra::{Cholesky, DMatrix};
 use proprio_topics::Nanos;
-use wide::f32x8;
+use pulp::{Arch, Simd, WithSimd};
 
 use super::link::{LinkRows, WIDTH, WITH_FORCE, link_rows};
 use crate::calibration::{Kind, Unknown};
 use crate::dynamics::{DynamicsError, Kinematics, Solver, Structure, check_size};
 use crate::spatial::{Motion, Pose, Wrench};
 
-/// Rows that are computed together.
-const LANES: usize = 8;
-type Lanes = f32x8;
+/// Rows that are kept together: as many as a vector of the widest processor has numbers, and a multiple of those of any other.
+const LANES: usize = 16;
+type Lanes = [f32; LANES];
 
 /// Covariance `P` of inertial parameters and F/T offsets, in blocks that are independent of each other, each as a root `U`, `P = U^T U`.
 ///
@@ -321,8 +323,10 @@ impl Piece {
         let count = self.rows.len();
         for (unknown, own) in &calibration.unknowns {
             let factor = single(unknown.as_offset(corrected, kelvin));
-            let sums = self.columns.iter_mut().skip(count * unknown.channel());
-            sums.zip(own).for_each(|(sum, value)| *sum += factor * *value);
+            let sums = self.columns.as_flattened_mut().iter_mut();
+            let sums = sums.skip(LANES * count * unknown.channel());
+            sums.zip(own.as_flattened())
+                .for_each(|(sum, value)| *sum += factor * value);
         }
     }
 }
@@ -413,13 +417,63 @@ impl Propagation {
             return Err(DynamicsError::NotSolved);
         }
         let begun = *self.begun.get_or_insert(t);
-        for (part, subtree) in self.parts.iter_mut().zip(structure.subtrees()) {
-            part.update(solver, kinematics);
+        Arch::new().dispatch(Update {
+            propagation: self,
+            structure,
+            solver,
+            kinematics,
+            times: (t, begun),
+        });
+        Ok(())
+    }
+
+    /// Standard deviations of the torques [Nm or N], by degree of freedom. Zero where nothing uncertain enters.
+    pub fn torque(&self) -> &[f64] {
+        &self.torque
+    }
+
+    /// Standard deviations of the contacts' wrenches, `[fx fy fz tx ty tz]` [N, Nm], in the order of the structure's.
+    pub fn contacts(&self) -> &[[f64; 6]] {
+        &self.contacts
+    }
+}
+
+/// All that [`Propagation::update`] does once it is clear that it can, in the instructions that the processor has.
+struct Update<'a> {
+    propagation: &'a mut Propagation,
+    structure: &'a Structure,
+    solver: &'a Solver,
+    kinematics: &'a Kinematics,
+    times: (Nanos, Nanos),
+}
+
+impl WithSimd for Update<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self {
+            propagation,
+            structure,
+            solver,
+            kinematics,
+            times,
+        } = self;
+        let Propagation {
+            parts,
+            drifts,
+            widened,
+            torque,
+            contacts,
+            ..
+        } = propagation;
+        for (part, subtree) in parts.iter_mut().zip(structure.subtrees()) {
+            part.update(simd, solver, kinematics);
             let wandered = |motion: &dyn Fn(usize) -> Motion| -> f64 {
                 let of = |end: &End| {
                     wander(
-                        (&self.drifts[end.sensor], &self.widened[end.sensor]),
-                        (t, begun),
+                        (&drifts[end.sensor], &widened[end.sensor]),
+                        times,
                         solver.sensor_pose(end.sensor),
                         || motion(end.link),
                     )
@@ -439,26 +493,15 @@ impl Propagation {
                         -*response
                     }
                 });
-                self.torque[dof] = (part.variance(place, axis, response) + moved).sqrt();
+                torque[dof] = (part.variance(simd, place, axis, response) + moved).sqrt();
             }
             for contact in subtree.contacts.iter() {
                 let motions = solver.contact_motions(contact);
-                for (deviation, motion) in self.contacts[contact].iter_mut().zip(motions) {
-                    *deviation = (part.variance_of_all(motion) + wandered(&|_| *motion)).sqrt();
+                for (deviation, motion) in contacts[contact].iter_mut().zip(motions) {
+                    *deviation = (part.variance_of_all(simd, motion) + wandered(&|_| *motion)).sqrt();
                 }
             }
         }
-        Ok(())
-    }
-
-    /// Standard deviations of the torques [Nm or N], by degree of freedom. Zero where nothing uncertain enters.
-    pub fn torque(&self) -> &[f64] {
-        &self.torque
-    }
-
-    /// Standard deviations of the contacts' wrenches, `[fx fy fz tx ty tz]` [N, Nm], in the order of the structure's.
-    pub fn contacts(&self) -> &[[f64; 6]] {
-        &self.contacts
     }
 }
 
@@ -524,8 +567,7 @@ impl Part {
             if wanted.is_empty() || block.root.nrows() == 0 {
                 continue;
             }
-            let root = DMatrix::from_fn(block.root.nrows(), wanted.len(), |i, j| block.root[(i, wanted[j])]);
-            let root = root.qr().r();
+            let root = triangle(block.root.select_columns(&wanted));
             if let [(Member::Link(number), link, _)] = members.as_slice() {
                 let at = |i, j| if i < root.nrows() && i <= j { root[(i, j)] } else { 0.0 };
                 let own = std::array::from_fn(|i| std::array::from_fn(|j| at(i, j)));
@@ -540,9 +582,8 @@ impl Part {
                 // Too large for single precision is infinite, and makes a deviation infinite.
                 #[allow(clippy::cast_possible_truncation, reason = "single precision suffices")]
                 let at = |row: usize, column: usize| if row < end { root[(row, column)] as f32 } else { 0.0 };
-                let lanes_of = |column: usize| {
-                    (0..count).map(move |chunk| Lanes::new(std::array::from_fn(|i| at(LANES * chunk + i, column))))
-                };
+                let lanes_of =
+                    |column: usize| (0..count).map(move |chunk| std::array::from_fn(|i| at(LANES * chunk + i, column)));
                 let lanes = first..first + columns.len();
                 first += columns.len();
                 if what == Member::Calibration {
@@ -592,7 +633,7 @@ impl Part {
             links[parent].rows = hull(&links[parent].rows, &below);
         }
         Self {
-            wrenches: vec![Lanes::ZERO; 6 * rows * links.len()],
+            wrenches: vec![[0.0; LANES]; 6 * rows * links.len()],
             below: if alone.is_empty() {
                 Vec::new()
             } else {
@@ -607,11 +648,12 @@ impl Part {
     }
 
     /// Computes `W` of every link.
-    fn update(&mut self, solver: &Solver, kinematics: &Kinematics) {
+    #[inline(always)]
+    fn update<S: Simd>(&mut self, simd: S, solver: &Solver, kinematics: &Kinematics) {
         let rows = self.rows;
         for (link, wrenches) in self.links.iter().zip(self.wrenches.chunks_exact_mut((6 * rows).max(1))) {
             for column in wrenches.chunks_exact_mut(rows.max(1)) {
-                column[link.rows.clone()].fill(Lanes::ZERO);
+                column[link.rows.clone()].fill([0.0; LANES]);
             }
         }
         for piece in &self.pieces {
@@ -619,10 +661,10 @@ impl Part {
             match piece.what {
                 Member::Link(link) => {
                     let coefficients = link_rows(kinematics.pose(link), kinematics.motion(link));
-                    add_link(out, rows, piece, &coefficients);
+                    add_link(simd, out, rows, piece, &coefficients);
                 }
                 Member::Sensor(sensor, plus) => {
-                    add_offset(out, rows, piece, solver.sensor_pose(sensor), plus);
+                    add_offset(simd, out, rows, piece, solver.sensor_pose(sensor), plus);
                 }
                 // Part of its sensor's.
                 Member::Calibration => {}
@@ -650,16 +692,18 @@ impl Part {
             for axis in 0..6 {
                 let below = &after[axis * rows..][range.clone()];
                 let above = &mut before[6 * rows * parent + axis * rows..][range.clone()];
+                let (above, below) = (vectors_mut::<S>(above), vectors::<S>(below));
                 for (sum, value) in above.iter_mut().zip(below) {
-                    *sum += *value;
+                    *sum = simd.add_f32s(*sum, *value);
                 }
             }
         }
     }
 
     /// `|W_l s - W_b h|^2`, `l` being the link at `place`.
-    fn variance(&self, place: usize, axis: &Motion, response: &Motion) -> f64 {
-        self.correlated(place, axis, response) + self.independent(place, axis, response)
+    #[inline(always)]
+    fn variance<S: Simd>(&self, simd: S, place: usize, axis: &Motion, response: &Motion) -> f64 {
+        self.correlated(simd, place, axis, response) + self.independent(place, axis, response)
     }
 
     fn independent(&self, place: usize, axis: &Motion, response: &Motion) -> f64 {
@@ -674,39 +718,67 @@ impl Part {
         (form(&s, below, &s) - 2.0 * form(&s, below, &h) + form(&h, all, &h)).max(0.0)
     }
 
-    fn correlated(&self, place: usize, axis: &Motion, response: &Motion) -> f64 {
-        let below = self.part_of(place);
-        let mut sum = Lanes::ZERO;
+    #[inline(always)]
+    fn correlated<S: Simd>(&self, simd: S, place: usize, axis: &Motion, response: &Motion) -> f64 {
+        let own = self.links[place].rows.clone();
+        let mut sum = simd.splat_f32s(0.0);
         if *response == Motion::zero() {
-            let s = splat(axis);
-            for row in self.links[place].rows.clone() {
-                let y = along(below, self.rows, row, &s);
-                sum += y * y;
+            let s = splat(simd, axis);
+            let below = self.axes::<S>(place, &own);
+            for i in 0..below[0].len() {
+                let y = along(simd, &below, i, &s);
+                sum = simd.mul_add_e_f32s(y, y, sum);
             }
         } else {
-            let (s, h, all) = (splat(axis), splat(response), self.part_of(0));
-            let own = &self.links[place].rows;
-            for row in self.links[0].rows.clone() {
-                let mut y = -along(all, self.rows, row, &h);
-                if own.contains(&row) {
-                    y += along(below, self.rows, row, &s);
+            let (s, minus_h) = (splat(simd, axis), splat(simd, &-*response));
+            // Below it are no other rows than there are in all.
+            let rows = self.links[0].rows.clone();
+            for (part, is_own) in [
+                (rows.start..own.start, false),
+                (own.clone(), true),
+                (own.end..rows.end, false),
+            ] {
+                let (all, below) = (self.axes::<S>(0, &part), self.axes::<S>(place, &part));
+                for i in 0..all[0].len() {
+                    let mut y = along(simd, &all, i, &minus_h);
+                    if is_own {
+                        y = simd.add_f32s(y, along(simd, &below, i, &s));
+                    }
+                    sum = simd.mul_add_e_f32s(y, y, sum);
                 }
-                sum += y * y;
             }
         }
-        f64::from(sum.reduce_add())
+        f64::from(simd.reduce_sum_f32s(sum))
     }
 
     /// `|W_b k|^2`.
-    fn variance_of_all(&self, motion: &Motion) -> f64 {
+    #[inline(always)]
+    fn variance_of_all<S: Simd>(&self, simd: S, motion: &Motion) -> f64 {
         if self.links.is_empty() || *motion == Motion::zero() {
             return 0.0;
         }
-        self.variance(0, motion, &Motion::zero())
+        self.variance(simd, 0, motion, &Motion::zero())
     }
 
-    fn part_of(&self, place: usize) -> &[Lanes] {
-        &self.wrenches[6 * self.rows * place..][..6 * self.rows]
+    /// Some rows of the six columns of a link's `W`.
+    #[inline(always)]
+    fn axes<S: Simd>(&self, place: usize, rows: &Range<usize>) -> [&[S::f32s]; 6] {
+        let all = &self.wrenches[6 * self.rows * place..][..6 * self.rows];
+        let mut axes: [&[S::f32s]; 6] = [&[]; 6];
+        if !rows.is_empty() {
+            for (axis, column) in axes.iter_mut().zip(all.chunks_exact(self.rows)) {
+                *axis = vectors::<S>(&column[rows.clone()]);
+            }
+        }
+        axes
+    }
+}
+
+/// The upper triangle `R` with `R^T R = U^T U`. By the product if that is positive definite: it loses nothing that single precision would keep, and is quick.
+fn triangle(root: DMatrix<f64>) -> DMatrix<f64> {
+    match Cholesky::new(root.transpose() * &root) {
+        Some(factor) => factor.l().transpose(),
+        None => root.qr().r(),
     }
 }
 
@@ -724,12 +796,28 @@ fn numbers(motion: &Motion) -> [f64; 6] {
 }
 
 #[allow(clippy::cast_possible_truncation, reason = "single precision suffices")]
-fn single(value: f64) -> Lanes {
-    Lanes::splat(value as f32)
+fn single(value: f64) -> f32 {
+    value as f32
 }
 
-fn splat(motion: &Motion) -> [Lanes; 6] {
-    numbers(motion).map(single)
+#[inline(always)]
+fn splat<S: Simd>(simd: S, motion: &Motion) -> [S::f32s; 6] {
+    let mut all = [simd.splat_f32s(0.0); 6];
+    for (to, value) in all.iter_mut().zip(numbers(motion)) {
+        *to = simd.splat_f32s(single(value));
+    }
+    all
+}
+
+/// Rows as vectors of the processor: a whole number of them.
+#[inline(always)]
+fn vectors<S: Simd>(rows: &[Lanes]) -> &[S::f32s] {
+    S::as_simd_f32s(rows.as_flattened()).0
+}
+
+#[inline(always)]
+fn vectors_mut<S: Simd>(rows: &mut [Lanes]) -> &mut [S::f32s] {
+    S::as_mut_simd_f32s(rows.as_flattened_mut()).0
 }
 
 /// `a^T C b`.
@@ -762,58 +850,84 @@ fn add_alone(out: &mut Covariance6, root: &Root, coefficients: &LinkRows) {
     }
 }
 
+/// One vector of `W m`.
 #[inline(always)]
-fn along(wrenches: &[Lanes], rows: usize, row: usize, motion: &[Lanes; 6]) -> Lanes {
-    let mut sum = wrenches[row] * motion[0];
-    for axis in 1..6 {
-        sum += wrenches[axis * rows + row] * motion[axis];
+fn along<S: Simd>(simd: S, axes: &[&[S::f32s]; 6], i: usize, motion: &[S::f32s; 6]) -> S::f32s {
+    let mut sum = simd.splat_f32s(0.0);
+    for (axis, m) in axes.iter().zip(motion) {
+        sum = simd.mul_add_e_f32s(axis[i], *m, sum);
     }
     sum
 }
 
 /// Adds `U_l A_l^T`.
-fn add_link(out: &mut [Lanes], rows: usize, piece: &Piece, coefficients: &LinkRows) {
-    let a: [[Lanes; 6]; WIDTH] = std::array::from_fn(|c| std::array::from_fn(|axis| single(coefficients[axis][c])));
-    let count = piece.rows.len();
-    for (i, row) in piece.rows.clone().enumerate() {
-        let mut sum: [Lanes; 6] = std::array::from_fn(|axis| out[axis * rows + row]);
-        for (column, a) in a.iter().enumerate() {
-            let u = piece.columns[column * count + i];
+#[inline(always)]
+fn add_link<S: Simd>(simd: S, out: &mut [Lanes], rows: usize, piece: &Piece, coefficients: &LinkRows) {
+    let mut a = [[0.0; 6]; WIDTH];
+    for (axis, row) in coefficients.iter().enumerate() {
+        for (a, value) in a.iter_mut().zip(row) {
+            a[axis] = single(*value);
+        }
+    }
+    let mut out = out.chunks_exact_mut(rows);
+    let mut next = || {
+        out.next()
+            .and_then(|column| column.get_mut(piece.rows.clone()))
+            .unwrap_or_default()
+    };
+    let [t0, t1, t2, f0, f1, f2] = [next(), next(), next(), next(), next(), next()];
+    let torques = vectors_mut::<S>(t0)
+        .iter_mut()
+        .zip(vectors_mut::<S>(t1))
+        .zip(vectors_mut::<S>(t2));
+    let forces = vectors_mut::<S>(f0)
+        .iter_mut()
+        .zip(vectors_mut::<S>(f1))
+        .zip(vectors_mut::<S>(f2));
+    let columns = vectors::<S>(&piece.columns);
+    let count = columns.len() / WIDTH;
+    for (i, (((t0, t1), t2), ((f0, f1), f2))) in torques.zip(forces).enumerate() {
+        let (mut torque, mut force) = ([*t0, *t1, *t2], [*f0, *f1, *f2]);
+        for (c, a) in a.iter().enumerate() {
+            let u = columns[c * count + i];
+            for axis in 0..3 {
+                torque[axis] = simd.mul_add_e_f32s(u, simd.splat_f32s(a[axis]), torque[axis]);
+            }
             // The tensor of inertia makes no force.
-            let width = if column < WITH_FORCE { 6 } else { 3 };
-            for (sum, a) in sum.iter_mut().zip(a).take(width) {
-                *sum += u * *a;
+            if c < WITH_FORCE {
+                for axis in 0..3 {
+                    force[axis] = simd.mul_add_e_f32s(u, simd.splat_f32s(a[axis + 3]), force[axis]);
+                }
             }
         }
-        for (axis, sum) in sum.into_iter().enumerate() {
-            out[axis * rows + row] = sum;
-        }
+        ([*t0, *t1, *t2], [*f0, *f1, *f2]) = (torque, force);
     }
 }
 
 /// Adds `U_s A_s^T`: a sensor's offset as the wrench, in base coordinates, that the links need more because of it.
-fn add_offset(out: &mut [Lanes], rows: usize, piece: &Piece, x_bm: &Pose, plus: bool) {
+#[inline(always)]
+fn add_offset<S: Simd>(simd: S, out: &mut [Lanes], rows: usize, piece: &Piece, x_bm: &Pose, plus: bool) {
     let sign = if plus { 1.0 } else { -1.0 };
     let turn = x_bm.rotation * sign;
     let levered = x_bm.translation.cross_matrix() * turn;
-    let splat = |m: &crate::spatial::Mat3| -> [[Lanes; 3]; 3] {
-        std::array::from_fn(|i| std::array::from_fn(|j| single(m[(i, j)])))
-    };
-    let (turn, levered) = (splat(&turn), splat(&levered));
-    let count = piece.rows.len();
-    for (i, row) in piece.rows.clone().enumerate() {
-        for axis in 0..3 {
-            let (mut torque, mut force) = (out[axis * rows + row], out[(axis + 3) * rows + row]);
-            for channel in 0..3 {
-                let (n, f) = (
-                    piece.columns[channel * count + i],
-                    piece.columns[(channel + 3) * count + i],
-                );
-                torque += n * turn[axis][channel] + f * levered[axis][channel];
-                force += f * turn[axis][channel];
+    let columns = vectors::<S>(&piece.columns);
+    let count = columns.len() / 6;
+    let (torques, forces) = out.split_at_mut(3 * rows);
+    let out = torques.chunks_exact_mut(rows).zip(forces.chunks_exact_mut(rows));
+    for (axis, (torque, force)) in out.enumerate() {
+        let torque = vectors_mut::<S>(&mut torque[piece.rows.clone()]);
+        let force = vectors_mut::<S>(&mut force[piece.rows.clone()]);
+        for channel in 0..3 {
+            let turn = simd.splat_f32s(single(turn[(axis, channel)]));
+            let levered = simd.splat_f32s(single(levered[(axis, channel)]));
+            let (n, f) = (
+                &columns[channel * count..][..count],
+                &columns[(channel + 3) * count..][..count],
+            );
+            for (((torque, force), n), f) in torque.iter_mut().zip(force.iter_mut()).zip(n).zip(f) {
+                *torque = simd.mul_add_e_f32s(*n, turn, simd.mul_add_e_f32s(*f, levered, *torque));
+                *force = simd.mul_add_e_f32s(*f, turn, *force);
             }
-            out[axis * rows + row] = torque;
-            out[(axis + 3) * rows + row] = force;
         }
     }
 }
