@@ -223,14 +223,9 @@ pub struct Estimate<const D: usize> {
 #[derive(Debug, Clone)]
 pub struct Window<const D: usize> {
     settings: Settings,
-    stamps: [Nanos; MAX_SAMPLES],
+    ring: Ring,
     values: [[f64; D]; MAX_SAMPLES],
-    /// Which samples begin anew: what came before them does not belong to the same motion.
-    anew: [bool; MAX_SAMPLES],
     interrupted: bool,
-    /// Where the newest sample is, and how many there are, oldest at `newest + 1 - len` modulo the length.
-    newest: usize,
-    len: usize,
 }
 
 /// What the stamps of the samples used say alone, whatever the values: it makes the better half of an estimate's work.
@@ -239,6 +234,10 @@ pub struct Window<const D: usize> {
 /// found once. A channel whose stamps differ finds its own; estimates are the same to the bit either way.
 #[derive(Debug, Clone)]
 pub struct Grid {
+    /// The window that it was made for, as far as stamps go: one with the same need not be looked through.
+    ring: Ring,
+    settings: (Nanos, Nanos, usize),
+    skipped: usize,
     /// How long before the newest sample the others were taken.
     before: [Nanos; MAX_SAMPLES],
     used: usize,
@@ -253,6 +252,17 @@ pub struct Grid {
     bases: [Basis; CANDIDATES],
     /// The instant that `Basis::here` is for, in the unit of `v`.
     at: f64,
+}
+
+/// Stamps of a window's samples, as they are kept.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Ring {
+    stamps: [Nanos; MAX_SAMPLES],
+    /// Which samples begin anew: what came before them does not belong to the same motion.
+    anew: [bool; MAX_SAMPLES],
+    /// Where the newest sample is, and how many there are, oldest at `newest + 1 - len` modulo the length.
+    newest: usize,
+    len: usize,
 }
 
 /// Polynomials orthogonal over the newest samples, and their values at an instant; found as far as they are asked for.
@@ -285,6 +295,15 @@ struct Values<const D: usize> {
     moments: [[[f64; TERMS]; CANDIDATES]; D],
 }
 
+impl Ring {
+    const EMPTY: Self = Self {
+        stamps: [Nanos::ZERO; MAX_SAMPLES],
+        anew: [false; MAX_SAMPLES],
+        newest: 0,
+        len: 0,
+    };
+}
+
 impl<const D: usize> Window<D> {
     /// An empty window.
     ///
@@ -304,12 +323,9 @@ impl<const D: usize> Window<D> {
         }
         Ok(Self {
             settings,
-            stamps: [Nanos::ZERO; MAX_SAMPLES],
+            ring: Ring::EMPTY,
             values: [[0.0; D]; MAX_SAMPLES],
-            anew: [false; MAX_SAMPLES],
             interrupted: false,
-            newest: 0,
-            len: 0,
         })
     }
 
@@ -331,15 +347,18 @@ impl<const D: usize> Window<D> {
                 pushed = Pushed::Restarted { gap };
             }
         }
-        self.newest = (self.newest + 1) % MAX_SAMPLES;
-        if let Some(anew) = self.anew.get_mut(self.newest) {
+        self.ring.newest = (self.ring.newest + 1) % MAX_SAMPLES;
+        if let Some(anew) = self.ring.anew.get_mut(self.ring.newest) {
             *anew = std::mem::take(&mut self.interrupted);
         }
-        if let (Some(s), Some(v)) = (self.stamps.get_mut(self.newest), self.values.get_mut(self.newest)) {
+        if let (Some(s), Some(v)) = (
+            self.ring.stamps.get_mut(self.ring.newest),
+            self.values.get_mut(self.ring.newest),
+        ) {
             (*s, *v) = (stamp, value);
         }
         // More are kept than an estimate uses: what came after the samples of an earlier instant must not push those out.
-        self.len = (self.len + 1).min(MAX_SAMPLES);
+        self.ring.len = (self.ring.len + 1).min(MAX_SAMPLES);
         Ok(pushed)
     }
 
@@ -350,19 +369,19 @@ impl<const D: usize> Window<D> {
 
     /// Forgets every sample.
     pub fn clear(&mut self) {
-        self.len = 0;
+        self.ring.len = 0;
     }
 
     /// Number of samples kept.
     #[must_use]
     pub const fn len(&self) -> usize {
-        self.len
+        self.ring.len
     }
 
     /// Whether no sample is kept.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
-        self.len == 0
+        self.ring.len == 0
     }
 
     /// What the window was made with.
@@ -373,11 +392,11 @@ impl<const D: usize> Window<D> {
 
     /// The sample that has `age` later ones: 0 is the newest.
     fn get(&self, age: usize) -> Option<(Nanos, &[f64; D])> {
-        if age >= self.len {
+        if age >= self.ring.len {
             return None;
         }
-        let at = (self.newest + MAX_SAMPLES - age) % MAX_SAMPLES;
-        Some((*self.stamps.get(at)?, self.values.get(at)?))
+        let at = (self.ring.newest + MAX_SAMPLES - age) % MAX_SAMPLES;
+        Some((*self.ring.stamps.get(at)?, self.values.get(at)?))
     }
 
     /// The newest sample: stamp and value.
@@ -389,7 +408,7 @@ impl<const D: usize> Window<D> {
     /// The oldest sample kept.
     #[must_use]
     pub fn oldest(&self) -> Option<(Nanos, [f64; D])> {
-        self.get(self.len.checked_sub(1)?).map(|(t, v)| (t, *v))
+        self.get(self.ring.len.checked_sub(1)?).map(|(t, v)| (t, *v))
     }
 
     /// The sample stamped exactly `t`, if it is kept.
@@ -403,9 +422,9 @@ impl<const D: usize> Window<D> {
     /// Number of samples kept that are stamped later than `t`.
     fn later_than(&self, t: Nanos) -> usize {
         // Instants asked for are near the newest sample: a search from there looks at one or two.
-        (0..self.len)
+        (0..self.ring.len)
             .find(|&age| self.get(age).is_some_and(|(stamp, _)| stamp <= t))
-            .unwrap_or(self.len)
+            .unwrap_or(self.ring.len)
     }
 
     /// The stamp of the newest sample that an estimate at `t` uses when it may use samples stamped up to `until`.
@@ -461,28 +480,33 @@ impl<const D: usize> Window<D> {
                 None => Unavailable::Starting { samples: 0 },
             });
         };
-        let mut values = [[0.0; MAX_SAMPLES]; D];
-        let most = (self.len - skipped).min(self.settings.capacity).min(MAX_SAMPLES);
-        let (mut used, mut oldest, mut is_shared, mut later_begins_anew) = (0, newest, true, false);
-        for (age, before) in grid.before.iter_mut().enumerate().take(most) {
-            let at = (self.newest + 2 * MAX_SAMPLES - skipped - age) % MAX_SAMPLES;
-            let stamp = self.stamps[at];
-            // Instants before a gap still have their samples; those after it do not look across. What is kept apart is decided by
-            // stamps alone, whenever the samples came.
-            if later_begins_anew || oldest - stamp > self.settings.max_gap || newest - stamp > self.settings.max_window
-            {
-                break;
+        let at = |age: usize| (self.ring.newest + 2 * MAX_SAMPLES - skipped - age) % MAX_SAMPLES;
+        let settings = (self.settings.max_gap, self.settings.max_window, self.settings.capacity);
+        let (mut used, mut oldest, mut is_shared) = (grid.used, newest, true);
+        if used > 0 && grid.skipped == skipped && grid.settings == settings && grid.ring == self.ring {
+            oldest = newest - grid.before[used - 1];
+        } else {
+            used = 0;
+            let mut later_begins_anew = false;
+            let most = (self.ring.len - skipped).min(self.settings.capacity).min(MAX_SAMPLES);
+            for (age, before) in grid.before.iter_mut().enumerate().take(most) {
+                let at = at(age);
+                let stamp = self.ring.stamps[at];
+                // Instants before a gap still have their samples; those after it do not look across. What is kept apart is decided by
+                // stamps alone, whenever the samples came.
+                let is_apart = oldest - stamp > self.settings.max_gap || newest - stamp > self.settings.max_window;
+                if later_begins_anew || is_apart {
+                    break;
+                }
+                later_begins_anew = self.ring.anew[at];
+                oldest = stamp;
+                is_shared &= *before == newest - stamp;
+                *before = newest - stamp;
+                used += 1;
             }
-            later_begins_anew = self.anew[at];
-            oldest = stamp;
-            is_shared &= *before == newest - stamp;
-            *before = newest - stamp;
-            for ((column, v), o) in values.iter_mut().zip(&self.values[at]).zip(origin) {
-                column[age] = v - o;
-            }
-            used += 1;
+            is_shared &= used == grid.used;
+            (grid.ring, grid.settings, grid.skipped) = (self.ring, settings, skipped);
         }
-        is_shared &= used == grid.used;
         // What it was made for is overwritten.
         if !is_shared {
             grid.used = 0;
@@ -500,6 +524,12 @@ impl<const D: usize> Window<D> {
             grid.make(used);
         }
         grid.place((t - newest).seconds());
+        let mut values = [[0.0; MAX_SAMPLES]; D];
+        for age in 0..used {
+            for ((column, v), o) in values.iter_mut().zip(&self.values[at(age)]).zip(origin) {
+                column[age] = v - o;
+            }
+        }
         let mut estimate = Values::new(values, grid).estimate(grid, self.settings.noise, origin);
         estimate.ahead = newest - t;
         if estimate.is_finite() {
@@ -555,6 +585,9 @@ impl Grid {
     #[must_use]
     pub const fn new() -> Self {
         Self {
+            ring: Ring::EMPTY,
+            settings: (Nanos::ZERO, Nanos::ZERO, 0),
+            skipped: 0,
             before: [Nanos::ZERO; MAX_SAMPLES],
             used: 0,
             span: 1.0,
