@@ -16,6 +16,7 @@
 
 mod defects;
 mod offset;
+mod reading;
 mod smooth;
 
 pub use defects::{Break, Defect, Units};
@@ -27,7 +28,7 @@ use crate::dynamics::{ContactSet, FrameMotion, SensorSet};
 use crate::pipeline::{UNTRUSTED_ENCODER, quality_reason};
 use crate::setup::{BaseMotion, Channel, Setup, Use};
 use crate::spatial::{Vec3, Wrench};
-use proprio_topics::csv::{Item, Reader, Report, Row, Value, What};
+use proprio_topics::csv::{Reader, Report, What};
 use proprio_topics::{Kind, Nanos, Quality, Reading, Reason};
 use smooth::{Scratch, Smoother};
 use std::io::Read;
@@ -174,8 +175,11 @@ impl Recording {
     /// # Errors
     /// [`RecordingError`]: it is no log, or lacks a joint that is not locked, or the IMU of the base. A missing F/T sensor is a defect.
     pub fn read(setup: &Setup, log: impl Read) -> Result<Self, RecordingError> {
-        let mut reader = Reader::new(log)?;
-        let mut recording = Self {
+        reading::read(setup, log)
+    }
+
+    fn empty(setup: &Setup) -> Self {
+        Self {
             channels: setup.channels().to_vec(),
             joints: vec![JointTrack::default(); setup.model.dof_count()],
             sensors: vec![Stream::default(); setup.structure.sensors().len()],
@@ -189,71 +193,7 @@ impl Recording {
             report: Report::default(),
             unused: Vec::new(),
             defects: Vec::new(),
-        };
-        recording.check_columns(&reader)?;
-        // Per series of the log: which channel or contact it is.
-        let mut targets = Vec::new();
-        for series in reader.series() {
-            let target = match series.what {
-                What::Channel(kind) => setup.channel(kind, &series.name).map(Target::Channel),
-                What::Contact => setup.contact(&series.name).map(Target::Contact),
-            };
-            if target.is_none() {
-                recording.unused.push(series.name.clone());
-            }
-            targets.push(target);
         }
-        // Rows of a log without stamps are so far apart that nothing is carried from one to the next.
-        let apart = setup.max_silence + setup.max_silence + Nanos(1);
-        let (mut row, mut pseudo) = (Row::default(), Nanos::ZERO);
-        let mut repeats = defects::Repeats::new(recording.channels.len());
-        while reader.next_row(&mut row)? {
-            let t = row.t.unwrap_or_else(|| {
-                recording.stamped = false;
-                pseudo += apart;
-                pseudo
-            });
-            for Item { series, value } in &row.items {
-                match (targets.get(*series).copied().flatten(), value) {
-                    (Some(Target::Channel(channel)), Value::Reading(reading, quality)) => {
-                        repeats.see(channel, t, reading);
-                        recording.take(channel, t, reading, *quality);
-                    }
-                    (Some(Target::Contact(contact)), Value::Active(active)) => {
-                        if let Some(declared) = recording.declared.get_mut(contact) {
-                            declared.push((t, *active));
-                        }
-                    }
-                    _ => {}
-                }
-            }
-        }
-        recording.report = reader.report().clone();
-        recording.declared.iter_mut().for_each(|d| d.sort_by_key(|(t, _)| *t));
-        recording
-            .temperatures
-            .iter_mut()
-            .for_each(|t| t.sort_by_key(|(t, _)| *t));
-        defects::settle(&mut recording, setup, repeats);
-        recording.span();
-        for channel in &recording.channels {
-            let empty = match channel.role {
-                Use::Joint(dof) => recording.joints.get(dof).is_none_or(|j| j.position.t.is_empty()),
-                Use::Base => {
-                    recording.imu.proper_acceleration.t.is_empty() || recording.imu.angular_velocity.t.is_empty()
-                }
-                Use::Sensor(_) => false,
-            };
-            if empty {
-                return Err(RecordingError::NoSamples(format!(
-                    "{}/{}",
-                    channel.kind.word(),
-                    channel.name
-                )));
-            }
-        }
-        defects::inspect(&mut recording, setup);
-        Ok(recording)
     }
 
     fn check_columns(&self, reader: &Reader<impl Read>) -> Result<(), RecordingError> {
@@ -572,12 +512,6 @@ impl Recording {
             .map(|t| at(*t).map_or_else(|fault| (standing, fault), |m| (m, Reason::None)))
             .collect()
     }
-}
-
-#[derive(Clone, Copy)]
-enum Target {
-    Channel(usize),
-    Contact(usize),
 }
 
 impl Instant {

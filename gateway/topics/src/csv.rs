@@ -147,6 +147,34 @@ pub struct Report {
 impl Report {
     /// How many bad rows are named.
     pub const NAMED: usize = 10;
+
+    /// Adds what there is to say of the rows that follow these, after `lines` lines.
+    pub fn add(&mut self, next: Self, lines: u64) {
+        self.rows += next.rows;
+        self.bad_rows += next.bad_rows;
+        let room = Self::NAMED.saturating_sub(self.bad.len());
+        let bad = next.bad.into_iter().take(room);
+        self.bad.extend(bad.map(|bad| BadRow {
+            line: lines + bad.line,
+            ..bad
+        }));
+    }
+
+    /// Whether a table of which this is all there is to say can be used.
+    ///
+    /// # Errors
+    /// [`Error::NoRow`], [`Error::Empty`].
+    pub fn usable(&self) -> Result<(), Error> {
+        match (self.rows, self.bad.first()) {
+            (0, Some(first)) => Err(Error::NoRow {
+                rows: self.bad_rows,
+                line: first.line,
+                reason: first.reason.clone(),
+            }),
+            (0, None) => Err(Error::Empty),
+            _ => Ok(()),
+        }
+    }
 }
 
 /// One row.
@@ -160,6 +188,7 @@ pub struct Row {
     pub items: Vec<Item>,
 }
 
+#[derive(Clone)]
 struct Column {
     series: usize,
     field: Field,
@@ -220,7 +249,10 @@ fn all_or_none(values: &[f64]) -> Option<bool> {
 pub struct Reader<R> {
     csv: ::csv::Reader<R>,
     record: ::csv::ByteRecord,
+    /// Whether it reads a whole table, from its header on.
+    is_whole: bool,
     series: Vec<Series>,
+    names: ::csv::StringRecord,
     /// Per column: what it is, or nothing if unknown; the stamp's column is `t_column`.
     columns: Vec<Option<Column>>,
     t_column: usize,
@@ -236,7 +268,7 @@ impl<R: io::Read> Reader<R> {
     pub fn new(input: R) -> Result<Self, Error> {
         let mut csv = ::csv::ReaderBuilder::new()
             .flexible(true)
-            .trim(::csv::Trim::All)
+            .trim(::csv::Trim::Headers)
             .from_reader(input);
         let header = csv.headers()?.clone();
         let Some(t_column) = header.iter().position(|name| name == "t") else {
@@ -295,12 +327,33 @@ impl<R: io::Read> Reader<R> {
         Ok(Self {
             csv,
             record: ::csv::ByteRecord::new(),
+            is_whole: true,
             series,
+            names: header,
             columns,
             t_column,
             cells,
             report,
         })
+    }
+
+    /// A reader of further rows of this table, lines counted from the first of them: for whoever takes a table apart, and puts it together with [`Report::add`] and [`Report::usable`].
+    #[must_use]
+    pub fn further<S: io::Read>(&self, rows: S) -> Reader<S> {
+        Reader {
+            csv: ::csv::ReaderBuilder::new()
+                .flexible(true)
+                .has_headers(false)
+                .from_reader(rows),
+            record: ::csv::ByteRecord::new(),
+            is_whole: false,
+            series: self.series.clone(),
+            names: self.names.clone(),
+            columns: self.columns.clone(),
+            t_column: self.t_column,
+            cells: self.cells.clone(),
+            report: Report::default(),
+        }
     }
 
     /// The channels and contacts of this log; an item's number counts these.
@@ -330,7 +383,7 @@ impl<R: io::Read> Reader<R> {
     /// The next usable row into `row`; `false` at the end.
     ///
     /// # Errors
-    /// [`Error`]: the file can not be read further, or at its end not a single row was usable.
+    /// [`Error`]: the file can not be read further, or at its end not a single row was usable (of a whole table).
     pub fn next_row(&mut self, row: &mut Row) -> Result<bool, Error> {
         loop {
             match self.csv.read_byte_record(&mut self.record) {
@@ -352,15 +405,10 @@ impl<R: io::Read> Reader<R> {
                 Err(reason) => self.skip(line, reason),
             }
         }
-        match (self.report.rows, self.report.bad.first()) {
-            (0, Some(first)) => Err(Error::NoRow {
-                rows: self.report.bad_rows,
-                line: first.line,
-                reason: first.reason.clone(),
-            }),
-            (0, None) => Err(Error::Empty),
-            _ => Ok(false),
+        if self.is_whole {
+            self.report.usable()?;
         }
+        Ok(false)
     }
 
     fn skip(&mut self, line: u64, reason: String) {
@@ -381,13 +429,9 @@ impl<R: io::Read> Reader<R> {
                 self.columns.len()
             ));
         }
-        let name = |csv: &mut ::csv::Reader<R>, at: usize| {
-            csv.headers()
-                .ok()
-                .and_then(|h| h.get(at).map(ToOwned::to_owned))
-                .unwrap_or_default()
-        };
         for (at, cell) in self.record.iter().enumerate() {
+            // (The table's reader would copy every record to do this.)
+            let cell = cell.trim_ascii();
             if cell.is_empty() {
                 continue;
             }
@@ -396,11 +440,10 @@ impl<R: io::Read> Reader<R> {
                 row.t =
                     Some(Nanos::parse_seconds(text).ok_or_else(|| format!("t is {text:?}, not a number of seconds"))?);
             } else if let Some(Some(column)) = self.columns.get(at) {
-                let value: f64 = text
-                    .parse()
-                    .ok()
-                    .filter(|v: &f64| v.is_finite())
-                    .ok_or_else(|| format!("{} is {text:?}, not a finite number", name(&mut self.csv, at)))?;
+                let value: f64 = text.parse().ok().filter(|v: &f64| v.is_finite()).ok_or_else(|| {
+                    let name = self.names.get(at).unwrap_or_default();
+                    format!("{name} is {text:?}, not a finite number")
+                })?;
                 if let Some(slot) = self.cells.get_mut(column.series).and_then(|c| c.slot(column.field)) {
                     *slot = value;
                 }
@@ -800,7 +843,7 @@ mod tests {
                     0.6,nan,,,,,,,\n\
                     x,1,,,,,,,\n\
                     0.8,,1,2,3,,,,\n\
-                    0.9,,1,2,3,4,5,6,7\n\
+                    0.9 , ,1 ,2, 3,4,5,\t6,7\n\
                     1.0,2";
         let Ok((rows, report, series)) = read(text) else {
             panic!("readable")

@@ -359,18 +359,44 @@ fn label(channel: &crate::setup::Channel) -> String {
 }
 
 /// Finds readings that repeat the one before, as they are read.
+#[derive(Clone)]
 pub(super) struct Repeats {
     channels: Vec<Repeat>,
 }
 
 #[derive(Clone, Default)]
 struct Repeat {
-    last: Option<(Nanos, [u64; 9])>,
+    first: Option<Look>,
+    last: Option<Look>,
     readings: usize,
     /// The same again with a later stamp, of channels whose noise would not allow it.
     again: Vec<Nanos>,
     /// The same again with the same stamp.
     twice: Vec<Nanos>,
+}
+
+/// What a reading looks like.
+#[derive(Clone, Copy)]
+struct Look {
+    t: Nanos,
+    bits: [u64; 9],
+    /// Whether the noise of what it reads would not allow the same again.
+    telling: bool,
+}
+
+impl Repeat {
+    /// Looks at a reading beside the last one.
+    fn compare(&mut self, look: Look) {
+        if let Some(last) = self.last
+            && last.bits == look.bits
+        {
+            if last.t == look.t {
+                self.twice.push(look.t);
+            } else if look.telling {
+                self.again.push(look.t);
+            }
+        }
+    }
 }
 
 impl Repeats {
@@ -404,18 +430,29 @@ impl Repeats {
             }
             _ => return,
         };
-        let bits = numbers.map(f64::to_bits);
+        let look = Look {
+            t,
+            bits: numbers.map(f64::to_bits),
+            telling,
+        };
         repeat.readings += 1;
-        if let Some((before, last)) = repeat.last
-            && last == bits
-        {
-            if before == t {
-                repeat.twice.push(t);
-            } else if telling {
-                repeat.again.push(t);
+        repeat.compare(look);
+        repeat.first.get_or_insert(look);
+        repeat.last = Some(look);
+    }
+
+    /// Adds what was seen after this.
+    pub(super) fn append(&mut self, next: Self) {
+        for (own, mut next) in self.channels.iter_mut().zip(next.channels) {
+            if let Some(first) = next.first {
+                own.compare(first);
             }
+            own.readings += next.readings;
+            own.again.append(&mut next.again);
+            own.twice.append(&mut next.twice);
+            own.first = own.first.or(next.first);
+            own.last = next.last.or(own.last);
         }
-        repeat.last = Some((t, bits));
     }
 }
 

@@ -25,7 +25,7 @@ const URDF: &str = r#"<robot name="arm">
   <joint name="elbow" type="revolute"><origin xyz="0 0 -0.25"/><parent link="lower"/><child link="hand"/><axis xyz="1 0 0"/><limit lower="-2" upper="2" effort="50" velocity="5"/></joint>
 </robot>"#;
 
-fn setup(more: &str) -> Setup {
+pub(super) fn setup(more: &str) -> Setup {
     let text = format!(
         "schema = 1\nrobot = \"arm\"\nmodel = \"arm.urdf\"\n[base]\nkind = \"fixed\"\nlink = \"base\"\n[[force_torque]]\nsensor = \"ft\"\njoint = \"ft\"\n{more}"
     );
@@ -99,13 +99,13 @@ fn truth_of(setup: &Setup, states: [[f64; 3]; 2]) -> (Wrench, Vec<f64>) {
 
 /// A log as a table of numbers: stamps in nanoseconds, NaN where a cell is empty.
 #[derive(Clone)]
-struct Table {
+pub(super) struct Table {
     header: Vec<String>,
-    rows: Vec<(i64, Vec<f64>)>,
+    pub(super) rows: Vec<(i64, Vec<f64>)>,
 }
 
 impl Table {
-    fn text(&self) -> String {
+    pub(super) fn text(&self) -> String {
         let mut text = format!("t,{}\n", self.header.join(","));
         for (t, row) in &self.rows {
             text += &Nanos(*t).to_string();
@@ -142,7 +142,7 @@ const OFFSET: [f64; 6] = [12.0, -35.0, 80.0, 1.1, -0.4, 0.7];
 
 /// Encoders with a coarse quantum and an F/T sensor with noise and offset, at `rate` \[Hz\], stamps that jitter by up to `jitter` of a period; F/T stamps are `late` \[s\].
 /// Encoders and F/T have rows of their own, as buses are read.
-fn log(setup: &Setup, seconds: f64, rate: f64, jitter: f64, late: f64, seed: u64) -> Table {
+pub(super) fn log(setup: &Setup, seconds: f64, rate: f64, jitter: f64, late: f64, seed: u64) -> Table {
     log_of(setup, motion, seconds, rate, jitter, late, seed)
 }
 
