@@ -290,7 +290,7 @@ pub(super) fn outcome(
 /// Rotors whose inertia only CAD tells from that of links: what the data say of one is what they say of some combination of the others and of the links' parameters.
 fn confused_rotors(setup: &Setup, identified: &Identified, spread: &[DMatrix<f64>]) -> Vec<String> {
     let layout = &identified.layout;
-    let fitted = layout.beside_cad();
+    let mut fitted = layout.beside_cad();
     if fitted.is_empty() {
         return Vec::new();
     }
@@ -299,28 +299,49 @@ fn confused_rotors(setup: &Setup, identified: &Identified, spread: &[DMatrix<f64
         let columns = r.columns(WIDTH * place, WIDTH).into_owned() * spread;
         r.columns_mut(WIDTH * place, WIDTH).copy_from(&columns);
     }
-    let mut sums = Vec::new();
-    for &column in &fitted {
+    // Of what no row has there is nothing to be told apart.
+    fitted.retain(|column| r.column(*column).norm() > 0.0);
+    let sum = |column: usize| {
         let Further::RotorInertia(dof) = layout.further[column - layout.inertial()] else {
-            continue;
+            return None;
         };
-        let own = r.column(column).normalize();
-        let svd = r.clone().remove_column(column).svd(true, false);
-        let greatest = svd.singular_values.max();
-        let mut rest = own.clone();
-        for (axis, size) in svd.u.iter().flat_map(|u| u.column_iter()).zip(&svd.singular_values) {
-            if *size > 1e-10 * greatest {
-                rest.axpy(-axis.dot(&own), &axis, 1.0);
-            }
-        }
-        if rest.norm() < 1e-5 {
-            sums.push(format!(
-                "only as a sum: the inertia of the rotor of {0}, and that of the links that {0} turns, about its axis",
-                setup.model.dof_name(dof)
-            ));
-        }
+        Some(format!(
+            "only as a sum: the inertia of the rotor of {0}, and that of the links that {0} turns, about its axis",
+            setup.model.dof_name(dof)
+        ))
+    };
+    combinations(&r, &fitted).into_iter().filter_map(sum).collect()
+}
+
+/// Of these columns of a matrix, none of them zero, those that combinations of all other columns come as near to as rounding lets tell: to a hundred thousandth of their length.
+fn combinations(matrix: &DMatrix<f64>, columns: &[usize]) -> Vec<usize> {
+    /// Of that length.
+    const NEAR: f64 = 1e-5;
+    const ROUNDING: f64 = 1e-12;
+    // Of each column what the rest of the matrix leaves of it, whose directions these are ...
+    let mut left = matrix.select_columns(columns);
+    left.column_iter_mut().for_each(|mut column| _ = column.normalize_mut());
+    let svd = matrix.clone().remove_columns_at(columns).svd(true, false);
+    let sizes = &svd.singular_values;
+    let known = (0..sizes.len()).filter(|&i| sizes[i] > 1e-10 * sizes.max());
+    if let Some(axes) = svd.u.map(|u| u.select_columns(&known.collect::<Vec<_>>())) {
+        left -= &axes * axes.tr_mul(&left);
     }
-    sums
+    // ... and how far that is from the others': one over the length of its row of the inverse.
+    let svd = left.svd(false, true);
+    let directions = svd.v_t.unwrap_or_else(|| DMatrix::zeros(0, columns.len()));
+    let far = |place: usize| {
+        let row = directions.column(place);
+        let squares = row
+            .iter()
+            .zip(&svd.singular_values)
+            .map(|(v, size)| (v / size.max(ROUNDING)).powi(2));
+        squares.sum::<f64>().sqrt().recip()
+    };
+    let each = columns.iter().enumerate();
+    each.filter(|(place, _)| far(*place) < NEAR)
+        .map(|(_, column)| *column)
+        .collect()
 }
 
 /// Inertias of the rotors whose motors' torques were measured.
@@ -1578,6 +1599,72 @@ mod tests {
     fn setup() -> Setup {
         let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/icub_left_arm/estimator.toml");
         Setup::new(&Config::load(&file).unwrap()).unwrap()
+    }
+
+    /// As one that is taken by itself out of the matrix finds them, column by column.
+    #[test]
+    fn columns_that_others_combine_to_are_found() {
+        let one_by_one = |matrix: &DMatrix<f64>, column: usize| {
+            let mut rest = matrix.column(column).normalize();
+            let svd = matrix.clone().remove_column(column).svd(true, false);
+            let (axes, sizes) = (svd.u.unwrap(), &svd.singular_values);
+            for (axis, _) in axes
+                .column_iter()
+                .zip(sizes)
+                .filter(|(_, size)| **size > 1e-10 * sizes.max())
+            {
+                rest.axpy(-axis.dot(&rest), &axis, 1.0);
+            }
+            rest.norm() < 1e-5
+        };
+        // Links in columns 0 to 19 of which 3 are nothing but sums and 2 are nothing, rotors in the others: each as it is, or as a change makes it.
+        let random = DMatrix::from_vec(30, 26, crate::identify::normals(11, 30 * 26));
+        let with = |change: &dyn Fn(&mut DMatrix<f64>)| {
+            let mut matrix = random.clone();
+            for column in 0..20 {
+                matrix
+                    .column_mut(column)
+                    .scale_mut(10.0_f64.powi(column as i32 % 5 - 4));
+            }
+            for (sum, a, b) in [(3, 0, 7), (9, 1, 3), (12, 4, 9)] {
+                let own = 2.0 * matrix.column(a) - matrix.column(b);
+                matrix.set_column(sum, &own);
+            }
+            [5, 17]
+                .into_iter()
+                .for_each(|column| matrix.column_mut(column).fill(0.0));
+            change(&mut matrix);
+            matrix
+        };
+        let set = |matrix: &mut DMatrix<f64>, column: usize, own: DVector<f64>| matrix.set_column(column, &own);
+        type Change<'a> = &'a dyn Fn(&mut DMatrix<f64>);
+        let cases: [(Change<'_>, &[usize]); 6] = [
+            (&|_| (), &[]),
+            // Of links alone, and long beside them.
+            (&|m| set(m, 21, 3e4 * m.column(2) + 1e5 * m.column(12)), &[21]),
+            // Of links and another rotor: neither is known, nor can be.
+            (&|m| set(m, 22, m.column(2) - m.column(24)), &[22, 24]),
+            // Of links, as one of a pair with another is.
+            (
+                &|m| {
+                    set(m, 20, m.column(0) * 1e3);
+                    set(m, 25, m.column(23) + m.column(20));
+                },
+                &[20, 23, 25],
+            ),
+            // Nearly, and not.
+            (&|m| set(m, 21, m.column(14) + 1e-7 * m.column(21)), &[21]),
+            (&|m| set(m, 21, m.column(14) + 1e-3 * m.column(21)), &[]),
+        ];
+        for (change, expected) in cases {
+            let (matrix, rotors) = (with(change), [20, 21, 22, 23, 24, 25]);
+            let alone: Vec<usize> = rotors
+                .into_iter()
+                .filter(|&column| one_by_one(&matrix, column))
+                .collect();
+            assert_eq!(combinations(&matrix, &rotors), alone);
+            assert_eq!(alone, expected);
+        }
     }
 
     /// Its integral is the variance (Parseval), it is flat for white noise, and a wave stands where its frequency is.
