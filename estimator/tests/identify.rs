@@ -1,6 +1,8 @@
 //! Identification from recorded logs: on the logs of real robots (`PROPRIO_DATA`; without it these tests say that they skip), and on simulated ones where the truth is known.
 
 use nalgebra::{Matrix4, Matrix6, Vector6};
+use nix::sched::{CpuSet, sched_getaffinity, sched_setaffinity};
+use nix::unistd::Pid;
 use proprio_estimator::calibration::{Calibration, Unknown};
 use proprio_estimator::config::{Config, Gain, IdentificationInput, TorqueSide};
 use proprio_estimator::dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
@@ -828,6 +830,50 @@ fn readings_of_two_sensors_are_compared_as_they_are() {
         // Both are stamped as the encoders are.
         let late = &outcome.logs[0].time_offsets;
         assert!(late.iter().all(|late| !late.significant), "{late:?}");
+    }
+}
+
+/// On one core and on all: the same to the last bit.
+#[test]
+fn the_number_of_cores_changes_nothing() {
+    if std::thread::available_parallelism().map_or(1, usize::from) < 2 {
+        println!("skipped: there is but one core");
+        return;
+    }
+    let setup = arm_with(&["ft", "wrist"]);
+    let truth = real(&setup, 5);
+    let first = simulate(&setup, &truth, 8.0, 0.01, 5);
+    // Its velocities and accelerations are to be found.
+    let second = simulate(&setup, &truth, 21.0, 0.01, 6);
+    let second = second.replace("/velocity", "/v").replace("/acceleration", "/a");
+    let outcome = || {
+        let logs = [
+            ("first", Role::Train, first.as_str()),
+            ("second", Role::Train, second.as_str()),
+        ];
+        let outcome = run(&setup, &logs, &[]);
+        assert_eq!(outcome.verdict, Verdict::Identified);
+        format!("{outcome:#?}")
+    };
+    let on_one = std::thread::scope(|scope| {
+        let alone = scope.spawn(|| {
+            let own = Pid::from_raw(0);
+            let all = sched_getaffinity(own).expect("the cores");
+            let core = (0..CpuSet::count())
+                .find(|&core| all.is_set(core) == Ok(true))
+                .expect("a core");
+            let mut one = CpuSet::new();
+            one.set(core).expect("a core");
+            sched_setaffinity(own, &one).expect("one core");
+            assert_eq!(std::thread::available_parallelism().map_or(0, usize::from), 1);
+            outcome()
+        });
+        alone.join().expect("an outcome")
+    });
+    let on_all = outcome();
+    assert_eq!(on_one.lines().count(), on_all.lines().count());
+    for (number, (one, all)) in on_one.lines().zip(on_all.lines()).enumerate() {
+        assert_eq!(one, all, "line {number}");
     }
 }
 
