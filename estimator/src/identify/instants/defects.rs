@@ -18,6 +18,7 @@ use crate::setup::{Setup, Use};
 use crate::spatial::Wrench;
 use proprio_topics::{Nanos, Reading, Reason};
 use std::fmt;
+use std::ops::Range;
 
 /// What units a channel seems to have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -892,7 +893,25 @@ fn stopped(position: &Stream<1>) -> Option<(Nanos, Nanos)> {
     None
 }
 
-/// Where a joint's torque repeats itself for longer than chance, coarse steps or a standstill make it do, while the joint moves.
+/// Steps by which a quantity falls within half as many samples as it lay flat if it did not turn round there: a parabola that is within one step for `n` samples is four steps or less away `n / 2` samples
+/// before and after.
+const STEEP: f64 = 10.0;
+
+/// Whether a quantity that is counted in these steps comes to a flat stretch, and leaves it, more steeply than what turns round there ([`STEEP`]). Where a log begins or ends, nobody knows: it may.
+fn steep(values: &[f64], flat: &Range<usize>, step: f64) -> [bool; 2] {
+    let reach = flat.len().div_ceil(2);
+    let falls = |j: usize| {
+        values
+            .get(j)
+            .is_none_or(|v| (v - values[flat.start]).abs() > STEEP * step)
+    };
+    [
+        flat.start.checked_sub(reach).is_none_or(falls),
+        falls(flat.end - 1 + reach),
+    ]
+}
+
+/// Where a joint's torque repeats itself for longer than chance, coarse steps, turning round or a standstill make it do, while the joint moves.
 fn dead(track: &JointTrack) -> Vec<(Nanos, Nanos)> {
     /// How likely a stretch that is called dead may be in a torque whose repeats are chance.
     const CHANCE: f64 = 1e-9;
@@ -914,9 +933,13 @@ fn dead(track: &JointTrack) -> Vec<(Nanos, Nanos)> {
     );
     let equal = steps(&mut stretches.iter()) - long;
     let often = (equal as f64 + 1.0) / ((all - long) as f64 + 2.0);
+    let step = quantum(&x);
     let dead = |stretch: &&(usize, usize)| {
         let (begin, end) = **stretch;
-        is_long(stretch) && often.powf((end - begin) as f64) < CHANCE && track.range(t[begin], t[end]) > MOTION
+        is_long(stretch)
+            && often.powf((end - begin) as f64) < CHANCE
+            && steep(&x, &(begin..end + 1), step).contains(&true)
+            && track.range(t[begin], t[end]) > MOTION
     };
     // One value from beginning to end leaves nothing to compare with.
     let all_equal = stretches.len() == 1 && stretches.iter().any(is_long);
@@ -957,35 +980,39 @@ pub(super) fn inspect(recording: &mut Recording, setup: &Setup) {
                         });
                     }
                 }
-                if let Some(defect) = flat(&mut recording.joints[dof].torque, 0, label(channel), "torque") {
-                    found.push(defect);
-                }
+                let cut = cut_off(&track.torque, 0, |from, to| recording.moves(from, to, None));
+                let torque = &mut recording.joints[dof].torque;
+                found.extend(cut.and_then(|cut| saturated(torque, cut, label(channel), "torque")));
             }
             Use::Sensor(number) => {
-                let stream = &mut recording.sensors[number];
+                let stream = &recording.sensors[number];
                 if stream.t.is_empty() && stream.disowned.is_empty() {
                     found.push(Defect::NeverSeen {
                         channel: label(channel),
                     });
                     continue;
                 }
-                let saturated: Vec<Nanos> = stream
+                let disowned: Vec<Nanos> = stream
                     .disowned
                     .iter()
                     .filter(|(_, r)| *r == Reason::Saturated)
                     .map(|(t, _)| *t)
                     .collect();
-                if let Some(first) = saturated.first() {
+                if let Some(first) = disowned.first() {
                     found.push(Defect::Saturated {
                         channel: label(channel),
                         axis: "",
-                        samples: saturated.len(),
+                        samples: disowned.len(),
                         first: *first,
                         value: f64::NAN,
                     });
                 }
                 for (axis, word) in AXES.into_iter().enumerate() {
-                    found.extend(flat(stream, axis, label(channel), word));
+                    let cut = cut_off(&recording.sensors[number], axis, |from, to| {
+                        recording.moves(from, to, None)
+                    });
+                    let stream = &mut recording.sensors[number];
+                    found.extend(cut.and_then(|cut| saturated(stream, cut, label(channel), word)));
                 }
             }
             Use::Base => {}
@@ -1052,51 +1079,89 @@ fn gaps(recording: &Recording, channels: &[crate::setup::Channel], found: &mut V
     }
 }
 
-/// Finds where one quantity lies at its extreme for five samples or more while the sensor's others (or, of a single one, what came before) change; leaves these
-/// samples out as saturated.
-fn flat<const D: usize>(stream: &mut Stream<D>, axis: usize, channel: String, word: &'static str) -> Option<Defect> {
+/// Where one quantity is cut off: at which value, and which samples, stretches of five and more that lie at the quantity's extreme while the sensor's others change (or, of a single
+/// one, comes back to it).
+///
+/// What turns round slowly lies flat as well. At least one stretch must be steeper than that on both sides ([`steep`]); what might be hidden otherwise is two or three steps, and harms nothing.
+/// `moves`: whether the robot moves from the one stamp to the other.
+fn cut_off<const D: usize>(
+    stream: &Stream<D>,
+    axis: usize,
+    moves: impl Fn(Nanos, Nanos) -> bool,
+) -> Option<(f64, Vec<usize>)> {
+    /// Samples that lie flat at least.
+    const FLAT: usize = 5;
     let values = stream.column(axis);
-    let (low, high) = values
-        .iter()
-        .fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
-    if values.len() < 20 || high - low <= 50.0 * quantum(&values) {
+    let step = quantum(&values);
+    let high = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let low = values.iter().copied().fold(f64::INFINITY, f64::min);
+    if values.len() < 20 || high - low <= 50.0 * step {
         return None;
     }
-    let mut worst: Option<(f64, Vec<usize>)> = None;
-    for extreme in [low, high] {
-        let mut flat = Vec::new();
-        let mut i = 0;
-        while i < values.len() {
-            let begin = i;
-            while i < values.len() && values[i].to_bits() == extreme.to_bits() {
-                i += 1;
-            }
-            let changes = |j: usize| {
-                (0..D).any(|k| k != axis && stream.value[j][k].to_bits() != stream.value[j - 1][k].to_bits())
-            };
-            let others = || D == 1 || (begin + 1..i).filter(|j| changes(*j)).count() * 2 > i - begin - 1;
-            if i >= begin + 5 && others() {
-                flat.extend(begin..i);
-            }
-            i = i.max(begin + 1);
-        }
-        // A robot at rest at the end of its motion lies still at an extreme too, its only torque with it: a clipped one comes back to it.
-        let runs = flat.windows(2).filter(|w| w[1] != w[0] + 1).count() + usize::from(!flat.is_empty());
-        if (D > 1 || runs >= 2) && flat.len() > worst.as_ref().map_or(0, |(_, w)| w.len()) {
-            worst = Some((extreme, flat));
+    // A torque that is measured more slowly than it is recorded repeats itself everywhere.
+    let mut runs: Vec<Range<usize>> = Vec::new();
+    for i in 0..values.len() {
+        match runs.last_mut() {
+            Some(run) if values[run.start].to_bits() == values[i].to_bits() => run.end = i + 1,
+            _ => runs.push(i..i + 1),
         }
     }
-    let (value, samples) = worst?;
+    let usual = median(runs.iter().map(|run| run.len() as f64).collect());
+    let is_long = |run: &&Range<usize>| run.len() >= FLAT && run.len() as f64 >= FLAT as f64 * usual;
+    let others_change = |run: &&Range<usize>| {
+        let changes =
+            |j: &usize| (0..D).any(|k| k != axis && stream.value[*j][k].to_bits() != stream.value[*j - 1][k].to_bits());
+        D == 1 || (run.start + 1..run.end).filter(changes).count() * 2 > run.len() - 1
+    };
+    // A robot at rest lies still at an extreme too, and its other quantities but for noise, unless something leans on it.
+    let rests = |run: &&Range<usize>| {
+        let (from, to) = (stream.t[run.start], stream.t[run.end - 1]);
+        let loaded = |k: usize| {
+            let own = || stream.value[run.start..run.end].iter().map(|v| v[k]);
+            let changes = own().zip(own().skip(1)).map(|(a, b)| (b - a).abs());
+            let changes: Vec<f64> = changes.filter(|change| *change > 0.0).collect();
+            let usual = changes.iter().sum::<f64>() / changes.len().max(1) as f64;
+            k != axis && range(own()) > STEEP * usual
+        };
+        to - from >= FREEZE && !moves(from, to) && !(0..D).any(loaded)
+    };
+    let mut worst: Option<(f64, Vec<usize>)> = None;
+    for extreme in [low, high] {
+        let at_it = runs
+            .iter()
+            .filter(|run| values[run.start].to_bits() == extreme.to_bits());
+        let flat: Vec<&Range<usize>> = at_it
+            .filter(is_long)
+            .filter(others_change)
+            .filter(|run| !rests(run))
+            .collect();
+        // A single torque that is cut off comes back to it.
+        let enough = if D == 1 { 2 } else { 1 };
+        let samples: Vec<usize> = flat.iter().flat_map(|run| (*run).clone()).collect();
+        let is_cut = flat.len() >= enough && flat.iter().any(|run| steep(&values, run, step) == [true; 2]);
+        if is_cut && samples.len() > worst.as_ref().map_or(0, |(_, worst)| worst.len()) {
+            worst = Some((extreme, samples));
+        }
+    }
+    worst
+}
+
+/// Leaves these samples of one quantity out as saturated, and says so.
+fn saturated<const D: usize>(
+    stream: &mut Stream<D>,
+    (value, samples): (f64, Vec<usize>),
+    channel: String,
+    axis: &'static str,
+) -> Option<Defect> {
     let first = stream.t[*samples.first()?];
     stream
         .disowned
         .extend(samples.iter().map(|i| (stream.t[*i], Reason::Saturated)));
     stream.disowned.sort_by_key(|(t, _)| *t);
-    let drop: Vec<bool> = (0..values.len()).map(|i| samples.binary_search(&i).is_ok()).collect();
-    stream.retain(|i| !drop[i]);
+    stream.retain(|i| samples.binary_search(&i).is_err());
     Some(Defect::Saturated {
         channel,
-        axis: word,
+        axis,
         samples: samples.len(),
         first,
         value,
@@ -1266,7 +1331,7 @@ pub(super) fn inspect_readings(recording: &Recording, setup: &Setup, instants: &
         let runs = runs(instants, &free, period);
         let expected = Expected::new(&runs, |i| predicted[i][sensor], period);
         let found = parallel::map(AXES.len(), |axis| {
-            let series = |range: &std::ops::Range<usize>| -> Vec<f64> {
+            let series = |range: &Range<usize>| -> Vec<f64> {
                 range
                     .clone()
                     .map(|i| instants.instants[i].readings[sensor].force_first()[axis] - predicted[i][sensor][axis])
@@ -1414,7 +1479,7 @@ fn free_of_contact(setup: &Setup, instants: &Instants, sensor: usize, predicted:
 }
 
 /// Stretches of instants, none missing.
-fn runs(instants: &Instants, free: &[bool], period: f64) -> Vec<std::ops::Range<usize>> {
+fn runs(instants: &Instants, free: &[bool], period: f64) -> Vec<Range<usize>> {
     let mut runs = Vec::new();
     let mut begin = 0;
     for i in 0..=free.len() {
@@ -1464,14 +1529,10 @@ struct Expected {
 
 impl Expected {
     /// For forces and for torques, of each stretch, given the prediction at an instant.
-    fn new(
-        runs: &[std::ops::Range<usize>],
-        predicted: impl Fn(usize) -> [f64; 6] + Sync,
-        period: f64,
-    ) -> [Vec<Self>; 2] {
+    fn new(runs: &[Range<usize>], predicted: impl Fn(usize) -> [f64; 6] + Sync, period: f64) -> [Vec<Self>; 2] {
         let half = median_reach(period);
         let off: Vec<Vec<Vec<f64>>> = parallel::map(AXES.len(), |k| {
-            let of_run = |run: &std::ops::Range<usize>| {
+            let of_run = |run: &Range<usize>| {
                 let values: Vec<f64> = run.clone().map(|i| predicted(i)[k]).collect();
                 off_median(&values, half)
             };
@@ -1479,7 +1540,7 @@ impl Expected {
         });
         // A centre of mass that is elsewhere makes torques of forces, not forces of torques.
         [[1.0, 1.0, 1.0, 0.0, 0.0, 0.0], [LEVER, LEVER, LEVER, 1.0, 1.0, 1.0]].map(|shares| {
-            let of_run = |(number, run): (usize, &std::ops::Range<usize>)| {
+            let of_run = |(number, run): (usize, &Range<usize>)| {
                 let share_of = |value: &dyn Fn(usize) -> f64| std::array::from_fn(|k| shares[k] * value(k));
                 let norm = |i: usize| {
                     let off: [f64; 6] = share_of(&|k| off[k][number][i]);
@@ -1501,7 +1562,7 @@ impl Expected {
 
 /// One axis of what a sensor reads beyond the model's prediction, over one stretch.
 struct Residual<'a> {
-    range: std::ops::Range<usize>,
+    range: Range<usize>,
     values: Vec<f64>,
     /// Off the running median.
     off: Vec<f64>,
@@ -1509,7 +1570,7 @@ struct Residual<'a> {
 }
 
 impl<'a> Residual<'a> {
-    fn new(range: std::ops::Range<usize>, values: Vec<f64>, expected: &'a Expected, period: f64) -> Self {
+    fn new(range: Range<usize>, values: Vec<f64>, expected: &'a Expected, period: f64) -> Self {
         let off = off_median(&values, median_reach(period));
         Self {
             range,

@@ -740,6 +740,65 @@ fn each_defect_put_into_a_clean_log_is_found_and_nothing_else() {
     assert!(failures.is_empty(), "{}", failures.join("\n"));
 }
 
+/// An extreme that is reached slowly, in coarse steps, is as flat as one that is cut off; so is that of a joint which stops there, or of a torque that is measured more slowly than it is recorded.
+#[test]
+fn what_turns_round_or_rests_at_its_extreme_is_not_saturated_and_what_is_cut_off_is() {
+    /// Of half a minute of two joints that go to and fro together, with stops if they may not go as far as one: what is told of fx and of the elbow's torque, which are these functions of where the
+    /// joints are, in steps of a two hundredth and of a two thousandth of their range.
+    fn told(hertz: f64, furthest: f64, torque: impl Fn(usize, f64) -> f64, force: impl Fn(f64) -> f64) -> Vec<String> {
+        let mut random = Random(3);
+        let rows = (0..3000_usize).map(|i| {
+            let x = (std::f64::consts::TAU * hertz * 0.01 * i as f64)
+                .sin()
+                .clamp(-furthest, furthest);
+            let mut row = vec![1.8 * x, 1.4 * x, 0.1 * (100.0 * force(x)).round()];
+            row.extend((0..5).map(|k| OFFSET[k] + 10.0 * x + 0.1 * random.normal()));
+            row.push(0.004 * (1000.0 * torque(i, x)).round());
+            (10_000_000 * i as i64, row)
+        });
+        let table = Table {
+            header: COLUMNS
+                .into_iter()
+                .chain(["joint/elbow/torque"])
+                .map(str::to_owned)
+                .collect(),
+            rows: rows.collect(),
+        };
+        let recording = table.recording(&setup(""));
+        let flat = |d: &&Defect| matches!(d, Defect::Saturated { .. } | Defect::Frozen { .. });
+        recording
+            .defects()
+            .iter()
+            .filter(flat)
+            .map(ToString::to_string)
+            .collect()
+    }
+    let none: [String; 0] = [];
+    for hertz in [0.1, 0.2, 1.0] {
+        assert_eq!(told(hertz, 1.0, |_, x| x, |x| x), none, "turns round at {hertz} Hz");
+    }
+    assert_eq!(told(0.05, 0.6, |_, x| x, |x| x), none, "rests");
+    // What a link weighs, at its greatest while the joint passes that place.
+    assert_eq!(told(0.02, 1.0, |_, x| (1.8 * x).cos(), |x| x), none, "passes");
+    // Every eighth sample is a new one.
+    let held = |i: usize, _: f64| (std::f64::consts::TAU * 0.6 * 0.08 * (i / 8) as f64).cos();
+    assert_eq!(told(0.2, 1.0, held, |x| x), none, "is slow");
+    for limit in [0.95, 0.9, 0.85] {
+        let found = told(1.0, 1.0, |_, x| x.max(-limit), |x| x.min(limit));
+        for (name, value) in [
+            ("joint/elbow: torque", -0.004 * (1000.0 * limit)),
+            ("wrench/ft: fx", 0.1 * (100.0 * limit)),
+        ] {
+            let expected = format!("{name} lies flat at {value}");
+            assert!(
+                found.iter().any(|told| told.starts_with(&expected)),
+                "{expected}: {found:?}"
+            );
+        }
+        assert_eq!(found.len(), 2, "{found:?}");
+    }
+}
+
 #[test]
 fn gating_follows_contacts_quality_and_edges() {
     let setup = setup("[[contact]]\nlink = \"hand\"\npresence = \"possible\"");
