@@ -269,11 +269,45 @@ fn kuka_touched_is_identified_all_the_same() {
     assert!((9.5..10.1).contains(&first) && (12.9..13.5).contains(&last), "{span:?}");
 }
 
+/// A push in a log to validate with, undeclared, makes what was identified look worse than it is: it is told, and the figures stay those of all of the log.
+#[test]
+fn a_touch_in_held_out_data_is_told() {
+    let setup = arm();
+    let log = simulate(&setup, &real(&setup, 5), 40.0, 3.0, 15);
+    let (train, rest) = (between(&log, -1.0, 20.0), between(&log, 20.0, 99.0));
+    let push = |row: usize, value: f64| {
+        let share = (row as f64 - 600.0) / 150.0;
+        value + 12.0 * (std::f64::consts::PI * share.clamp(0.0, 1.0)).sin()
+    };
+    let touched = change_rows(&change_rows(&rest, "wrench/ft/fx", push), "wrench/ft/fz", push);
+    let logs = [
+        ("train", Role::Train, &*train),
+        ("rest", Role::Validate, &rest),
+        ("touched", Role::Validate, &touched),
+    ];
+    let outcome = run(&setup, &logs, &[IdentificationInput::Wrench]);
+    let told: Vec<Vec<&Finding>> = (outcome.logs.iter())
+        .map(|log| log.findings.iter().filter(|f| f.code == "contact_suspected").collect())
+        .collect();
+    assert!(told[0].is_empty() && told[1].is_empty(), "{told:?}");
+    let [note] = told[2].as_slice() else { panic!("{told:?}") };
+    assert_eq!((note.severity, &*note.subject), (Severity::Note, "the links at ft"));
+    let [from, to] = ["between ", " and "].map(|before| {
+        let after = note.text.split_once(before).expect("a span").1;
+        let end = after.find(' ').expect("more");
+        after[..end].parse::<f64>().expect("seconds")
+    });
+    assert!((5.6..6.1).contains(&from) && (7.4..7.9).contains(&to), "{}", note.text);
+    let [free, pushed] = [1, 2].map(|log| &outcome.logs[log]);
+    assert_eq!((free.used, &free.left_out), (pushed.used, &pushed.left_out));
+    assert!(pushed.relative_error.identified > 3.0 * free.relative_error.identified);
+}
+
 /// Nothing undeclared acts on the robots of the recorded logs: nothing of them may be thought a contact, whatever CAD has wrong and however the structure shakes.
 fn nothing_is_suspected(outcome: &Outcome) {
-    let left_out = outcome.logs.iter().flat_map(|log| &log.left_out);
-    let suspected: Vec<_> = left_out
-        .filter(|out| out.reason.contains("suspected") || out.reason.contains("load"))
+    let findings = outcome.logs.iter().flat_map(|log| &log.findings);
+    let suspected: Vec<_> = findings
+        .filter(|f| ["contact_suspected", "load_changed"].contains(&f.code))
         .collect();
     assert!(suspected.is_empty(), "{suspected:?}");
 }

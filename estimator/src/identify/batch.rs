@@ -8,7 +8,7 @@
 //!    Then, where gains of sensors are asked for, fits with these unknown, too.
 //! 4. A check on data held out: pieces of the logs are predicted from the others. The change from CAD is shrunk where it gains nothing ([`held_out`]).
 //! 5. Shaking that encoders do not show ([`super::shaking`]), where other sensors tell of it, is taken off; then 2 and 4 once more.
-//! 6. Figures for every log ([`super::assess`]).
+//! 6. Figures for every log ([`super::assess`]), and what undeclared acted on the robot in those to validate with.
 
 use super::assess;
 use super::consistent;
@@ -240,11 +240,13 @@ pub fn identify(
         ..setup.calibrated
     };
     maker.calibrate(of_temperature, training.iter().flat_map(|log| log.instants.iter()));
-    let (mut settled, restless) = gated(setup, &maker, &mut prepared, &mut tell_progress)?;
+    let mut gated = gated(setup, &maker, &mut prepared, &mut tell_progress)?;
     if setup.calibrated.gain != Gain::None {
-        settled = with_gains(setup, &mut maker, &mut prepared, settled, &mut tell_progress)?;
+        gated = with_gains(setup, &mut maker, &mut prepared, gated, &mut tell_progress)?;
     }
     let maker = maker;
+    tell_suspicions(&maker, &mut prepared, &gated);
+    let Gated { settled, restless, .. } = gated;
     let training = used(&prepared);
     let mut identified = fit(&maker, &training, inputs.clone(), settled, &mut tell_progress)?;
     tell_progress("shaking".into(), 0.8);
@@ -261,6 +263,7 @@ pub fn identify(
     }
     identified.findings.extend(restless);
     identified.findings.extend(asked_in_vain(setup, &identified.inputs));
+    tell_touches(&maker, &mut prepared, &identified);
     let training = used(&prepared);
     tell_progress("figures".into(), 0.9);
     let outcome = assess::outcome(setup, &maker, &prepared, &training, &identified);
@@ -685,13 +688,23 @@ fn settle(
     }
 }
 
-/// Fits, leaves out what something undeclared acted on, and fits again, until that stays; says in the logs what was left out, and to the caller if it did not stay.
+/// What is left when what something undeclared acted on was left out.
+struct Gated {
+    settled: Settled,
+    loads: Vec<Load>,
+    /// Per training log and instant.
+    contacts: Vec<Vec<UnitSet>>,
+    /// Said if what is left out did not come to stay.
+    restless: Option<Finding>,
+}
+
+/// Fits, leaves out what something undeclared acted on, and fits again, until that stays.
 fn gated(
     setup: &Setup,
     maker: &RowMaker<'_>,
     prepared: &mut [Prepared],
     progress: &mut dyn FnMut(String, f64),
-) -> Result<(Settled, Option<Finding>), IdentifyError> {
+) -> Result<Gated, IdentifyError> {
     let mut settled = settle(setup, maker, &used(prepared), None, progress)?;
     // It has been told how far along this is.
     let mut progress = |step: String, _| progress(step, 0.7);
@@ -735,22 +748,6 @@ fn gated(
         suspect(prepared, &loads, &contacts);
         settled = settle(setup, maker, &used(prepared), Some(settled.noise), &mut progress)?;
     }
-    let training = used(prepared);
-    let bodies: Vec<Option<gate::Added>> = loads
-        .iter()
-        .map(|load| {
-            gate::added(
-                maker,
-                &settled.prior,
-                &training,
-                load,
-                &settled.noise,
-                &settled.information,
-                settled.fit.tau,
-            )
-        })
-        .collect();
-    tell_suspicions(maker, prepared, &loads, &bodies, &contacts);
     let restless = (!stays).then(|| Finding {
         severity: Severity::Warning,
         code: "contact_unsettled",
@@ -759,11 +756,28 @@ fn gated(
             "after {GATES} fits, what is left out because something undeclared acted there had not come to stay: look at what the logs leave out, and declare contacts where they were"
         ),
     });
-    Ok((settled, restless))
+    Ok(Gated {
+        settled,
+        loads,
+        contacts,
+        restless,
+    })
 }
 
-/// Gains of the sensors, too: what a gain multiplies is what the fit before says that was there to be read ([`super::rows`]); until that stays.
+/// Gains of the sensors, too.
 fn with_gains(
+    setup: &Setup,
+    maker: &mut RowMaker<'_>,
+    prepared: &mut [Prepared],
+    gated: Gated,
+    progress: &mut dyn FnMut(String, f64),
+) -> Result<Gated, IdentifyError> {
+    let settled = gains(setup, maker, prepared, gated.settled, progress)?;
+    Ok(Gated { settled, ..gated })
+}
+
+/// Fits gains, too: what a gain multiplies is what the fit before says that was there to be read ([`super::rows`]); until that stays.
+fn gains(
     setup: &Setup,
     maker: &mut RowMaker<'_>,
     prepared: &mut [Prepared],
@@ -840,22 +854,100 @@ fn suspect(prepared: &mut [Prepared], loads: &[Load], contacts: &[Vec<UnitSet>])
     }
 }
 
-/// Says what was left out because of something undeclared.
-fn tell_suspicions(
-    maker: &RowMaker<'_>,
-    prepared: &mut [Prepared],
-    loads: &[Load],
-    bodies: &[Option<gate::Added>],
-    contacts: &[Vec<UnitSet>],
-) {
-    let setup = maker.setup();
-    let part = |unit: usize| match setup.structure.subtrees().get(unit) {
+/// The links of a unit, in words.
+fn part(setup: &Setup, unit: usize) -> String {
+    match setup.structure.subtrees().get(unit) {
         Some(subtree) => {
             let sensors: Vec<String> = subtree.sensors.iter().map(|s| assess::sensor_name(setup, s)).collect();
             format!("the links at {}", sensors.join(", "))
         }
         None => "the links whose joint torques are measured".to_owned(),
+    }
+}
+
+/// When something acted on a part of the robot.
+struct Touches {
+    times: usize,
+    instants: usize,
+    first: Nanos,
+    last: Nanos,
+}
+
+impl Touches {
+    /// At those of a log's instants of which `is_touched` says so; none if it does of none.
+    fn of(instants: &[Instant], is_touched: impl Fn(usize) -> bool) -> Option<Self> {
+        let touched: Vec<usize> = (0..instants.len()).filter(|&i| is_touched(i)).collect();
+        Some(Self {
+            times: 1 + touched.windows(2).filter(|two| two[1] > two[0] + 1).count(),
+            instants: touched.len(),
+            first: instants[*touched.first()?].t,
+            last: instants[*touched.last()?].t,
+        })
+    }
+
+    /// `2 times between 3.1 and 7.4 s after the log's start: 5.0 % of the log`.
+    fn describe(&self, log: &Prepared) -> String {
+        let since = |t: Nanos| (t - log.span.0).seconds();
+        format!(
+            "{} time{} between {:.1} and {:.1} s after the log's start: {:.1} % of the log",
+            self.times,
+            if self.times == 1 { "" } else { "s" },
+            since(self.first),
+            since(self.last),
+            100.0 * self.instants as f64 / log.instants.len() as f64
+        )
+    }
+}
+
+/// Says what acted on the robot in the logs to validate with though nobody declared it. Their figures stay those of all rows: what is held out must not be picked by what it is to check.
+fn tell_touches(maker: &RowMaker<'_>, prepared: &mut [Prepared], identified: &Identified) {
+    let is_checked = |log: &&Prepared| log.role == Role::Validate && !log.refused;
+    let checked: Vec<&Prepared> = prepared.iter().filter(is_checked).collect();
+    let found = gate::contacts(maker, &checked, &[], &identified.noise, &identified.d);
+    let checked = prepared
+        .iter_mut()
+        .filter(|log| log.role == Role::Validate && !log.refused);
+    for (log, contacts) in checked.zip(found) {
+        let units = contacts.iter().fold(UnitSet::default(), |units, set| units.union(set));
+        for unit in units.iter() {
+            let Some(touches) = Touches::of(&log.instants, |i| contacts[i].contains(unit)) else {
+                continue;
+            };
+            let part = part(maker.setup(), unit);
+            log.findings.push(Finding {
+                severity: Severity::Note,
+                code: "contact_suspected",
+                text: format!(
+                    "as if something that nobody declared acted on {part}, what was identified does not hold there {}. This log's figures are of all of it, these times too",
+                    touches.describe(log)
+                ),
+                subject: part,
+            });
+        }
+    }
+}
+
+/// Says what was left out because of something undeclared.
+fn tell_suspicions(maker: &RowMaker<'_>, prepared: &mut [Prepared], gated: &Gated) {
+    let Gated {
+        settled,
+        loads,
+        contacts,
+        ..
+    } = gated;
+    let setup = maker.setup();
+    let training = used(prepared);
+    let body = |load: &Load| {
+        let Settled {
+            prior,
+            noise,
+            information,
+            fit,
+            ..
+        } = settled;
+        gate::added(maker, prior, &training, load, noise, information, fit.tau)
     };
+    let bodies: Vec<Option<gate::Added>> = loads.iter().map(body).collect();
     let training = prepared
         .iter_mut()
         .filter(|log| log.role == Role::Train && !log.refused);
@@ -871,36 +963,28 @@ fn tell_suspicions(
                     .iter()
                     .any(|load| of_load(load) && load.has_nearly(log.instants[i].t))
             };
-            let touched: Vec<usize> = (0..contacts.len())
-                .filter(|&i| contacts[i].contains(unit) && !handed(i))
-                .collect();
-            let (Some(&first), Some(&last)) = (touched.first(), touched.last()) else {
+            let Some(touches) = Touches::of(&log.instants, |i| contacts[i].contains(unit) && !handed(i)) else {
                 continue;
             };
-            let times = 1 + touched.windows(2).filter(|two| two[1] > two[0] + 1).count();
-            let share = touched.len() as f64 / contacts.len() as f64;
             log.left_out.push(LeftOut {
-                reason: format!("contact suspected: {}", part(unit)),
-                instants: touched.len() as u64,
-                first: log.instants[first].t,
-                last: log.instants[last].t,
+                reason: format!("contact suspected: {}", part(setup, unit)),
+                instants: touches.instants as u64,
+                first: touches.first,
+                last: touches.last,
             });
             log.findings.push(Finding {
                 severity: Severity::Warning,
                 code: "contact_suspected",
-                subject: part(unit),
+                subject: part(setup, unit),
                 text: format!(
-                    "something that nobody declared acted on {}, {times} time{} between {:.1} and {:.1} s after the log's start: {:.1} % of the log {} left out there",
-                    part(unit),
-                    if times == 1 { "" } else { "s" },
-                    since(log.instants[first].t),
-                    since(log.instants[last].t),
-                    100.0 * share,
-                    if times == 1 { "was" } else { "were" }
+                    "something that nobody declared acted on {}, {} {} left out there",
+                    part(setup, unit),
+                    touches.describe(log),
+                    if touches.times == 1 { "was" } else { "were" }
                 ),
             });
         }
-        for (load, body) in loads.iter().zip(bodies).filter(|(load, _)| load.log == number) {
+        for (load, body) in loads.iter().zip(&bodies).filter(|(load, _)| load.log == number) {
             let link = setup.model.link_name(maker.layout().links[load.place]);
             let is_out = |(instant, contact): &(&Instant, &UnitSet)| {
                 let touched = !contact.intersection(&load.units).is_empty();

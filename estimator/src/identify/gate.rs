@@ -95,14 +95,14 @@ pub(super) struct Added {
 /// Per instant of a log, the units that something undeclared acts on. `loads` are left alone.
 pub(super) fn contacts(
     maker: &RowMaker<'_>,
-    training: &[&Prepared],
+    all: &[&Prepared],
     loads: &[Load],
     noise: &NoiseModel,
     d: &DVector<f64>,
 ) -> Vec<Vec<UnitSet>> {
     // Long logs in parts, so that all cores have work: of a minute at least, which a contact is not most of.
     let (mut pieces, mut logs) = (Vec::new(), Vec::new());
-    for (number, log) in training.iter().enumerate() {
+    for (number, log) in all.iter().enumerate() {
         let minutes = ((log.span.1 - log.span.0).seconds() / 60.0) as usize;
         let count = log.instants.len().div_ceil(LONG).min(minutes).max(1);
         let at = |part: usize| log.instants.len() * part / count;
@@ -118,7 +118,7 @@ pub(super) fn contacts(
         let own: Vec<&Load> = loads.iter().filter(|load| load.log == logs[number]).collect();
         of_piece(maker, piece, &own, noise, d)
     });
-    let mut out = vec![Vec::new(); training.len()];
+    let mut out = vec![Vec::new(); all.len()];
     for (log, found) in logs.into_iter().zip(found) {
         out[log].extend(found);
     }
