@@ -5,7 +5,7 @@
 //!    probable bodies under the prior and its weight ([`super::prior`]). With these bodies: what is left, and from it the noise ([`super::noise`]). Until both stay.
 //!    Before the first of them: a sensor that is mounted the wrong way is refused, or the log in which alone it is ([`super::mounting`]).
 //! 3. What this fit says that something undeclared acted on is left out, and the rounds repeated, until that stays ([`super::gate`]).
-//!    Then, where gains of sensors are asked for, fits with these unknown, too.
+//!    Then, where gains of sensors are asked for, fits with these unknown, too, and what is left out is asked again.
 //! 4. A check on data held out: pieces of the logs are predicted from the others. The change from CAD is shrunk where it gains nothing ([`held_out`]).
 //! 5. Shaking that encoders do not show ([`super::shaking`]), where other sensors tell of it, is taken off; then 2 and 4 once more.
 //! 6. Figures for every log ([`super::assess`]), and what undeclared acted on the robot in those to validate with.
@@ -764,16 +764,28 @@ fn gated(
     })
 }
 
-/// Gains of the sensors, too.
+/// Gains of the sensors, too. What a gain that is off leaves where the robot carries much may have been taken for a contact: that is asked again when gains are known, and if it was otherwise, gains are
+/// fitted again, a few times at the most. (Each time some of what was left out comes back, and tells more of gains.)
 fn with_gains(
     setup: &Setup,
     maker: &mut RowMaker<'_>,
     prepared: &mut [Prepared],
-    gated: Gated,
+    mut gated: Gated,
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<Gated, IdentifyError> {
-    let settled = gains(setup, maker, prepared, gated.settled, progress)?;
-    Ok(Gated { settled, ..gated })
+    const AGAIN: usize = 4;
+    gated.settled = gains(setup, maker, prepared, gated.settled, progress)?;
+    for _ in 0..AGAIN {
+        let Settled { noise, fit, .. } = &gated.settled;
+        let contacts = gate::contacts(maker, &used(prepared), &gated.loads, noise, &fit.x);
+        if contacts == gated.contacts {
+            break;
+        }
+        gated.contacts = contacts;
+        suspect(prepared, &gated.loads, &gated.contacts);
+        gated.settled = gains(setup, maker, prepared, gated.settled, progress)?;
+    }
+    Ok(gated)
 }
 
 /// Fits gains, too: what a gain multiplies is what the fit before says that was there to be read ([`super::rows`]); until that stays.
