@@ -1289,30 +1289,32 @@ fn torques_that_can_not_be_are_named_and_left_out() {
         println!("{expected}: {cad:.4} -> {own:.4} Nm, {best:.4} without it, covered {inside:.3}");
         assert!(3.0 * own < cad && inside > 0.8, "{expected}: {cad} {own} {inside}");
     }
-    // Late by three rows.
-    let mut late = good.clone();
-    for joint in ARM_JOINTS {
-        let mut before = std::collections::VecDeque::new();
-        late = change_rows(&late, &torque(joint), |_, x| {
-            before.push_back(x);
-            if before.len() > 4 {
-                before.pop_front();
-            }
-            if before.len() == 4 { before[0] } else { x }
-        });
+    // Late by three rows: all of them, or one.
+    for (joints, subject) in [(&ARM_JOINTS[..], "joint torques"), (&["j4"], "joint/j4/torque")] {
+        let mut late = good.clone();
+        for joint in joints {
+            let mut before = std::collections::VecDeque::new();
+            late = change_rows(&late, &torque(joint), |_, x| {
+                before.push_back(x);
+                if before.len() > 4 {
+                    before.pop_front();
+                }
+                if before.len() == 4 { before[0] } else { x }
+            });
+        }
+        let (outcome, names) = named(&late);
+        assert_eq!(names, [format!("time_offset {subject}")]);
+        let finding = outcome.findings.iter().find(|f| f.code == "time_offset").expect("it");
+        println!("{}", finding.text);
+        let words: Vec<&str> = finding.text.split(' ').collect();
+        let at = words.iter().position(|word| *word == "stamped").expect("how late");
+        let late: f64 = words[at + 1].parse().expect("milliseconds");
+        assert!(
+            (25.0..35.0).contains(&late) && words[at + 3] == "behind",
+            "{}",
+            finding.text
+        );
     }
-    let (outcome, names) = named(&late);
-    assert_eq!(names, ["time_offset joint torques"]);
-    let finding = outcome.findings.iter().find(|f| f.code == "time_offset").expect("it");
-    println!("{}", finding.text);
-    let words: Vec<&str> = finding.text.split(' ').collect();
-    let at = words.iter().position(|word| *word == "stamped").expect("how late");
-    let late: f64 = words[at + 1].parse().expect("milliseconds");
-    assert!(
-        (25.0..35.0).contains(&late) && words[at + 3] == "behind",
-        "{}",
-        finding.text
-    );
 }
 
 /// Where links stay as in CAD because nothing could be checked, rotors are what goes best with CAD, and as uncertain as it.
