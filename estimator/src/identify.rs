@@ -4,6 +4,7 @@
 //! ```text
 //! log -> Recording, Instants: all channels at common instants, derivatives, what is wrong      instants
 //!     -> joint torques that are none (sign, units, dead) taken out                             torques
+//!     -> F/T readings that are none refused, or those of a sensor mounted otherwise                     mounting, wrenches
 //!     -> rows of each instant: A d + G s = r + N e                                             rows
 //!     -> offsets and friction s eliminated, by a filter on all columns at once                 session, passes
 //!     -> [R | z], what all logs tell of d = phi - phi_CAD                                      information
@@ -47,6 +48,7 @@ mod rows;
 mod session;
 mod shaking;
 mod torques;
+mod wrenches;
 
 pub use batch::{IdentifyError, Log, Options, Progress, identify};
 pub use export::parameters;

@@ -1673,8 +1673,96 @@ fn joint_whose_zero_is_elsewhere_is_named() {
             .collect()
     };
     assert!(names(&log).is_empty(), "none in a log where all are right");
-    let off = change(&log, "joint/j4/position", |q| q + 0.06);
-    assert_eq!(names(&off), ["j4"]);
+    // Beyond the sensor, and between the base and it, where an error tilts all that it carries.
+    for joint in ["j4", "j2"] {
+        let off = change(&log, &format!("joint/{joint}/position"), |q| q + 0.06);
+        assert_eq!(names(&off), [joint]);
+    }
+}
+
+/// Readings in other units are refused, however well bodies of some other weight would fit them; what might be the URDF's mistake is said.
+#[test]
+fn readings_in_other_units_are_no_heavy_bodies() {
+    let setup = arm();
+    let log = simulate(&setup, &real(&setup, 3), 6.0, 0.01, 3);
+    let scaled = |axes: &[&str], by: f64| {
+        let each = |log: String, axis: &&str| change(&log, &format!("wrench/ft/{axis}"), |x| by * x);
+        axes.iter().fold(log.clone(), each)
+    };
+    let found = |log: &str| {
+        let outcome = run(&setup, &[("log", Role::Train, log)], &[]);
+        let units = outcome.logs[0].findings.iter();
+        let units = units.filter(|f| ["wrong_units", "scale"].contains(&f.code));
+        let units: Vec<String> = units.map(|f| format!("{} {}", f.code, f.subject)).collect();
+        (units, matches!(outcome.verdict, Verdict::Nothing(_)))
+    };
+    assert_eq!(found(&log), (vec![], false));
+    for (axes, by) in [(&AXES[..], 100.0), (&AXES[3..], 1000.0), (&AXES[..], 0.001)] {
+        let expected = vec!["wrong_units wrench/ft".to_owned()];
+        assert_eq!(found(&scaled(axes, by)), (expected, true), "{by}");
+    }
+    for by in [0.102, 10.0] {
+        assert_eq!(
+            found(&scaled(&AXES, by)),
+            (vec!["scale wrench/ft".to_owned()], false),
+            "{by}"
+        );
+    }
+    // One log of two: the other is used.
+    let other = simulate(&setup, &real(&setup, 3), 6.0, 0.01, 4);
+    let counts = scaled(&AXES, 300.0);
+    let logs = [("counts", Role::Train, counts.as_str()), ("good", Role::Train, &other)];
+    let outcome = run(&setup, &logs, &[]);
+    assert_eq!(outcome.verdict, Verdict::Identified);
+    assert_eq!(
+        outcome.logs.iter().map(|log| log.used > 0).collect::<Vec<_>>(),
+        [false, true]
+    );
+}
+
+/// What no parameters explain is said, and where most is, refused: an encoder that is dead, an axis with its sign turned, another robot's log.
+#[test]
+fn readings_that_nothing_explains_are_said() {
+    let setup = arm();
+    let log = simulate(&setup, &real(&setup, 3), 6.0, 0.01, 3);
+    let found = |log: &str| {
+        let outcome = run(&setup, &[("log", Role::Train, log)], &[]);
+        let mut findings = outcome.logs.into_iter().flat_map(|log| log.findings);
+        findings.find(|f| f.code == "unexplained")
+    };
+    assert_eq!(found(&log), None);
+    let dead = found(&change(&log, "joint/j4/position", |_| 0.3)).expect("a dead encoder");
+    assert_eq!(dead.severity, Severity::Warning);
+    assert!(
+        dead.text.contains("Dead may be what never changes: joint/j4."),
+        "{}",
+        dead.text
+    );
+    let axis = found(&change(&log, "wrench/ft/fx", |x| -x)).expect("a turned axis");
+    assert!(axis.text.contains(" fx against what is predicted"), "{}", axis.text);
+    // What the sensor read while the arm moved otherwise.
+    let other = simulate(&setup, &real(&setup, 3), 6.0, 0.01, 9);
+    let is_read: Vec<bool> = log
+        .lines()
+        .next()
+        .expect("a header")
+        .split(',')
+        .map(|name| name.starts_with("wrench/"))
+        .collect();
+    let rows = log.lines().zip(other.lines()).map(|(row, other)| {
+        let cells = row.split(',').zip(other.split(',')).zip(&is_read);
+        cells
+            .map(|((own, other), is_read)| if *is_read { other } else { own })
+            .collect::<Vec<_>>()
+            .join(",")
+            + "\n"
+    });
+    let other: String = rows.collect();
+    assert_eq!(
+        found(&other).map(|f| f.severity),
+        Some(Severity::Refusal),
+        "{other:.200}"
+    );
 }
 
 #[test]

@@ -193,12 +193,22 @@ impl Advice {
             return;
         }
         self.worsen(Grade::Care);
+        for (log, finding) in
+            findings(outcome).filter(|(_, f)| f.code == "unexplained" && f.severity == Severity::Refusal)
+        {
+            self.worsen(Grade::Reject);
+            self.why.push(format!(
+                "Most of what {} reads in {} is explained by no parameters: something else is wrong.",
+                finding.subject,
+                log.map_or("the logs", |log| log.file.as_str())
+            ));
+        }
         // What a fit to any motion would meet again; each once, although several logs may show it.
         let mut said = BTreeSet::new();
         for finding in all().filter(|f| {
             matches!(
                 f.code,
-                "wrong_sign" | "wrong_frame" | "joint_zero" | "units" | "wrong_units"
+                "wrong_sign" | "wrong_frame" | "joint_zero" | "units" | "wrong_units" | "scale" | "unexplained"
             )
         }) {
             if finding.severity >= Severity::Warning && said.insert(finding.text.as_str()) {
@@ -400,6 +410,23 @@ mod tests {
                 .any(|n| n == "r_leg_ft_sensor seems to be mounted the wrong way round."),
             "{advice:?}"
         );
+    }
+
+    #[test]
+    fn what_no_parameters_explain_is_rejected() {
+        let mut outcome = good();
+        outcome.logs[0].findings.push(Finding {
+            severity: Severity::Warning,
+            code: "unexplained",
+            subject: "wrench/r_leg_ft_sensor".into(),
+            text: "wrench/r_leg_ft_sensor: 20 % is left".into(),
+        });
+        assert_eq!(Advice::of(&outcome).grade, Grade::Care);
+        outcome.logs[0].findings[0].severity = Severity::Refusal;
+        let advice = Advice::of(&outcome);
+        assert_eq!(advice.grade, Grade::Reject);
+        let why = "Most of what wrench/r_leg_ft_sensor reads in walk_1.csv is explained by no parameters";
+        assert!(advice.why.iter().any(|n| n.starts_with(why)), "{advice:?}");
     }
 
     #[test]

@@ -985,10 +985,12 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
 
     let compared = Compared::new(maker, instants, &left, identified, &sets);
     let mut sensors = Vec::new();
+    let mut findings = Vec::new();
     let mut wrench_share = Vec::new();
     for (place, &sensor) in layout.sensors.iter().enumerate() {
         let name = sensor_name(setup, sensor);
         let mut values = [[f64::NAN; 6]; 3];
+        findings.extend(unexplained(setup, sensor, &name, &compared, place, &log.findings));
         for axis in 0..6 {
             let channel = channel_of(place, axis);
             let errors = compared.errors.each_ref().map(|set| &set[channel]);
@@ -1047,7 +1049,7 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         offsets: offsets(setup, layout, log, identified, &left, &deviations),
         friction: friction(setup, layout, &left, &deviations),
         time_offsets: late,
-        findings: log.findings.iter().cloned().chain(found).collect(),
+        findings: log.findings.iter().cloned().chain(found).chain(findings).collect(),
         curves: curves(maker, instants, &times, &compared, identified, root, &torque_series),
         spectra: spectra(setup, layout, places.as_ref(), &left),
     }
@@ -1059,6 +1061,83 @@ fn three<T: Copy>(values: [T; 3]) -> Three<T> {
         cad_fitted: values[1],
         identified: values[2],
     }
+}
+
+/// What the identified parameters leave of a sensor's readings if it is far more than its noise; a refusal if it is most of what they change by.
+fn unexplained(
+    setup: &Setup,
+    sensor: usize,
+    name: &str,
+    compared: &Compared,
+    place: usize,
+    others: &[Finding],
+) -> Option<Finding> {
+    /// More than so many times the stated noise, and than this share of what the axis changes by, is said.
+    const TIMES: f64 = 10.0;
+    const SHARE: f64 = 0.02;
+    /// The share of all that the sensor changes by, from which on the model is not that of the log: half of the squares.
+    const MOST: f64 = 0.7;
+    /// Correlation of an axis with its prediction that no noise makes.
+    const AGAINST: f64 = -0.5;
+    let noise = setup.structure.sensors()[sensor].noise();
+    let noise = [noise.force, noise.torque].concat();
+    let (mut left, mut all) = (0.0, 0.0);
+    let (mut axes, mut turned) = (Vec::new(), Vec::new());
+    for (axis, word) in AXES.into_iter().enumerate() {
+        let channel = channel_of(place, axis);
+        let pairs = compared.load[channel].iter().zip(&compared.errors[2][channel]);
+        let (load, error): (Vec<f64>, Vec<f64>) = pairs.filter(|(l, e)| l.is_finite() && e.is_finite()).unzip();
+        let centre = mean(&load);
+        let load: Vec<f64> = load.iter().map(|x| x - centre).collect();
+        let predicted: Vec<f64> = load.iter().zip(&error).map(|(l, e)| l - e).collect();
+        let scale = if axis < 3 { Structure::LENGTH_SCALE } else { 1.0 };
+        let [ll, ee, pp, lp] = [
+            (&load, &load),
+            (&error, &error),
+            (&predicted, &predicted),
+            (&load, &predicted),
+        ]
+        .map(|(a, b)| dot(a, b));
+        (left, all) = (left + scale * scale * ee, all + scale * scale * ll);
+        let times = (ee / load.len() as f64).sqrt() / noise[axis];
+        if times > TIMES && ee > SHARE * SHARE * ll {
+            axes.push(format!("{word} {times:.0}"));
+            if lp < AGAINST * (ll * pp).sqrt() {
+                turned.push(word);
+            }
+        }
+    }
+    if axes.is_empty() {
+        return None;
+    }
+    let share = (left / all).sqrt();
+    let still = others.iter().filter(|f| f.code == "still").map(|f| f.subject.as_str());
+    let still: Vec<&str> = still.collect();
+    let mut hints = Vec::new();
+    if !turned.is_empty() {
+        hints.push(format!(
+            " {} against what is predicted: turned, or another axis.",
+            turned.join(", ")
+        ));
+    }
+    if !still.is_empty() {
+        hints.push(format!(" Dead may be what never changes: {}.", still.join(", ")));
+    }
+    Some(Finding {
+        severity: if share > MOST {
+            Severity::Refusal
+        } else {
+            Severity::Warning
+        },
+        code: "unexplained",
+        subject: format!("wrench/{name}"),
+        text: format!(
+            "wrench/{name}: {:.0} % of what it changes by is left with the identified parameters (times the stated noise: {}).{} A joint's zero, sign or order, a dead encoder, an axis or the calibration of the sensor, stamps, cables or a contact that nobody declared may be wrong, or the log is of another robot; or noise_n, noise_nm state too little",
+            100.0 * share,
+            axes.join(", "),
+            hints.concat()
+        ),
+    })
 }
 
 /// When something first moves by more than [`STILL`] from where it was; none if it never does, or within the first half second.
@@ -1287,7 +1366,7 @@ fn configured_session(setup: &Setup, layout: &Layout) -> Vec<f64> {
 
 /// The map from the residuals of rows (not whitened) to the noise of these channels that explains them, all other channels being taken to be exact: `V N^T (N V N^T)^-1`; none if no
 /// row has any of them.
-fn laid_to(rows: &Rows, variances: &[f64], channels: std::ops::Range<usize>) -> Option<DMatrix<f64>> {
+pub(super) fn laid_to(rows: &Rows, variances: &[f64], channels: std::ops::Range<usize>) -> Option<DMatrix<f64>> {
     /// Where several sub-trees disagree about the channels, the others take the rest, which must cost something.
     const OTHERS: f64 = 1e-6;
     let has = |row: &usize| rows.n(*row)[channels.clone()].iter().any(|x| *x != 0.0);

@@ -23,6 +23,7 @@ use super::prior::{Fit, Posterior, Prior, PriorError};
 use super::rows::{Further, Groups, Layout, RowMaker, Rows};
 use super::shaking::Shaking;
 use super::torques;
+use super::wrenches;
 use crate::calibration::Kind;
 use crate::config::{Gain, IdentificationInput, TorqueSide};
 use crate::dynamics::DynamicsError;
@@ -204,6 +205,17 @@ pub fn identify(
             format!("nothing shows the links' parameters: {what}"),
         ));
     }
+    let before = training.len();
+    for log in &mut prepared {
+        wrenches::check(&mut maker, log);
+    }
+    if let Some(surveyed) = surveyed_again(setup, &inputs, &prepared, before)? {
+        maker = surveyed;
+    }
+    if maker.layout().links.is_empty() {
+        return Ok(assess::nothing(setup, &prepared, NO_LOG.into()));
+    }
+    let training = used(&prepared);
     let wrong = mounting::wrong(&maker, &training);
     if !wrong.is_empty() {
         let names: Vec<&str> = wrong.iter().map(|f| f.subject.as_str()).collect();
@@ -220,21 +232,18 @@ pub fn identify(
     }
     // Not mounted alike in all logs?
     let found = mounting::wrong_alone(&maker, &training, &prepared);
-    let apart = found.iter().any(|found| !found.is_empty());
+    let before = training.len();
     for (log, found) in prepared.iter_mut().zip(found) {
         log.refused |= !found.is_empty();
         log.findings.extend(found);
     }
-    let training = used(&prepared);
-    if apart {
-        if training.is_empty() {
-            return Ok(assess::nothing(setup, &prepared, NO_LOG.into()));
-        }
-        maker = RowMaker::survey(setup, &inputs, training.iter().flat_map(|log| log.instants.iter()))?;
-        if maker.layout().links.is_empty() {
-            return Ok(assess::nothing(setup, &prepared, NO_LOG.into()));
-        }
+    if let Some(surveyed) = surveyed_again(setup, &inputs, &prepared, before)? {
+        maker = surveyed;
     }
+    if maker.layout().links.is_empty() {
+        return Ok(assess::nothing(setup, &prepared, NO_LOG.into()));
+    }
+    let training = used(&prepared);
     let of_temperature = Kind {
         gain: Gain::None,
         ..setup.calibrated
@@ -300,6 +309,21 @@ fn asked_in_vain(setup: &Setup, inputs: &[IdentificationInput]) -> Vec<Finding> 
         notes.push(note("no_rotors", key, text));
     }
     notes
+}
+
+/// A survey of the logs to train on, if they are not the `before` that there were; without any link if there are none left.
+fn surveyed_again<'a>(
+    setup: &'a Setup,
+    inputs: &[IdentificationInput],
+    prepared: &[Prepared],
+    before: usize,
+) -> Result<Option<RowMaker<'a>>, IdentifyError> {
+    let training = used(prepared);
+    if training.len() == before {
+        return Ok(None);
+    }
+    let instants = training.iter().flat_map(|log| log.instants.iter());
+    Ok(Some(RowMaker::survey(setup, inputs, instants)?))
 }
 
 /// The logs to train on.
@@ -1364,32 +1388,38 @@ fn held_out(
 }
 
 /// Joints whose zero is elsewhere than the model's: a constant error of the position that explains more than inertial parameters can, at the prior's weight.
+///
+/// Of joints beyond sensors, or between them, and of those between the base and them: an error of these tilts all that is seen, otherwise in every posture, unless it is the joint at the base, which
+/// looks as a base that is not level does.
 pub(super) fn joint_zeros(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Identified) -> Vec<Finding> {
     /// A position is expected to be off by this much \[rad\], one standard deviation, before anything is measured.
     const SPREAD: f64 = 0.1;
     /// Squared deviations that must be gained: one joint in a thousand gains more by chance (chi-square, one degree).
     const GAIN: f64 = 10.83;
-    /// Less than this matters to nobody \[rad\].
+    /// Less than this matters to nobody \[rad\]; of a joint before the sensors: less is what floors and bases have.
     const LEAST: f64 = 0.01;
+    const LEAST_BEFORE: f64 = 0.02;
     /// Instants that are looked at, in stretches of every log: offsets and noise need what follows each other, and each stretch pays for offsets of its own.
     const ENOUGH: usize = 2000;
     const STRETCHES: usize = 4;
     let setup = maker.setup();
     let layout = &identified.layout;
-    // Joints beyond which, or between which, everything is seen: an error of another one only tilts all of it, as a base that is not level does.
-    let turns = |dof: &usize| {
-        let joint = setup.model.dof_joint(*dof).map(|joint| setup.model.joints()[joint]);
-        joint
-            .filter(|j| matches!(j.kind, JointKind::Revolute(_)))
-            .is_some_and(|j| {
-                let inside = setup.structure.subtree_of(j.parent) == setup.structure.subtree_of(j.child)
-                    && layout.links.contains(&j.parent);
-                layout.links.contains(&j.child) && (inside || !layout.joints.is_empty())
-            })
+    let joint = |dof: usize| {
+        let joint = setup.model.dof_joint(dof).map(|joint| &setup.model.joints()[joint]);
+        joint.filter(|joint| matches!(joint.kind, JointKind::Revolute(_)))
     };
+    // Beyond which, or between which, everything is seen.
+    let is_within = |dof: usize| {
+        joint(dof).is_some_and(|joint| {
+            let inside = setup.structure.subtree_of(joint.parent) == setup.structure.subtree_of(joint.child)
+                && layout.links.contains(&joint.parent);
+            layout.links.contains(&joint.child) && (inside || !layout.joints.is_empty())
+        })
+    };
+    // Whoever moves nothing that is seen has columns of zeros, and explains nothing.
     let angles: Vec<usize> = (0..setup.model.dof_count())
         .filter(|&dof| setup.locked[dof].is_nan())
-        .filter(turns)
+        .filter(|dof| joint(*dof).is_some())
         .collect();
     let mut parts = Vec::new();
     for log in training {
@@ -1451,18 +1481,13 @@ pub(super) fn joint_zeros(maker: &RowMaker<'_>, training: &[&Prepared], identifi
     }
     let mut findings = Vec::new();
     for (value, &place) in values.iter().zip(&chosen) {
-        if value.abs() > LEAST {
-            let joint = setup.model.dof_name(angles[place]).to_owned();
-            findings.push(Finding {
-                severity: Severity::Warning,
-                code: "joint_zero",
-                text: Defect::JointZero {
-                    joint: joint.clone(),
-                    radians: *value,
-                }
-                .to_string(),
-                subject: joint,
-            });
+        let is_within = is_within(angles[place]);
+        if value.abs() > if is_within { LEAST } else { LEAST_BEFORE } {
+            findings.push(finding(&Defect::JointZero {
+                joint: setup.model.dof_name(angles[place]).to_owned(),
+                radians: *value,
+                is_before: !is_within,
+            }));
         }
     }
     findings

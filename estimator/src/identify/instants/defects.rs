@@ -198,6 +198,8 @@ pub enum Defect {
         joint: String,
         /// By how much \[rad\].
         radians: f64,
+        /// Whether it is between the base and the sensors.
+        is_before: bool,
     },
 }
 
@@ -339,9 +341,21 @@ impl fmt::Display for Defect {
                 f,
                 "wrench/{sensor} does not fit the links beyond it in the frame that the configuration says, but would with {instead}: check how it is mounted, and `frame` and `direction` in its [[force_torque]]"
             ),
-            Self::JointZero { joint, radians } => write!(
+            Self::JointZero {
+                joint,
+                radians,
+                is_before: false,
+            } => write!(
                 f,
                 "joint/{joint}: its zero is {radians:.4} rad from the model's; calibrate the encoder, or the error is taken for a shifted centre of mass"
+            ),
+            Self::JointZero {
+                joint,
+                radians,
+                is_before: true,
+            } => write!(
+                f,
+                "joint/{joint}: its zero is {radians:.4} rad from the model's, or the base (its IMU, its gravity_mps2, the floor) is turned by that: what is beyond weighs in another direction than the model says; calibrate the encoder and level the base"
             ),
         }
     }
