@@ -177,7 +177,8 @@ fn names(files: &[(&PathBuf, Role)]) -> Vec<String> {
                     .count()
                     == 1
             };
-            short(file, (1..=most).find(alone).unwrap_or(most))
+            let told = (1..=most).find(alone).map(|parts| short(file, parts));
+            told.unwrap_or_else(|| file.display().to_string())
         })
         .collect()
 }
@@ -221,10 +222,20 @@ mod tests {
 
     #[test]
     fn logs_are_named_by_what_tells_them_apart() {
-        let files: Vec<PathBuf> = ["/a/one/x.csv", "/a/two/x.csv", "y.csv", "/a/two/y.csv"]
-            .map(PathBuf::from)
-            .to_vec();
+        let files: Vec<PathBuf> = [
+            "/a/one/x.csv",
+            "/a/two/x.csv",
+            "y.csv",
+            "/a/two/y.csv",
+            "/z.csv",
+            "/z.csv",
+        ]
+        .map(PathBuf::from)
+        .to_vec();
         let files: Vec<(&PathBuf, Role)> = files.iter().map(|f| (f, Role::Train)).collect();
-        assert_eq!(names(&files), ["one/x.csv", "two/x.csv", "y.csv", "two/y.csv"]);
+        assert_eq!(
+            names(&files),
+            ["one/x.csv", "two/x.csv", "y.csv", "two/y.csv", "/z.csv", "/z.csv"]
+        );
     }
 }

@@ -1804,3 +1804,98 @@ fn simulated_arm_is_identified_and_its_uncertainty_is_true() {
         assert!(median <= 3.0 * rms, "{median} {rms}");
     }
 }
+
+/// A log that is another one again neither counts twice nor shows what parameters are worth that it was trained on; one with nothing in it is refused alone.
+#[test]
+fn logs_that_say_nothing_new_or_nothing_at_all_are_left_out() {
+    let setup = arm();
+    let log = simulate(&setup, &real(&setup, 3), 6.0, 0.01, 3);
+    let once = run(&setup, &[("one", Role::Train, &log)], &[]);
+    let header = log.lines().next().expect("a header").to_owned() + "\n";
+    let dates = log.replace('\n', "\n2024-01-01T00:00:0");
+    let logs = [
+        ("one", Role::Train, log.as_str()),
+        ("again", Role::Train, &log),
+        ("header", Role::Train, &header),
+        ("same", Role::Validate, &log),
+        (
+            "other",
+            Role::Validate,
+            &simulate(&setup, &real(&setup, 3), 6.0, 0.01, 4),
+        ),
+    ];
+    let outcome = run(&setup, &logs, &[]);
+    assert_eq!(outcome.tau, once.tau);
+    assert_eq!(
+        outcome.logs.iter().map(|log| log.used > 0).collect::<Vec<_>>(),
+        [true, false, false, false, true]
+    );
+    let refusal = |log: &LogOutcome| {
+        let refusals = log.findings.iter().filter(|f| f.severity == Severity::Refusal);
+        refusals.map(|f| format!("{}: {}", f.code, f.text)).collect::<String>()
+    };
+    let refusals: Vec<String> = outcome.logs.iter().map(refusal).collect();
+    assert_eq!(
+        refusals[1],
+        "same_log: it is the same recording as one: it is used once"
+    );
+    assert_eq!(refusals[2], "unreadable: it has a header but no rows");
+    assert!(
+        refusals[3].starts_with("same_log: it is the same recording as one: it was left out"),
+        "{}",
+        refusals[3]
+    );
+
+    // The verdict says of each what is wrong.
+    let milliseconds = change(&log, "t", |t| 1e3 * t);
+    let dead = AXES.iter().fold(log.clone(), |log, axis| {
+        change(&log, &format!("wrench/ft/{axis}"), |_| 1.5)
+    });
+    for (log, reason) in [
+        (
+            &header,
+            "no log can be identified from: bad: it has a header but no rows",
+        ),
+        (&dates, "none of its"),
+        (&milliseconds, "if t is in milliseconds"),
+        (&dead, "wrench/ft does not change"),
+    ] {
+        let outcome = run(&setup, &[("bad", Role::Train, log)], &[]);
+        let Verdict::Nothing(found) = outcome.verdict else {
+            panic!("{:?}", outcome.verdict)
+        };
+        assert!(found.contains(reason), "{found}");
+    }
+}
+
+/// A slow sensor in the rows of fast encoders, its last reading in each: it is used at its own pace.
+#[test]
+fn a_sensor_that_is_held_between_its_readings_is_used() {
+    let setup = arm();
+    let log = simulate(&setup, &real(&setup, 3), 12.0, 0.01, 3);
+    let is_read: Vec<bool> = log
+        .lines()
+        .next()
+        .expect("a header")
+        .split(',')
+        .map(|name| name.starts_with("wrench/"))
+        .collect();
+    let mut held: Vec<&str> = Vec::new();
+    let rows = log.lines().enumerate().map(|(number, row)| {
+        let cells: Vec<&str> = row.split(',').collect();
+        // The header, and every eighth row.
+        if number == 0 || number % 8 == 1 {
+            held.clone_from(&cells);
+        }
+        let cells = cells.iter().zip(&held).zip(&is_read);
+        cells
+            .map(|((own, held), is_read)| if *is_read { *held } else { own })
+            .collect::<Vec<_>>()
+            .join(",")
+            + "\n"
+    });
+    let outcome = run(&setup, &[("held", Role::Train, &rows.collect::<String>())], &[]);
+    assert_eq!(outcome.verdict, Verdict::Identified);
+    let codes: Vec<&str> = outcome.logs[0].findings.iter().map(|f| f.code).collect();
+    assert_eq!(codes, ["repeated"]);
+}

@@ -14,7 +14,7 @@ use super::assess;
 use super::consistent;
 use super::gate::{self, Load, UnitSet};
 use super::information::Information;
-use super::instants::{Break, Defect, Instant, Recording, Settings, Signal, TimeOffset};
+use super::instants::{Break, Defect, Instant, Recording, RecordingError, Settings, Signal, TimeOffset};
 use super::mounting;
 use super::outcome::{Finding, LeftOut, Outcome, Role, Severity, Verdict};
 use super::parallel;
@@ -31,7 +31,7 @@ use crate::model::JointKind;
 use crate::setup::{Setup, Use};
 use crate::spatial::{RigidInertia, Vec3, Wrench};
 use nalgebra::DVector;
-use proprio_topics::{Nanos, Reason};
+use proprio_topics::{Nanos, Reason, csv};
 use std::collections::BTreeMap;
 use std::io::Read;
 
@@ -87,9 +87,6 @@ pub enum IdentifyError {
     Fit(#[from] PriorError),
 }
 
-/// Why nothing can be said.
-const NO_LOG: &str = "no log can be identified from: what is wrong with each is said there";
-
 /// An offset's walk follows nothing faster than this \[s\]: the motion that identifies is faster.
 const DRIFT_TIME: f64 = 1.0;
 
@@ -130,7 +127,8 @@ pub(super) struct Prepared {
     pub left_out: Vec<LeftOut>,
     pub findings: Vec<Finding>,
     pub refused: bool,
-    recording: Recording,
+    /// None if it can not be read.
+    recording: Option<Recording>,
 }
 
 /// What was identified, before figures are made of it.
@@ -183,9 +181,10 @@ pub fn identify(
         torques::check(setup, &mut log)?;
         prepared.push(log);
     }
+    refuse_repeated(&mut prepared);
     let training = used(&prepared);
     if training.is_empty() {
-        return Ok(assess::nothing(setup, &prepared, NO_LOG.into()));
+        return Ok(assess::nothing(setup, &prepared, no_log(&prepared)));
     }
     let all = training.iter().flat_map(|log| log.instants.iter());
     let mut maker = RowMaker::survey(setup, &inputs, all)?;
@@ -213,7 +212,7 @@ pub fn identify(
         maker = surveyed;
     }
     if maker.layout().links.is_empty() {
-        return Ok(assess::nothing(setup, &prepared, NO_LOG.into()));
+        return Ok(assess::nothing(setup, &prepared, no_log(&prepared)));
     }
     let training = used(&prepared);
     let wrong = mounting::wrong(&maker, &training);
@@ -241,7 +240,7 @@ pub fn identify(
         maker = surveyed;
     }
     if maker.layout().links.is_empty() {
-        return Ok(assess::nothing(setup, &prepared, NO_LOG.into()));
+        return Ok(assess::nothing(setup, &prepared, no_log(&prepared)));
     }
     let training = used(&prepared);
     let of_temperature = Kind {
@@ -356,13 +355,84 @@ fn shaken(maker: &RowMaker<'_>, shaking: &Shaking) -> Vec<Finding> {
         .collect()
 }
 
-/// Reads a log.
+/// Reads a log; one that has columns but nothing in them is refused.
 fn prepare(setup: &Setup, log: Log<'_>) -> Result<Prepared, IdentifyError> {
-    let recording = Recording::read(setup, log.samples).map_err(|e| IdentifyError::Log {
-        file: log.file.clone(),
-        problem: e.to_string(),
-    })?;
-    Ok(usable(setup, log.file, log.role, recording))
+    match Recording::read(setup, log.samples) {
+        Ok(recording) => Ok(usable(setup, log.file, log.role, recording)),
+        Err(
+            problem
+            @ (RecordingError::NoSamples(_) | RecordingError::Log(csv::Error::Empty | csv::Error::NoRow { .. })),
+        ) => Ok(Prepared {
+            file: log.file,
+            role: log.role,
+            span: (Nanos::ZERO, Nanos::ZERO),
+            torque_rate: 0.0,
+            instants: Vec::new(),
+            breaks: Vec::new(),
+            left_out: Vec::new(),
+            findings: vec![refusal("unreadable", problem.to_string())],
+            refused: true,
+            recording: None,
+        }),
+        Err(problem) => Err(IdentifyError::Log {
+            file: log.file,
+            problem: problem.to_string(),
+        }),
+    }
+}
+
+/// A finding for which a log is not used.
+fn refusal(code: &'static str, text: String) -> Finding {
+    Finding {
+        severity: Severity::Refusal,
+        code,
+        subject: String::new(),
+        text,
+    }
+}
+
+/// Refuses logs that are another one again: training twice on the same counts its noise as if it were less, and what was trained on tells nothing of the result.
+fn refuse_repeated(prepared: &mut [Prepared]) {
+    for number in 1..prepared.len() {
+        let (before, rest) = prepared.split_at_mut(number);
+        let Some(log) = rest.first_mut().filter(|log| !log.refused) else {
+            continue;
+        };
+        let moves_alike = |other: &&Prepared| {
+            let mut pairs = other.instants.iter().zip(&log.instants);
+            let alike =
+                |(a, b): (&Instant, &Instant)| a.t - other.span.0 == b.t - log.span.0 && a.position == b.position;
+            !other.refused && other.instants.len() == log.instants.len() && pairs.all(alike)
+        };
+        let Some(other) = before.iter().find(moves_alike) else {
+            continue;
+        };
+        let instead = match log.role {
+            Role::Train => "it is used once",
+            Role::Validate => {
+                "it was left out, for it can not show what the parameters are worth; record another motion"
+            }
+        };
+        let text = format!("it is the same recording as {}: {instead}", other.file);
+        log.findings.push(refusal("same_log", text));
+        log.refused = true;
+    }
+}
+
+/// Why nothing can be identified: of each log that should have been, what it was refused for.
+fn no_log(prepared: &[Prepared]) -> String {
+    /// So many are named.
+    const NAMED: usize = 3;
+    let training = prepared.iter().filter(|log| log.role == Role::Train);
+    let reasons: Vec<String> = training
+        .flat_map(|log| {
+            let refusals = log.findings.iter().filter(|f| f.severity == Severity::Refusal);
+            refusals.map(|f| format!("{}: {}", log.file, f.text))
+        })
+        .collect();
+    let more = if reasons.len() > NAMED { "; ..." } else { "" };
+    let named: Vec<&str> = reasons.iter().take(NAMED).map(String::as_str).collect();
+    format!("no log can be identified from: {}{more}", named.join("; "))
 }
 
 /// How far each F/T stream is behind the encoders, against what the identified parameters predict: told, not removed, for what looks like a delay may be a model that is wrong.
@@ -382,7 +452,8 @@ pub(super) fn time_offsets(
                 predicted[6 * i + axis] = load - error;
             }
         }
-        let Some(offset) = log.recording.time_offset(Signal::Wrench(sensor), &times, &predicted) else {
+        let recording = log.recording.as_ref();
+        let Some(offset) = recording.and_then(|r| r.time_offset(Signal::Wrench(sensor), &times, &predicted)) else {
             continue;
         };
         if offset.significant {
@@ -465,15 +536,10 @@ fn usable(setup: &Setup, file: String, role: Role, recording: Recording) -> Prep
         instants.push(instant);
     }
     if instants.len() < LEAST_FOLD && !refused {
-        findings.push(Finding {
-            severity: Severity::Refusal,
-            code: "too_short",
-            subject: String::new(),
-            text: format!(
-                "only {} instants can be used: nothing is identified from this log",
-                instants.len()
-            ),
-        });
+        findings.push(refusal(
+            "too_short",
+            too_few(setup, instants.len(), &recording, &reasons, &findings),
+        ));
     }
     Prepared {
         file,
@@ -485,8 +551,32 @@ fn usable(setup: &Setup, file: String, role: Role, recording: Recording) -> Prep
         breaks: found.breaks,
         left_out: reasons.into_values().collect(),
         findings,
-        recording,
+        recording: Some(recording),
     }
+}
+
+/// Why so few instants can be used.
+fn too_few(
+    setup: &Setup,
+    count: usize,
+    recording: &Recording,
+    left_out: &BTreeMap<String, LeftOut>,
+    findings: &[Finding],
+) -> String {
+    let (spacing, silence) = (recording.spacing(), setup.max_silence);
+    let why = if recording.is_stamped() && spacing > silence {
+        format!(
+            "its samples are {spacing} s apart, and a channel is silent after {silence} s (input.max_silence_ms): record faster, allow more, or, if t is in milliseconds or nanoseconds, convert it to seconds"
+        )
+    } else if let Some(dead) = findings.iter().find(|f| ["frozen", "never_seen"].contains(&f.code)) {
+        dead.text.clone()
+    } else {
+        let most = left_out.values().max_by_key(|l| l.instants);
+        most.map_or("record more motion".to_owned(), |l| {
+            format!("{} left out: {}", l.instants, l.reason)
+        })
+    };
+    format!("only {count} instants can be used, and nothing is identified from this log: {why}")
 }
 
 pub(super) fn finding(defect: &Defect) -> Finding {

@@ -315,6 +315,16 @@ impl Recording {
         }
     }
 
+    /// Median time between samples of the joint or base that is measured the fastest.
+    #[must_use]
+    pub fn spacing(&self) -> Nanos {
+        let joints = self.joints.iter().map(|joint| joint.position.spacing);
+        let all = joints.chain([self.imu.angular_velocity.spacing]);
+        all.filter(|spacing| *spacing > Nanos::ZERO)
+            .min()
+            .unwrap_or(Nanos::ZERO)
+    }
+
     /// Whether the log has stamps.
     #[must_use]
     pub fn is_stamped(&self) -> bool {

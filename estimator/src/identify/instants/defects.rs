@@ -788,7 +788,7 @@ fn repeated(
     for (channel, repeat) in channels.iter().zip(&mut repeats.channels) {
         repeat.again.sort_unstable();
         let (stamps, ..) = recording.stamps(channel.role);
-        let mut drop = Vec::new();
+        let (mut drop, mut held, all) = (Vec::new(), 0, stamps.len());
         // Runs of repeats: each follows the sample that it repeats.
         let mut i = 1;
         while i < stamps.len() {
@@ -806,6 +806,7 @@ fn repeated(
                 let run = &stamps[begin..i];
                 if to - from < FREEZE {
                     drop.extend_from_slice(run);
+                    held += run.len();
                 } else if recording.moves(from, to, but) {
                     drop.extend_from_slice(run);
                     found.push(Defect::Frozen {
@@ -825,6 +826,16 @@ fn repeated(
             &mut |s| s.leave_out(&again),
             &mut |s| s.leave_out(&again),
         );
+        // Most of what was recorded is the last reading again: its own pace is that of the others.
+        if held * 2 > all {
+            let max_silence = recording.max_silence;
+            recording.streams(
+                channel.role,
+                &mut |s| s.measure(max_silence),
+                &mut |s| s.measure(max_silence),
+                &mut |s| s.measure(max_silence),
+            );
+        }
     }
     let of_rows = |r: &Repeat| {
         let mut all: Vec<Nanos> = r.again.iter().chain(&r.twice).copied().collect();
