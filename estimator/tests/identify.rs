@@ -1847,7 +1847,10 @@ fn logs_that_say_nothing_new_or_nothing_at_all_are_left_out() {
     );
 
     // The verdict says of each what is wrong.
-    let milliseconds = change(&log, "t", |t| 1e3 * t);
+    // Without derivatives, which make each row a posture of its own.
+    let milliseconds = change(&log, "t", |t| 1e3 * t)
+        .replace("/velocity", "/speed")
+        .replace("/acceleration", "/rate");
     let dead = AXES.iter().fold(log.clone(), |log, axis| {
         change(&log, &format!("wrench/ft/{axis}"), |_| 1.5)
     });
@@ -1898,4 +1901,25 @@ fn a_sensor_that_is_held_between_its_readings_is_used() {
     assert_eq!(outcome.verdict, Verdict::Identified);
     let codes: Vec<&str> = outcome.logs[0].findings.iter().map(|f| f.code).collect();
     assert_eq!(codes, ["repeated"]);
+}
+
+/// Encoders that are as good as the configuration says have no spikes; what is beyond that has.
+#[test]
+fn what_a_position_may_be_off_by_is_no_spike() {
+    let setup = arm();
+    let log = simulate(&setup, &real(&setup, 3), 6.0, 0.01, 3);
+    let spikes = |size: f64| {
+        let row = std::cell::Cell::new(0);
+        let spiked = change(&log, "joint/j4/position", |q| {
+            row.set(row.get() + 1);
+            if row.get() % 100 == 50 { q + size } else { q }
+        });
+        let outcome = run(&setup, &[("log", Role::Train, &spiked)], &[]);
+        let findings = outcome.logs[0].findings.iter();
+        findings
+            .filter(|f| f.code == "outliers" && f.subject == "joint/j4")
+            .count()
+    };
+    assert_eq!(setup.joint_settings.noise, 4.8e-4);
+    assert_eq!([spikes(4e-4), spikes(0.02)], [0, 1]);
 }

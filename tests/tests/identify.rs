@@ -163,6 +163,7 @@ fn check_shape(summary: &Json, logs: &[(&str, &str)]) {
         }
         for (name, sensor) in entry["sensors"].as_object().expect("sensors by name") {
             three(&sensor["rms"], 6, name);
+            assert_eq!(sensor["coverage"].as_array().map(Vec::len), Some(6), "{name}: {sensor}");
         }
         for key in ["two_route_rms_nm", "two_route_rms_mean_removed_nm"] {
             for (joint, torque) in entry[key].as_object().expect("joints by name") {

@@ -36,7 +36,7 @@
 //! | `onset_s` | when the robot began to move; `null`: from the start, or never |
 //! | `relative_error` | the three: norm of (predicted - measured) over norm of measured |
 //! | `joints` | {name: {`rms_nm`: the three, `measured_rms_nm`, `coverage`: share of instants within 1.96 sigma}}, of joints with a measured torque |
-//! | `sensors` | {name: {`rms`: the three, six numbers each}} |
+//! | `sensors` | {name: {`rms`: the three, six numbers each; `coverage`: share of instants within 1.96 sigma, six numbers}} |
 //! | `two_route_rms_nm`, `two_route_rms_mean_removed_nm` | {joint: the three}: RMS of the difference between the torque from one side's F/T sensor and from the other's, and the same without its mean |
 //! | `offsets` | {sensor: {`start`, `end`, `deviation`, `rate`: six numbers each, `breaks_s`}} |
 //! | `friction` | {joint: {`coulomb_nm`, `viscous`: Nm s/rad, `offset_nm`, `deviation`: of the three}} |
@@ -136,7 +136,9 @@ fn log(log: &LogOutcome) -> Json {
         let rest = json!({ "rms_nm": three(&j.rms_nm), "measured_rms_nm": j.measured_rms_nm, "coverage": j.coverage });
         (&j.name, rest)
     });
-    let sensors = object(&log.sensors, |s| (&s.name, json!({ "rms": three(&s.rms) })));
+    let sensors = object(&log.sensors, |s| {
+        (&s.name, json!({ "rms": three(&s.rms), "coverage": s.coverage }))
+    });
     let offsets = object(&log.offsets, |o| {
         let breaks: Vec<f64> = o.breaks.iter().map(|t| since(*t)).collect();
         (
@@ -217,6 +219,10 @@ mod tests {
         let rms = &log["sensors"]["r_leg_ft_sensor"]["rms"];
         assert_eq!(rms["cad"], json!([null, null, null, null, null, null]));
         assert_eq!(rms["identified"], json!([0.4, 0.9, 0.45, 0.1, 0.09, 0.04]));
+        assert_eq!(
+            log["sensors"]["r_leg_ft_sensor"]["coverage"],
+            json!([0.95, 0.94, 0.96, 0.95, 0.97, 0.93])
+        );
         assert_eq!(log["two_route_rms_nm"]["r_knee"]["identified"], 0.13);
         assert_eq!(
             (&json["tau"], &json["rank"], &json["condition"]),

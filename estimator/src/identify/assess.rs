@@ -965,14 +965,9 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         let measured = keep(&smooth(measured));
         let place = layout.joints.binary_search(dof).ok();
         let coverage = place.map_or(f64::NAN, |place| {
-            covered(
-                maker,
-                instants,
-                &left.noise[1][wrenches + place],
-                wrenches + place,
-                identified,
-                root,
-            )
+            let channel = wrenches + place;
+            let errors = [(channel, left.noise[1][channel].as_slice())];
+            covered(maker, instants, &errors, identified, root)[0]
         });
         joints.push(JointOutcome {
             name: setup.model.dof_name(*dof).to_owned(),
@@ -987,6 +982,8 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
     let mut sensors = Vec::new();
     let mut findings = Vec::new();
     let mut wrench_share = Vec::new();
+    let all: Vec<(usize, &[f64])> = compared.errors[2].iter().map(Vec::as_slice).enumerate().collect();
+    let coverage = covered(maker, instants, &all, identified, root);
     for (place, &sensor) in layout.sensors.iter().enumerate() {
         let name = sensor_name(setup, sensor);
         let mut values = [[f64::NAN; 6]; 3];
@@ -1010,6 +1007,7 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         sensors.push(SensorOutcome {
             name,
             rms: three(values),
+            coverage: std::array::from_fn(|axis| coverage[channel_of(place, axis)]),
         });
     }
     let share = if torque_share.is_empty() {
@@ -1424,24 +1422,28 @@ fn predicted_deviations(
 }
 
 /// Share of instants whose residual is within 1.96 standard deviations of parameters and noise together.
+/// Per channel of `errors`, the share of instants at which it is within 1.96 standard deviations, looked at here and there.
 fn covered(
     maker: &mut RowMaker<'_>,
     instants: &[super::instants::Instant],
-    errors: &[f64],
-    channel: usize,
+    errors: &[(usize, &[f64])],
     identified: &Identified,
     root: &DMatrix<f64>,
-) -> f64 {
-    let (mut inside, mut count) = (0.0, 0.0);
+) -> Vec<f64> {
+    let mut told = vec![(0.0, 0.0); errors.len()];
     for i in (0..instants.len()).step_by((instants.len() / 200).max(1)) {
-        if !errors[i].is_finite() {
+        if errors.iter().all(|(_, errors)| !errors[i].is_finite()) {
             continue;
         }
-        let deviation = predicted_deviations(maker, &instants[i], identified, root)[channel];
-        inside += f64::from(u8::from(errors[i].abs() <= 1.96 * deviation));
-        count += 1.0;
+        let deviations = predicted_deviations(maker, &instants[i], identified, root);
+        for ((channel, errors), (inside, count)) in errors.iter().zip(&mut told) {
+            if errors[i].is_finite() {
+                *inside += f64::from(u8::from(errors[i].abs() <= 1.96 * deviations[*channel]));
+                *count += 1.0;
+            }
+        }
     }
-    inside / count
+    told.into_iter().map(|(inside, count)| inside / count).collect()
 }
 
 fn curves(

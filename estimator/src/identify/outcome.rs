@@ -242,6 +242,8 @@ pub struct SensorOutcome {
     pub name: String,
     /// RMS of what it reads less what the parameters of all links on its contact-free side, offsets and neighbouring sensors predict, `[fx fy fz tx ty tz]` [N, Nm].
     pub rms: Three<[f64; 6]>,
+    /// Per axis, share of the instants at which it is within 1.96 standard deviations, of noise and of the identified parameters.
+    pub coverage: [f64; 6],
 }
 
 /// A joint torque had from two sides: from one F/T sensor and the links on its side alone, and from the other.

@@ -532,8 +532,8 @@ impl<const D: usize> Stream<D> {
         }
     }
 
-    /// Leaves out what is far from three neighbours on each side, of one axis, and tells how many, the worst, and when.
-    fn despike(&mut self, axis: usize) -> Option<(usize, f64, Nanos)> {
+    /// Leaves out what is far from three neighbours on each side, of one axis, and tells how many, the worst, and when. Nothing within `least` is far.
+    fn despike(&mut self, axis: usize, least: f64) -> Option<(usize, f64, Nanos)> {
         let values = self.column(axis);
         let mut neighbours = [0.0; 6];
         // How far off, and how far the neighbours lie apart but for the two outermost, which may be another spike.
@@ -564,7 +564,7 @@ impl<const D: usize> Stream<D> {
                     .collect(),
             );
         let floor = 8.0 * usual + 3.0 * quantum(&values);
-        let far = |(d, spread): (f64, f64)| d.abs() > floor + spread && d.abs() > 1e-9;
+        let far = |(d, spread): (f64, f64)| d.abs() > floor + spread && d.abs() > least;
         let count = off.iter().filter(|o| far(**o)).count();
         let worst = (0..off.len())
             .filter(|i| far(off[*i]))
@@ -729,8 +729,13 @@ pub(super) fn settle(recording: &mut Recording, setup: &Setup, mut repeats: Repe
                 recording.joints[dof].torque.retain(|i| !drop[i]);
             }
             let track = &mut recording.joints[dof];
-            for (axis, stream) in [("position", &mut track.position), ("torque", &mut track.torque)] {
-                if let Some((samples, largest, t)) = stream.despike(0) {
+            // What a position may be off by as configured is no spike of it.
+            let noise = setup.joint_settings.noise;
+            for (axis, stream, least) in [
+                ("position", &mut track.position, noise),
+                ("torque", &mut track.torque, 1e-9),
+            ] {
+                if let Some((samples, largest, t)) = stream.despike(0, least) {
                     found.push(Defect::Outliers {
                         channel: name.clone(),
                         axis,
@@ -743,7 +748,7 @@ pub(super) fn settle(recording: &mut Recording, setup: &Setup, mut repeats: Repe
         }
         if channel.role == Use::Base {
             for (axis, word) in ["gx", "gy", "gz"].into_iter().enumerate() {
-                if let Some((samples, largest, t)) = recording.imu.angular_velocity.despike(axis) {
+                if let Some((samples, largest, t)) = recording.imu.angular_velocity.despike(axis, 1e-9) {
                     found.push(Defect::Outliers {
                         channel: label(channel),
                         axis: word,
