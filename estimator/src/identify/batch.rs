@@ -3,7 +3,8 @@
 //! 1. Each log becomes instants ([`super::instants`]), each instant rows ([`super::rows`]).
 //! 2. Rounds. With the noise that the last parameters leave: what each log tells of the parameters, its own unknowns eliminated ([`super::passes`]); logs added up; the most
 //!    probable bodies under the prior and its weight ([`super::prior`]). With these bodies: what is left, and from it the noise ([`super::noise`]). Until both stay.
-//!    Before the first of them: a sensor that is mounted the wrong way is refused, or the log in which alone it is ([`super::mounting`]).
+//!    Before the first of them: logs that repeat another one, or whose readings are no newtons ([`super::wrenches`]), are refused; so is a sensor that is mounted the wrong way, or the log in which
+//!    alone it is ([`super::mounting`]).
 //! 3. What this fit says that something undeclared acted on is left out, and the rounds repeated, until that stays ([`super::gate`]).
 //!    Then, where gains of sensors are asked for, fits with these unknown, too, and what is left out is asked again.
 //! 4. A check on data held out: pieces of the logs are predicted from the others. The change from CAD is shrunk where it gains nothing ([`held_out`]).
