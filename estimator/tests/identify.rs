@@ -273,13 +273,12 @@ fn kuka_touched_is_identified_all_the_same() {
 #[test]
 fn a_touch_in_held_out_data_is_told() {
     let setup = arm();
-    let log = simulate(&setup, &real(&setup, 5), 40.0, 3.0, 15);
-    let (train, rest) = (between(&log, -1.0, 20.0), between(&log, 20.0, 99.0));
+    let [train, rest, again] = [15, 16, 17].map(|seed| simulate(&setup, &real(&setup, 5), 20.0, 3.0, seed));
     let push = |row: usize, value: f64| {
         let share = (row as f64 - 600.0) / 150.0;
         value + 12.0 * (std::f64::consts::PI * share.clamp(0.0, 1.0)).sin()
     };
-    let touched = change_rows(&change_rows(&rest, "wrench/ft/fx", push), "wrench/ft/fz", push);
+    let touched = change_rows(&change_rows(&again, "wrench/ft/fx", push), "wrench/ft/fz", push);
     let logs = [
         ("train", Role::Train, &*train),
         ("rest", Role::Validate, &rest),
@@ -301,6 +300,12 @@ fn a_touch_in_held_out_data_is_told() {
     let [free, pushed] = [1, 2].map(|log| &outcome.logs[log]);
     assert_eq!((free.used, &free.left_out), (pushed.used, &pushed.left_out));
     assert!(pushed.relative_error.identified > 3.0 * free.relative_error.identified);
+    // How true the stated deviations of held-out readings are.
+    let coverage = free.sensors[0].coverage;
+    assert!(
+        coverage.iter().all(|share| (0.85..=1.0).contains(share)),
+        "{coverage:?}"
+    );
 }
 
 /// Nothing undeclared acts on the robots of the recorded logs: nothing of them may be thought a contact, whatever CAD has wrong and however the structure shakes.
@@ -1020,6 +1025,56 @@ fn noise_of_a_torque_that_was_seldom_measured_is_known() {
     }
 }
 
+/// A rich log of an arm with joint torque sensors at 1 kHz, as such robots give it: positions by encoders' steps, torques with friction and an offset, and noise of which as much lies above 5 Hz as
+/// in a real arm's (2.6 % of their RMS).
+fn rich_torques(setup: &Setup, truth: &Model, seconds: f64, seed: u64) -> String {
+    const RATE: f64 = 1000.0;
+    let mut noise = Noise(seed);
+    let phase: Vec<f64> = (0..18).map(|_| noise.uniform()).collect();
+    let mut kinematics = Kinematics::new(truth, setup.base_link).expect("a base");
+    let mut dynamics = InverseDynamics::new(truth);
+    let rows: Vec<([f64; 6], [f64; 6])> = (0..(RATE * seconds) as usize)
+        .map(|i| {
+            let (q, dq, ddq) = state(&phase, i as f64 / RATE);
+            move_to(&mut kinematics, truth, &(q, dq, ddq));
+            dynamics.update(truth, &kinematics, &[]).expect("a state");
+            let friction = |dq: f64| 0.3 * (dq / 0.02).tanh() + 0.2 * dq + 0.1;
+            (
+                q,
+                std::array::from_fn(|joint| dynamics.torque()[joint] + friction(dq[joint])),
+            )
+        })
+        .collect();
+    let mut text = String::from("t");
+    for joint in ARM_JOINTS {
+        text += &format!(",joint/{joint}/position,joint/{joint}/torque");
+    }
+    let square = |joint: usize| rows.iter().map(|(_, torque)| torque[joint].powi(2)).sum::<f64>();
+    let sizes: [f64; 6] = std::array::from_fn(|joint| (square(joint) / rows.len() as f64).sqrt());
+    for (i, (q, torque)) in rows.iter().enumerate() {
+        text += &format!("\n{:.3}", i as f64 / RATE);
+        for joint in 0..6 {
+            let torque = torque[joint] + 0.026 * sizes[joint] * noise.normal();
+            text += &format!(",{:.5},{torque:.4}", (q[joint] / 5e-5).round() * 5e-5);
+        }
+    }
+    text + "\n"
+}
+
+/// Trained on one trajectory and tested on another: within a hundredth, where the URDF with friction and offsets fitted is several hundredths off.
+#[test]
+fn torques_of_a_rich_log_come_within_a_hundredth() {
+    let setup = arm_with(&[]);
+    let truth = real(&setup, 5);
+    let logs = [(5, Role::Train, 25.0), (7, Role::Validate, 12.0)];
+    let logs = logs.map(|(seed, role, seconds)| (role, rich_torques(&setup, &truth, seconds, seed)));
+    let given: Vec<(&str, Role, &str)> = logs.iter().map(|(role, log)| ("log", *role, &**log)).collect();
+    let outcome = run(&setup, &given, &TORQUE);
+    assert_eq!(outcome.verdict, Verdict::Identified);
+    let error = &outcome.logs[1].relative_error;
+    assert!(error.identified < 0.011 && error.cad_fitted > 0.02, "{error:?}");
+}
+
 /// Inertia of the arm's rotors, reflected [kg m^2]: about that of the links that each joint turns.
 const ROTORS: [f64; 6] = [0.6, 0.5, 0.25, 0.2, 0.05, 0.02];
 
@@ -1290,7 +1345,7 @@ fn torques_that_can_not_be_are_named_and_left_out() {
         assert!(3.0 * own < cad && inside > 0.8, "{expected}: {cad} {own} {inside}");
     }
     // Late by three rows: all of them, or one.
-    for (joints, subject) in [(&ARM_JOINTS[..], "joint torques"), (&["j4"], "joint/j4/torque")] {
+    let late = |joints: &[&str]| {
         let mut late = good.clone();
         for joint in joints {
             let mut before = std::collections::VecDeque::new();
@@ -1302,7 +1357,10 @@ fn torques_that_can_not_be_are_named_and_left_out() {
                 if before.len() == 4 { before[0] } else { x }
             });
         }
-        let (outcome, names) = named(&late);
+        late
+    };
+    for (joints, subject) in [(&ARM_JOINTS[..], "joint torques"), (&["j4"], "joint/j4/torque")] {
+        let (outcome, names) = named(&late(joints));
         assert_eq!(names, [format!("time_offset {subject}")]);
         let finding = outcome.findings.iter().find(|f| f.code == "time_offset").expect("it");
         println!("{}", finding.text);
@@ -1315,6 +1373,9 @@ fn torques_that_can_not_be_are_named_and_left_out() {
             finding.text
         );
     }
+    // The one that is on time is not to blame if the others are late.
+    let (_, names) = named(&late(&["j1", "j2", "j3", "j5", "j6"]));
+    assert!(!names.iter().any(|name| name.contains("j4")), "{names:?}");
 }
 
 /// Where links stay as in CAD because nothing could be checked, rotors are what goes best with CAD, and as uncertain as it.
@@ -1720,7 +1781,7 @@ fn readings_in_other_units_are_no_heavy_bodies() {
     );
 }
 
-/// What no parameters explain is said, and where most is, refused: an encoder that is dead, an axis with its sign turned, another robot's log.
+/// What no parameters explain is said: an encoder that is dead, an axis with its sign turned, another robot's log.
 #[test]
 fn readings_that_nothing_explains_are_said() {
     let setup = arm();
@@ -1733,11 +1794,6 @@ fn readings_that_nothing_explains_are_said() {
     assert_eq!(found(&log), None);
     let dead = found(&change(&log, "joint/j4/position", |_| 0.3)).expect("a dead encoder");
     assert_eq!(dead.severity, Severity::Warning);
-    assert!(
-        dead.text.contains("Dead may be what never changes: joint/j4."),
-        "{}",
-        dead.text
-    );
     let axis = found(&change(&log, "wrench/ft/fx", |x| -x)).expect("a turned axis");
     assert!(axis.text.contains(" fx against what is predicted"), "{}", axis.text);
     // What the sensor read while the arm moved otherwise.
@@ -1758,11 +1814,7 @@ fn readings_that_nothing_explains_are_said() {
             + "\n"
     });
     let other: String = rows.collect();
-    assert_eq!(
-        found(&other).map(|f| f.severity),
-        Some(Severity::Refusal),
-        "{other:.200}"
-    );
+    assert!(found(&other).is_some(), "another robot's readings");
 }
 
 #[test]

@@ -95,7 +95,11 @@ fn what_was_learnt_survives_the_process() {
     let learnt = inertia(&mut reader, began, |e| {
         e.links().iter().all(|link| link.accepted == 1 && link.motion > 2.0)
     });
-    let learnt = learnt.expect("something is learnt");
+    let learnt = learnt.unwrap_or_else(|| {
+        let newest = inertia(&mut reader, began, |_| true).map(|e| e.links().to_vec());
+        let health = Newest::<EstimatorHealth>::open(&domain, ROBOT).wait("how it is", |_| true);
+        panic!("nothing is learnt: {newest:?} {:?}", health.identification)
+    });
     assert!(uncertainty(&learnt) < 0.5 * uncertainty(&start_of_all));
     // What health counts agrees with it.
     let mut health = Newest::<EstimatorHealth>::open(&domain, ROBOT);

@@ -987,7 +987,7 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
     for (place, &sensor) in layout.sensors.iter().enumerate() {
         let name = sensor_name(setup, sensor);
         let mut values = [[f64::NAN; 6]; 3];
-        findings.extend(unexplained(setup, sensor, &name, &compared, place, &log.findings));
+        findings.extend(unexplained(setup, sensor, &name, &compared, place));
         for axis in 0..6 {
             let channel = channel_of(place, axis);
             let errors = compared.errors.each_ref().map(|set| &set[channel]);
@@ -1061,20 +1061,11 @@ fn three<T: Copy>(values: [T; 3]) -> Three<T> {
     }
 }
 
-/// What the identified parameters leave of a sensor's readings if it is far more than its noise; a refusal if it is most of what they change by.
-fn unexplained(
-    setup: &Setup,
-    sensor: usize,
-    name: &str,
-    compared: &Compared,
-    place: usize,
-    others: &[Finding],
-) -> Option<Finding> {
+/// What the identified parameters leave of a sensor's readings if it is far more than its noise. How much of what they change by that is depends on how much the log moves: it is told, and refuses nothing.
+fn unexplained(setup: &Setup, sensor: usize, name: &str, compared: &Compared, place: usize) -> Option<Finding> {
     /// More than so many times the stated noise, and than this share of what the axis changes by, is said.
     const TIMES: f64 = 10.0;
     const SHARE: f64 = 0.02;
-    /// The share of all that the sensor changes by, from which on the model is not that of the log: half of the squares.
-    const MOST: f64 = 0.7;
     /// Correlation of an axis with its prediction that no noise makes.
     const AGAINST: f64 = -0.5;
     let noise = setup.structure.sensors()[sensor].noise();
@@ -1109,31 +1100,22 @@ fn unexplained(
         return None;
     }
     let share = (left / all).sqrt();
-    let still = others.iter().filter(|f| f.code == "still").map(|f| f.subject.as_str());
-    let still: Vec<&str> = still.collect();
-    let mut hints = Vec::new();
-    if !turned.is_empty() {
-        hints.push(format!(
+    let hint = if turned.is_empty() {
+        String::new()
+    } else {
+        format!(
             " {} against what is predicted: turned, or another axis.",
             turned.join(", ")
-        ));
-    }
-    if !still.is_empty() {
-        hints.push(format!(" Dead may be what never changes: {}.", still.join(", ")));
-    }
+        )
+    };
     Some(Finding {
-        severity: if share > MOST {
-            Severity::Refusal
-        } else {
-            Severity::Warning
-        },
+        severity: Severity::Warning,
         code: "unexplained",
         subject: format!("wrench/{name}"),
         text: format!(
-            "wrench/{name}: {:.0} % of what it changes by is left with the identified parameters (times the stated noise: {}).{} A joint's zero, sign or order, a dead encoder, an axis or the calibration of the sensor, stamps, cables or a contact that nobody declared may be wrong, or the log is of another robot; or noise_n, noise_nm state too little",
+            "wrench/{name}: {:.0} % of what it changes by is left with the identified parameters (times the stated noise: {}).{hint} A joint's zero, sign or order, a dead encoder, an axis or the calibration of the sensor, stamps, cables or a contact that nobody declared may be wrong, or the log is of another robot; or noise_n, noise_nm state too little",
             100.0 * share,
-            axes.join(", "),
-            hints.concat()
+            axes.join(", ")
         ),
     })
 }
@@ -1421,7 +1403,6 @@ fn predicted_deviations(
     out
 }
 
-/// Share of instants whose residual is within 1.96 standard deviations of parameters and noise together.
 /// Per channel of `errors`, the share of instants at which it is within 1.96 standard deviations, looked at here and there.
 fn covered(
     maker: &mut RowMaker<'_>,

@@ -399,15 +399,26 @@ fn refuse_repeated(prepared: &mut [Prepared]) {
         let Some(log) = rest.first_mut().filter(|log| !log.refused) else {
             continue;
         };
-        let moves_alike = |other: &&Prepared| {
+        let is_same = |other: &&mut Prepared| {
+            // To the bit: torques that were not measured are no numbers.
+            let same = |a: &[f64], b: &[f64]| a.iter().map(|x| x.to_bits()).eq(b.iter().map(|x| x.to_bits()));
             let mut pairs = other.instants.iter().zip(&log.instants);
-            let alike =
-                |(a, b): (&Instant, &Instant)| a.t - other.span.0 == b.t - log.span.0 && a.position == b.position;
+            let alike = |(a, b): (&Instant, &Instant)| {
+                a.t - other.span.0 == b.t - log.span.0
+                    && same(&a.position, &b.position)
+                    && same(&a.torque, &b.torque)
+                    && a.readings == b.readings
+            };
             !other.refused && other.instants.len() == log.instants.len() && pairs.all(alike)
         };
-        let Some(other) = before.iter().find(moves_alike) else {
+        let Some(mut other) = before.iter_mut().find(is_same) else {
             continue;
         };
+        let mut log = log;
+        // The one that is to validate with is left out.
+        if log.role == Role::Train && other.role == Role::Validate {
+            std::mem::swap(&mut log, &mut other);
+        }
         let instead = match log.role {
             Role::Train => "it is used once",
             Role::Validate => {
@@ -863,20 +874,24 @@ fn gated(
         suspect(prepared, &loads, &contacts);
         settled = settle(setup, maker, &used(prepared), Some(settled.noise), &mut progress)?;
     }
-    let restless = (!stays).then(|| Finding {
-        severity: Severity::Warning,
-        code: "contact_unsettled",
-        subject: String::new(),
-        text: format!(
-            "after {GATES} fits, what is left out because something undeclared acted there had not come to stay: look at what the logs leave out, and declare contacts where they were"
-        ),
-    });
     Ok(Gated {
         settled,
         loads,
         contacts,
-        restless,
+        restless: (!stays).then(|| restless(GATES)),
     })
+}
+
+/// After so many fits, what is left out changes still.
+fn restless(fits: usize) -> Finding {
+    Finding {
+        severity: Severity::Warning,
+        code: "contact_unsettled",
+        subject: String::new(),
+        text: format!(
+            "after {fits} fits, what is left out because something undeclared acted there had not come to stay: look at what the logs leave out, and declare contacts where they were"
+        ),
+    }
 }
 
 /// Gains of the sensors, too. What a gain that is off leaves where the robot carries much may have been taken for a contact: that is asked again when gains are known, and if it was otherwise, gains are
@@ -890,10 +905,12 @@ fn with_gains(
 ) -> Result<Gated, IdentifyError> {
     const AGAIN: usize = 4;
     gated.settled = gains(setup, maker, prepared, gated.settled, progress)?;
+    gated.restless = Some(restless(AGAIN));
     for _ in 0..AGAIN {
         let Settled { noise, fit, .. } = &gated.settled;
         let contacts = gate::contacts(maker, &used(prepared), &gated.loads, noise, &fit.x);
         if contacts == gated.contacts {
+            gated.restless = None;
             break;
         }
         gated.contacts = contacts;

@@ -23,7 +23,7 @@
 //! # Where the speed comes from
 //! A panel is absorbed column by column by Householder reflections of the panel's column and one number of `R`: 2 m n^2 operations for `m` rows, all of them
 //! in loops over the panel's columns, which are contiguous, short, and stay in the first cache. Four reflections are applied together, to eight columns at a time, in the widest instructions of the processor
-//! ([`super::lanes`]). Exact zeros are skipped: a column that is zero in the panel costs little until a reflection fills it. So rows about few unknowns are cheap, provided that their panel has no other rows.
+//! (`lanes.rs`). Exact zeros are skipped: a column that is zero in the panel costs little until a reflection fills it. So rows about few unknowns are cheap, provided that their panel has no other rows.
 //!
 //! Six rows a sample, plain x86-64, `cargo bench -p proprio-estimator --bench identify` (two-core virtual machine, AMD EPYC with AVX-512: fastest of
 //! 100), us per sample, solution once per panel:

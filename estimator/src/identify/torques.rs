@@ -246,7 +246,8 @@ const SPREAD: f64 = 0.05;
 
 /// Whether what parameters were identified from is stamped otherwise than the encoders: all joint torques, by the same time, or that of one joint by itself.
 ///
-/// Friction that is not as the model has it makes each joint seem late by a time of its own. So one is named only if it seems later (or earlier) than the others have in common by far more than any of these.
+/// Friction that is not as the model has it makes each joint seem late by a time of its own. So one is named only if it seems later (or earlier) than the others have in common by far more than any of these,
+/// and these others, together, are on time: who is late is told by the encoders, and not by a majority.
 pub(super) fn late(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Identified) -> Vec<Finding> {
     /// It is said if it is so many standard deviations long, and so long \[s\].
     const DEVIATIONS: f64 = 4.0;
@@ -267,12 +268,6 @@ pub(super) fn late(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Id
     };
     let is_long = |seconds: f64, deviation: f64| seconds.abs() > LEAST_DELAY.max(DEVIATIONS * deviation);
     let mut findings = Vec::new();
-    if let Some(&[(seconds, deviation)]) = delays(maker, training, identified, false).as_deref()
-        && is_long(seconds, deviation)
-    {
-        let all = "the joint torques seem";
-        findings.push(finding("joint torques".into(), all, seconds, deviation));
-    }
     let each = delays(maker, training, identified, true).unwrap_or_default();
     // Those of which the logs tell more than was known before.
     let known: Vec<usize> = (0..each.len()).filter(|&k| each[k].1 < 0.5 * SPREAD).collect();
@@ -286,12 +281,23 @@ pub(super) fn late(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Id
         let farthest = others()
             .map(|(seconds, _)| (seconds - common).abs())
             .fold(0.0, f64::max);
-        let (seconds, deviation) = (each[place].0 - common, each[place].1.hypot(weight.sqrt().recip()));
-        if is_long(seconds, deviation) && seconds.abs() > ALONE * farthest {
+        let uncertain = weight.sqrt().recip();
+        let (own, deviation) = each[place];
+        let apart = own - common;
+        let is_alone = is_long(apart, deviation.hypot(uncertain)) && apart.abs() > ALONE * farthest;
+        if is_alone && is_long(own, deviation) && !is_long(common, uncertain) {
             let joint = format!("joint/{}/torque", maker.setup().model.dof_name(joints[place]));
-            let own = format!("{joint}, unlike the other torques, seems");
-            findings.push(finding(joint, &own, seconds, deviation));
+            let seems = format!("{joint}, unlike the other torques, seems");
+            findings.push(finding(joint, &seems, own, deviation));
         }
+    }
+    // One that is late by itself is what all together seem late by.
+    if findings.is_empty()
+        && let Some(&[(seconds, deviation)]) = delays(maker, training, identified, false).as_deref()
+        && is_long(seconds, deviation)
+    {
+        let all = "the joint torques seem";
+        findings.push(finding("joint torques".into(), all, seconds, deviation));
     }
     findings
 }

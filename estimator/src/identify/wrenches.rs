@@ -1,10 +1,12 @@
 //! Whether what a log gives as an F/T sensor's reading is in newtons and newton metres. Asked before anything is fitted.
 //!
-//! What CAD says of a reading's changes is roughly right, however wrong its masses are. Both, the reading and the prediction, lose their means (an offset may be anything), and are compared, forces
-//! and torques each by themselves:
+//! Both, the reading and what CAD predicts, lose their means (an offset may be anything), and are compared, forces and torques each by themselves. CAD may be wrong by much: a gripper that the URDF does
+//! not have on a light flange is thirty times its mass. So a log is refused only for what no robot reads, while the two go together (correlation above 0.7 either way):
 //!
-//! - 30 times as much while the two go together (correlation above 0.7 either way), or less than a thirtieth: no newtons, or no newton metres. The log is refused;
-//! - more than 3 times, or less than a third, while they go together: said. Kilograms of force look so, and a URDF whose masses are wrong by that.
+//! - 30 times as much as predicted, and changes beyond the weight of the whole robot, at a lever of a metre: no newtons, or no newton metres;
+//! - forces and torques both less than a 300th: kilonewtons.
+//!
+//! More than 3 times, or less than a third, is said. Kilograms of force look so, and masses that are wrong by that.
 
 use super::assess::{laid_to, sensor_name};
 use super::batch::Prepared;
@@ -17,9 +19,13 @@ use nalgebra::DVector;
 const ENOUGH: usize = 2000;
 const LEAST: usize = 50;
 
-/// A reading so many times what CAD says, or as many times less, is none in newtons; one so many times is said.
-const FACTOR: f64 = 30.0;
+/// A reading so many times what CAD says may be none in newtons; nor may one so many times less; one so many times is said.
+const LARGE: f64 = 30.0;
+const SMALL: f64 = 300.0;
 const ODD: f64 = 3.0;
+
+/// Of the whole robot's weight [m].
+const LEVER: f64 = 1.0;
 
 /// The two go together.
 const TOGETHER: f64 = 0.7;
@@ -65,12 +71,13 @@ struct Compared {
 }
 
 impl Compared {
-    fn is_too_large(&self) -> bool {
-        self.ratio > FACTOR && self.correlation.abs() > TOGETHER
+    /// `most`: what a robot could make it read.
+    fn is_too_large(&self, most: f64) -> bool {
+        self.ratio > LARGE && self.correlation.abs() > TOGETHER && self.ratio * self.predicted > most
     }
 
     fn is_too_small(&self) -> bool {
-        self.ratio < 1.0 / FACTOR
+        self.ratio < 1.0 / SMALL && self.correlation.abs() > TOGETHER
     }
 
     fn is_odd(&self) -> bool {
@@ -84,66 +91,84 @@ pub(super) fn check(maker: &mut RowMaker<'_>, log: &mut Prepared) {
         return;
     }
     let sensors = maker.layout().sensors.clone();
-    let mut findings = Vec::new();
+    let weight = 9.80665 * maker.setup().cad().iter().map(|body| body.mass).sum::<f64>();
+    let mut faults = Vec::new();
     for (place, pairs) in pairs(maker, log).into_iter().enumerate() {
         let noise = maker.setup().structure.sensors()[sensors[place]].noise();
         let [torque, force] = [(0..3, noise.torque), (3..6, noise.force)].map(|(axes, noise)| {
             let found = Pairs::compare(pairs[axes].iter());
             (found.predicted > TELLS * noise.into_iter().fold(0.0, f64::max)).then_some(found)
         });
-        findings.extend(units(&sensor_name(maker.setup(), sensors[place]), force, torque));
+        let fault = fault(force, torque, weight);
+        faults.extend(fault.map(|fault| (fault, sensor_name(maker.setup(), sensors[place]), force, torque)));
     }
     // What is predicted of one sensor rests on the others of its part of the robot: who is far too large makes them look too small.
-    if findings.iter().any(|found| found.code == LARGE) {
-        findings.retain(|found| found.code != SMALL);
+    if faults.iter().any(|(fault, ..)| *fault == Fault::Large) {
+        faults.retain(|(fault, ..)| *fault != Fault::Small);
     }
-    for found in &mut findings {
-        if found.code == LARGE || found.code == SMALL {
-            found.code = "wrong_units";
-        }
-    }
-    log.refused = findings.iter().any(|found| found.severity == Severity::Refusal);
+    log.refused = faults.iter().any(|(fault, ..)| *fault != Fault::Odd);
+    let findings = faults
+        .into_iter()
+        .map(|(fault, name, force, torque)| fault.finding(&name, force, torque));
     log.findings.extend(findings);
 }
 
-/// Told apart until all sensors are known.
-const LARGE: &str = "large";
-const SMALL: &str = "small";
+/// What is wrong with a sensor's units.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Fault {
+    Large,
+    Small,
+    Odd,
+}
 
-fn units(name: &str, force: Option<Compared>, torque: Option<Compared>) -> Option<Finding> {
-    let some = |is: fn(&Compared) -> bool| force.as_ref().is_some_and(is) || torque.as_ref().is_some_and(is);
-    let both = [("forces", force), ("torques", torque)];
-    let told = both.iter().filter_map(|(word, own)| Some((word, own.as_ref()?.ratio)));
-    let told: Vec<String> = told.map(|(word, ratio)| format!("{word} {}", times(ratio))).collect();
-    let told = told.join(" and ");
-    let finding = |severity, code, rest: &str| Finding {
-        severity,
-        code,
-        subject: format!("wrench/{name}"),
-        text: format!(
-            "wrench/{name} does not change by what the masses of the URDF ask for, but by {told} as much: {rest}"
-        ),
+fn fault(force: Option<Compared>, torque: Option<Compared>, weight: f64) -> Option<Fault> {
+    let both = || {
+        [(force, weight), (torque, LEVER * weight)]
+            .into_iter()
+            .filter_map(|(of, most)| Some((of?, most)))
     };
-    if some(Compared::is_too_large) {
-        Some(finding(
-            Severity::Refusal,
-            LARGE,
-            "it is in counts or thousandths (convert it to N and Nm), or the URDF's masses are not in kg",
-        ))
-    } else if some(Compared::is_too_small) {
-        Some(finding(
-            Severity::Refusal,
-            SMALL,
-            "its channel is dead, or it is in thousands (convert it to N and Nm), or the URDF's masses are not in kg",
-        ))
-    } else if some(Compared::is_odd) {
-        Some(finding(
-            Severity::Warning,
-            "scale",
-            "either its units are others (1 kgf is 9.807 N) or its calibration is wrong, and so are the parameters, or the URDF's masses are wrong by as much: weigh the robot, or hang a known mass on it",
-        ))
+    if both().any(|(of, most)| of.is_too_large(most)) {
+        Some(Fault::Large)
+    } else if both().count() > 0 && both().all(|(of, _)| of.is_too_small()) {
+        Some(Fault::Small)
+    } else if both().any(|(of, _)| of.is_odd()) {
+        Some(Fault::Odd)
     } else {
         None
+    }
+}
+
+impl Fault {
+    fn finding(self, name: &str, force: Option<Compared>, torque: Option<Compared>) -> Finding {
+        let both = [("forces", force), ("torques", torque)];
+        let told = both.iter().filter_map(|(word, own)| Some((word, own.as_ref()?.ratio)));
+        let told: Vec<String> = told.map(|(word, ratio)| format!("{word} {}", times(ratio))).collect();
+        let told = told.join(" and ");
+        let (severity, code, rest) = match self {
+            Self::Large => (
+                Severity::Refusal,
+                "wrong_units",
+                "it is in counts or thousandths (convert it to N and Nm), or the URDF's masses are not in kg",
+            ),
+            Self::Small => (
+                Severity::Refusal,
+                "wrong_units",
+                "it is in thousands (convert it to N and Nm), or the URDF's masses are not in kg",
+            ),
+            Self::Odd => (
+                Severity::Warning,
+                "scale",
+                "the robot carries what the URDF does not have, or its masses are wrong by as much; or the units are others (1 kgf is 9.807 N) or the calibration is wrong, and so are the parameters: weigh the robot, or hang a known mass on it",
+            ),
+        };
+        Finding {
+            severity,
+            code,
+            subject: format!("wrench/{name}"),
+            text: format!(
+                "wrench/{name} does not change by what the masses of the URDF ask for, but by {told} as much: {rest}"
+            ),
+        }
     }
 }
 
@@ -210,8 +235,12 @@ mod tests {
     use super::super::normals;
     use super::*;
 
-    /// What is found of a sensor whose forces are `scale` times those that CAD asks for, which is wrong by `wrong` of another motion; with noise.
-    fn found(scale: f64, wrong: f64, noise: f64) -> Option<&'static str> {
+    /// What is found of a sensor whose forces are `scale` times those that CAD asks for, which is wrong by `wrong` of another motion; with noise. The robot weighs ten times what moves there.
+    fn found(scale: f64, wrong: f64, noise: f64) -> Option<Fault> {
+        fault(Some(forces(scale, wrong, noise)), None, 80.0)
+    }
+
+    fn forces(scale: f64, wrong: f64, noise: f64) -> Compared {
         let deviates = normals(3, 1000);
         let each = deviates.iter().enumerate().map(|(i, deviate)| {
             let t = 0.05 * i as f64;
@@ -220,7 +249,7 @@ mod tests {
         });
         let mut pairs = Pairs::default();
         pairs.add(&each.collect::<Vec<_>>());
-        units("ft", Some(Pairs::compare(std::iter::once(&pairs))), None).map(|f| f.code)
+        Pairs::compare(std::iter::once(&pairs))
     }
 
     #[test]
@@ -230,12 +259,24 @@ mod tests {
         }
         // Cables and offsets that wander, over little motion, are not counts.
         assert_eq!(found(1.0, 60.0, 1.0), None);
-        assert_eq!(found(1000.0, 0.3, 1.0), Some(LARGE));
-        assert_eq!(found(-1000.0, 0.3, 1.0), Some(LARGE));
-        assert_eq!(found(0.001, 0.3, 1.0), Some(SMALL));
-        assert_eq!(found(0.0, 0.0, 0.0), Some(SMALL));
+        assert_eq!(found(1000.0, 0.3, 1.0), Some(Fault::Large));
+        assert_eq!(found(-1000.0, 0.3, 1.0), Some(Fault::Large));
+        assert_eq!(found(0.001, 0.3, 1.0), Some(Fault::Small));
         for kilograms in [0.102, 9.8] {
-            assert_eq!(found(kilograms, 0.3, 1.0), Some("scale"));
+            assert_eq!(found(kilograms, 0.3, 1.0), Some(Fault::Odd));
+        }
+    }
+
+    /// A gripper on a flange that the URDF has alone, or the other way round; a tool whose centre of mass is elsewhere: odd, but a robot's.
+    #[test]
+    fn what_the_urdf_has_wrong_is_not_refused() {
+        let heavy = |scale| fault(Some(forces(scale, 0.3, 1.0)), Some(forces(scale, 0.3, 1.0)), 5000.0);
+        for scale in [40.0, 0.02] {
+            assert_eq!(heavy(scale), Some(Fault::Odd), "{scale}");
+        }
+        for scale in [40.0, 0.001] {
+            let elsewhere = fault(Some(forces(1.1, 0.3, 1.0)), Some(forces(scale, 0.3, 1.0)), 5000.0);
+            assert_eq!(elsewhere, Some(Fault::Odd), "{scale}");
         }
     }
 }

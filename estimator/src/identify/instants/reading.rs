@@ -98,7 +98,11 @@ fn header(text: &[u8]) -> Option<(usize, u64)> {
     for (lines, own) in (1..).zip(text.split_inclusive(|byte| *byte == b'\n')) {
         end += own.len();
         if !own.iter().all(|byte| b"\r\n".contains(byte)) {
-            let is_whole = own.ends_with(b"\n") && !own.contains(&b'"');
+            // Other ends of lines than these, or names in quotes, are the parser's business.
+            let is_line = own
+                .strip_suffix(b"\n")
+                .map(|own| own.strip_suffix(b"\r").unwrap_or(own));
+            let is_whole = is_line.is_some_and(|own| !own.contains(&b'\r') && !own.contains(&b'"'));
             return is_whole.then_some((end, lines));
         }
     }
@@ -280,6 +284,10 @@ mod tests {
                 format!("\n\r\n{}", text.replace('\n', "\r\n\n")),
             ),
             ("old ends of lines", text.replace('\n', "\r")),
+            (
+                "old ends of lines but the last",
+                text.trim_end().replace('\n', "\r") + "\n",
+            ),
             (
                 "contacts, bad rows and quality",
                 change(&|number, line| match number {
