@@ -27,6 +27,7 @@ ROWS = {
     "rnea_floating": "inverse dynamics (RNEA), base moving, 33 links",
     "regressor_33": "regressor, base moving, 38 x 330",
     "regressor_39": "regressor, base moving, F/T joints kept, 38 x 390",
+    "pass_33": "least squares over a log: regressor_33, its rows into [R z] every 16 samples; per sample",
     "cycle": "full cycle: kinematics, 6 F/T readings to 7 contact wrenches and 32 torques",
     "recursion_44": "recursive least squares, 44 unknowns, 6 rows a sample, solved at each sample; per sample",
     "panels_44": "the same, absorbed and solved every 8 samples; per sample, square-root form",

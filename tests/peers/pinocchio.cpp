@@ -12,6 +12,8 @@
 #include <pinocchio/algorithm/regressor.hpp>
 #include <pinocchio/algorithm/rnea.hpp>
 
+#include <Eigen/QR>
+
 namespace pin = pinocchio;
 using peers::fail;
 using peers::Output;
@@ -25,6 +27,9 @@ Eigen::Vector3d vector(const peers::Triple& values)
 {
     return Eigen::Vector3d(values[0], values[1], values[2]);
 }
+
+// Pinocchio's order of the tensor of inertia is xx xy yy xz yz zz, that of the states xx xy xz yy yz zz.
+constexpr std::array<int, 10> ORDER{0, 1, 2, 3, 4, 5, 7, 6, 8, 9};
 
 struct Robot
 {
@@ -118,19 +123,22 @@ struct Robot
         }
     }
 
-    // The regressor times parameters that are random numbers: every column counts.
-    void showRegressor(const pin::Data& data, Output& output) const
+    // Random numbers, ten per link, so that every column of a regressor counts.
+    Eigen::VectorXd parameters() const
     {
-        // Pinocchio's order of the tensor of inertia is xx xy yy xz yz zz, that of the states xx xy xz yy yz zz.
-        const std::array<int, 10> order{0, 1, 2, 3, 4, 5, 7, 6, 8, 9};
         Eigen::VectorXd parameters(10 * (1 + children.size()));
         for (std::size_t link = 0; link <= children.size(); ++link)
         {
             const std::size_t body = link == 0 ? 0 : peers::place(states.bodies, children[link - 1]);
             for (int i = 0; i < 10; ++i)
-                parameters[10 * link + i] = states.parameters[body][order[i]];
+                parameters[10 * link + i] = states.parameters[body][ORDER[i]];
         }
-        showGeneralized(data.jointTorqueRegressor * parameters, output);
+        return parameters;
+    }
+
+    void showRegressor(const pin::Data& data, Output& output) const
+    {
+        showGeneralized(data.jointTorqueRegressor * parameters(), output);
     }
 
 private:
@@ -157,6 +165,59 @@ private:
     }
 };
 
+// A pass of least squares over a log, as in ours/src/main.rs: the regressor of each sample, some samples' rows at once into [R z], by Eigen's Householder.
+struct Pass
+{
+    static constexpr std::size_t SAMPLES = 16;
+    const Robot& robot;
+    pin::Data data{robot.model};
+    const Eigen::Index rows = robot.model.nv, columns = 10 * (1 + robot.children.size());
+    // [R | z] above, rows to come below.
+    Eigen::MatrixXd stacked = Eigen::MatrixXd::Zero(columns + rows * SAMPLES, columns + 1);
+    double residual = 0.0;
+    std::size_t waiting = 0, last = 0;
+
+    explicit Pass(const Robot& robot_)
+        : robot(robot_)
+    {
+    }
+
+    void take(std::size_t k)
+    {
+        last = k;
+        pin::computeJointTorqueRegressor(robot.model, data, robot.positions[k], robot.velocities[k], robot.accelerations[k]);
+        auto to = stacked.middleRows(columns + rows * waiting, rows);
+        to.leftCols(columns) = data.jointTorqueRegressor;
+        to.col(columns) = robot.velocities[k];
+        if (++waiting < SAMPLES)
+            return;
+        waiting = 0;
+        Eigen::HouseholderQR<Eigen::Ref<Eigen::MatrixXd>> inPlace(stacked);
+        stacked.topRows(columns).triangularView<Eigen::StrictlyLower>().setZero();
+        residual += stacked(columns, columns) * stacked(columns, columns);
+    }
+
+    void show(Output& output) const
+    {
+        Pass fresh(robot);
+        for (std::size_t k = 0; k < (last / SAMPLES + 1) * SAMPLES; ++k)
+            fresh.take(k);
+        const auto root = fresh.stacked.topLeftCorner(columns, columns);
+        const Eigen::VectorXd misfit = root * robot.parameters() - fresh.stacked.col(columns).head(columns);
+        const Eigen::VectorXd gradient = root.transpose() * misfit;
+        output.add("square", "sum", misfit.squaredNorm() + fresh.residual);
+        for (Eigen::Index link = 0; 10 * link < columns; ++link)
+        {
+            const std::string name = link == 0 ? "base" : robot.children[link - 1];
+            const auto of = gradient.segment<10>(10 * link);
+            output.add("mass", name, of[0]);
+            output.add3("moment", name, of.segment<3>(1));
+            for (int i = 4; i < 10; ++i)
+                output.add("inertia", name + "." + std::to_string(ORDER[i] - 4), of[i]);
+        }
+    }
+};
+
 } // namespace
 
 int main(int count, char** arguments)
@@ -166,6 +227,7 @@ int main(int count, char** arguments)
     const States states(arguments[2]);
     const Robot fixed(arguments[1], states, false), floating(arguments[1], states, true);
     pin::Data fixedData(fixed.model), floatingData(floating.model);
+    Pass pass(floating);
 
     peers::serve(
         states.states.size(),
@@ -187,5 +249,6 @@ int main(int count, char** arguments)
                      floating.model, floatingData, floating.positions[k], floating.velocities[k], floating.accelerations[k]);
              },
              [&](Output& o) { floating.showRegressor(floatingData, o); }},
+            {"pass_33", [&](std::size_t k) { pass.take(k); }, [&](Output& o) { pass.show(o); }},
         });
 }

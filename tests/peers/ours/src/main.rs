@@ -66,6 +66,17 @@ impl Robot {
         ));
     }
 
+    /// Random numbers, ten per link, so that every column of a regressor counts.
+    fn parameters(&self) -> Vec<f64> {
+        let states = &self.states;
+        (0..self.model.link_count())
+            .flat_map(|link| match link {
+                0 => states.parameters[0],
+                _ => states.parameters[server::place(&states.bodies, self.model.link_name(link))],
+            })
+            .collect()
+    }
+
     fn show_torque(&self, torque: &[f64], output: &mut Output) {
         for (name, torque) in self.states.joints.iter().zip(torque) {
             output.add("torque", name, *torque);
@@ -130,26 +141,103 @@ struct Regression {
     regressor: Regressor,
 }
 
+impl Regression {
+    fn new(robot: &Rc<Robot>) -> Self {
+        Self {
+            robot: Rc::clone(robot),
+            kinematics: must(Kinematics::new(&robot.model, 0)),
+            regressor: Regressor::new(&robot.model),
+        }
+    }
+}
+
 impl Bench for Regression {
     fn run(&mut self, state: usize) {
         self.robot.update(&mut self.kinematics, state);
         must(self.regressor.update(&self.robot.model, &self.kinematics));
     }
 
-    /// Times parameters that are random numbers: every column counts.
+    /// Times the parameters.
     fn show(&self, output: &mut Output) {
-        let (model, states) = (&self.robot.model, &self.robot.states);
-        let parameters: Vec<f64> = (0..model.link_count())
-            .flat_map(|link| match link {
-                0 => states.parameters[0],
-                _ => states.parameters[server::place(&states.bodies, model.link_name(link))],
-            })
-            .collect();
+        let (model, parameters) = (&self.robot.model, self.robot.parameters());
         let times = |row: &[f64]| row.iter().zip(&parameters).map(|(a, b)| a * b).sum::<f64>();
         output.add3("moment", "base", self.regressor.base_torque_rows().map(times));
         output.add3("force", "base", self.regressor.base_force_rows().map(times));
         let rows = (0..model.dof_count()).filter_map(|dof| self.regressor.joint_row(dof));
         self.robot.show_torque(&rows.map(times).collect::<Vec<_>>(), output);
+    }
+}
+
+/// A pass of least squares over a log: the regressor of each sample, some samples' rows at once into `[R z]`. What was measured does not matter here: the
+/// velocities stand for it.
+struct Identification {
+    regression: Regression,
+    information: Information,
+    panel: Panel,
+    last: usize,
+}
+
+/// As in ../../pinocchio.cpp. Fewer would make the peer slower: it computes with the zeros of `R` too, once per panel.
+const SAMPLES_IN_PASS: usize = 16;
+
+impl Identification {
+    fn new(robot: &Rc<Robot>) -> Self {
+        let regression = Regression::new(robot);
+        let (rows, columns) = (regression.regressor.row_count(), regression.regressor.column_count());
+        Self {
+            regression,
+            information: Information::new(columns),
+            panel: Panel::new(columns, rows * SAMPLES_IN_PASS),
+            last: 0,
+        }
+    }
+}
+
+impl Bench for Identification {
+    fn run(&mut self, state: usize) {
+        self.regression.run(state);
+        let s = &self.regression.robot.states.states[state];
+        let measured = s
+            .base
+            .angular_velocity
+            .iter()
+            .chain(&s.base.velocity)
+            .chain(&s.velocity);
+        for (row, right) in measured.enumerate() {
+            must(self.panel.push_row(self.regression.regressor.row(row), *right));
+        }
+        if self.panel.rows() == self.panel.capacity() {
+            must(self.information.absorb(&mut self.panel));
+        }
+        self.last = state;
+    }
+
+    /// Of the log up to this state's panel, afresh: `|A x - y|^2` at the parameters and half its gradient, `A^T (A x - y)`. The signs of rows and what rounding leaves
+    /// where nothing is identifiable do not show in them.
+    fn show(&self, output: &mut Output) {
+        let robot = &self.regression.robot;
+        let mut fresh = Self::new(robot);
+        (0..(self.last / SAMPLES_IN_PASS + 1) * SAMPLES_IN_PASS).for_each(|state| fresh.run(state));
+        let parameters = robot.parameters();
+        let (mut square, mut gradient) = (fresh.information.residual_square(), vec![0.0; parameters.len()]);
+        for k in 0..parameters.len() {
+            let row = fresh.information.row(k);
+            let with_right = parameters[k..].iter().chain([&-1.0]);
+            let misfit = row.iter().zip(with_right).map(|(a, b)| a * b).sum::<f64>();
+            square += misfit * misfit;
+            for (to, value) in gradient[k..].iter_mut().zip(row) {
+                *to += misfit * value;
+            }
+        }
+        output.add("square", "sum", square);
+        for (link, gradient) in gradient.chunks(10).enumerate() {
+            let name = if link == 0 { "base" } else { robot.model.link_name(link) };
+            output.add("mass", name, gradient[0]);
+            output.add3("moment", name, gradient[1..4].iter().copied());
+            for (number, value) in gradient[4..].iter().enumerate() {
+                output.add("inertia", &format!("{name}.{number}"), *value);
+            }
+        }
     }
 }
 
@@ -337,11 +425,6 @@ fn main() {
         inverse: InverseDynamics::new(&robot.model),
         floating,
     };
-    let regression = |robot: &Rc<Robot>| Regression {
-        robot: Rc::clone(robot),
-        kinematics: must(Kinematics::new(&robot.model, 0)),
-        regressor: Regressor::new(&robot.model),
-    };
     let pass = Pass {
         robot: Rc::clone(&folded),
         kinematics: must(Kinematics::new(&folded.model, 0)),
@@ -357,8 +440,9 @@ fn main() {
             ("kinematics", Box::new(pass)),
             ("rnea", Box::new(inverse(&folded, false))),
             ("rnea_floating", Box::new(inverse(&folded_floating, true))),
-            ("regressor_33", Box::new(regression(&folded_floating))),
-            ("regressor_39", Box::new(regression(&kept_floating))),
+            ("regressor_33", Box::new(Regression::new(&folded_floating))),
+            ("regressor_39", Box::new(Regression::new(&kept_floating))),
+            ("pass_33", Box::new(Identification::new(&folded_floating))),
             ("cycle", Box::new(Cycle::new(&kept))),
             ("recursion_44", Box::new(Recursion::new(&samples, 1))),
             ("panels_44", Box::new(Recursion::new(&samples, SAMPLES))),
