@@ -30,12 +30,12 @@
 //!
 //! | unknowns | panels of 1 sample | 4 | 8 | 16 |
 //! |---|---|---|---|---|
-//! | 44 | 5.0 | 1.8 | 1.3 | 1.0 |
-//! | 66 | 9.5 | 3.5 | 2.5 | 2.0 |
-//! | 120 | 27 | 7.9 | 5.4 | 4.1 |
-//! | 426 | 317 | 112 | 80 | 65 |
+//! | 44 | 4.5 | 1.5 | 1.0 | 0.8 |
+//! | 66 | 8.7 | 2.9 | 2.0 | 1.5 |
+//! | 120 | 24 | 7.8 | 5.2 | 4.0 |
+//! | 426 | 282 | 89 | 57 | 43 |
 //!
-//! Rows about 56 of 426 unknowns that nothing links to the others, panels of 8: 6.1. A step of six walks among 44 unknowns: 0.6 us if they are the first,
+//! Rows about 56 of 426 unknowns that nothing links to the others, panels of 8: 5.7. A step of six walks among 44 unknowns: 0.6 us if they are the first,
 //! 5.5 if the last; of 36 among 426: 92 us and 1200.
 //!
 //! # Why it stays sound
@@ -49,7 +49,7 @@ use nalgebra::{DMatrix, DVector};
 use pulp::{Arch, Simd, WithSimd};
 
 use super::dot;
-use super::lanes::{self, LANES, TOGETHER};
+use super::lanes::{self, Aligned, LANES, TOGETHER};
 
 /// Why rows were refused, or why nothing can be solved.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -124,7 +124,7 @@ pub struct Panel {
     /// Distance of columns, which are padded with zeros to a multiple of the lanes.
     stride: usize,
     /// Column by column, the right side last.
-    values: Vec<f64>,
+    values: Aligned,
     /// Which columns hold anything but zeros.
     filled: Vec<bool>,
 }
@@ -138,7 +138,7 @@ impl Panel {
             capacity,
             rows: 0,
             stride,
-            values: vec![0.0; stride * (unknowns + 1)],
+            values: Aligned::zeros(stride * (unknowns + 1)),
             filled: vec![false; unknowns + 1],
         }
     }

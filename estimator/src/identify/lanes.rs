@@ -1,6 +1,8 @@
 //! Inner loops over long slices in the widest instructions of the processor that runs them, in a portable build too ([`pulp`]). To be called within [`pulp::Arch::dispatch`]: without closures in between,
 //! which would be compiled for any processor.
 
+use std::ops::{Deref, DerefMut};
+
 use pulp::Simd;
 
 /// Vectors that go together where there are many: nothing then waits for a single sum.
@@ -8,6 +10,47 @@ pub(super) const TOGETHER: usize = 4;
 
 /// A multiple of the numbers in a vector of any processor.
 pub(super) const LANES: usize = 8;
+
+/// Numbers from the beginning of a cache line on: a vector that straddles two lines is two loads.
+#[derive(Debug)]
+pub(super) struct Aligned {
+    storage: Vec<f64>,
+    start: usize,
+    len: usize,
+}
+
+impl Aligned {
+    pub(super) fn zeros(len: usize) -> Self {
+        const LINE: usize = 64;
+        let storage = vec![0.0; len + LINE / size_of::<f64>()];
+        // Nowhere is a place, too, and slower.
+        let start = storage.as_ptr().align_offset(LINE).min(storage.len() - len);
+        Self { storage, start, len }
+    }
+}
+
+impl Clone for Aligned {
+    /// Elsewhere, where lines begin elsewhere.
+    fn clone(&self) -> Self {
+        let mut other = Self::zeros(self.len);
+        other.copy_from_slice(self);
+        other
+    }
+}
+
+impl Deref for Aligned {
+    type Target = [f64];
+
+    fn deref(&self) -> &[f64] {
+        &self.storage[self.start..][..self.len]
+    }
+}
+
+impl DerefMut for Aligned {
+    fn deref_mut(&mut self) -> &mut [f64] {
+        &mut self.storage[self.start..][..self.len]
+    }
+}
 
 /// The inner product of two slices of one length.
 #[inline(always)]
