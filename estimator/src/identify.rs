@@ -90,6 +90,14 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     (four[0] + four[2]) + (four[1] + four[3]) + rest
 }
 
+/// `to += factor * from`.
+#[inline(always)]
+fn add_multiple(to: &mut [f64], factor: f64, from: &[f64]) {
+    for (to, from) in to.iter_mut().zip(from) {
+        *to += factor * from;
+    }
+}
+
 /// Lower factor of a covariance, row by row in place; combinations without noise get 1e-9 of the greatest variance.
 fn factorise(covariance: &mut [f64], count: usize) {
     let greatest = (0..count).map(|i| covariance[i * count + i]).fold(0.0, f64::max);

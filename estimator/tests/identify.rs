@@ -677,6 +677,18 @@ fn change(log: &str, column: &str, by: impl Fn(f64) -> f64) -> String {
     text
 }
 
+/// The log with the F/T readings of other rows.
+fn with_readings<'a>(log: &'a str, others: impl Iterator<Item = &'a str>) -> String {
+    let header = log.lines().next().expect("a header").split(',');
+    let is_reading: Vec<bool> = header.map(|name| name.starts_with("wrench/")).collect();
+    let rows = log.lines().zip(others).map(|(row, other)| {
+        let cells = row.split(',').zip(other.split(',')).zip(&is_reading);
+        let cells = cells.map(|((own, other), is_reading)| if *is_reading { other } else { own });
+        cells.collect::<Vec<_>>().join(",") + "\n"
+    });
+    rows.collect()
+}
+
 #[test]
 fn sensor_the_wrong_way_round_is_named_and_nothing_identified() {
     let setup = arm();
@@ -1798,22 +1810,7 @@ fn readings_that_nothing_explains_are_said() {
     assert!(axis.text.contains(" fx against what is predicted"), "{}", axis.text);
     // What the sensor read while the arm moved otherwise.
     let other = simulate(&setup, &real(&setup, 3), 6.0, 0.01, 9);
-    let is_read: Vec<bool> = log
-        .lines()
-        .next()
-        .expect("a header")
-        .split(',')
-        .map(|name| name.starts_with("wrench/"))
-        .collect();
-    let rows = log.lines().zip(other.lines()).map(|(row, other)| {
-        let cells = row.split(',').zip(other.split(',')).zip(&is_read);
-        cells
-            .map(|((own, other), is_read)| if *is_read { other } else { own })
-            .collect::<Vec<_>>()
-            .join(",")
-            + "\n"
-    });
-    let other: String = rows.collect();
+    let other = with_readings(&log, other.lines());
     assert!(found(&other).is_some(), "another robot's readings");
 }
 
@@ -1928,28 +1925,15 @@ fn logs_that_say_nothing_new_or_nothing_at_all_are_left_out() {
 fn a_sensor_that_is_held_between_its_readings_is_used() {
     let setup = arm();
     let log = simulate(&setup, &real(&setup, 3), 12.0, 0.01, 3);
-    let is_read: Vec<bool> = log
-        .lines()
-        .next()
-        .expect("a header")
-        .split(',')
-        .map(|name| name.starts_with("wrench/"))
-        .collect();
-    let mut held: Vec<&str> = Vec::new();
-    let rows = log.lines().enumerate().map(|(number, row)| {
-        let cells: Vec<&str> = row.split(',').collect();
+    let mut last = "";
+    let held = log.lines().enumerate().map(|(number, row)| {
         // The header, and every eighth row.
         if number == 0 || number % 8 == 1 {
-            held.clone_from(&cells);
+            last = row;
         }
-        let cells = cells.iter().zip(&held).zip(&is_read);
-        cells
-            .map(|((own, held), is_read)| if *is_read { *held } else { own })
-            .collect::<Vec<_>>()
-            .join(",")
-            + "\n"
+        last
     });
-    let outcome = run(&setup, &[("held", Role::Train, &rows.collect::<String>())], &[]);
+    let outcome = run(&setup, &[("held", Role::Train, &with_readings(&log, held))], &[]);
     assert_eq!(outcome.verdict, Verdict::Identified);
     let codes: Vec<&str> = outcome.logs[0].findings.iter().map(|f| f.code).collect();
     assert_eq!(codes, ["repeated"]);

@@ -915,6 +915,10 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         times[*i] >= first + EDGE && times[*i] <= last - EDGE
     };
     let wrenches = 6 * layout.sensors.len();
+    let compared = Compared::new(maker, instants, &left, identified, &sets);
+    let torques = left.noise[1].iter().skip(wrenches);
+    let errors: Vec<&[f64]> = compared.errors[2].iter().chain(torques).map(Vec::as_slice).collect();
+    let coverage = covered(maker, instants, &errors, identified, root);
 
     // Torques: identified from, or the truth beside F/T sensors.
     let mut joints = Vec::new();
@@ -964,26 +968,18 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         let [cad, fitted, own] = errors.each_ref().map(|e| keep(&smooth(e)));
         let measured = keep(&smooth(measured));
         let place = layout.joints.binary_search(dof).ok();
-        let coverage = place.map_or(f64::NAN, |place| {
-            let channel = wrenches + place;
-            let errors = [(channel, left.noise[1][channel].as_slice())];
-            covered(maker, instants, &errors, identified, root)[0]
-        });
         joints.push(JointOutcome {
             name: setup.model.dof_name(*dof).to_owned(),
             rms_nm: three([&cad, &fitted, &own].map(|x| rms(x.iter().copied()))),
             measured_rms_nm: rms(measured.iter().copied()),
-            coverage,
+            coverage: place.map_or(f64::NAN, |place| coverage[wrenches + place]),
         });
         torque_share.push(([cad, fitted, own], measured));
     }
 
-    let compared = Compared::new(maker, instants, &left, identified, &sets);
     let mut sensors = Vec::new();
     let mut findings = Vec::new();
     let mut wrench_share = Vec::new();
-    let all: Vec<(usize, &[f64])> = compared.errors[2].iter().map(Vec::as_slice).enumerate().collect();
-    let coverage = covered(maker, instants, &all, identified, root);
     for (place, &sensor) in layout.sensors.iter().enumerate() {
         let name = sensor_name(setup, sensor);
         let mut values = [[f64::NAN; 6]; 3];
@@ -1403,23 +1399,23 @@ fn predicted_deviations(
     out
 }
 
-/// Per channel of `errors`, the share of instants at which it is within 1.96 standard deviations, looked at here and there.
+/// Per channel, the share of its errors that are within 1.96 standard deviations, looked at here and there.
 fn covered(
     maker: &mut RowMaker<'_>,
     instants: &[super::instants::Instant],
-    errors: &[(usize, &[f64])],
+    errors: &[&[f64]],
     identified: &Identified,
     root: &DMatrix<f64>,
 ) -> Vec<f64> {
     let mut told = vec![(0.0, 0.0); errors.len()];
     for i in (0..instants.len()).step_by((instants.len() / 200).max(1)) {
-        if errors.iter().all(|(_, errors)| !errors[i].is_finite()) {
+        if errors.iter().all(|errors| !errors[i].is_finite()) {
             continue;
         }
         let deviations = predicted_deviations(maker, &instants[i], identified, root);
-        for ((channel, errors), (inside, count)) in errors.iter().zip(&mut told) {
+        for ((errors, deviation), (inside, count)) in errors.iter().zip(deviations).zip(&mut told) {
             if errors[i].is_finite() {
-                *inside += f64::from(u8::from(errors[i].abs() <= 1.96 * deviations[*channel]));
+                *inside += f64::from(u8::from(errors[i].abs() <= 1.96 * deviation));
                 *count += 1.0;
             }
         }

@@ -1045,12 +1045,10 @@ impl Touches {
 
 /// Says what acted on the robot in the logs to validate with though nobody declared it. Their figures stay those of all rows: what is held out must not be picked by what it is to check.
 fn tell_touches(maker: &RowMaker<'_>, prepared: &mut [Prepared], identified: &Identified) {
-    let is_checked = |log: &&Prepared| log.role == Role::Validate && !log.refused;
-    let checked: Vec<&Prepared> = prepared.iter().filter(is_checked).collect();
+    let is_checked = |log: &Prepared| log.role == Role::Validate && !log.refused;
+    let checked: Vec<&Prepared> = prepared.iter().filter(|log| is_checked(log)).collect();
     let found = gate::contacts(maker, &checked, &[], &identified.noise, &identified.d);
-    let checked = prepared
-        .iter_mut()
-        .filter(|log| log.role == Role::Validate && !log.refused);
+    let checked = prepared.iter_mut().filter(|log| is_checked(log));
     for (log, contacts) in checked.zip(found) {
         let units = contacts.iter().fold(UnitSet::default(), |units, set| units.union(set));
         for unit in units.iter() {

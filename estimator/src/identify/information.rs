@@ -48,8 +48,8 @@
 use nalgebra::{DMatrix, DVector};
 use pulp::{Arch, Simd, WithSimd};
 
-use super::dot;
 use super::lanes::{self, Aligned, LANES, TOGETHER};
+use super::{add_multiple, dot};
 
 /// Why rows were refused, or why nothing can be solved.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -199,14 +199,6 @@ impl Panel {
             }
         }
         padded
-    }
-}
-
-/// `to += factor * from`.
-#[inline(always)]
-fn add_multiple(to: &mut [f64], factor: f64, from: &[f64]) {
-    for (to, from) in to.iter_mut().zip(from) {
-        *to += factor * from;
     }
 }
 

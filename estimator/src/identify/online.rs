@@ -47,7 +47,7 @@ use self::wander::Walk;
 use super::information::{Information, InformationError, Panel};
 use super::lanes::{self, TOGETHER};
 use super::prior::{GREATEST_TAU, Posterior, Prior, PriorError};
-use super::{dot, factorise, forward};
+use super::{add_multiple, dot, factorise, forward};
 use crate::dynamics::{ContactSet, DofSet, DynamicsError, Kinematics, Structure};
 use crate::model::Model;
 use crate::regressor::{StackedRegressor, Weighting};
@@ -313,6 +313,7 @@ struct Component {
     wander: Vec<f64>,
     /// Columns of the offsets.
     offsets: Vec<usize>,
+    /// Room for how far these wander at once, in standard deviations.
     deviations: Vec<f64>,
     gathered: Rows,
     pending: Rows,
@@ -863,14 +864,8 @@ impl Component {
             } += 1;
             return;
         }
-        for (deviation, variance) in self.deviations.iter_mut().zip(&self.variances) {
-            *deviation = variance.sqrt();
-        }
-        if self
-            .instant
-            .make(&self.kinds, stacked, &self.reference, &self.deviations)
-            == 0
-        {
+        let made = (self.instant).make(&self.kinds, stacked, &self.reference, &self.variances);
+        if made == 0 {
             self.paused = Paused::Contact;
             self.counts.contact += 1;
             return;
@@ -1023,8 +1018,7 @@ impl Component {
                     add_multiple(mean, scale, row);
                 }
                 let (row, right) = mean.split_at(kind.columns.len());
-                let estimate = kind.columns.iter().map(|&column| known.estimate[column]);
-                innovations[m] = right[0] - estimate.zip(row).map(|(x, a)| x * a).sum::<f64>();
+                innovations[m] = kind.left(row, right[0], &known.estimate);
                 // U a: the columns of U are [d | s].
                 Arch::new().dispatch(Project {
                     root: &known.root,
@@ -1301,10 +1295,8 @@ impl Part {
                 let bodies = kind.columns.iter().zip(column.iter()).skip(kind.offsets);
                 bodies.for_each(|(at, value)| sensitivities[(at - session, kind.columns[place])] += value);
             }
-            residuals.extend(rows.iter().map(|(row, right, _)| {
-                let estimate = kind.columns.iter().map(|&column| solution.estimate[column]);
-                right - estimate.zip(row).map(|(x, a)| x * a).sum::<f64>()
-            }));
+            let rows = rows.iter();
+            residuals.extend(rows.map(|(row, right, _)| kind.left(row, right, &solution.estimate)));
         }
         // Per channel, the standard deviation that this has by the bodies: |U s|.
         let of_bodies = solution.root.columns(0, unknowns - session) * sensitivities;
@@ -1446,12 +1438,6 @@ impl Job {
 fn chi_square(freedom: usize, level: f64) -> f64 {
     let (n, spread) = (freedom as f64, 2.0 / (9.0 * freedom as f64));
     n * (1.0 - spread + level * spread.sqrt()).powi(3)
-}
-
-fn add_multiple(to: &mut [f64], factor: f64, from: &[f64]) {
-    for (to, from) in to.iter_mut().zip(from) {
-        *to += factor * from;
-    }
 }
 
 #[cfg(test)]

@@ -19,6 +19,14 @@ pub(super) struct Kind {
     within: Vec<Vec<usize>>,
 }
 
+impl Kind {
+    /// What these unknowns, `[s | d]`, leave of a row's right side.
+    pub(super) fn left(&self, row: &[f64], right: f64, unknowns: &[f64]) -> f64 {
+        let own = self.columns.iter().map(|&column| unknowns[column]);
+        right - own.zip(row).map(|(x, a)| x * a).sum::<f64>()
+    }
+}
+
 /// The kinds of a component's rows, over `[s | d]`.
 #[derive(Clone, Debug)]
 pub(super) struct Kinds {
@@ -100,6 +108,8 @@ pub(super) struct Instant {
     values: Vec<f64>,
     /// Of each row its kind, and where it begins.
     places: Vec<(usize, usize)>,
+    /// Of each offset's channel.
+    deviations: Vec<f64>,
     noise: Vec<f64>,
     covariance: Vec<f64>,
 }
@@ -110,18 +120,19 @@ impl Instant {
         Self {
             values: Vec::with_capacity(kinds.all.iter().map(|kind| 6 * (kind.columns.len() + 1)).sum()),
             places: Vec::with_capacity(most),
+            deviations: vec![0.0; kinds.session],
             noise: vec![0.0; most * kinds.session],
             covariance: vec![0.0; most * most],
         }
     }
 
-    /// Makes the whitened rows of the regressor's last update, relative to `reference`, given the standard deviation of each offset's channel; how many.
+    /// Makes the whitened rows of the regressor's last update, relative to `reference`, given the variance of each offset's channel; how many.
     pub(super) fn make(
         &mut self,
         kinds: &Kinds,
         stacked: &StackedRegressor,
         reference: &[f64],
-        deviations: &[f64],
+        variances: &[f64],
     ) -> usize {
         self.values.clear();
         self.places.clear();
@@ -145,13 +156,16 @@ impl Instant {
             self.places.clear();
             return 0;
         }
+        for (deviation, variance) in self.deviations.iter_mut().zip(variances) {
+            *deviation = variance.sqrt();
+        }
         // Noise enters as offsets do.
         let (session, noise) = (kinds.session, &mut self.noise);
         noise[..count * session].fill(0.0);
         for (&(number, start), noise) in self.places.iter().zip(noise.chunks_exact_mut(session.max(1))) {
             let kind = &kinds.all[number];
             for (&column, value) in kind.columns[..kind.offsets].iter().zip(&self.values[start..]) {
-                noise[column] = value * deviations[column];
+                noise[column] = value * self.deviations[column];
             }
         }
         for (i, (number, _)) in self.places.iter().enumerate() {
