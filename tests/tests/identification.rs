@@ -1291,6 +1291,13 @@ fn suspicions(outcome: &Outcome) -> Vec<(&'static str, String)> {
     about.map(|finding| (finding.code, finding.text.clone())).collect()
 }
 
+/// No sensor's offset jumps, though readings of all sensors that what is touched is carried by look like it.
+fn must_not_jump(outcome: &Outcome) {
+    let findings = outcome.logs.iter().flat_map(|log| &log.findings);
+    let jumps: Vec<&str> = findings.filter(|f| f.code == "jump").map(|f| f.text.as_str()).collect();
+    assert!(jumps.is_empty(), "{jumps:?}");
+}
+
 #[test]
 fn undeclared_pushes_do_no_harm() {
     for sessions in robots() {
@@ -1300,6 +1307,7 @@ fn undeclared_pushes_do_no_harm() {
         must_be_good("pushes, undeclared", &sessions, &outcome);
         let said = suspicions(&outcome);
         assert!(said.len() == 1 && said[0].0 == "contact_suspected", "{said:?}");
+        must_not_jump(&outcome);
         // All of every push but its soft beginning and end is left out, and little else.
         let pushed: f64 = sessions.pushes("contact").iter().map(|(from, to)| to - from).sum();
         let (begin, end) = outcome.logs[0].span;
@@ -1395,6 +1403,7 @@ fn a_payload_picked_up_within_a_log_is_noticed_and_told() {
             let said = suspicions(&outcome);
             println!("{said:?}");
             assert!(said.len() == 1 && said[0].0 == "load_changed", "{said:?}");
+            must_not_jump(&outcome);
             let left_out = &outcome.logs.last().expect("a log").left_out;
             let load = left_out
                 .iter()

@@ -114,7 +114,7 @@ pub(super) fn nothing(setup: &Setup, prepared: &[Prepared], reason: String) -> O
         offsets: Vec::new(),
         friction: Vec::new(),
         time_offsets: Vec::new(),
-        findings: log.findings.clone(),
+        findings: log.findings(),
         curves: Vec::new(),
         spectra: Vec::new(),
     });
@@ -1043,7 +1043,7 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         offsets: offsets(setup, layout, log, identified, &left, &deviations),
         friction: friction(setup, layout, &left, &deviations),
         time_offsets: late,
-        findings: log.findings.iter().cloned().chain(found).chain(findings).collect(),
+        findings: log.findings().into_iter().chain(found).chain(findings).collect(),
         curves: curves(maker, instants, &times, &compared, identified, root, &torque_series),
         spectra: spectra(setup, layout, places.as_ref(), &left),
     }

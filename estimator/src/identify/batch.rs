@@ -132,6 +132,14 @@ pub(super) struct Prepared {
     recording: Option<Recording>,
 }
 
+impl Prepared {
+    /// What is said of the log itself.
+    pub(super) fn findings(&self) -> Vec<Finding> {
+        let jumps = self.breaks.iter().map(|b| finding(&b.jump));
+        self.findings.iter().cloned().chain(jumps).collect()
+    }
+}
+
 /// What was identified, before figures are made of it.
 pub(super) struct Identified {
     pub layout: Layout,
@@ -330,6 +338,11 @@ fn surveyed_again<'a>(
 fn used(prepared: &[Prepared]) -> Vec<&Prepared> {
     let is_used = |log: &&Prepared| log.role == Role::Train && !log.refused;
     prepared.iter().filter(is_used).collect()
+}
+
+fn used_mut(prepared: &mut [Prepared]) -> impl Iterator<Item = &mut Prepared> {
+    let is_used = |log: &&mut Prepared| log.role == Role::Train && !log.refused;
+    prepared.iter_mut().filter(is_used)
 }
 
 /// What was found of motion that encoders do not show.
@@ -839,6 +852,7 @@ fn gated(
         .iter()
         .map(|log| vec![UnitSet::default(); log.instants.len()])
         .collect();
+    let jumps: Vec<Vec<Break>> = used(prepared).iter().map(|log| log.breaks.clone()).collect();
     let mut refused = 0;
     let mut stays = false;
     for _ in 0..GATES {
@@ -865,12 +879,19 @@ fn gated(
             refused += 1;
             suspect(prepared, &loads, &contacts);
         }
-        let found = gate::contacts(maker, &used(prepared), &loads, &settled.noise, &settled.fit.x);
-        stays = found == contacts;
+        let training = used(prepared);
+        let found = gate::contacts(maker, &training, &loads, &settled.noise, &settled.fit.x);
+        // Of all that there were: what was no jump beside the noise of a touch may be one when that is left out.
+        let breaks = gate::breaks(maker, &training, &jumps, &settled.noise, &settled.fit.x);
+        stays = found == contacts && training.iter().zip(&breaks).all(|(log, breaks)| log.breaks == *breaks);
         if stays {
             break;
         }
         contacts = found;
+        let training = used_mut(prepared);
+        for (log, breaks) in training.zip(breaks) {
+            log.breaks = breaks;
+        }
         suspect(prepared, &loads, &contacts);
         settled = settle(setup, maker, &used(prepared), Some(settled.noise), &mut progress)?;
     }
@@ -974,9 +995,7 @@ fn read_as_fitted(maker: &RowMaker<'_>, prepared: &mut [Prepared], settled: &Set
     }
     // In the order of the pieces, which is that of the logs.
     let mut fitted = fitted.into_iter();
-    let training = prepared
-        .iter_mut()
-        .filter(|log| log.role == Role::Train && !log.refused);
+    let training = used_mut(prepared);
     for instant in training.flat_map(|log| &mut log.instants) {
         instant.fitted = fitted.next().unwrap_or_default();
     }
@@ -984,9 +1003,7 @@ fn read_as_fitted(maker: &RowMaker<'_>, prepared: &mut [Prepared], settled: &Set
 
 /// Marks the instants of the training logs.
 fn suspect(prepared: &mut [Prepared], loads: &[Load], contacts: &[Vec<UnitSet>]) {
-    let training = prepared
-        .iter_mut()
-        .filter(|log| log.role == Role::Train && !log.refused);
+    let training = used_mut(prepared);
     for (number, (log, contacts)) in training.zip(contacts).enumerate() {
         for (instant, contact) in log.instants.iter_mut().zip(contacts) {
             let carries = |load: &&Load| load.log == number && load.has(instant.t);
@@ -1090,9 +1107,7 @@ fn tell_suspicions(maker: &RowMaker<'_>, prepared: &mut [Prepared], gated: &Gate
         gate::added(maker, prior, &training, load, noise, information, fit.tau)
     };
     let bodies: Vec<Option<gate::Added>> = loads.iter().map(body).collect();
-    let training = prepared
-        .iter_mut()
-        .filter(|log| log.role == Role::Train && !log.refused);
+    let training = used_mut(prepared);
     for (number, (log, contacts)) in training.zip(contacts).enumerate() {
         let begin = log.span.0;
         let since = |t: Nanos| (t - begin).seconds();

@@ -5,16 +5,18 @@
 //!
 //! - [`contacts`]: per part of the robot (*unit*: a sub-tree between F/T sensors, or all measured joint torques) and block of 0.1 s, the mean of what is left. Its square, whitened, is
 //!   compared with that of blocks in which the robot moves as much. What stands out is left out with a margin, and the fit repeated ([`super::batch`]) until it stays.
+//! - [`breaks`]: which sudden changes of a sensor's reading are one of its offset, and not of what it carries.
 //! - [`load`]: from some instant on, everything fails in the same way, and the ten parameters of one body at the end of a limb explain it.
 
 use super::batch::{LONG, Prepared, over};
 use super::information::Information;
-use super::instants::Instant;
+use super::instants::{Break, Instant};
 use super::passes::{NoiseModel, Piece, blocks, leave, tell};
 use super::prior::Prior;
 use super::rows::{Layout, RowMaker, Rows, WIDTH};
+use super::session::Block;
 use crate::dynamics::BitSet;
-use nalgebra::{DMatrix, DVector, SMatrix, SVector};
+use nalgebra::{DMatrix, DVector, Matrix6, SMatrix, SVector, Vector6};
 use proprio_topics::Nanos;
 use std::ops::Range;
 
@@ -30,6 +32,15 @@ const MARGIN: usize = 2;
 
 /// Rounds of level, scale and what stands out from them.
 const ROUNDS: usize = 20;
+
+/// The level of less than this is not asked for [blocks].
+const SHORT: usize = 10;
+
+/// A whitened square of six channels that no two values of one offset are apart: one in twenty thousand by chance. So many times less of a variance is to be known better. And what lasts
+/// longer than this between two breaks is no touch \[s\].
+const STEP: f64 = 30.0;
+const BETTER: f64 = 100.0;
+const TOUCH: f64 = 10.0;
 
 /// No contact is looked for where more than this would be one: then the model is not the robot's, or the log not this robot's.
 const MOST: f64 = 0.7;
@@ -125,6 +136,101 @@ pub(super) fn contacts(
     out
 }
 
+/// Which of these breaks, of each log, a fit bears out: an offset that is the same before and after, within what it wanders and the fit knows, was none. (What touches the robot shows in the readings
+/// of every sensor that it goes through, as if their offsets changed; by the links between the sensors it is told apart.)
+pub(super) fn breaks(
+    maker: &RowMaker<'_>,
+    all: &[&Prepared],
+    breaks: &[Vec<Break>],
+    noise: &NoiseModel,
+    d: &DVector<f64>,
+) -> Vec<Vec<Break>> {
+    let layout = maker.layout();
+    let borne_out = |(log, breaks): (&&Prepared, &Vec<Break>)| {
+        if breaks.is_empty() {
+            return Vec::new();
+        }
+        let piece = Piece {
+            instants: &log.instants,
+            breaks,
+        };
+        let left = leave(maker, piece, noise, std::slice::from_ref(d));
+        let ranges = blocks(layout, piece);
+        let t = |block: usize| log.instants[ranges[block].0.start].t;
+        let mut kept = vec![false; breaks.len()];
+        for (place, sensor) in layout.sensors.iter().enumerate() {
+            let begins: Vec<usize> = (0..ranges.len()).filter(|&k| ranges[k].1.contains(&place)).collect();
+            let level = |block: usize| {
+                let Block { x, p, .. } = &left.session[block];
+                let of_sensor = |axis: usize| 6 * place + axis;
+                Level {
+                    t: t(block),
+                    value: Vector6::from_fn(|i, _| x[(of_sensor(i), 0)]),
+                    covariance: Matrix6::from_fn(|i, j| p[(of_sensor(i), of_sensor(j))]),
+                }
+            };
+            let walk = Vector6::from_fn(|axis, _| noise.drift[6 * place + axis]);
+            // The last level before each break, and the first after it.
+            let levels: Vec<(Level, Level)> = begins.iter().map(|&k| (level(k - 1), level(k))).collect();
+            let is_new = new_levels(&levels, &walk);
+            let own = breaks.iter().zip(&mut kept).filter(|(b, _)| b.sensor == *sensor);
+            for (b, kept) in own {
+                let number = begins.partition_point(|&k| t(k) < b.t);
+                *kept = is_new.get(number).is_some_and(|is| *is);
+            }
+        }
+        let kept = breaks.iter().zip(kept).filter(|(_, kept)| *kept);
+        kept.map(|(b, _)| b.clone()).collect()
+    };
+    all.iter().zip(breaks).map(borne_out).collect()
+}
+
+/// A sensor's offset at some time.
+#[derive(Clone, Debug)]
+struct Level {
+    t: Nanos,
+    value: Vector6<f64>,
+    covariance: Matrix6<f64>,
+}
+
+impl Level {
+    /// Whether it can not be another one's that went on, walking.
+    fn is_other(&self, before: &Self, walk: &Vector6<f64>) -> bool {
+        let step = self.value - before.value;
+        let walked = Matrix6::from_diagonal(&(walk * (self.t - before.t).seconds().max(0.0)));
+        let covariance = self.covariance + before.covariance + walked;
+        covariance
+            .cholesky()
+            .is_none_or(|factor| step.dot(&factor.solve(&step)) > STEP)
+    }
+
+    /// Whether more is known of it than of another one, clearly.
+    fn is_known_better(&self, than: &Self) -> bool {
+        let known = |level: &Self| level.covariance.diagonal().iter().map(|v| v.ln()).sum::<f64>();
+        known(self) < known(than) - 6.0 * BETTER.ln()
+    }
+}
+
+/// Of each break of a sensor, given its level before and after: whether there is another level indeed. What soon comes back to where it was is a touch between two breaks.
+fn new_levels(levels: &[(Level, Level)], walk: &Vector6<f64>) -> Vec<bool> {
+    let mut is_new = vec![true; levels.len()];
+    let mut number = 0;
+    let mut known: Option<&Level> = None;
+    while number < levels.len() {
+        let own = &levels[number].0;
+        let before = known.filter(|known| known.is_known_better(own)).unwrap_or(own);
+        // As far as possible.
+        let last = (number..levels.len())
+            .take_while(|&k| k == number || (levels[k].1.t - own.t).seconds() < TOUCH)
+            .filter(|&k| !levels[k].1.is_other(before, walk))
+            .last();
+        known = last.map(|_| before);
+        let last = last.inspect(|&last| is_new[number..=last].fill(false));
+        number = last.unwrap_or(number) + 1;
+    }
+    is_new
+}
+
 fn of_piece(
     maker: &mut RowMaker<'_>,
     piece: Piece<'_>,
@@ -138,17 +244,20 @@ fn of_piece(
     let left = leave(maker, piece, noise, std::slice::from_ref(d));
     // Offsets where they are most of the time: a contact that they followed must not hide behind them.
     let ranges = blocks(&layout, piece);
-    let mut starts: Vec<usize> = (0..ranges.len())
-        .filter(|&k| k == 0 || !ranges[k].1.is_empty())
-        .collect();
-    starts.push(ranges.len());
+    let starts = |is_afresh: &dyn Fn(usize) -> bool| {
+        let breaks = (0..ranges.len()).filter(|&k| ranges[k].1.iter().any(|sensor| is_afresh(*sensor)));
+        stretches(breaks, ranges.len())
+    };
     let mut session = vec![DVector::zeros(layout.session()); ranges.len()];
-    for stretch in starts.windows(2) {
-        let middle = DVector::from_fn(layout.session(), |unknown, _| {
+    for unknown in 0..layout.session() {
+        // Six offsets per sensor, then what never starts afresh.
+        for stretch in starts(&|sensor| sensor == unknown / 6).windows(2) {
             let own = left.session[stretch[0]..stretch[1]].iter();
-            quantile(own.map(|block| block.x[(unknown, 0)]).collect(), 0.5)
-        });
-        session[stretch[0]..stretch[1]].fill(middle);
+            let middle = quantile(own.map(|block| block.x[(unknown, 0)]).collect(), 0.5);
+            session[stretch[0]..stretch[1]]
+                .iter_mut()
+                .for_each(|x| x[unknown] = middle);
+        }
     }
     // Per unit, channel and block: the most likely mean of the channel's noise and the offset's wandering, by the unit's rows alone.
     let units: Vec<usize> = (0..maker.setup().structure.subtrees().len())
@@ -205,6 +314,7 @@ fn of_piece(
             .collect();
         let own: Vec<&[f64]> = seen.iter().map(|&c| series[c].as_slice()).collect();
         let least: Vec<f64> = seen.iter().map(|&c| noise.least[c]).collect();
+        let starts = starts(&|sensor| seen.iter().any(|channel| channel / 6 == sensor));
         let odd = stands_out(&own, &starts, &motion, &least);
         let share = odd.iter().filter(|odd| **odd).count() as f64 / odd.len().max(1) as f64;
         if share > MOST {
@@ -215,6 +325,22 @@ fn of_piece(
         }
     }
     out
+}
+
+/// Where stretches of blocks begin of which each has a level of its own, and the number of blocks: at these breaks. One that is too short to tell its level from what acts there goes with
+/// its neighbour: where something touches the robot, breaks of several sensors follow each other.
+fn stretches(breaks: impl Iterator<Item = usize>, count: usize) -> Vec<usize> {
+    let mut starts = vec![0];
+    for at in breaks {
+        if at - starts[starts.len() - 1] >= SHORT {
+            starts.push(at);
+        }
+    }
+    if starts.len() > 1 && count - starts[starts.len() - 1] < SHORT {
+        starts.pop();
+    }
+    starts.push(count);
+    starts
 }
 
 /// Which blocks of some channels' means stand out from a slowly wandering level. A new level begins at each of `starts`, which end with the number of blocks; `motion` says how much the robot
@@ -242,10 +368,8 @@ fn stands_out(series: &[&[f64]], starts: &[usize], motion: &[f64], least: &[f64]
         let usual = usual(&squares, &seen, motion);
         let fails: Vec<bool> = (0..count).map(|k| seen[k] && squares[k] > FACTOR * usual[k]).collect();
         let mut next = vec![false; count];
-        for stretch in starts.windows(2) {
-            for k in (stretch[0]..stretch[1]).filter(|&k| fails[k]) {
-                next[k.saturating_sub(MARGIN).max(stretch[0])..(k + MARGIN + 1).min(stretch[1])].fill(true);
-            }
+        for k in (0..count).filter(|&k| fails[k]) {
+            next[k.saturating_sub(MARGIN)..(k + MARGIN + 1).min(count)].fill(true);
         }
         if next == odd {
             break;
@@ -572,6 +696,71 @@ mod tests {
                 assert!(*odd || !touched, "seed {seed}: block {k} is touched");
                 assert!(!*odd || near, "seed {seed}: block {k} is free");
             }
+        }
+    }
+
+    /// Breaks of two sensors that follow each other, as where something is picked up: what is between them has no level of its own, and what acts there does not end there.
+    #[test]
+    fn a_contact_does_not_hide_between_breaks() {
+        for seed in 0..20 {
+            let (mut series, _, motion) = usual_log(seed);
+            let span = 100..160;
+            for (channel, size) in [(0, 60.0), (3, -40.0)] {
+                series[channel][span.clone()].iter_mut().for_each(|x| *x += size);
+            }
+            let starts = stretches([127, 131, 350].into_iter(), motion.len());
+            assert_eq!(starts, [0, 127, 350, 600]);
+            let odd = found(&series, &starts, &motion);
+            assert!(odd[span].iter().all(|odd| *odd), "seed {seed}");
+        }
+        assert_eq!(stretches([4, 300, 595].into_iter(), 600), [0, 300, 600]);
+    }
+
+    /// A sensor's level, known to .1 in each channel.
+    fn level(seconds: f64, value: f64, deviation: f64) -> Level {
+        Level {
+            t: Nanos::from_seconds(seconds),
+            value: Vector6::repeat(value),
+            covariance: Matrix6::identity() * deviation * deviation,
+        }
+    }
+
+    #[test]
+    fn an_offset_that_is_the_same_before_and_after_did_not_jump() {
+        // Per case: time of each break, and the levels before the first of them and after each; which of them stay.
+        for (what, breaks, values, expected) in [
+            ("nothing", &[3.0][..], &[7.0, 7.1][..], &[false][..]),
+            ("a jump", &[3.0], &[7.0, 9.0], &[true]),
+            ("there and back soon", &[3.0, 5.0], &[7.0, 9.0, 7.1], &[false, false]),
+            ("there and back late", &[3.0, 25.0], &[7.0, 9.0, 7.1], &[true, true]),
+            (
+                "a jump, then a touch",
+                &[3.0, 15.0, 17.0],
+                &[7.0, 9.0, 5.0, 9.0],
+                &[true, false, false],
+            ),
+        ] {
+            let at = |number: usize, t: f64| level(t, values[number], 0.1);
+            let levels: Vec<(Level, Level)> = (breaks.iter().enumerate())
+                .map(|(number, &t)| (at(number, t - 0.1), at(number + 1, t)))
+                .collect();
+            assert_eq!(new_levels(&levels, &Vector6::zeros()), expected, "{what}");
+            // A walk that goes as far in the time between two blocks leaves nothing to tell a jump by.
+            let walk = Vector6::repeat(100.0);
+            assert!(new_levels(&levels, &walk).iter().all(|is_new| !is_new), "{what}");
+        }
+    }
+
+    /// What is between two breaks was left out, and says nothing: whether the offset jumped is told by what is before and after both.
+    #[test]
+    fn a_jump_is_told_across_what_was_left_out() {
+        for (after, expected) in [(7.1, [false, false]), (9.0, [false, true])] {
+            let between = |t: f64| level(t, 40.0, 1e3);
+            let levels = [
+                (level(3.0, 7.0, 0.1), between(3.1)),
+                (between(8.0), level(8.1, after, 0.1)),
+            ];
+            assert_eq!(new_levels(&levels, &Vector6::zeros()), expected, "{after}");
         }
     }
 }

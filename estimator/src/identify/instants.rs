@@ -163,7 +163,7 @@ pub struct Instants {
     pub instants: Vec<Instant>,
     /// Where an F/T sensor's offset became another one at once: from there on it is to be determined anew.
     pub breaks: Vec<Break>,
-    /// What is wrong with the log: what [`Recording::defects`] holds, and what only shows at the instants.
+    /// What else is wrong with the log: what [`Recording::defects`] holds, and what only shows at the instants.
     pub defects: Vec<Defect>,
 }
 

@@ -32,13 +32,15 @@ pub enum Units {
     NotMetresPerSecondSquared,
 }
 
-/// Where the offset of an F/T sensor became another one at once.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// Where the offset of an F/T sensor became another one at once, by what its readings look like.
+#[derive(Debug, Clone, PartialEq)]
 pub struct Break {
     /// The sensor.
     pub sensor: usize,
     /// When.
     pub t: Nanos,
+    /// How it shows: a [`Defect::Jump`].
+    pub jump: Defect,
 }
 
 /// Something wrong with a log. [`fmt::Display`] says what, where, how much, and what to do.
@@ -1421,13 +1423,13 @@ pub(super) fn inspect_readings(recording: &Recording, setup: &Setup, instants: &
         }
         kept.sort_by_key(|(t, ..)| *t);
         for (t, axis, size) in kept {
-            instants.breaks.push(Break { sensor, t });
-            instants.defects.push(Defect::Jump {
+            let jump = Defect::Jump {
                 channel: label(channel),
                 axis,
                 t,
                 size,
-            });
+            };
+            instants.breaks.push(Break { sensor, t, jump });
         }
     }
     for (instant, sensor) in outliers {
