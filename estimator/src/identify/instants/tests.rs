@@ -475,8 +475,10 @@ fn given_velocities_are_kept_and_differentiated() {
         })
         .collect();
     assert!(errors.len() > 900);
-    // On straight lines between samples 10 ms apart: a^2 dt^2 / 8.
-    assert!(rms(errors.iter().map(|e| e[0])) < 1e-3 && rms(errors.iter().map(|e| e[1])) < 2e-4);
+    let [velocity, acceleration] = [0, 1].map(|k| rms(errors.iter().map(|e| e[k])));
+    println!("{velocity:.2e} {acceleration:.2e}");
+    // A straight line between samples 10 ms apart is off by up to a dt^2 / 8 times a second derivative, 1e-3 here.
+    assert!(velocity < 1e-6 && acceleration < 1e-5);
 }
 
 /// With those that are said of breaks.
