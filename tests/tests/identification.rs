@@ -1323,8 +1323,10 @@ fn undeclared_pushes_do_no_harm() {
             share * seconds > pushed - 0.8,
             "{share} of {seconds} s, pushed for {pushed} s"
         );
+        // Two blocks of 0.1 s before and after each are left out with it, and the blocks that it begins and ends in.
+        let beside = 0.6 * sessions.pushes("contact").len() as f64;
         assert!(
-            share * seconds < pushed + 3.0,
+            share * seconds < pushed + beside,
             "{share} of {seconds} s, pushed for {pushed} s"
         );
     }
