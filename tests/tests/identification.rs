@@ -1332,6 +1332,27 @@ fn undeclared_pushes_do_no_harm() {
     }
 }
 
+/// Pushes that nobody declared, in a log that is trained on or in one to validate with, are told as such; nothing is said to be wrong with the sensor that felt them.
+#[test]
+fn undeclared_pushes_are_no_fault_of_the_sensor() {
+    let sessions = arm();
+    let (train, pushed) = (sessions.log("train"), undeclared(&sessions.log("contact")));
+    for logs in [
+        vec![("contact.csv", &*pushed, Role::Train)],
+        vec![
+            ("train.csv", &*train, Role::Train),
+            ("contact.csv", &*pushed, Role::Validate),
+        ],
+    ] {
+        let outcome = identified(&sessions, &logs);
+        let touched = outcome.logs.last().expect("a log");
+        let said = |code: &str| touched.findings.iter().filter(|finding| finding.code == code).count();
+        let (role, findings) = (touched.role, &touched.findings);
+        assert_eq!(said("contact_suspected"), 1, "{role:?}: {findings:?}");
+        assert_eq!(said("unexplained"), 0, "{role:?}: {findings:?}");
+    }
+}
+
 /// The lines of a log in a span of time \[s\].
 fn part(log: &str, from: f64, to: f64) -> String {
     let within = |line: &&str| {

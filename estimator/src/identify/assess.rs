@@ -1,6 +1,9 @@
 //! Figures: what is left of every log with CAD, with CAD and fitted offsets, and with the identified parameters; and what is known of the parameters, in numbers and words.
 
-use super::batch::{Identified, Prepared, bodies, feasibility, joint_zeros, per_column, time_offsets, verdict};
+use super::batch::{
+    Identified, LEAST_FOLD, Prepared, bodies, feasibility, joint_zeros, per_column, time_offsets, verdict,
+};
+use super::gate::UnitSet;
 use super::outcome::{
     BaseParameterOutcome, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
     FrictionOutcome, JointOutcome, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, RotorOutcome, SensorOutcome,
@@ -916,6 +919,7 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
     };
     let wrenches = 6 * layout.sensors.len();
     let compared = Compared::new(maker, instants, &left, identified, &sets);
+    let untouched = untouched(maker, log, identified, &sets);
     let torques = left.noise[1].iter().skip(wrenches);
     let errors: Vec<&[f64]> = compared.errors[2].iter().chain(torques).map(Vec::as_slice).collect();
     let coverage = covered(maker, instants, &errors, identified, root);
@@ -983,7 +987,13 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
     for (place, &sensor) in layout.sensors.iter().enumerate() {
         let name = sensor_name(setup, sensor);
         let mut values = [[f64::NAN; 6]; 3];
-        findings.extend(unexplained(setup, sensor, &name, &compared, place));
+        findings.extend(unexplained(
+            setup,
+            sensor,
+            &name,
+            untouched.as_ref().unwrap_or(&compared),
+            place,
+        ));
         for axis in 0..6 {
             let channel = channel_of(place, axis);
             let errors = compared.errors.each_ref().map(|set| &set[channel]);
@@ -1057,7 +1067,31 @@ fn three<T: Copy>(values: [T; 3]) -> Three<T> {
     }
 }
 
+/// A log to validate with as if it were one to train on: without what something undeclared was found to act on, nor its share in the offsets. None if nothing was found, for then it is the same.
+fn untouched(
+    maker: &RowMaker<'_>,
+    log: &Prepared,
+    identified: &Identified,
+    sets: &[DVector<f64>; 2],
+) -> Option<Compared> {
+    if log.touched.iter().all(UnitSet::is_empty) {
+        return None;
+    }
+    let mut instants = log.instants.clone();
+    for (instant, units) in instants.iter_mut().zip(&log.touched) {
+        instant.suspected = *units;
+    }
+    let piece = super::passes::Piece {
+        instants: &instants,
+        breaks: &log.breaks,
+    };
+    let left = leave(maker, piece, &identified.noise, sets);
+    Some(Compared::new(maker, &instants, &left, identified, sets))
+}
+
 /// What the identified parameters leave of a sensor's readings if it is far more than its noise. How much of what they change by that is depends on how much the log moves: it is told, and refuses nothing.
+///
+/// Of a log in which something undeclared acted, `compared` is of the rest; nothing is said of fewer than [`LEAST_FOLD`] instants.
 fn unexplained(setup: &Setup, sensor: usize, name: &str, compared: &Compared, place: usize) -> Option<Finding> {
     /// More than so many times the stated noise, and than this share of what the axis changes by, is said.
     const TIMES: f64 = 10.0;
@@ -1072,6 +1106,9 @@ fn unexplained(setup: &Setup, sensor: usize, name: &str, compared: &Compared, pl
         let channel = channel_of(place, axis);
         let pairs = compared.load[channel].iter().zip(&compared.errors[2][channel]);
         let (load, error): (Vec<f64>, Vec<f64>) = pairs.filter(|(l, e)| l.is_finite() && e.is_finite()).unzip();
+        if load.len() < LEAST_FOLD {
+            continue;
+        }
         let centre = mean(&load);
         let load: Vec<f64> = load.iter().map(|x| x - centre).collect();
         let predicted: Vec<f64> = load.iter().zip(&error).map(|(l, e)| l - e).collect();
@@ -1657,6 +1694,26 @@ mod tests {
     fn setup() -> Setup {
         let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/icub_left_arm/estimator.toml");
         Setup::new(&Config::load(&file).unwrap()).unwrap()
+    }
+
+    /// A tenth is left of what each axis changes by, at so many instants.
+    fn a_tenth_left(instants: usize) -> Option<Finding> {
+        let setup = setup();
+        let mut load: Vec<f64> = (0..400).map(|i| 100.0 * (0.3 * f64::from(i)).sin()).collect();
+        load[instants..].fill(f64::NAN);
+        let error = load.iter().map(|load| 0.1 * load).collect();
+        let compared = Compared {
+            load: vec![load; 6],
+            errors: [Vec::new(), Vec::new(), vec![error; 6]],
+        };
+        unexplained(&setup, 0, "ft", &compared, 0)
+    }
+
+    #[test]
+    fn of_what_is_hardly_compared_nothing_is_said() {
+        assert!(a_tenth_left(LEAST_FOLD).is_some());
+        assert!(a_tenth_left(LEAST_FOLD - 1).is_none());
+        assert!(a_tenth_left(0).is_none());
     }
 
     /// As one that is taken by itself out of the matrix finds them, column by column.

@@ -107,7 +107,7 @@ const SETTLED: f64 = 0.03;
 
 /// Pieces of each log for the check on held-out data, and how many instants one has at least.
 const FOLDS: usize = 5;
-const LEAST_FOLD: usize = 50;
+pub(super) const LEAST_FOLD: usize = 50;
 
 /// Instants that noise, prior weight and the check on held-out data look at, at most, and in how many stretches of long logs.
 const SAMPLE: usize = 10_000;
@@ -128,6 +128,8 @@ pub(super) struct Prepared {
     pub left_out: Vec<LeftOut>,
     pub findings: Vec<Finding>,
     pub refused: bool,
+    /// Of a log to validate with: per instant, what something undeclared was found to act on; empty where none was looked for. No [`Instant::suspected`], for figures are of all of such a log.
+    pub touched: Vec<UnitSet>,
     /// None if it can not be read.
     recording: Option<Recording>,
 }
@@ -386,6 +388,7 @@ fn prepare(setup: &Setup, log: Log<'_>) -> Result<Prepared, IdentifyError> {
             left_out: Vec::new(),
             findings: vec![refusal("unreadable", problem.to_string())],
             refused: true,
+            touched: Vec::new(),
             recording: None,
         }),
         Err(problem) => Err(IdentifyError::Log {
@@ -576,6 +579,7 @@ fn usable(setup: &Setup, file: String, role: Role, recording: Recording) -> Prep
         breaks: found.breaks,
         left_out: reasons.into_values().collect(),
         findings,
+        touched: Vec::new(),
         recording: Some(recording),
     }
 }
@@ -1060,7 +1064,8 @@ impl Touches {
     }
 }
 
-/// Says what acted on the robot in the logs to validate with though nobody declared it. Their figures stay those of all rows: what is held out must not be picked by what it is to check.
+/// Says, and keeps in [`Prepared::touched`], what acted on the robot in the logs to validate with though nobody declared it. Their figures stay those of all rows: what is held out must not be
+/// picked by what it is to check.
 fn tell_touches(maker: &RowMaker<'_>, prepared: &mut [Prepared], identified: &Identified) {
     let is_checked = |log: &Prepared| log.role == Role::Validate && !log.refused;
     let checked: Vec<&Prepared> = prepared.iter().filter(|log| is_checked(log)).collect();
@@ -1083,6 +1088,7 @@ fn tell_touches(maker: &RowMaker<'_>, prepared: &mut [Prepared], identified: &Id
                 subject: part,
             });
         }
+        log.touched = contacts;
     }
 }
 
