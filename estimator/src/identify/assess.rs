@@ -117,7 +117,7 @@ pub(super) fn nothing(setup: &Setup, prepared: &[Prepared], reason: String) -> O
         offsets: Vec::new(),
         friction: Vec::new(),
         time_offsets: Vec::new(),
-        findings: log.findings(),
+        findings: log.all_findings(),
         curves: Vec::new(),
         spectra: Vec::new(),
     });
@@ -1053,7 +1053,7 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         offsets: offsets(setup, layout, log, identified, &left, &deviations),
         friction: friction(setup, layout, &left, &deviations),
         time_offsets: late,
-        findings: log.findings().into_iter().chain(found).chain(findings).collect(),
+        findings: log.all_findings().into_iter().chain(found).chain(findings).collect(),
         curves: curves(maker, instants, &times, &compared, identified, root, &torque_series),
         spectra: spectra(setup, layout, places.as_ref(), &left),
     }
@@ -1100,12 +1100,16 @@ fn unexplained(setup: &Setup, sensor: usize, name: &str, compared: &Compared, pl
     const AGAINST: f64 = -0.5;
     let noise = setup.structure.sensors()[sensor].noise();
     let noise = [noise.force, noise.torque].concat();
+    // Where one of the sub-trees that the sensor is at says nothing, because something acts on it, the others' errors are laid to it alone.
+    let all_rows = compared.rows[place].iter().copied().max().unwrap_or(0);
     let (mut left, mut all) = (0.0, 0.0);
     let (mut axes, mut turned) = (Vec::new(), Vec::new());
     for (axis, word) in AXES.into_iter().enumerate() {
         let channel = channel_of(place, axis);
         let pairs = compared.load[channel].iter().zip(&compared.errors[2][channel]);
-        let (load, error): (Vec<f64>, Vec<f64>) = pairs.filter(|(l, e)| l.is_finite() && e.is_finite()).unzip();
+        let is_told = |((l, e), rows): &((&f64, &f64), &usize)| l.is_finite() && e.is_finite() && **rows == all_rows;
+        let pairs = pairs.zip(&compared.rows[place]).filter(is_told);
+        let (load, error): (Vec<f64>, Vec<f64>) = pairs.map(|(pair, _)| pair).unzip();
         if load.len() < LEAST_FOLD {
             continue;
         }
@@ -1296,6 +1300,8 @@ pub(super) struct Compared {
     pub load: Vec<Vec<f64>>,
     /// The same less what is predicted: by CAD with the configured offsets, by CAD with fitted ones, by the identified parameters with fitted ones.
     pub errors: [Vec<Vec<f64>>; 3],
+    /// Per sensor (place in the layout) and instant, how many rows have its reading: six of each sub-tree that it is at, unless something acts there.
+    pub rows: Vec<Vec<usize>>,
 }
 
 impl Compared {
@@ -1313,6 +1319,7 @@ impl Compared {
         let (mut load, mut errors) = (empty(), [empty(), empty(), empty()]);
         let variances = identified.noise.following();
         let channels = 6 * layout.sensors.len();
+        let mut held = vec![vec![0; instants.len()]; layout.sensors.len()];
         let parts = parallel::map_with(
             left.ranges.len().div_ceil(TOGETHER),
             || (maker.clone(), Rows::new(&layout)),
@@ -1324,7 +1331,7 @@ impl Compared {
                     let (_, own) = cases[2];
                     for instant in &instants[range.clone()] {
                         let start = out.len();
-                        out.resize(start + channels, [f64::NAN; 4]);
+                        out.resize(start + channels, ([f64::NAN; 4], 0));
                         if channels == 0 || maker.make(instant, rows).is_err() {
                             continue;
                         }
@@ -1337,12 +1344,15 @@ impl Compared {
                             let Some(map) = laid_to(rows, &variances, 6 * place..6 * place + 6) else {
                                 continue;
                             };
+                            let has = |row: &usize| rows.g(*row)[6 * place..6 * place + 6].iter().any(|g| *g != 0.0);
+                            let count = (0..rows.count).filter(has).count();
                             let reading = instant.readings[sensor];
                             let [cad, cad_fitted, identified] = residuals.each_ref().map(|residual| &map * residual);
                             for (k, value) in reading.torque.iter().chain(&reading.force).enumerate() {
                                 let channel = 6 * place + k;
                                 if rows.has(channel) {
-                                    out[start + channel] = [value - own[channel], cad[k], cad_fitted[k], identified[k]];
+                                    let values = [value - own[channel], cad[k], cad_fitted[k], identified[k]];
+                                    out[start + channel] = (values, count);
                                 }
                             }
                         }
@@ -1354,15 +1364,20 @@ impl Compared {
         let places = left.ranges.iter().cloned().flatten();
         let each = parts.iter().flat_map(|part| part.chunks_exact(channels.max(1)));
         for (i, values) in places.zip(each) {
-            for (channel, [own, off @ ..]) in values.iter().enumerate() {
+            for (channel, ([own, off @ ..], count)) in values.iter().enumerate() {
                 load[channel][i] = *own;
+                held[channel / 6][i] = held[channel / 6][i].max(*count);
                 errors
                     .iter_mut()
                     .zip(off)
                     .for_each(|(errors, off)| errors[channel][i] = *off);
             }
         }
-        Self { load, errors }
+        Self {
+            load,
+            errors,
+            rows: held,
+        }
     }
 }
 
@@ -1703,6 +1718,7 @@ mod tests {
         load[instants..].fill(f64::NAN);
         let error = load.iter().map(|load| 0.1 * load).collect();
         let compared = Compared {
+            rows: vec![vec![6; load.len()]],
             load: vec![load; 6],
             errors: [Vec::new(), Vec::new(), vec![error; 6]],
         };

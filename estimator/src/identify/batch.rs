@@ -135,8 +135,8 @@ pub(super) struct Prepared {
 }
 
 impl Prepared {
-    /// What is said of the log itself.
-    pub(super) fn findings(&self) -> Vec<Finding> {
+    /// What is said of the log itself, jumps included.
+    pub(super) fn all_findings(&self) -> Vec<Finding> {
         let jumps = self.breaks.iter().map(|b| finding(&b.jump));
         self.findings.iter().cloned().chain(jumps).collect()
     }

@@ -11,13 +11,14 @@
 use super::batch::{LONG, Prepared, over};
 use super::information::Information;
 use super::instants::{Break, Instant};
-use super::passes::{NoiseModel, Piece, blocks, leave, tell};
+use super::passes::{NoiseModel, Piece, blocks, follow, leave, tell};
 use super::prior::Prior;
 use super::rows::{Layout, RowMaker, Rows, WIDTH};
-use super::session::Block;
+use super::session::{Block, smooth_with};
 use crate::dynamics::BitSet;
 use nalgebra::{DMatrix, DVector, Matrix6, SMatrix, SVector, Vector6};
 use proprio_topics::Nanos;
+use std::collections::BTreeMap;
 use std::ops::Range;
 
 /// Squares of a block so many times the usual ones are no chance: Gaussian noise in six channels comes to ten times. (Real logs without contacts, a leg of cables and a torque-controlled arm, come to
@@ -136,8 +137,8 @@ pub(super) fn contacts(
     out
 }
 
-/// Which of these breaks, of each log, a fit bears out: an offset that is the same before and after, within what it wanders and the fit knows, was none. (What touches the robot shows in the readings
-/// of every sensor that it goes through, as if their offsets changed; by the links between the sensors it is told apart.)
+/// Which of these breaks, of each log, a fit bears out: an offset that is the same before and after, within what it wanders and what is known of it by these parameters, was none. (What touches the
+/// robot shows in the readings of every sensor that it goes through, as if their offsets changed; by the links between the sensors it is told apart.) Of a sensor that nothing is fitted to, all.
 pub(super) fn breaks(
     maker: &RowMaker<'_>,
     all: &[&Prepared],
@@ -147,34 +148,54 @@ pub(super) fn breaks(
 ) -> Vec<Vec<Break>> {
     let layout = maker.layout();
     let borne_out = |(log, breaks): (&&Prepared, &Vec<Break>)| {
-        if breaks.is_empty() {
-            return Vec::new();
+        let place = |b: &Break| layout.sensors.binary_search(&b.sensor).ok();
+        if breaks.iter().all(|b| place(b).is_none()) {
+            return breaks.clone();
         }
         let piece = Piece {
             instants: &log.instants,
             breaks,
         };
-        let left = leave(maker, piece, noise, std::slice::from_ref(d));
-        let ranges = blocks(layout, piece);
-        let t = |block: usize| log.instants[ranges[block].0.start].t;
-        let mut kept = vec![false; breaks.len()];
-        for (place, sensor) in layout.sensors.iter().enumerate() {
-            let begins: Vec<usize> = (0..ranges.len()).filter(|&k| ranges[k].1.contains(&place)).collect();
+        let (ranges, mut states) = follow(maker, piece, noise, std::slice::from_ref(d));
+        let afresh: Vec<Vec<usize>> = blocks(layout, piece).into_iter().map(|(_, afresh)| afresh).collect();
+        let t = |block: usize| log.instants[ranges[block].start].t;
+        // Offsets go together where rows show several: how the level after each break does with those before it, and before the breaks of a touch's time earlier.
+        let mut carried: Vec<(usize, usize, DMatrix<f64>)> = Vec::new();
+        let mut together = BTreeMap::new();
+        smooth_with(&mut states, |block, state, gain| {
+            for &place in &afresh[block] {
+                carried.push((place, block, state.p.columns(6 * place, 6).into_owned()));
+            }
+            carried.retain(|(_, later, _)| (t(*later) - t(block)).seconds() <= TOUCH);
+            for (place, later, covariance) in &mut carried {
+                *covariance = gain * &*covariance;
+                if afresh[block].contains(place) {
+                    let own: Matrix6<f64> = covariance.fixed_view::<6, 6>(6 * *place, 0).into_owned();
+                    together.insert((*place, block, *later), own);
+                }
+            }
+        });
+        let mut kept: Vec<bool> = breaks.iter().map(|b| place(b).is_none()).collect();
+        for place in 0..layout.sensors.len() {
+            let begins: Vec<usize> = (0..ranges.len()).filter(|&k| afresh[k].contains(&place)).collect();
             let level = |block: usize| {
-                let Block { x, p, .. } = &left.session[block];
-                let of_sensor = |axis: usize| 6 * place + axis;
+                let Block { x, p, .. } = &states[block];
                 Level {
                     t: t(block),
-                    value: Vector6::from_fn(|i, _| x[(of_sensor(i), 0)]),
-                    covariance: Matrix6::from_fn(|i, j| p[(of_sensor(i), of_sensor(j))]),
+                    value: x.fixed_view::<6, 1>(6 * place, 0).into_owned(),
+                    covariance: p.fixed_view::<6, 6>(6 * place, 6 * place).into_owned(),
                 }
             };
             let walk = Vector6::from_fn(|axis, _| noise.drift[6 * place + axis]);
             // The last level before each break, and the first after it.
             let levels: Vec<(Level, Level)> = begins.iter().map(|&k| (level(k - 1), level(k))).collect();
-            let is_new = new_levels(&levels, &walk);
-            let own = breaks.iter().zip(&mut kept).filter(|(b, _)| b.sensor == *sensor);
-            for (b, kept) in own {
+            let shared = |before: usize, after: usize| {
+                let key = (place, begins[before], begins[after]);
+                together.get(&key).copied().unwrap_or_default()
+            };
+            let is_new = new_levels(&levels, &shared, &walk);
+            let own = breaks.iter().zip(&mut kept);
+            for (b, kept) in own.filter(|(b, _)| b.sensor == layout.sensors[place]) {
                 let number = begins.partition_point(|&k| t(k) < b.t);
                 *kept = is_new.get(number).is_some_and(|is| *is);
             }
@@ -194,11 +215,11 @@ struct Level {
 }
 
 impl Level {
-    /// Whether it can not be another one's that went on, walking.
-    fn is_other(&self, before: &Self, walk: &Vector6<f64>) -> bool {
+    /// Whether it can not be another one's that went on, walking. `shared`: the covariance of the other one with this one.
+    fn is_other(&self, before: &Self, shared: &Matrix6<f64>, walk: &Vector6<f64>) -> bool {
         let step = self.value - before.value;
         let walked = Matrix6::from_diagonal(&(walk * (self.t - before.t).seconds().max(0.0)));
-        let covariance = self.covariance + before.covariance + walked;
+        let covariance = self.covariance + before.covariance - shared - shared.transpose() + walked;
         covariance
             .cholesky()
             .is_none_or(|factor| step.dot(&factor.solve(&step)) > STEP)
@@ -211,18 +232,24 @@ impl Level {
     }
 }
 
-/// Of each break of a sensor, given its level before and after: whether there is another level indeed. What soon comes back to where it was is a touch between two breaks.
-fn new_levels(levels: &[(Level, Level)], walk: &Vector6<f64>) -> Vec<bool> {
+/// Of each break of a sensor, given its level before and after, and the covariance of the one before a break with the one after the same or a later break: whether there is another level
+/// indeed. What soon comes back to where it was is a touch between two breaks.
+fn new_levels(
+    levels: &[(Level, Level)],
+    shared: &dyn Fn(usize, usize) -> Matrix6<f64>,
+    walk: &Vector6<f64>,
+) -> Vec<bool> {
     let mut is_new = vec![true; levels.len()];
     let mut number = 0;
-    let mut known: Option<&Level> = None;
+    let mut known: Option<usize> = None;
     while number < levels.len() {
         let own = &levels[number].0;
-        let before = known.filter(|known| known.is_known_better(own)).unwrap_or(own);
+        let is_better = |known: &usize| levels[*known].0.is_known_better(own);
+        let before = known.filter(is_better).unwrap_or(number);
         // As far as possible.
         let last = (number..levels.len())
             .take_while(|&k| k == number || (levels[k].1.t - own.t).seconds() < TOUCH)
-            .filter(|&k| !levels[k].1.is_other(before, walk))
+            .filter(|&k| !levels[k].1.is_other(&levels[before].0, &shared(before, k), walk))
             .last();
         known = last.map(|_| before);
         let last = last.inspect(|&last| is_new[number..=last].fill(false));
@@ -716,13 +743,17 @@ mod tests {
         assert_eq!(stretches([4, 300, 595].into_iter(), 600), [0, 300, 600]);
     }
 
-    /// A sensor's level, known to .1 in each channel.
+    /// A sensor's level, known to `deviation` in each channel.
     fn level(seconds: f64, value: f64, deviation: f64) -> Level {
         Level {
             t: Nanos::from_seconds(seconds),
             value: Vector6::repeat(value),
             covariance: Matrix6::identity() * deviation * deviation,
         }
+    }
+
+    fn apart(_: usize, _: usize) -> Matrix6<f64> {
+        Matrix6::zeros()
     }
 
     #[test]
@@ -744,10 +775,13 @@ mod tests {
             let levels: Vec<(Level, Level)> = (breaks.iter().enumerate())
                 .map(|(number, &t)| (at(number, t - 0.1), at(number + 1, t)))
                 .collect();
-            assert_eq!(new_levels(&levels, &Vector6::zeros()), expected, "{what}");
+            assert_eq!(new_levels(&levels, &apart, &Vector6::zeros()), expected, "{what}");
             // A walk that goes as far in the time between two blocks leaves nothing to tell a jump by.
             let walk = Vector6::repeat(100.0);
-            assert!(new_levels(&levels, &walk).iter().all(|is_new| !is_new), "{what}");
+            assert!(
+                new_levels(&levels, &apart, &walk).iter().all(|is_new| !is_new),
+                "{what}"
+            );
         }
     }
 
@@ -760,7 +794,7 @@ mod tests {
                 (level(3.0, 7.0, 0.1), between(3.1)),
                 (between(8.0), level(8.1, after, 0.1)),
             ];
-            assert_eq!(new_levels(&levels, &Vector6::zeros()), expected, "{after}");
+            assert_eq!(new_levels(&levels, &apart, &Vector6::zeros()), expected, "{after}");
         }
     }
 }

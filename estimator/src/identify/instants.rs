@@ -736,13 +736,13 @@ impl<const D: usize> Stream<D> {
             });
         }
         // Trapezoids under the straight lines between low, the samples in between, and high.
-        let (mut sum, mut from, mut value) = ([0.0; D], low, self.between(begin, low));
+        let (mut sum, mut from, mut value) = ([0.0; D], low, self.line(begin, low));
         for i in begin + 1..=end {
             let to = self.t[i].min(high);
             let next = if to == self.t[i] {
                 self.value[i]
             } else {
-                self.between(i - 1, high)
+                self.line(i - 1, high)
             };
             let weight = 0.5 * (to - from).seconds();
             for (sum, (a, b)) in sum.iter_mut().zip(value.iter().zip(&next)) {
@@ -753,21 +753,28 @@ impl<const D: usize> Stream<D> {
         Ok(sum.map(|sum| sum / (high - low).seconds()))
     }
 
-    /// The cubic through sample `i`, the next, and their neighbours, at `t`; the straight line where these are missing, or so unevenly spaced that the cubic would swing.
+    /// The cubic through sample `i`, the next, and their neighbours, at `t`; the straight line where these are missing, do not belong together, or are so unevenly spaced that the cubic would be
+    /// noisier than a sample.
     fn between(&self, i: usize, t: Nanos) -> Values<D> {
         /// How unevenly, as a ratio.
-        const UNEVEN: f64 = 3.0;
+        const UNEVEN: f64 = 2.0;
         let (Some(a), Some(b)) = (self.t.get(i), self.t.get(i + 1)) else {
             return self.value[i];
         };
         let own = (*b - *a).seconds();
-        let even = |from: Nanos, to: Nanos| (own / UNEVEN..=own * UNEVEN).contains(&(to - from).seconds());
+        let even = |from: Nanos, to: Nanos| {
+            to - from <= self.max_gap && (own / UNEVEN..=own * UNEVEN).contains(&(to - from).seconds())
+        };
         let around = i
             .checked_sub(1)
             .and_then(|before| Some((self.t.get(before..i + 3)?, self.value.get(before..i + 3)?)));
         let (stamps, values) = match around {
-            Some((stamps, values)) if even(stamps[0], *a) && even(*b, stamps[3]) => (stamps, values),
-            _ => (&self.t[i..i + 2], &self.value[i..i + 2]),
+            Some((stamps, values))
+                if even(stamps[0], *a) && even(*b, stamps[3]) && self.disowned(stamps[0], stamps[3]).is_none() =>
+            {
+                (stamps, values)
+            }
+            _ => return self.line(i, t),
         };
         // Lagrange's form: the weight of a sample is 1 at its stamp and 0 at the others'.
         let mut sum = [0.0; D];
@@ -781,6 +788,14 @@ impl<const D: usize> Stream<D> {
                 .for_each(|(sum, value)| *sum += weight * value);
         }
         sum
+    }
+    /// The straight line from sample `i` to the next, at `t`.
+    fn line(&self, i: usize, t: Nanos) -> Values<D> {
+        let (Some(a), Some(b)) = (self.t.get(i), self.t.get(i + 1)) else {
+            return self.value[i];
+        };
+        let share = (t - *a).seconds() / (*b - *a).seconds();
+        std::array::from_fn(|k| self.value[i][k] + share * (self.value[i + 1][k] - self.value[i][k]))
     }
 }
 

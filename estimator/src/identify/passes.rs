@@ -312,10 +312,15 @@ impl Residuals {
     }
 }
 
-/// Takes parameters as given, fits offsets and friction, and gives what is left.
-pub(super) fn leave(maker: &RowMaker<'_>, piece: Piece<'_>, noise: &NoiseModel, sets: &[DVector<f64>]) -> Residuals {
+/// Takes parameters as given, and fits offsets and friction: what is known of them at the end of each block of instants by what was before, a column per set.
+pub(super) fn follow(
+    maker: &RowMaker<'_>,
+    piece: Piece<'_>,
+    noise: &NoiseModel,
+    sets: &[DVector<f64>],
+) -> (Vec<Range<usize>>, Vec<Block>) {
     let layout = maker.layout().clone();
-    let (k, channels, count) = (sets.len(), layout.channels(), piece.instants.len());
+    let k = sets.len();
     let variances = noise.following();
     let mut session = Session::new(&session_prior(&layout), k);
     let make = || (maker.clone(), Rows::new(&layout));
@@ -361,6 +366,16 @@ pub(super) fn leave(maker: &RowMaker<'_>, piece: Piece<'_>, noise: &NoiseModel, 
             ranges.push(range.clone());
         }
     }
+    (ranges, states)
+}
+
+/// The same given all of the piece, and what is left.
+pub(super) fn leave(maker: &RowMaker<'_>, piece: Piece<'_>, noise: &NoiseModel, sets: &[DVector<f64>]) -> Residuals {
+    let layout = maker.layout().clone();
+    let (k, channels, count) = (sets.len(), layout.channels(), piece.instants.len());
+    let variances = noise.following();
+    let make = || (maker.clone(), Rows::new(&layout));
+    let (ranges, mut states) = follow(maker, piece, noise, sets);
     smooth(&mut states);
     let mut first = maker.cad_of_layout();
     if let Some(set) = sets.first() {

@@ -161,6 +161,12 @@ pub(super) struct Block {
 
 /// Estimates of every block given all blocks, in place (Rauch, Tung, Striebel).
 pub(super) fn smooth(blocks: &mut [Block]) {
+    smooth_with(blocks, |_, _, _| ());
+}
+
+/// The same, telling on the way back in time, of each block but the first, by which matrix it is known from there to the block before: `(number, block, gain)`. The covariance of the unknowns of
+/// the block before with those of any later block is `gain` times that of this block's with it. Columns of `gain` are zero for what started afresh.
+pub(super) fn smooth_with(blocks: &mut [Block], mut tell: impl FnMut(usize, &Block, &DMatrix<f64>)) {
     for k in (1..blocks.len()).rev() {
         let (before, after) = blocks.split_at_mut(k);
         let (old, new) = (&mut before[k - 1], &after[0]);
@@ -172,11 +178,12 @@ pub(super) fn smooth(blocks: &mut [Block]) {
             }
         }
         let continues: Vec<usize> = (0..new.drift.len()).filter(|&i| new.drift[i].is_finite()).collect();
-        if continues.is_empty() {
-            continue;
-        }
+        let mut whole = DMatrix::zeros(new.drift.len(), new.drift.len());
         let inner = predicted.select_rows(&continues).select_columns(&continues);
-        let Some(factor) = inner.cholesky() else { continue };
+        let Some(factor) = inner.cholesky().filter(|_| !continues.is_empty()) else {
+            tell(k, new, &whole);
+            continue;
+        };
         // P (P + Q)^-1 as 1 - Q (P + Q)^-1: what hardly walks is known from the future to the last digit.
         let mut gain = factor.solve(&old.p.select_columns(&continues).transpose()).transpose();
         let inverse = factor.inverse();
@@ -185,6 +192,10 @@ pub(super) fn smooth(blocks: &mut [Block]) {
                 gain[(i, other)] = f64::from(u8::from(place == other)) - new.drift[i] * inverse[(place, other)];
             }
         }
+        for (place, &i) in continues.iter().enumerate() {
+            whole.set_column(i, &gain.column(place));
+        }
+        tell(k, new, &whole);
         let ahead = new.x.select_rows(&continues) - old.x.select_rows(&continues);
         old.x += &gain * ahead;
         let apart = new.p.select_rows(&continues).select_columns(&continues)
@@ -293,6 +304,62 @@ mod tests {
                 assert!((found.x[(i, 0)] - all[p + s * block + i]).abs() < 1e-6, "block {block}");
             }
         }
+    }
+
+    /// Covariances of all blocks with all others, against those of least squares; an unknown that starts afresh has none with what it was before but through what goes on.
+    #[test]
+    fn blocks_go_together_as_in_least_squares_on_everything() {
+        let (s, count) = (2, 5);
+        let (prior, steps) = ([4.0, 9.0], [0.3, 0.1]);
+        let g = |block: usize| [[1.0, 1.0], [0.2 * block as f64, -0.5]];
+        let mut precision = DMatrix::<f64>::zeros(s * count, s * count);
+        let mut session = Session::new(&prior, 1);
+        let mut blocks: Vec<Block> = Vec::new();
+        for block in 0..count {
+            let mut drift = steps.to_vec();
+            if block == 3 {
+                drift[0] = f64::INFINITY;
+            }
+            for i in 0..s {
+                let (now, before) = (s * block + i, (s * block + i).wrapping_sub(s));
+                if block == 0 || drift[i].is_infinite() {
+                    precision[(now, now)] += 1.0 / prior[i];
+                } else {
+                    precision[(now, now)] += 1.0 / drift[i];
+                    precision[(before, before)] += 1.0 / drift[i];
+                    precision[(now, before)] -= 1.0 / drift[i];
+                    precision[(before, now)] -= 1.0 / drift[i];
+                }
+            }
+            if block > 0 {
+                session.drift(&steps);
+            }
+            if block == 3 {
+                session.renew(0, prior[0]);
+            }
+            for row in g(block) {
+                for (i, j) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+                    precision[(s * block + i, s * block + j)] += row[i] * row[j];
+                }
+                session.update(&row, &mut [0.0]);
+            }
+            blocks.push(Block {
+                x: session.estimates(),
+                p: session.covariance(),
+                drift,
+            });
+        }
+        let expected = precision.try_inverse().expect("regular");
+        let mut carried: Vec<(usize, DMatrix<f64>)> = Vec::new();
+        smooth_with(&mut blocks, |block, state, gain| {
+            carried.push((block, state.p.clone()));
+            for (later, covariance) in &mut carried {
+                *covariance = gain * &*covariance;
+                let expected = expected.view((s * (block - 1), s * *later), (s, s));
+                assert!((&*covariance - expected).amax() < 1e-9, "{} and {later}", block - 1);
+            }
+        });
+        assert_eq!(carried.len(), count - 1);
     }
 
     /// An offset of which next to nothing is known, and rows as exact as those of a torque sensor: every digit counts. Against orthogonal least squares on all unknowns.
