@@ -339,6 +339,73 @@ fn what_pushes_leave_is_not_unexplained() {
     }
 }
 
+/// A sensor whose offset jumps, as when its cable slips: it is told, its offset starts afresh there, and nothing else becomes worse.
+#[test]
+fn a_jump_of_an_offset_is_told_and_does_no_harm() {
+    // Of two sensors, what the links between them carry tells the one that jumped.
+    for (sensors, slipped) in [
+        (&["ft"][..], "ft"),
+        (&["ft", "wrist"], "ft"),
+        (&["ft", "wrist"], "wrist"),
+    ] {
+        let setup = arm_with(sensors);
+        let truth = real(&setup, 5);
+        let [train, rest] = [15, 16].map(|seed| simulate(&setup, &truth, 20.0, 3.0, seed));
+        let column = format!("wrench/{slipped}/fx");
+        let slip = change_rows(&train, &column, |row, value| value + if row < 900 { 0.0 } else { 5.0 });
+        let of = |train: &str| {
+            let logs = [("train", Role::Train, train), ("rest", Role::Validate, &*rest)];
+            let outcome = run(&setup, &logs, &[IdentificationInput::Wrench]);
+            assert_eq!(outcome.verdict, Verdict::Identified);
+            outcome
+        };
+        let (free, jumped) = (of(&train), of(&slip));
+        let said = |outcome: &Outcome| -> Vec<(&str, String, String)> {
+            let findings = outcome.logs.iter().flat_map(|log| &log.findings);
+            let said = findings.map(|f| (f.code, f.subject.clone(), f.text.clone()));
+            said.collect()
+        };
+        assert_eq!(said(&free), [], "{sensors:?}");
+        let (told, others): (Vec<_>, Vec<_>) = said(&jumped).into_iter().partition(|f| f.0 == "jump");
+        let [(_, subject, text)] = told.as_slice() else {
+            panic!("{slipped} of {sensors:?}: {told:?}")
+        };
+        assert!(
+            *subject == format!("wrench/{slipped}") && text.contains("fx changes by "),
+            "{text}"
+        );
+        // The moment itself, which is known but nearly, may be thought a touch.
+        assert!(others.iter().all(|f| f.0 == "contact_suspected"), "{others:?}");
+        // Of 2000 instants, for each part of the robot.
+        let left_out = &jumped.logs[0].left_out;
+        assert!(left_out.iter().all(|l| l.instants <= 60), "{left_out:?}");
+        for offset in &jumped.logs[0].offsets {
+            let breaks: Vec<f64> = offset.breaks.iter().map(|t| t.seconds()).collect();
+            if offset.sensor == slipped {
+                assert!(matches!(*breaks, [t] if (t - 9.0).abs() < 0.1), "{breaks:?}");
+                let change = offset.end[0] - offset.start[0];
+                println!("{slipped} of {sensors:?} jumps at {breaks:?} by {change:.3} N");
+                assert!((change - 5.0).abs() < 0.5, "{change}");
+            } else {
+                assert_eq!(breaks, [], "{}", offset.sensor);
+            }
+        }
+        assert_eq!(jumped.logs[0].offsets.len(), sensors.len());
+        // What a break and its moment cost in knowledge is little: of one noise, they come to other errors of the same size.
+        let errors = [&free, &jumped].map(|outcome| {
+            let (_, torque, ..) = torque_errors(&setup, &truth, outcome, 505);
+            [torque, outcome.logs[1].relative_error.identified]
+        });
+        println!(
+            "{slipped} of {sensors:?}: without the jump {:.5?}, with it {:.5?}",
+            errors[0], errors[1]
+        );
+        for (without, with) in errors[0].iter().zip(errors[1]) {
+            assert!(with < 1.5 * without, "{slipped} of {sensors:?}: {errors:?}");
+        }
+    }
+}
+
 /// Nothing undeclared acts on the robots of the recorded logs: nothing of them may be thought a contact, whatever CAD has wrong and however the structure shakes.
 fn nothing_is_suspected(outcome: &Outcome) {
     let findings = outcome.logs.iter().flat_map(|log| &log.findings);
