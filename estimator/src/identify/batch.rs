@@ -5,7 +5,7 @@
 //!    probable bodies under the prior and its weight ([`super::prior`]). With these bodies: what is left, and from it the noise ([`super::noise`]). Until both stay.
 //!    Before the first of them: logs that repeat another one, or whose readings are no newtons ([`super::wrenches`]), are refused; so is a sensor that is mounted the wrong way, or the log in which
 //!    alone it is ([`super::mounting`]).
-//! 3. What this fit says that something undeclared acted on is left out, and the rounds repeated, until that stays ([`super::gate`]).
+//! 3. What this fit says that something undeclared acted on is left out, jumps of offsets that it does not bear out are dropped, and the rounds repeated, until that stays ([`super::gate`]).
 //!    Then, where gains of sensors are asked for, fits with these unknown, too, and what is left out is asked again.
 //! 4. A check on data held out: pieces of the logs are predicted from the others. The change from CAD is shrunk where it gains nothing ([`held_out`]).
 //! 5. Shaking that encoders do not show ([`super::shaking`]), where other sensors tell of it, is taken off; then 2 and 4 once more.

@@ -161,7 +161,7 @@ pub struct Instant {
 pub struct Instants {
     /// In time.
     pub instants: Vec<Instant>,
-    /// Where an F/T sensor's offset became another one at once: from there on it is to be determined anew.
+    /// Where an F/T sensor's offset seems to have become another one at once, by its readings alone: from there on it is to be determined anew. (A fit may say otherwise.)
     pub breaks: Vec<Break>,
     /// What else is wrong with the log: what [`Recording::defects`] holds, and what only shows at the instants.
     pub defects: Vec<Defect>,
