@@ -49,6 +49,8 @@ struct Sessions {
     near: f64,
     /// With noise, those of CAD are at least so many times further off, in every joint of `distal`.
     cad_further: f64,
+    /// It stands on a foot, which never turns: what that leg weighs and the offset of the foot's sensor are told apart by CAD alone.
+    stands: bool,
 }
 
 fn arm() -> Sessions {
@@ -87,7 +89,10 @@ fn icub() -> Option<Sessions> {
         "r_ankle_roll",
     ];
     let urdf = Path::new(&models).join("iCubGazeboV2_5.urdf");
-    Some(Sessions::new(folder, urdf, distal, (0.15, 1.5)))
+    Some(Sessions {
+        stands: true,
+        ..Sessions::new(folder, urdf, distal, (0.15, 1.5))
+    })
 }
 
 /// The robots whose sessions are at hand.
@@ -113,6 +118,7 @@ impl Sessions {
             distal,
             near,
             cad_further,
+            stands: false,
         }
     }
 
@@ -1136,7 +1142,7 @@ fn without_noise(sessions: &Sessions, setup: Setup) -> BTreeMap<String, Score> {
 /// and with anything possible at the hand (so that torques rest on the sensor's reading; without, they rest on the links beyond the joint, and 28 s of
 /// 50 Hz do not hold what it would take to come within 1.5 times of exact parameters) it is at most 1.5 times as far from the truth as exact parameters
 /// get, and CAD's are five times further off, as long as noise lets that be seen: always, with the arm. Every other torque, which rests on
-/// links that the motion does not show in full, is off by what it is said to be: most of their errors are within 1.96 of the stated deviations, none beyond four, unless it is no worse than CAD's.
+/// links that the motion does not show in full: no worse than CAD's, or, of a robot that stands on a foot, within four of the stated deviations; most of their errors are within 1.96 of these.
 fn must_be_good(what: &str, sessions: &Sessions, outcome: &Outcome) {
     println!(
         "{what}: {:?}, tau {:.3}, shrink {}",
@@ -1179,7 +1185,7 @@ fn must_be_good(what: &str, sessions: &Sessions, outcome: &Outcome) {
             let stated = score.stated;
             covered.push(score.covered);
             assert!(
-                noisy <= 1.05 * off + 1e-3 || error <= 4.0 * stated,
+                noisy <= 1.05 * off + 1e-3 || sessions.stands && error <= 4.0 * stated,
                 "{what}: {joint}: {noisy} Nm, CAD {off}; without noise {error} +- {stated}"
             );
         }
@@ -1249,8 +1255,8 @@ fn a_swing_is_enough_to_identify_what_a_sensor_carries() {
                 }
             }
         }
-        // The sensor at a foot that stands never turns: its offset is told from the weight of the links above by what CAD says of these.
-        assert!(10 * far.len() <= offsets, "{far:?}");
+        let most = if sessions.stands { offsets / 10 } else { 0 };
+        assert!(far.len() <= most, "{far:?}");
         let validated = &outcome.logs[1];
         for sensor in &validated.sensors {
             for (part, (own, cad)) in WRENCH

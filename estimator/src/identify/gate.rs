@@ -156,20 +156,20 @@ pub(super) fn breaks(
             instants: &log.instants,
             breaks,
         };
-        let (ranges, mut states) = follow(maker, piece, noise, std::slice::from_ref(d));
-        let afresh: Vec<Vec<usize>> = blocks(layout, piece).into_iter().map(|(_, afresh)| afresh).collect();
-        let t = |block: usize| log.instants[ranges[block].start].t;
+        let (blocks, mut states) = follow(maker, piece, noise, std::slice::from_ref(d));
+        let afresh = |block: usize| &blocks[block].1;
+        let t = |block: usize| log.instants[blocks[block].0.start].t;
         // Offsets go together where rows show several: how the level after each break does with those before it, and before the breaks of a touch's time earlier.
         let mut carried: Vec<(usize, usize, DMatrix<f64>)> = Vec::new();
         let mut together = BTreeMap::new();
-        smooth_with(&mut states, |block, state, gain| {
-            for &place in &afresh[block] {
+        smooth_with(&mut states, |block, state, gain, continues| {
+            for &place in afresh(block) {
                 carried.push((place, block, state.p.columns(6 * place, 6).into_owned()));
             }
             carried.retain(|(_, later, _)| (t(*later) - t(block)).seconds() <= TOUCH);
             for (place, later, covariance) in &mut carried {
-                *covariance = gain * &*covariance;
-                if afresh[block].contains(place) {
+                *covariance = gain * covariance.select_rows(continues);
+                if afresh(block).contains(place) {
                     let own: Matrix6<f64> = covariance.fixed_view::<6, 6>(6 * *place, 0).into_owned();
                     together.insert((*place, block, *later), own);
                 }
@@ -177,7 +177,7 @@ pub(super) fn breaks(
         });
         let mut kept: Vec<bool> = breaks.iter().map(|b| place(b).is_none()).collect();
         for place in 0..layout.sensors.len() {
-            let begins: Vec<usize> = (0..ranges.len()).filter(|&k| afresh[k].contains(&place)).collect();
+            let begins: Vec<usize> = (0..blocks.len()).filter(|&k| afresh(k).contains(&place)).collect();
             let level = |block: usize| {
                 let Block { x, p, .. } = &states[block];
                 Level {
@@ -252,8 +252,11 @@ fn new_levels(
             .filter(|&k| !levels[k].1.is_other(&levels[before].0, &shared(before, k), walk))
             .last();
         known = last.map(|_| before);
-        let last = last.inspect(|&last| is_new[number..=last].fill(false));
-        number = last.unwrap_or(number) + 1;
+        if let Some(last) = last {
+            is_new[number..=last].fill(false);
+            number = last;
+        }
+        number += 1;
     }
     is_new
 }
@@ -271,14 +274,14 @@ fn of_piece(
     let left = leave(maker, piece, noise, std::slice::from_ref(d));
     // Offsets where they are most of the time: a contact that they followed must not hide behind them.
     let ranges = blocks(&layout, piece);
-    let starts = |is_afresh: &dyn Fn(usize) -> bool| {
-        let breaks = (0..ranges.len()).filter(|&k| ranges[k].1.iter().any(|sensor| is_afresh(*sensor)));
+    let starts_of = |counts: &dyn Fn(usize) -> bool| {
+        let breaks = (0..ranges.len()).filter(|&k| ranges[k].1.iter().any(|sensor| counts(*sensor)));
         stretches(breaks, ranges.len())
     };
     let mut session = vec![DVector::zeros(layout.session()); ranges.len()];
     for unknown in 0..layout.session() {
         // Six offsets per sensor, then what never starts afresh.
-        for stretch in starts(&|sensor| sensor == unknown / 6).windows(2) {
+        for stretch in starts_of(&|sensor| sensor == unknown / 6).windows(2) {
             let own = left.session[stretch[0]..stretch[1]].iter();
             let middle = quantile(own.map(|block| block.x[(unknown, 0)]).collect(), 0.5);
             session[stretch[0]..stretch[1]]
@@ -341,7 +344,7 @@ fn of_piece(
             .collect();
         let own: Vec<&[f64]> = seen.iter().map(|&c| series[c].as_slice()).collect();
         let least: Vec<f64> = seen.iter().map(|&c| noise.least[c]).collect();
-        let starts = starts(&|sensor| seen.iter().any(|channel| channel / 6 == sensor));
+        let starts = starts_of(&|sensor| seen.iter().any(|channel| channel / 6 == sensor));
         let odd = stands_out(&own, &starts, &motion, &least);
         let share = odd.iter().filter(|odd| **odd).count() as f64 / odd.len().max(1) as f64;
         if share > MOST {

@@ -23,7 +23,7 @@ pub use defects::{Break, Defect, Units};
 pub use offset::{Signal, TimeOffset};
 
 use super::gate::UnitSet;
-use super::parallel;
+use super::{add_multiple, parallel};
 use crate::dynamics::{ContactSet, FrameMotion, SensorSet};
 use crate::pipeline::{UNTRUSTED_ENCODER, quality_reason};
 use crate::setup::{BaseMotion, Channel, Setup, Use};
@@ -776,19 +776,14 @@ impl<const D: usize> Stream<D> {
             }
             _ => return self.line(i, t),
         };
-        // Lagrange's form: the weight of a sample is 1 at its stamp and 0 at the others'.
+        let x = [0, 1, 2, 3].map(|k| (stamps[k] - t).seconds());
         let mut sum = [0.0; D];
-        for (j, (stamp, value)) in stamps.iter().zip(values).enumerate() {
-            let others = stamps.iter().enumerate().filter(|(k, _)| *k != j);
-            let weight: f64 = others
-                .map(|(_, other)| (t - *other).seconds() / (*stamp - *other).seconds())
-                .product();
-            sum.iter_mut()
-                .zip(value)
-                .for_each(|(sum, value)| *sum += weight * value);
+        for (weight, value) in cubic(x, 0.0).iter().zip(values) {
+            add_multiple(&mut sum, *weight, value);
         }
         sum
     }
+
     /// The straight line from sample `i` to the next, at `t`.
     fn line(&self, i: usize, t: Nanos) -> Values<D> {
         let (Some(a), Some(b)) = (self.t.get(i), self.t.get(i + 1)) else {
@@ -797,6 +792,17 @@ impl<const D: usize> Stream<D> {
         let share = (t - *a).seconds() / (*b - *a).seconds();
         std::array::from_fn(|k| self.value[i][k] + share * (self.value[i + 1][k] - self.value[i][k]))
     }
+}
+
+/// Weights of four samples, at `x`, in the cubic through them (Lagrange), at `t`.
+fn cubic(x: [f64; 4], t: f64) -> [f64; 4] {
+    let d = x.map(|x| t - x);
+    [
+        d[1] * d[2] * d[3] / ((x[0] - x[1]) * (x[0] - x[2]) * (x[0] - x[3])),
+        d[0] * d[2] * d[3] / ((x[1] - x[0]) * (x[1] - x[2]) * (x[1] - x[3])),
+        d[0] * d[1] * d[3] / ((x[2] - x[0]) * (x[2] - x[1]) * (x[2] - x[3])),
+        d[0] * d[1] * d[2] / ((x[3] - x[0]) * (x[3] - x[1]) * (x[3] - x[2])),
+    ]
 }
 
 #[cfg(test)]

@@ -123,8 +123,11 @@ pub(super) fn session_prior(layout: &Layout) -> Vec<f64> {
     prior
 }
 
-/// Blocks of instants, each with the sensors (places in the layout) that start afresh with it.
-pub(super) fn blocks(layout: &Layout, piece: Piece<'_>) -> Vec<(Range<usize>, Vec<usize>)> {
+/// A block of instants, with the sensors (places in the layout) that start afresh with it.
+pub(super) type Stretch = (Range<usize>, Vec<usize>);
+
+/// The blocks of a piece.
+pub(super) fn blocks(layout: &Layout, piece: Piece<'_>) -> Vec<Stretch> {
     let instants = piece.instants;
     let mut out = Vec::new();
     let mut start = 0;
@@ -312,27 +315,26 @@ impl Residuals {
     }
 }
 
-/// Takes parameters as given, and fits offsets and friction: what is known of them at the end of each block of instants by what was before, a column per set.
+/// Takes parameters as given, and fits offsets and friction: the blocks of instants, and what is known at the end of each by what was before, a column per set.
 pub(super) fn follow(
     maker: &RowMaker<'_>,
     piece: Piece<'_>,
     noise: &NoiseModel,
     sets: &[DVector<f64>],
-) -> (Vec<Range<usize>>, Vec<Block>) {
+) -> (Vec<Stretch>, Vec<Block>) {
     let layout = maker.layout().clone();
     let k = sets.len();
     let variances = noise.following();
     let mut session = Session::new(&session_prior(&layout), k);
     let make = || (maker.clone(), Rows::new(&layout));
-    let (mut states, mut ranges) = (Vec::new(), Vec::new());
-    let mut last = None;
+    let (mut states, mut last) = (Vec::new(), None);
     let blocks = blocks(&layout, piece);
     for some in blocks.chunks(AT_ONCE * TOGETHER) {
         // Per row what every set leaves of it, and how offsets and friction are in it.
         let width = k + layout.session();
         let shares: Vec<_> = some.chunks(TOGETHER).collect();
         let lines = parallel::map_with(shares.len(), make, |(maker, rows), number| -> Vec<Vec<f64>> {
-            let of_block = |(range, _): &(Range<usize>, Vec<usize>)| {
+            let of_block = |(range, _): &Stretch| {
                 let mut lines = Vec::new();
                 for instant in &piece.instants[range.clone()] {
                     if maker.make(instant, rows).is_err() {
@@ -363,10 +365,9 @@ pub(super) fn follow(
                 p: session.covariance(),
                 drift,
             });
-            ranges.push(range.clone());
         }
     }
-    (ranges, states)
+    (blocks, states)
 }
 
 /// The same given all of the piece, and what is left.
@@ -375,7 +376,8 @@ pub(super) fn leave(maker: &RowMaker<'_>, piece: Piece<'_>, noise: &NoiseModel, 
     let (k, channels, count) = (sets.len(), layout.channels(), piece.instants.len());
     let variances = noise.following();
     let make = || (maker.clone(), Rows::new(&layout));
-    let (ranges, mut states) = follow(maker, piece, noise, sets);
+    let (blocks, mut states) = follow(maker, piece, noise, sets);
+    let ranges: Vec<Range<usize>> = blocks.into_iter().map(|(range, _)| range).collect();
     smooth(&mut states);
     let mut first = maker.cad_of_layout();
     if let Some(set) = sets.first() {

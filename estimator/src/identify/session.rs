@@ -161,12 +161,12 @@ pub(super) struct Block {
 
 /// Estimates of every block given all blocks, in place (Rauch, Tung, Striebel).
 pub(super) fn smooth(blocks: &mut [Block]) {
-    smooth_with(blocks, |_, _, _| ());
+    smooth_with(blocks, |_, _, _, _| ());
 }
 
-/// The same, telling on the way back in time, of each block but the first, by which matrix it is known from there to the block before: `(number, block, gain)`. The covariance of the unknowns of
-/// the block before with those of any later block is `gain` times that of this block's with it. Columns of `gain` are zero for what started afresh.
-pub(super) fn smooth_with(blocks: &mut [Block], mut tell: impl FnMut(usize, &Block, &DMatrix<f64>)) {
+/// The same, telling on the way back in time, of each block but the first, how the block before is known from it: `(number, block, gain, continues)`. The covariance of the unknowns of the block
+/// before with those of any later block is `gain` times the rows `continues` of this block's with it: of what did not start afresh.
+pub(super) fn smooth_with(blocks: &mut [Block], mut tell: impl FnMut(usize, &Block, &DMatrix<f64>, &[usize])) {
     for k in (1..blocks.len()).rev() {
         let (before, after) = blocks.split_at_mut(k);
         let (old, new) = (&mut before[k - 1], &after[0]);
@@ -178,10 +178,9 @@ pub(super) fn smooth_with(blocks: &mut [Block], mut tell: impl FnMut(usize, &Blo
             }
         }
         let continues: Vec<usize> = (0..new.drift.len()).filter(|&i| new.drift[i].is_finite()).collect();
-        let mut whole = DMatrix::zeros(new.drift.len(), new.drift.len());
         let inner = predicted.select_rows(&continues).select_columns(&continues);
         let Some(factor) = inner.cholesky().filter(|_| !continues.is_empty()) else {
-            tell(k, new, &whole);
+            tell(k, new, &DMatrix::zeros(new.drift.len(), 0), &[]);
             continue;
         };
         // P (P + Q)^-1 as 1 - Q (P + Q)^-1: what hardly walks is known from the future to the last digit.
@@ -192,10 +191,7 @@ pub(super) fn smooth_with(blocks: &mut [Block], mut tell: impl FnMut(usize, &Blo
                 gain[(i, other)] = f64::from(u8::from(place == other)) - new.drift[i] * inverse[(place, other)];
             }
         }
-        for (place, &i) in continues.iter().enumerate() {
-            whole.set_column(i, &gain.column(place));
-        }
-        tell(k, new, &whole);
+        tell(k, new, &gain, &continues);
         let ahead = new.x.select_rows(&continues) - old.x.select_rows(&continues);
         old.x += &gain * ahead;
         let apart = new.p.select_rows(&continues).select_columns(&continues)
@@ -351,10 +347,10 @@ mod tests {
         }
         let expected = precision.try_inverse().expect("regular");
         let mut carried: Vec<(usize, DMatrix<f64>)> = Vec::new();
-        smooth_with(&mut blocks, |block, state, gain| {
+        smooth_with(&mut blocks, |block, state, gain, continues| {
             carried.push((block, state.p.clone()));
             for (later, covariance) in &mut carried {
-                *covariance = gain * &*covariance;
+                *covariance = gain * covariance.select_rows(continues);
                 let expected = expected.view((s * (block - 1), s * *later), (s, s));
                 assert!((&*covariance - expected).amax() < 1e-9, "{} and {later}", block - 1);
             }

@@ -14,8 +14,8 @@
 //! stretch of the log wants the offset moved by is looked at: their scatter is what the offset is uncertain by, `sqrt(sum s_b^2) / I` for scores `s_b` of the stretches and the
 //! information `I` (the sandwich estimator; White 1980, in blocks: Liang, Zeger 1986), if that is more than what noise gives with its autocorrelation time.
 
-use super::{Recording, Stream};
-use crate::identify::{dot, parallel};
+use super::{Recording, Stream, cubic};
+use crate::identify::{add_multiple, dot, parallel};
 use proprio_topics::Nanos;
 use std::collections::BTreeMap;
 
@@ -256,13 +256,6 @@ fn inflated_variance(series: &[f64]) -> f64 {
     variance * time.max(1.0)
 }
 
-/// Sums of all columns at once: where a sample is and what it weighs is the same for each.
-fn plus<const D: usize>(sum: &mut [f64; D], weight: f64, values: &[f64; D]) {
-    sum.iter_mut()
-        .zip(values)
-        .for_each(|(sum, value)| *sum += weight * value);
-}
-
 /// Series smoothed by lines fitted around each sample, weighted by a Gaussian curve of this standard deviation \[s\].
 fn smoothed<const D: usize>(at: &[f64], values: &[[f64; D]], width: f64) -> Vec<[f64; D]> {
     let mut low = 0;
@@ -280,8 +273,8 @@ fn smoothed<const D: usize>(at: &[f64], values: &[[f64; D]], width: f64) -> Vec<
                 }
                 let w = (-0.5 * x * x).exp();
                 (w0, w1, w2) = (w0 + w, w1 + w * x, w2 + w * x * x);
-                plus(&mut y0, w, y);
-                plus(&mut y1, w * x, y);
+                add_multiple(&mut y0, w, y);
+                add_multiple(&mut y1, w * x, y);
             }
             let determinant = w0 * w2 - w1 * w1;
             if determinant > 1e-9 * w0 * w0 {
@@ -300,16 +293,16 @@ fn quick<const D: usize>(at: &[f64], values: &[[f64; D]], width: f64) -> Vec<[f6
     let mut integral = vec![[0.0; D]];
     for (i, (t, v)) in at.windows(2).zip(values.windows(2)).enumerate() {
         let mut sum = integral[i];
-        plus(&mut sum, 0.5 * (t[1] - t[0]), &v[0]);
-        plus(&mut sum, 0.5 * (t[1] - t[0]), &v[1]);
+        add_multiple(&mut sum, 0.5 * (t[1] - t[0]), &v[0]);
+        add_multiple(&mut sum, 0.5 * (t[1] - t[0]), &v[1]);
         integral.push(sum);
     }
     let until = |place: &mut Place<'_>, t: f64| -> [f64; D] {
         let i = place.of(t);
         let (dt, span) = (t - at[i - 1], at[i] - at[i - 1]);
         let mut sum = integral[i - 1];
-        plus(&mut sum, dt - 0.5 * dt * dt / span, &values[i - 1]);
-        plus(&mut sum, 0.5 * dt * dt / span, &values[i]);
+        add_multiple(&mut sum, dt - 0.5 * dt * dt / span, &values[i - 1]);
+        add_multiple(&mut sum, 0.5 * dt * dt / span, &values[i]);
         sum
     };
     let (mut low, mut high) = (Place::new(at), Place::new(at));
@@ -317,8 +310,8 @@ fn quick<const D: usize>(at: &[f64], values: &[[f64; D]], width: f64) -> Vec<[f6
         .zip(&values)
         .map(|(t, value)| {
             let mut out = *value;
-            plus(&mut out, -0.5 / SLOW, &until(&mut high, t + SLOW));
-            plus(&mut out, 0.5 / SLOW, &until(&mut low, t - SLOW));
+            add_multiple(&mut out, -0.5 / SLOW, &until(&mut high, t + SLOW));
+            add_multiple(&mut out, 0.5 / SLOW, &until(&mut low, t - SLOW));
             out
         })
         .collect()
@@ -366,20 +359,13 @@ impl<'a, const D: usize> Model<'a, D> {
         let mut sum = [0.0; D];
         if i < 2 || i + 1 >= at.len() {
             let share = (t - at[i - 1]) / (at[i] - at[i - 1]);
-            plus(&mut sum, 1.0 - share, &self.values[i - 1]);
-            plus(&mut sum, share, &self.values[i]);
+            add_multiple(&mut sum, 1.0 - share, &self.values[i - 1]);
+            add_multiple(&mut sum, share, &self.values[i]);
             return sum;
         }
         let x = [at[i - 2], at[i - 1], at[i], at[i + 1]];
-        let d = x.map(|x| t - x);
-        let weights = [
-            d[1] * d[2] * d[3] / ((x[0] - x[1]) * (x[0] - x[2]) * (x[0] - x[3])),
-            d[0] * d[2] * d[3] / ((x[1] - x[0]) * (x[1] - x[2]) * (x[1] - x[3])),
-            d[0] * d[1] * d[3] / ((x[2] - x[0]) * (x[2] - x[1]) * (x[2] - x[3])),
-            d[0] * d[1] * d[2] / ((x[3] - x[0]) * (x[3] - x[1]) * (x[3] - x[2])),
-        ];
-        for (weight, values) in weights.iter().zip(&self.values[i - 2..i + 2]) {
-            plus(&mut sum, *weight, values);
+        for (weight, values) in cubic(x, t).iter().zip(&self.values[i - 2..i + 2]) {
+            add_multiple(&mut sum, *weight, values);
         }
         sum
     }
