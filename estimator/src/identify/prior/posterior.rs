@@ -174,6 +174,7 @@ impl Posterior {
         let mut state = self.start();
         if let Some(u) = self.place(x) {
             state.y = &self.chart.t * u;
+            state.centred = None;
         }
         let weight = 0.5 / (tau * tau);
         let end = self.descend(&mut state, weight, decrement.max(1e-13 * weight))?;
@@ -242,14 +243,15 @@ impl Posterior {
         State {
             chart: self.chart.clone(),
             y: DVector::zeros(self.chart.scale.len()),
-            centred: f64::INFINITY,
+            centred: Some(f64::INFINITY),
         }
     }
 
     /// The minimum of `1/2 |R x - z|^2 + weight sum D + ...`, until the squared Newton decrement is below the tolerance.
     ///
     /// Where a Newton step would leave the bodies, it begins with a weight at which it does not, and lowers it by tenths (the central path: a descent that ran straight
-    /// into the boundary would creep along it).
+    /// into the boundary would creep along it). From a guess there is no such path (where a body is more than twice CAD's, a Newton step to CAD overshoots at any
+    /// weight), so a guess from which the step leaves the bodies is given up for CAD.
     pub(in crate::identify) fn descend(
         &self,
         state: &mut State,
@@ -258,8 +260,13 @@ impl Posterior {
     ) -> Result<Descent, PriorError> {
         let (mut current, mut iterations) = (weight, 0);
         let mut newton = self.newton(state, current)?;
-        while newton.least < -OUTSIDE && current < 0.1 * state.centred {
-            current = (100.0 * current).min(0.1 * state.centred);
+        if newton.least < -OUTSIDE && state.centred.is_none() {
+            *state = self.start();
+            newton = self.newton(state, current)?;
+        }
+        let greatest = 0.1 * state.centred.unwrap_or(0.0);
+        while newton.least < -OUTSIDE && current < greatest {
+            current = (100.0 * current).min(greatest);
             newton = self.newton(state, current)?;
         }
         loop {
@@ -279,7 +286,7 @@ impl Posterior {
                 iterations += 1;
                 newton = self.newton(state, current)?;
             };
-            state.centred = current;
+            state.centred = Some(current);
             if is_last || iterations >= NEWTON_STEPS {
                 return Ok(Descent {
                     decrement: newton.decrement,
@@ -466,8 +473,8 @@ impl Posterior {
 pub(in crate::identify) struct State {
     chart: Chart,
     y: DVector<f64>,
-    /// The last weight that this was the minimum for, about; CAD is for an infinite one.
-    centred: f64,
+    /// The last weight that this was the minimum for, about; CAD is for an infinite one, a guess for none.
+    centred: Option<f64>,
 }
 
 impl State {
@@ -819,8 +826,15 @@ mod tests {
         let precision = fit.precision_root();
         let mut impossible = fit.x.clone();
         impossible[10] = -100.0;
+        // Where a body is more than twice CAD's a Newton step overshoots, whatever the prior's weight.
+        let mut heavy = fit.x.clone();
+        for (link, (cad, own)) in cad.iter().zip(&fit.bodies).enumerate() {
+            let more = Vector10::from(own.parameters()) * 20.0 - Vector10::from(cad.parameters());
+            heavy.fixed_rows_mut::<10>(10 * link).copy_from(&more);
+        }
         let other = posterior.fit(0.3).unwrap();
-        for (x, most) in [(&fit.x, 1), (&other.x, fit.iterations), (&impossible, fit.iterations)] {
+        let steps = fit.iterations;
+        for (x, most) in [(&fit.x, 1), (&other.x, steps), (&impossible, steps), (&heavy, steps)] {
             let found = posterior.fit_from(x.as_slice(), 0.4, 1e-8).unwrap();
             // In standard deviations.
             let off = (&precision * (&found.x - &fit.x)).norm();
