@@ -488,8 +488,20 @@ impl Identifier {
         let (back, done) = mpsc::sync_channel(1);
         let work = move || {
             let (mut unwritten, mut written) = (None, monotonic());
+            let mut fails = vec![false; components];
             while let Ok(mut job) = waiting.recv() {
                 job.run();
+                for (component, (fails, failure)) in fails.iter_mut().zip(job.failures()).enumerate() {
+                    match failure {
+                        Some(error) if !*fails => tracing::error!(
+                            component,
+                            "identification can not solve for the parameters: {error}; what was known before stays in force"
+                        ),
+                        None if *fails => tracing::info!(component, "identification solves for the parameters again"),
+                        _ => {}
+                    }
+                    *fails = failure.is_some();
+                }
                 if let Some(kept) = &kept {
                     let text = job.state();
                     if monotonic() - written >= kept.every {

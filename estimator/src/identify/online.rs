@@ -638,8 +638,8 @@ impl Online {
         for (part, component) in job.parts.iter_mut().zip(&mut self.components) {
             component.variances.copy_from_slice(&part.variances);
             component.wander.copy_from_slice(&part.wander);
-            component.judges = !part.has_failed;
-            component.counts.failed += u64::from(part.has_failed);
+            component.judges = part.failure.is_none();
+            component.counts.failed += u64::from(part.failure.is_some());
             if let Some((change, information)) = &mut part.change {
                 component.last_change = Some(*change);
                 std::mem::swap(information, &mut component.information);
@@ -1109,7 +1109,8 @@ struct Part {
     wander: Vec<f64>,
     period: f64,
     tau: f64,
-    has_failed: bool,
+    /// Why the last job found nothing.
+    failure: Option<PriorError>,
     motion: f64,
     rows: u64,
     /// The last solution that was found.
@@ -1187,7 +1188,7 @@ impl Part {
             wander: component.wander.clone(),
             period: period.seconds(),
             tau: GREATEST_TAU,
-            has_failed: false,
+            failure: None,
             motion: 0.0,
             rows: 0,
             good,
@@ -1201,17 +1202,18 @@ impl Part {
     fn run(&mut self, prior: &Prior, data: Nanos, solution: &mut ComponentSolution) {
         self.change = None;
         self.weigh_change();
-        self.has_failed = self.solve(prior, solution).is_err();
-        if self.has_failed {
+        self.failure = self.solve(prior, solution).err();
+        let has_failed = self.failure.is_some();
+        if has_failed {
             // What it holds is older than what is in force.
             solution.clone_from(&self.good);
         } else {
             self.take_noise(solution);
             solution.data = data;
         }
-        solution.is_accepted = !self.has_failed;
+        solution.is_accepted = !has_failed;
         (solution.motion, solution.rows) = (self.motion, self.rows);
-        if !self.has_failed {
+        if !has_failed {
             self.good.clone_from(solution);
         }
     }
@@ -1431,6 +1433,11 @@ impl Job {
     /// What it found.
     pub fn solution(&self) -> &Solution {
         &self.solution
+    }
+
+    /// For each component why it was not solved, if it was not: what was known before stays in force.
+    pub fn failures(&self) -> impl Iterator<Item = Option<&PriorError>> {
+        self.parts.iter().map(|part| part.failure.as_ref())
     }
 }
 

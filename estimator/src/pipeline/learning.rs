@@ -13,6 +13,7 @@ use crate::dynamics::{ContactSet, DofSet, FrameMotion, JointState, Kinematics};
 use crate::history::{History, KEPT};
 use crate::identify::online::state::{Measuring, StateError};
 use crate::identify::online::{Job as Solving, Observation, Online, OnlineError, Solution};
+use crate::identify::prior::PriorError;
 use crate::regressor::{Covariance, Propagation};
 use crate::setup::{BaseMotion, Learnt, Setup, Use};
 use crate::spatial::{RigidInertia, Vec3, Wrench};
@@ -75,6 +76,11 @@ impl Job {
             *propagation = new;
         }
         tell(setup, self.solving.solution(), inertia);
+    }
+
+    /// For each component why it was not solved, if it was not: what was known before stays in force.
+    pub fn failures(&self) -> impl Iterator<Item = Option<&PriorError>> {
+        self.solving.failures()
     }
 
     /// What was known when it began, as text: for [`super::Pipeline::resume`].

@@ -208,7 +208,7 @@ impl Online {
             .zip(&job.solution.components)
             .zip(&job.parts)
         {
-            if !part.has_failed {
+            if part.failure.is_none() {
                 own.clone_from(found);
             }
         }
