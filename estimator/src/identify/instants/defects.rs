@@ -5,7 +5,7 @@
 //! tell a blow or a slipping cable from motion:
 //!
 //! - outliers: further from the running median over +-0.12 s than 8 times the usual distance (1.4826 x median, along the log and around the place),
-//!   and than 1.5 times what the model's own prediction is within +-0.24 s;
+//!   and than 1.5 times what the model's own prediction is, or bends, within +-0.24 s;
 //! - jumps: lines fitted on 0.2 s before and after a place, 0.1 s apart, miss one another by more than 6 times that scatter, by more than 6 times what they usually do, and
 //!   by more than 1.5 times what the model's own prediction does (a model that is wrong, however much, must not look like a jump);
 //! - slides: the same with lines on 0.5 s, 0.6 s apart.
@@ -1552,10 +1552,16 @@ fn off_median(values: &[f64], half: usize) -> Vec<f64> {
         .collect()
 }
 
+/// How far off its running median a parabola is at its vertex that bends as much as numbers do here: with a summand of another sign what rises steadily has its peak here.
+fn bend(values: &[f64], i: usize, half: usize) -> f64 {
+    let half = half.min(i).min(values.len() - 1 - i);
+    (values[i - half] - 2.0 * values[i] + values[i + half]).abs() / 8.0
+}
+
 /// What the model predicts over one stretch, as far as it matters to an axis.
 struct Expected {
     values: Vec<[f64; 6]>,
-    /// How far it is off its running median, at the most nearby.
+    /// How far it is off its running median, or would be if it did not rise or fall steadily, at the most nearby.
     off: Vec<f64>,
 }
 
@@ -1566,7 +1572,10 @@ impl Expected {
         let off: Vec<Vec<Vec<f64>>> = parallel::map(AXES.len(), |k| {
             let of_run = |run: &Range<usize>| {
                 let values: Vec<f64> = run.clone().map(|i| predicted(i)[k]).collect();
-                off_median(&values, half)
+                let off = off_median(&values, half);
+                (0..values.len())
+                    .map(|i| off[i].abs().max(bend(&values, i, half)))
+                    .collect()
             };
             runs.iter().map(of_run).collect()
         });
