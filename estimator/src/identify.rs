@@ -48,6 +48,7 @@ mod rows;
 mod session;
 mod shaking;
 mod torques;
+mod undeclared;
 mod wrenches;
 
 pub use batch::{IdentifyError, Log, Options, Progress, identify};

@@ -13,7 +13,7 @@
 
 use super::assess;
 use super::consistent;
-use super::gate::{self, Load, UnitSet};
+use super::gate::{self, UnitSet};
 use super::information::Information;
 use super::instants::{Break, Defect, Instant, Recording, RecordingError, Settings, Signal, TimeOffset};
 use super::mounting;
@@ -24,6 +24,7 @@ use super::prior::{Fit, Posterior, Prior, PriorError};
 use super::rows::{Further, Groups, Layout, RowMaker, Rows};
 use super::shaking::Shaking;
 use super::torques;
+use super::undeclared::{self, Undeclared};
 use super::wrenches;
 use crate::calibration::Kind;
 use crate::config::{Gain, IdentificationInput, TorqueSide};
@@ -264,8 +265,12 @@ pub fn identify(
         gated = with_gains(setup, &mut maker, &mut prepared, gated, &mut tell_progress)?;
     }
     let maker = maker;
-    tell_suspicions(&maker, &mut prepared, &gated);
-    let Gated { settled, restless, .. } = gated;
+    let Gated {
+        settled,
+        undeclared,
+        restless,
+    } = gated;
+    undeclared.tell(&maker, &mut prepared, &settled);
     let training = used(&prepared);
     let mut identified = fit(&maker, &training, inputs.clone(), settled, &mut tell_progress)?;
     tell_progress("shaking".into(), 0.8);
@@ -282,7 +287,7 @@ pub fn identify(
     }
     identified.findings.extend(restless);
     identified.findings.extend(asked_in_vain(setup, &identified.inputs));
-    tell_touches(&maker, &mut prepared, &identified);
+    undeclared::tell_of_checks(&maker, &mut prepared, &identified);
     let training = used(&prepared);
     tell_progress("figures".into(), 0.9);
     let outcome = assess::outcome(setup, &maker, &prepared, &training, &identified);
@@ -337,12 +342,12 @@ fn surveyed_again<'a>(
 }
 
 /// The logs to train on.
-fn used(prepared: &[Prepared]) -> Vec<&Prepared> {
+pub(super) fn used(prepared: &[Prepared]) -> Vec<&Prepared> {
     let is_used = |log: &&Prepared| log.role == Role::Train && !log.refused;
     prepared.iter().filter(is_used).collect()
 }
 
-fn used_mut(prepared: &mut [Prepared]) -> impl Iterator<Item = &mut Prepared> {
+pub(super) fn used_mut(prepared: &mut [Prepared]) -> impl Iterator<Item = &mut Prepared> {
     let is_used = |log: &&mut Prepared| log.role == Role::Train && !log.refused;
     prepared.iter_mut().filter(is_used)
 }
@@ -768,11 +773,11 @@ fn negative_rotors(setup: &Setup, layout: &Layout, fit: &Fit) -> Vec<Finding> {
 }
 
 /// Noise, prior and its weight, after rounds that settled.
-struct Settled {
-    prior: Prior,
-    noise: NoiseModel,
-    fit: Fit,
-    information: Information,
+pub(super) struct Settled {
+    pub prior: Prior,
+    pub noise: NoiseModel,
+    pub fit: Fit,
+    pub information: Information,
     /// By how much the last round still changed a variance.
     change: f64,
 }
@@ -834,9 +839,7 @@ fn settle(
 /// What is left when what something undeclared acted on was left out.
 struct Gated {
     settled: Settled,
-    loads: Vec<Load>,
-    /// Per training log and instant.
-    contacts: Vec<Vec<UnitSet>>,
+    undeclared: Undeclared,
     /// Said if what is left out did not come to stay.
     restless: Option<Finding>,
 }
@@ -851,23 +854,18 @@ fn gated(
     let mut settled = settle(setup, maker, &used(prepared), None, progress)?;
     // It has been told how far along this is.
     let mut progress = |step: String, _| progress(step, 0.7);
-    let mut loads: Vec<Load> = Vec::new();
-    let mut contacts: Vec<Vec<UnitSet>> = used(prepared)
-        .iter()
-        .map(|log| vec![UnitSet::default(); log.instants.len()])
-        .collect();
-    let jumps: Vec<Vec<Break>> = used(prepared).iter().map(|log| log.breaks.clone()).collect();
+    let mut undeclared = Undeclared::none(used_mut(prepared));
     let mut refused = 0;
     let mut stays = false;
     for _ in 0..GATES {
         progress("undeclared contacts".into(), 0.7);
         let training = used(prepared);
-        let load = (refused < REFUSED && loads.len() < LOADS)
+        let load = (refused < REFUSED && undeclared.loads.len() < LOADS)
             .then(|| gate::load(maker, &settled.prior, &training, &settled.noise, settled.fit.tau))
             .flatten();
         if let Some(load) = load {
-            loads.push(load);
-            suspect(prepared, &loads, &contacts);
+            undeclared.loads.push(load);
+            undeclared.mark(used_mut(prepared));
             let without = settle(
                 setup,
                 maker,
@@ -879,44 +877,22 @@ fn gated(
                 settled = without;
                 continue;
             }
-            loads.pop();
+            undeclared.loads.pop();
             refused += 1;
-            suspect(prepared, &loads, &contacts);
+            undeclared.mark(used_mut(prepared));
         }
-        let training = used(prepared);
-        let found = gate::contacts(maker, &training, &loads, &settled.noise, &settled.fit.x);
-        // Of all that there were: what was no jump beside the noise of a touch may be one when that is left out.
-        let breaks = gate::breaks(maker, &training, &jumps, &settled.noise, &settled.fit.x);
-        stays = found == contacts && training.iter().zip(&breaks).all(|(log, breaks)| log.breaks == *breaks);
+        let Settled { noise, fit, .. } = &settled;
+        stays = undeclared.ask(maker, used_mut(prepared), noise, &fit.x);
         if stays {
             break;
         }
-        contacts = found;
-        let training = used_mut(prepared);
-        for (log, breaks) in training.zip(breaks) {
-            log.breaks = breaks;
-        }
-        suspect(prepared, &loads, &contacts);
         settled = settle(setup, maker, &used(prepared), Some(settled.noise), &mut progress)?;
     }
     Ok(Gated {
         settled,
-        loads,
-        contacts,
-        restless: (!stays).then(|| restless(GATES)),
+        undeclared,
+        restless: (!stays).then(|| undeclared::restless(GATES)),
     })
-}
-
-/// After so many fits, what is left out changes still.
-fn restless(fits: usize) -> Finding {
-    Finding {
-        severity: Severity::Warning,
-        code: "contact_unsettled",
-        subject: String::new(),
-        text: format!(
-            "after {fits} fits, what is left out because something undeclared acted there had not come to stay: look at what the logs leave out, and declare contacts where they were"
-        ),
-    }
 }
 
 /// Gains of the sensors, too. What a gain that is off leaves where the robot carries much may have been taken for a contact: that is asked again when gains are known, and if it was otherwise, gains are
@@ -930,16 +906,13 @@ fn with_gains(
 ) -> Result<Gated, IdentifyError> {
     const AGAIN: usize = 4;
     gated.settled = gains(setup, maker, prepared, gated.settled, progress)?;
-    gated.restless = Some(restless(AGAIN));
+    gated.restless = Some(undeclared::restless(AGAIN));
     for _ in 0..AGAIN {
         let Settled { noise, fit, .. } = &gated.settled;
-        let contacts = gate::contacts(maker, &used(prepared), &gated.loads, noise, &fit.x);
-        if contacts == gated.contacts {
+        if gated.undeclared.ask(maker, used_mut(prepared), noise, &fit.x) {
             gated.restless = None;
             break;
         }
-        gated.contacts = contacts;
-        suspect(prepared, &gated.loads, &gated.contacts);
         gated.settled = gains(setup, maker, prepared, gated.settled, progress)?;
     }
     Ok(gated)
@@ -1002,198 +975,6 @@ fn read_as_fitted(maker: &RowMaker<'_>, prepared: &mut [Prepared], settled: &Set
     let training = used_mut(prepared);
     for instant in training.flat_map(|log| &mut log.instants) {
         instant.fitted = fitted.next().unwrap_or_default();
-    }
-}
-
-/// Marks the instants of the training logs.
-fn suspect(prepared: &mut [Prepared], loads: &[Load], contacts: &[Vec<UnitSet>]) {
-    let training = used_mut(prepared);
-    for (number, (log, contacts)) in training.zip(contacts).enumerate() {
-        for (instant, contact) in log.instants.iter_mut().zip(contacts) {
-            let carries = |load: &&Load| load.log == number && load.has(instant.t);
-            instant.suspected = loads
-                .iter()
-                .filter(carries)
-                .fold(*contact, |set, load| set.union(&load.units));
-        }
-    }
-}
-
-/// The links of a unit, in words.
-fn part(setup: &Setup, unit: usize) -> String {
-    match setup.structure.subtrees().get(unit) {
-        Some(subtree) => {
-            let sensors: Vec<String> = subtree.sensors.iter().map(|s| assess::sensor_name(setup, s)).collect();
-            format!("the links at {}", sensors.join(", "))
-        }
-        None => "the links whose joint torques are measured".to_owned(),
-    }
-}
-
-/// When something acted on a part of the robot.
-struct Touches {
-    times: usize,
-    instants: usize,
-    first: Nanos,
-    last: Nanos,
-}
-
-impl Touches {
-    /// At those of a log's instants of which `is_touched` says so; none if it does of none.
-    fn of(instants: &[Instant], is_touched: impl Fn(usize) -> bool) -> Option<Self> {
-        let touched: Vec<usize> = (0..instants.len()).filter(|&i| is_touched(i)).collect();
-        Some(Self {
-            times: 1 + touched.windows(2).filter(|two| two[1] > two[0] + 1).count(),
-            instants: touched.len(),
-            first: instants[*touched.first()?].t,
-            last: instants[*touched.last()?].t,
-        })
-    }
-
-    /// `2 times between 3.1 and 7.4 s after the log's start: 5.0 % of the log`.
-    fn describe(&self, log: &Prepared) -> String {
-        let since = |t: Nanos| (t - log.span.0).seconds();
-        format!(
-            "{} time{} between {:.1} and {:.1} s after the log's start: {:.1} % of the log",
-            self.times,
-            if self.times == 1 { "" } else { "s" },
-            since(self.first),
-            since(self.last),
-            100.0 * self.instants as f64 / log.instants.len() as f64
-        )
-    }
-}
-
-/// Says, and keeps in [`Prepared::touched`], what acted on the robot in the logs to validate with though nobody declared it. Their figures stay those of all rows: what is held out must not be
-/// picked by what it is to check.
-fn tell_touches(maker: &RowMaker<'_>, prepared: &mut [Prepared], identified: &Identified) {
-    let is_checked = |log: &Prepared| log.role == Role::Validate && !log.refused;
-    let checked: Vec<&Prepared> = prepared.iter().filter(|log| is_checked(log)).collect();
-    let found = gate::contacts(maker, &checked, &[], &identified.noise, &identified.d);
-    let checked = prepared.iter_mut().filter(|log| is_checked(log));
-    for (log, contacts) in checked.zip(found) {
-        let units = contacts.iter().fold(UnitSet::default(), |units, set| units.union(set));
-        for unit in units.iter() {
-            let Some(touches) = Touches::of(&log.instants, |i| contacts[i].contains(unit)) else {
-                continue;
-            };
-            let part = part(maker.setup(), unit);
-            log.findings.push(Finding {
-                severity: Severity::Note,
-                code: "contact_suspected",
-                text: format!(
-                    "as if something that nobody declared acted on {part}, what was identified does not hold there {}. This log's figures are of all of it, these times too",
-                    touches.describe(log)
-                ),
-                subject: part,
-            });
-        }
-        log.touched = contacts;
-    }
-}
-
-/// Says what was left out because of something undeclared.
-fn tell_suspicions(maker: &RowMaker<'_>, prepared: &mut [Prepared], gated: &Gated) {
-    let Gated {
-        settled,
-        loads,
-        contacts,
-        ..
-    } = gated;
-    let setup = maker.setup();
-    let training = used(prepared);
-    let body = |load: &Load| {
-        let Settled {
-            prior,
-            noise,
-            information,
-            fit,
-            ..
-        } = settled;
-        gate::added(maker, prior, &training, load, noise, information, fit.tau)
-    };
-    let bodies: Vec<Option<gate::Added>> = loads.iter().map(body).collect();
-    let training = used_mut(prepared);
-    for (number, (log, contacts)) in training.zip(contacts).enumerate() {
-        let begin = log.span.0;
-        let since = |t: Nanos| (t - begin).seconds();
-        let mut units = UnitSet::default();
-        contacts.iter().for_each(|set| units = units.union(set));
-        for unit in units.iter() {
-            let handed = |i: usize| {
-                let of_load = |load: &Load| load.log == number && load.units.contains(unit);
-                loads
-                    .iter()
-                    .any(|load| of_load(load) && load.has_nearly(log.instants[i].t))
-            };
-            let Some(touches) = Touches::of(&log.instants, |i| contacts[i].contains(unit) && !handed(i)) else {
-                continue;
-            };
-            log.left_out.push(LeftOut {
-                reason: format!("contact suspected: {}", part(setup, unit)),
-                instants: touches.instants as u64,
-                first: touches.first,
-                last: touches.last,
-            });
-            log.findings.push(Finding {
-                severity: Severity::Warning,
-                code: "contact_suspected",
-                subject: part(setup, unit),
-                text: format!(
-                    "something that nobody declared acted on {}, {} {} left out there",
-                    part(setup, unit),
-                    touches.describe(log),
-                    if touches.times == 1 { "was" } else { "were" }
-                ),
-            });
-        }
-        for (load, body) in loads.iter().zip(&bodies).filter(|(load, _)| load.log == number) {
-            let link = setup.model.link_name(maker.layout().links[load.place]);
-            let is_out = |(instant, contact): &(&Instant, &UnitSet)| {
-                let touched = !contact.intersection(&load.units).is_empty();
-                load.has(instant.t) || touched && load.has_nearly(instant.t)
-            };
-            let out: Vec<Nanos> = (log.instants.iter().zip(contacts))
-                .filter(is_out)
-                .map(|(instant, _)| instant.t)
-                .collect();
-            let (Some(&first), Some(&last)) = (out.first(), out.last()) else {
-                continue;
-            };
-            log.left_out.push(LeftOut {
-                reason: format!("another load: {link}"),
-                instants: out.len() as u64,
-                first,
-                last,
-            });
-            let (when, at) = if load.is_after {
-                ("From", first)
-            } else {
-                ("Up to", last)
-            };
-            let what = body.as_ref().map_or(String::new(), |body| {
-                let p = &body.parameters;
-                let sigma = |i: usize| body.covariance[(i, i)].sqrt();
-                format!(
-                    ": {:+.3} +- {:.3} kg, first moment {:+.4}, {:+.4}, {:+.4} +- {:.4} kg m in the axes and about the origin of {link}",
-                    p[0],
-                    sigma(0),
-                    p[1],
-                    p[2],
-                    p[3],
-                    (1..4).map(sigma).fold(0.0, f64::max)
-                )
-            });
-            log.findings.push(Finding {
-                severity: Severity::Warning,
-                code: "load_changed",
-                subject: link.to_owned(),
-                text: format!(
-                    "{when} about {:.1} s after the log's start, {link} carried another load than in the rest of what was used{what}. That part was left out: parameters are those without it",
-                    since(at)
-                ),
-            });
-        }
     }
 }
 

@@ -67,9 +67,6 @@ const GAIN: f64 = 25.0;
 /// Parts of the robot whose equations hold or fail together: numbers of sub-trees, and [`Instant::TORQUES`].
 pub type UnitSet = BitSet<2>;
 
-/// A touch so near to a change of load is of the hand that gives or takes it \[s\].
-const HANDING: f64 = 1.0;
-
 /// A load that came or went within a log.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Load {
@@ -89,11 +86,6 @@ impl Load {
     /// Whether an instant of that log is in the part that is left out.
     pub(super) fn has(&self, t: Nanos) -> bool {
         self.span.0 <= t && t <= self.span.1
-    }
-
-    /// Whether it is in it, or so near that what acts on the robot is the change itself.
-    pub(super) fn has_nearly(&self, t: Nanos) -> bool {
-        (self.span.0 - t).seconds() <= HANDING && (t - self.span.1).seconds() <= HANDING
     }
 }
 

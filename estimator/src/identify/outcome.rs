@@ -292,8 +292,8 @@ pub struct Spectrum {
 /// A span that was left out, and why.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LeftOut {
-    /// Why, in a few words: `contact declared: hand (the links that it touches)`, `contact suspected: the links at l_arm_ft_sensor`, `another load: l_hand`,
-    /// `outlier of r_leg_ft_sensor`, `stale of knee`, or that it is too close to an end or a gap for accelerations.
+    /// Why, in a few words: `contact declared: hand (the links that it touches)`, `contact suspected: the links at l_arm_ft_sensor`, `moment of a jump: the links at
+    /// l_arm_ft_sensor`, `another load: l_hand`, `outlier of r_leg_ft_sensor`, `stale of knee`, or that it is too close to an end or a gap for accelerations.
     pub reason: String,
     /// How many instants.
     pub instants: u64,

@@ -1644,7 +1644,7 @@ impl<'a> Residual<'a> {
         (0..marked.len()).filter(|i| marked[*i]).collect()
     }
 
-    /// Places where lines before and after miss one another: where, by how much, and how many times more than needed.
+    /// Places where lines before and after miss one another: the first value after, by how much, and how many times more than needed.
     fn jumps(&self, (line, gap): (f64, f64), scatter: &[f64], period: f64) -> Vec<(usize, f64, f64)> {
         let (line, gap) = (samples(line, period).max(5), samples(0.5 * gap, period));
         let (reach, count) = (line + gap, self.values.len());
@@ -1657,13 +1657,14 @@ impl<'a> Residual<'a> {
         let weights: Vec<f64> = (0..line)
             .map(|k| 1.0 / n - middle * (k as f64 - 0.5 * (n - 1.0)) / spread)
             .collect();
+        let ends = |value: &dyn Fn(usize) -> f64, i: usize| {
+            let line = |at: &dyn Fn(usize) -> usize| -> f64 {
+                weights.iter().enumerate().map(|(k, w)| w * value(at(k))).sum()
+            };
+            [line(&|k| i - gap - 1 - k), line(&|k| i + gap + k)]
+        };
         let miss = |value: &dyn Fn(usize) -> f64, i: usize| {
-            let after: f64 = weights.iter().enumerate().map(|(k, w)| w * value(i + gap + k)).sum();
-            let before: f64 = weights
-                .iter()
-                .enumerate()
-                .map(|(k, w)| w * value(i - gap - 1 - k))
-                .sum();
+            let [before, after] = ends(value, i);
             after - before
         };
         let misses: Vec<f64> = (0..count)
@@ -1706,6 +1707,15 @@ impl<'a> Residual<'a> {
             let before = median(self.values[(i - gap).saturating_sub(level)..i - gap].to_vec());
             (after - before) * misses[i].signum() > 0.5 * misses[i].abs()
         };
+        // Anywhere between the lines gives the same miss. Where the fewest values are far from the line on their side:
+        let moment = |i: usize| {
+            let ends = ends(&|j| self.values[j], i);
+            let off = |j: usize, side: usize| (self.values[j] - ends[side]).powi(2);
+            let all = i - gap..i + gap;
+            let cost = |at: usize| -> f64 { all.clone().map(|j| off(j, usize::from(j >= at))).sum() };
+            let places = i - gap..=i + gap;
+            places.min_by(|a, b| cost(*a).total_cmp(&cost(*b))).unwrap_or(i)
+        };
         // The peak of each stretch above 1.
         let mut found = Vec::new();
         let mut i = 0;
@@ -1722,7 +1732,7 @@ impl<'a> Residual<'a> {
                 .max_by(|a, b| misses[*a].abs().total_cmp(&misses[*b].abs()))
                 .unwrap_or(begin);
             if stays(peak) {
-                found.push((peak, misses[peak], excesses[peak]));
+                found.push((moment(peak), misses[peak], excesses[peak]));
             }
         }
         found
