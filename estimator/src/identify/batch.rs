@@ -864,7 +864,8 @@ fn gated(
             .then(|| gate::load(maker, &settled.prior, &training, &settled.noise, settled.fit.tau))
             .flatten();
         if let Some(load) = load {
-            undeclared.loads.push(load);
+            let before = undeclared.loads.clone();
+            undeclared.carry(load);
             undeclared.mark(used_mut(prepared));
             let without = settle(
                 setup,
@@ -877,7 +878,7 @@ fn gated(
                 settled = without;
                 continue;
             }
-            undeclared.loads.pop();
+            undeclared.loads = before;
             refused += 1;
             undeclared.mark(used_mut(prepared));
         }
@@ -1298,7 +1299,7 @@ fn held_out(
 /// Joints whose zero is elsewhere than the model's: a constant error of the position that explains more than inertial parameters can, at the prior's weight.
 ///
 /// Of joints beyond sensors, or between them, and of those between the base and them: an error of these tilts all that is seen, otherwise in every posture, unless it is the joint at the base, which
-/// looks as a base that is not level does.
+/// looks as a base that is not level does. In all logs, or in one of several: the zeros of incremental encoders are found anew with each start.
 pub(super) fn joint_zeros(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Identified) -> Vec<Finding> {
     /// A position is expected to be off by this much \[rad\], one standard deviation, before anything is measured.
     const SPREAD: f64 = 0.1;
@@ -1310,6 +1311,8 @@ pub(super) fn joint_zeros(maker: &RowMaker<'_>, training: &[&Prepared], identifi
     /// Instants that are looked at, in stretches of every log: offsets and noise need what follows each other, and each stretch pays for offsets of its own.
     const ENOUGH: usize = 2000;
     const STRETCHES: usize = 4;
+    /// Of all that might be, these are looked at closely in each round.
+    const TRIED: usize = 6;
     let setup = maker.setup();
     let layout = &identified.layout;
     let joint = |dof: usize| {
@@ -1329,33 +1332,57 @@ pub(super) fn joint_zeros(maker: &RowMaker<'_>, training: &[&Prepared], identifi
         .filter(|&dof| setup.locked[dof].is_nan())
         .filter(|dof| joint(*dof).is_some())
         .collect();
-    let mut parts = Vec::new();
-    for log in training {
-        let share = ENOUGH / training.len().max(1);
+    let (mut parts, mut logs) = (Vec::new(), Vec::new());
+    for (number, log) in training.iter().enumerate() {
+        let share = ENOUGH / training.len();
         let stretches = if log.instants.len() > share { STRETCHES } else { 1 };
         let count = log.instants.len().min(share) / stretches;
-        for number in 0..stretches {
+        for stretch in 0..stretches {
             // From the first to the last.
-            let start = (log.instants.len() - count) * number / (stretches - 1).max(1);
+            let start = (log.instants.len() - count) * stretch / (stretches - 1).max(1);
             parts.push(Piece {
                 instants: &log.instants[start..start + count],
                 breaks: &log.breaks,
             });
+            logs.push(number);
         }
     }
     let told = over(maker, &parts, |maker, _, piece| {
         tell_angles(maker, piece, &identified.noise, &angles, identified.fit.x.as_slice())
     });
-    let p = layout.unknowns();
-    let sum = added(&told, p + angles.len());
-    let cost = |columns: &[usize]| -> Option<(f64, Fit)> {
-        // Angles that are not asked for are known to be right: their columns are left out.
-        let (r, z) = sum.to_triangle();
-        let keep: Vec<usize> = (0..p).chain(columns.iter().map(|c| p + c)).collect();
-        let r = r.select_columns(&keep);
+    // Of each log its own angles.
+    let (p, n) = (layout.unknowns(), angles.len());
+    let mut sum = Information::new(p + n * training.len());
+    for (log, told) in logs.iter().zip(&told) {
+        let columns: Vec<usize> = (0..p).chain((0..n).map(|angle| p + n * log + angle)).collect();
+        let _ = sum.merge(&told.information, &columns);
+    }
+    let (r, z) = sum.to_triangle();
+    // A joint's zero in all logs, or in one of several.
+    let in_all = (0..n).map(|angle| (angle, None));
+    let in_one = (0..training.len()).flat_map(|log| (0..n).map(move |angle| (angle, Some(log))));
+    let candidates: Vec<(usize, Option<usize>)> = match training.len() {
+        1 => in_all.collect(),
+        _ => in_all.chain(in_one).collect(),
+    };
+    let column = |(angle, log): (usize, Option<usize>)| -> DVector<f64> {
+        let logs = log.map_or(0..training.len(), |log| log..log + 1);
+        logs.fold(DVector::zeros(r.nrows()), |sum, log| {
+            sum + r.column(p + n * log + angle)
+        })
+    };
+    // Angles that are not asked for are known to be right: their columns are left out.
+    let with = |columns: &[(usize, Option<usize>)]| {
+        let mut own = r.columns(0, p).into_owned().resize_horizontally(p + columns.len(), 0.0);
+        for (place, candidate) in columns.iter().enumerate() {
+            own.set_column(p + place, &column(*candidate));
+        }
+        own
+    };
+    let cost = |columns: &[(usize, Option<usize>)]| -> Option<(f64, Fit)> {
         let mut precision = layout.precision.clone();
         precision.resize(layout.further.len() + columns.len(), SPREAD.powi(-2));
-        let fit = Posterior::new(&identified.prior, &layout.links, &r, &z, &precision)
+        let fit = Posterior::new(&identified.prior, &layout.links, &with(columns), &z, &precision)
             .ok()?
             .fit(identified.fit.tau)
             .ok()?;
@@ -1363,38 +1390,44 @@ pub(super) fn joint_zeros(maker: &RowMaker<'_>, training: &[&Prepared], identifi
         let extra: f64 = own.zip(&precision).map(|(x, precision)| x * x * precision).sum();
         Some((fit.residual_square + fit.divergence / fit.tau.powi(2) + extra, fit))
     };
-    let mut chosen: Vec<usize> = Vec::new();
-    let Some((mut before, _)) = cost(&[]) else {
+    let mut chosen: Vec<(usize, Option<usize>)> = Vec::new();
+    let Some((mut before, mut fit)) = cost(&[]) else {
         return Vec::new();
     };
-    let mut values = DVector::zeros(0);
     // Greedy: the joint that explains the most, then what else remains.
-    while chosen.len() < angles.len() {
-        let tries = (0..angles.len())
-            .filter(|c| !chosen.contains(c))
-            .filter_map(|candidate| {
-                let columns: Vec<usize> = chosen.iter().copied().chain([candidate]).collect();
-                let (cost, fit) = cost(&columns)?;
-                Some((candidate, cost, fit))
-            });
-        let Some((candidate, cost, fit)) = tries.min_by(|a, b| a.1.total_cmp(&b.1)) else {
+    loop {
+        // About what each gains, as if the prior were quadratic; those that gain the most are tried.
+        let own = with(&chosen);
+        let (left, root) = (&z - &own * &fit.x, fit.covariance_root());
+        let gain = |candidate: &(usize, Option<usize>)| {
+            let column = column(*candidate);
+            let known = root.tr_mul(&own.tr_mul(&column)).norm_squared();
+            column.dot(&left).powi(2) / (column.norm_squared() - known + SPREAD.powi(-2)).max(SPREAD.powi(-2))
+        };
+        let rest = candidates.iter().filter(|candidate| !chosen.contains(candidate));
+        let mut ranked: Vec<(f64, (usize, Option<usize>))> = rest.map(|c| (gain(c), *c)).collect();
+        ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
+        ranked.truncate(TRIED);
+        let tries = parallel::map(ranked.len(), |number| {
+            let columns: Vec<_> = chosen.iter().copied().chain([ranked[number].1]).collect();
+            Some((ranked[number].1, cost(&columns)?))
+        });
+        let best = tries.into_iter().flatten().min_by(|a, b| a.1.0.total_cmp(&b.1.0));
+        let Some((candidate, (cost, with))) = best.filter(|(_, (cost, _))| before - cost >= GAIN) else {
             break;
         };
-        if before - cost < GAIN {
-            break;
-        }
         chosen.push(candidate);
-        before = cost;
-        values = fit.x.rows(p, chosen.len()).into_owned();
+        (before, fit) = (cost, with);
     }
     let mut findings = Vec::new();
-    for (value, &place) in values.iter().zip(&chosen) {
-        let is_within = is_within(angles[place]);
+    for (value, &(angle, log)) in fit.x.iter().skip(p).zip(&chosen) {
+        let is_within = is_within(angles[angle]);
         if value.abs() > if is_within { LEAST } else { LEAST_BEFORE } {
             findings.push(finding(&Defect::JointZero {
-                joint: setup.model.dof_name(angles[place]).to_owned(),
+                joint: setup.model.dof_name(angles[angle]).to_owned(),
                 radians: *value,
                 is_before: !is_within,
+                log: log.map(|log| training[log].file.clone()),
             }));
         }
     }

@@ -164,29 +164,33 @@ fn follow(posterior: &Posterior, further: usize) -> Result<Consistent, PriorErro
     let mut state = posterior.start();
     let mut weight = 0.5;
     let mut iterations = 0;
-    let (descent, gap) = loop {
+    // What no bodies can be below.
+    let mut least = 0.0_f64;
+    let descent = loop {
         let descent = posterior.descend(&mut state, weight, CENTRED * weight)?;
         iterations += descent.iterations;
         // Of |R x - z|^2, above that of the best bodies: twice four barrier parameters per link times the weight.
         let gap = 8.0 * links as f64 * weight;
+        if descent.is_converged {
+            least = least.max(state.excess() - gap);
+        }
         if gap <= 1e-7 + 1e-4 * state.excess() || !descent.is_converged {
             let descent = posterior.descend(&mut state, weight, 1e-12 * weight)?;
             iterations += descent.iterations;
-            break (descent, gap);
+            break descent;
         }
         weight *= 0.1;
     };
-    let is_converged = descent.is_converged;
     let excess = state.excess();
     let fit = posterior.finish(state, descent, (0.5 / weight).sqrt());
     let rank = posterior.rank().saturating_sub(further);
     let limit = chi_square_limit(rank);
     let verdict = if excess <= limit {
         Verdict::Feasible
-    } else if !is_converged || excess - gap <= limit {
-        Verdict::Undecided
-    } else {
+    } else if least > limit {
         Verdict::Infeasible(violations(posterior, &fit.inverses)?)
+    } else {
+        Verdict::Undecided
     };
     Ok(Consistent {
         x: fit.x,

@@ -20,7 +20,7 @@ const MOMENT: f64 = 1.2;
 /// ... and what begins or ends so near to it \[s\].
 const SETTLING: f64 = 0.3;
 
-/// A touch so near to a change of load, and no longer, is of the hand that gives or takes it \[s\].
+/// A touch so near to a change of load, and no longer, is of the hand that gives or takes it; a change so soon after another one is the same one \[s\].
 const HANDING: f64 = 1.0;
 const HANDED: f64 = 3.0;
 
@@ -48,6 +48,19 @@ impl Undeclared {
             loads: Vec::new(),
             contacts,
             jumps,
+        }
+    }
+
+    /// Adds a load. Of what only makes another one come a little sooner or go a little later, that other one is told: the moment of its change is found but to a piece of the log.
+    pub(super) fn carry(&mut self, load: Load) {
+        let edge = |load: &Load| if load.is_after { load.span.0 } else { load.span.1 };
+        let is_same = |other: &&mut Load| {
+            let apart = (edge(other) - edge(&load)).seconds().abs();
+            (other.log, other.place, other.is_after) == (load.log, load.place, load.is_after) && apart <= HANDED
+        };
+        match self.loads.iter_mut().find(is_same) {
+            Some(other) => other.span = (other.span.0.min(load.span.0), other.span.1.max(load.span.1)),
+            None => self.loads.push(load),
         }
     }
 

@@ -202,6 +202,8 @@ pub enum Defect {
         radians: f64,
         /// Whether it is between the base and the sensors.
         is_before: bool,
+        /// In which log, if not in all that were trained on.
+        log: Option<String>,
     },
 }
 
@@ -346,19 +348,28 @@ impl fmt::Display for Defect {
             Self::JointZero {
                 joint,
                 radians,
-                is_before: false,
-            } => write!(
-                f,
-                "joint/{joint}: its zero is {radians:.4} rad from the model's; calibrate the encoder, or the error is taken for a shifted centre of mass"
-            ),
-            Self::JointZero {
-                joint,
-                radians,
-                is_before: true,
-            } => write!(
-                f,
-                "joint/{joint}: its zero is {radians:.4} rad from the model's, or the base (its IMU, its gravity_mps2, the floor) is turned by that: what is beyond weighs in another direction than the model says; calibrate the encoder and level the base"
-            ),
+                is_before,
+                log,
+            } => {
+                let from = log.as_ref().map_or_else(
+                    || "the model's".to_owned(),
+                    |log| format!("that in the other logs in {log}"),
+                );
+                write!(f, "joint/{joint}: its zero is {radians:.4} rad from {from}")?;
+                if *is_before {
+                    let doubt = ", or the base (its IMU, its gravity_mps2, the floor) is turned by that: what is beyond weighs in another direction than the model says";
+                    write!(f, "{doubt}; calibrate the encoder and level the base")?;
+                } else {
+                    write!(
+                        f,
+                        "; calibrate the encoder, or the error is taken for a shifted centre of mass"
+                    )?;
+                }
+                match log {
+                    Some(log) => write!(f, ", and leave {log} out"),
+                    None => Ok(()),
+                }
+            }
         }
     }
 }
