@@ -103,7 +103,7 @@ const QUIETER: f64 = 2.0;
 /// Most rounds of noise and prior.
 const ROUNDS: usize = 14;
 
-/// Rounds end when the logarithm of no variance changes by more.
+/// Rounds end when the logarithm of no variance changes by more, from the last round or round a circle.
 const SETTLED: f64 = 0.03;
 
 /// Pieces of each log for the check on held-out data, and how many instants one has at least.
@@ -778,7 +778,7 @@ pub(super) struct Settled {
     pub noise: NoiseModel,
     pub fit: Fit,
     pub information: Information,
-    /// By how much the last round still changed a variance.
+    /// By how much the last round still changed a variance, if rounds did not end; else 0.
     change: f64,
 }
 
@@ -802,7 +802,7 @@ fn settle(
         noise_of(&layout, &left, 0, bound, &least)
     };
     let has_cad = layout.beside_cad().is_empty();
-    let mut noise = from.unwrap_or_else(|| {
+    let noise = from.unwrap_or_else(|| {
         let unknown = NoiseModel::unknown(least.clone());
         (0..3).fold(unknown, |noise, _| {
             let cad = if has_cad {
@@ -814,25 +814,29 @@ fn settle(
             noise_left(&noise, &cad)
         })
     });
-    let mut round = 0;
+    let mut rounds = vec![noise];
     loop {
-        progress(format!("round {}", round + 1), 0.2 + 0.5 * round as f64 / ROUNDS as f64);
-        let told = over(maker, &sampled, |maker, _, piece| tell(maker, piece, &noise));
+        let round = rounds.len();
+        progress(format!("round {round}"), 0.2 + 0.5 * (round - 1) as f64 / ROUNDS as f64);
+        let last = &rounds[round - 1];
+        let told = over(maker, &sampled, |maker, _, piece| tell(maker, piece, last));
         let information = added(&told, layout.unknowns());
         let fit = posterior(&prior, &layout, &information)?.weigh()?;
-        let next = noise_left(&noise, &fit.x);
-        let change = next.change(&noise);
-        noise = next;
-        round += 1;
-        if change < SETTLED || round == ROUNDS {
-            return Ok(Settled {
-                prior,
-                noise,
-                fit,
-                information,
-                change,
-            });
-        }
+        let next = noise_left(last, &fit.x);
+        let change = next.change(last);
+        rounds.push(next);
+        let (noise, change) = match NoiseModel::of_circle(&rounds, SETTLED) {
+            Some(noise) => (noise, 0.0),
+            None if round == ROUNDS => (rounds.swap_remove(round), change),
+            None => continue,
+        };
+        return Ok(Settled {
+            prior,
+            noise,
+            fit,
+            information,
+            change,
+        });
     }
 }
 

@@ -100,6 +100,24 @@ impl NoiseModel {
         pairs.map(|(x, y)| (x / y).ln().abs()).fold(0.0, f64::max)
     }
 
+    /// Where rounds of noise and fit go round in a circle, the last of these models back to one like the newest (no variance changed by more than `within`, as [`NoiseModel::change`] has it): of
+    /// each channel the greatest noise on the way, so that nothing is stated as surer than it is in any of them. None if they do not.
+    pub(super) fn of_circle(rounds: &[Self], within: f64) -> Option<Self> {
+        let (newest, before) = rounds.split_last()?;
+        let back = before.iter().rposition(|other| newest.change(other) < within)?;
+        let mut greatest = newest.clone();
+        for other in &before[back + 1..] {
+            let (own, others) = (greatest.inflated(), other.inflated());
+            for channel in (0..own.len()).filter(|&channel| others[channel] > own[channel]) {
+                greatest.square[channel] = other.square[channel];
+                greatest.time[channel] = other.time[channel];
+                greatest.drift[channel] = other.drift[channel];
+                greatest.block[channel] = other.block[channel];
+            }
+        }
+        Some(greatest)
+    }
+
     /// By how much the variances are less than those of another model: the geometric mean over the channels.
     pub(super) fn quieter(&self, other: &Self) -> f64 {
         let (own, others) = (self.inflated(), other.inflated());
@@ -554,6 +572,28 @@ mod tests {
     use crate::spatial::{Vec3, Wrench};
     use nalgebra::{Matrix6, Vector6};
     use proprio_topics::{Nanos, Reason};
+
+    /// Rounds end where they stay, or come back to where they were; then with the greatest noise on the way round.
+    #[test]
+    fn rounds_that_go_round_end() {
+        let noise = |squares: [f64; 2]| NoiseModel {
+            square: squares.to_vec(),
+            time: vec![2.0; 2],
+            block: vec![1e-3; 2],
+            drift: squares.map(|x| 0.01 * x).to_vec(),
+            least: vec![1e-9; 2],
+        };
+        let far = [[9.0, 9.0], [5.0, 7.0]].map(noise);
+        let of = |rounds: &[[f64; 2]]| {
+            let rounds: Vec<NoiseModel> = far.iter().cloned().chain(rounds.iter().copied().map(noise)).collect();
+            NoiseModel::of_circle(&rounds, 0.03)
+        };
+        assert_eq!(of(&[[1.0, 2.0], [1.2, 2.0], [1.5, 2.0]]), None);
+        assert_eq!(of(&[[1.0, 2.0], [1.2, 2.0], [1.201, 2.0]]), Some(noise([1.201, 2.0])));
+        let found = of(&[[3.0, 3.0], [1.0, 2.2], [1.3, 2.0], [1.1, 2.1], [1.001, 2.201]]).unwrap();
+        assert_eq!(found, noise([1.3, 2.201]));
+        assert_eq!(NoiseModel::of_circle(&far[..1], 0.03), None);
+    }
 
     /// Three links between two F/T sensors, a foot beyond that stands on something: the readings of both sensors are in the same six equations.
     fn between_two_sensors() -> Setup {
