@@ -357,10 +357,10 @@ fn residuals(outcome: &Outcome) -> Option<String> {
         for sensor in &log.sensors {
             let mut table = Table::new(
                 &format!(
-                    "{}, {}: RMS of what it reads less what is predicted",
+                    "{}, {}: RMS of what it reads less what is predicted, and how often it reads what lies within the stated 95 % interval",
                     sensor.name, log.file
                 ),
-                &[&["channel"], &ERRORS[..]].concat(),
+                &[&["channel"], &ERRORS[..], &["within 95 %"]].concat(),
             );
             let Three {
                 cad,
@@ -375,6 +375,7 @@ fn residuals(outcome: &Outcome) -> Option<String> {
                     identified: identified[i],
                 };
                 cells.extend(errors(&three, number));
+                cells.push(Cell::Written(percent(sensor.coverage[i])));
                 table.row(cells);
             }
             tables.push(format!("<div>{}</div>", table.html()));
@@ -852,6 +853,7 @@ mod tests {
             "contact declared: right_foot",
             "Coulomb [Nm]",
             "r_leg_ft_sensor fx",
+            "96.8 %",
             "nothing turned about a horizontal axis",
         ] {
             assert!(html.contains(part), "the page does not say {part:?}");

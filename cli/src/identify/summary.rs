@@ -221,7 +221,7 @@ mod tests {
         assert_eq!(rms["identified"], json!([0.4, 0.9, 0.45, 0.1, 0.09, 0.04]));
         assert_eq!(
             log["sensors"]["r_leg_ft_sensor"]["coverage"],
-            json!([0.95, 0.94, 0.96, 0.95, 0.97, 0.93])
+            json!([0.95, 0.94, 0.968, 0.95, 0.97, 0.93])
         );
         assert_eq!(log["two_route_rms_nm"]["r_knee"]["identified"], 0.13);
         assert_eq!(
