@@ -488,10 +488,10 @@ impl Identifier {
         let (back, done) = mpsc::sync_channel(1);
         let work = move || {
             let (mut unwritten, mut written) = (None, monotonic());
-            let mut fails = vec![false; components];
+            let mut failing = vec![false; components];
             while let Ok(mut job) = waiting.recv() {
                 job.run();
-                for (component, (fails, failure)) in fails.iter_mut().zip(job.failures()).enumerate() {
+                for (component, (fails, failure)) in failing.iter_mut().zip(job.failures()).enumerate() {
                     match failure {
                         Some(error) if !*fails => tracing::error!(
                             component,

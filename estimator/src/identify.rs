@@ -10,10 +10,10 @@
 //!     -> [R | z], what all logs tell of d = phi - phi_CAD                                      information
 //!     -> the most probable bodies under CAD's prior, and its weight                            prior
 //!     -> what is left -> noise of each channel -> again, until it stays                        noise, passes
-//!     -> undeclared contacts, another load: left out, and again, until it stays                gate
+//!     -> undeclared contacts, another load: left out, and again, until it stays                gate, undeclared
 //!     -> held-out data: what gains nothing is shrunk to CAD                                    batch
 //!     -> motion that only other F/T sensors feel, taken off; all of the fit again              shaking
-//!     -> Outcome: parameters, covariance, figures per log, in words                            assess, export
+//!     -> Outcome: parameters, covariance, figures per log, joints whose zero is elsewhere, in words          assess, zeros, export
 //! ```
 //! [`identify`] does all of it. Parameters belong to the robot and are common to all logs; offsets and friction belong to a log.
 //!
@@ -50,6 +50,7 @@ mod shaking;
 mod torques;
 mod undeclared;
 mod wrenches;
+mod zeros;
 
 pub use batch::{IdentifyError, Log, Options, Progress, identify};
 pub use export::parameters;

@@ -1,8 +1,6 @@
 //! Figures: what is left of every log with CAD, with CAD and fitted offsets, and with the identified parameters; and what is known of the parameters, in numbers and words.
 
-use super::batch::{
-    Identified, LEAST_FOLD, Prepared, bodies, feasibility, joint_zeros, per_column, time_offsets, verdict,
-};
+use super::batch::{Identified, LEAST_FOLD, Prepared, bodies, feasibility, per_column, time_offsets, verdict};
 use super::gate::UnitSet;
 use super::outcome::{
     BaseParameterOutcome, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
@@ -12,7 +10,7 @@ use super::outcome::{
 use super::passes::{OFFSET_VARIANCE, Residuals, Told, leave, tell};
 use super::rows::{FRICTION, Further, Layout, RowMaker, Rows, WIDTH};
 use super::session::Block;
-use super::{AXES, dot, parallel, torques};
+use super::{AXES, dot, parallel, torques, zeros};
 use crate::calibration::{Kind, Unknown, swapped};
 use crate::config::{Gain, IdentificationInput};
 use crate::dynamics::Structure;
@@ -235,7 +233,7 @@ pub(super) fn outcome(
             text: floor.describe(setup.model.link_name(floor.link)),
         })
         .collect();
-    findings.extend(joint_zeros(maker, training, identified));
+    findings.extend(zeros::joint_zeros(maker, training, identified));
     findings.extend(torques::late(maker, training, identified));
     let consistency = feasibility(setup, identified);
     if consistency.feasible != Some(true) {

@@ -19,7 +19,7 @@ use super::instants::{Break, Defect, Instant, Recording, RecordingError, Setting
 use super::mounting;
 use super::outcome::{Finding, LeftOut, Outcome, Role, Severity, Verdict};
 use super::parallel;
-use super::passes::{NoiseModel, Piece, Residuals, Told, leave, noise_of, tell, tell_angles};
+use super::passes::{NoiseModel, Piece, Residuals, Told, leave, noise_of, tell};
 use super::prior::{Fit, Posterior, Prior, PriorError};
 use super::rows::{Further, Groups, Layout, RowMaker, Rows};
 use super::shaking::Shaking;
@@ -29,7 +29,6 @@ use super::wrenches;
 use crate::calibration::Kind;
 use crate::config::{Gain, IdentificationInput, TorqueSide};
 use crate::dynamics::DynamicsError;
-use crate::model::JointKind;
 use crate::setup::{Setup, Use};
 use crate::spatial::{RigidInertia, Vec3, Wrench};
 use nalgebra::DVector;
@@ -632,7 +631,6 @@ pub(super) fn finding(defect: &Defect) -> Finding {
         Defect::Outliers { channel, .. } => ("outliers", channel.clone()),
         Defect::WrongSign { sensor } => ("wrong_sign", sensor.clone()),
         Defect::WrongFrame { sensor, .. } => ("wrong_frame", sensor.clone()),
-        Defect::JointZero { joint, .. } => ("joint_zero", joint.clone()),
     };
     Finding {
         severity: defect.severity(),
@@ -1298,144 +1296,6 @@ fn held_out(
         findings,
         noise: noise.midway(&noise_of(layout, &left, 1, bound, &noise.least)),
     })
-}
-
-/// Joints whose zero is elsewhere than the model's: a constant error of the position that explains more than inertial parameters can, at the prior's weight.
-///
-/// Of joints beyond sensors, or between them, and of those between the base and them: an error of these tilts all that is seen, otherwise in every posture, unless it is the joint at the base, which
-/// looks as a base that is not level does. In all logs, or in one of several: the zeros of incremental encoders are found anew with each start.
-pub(super) fn joint_zeros(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Identified) -> Vec<Finding> {
-    /// A position is expected to be off by this much \[rad\], one standard deviation, before anything is measured.
-    const SPREAD: f64 = 0.1;
-    /// Squared deviations that must be gained: one joint in a thousand gains more by chance (chi-square, one degree).
-    const GAIN: f64 = 10.83;
-    /// Less than this matters to nobody \[rad\]; of a joint before the sensors: less is what floors and bases have.
-    const LEAST: f64 = 0.01;
-    const LEAST_BEFORE: f64 = 0.02;
-    /// Instants that are looked at, in stretches of every log: offsets and noise need what follows each other, and each stretch pays for offsets of its own.
-    const ENOUGH: usize = 2000;
-    const STRETCHES: usize = 4;
-    /// Of all that might be, these are looked at closely in each round.
-    const TRIED: usize = 6;
-    let setup = maker.setup();
-    let layout = &identified.layout;
-    let joint = |dof: usize| {
-        let joint = setup.model.dof_joint(dof).map(|joint| &setup.model.joints()[joint]);
-        joint.filter(|joint| matches!(joint.kind, JointKind::Revolute(_)))
-    };
-    // Beyond which, or between which, everything is seen.
-    let is_within = |dof: usize| {
-        joint(dof).is_some_and(|joint| {
-            let inside = setup.structure.subtree_of(joint.parent) == setup.structure.subtree_of(joint.child)
-                && layout.links.contains(&joint.parent);
-            layout.links.contains(&joint.child) && (inside || !layout.joints.is_empty())
-        })
-    };
-    // Whoever moves nothing that is seen has columns of zeros, and explains nothing.
-    let angles: Vec<usize> = (0..setup.model.dof_count())
-        .filter(|&dof| setup.locked[dof].is_nan())
-        .filter(|dof| joint(*dof).is_some())
-        .collect();
-    let (mut parts, mut logs) = (Vec::new(), Vec::new());
-    for (number, log) in training.iter().enumerate() {
-        let share = ENOUGH / training.len();
-        let stretches = if log.instants.len() > share { STRETCHES } else { 1 };
-        let count = log.instants.len().min(share) / stretches;
-        for stretch in 0..stretches {
-            // From the first to the last.
-            let start = (log.instants.len() - count) * stretch / (stretches - 1).max(1);
-            parts.push(Piece {
-                instants: &log.instants[start..start + count],
-                breaks: &log.breaks,
-            });
-            logs.push(number);
-        }
-    }
-    let told = over(maker, &parts, |maker, _, piece| {
-        tell_angles(maker, piece, &identified.noise, &angles, identified.fit.x.as_slice())
-    });
-    // Of each log its own angles.
-    let (p, n) = (layout.unknowns(), angles.len());
-    let mut sum = Information::new(p + n * training.len());
-    for (log, told) in logs.iter().zip(&told) {
-        let columns: Vec<usize> = (0..p).chain((0..n).map(|angle| p + n * log + angle)).collect();
-        let _ = sum.merge(&told.information, &columns);
-    }
-    let (r, z) = sum.to_triangle();
-    // A joint's zero in all logs, or in one of several.
-    let in_all = (0..n).map(|angle| (angle, None));
-    let in_one = (0..training.len()).flat_map(|log| (0..n).map(move |angle| (angle, Some(log))));
-    let candidates: Vec<(usize, Option<usize>)> = match training.len() {
-        1 => in_all.collect(),
-        _ => in_all.chain(in_one).collect(),
-    };
-    let column = |(angle, log): (usize, Option<usize>)| -> DVector<f64> {
-        let logs = log.map_or(0..training.len(), |log| log..log + 1);
-        logs.fold(DVector::zeros(r.nrows()), |sum, log| {
-            sum + r.column(p + n * log + angle)
-        })
-    };
-    // Angles that are not asked for are known to be right: their columns are left out.
-    let with = |columns: &[(usize, Option<usize>)]| {
-        let mut own = r.columns(0, p).into_owned().resize_horizontally(p + columns.len(), 0.0);
-        for (place, candidate) in columns.iter().enumerate() {
-            own.set_column(p + place, &column(*candidate));
-        }
-        own
-    };
-    let cost = |columns: &[(usize, Option<usize>)]| -> Option<(f64, Fit)> {
-        let mut precision = layout.precision.clone();
-        precision.resize(layout.further.len() + columns.len(), SPREAD.powi(-2));
-        let fit = Posterior::new(&identified.prior, &layout.links, &with(columns), &z, &precision)
-            .ok()?
-            .fit(identified.fit.tau)
-            .ok()?;
-        let own = fit.x.iter().skip(layout.inertial());
-        let extra: f64 = own.zip(&precision).map(|(x, precision)| x * x * precision).sum();
-        Some((fit.residual_square + fit.divergence / fit.tau.powi(2) + extra, fit))
-    };
-    let mut chosen: Vec<(usize, Option<usize>)> = Vec::new();
-    let Some((mut before, mut fit)) = cost(&[]) else {
-        return Vec::new();
-    };
-    // Greedy: the joint that explains the most, then what else remains.
-    loop {
-        // About what each gains, as if the prior were quadratic; those that gain the most are tried.
-        let own = with(&chosen);
-        let (left, root) = (&z - &own * &fit.x, fit.covariance_root());
-        let gain = |candidate: &(usize, Option<usize>)| {
-            let column = column(*candidate);
-            let known = root.tr_mul(&own.tr_mul(&column)).norm_squared();
-            column.dot(&left).powi(2) / (column.norm_squared() - known + SPREAD.powi(-2)).max(SPREAD.powi(-2))
-        };
-        let rest = candidates.iter().filter(|candidate| !chosen.contains(candidate));
-        let mut ranked: Vec<(f64, (usize, Option<usize>))> = rest.map(|c| (gain(c), *c)).collect();
-        ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
-        ranked.truncate(TRIED);
-        let tries = parallel::map(ranked.len(), |number| {
-            let columns: Vec<_> = chosen.iter().copied().chain([ranked[number].1]).collect();
-            Some((ranked[number].1, cost(&columns)?))
-        });
-        let best = tries.into_iter().flatten().min_by(|a, b| a.1.0.total_cmp(&b.1.0));
-        let Some((candidate, (cost, with))) = best.filter(|(_, (cost, _))| before - cost >= GAIN) else {
-            break;
-        };
-        chosen.push(candidate);
-        (before, fit) = (cost, with);
-    }
-    let mut findings = Vec::new();
-    for (value, &(angle, log)) in fit.x.iter().skip(p).zip(&chosen) {
-        let is_within = is_within(angles[angle]);
-        if value.abs() > if is_within { LEAST } else { LEAST_BEFORE } {
-            findings.push(finding(&Defect::JointZero {
-                joint: setup.model.dof_name(angles[angle]).to_owned(),
-                radians: *value,
-                is_before: !is_within,
-                log: log.map(|log| training[log].file.clone()),
-            }));
-        }
-    }
-    findings
 }
 
 /// CAD moved by `d` in the columns of a layout: all links.

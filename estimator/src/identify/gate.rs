@@ -76,6 +76,10 @@ pub(super) struct Load {
     pub place: usize,
     /// The side that is left out.
     pub span: (Nanos, Nanos),
+    /// The part of it in which the load was there all the time, as it is in the end: not so near to the change.
+    pub clear: (Nanos, Nanos),
+    /// Within so much the moment of its change is known \[s\].
+    pub within: f64,
     /// Whether that is the side after the change.
     pub is_after: bool,
     /// Whose equations it is in.
@@ -534,15 +538,16 @@ pub(super) fn load(
     let model = &maker.setup().model;
     let mut pieces = Vec::new();
     let mut of_log: Vec<Range<usize>> = Vec::new();
+    let piece = |log: &Prepared| ((log.span.1 - log.span.0).seconds() / PIECES as f64).max(PIECE);
     for log in training {
         let first = pieces.len();
-        let seconds = (log.span.1 - log.span.0).seconds() / PIECES as f64;
+        let seconds = piece(log);
         let mut start = 0;
         for i in 1..=log.instants.len() {
             let ends = log
                 .instants
                 .get(i)
-                .is_none_or(|instant| (instant.t - log.instants[start].t).seconds() >= seconds.max(PIECE));
+                .is_none_or(|instant| (instant.t - log.instants[start].t).seconds() >= seconds);
             if ends {
                 pieces.push(Piece {
                     instants: &log.instants[start..i],
@@ -615,10 +620,19 @@ pub(super) fn load(
             }
         }
     }
+    // The change may be anywhere in the piece beside it.
+    let (from, to) = if is_after {
+        (left_out.start + 1, left_out.end)
+    } else {
+        (left_out.start, left_out.end - 1)
+    };
+    let clear = (pieces[from].instants.first()?.t, pieces[to - 1].instants.last()?.t);
     Some(Load {
         log,
         place,
         span: (first, last),
+        clear,
+        within: piece(training[log]),
         is_after,
         units,
     })
@@ -635,11 +649,9 @@ pub(super) fn added(
     tau: f64,
 ) -> Option<Added> {
     let log = training.get(load.log)?;
-    let first = log.instants.iter().position(|instant| load.has(instant.t))?;
-    let count = log.instants[first..]
-        .iter()
-        .take_while(|instant| load.has(instant.t))
-        .count();
+    let is_clear = |instant: &&Instant| load.clear.0 <= instant.t && instant.t <= load.clear.1;
+    let first = log.instants.iter().position(|instant| is_clear(&instant))?;
+    let count = log.instants[first..].iter().take_while(is_clear).count();
     let mut maker = maker.clone();
     maker.disregard_suspicions(true);
     let piece = Piece {

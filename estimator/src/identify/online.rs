@@ -1493,6 +1493,18 @@ mod tests {
         (model, sensors)
     }
 
+    fn structure(model: &Model, sensors: &[String]) -> Structure {
+        let noise = Noise {
+            force: [0.1, 0.2, 0.3],
+            torque: [0.01, 0.02, 0.03],
+        };
+        let (frame, direction) = (MeasurementFrame::Child, MeasurementDirection::ChildToParent);
+        let cuts: Vec<SensorCut> = (sensors.iter())
+            .map(|joint| SensorCut::new(model, joint, frame, direction, &Pose::identity(), &noise).unwrap())
+            .collect();
+        Structure::new(model, &cuts, &[], Structure::LENGTH_SCALE).unwrap()
+    }
+
     fn online(model: &Model, structure: &Structure) -> Online {
         let offsets = vec![Wrench::zero(); structure.sensors().len()];
         let none = ContactSet::default();
@@ -1500,19 +1512,32 @@ mod tests {
         Online::new(model, structure, model.inertias(), &offsets, &none, 0, period).unwrap()
     }
 
+    /// What can not be solved is told, with what was known before in force; and that it is over.
+    #[test]
+    fn a_failure_is_told_until_it_is_over() {
+        let (model, sensors) = robot();
+        let mut job = online(&model, &structure(&model, &sensors)).job.unwrap();
+        let good = job.solution.components[0].clone();
+        for (tau, text) in [(f64::NAN, Some("the weight tau is NaN")), (1.0, None)] {
+            job.parts[0].tau = tau;
+            job.run();
+            let told: Vec<Option<String>> = job.failures().map(|f| f.map(ToString::to_string)).collect();
+            let [told] = told.try_into().unwrap();
+            let begins = |told: &String| text.is_some_and(|text| told.starts_with(text));
+            assert!(told.as_ref().map_or(text.is_none(), begins), "{told:?}");
+            let own = &job.solution.components[0];
+            assert_eq!(
+                (own.is_accepted, own.estimate == good.estimate),
+                (text.is_none(), text.is_some())
+            );
+        }
+    }
+
     /// Limb by limb or all together, the same is known; and limbs' rows do go limb by limb.
     #[test]
     fn limbs_tell_the_same_by_themselves() {
         let (model, sensors) = robot();
-        let noise = Noise {
-            force: [0.1, 0.2, 0.3],
-            torque: [0.01, 0.02, 0.03],
-        };
-        let (frame, direction) = (MeasurementFrame::Child, MeasurementDirection::ChildToParent);
-        let cuts: Vec<SensorCut> = (sensors.iter())
-            .map(|joint| SensorCut::new(&model, joint, frame, direction, &Pose::identity(), &noise).unwrap())
-            .collect();
-        let structure = Structure::new(&model, &cuts, &[], Structure::LENGTH_SCALE).unwrap();
+        let structure = structure(&model, &sensors);
         let [mut apart, mut together] = [(); 2].map(|()| online(&model, &structure));
         assert_eq!((apart.components.len(), apart.components[0].limbs.len()), (1, 5));
         together.components[0].limbs.clear();

@@ -142,10 +142,10 @@ pub(super) fn session_prior(layout: &Layout) -> Vec<f64> {
 }
 
 /// A block of instants, with the sensors (places in the layout) that start afresh with it.
-pub(super) type Stretch = (Range<usize>, Vec<usize>);
+pub(super) type BlockRange = (Range<usize>, Vec<usize>);
 
 /// The blocks of a piece.
-pub(super) fn blocks(layout: &Layout, piece: Piece<'_>) -> Vec<Stretch> {
+pub(super) fn blocks(layout: &Layout, piece: Piece<'_>) -> Vec<BlockRange> {
     let instants = piece.instants;
     let mut out = Vec::new();
     let mut start = 0;
@@ -339,7 +339,7 @@ pub(super) fn follow(
     piece: Piece<'_>,
     noise: &NoiseModel,
     sets: &[DVector<f64>],
-) -> (Vec<Stretch>, Vec<Block>) {
+) -> (Vec<BlockRange>, Vec<Block>) {
     let layout = maker.layout().clone();
     let k = sets.len();
     let variances = noise.following();
@@ -352,7 +352,7 @@ pub(super) fn follow(
         let width = k + layout.session();
         let shares: Vec<_> = some.chunks(TOGETHER).collect();
         let lines = parallel::map_with(shares.len(), make, |(maker, rows), number| -> Vec<Vec<f64>> {
-            let of_block = |(range, _): &Stretch| {
+            let of_block = |(range, _): &BlockRange| {
                 let mut lines = Vec::new();
                 for instant in &piece.instants[range.clone()] {
                     if maker.make(instant, rows).is_err() {

@@ -20,8 +20,9 @@ const MOMENT: f64 = 1.2;
 /// ... and what begins or ends so near to it \[s\].
 const SETTLING: f64 = 0.3;
 
-/// A touch so near to a change of load, and no longer, is of the hand that gives or takes it; a change so soon after another one is the same one \[s\].
+/// A touch that comes so near to a change of load is of the hand that gives or takes it \[s\] ...
 const HANDING: f64 = 1.0;
+/// ... if it lasts no longer than this; and a change so soon before or after another one is the same one \[s\]. Or than the moment of the change is known, if that is longer.
 const HANDED: f64 = 3.0;
 
 /// Rounds in which what acts undeclared, and which breaks are real, are asked of a fit that stays as it is.
@@ -56,10 +57,14 @@ impl Undeclared {
         let edge = |load: &Load| if load.is_after { load.span.0 } else { load.span.1 };
         let is_same = |other: &&mut Load| {
             let apart = (edge(other) - edge(&load)).seconds().abs();
-            (other.log, other.place, other.is_after) == (load.log, load.place, load.is_after) && apart <= HANDED
+            (other.log, other.place, other.is_after) == (load.log, load.place, load.is_after)
+                && apart <= HANDED.max(1.5 * load.within)
         };
         match self.loads.iter_mut().find(is_same) {
-            Some(other) => other.span = (other.span.0.min(load.span.0), other.span.1.max(load.span.1)),
+            Some(other) => {
+                other.span = (other.span.0.min(load.span.0), other.span.1.max(load.span.1));
+                other.clear = (other.clear.0.max(load.clear.0), other.clear.1.min(load.clear.1));
+            }
             None => self.loads.push(load),
         }
     }
@@ -128,7 +133,7 @@ impl Undeclared {
             let loads: Vec<&Load> = own.iter().map(|(load, _)| *load).collect();
             let touches = touches(setup, log, contacts, &loads);
             for unit in units(contacts).iter() {
-                let of = |cause| Sum::of(log, touches.iter().filter(|touch| touch.is(unit, cause)));
+                let of = |cause| Tally::of(log, touches.iter().filter(|touch| touch.is(unit, cause)));
                 let (jumps, contacts) = (of(Cause::Jump), of(Cause::Contact));
                 if let Some(jumps) = jumps {
                     let reason = format!("moment of a jump: {}", part(setup, unit));
@@ -252,7 +257,7 @@ fn units(contacts: &[UnitSet]) -> UnitSet {
     contacts.iter().fold(UnitSet::default(), |units, set| units.union(set))
 }
 
-/// What seems to act on the robot in a log, beside these loads.
+/// What seems to act on the robot in a log, and of that what the hands do that give and take these loads.
 fn touches(setup: &Setup, log: &Prepared, contacts: &[UnitSet], loads: &[&Load]) -> Vec<Touch> {
     let mut touches = Vec::new();
     for unit in units(contacts).iter() {
@@ -272,7 +277,8 @@ fn touches(setup: &Setup, log: &Prepared, contacts: &[UnitSet], loads: &[&Load])
             };
             let is_handed = |load: &&Load| load.units.contains(unit) && is_near(load.span, HANDING);
             let is_jump = |b: &Break| is_own(b) && is_near((b.t, b.t), SETTLING);
-            let load = loads.iter().position(is_handed).filter(|_| lasts <= HANDED);
+            let load = loads.iter().position(is_handed);
+            let load = load.filter(|&load| lasts <= HANDED.max(loads[load].within));
             let cause = match load {
                 Some(number) => Cause::Load(number),
                 None if lasts <= MOMENT && log.breaks.iter().any(is_jump) => Cause::Jump,
@@ -289,14 +295,14 @@ fn touches(setup: &Setup, log: &Prepared, contacts: &[UnitSet], loads: &[&Load])
 }
 
 /// How often, how long and when something acted on a part of the robot.
-struct Sum {
+struct Tally {
     times: usize,
     instants: usize,
     first: Nanos,
     last: Nanos,
 }
 
-impl Sum {
+impl Tally {
     /// Of these, in the order of time; none if there are none.
     fn of<'a>(log: &Prepared, touches: impl Iterator<Item = &'a Touch>) -> Option<Self> {
         let touches: Vec<&Touch> = touches.collect();
@@ -337,18 +343,16 @@ pub(super) fn tell_of_checks(maker: &RowMaker<'_>, prepared: &mut [Prepared], id
     let is_checked = |log: &&mut Prepared| log.role == Role::Validate && !log.refused;
     let setup = maker.setup();
     let mut undeclared = Undeclared::none(prepared.iter_mut().filter(is_checked));
-    for _ in 0..ROUNDS {
+    let settles = (0..ROUNDS).any(|_| {
         let checked = prepared.iter_mut().filter(is_checked);
-        if undeclared.ask(maker, checked, &identified.noise, &identified.d) {
-            break;
-        }
-    }
+        undeclared.ask(maker, checked, &identified.noise, &identified.d)
+    });
     let checked = prepared.iter_mut().filter(is_checked);
     for (log, contacts) in checked.zip(undeclared.contacts) {
         let touches = touches(setup, log, &contacts, &[]);
         for unit in units(&contacts).iter() {
             let own = touches.iter().filter(|touch| touch.is(unit, Cause::Contact));
-            let Some(sum) = Sum::of(log, own) else {
+            let Some(sum) = Tally::of(log, own) else {
                 continue;
             };
             let part = part(setup, unit);
@@ -362,9 +366,57 @@ pub(super) fn tell_of_checks(maker: &RowMaker<'_>, prepared: &mut [Prepared], id
                 subject: part,
             });
         }
+        if !settles {
+            log.findings.push(Finding {
+                severity: Severity::Note,
+                code: "contact_unsettled",
+                subject: String::new(),
+                text: format!("after {ROUNDS} rounds, when something undeclared acted in this log, and which jumps of offsets are real, had not come to stay: take what is said of both with care"),
+            });
+        }
         log.instants
             .iter_mut()
             .for_each(|instant| instant.suspected = UnitSet::default());
         log.touched = contacts;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A load that comes at `from` \[s\], known to `within`, of a log of 100 s.
+    fn load(log: usize, place: usize, from: i64, within: f64) -> Load {
+        let at = |seconds: i64| Nanos::from_millis(1000 * seconds);
+        Load {
+            log,
+            place,
+            span: (at(from), at(100)),
+            clear: (at(from + 1), at(100)),
+            within,
+            is_after: true,
+            units: UnitSet::default(),
+        }
+    }
+
+    #[test]
+    fn a_change_that_is_found_twice_is_one() {
+        let of = |loads: &[Load]| {
+            let mut undeclared = Undeclared::none(std::iter::empty());
+            loads.iter().cloned().for_each(|load| undeclared.carry(load));
+            undeclared.loads
+        };
+        let first = load(0, 3, 23, 1.0);
+        for sooner in [22, 24] {
+            let [one] = of(&[first.clone(), load(0, 3, sooner, 1.0)]).try_into().unwrap();
+            // All that it may be in is left out; what surely has it tells of it.
+            assert_eq!(one.span, load(0, 3, sooner.min(23), 1.0).span);
+            assert_eq!(one.clear, load(0, 3, sooner.max(23), 1.0).clear);
+        }
+        // Of a long log a change is known to a piece of it.
+        assert_eq!(of(&[load(0, 3, 40, 9.4), load(0, 3, 31, 9.4)]).len(), 1);
+        for other in [load(1, 3, 22, 1.0), load(0, 4, 22, 1.0), load(0, 3, 18, 1.0)] {
+            assert_eq!(of(&[first.clone(), other.clone()]), [first.clone(), other]);
+        }
     }
 }

@@ -194,17 +194,6 @@ pub enum Defect {
         /// What the configuration should say.
         instead: String,
     },
-    /// A joint whose zero is elsewhere than the model's.
-    JointZero {
-        /// The joint.
-        joint: String,
-        /// By how much \[rad\].
-        radians: f64,
-        /// Whether it is between the base and the sensors.
-        is_before: bool,
-        /// In which log, if not in all that were trained on.
-        log: Option<String>,
-    },
 }
 
 impl Defect {
@@ -345,31 +334,6 @@ impl fmt::Display for Defect {
                 f,
                 "wrench/{sensor} does not fit the links beyond it in the frame that the configuration says, but would with {instead}: check how it is mounted, and `frame` and `direction` in its [[force_torque]]"
             ),
-            Self::JointZero {
-                joint,
-                radians,
-                is_before,
-                log,
-            } => {
-                let from = log.as_ref().map_or_else(
-                    || "the model's".to_owned(),
-                    |log| format!("that in the other logs in {log}"),
-                );
-                write!(f, "joint/{joint}: its zero is {radians:.4} rad from {from}")?;
-                if *is_before {
-                    let doubt = ", or the base (its IMU, its gravity_mps2, the floor) is turned by that: what is beyond weighs in another direction than the model says";
-                    write!(f, "{doubt}; calibrate the encoder and level the base")?;
-                } else {
-                    write!(
-                        f,
-                        "; calibrate the encoder, or the error is taken for a shifted centre of mass"
-                    )?;
-                }
-                match log {
-                    Some(log) => write!(f, ", and leave {log} out"),
-                    None => Ok(()),
-                }
-            }
         }
     }
 }
@@ -1718,7 +1682,7 @@ impl<'a> Residual<'a> {
             let before = median(self.values[(i - gap).saturating_sub(level)..i - gap].to_vec());
             (after - before) * misses[i].signum() > 0.5 * misses[i].abs()
         };
-        // Anywhere between the lines gives the same miss. Where the fewest values are far from the line on their side:
+        // Anywhere between the lines gives the same miss. Where values are nearest to the level on their side:
         let moment = |i: usize| {
             let ends = ends(&|j| self.values[j], i);
             let off = |j: usize, side: usize| (self.values[j] - ends[side]).powi(2);
@@ -1747,5 +1711,32 @@ impl<'a> Residual<'a> {
             }
         }
         found
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Where the prediction rises steadily, and is never off its median, what a wrong model leaves over may have its peak: that is no blow, and one beside it is.
+    #[test]
+    fn a_wrong_models_peak_is_no_outlier() {
+        let period = 0.01;
+        let run = 0..400;
+        let time = |i: usize| period * i as f64;
+        let expected = |steepness: f64| {
+            let predicted = move |i: usize| [0.0, 0.0, 0.0, steepness * time(i).powi(2), 0.0, 0.0];
+            let [_, torques] = Expected::new(std::slice::from_ref(&run), predicted, period);
+            torques
+        };
+        let mut values: Vec<f64> = run.clone().map(|i| -(time(i) - 2.0).powi(2)).collect();
+        values[100] += 0.1;
+        let outliers = |steepness: f64| {
+            let expected = expected(steepness);
+            let residual = Residual::new(run.clone(), values.clone(), &expected[0], period);
+            residual.outliers(&vec![3e-4; run.len()])
+        };
+        assert_eq!(outliers(4.0), [100]);
+        assert!(outliers(0.0).contains(&200), "no prediction explains it");
     }
 }

@@ -166,7 +166,7 @@ impl Posterior {
     }
 
     /// The same from near where the minimum is to be expected, unknowns as in [`Fit::x`], and as near as the square of the Newton decrement says: by half as much the
-    /// cost may be above its least, which is one half at a standard deviation. From CAD where these are no bodies.
+    /// cost may be above its least, which is one half at a standard deviation. From CAD where these are no bodies, or a step from them leaves the bodies.
     pub(in crate::identify) fn fit_from(&self, x: &[f64], tau: f64, decrement: f64) -> Result<Fit, PriorError> {
         if !(tau.is_finite() && tau > 0.0) {
             return self.fit(tau);
