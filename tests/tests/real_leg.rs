@@ -377,7 +377,7 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
     let offline = rows(&String::from_utf8(out).expect("text"));
     let live = recorder.estimate_rows(&setup);
     let stamp = |t: &str| Nanos::parse_seconds(t);
-    let first = live.keys().find_map(|t| stamp(t)).expect("estimates");
+    let first = live.keys().filter_map(|t| stamp(t)).min().expect("estimates");
     // The estimator may find the samples a little later than the recorder, and the last instants may still have been waiting when it was stopped.
     let before = offline.keys().filter(|t| stamp(t).is_some_and(|t| t < first)).count();
     assert!(
