@@ -123,8 +123,6 @@ impl Undeclared {
         let bodies: Vec<Option<gate::Added>> = loads.iter().map(body).collect();
         let training = used_mut(prepared);
         for (number, (log, contacts)) in training.zip(contacts).enumerate() {
-            let begin = log.span.0;
-            let since = |t: Nanos| (t - begin).seconds();
             let own: Vec<(&Load, &Option<gate::Added>)> = loads
                 .iter()
                 .zip(&bodies)
@@ -156,55 +154,69 @@ impl Undeclared {
                     ),
                 });
             }
-            for (number, (load, body)) in own.into_iter().enumerate() {
-                let link = setup.model.link_name(maker.layout().links[load.place]);
-                let mut out: Vec<bool> = log.instants.iter().map(|instant| load.has(instant.t)).collect();
-                for touch in touches.iter().filter(|touch| touch.cause == Cause::Load(number)) {
-                    out[touch.instants.clone()].fill(true);
-                }
-                let out: Vec<Nanos> = (log.instants.iter().zip(out))
-                    .filter(|(_, out)| *out)
-                    .map(|(instant, _)| instant.t)
-                    .collect();
-                let (Some(&first), Some(&last)) = (out.first(), out.last()) else {
-                    continue;
-                };
-                log.left_out.push(LeftOut {
-                    reason: format!("another load: {link}"),
-                    instants: out.len() as u64,
-                    first,
-                    last,
-                });
-                let (when, at) = if load.is_after {
-                    ("From", first)
-                } else {
-                    ("Up to", last)
-                };
-                let what = body.as_ref().map_or(String::new(), |body| {
-                    let p = &body.parameters;
-                    let sigma = |i: usize| body.covariance[(i, i)].sqrt();
-                    format!(
-                        ": {:+.3} +- {:.3} kg, first moment {:+.4}, {:+.4}, {:+.4} +- {:.4} kg m in the axes and about the origin of {link}",
-                        p[0],
-                        sigma(0),
-                        p[1],
-                        p[2],
-                        p[3],
-                        (1..4).map(sigma).fold(0.0, f64::max)
-                    )
-                });
-                log.findings.push(Finding {
-                    severity: Severity::Warning,
-                    code: "load_changed",
-                    subject: link.to_owned(),
-                    text: format!(
-                        "{when} about {:.1} s after the log's start, {link} carried another load than in the rest of what was used{what}. That part was left out: parameters are those without it",
-                        since(at)
-                    ),
-                });
+            for (place, (load, body)) in own.into_iter().enumerate() {
+                let hands = touches.iter().filter(|touch| touch.cause == Cause::Load(place));
+                tell_load(maker, log, load, body.as_ref(), hands);
             }
         }
     }
+}
+
+/// Says that a load was another one in a part of a log, which was left out, and what body that is, if it is known; `hands`: what else was left out because of those that gave or took it.
+fn tell_load<'a>(
+    maker: &RowMaker<'_>,
+    log: &mut Prepared,
+    load: &Load,
+    body: Option<&gate::Added>,
+    hands: impl Iterator<Item = &'a Touch>,
+) {
+    let (setup, layout) = (maker.setup(), maker.layout());
+    let link = setup.model.link_name(layout.links[load.place]);
+    let since = |t: Nanos| (t - log.span.0).seconds();
+    let mut out: Vec<bool> = log.instants.iter().map(|instant| load.has(instant.t)).collect();
+    for touch in hands {
+        out[touch.instants.clone()].fill(true);
+    }
+    let out: Vec<Nanos> = (log.instants.iter().zip(out))
+        .filter(|(_, out)| *out)
+        .map(|(instant, _)| instant.t)
+        .collect();
+    let (Some(&first), Some(&last)) = (out.first(), out.last()) else {
+        return;
+    };
+    log.left_out.push(LeftOut {
+        reason: format!("another load: {link}"),
+        instants: out.len() as u64,
+        first,
+        last,
+    });
+    let (when, at) = if load.is_after {
+        ("From", first)
+    } else {
+        ("Up to", last)
+    };
+    let what = body.map_or(String::new(), |body| {
+        let p = &body.parameters;
+        let sigma = |i: usize| body.covariance[(i, i)].sqrt();
+        format!(
+            ": {:+.3} +- {:.3} kg, first moment {:+.4}, {:+.4}, {:+.4} +- {:.4} kg m in the axes and about the origin of {link}",
+            p[0],
+            sigma(0),
+            p[1],
+            p[2],
+            p[3],
+            (1..4).map(sigma).fold(0.0, f64::max)
+        )
+    });
+    log.findings.push(Finding {
+        severity: Severity::Warning,
+        code: "load_changed",
+        subject: link.to_owned(),
+        text: format!(
+            "{when} about {:.1} s after the log's start, {link} carried another load than in the rest of what was used{what}. That part was left out: parameters are those without it",
+            since(at)
+        ),
+    });
 }
 
 /// After so many fits, what is left out changes still.

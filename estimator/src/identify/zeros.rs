@@ -46,6 +46,8 @@ struct Search<'a> {
     identified: &'a Identified,
     joints: usize,
     logs: usize,
+    /// Where a joint's zero may be elsewhere: in all logs; of several, in each.
+    places: Vec<Option<usize>>,
     /// The information's triangle over the angles, log by log, then the parameters; and its right side.
     r: DMatrix<f64>,
     z: DVector<f64>,
@@ -79,21 +81,25 @@ impl<'a> Search<'a> {
             let _ = sum.merge(&own, &parameters.chain(angles).collect::<Vec<_>>());
         }
         let (r, z) = sum.to_triangle();
-        let candidates = if logs > 1 { logs + 1 } else { 1 };
+        let each = (0..logs).filter(|_| logs > 1).map(Some);
+        let places: Vec<Option<usize>> = std::iter::once(None).chain(each).collect();
         Self {
             identified,
             joints,
             logs,
             r,
             z,
-            gain: GAIN + 2.0 * f64::ln(candidates as f64),
+            gain: GAIN + 2.0 * f64::ln(places.len() as f64),
+            places,
         }
     }
 
-    fn candidates(&self) -> Vec<Zero> {
-        let logs = if self.logs > 1 { 0..self.logs } else { 0..0 };
-        let of = |log: Option<usize>| (0..self.joints).map(move |joint| Zero { joint, log });
-        std::iter::once(None).chain(logs.map(Some)).flat_map(of).collect()
+    fn candidates(&self) -> impl Iterator<Item = Zero> {
+        let of = |log: &Option<usize>| {
+            let log = *log;
+            (0..self.joints).map(move |joint| Zero { joint, log })
+        };
+        self.places.iter().flat_map(of)
     }
 
     fn column(&self, zero: Zero) -> DVector<f64> {
@@ -134,7 +140,7 @@ impl<'a> Search<'a> {
             let known = root.tr_mul(&own.tr_mul(&column)).norm_squared();
             column.dot(&left).powi(2) / (column.norm_squared() - known + SPREAD.powi(-2)).max(SPREAD.powi(-2))
         };
-        let rest = self.candidates().into_iter().filter(|zero| !zeros.contains(zero));
+        let rest = self.candidates().filter(|zero| !zeros.contains(zero));
         let mut ranked: Vec<(f64, Zero)> = rest.map(|zero| (gain(zero), zero)).collect();
         ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
         let mut likely: Vec<Zero> = ranked.into_iter().take(TRIED).map(|(_, zero)| zero).collect();
