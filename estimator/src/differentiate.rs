@@ -18,7 +18,9 @@
 //! its standard deviation from noise:      s^2 = sigma^2 sum_{k <= d} p_k^(m)(u)^2 / <p_k, p_k> / span^2m
 //! ```
 //!
-//! with sigma = noise / sqrt 3, for an error spread evenly over +-noise.
+//! with sigma = noise / sqrt 3, for an error spread evenly over +-noise. The noise is what the channel was said to have, or what its samples show, if that is more: the
+//! root mean square of their divided differences over five neighbours, which no smooth motion has, in units in which it is a sample's ([`Window::noise`]). Stamps that are late at random make
+//! as much noise as the signal changes meanwhile.
 //!
 //! How long the window is, is decided in three steps, for each of the `D` numbers by itself:
 //!
@@ -85,6 +87,8 @@ const STRETCH: [f64; FITTED] = [0.0, 1.6, 1.4];
 const SHARE: f64 = 0.4;
 /// Width of the confidence intervals of value, first and second derivative (step 3) \[standard deviations\].
 const KAPPA: [f64; 3] = [1.0, 1.5, 2.0];
+/// Samples whose difference tells the noise.
+const ROUGH: usize = 5;
 /// Windows tried: 3, 4, 5, 6, then a third longer each time; 15 of them reach 128 samples.
 const CANDIDATES: usize = 16;
 /// Polynomials of a basis: the degrees fitted, those below, and one more for what they leave out.
@@ -225,6 +229,8 @@ pub struct Window<const D: usize> {
     settings: Settings,
     ring: Ring,
     values: [[f64; D]; MAX_SAMPLES],
+    /// Of each sample, the square of what it and those before it say of the noise ([`Window::roughness`]).
+    rough: [[f64; D]; MAX_SAMPLES],
     interrupted: bool,
 }
 
@@ -325,6 +331,7 @@ impl<const D: usize> Window<D> {
             settings,
             ring: Ring::EMPTY,
             values: [[0.0; D]; MAX_SAMPLES],
+            rough: [[0.0; D]; MAX_SAMPLES],
             interrupted: false,
         })
     }
@@ -359,7 +366,51 @@ impl<const D: usize> Window<D> {
         }
         // More are kept than an estimate uses: what came after the samples of an earlier instant must not push those out.
         self.ring.len = (self.ring.len + 1).min(MAX_SAMPLES);
+        let rough = self.roughness();
+        if let Some(place) = self.rough.get_mut(self.ring.newest) {
+            *place = rough;
+        }
         Ok(pushed)
+    }
+
+    /// Standard deviation of a sample about a smooth motion, as the newest samples up to `until` show it, that of late stamps included; of quantisation it knows what a motion
+    /// across steps shows.
+    #[must_use]
+    pub fn noise(&self, until: Nanos) -> [f64; D] {
+        const SAMPLES: usize = 64;
+        let skipped = self.later_than(until);
+        let count = self.ring.len.saturating_sub(skipped + ROUGH - 1).min(SAMPLES);
+        let mut sum = [0.0; D];
+        for age in skipped..skipped + count {
+            let at = (self.ring.newest + MAX_SAMPLES - age) % MAX_SAMPLES;
+            sum.iter_mut()
+                .zip(&self.rough[at])
+                .for_each(|(sum, rough)| *sum += rough);
+        }
+        sum.map(|sum| (sum / count.max(1) as f64).sqrt())
+    }
+
+    /// The newest samples' divided difference over [`ROUGH`] of them, in units in which it has the variance of a sample's noise, squared. A polynomial of degree three has none, and what
+    /// a motion has is less than an encoder's step; so it tells noise, that of late stamps included.
+    fn roughness(&self) -> [f64; D] {
+        let mut samples = [(0.0, &[0.0; D]); ROUGH];
+        let Some((newest, _)) = self.get(0) else {
+            return [0.0; D];
+        };
+        for (age, place) in samples.iter_mut().enumerate() {
+            let Some((stamp, value)) = self.get(age) else {
+                return [0.0; D];
+            };
+            *place = ((stamp - newest).seconds(), value);
+        }
+        let (mut sum, mut square) = ([0.0; D], 0.0);
+        for (i, (t, value)) in samples.iter().enumerate() {
+            let others = samples.iter().enumerate().filter(|(j, _)| *j != i);
+            let weight: f64 = others.map(|(_, (other, _))| 1.0 / (t - other)).product();
+            square += weight * weight;
+            sum.iter_mut().zip(*value).for_each(|(sum, x)| *sum += weight * x);
+        }
+        sum.map(|sum| if square.is_finite() { sum * sum / square } else { 0.0 })
     }
 
     /// What came so far does not belong together with what comes next: the next sample begins anew.
@@ -530,7 +581,17 @@ impl<const D: usize> Window<D> {
                 column[age] = v - o;
             }
         }
-        let mut estimate = Values::new(values, grid).estimate(grid, self.settings.noise, origin);
+        // Those that lie on samples used alone.
+        let own = used.saturating_sub(ROUGH - 1);
+        let mut rough = [0.0; D];
+        for age in 0..own {
+            for (sum, rough) in rough.iter_mut().zip(&self.rough[at(age)]) {
+                *sum += rough;
+            }
+        }
+        // An error spread evenly over +-noise has a third of its square.
+        let noise = rough.map(|sum| (3.0 * sum / own.max(1) as f64).sqrt().max(self.settings.noise));
+        let mut estimate = Values::new(values, grid).estimate(grid, &noise, origin);
         estimate.ahead = newest - t;
         if estimate.is_finite() {
             Ok(estimate)
@@ -796,10 +857,10 @@ impl<const D: usize> Values<D> {
     }
 
     /// The three steps of the module's head.
-    fn estimate(&self, grid: &mut Grid, noise: f64, origin: &[f64; D]) -> Estimate<D> {
+    fn estimate(&self, grid: &mut Grid, noise: &[f64; D], origin: &[f64; D]) -> Estimate<D> {
         let mut estimate = Estimate::NONE;
-        for component in 0..D {
-            self.component(component, grid, noise, origin, &mut estimate);
+        for (component, noise) in noise.iter().enumerate() {
+            self.component(component, grid, *noise, origin, &mut estimate);
         }
         estimate
     }

@@ -14,8 +14,8 @@
 //! With identification on ([`crate::identify::online`]), inertial parameters, offsets and their covariance are those of the last solution in force; who owns the pipeline runs its
 //! jobs ([`Pipeline::take_job`]), at once or in another thread.
 //!
-//! Standard deviations hold F/T noise, what is uncertain of inertial parameters and F/T offsets ([`crate::regressor::Propagation`]), and of accelerations that are
-//! differentiated; not the errors of positions and velocities, nor the noise of the IMU's proper acceleration.
+//! Standard deviations hold F/T noise, what is uncertain of inertial parameters and F/T offsets ([`crate::regressor::Propagation`]), of accelerations that are
+//! differentiated, of encoders' zeros and of the base's proper acceleration (`motion`); not the errors of velocities.
 
 mod learning;
 mod motion;
@@ -27,11 +27,12 @@ use crate::dynamics::{Certainty, ContactSet, Dependence, FrameMotion, JointState
 use crate::history::{Held, History};
 use crate::identify::online::state::StateError;
 use crate::identify::online::{Online, OnlineError};
+use crate::model::{JointKind, Model};
 use crate::regressor::Propagation;
 use crate::setup::{BaseMotion, Setup, Use};
 use crate::spatial::{Vec3, Wrench};
 use learning::Learning;
-use motion::{Instant, MotionErrors};
+use motion::{ENCODER_ZERO, Instant, MotionErrors};
 use proprio_topics::{
     ContactEstimate, ContactWrench, Header, InertiaEstimate, JointTorque, MAX_CONTACTS, MAX_JOINTS, NO_CAUSE, Nanos,
     Quality, Reading, Reason, TorqueEstimate,
@@ -173,6 +174,8 @@ pub struct Pipeline {
     position: Vec<f64>,
     velocity: Vec<f64>,
     acceleration: Vec<f64>,
+    /// How far each encoder's zero may be off.
+    zeros: Vec<f64>,
     readings: Vec<Wrench>,
     /// Per F/T sensor, whether its calibration wants a temperature that was not told lately.
     without_temperature: Vec<bool>,
@@ -243,6 +246,7 @@ impl Pipeline {
             position: setup.locked.iter().map(|q| if q.is_nan() { 0.0 } else { *q }).collect(),
             velocity: vec![0.0; dofs],
             acceleration: vec![0.0; dofs],
+            zeros: zeros(&setup.model),
             readings: vec![Wrench::zero(); setup.structure.sensors().len()],
             without_temperature: vec![false; setup.structure.sensors().len()],
             dependences: Dependences {
@@ -527,7 +531,6 @@ impl Pipeline {
         let active = self.active(t);
         let mut base = self.base_standing(&active);
         let mut imu = None;
-        self.motion.acceleration.fill(0.0);
         for ((track, channel), fault) in self.tracks.iter().zip(self.setup.channels()).zip(&mut self.faults) {
             *fault = match (track, channel.role) {
                 (Track::Joint(history, window), Use::Joint(dof)) => match history.at(t, until) {
@@ -535,9 +538,9 @@ impl Pipeline {
                     Some(held) => {
                         let (state, deviation, reason) =
                             joint_at(t, until, &held, (window, &mut self.grid), self.setup.max_silence);
-                        if let Some(place) = self.motion.acceleration.get_mut(dof) {
-                            *place = deviation;
-                        }
+                        let [noise] = window.noise(t);
+                        let zero = self.zeros.get(dof).copied().unwrap_or(0.0);
+                        self.motion.set_joint(dof, deviation, zero.hypot(noise));
                         let places = (
                             self.position.get_mut(dof),
                             self.velocity.get_mut(dof),
@@ -560,10 +563,13 @@ impl Pipeline {
                         ) {
                             let (celsius, age) = temperature_at(temperatures, t, self.setup.max_wait);
                             let unknown = calibration.temperature_variance(age);
-                            self.propagation.set_widened(number, unknown);
                             if let Some(place) = self.without_temperature.get_mut(number) {
                                 *place = unknown != [0.0; 6];
                             }
+                            let learning = self.learning.as_ref();
+                            let excess = learning.map_or([0.0; 6], |l| l.excess(&self.setup, number));
+                            let widened = std::array::from_fn(|i| unknown[i] + excess[i]);
+                            self.propagation.set_widened(number, widened);
                             let corrected = calibration.apply(&Wrench::from_parts([fx, fy, fz], [tx, ty, tz]), celsius);
                             self.propagation
                                 .set_reading(number, &corrected, calibration.warmth(celsius));
@@ -581,8 +587,7 @@ impl Pipeline {
                             base = FrameMotion::of_link_from_imu(&measured, pose);
                             imu = Some((measured, *pose));
                         }
-                        let places = self.motion.acceleration.iter_mut().rev();
-                        places.zip(deviation.iter().rev()).for_each(|(to, from)| *to = *from);
+                        self.motion.set_angular(&deviation);
                         quality_reason(held.quality, Quality::DEVICE_FAULT).or(reason)
                     }
                 },
@@ -657,19 +662,14 @@ impl Pipeline {
         let places = self.estimate.torques.joints.iter_mut().zip(&self.dependences.torques);
         for ((place, dependence), ((((torque, noise), model), certainty), motion)) in places.zip(results) {
             let (mut reason, mut cause) = judge.verdict(dependence);
-            // Without a sensor in it a torque rests on the model alone. If that is said to be exact, nothing is known of the torque's error.
-            let deviation = if dependence.sensors.is_empty() && *model == 0.0 {
-                f64::NAN
-            } else {
-                noise.hypot(*model).hypot(*motion)
-            };
+            let deviation = noise.hypot(*model).hypot(*motion);
             if reason == Reason::None && *certainty == Certainty::Assumed {
                 reason = Reason::Undetermined;
             }
             if reason == Reason::None && deviation > self.setup.max_deviation {
                 reason = Reason::Uncertain;
             }
-            if !solved || !torque.is_finite() || deviation.is_infinite() || model.is_nan() {
+            if !solved || !torque.is_finite() || !deviation.is_finite() {
                 (reason, cause) = (Reason::NotFinite, NO_CAUSE);
             }
             // A number that rests on a channel nobody has seen is no number.
@@ -725,6 +725,19 @@ impl Pipeline {
             };
         }
     }
+}
+
+/// How far each joint's zero may be off.
+fn zeros(model: &Model) -> Vec<f64> {
+    let of_dof = |dof: usize| {
+        let kind = model
+            .joints()
+            .iter()
+            .find(|joint| joint.dof == Some(dof))
+            .map(|joint| &joint.kind);
+        ENCODER_ZERO[usize::from(matches!(kind, Some(JointKind::Prismatic(_))))]
+    };
+    (0..model.dof_count()).map(of_dof).collect()
 }
 
 /// Finds what speaks against a value: the first channel it depends on that is at fault.

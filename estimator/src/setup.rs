@@ -476,8 +476,8 @@ impl Setup {
                 continue;
             }
             for &link in group.links {
-                if let Some(cad) = self.cad.get(link) {
-                    let _ = covariance.add(&[link], &[], own_root(cad, 1.0));
+                if let Some(cad) = self.cad.get(link).filter(|_| self.model_deviation > 0.0) {
+                    let _ = covariance.add(&[link], &[], own_root(cad, self.model_deviation));
                 }
             }
             for &sensor in group.sensors {
@@ -486,6 +486,12 @@ impl Setup {
         }
         self.fill(&mut covariance, &measured);
         covariance
+    }
+
+    /// How far the URDF's inertial parameters are expected to be from the robot's, relative ([`crate::config::Identification::model_std`]).
+    #[must_use]
+    pub fn model_deviation(&self) -> f64 {
+        self.model_deviation
     }
 
     /// Calibrations of the F/T sensors as the configuration has them, whatever was identified.

@@ -595,3 +595,36 @@ fn instants_before_a_gap_keep_their_samples_whenever_the_gap_ends() {
     assert_eq!(window.at(ms(203)), Err(Unavailable::Starting { samples: 1 }));
     assert_eq!(window.at_using(ms(202), ms(202)).unwrap(), after);
 }
+
+/// Noise is seen in motion and at rest, late stamps as noise of what moves, and the motion itself as none.
+#[test]
+fn noise_shows_in_the_samples_late_stamps_included() {
+    let found = |noise: f64, late: f64, amplitude: f64| {
+        let mut window = Window::<1>::new(Settings::new(1e-6)).unwrap();
+        let mut random = 4_u32;
+        let mut uniform = || {
+            random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            f64::from(random >> 8) / f64::from(1_u32 << 24)
+        };
+        // A sum of twelve uniform numbers is nearly normal.
+        let mut normal = || (0..12).map(|_| uniform()).sum::<f64>() - 6.0;
+        let mut last = Nanos::MIN;
+        for k in 0..120 {
+            let t = 0.01 * f64::from(k);
+            let value = amplitude * (3.0 * t).sin() + noise * normal();
+            let stamp = Nanos::from_seconds(t + late * normal().abs()).max(last + Nanos(1000));
+            last = stamp;
+            window.push(stamp, [value]).unwrap();
+        }
+        window.noise(Nanos::from_seconds(1.2))[0]
+    };
+    assert!(found(0.0, 0.0, 1.0) < 1e-6);
+    for amplitude in [0.0, 1.0] {
+        let ratio = found(1e-3, 0.0, amplitude) / 1e-3;
+        assert!((0.8..1.2).contains(&ratio), "{amplitude}: {ratio}");
+    }
+    // |N(0, 1 ms)| varies by 0.6 ms, and the signal changes by 2.1 /s in the root mean square.
+    let ratio = found(0.0, 1e-3, 1.0) / (0.6e-3 * 2.1);
+    assert!((0.6..1.6).contains(&ratio), "{ratio}");
+    assert!(found(0.0, 1e-3, 0.0) < 1e-9);
+}

@@ -1361,7 +1361,7 @@ fn a_negative_rotor_is_no_help_on_held_out_data() {
         let outcome = run(&setup, &[("log", Role::Train, &log)], &TORQUE);
         let (cad, own, inside, _) = torque_errors(&setup, &truth, &outcome, 77);
         println!("torques of the links: {cad:.4} -> {own:.4} Nm, covered {inside:.3}");
-        assert!(own <= cad && inside > 0.8, "{seed} {negative}: {cad} {own} {inside}");
+        assert!(own <= cad && inside > 0.7, "{seed} {negative}: {cad} {own} {inside}");
         assert!(outcome.rotors.iter().all(|rotor| rotor.inertia >= 0.0));
     }
 }

@@ -2,7 +2,8 @@
 //! through gateway and estimator. Needs the log (`PROPRIO_DATA`) and the folder of the robot's URDF (`PROPRIO_ICUB_MODELS`); says that it skips
 //! without.
 
-use proprio_estimator::config::Config;
+use proprio_estimator::config::{Config, Presence};
+use proprio_estimator::identify::{Log, Options, Role, identify, parameters};
 use proprio_estimator::offline::estimate;
 use proprio_estimator::setup::Setup;
 use proprio_gateway::candump;
@@ -417,4 +418,117 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
     );
     assert!(count * 10 > original.len() * 9, "{count} of {}", original.len());
     true
+}
+
+/// Torques of some joints from 34 to 44 s, each with its standard deviation; none where it is not valid.
+fn swinging(setup: Setup, table: &str) -> Vec<[Option<(f64, f64)>; 4]> {
+    let joints = ["r_hip_pitch", "r_hip_yaw", "r_knee", "r_ankle_pitch"];
+    let mut out = Vec::new();
+    estimate(setup, table.as_bytes(), &mut out).expect("estimates");
+    let text = String::from_utf8(out).expect("text");
+    let mut lines = text.lines().map(|line| line.split(',').collect::<Vec<_>>());
+    let header = lines.next().expect("a header");
+    let place = |name: String| header.iter().position(|column| *column == name).expect("a column");
+    let columns = joints.map(|joint| ["torque", "torque_std", "valid"].map(|what| place(format!("{what}/{joint}"))));
+    let number = |cell: &str| cell.parse::<f64>().unwrap_or(f64::NAN);
+    lines
+        .filter(|cells| (34.0..44.0).contains(&number(cells[0])))
+        .map(|cells| {
+            columns.map(|[torque, deviation, valid]| {
+                (cells[valid] == "1").then(|| (number(cells[torque]), number(cells[deviation])))
+            })
+        })
+        .collect()
+}
+
+/// Identified on-line, from whichever moment on, what the swinging leg's torques are agrees with what identification from the log finds, and with the inverse dynamics of the CAD, which
+/// for a free limb is as right as the CAD is. Nobody says that the foot stands on the ground until 14 s, nor that its sensors were never tared.
+#[test]
+fn on_line_the_torques_of_a_real_leg_are_what_they_are_from_its_log() {
+    /// Medians of iDynTree's inverse dynamics of `iCubGenova02` \[Nm\], and the share that a CAD is off by.
+    const CAD: [(f64, f64); 4] = [(0.44, 0.2), (-0.10, 0.2), (4.11, 0.2), (-0.36, 0.2)];
+    /// At the hip and the ankle the moments of the limb's parts cancel: two fifths of what is left are little beside a fifth of each \[Nm\].
+    const LITTLE: f64 = 0.4;
+    let Some(mut leg) = leg() else { return };
+    let data = PathBuf::from(std::env::var_os("PROPRIO_DATA").expect("the logs"));
+    let spans = ["icub_leg_12_24s.csv", "icub_leg_24_44s.csv"];
+    let [Ok(first), Ok(second)] = spans.map(|name| std::fs::read_to_string(data.join(name))) else {
+        println!("skipped: there is no {}", spans.join(", or no "));
+        return;
+    };
+    let texts = [first, second];
+    leg.config.contact.retain(|contact| contact.name() != "right_leg");
+    let foot = leg
+        .config
+        .contact
+        .iter_mut()
+        .find(|contact| contact.name() == "right_foot");
+    foot.expect("the foot's contact").presence = Presence::Possible;
+
+    let identified = {
+        let mut reader = texts[1].as_bytes();
+        let log = Log {
+            file: spans[1].to_owned(),
+            role: Role::Train,
+            samples: &mut reader,
+        };
+        let setup = leg.setup();
+        let outcome = identify(&setup, vec![log], &Options::default(), &mut |_| ()).expect("an outcome");
+        let mut with = setup.clone();
+        with.apply(&parameters(&outcome, &setup, "this test").expect("parameters"))
+            .expect("they fit");
+        swinging(with, &texts[1])
+    };
+    leg.config.identification.enabled = true;
+    let mut rows = texts[0].lines().chain(texts[1].lines().skip(1));
+    let header = rows.next().expect("a header").to_owned();
+    let rows: Vec<&str> = rows.collect();
+    let mut all = Vec::new();
+    for begin in [12.0, 17.0, 20.0, 24.0, 30.0] {
+        let is_later = |row: &&&str| {
+            row.split(',')
+                .next()
+                .and_then(|t| t.parse().ok())
+                .is_some_and(|t: f64| t >= begin)
+        };
+        let table = std::iter::once(header.as_str())
+            .chain(rows.iter().filter(is_later).copied())
+            .flat_map(|row| [row, "\n"])
+            .collect::<String>();
+        let own = swinging(leg.setup(), &table);
+        for (joint, (cad, share)) in CAD.iter().enumerate() {
+            // Both are of the same instants, but for how the table begins.
+            let from = identified.len().saturating_sub(own.len());
+            let pairs: Vec<_> = (own.iter().rev().zip(identified[from..].iter().rev()))
+                .filter_map(|(own, other)| Some((own[joint]?, other[joint]?)))
+                .collect();
+            let within = |((a, s), (b, r)): &&((f64, f64), (f64, f64))| (a - b).abs() <= 2.0 * s.hypot(*r);
+            let covered = pairs.iter().filter(within).count() as f64 / pairs.len() as f64;
+            all.push(covered);
+            let median = |of: &dyn Fn(&((f64, f64), (f64, f64))) -> f64| {
+                let mut values: Vec<f64> = pairs.iter().map(of).collect();
+                values.sort_by(f64::total_cmp);
+                values[values.len() / 2]
+            };
+            let apart = median(&|((a, _), (b, _))| a - b).abs();
+            let joint_deviation = median(&|((_, s), (_, r))| s.hypot(*r));
+            let median = median(&|((value, _), _)| *value);
+            println!(
+                "from {begin} s, joint {joint}: {median:.2} Nm, {:.0} % within",
+                100.0 * covered
+            );
+            assert!(
+                apart < 2.0 * joint_deviation,
+                "from {begin} s, joint {joint}: {apart}, {joint_deviation}"
+            );
+            let apart = (median - cad).abs();
+            assert!(
+                apart < (2.0 * share * cad).abs().max(LITTLE),
+                "from {begin} s, joint {joint}: {median}, CAD {cad}"
+            );
+        }
+    }
+    let mean = all.iter().sum::<f64>() / all.len() as f64;
+    println!("{:.0} % within in all", 100.0 * mean);
+    assert!(mean >= 0.85, "{all:?}");
 }

@@ -789,7 +789,7 @@ fn settle(
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<Settled, IdentifyError> {
     let layout = maker.layout().clone();
-    let prior = Prior::new(setup.model.inertias())?;
+    let prior = Prior::new(setup.model.inertias())?.expecting(setup.model_deviation());
     let least = least_variances(setup, &layout);
     let bound = (super::passes::BLOCK / DRIFT_TIME).powi(2);
     let sampled = sample(maker, training);

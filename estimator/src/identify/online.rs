@@ -18,38 +18,43 @@
 //! offsets wander is reckoned as often, for each step of a walk is one of all that hangs together. (Small components: ten times a second.)
 //!
 //! # Noise
-//! Rows are whitened with *inflated* variances: a channel's residual variance times its integrated autocorrelation time, both found by every [`Job`] from the rows of the
-//! last second under the newest solution, and averaged over half a minute. Never less than the configured variance.
+//! Rows are whitened with *inflated* variances, and offsets wander between blocks (random walks), both as [`channel`] finds them from what each channel reads in the mean from one second
+//! to the next, less what the bodies explain that were known before. All that is read counts there, also what was put aside: noise that is larger than was thought would else be put
+//! aside for ever. Before anything is known the noise is taken as hundreds of times what was stated. Offsets stand still while a contact is declared or suspected.
 //!
 //! # Gating
 //! A block goes in one block after it was gathered, and only if that and the next are clean: its mean innovation, whitened by the predictive covariance `P + R`, is
 //! tested against chi-square. What fails is a contact that nobody declared, an outlier, a jump of an offset, or another load: rows are kept aside, the component is
-//! [`Paused::Suspected`] and says so. If it lasts three seconds while the sensors tilt, the rows put aside are asked what they are. If the same information with offsets that
-//! start afresh explains them, the offsets do; if with new parameters of the outermost links it does, a load has changed; else it stays a contact.
+//! [`Paused::Suspected`] and says so. If it lasts three seconds while a sensor tilts, the rows put aside are asked what they are. If the same information with offsets of the sensors that have
+//! tilted starting afresh explains them, beside bodies as probable as CAD lets them be, the offsets do; if new parameters of the outermost links explain them better, a load
+//! has changed; else it stays a contact, however long.
 //!
-//! # Offsets
-//! Offsets wander between blocks (random walks), and stand still while a contact is declared or suspected. How fast each wanders is found by the likelihood of what its channel
-//! reads in the mean from one second to the next (`wander`), between bounds, so that a slow push is not taken for one.
+//! # What is in force
+//! CAD, and then what has predicted the readings that came after it better ([`contest`]), with the offsets that go best with it. What is most probable is found every second, and judges new
+//! rows.
 
+mod channel;
+mod contest;
 mod rows;
 pub mod state;
-mod wander;
 
 use std::sync::Arc;
 
-use nalgebra::{DMatrix, DMatrixView};
+use nalgebra::{DMatrix, DMatrixView, DVector};
 use proprio_topics::{Nanos, Reason};
 
 use pulp::{Arch, Simd, WithSimd};
 
+use self::channel::{Channel, Second};
+use self::contest::Contest;
 use self::rows::{Instant, Kinds, Rows, spread};
-use self::wander::Walk;
 use super::information::{Information, InformationError, Panel};
 use super::lanes::{self, TOGETHER};
-use super::prior::{GREATEST_TAU, Posterior, Prior, PriorError};
+use super::prior::{Posterior, Prior, PriorError};
 use super::{add_multiple, dot, factorise, forward};
 use crate::dynamics::{ContactSet, DofSet, DynamicsError, Kinematics, Structure};
 use crate::model::Model;
+use crate::parameters::cad_root;
 use crate::regressor::{StackedRegressor, Weighting};
 use crate::spatial::{RigidInertia, Vec3, Wrench};
 
@@ -69,21 +74,12 @@ const GATE: f64 = 5.0;
 const CLEAN: u32 = 3;
 /// Innovations of one kind for so long, while the sensors tilt, are no contact but a change.
 const PERSISTENT: f64 = 3.0;
-/// Innovations that nothing explains are given in to after so long [s].
-const HOPELESS: f64 = 30.0;
-/// By how much sensors must tilt meanwhile, as the cosine of the angle: 20 degrees. A weight and a push can not be told apart at rest.
+/// By how much a sensor must tilt meanwhile, as the cosine of the angle: 20 degrees. An offset, a weight and a push can not be told apart where it does not.
 const TILTED: f64 = 0.94;
 /// Mean square of what a change leaves of the rows' innovations, in units of inflated noise, up to which it explains them.
-const EXPLAINED: f64 = 2.0;
+const EXPLAINED: f64 = 1.0;
 /// Standard deviation of an offset before anything is known of it [Nm], [N]: no sensor is that far off.
 const OFFSET: [f64; 2] = [100.0, 1000.0];
-/// How much the noise is inflated before it is known, and for how many instants' worth that counts.
-const INFLATION: f64 = 30.0;
-const INFLATION_WORTH: f64 = 300.0;
-/// How many instants the noise is averaged over.
-const MEMORY: f64 = 3000.0;
-/// Lags of autocorrelation that are looked at [instants].
-const LAGS: usize = 64;
 /// The squared Newton decrement down to which bodies are sought to find the prior's weight, and to tell of them: a hundredth and a ten-thousandth of a standard deviation.
 const NEAR: f64 = 1e-4;
 const NEAREST: f64 = 1e-8;
@@ -91,10 +87,10 @@ const NEAREST: f64 = 1e-8;
 const SETTLED: f64 = 1e-3;
 /// Half of the memory that is kept for jobs \[B\]; glibc follows up to 32 MiB.
 const KEPT: usize = 24 << 20;
+/// A channel of whose noise less than this shows among that of others is judged as if it were so much.
+const LEAST_SHARE: f64 = 1e-3;
 /// A series of residuals that is longer has holes that nothing explains [instants].
 const LONGEST: usize = 100_000;
-/// Window of the autocorrelation time, in such times (Sokal 1997).
-const SOKAL: f64 = 6.0;
 
 /// Why nothing can be identified on-line.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -176,8 +172,6 @@ pub enum Change {
     Offset,
     /// The outermost links have another load, and their parameters start afresh.
     Load,
-    /// For half a minute neither of these explained the readings, nor did anybody declare a contact: all starts afresh.
-    Unknown,
 }
 
 impl std::fmt::Display for Change {
@@ -185,7 +179,6 @@ impl std::fmt::Display for Change {
         f.write_str(match self {
             Self::Offset => "an F/T offset has jumped: offsets are learnt anew",
             Self::Load => "the robot carries another load: the parameters of its outermost links are learnt anew",
-            Self::Unknown => "the readings have long not fitted what was known: everything is learnt anew",
         })
     }
 }
@@ -238,6 +231,8 @@ pub struct ComponentSolution {
     pub root: DMatrix<f64>,
     /// How far each offset wanders in a second [Nm/s^½, N/s^½], [torque; force].
     pub drift: Vec<[f64; 6]>,
+    /// Variance of one reading about what the model says of it [Nm^2, N^2], [torque; force]: the sensor's noise, vibration, late stamps.
+    pub noise: Vec<[f64; 6]>,
     /// The stamp of the newest data that this is found from.
     pub data: Nanos,
     /// The prior's weight; not a number before the first solution.
@@ -250,8 +245,9 @@ pub struct ComponentSolution {
     pub rows: u64,
     /// Whether all this is found from the data up to [`Solution::data`]. Else nothing that can exist fitted these, and it is what was there before.
     pub is_accepted: bool,
-    /// `[s | d]`.
+    /// What is most probable, `[s | d]`, and a root of its covariance over `[d | s]`: by this new readings are judged.
     estimate: Vec<f64>,
+    spread: DMatrix<f64>,
 }
 
 /// What a job found.
@@ -284,8 +280,6 @@ impl Limb {
 /// Sub-trees that sensors join, and what is known of them.
 #[derive(Clone, Debug)]
 struct Component {
-    /// The link that tells how its sensors are tilted.
-    top: usize,
     links: Vec<usize>,
     sensors: Vec<usize>,
     /// Joints whose motion its rows rest on, by the link that kinematics start at.
@@ -307,6 +301,8 @@ struct Component {
     wandered: f64,
     stride: f64,
     variances: Vec<f64>,
+    /// Those that the rows for the next job are whitened with.
+    whitened: Vec<f64>,
     /// The configured ones.
     least: Vec<f64>,
     /// Standard deviations of a second of drift.
@@ -327,9 +323,10 @@ struct Component {
     /// Whether a second block did not fit, either.
     lasts: bool,
     clean: u32,
-    /// How the proper acceleration pointed when the present suspicion began; the least cosine to it since.
-    direction: Vec3,
-    cosine: f64,
+    /// The links that carry the sensors; how the proper acceleration of each pointed when the present suspicion began; the least cosine to it since.
+    carriers: Vec<usize>,
+    directions: Vec<Vec3>,
+    cosines: Vec<f64>,
     /// Whether what is in force can be trusted to judge rows.
     judges: bool,
     paused: Paused,
@@ -371,10 +368,11 @@ pub struct Online {
 }
 
 impl Online {
-    /// Nothing known but `cad`, one inertia per link, and `offsets`, one per sensor. One instant is expected per `period`. `always` are the contacts that are never absent.
+    /// Nothing known but `cad`, one inertia per link, and `offsets`, one per sensor. One instant is expected per `period`, and CAD to be off by this share, `relative`. `always` are the contacts that are never absent.
     ///
     /// # Errors
     /// [`OnlineError`].
+    #[allow(clippy::too_many_arguments, reason = "each of another kind")]
     pub fn new(
         model: &Model,
         structure: &Structure,
@@ -383,6 +381,7 @@ impl Online {
         always: &ContactSet,
         base: usize,
         period: Nanos,
+        relative: f64,
     ) -> Result<Self, OnlineError> {
         let kinematics = Kinematics::new(model, base)?;
         let mut stacked = StackedRegressor::new(structure);
@@ -413,7 +412,17 @@ impl Online {
                 let subtrees = (0..is_free.len())
                     .filter(|&k| is_free[k] && group[k] == first)
                     .collect();
-                Component::new(model, &stacked, subtrees, cad, offsets, always, per_job, per_block)
+                Component::new(
+                    model,
+                    &stacked,
+                    subtrees,
+                    cad,
+                    offsets,
+                    always,
+                    per_job,
+                    per_block,
+                    period.seconds(),
+                )
             })
             .collect();
         if components.is_empty() {
@@ -426,17 +435,17 @@ impl Online {
         {
             drop(std::hint::black_box(Vec::<u8>::with_capacity(KEPT)));
         }
-        let prior = Arc::new(Prior::new(cad)?);
+        let prior = Arc::new(Prior::new(cad)?.expecting(relative));
         let solution = Solution {
             data: Nanos::MIN,
             components: components.iter().map(|c| c.unknown(cad, offsets)).collect(),
         };
         let job = Box::new(Job {
-            prior,
             data: Nanos::MIN,
             parts: (components.iter().zip(&solution.components))
-                .map(|(component, known)| Part::new(component, known.clone(), period))
+                .map(|(component, known)| Part::new(component, known.clone(), period, &prior, relative))
                 .collect(),
+            prior,
             solution: solution.clone(),
         });
         Ok(Self {
@@ -469,7 +478,8 @@ impl Online {
             let (what, got, expected) = ("columns of the covariance's root", root.ncols(), width);
             return Err(InformationError::Size { what, got, expected }.into());
         }
-        for (component, known) in self.components.iter_mut().zip(&mut self.solution.components) {
+        let pairs = self.components.iter_mut().zip(&mut self.solution.components);
+        for (number, (component, known)) in pairs.enumerate() {
             let (session, unknowns) = (component.offsets.len(), component.information.unknowns());
             // Columns in the component, columns of the root, and what the parameters are beside CAD.
             let mut columns = Vec::new();
@@ -508,24 +518,28 @@ impl Online {
                 panel.push_row(&row, right)?;
             }
             component.information.absorb(&mut panel)?;
-            // In force from the beginning, offsets being unknown; if every link is among them.
-            if columns.len() == WIDTH * component.links.len() {
-                let total = columns.len() + session;
-                known.root = DMatrix::zeros(total, total);
-                for (j, deviation) in deviations.iter().enumerate() {
-                    for i in 0..=j {
-                        known.root[(i, j)] = upper[(i, j)] * deviation;
-                    }
-                }
-                for i in 0..session {
-                    known.root[(columns.len() + i, columns.len() + i)] = OFFSET[usize::from(i % 6 > 2)];
+            // In force from the beginning: of links that are not among them CAD is.
+            let Some(job) = &mut self.job else { continue };
+            let Some(part) = job.parts.get_mut(number) else {
+                continue;
+            };
+            let mut begun = part.contest.in_force().clone();
+            let (rows, parameters) = begun.root.shape();
+            begun.root = begun.root.resize_vertically(rows + columns.len(), 0.0);
+            for (j, (&(column, _, value), deviation)) in columns.iter().zip(&deviations).enumerate() {
+                begun.change[column - session] = value;
+                begun.root.column_mut(column - session).fill(0.0);
+                for i in 0..=j {
+                    begun.root[(rows + i, column - session)] = upper[(i, j)] * deviation;
                 }
             }
-        }
-        if let Some(job) = &mut self.job {
-            for (part, known) in job.parts.iter_mut().zip(&self.solution.components) {
-                part.good.clone_from(known);
-            }
+            begun.root = begun.root.qr().r();
+            begun.bodies.clone_from(&known.bodies);
+            begun.tau = f64::NAN;
+            debug_assert_eq!(begun.root.ncols(), parameters);
+            part.contest.enthrone(begun);
+            part.tell(known);
+            part.good.clone_from(known);
         }
         Ok(())
     }
@@ -607,8 +621,10 @@ impl Online {
             component.learnt.clear();
             component.aside.clear();
             part.is_suspected = component.is_suspected;
-            part.cosine = component.cosine;
-            part.variances.copy_from_slice(&component.variances);
+            part.is_moving = part.learnt.is_moving() || part.aside.is_moving();
+            part.cosines.copy_from_slice(&component.cosines);
+            part.whitened.copy_from_slice(&component.whitened);
+            component.whitened.copy_from_slice(&component.variances);
             part.motion = component.motion;
             part.rows = component.rows;
         }
@@ -653,7 +669,6 @@ impl Online {
                 match change {
                     Change::Offset => component.counts.offset_changes += 1,
                     Change::Load => component.counts.load_changes += 1,
-                    Change::Unknown => {}
                 }
                 component.pending.clear();
                 component.gathered.clear();
@@ -679,8 +694,8 @@ impl Component {
         always: &ContactSet,
         per_job: usize,
         per_block: usize,
+        period: f64,
     ) -> Self {
-        let top = stacked.subtrees()[subtrees[0]].top();
         let structure = stacked.structure();
         let mut links: Vec<usize> = subtrees.iter().flat_map(|&k| structure.links_of(k)).collect();
         let mut sensors: Vec<usize> = subtrees.iter().flat_map(|&k| stacked.subtrees()[k].sensors()).collect();
@@ -764,8 +779,8 @@ impl Component {
             }
         }
         let most = kinds.most();
+        let channels = channels(&noise, period);
         Self {
-            top,
             stride: if limbs.is_empty() { 0.0 } else { GATHERED },
             wandered: 0.0,
             limbs,
@@ -776,9 +791,10 @@ impl Component {
             outermost,
             information: Information::new(unknowns),
             panel: Panel::new(unknowns, most * per_block),
-            variances: noise.iter().map(|sigma| INFLATION * sigma * sigma).collect(),
+            variances: channels.iter().map(|channel| channel.noise().0).collect(),
             least: noise.iter().map(|sigma| sigma * sigma).collect(),
-            wander: noise.iter().map(|sigma| wander::GUESS * sigma).collect(),
+            wander: channels.iter().map(|channel| channel.noise().1).collect(),
+            whitened: channels.iter().map(|channel| channel.noise().0).collect(),
             offsets: (0..session).collect(),
             deviations: vec![0.0; session],
             gathered: Rows::new(&kinds, per_block),
@@ -791,8 +807,9 @@ impl Component {
             is_suspected: false,
             lasts: false,
             clean: 0,
-            direction: Vec3::zeros(),
-            cosine: 1.0,
+            carriers: sensors.iter().map(|&s| structure.sensors()[s].joint() + 1).collect(),
+            directions: vec![Vec3::zeros(); sensors.len()],
+            cosines: vec![1.0; sensors.len()],
             judges: false,
             paused: Paused::No,
             last_change: None,
@@ -824,6 +841,9 @@ impl Component {
             drift: self
                 .wander
                 .chunks_exact(6)
+                .map(|six| std::array::from_fn(|i| six[i]))
+                .collect(),
+            noise: (self.least.chunks_exact(6))
                 .map(|six| std::array::from_fn(|i| six[i]))
                 .collect(),
             tau: f64::NAN,
@@ -876,15 +896,18 @@ impl Component {
             Paused::No
         };
         if self.is_suspected {
-            let acceleration = seen.kinematics.motion(self.top).proper_acceleration;
-            let direction = acceleration / acceleration.norm().max(1e-3);
-            if self.direction == Vec3::zeros() {
-                self.direction = direction;
+            let tilts = self.carriers.iter().zip(&mut self.directions).zip(&mut self.cosines);
+            for ((&link, began), cosine) in tilts {
+                let acceleration = seen.kinematics.motion(link).proper_acceleration;
+                let direction = acceleration / acceleration.norm().max(1e-3);
+                if *began == Vec3::zeros() {
+                    *began = direction;
+                }
+                *cosine = cosine.min(direction.dot(began));
             }
-            self.cosine = self.cosine.min(direction.dot(&self.direction));
         }
         self.gathered.push(slot, &self.instant);
-        self.gathered.is_moving |= seen.is_base_moved || !seen.moved.intersection(&self.dofs[base]).is_empty();
+        self.gathered.has_moved |= seen.is_base_moved || !seen.moved.intersection(&self.dofs[base]).is_empty();
     }
 
     /// The end of a block: the gate judges, offsets wander, rows go in or aside.
@@ -895,7 +918,8 @@ impl Component {
             self.lasts = self.is_suspected;
             if !self.is_suspected {
                 self.is_suspected = true;
-                (self.cosine, self.direction) = (1.0, Vec3::zeros());
+                self.cosines.fill(1.0);
+                self.directions.fill(Vec3::zeros());
             }
             self.clean = 0;
             let instants = self.pending.instants() + self.gathered.instants();
@@ -975,7 +999,7 @@ impl Component {
         }
         let instants = self.pending.instants();
         self.counts.learnt += instants;
-        if self.pending.is_moving {
+        if self.pending.is_moving() {
             self.motion += self.pending.span;
         } else {
             self.counts.still += instants;
@@ -988,7 +1012,7 @@ impl Component {
     /// Whether the mean innovation of the gathered block is beyond what noise and the uncertainty of what is in force explain.
     fn is_odd(&mut self, known: &ComponentSolution) -> bool {
         let unknowns = self.kinds.unknowns();
-        if known.estimate.len() != unknowns || known.root.shape() != (unknowns, unknowns) {
+        if known.estimate.len() != unknowns || known.spread.shape() != (unknowns, unknowns) {
             return false;
         }
         let Scratch {
@@ -1021,7 +1045,7 @@ impl Component {
                 innovations[m] = kind.left(row, right[0], &known.estimate);
                 // U a: the columns of U are [d | s].
                 Arch::new().dispatch(Project {
-                    root: &known.root,
+                    root: &known.spread,
                     session: self.offsets.len(),
                     columns: &kind.columns,
                     row,
@@ -1098,14 +1122,17 @@ struct Part {
     learnt: Rows,
     aside: Rows,
     is_suspected: bool,
-    /// For how long rows have been put aside in the present suspicion [s].
-    lasting: f64,
-    cosine: f64,
-    /// Configured, and inflated.
-    least: Vec<f64>,
+    /// Whether something moved in the second.
+    is_moving: bool,
+    /// [`Component::cosines`].
+    cosines: Vec<f64>,
+    /// Inflated.
     variances: Vec<f64>,
-    noise: Vec<Autocorrelation>,
-    walks: Vec<Walk>,
+    channels: Vec<Channel>,
+    /// How the means of the second before hang on the bodies, a column per channel, and what these were held to be.
+    before: Option<(DMatrix<f64>, Vec<f64>)>,
+    /// What the rows are whitened with.
+    whitened: Vec<f64>,
     wander: Vec<f64>,
     period: f64,
     tau: f64,
@@ -1115,60 +1142,117 @@ struct Part {
     rows: u64,
     /// The last solution that was found.
     good: ComponentSolution,
-    /// The same information with one thing started afresh, the rows put aside taken in, and how many.
-    hypotheses: Vec<(Change, Information, f64)>,
-    aside_rows: f64,
-    /// For how long [s].
+    /// The most probable unknowns, `[s | d]`, and parameters; those in force, and who might replace them.
+    estimate: Vec<f64>,
+    spread: DMatrix<f64>,
+    newest: Parameters,
+    contest: Contest<Parameters>,
+    /// Whether those in force are to be replaced, come what may.
+    is_replaced: bool,
+    /// What the rows that were put aside tell, and for how long there were any \[s\].
+    put_aside: Information,
     asked: f64,
     change: Option<(Change, Information)>,
 }
 
-/// Sums of products of a channel's residuals, by lag; old ones fade.
-#[derive(Clone, Debug)]
-struct Autocorrelation {
-    sums: [f64; LAGS],
-    pairs: [f64; LAGS],
+/// Parameters that are, or may come, in force.
+#[derive(Clone, Debug, Default)]
+struct Parameters {
+    /// `d`.
+    change: Vec<f64>,
+    /// A root `U` of their covariance `U^T U`.
+    root: DMatrix<f64>,
+    bodies: Vec<RigidInertia>,
+    tau: f64,
+    effective: f64,
 }
 
-impl Autocorrelation {
-    fn take(&mut self, series: &[f64]) {
-        let own = series.iter().filter(|value| value.is_finite()).count() as f64;
-        let keep = (1.0 - own / MEMORY).max(0.0);
-        for (lag, (sum, pairs)) in self.sums.iter_mut().zip(&mut self.pairs).enumerate() {
-            (*sum, *pairs) = (*sum * keep, *pairs * keep);
-            for (x, y) in series.iter().zip(series.iter().skip(lag)) {
-                if (x * y).is_finite() {
-                    *sum += x * y;
-                    *pairs += 1.0;
-                }
-            }
+impl Parameters {
+    /// CAD's, each uncertain by this share.
+    fn of_cad(bodies: &[RigidInertia], relative: f64) -> Self {
+        let count = WIDTH * bodies.len();
+        let mut root = DMatrix::zeros(count, count);
+        for (place, body) in bodies.iter().enumerate() {
+            let at = WIDTH * place;
+            root.view_mut((at, at), (WIDTH, WIDTH))
+                .copy_from(&cad_root(body, relative));
+        }
+        Self {
+            change: vec![0.0; count],
+            root,
+            bodies: bodies.to_vec(),
+            tau: f64::NAN,
+            effective: 0.0,
         }
     }
+}
 
-    /// Variance times integrated autocorrelation time, and how many instants that rests on.
-    fn inflated(&self) -> (f64, f64) {
-        let count = self.pairs[0];
-        if count == 0.0 || self.sums[0] == 0.0 {
-            return (0.0, count);
+impl Parameters {
+    /// So far from the first to the second: the mean of a mixture of both, and its covariance.
+    ///
+    /// ```text
+    /// P = (1 - k) P_1 + k P_2 + k (1 - k) (d_2 - d_1) (d_2 - d_1)^T
+    /// ```
+    fn between(first: &Self, second: &Self, share: f64) -> Self {
+        let mixed = |a: f64, b: f64| a + share * (b - a);
+        let bodies: Vec<RigidInertia> = (first.bodies.iter().zip(&second.bodies))
+            .map(|(a, b)| {
+                let (a, b) = (a.parameters(), b.parameters());
+                RigidInertia::from_parameters(&std::array::from_fn(|i| mixed(a[i], b[i])))
+            })
+            .collect();
+        let (rows, columns) = first.root.shape();
+        let mut root = DMatrix::zeros(rows + second.root.nrows() + 1, columns);
+        root.rows_mut(0, rows).copy_from(&(&first.root * (1.0 - share).sqrt()));
+        root.rows_mut(rows, second.root.nrows())
+            .copy_from(&(&second.root * share.sqrt()));
+        let between = (share * (1.0 - share)).sqrt();
+        let pairs = first.change.iter().zip(&second.change);
+        for (to, (a, b)) in root.row_mut(rows + second.root.nrows()).iter_mut().zip(pairs) {
+            *to = between * (b - a);
         }
-        let variance = self.sums[0] / count;
-        let mut time = 1.0;
-        for lag in 1..LAGS {
-            if lag as f64 > SOKAL * time || self.pairs[lag] == 0.0 {
-                break;
-            }
-            time += 2.0 * self.sums[lag] / self.pairs[lag] / variance;
+        Self {
+            change: first
+                .change
+                .iter()
+                .zip(&second.change)
+                .map(|(a, b)| mixed(*a, *b))
+                .collect(),
+            root: root.qr().r(),
+            bodies,
+            tau: second.tau,
+            effective: second.effective,
         }
-        (variance * time.max(1.0), count)
+    }
+}
+
+/// Per block of a tenth of a second, when it was and the mean of each channel.
+type Blocks = Vec<(f64, Vec<f64>)>;
+
+/// The instants of some rows.
+struct Span {
+    first: i64,
+    count: usize,
+}
+
+impl Span {
+    /// None if there are none, or if they have holes that nothing explains.
+    fn of<'a>(rows: impl Iterator<Item = &'a Rows>) -> Option<Self> {
+        let ends = |rows: &'a Rows| rows.iter().flat_map(rows::OfKind::slots).copied();
+        let (first, last) = rows
+            .flat_map(ends)
+            .fold((i64::MAX, i64::MIN), |(a, b), slot| (a.min(slot), b.max(slot)));
+        let count = usize::try_from(last.checked_sub(first)?).ok()? + 1;
+        (count <= LONGEST).then_some(Self { first, count })
+    }
+
+    fn place(&self, slot: i64) -> Option<usize> {
+        usize::try_from(slot - self.first).ok().filter(|at| *at < self.count)
     }
 }
 
 impl Part {
-    fn new(component: &Component, good: ComponentSolution, period: Nanos) -> Self {
-        let none = Autocorrelation {
-            sums: [0.0; LAGS],
-            pairs: [0.0; LAGS],
-        };
+    fn new(component: &Component, good: ComponentSolution, period: Nanos, prior: &Prior, relative: f64) -> Self {
         Self {
             kinds: component.kinds.clone(),
             links: component.links.clone(),
@@ -1179,65 +1263,68 @@ impl Part {
             learnt: component.learnt.clone_room(),
             aside: component.aside.clone_room(),
             is_suspected: false,
-            lasting: 0.0,
-            cosine: 1.0,
-            least: component.least.clone(),
+            is_moving: false,
+            cosines: component.cosines.clone(),
             variances: component.variances.clone(),
-            noise: vec![none; component.variances.len()],
-            walks: component.least.iter().map(|v| Walk::new(v.sqrt())).collect(),
+            channels: channels(
+                &component.least.iter().map(|v| v.sqrt()).collect::<Vec<_>>(),
+                period.seconds(),
+            ),
+            before: None,
+            whitened: component.variances.clone(),
             wander: component.wander.clone(),
             period: period.seconds(),
-            tau: GREATEST_TAU,
+            tau: prior.expected_tau(),
             failure: None,
             motion: 0.0,
             rows: 0,
+            estimate: Vec::new(),
+            spread: DMatrix::zeros(0, 0),
+            newest: Parameters::default(),
+            contest: Contest::new(component.variances.len(), Parameters::of_cad(&good.bodies, relative)),
+            is_replaced: false,
             good,
-            hypotheses: Vec::new(),
-            aside_rows: 0.0,
+            put_aside: Information::new(component.information.unknowns()),
             asked: 0.0,
             change: None,
         }
     }
 
     fn run(&mut self, prior: &Prior, data: Nanos, solution: &mut ComponentSolution) {
+        // A load that was found is in the information by now, and in nothing that is in force.
+        let is_replaced = std::mem::take(&mut self.is_replaced);
         self.change = None;
-        self.weigh_change();
-        self.failure = self.solve(prior, solution).err();
-        let has_failed = self.failure.is_some();
-        if has_failed {
+        let weighed = self.weigh_change(prior);
+        self.take_noise();
+        self.judge();
+        self.failure = weighed.and_then(|()| self.solve(prior)).err();
+        match &self.failure {
             // What it holds is older than what is in force.
-            solution.clone_from(&self.good);
-        } else {
-            self.take_noise(solution);
-            solution.data = data;
+            Some(_) => solution.clone_from(&self.good),
+            None => {
+                if is_replaced {
+                    self.contest.enthrone(self.newest.clone());
+                }
+                let newest = &self.newest;
+                self.contest.enter(|| newest.clone());
+                self.tell(solution);
+                solution.data = data;
+            }
         }
-        solution.is_accepted = !has_failed;
+        solution.is_accepted = self.failure.is_none();
         (solution.motion, solution.rows) = (self.motion, self.rows);
-        if !has_failed {
+        if solution.is_accepted {
             self.good.clone_from(solution);
         }
     }
 
-    fn solve(&mut self, prior: &Prior, solution: &mut ComponentSolution) -> Result<(), PriorError> {
+    /// The most probable bodies and offsets: where the next trial begins.
+    fn solve(&mut self, prior: &Prior) -> Result<(), PriorError> {
         let (session, parameters) = (6 * self.sensors.len(), WIDTH * self.links.len());
         let unknowns = session + parameters;
-        let (root, right) = self.information.to_triangle();
-        // [s | d] -> [d | s]
-        let from = |column: usize| {
-            if column < parameters {
-                session + column
-            } else {
-                column - parameters
-            }
-        };
-        let mut reordered = DMatrix::zeros(unknowns, unknowns);
-        for (j, mut column) in reordered.column_iter_mut().enumerate() {
-            column.copy_from(&root.column(from(j)));
-        }
-        let precision: Vec<f64> = (0..session).map(|i| OFFSET[usize::from(i % 6 > 2)].powi(-2)).collect();
-        let posterior = Posterior::new(prior, &self.links, &reordered, &right, &precision)?;
+        let posterior = self.posterior(prior, &self.information)?;
         // One round of the evidence a second: it settles while data come in. Where it has, and from one second to the next, bodies are near where they were.
-        let last: Vec<f64> = match self.good.estimate.split_at_checked(session) {
+        let last: Vec<f64> = match self.estimate.split_at_checked(session) {
             Some((offsets, bodies)) => bodies.iter().chain(offsets).copied().collect(),
             None => vec![0.0; unknowns],
         };
@@ -1247,168 +1334,300 @@ impl Part {
             fit = posterior.fit_from(fit.x.as_slice(), tau, NEAREST)?;
         }
         self.tau = tau;
-        solution.tau = fit.tau;
-        solution.effective = fit.effective;
-        solution.bodies.clone_from(&fit.bodies);
-        solution.root = fit.covariance_root().transpose();
-        for (to, rates) in solution.drift.iter_mut().zip(self.wander.chunks_exact(6)) {
-            to.copy_from_slice(rates);
-        }
         // [d | s] -> [s | d]
         let (bodies, offsets) = fit.x.as_slice().split_at(parameters);
-        solution.estimate.clear();
-        solution.estimate.extend_from_slice(offsets);
-        solution.estimate.extend_from_slice(bodies);
-        for (place, offset) in solution.offsets.iter_mut().enumerate() {
-            let six = |i: usize| self.reference[6 * place + i] + solution.estimate[6 * place + i];
-            *offset = Wrench::from_torque_first(std::array::from_fn(six));
-        }
+        self.estimate.clear();
+        self.estimate.extend_from_slice(offsets);
+        self.estimate.extend_from_slice(bodies);
+        self.spread = fit.covariance_root().transpose();
+        self.newest = Parameters {
+            change: bodies.to_vec(),
+            root: self.spread.columns(0, parameters).into_owned(),
+            tau: fit.tau,
+            effective: fit.effective,
+            bodies: fit.bodies,
+        };
         Ok(())
     }
 
-    /// The channels' noise from the rows that went in, under the new solution: whitened residuals back to channels (Gauss, Markov).
-    fn take_noise(&mut self, solution: &ComponentSolution) {
-        let slots = || {
-            self.learnt
-                .iter()
-                .flat_map(|rows| [rows.slots().first(), rows.slots().last()])
-                .flatten()
-        };
-        let (Some(&first), Some(&last)) = (slots().min(), slots().max()) else {
+    /// Judges the candidates by the second's rows.
+    fn judge(&mut self) {
+        // At rest all parameters predict as well.
+        let is_any = self.learnt.is_moving() && !self.estimate.is_empty();
+        let Some(span) = Span::of([&self.learnt].into_iter()).filter(|_| is_any) else {
             return;
         };
-        let (session, unknowns) = (self.variances.len(), solution.estimate.len());
-        let instants = usize::try_from(last - first).unwrap_or(0) + 1;
-        if instants > LONGEST {
-            return;
+        let left: Vec<Blocks> = self.contest.all().map(|own| self.blocks(&span, &own.change)).collect();
+        for (number, (t, _)) in left.first().into_iter().flatten().enumerate() {
+            self.contest.take(*t, left.iter().map(|own| own[number].1.as_slice()));
         }
-        let mut series = vec![f64::NAN; instants];
-        // What each channel's share, summed, says of the bodies: its column of rows^T x weights.
-        let mut sensitivities = DMatrix::zeros(unknowns - session, session);
-        let mut residuals = Vec::with_capacity(self.learnt.len());
-        for (kind, rows) in self.kinds.iter().zip(self.learnt.iter()) {
-            let (width, count) = (kind.columns.len() + 1, rows.slots().len());
-            let all = DMatrixView::from_slice(rows.values(), width, count);
-            let weights = DMatrix::from_fn(count, kind.offsets, |row, place| {
-                self.variances[kind.columns[place]] * all[(place, row)]
-            });
-            let own = all * weights;
-            for (place, column) in own.column_iter().enumerate() {
-                let bodies = kind.columns.iter().zip(column.iter()).skip(kind.offsets);
-                bodies.for_each(|(at, value)| sensitivities[(at - session, kind.columns[place])] += value);
+        self.contest.decide(Parameters::between);
+    }
+
+    /// What each channel has left of the second's rows for these parameters, in the mean of each block: when that was, and per channel.
+    fn blocks(&self, span: &Span, change: &[f64]) -> Blocks {
+        let session = self.variances.len();
+        let unknowns: Vec<f64> = self.estimate.iter().take(session).chain(change).copied().collect();
+        let (series, _) = self.series(&[&self.learnt], span, &unknowns);
+        let per_block = (contest::BLOCK / self.period).round().max(1.0) as usize;
+        let mean = |channel: usize, from: usize| {
+            let own = series[channel * span.count..][..span.count].iter();
+            let (sum, count) = (own.skip(from).take(per_block).filter(|x| x.is_finite()))
+                .fold((0.0, 0.0), |(sum, count), x| (sum + x, count + 1.0));
+            sum / count
+        };
+        let starts = (0..span.count).step_by(per_block);
+        let blocks = starts.map(|from| {
+            let means: Vec<f64> = (0..session).map(|channel| mean(channel, from)).collect();
+            ((span.first as f64 + from as f64) * self.period, means)
+        });
+        blocks
+            .filter(|(_, means)| means.iter().any(|x| x.is_finite()))
+            .collect()
+    }
+
+    /// What is in force: the parameters, the offsets that go best with these, and what both are uncertain by.
+    fn tell(&self, solution: &mut ComponentSolution) {
+        let Parameters {
+            change,
+            root,
+            bodies,
+            tau,
+            effective,
+        } = self.contest.in_force();
+        let (session, parameters) = (self.variances.len(), change.len());
+        let (r, z) = self.information.to_triangle();
+        // R_ss s = z - R_sd d, beside what was known of offsets before any data.
+        let mut of_offsets = DMatrix::zeros(2 * session, session + parameters + 1);
+        for i in 0..session {
+            for j in i..session + parameters {
+                of_offsets[(i, j)] = r[(i, j)];
             }
-            let rows = rows.iter();
-            residuals.extend(rows.map(|(row, right, _)| kind.left(row, right, &solution.estimate)));
+            of_offsets[(i, session + parameters)] = z[i];
+            of_offsets[(session + i, i)] = 1.0 / OFFSET[usize::from(i % 6 > 2)];
         }
-        // Per channel, the standard deviation that this has by the bodies: |U s|.
-        let of_bodies = solution.root.columns(0, unknowns - session) * sensitivities;
-        // An offset that has jumped has not wandered there.
-        if self.change.is_some() {
-            self.walks.iter_mut().for_each(Walk::interrupt);
+        let qr = of_offsets.columns(0, session).into_owned().qr();
+        qr.q_tr_mul(&mut of_offsets);
+        let triangle = qr.r();
+        let mut solved = of_offsets.view((0, session), (session, parameters + 1)).into_owned();
+        let _ = triangle.solve_upper_triangular_mut(&mut solved);
+        let slope = solved.columns(0, parameters);
+        let offsets = solved.column(parameters) - slope * DVector::from_column_slice(change);
+        solution.estimate.clone_from(&self.estimate);
+        solution.spread.clone_from(&self.spread);
+        // [d | s]: what is uncertain of d is, by the slope, of s.
+        let own = root.nrows();
+        let mut joint = DMatrix::zeros(own + session, parameters + session);
+        joint.view_mut((0, 0), (own, parameters)).copy_from(root);
+        joint
+            .view_mut((0, parameters), (own, session))
+            .copy_from(&(root * slope.transpose() * -1.0));
+        let inverse = triangle
+            .try_inverse()
+            .unwrap_or_else(|| DMatrix::from_element(session, session, f64::INFINITY));
+        joint
+            .view_mut((own, parameters), (session, session))
+            .copy_from(&inverse.transpose());
+        solution.root = joint;
+        (solution.tau, solution.effective) = (*tau, *effective);
+        solution.bodies.clone_from(bodies);
+        for (to, rates) in solution.drift.iter_mut().zip(self.wander.chunks_exact(6)) {
+            to.copy_from_slice(rates);
         }
-        for channel in 0..session {
-            series.fill(f64::NAN);
-            let mut residuals = residuals.as_slice();
-            for (kind, rows) in self.kinds.iter().zip(self.learnt.iter()) {
-                let (own, rest) = residuals.split_at(rows.slots().len());
-                residuals = rest;
-                let Ok(at) = kind.columns[..kind.offsets].binary_search(&channel) else {
-                    continue;
-                };
-                for ((row, _, slot), residual) in rows.iter().zip(own) {
-                    if row[at] == 0.0 {
-                        continue;
-                    }
-                    let Some(place) = usize::try_from(slot - first).ok().and_then(|i| series.get_mut(i)) else {
-                        continue;
-                    };
-                    let share = self.variances[channel] * row[at] * residual;
-                    *place = if place.is_nan() { share } else { *place + share };
-                }
-            }
-            // What the channel reads in the mean, less what the bodies explain; and how uncertain that is, by noise and by the bodies.
-            let seen: Vec<f64> = series.iter().copied().filter(|x| x.is_finite()).collect();
-            if !seen.is_empty() {
-                let count = seen.len() as f64;
-                let apparent = solution.estimate[channel] + seen.iter().sum::<f64>() / count;
-                let of_bodies = of_bodies.column(channel).norm_squared() / (count * count);
-                let t = (first + last) as f64 / 2.0 * self.period;
-                self.walks[channel].take(t, apparent, self.variances[channel] / count + of_bodies);
-                self.wander[channel] = self.walks[channel].rate();
-            }
-            self.noise[channel].take(&series);
+        for (to, six) in solution.noise.iter_mut().zip(self.channels.chunks_exact(6)) {
+            *to = std::array::from_fn(|i| six[i].reading());
         }
-        for ((variance, noise), least) in self.variances.iter_mut().zip(&self.noise).zip(&self.least) {
-            let (found, count) = noise.inflated();
-            let guess = INFLATION * least;
-            *variance = ((INFLATION_WORTH * guess + count * found) / (INFLATION_WORTH + count)).max(*least);
+        for (place, offset) in solution.offsets.iter_mut().enumerate() {
+            let six = |i: usize| self.reference[6 * place + i] + offsets[6 * place + i];
+            *offset = Wrench::from_torque_first(std::array::from_fn(six));
         }
     }
 
-    /// Asks the rows that were put aside what they are.
-    fn weigh_change(&mut self) {
-        if !self.is_suspected {
-            self.hypotheses.clear();
-            (self.aside_rows, self.asked, self.lasting) = (0.0, 0.0, 0.0);
+    /// The channels' noise, from the second's rows and what was known before: whitened residuals back to channels (Gauss, Markov).
+    fn take_noise(&mut self) {
+        let (session, unknowns) = (self.variances.len(), self.information.unknowns());
+        if self.estimate.len() != unknowns || self.newest.root.ncols() + session != unknowns {
             return;
+        }
+        let rows = [&self.learnt, &self.aside];
+        let Some(span) = Span::of(rows.into_iter()) else {
+            return;
+        };
+        let instants = span.count;
+        let (series, shown) = self.series(&rows, &span, &self.estimate);
+        let mut sensitivities = self.sensitivities(&rows);
+        let counts: Vec<f64> = (series.chunks_exact(instants))
+            .map(|own| own.iter().filter(|x| x.is_finite()).count() as f64)
+            .collect();
+        // Where rows mix channels, the most likely noise of each varies less than its noise, by a share that is known.
+        let shares: Vec<f64> = (shown.iter().zip(&counts))
+            .map(|(shown, count)| (shown / count).clamp(LEAST_SHARE, 1.0))
+            .collect();
+        for ((mut column, count), share) in sensitivities.column_iter_mut().zip(&counts).zip(&shares) {
+            column /= count.max(1.0) * share.sqrt();
+        }
+        // What is wrong of the bodies is, as long as the robot is as it was in the second before, a part of the offset. What a change of posture makes of it: |U (s - s')|.
+        let bodies = &self.estimate[session..];
+        let before = match self.before.take() {
+            Some((before, others)) => {
+                let change = DVector::from_fn(bodies.len(), |i, _| bodies[i] - others[i]);
+                let shifts = before.tr_mul(&change);
+                self.channels
+                    .iter_mut()
+                    .zip(&shifts)
+                    .for_each(|(own, shift)| own.shift(-shift));
+                before
+            }
+            None => sensitivities.clone(),
+        };
+        let of_bodies = &self.newest.root * (&sensitivities - before);
+        self.before = Some((sensitivities, bodies.to_vec()));
+        for (channel, own) in self.channels.iter_mut().enumerate() {
+            // An offset that has jumped has not wandered there.
+            if self.change.is_some() {
+                own.interrupt();
+            }
+            let seen = || {
+                series[channel * instants..][..instants]
+                    .iter()
+                    .filter(|x| x.is_finite())
+            };
+            let (count, share) = (counts[channel], shares[channel]);
+            if count > 0.0 {
+                let mean = seen().sum::<f64>() / count;
+                own.take(&Second {
+                    t: (span.first as f64 + 0.5 * span.count as f64) * self.period,
+                    mean: self.estimate[channel] + mean / share.sqrt(),
+                    count,
+                    of_bodies: of_bodies.column(channel).norm_squared(),
+                    scatter: seen().map(|x| (x - mean) * (x - mean)).sum::<f64>() / (count * share),
+                    is_moving: self.is_moving,
+                });
+            }
+            (self.variances[channel], self.wander[channel]) = own.noise();
+        }
+    }
+
+    /// Whitened residuals back to channels (Gauss, Markov): per channel and instant its share of what these unknowns leave, NaN where no row has it. And per channel, of one unit of
+    /// its own noise, how much of that shows, summed over instants.
+    fn series(&self, rows: &[&Rows], span: &Span, unknowns: &[f64]) -> (Vec<f64>, Vec<f64>) {
+        let session = self.variances.len();
+        let (mut series, mut shown) = (vec![f64::NAN; session * span.count], vec![0.0; session]);
+        for rows in rows {
+            for (kind, rows) in self.kinds.iter().zip(rows.iter()) {
+                for (row, right, slot) in rows.iter() {
+                    let residual = kind.left(row, right, unknowns);
+                    let Some(instant) = span.place(slot) else { continue };
+                    for (value, &channel) in row.iter().zip(&kind.columns[..kind.offsets]) {
+                        if *value != 0.0 {
+                            let weight = self.whitened[channel] * value;
+                            let sum = &mut series[channel * span.count + instant];
+                            *sum = if sum.is_nan() { 0.0 } else { *sum } + weight * residual;
+                            shown[channel] += weight * value;
+                        }
+                    }
+                }
+            }
+        }
+        (series, shown)
+    }
+
+    /// How each channel's share, summed over instants, hangs on the bodies: its column of rows^T x weights.
+    fn sensitivities(&self, rows: &[&Rows]) -> DMatrix<f64> {
+        let (session, unknowns) = (self.variances.len(), self.information.unknowns());
+        let mut sensitivities = DMatrix::zeros(unknowns - session, session);
+        for rows in rows {
+            for (kind, rows) in self.kinds.iter().zip(rows.iter()) {
+                let (width, count) = (kind.columns.len() + 1, rows.slots().len());
+                let all = DMatrixView::from_slice(rows.values(), width, count);
+                let weights = DMatrix::from_fn(count, kind.offsets, |row, place| {
+                    self.whitened[kind.columns[place]] * all[(place, row)]
+                });
+                let own = all * &weights;
+                for (place, column) in own.column_iter().enumerate() {
+                    let bodies = kind.columns.iter().zip(column.iter()).skip(kind.offsets);
+                    bodies.for_each(|(at, value)| sensitivities[(at - session, kind.columns[place])] += value);
+                }
+            }
+        }
+        sensitivities
+    }
+
+    /// Asks the rows that were put aside what they are: offsets of sensors that have tilted, or another load, start afresh, if that explains them.
+    ///
+    /// A push explains whatever is read, so nothing else can be preferred to it but what is as good in many postures. And it harms least: nothing is learnt from it.
+    fn weigh_change(&mut self, prior: &Prior) -> Result<(), PriorError> {
+        if !self.is_suspected {
+            self.put_aside.clear();
+            self.asked = 0.0;
+            return Ok(());
         }
         // Under a declared contact, or without a sensor, nothing is put aside: that time says nothing.
         if self.aside.is_empty() {
-            return;
+            return Ok(());
         }
-        self.lasting += SOLVE.seconds();
         let unknowns = self.information.unknowns();
-        if self.hypotheses.is_empty() {
-            let offsets: Vec<usize> = (0..6 * self.sensors.len()).collect();
-            let all: Vec<usize> = (0..unknowns).collect();
-            for (change, columns) in [
-                (Change::Offset, &offsets),
-                (Change::Load, &self.outermost),
-                (Change::Unknown, &all),
-            ] {
-                let mut fresh = self.information.clone();
-                if !columns.is_empty() && fresh.marginalise(columns).is_ok() {
-                    let before = fresh.residual_square();
-                    self.hypotheses.push((change, fresh, before));
-                }
+        let (mut panel, mut dense) = (Panel::new(unknowns, self.aside.len()), vec![0.0; unknowns]);
+        for (kind, rows) in self.kinds.iter().zip(self.aside.iter()) {
+            for (row, right, _) in rows.iter() {
+                spread(kind, row, &mut dense);
+                let _ = panel.push_row(&dense, right);
             }
         }
-        let (mut panel, mut dense) = (Panel::new(unknowns, self.aside.len().max(1)), vec![0.0; unknowns]);
-        for (_, information, _) in &mut self.hypotheses {
-            for (kind, rows) in self.kinds.iter().zip(self.aside.iter()) {
-                for (row, right, _) in rows.iter() {
-                    spread(kind, row, &mut dense);
-                    let _ = panel.push_row(&dense, right);
-                }
-            }
-            let _ = information.absorb(&mut panel);
-        }
-        self.aside_rows += self.aside.len() as f64;
+        let _ = self.put_aside.absorb(&mut panel);
         self.asked += SOLVE.seconds();
-        if self.asked < PERSISTENT || self.cosine > TILTED {
-            return;
+        let tilted: Vec<usize> = (self.cosines.iter().enumerate())
+            .filter(|(_, cosine)| **cosine < TILTED)
+            .flat_map(|(place, _)| 6 * place..6 * place + 6)
+            .collect();
+        if self.asked < PERSISTENT || tilted.is_empty() {
+            return Ok(());
         }
-        let left = |(_, information, before): &(Change, Information, f64)| {
-            (information.residual_square() - before) / self.aside_rows
-        };
-        // The last explains anything: it is taken where the others have failed for long.
-        let explaining = |&at: &usize| match self.hypotheses[at].0 {
-            Change::Unknown => self.lasting >= HOPELESS,
-            _ => left(&self.hypotheses[at]) < EXPLAINED,
-        };
-        let best = (0..self.hypotheses.len()).filter(explaining).min_by(|&a, &b| {
-            let hopeless = |at: usize| self.hypotheses[at].0 == Change::Unknown;
-            let by_residual = left(&self.hypotheses[a]).total_cmp(&left(&self.hypotheses[b]));
-            hopeless(a).cmp(&hopeless(b)).then(by_residual)
-        });
-        if let Some(best) = best {
-            let (change, information, _) = self.hypotheses.swap_remove(best);
+        let all: Vec<usize> = (0..unknowns).collect();
+        let (mut best, mut least) = (None, EXPLAINED * self.put_aside.rows() as f64);
+        for (change, columns) in [(Change::Offset, &tilted), (Change::Load, &self.outermost)] {
+            let mut fresh = self.information.clone();
+            if columns.is_empty() || fresh.marginalise(columns).is_err() {
+                continue;
+            }
+            let before = self.misfit(prior, &fresh)?;
+            let _ = fresh.merge(&self.put_aside, &all);
+            let left = self.misfit(prior, &fresh)? - before;
+            if left < least {
+                (best, least) = (Some((change, fresh)), left);
+            }
+        }
+        if let Some((change, information)) = best {
+            // What is in force knows nothing of the load; of offsets it says nothing.
+            self.is_replaced = change == Change::Load;
             self.change = Some((change, information));
         }
         // A load that is being taken up is explained by nothing, but once it is, it is: what is not explained is asked anew with new rows.
-        self.hypotheses.clear();
-        (self.aside_rows, self.asked) = (0.0, 0.0);
+        self.put_aside.clear();
+        self.asked = 0.0;
+        Ok(())
     }
+
+    /// What the most probable bodies leave of these data, squared, and twice what they cost by the prior.
+    fn misfit(&self, prior: &Prior, information: &Information) -> Result<f64, PriorError> {
+        let fit = self.posterior(prior, information)?.fit(self.tau)?;
+        Ok(fit.residual_square + information.residual_square() + fit.divergence / (fit.tau * fit.tau))
+    }
+
+    /// Data beside the prior, over `[d | s]`.
+    fn posterior(&self, prior: &Prior, information: &Information) -> Result<Posterior, PriorError> {
+        let (session, parameters) = (6 * self.sensors.len(), WIDTH * self.links.len());
+        let (root, right) = information.to_triangle();
+        // [s | d] -> [d | s]
+        let order: Vec<usize> = (session..session + parameters).chain(0..session).collect();
+        let precision: Vec<f64> = (0..session).map(|i| OFFSET[usize::from(i % 6 > 2)].powi(-2)).collect();
+        Posterior::new(prior, &self.links, &root.select_columns(&order), &right, &precision)
+    }
+}
+
+/// Of channels with these stated deviations.
+fn channels(stated: &[f64], period: f64) -> Vec<Channel> {
+    stated.iter().map(|sigma| Channel::new(sigma * sigma, period)).collect()
 }
 
 /// A snapshot of what was taken in, to be solved wherever there is time. Pure: what it finds depends on what it was given alone.
@@ -1509,7 +1728,7 @@ mod tests {
         let offsets = vec![Wrench::zero(); structure.sensors().len()];
         let none = ContactSet::default();
         let period = Nanos::from_millis(10);
-        Online::new(model, structure, model.inertias(), &offsets, &none, 0, period).unwrap()
+        Online::new(model, structure, model.inertias(), &offsets, &none, 0, period, 0.2).unwrap()
     }
 
     /// What can not be solved is told, with what was known before in force; and that it is over.

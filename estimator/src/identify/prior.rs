@@ -38,8 +38,9 @@
 //! `tau^2 = D / gamma = d^T M d / (2 gamma)`, `M = hess D`; the mean of the Wishart distribution takes away what that form overstates: on bodies drawn from the prior with
 //! tau = 0.5 and 0.8 it finds 0.55 and 0.96, this rule 0.50 and 0.81 (medians; `tau 0.1`: 0.094 both).
 //!
-//! Two things are said of `tau` before any data: it is at most 1, for CAD is worth at least one sample per parameter; and `ln tau ~ N(0, 1)`, worth half a parameter. So
-//! data that say nothing leave tau at 1, the weakest claim, where D / gamma would be nothing by nothing.
+//! Two things are said of `tau` before any data: it is at most 1, for CAD is worth at least one sample per parameter; and `ln tau ~ N(ln tau_0, 1)`, worth half a parameter, where `tau_0` is
+//! how far CADs are from robots ([`Prior::expecting`]). So data that say nothing leave tau there, where D / gamma would be nothing by nothing. Of a CAD of which nothing is said `tau_0` is 1,
+//! the weakest claim.
 //!
 //! # Speed
 //! One round grades, `O(n^3)` once, and takes some five Newton steps of a matrix product and a Cholesky factorization each; from where the last solution was, one or two. All factors are
@@ -66,6 +67,15 @@ pub const LEAST_RADIUS: f64 = 0.02;
 
 /// The greatest weight `tau`, and the one that nothing known gives.
 pub const GREATEST_TAU: f64 = 1.0;
+
+/// Nothing is said of CAD: data that say nothing leave `tau` at its greatest.
+const NOTHING: Expected = Expected {
+    median: GREATEST_TAU,
+    spread: 1.0,
+};
+
+/// How many times farther from the robot, or nearer to it, a CAD may well be than it is said to be.
+const FACTOR: f64 = std::f64::consts::E;
 
 /// Below it `tau` is not followed: CAD right to a hundredth of a per cent.
 const LEAST_TAU: f64 = 1e-4;
@@ -163,6 +173,14 @@ struct Centre {
 pub struct Prior {
     centres: Vec<Centre>,
     floors: Vec<Floor>,
+    expected: Expected,
+}
+
+/// What is known of `tau` before any data: `ln tau ~ N(ln median, spread^2)`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Expected {
+    median: f64,
+    spread: f64,
 }
 
 impl Prior {
@@ -200,7 +218,26 @@ impl Prior {
                 parameters,
             });
         }
-        Ok(Self { centres, floors })
+        Ok(Self {
+            centres,
+            floors,
+            expected: NOTHING,
+        })
+    }
+
+    /// With what is known of CAD before any data: its masses and second moments are off by the share `relative`, to a factor of `e`.
+    /// That is `tau = relative / sqrt 2` ([`crate::parameters::cad_root`]). Zero: CAD is exact.
+    #[must_use]
+    pub fn expecting(self, relative: f64) -> Self {
+        let median = (relative * std::f64::consts::FRAC_1_SQRT_2).clamp(LEAST_TAU, GREATEST_TAU);
+        let spread = FACTOR.ln();
+        let expected = Expected { median, spread };
+        Self { expected, ..self }
+    }
+
+    /// `tau` before any data.
+    pub fn expected_tau(&self) -> f64 {
+        self.expected.median
     }
 
     /// How many links.
@@ -368,8 +405,10 @@ fn check_finite(what: &'static str, values: &[f64]) -> Result<(), PriorError> {
 }
 
 /// The `tau` at which the evidence is stationary: `(gamma / 10) e(tau) + tau^2 ln tau = D`, the middle term from `ln tau ~ N(0, 1)`.
-fn stationary_tau(divergence: f64, effective: f64) -> f64 {
-    let slope = |tau: f64| effective / 10.0 * mean_divergence(tau) / (tau * tau) + tau.ln() - divergence / (tau * tau);
+fn stationary_tau(divergence: f64, effective: f64, expected: Expected) -> f64 {
+    let of_prior = |tau: f64| (tau / expected.median).ln() / (expected.spread * expected.spread);
+    let slope =
+        |tau: f64| effective / 10.0 * mean_divergence(tau) / (tau * tau) + of_prior(tau) - divergence / (tau * tau);
     let (mut low, mut high) = (LEAST_TAU.ln(), GREATEST_TAU.ln());
     if slope(GREATEST_TAU) <= 0.0 {
         return GREATEST_TAU;
@@ -440,11 +479,11 @@ mod tests {
         }
         for tau in [0.01, 0.1, 0.4, 0.9] {
             // Enough of it that ln tau ~ N(0, 1) does not matter.
-            let found = stationary_tau(1e5 * mean_divergence(tau), 1e6);
+            let found = stationary_tau(1e5 * mean_divergence(tau), 1e6, NOTHING);
             assert!((found / tau - 1.0).abs() < 1e-4, "{tau}: {found}");
         }
-        assert_eq!(stationary_tau(0.0, 0.0).to_bits(), GREATEST_TAU.to_bits());
-        assert_eq!(stationary_tau(1e9, 10.0).to_bits(), GREATEST_TAU.to_bits());
-        assert_eq!(stationary_tau(0.0, 1e3).to_bits(), LEAST_TAU.to_bits());
+        assert_eq!(stationary_tau(0.0, 0.0, NOTHING).to_bits(), GREATEST_TAU.to_bits());
+        assert_eq!(stationary_tau(1e9, 10.0, NOTHING).to_bits(), GREATEST_TAU.to_bits());
+        assert_eq!(stationary_tau(0.0, 1e3, NOTHING).to_bits(), LEAST_TAU.to_bits());
     }
 }

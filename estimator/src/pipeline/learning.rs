@@ -9,7 +9,7 @@
 use proprio_topics::{InertiaEstimate, LinkInertia, Name, Nanos, Quality, Reason, SensorOffset};
 
 use super::{OrReason, Track, UNTRUSTED_ENCODER, quality_reason, temperature_at};
-use crate::dynamics::{ContactSet, DofSet, FrameMotion, JointState, Kinematics};
+use crate::dynamics::{ContactSet, DofSet, FrameMotion, JointState, Kinematics, SensorCut};
 use crate::history::{History, KEPT};
 use crate::identify::online::state::{Measuring, StateError};
 use crate::identify::online::{Job as Solving, Observation, Online, OnlineError, Solution};
@@ -31,10 +31,10 @@ pub(super) struct Learning {
     /// What is held, and what is found at the present instant.
     held: Motion,
     found: Motion,
-    /// Variance of the samples of each joint, then of nine numbers of the IMU; NaN where it has not shown.
-    noise: Vec<f64>,
+    /// What has shown of each joint's samples, then of nine numbers of the IMU.
+    shown: Vec<Shown>,
     /// Likewise of each joint's position and velocity, where they are used as they are measured.
-    raw_noise: Vec<f64>,
+    raw: Vec<Shown>,
     readings: Vec<Wrench>,
     joints: Vec<Reason>,
     /// Joints that move at the present instant.
@@ -169,6 +169,7 @@ impl Learning {
             &setup.always,
             setup.base_link,
             period,
+            setup.model_deviation(),
         )?;
         if let Some(parameters) = setup.identified() {
             let links: Vec<(usize, RigidInertia)> = parameters
@@ -193,8 +194,8 @@ impl Learning {
             period,
             cell: i64::MIN,
             found: held.clone(),
-            noise: vec![f64::NAN; dofs + 9],
-            raw_noise: vec![f64::NAN; 2 * dofs],
+            shown: vec![Shown::default(); dofs + 9],
+            raw: vec![Shown::default(); 2 * dofs],
             held,
             readings: vec![Wrench::zero(); setup.structure.sensors().len()],
             joints: vec![Reason::None; dofs],
@@ -242,7 +243,7 @@ impl Learning {
         self.found.copy_from(&self.held);
         for (track, channel) in tracks.iter().zip(setup.channels()) {
             match (track, channel.role) {
-                (Track::Joint(history, _), Use::Joint(dof)) => {
+                (Track::Joint(history, window), Use::Joint(dof)) => {
                     let places = (
                         self.found.position.get_mut(dof),
                         self.found.velocity.get_mut(dof),
@@ -258,11 +259,13 @@ impl Learning {
                         .gather(history, from, to, setup.max_silence, UNTRUSTED_ENCODER);
                     *fault = gathered.err().unwrap_or(Reason::None);
                     let highest = (0..3).rev().find(|&order| self.scratch.is_complete(order)).unwrap_or(0);
-                    let Some(noise) = self.noise.get_mut(dof) else { continue };
-                    let fit = self.scratch.fit(highest, t, noise);
-                    let mut raw = self.raw_noise.iter_mut().skip(2 * dof);
+                    let Some(shown) = self.shown.get_mut(dof) else { continue };
+                    // Of positions the noise in motion is known, too.
+                    let [sigma] = if highest == 0 { window.noise(to) } else { [f64::NAN] };
+                    let fit = self.scratch.fit(highest, t, shown, (sigma, 2));
+                    let mut raw = self.raw.iter_mut().skip(2 * dof);
                     let mut exact = |order: usize| {
-                        let deviation = raw.next().map_or(0.0, |noise| self.scratch.deviation(order, t, noise));
+                        let deviation = raw.next().map_or(0.0, |shown| self.scratch.deviation(order, t, shown));
                         (self.scratch.value(order, t), deviation)
                     };
                     let values = match highest {
@@ -293,26 +296,27 @@ impl Learning {
                     *reading = calibration.map_or(mean, |calibration| calibration.apply(&mean, celsius));
                     *fault = reason;
                 }
-                (Track::Imu(history, _), Use::Base) => {
+                (Track::Imu(history, window), Use::Base) => {
                     let gathered = self
                         .scratch
                         .gather(history, from, to, setup.max_silence, Quality::DEVICE_FAULT);
                     base_fault = gathered.err().unwrap_or(Reason::None);
                     let measured = &mut self.found.imu;
-                    let first = self.noise.len().saturating_sub(9);
-                    for axis in 0..3 {
+                    let first = self.shown.len().saturating_sub(9);
+                    let sigma = window.noise(to);
+                    for (axis, sigma) in sigma.into_iter().enumerate() {
                         // Places of their own: angular acceleration may come and go.
-                        let mut none = [f64::NAN; 3];
-                        let own = self.noise.get_mut(first + 3 * axis..first + 3 * axis + 3);
-                        let [of_rate, of_angular, of_linear]: &mut [f64; 3] =
+                        let mut none = [Shown::default(); 3];
+                        let own = self.shown.get_mut(first + 3 * axis..first + 3 * axis + 3);
+                        let [of_rate, of_angular, of_linear]: &mut [Shown; 3] =
                             own.and_then(|own| own.try_into().ok()).unwrap_or(&mut none);
-                        let gyro = self.scratch.fit(3 + axis, t, of_rate);
+                        let gyro = self.scratch.fit(3 + axis, t, of_rate, (sigma, 1));
                         let alpha = if self.scratch.is_complete(6 + axis) {
-                            self.scratch.fit(6 + axis, t, of_angular)[0]
+                            self.scratch.fit(6 + axis, t, of_angular, (f64::NAN, 0))[0]
                         } else {
                             gyro[1]
                         };
-                        let acceleration = self.scratch.fit(axis, t, of_linear)[0];
+                        let acceleration = self.scratch.fit(axis, t, of_linear, (f64::NAN, 0))[0];
                         let errors = self.found.errors.iter_mut().rev().skip(3 * axis);
                         for ((place, (value, error)), old) in [
                             (&mut measured.proper_acceleration[axis], acceleration),
@@ -396,6 +400,20 @@ impl Learning {
         }
         self.enforce(setup, propagation);
         Ok(())
+    }
+
+    /// By what variance readings of a sensor are noisier than stated, [torque; force].
+    pub(super) fn excess(&self, setup: &Setup, sensor: usize) -> [f64; 6] {
+        let stated = setup.structure.sensors().get(sensor).map(SensorCut::noise);
+        let found = self.online.solution().components.iter().find_map(|component| {
+            let place = component.sensors.iter().position(|own| *own == sensor)?;
+            component.noise.get(place)
+        });
+        let (Some(stated), Some(found)) = (stated, found) else {
+            return [0.0; 6];
+        };
+        let stated = Wrench::from_parts(stated.force, stated.torque).torque_first();
+        std::array::from_fn(|i| (found[i] - stated[i] * stated[i]).max(0.0))
     }
 
     /// Puts the last solution where the pipeline reads it.
@@ -498,15 +516,17 @@ fn mean_reading(history: &History<6>, t: Nanos, period: Nanos, max_silence: Nano
 const POINTS: usize = 80;
 
 /// Windows: how far samples reach to both sides of the instant, as a share of [`DELAY`], and the polynomial's degree.
-const LONG: (f64, usize) = (1.0, 2);
-const MIDDLE: (f64, usize) = (0.6, 4);
-const SHORT: (f64, usize) = (0.32, 4);
+const REST: (f64, usize) = (1.0, 2);
+const WINDOWS: [(f64, usize); 3] = [(0.32, 4), (0.6, 4), (1.0, 4)];
 
 /// Least-squares polynomials about an instant, on the samples' own stamps, by polynomials orthogonal over these (Forsythe 1957): value and two derivatives.
 ///
-/// Where a parabola over the whole window leaves no more than a quartic over its middle does, nothing much moves, and the parabola's derivatives are hardly noisy. Else
-/// the quartic over the shortest window follows: its error, for a sine of angular frequency `w` over `+-h`, goes with the fourth power of `w h`, and what it
-/// has of noise changes within a few instants. A bias would stay as long as the motion is alike, and weigh as much as many instants do.
+/// Where a parabola over the whole window leaves no more than a quartic over its middle does, nothing much moves, and the parabola's derivatives are hardly noisy.
+///
+/// Else a quartic follows. Over a window of `+-h` its error, for a sine of angular frequency `w`, goes with the fourth power of `w h`. That is a bias `b`, proportional to the
+/// derivative `s` itself, and makes the parameters that rest on it wrong by `b / s`. Noise of variance `n` in the derivative makes them wrong, too, for it is motion that no force
+/// answers (errors in variables): by `n / s^2`. So the wider window is taken where `b s` and its own noise together are less than the noise of the narrower one. `b` is what
+/// is between the two beyond their noise, in the root mean square of the last second ([`Shown`]). Where the samples' noise is not known, the narrowest window is taken.
 pub(super) struct Centred {
     count: usize,
     width: usize,
@@ -539,8 +559,70 @@ impl Default for Centred {
 const FEWEST: usize = 5;
 /// Fewest samples more than a polynomial has coefficients, for what it leaves to tell of their noise.
 const SPARE: usize = 10;
-/// What one quiet instant adds to what is known of a number's noise.
+/// What one quiet instant adds to what is known of a number's noise, and any instant to what is known of windows.
 const LEARNT: f64 = 0.05;
+const SEEN: f64 = 0.01;
+
+/// What has shown of a number so far.
+#[derive(Clone, Copy, Debug)]
+struct Shown {
+    /// Variance of its samples where nothing moved; NaN where it has not shown.
+    rest: f64,
+    /// Of the last second: mean square of the derivative; of what is between windows, less the noise that this has.
+    square: f64,
+    apart: [f64; WINDOWS.len() - 1],
+}
+
+impl Default for Shown {
+    fn default() -> Self {
+        Self {
+            rest: f64::NAN,
+            square: f64::NAN,
+            apart: [f64::NAN; WINDOWS.len() - 1],
+        }
+    }
+}
+
+impl Shown {
+    /// Of quartics of growing windows the one that makes parameters least wrong by the derivative of this order, the samples' deviation being `sigma`.
+    fn choose(&mut self, fits: [Option<Fitted>; WINDOWS.len()], (sigma, order): (f64, usize)) -> Option<Fitted> {
+        let learn = |mean: &mut f64, value: f64| {
+            *mean = if mean.is_nan() {
+                value
+            } else {
+                *mean + SEEN * (value - *mean)
+            }
+        };
+        let mut chosen: Option<Fitted> = None;
+        let mut noise = f64::NAN;
+        for (number, fit) in fits.into_iter().enumerate() {
+            let Some(fit) = fit else { continue };
+            let (Some(value), Some(error)) = (fit.at.get(order), fit.errors.get(order)) else {
+                continue;
+            };
+            let own = (sigma * error).powi(2);
+            let Some(narrower) = chosen else {
+                learn(&mut self.square, value * value);
+                (chosen, noise) = (Some(fit), own);
+                continue;
+            };
+            let Some(apart) = number.checked_sub(1).and_then(|place| self.apart.get_mut(place)) else {
+                continue;
+            };
+            // What the wider one has of noise the narrower has, too.
+            learn(
+                apart,
+                (value - narrower.at.get(order).unwrap_or(value)).powi(2) - (noise - own).max(0.0),
+            );
+            let is_better = apart.max(0.0).sqrt() * self.square.sqrt() + own < noise;
+            if !is_better {
+                break;
+            }
+            (chosen, noise) = (Some(fit), own);
+        }
+        chosen
+    }
+}
 
 impl Centred {
     /// Takes the samples of a channel between two instants.
@@ -612,57 +694,57 @@ impl Centred {
 
     /// A number at `t`: value, first and second derivative, each with its standard error.
     ///
-    /// `noise` is the variance of the number's samples, as far as it has shown where nothing moved: what a motion leaves of a polynomial is no noise. NaN: not
-    /// known yet, and taken as zero.
-    fn fit(&mut self, number: usize, t: Nanos, noise: &mut f64) -> [(f64, f64); 3] {
+    /// `shown` is what has shown of the number, and `by` what a window is chosen by: the deviation of its samples, NaN if it is not known, and the derivative that
+    /// matters. The standard errors are by the noise that has shown where nothing moved: what a motion leaves of a polynomial is no noise. Before it has: zero.
+    fn fit(&mut self, number: usize, t: Nanos, shown: &mut Shown, by: (f64, usize)) -> [(f64, f64); 3] {
         const NONE: (f64, f64) = (f64::NAN, 0.0);
         if self.count < FEWEST || number >= self.values.len() {
             return [NONE; 3];
         }
-        self.condense(number, t);
-        let long = self.polynomial(LONG.0, LONG.1);
+        let sigma = by.0 / (self.condense(number, t) as f64).sqrt();
+        let rest = self.polynomial(REST.0, REST.1);
+        let [short, middle, wide] = WINDOWS.map(|(reach, degree)| self.polynomial(reach, degree));
         // What leaves few samples over seems exact by chance.
-        let middle = self
-            .polynomial(MIDDLE.0, MIDDLE.1)
-            .filter(|fit| fit.points > MIDDLE.1 + SPARE);
-        let short = self.polynomial(SHORT.0, SHORT.1).filter(|fit| fit.points > SHORT.1 + 3);
-        let is_quiet = match (&long, &middle) {
+        let middle = middle.filter(|fit| fit.points > WINDOWS[1].1 + SPARE);
+        let short = short.filter(|fit| fit.points > WINDOWS[0].1 + 3);
+        let is_quiet = match (&rest, &middle) {
             // Two standard deviations of the middle's variance.
-            (Some(long), Some(middle)) => {
-                long.variance <= middle.variance * (1.0 + 2.0 * (2.0 / middle.freedom).sqrt())
+            (Some(rest), Some(middle)) => {
+                rest.variance <= middle.variance * (1.0 + 2.0 * (2.0 / middle.freedom).sqrt())
             }
             _ => false,
         };
-        let chosen = if is_quiet { long } else { short.or(middle).or(long) };
-        if let (true, Some(long)) = (is_quiet, &long) {
-            let learnt = if noise.is_nan() { 1.0 } else { LEARNT };
-            *noise = if noise.is_nan() { 0.0 } else { *noise };
-            *noise += learnt * (long.variance - *noise);
+        let moving = shown.choose([short, middle, wide.filter(|_| short.is_some())], (sigma, by.1));
+        let chosen = if is_quiet { rest } else { moving.or(rest) };
+        if let (true, Some(rest)) = (is_quiet, &rest) {
+            let learnt = if shown.rest.is_nan() { 1.0 } else { LEARNT };
+            shown.rest = if shown.rest.is_nan() { 0.0 } else { shown.rest };
+            shown.rest += learnt * (rest.variance - shown.rest);
         }
-        let deviation = if noise.is_nan() { 0.0 } else { noise.sqrt() };
+        let deviation = if shown.rest.is_nan() { 0.0 } else { shown.rest.sqrt() };
         chosen.map_or([NONE; 3], |fit| {
             std::array::from_fn(|i| (fit.at[i], fit.errors[i] * deviation))
         })
     }
 
-    /// Standard deviation of a number's samples about `t`, as far as it has shown where nothing moved; `noise` as for [`Centred::fit`].
-    fn deviation(&mut self, number: usize, t: Nanos, noise: &mut f64) -> f64 {
-        self.fit(number, t, noise);
+    /// Standard deviation of a number's samples about `t`, as far as it has shown where nothing moved; `shown` as for [`Centred::fit`].
+    fn deviation(&mut self, number: usize, t: Nanos, shown: &mut Shown) -> f64 {
+        self.fit(number, t, shown, (f64::NAN, 0));
         // What was fitted to are means of so many samples.
         let share = self.count.div_ceil(POINTS).max(1);
-        if noise.is_nan() {
+        if shown.rest.is_nan() {
             0.0
         } else {
-            (*noise * share as f64).sqrt()
+            (shown.rest * share as f64).sqrt()
         }
     }
 
-    /// Times relative to `t` in units of [`DELAY`], and values relative to the newest.
+    /// Times relative to `t` in units of [`DELAY`], and values relative to the newest; how many samples each point is the mean of.
     #[allow(
         clippy::indexing_slicing,
         reason = "count is at most the arrays' length, and so many points fit"
     )]
-    fn condense(&mut self, number: usize, t: Nanos) {
+    fn condense(&mut self, number: usize, t: Nanos) -> usize {
         let n = self.count.min(KEPT);
         let share = n.div_ceil(POINTS).max(1);
         self.points = 0;
@@ -676,6 +758,7 @@ impl Centred {
             self.signal[self.points] = values.iter().sum::<f64>() * of;
             self.points += 1;
         }
+        share
     }
 
     #[allow(clippy::indexing_slicing, reason = "as many points as were condensed")]
@@ -766,13 +849,13 @@ mod tests {
             history.push(t, [signal((t - centre).seconds()), f64::NAN, f64::NAN], Quality::GOOD);
         }
         let mut centred = Centred::default();
-        let mut noise_found = f64::NAN;
+        let mut shown = Shown::default();
         let silence = Nanos::from_millis(50);
         centred
             .gather(&history, centre - DELAY, centre + DELAY, silence, UNTRUSTED_ENCODER)
             .unwrap();
         assert!(centred.is_complete(0) && !centred.is_complete(1));
-        let found = centred.fit(0, centre, &mut noise_found);
+        let found = centred.fit(0, centre, &mut shown, (f64::NAN, 2));
         for (found, expected) in found.iter().zip([0.3, -0.5, 4.0]) {
             assert!((found.0 - expected).abs() < 1e-9, "{found:?}, not {expected}");
         }
@@ -788,7 +871,7 @@ mod tests {
             (f64::from(random) / f64::from(u32::MAX) - 0.5) * 2e-4
         };
         let mut centred = Centred::default();
-        let mut noise_found = f64::NAN;
+        let mut shown = Shown::default();
         for (size, bound) in [(1.0, 0.5), (0.0, 0.02)] {
             let mut history = History::<3>::default();
             for k in 0..250 {
@@ -799,7 +882,7 @@ mod tests {
             centred
                 .gather(&history, centre - DELAY, centre + DELAY, silence, UNTRUSTED_ENCODER)
                 .unwrap();
-            let [_, _, (acceleration, _)] = centred.fit(0, centre, &mut noise_found);
+            let [_, _, (acceleration, _)] = centred.fit(0, centre, &mut shown, (f64::NAN, 2));
             let error = (acceleration + size * w * w).abs();
             // Of 39.5 rad/s^2: a quadratic over all of the window would lose 7.
             assert!(error < bound, "{error}");

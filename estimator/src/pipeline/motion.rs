@@ -1,13 +1,16 @@
-//! What errors of differentiated motion do to torques and contact wrenches.
+//! What errors of the motion do to torques and contact wrenches.
 //!
 //! ```text
-//! torques and wrenches = S a + what positions, velocities and readings give,    a = [joint accelerations; angular acceleration of the IMU]
-//! variance = sum over a of S_ij^2 sigma_j^2
+//! x = [joint accelerations; joint positions; proper acceleration of the base; angular acceleration of the IMU]
+//! variance = sum over x of S_ij^2 sigma_j^2,    S = d(torques and wrenches) / dx
 //! ```
 //!
-//! with sigma as [`crate::differentiate`] states it, errors of different channels being independent. Forces are linear in accelerations, so a column of S is the difference
-//! that one unit of acceleration makes. S follows the posture alone: it is found anew with the first estimate of each tenth of a second, and when contacts or base
-//! change. By stamps, so that a replay which begins elsewhere finds the same. Errors of positions and velocities are smaller by orders of magnitude, and left out; so is the noise of the IMU's proper acceleration.
+//! with the sigma of differentiated accelerations as [`crate::differentiate`] states it, and errors of different channels being independent. Positions are off by their
+//! noise, late stamps included, and by an encoder's zero, [`ENCODER_ZERO`]; the base's proper acceleration by [`BASE_ACCELERATION`], which is an IMU's bias and
+//! mounting, or that a fixed base is not level. These are what robots are calibrated to, not what one robot has.
+//!
+//! A column of S is the difference that a little of x makes. S follows the posture alone: it is found anew with the first estimate of each tenth of a second, and when contacts or base
+//! change. By stamps, so that a replay which begins elsewhere finds the same. Errors of velocities are smaller by an order of magnitude, and left out.
 
 use crate::dynamics::{ContactSet, DynamicsError, FrameMotion, JointState, Kinematics, Solver, Structure};
 use crate::model::Model;
@@ -16,6 +19,15 @@ use proprio_topics::Nanos;
 
 /// How long a posture counts as the same.
 const CELL: Nanos = Nanos::from_millis(100);
+
+/// Standard deviation of an encoder's zero \[rad\], a third of a degree; of a prismatic joint's \[m\].
+pub(super) const ENCODER_ZERO: [f64; 2] = [0.005, 0.001];
+
+/// Standard deviation of the base's proper acceleration, each axis \[m/s^2\]: a hundredth of gravity, or 0.6 degrees of level.
+const BASE_ACCELERATION: f64 = 0.1;
+
+/// How far positions are moved to see what that does \[rad, m\].
+const STEP: f64 = 1e-4;
 
 /// All that an estimate is made of.
 pub(super) struct Instant<'a> {
@@ -37,8 +49,8 @@ pub(super) struct Instant<'a> {
 pub(super) struct MotionErrors {
     kinematics: Kinematics,
     solver: Solver,
-    /// Standard deviations: of each joint's acceleration, then of the IMU's angular acceleration. Zero where it is measured, or exact.
-    pub(super) acceleration: Vec<f64>,
+    /// Standard deviations of x. Zero where it is exact.
+    sigma: Vec<f64>,
     /// Column by column: torques, then six numbers per contact.
     sensitivity: Vec<f64>,
     is_known: Vec<bool>,
@@ -53,18 +65,40 @@ pub(super) struct MotionErrors {
 impl MotionErrors {
     pub(super) fn new(model: &Model, structure: &Structure, base_link: usize) -> Result<Self, DynamicsError> {
         let dofs = model.dof_count();
-        let (columns, rows) = (dofs + 3, dofs + 6 * structure.contacts().len());
+        let (columns, rows) = (2 * dofs + 6, dofs + 6 * structure.contacts().len());
+        let mut sigma = vec![0.0; columns];
+        sigma[2 * dofs..2 * dofs + 3].fill(BASE_ACCELERATION);
         Ok(Self {
             kinematics: Kinematics::new(model, base_link)?,
             solver: Solver::new(structure),
-            acceleration: vec![0.0; columns],
+            sigma,
             sensitivity: vec![0.0; columns * rows],
             is_known: vec![false; columns],
             of: None,
-            perturbed: vec![0.0; dofs],
+            perturbed: vec![0.0; 2 * dofs],
             deviation: vec![0.0; rows],
             dofs,
         })
+    }
+
+    /// Says what a joint's acceleration and position are uncertain by.
+    pub(super) fn set_joint(&mut self, dof: usize, acceleration: f64, position: f64) {
+        if let [of_accelerations, of_positions] = self.halves()
+            && let (Some(a), Some(q)) = (of_accelerations.get_mut(dof), of_positions.get_mut(dof))
+        {
+            (*a, *q) = (acceleration, position);
+        }
+    }
+
+    fn halves(&mut self) -> [&mut [f64]; 2] {
+        let (accelerations, rest) = self.sigma.split_at_mut(self.dofs);
+        [accelerations, rest.get_mut(..self.dofs).unwrap_or_default()]
+    }
+
+    /// Says what the IMU's angular acceleration is uncertain by.
+    pub(super) fn set_angular(&mut self, deviation: &[f64; 3]) {
+        let places = self.sigma.iter_mut().rev();
+        places.zip(deviation.iter().rev()).for_each(|(to, from)| *to = *from);
     }
 
     /// Finds the deviations at an instant. Does not allocate.
@@ -73,9 +107,6 @@ impl MotionErrors {
     /// Sizes that differ, or a number that is not finite.
     pub(super) fn update(&mut self, instant: &Instant<'_>) -> Result<(), DynamicsError> {
         self.deviation.fill(0.0);
-        if self.acceleration.iter().all(|sigma| *sigma == 0.0) {
-            return Ok(());
-        }
         let of = Some((*instant.active, instant.base_link, instant.t.0.div_euclid(CELL.0)));
         if self.of != of {
             self.is_known.fill(false);
@@ -85,14 +116,14 @@ impl MotionErrors {
             self.of = of;
         }
         for column in 0..self.is_known.len() {
-            let matters = self.acceleration.get(column).is_some_and(|sigma| *sigma > 0.0);
+            let matters = self.sigma.get(column).is_some_and(|sigma| *sigma > 0.0);
             let is_known = self.is_known.get(column).is_some_and(|known| *known);
             if matters && !is_known {
                 self.probe(column, instant)?;
             }
         }
         let rows = self.deviation.len();
-        for (column, sigma) in self.sensitivity.chunks_exact(rows).zip(&self.acceleration) {
+        for (column, sigma) in self.sensitivity.chunks_exact(rows).zip(&self.sigma) {
             if *sigma > 0.0 {
                 for (sum, s) in self.deviation.iter_mut().zip(column) {
                     *sum += (s * sigma).powi(2);
@@ -103,24 +134,33 @@ impl MotionErrors {
         Ok(())
     }
 
-    /// What one unit of an acceleration changes.
+    /// What a unit of x changes.
     fn probe(&mut self, column: usize, instant: &Instant<'_>) -> Result<(), DynamicsError> {
-        self.perturbed.copy_from_slice(instant.state.acceleration);
+        let dofs = self.dofs;
+        let (accelerations, positions) = self.perturbed.split_at_mut(dofs);
+        accelerations.copy_from_slice(instant.state.acceleration);
+        positions.copy_from_slice(instant.state.position);
         let mut base = *instant.base;
-        match (self.perturbed.get_mut(column), instant.imu) {
-            (Some(acceleration), _) => *acceleration += 1.0,
-            (None, Some((measured, pose))) => {
-                let mut measured = *measured;
-                if let Some(axis) = measured.angular_acceleration.get_mut(column - self.dofs) {
-                    *axis += 1.0;
-                }
-                base = FrameMotion::of_link_from_imu(&measured, pose);
-            }
-            // No IMU: nothing changes.
-            (None, None) => {}
+        let step = if (dofs..2 * dofs).contains(&column) { STEP } else { 1.0 };
+        if let Some(value) = self.perturbed.get_mut(column) {
+            *value += step;
+        } else {
+            // Of the IMU, where there is one: its axes are those of its errors.
+            let mut motion = instant.imu.map_or(base, |(measured, _)| *measured);
+            let axis = column - 2 * dofs;
+            let place = match axis.checked_sub(3) {
+                None => motion.proper_acceleration.get_mut(axis),
+                Some(axis) => motion.angular_acceleration.get_mut(axis),
+            };
+            place.into_iter().for_each(|x| *x += 1.0);
+            base = instant
+                .imu
+                .map_or(motion, |(_, pose)| FrameMotion::of_link_from_imu(&motion, pose));
         }
+        let (acceleration, position) = self.perturbed.split_at(dofs);
         let state = JointState {
-            acceleration: &self.perturbed,
+            acceleration,
+            position,
             ..instant.state
         };
         self.kinematics.update(instant.model, state, &base)?;
@@ -142,12 +182,12 @@ impl MotionErrors {
             .zip(self.solver.torque())
             .zip(instant.solver.torque())
         {
-            *to = with - without;
+            *to = (with - without) / step;
         }
         let results = self.solver.contacts().iter().zip(instant.solver.contacts());
         for (six, (with, without)) in contacts.chunks_exact_mut(6).zip(results) {
             let difference = (with.wrench - without.wrench).force_first();
-            six.copy_from_slice(&difference);
+            six.iter_mut().zip(difference).for_each(|(to, x)| *to = x / step);
         }
         if let Some(known) = self.is_known.get_mut(column) {
             *known = true;

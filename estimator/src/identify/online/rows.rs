@@ -210,9 +210,11 @@ impl Instant {
 pub(super) struct Rows {
     kinds: Vec<OfKind>,
     instants: u64,
-    /// How long they were gathered [s], and whether something moved meanwhile.
+    /// How long they were gathered [s].
     pub(super) span: f64,
-    pub(super) is_moving: bool,
+    /// Of a block, whether something moved meanwhile; of several, how many of their instants are of such.
+    pub(super) has_moved: bool,
+    moving: u64,
 }
 
 /// Those of one sub-tree.
@@ -266,7 +268,8 @@ impl Rows {
             kinds: kinds.all.iter().map(of_kind).collect(),
             instants: 0,
             span: 0.0,
-            is_moving: false,
+            has_moved: false,
+            moving: 0,
         }
     }
 
@@ -298,7 +301,7 @@ impl Rows {
             kind.values.clear();
             kind.slots.clear();
         }
-        (self.instants, self.span, self.is_moving) = (0, 0.0, false);
+        (self.instants, self.span, self.has_moved, self.moving) = (0, 0.0, false, 0);
     }
 
     /// Adds the rows of an instant, as far as there is room.
@@ -310,8 +313,14 @@ impl Rows {
         }
     }
 
+    /// Whether something moved most of the time.
+    pub(super) fn is_moving(&self) -> bool {
+        self.has_moved || 2 * self.moving > self.instants
+    }
+
     pub(super) fn take_from(&mut self, other: &Self) {
         self.instants += other.instants;
+        self.moving += if other.is_moving() { other.instants } else { 0 };
         for (to, from) in self.kinds.iter_mut().zip(&other.kinds) {
             for (row, slot) in from.values.chunks_exact(from.width).zip(&from.slots) {
                 to.push(*slot, row);

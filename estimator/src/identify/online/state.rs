@@ -1,11 +1,11 @@
 //! What identification knows, in a file: what a robot was taught survives a restart.
 //!
 //! ```text
-//! proprio identification state 2
+//! proprio identification state 3
 //! robot <name>
 //! model <hash of the links, the sensors and CAD>
 //! sensors <hash of how each is mounted and calibrated>
-//! component <unknowns> <tau>
+//! component <unknowns> <tau> <1: parameters that were learnt are in force, 0: CAD's>
 //! noise <variance of each F/T channel>
 //! row <R_kk ... R_kn z_k>                     one line per parameter
 //! ...
@@ -25,7 +25,7 @@ use crate::dynamics::Structure;
 use crate::identify::information::{Information, Panel};
 
 const TITLE: &str = "proprio identification state";
-const SCHEMA: &str = "2";
+const SCHEMA: &str = "3";
 /// What differs, in words.
 const SENSORS: &str = "mounting or calibration of its force/torque sensors";
 
@@ -126,7 +126,8 @@ impl Job {
         for part in &self.parts {
             let parameters = part.information.trailing(6 * part.sensors.len());
             let _ = write!(text, "component {}", parameters.unknowns());
-            put(&mut text, "", std::iter::once(part.tau));
+            let is_learnt = part.contest.in_force().effective > 0.0;
+            put(&mut text, "", [part.tau, f64::from(u8::from(is_learnt))].into_iter());
             put(&mut text, "noise", part.variances.iter().copied());
             for k in 0..parameters.unknowns() {
                 put(&mut text, "row", parameters.row(k).iter().copied());
@@ -173,7 +174,7 @@ impl Online {
         let mut read = Vec::new();
         for part in &job.parts {
             let (session, parameters) = (6 * part.sensors.len(), WIDTH * part.links.len());
-            let [tau] = numbers(lines.next(), &format!("component {parameters}"), 1)?[..] else {
+            let [tau, is_learnt] = numbers(lines.next(), &format!("component {parameters}"), 2)?[..] else {
                 return Err(StateError::Damaged("no weight"));
             };
             let variances = numbers(lines.next(), "noise", session)?;
@@ -192,12 +193,13 @@ impl Online {
             if !(tau > 0.0 && variances.iter().all(|v| *v > 0.0)) {
                 return Err(StateError::Damaged("a variance is not positive"));
             }
-            read.push((tau, variances, information));
+            read.push(((tau, is_learnt > 0.0), variances, information));
         }
-        for ((part, component), (tau, variances, information)) in
+        for ((part, component), ((tau, is_learnt), variances, information)) in
             job.parts.iter_mut().zip(&mut self.components).zip(read)
         {
             part.tau = tau;
+            part.is_replaced = is_learnt;
             part.variances.copy_from_slice(&variances);
             component.variances = variances;
             let _ = part.information.copy_from(&information);

@@ -5,7 +5,7 @@ use nalgebra::{DMatrix, DVector, Dyn, Matrix4, Vector4};
 use pulp::{Arch, Simd, WithSimd};
 
 use super::{
-    Centre, GREATEST_TAU, Matrix10, Prior, PriorError, Vector10, blocked, body_of, check_finite, congruence,
+    Centre, Expected, GREATEST_TAU, Matrix10, Prior, PriorError, Vector10, blocked, body_of, check_finite, congruence,
     divergence, pack, stationary_tau, unpack,
 };
 use crate::identify::lanes;
@@ -31,6 +31,7 @@ pub(in crate::identify) const CENTRED: f64 = 0.1;
 pub struct Posterior {
     links: Vec<usize>,
     centres: Vec<Centre>,
+    expected: Expected,
     /// By `u` about CAD: as many rows as the data's rank.
     data: DMatrix<f64>,
     right: DVector<f64>,
@@ -128,6 +129,7 @@ impl Posterior {
             right: chart.right.rows(0, rank).into_owned(),
             residual_square: std::mem::take(&mut chart.residual_square),
             centres,
+            expected: prior.expected,
             further,
             chart,
         })
@@ -461,6 +463,7 @@ impl Posterior {
             decrement: descent.decrement,
             inverses,
             maps,
+            expected: self.expected,
             units: self.further.iter().map(|&(unit, _)| unit).collect(),
             chart,
             factor: descent.factor,
@@ -745,6 +748,8 @@ pub struct Fit {
     pub(in crate::identify) inverses: Vec<Matrix4<f64>>,
     /// `u -> phi` and back, for each link.
     maps: Vec<(Matrix10, Matrix10)>,
+    /// What is known of `tau` before any data.
+    expected: Expected,
     /// Units of the further unknowns.
     units: Vec<f64>,
     chart: Chart,
@@ -756,7 +761,7 @@ pub struct Fit {
 impl Fit {
     /// One round of the evidence: the weight that makes this divergence, of this many parameters, the expected one (above, under "The weight"). At most [`GREATEST_TAU`].
     pub fn next_tau(&self) -> f64 {
-        stationary_tau(self.divergence, self.effective)
+        stationary_tau(self.divergence, self.effective, self.expected)
     }
 
     /// A square root of the posterior covariance of `x`: `F` with `F F^T` the covariance. The variance of `a^T x` is `|F^T a|^2`.
