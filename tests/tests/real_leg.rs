@@ -420,6 +420,9 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
     true
 }
 
+/// A torque and its standard deviation, of two estimates.
+type Pair = ((f64, f64), (f64, f64));
+
 /// Torques of some joints from 34 to 44 s, each with its standard deviation; none where it is not valid.
 fn swinging(setup: Setup, table: &str) -> Vec<[Option<(f64, f64)>; 4]> {
     let joints = ["r_hip_pitch", "r_hip_yaw", "r_knee", "r_ankle_pitch"];
@@ -502,10 +505,10 @@ fn on_line_the_torques_of_a_real_leg_are_what_they_are_from_its_log() {
             let pairs: Vec<_> = (own.iter().rev().zip(identified[from..].iter().rev()))
                 .filter_map(|(own, other)| Some((own[joint]?, other[joint]?)))
                 .collect();
-            let within = |((a, s), (b, r)): &&((f64, f64), (f64, f64))| (a - b).abs() <= 2.0 * s.hypot(*r);
+            let within = |((a, s), (b, r)): &&Pair| (a - b).abs() <= 2.0 * s.hypot(*r);
             let covered = pairs.iter().filter(within).count() as f64 / pairs.len() as f64;
             all.push(covered);
-            let median = |of: &dyn Fn(&((f64, f64), (f64, f64))) -> f64| {
+            let median = |of: &dyn Fn(&Pair) -> f64| {
                 let mut values: Vec<f64> = pairs.iter().map(of).collect();
                 values.sort_by(f64::total_cmp);
                 values[values.len() / 2]

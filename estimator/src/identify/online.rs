@@ -18,7 +18,7 @@
 //! offsets wander is reckoned as often, for each step of a walk is one of all that hangs together. (Small components: ten times a second.)
 //!
 //! # Noise
-//! Rows are whitened with *inflated* variances, and offsets wander between blocks (random walks), both as [`channel`] finds them from what each channel reads in the mean from one second
+//! Rows are whitened with *inflated* variances, and offsets wander between blocks (random walks), both as `channel` finds them from what each channel reads in the mean from one second
 //! to the next, less what the bodies explain that were known before. All that is read counts there, also what was put aside: noise that is larger than was thought would else be put
 //! aside for ever. Before anything is known the noise is taken as hundreds of times what was stated. Offsets stand still while a contact is declared or suspected.
 //!
@@ -30,7 +30,7 @@
 //! has changed; else it stays a contact, however long.
 //!
 //! # What is in force
-//! CAD, and then what has predicted the readings that came after it better ([`contest`]), with the offsets that go best with it. What is most probable is found every second, and judges new
+//! CAD, and then what has predicted the readings that came after it better (`contest`), with the offsets that go best with it. What is most probable is found every second, and judges new
 //! rows.
 
 mod channel;
