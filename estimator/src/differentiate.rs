@@ -373,21 +373,27 @@ impl<const D: usize> Window<D> {
         Ok(pushed)
     }
 
-    /// Standard deviation of a sample about a smooth motion, as the newest samples up to `until` show it, that of late stamps included; of quantisation it knows what a motion
-    /// across steps shows.
+    /// Standard deviation of a sample about a smooth motion, that of late stamps included, as the
+    /// samples of `max_window` up to `until` show it; of quantisation it knows what a motion across
+    /// steps shows.
     #[must_use]
     pub fn noise(&self, until: Nanos) -> [f64; D] {
         const SAMPLES: usize = 64;
         let skipped = self.later_than(until);
-        let count = self.ring.len.saturating_sub(skipped + ROUGH - 1).min(SAMPLES);
-        let mut sum = [0.0; D];
-        for age in skipped..skipped + count {
+        let known = self.ring.len.saturating_sub(skipped + ROUGH - 1).min(SAMPLES);
+        let (mut sum, mut count) = ([0.0; D], 0.0_f64);
+        for age in skipped..skipped + known {
             let at = (self.ring.newest + MAX_SAMPLES - age) % MAX_SAMPLES;
+            // By time, so that who begins later finds the same.
+            if until - self.ring.stamps[at] > self.settings.max_window {
+                break;
+            }
+            count += 1.0;
             sum.iter_mut()
                 .zip(&self.rough[at])
                 .for_each(|(sum, rough)| *sum += rough);
         }
-        sum.map(|sum| (sum / count.max(1) as f64).sqrt())
+        sum.map(|sum| (sum / count.max(1.0)).sqrt())
     }
 
     /// The newest samples' divided difference over [`ROUGH`] of them, in units in which it has the variance of a sample's noise, squared. A polynomial of degree three has none, and what

@@ -628,3 +628,20 @@ fn noise_shows_in_the_samples_late_stamps_included() {
     assert!((0.6..1.6).contains(&ratio), "{ratio}");
     assert!(found(0.0, 1e-3, 0.0) < 1e-9);
 }
+
+/// Who begins later finds the same noise: it is of the longest window alone, however slow the samples come.
+#[test]
+fn noise_is_of_the_longest_window_alone() {
+    let begun = |at: i64| {
+        let mut window = Window::<1>::new(Settings::new(1e-6)).unwrap();
+        for k in at..60 {
+            // Rough at first, then less and less so.
+            let value = if k % 2 == 0 { 1.0 / k as f64 } else { 0.0 };
+            window.push(Nanos::from_millis(40 * k), [value]).unwrap();
+        }
+        window.noise(Nanos::from_millis(40 * 59))[0]
+    };
+    let late = begun(60 - 26 - 5);
+    assert!(late > 0.0);
+    assert_eq!(late, begun(2));
+}

@@ -387,8 +387,9 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
         live.len(),
         offline.len()
     );
-    // Deviations hold on to a posture for a tenth of a second, and derivatives are of the longest window that there is: who begins later begins with others.
-    let begun = first + Nanos::from_millis(if before > 0 { 1000 } else { 100 });
+    // Deviations hold on to a posture for a tenth of a second, derivatives are of the longest window
+    // that there is, and its noise of four samples more: who begins later begins with others.
+    let begun = first + Nanos::from_millis(if before > 0 { 1000 + 40 * slower } else { 100 });
     let mut differing = live
         .iter()
         .filter(|(t, row)| stamp(t).is_none_or(|t| t >= begun) && offline.get(*t) != Some(*row));
