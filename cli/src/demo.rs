@@ -314,10 +314,7 @@ impl Experiment {
             truth: links(&robot.model, robot.model.inertias()),
             cad: links(&with.model, with.cad()),
             offsets: (robot.config.force_torque.iter())
-                .map(|ft| {
-                    let ([fx, fy, fz], [tx, ty, tz]) = (ft.offset_n, ft.offset_nm);
-                    (ft.sensor.clone(), [fx, fy, fz, tx, ty, tz])
-                })
+                .map(|ft| (ft.sensor.clone(), ft.offset().0.force_first()))
                 .collect(),
             most_std,
             refused: Pipeline::new(with.clone())

@@ -126,8 +126,11 @@ fn exactly_if_given<'de, D: Deserializer<'de>, const N: usize>(deserializer: D) 
     exactly(deserializer).map(Some)
 }
 
+/// \[m/s^2\]
+pub const STANDARD_GRAVITY: f64 = 9.80665;
+
 const fn standard_gravity() -> [f64; 3] {
-    [0.0, 0.0, -9.80665]
+    [0.0, 0.0, -STANDARD_GRAVITY]
 }
 
 /// A force/torque sensor.
@@ -154,18 +157,18 @@ pub struct ForceTorque {
     /// Standard deviation of its torques \[Nm\]. The default as above.
     #[serde(default = "default_noise_nm", deserialize_with = "exactly")]
     pub noise_nm: [f64; 3],
-    /// What it reads with no load: forces \[N\].
-    #[serde(default, deserialize_with = "exactly")]
-    pub offset_n: [f64; 3],
-    /// What it reads with no load: torques \[Nm\].
-    #[serde(default, deserialize_with = "exactly")]
-    pub offset_nm: [f64; 3],
-    /// Standard deviation of `offset_n` \[N\]; default: it is exact.
-    #[serde(default, deserialize_with = "exactly")]
-    pub offset_std_n: [f64; 3],
-    /// Standard deviation of `offset_nm` \[Nm\]; default: it is exact.
-    #[serde(default, deserialize_with = "exactly")]
-    pub offset_std_nm: [f64; 3],
+    /// What it reads with no load: forces \[N\]. Default: nobody knows ([`UNKNOWN_OFFSET`]).
+    #[serde(default, deserialize_with = "exactly_if_given")]
+    pub offset_n: Option<[f64; 3]>,
+    /// What it reads with no load: torques \[Nm\]. Default: nobody knows ([`UNKNOWN_OFFSET`]).
+    #[serde(default, deserialize_with = "exactly_if_given")]
+    pub offset_nm: Option<[f64; 3]>,
+    /// Standard deviation of `offset_n` \[N\]; default: it is exact, if it is given.
+    #[serde(default, deserialize_with = "exactly_if_given")]
+    pub offset_std_n: Option<[f64; 3]>,
+    /// Standard deviation of `offset_nm` \[Nm\]; default: it is exact, if it is given.
+    #[serde(default, deserialize_with = "exactly_if_given")]
+    pub offset_std_nm: Option<[f64; 3]>,
     /// What its readings are multiplied with before everything else, beyond what its board does ([`crate::calibration`]): 36 numbers row by row, rows and columns
     /// `fx fy fz tx ty tz`, or the 6 of a diagonal; default: nothing.
     #[serde(default, deserialize_with = "gain_numbers")]
@@ -234,7 +237,7 @@ pub struct Contact {
     /// The direction of a `force_along`, in the frame's axes.
     #[serde(default, deserialize_with = "exactly_if_given")]
     pub direction: Option<[f64; 3]>,
-    /// Where it acts, in the frame's axes \[m\].
+    /// Where it acts, in the frame's axes \[m\]. A touch of a possible contact is told from others by this place.
     #[serde(default, deserialize_with = "exactly")]
     pub position_m: [f64; 3],
     /// Whether it is always there.
@@ -262,7 +265,7 @@ pub enum Presence {
     /// It is.
     #[default]
     Always,
-    /// It is taken as absent unless somebody declares it.
+    /// It is taken as absent unless somebody declares it, or F/T readings show it.
     Possible,
 }
 
@@ -396,7 +399,8 @@ pub struct Output {
     /// the fastest channel. A channel that has died costs this wait. The order of arrival does not matter as long as no sample
     /// comes more than half of it behind a later one.
     pub max_wait_ms: f64,
-    /// A joint torque whose predicted standard deviation exceeds this is withheld \[Nm\]; default: no bound.
+    /// A joint torque whose predicted standard deviation exceeds this is withheld \[Nm\]; default: the most that gravity can make of the links beyond the joint
+    /// ([`crate::setup::Setup::max_deviation`]).
     pub max_torque_std_nm: Option<f64>,
 }
 
@@ -529,7 +533,7 @@ impl Config {
                 }
             }
             for (key, deviation) in [("offset_std_n", ft.offset_std_n), ("offset_std_nm", ft.offset_std_nm)] {
-                if let Some(value) = deviation.into_iter().find(|v| !(*v >= 0.0 && v.is_finite())) {
+                if let Some(value) = deviation.into_iter().flatten().find(|v| !(*v >= 0.0 && v.is_finite())) {
                     return Err(format!(
                         "{} has the value {value}; a standard deviation can not be negative",
                         at(key)
@@ -552,8 +556,8 @@ impl Config {
                     at("reference_celsius")
                 ));
             }
-            finite(&at("offset_n"), &ft.offset_n)?;
-            finite(&at("offset_nm"), &ft.offset_nm)?;
+            finite(&at("offset_n"), &ft.offset_n.unwrap_or_default())?;
+            finite(&at("offset_nm"), &ft.offset_nm.unwrap_or_default())?;
             finite(&at("xyz_m"), &ft.xyz_m.unwrap_or_default())?;
             finite(&at("rpy_rad"), &ft.rpy_rad.unwrap_or_default())?;
         }
@@ -581,7 +585,24 @@ impl Config {
     }
 }
 
+/// Standard deviation of an offset that nobody states and nobody has identified, of each channel [torque; force] \[Nm, N\]: more than sensors of this kind are off by, so
+/// that it has no say in what is found.
+pub const UNKNOWN_OFFSET: [f64; 6] = [100.0, 100.0, 100.0, 1000.0, 1000.0, 1000.0];
+
 impl ForceTorque {
+    /// What it reads with no load, and the standard deviations of that [torque; force] \[Nm, N\].
+    #[must_use]
+    pub fn offset(&self) -> (Wrench, [f64; 6]) {
+        let of = |value: Option<[f64; 3]>, deviation: Option<[f64; 3]>, unknown: f64| {
+            let exact = if value.is_some() { 0.0 } else { unknown };
+            (value.unwrap_or_default(), deviation.unwrap_or([exact; 3]))
+        };
+        let [of_torque, of_force] = [UNKNOWN_OFFSET[0], UNKNOWN_OFFSET[3]];
+        let (force, [fx, fy, fz]) = of(self.offset_n, self.offset_std_n, of_force);
+        let (torque, [tx, ty, tz]) = of(self.offset_nm, self.offset_std_nm, of_torque);
+        (Wrench::from_parts(force, torque), [tx, ty, tz, fx, fy, fz])
+    }
+
     /// How its readings are corrected.
     #[must_use]
     pub fn calibration(&self) -> Calibration {
@@ -666,7 +687,8 @@ mod tests {
         assert_eq!(config.identification.gain_std, 0.05);
         assert!(!config.identification.temperature);
         assert_eq!(config.force_torque[0].calibration(), Calibration::default());
-        assert_eq!(config.force_torque[0].offset_std_n, [0.0; 3]);
+        let (_, deviations) = config.force_torque[0].offset();
+        assert_eq!(deviations, UNKNOWN_OFFSET);
     }
 
     #[test]

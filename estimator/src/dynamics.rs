@@ -67,6 +67,7 @@ pub use equation::EquationOfMotion;
 pub use kinematics::{ExternalWrench, FrameMotion, InverseDynamics, JointState, Kinematics};
 pub(crate) use kinematics::{check_external, check_readings};
 pub(crate) use least::{LeastSquares, noise_factor, scale_factor};
+pub(crate) use solver::unknowns;
 pub use solver::{Balance, Certainty, ContactEstimate, Disagreement, SideTorque, Sides, Solver};
 pub use structure::{
     BitSet, ContactKind, ContactSet, ContactSpec, Dependence, DofSet, LinkSet, Noise, Route, SensorCut, SensorSet,

@@ -34,3 +34,4 @@ pub mod pipeline;
 pub mod regressor;
 pub mod setup;
 pub mod spatial;
+mod statistics;

@@ -177,6 +177,7 @@ struct JointFacts {
     parent_link: String,
     child_link: String,
     limits: Option<Limits>,
+    effort: Option<f64>,
 }
 
 /// The robot after folding: bodies, joints, frames by name.
@@ -289,6 +290,11 @@ impl Model {
     /// The range that the URDF gives a joint; none for continuous and fixed joints.
     pub fn limits(&self, joint: usize) -> Option<Limits> {
         self.joint_facts.get(joint).and_then(|facts| facts.limits)
+    }
+
+    /// The greatest torque or force that the URDF gives a joint [Nm or N]; none if it says nothing or zero.
+    pub fn effort(&self, joint: usize) -> Option<f64> {
+        self.joint_facts.get(joint).and_then(|facts| facts.effort)
     }
 
     /// The inertia of every body, about the origin and in the axes of its frame.

@@ -6,14 +6,19 @@
 //! | `torque/<joint>` | \[Nm\], by the parent link on the child link along the URDF axis |
 //! | `torque_std/<joint>` | its standard deviation: from F/T noise, and from what is uncertain of inertial parameters and F/T offsets |
 //! | `contact/<name>/fx fy fz tx ty tz` | \[N, Nm\], on the link by the environment, axes and origin of the frame that `link` names |
+//! | `contact/<name>/fx_std fy_std fz_std tx_std ty_std tz_std` | their standard deviations |
 //! | `contact/<name>/valid`, `contact/<name>/reason` | as below, of the contact |
+//! | `contact/<name>/detected` | 1 if nobody declared it and F/T readings show it, else 0 |
 //! | `valid/<joint>` | 1 if it may be used, else 0 |
 //! | `reason/<joint>` | why not: a word, and the channel to blame behind a colon |
+//! | `residual/<link>/fx fy fz tx ty tz` | \[N, Nm\], what links, sensors and known contacts leave unexplained in the sub-tree with this top link, at its origin and in its axes |
+//! | `residual/<link>/significance` | how rare that is if nothing unknown acts, in standard deviations of a normal variable; empty where nothing can be tested |
+//! | `residual/<link>/contact` | the contact that was detected there, or `unexplained` |
 
 use crate::pipeline::{Estimate, Pipeline};
 use crate::setup::{Channel, Setup};
 use proprio_topics::csv::{Item, Reader, Report, Row, Series, Value, What};
-use proprio_topics::{ContactWrench, JointTorque, Kind, NO_CAUSE, Nanos, Reason};
+use proprio_topics::{ContactWrench, JointTorque, Kind, NO_CAUSE, Nanos, Reason, Residual};
 use std::io::{self, Read, Write};
 
 /// Why a log gives no estimates.
@@ -158,7 +163,8 @@ pub struct Table<W> {
     out: W,
     channels: Vec<String>,
     joints: usize,
-    contacts: usize,
+    contacts: Vec<String>,
+    subtrees: usize,
     text: Vec<u8>,
     rows: u64,
     withheld: u64,
@@ -177,12 +183,19 @@ impl<W: Write> Table<W> {
             joints.iter().for_each(|j| header.push_str(&format!(",{part}/{j}")));
         }
         for contact in &contacts {
-            ["fx", "fy", "fz", "tx", "ty", "tz", "valid", "reason"]
-                .iter()
+            let columns = "fx fy fz tx ty tz fx_std fy_std fz_std tx_std ty_std tz_std valid reason detected";
+            columns
+                .split(' ')
                 .for_each(|c| header.push_str(&format!(",contact/{contact}/{c}")));
         }
         for part in ["valid", "reason"] {
             joints.iter().for_each(|j| header.push_str(&format!(",{part}/{j}")));
+        }
+        let subtrees: Vec<&str> = setup.subtree_names().collect();
+        for top in &subtrees {
+            "fx fy fz tx ty tz significance contact"
+                .split(' ')
+                .for_each(|c| header.push_str(&format!(",residual/{top}/{c}")));
         }
         header.push('\n');
         out.write_all(header.as_bytes())?;
@@ -191,7 +204,8 @@ impl<W: Write> Table<W> {
             out,
             channels,
             joints: joints.len(),
-            contacts: contacts.len(),
+            contacts: contacts.iter().map(|&name| name.to_owned()).collect(),
+            subtrees: subtrees.len(),
             text: Vec::new(),
             rows: 0,
             withheld: 0,
@@ -215,7 +229,7 @@ impl<W: Write> Table<W> {
         for joint in joints() {
             number(&mut self.text, joint.standard_deviation);
         }
-        for i in 0..self.contacts {
+        for i in 0..self.contacts.len() {
             let contact = estimate
                 .contacts
                 .contacts()
@@ -226,18 +240,34 @@ impl<W: Write> Table<W> {
                 .force
                 .into_iter()
                 .chain(contact.torque)
+                .chain(contact.standard_deviation)
                 .for_each(|v| number(&mut self.text, v));
-            self.text
-                .extend_from_slice(if contact.valid == 1 { b",1" } else { b",0" });
+            flag(&mut self.text, contact.valid);
             reason(&mut self.text, &self.channels, contact.reason, contact.cause);
+            flag(&mut self.text, contact.detected);
         }
         for joint in joints() {
-            self.text
-                .extend_from_slice(if joint.valid == 1 { b",1" } else { b",0" });
+            flag(&mut self.text, joint.valid);
             self.withheld += u64::from(joint.valid != 1);
         }
         for joint in joints() {
             reason(&mut self.text, &self.channels, joint.reason, joint.cause);
+        }
+        for i in 0..self.subtrees {
+            let residual = estimate
+                .contacts
+                .residuals()
+                .get(i)
+                .copied()
+                .unwrap_or(Residual::ABSENT);
+            let numbers = residual.force.into_iter().chain(residual.torque);
+            numbers
+                .chain([residual.significance])
+                .for_each(|v| number(&mut self.text, v));
+            self.text.push(b',');
+            let contact = self.contacts.get(residual.contact as usize).map(String::as_str);
+            let contact = contact.or((residual.unexplained == 1).then_some("unexplained"));
+            self.text.extend_from_slice(contact.unwrap_or_default().as_bytes());
         }
         self.text.push(b'\n');
         self.rows += 1;
@@ -248,6 +278,11 @@ impl<W: Write> Table<W> {
     pub fn into_inner(self) -> W {
         self.out
     }
+}
+
+/// A cell: 1 or 0.
+fn flag(text: &mut Vec<u8>, value: u32) {
+    text.extend_from_slice(if value == 1 { b",1" } else { b",0" });
 }
 
 /// A cell: why something is withheld, and the channel to blame behind a colon; empty if it is valid.

@@ -125,6 +125,8 @@ pub struct Offset {
     pub drift: Wrench,
     /// When it was so, in the clock of the log.
     pub known: Nanos,
+    /// Standard deviation of a reading about what these parameters say of it [Nm, N]: noise of the sensor, and what is wrong of the model; zero if it is no more than configured.
+    pub noise: Wrench,
     /// How its readings are corrected before this is taken off, if that was identified; else as configured.
     pub calibrated: Option<Calibrated>,
 }
@@ -593,6 +595,7 @@ impl Parameters {
             new_name(&at())?;
             finite(&at, &sensor.reading.force_first())?;
             finite(&at, &sensor.drift.force_first().map(f64::sqrt))?;
+            finite(&at, &sensor.noise.force_first().map(f64::sqrt))?;
             if let Some(Calibrated { calibration, kind }) = &sensor.calibrated {
                 finite(&at, &calibration.gain_force_first())?;
                 finite(&at, &calibration.per_kelvin().force_first())?;
@@ -744,7 +747,7 @@ impl fmt::Display for Parameters {
             let deviation = self.offset_deviation(place).unwrap_or_default();
             writeln!(
                 f,
-                "\n[[sensor]]\nname = {}\noffset_n = {:?}\noffset_nm = {:?}\nstd_n = {:?}\nstd_nm = {:?}\ndrift_n = {:?}\ndrift_nm = {:?}\nknown_ns = {}",
+                "\n[[sensor]]\nname = {}\noffset_n = {:?}\noffset_nm = {:?}\nstd_n = {:?}\nstd_nm = {:?}\ndrift_n = {:?}\ndrift_nm = {:?}\nknown_ns = {}\nnoise_n = {:?}\nnoise_nm = {:?}",
                 text(&sensor.sensor),
                 force(&sensor.reading),
                 moment(&sensor.reading),
@@ -752,7 +755,9 @@ impl fmt::Display for Parameters {
                 moment(&deviation),
                 force(&sensor.drift),
                 moment(&sensor.drift),
-                sensor.known.0
+                sensor.known.0,
+                force(&sensor.noise),
+                moment(&sensor.noise)
             )?;
             let Some(Calibrated { calibration, kind }) = &sensor.calibrated else {
                 continue;
@@ -866,6 +871,8 @@ struct FileSensor {
     drift_nm: Numbers<3>,
     #[serde(with = "nanoseconds", rename = "known_ns")]
     known: Nanos,
+    noise_n: Option<Numbers<3>>,
+    noise_nm: Option<Numbers<3>>,
     gain: Option<Vec<f64>>,
     gain_std: Option<Vec<f64>>,
     temperature_n_per_k: Option<Numbers<3>>,
@@ -1033,6 +1040,10 @@ impl File {
                     reading: Wrench::from_parts(sensor.offset_n.0, sensor.offset_nm.0),
                     drift: Wrench::from_parts(sensor.drift_n.0, sensor.drift_nm.0),
                     known: sensor.known,
+                    noise: {
+                        let of = |noise: Option<Numbers<3>>| noise.map_or([0.0; 3], |noise| noise.0);
+                        Wrench::from_parts(of(sensor.noise_n), of(sensor.noise_nm))
+                    },
                 })
                 .collect(),
             joints: self

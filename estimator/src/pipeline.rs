@@ -16,28 +16,32 @@
 //!
 //! Standard deviations hold F/T noise, what is uncertain of inertial parameters and F/T offsets ([`crate::regressor::Propagation`]), of accelerations that are
 //! differentiated, of encoders' zeros and of the base's proper acceleration (`motion`); not the errors of velocities.
+//!
+//! What F/T readings contradict is found at each instant (`watch`): a possible contact that explains them is taken as present, else the sub-tree's torques are withheld.
 
 mod learning;
 mod motion;
+mod watch;
 
 pub use learning::Job;
 
 use crate::differentiate::{Grid, Unavailable, Window};
-use crate::dynamics::{Certainty, ContactSet, Dependence, FrameMotion, JointState, Kinematics, Solver};
+use crate::dynamics::{Certainty, ContactSet, Dependence, FrameMotion, JointState, Kinematics, Solver, Structure};
 use crate::history::{Held, History};
 use crate::identify::online::state::StateError;
 use crate::identify::online::{Online, OnlineError};
 use crate::model::{JointKind, Model};
 use crate::regressor::Propagation;
 use crate::setup::{BaseMotion, Setup, Use};
-use crate::spatial::{Vec3, Wrench};
+use crate::spatial::{Pose, Vec3, Wrench};
 use learning::Learning;
 use motion::{ENCODER_ZERO, Instant, MotionErrors};
 use proprio_topics::{
-    ContactEstimate, ContactWrench, Header, InertiaEstimate, JointTorque, MAX_CONTACTS, MAX_JOINTS, NO_CAUSE, Nanos,
-    Quality, Reading, Reason, TorqueEstimate,
+    ContactEstimate, ContactWrench, Header, InertiaEstimate, JointTorque, MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES,
+    NO_CAUSE, NO_CONTACT, Nanos, Quality, Reading, Reason, Residual, TorqueEstimate,
 };
 use std::collections::VecDeque;
+use watch::Watch;
 
 /// The most instants that wait at one time; beyond it the oldest is released at once.
 const MOST_WAITING: usize = 256;
@@ -74,8 +78,9 @@ impl Estimate {
             contacts: ContactEstimate {
                 header,
                 count: 0,
-                reserved: 0,
+                residual_count: 0,
                 contacts: [ContactWrench::ABSENT; MAX_CONTACTS],
+                residuals: [Residual::ABSENT; MAX_SUBTREES],
             },
         }
     }
@@ -171,6 +176,8 @@ pub struct Pipeline {
     propagation: Propagation,
     /// What is uncertain of accelerations, likewise.
     motion: Box<MotionErrors>,
+    /// What readings contradict.
+    watch: Watch,
     position: Vec<f64>,
     velocity: Vec<f64>,
     acceleration: Vec<f64>,
@@ -186,11 +193,32 @@ pub struct Pipeline {
     estimate: Box<Estimate>,
 }
 
-/// What each torque and contact depends on; it changes only with the set of contacts present.
+/// What each torque, contact and sub-tree's balance depends on; it changes only with the set of contacts present.
 struct Dependences {
     active: Option<ContactSet>,
     torques: Vec<Dependence>,
     contacts: Vec<Dependence>,
+    subtrees: Vec<Dependence>,
+}
+
+impl Dependences {
+    /// Brings them to the contacts in `active`.
+    fn update(&mut self, structure: &Structure, kinematics: &Kinematics, active: &ContactSet) {
+        if self.active.replace(*active) == Some(*active) {
+            return;
+        }
+        for (dof, place) in self.torques.iter_mut().enumerate() {
+            *place = structure.torque_dependence(dof, kinematics, active).unwrap_or_default();
+        }
+        for (contact, place) in self.contacts.iter_mut().enumerate() {
+            *place = structure
+                .contact_dependence(contact, kinematics, active)
+                .unwrap_or_default();
+        }
+        for (number, place) in self.subtrees.iter_mut().enumerate() {
+            *place = structure.subtree_dependence(number, kinematics, active);
+        }
+    }
 }
 
 impl Pipeline {
@@ -218,6 +246,7 @@ impl Pipeline {
         let mut estimate = Box::new(Estimate::absent(Nanos::ZERO));
         estimate.torques.count = u32::try_from(dofs).unwrap_or(0);
         estimate.contacts.count = u32::try_from(setup.contacts.len()).unwrap_or(0);
+        estimate.contacts.residual_count = u32::try_from(setup.subtree_names().count()).unwrap_or(0);
         let mut propagation =
             Propagation::new(&setup.structure, &setup.covariance).expect("the covariance is of the model");
         let (learning, refusal) = match setup.identifies.then(|| Learning::new(&setup)).transpose() {
@@ -243,6 +272,7 @@ impl Pipeline {
             solver: Solver::new(&setup.structure),
             propagation,
             motion: Box::new(motion.expect("the base is a link of the model")),
+            watch: Watch::new(&setup.structure),
             position: setup.locked.iter().map(|q| if q.is_nan() { 0.0 } else { *q }).collect(),
             velocity: vec![0.0; dofs],
             acceleration: vec![0.0; dofs],
@@ -253,6 +283,7 @@ impl Pipeline {
                 active: None,
                 torques: vec![Dependence::default(); dofs],
                 contacts: vec![Dependence::default(); contacts],
+                subtrees: vec![Dependence::default(); setup.structure.subtrees().len()],
             },
             learning,
             refusal,
@@ -464,7 +495,9 @@ impl Pipeline {
             let active = self.active(instant);
             let base = self.standing(&active);
             learning.observe(instant, &self.setup, &self.tracks, &active, base);
-            learning.apply(&mut self.setup, &mut self.propagation);
+            if learning.apply(&mut self.setup, &mut self.propagation) {
+                self.watch.begin_anew();
+            }
         }
         self.learning = Some(learning);
     }
@@ -566,8 +599,7 @@ impl Pipeline {
                             if let Some(place) = self.without_temperature.get_mut(number) {
                                 *place = unknown != [0.0; 6];
                             }
-                            let learning = self.learning.as_ref();
-                            let excess = learning.map_or([0.0; 6], |l| l.excess(&self.setup, number));
+                            let excess = self.setup.excess.get(number).copied().unwrap_or_default();
                             let widened = std::array::from_fn(|i| unknown[i] + excess[i]);
                             self.propagation.set_widened(number, widened);
                             let corrected = calibration.apply(&Wrench::from_parts([fx, fy, fz], [tx, ty, tz]), celsius);
@@ -595,18 +627,30 @@ impl Pipeline {
                 _ => Reason::NeverSeen,
             };
         }
+        // What was detected at the last instant most likely is still there.
+        let detected = self.watch.detected().difference(&active);
+        let mut solved = self.solve(t, &base, imu.as_ref(), &active.union(&detected));
+        self.watch(t, &active, solved);
+        if solved && self.watch.detected() != detected {
+            solved = self.solve(t, &base, imu.as_ref(), &active.union(&self.watch.detected()));
+        }
+        self.tell(t, solved);
+    }
+
+    /// Solves with these contacts present, and says how uncertain that is; whether it could.
+    fn solve(&mut self, t: Nanos, base: &FrameMotion, imu: Option<&(FrameMotion, Pose)>, active: &ContactSet) -> bool {
         let Setup { model, structure, .. } = &self.setup;
         let state = JointState {
             position: &self.position,
             velocity: &self.velocity,
             acceleration: &self.acceleration,
         };
-        let solved = self
-            .kinematics
-            .update(model, state, &base)
+        self.dependences.update(structure, &self.kinematics, active);
+        self.kinematics
+            .update(model, state, base)
             .and_then(|()| {
                 self.solver
-                    .solve(model, structure, &self.kinematics, &self.readings, &active, &[])
+                    .solve(model, structure, &self.kinematics, &self.readings, active, &[])
             })
             .and_then(|()| self.solver.update_deviations(structure))
             .and_then(|()| self.propagation.update(structure, &self.solver, &self.kinematics, t))
@@ -616,29 +660,41 @@ impl Pipeline {
                     model,
                     structure,
                     state,
-                    base: &base,
-                    imu: imu.as_ref().map(|(measured, pose)| (measured, pose)),
+                    base,
+                    imu: imu.map(|(measured, pose)| (measured, pose)),
                     readings: &self.readings,
-                    active: &active,
+                    active,
                     solver: &self.solver,
                     base_link: self.kinematics.base(),
                 })
             })
-            .is_ok();
-        if self.dependences.active != Some(active) {
-            self.dependences.active = Some(active);
-            for (dof, place) in self.dependences.torques.iter_mut().enumerate() {
-                *place = structure
-                    .torque_dependence(dof, &self.kinematics, &active)
-                    .unwrap_or_default();
-            }
-            for (contact, place) in self.dependences.contacts.iter_mut().enumerate() {
-                *place = structure
-                    .contact_dependence(contact, &self.kinematics, &active)
-                    .unwrap_or_default();
-            }
+            .is_ok()
+    }
+
+    /// Looks for what contradicts the solution, when the contacts in `declared` are known to be present.
+    fn watch(&mut self, t: Nanos, declared: &ContactSet, solved: bool) {
+        if !solved {
+            return self.watch.forget();
         }
-        self.tell(t, solved);
+        let judge = Judge {
+            channels: self.setup.channels(),
+            faults: &self.faults,
+            base_fault: self.base_fault,
+        };
+        let instant = watch::Instant {
+            t,
+            structure: &self.setup.structure,
+            kinematics: &self.kinematics,
+            solver: &self.solver,
+            declared,
+        };
+        let covariance = |number: usize| {
+            let dependence = self.dependences.subtrees.get(number)?;
+            let (reason, _) = judge.verdict(dependence);
+            let learnt = self.propagation.imbalances().get(number)?;
+            (reason == Reason::None).then(|| learnt + self.motion.imbalance(number))
+        };
+        self.watch.update(&instant, covariance);
     }
 
     /// Writes the estimate: numbers, validity, reasons.
@@ -659,14 +715,28 @@ impl Pipeline {
             .zip(self.propagation.torque())
             .zip(self.solver.torque_certainty())
             .zip(self.motion.torques());
+        let structure = &self.setup.structure;
+        let is_unexplained = |link: usize| {
+            let seen = structure
+                .subtree_of(link)
+                .and_then(|number| self.watch.seen().nth(number));
+            seen.is_some_and(|seen| seen.is_unexplained)
+        };
+        let unexplained = |dof: usize| structure.link_of(dof).is_some_and(is_unexplained);
+        let detected = self.watch.detected();
         let places = self.estimate.torques.joints.iter_mut().zip(&self.dependences.torques);
-        for ((place, dependence), ((((torque, noise), model), certainty), motion)) in places.zip(results) {
+        for (dof, ((place, dependence), ((((torque, noise), model), certainty), motion))) in
+            places.zip(results).enumerate()
+        {
             let (mut reason, mut cause) = judge.verdict(dependence);
             let deviation = noise.hypot(*model).hypot(*motion);
             if reason == Reason::None && *certainty == Certainty::Assumed {
                 reason = Reason::Undetermined;
             }
-            if reason == Reason::None && deviation > self.setup.max_deviation {
+            if reason == Reason::None && unexplained(dof) {
+                reason = Reason::Unexplained;
+            }
+            if reason == Reason::None && self.setup.max_deviation.get(dof).is_some_and(|most| deviation > *most) {
                 reason = Reason::Uncertain;
             }
             if !solved || !torque.is_finite() || !deviation.is_finite() {
@@ -691,8 +761,13 @@ impl Pipeline {
             .zip(&self.dependences.contacts);
         let results = self.solver.contacts().iter().zip(self.propagation.contacts());
         let results = results.zip(self.motion.contacts());
-        for ((place, dependence), ((result, model), motion)) in places.zip(results).take(self.setup.contacts.len()) {
+        let contacts = places.zip(results).take(self.setup.contacts.len());
+        for (number, ((place, dependence), ((result, model), motion))) in contacts.enumerate() {
             let (mut reason, mut cause) = judge.verdict(dependence);
+            let link = structure.contacts().get(number).map(|spec| spec.frame.link);
+            if reason == Reason::None && link.is_some_and(is_unexplained) {
+                reason = Reason::Unexplained;
+            }
             match result.certainty {
                 Certainty::Absent => (reason, cause) = (Reason::Absent, NO_CAUSE),
                 Certainty::Assumed if reason == Reason::None => reason = Reason::Undetermined,
@@ -721,7 +796,21 @@ impl Pipeline {
                 valid: u32::from(reason == Reason::None),
                 reason,
                 cause,
-                reserved: 0,
+                detected: u32::from(detected.contains(number)),
+            };
+        }
+        let places = self.estimate.contacts.residuals.iter_mut();
+        for (place, seen) in places.zip(self.watch.seen()) {
+            let [fx, fy, fz, tx, ty, tz] = seen.residual.force_first();
+            *place = Residual {
+                force: [fx, fy, fz],
+                torque: [tx, ty, tz],
+                significance: seen.significance,
+                contact: seen
+                    .contact
+                    .and_then(|contact| u32::try_from(contact).ok())
+                    .unwrap_or(NO_CONTACT),
+                unexplained: u32::from(seen.is_unexplained),
             };
         }
     }

@@ -3,17 +3,17 @@
 use crate::calibration::{self, Calibration, Kind as Calibrated, Unknown};
 use crate::config::{
     Base, Config, ContactKind as KindWord, Differentiation, Direction, Foot, ForceTorque, Gain, IdentificationInput,
-    Presence, SensorFrame, TorqueSide,
+    Presence, STANDARD_GRAVITY, SensorFrame, TorqueSide, UNKNOWN_OFFSET,
 };
 use crate::differentiate::Settings;
 use crate::dynamics::{ContactKind, ContactSet, ContactSpec, FrameMotion, Noise, SensorCut, Structure, StructureError};
-use crate::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
+use crate::model::{Frame, JointKind, MeasurementDirection, MeasurementFrame, Model};
 use crate::parameters::{Offset, Parameters, ParametersError, cad_root};
 use crate::regressor::Covariance;
 use crate::regressor::identifiable::{BaseRegime, Identifiable, JointMotion, Measured, Offsets, Regime, Scope};
 use crate::spatial::{Pose, RigidInertia, Vec3, Wrench};
 use nalgebra::DMatrix;
-use proprio_topics::{Description, Entry, Kind, MAX_CONTACTS, MAX_JOINTS, Name, Nanos, Publisher, Role};
+use proprio_topics::{Description, Entry, Kind, MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name, Nanos, Publisher, Role};
 use std::fmt;
 
 /// How many samples an estimate of velocity and acceleration uses at the most: the differentiator keeps 128, and the rest
@@ -92,6 +92,8 @@ pub struct Setup {
     pub locked: Vec<f64>,
     /// Per F/T sensor, what its corrected reading is with no load.
     pub offsets: Vec<Wrench>,
+    /// Per F/T sensor, by what variance its readings are noisier than configured, as was found [torque; force] \[Nm^2, N^2\].
+    pub excess: Vec<[f64; 6]>,
     /// Per F/T sensor, how its readings are corrected.
     pub calibrations: Vec<Calibration>,
     /// What of the sensors' calibrations is identified from recorded logs.
@@ -110,8 +112,10 @@ pub struct Setup {
     pub max_wait: Nanos,
     /// How long a channel may be silent.
     pub max_silence: Nanos,
-    /// A torque whose standard deviation exceeds this is withheld \[Nm\].
-    pub max_deviation: f64,
+    /// Per degree of freedom: a torque whose standard deviation exceeds this is withheld \[Nm or N\]. If it is not configured, the most that gravity can make of the links beyond the
+    /// joint, by the URDF and the limb stretched out (who knows nothing but that knows as much), or a quarter of the joint's effort limit, whichever is more. A URDF without a credible
+    /// limit is taken to mean ten times that load.
+    pub max_deviation: Vec<f64>,
     /// How joint positions are differentiated.
     pub joint_settings: Settings,
     /// How angular velocities are differentiated.
@@ -305,16 +309,10 @@ impl Setup {
             max_window: Nanos::from_seconds(max_window_ms * 1e-3),
             max_gap: max_silence,
         };
-        let configured: Vec<(Wrench, [f64; 6])> = config
-            .force_torque
-            .iter()
-            .map(|f| {
-                let ([fx, fy, fz], [tx, ty, tz]) = (f.offset_std_n, f.offset_std_nm);
-                (Wrench::from_parts(f.offset_n, f.offset_nm), [tx, ty, tz, fx, fy, fz])
-            })
-            .collect();
+        let configured: Vec<(Wrench, [f64; 6])> = config.force_torque.iter().map(ForceTorque::offset).collect();
         let workbench: Vec<Calibration> = config.force_torque.iter().map(ForceTorque::calibration).collect();
         let mut setup = Self {
+            excess: vec![[0.0; 6]; configured.len()],
             calibrations: workbench.clone(),
             workbench,
             calibrated: calibration::Kind {
@@ -334,7 +332,10 @@ impl Setup {
             trigger,
             max_wait: Nanos::from_seconds(config.output.max_wait_ms * 1e-3),
             max_silence,
-            max_deviation: config.output.max_torque_std_nm.unwrap_or(f64::INFINITY),
+            max_deviation: config
+                .output
+                .max_torque_std_nm
+                .map_or_else(|| worthless(&model), |bound| vec![bound; dofs]),
             joint_settings: settings(position_noise_rad),
             gyro_settings: settings(angular_velocity_noise_radps),
             covariance: Covariance::exact(model.link_count(), configured.len()),
@@ -375,6 +376,7 @@ impl Setup {
         self.covariance = Covariance::exact(links, sensors);
         self.offsets = self.configured.iter().map(|(offset, _)| *offset).collect();
         self.calibrations.clone_from(&self.workbench);
+        self.excess.fill([0.0; 6]);
         for (link, cad) in self.cad.iter().enumerate() {
             let identified = self.identified.as_ref().and_then(|parameters| parameters.inertia(link));
             let _ = self.model.set_inertia(link, identified.unwrap_or(*cad));
@@ -388,6 +390,12 @@ impl Setup {
                 if let Some(place) = self.offsets.get_mut(sensor) {
                     *place = offset.reading;
                 }
+                set_noise(
+                    &mut self.excess,
+                    &self.structure,
+                    sensor,
+                    offset.noise.torque_first().map(|x| x * x),
+                );
                 if let (Some(place), Some(found)) = (self.calibrations.get_mut(sensor), &offset.calibrated) {
                     *place = found.calibration;
                     calibrated.push((sensor, found.kind));
@@ -458,8 +466,6 @@ impl Setup {
     /// Calibrations are not identified on-line. Those that were identified before stay as uncertain as they were found to be, independent of the rest but for this: an offset that is
     /// found on-line was found with the gain as it is, and takes up what the gain's error `E` makes of the offset itself. What is left is its share of the load, `E (r - o)`.
     pub fn covariance_with<'a>(&self, groups: impl Iterator<Item = Learnt<'a>>) -> Covariance {
-        /// Of an offset before anything is known of it [Nm], [N].
-        const ANYTHING: [f64; 6] = [100.0, 100.0, 100.0, 1000.0, 1000.0, 1000.0];
         let mut covariance = Covariance::exact(self.cad.len(), self.configured.len());
         let mut measured = Vec::new();
         // Numbers are the model's own, and each is in one group only: nothing is refused.
@@ -481,7 +487,7 @@ impl Setup {
                 }
             }
             for &sensor in group.sensors {
-                self.add_offset(&mut covariance, sensor, &ANYTHING);
+                self.add_offset(&mut covariance, sensor, &UNKNOWN_OFFSET);
             }
         }
         self.fill(&mut covariance, &measured);
@@ -558,6 +564,14 @@ impl Setup {
     /// The names of the contacts, in the order of the estimates.
     pub fn contact_names(&self) -> impl Iterator<Item = &str> {
         self.contacts.iter().map(|c| c.name.as_str())
+    }
+
+    /// The names of the sub-trees, those of their top links, in the order of the estimates.
+    pub fn subtree_names(&self) -> impl Iterator<Item = &str> {
+        let subtrees = self.structure.subtrees().iter();
+        subtrees
+            .take(MAX_SUBTREES)
+            .map(|subtree| self.model.link_name(subtree.top))
     }
 
     /// What is odd but not wrong, one sentence each.
@@ -760,12 +774,65 @@ impl Setup {
             kind: Kind::Wrench,
             ..Entry::NONE
         });
+        let subtrees = self.subtree_names().map(|top| Entry {
+            name: name(top),
+            frame: name(top),
+            role: Role::SubTree,
+            kind: Kind::Wrench,
+            ..Entry::NONE
+        });
         let numbered = channels.zip(0..).chain(joints.zip(0..)).chain(contacts.zip(0..));
+        let numbered = numbered.chain(subtrees.zip(0..));
         Box::new(Description::new(
             Publisher::Estimator,
             numbered.map(|(entry, index)| Entry { index, ..entry }),
         ))
     }
+}
+
+/// Says what variance the readings of a sensor have [torque; force].
+pub(crate) fn set_noise(excess: &mut [[f64; 6]], structure: &Structure, sensor: usize, found: [f64; 6]) {
+    if let (Some(place), Some(cut)) = (excess.get_mut(sensor), structure.sensors().get(sensor)) {
+        let stated = Wrench::from_parts(cut.noise().force, cut.noise().torque).torque_first();
+        *place = std::array::from_fn(|i| (found[i] - stated[i] * stated[i]).max(0.0));
+    }
+}
+
+/// Of each degree of freedom, the standard deviation beyond which a torque is worth nothing ([`Setup::max_deviation`]) \[Nm or N\]. Gravity makes of the links beyond a joint at the most
+/// `g sum m d`, `d` along the joints' origins.
+fn worthless(model: &Model) -> Vec<f64> {
+    /// Drives carry some ten times the links alone. A limit beyond a hundred times is no limit, but a number that had to be there.
+    const USUAL: f64 = 10.0;
+    const CREDIBLE: f64 = 100.0;
+    let mut bounds = gravity_loads(model);
+    for (number, joint) in model.joints().iter().enumerate() {
+        if let Some(bound) = joint.dof.and_then(|dof| bounds.get_mut(dof)) {
+            let effort = model.effort(number).filter(|effort| *effort <= CREDIBLE * *bound);
+            *bound = bound.max(effort.unwrap_or(USUAL * *bound) / 4.0);
+        }
+    }
+    bounds
+}
+
+fn gravity_loads(model: &Model) -> Vec<f64> {
+    let mut loads = vec![0.0; model.dof_count()];
+    // Beyond each joint, from the tips on: mass, and its moment with the limb stretched out from the joint's origin.
+    let mut beyond = vec![(0.0, 0.0); model.link_count()];
+    for joint in model.joints().iter().rev() {
+        let body = model.inertias().get(joint.child);
+        let (mass, moment) = body.map_or((0.0, 0.0), |body| (body.mass, body.first_moment.norm()));
+        let (more, moment_of_more) = beyond.get(joint.child).copied().unwrap_or_default();
+        let (mass, moment) = (mass + more, moment + moment_of_more);
+        if let Some(load) = joint.dof.and_then(|dof| loads.get_mut(dof)) {
+            let is_prismatic = matches!(joint.kind, JointKind::Prismatic(_));
+            *load = STANDARD_GRAVITY * if is_prismatic { mass } else { moment };
+        }
+        if let Some((sum, moments)) = beyond.get_mut(joint.parent) {
+            *sum += mass;
+            *moments += moment + mass * joint.placement.translation.norm();
+        }
+    }
+    loads
 }
 
 fn sensors(config: &Config, model: &Model, warnings: &mut Vec<String>) -> Result<Vec<SensorCut>, String> {

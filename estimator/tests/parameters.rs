@@ -450,6 +450,7 @@ fn identified(setup: &Setup, random: &mut Random) -> Parameters {
         reading: Wrench::from_parts([1.0, 2.0, 3.0], [0.1, 0.2, 0.3]),
         drift: Wrench::from_parts([0.01, 0.02, 0.03], [1e-3, 2e-3, 3e-3]),
         known: KNOWN,
+        noise: Wrench::from_parts([0.3, 0.2, 0.1], [0.03, 0.02, 0.01]),
         calibrated: None,
     };
     let columns = 10 * links.len() + 6;
@@ -577,7 +578,7 @@ fn a_torque_without_a_sensor_is_as_uncertain_as_the_model() {
 #[test]
 fn an_uncertain_offset_makes_torques_uncertain_and_drift_makes_them_more_so() {
     let known = estimates(arm());
-    let unsure = estimates(arm_with(|config| config.force_torque[0].offset_std_nm = [3.0; 3]));
+    let unsure = estimates(arm_with(|config| config.force_torque[0].offset_std_nm = Some([3.0; 3])));
     let shoulder = "torque_std/l_shoulder_pitch";
     assert!(
         known[shoulder]
@@ -955,6 +956,7 @@ fn an_icubs_file_is_less_than_a_megabyte() {
             reading: Wrench::from_parts([1.0 / 3.0; 3], [1.0 / 7.0; 3]),
             drift: Wrench::zero(),
             known: Nanos::ZERO,
+            noise: Wrench::zero(),
             calibrated: None,
         })
         .collect();

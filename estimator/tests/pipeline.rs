@@ -20,7 +20,7 @@ fn root() -> PathBuf {
 fn setup(change: impl FnOnce(&mut Config)) -> Setup {
     let mut config = Config::load(&root().join("config/icub_left_arm/estimator.toml")).unwrap();
     for ft in &mut config.force_torque {
-        (ft.offset_n, ft.offset_nm) = ([0.0; 3], [0.0; 3]);
+        (ft.offset_n, ft.offset_nm) = (Some([0.0; 3]), Some([0.0; 3]));
     }
     change(&mut config);
     Setup::new(&config).unwrap()
@@ -289,8 +289,8 @@ fn without_a_temperature_torques_are_less_certain() {
         let mut pipeline = Pipeline::new(setup(|config| {
             calibrate(config, &change);
             let ft = &mut config.force_torque[0];
-            ft.offset_std_n = ft.temperature_n_per_k.map(|k| (k * kelvin).abs());
-            ft.offset_std_nm = ft.temperature_nm_per_k.map(|k| (k * kelvin).abs());
+            ft.offset_std_n = Some(ft.temperature_n_per_k.map(|k| (k * kelvin).abs()));
+            ft.offset_std_nm = Some(ft.temperature_nm_per_k.map(|k| (k * kelvin).abs()));
         }));
         let t = Nanos::from_seconds(10_000.0);
         if let Some(age) = age {
@@ -355,7 +355,7 @@ fn what_was_learnt_with_sensors_that_measured_otherwise_is_not_resumed() {
     let state = state.expect("a job within three seconds");
     learning(&|_| {}).resume(&state).unwrap();
     // Offsets are not of it: a restart may change them.
-    learning(&|config| config.force_torque[0].offset_n = [5.0, 0.0, 0.0])
+    learning(&|config| config.force_torque[0].offset_n = Some([5.0, 0.0, 0.0]))
         .resume(&state)
         .unwrap();
     let other: [&dyn Fn(&mut Config); 4] = [
@@ -506,7 +506,8 @@ fn bits(estimates: &[Estimate]) -> Vec<(Nanos, Vec<Bits>)> {
 
 #[test]
 fn every_trigger_stamp_gives_one_estimate_in_order() {
-    let setup = setup(|_| {});
+    // However uncertain what is extrapolated is.
+    let setup = setup(|config| config.output.max_torque_std_nm = Some(1000.0));
     let events = recording(&setup, 0.5);
     let stamps: Vec<Nanos> = events.iter().filter(|e| e.0 == setup.trigger).map(|e| e.1).collect();
     let (estimates, _) = run(setup, &events);
@@ -1112,4 +1113,179 @@ fn a_torque_that_is_too_uncertain_is_withheld() {
             (expected, other.torque.to_bits())
         );
     }
+}
+
+/// The hand may be touched, but nobody says when; the arm is known exactly.
+fn touchable(config: &mut Config) {
+    config.identification.model_std = 0.0;
+    let hand = config.contact.iter_mut().find(|contact| contact.name() == "hand");
+    hand.unwrap().presence = Presence::Possible;
+}
+
+/// What is estimated of a golden log, with so much added to what the F/T sensor reads from each row on [N, Nm].
+fn touched(
+    change: impl FnOnce(&mut Config),
+    name: &str,
+    add: impl Fn(usize) -> [f64; 6],
+) -> HashMap<String, Vec<String>> {
+    let log = golden(name);
+    let mut rows = log
+        .lines()
+        .map(|line| line.split(',').map(str::to_owned).collect::<Vec<_>>());
+    let header = rows.next().unwrap();
+    let first = header.iter().position(|c| c == "wrench/l_arm_ft_sensor/fx").unwrap();
+    let mut text = header.join(",") + "\n";
+    for (number, mut row) in rows.enumerate() {
+        for (cell, more) in row[first..first + 6].iter_mut().zip(add(number)) {
+            *cell = (cell.parse::<f64>().unwrap() + more).to_string();
+        }
+        text += &(row.join(",") + "\n");
+    }
+    let mut out = Vec::new();
+    offline::estimate(setup(change), text.as_bytes(), &mut out).unwrap();
+    table(std::str::from_utf8(&out).unwrap())
+}
+
+/// MuJoCo pushes the hand, and nobody says so: the same torques and the same wrench as if somebody had.
+#[test]
+fn a_touch_that_nobody_declares_is_detected() {
+    let file = "icub_left_arm_mujoco_contact.csv";
+    let found = touched(touchable, file, |_| [0.0; 6]);
+    let told = touched(
+        |config| {
+            touchable(config);
+            config.contact.last_mut().unwrap().presence = Presence::Always;
+        },
+        file,
+        |_| [0.0; 6],
+    );
+    for (name, cells) in &told {
+        if !name.starts_with("residual/") && name != "contact/hand/detected" {
+            assert_eq!(cells, &found[name], "{name}");
+        }
+    }
+    assert!(found["contact/hand/detected"].iter().all(|d| d == "1"));
+    assert!(told["contact/hand/detected"].iter().all(|d| d == "0"));
+    assert!(found["residual/l_upper_arm/contact"].iter().all(|name| name == "hand"));
+    // What acts there is told with how uncertain it is, and nothing is told where it can not be tested.
+    assert!(
+        found["contact/hand/fx_std"]
+            .iter()
+            .all(|std| std.parse::<f64>().unwrap() > 0.0)
+    );
+    assert!(told["residual/l_upper_arm/significance"].iter().all(String::is_empty));
+    assert!(found["residual/chest/significance"].iter().all(String::is_empty));
+}
+
+#[test]
+fn nothing_is_detected_where_nothing_acts() {
+    for model_std in [0.0, 0.2] {
+        let change = |config: &mut Config| {
+            touchable(config);
+            config.identification.model_std = model_std;
+        };
+        let found = touched(change, "icub_left_arm_mujoco.csv", |_| [0.0; 6]);
+        assert!(found["residual/l_upper_arm/contact"].iter().all(String::is_empty));
+        let significance = &found["residual/l_upper_arm/significance"];
+        assert!(significance.iter().all(|s| s.parse::<f64>().unwrap() < 0.0));
+        assert!(found["contact/hand/detected"].iter().all(|d| d == "0"));
+    }
+}
+
+/// A moment without a force is no touch of the hand, and a force far from it is none either. Where it acts nobody knows.
+#[test]
+fn what_no_contact_explains_withholds_the_torques_that_rest_on_it() {
+    let push = |number: usize| if (50..100).contains(&number) { 1.0 } else { 0.0 };
+    for far in [[0.0, 0.0, 0.0, 0.0, 8.0, 0.0], [0.0, 100.0, 0.0, 0.0, 0.0, 0.0]] {
+        let found = touched(touchable, "icub_left_arm_mujoco.csv", |n| far.map(|x| x * push(n)));
+        for (joint, sees) in [("l_elbow", true), ("l_wrist_yaw", true), ("l_shoulder_roll", false)] {
+            let column = |what: &str| &found[&format!("{what}/{joint}")];
+            for (number, (reason, valid)) in column("reason").iter().zip(column("valid")).enumerate() {
+                let is_pushed = sees && push(number) > 0.0;
+                let expected = if is_pushed { ("unexplained", "0") } else { ("", "1") };
+                assert_eq!((reason.as_str(), valid.as_str()), expected, "{joint} {number} {far:?}");
+            }
+        }
+        let told = |number: usize| found["residual/l_upper_arm/contact"][number].as_str();
+        assert!((0..201).all(|n| told(n) == if push(n) > 0.0 { "unexplained" } else { "" }));
+        // The residual is what was added: by the parent on the child it is the opposite.
+        let force: f64 = ["fx", "fy", "fz"]
+            .map(|axis| {
+                found[&format!("residual/l_upper_arm/{axis}")][60]
+                    .parse::<f64>()
+                    .unwrap()
+                    .powi(2)
+            })
+            .iter()
+            .sum();
+        assert!((force.sqrt() - far[1]).abs() < 1e-6);
+    }
+}
+
+/// Noise hides a small force from one reading, but not from the mean of many. And once it is over, it is over.
+#[test]
+fn a_mean_shows_what_no_single_reading_does() {
+    let noisy = |config: &mut Config| {
+        touchable(config);
+        config.force_torque[0].noise_n = [1.0; 3];
+        config.force_torque[0].noise_nm = [0.1; 3];
+        config.output.max_wait_ms = 20.0;
+    };
+    let setup = setup(noisy);
+    let events = recording(&setup, 0.9);
+    let hand = setup.contact("hand").unwrap();
+    let (from, to) = (Nanos::from_millis(400), Nanos::from_millis(700));
+    let detected = |force: f64| {
+        let mut pipeline = Pipeline::new(setup.clone());
+        let mut found = Vec::new();
+        for (channel, t, reading, quality) in &events {
+            let mut reading = *reading;
+            if let Reading::Wrench(wrench) = &mut reading
+                && (from..to).contains(t)
+            {
+                wrench.force[0] += force;
+            }
+            pipeline.push(*channel, *t, &reading, *quality);
+            while let Some(estimate) = pipeline.poll() {
+                let residuals = estimate.contacts.residuals();
+                let is_seen = residuals.iter().any(|r| r.unexplained == 1 || r.contact == hand as u32);
+                found.push((estimate.t, is_seen));
+            }
+        }
+        found
+    };
+    // 2.5 standard deviations of one reading; of some 50 that are averaged many more.
+    let found = detected(2.5);
+    let first = found.iter().find(|(_, seen)| *seen).expect("it is seen").0;
+    let last = found.iter().rev().find(|(_, seen)| *seen).unwrap().0;
+    assert!(
+        first > from + Nanos::from_millis(2) && first < from + Nanos::from_millis(60),
+        "{first}"
+    );
+    assert!(last > to && last < to + Nanos::from_millis(150), "{last}");
+    // Ten of them are seen at once.
+    let found = detected(10.0);
+    let first = found.iter().find(|(_, seen)| *seen).expect("it is seen").0;
+    assert!(first >= from && first < from + Nanos::from_millis(2), "{first}");
+}
+
+/// An offset that is neither configured nor identified may be anything: nothing contradicts it, and what rests on it says nothing.
+#[test]
+fn an_offset_that_nobody_states_is_unknown() {
+    let unknown = |config: &mut Config| {
+        touchable(config);
+        (config.force_torque[0].offset_n, config.force_torque[0].offset_nm) = (None, None);
+    };
+    let found = touched(unknown, "icub_left_arm_mujoco.csv", |_| {
+        [100.0, -50.0, 20.0, 3.0, -2.0, 1.0]
+    });
+    assert!(found["residual/l_upper_arm/contact"].iter().all(String::is_empty));
+    for (joint, reason) in [("l_shoulder_roll", "uncertain"), ("l_elbow", "")] {
+        assert!(
+            found[&format!("reason/{joint}")].iter().all(|own| own == reason),
+            "{joint}"
+        );
+    }
+    let std = |joint: &str| found[&format!("torque_std/{joint}")][0].parse::<f64>().unwrap();
+    assert!(std("l_shoulder_roll") > 100.0 && std("l_elbow") < 0.1);
 }

@@ -161,11 +161,10 @@ impl Simulation {
         let mut sensors = Vec::new();
         for ft in &robot.config.force_torque {
             let cut = sensor_cut(&model, ft).map_err(|e| wrong(format!("force_torque {:?}: {e}", ft.sensor)))?;
-            let ([a, b, c], [d, e, f]) = (ft.offset_n, ft.offset_nm);
             sensors.push(Sensor {
                 name: ft.sensor.clone(),
                 cut,
-                offset: [a, b, c, d, e, f],
+                offset: ft.offset().0.force_first(),
             });
         }
 
@@ -513,8 +512,8 @@ mod tests {
     fn agrees(file: &str, rows: usize) {
         let mut robot = robot();
         let offsets = robot.config.force_torque[0].clone();
-        robot.config.force_torque[0].offset_n = [0.0; 3];
-        robot.config.force_torque[0].offset_nm = [0.0; 3];
+        robot.config.force_torque[0].offset_n = None;
+        robot.config.force_torque[0].offset_nm = None;
         let mut simulation = Simulation::new(&robot, &Settings::default()).unwrap();
         let push = simulation.push.unwrap();
         let table = golden(file);
@@ -561,7 +560,7 @@ mod tests {
         let bare = simulation.at(3.0).wrenches[0];
         robot.config.force_torque[0] = offsets.clone();
         let mut simulation = Simulation::new(&robot, &Settings::default()).unwrap();
-        let offset = [offsets.offset_n, offsets.offset_nm].concat();
+        let offset = offsets.offset().0.force_first();
         assert!(
             offset.iter().all(|o| *o != 0.0),
             "a robot whose offsets are zero shows nothing"

@@ -1618,6 +1618,7 @@ fn parameters_file() -> String {
         reading: spatial::Wrench::zero(),
         drift: spatial::Wrench::zero(),
         known: Nanos::ZERO,
+        noise: spatial::Wrench::zero(),
         calibrated: None,
     };
     let provenance = Provenance {

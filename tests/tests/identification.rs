@@ -137,6 +137,10 @@ impl Sessions {
     }
 
     fn setup_for(&self, hand: Presence, urdf: Urdf, offsets_of: Option<&str>) -> Setup {
+        Setup::new(&self.config(hand, urdf, offsets_of)).unwrap()
+    }
+
+    fn config(&self, hand: Presence, urdf: Urdf, offsets_of: Option<&str>) -> Config {
         let mut config = Config::load(&self.folder.join("estimator.toml")).unwrap();
         config.contact.last_mut().expect("the hand").presence = hand;
         if urdf == Urdf::True {
@@ -155,11 +159,11 @@ impl Sessions {
             {
                 let [start, end] = ["start", "end"].map(|when| numbers(&offsets[sensor.as_str()][when]));
                 let middle: Vec<f64> = start.iter().zip(end).map(|(a, b)| 0.5 * (a + b)).collect();
-                offset_n.copy_from_slice(&middle[..3]);
-                offset_nm.copy_from_slice(&middle[3..]);
+                let three = |of: &[f64]| of.try_into().ok();
+                (*offset_n, *offset_nm) = (three(&middle[..3]), three(&middle[3..]));
             }
         }
-        Setup::new(&config).unwrap()
+        config
     }
 
     /// When a session begins to move, and when it ends [s].
@@ -433,8 +437,8 @@ fn a_push_at_the_hand_is_told_where_it_is_declared() {
             );
             assert!(error < &(2.0 * stated), "{joint}: {error}, stated {stated}");
         }
-        // A push is much of an elbow's torque: who is not told of it can not know the torque.
-        assert!(hidden["l_elbow"].error > 5.0 * declared["l_elbow"].error);
+        // Who is not told of a push finds it.
+        assert!(hidden["l_elbow"].error < 1.1 * declared["l_elbow"].error);
     }
 }
 
@@ -563,7 +567,7 @@ fn pushes_do_no_harm_to_what_is_learnt_on_line_declared_or_not() {
     let last = sessions.pushes("contact").last().expect("a push").1;
     for log in [undeclared(&log), log] {
         let (each, all) = nearer(&sessions, "contact", &log, |t| t > last + 1.0);
-        assert!(all > 3.0 && each.iter().all(|ratio| *ratio > 1.0), "{all} {each:?}");
+        assert!(all > 3.0 && each.iter().all(|ratio| *ratio > 1.2), "{all} {each:?}");
     }
 }
 
@@ -713,13 +717,11 @@ fn a_load_that_is_picked_up_is_noticed_and_learnt() {
                 (t > 21.5 && t < 23.5).then(|| at.torques.joints()[number].torque - tau)
             }))
         };
-        let exact = scores(
-            &sessions,
-            "payload",
-            &log,
-            sessions.setup(Urdf::True, Some("payload")),
-            |t| t > 20.0,
-        );
+        // Who knows the arm exactly, and that nothing touches it.
+        let mut exact = sessions.config(Presence::Possible, Urdf::True, Some("payload"));
+        exact.contact.retain(|contact| contact.name() != "hand");
+        let exact = Setup::new(&exact).unwrap();
+        let exact = scores(&sessions, "payload", &log, exact, |t| t > 20.0);
         let (error, without) = (error_of(&estimates), exact[*joint].error);
         println!("{joint}: {error:.4} Nm, without the load {without:.4}");
         // Two seconds after it is known what it is.
@@ -742,6 +744,7 @@ fn identification_begins_where_the_session_before_ended() {
         reading: known.offsets[0],
         drift: Wrench::zero(),
         known: Nanos::ZERO,
+        noise: Wrench::zero(),
         calibrated: None,
     };
     parameters.set_identified(&inertias, &[offset], &known.root).unwrap();
@@ -797,12 +800,7 @@ fn a_state_is_resumed_and_one_that_does_not_fit_is_refused() {
     let known = |pipeline: &Pipeline| pipeline.identification().unwrap().solution().components[0].clone();
     let (before, after) = (known(&taught), known(&resumed));
     for (a, b) in before.bodies.iter().zip(&after.bodies) {
-        assert!(
-            (a.mass - b.mass).abs() < 0.06 * a.mass.max(0.1),
-            "{} {}",
-            a.mass,
-            b.mass
-        );
+        assert!((a.mass - b.mass).abs() < 0.1 * a.mass.max(0.1), "{} {}", a.mass, b.mass);
     }
     // And it is of use from the beginning of the next session.
     let (begin, _) = sessions.moving("validate");

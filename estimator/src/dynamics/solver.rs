@@ -423,35 +423,16 @@ impl Solver {
         self.owners.clear();
         for contact in present.iter() {
             let spec = &structure.contacts()[contact];
-            let x_bf = contact_pose(spec, kinematics);
-            let arm = x_bf.point(&spec.position) - point;
-            let force = |direction: Vec3| (stack(&arm.cross(&direction), &direction), 1.0);
-            let torque = |direction: Vec3| (stack(&direction, &Vec3::zeros()), length);
-            let axis = |i: usize| x_bf.rotation.column(i).into_owned();
             self.starts[contact] = self.columns.len();
-            let mut push = |(column, weight): (Vector6<f64>, f64)| {
+            for (column, weight) in unknowns(spec, kinematics, point, length) {
                 self.columns.push(column);
                 self.owners.push(contact);
                 self.least.push(column, weight);
-            };
-            match spec.kind {
-                ContactKind::Wrench => {
-                    (0..3).for_each(|i| push(force(axis(i))));
-                    (0..3).for_each(|i| push(torque(axis(i))));
-                }
-                ContactKind::Force => (0..3).for_each(|i| push(force(axis(i)))),
-                ContactKind::ForceAlong(direction) => push(force(x_bf.rotation * direction)),
             }
         }
 
         let measured = !subtree.sensors.is_empty();
-        let lower = measured.then(|| {
-            let mut covariance = Matrix6::zeros();
-            for sensor in subtree.sensors.iter() {
-                add_covariance(&mut covariance, structure, sensor, &self.sensor_poses[sensor], point);
-            }
-            noise_factor(covariance)
-        });
+        let lower = measured.then(|| noise_factor(self.noise(structure, number, point)));
         // Without sensors nothing weighs the equations: the length scale does, about the contacts.
         let lower = lower.unwrap_or_else(|| scale_factor(length));
         self.least.factorise(&lower);
@@ -604,6 +585,20 @@ impl Solver {
         &self.gains[contact]
     }
 
+    /// What the links of a sub-tree need and its sensors do not give, contacts left out: `b`, in base coordinates.
+    pub(crate) fn imbalance(&self, structure: &Structure, number: usize) -> Wrench {
+        self.wrenches[structure.subtrees()[number].top]
+    }
+
+    /// Covariance of `b` [torque; force] from F/T noise, about `point`.
+    pub(crate) fn noise(&self, structure: &Structure, number: usize, point: &Vec3) -> Matrix6<f64> {
+        let mut covariance = Matrix6::zeros();
+        for sensor in structure.subtrees()[number].sensors.iter() {
+            add_covariance(&mut covariance, structure, sensor, &self.sensor_poses[sensor], point);
+        }
+        covariance
+    }
+
     /// Whether its last solution is of these kinematics, as far as the poses of the F/T sensors tell. Not before the first.
     pub(crate) fn is_solved(&self, structure: &Structure, kinematics: &Kinematics) -> bool {
         // The same product of the same numbers has the same bits.
@@ -653,6 +648,28 @@ fn variance(structure: &Structure, sensor: usize, x_bm: &Pose, motion: &Motion) 
 
 fn contact_pose(spec: &ContactSpec, kinematics: &Kinematics) -> Pose {
     *kinematics.pose(spec.frame.link) * spec.frame.pose
+}
+
+/// The columns [torque; force] about `point` of what is unknown of a contact, and their weights in the least norm: forces and torques at its position, along the axes of its frame.
+pub(crate) fn unknowns(
+    spec: &ContactSpec,
+    kinematics: &Kinematics,
+    point: &Vec3,
+    length: f64,
+) -> arrayvec::ArrayVec<(Vector6<f64>, f64), 6> {
+    let x_bf = contact_pose(spec, kinematics);
+    let arm = x_bf.point(&spec.position) - point;
+    let force = |direction: Vec3| (stack(&arm.cross(&direction), &direction), 1.0);
+    let torque = |direction: Vec3| (stack(&direction, &Vec3::zeros()), length);
+    let axis = |i: usize| x_bf.rotation.column(i).into_owned();
+    match spec.kind {
+        ContactKind::Wrench => (0..3)
+            .map(|i| force(axis(i)))
+            .chain((0..3).map(|i| torque(axis(i))))
+            .collect(),
+        ContactKind::Force => (0..3).map(|i| force(axis(i))).collect(),
+        ContactKind::ForceAlong(direction) => std::iter::once(force(x_bf.rotation * direction)).collect(),
+    }
 }
 
 /// A row of motion coordinates about `point`, as a motion about the origin.

@@ -565,10 +565,14 @@ impl Structure {
         active: &ContactSet,
     ) -> Option<Dependence> {
         let link = self.contacts.get(contact)?.frame.link;
-        let number = self.subtree_of(link)?;
+        Some(self.subtree_dependence(self.subtree_of(link)?, kinematics, active))
+    }
+
+    /// What the balance of a sub-tree depends on.
+    pub(crate) fn subtree_dependence(&self, number: usize, kinematics: &Kinematics, active: &ContactSet) -> Dependence {
         let subtree = &self.subtrees[number];
         let links = self.links_of(number).collect();
-        Some(self.dependence(subtree.sensors, subtree.contacts, links, kinematics, active))
+        self.dependence(subtree.sensors, subtree.contacts, links, kinematics, active)
     }
 
     fn dependence(

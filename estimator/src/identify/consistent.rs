@@ -25,6 +25,7 @@ use nalgebra::{DMatrix, DVector, Matrix4, SymmetricEigen, Vector4};
 
 use super::prior::{CENTRED, Posterior, Prior, PriorError};
 use crate::spatial::{RigidInertia, Vec3};
+use crate::statistics::chi_square;
 
 /// The chance that bodies which exist are called impossible is at most this.
 pub const LEVEL: f64 = 1e-3;
@@ -185,7 +186,7 @@ fn follow(posterior: &Posterior, further: usize) -> Result<Consistent, PriorErro
     let excess = state.excess();
     let fit = posterior.finish(state, descent, (0.5 / weight).sqrt());
     let rank = posterior.rank().saturating_sub(further);
-    let limit = chi_square_limit(rank);
+    let limit = chi_square(rank, DEVIATE);
     let verdict = if excess <= limit {
         Verdict::Feasible
     } else if least > limit {
@@ -233,11 +234,4 @@ fn violations(posterior: &Posterior, inverses: &[Matrix4<f64>]) -> Result<Vec<Vi
     found.retain(|violation| violation.share >= LEAST_SHARE);
     found.sort_by(|a, b| b.share.total_cmp(&a.share));
     Ok(found)
-}
-
-/// What a chi-square variable exceeds with probability [`LEVEL`], by Wilson and Hilferty's cube; within 1 % from 3 degrees of freedom on, 3 % too large for one.
-fn chi_square_limit(freedom: usize) -> f64 {
-    let k = freedom.max(1) as f64;
-    let spread = 2.0 / (9.0 * k);
-    k * (1.0 - spread + DEVIATE * spread.sqrt()).powi(3)
 }

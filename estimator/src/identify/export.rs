@@ -67,6 +67,11 @@ pub fn parameters(outcome: &Outcome, setup: &Setup, program: &str) -> Result<Par
             reading: wrench(&offset.end),
             drift: wrench(&offset.rate),
             known: log.span.1,
+            noise: wrench(&["fx", "fy", "fz", "tx", "ty", "tz"].map(|axis| {
+                let name = format!("wrench/{}/{axis}", channel.name);
+                let found = outcome.channels.iter().find(|own| own.name == name);
+                found.map_or(0.0, |own| own.deviation)
+            })),
             calibrated: calibration.map(|own| Calibrated {
                 calibration: own.identified,
                 kind: own.kind,

@@ -57,6 +57,7 @@ use crate::model::Model;
 use crate::parameters::cad_root;
 use crate::regressor::{StackedRegressor, Weighting};
 use crate::spatial::{RigidInertia, Vec3, Wrench};
+use crate::statistics::chi_square;
 
 /// Ten parameters per link.
 const WIDTH: usize = 10;
@@ -656,7 +657,9 @@ impl Online {
             component.wander.copy_from_slice(&part.wander);
             component.judges = part.failure.is_none();
             component.counts.failed += u64::from(part.failure.is_some());
-            if let Some((change, information)) = &mut part.change {
+            // What has passed by itself meanwhile was no change.
+            part.is_replaced &= component.is_suspected;
+            if let Some((change, information)) = part.change.as_mut().filter(|_| component.is_suspected) {
                 component.last_change = Some(*change);
                 std::mem::swap(information, &mut component.information);
                 // As old as what it replaces.
@@ -1658,12 +1661,6 @@ impl Job {
     pub fn failures(&self) -> impl Iterator<Item = Option<&PriorError>> {
         self.parts.iter().map(|part| part.failure.as_ref())
     }
-}
-
-/// The number that a chi-square distribution with `freedom` degrees exceeds as often as a normal one exceeds `level` (Wilson, Hilferty 1931).
-fn chi_square(freedom: usize, level: f64) -> f64 {
-    let (n, spread) = (freedom as f64, 2.0 / (9.0 * freedom as f64));
-    n * (1.0 - spread + level * spread.sqrt()).powi(3)
 }
 
 #[cfg(test)]

@@ -66,6 +66,7 @@ struct RawJoint {
     child: usize,
     origin: Pose,
     limits: Option<Limits>,
+    effort: Option<f64>,
 }
 
 /// Reads, checks, folds and numbers.
@@ -469,6 +470,7 @@ fn read_joints(
             child,
             origin: pose(&joint.origin),
             limits,
+            effort: Some(joint.limit.effort).filter(|effort| *effort > 0.0 && effort.is_finite()),
         });
     }
     Ok(joints)
@@ -645,6 +647,7 @@ impl Folder<'_> {
                     parent_link: self.links[joint.parent].name.clone(),
                     child_link: self.links[joint.child].name.clone(),
                     limits: joint.limits,
+                    effort: joint.effort,
                 });
             } else if !has_inertial {
                 warnings.push(format!("root link {link_name}: neither it nor a link fixed to it has an <inertial>; it is taken to weigh nothing"));

@@ -9,13 +9,13 @@
 use proprio_topics::{InertiaEstimate, LinkInertia, Name, Nanos, Quality, Reason, SensorOffset};
 
 use super::{OrReason, Track, UNTRUSTED_ENCODER, quality_reason, temperature_at};
-use crate::dynamics::{ContactSet, DofSet, FrameMotion, JointState, Kinematics, SensorCut};
+use crate::dynamics::{ContactSet, DofSet, FrameMotion, JointState, Kinematics};
 use crate::history::{History, KEPT};
 use crate::identify::online::state::{Measuring, StateError};
 use crate::identify::online::{Job as Solving, Observation, Online, OnlineError, Solution};
 use crate::identify::prior::PriorError;
 use crate::regressor::{Covariance, Propagation};
-use crate::setup::{BaseMotion, Learnt, Setup, Use};
+use crate::setup::{BaseMotion, Learnt, Setup, Use, set_noise};
 use crate::spatial::{RigidInertia, Vec3, Wrench};
 
 /// How far behind an estimate an identification instant lies, and how far the samples reach that it is differentiated from.
@@ -402,20 +402,6 @@ impl Learning {
         Ok(())
     }
 
-    /// By what variance readings of a sensor are noisier than stated, [torque; force].
-    pub(super) fn excess(&self, setup: &Setup, sensor: usize) -> [f64; 6] {
-        let stated = setup.structure.sensors().get(sensor).map(SensorCut::noise);
-        let found = self.online.solution().components.iter().find_map(|component| {
-            let place = component.sensors.iter().position(|own| *own == sensor)?;
-            component.noise.get(place)
-        });
-        let (Some(stated), Some(found)) = (stated, found) else {
-            return [0.0; 6];
-        };
-        let stated = Wrench::from_parts(stated.force, stated.torque).torque_first();
-        std::array::from_fn(|i| (found[i] - stated[i] * stated[i]).max(0.0))
-    }
-
     /// Puts the last solution where the pipeline reads it.
     fn enforce(&mut self, setup: &mut Setup, propagation: &mut Propagation) {
         for component in &self.online.solution().components {
@@ -427,6 +413,9 @@ impl Learning {
                 if let Some(place) = setup.offsets.get_mut(sensor) {
                     *place = *offset;
                 }
+            }
+            for (&sensor, found) in component.sensors.iter().zip(&component.noise) {
+                set_noise(&mut setup.excess, &setup.structure, sensor, *found);
             }
         }
         if let Some(room) = &mut self.room {

@@ -15,6 +15,7 @@
 use crate::dynamics::{ContactSet, DynamicsError, FrameMotion, JointState, Kinematics, Solver, Structure};
 use crate::model::Model;
 use crate::spatial::{Pose, Wrench};
+use nalgebra::{Matrix6, Vector6};
 use proprio_topics::Nanos;
 
 /// How long a posture counts as the same.
@@ -51,7 +52,7 @@ pub(super) struct MotionErrors {
     solver: Solver,
     /// Standard deviations of x. Zero where it is exact.
     sigma: Vec<f64>,
-    /// Column by column: torques, then six numbers per contact.
+    /// Column by column: torques, then six numbers per contact, then the imbalance of each sub-tree.
     sensitivity: Vec<f64>,
     is_known: Vec<bool>,
     /// What the columns belong to.
@@ -60,12 +61,14 @@ pub(super) struct MotionErrors {
     /// Of each torque, then of `[fx fy fz tx ty tz]` of each contact.
     deviation: Vec<f64>,
     dofs: usize,
+    contacts: usize,
 }
 
 impl MotionErrors {
     pub(super) fn new(model: &Model, structure: &Structure, base_link: usize) -> Result<Self, DynamicsError> {
         let dofs = model.dof_count();
-        let (columns, rows) = (2 * dofs + 6, dofs + 6 * structure.contacts().len());
+        let contacts = structure.contacts().len();
+        let (columns, rows) = (2 * dofs + 6, dofs + 6 * (contacts + structure.subtrees().len()));
         let mut sigma = vec![0.0; columns];
         sigma[2 * dofs..2 * dofs + 3].fill(BASE_ACCELERATION);
         Ok(Self {
@@ -78,6 +81,7 @@ impl MotionErrors {
             perturbed: vec![0.0; 2 * dofs],
             deviation: vec![0.0; rows],
             dofs,
+            contacts,
         })
     }
 
@@ -184,9 +188,15 @@ impl MotionErrors {
         {
             *to = (with - without) / step;
         }
+        let mut sixes = contacts.chunks_exact_mut(6);
         let results = self.solver.contacts().iter().zip(instant.solver.contacts());
-        for (six, (with, without)) in contacts.chunks_exact_mut(6).zip(results) {
+        for ((with, without), six) in results.zip(&mut sixes) {
             let difference = (with.wrench - without.wrench).force_first();
+            six.iter_mut().zip(difference).for_each(|(to, x)| *to = x / step);
+        }
+        for (number, six) in sixes.enumerate() {
+            let [with, without] = [&self.solver, instant.solver].map(|s| s.imbalance(instant.structure, number));
+            let difference = (with - without).torque_first();
             six.iter_mut().zip(difference).for_each(|(to, x)| *to = x / step);
         }
         if let Some(known) = self.is_known.get_mut(column) {
@@ -203,5 +213,20 @@ impl MotionErrors {
     /// Of each contact's wrench, `[fx fy fz tx ty tz]` [N, Nm].
     pub(super) fn contacts(&self) -> impl Iterator<Item = &[f64]> {
         self.deviation.get(self.dofs..).unwrap_or_default().chunks_exact(6)
+    }
+
+    /// Covariance of a sub-tree's imbalance [torque; force], at the origin of base coordinates.
+    pub(super) fn imbalance(&self, number: usize) -> Matrix6<f64> {
+        let first = self.dofs + 6 * (self.contacts + number);
+        let mut covariance = Matrix6::zeros();
+        for (column, sigma) in self.sensitivity.chunks_exact(self.deviation.len()).zip(&self.sigma) {
+            if *sigma > 0.0
+                && let Some(six) = column.get(first..first + 6)
+            {
+                let six = Vector6::from_column_slice(six) * *sigma;
+                covariance += six * six.transpose();
+            }
+        }
+        covariance
     }
 }

@@ -29,7 +29,7 @@
 
 use std::ops::Range;
 
-use nalgebra::{Cholesky, DMatrix};
+use nalgebra::{Cholesky, DMatrix, Matrix6, Vector6};
 use proprio_topics::Nanos;
 use pulp::{Arch, Simd, WithSimd};
 
@@ -262,6 +262,8 @@ pub struct Propagation {
     begun: Option<Nanos>,
     torque: Vec<f64>,
     contacts: Vec<[f64; 6]>,
+    /// Of each sub-tree that a sensor measures, the covariance of its imbalance.
+    imbalances: Vec<Matrix6<f64>>,
 }
 
 /// A sub-tree: its part of the root, and room for the wrenches' roots.
@@ -375,6 +377,7 @@ impl Propagation {
             begun: None,
             torque: vec![0.0; structure.dof_count()],
             contacts: vec![[0.0; 6]; structure.contacts().len()],
+            imbalances: vec![Matrix6::zeros(); structure.subtrees().len()],
         })
     }
 
@@ -432,6 +435,11 @@ impl Propagation {
         &self.torque
     }
 
+    /// Covariance of each sub-tree's imbalance `b` [torque; force], at the origin of base coordinates [Nm, N]; zero where no sensor measures it.
+    pub fn imbalances(&self) -> &[Matrix6<f64>] {
+        &self.imbalances
+    }
+
     /// Standard deviations of the contacts' wrenches, `[fx fy fz tx ty tz]` [N, Nm], in the order of the structure's.
     pub fn contacts(&self) -> &[[f64; 6]] {
         &self.contacts
@@ -465,10 +473,18 @@ impl WithSimd for Update<'_> {
             widened,
             torque,
             contacts,
+            imbalances,
             ..
         } = propagation;
-        for (part, subtree) in parts.iter_mut().zip(structure.subtrees()) {
+        for ((part, subtree), imbalance) in parts.iter_mut().zip(structure.subtrees()).zip(imbalances) {
             part.update(simd, solver, kinematics);
+            if !part.ends.is_empty() {
+                *imbalance = part.covariance_of_all(simd);
+                for end in &part.ends {
+                    let variances = uncertain((&drifts[end.sensor], &widened[end.sensor]), times);
+                    add_turned(imbalance, solver.sensor_pose(end.sensor), &variances);
+                }
+            }
             let wandered = |motion: &dyn Fn(usize) -> Motion| -> f64 {
                 let of = |end: &End| {
                     wander(
@@ -515,11 +531,28 @@ fn wander(
     if drift.rate == [0.0; 6] && *widened == [0.0; 6] {
         return 0.0;
     }
-    let seconds = drift.known.elapsed(t, begun);
+    let variances = uncertain((drift, widened), (t, begun));
     let seen = x_bm.twist_back(&motion());
-    let variances = drift.rate.iter().zip(widened).map(|(rate, more)| seconds * rate + more);
     let squares = seen.angular.iter().chain(seen.linear.iter()).zip(variances);
     squares.map(|(m, variance)| m * m * variance).sum()
+}
+
+/// What an offset has wandered by `t`, and is uncertain by beside: a variance of each channel [torque; force].
+fn uncertain((drift, widened): (&Drift, &[f64; 6]), (t, begun): (Nanos, Nanos)) -> [f64; 6] {
+    let seconds = drift.known.elapsed(t, begun);
+    std::array::from_fn(|i| seconds * drift.rate[i] + widened[i])
+}
+
+/// Adds the covariance of a sensor whose channels [torque; force] have these variances, at the origin.
+fn add_turned(covariance: &mut Matrix6<f64>, x_bm: &Pose, variances: &[f64; 6]) {
+    for (channel, variance) in variances.iter().enumerate().filter(|(_, variance)| **variance > 0.0) {
+        let mut unit = [0.0; 6];
+        unit[channel] = 1.0;
+        let [tx, ty, tz, fx, fy, fz] = unit;
+        let column = x_bm.wrench(&Wrench::from_parts([fx, fy, fz], [tx, ty, tz]));
+        let column = Vector6::from(column.torque_first());
+        *covariance += *variance * column * column.transpose();
+    }
 }
 
 impl Part {
@@ -749,6 +782,28 @@ impl Part {
             }
         }
         f64::from(simd.reduce_sum_f32s(sum))
+    }
+
+    /// `W_b^T W_b`.
+    #[inline(always)]
+    fn covariance_of_all<S: Simd>(&self, simd: S) -> Matrix6<f64> {
+        let mut covariance = Matrix6::zeros();
+        let Some(link) = self.links.first() else {
+            return covariance;
+        };
+        let axes = self.axes::<S>(0, &link.rows);
+        for i in 0..6 {
+            for j in i..6 {
+                let mut sum = simd.splat_f32s(0.0);
+                for (a, b) in axes[i].iter().zip(axes[j]) {
+                    sum = simd.mul_add_e_f32s(*a, *b, sum);
+                }
+                let alone = self.below.first().map_or(0.0, |below| below[i][j]);
+                let sum = f64::from(simd.reduce_sum_f32s(sum)) + alone;
+                (covariance[(i, j)], covariance[(j, i)]) = (sum, sum);
+            }
+        }
+        covariance
     }
 
     /// `|W_b k|^2`.

@@ -71,6 +71,8 @@ pub enum Role {
     Joint = 1,
     /// The index into `ContactEstimate::contacts`.
     Contact = 2,
+    /// The index into `ContactEstimate::residuals`; the name is that of the sub-tree's top link.
+    SubTree = 3,
 }
 
 /// One named number.
@@ -79,7 +81,7 @@ pub enum Role {
 pub struct Entry {
     /// Its name.
     pub name: Name,
-    /// For a contact, the frame its wrench is expressed in: axes and point. Otherwise empty.
+    /// For a contact or a sub-tree, the frame its wrench is expressed in: axes and point. Otherwise empty.
     pub frame: Name,
     /// The longest time between two samples that is still normal \[ns\]; 0 where it has no meaning.
     pub max_silence: Nanos,
@@ -87,7 +89,7 @@ pub struct Entry {
     pub role: Role,
     /// The number.
     pub index: u32,
-    /// What it measures (channels), else `Kind::Joint` for a joint and `Kind::Wrench` for a contact.
+    /// What it measures (channels), else `Kind::Joint` for a joint and `Kind::Wrench` for a contact or sub-tree.
     pub kind: Kind,
     /// The bus that a channel is on.
     pub bus: u32,
@@ -96,7 +98,7 @@ pub struct Entry {
 /// The names behind the numbers of one publisher: the payload of `<robot>/description`, of which late readers get the last.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
-#[type_name("proprio/Description/1")]
+#[type_name("proprio/Description/2")]
 pub struct Description {
     /// When, in which order; `epoch` is that of the publisher's samples.
     pub header: Header,
@@ -139,7 +141,7 @@ impl Description {
     }
 
     /// The most entries.
-    pub const CAPACITY: usize = crate::MAX_CHANNELS + crate::MAX_JOINTS + crate::MAX_CONTACTS;
+    pub const CAPACITY: usize = crate::MAX_CHANNELS + crate::MAX_JOINTS + crate::MAX_CONTACTS + crate::MAX_SUBTREES;
 
     /// The entries that are set.
     #[must_use]

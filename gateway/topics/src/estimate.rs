@@ -1,6 +1,6 @@
 //! What the estimator tells: joint torques, contact wrenches, and what it is told of contacts.
 
-use crate::{Header, MAX_CONTACTS, MAX_JOINTS, Name};
+use crate::{Header, MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name};
 use core::fmt;
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
@@ -32,6 +32,8 @@ pub enum Reason {
     Starting = 9,
     /// It depends on how the base moves, and no link is declared to stand still.
     NoStance = 10,
+    /// Neither the model nor a possible contact explains what the F/T sensors of its sub-tree read.
+    Unexplained = 11,
 }
 
 impl Reason {
@@ -50,6 +52,7 @@ impl Reason {
             Self::Absent => "absent",
             Self::Starting => "starting",
             Self::NoStance => "no_stance",
+            Self::Unexplained => "unexplained",
         }
     }
 }
@@ -133,8 +136,8 @@ pub struct ContactWrench {
     pub reason: Reason,
     /// The channel to blame, or [`NO_CAUSE`].
     pub cause: u32,
-    /// Unused, zero.
-    pub reserved: u32,
+    /// 1 if nobody declared it and F/T readings show that it is present, else 0.
+    pub detected: u32,
 }
 
 impl ContactWrench {
@@ -146,23 +149,56 @@ impl ContactWrench {
         valid: 0,
         reason: Reason::NeverSeen,
         cause: NO_CAUSE,
-        reserved: 0,
+        detected: 0,
     };
 }
 
-/// The wrenches of all contacts at one instant: the payload of `<robot>/estimate/contact`.
+/// What links, F/T sensors and the contacts that are known to be present leave unexplained in a sub-tree, one piece of the robot between F/T sensors.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
-#[type_name("proprio/ContactEstimate/2")]
+pub struct Residual {
+    /// Force \[N\] that acts on the sub-tree and is not accounted for, in the axes of its top link.
+    pub force: [f64; 3],
+    /// Torque \[Nm\], in the same axes, about that link's origin.
+    pub torque: [f64; 3],
+    /// How rare this is if nothing unknown acts: as many standard deviations of a normal variable. NaN where nothing can be tested: no sensor, one that is at fault, or a contact
+    /// that may take up anything.
+    pub significance: f64,
+    /// The contact that explains it and is taken as present: its number in [`ContactEstimate::contacts`]; [`NO_CONTACT`] if there is none.
+    pub contact: u32,
+    /// 1 if it is significant and no possible contact explains it: the sub-tree's torques are withheld.
+    pub unexplained: u32,
+}
+
+/// [`Residual::contact`] where no contact was detected.
+pub const NO_CONTACT: u32 = u32::MAX;
+
+impl Residual {
+    /// Nothing estimated yet.
+    pub const ABSENT: Self = Self {
+        force: [f64::NAN; 3],
+        torque: [f64::NAN; 3],
+        significance: f64::NAN,
+        contact: NO_CONTACT,
+        unexplained: 0,
+    };
+}
+
+/// The wrenches of all contacts at one instant, and what they leave unexplained: the payload of `<robot>/estimate/contact`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[type_name("proprio/ContactEstimate/3")]
 pub struct ContactEstimate {
     /// When; `acquired` is the instant that the wrenches are of.
     pub header: Header,
     /// How many of `contacts` are set.
     pub count: u32,
-    /// Unused, zero.
-    pub reserved: u32,
+    /// How many of `residuals` are set.
+    pub residual_count: u32,
     /// The contacts, in the order of the estimator's description.
     pub contacts: [ContactWrench; MAX_CONTACTS],
+    /// The sub-trees, in the order of the estimator's description.
+    pub residuals: [Residual; MAX_SUBTREES],
 }
 
 impl ContactEstimate {
@@ -170,6 +206,14 @@ impl ContactEstimate {
     #[must_use]
     pub fn contacts(&self) -> &[ContactWrench] {
         self.contacts.get(..self.count as usize).unwrap_or(&self.contacts)
+    }
+
+    /// The residuals that are set.
+    #[must_use]
+    pub fn residuals(&self) -> &[Residual] {
+        self.residuals
+            .get(..self.residual_count as usize)
+            .unwrap_or(&self.residuals)
     }
 }
 
@@ -189,7 +233,6 @@ pub struct ContactDeclaration {
 }
 
 const _: () = assert!(size_of::<JointTorque>() == 32 && size_of::<ContactWrench>() == 112);
-const _: () = assert!(
-    size_of::<TorqueEstimate>() == 56 + 32 * MAX_JOINTS && size_of::<ContactEstimate>() == 56 + 112 * MAX_CONTACTS
-);
+const _: () = assert!(size_of::<TorqueEstimate>() == 56 + 32 * MAX_JOINTS && size_of::<Residual>() == 64);
+const _: () = assert!(size_of::<ContactEstimate>() == 56 + 112 * MAX_CONTACTS + 64 * MAX_SUBTREES);
 const _: () = assert!(size_of::<ContactDeclaration>() == 120);

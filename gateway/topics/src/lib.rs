@@ -38,7 +38,10 @@ pub mod sample;
 pub mod time;
 
 pub use description::{Description, Entry, Name, Publisher, Role};
-pub use estimate::{ContactDeclaration, ContactEstimate, ContactWrench, JointTorque, NO_CAUSE, Reason, TorqueEstimate};
+pub use estimate::{
+    ContactDeclaration, ContactEstimate, ContactWrench, JointTorque, NO_CAUSE, NO_CONTACT, Reason, Residual,
+    TorqueEstimate,
+};
 pub use health::{BusHealth, Counter, DeviceHealth, EstimatorHealth, GatewayHealth, IdentificationHealth, LinkState};
 pub use inertia::{InertiaEstimate, LinkInertia, SensorOffset};
 pub use reading::{Actuator, Gauges, Imu, JointState, Kind, Reading, Temperature, Wrench};
@@ -55,5 +58,7 @@ pub const MAX_CONTACTS: usize = 16;
 pub const MAX_LINKS: usize = 128;
 /// The most F/T sensors whose offsets one estimate holds.
 pub const MAX_SENSORS: usize = 32;
+/// The most sub-trees, pieces of the robot between F/T sensors, one estimate holds.
+pub const MAX_SUBTREES: usize = MAX_SENSORS + 1;
 /// The most buses one gateway reads; also the most publishers of samples.
 pub const MAX_BUSES: usize = 16;

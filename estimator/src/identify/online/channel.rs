@@ -161,11 +161,7 @@ impl Channel {
 
     /// Variance of one reading about what the model says of it: what scatters within a second, and what changes from one to the next.
     pub(super) fn reading(&self) -> f64 {
-        let slow = if self.scatter.is_some() {
-            self.noise().0 * self.period
-        } else {
-            0.0
-        };
+        let slow = self.noise().0 * self.period;
         (self.scatter.unwrap_or(0.0) + slow).max(self.stated)
     }
 

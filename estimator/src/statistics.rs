@@ -1,0 +1,40 @@
+//! Chi-square variables as normal deviates: Wilson and Hilferty's cube root (1931).
+//!
+//! Within 1 % of the quantile from three degrees of freedom on; a few per cent too large for one.
+
+/// What a chi-square variable of `freedom` degrees exceeds as often as a normal one exceeds `level`.
+pub(crate) fn chi_square(freedom: usize, level: f64) -> f64 {
+    let (k, spread) = cube(freedom);
+    k * (1.0 - spread + level * spread.sqrt()).powi(3)
+}
+
+/// The normal deviate as rare as `square` is for a chi-square variable: the inverse of [`chi_square`].
+pub(crate) fn deviate(square: f64, freedom: usize) -> f64 {
+    let (k, spread) = cube(freedom);
+    ((square / k).cbrt() - (1.0 - spread)) / spread.sqrt()
+}
+
+fn cube(freedom: usize) -> (f64, f64) {
+    let k = freedom.max(1) as f64;
+    (k, 2.0 / (9.0 * k))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Quantiles from tables (Abramowitz and Stegun, table 26.8).
+    #[test]
+    fn quantiles_are_those_of_tables() {
+        for (freedom, level, quantile, tolerance) in [
+            (1, 1.644_854, 3.841, 0.03),
+            (3, 2.326_348, 11.345, 0.01),
+            (6, 3.090_232, 22.458, 0.01),
+            (30, 2.326_348, 50.892, 0.01),
+        ] {
+            let found = chi_square(freedom, level);
+            assert!((found / quantile - 1.0).abs() < tolerance, "{freedom} {level}: {found}");
+            assert!((deviate(found, freedom) - level).abs() < 1e-9);
+        }
+    }
+}
