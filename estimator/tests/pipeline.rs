@@ -1159,19 +1159,32 @@ fn a_touch_that_nobody_declares_is_detected() {
         file,
         |_| [0.0; 6],
     );
+    // Where it hardly pushes but still turns, by 0.5 Nm, it is no touch of the hand.
+    let is_found: Vec<bool> = found["contact/hand/detected"].iter().map(|d| d == "1").collect();
+    let count = is_found.iter().filter(|found| **found).count();
+    assert!(count > 190, "{count}");
     for (name, cells) in &told {
-        if !name.starts_with("residual/") && name != "contact/hand/detected" {
-            assert_eq!(cells, &found[name], "{name}");
+        // Deviations hold on to the posture that contacts changed in.
+        if name.starts_with("residual/") || name.contains("_std") || name == "contact/hand/detected" {
+            continue;
+        }
+        let pairs = cells.iter().zip(&found[name]).zip(&is_found);
+        for ((told, found), is_found) in pairs {
+            assert!(!is_found || told == found, "{name}: {told} {found}");
         }
     }
-    assert!(found["contact/hand/detected"].iter().all(|d| d == "1"));
     assert!(told["contact/hand/detected"].iter().all(|d| d == "0"));
-    assert!(found["residual/l_upper_arm/contact"].iter().all(|name| name == "hand"));
-    // What acts there is told with how uncertain it is, and nothing is told where it can not be tested.
+    let names = found["residual/l_upper_arm/contact"].iter().zip(&is_found);
     assert!(
-        found["contact/hand/fx_std"]
-            .iter()
-            .all(|std| std.parse::<f64>().unwrap() > 0.0)
+        names
+            .into_iter()
+            .all(|(name, is_found)| name == if *is_found { "hand" } else { "unexplained" })
+    );
+    // What acts there is told with how uncertain it is, and nothing is told where it can not be tested.
+    let stds = found["contact/hand/fx_std"].iter();
+    assert!(
+        stds.zip(&is_found)
+            .all(|(std, is_found)| (std.parse::<f64>().unwrap() > 0.0) == *is_found)
     );
     assert!(told["residual/l_upper_arm/significance"].iter().all(String::is_empty));
     assert!(found["residual/chest/significance"].iter().all(String::is_empty));

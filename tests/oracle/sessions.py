@@ -1,8 +1,9 @@
 """Sessions: what a robot's own boards would have recorded while MuJoCo moved it, with the truth beside it. For identification to be judged by.
 
 A session is a log in the project's CSV form: every board samples at its own period and phase, its stamps are a little late, its numbers are noisy and
-in steps. The robot has the inertias of its URDF; the estimator is given another URDF, whose every link is 20 % off. Four sessions of each robot:
-`train` stands still, then swings; `validate` goes from posture to posture; `contact` is pushed at the hand; `payload` picks something up half-way.
+in steps. The robot has the inertias of its URDF; the estimator is given another URDF, whose every link is 20 % off. Five sessions of each robot:
+`train` stands still, then swings; `validate` goes from posture to posture; `contact` is pushed at the hand; `payload` picks something up half-way;
+`pushed` is pushed at hand and forearm, from 2 to 50 N, and nobody declares it.
 README.md ("Sessions") says what stands in the files.
 """
 
@@ -208,6 +209,30 @@ class Pushes:
         return np.concatenate([force, np.cross(self.point, force)])
 
 
+class Pokes:
+    """Pushes that nobody declares, from weak to strong in turn: at one point of each of some links, in the link's axes, for a second each."""
+
+    EDGE, LAST, PAUSE = 0.05, 1.0, 3.0
+
+    def __init__(self, random, first, last, points, forces):
+        self.spans, start, number = [], first, 0
+        while start + self.LAST <= last:
+            link, point = list(points.items())[number % len(points)]
+            direction = random.normal(size=3)
+            force = forces[number // len(points) % len(forces)]
+            self.spans.append((start, start + self.LAST, force * direction / np.linalg.norm(direction), link, np.array(point)))
+            start, number = start + self.LAST + self.PAUSE, number + 1
+
+    def at(self, t):
+        """Links and wrenches at their origins."""
+        found = []
+        for start, end, most, link, point in self.spans:
+            if start < t < end:
+                force = most * smooth_step((t - start) / self.EDGE)[0] * smooth_step((end - t) / self.EDGE)[0]
+                found.append((link, np.concatenate([force, np.cross(point, force)])))
+        return found
+
+
 class Leaning:
     """A root that leans to and fro by up to 5 degrees, turning about a point 0.3 m below it, once the session's stillness is over."""
 
@@ -247,6 +272,8 @@ class World:
         return {key: sum(weight * answer[key] for weight, answer in answers) for key in answers[0][1]}
 
     def wrenches(self, t):
+        if isinstance(self.pushes, Pokes):
+            return self.pushes.at(t)
         return [] if self.pushes is None else [(self.plan["hand"], self.pushes.at(t))]
 
     def base(self, t, pinocchio):
@@ -314,7 +341,7 @@ def record(plan, robot, world, duration, stream):
     columns = [f"joint/{j}/position" for j in joints] + [f"joint/{j}/torque" for j in joints]
     columns += [f"wrench/{s.name}/{c}" for s in robot.sensors for c in WRENCH]
     columns += [f"imu/{plan['imu']}/{c}" for c in IMU] if plan["imu"] else []
-    pushed = world.pushes is not None
+    pushed = isinstance(world.pushes, Pushes)
     columns += [f"contact/{plan['contact']}/{c}" for c in ("active", *WRENCH)] if pushed else []
     log, truth = Log(columns), {"offsets": {}}
 
@@ -355,6 +382,11 @@ def record(plan, robot, world, duration, stream):
         for t, active in declared:
             log.add(t, {f"contact/{plan['contact']}/active": str(active)})
         truth["pushes"] = [{"from": round(start, 5), "to": round(end, 5), "force": plain(force)} for start, end, force in world.pushes.spans]
+    if isinstance(world.pushes, Pokes):
+        truth["pushes"] = [
+            {"from": round(start, 5), "to": round(end, 5), "force": plain(force), "link": link, "point": plain(point)}
+            for start, end, force, link, point in world.pushes.spans
+        ]
     return log.text(), truth
 
 
@@ -369,7 +401,8 @@ def make(plan, urdf, out, seed):
     robot = Robot(urdf, plan["imu_frame"])
     stream = lambda *what: np.random.default_rng([seed, *(number_of(w) for w in what)])
     out.mkdir(parents=True, exist_ok=True)
-    (out / "estimator.toml").write_text(plan["config"].replace("POSITION_NOISE", f"{plan['encoder_step'] / 2 + 1.4e-4:.2g}"))
+    config = plan["config"].replace("POSITION_NOISE", f"{plan['encoder_step'] / 2 + 1.4e-4:.2g}").replace("PALM", str(plan["palm"]))
+    (out / "estimator.toml").write_text(config)
     point = np.array(plan["palm"])
     payload = loaded(robot, plan["hand"], point)
     engines = {
@@ -383,16 +416,21 @@ def make(plan, urdf, out, seed):
     for name, duration in plan["durations"].items():
         still = 5.0 if name == "train" else 1.0
         of = lambda *what, name=name: stream(name, *what)
-        if name in ("train", "contact"):
+        if name in ("train", "contact", "pushed"):
             motion = Swing(of("motion"), rest, reach, plan["speed"], still)
         else:
             motion = Postures(of("motion"), rest, reach, plan["speed"], still, duration)
         leaning = Leaning(of("leaning"), still) if plan["stands_on"] is None else None
         pushes = Pushes(of("pushes"), still + 3.0, duration - 2.0, point) if name == "contact" else None
+        if name == "pushed":
+            points = {plan["hand"]: plan["palm"], plan["forearm"]: plan["forearm_point"]}
+            pushes = Pokes(of("pushes"), still + 9.0, duration, points, plan["forces"])
         world = World(plan, robot, engines, motion, leaning, pushes, duration / 2 if name == "payload" else None)
         if name == "train":
             (out / "cad.urdf").write_text(wrong_enough(plan, world, urdf, stream("cad"), out / "cad.urdf"))
-        exact += compare(plan, robot, idyn, world, name, of("exact").uniform(0, duration, plan["compared"]))
+        compared = compare(plan, robot, idyn, world, name, of("exact").uniform(0, duration, plan["compared"]))
+        # There something touches the hand alone.
+        exact += compared if name != "pushed" else []
         text, truth = record(plan, robot, world, duration, of)
         (out / f"{name}.csv").write_text(text)
         facts[name] = {"seconds": duration, "still_until": still, **truth}
@@ -482,6 +520,7 @@ link = "chest"
 [[contact]]
 name = "hand"
 link = "l_hand"
+position_m = PALM
 presence = "possible"
 
 [differentiation]
@@ -501,6 +540,7 @@ ARM = {
     "config": ARM_CONFIG,
     "imu": "chest_imu", "imu_frame": "chest_imu_frame", "stands_on": None,
     "hand": "l_hand", "palm": [-0.0017, 0.0056, 0.0592], "contact": "hand",
+    "forearm": "l_forearm", "forearm_point": [0.0007, 0.0053, 0.0405],
     "encoders": [
         ["l_shoulder_pitch", "l_shoulder_roll", "l_shoulder_yaw", "l_elbow"], ["l_wrist_prosup", "l_wrist_pitch", "l_wrist_yaw"],
     ],
@@ -511,9 +551,11 @@ ARM = {
 }
 # In the repository: small. Everything every 20 ms.
 SMALL = {"ft_period": 0.02, "encoder_period": 0.02, "imu_period": 0.02,
-         "durations": {"train": 28.0, "validate": 18.0, "contact": 24.0, "payload": 24.0}}
+         "durations": {"train": 28.0, "validate": 18.0, "contact": 24.0, "payload": 24.0, "pushed": 27.0},
+         "forces": (5.0, 20.0)}
 FULL = {"ft_period": 0.01, "encoder_period": 0.01, "imu_period": 0.01,
-        "durations": {"train": 45.0, "validate": 20.0, "contact": 45.0, "payload": 45.0}}
+        "durations": {"train": 45.0, "validate": 20.0, "contact": 45.0, "payload": 45.0, "pushed": 90.0},
+        "forces": (2.0, 5.0, 10.0, 20.0, 50.0)}
 
 
 def limb(side):
@@ -540,6 +582,7 @@ ICUB_CONFIG_TAIL = """
 [[contact]]
 name = "hand"
 link = "l_hand"
+position_m = PALM
 presence = "possible"
 
 [differentiation]
@@ -557,6 +600,7 @@ ICUB = {
     "model": "iCubGazeboV2_5.urdf of icub-models 3.2.0",
     "imu": None, "imu_frame": "chest", "stands_on": "l_sole",
     "hand": "l_hand", "palm": [0.0, 0.0, 0.06], "contact": "hand",
+    "forearm": "l_forearm", "forearm_point": [0.0, 0.005, 0.04],
     "encoders": [*limb("l"), *limb("r"), ["torso_pitch", "torso_roll", "torso_yaw"], ["neck_pitch", "neck_roll", "neck_yaw"]],
     "distal": [*limb("l")[0][3:], *limb("r")[0][3:], *limb("r")[1][2:]],
     "encoder_noise": 2e-5, "encoder_step": 1e-5,

@@ -571,6 +571,96 @@ fn pushes_do_no_harm_to_what_is_learnt_on_line_declared_or_not() {
     }
 }
 
+/// MuJoCo pushes hand and forearm, and nobody declares it: found in time, told of the right link, and no torque that is valid is wrong for it. Nothing else is found.
+#[test]
+fn pushes_that_nobody_declares_are_found_where_they_act() {
+    for sessions in robots() {
+        let (log, facts) = (sessions.log("pushed"), &sessions.facts["sessions"]["pushed"]);
+        let mut config = sessions.config(Presence::Possible, Urdf::Cad, None);
+        config.identification.enabled = true;
+        let mut forearm = config.contact.last().unwrap().clone();
+        (forearm.name, forearm.link) = (Some("forearm".into()), "l_forearm".into());
+        for push in facts["pushes"].as_array().unwrap() {
+            if push["link"] == "l_forearm" {
+                forearm.position_m = numbers(&push["point"]).try_into().unwrap();
+            }
+        }
+        config.contact.push(forearm);
+        let setup = Setup::new(&config).unwrap();
+        let contact = ["hand", "forearm"].map(|name| setup.contact(name).unwrap());
+        let names: Vec<String> = setup.joint_names().map(str::to_owned).collect();
+        let truth = Table::new(&log);
+        let stamps = truth.column("t");
+        let (estimates, ..) = told(setup, &log, 0);
+        // Which of the two was found at an instant, if anything.
+        let found = |e: &Estimate| {
+            let detected = |place: usize| e.contacts.contacts()[contact[place]].detected == 1;
+            let is_unexplained = e.contacts.residuals().iter().any(|r| r.unexplained == 1);
+            [detected(0), detected(1), is_unexplained].iter().position(|is| *is)
+        };
+        let pushes: Vec<(f64, f64, usize, f64)> = (facts["pushes"].as_array().unwrap().iter())
+            .map(|push| {
+                let [from, to] = ["from", "to"].map(|when| push[when].as_f64().unwrap());
+                let force = numbers(&push["force"]).iter().map(|f| f * f).sum::<f64>().sqrt();
+                (from, to, usize::from(push["link"] == "l_forearm"), force)
+            })
+            .collect();
+        assert!(pushes.len() >= 4);
+        let (mut errors, mut within, mut count) = (Vec::new(), 0, 0);
+        for (from, to, link, force) in &pushes {
+            let during: Vec<&Estimate> = (estimates.iter())
+                .filter(|e| (from + 0.1..to - 0.1).contains(&e.t.seconds()))
+                .collect();
+            let share =
+                |of: &dyn Fn(&Estimate) -> bool| during.iter().filter(|e| of(e)).count() as f64 / during.len() as f64;
+            let (seen, right) = (share(&|e| found(e).is_some()), share(&|e| found(e) == Some(*link)));
+            let first = estimates.iter().find(|e| e.t.seconds() > *from && found(e).is_some());
+            let delay = first.map_or(f64::INFINITY, |e| e.t.seconds() - from);
+            for e in &during {
+                // Truth stands in rows of its own, with the stamps of the first F/T sensor.
+                let at = stamps.partition_point(|t| *t < e.t.seconds() - 1e-6);
+                for joint in &sessions.distal {
+                    let (number, tau) = (
+                        names.iter().position(|name| name == joint).unwrap(),
+                        truth.column(&format!("joint/{joint}/torque"))[at],
+                    );
+                    let told = e.torques.joints()[number];
+                    if told.valid == 1 && !tau.is_nan() {
+                        errors.push(told.torque - tau);
+                        within += usize::from((told.torque - tau).abs() < 2.0 * told.standard_deviation);
+                        count += 1;
+                    }
+                }
+            }
+            println!(
+                "{force:.0} N at link {link}: found {:.0} %, the right link {:.0} %, after {:.0} ms",
+                100.0 * seen,
+                100.0 * right,
+                1e3 * delay
+            );
+            if *force > 4.0 {
+                assert!(
+                    seen > 0.97 && right > 0.9 && delay < 0.1,
+                    "{force} {seen} {right} {delay}"
+                );
+            }
+        }
+        let error = rms(errors.into_iter());
+        let covered = within as f64 / f64::from(count);
+        println!(
+            "torques beyond sensors, while pushed: RMS error {error:.4} Nm, {:.0} % within 2 sigma",
+            100.0 * covered
+        );
+        assert!(count > 50 && error < 0.05 && covered > 0.9, "{count} {error} {covered}");
+        let quiet = |e: &&Estimate| {
+            let t = e.t.seconds();
+            t > facts["still_until"].as_f64().unwrap() && !pushes.iter().any(|(from, to, ..)| t > *from && t < to + 0.3)
+        };
+        let false_alarms = estimates.iter().filter(quiet).filter(|e| found(e).is_some()).count();
+        assert_eq!(false_alarms, 0);
+    }
+}
+
 /// Estimates; since when what was said of the arm's identification; its counts at the end; what changed.
 type Told = (Vec<Estimate>, Vec<(f64, Paused)>, Counts, Vec<Change>);
 

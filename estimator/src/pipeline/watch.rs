@@ -8,7 +8,7 @@
 //!
 //! Two `b` are tested, that of the instant and, where no contact is known, the mean of some [`MEAN`], which shows what is smaller than the noise of one reading. `q` counts as the normal deviate that is as rare.
 //! Beyond [`CONTRADICTED`] something acts that is not known. Of the contacts that are possible there, the one that leaves least unexplained is taken as present, provided that what
-//! it leaves is usual ([`USUAL`]). A touch is a force within [`REACH`] of the contact's `position_m`, within [`HELD`] once it is known: any six numbers could be a wrench at any one of them.
+//! it leaves is usual ([`USUAL`]). A touch is a force within [`REACH`] of the contact's `position_m`: any six numbers could be a wrench at any one of them.
 //! It stays present until `q` is usual without it. What no contact explains condemns the sub-tree: where it acts nobody knows.
 
 use crate::dynamics::{ContactKind, ContactSet, Kinematics, LeastSquares, Solver, Structure, noise_factor, unknowns};
@@ -25,8 +25,6 @@ const USUAL: f64 = 2.326;
 const MEAN: Nanos = Nanos::from_millis(50);
 /// How far from a contact's position a touch acts, one standard deviation \[m\]: 99 % within 17 cm, a hand or a foot.
 const REACH: f64 = 0.05;
-/// The same once a touch is known: what holds on may turn, too, where it pushes little at the moment.
-const HELD: f64 = 0.2;
 /// Of the variances that are found in single precision, what rounding may leave.
 const ROUNDING: f64 = 1e-6;
 
@@ -211,11 +209,9 @@ impl Case<'_> {
             .difference(&self.declared);
         let mut best = USUAL;
         for contact in possible.iter() {
-            if before == Some(contact) && self.test(least, Some((contact, HELD))).0 <= USUAL {
-                seen.contact = before;
-                break;
-            }
-            let (left, _) = self.test(least, Some((contact, REACH)));
+            let (left, _) = self.test(least, Some(contact));
+            // Of two that do equally well, the one that it was.
+            let left = if before == Some(contact) { left - 1.0 } else { left };
             if left <= best {
                 (best, seen.contact) = (left, Some(contact));
             }
@@ -224,27 +220,26 @@ impl Case<'_> {
         seen
     }
 
-    /// How rare what is unexplained would be, of the instant or of the mean, whichever is rarer, if this contact were present, too, and pushed so near to its
-    /// position; and what the instant leaves.
-    fn test(&self, least: &mut LeastSquares, touch: Option<(usize, f64)>) -> (f64, Vector6<f64>) {
+    /// How rare what is unexplained would be, of the instant or of the mean, whichever is rarer, if this contact were present, too; and what the instant leaves.
+    fn test(&self, least: &mut LeastSquares, touch: Option<usize>) -> (f64, Vector6<f64>) {
         let (structure, origin) = (self.instant.structure, Vec3::zeros());
         let columns = |contact: usize| {
             let spec = &structure.contacts()[contact];
             unknowns(spec, self.instant.kinematics, &origin, structure.length_scale())
         };
-        let reach = touch.filter(|(contact, _)| structure.contacts()[*contact].kind == ContactKind::Wrench);
+        let is_loose = touch.is_some_and(|contact| structure.contacts()[contact].kind == ContactKind::Wrench);
         let mut worst = (f64::NEG_INFINITY, self.b);
         for (b, share) in [(self.mean.value, self.mean.share), (self.b, 1.0)] {
             let mut covariance = self.noise * share + self.known;
-            if let Some((_, reach)) = reach {
-                let moment = (reach * b.fixed_rows::<3>(3).norm()).powi(2);
+            if is_loose {
+                let moment = (REACH * b.fixed_rows::<3>(3).norm()).powi(2);
                 (0..3).for_each(|axis| covariance[(axis, axis)] += moment);
             }
             least.clear();
             let declared = self.declared.iter().flat_map(columns);
             let detected = touch
                 .into_iter()
-                .flat_map(|(contact, _)| columns(contact).into_iter().take(3));
+                .flat_map(|contact| columns(contact).into_iter().take(3));
             declared
                 .chain(detected)
                 .for_each(|(column, weight)| least.push(column, weight));

@@ -119,21 +119,20 @@ impl Channel {
         if !(second.mean.is_finite() && second.of_bodies.is_finite() && second.count > 0.0) {
             return;
         }
-        let scatter = self.scatter.unwrap_or(second.scatter);
-        self.scatter = Some(scatter + (second.scatter - scatter) / MEMORY);
         let since = (self.last.replace(second.t))
             .map(|last| second.t - last)
             .filter(|dt| (0.0..PAUSE).contains(dt));
         let levels: [f64; LEVELS] = std::array::from_fn(|number| self.level(number));
         let disturbed = DISTURBED / (RANGE * self.stated.sqrt());
-        let mut best = (f64::NEG_INFINITY, f64::NAN);
+        // Of the most likely: the innovation, and the share of noise in it.
+        let mut best = (f64::NEG_INFINITY, (f64::NAN, 1.0));
         for (row, level) in self.filters.iter_mut().zip(levels) {
             let noise = level / second.count + second.of_bodies;
             for (filter, rate) in row.iter_mut().zip(RATES) {
                 let innovation = match since {
                     None => {
                         (filter.offset, filter.variance) = (second.mean, noise);
-                        f64::NAN
+                        (f64::NAN, 1.0)
                     }
                     Some(dt) => {
                         let walked = rate * rate * level * self.period * dt;
@@ -151,7 +150,10 @@ impl Channel {
                 filter.likelihood = filter.likelihood.max(-AT_REST);
             }
         }
-        let last = std::mem::replace(&mut self.innovation, best.1.clamp(-LARGE, LARGE));
+        let (innovation, share) = best.1;
+        let scatter = self.scatter.unwrap_or(second.scatter);
+        self.scatter = Some(scatter + share * (second.scatter - scatter) / MEMORY);
+        let last = std::mem::replace(&mut self.innovation, innovation.clamp(-LARGE, LARGE));
         if (last * self.innovation).is_finite() && second.is_moving {
             let keep = 1.0 - 1.0 / MEMORY;
             self.products.0 = self.products.0 * keep + last * self.innovation;
@@ -190,8 +192,8 @@ impl Channel {
 }
 
 impl Filter {
-    /// A mean with its variance, `dt` seconds after the last one, in which the offset's variance grew by `walked`; the density of what is no noise. Returns the innovation, normalised.
-    fn take(&mut self, (mean, noise): (f64, f64), walked: f64, dt: f64, disturbed: f64) -> f64 {
+    /// A mean with its variance, `dt` seconds after the last one, in which the offset's variance grew by `walked`; the density of what is no noise. Returns the innovation, normalised, and how far it is noise.
+    fn take(&mut self, (mean, noise): (f64, f64), walked: f64, dt: f64, disturbed: f64) -> (f64, f64) {
         let grown = self.variance + walked;
         let total = grown + noise;
         let innovation = mean - self.offset;
@@ -204,7 +206,7 @@ impl Filter {
         self.variance = (self.variance + share * walked) * (1.0 - gain);
         self.likelihood *= (-share * dt / MEMORY).exp();
         self.likelihood += (regular + disturbed).ln();
-        innovation / total.sqrt()
+        (innovation / total.sqrt(), share)
     }
 }
 
