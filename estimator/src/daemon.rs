@@ -240,11 +240,7 @@ impl DataPlane {
                 look(&mut self.descriptions, &self.domain, &self.robot);
             }
             self.take_declarations();
-            if let Some(job) = self
-                .identifier
-                .as_ref()
-                .and_then(|identifier| identifier.done.try_recv().ok())
-            {
+            if let Some(job) = self.identifier.as_mut().and_then(Identifier::take) {
                 self.pipeline.give_back(job);
             }
             let idle = !self.take_samples();
@@ -502,8 +498,10 @@ impl Identifier {
                     }
                     *fails = failure.is_some();
                 }
-                if let Some(kept) = &kept {
-                    let text = job.state();
+                let text = kept.as_ref().map(|_| job.state());
+                // Before the disk, which may be slow: what it found has to be in force in time. Who has ended needs no solution any more.
+                let _ = back.send(job);
+                if let (Some(kept), Some(text)) = (&kept, text) {
                     if monotonic() - written >= kept.every {
                         kept.write(&text);
                         (unwritten, written) = (None, monotonic());
@@ -511,8 +509,6 @@ impl Identifier {
                         unwritten = Some(text);
                     }
                 }
-                // Who has ended needs no solution any more.
-                let _ = back.send(job);
             }
             if let (Some(kept), Some(text)) = (&kept, unwritten) {
                 kept.write(&text);
@@ -528,6 +524,24 @@ impl Identifier {
             thread: Some(thread),
             told: vec![(Paused::No, 0); components],
         })
+    }
+}
+
+impl Identifier {
+    /// A job that is done. Says once if there will be no more.
+    fn take(&mut self) -> Option<Job> {
+        match self.done.try_recv() {
+            Ok(job) => Some(job),
+            Err(mpsc::TryRecvError::Empty) => None,
+            Err(mpsc::TryRecvError::Disconnected) => {
+                if self.jobs.take().is_some() {
+                    tracing::error!(
+                        "the thread that identifies has panicked: what is in force stays so and nothing is learnt any more; restart the estimator, and report this"
+                    );
+                }
+                None
+            }
+        }
     }
 }
 
@@ -547,5 +561,36 @@ fn look<T: Topic>(reader: &mut Option<Reader<T>>, domain: &Domain, robot: &str) 
             Err(PortError::NotYet { .. }) => {}
             Err(error) => tracing::warn!("{error}; trying again"),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_thread_that_panics_is_told_once_and_asked_for_nothing_more() {
+        let (jobs, waiting) = mpsc::sync_channel::<Job>(1);
+        let (back, done) = mpsc::sync_channel::<Job>(1);
+        let work = move || {
+            let _ends = (waiting, back);
+            panic!("as a fault in identification would");
+        };
+        let thread = std::thread::spawn(work);
+        let mut identifier = Identifier {
+            jobs: Some(jobs),
+            done,
+            thread: Some(thread),
+            told: Vec::new(),
+        };
+        while !identifier
+            .thread
+            .as_ref()
+            .is_some_and(std::thread::JoinHandle::is_finished)
+        {
+            std::thread::yield_now();
+        }
+        assert!(identifier.take().is_none() && identifier.jobs.is_none());
+        assert!(identifier.take().is_none());
     }
 }

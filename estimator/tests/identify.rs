@@ -2110,6 +2110,36 @@ fn logs_that_say_nothing_new_or_nothing_at_all_are_left_out() {
         refusals[3]
     );
 
+    // Two seconds are two seconds, from the first row to the last's end.
+    let short: String = log.lines().take(201).map(|line| line.to_owned() + "\n").collect();
+    let shorter: String = log.lines().take(199).map(|line| line.to_owned() + "\n").collect();
+    let logs = [
+        ("one", Role::Train, log.as_str()),
+        ("short", Role::Validate, &short),
+        ("shorter", Role::Validate, &shorter),
+    ];
+    let refusals: Vec<String> = run(&setup, &logs, &[]).logs.iter().map(refusal).collect();
+    assert_eq!(refusals[1], "");
+    assert!(
+        refusals[2].contains("too short; record at least 2 s"),
+        "{}",
+        refusals[2]
+    );
+
+    // Nor does one with readings that are missing, twice.
+    let holes: String = log.lines().enumerate().fold(String::new(), |text, (number, line)| {
+        let at = line.split(',').count();
+        let gone = |(place, cell)| if number % 50 == 9 && place + 6 >= at { "" } else { cell };
+        let cells: Vec<&str> = line.split(',').enumerate().map(gone).collect();
+        text + &cells.join(",") + "\n"
+    });
+    let twice = run(
+        &setup,
+        &[("one", Role::Train, &holes), ("again", Role::Train, &holes)],
+        &[],
+    );
+    assert!(refusal(&twice.logs[1]).starts_with("same_log: "));
+
     // The verdict says of each what is wrong.
     // Without derivatives, which make each row a posture of its own.
     let milliseconds = change(&log, "t", |t| 1e3 * t)
