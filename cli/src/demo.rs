@@ -21,7 +21,7 @@ use proprio_simulator::{Fault, Robot, Settings, Simulation, Simulator, wrong_urd
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, Topic, monotonic};
 use proprio_topics::{
     ContactEstimate, ContactWrench, EstimatorHealth, GatewayHealth, InertiaEstimate, JointTorque, LinkInertia, Nanos,
-    SensorOffset, TorqueEstimate,
+    Residual, SensorOffset, TorqueEstimate,
 };
 use serde_json::Value as Json;
 use std::fs::{self, File};
@@ -481,6 +481,7 @@ struct Seen {
     published: Nanos,
     joints: Box<[JointTorque]>,
     contacts: Box<[ContactWrench]>,
+    residuals: Box<[Residual]>,
 }
 
 fn open<T: Topic>(domain: &Domain, robot: &str, processes: &mut Processes) -> anyhow::Result<Reader<T>> {
@@ -581,6 +582,7 @@ fn watch(args: &Args, robot: &Robot, experiment: &Experiment, processes: &mut Pr
                 published: estimate.header.published,
                 joints: estimate.joints().into(),
                 contacts: Box::default(),
+                residuals: Box::default(),
             });
         }
         while let Some(estimate) = contacts.try_take()? {
@@ -593,6 +595,7 @@ fn watch(args: &Args, robot: &Robot, experiment: &Experiment, processes: &mut Pr
                 .find(|s| s.t == estimate.header.acquired);
             if let Some(seen) = seen {
                 seen.contacts = estimate.contacts().into();
+                seen.residuals = estimate.residuals().into();
             }
         }
         while let Some(inertia) = inertias.as_mut().map_or(Ok(None), Reader::try_take)? {

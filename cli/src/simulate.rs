@@ -29,7 +29,7 @@ pub(crate) struct Args {
     /// Declare touches of the robot on ROBOT/contact/declared, as a skin does
     #[arg(long)]
     skin: bool,
-    /// A fault: "lost:0.01", "silent:BOARD@3..4", "saturate:BOARD@5..5.5", "spike:BOARD@6", "late_half:BOARD@2..8"; may be repeated
+    /// A fault: "lost:0.01", "silent:BOARD@3..4", "saturate:BOARD@5..5.5", "spike:BOARD@6", "late_half:BOARD@2..8", "push:LINK=20@8..9"; may be repeated
     #[arg(long, value_name = "FAULT")]
     fault: Vec<String>,
     /// Where to write the truth at the end: a table of joint torques, wrenches and motion

@@ -13,7 +13,7 @@
 //! | `reason/<joint>` | why not: a word, and the channel to blame behind a colon |
 //! | `residual/<link>/fx fy fz tx ty tz` | \[N, Nm\], what links, sensors and known contacts leave unexplained in the sub-tree with this top link, at its origin and in its axes |
 //! | `residual/<link>/significance` | how rare that is if nothing unknown acts, in standard deviations of a normal variable; empty where nothing can be tested |
-//! | `residual/<link>/contact` | the contact that was detected there, or `unexplained` |
+//! | `residual/<link>/reason` | what it comes from: the contact that was detected there, or `unexplained` |
 
 use crate::pipeline::{Estimate, Pipeline};
 use crate::setup::{Channel, Setup};
@@ -193,7 +193,7 @@ impl<W: Write> Table<W> {
         }
         let subtrees: Vec<&str> = setup.subtree_names().collect();
         for top in &subtrees {
-            "fx fy fz tx ty tz significance contact"
+            "fx fy fz tx ty tz significance reason"
                 .split(' ')
                 .for_each(|c| header.push_str(&format!(",residual/{top}/{c}")));
         }

@@ -1174,7 +1174,7 @@ fn a_touch_that_nobody_declares_is_detected() {
         }
     }
     assert!(told["contact/hand/detected"].iter().all(|d| d == "0"));
-    let names = found["residual/l_upper_arm/contact"].iter().zip(&is_found);
+    let names = found["residual/l_upper_arm/reason"].iter().zip(&is_found);
     assert!(
         names
             .into_iter()
@@ -1198,7 +1198,7 @@ fn nothing_is_detected_where_nothing_acts() {
             config.identification.model_std = model_std;
         };
         let found = touched(change, "icub_left_arm_mujoco.csv", |_| [0.0; 6]);
-        assert!(found["residual/l_upper_arm/contact"].iter().all(String::is_empty));
+        assert!(found["residual/l_upper_arm/reason"].iter().all(String::is_empty));
         let significance = &found["residual/l_upper_arm/significance"];
         assert!(significance.iter().all(|s| s.parse::<f64>().unwrap() < 0.0));
         assert!(found["contact/hand/detected"].iter().all(|d| d == "0"));
@@ -1219,7 +1219,7 @@ fn what_no_contact_explains_withholds_the_torques_that_rest_on_it() {
                 assert_eq!((reason.as_str(), valid.as_str()), expected, "{joint} {number} {far:?}");
             }
         }
-        let told = |number: usize| found["residual/l_upper_arm/contact"][number].as_str();
+        let told = |number: usize| found["residual/l_upper_arm/reason"][number].as_str();
         assert!((0..201).all(|n| told(n) == if push(n) > 0.0 { "unexplained" } else { "" }));
         // The residual is what was added: by the parent on the child it is the opposite.
         let force: f64 = ["fx", "fy", "fz"]
@@ -1292,7 +1292,7 @@ fn an_offset_that_nobody_states_is_unknown() {
     let found = touched(unknown, "icub_left_arm_mujoco.csv", |_| {
         [100.0, -50.0, 20.0, 3.0, -2.0, 1.0]
     });
-    assert!(found["residual/l_upper_arm/contact"].iter().all(String::is_empty));
+    assert!(found["residual/l_upper_arm/reason"].iter().all(String::is_empty));
     for (joint, reason) in [("l_shoulder_roll", "uncertain"), ("l_elbow", "")] {
         assert!(
             found[&format!("reason/{joint}")].iter().all(|own| own == reason),

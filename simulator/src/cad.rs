@@ -65,6 +65,7 @@ pub fn wrong_urdf(robot: &Robot, settings: &Settings, relative: f64) -> Result<S
 fn torques(robot: &Robot, settings: &Settings) -> Result<Vec<Vec<f64>>, RobotError> {
     let settings = Settings {
         push: false,
+        faults: Vec::new(),
         ..settings.clone()
     };
     let mut simulation = Simulation::new(robot, &settings)?;

@@ -8,6 +8,7 @@
 //! | `saturate:l_arm_ft_sensor@5..5.5` | a gauge is at its upper end: flagged, and the values frozen, as strain boards do |
 //! | `spike:l_arm_ft_sensor@6` | one reading is off by 200 N and 5 Nm on every axis |
 //! | `late_half:l_arm_ft_sensor@2..8` | about one reading in ten has its second half come late: just behind the next reading's first; with `@6` one reading |
+//! | `push:l_forearm=20@8..9` | a force of 20 N pushes this link of the URDF, at its origin along its x axis, and nobody declares it |
 //!
 //! Times are seconds since the simulation began; an end may be left out (`5..`). A board is named as in gateway.toml, or by
 //! one of its channels.
@@ -62,6 +63,15 @@ pub enum Fault {
         /// Only the first reading in it.
         once: bool,
     },
+    /// Something pushes the robot, and nobody declares it.
+    Push {
+        /// Which link of the URDF, at its origin and along its x axis.
+        link: String,
+        /// How hard \[N\].
+        force: f64,
+        /// When.
+        window: Window,
+    },
 }
 
 /// From when until when, in seconds since the simulation began; the end does not belong to it.
@@ -93,7 +103,7 @@ impl Window {
 pub enum FaultError {
     /// No such fault.
     #[error(
-        "fault {text:?}: {kind:?} is not known; there is lost, silent, reboot, saturate, spike, late_half; for example {EXAMPLES}"
+        "fault {text:?}: {kind:?} is not known; there is lost, silent, reboot, saturate, spike, late_half, push; for example {EXAMPLES}"
     )]
     Kind {
         /// What was typed.
@@ -140,7 +150,7 @@ impl Fault {
     #[must_use]
     pub fn device(&self) -> Option<&str> {
         match self {
-            Self::Lost { .. } => None,
+            Self::Lost { .. } | Self::Push { .. } => None,
             Self::Silent { device, .. }
             | Self::Reboot { device, .. }
             | Self::Saturate { device, .. }
@@ -228,6 +238,18 @@ impl FromStr for Fault {
                     "\"late_half:l_arm_ft_sensor@2..8\"",
                 )),
             },
+            "push" => {
+                let (link, force) = what.split_once('=').unwrap_or_default();
+                let force = force.trim().parse().ok().filter(|force: &f64| force.is_finite());
+                match (span, force) {
+                    (Some(window), Some(force)) if !link.is_empty() => Ok(Self::Push {
+                        link: link.to_owned(),
+                        force,
+                        window,
+                    }),
+                    _ => Err(form("push:LINK=NEWTONS@FROM..UNTIL", "\"push:l_forearm=20@8..9\"")),
+                }
+            }
             _ => Err(FaultError::Kind {
                 text: text.to_owned(),
                 kind: kind.to_owned(),
@@ -266,6 +288,7 @@ impl fmt::Display for Fault {
                 window,
                 once: false,
             } => write!(f, "late_half:{device}@{window}"),
+            Self::Push { link, force, window } => write!(f, "push:{link}={force}@{window}"),
         }
     }
 }
@@ -286,6 +309,8 @@ mod tests {
             "spike:l_arm_ft_sensor@6",
             "late_half:l_arm_ft_sensor@2..8",
             "late_half:l_arm_ft_sensor@2.5",
+            "push:l_forearm=20@8..9",
+            "push:l_hand=-2.5@3..",
         ] {
             assert_eq!(text.parse::<Fault>().unwrap().to_string(), text);
         }
@@ -309,6 +334,10 @@ mod tests {
             ("reboot:ft@1..2", "reboot:BOARD@TIME"),
             ("saturate:ft@inf..", "saturate:BOARD@FROM..UNTIL"),
             ("late_half:ft", "late_half:BOARD@FROM..UNTIL or"),
+            ("push:hand@1..2", "push:LINK=NEWTONS@FROM..UNTIL"),
+            ("push:=5@1..2", "push:LINK=NEWTONS@FROM..UNTIL"),
+            ("push:hand=5@3", "push:LINK=NEWTONS@FROM..UNTIL"),
+            ("push:hand=hard@1..2", "push:LINK=NEWTONS@FROM..UNTIL"),
         ] {
             let message = text.parse::<Fault>().unwrap_err().to_string();
             assert!(message.contains(expected), "{text}: {message}");

@@ -211,7 +211,7 @@ impl Simulator {
             })
         };
         match fault {
-            Fault::Lost { .. } => {}
+            Fault::Lost { .. } | Fault::Push { .. } => {}
             Fault::Silent { window, .. } => node.silences.push(*window),
             Fault::Reboot { at, .. } => {
                 node.silences.push(Window {

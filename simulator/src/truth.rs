@@ -2,8 +2,9 @@
 //!
 //! One link stands still and carries the robot: the fixed base, or with an IMU as base the link of the first contact that is on
 //! the IMU's link (else of the first contact that is not pushed). Gravity points down its frame's z axis, or as `gravity_mps2`
-//! says. What else touches the robot is one push on its hand: the contact named `hand`, else the last one that does not carry it.
+//! says. What else touches the robot is one push on its hand, the contact named `hand`, else the last one that does not carry it; and what faults push ([`Fault::Push`]).
 
+use crate::fault::{Fault, Window};
 use crate::noise::Random;
 use crate::robot::{Robot, RobotError};
 use crate::simulator::Settings;
@@ -92,6 +93,8 @@ pub struct Simulation {
     /// Which contact carries the robot.
     carries: Option<usize>,
     push: Option<Push>,
+    /// What pushes beside, and nobody declares: where, its force at the frame's origin, when.
+    pokes: Vec<(Frame, Wrench, Window)>,
     state: [Vec<f64>; 3],
     truth: Truth,
 }
@@ -218,6 +221,16 @@ impl Simulation {
                 })
             });
 
+        let mut pokes = Vec::new();
+        for fault in &settings.faults {
+            if let Fault::Push { link, force, window } = fault {
+                let Some(frame) = model.frame(link) else {
+                    return Err(robot.mismatch(format!("fault {fault}: {link:?} is not a link of the URDF")));
+                };
+                pokes.push((frame, Wrench::from_parts([*force, 0.0, 0.0], [0.0; 3]), *window));
+            }
+        }
+
         let dofs = model.dof_count();
         let joint_names: Vec<String> = (0..dofs).map(|dof| model.dof_name(dof).to_owned()).collect();
         let ranges: Vec<_> = (0..dofs).map(|dof| model.limits(model.dof_joint(dof)?)).collect();
@@ -262,6 +275,7 @@ impl Simulation {
             contacts,
             carries,
             push,
+            pokes,
         };
         // What does not fit shows here rather than as absent readings later.
         this.evaluate(0.0).map_err(|e| wrong(e.to_string()))?;
@@ -357,13 +371,15 @@ impl Simulation {
             }
         }
         let push = self.push.map(|push| (push, push.at(t)));
-        self.solve(push)?;
+        let begin = self.pokes.iter().filter(|(.., when)| when.contains(t));
+        let poked: Vec<_> = begin.map(|(frame, wrench, _)| (*frame, *wrench)).collect();
+        self.solve(push, &poked)?;
         self.truth.t = t;
         Ok(())
     }
 
-    /// Fills in the truth for the joints' `state` and a push.
-    fn solve(&mut self, push: Option<(Push, Wrench)>) -> Result<(), DynamicsError> {
+    /// Fills in the truth for the joints' `state`, a push, and what else pushes.
+    fn solve(&mut self, push: Option<(Push, Wrench)>, poked: &[(Frame, Wrench)]) -> Result<(), DynamicsError> {
         let [position, velocity, acceleration] = &self.state;
         self.kinematics.update(
             &self.model,
@@ -374,12 +390,10 @@ impl Simulation {
             },
             &self.base,
         )?;
-        let external = push.map(|(push, wrench)| ExternalWrench {
-            frame: push.frame,
-            wrench,
-        });
-        self.dynamics
-            .update(&self.model, &self.kinematics, external.as_slice())?;
+        let all = push.map(|(push, wrench)| (push.frame, wrench));
+        let all = all.into_iter().chain(poked.iter().copied());
+        let external: Vec<ExternalWrench> = all.map(|(frame, wrench)| ExternalWrench { frame, wrench }).collect();
+        self.dynamics.update(&self.model, &self.kinematics, &external)?;
         let state = position
             .iter()
             .zip(velocity)
@@ -413,8 +427,17 @@ impl Simulation {
             *truth = match push {
                 // The base of the kinematics is the body that carries the robot.
                 _ if self.carries == Some(number) => frame.pose.wrench_back(&self.dynamics.base_wrench()).force_first(),
-                Some((push, wrench)) if push.contact == number => wrench.force_first(),
-                _ => [0.0; 6],
+                _ => {
+                    let own = push.filter(|(push, _)| push.contact == number);
+                    let of_push = own.map_or(Wrench::zero(), |(_, wrench)| wrench);
+                    // Whatever else pushes the same link.
+                    let others = poked.iter().filter(|(other, _)| other.link == frame.link);
+                    others
+                        .fold(of_push, |sum, (other, wrench)| {
+                            sum + frame.pose.wrench_back(&other.pose.wrench(wrench))
+                        })
+                        .force_first()
+                }
             };
         }
         Ok(())
@@ -533,7 +556,7 @@ mod tests {
             let six = |what: &str| parts.map(|part| row.get(&format!("{what}/{part}")).copied().unwrap_or(0.0));
             let [fx, fy, fz, tx, ty, tz] = six("contact/hand");
             let hand = Wrench::from_parts([fx, fy, fz], [tx, ty, tz]);
-            simulation.solve(Some((push, hand))).unwrap();
+            simulation.solve(Some((push, hand)), &[]).unwrap();
             let close =
                 |ours: f64, theirs: f64, what: &str| assert!((ours - theirs).abs() < 1e-9, "{what}: {ours}, {theirs}");
             for (joint, name) in simulation.truth.joints.iter().zip(&simulation.joint_names) {
@@ -678,5 +701,36 @@ mod tests {
             message.contains("contact \"hand\": link = \"left_hand\" is not a link of the URDF"),
             "{message}"
         );
+    }
+
+    /// What a fault pushes with is a wrench on that link, and shows in what the sensor reads and in the torques beyond as much as the link's contact says.
+    #[test]
+    fn a_push_by_a_fault_acts_where_it_is_typed() {
+        let robot = robot();
+        let at = |faults: &[&str], t: f64| {
+            let settings = Settings {
+                push: false,
+                faults: faults.iter().map(|fault| fault.parse().unwrap()).collect(),
+                ..Settings::default()
+            };
+            Simulation::new(&robot, &settings).map(|mut simulation| simulation.at(t).clone())
+        };
+        let hand = robot.config.contact.iter().position(|c| c.name() == "hand").unwrap();
+        let (free, pushed) = (at(&[], 1.5).unwrap(), at(&["push:l_hand=20@1..2"], 1.5).unwrap());
+        assert_eq!(pushed.contacts[hand], [20.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+        let force = |truth: &Truth| Vec3::from_column_slice(&truth.wrenches[0][..3]);
+        assert!(((force(&pushed) - force(&free)).norm() - 20.0).abs() < 1e-9);
+        assert!(
+            free.joints
+                .iter()
+                .zip(&pushed.joints)
+                .any(|(a, b)| (a.torque - b.torque).abs() > 0.5)
+        );
+        // Two at a time, on a frame of the same body; none before and after.
+        let both = at(&["push:l_hand=20@1..2", "push:l_hand_palm=-5@1..2"], 1.5).unwrap();
+        assert!((both.contacts[hand][0] - 20.0).hypot(both.contacts[hand][1]) > 1.0);
+        assert_eq!(at(&["push:l_hand=20@1..2"], 2.0).unwrap(), at(&[], 2.0).unwrap());
+        let message = at(&["push:hnad=20@1..2"], 0.0).unwrap_err().to_string();
+        assert!(message.contains("\"hnad\" is not a link of the URDF"), "{message}");
     }
 }

@@ -2099,6 +2099,23 @@ fn a_demonstration_with_faults_says_so() {
     assert!(share > 0.2 && share < 0.95, "{summary}");
     let found = reasons(&place);
     assert!(found["saturated:l_arm_ft_sensor"] > 100, "{found:?}");
+    // The hand is pushed, and nobody says so: seen while it lasts.
+    demo(&place, 8.0, &["--fault", "push:l_hand=50@6..7"]);
+    let table = place.read("d/estimates.csv");
+    let column = |name: &str| {
+        table
+            .lines()
+            .next()
+            .unwrap()
+            .split(',')
+            .position(|own| own == name)
+            .unwrap()
+    };
+    let (detected, told) = (column("contact/hand/detected"), column("residual/l_upper_arm/reason"));
+    let rows = table.lines().skip(1).map(|line| line.split(',').collect::<Vec<_>>());
+    let seen: Vec<bool> = rows.map(|row| row[detected] == "1" && row[told] == "hand").collect();
+    let count = seen.iter().filter(|seen| **seen).count();
+    assert!((700..1500).contains(&count), "{count} of {}", seen.len());
 }
 
 #[test]

@@ -497,8 +497,15 @@ pub(super) fn finish(
             .iter_mut()
             .zip(&seen.contacts)
             .for_each(|(to, from)| *to = *from);
+        estimate
+            .contacts
+            .residuals
+            .iter_mut()
+            .zip(&seen.residuals)
+            .for_each(|(to, from)| *to = *from);
         estimate.torques.count = u32::try_from(seen.joints.len())?;
         estimate.contacts.count = u32::try_from(seen.contacts.len())?;
+        estimate.contacts.residual_count = u32::try_from(seen.residuals.len())?;
         table.write(&estimate, true)?;
     }
     table.into_inner().flush()?;
