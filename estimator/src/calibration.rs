@@ -19,6 +19,10 @@ use crate::spatial::Wrench;
 use nalgebra::{Matrix6, Vector6};
 use proprio_topics::Nanos;
 
+/// Standard deviation of an offset that nobody states and nobody has identified yet, of each channel
+/// [torque; force] \[Nm, N\]: no sensor is that far off, so it has no say in what is found.
+pub const UNKNOWN_OFFSET: [f64; 6] = [100.0, 100.0, 100.0, 1000.0, 1000.0, 1000.0];
+
 /// What turns a sensor's reading into a wrench with an offset.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Calibration {

@@ -2,7 +2,7 @@
 //!
 //! [`crate::setup`] checks it against the model and resolves names; nothing after that sees this form.
 
-use crate::calibration::{Calibration, gain_from_force_first};
+use crate::calibration::{Calibration, UNKNOWN_OFFSET, gain_from_force_first};
 use crate::spatial::Wrench;
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
@@ -584,10 +584,6 @@ impl Config {
         Ok(())
     }
 }
-
-/// Standard deviation of an offset that nobody states and nobody has identified, of each channel [torque; force] \[Nm, N\]: more than sensors of this kind are off by, so
-/// that it has no say in what is found.
-pub const UNKNOWN_OFFSET: [f64; 6] = [100.0, 100.0, 100.0, 1000.0, 1000.0, 1000.0];
 
 impl ForceTorque {
     /// What it reads with no load, and the standard deviations of that [torque; force] \[Nm, N\].

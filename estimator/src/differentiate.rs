@@ -308,6 +308,11 @@ impl Ring {
         newest: 0,
         len: 0,
     };
+
+    /// Where the sample is that so many came after.
+    fn at(&self, age: usize) -> usize {
+        (self.newest + MAX_SAMPLES - age) % MAX_SAMPLES
+    }
 }
 
 impl<const D: usize> Window<D> {
@@ -381,19 +386,22 @@ impl<const D: usize> Window<D> {
         const SAMPLES: usize = 64;
         let skipped = self.later_than(until);
         let known = self.ring.len.saturating_sub(skipped + ROUGH - 1).min(SAMPLES);
-        let (mut sum, mut count) = ([0.0; D], 0.0_f64);
-        for age in skipped..skipped + known {
-            let at = (self.ring.newest + MAX_SAMPLES - age) % MAX_SAMPLES;
-            // By time, so that who begins later finds the same.
-            if until - self.ring.stamps[at] > self.settings.max_window {
-                break;
+        // By time, so that who begins later finds the same.
+        let is_in = |age: &usize| until - self.ring.stamps[self.ring.at(*age)] <= self.settings.max_window;
+        let count = (skipped..skipped + known).take_while(is_in).count();
+        let sum = self.sum_of_roughness(skipped, count);
+        sum.map(|sum| (sum / count.max(1) as f64).sqrt())
+    }
+
+    /// Of so many samples from this age on.
+    fn sum_of_roughness(&self, first: usize, count: usize) -> [f64; D] {
+        let mut sum = [0.0; D];
+        for age in first..first + count {
+            for (sum, rough) in sum.iter_mut().zip(&self.rough[self.ring.at(age)]) {
+                *sum += rough;
             }
-            count += 1.0;
-            sum.iter_mut()
-                .zip(&self.rough[at])
-                .for_each(|(sum, rough)| *sum += rough);
         }
-        sum.map(|sum| (sum / count.max(1.0)).sqrt())
+        sum
     }
 
     /// The newest samples' divided difference over [`ROUGH`] of them, in units in which it has the variance of a sample's noise, squared. A polynomial of degree three has none, and what
@@ -452,7 +460,7 @@ impl<const D: usize> Window<D> {
         if age >= self.ring.len {
             return None;
         }
-        let at = (self.ring.newest + MAX_SAMPLES - age) % MAX_SAMPLES;
+        let at = self.ring.at(age);
         Some((*self.ring.stamps.get(at)?, self.values.get(at)?))
     }
 
@@ -537,7 +545,7 @@ impl<const D: usize> Window<D> {
                 None => Unavailable::Starting { samples: 0 },
             });
         };
-        let at = |age: usize| (self.ring.newest + 2 * MAX_SAMPLES - skipped - age) % MAX_SAMPLES;
+        let at = |age: usize| self.ring.at(skipped + age);
         let settings = (self.settings.max_gap, self.settings.max_window, self.settings.capacity);
         let (mut used, mut oldest, mut is_shared) = (grid.used, newest, true);
         if used > 0 && grid.skipped == skipped && grid.settings == settings && grid.ring == self.ring {
@@ -589,12 +597,7 @@ impl<const D: usize> Window<D> {
         }
         // Those that lie on samples used alone.
         let own = used.saturating_sub(ROUGH - 1);
-        let mut rough = [0.0; D];
-        for age in 0..own {
-            for (sum, rough) in rough.iter_mut().zip(&self.rough[at(age)]) {
-                *sum += rough;
-            }
-        }
+        let rough = self.sum_of_roughness(skipped, own);
         // An error spread evenly over +-noise has a third of its square.
         let noise = rough.map(|sum| (3.0 * sum / own.max(1) as f64).sqrt().max(self.settings.noise));
         let mut estimate = Values::new(values, grid).estimate(grid, &noise, origin);

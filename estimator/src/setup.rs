@@ -1,9 +1,9 @@
 //! estimator.toml, the URDF and what was identified, checked against each other and resolved: what the rest of the estimator works with.
 
-use crate::calibration::{self, Calibration, Kind as Calibrated, Unknown};
+use crate::calibration::{self, Calibration, Kind as Calibrated, UNKNOWN_OFFSET, Unknown};
 use crate::config::{
     Base, Config, ContactKind as KindWord, Differentiation, Direction, Foot, ForceTorque, Gain, IdentificationInput,
-    Presence, STANDARD_GRAVITY, SensorFrame, TorqueSide, UNKNOWN_OFFSET,
+    Presence, STANDARD_GRAVITY, SensorFrame, TorqueSide,
 };
 use crate::differentiate::Settings;
 use crate::dynamics::{ContactKind, ContactSet, ContactSpec, FrameMotion, Noise, SensorCut, Structure, StructureError};
@@ -798,8 +798,7 @@ pub(crate) fn set_noise(excess: &mut [[f64; 6]], structure: &Structure, sensor: 
     }
 }
 
-/// Of each degree of freedom, the standard deviation beyond which a torque is worth nothing ([`Setup::max_deviation`]) \[Nm or N\]. Gravity makes of the links beyond a joint at the most
-/// `g sum m d`, `d` along the joints' origins.
+/// Of each degree of freedom, the standard deviation beyond which a torque is worth nothing ([`Setup::max_deviation`]) \[Nm or N\].
 fn worthless(model: &Model) -> Vec<f64> {
     /// Drives carry some ten times the links alone. A limit beyond a hundred times is no limit, but a number that had to be there.
     const USUAL: f64 = 10.0;
@@ -814,6 +813,8 @@ fn worthless(model: &Model) -> Vec<f64> {
     bounds
 }
 
+/// Of each degree of freedom, what gravity makes at the most of the links beyond its joint:
+/// `g sum m d`, `d` along the joints' origins \[Nm or N\].
 fn gravity_loads(model: &Model) -> Vec<f64> {
     let mut loads = vec![0.0; model.dof_count()];
     // Beyond each joint, from the tips on: mass, and its moment with the limb stretched out from the joint's origin.

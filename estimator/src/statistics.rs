@@ -2,13 +2,15 @@
 //!
 //! Within 1 % of the quantile from three degrees of freedom on; a few per cent too large for one.
 
-/// What a chi-square variable of `freedom` degrees exceeds as often as a normal one exceeds `level`.
+/// What a chi-square variable of `freedom` degrees exceeds as often as a normal one exceeds
+/// `level`.
 pub(crate) fn chi_square(freedom: usize, level: f64) -> f64 {
     let (k, spread) = cube(freedom);
     k * (1.0 - spread + level * spread.sqrt()).powi(3)
 }
 
-/// The normal deviate as rare as `square` is for a chi-square variable: the inverse of [`chi_square`].
+/// The normal deviate as rare as `square` is for a chi-square variable: the inverse of
+/// [`chi_square`].
 pub(crate) fn deviate(square: f64, freedom: usize) -> f64 {
     let (k, spread) = cube(freedom);
     ((square / k).cbrt() - (1.0 - spread)) / spread.sqrt()

@@ -93,8 +93,8 @@ pub struct Simulation {
     /// Which contact carries the robot.
     carries: Option<usize>,
     push: Option<Push>,
-    /// What pushes beside, and nobody declares: where, its force at the frame's origin, when.
-    pokes: Vec<(Frame, Wrench, Window)>,
+    /// What pushes beside, and nobody declares; and when.
+    pokes: Vec<(ExternalWrench, Window)>,
     state: [Vec<f64>; 3],
     truth: Truth,
 }
@@ -227,7 +227,8 @@ impl Simulation {
                 let Some(frame) = model.frame(link) else {
                     return Err(robot.mismatch(format!("fault {fault}: {link:?} is not a link of the URDF")));
                 };
-                pokes.push((frame, Wrench::from_parts([*force, 0.0, 0.0], [0.0; 3]), *window));
+                let wrench = Wrench::from_parts([*force, 0.0, 0.0], [0.0; 3]);
+                pokes.push((ExternalWrench { frame, wrench }, *window));
             }
         }
 
@@ -371,15 +372,15 @@ impl Simulation {
             }
         }
         let push = self.push.map(|push| (push, push.at(t)));
-        let begin = self.pokes.iter().filter(|(.., when)| when.contains(t));
-        let poked: Vec<_> = begin.map(|(frame, wrench, _)| (*frame, *wrench)).collect();
+        let present = self.pokes.iter().filter(|(_, when)| when.contains(t));
+        let poked: Vec<ExternalWrench> = present.map(|(poke, _)| *poke).collect();
         self.solve(push, &poked)?;
         self.truth.t = t;
         Ok(())
     }
 
     /// Fills in the truth for the joints' `state`, a push, and what else pushes.
-    fn solve(&mut self, push: Option<(Push, Wrench)>, poked: &[(Frame, Wrench)]) -> Result<(), DynamicsError> {
+    fn solve(&mut self, push: Option<(Push, Wrench)>, poked: &[ExternalWrench]) -> Result<(), DynamicsError> {
         let [position, velocity, acceleration] = &self.state;
         self.kinematics.update(
             &self.model,
@@ -390,9 +391,11 @@ impl Simulation {
             },
             &self.base,
         )?;
-        let all = push.map(|(push, wrench)| (push.frame, wrench));
-        let all = all.into_iter().chain(poked.iter().copied());
-        let external: Vec<ExternalWrench> = all.map(|(frame, wrench)| ExternalWrench { frame, wrench }).collect();
+        let pushed = push.map(|(push, wrench)| ExternalWrench {
+            frame: push.frame,
+            wrench,
+        });
+        let external: Vec<ExternalWrench> = pushed.into_iter().chain(poked.iter().copied()).collect();
         self.dynamics.update(&self.model, &self.kinematics, &external)?;
         let state = position
             .iter()
@@ -431,10 +434,10 @@ impl Simulation {
                     let own = push.filter(|(push, _)| push.contact == number);
                     let of_push = own.map_or(Wrench::zero(), |(_, wrench)| wrench);
                     // Whatever else pushes the same link.
-                    let others = poked.iter().filter(|(other, _)| other.link == frame.link);
+                    let others = poked.iter().filter(|other| other.frame.link == frame.link);
                     others
-                        .fold(of_push, |sum, (other, wrench)| {
-                            sum + frame.pose.wrench_back(&other.pose.wrench(wrench))
+                        .fold(of_push, |sum, other| {
+                            sum + frame.pose.wrench_back(&other.frame.pose.wrench(&other.wrench))
                         })
                         .force_first()
                 }

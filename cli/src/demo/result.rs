@@ -467,6 +467,12 @@ fn learnt_section(parameters: &[Course], offsets: &[Course], compared: &Compared
     )
 }
 
+/// Puts values in the first places; how many.
+fn fill<T: Copy>(places: &mut [T], values: &[T]) -> anyhow::Result<u32> {
+    places.iter_mut().zip(values).for_each(|(to, from)| *to = *from);
+    Ok(u32::try_from(values.len())?)
+}
+
 /// Writes estimates.csv, summary.json and report.html to `out`, and tells the result. The simulator's truth is in `truth`.
 pub(super) fn finish(
     args: &Args,
@@ -485,27 +491,10 @@ pub(super) fn finish(
     let mut table = Table::new(file("estimates.csv")?, setup)?;
     for seen in &watched.estimates {
         let mut estimate = Estimate::absent(seen.t);
-        estimate
-            .torques
-            .joints
-            .iter_mut()
-            .zip(&seen.joints)
-            .for_each(|(to, from)| *to = *from);
-        estimate
-            .contacts
-            .contacts
-            .iter_mut()
-            .zip(&seen.contacts)
-            .for_each(|(to, from)| *to = *from);
-        estimate
-            .contacts
-            .residuals
-            .iter_mut()
-            .zip(&seen.residuals)
-            .for_each(|(to, from)| *to = *from);
-        estimate.torques.count = u32::try_from(seen.joints.len())?;
-        estimate.contacts.count = u32::try_from(seen.contacts.len())?;
-        estimate.contacts.residual_count = u32::try_from(seen.residuals.len())?;
+        let (torques, contacts) = (&mut estimate.torques, &mut estimate.contacts);
+        torques.count = fill(&mut torques.joints, &seen.joints)?;
+        contacts.count = fill(&mut contacts.contacts, &seen.contacts)?;
+        contacts.residual_count = fill(&mut contacts.residuals, &seen.residuals)?;
         table.write(&estimate, true)?;
     }
     table.into_inner().flush()?;

@@ -52,6 +52,7 @@ use super::information::{Information, InformationError, Panel};
 use super::lanes::{self, TOGETHER};
 use super::prior::{Posterior, Prior, PriorError};
 use super::{add_multiple, dot, factorise, forward};
+use crate::calibration::UNKNOWN_OFFSET;
 use crate::dynamics::{ContactSet, DofSet, DynamicsError, Kinematics, Structure};
 use crate::model::Model;
 use crate::parameters::cad_root;
@@ -79,8 +80,6 @@ const PERSISTENT: f64 = 3.0;
 const TILTED: f64 = 0.94;
 /// Mean square of what a change leaves of the rows' innovations, in units of inflated noise, up to which it explains them.
 const EXPLAINED: f64 = 1.0;
-/// Standard deviation of an offset before anything is known of it [Nm], [N]: no sensor is that far off.
-const OFFSET: [f64; 2] = [100.0, 1000.0];
 /// The squared Newton decrement down to which bodies are sought to find the prior's weight, and to tell of them: a hundredth and a ten-thousandth of a standard deviation.
 const NEAR: f64 = 1e-4;
 const NEAREST: f64 = 1e-8;
@@ -1407,7 +1406,7 @@ impl Part {
                 of_offsets[(i, j)] = r[(i, j)];
             }
             of_offsets[(i, session + parameters)] = z[i];
-            of_offsets[(session + i, i)] = 1.0 / OFFSET[usize::from(i % 6 > 2)];
+            of_offsets[(session + i, i)] = 1.0 / UNKNOWN_OFFSET[i % 6];
         }
         let qr = of_offsets.columns(0, session).into_owned().qr();
         qr.q_tr_mul(&mut of_offsets);
@@ -1623,7 +1622,7 @@ impl Part {
         let (root, right) = information.to_triangle();
         // [s | d] -> [d | s]
         let order: Vec<usize> = (session..session + parameters).chain(0..session).collect();
-        let precision: Vec<f64> = (0..session).map(|i| OFFSET[usize::from(i % 6 > 2)].powi(-2)).collect();
+        let precision: Vec<f64> = (0..session).map(|i| UNKNOWN_OFFSET[i % 6].powi(-2)).collect();
         Posterior::new(prior, &self.links, &root.select_columns(&order), &right, &precision)
     }
 }

@@ -5,12 +5,16 @@
 //! variance = sum over x of S_ij^2 sigma_j^2,    S = d(torques and wrenches) / dx
 //! ```
 //!
-//! with the sigma of differentiated accelerations as [`crate::differentiate`] states it, and errors of different channels being independent. Positions are off by their
-//! noise, late stamps included, and by an encoder's zero, [`ENCODER_ZERO`]; the base's proper acceleration by [`BASE_ACCELERATION`], which is an IMU's bias and
-//! mounting, or that a fixed base is not level. These are what robots are calibrated to, not what one robot has.
+//! with the sigma of differentiated accelerations as [`crate::differentiate`] states it, and errors
+//! of different channels being independent. Positions are off by their noise, late stamps included,
+//! and by an encoder's zero, [`ENCODER_ZERO`]; the base's proper acceleration by
+//! [`BASE_ACCELERATION`], which is an IMU's bias and mounting, or that a fixed base is not level.
+//! These are what robots are calibrated to, not what one robot has.
 //!
-//! A column of S is the difference that a little of x makes. S follows the posture alone: it is found anew with the first estimate of each tenth of a second, and when contacts or base
-//! change. By stamps, so that a replay which begins elsewhere finds the same. Errors of velocities are smaller by an order of magnitude, and left out.
+//! A column of S is the difference that a little of x makes. S follows the posture alone: it is
+//! found anew with the first estimate of each tenth of a second, and when contacts or base change.
+//! By stamps, so that a replay which begins elsewhere finds the same. Errors of velocities are
+//! smaller by an order of magnitude, and left out.
 
 use crate::dynamics::{ContactSet, DynamicsError, FrameMotion, JointState, Kinematics, Solver, Structure};
 use crate::model::Model;
@@ -21,10 +25,12 @@ use proprio_topics::Nanos;
 /// How long a posture counts as the same.
 const CELL: Nanos = Nanos::from_millis(100);
 
-/// Standard deviation of an encoder's zero \[rad\], a third of a degree; of a prismatic joint's \[m\].
+/// Standard deviation of an encoder's zero \[rad\], a third of a degree; of a prismatic joint's
+/// \[m\].
 pub(super) const ENCODER_ZERO: [f64; 2] = [0.005, 0.001];
 
-/// Standard deviation of the base's proper acceleration, each axis \[m/s^2\]: a hundredth of gravity, or 0.6 degrees of level.
+/// Standard deviation of the base's proper acceleration, each axis \[m/s^2\]: a hundredth of
+/// gravity, or 0.6 degrees of level.
 const BASE_ACCELERATION: f64 = 0.1;
 
 /// How far positions are moved to see what that does \[rad, m\].
@@ -52,7 +58,8 @@ pub(super) struct MotionErrors {
     solver: Solver,
     /// Standard deviations of x. Zero where it is exact.
     sigma: Vec<f64>,
-    /// Column by column: torques, then six numbers per contact, then the imbalance of each sub-tree.
+    /// Column by column: torques, then six numbers per contact, then the imbalance of each
+    /// sub-tree.
     sensitivity: Vec<f64>,
     is_known: Vec<bool>,
     /// What the columns belong to.
@@ -61,7 +68,8 @@ pub(super) struct MotionErrors {
     /// Of each torque, then of `[fx fy fz tx ty tz]` of each contact.
     deviation: Vec<f64>,
     dofs: usize,
-    contacts: usize,
+    /// How many numbers a column has.
+    rows: usize,
 }
 
 impl MotionErrors {
@@ -79,9 +87,9 @@ impl MotionErrors {
             is_known: vec![false; columns],
             of: None,
             perturbed: vec![0.0; 2 * dofs],
-            deviation: vec![0.0; rows],
+            deviation: vec![0.0; dofs + 6 * contacts],
             dofs,
-            contacts,
+            rows,
         })
     }
 
@@ -126,8 +134,7 @@ impl MotionErrors {
                 self.probe(column, instant)?;
             }
         }
-        let rows = self.deviation.len();
-        for (column, sigma) in self.sensitivity.chunks_exact(rows).zip(&self.sigma) {
+        for (column, sigma) in self.sensitivity.chunks_exact(self.rows).zip(&self.sigma) {
             if *sigma > 0.0 {
                 for (sum, s) in self.deviation.iter_mut().zip(column) {
                     *sum += (s * sigma).powi(2);
@@ -176,8 +183,7 @@ impl MotionErrors {
             instant.active,
             &[],
         )?;
-        let rows = self.deviation.len();
-        let Some(to) = self.sensitivity.chunks_exact_mut(rows).nth(column) else {
+        let Some(to) = self.sensitivity.chunks_exact_mut(self.rows).nth(column) else {
             return Ok(());
         };
         let (torques, contacts) = to.split_at_mut(self.dofs);
@@ -217,9 +223,9 @@ impl MotionErrors {
 
     /// Covariance of a sub-tree's imbalance [torque; force], at the origin of base coordinates.
     pub(super) fn imbalance(&self, number: usize) -> Matrix6<f64> {
-        let first = self.dofs + 6 * (self.contacts + number);
+        let first = self.deviation.len() + 6 * number;
         let mut covariance = Matrix6::zeros();
-        for (column, sigma) in self.sensitivity.chunks_exact(self.deviation.len()).zip(&self.sigma) {
+        for (column, sigma) in self.sensitivity.chunks_exact(self.rows).zip(&self.sigma) {
             if *sigma > 0.0
                 && let Some(six) = column.get(first..first + 6)
             {

@@ -1,4 +1,5 @@
-//! Whether F/T readings contradict what a sub-tree's links need, and which contact that nobody declared would explain it.
+//! Whether F/T readings contradict what a sub-tree's links need, and which contact that nobody
+//! declared would explain it.
 //!
 //! ```text
 //! b = sum of net wrenches less sensors' and known wrenches      A x: what contacts that are present may do to it
@@ -6,10 +7,14 @@
 //! q = min over x of (b - A x)^T S^-1 (b - A x)                  chi-square with 6 - rank A degrees of freedom
 //! ```
 //!
-//! Two `b` are tested, that of the instant and, where no contact is known, the mean of some [`MEAN`], which shows what is smaller than the noise of one reading. `q` counts as the normal deviate that is as rare.
-//! Beyond [`CONTRADICTED`] something acts that is not known. Of the contacts that are possible there, the one that leaves least unexplained is taken as present, provided that what
-//! it leaves is usual ([`USUAL`]). A touch is a force within [`REACH`] of the contact's `position_m`: any six numbers could be a wrench at any one of them.
-//! It stays present until `q` is usual without it. What no contact explains condemns the sub-tree: where it acts nobody knows.
+//! Two `b` are tested, that of the instant and, where no contact is known, the mean of some
+//! [`MEAN`], which shows what is smaller than the noise of one reading. `q` counts as the normal
+//! deviate that is as rare. Beyond [`CONTRADICTED`] something acts that is not known. Of the
+//! contacts that are possible there, the one that leaves least unexplained is taken as present,
+//! provided that what it leaves is usual ([`USUAL`]). A touch is a force within [`REACH`] of the
+//! contact's `position_m`: any six numbers could be a wrench at any one of them. It stays present
+//! until `q` is usual without it. What no contact explains condemns the sub-tree: where it acts
+//! nobody knows.
 
 use crate::dynamics::{ContactKind, ContactSet, Kinematics, LeastSquares, Solver, Structure, noise_factor, unknowns};
 use crate::spatial::{Vec3, Wrench};
@@ -23,7 +28,8 @@ const CONTRADICTED: f64 = 5.0;
 const USUAL: f64 = 2.326;
 /// Time constant of the mean.
 const MEAN: Nanos = Nanos::from_millis(50);
-/// How far from a contact's position a touch acts, one standard deviation \[m\]: 99 % within 17 cm, a hand or a foot.
+/// How far from a contact's position a touch acts, one standard deviation \[m\]: 99 % within 17 cm,
+/// a hand or a foot.
 const REACH: f64 = 0.05;
 /// Of the variances that are found in single precision, what rounding may leave.
 const ROUNDING: f64 = 1e-6;
@@ -31,7 +37,8 @@ const ROUNDING: f64 = 1e-6;
 /// What was seen of a sub-tree at the last instant.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Seen {
-    /// What is unexplained but for contacts that were detected: at the origin and in the axes of the sub-tree's top link.
+    /// What is unexplained but for contacts that were detected: at the origin and in the axes of
+    /// the sub-tree's top link.
     pub(super) residual: Wrench,
     /// As a normal deviate. Not a number where nothing can be tested.
     pub(super) significance: f64,
@@ -109,7 +116,8 @@ impl Watch {
         detected
     }
 
-    /// Looks at an instant. `covariance` is that of a sub-tree's imbalance but for F/T noise, `P + M`; none where it can not be trusted. Does not allocate.
+    /// Looks at an instant. `covariance` is that of a sub-tree's imbalance but for F/T noise, `P +
+    /// M`; none where it can not be trusted. Does not allocate.
     pub(super) fn update(&mut self, instant: &Instant<'_>, covariance: impl Fn(usize) -> Option<Matrix6<f64>>) {
         let Self { subtrees, least } = self;
         for (number, subtree) in subtrees.iter_mut().enumerate() {
@@ -127,12 +135,15 @@ impl Watch {
                 subtree.mean = None;
                 continue;
             };
+            let b = Vector6::from(instant.solver.imbalance(instant.structure, number).torque_first());
+            // What a known contact does changes with its place: there is no mean of that.
+            let before_it = subtree.mean.filter(|_| declared.is_empty());
             let case = Case {
                 instant,
                 number,
                 declared,
-                b: Vector6::from(instant.solver.imbalance(instant.structure, number).torque_first()),
-                mean: Mean::next(subtree.mean, instant, number, &declared),
+                b,
+                mean: Mean::next(before_it, instant.t, b),
                 noise: instant.solver.noise(instant.structure, number, &Vec3::zeros()),
                 known: known + Matrix6::from_diagonal(&(ROUNDING * known.diagonal())),
             };
@@ -155,22 +166,19 @@ impl Watch {
 }
 
 impl Mean {
-    fn next(before: Option<Self>, instant: &Instant<'_>, number: usize, declared: &ContactSet) -> Self {
-        let b = Vector6::from(instant.solver.imbalance(instant.structure, number).torque_first());
-        let fresh = Self {
-            value: b,
-            share: 1.0,
-            t: instant.t,
+    fn next(before: Option<Self>, t: Nanos, b: Vector6<f64>) -> Self {
+        let Some(before) = before.filter(|mean| t - mean.t < MEAN) else {
+            return Self {
+                value: b,
+                share: 1.0,
+                t,
+            };
         };
-        // What a known contact does changes with its place: there is no mean of that.
-        let Some(before) = before.filter(|mean| declared.is_empty() && instant.t - mean.t < MEAN) else {
-            return fresh;
-        };
-        let keep = (-(instant.t - before.t).seconds() / MEAN.seconds()).exp();
+        let keep = (-(t - before.t).seconds() / MEAN.seconds()).exp();
         Self {
             value: before.value * keep + b * (1.0 - keep),
             share: keep * keep * before.share + (1.0 - keep) * (1.0 - keep),
-            ..fresh
+            t,
         }
     }
 }
@@ -220,7 +228,8 @@ impl Case<'_> {
         seen
     }
 
-    /// How rare what is unexplained would be, of the instant or of the mean, whichever is rarer, if this contact were present, too; and what the instant leaves.
+    /// How rare what is unexplained would be, of the instant or of the mean, whichever is rarer, if
+    /// this contact were present, too; and what the instant leaves.
     fn test(&self, least: &mut LeastSquares, touch: Option<usize>) -> (f64, Vector6<f64>) {
         let (structure, origin) = (self.instant.structure, Vec3::zeros());
         let columns = |contact: usize| {
@@ -229,7 +238,9 @@ impl Case<'_> {
         };
         let is_loose = touch.is_some_and(|contact| structure.contacts()[contact].kind == ContactKind::Wrench);
         let mut worst = (f64::NEG_INFINITY, self.b);
-        for (b, share) in [(self.mean.value, self.mean.share), (self.b, 1.0)] {
+        // A mean of one reading is that reading.
+        let mean = Some((self.mean.value, self.mean.share)).filter(|(_, share)| *share < 1.0);
+        for (b, share) in mean.into_iter().chain([(self.b, 1.0)]) {
             let mut covariance = self.noise * share + self.known;
             if is_loose {
                 let moment = (REACH * b.fixed_rows::<3>(3).norm()).powi(2);

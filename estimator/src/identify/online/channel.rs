@@ -5,36 +5,46 @@
 //! y_k   = o_k + v_k,   v_k ~ N(0, V / n + b_k)    the channel's mean over second k, less what the bodies explain
 //! ```
 //!
-//! `V` is the variance of one of the second's `n` instants that would give its mean this variance if they were independent: it holds the sensor's noise, its
-//! autocorrelation, stamps' jitter, vibration, and whatever else the model lacks. `b_k` is what the bodies' own uncertainty makes of the mean. The bodies are
-//! those known *before* the second: its readings have had no say in them, so that a fit which is too close to its data does not show as little noise.
+//! `V` is the variance of one of the second's `n` instants that would give its mean this variance
+//! if they were independent: it holds the sensor's noise, its autocorrelation, stamps' jitter,
+//! vibration, and whatever else the model lacks. `b_k` is what the bodies' own uncertainty makes of
+//! the mean. The bodies are those known *before* the second: its readings have had no say in them,
+//! so that a fit which is too close to its data does not show as little noise.
 //!
-//! For each of some pairs `(V, q)` a Kalman filter of one state gives the likelihood of the innovations `y_k - o_k|k-1`. A second in which something undeclared
-//! acts is no noise: each innovation is of a mixture, a share [`DISTURBED`] of them being anything within [`RANGE`]. The pairs' likelihoods and a prior weigh the
-//! estimates of `V` and `q^2`. Before anything is known `V` is hundreds of times what the sensor was stated to have: readings are not believed before
+//! For each of some pairs `(V, q)` a Kalman filter of one state gives the likelihood of the
+//! innovations `y_k - o_k|k-1`. A second in which something undeclared acts is no noise: each
+//! innovation is of a mixture, a share [`DISTURBED`] of them being anything within [`RANGE`]. The
+//! pairs' likelihoods and a prior weigh the estimates of `V` and `q^2`. Before anything is known
+//! `V` is hundreds of times what the sensor was stated to have: readings are not believed before
 //! their noise has shown.
 //!
-//! Source: the local level model, A. C. Harvey, "Forecasting, structural time series models and the Kalman filter", 1989, chapter 2.
+//! Source: the local level model, A. C. Harvey, "Forecasting, structural time series models and the
+//! Kalman filter", 1989, chapter 2.
 
-/// The noise's grid: `V` by the stated variance, in half decades, `10^0 ... 10^4`. Beyond that what is read is no noise: on a real leg 10^4 is the greatest found.
+/// The noise's grid: `V` by the stated variance, in half decades, `10^0 ... 10^5`. Beyond that what
+/// is read is no noise: on a real leg 10^4 is the greatest found.
 const LEVELS: usize = 11;
-/// The walk's grid: `q` by the standard deviation of a second's mean, `(V dt)^1/2`. At 1 the offset follows in about a second, and as in identification from
-/// logs it may be no faster, or it would follow the motion that identifies.
+/// The walk's grid: `q` by the standard deviation of a second's mean, `(V dt)^1/2`. At 1 the offset
+/// follows in about a second, and as in identification from logs it may be no faster, or it would
+/// follow the motion that identifies.
 const RATES: [f64; 5] = [0.01, 0.03, 0.1, 0.3, 1.0];
 /// The walk's prior: log-normal about this, its standard deviation a factor of three.
 const RATE: f64 = 0.1;
 const SPREAD: f64 = 1e3;
 /// How long an innovation counts \[s\].
 const MEMORY: f64 = 60.0;
-/// After a pause of so long the filters begin afresh: what happened meanwhile may have been a contact \[s\].
+/// After a pause of so long the filters begin afresh: what happened meanwhile may have been a
+/// contact \[s\].
 const PAUSE: f64 = 3.0;
-/// The share of seconds in which something undeclared is supposed to act, and up to what it does then, in stated standard deviations: all of it as likely.
+/// The share of seconds in which something undeclared is supposed to act, and up to what it does
+/// then, in stated standard deviations: all of it as likely.
 const DISTURBED: f64 = 0.02;
 const RANGE: f64 = 1000.0;
 /// Rest tells the noise of motion at odds of no more than twenty: `e^3`.
 const AT_REST: f64 = 3.0;
 
-/// The correlation of innovations in a row before it is known, and how many seconds' worth that counts.
+/// The correlation of innovations in a row before it is known, and how many seconds' worth that
+/// counts.
 const CORRELATED: (f64, f64) = (0.0, 10.0);
 
 /// An innovation counts as no larger, in standard deviations, and no correlation as greater.
@@ -76,7 +86,8 @@ pub(super) struct Channel {
     /// When the last second was \[s\]; none: the filters begin with the next.
     last: Option<f64>,
     filters: [[Filter; RATES.len()]; LEVELS],
-    /// Normalised innovation of the likeliest filter, the mean product of two in a row, the mean square.
+    /// Normalised innovation of the likeliest filter, the mean product of two in a row, the mean
+    /// square.
     innovation: f64,
     products: (f64, f64),
     /// Mean square of instants about the mean of their second; none before the first.
@@ -161,13 +172,15 @@ impl Channel {
         }
     }
 
-    /// Variance of one reading about what the model says of it: what scatters within a second, and what changes from one to the next.
+    /// Variance of one reading about what the model says of it: what scatters within a second, and
+    /// what changes from one to the next.
     pub(super) fn reading(&self) -> f64 {
         let slow = self.noise().0 * self.period;
         (self.scatter.unwrap_or(0.0) + slow).max(self.stated)
     }
 
-    /// `V`, and the standard deviation of a second of drift: means over the grid by likelihood and prior.
+    /// `V`, and the standard deviation of a second of drift: means over the grid by likelihood and
+    /// prior.
     pub(super) fn noise(&self) -> (f64, f64) {
         let best = (self.filters.as_flattened().iter())
             .map(|filter| filter.likelihood)
@@ -192,7 +205,9 @@ impl Channel {
 }
 
 impl Filter {
-    /// A mean with its variance, `dt` seconds after the last one, in which the offset's variance grew by `walked`; the density of what is no noise. Returns the innovation, normalised, and how far it is noise.
+    /// A mean with its variance, `dt` seconds after the last one, in which the offset's variance
+    /// grew by `walked`; the density of what is no noise. Returns the innovation, normalised, and
+    /// how far it is noise.
     fn take(&mut self, (mean, noise): (f64, f64), walked: f64, dt: f64, disturbed: f64) -> (f64, f64) {
         let grown = self.variance + walked;
         let total = grown + noise;
@@ -200,7 +215,8 @@ impl Filter {
         let square = innovation * innovation / total;
         let regular = (1.0 - DISTURBED) * (-0.5 * square).exp() / (std::f64::consts::TAU * total).sqrt();
         let share = regular / (regular + disturbed);
-        // What is no noise says nothing of the offset, which stands still meanwhile, nor does it make older innovations older.
+        // What is no noise says nothing of the offset, which stands still meanwhile, nor does it
+        // make older innovations older.
         let gain = share * grown / total;
         self.offset += gain * innovation;
         self.variance = (self.variance + share * walked) * (1.0 - gain);
@@ -218,7 +234,8 @@ mod tests {
     const PERIOD: f64 = 0.01;
     const STATED: f64 = 0.0064;
 
-    /// A channel after so many seconds of motion: its noise `factor` times the stated variance, its walk of rate `q`, in deviations of a second's mean; something acts on it in some of them.
+    /// A channel after so many seconds of motion: its noise `factor` times the stated variance, its
+    /// walk of rate `q`, in deviations of a second's mean; something acts on it in some of them.
     fn after(seconds: usize, factor: f64, rate: f64, seed: u64, acts: impl Fn(usize) -> f64) -> Channel {
         let mut channel = Channel::new(STATED, PERIOD);
         let deviates = normals(seed, 2 * seconds);

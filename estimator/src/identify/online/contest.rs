@@ -1,16 +1,21 @@
-//! Which parameters are in force: those that have predicted what came after them better than the ones before.
+//! Which parameters are in force: those that have predicted what came after them better than the
+//! ones before.
 //!
 //! ```text
 //! e_b = y_b - A_b d,   per channel and block of 0.1 s, less the line through them since the candidate entered
 //! g_b = sum over channels of rho(e_b(in force) / s) - rho(e_b(candidate) / s),   rho(x) = min(x^2, BOUND^2), s their scale
 //! ```
 //!
-//! A candidate is what was most probable when it entered, and it is judged by what came later. Both sets have the same freedom: of each channel an offset, and a drift of it. The mean of `g`
-//! must exceed its own standard error, autocorrelation included, by [`LEVEL`]. Some candidates are on trial at a time, their ages about in geometric progression: a
-//! young one knows more, an old one has been judged by more, and small gains take long to show.
+//! A candidate is what was most probable when it entered, and it is judged by what came later. Both
+//! sets have the same freedom: of each channel an offset, and a drift of it. The mean of `g` must
+//! exceed its own standard error, autocorrelation included, by [`LEVEL`]. Some candidates are on
+//! trial at a time, their ages about in geometric progression: a young one knows more, an old one
+//! has been judged by more, and small gains take long to show.
 //!
-//! Of the change from those in force to a candidate that wins as much is made as its gain exceeds its own standard error: the share of it that goes best with what came later, by least squares,
-//! less one standard error. (What a model lacks comes back with the motion, so that all blocks of [`CYCLE`] count as one.) What is left of the change is not known, and the covariance says so.
+//! Of the change from those in force to a candidate that wins as much is made as its gain exceeds
+//! its own standard error: the share of it that goes best with what came later, by least squares,
+//! less one standard error. (What a model lacks comes back with the motion, so that all blocks of
+//! [`CYCLE`] count as one.) What is left of the change is not known, and the covariance says so.
 //!
 //! Before anything is known the URDF's parameters are in force.
 
@@ -21,12 +26,15 @@ pub(super) const BLOCK: f64 = 0.1;
 /// How much motion a trial needs before it can be decided, and how much counts \[s\].
 const LEAST: f64 = 4.0;
 const MOST: f64 = 60.0;
-/// How much motion lies between the entries of two candidates at least \[s\], and how many there are at a time.
+/// How much motion lies between the entries of two candidates at least \[s\], and how many there
+/// are at a time.
 const APART: f64 = 1.0;
 const TOGETHER: usize = 5;
-/// In standard errors: of candidates that are no better one in thirty thousand looks does as well. There are at most five looks in a second, most of them at what was looked at before.
+/// In standard errors: of candidates that are no better one in thirty thousand looks does as well.
+/// There are at most five looks in a second, most of them at what was looked at before.
 const LEVEL: f64 = 4.0;
-/// What lies farther off, in standard deviations, is no worse: pushes and outliers say nothing of parameters.
+/// What lies farther off, in standard deviations, is no worse: pushes and outliers say nothing of
+/// parameters.
 const BOUND: f64 = 3.0;
 
 /// How long a motion takes before it comes back \[s\].
@@ -44,7 +52,8 @@ pub(super) struct Contest<P> {
     entrants: Vec<Entrant<P>>,
 }
 
-/// Parameters, the first block after they entered, and what each channel has left of them in the blocks since; NaN where it was not seen.
+/// Parameters, the first block after they entered, and what each channel has left of them in the
+/// blocks since; NaN where it was not seen.
 #[derive(Clone, Debug)]
 struct Entrant<P> {
     parameters: P,
@@ -105,7 +114,8 @@ impl<P> Contest<P> {
         });
     }
 
-    /// Takes a block in: what each channel has left of everybody's parameters, in the order of [`Contest::all`].
+    /// Takes a block in: what each channel has left of everybody's parameters, in the order of
+    /// [`Contest::all`].
     pub(super) fn take<'a>(&mut self, t: f64, left: impl Iterator<Item = &'a [f64]>) {
         self.times.push(t);
         for (entrant, own) in self.entrants.iter_mut().zip(left) {
@@ -113,7 +123,8 @@ impl<P> Contest<P> {
         }
     }
 
-    /// Puts the youngest in force that has shown to be better, as far as it has, and lets go of whoever is older. `between` gives parameters so far from the first to the second.
+    /// Puts the youngest in force that has shown to be better, as far as it has, and lets go of
+    /// whoever is older. `between` gives parameters so far from the first to the second.
     pub(super) fn decide(&mut self, between: impl FnOnce(&P, &P, f64) -> P) {
         let better = (1..self.entrants.len())
             .rev()
@@ -152,7 +163,8 @@ impl<P> Contest<P> {
             return None;
         }
         let mut gain = vec![f64::NAN; times.len()];
-        // Of each block and channel, what those in force leave and how much of that the candidate changes, in units of what this leaves.
+        // Of each block and channel, what those in force leave and how much of that the candidate
+        // changes, in units of what this leaves.
         let mut pairs = Vec::new();
         for channel in 0..self.channels {
             let [one, other] = [&self.entrants[0], candidate].map(|entrant| {
@@ -212,7 +224,8 @@ fn scale<'a>(values: impl Iterator<Item = &'a f64>) -> f64 {
     *sizes.select_nth_unstable_by(middle, f64::total_cmp).1 / MEDIAN
 }
 
-/// Values less the line through them; what lies far off counts less, down to nothing (Tukey's biweight).
+/// Values less the line through them; what lies far off counts less, down to nothing (Tukey's
+/// biweight).
 fn detrended(times: &[f64], values: Vec<f64>) -> Vec<f64> {
     /// Beyond so many deviations nothing counts.
     const BEYOND: f64 = 5.0;
@@ -254,7 +267,8 @@ mod tests {
     use super::*;
     use crate::identify::normals;
 
-    /// Two channels, blocks for so many seconds: noise of unit variance; what is left of parameters `p` has `p` times a motion besides, an offset and a drift.
+    /// Two channels, blocks for so many seconds: noise of unit variance; what is left of parameters
+    /// `p` has `p` times a motion besides, an offset and a drift.
     fn play(contest: &mut Contest<f64>, seconds: f64, seed: u64) {
         let count = (seconds / BLOCK) as usize;
         let noise: Vec<f64> = normals(seed, 2 * count).iter().map(|x| 0.2 * x).collect();
