@@ -185,14 +185,15 @@ impl Kind {
     /// Whether nothing is.
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        self.gain == Gain::None && !self.temperature
+        matches!(self.gain, Gain::None | Gain::Auto) && !self.temperature
     }
 
     /// How many numbers are unknown.
     #[must_use]
     pub fn count(&self) -> usize {
         let gains = match self.gain {
-            Gain::None => 0,
+            // Nothing until it is chosen.
+            Gain::None | Gain::Auto => 0,
             Gain::Diagonal => 6,
             Gain::Full => 36,
         };

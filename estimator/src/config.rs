@@ -303,8 +303,10 @@ pub struct Identification {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Gain {
-    /// None: the workbench's gain is right.
+    /// As many as predict data held out better than fewer do.
     #[default]
+    Auto,
+    /// None: the workbench's gain is right.
     None,
     /// One for each channel.
     Diagonal,
@@ -323,7 +325,7 @@ impl Default for Identification {
             state: None,
             save_every_s: 60.0,
             model_std: 0.2,
-            gain: Gain::None,
+            gain: Gain::Auto,
             gain_std: 0.05,
             temperature: false,
         }
@@ -679,7 +681,7 @@ mod tests {
         assert!(!config.identification.enabled);
         assert_eq!(config.identification.model_std, 0.2);
         assert_eq!(config.identification.rate_hz, 100.0);
-        assert_eq!(config.identification.gain, Gain::None);
+        assert_eq!(config.identification.gain, Gain::Auto);
         assert_eq!(config.identification.gain_std, 0.05);
         assert!(!config.identification.temperature);
         assert_eq!(config.force_torque[0].calibration(), Calibration::default());
@@ -744,7 +746,7 @@ mod tests {
             (
                 "[output]",
                 "[identification]\ngain = \"some\"\n[output]",
-                "unknown variant `some`, expected one of `none`, `diagonal`, `full`",
+                "unknown variant `some`, expected one of `auto`, `none`, `diagonal`, `full`",
             ),
             (
                 "[output]",

@@ -11,7 +11,7 @@
 //!     -> the most probable bodies under CAD's prior, and its weight                            prior
 //!     -> what is left -> noise of each channel -> again, until it stays                        noise, passes
 //!     -> undeclared contacts, another load: left out, and again, until it stays                gate, undeclared
-//!     -> held-out data: what gains nothing is shrunk to CAD                                    batch
+//!     -> held-out data: what gains nothing is shrunk to CAD                                    guard
 //!     -> motion that only other F/T sensors feel, taken off; all of the fit again              shaking
 //!     -> Outcome: parameters, covariance, figures per log, joints whose zero is elsewhere, in words          assess, zeros, export
 //! ```
@@ -26,14 +26,15 @@
 //! # Noise
 //! What is left of a channel is mostly model error, not noise of the sensor: correlated in time, and larger when the robot moves. As white noise it would be believed far too much, and the
 //! evidence would let the data overrule CAD where they know nothing. So its variance is multiplied by its integrated autocorrelation time, or taken from the scatter of block means,
-//! whichever is more. An F/T sensor's offset walks besides; how fast is found by the likelihood of the block means, within a bound: it follows nothing faster than a second, or it would swallow
-//! motion and touch. Where a contact is declared, or found though nobody declared it, the rows that it reaches are gone, and with them all influence on parameters and offsets.
+//! whichever is more. An F/T sensor's offset walks besides; how fast is found by the likelihood of the block means, within bounds: it follows nothing faster than a second, or it would swallow
+//! motion and touch; and beside bodies it walks no faster than sensors do by themselves, by their stated noise per square root of a second, or it would take up what the model has wrong. Where a contact is declared, or found though nobody declared it, the rows that it reaches are gone, and with them all influence on parameters and offsets.
 
 mod assess;
 mod batch;
 pub mod consistent;
 mod export;
 mod gate;
+mod guard;
 pub mod information;
 pub mod instants;
 mod lanes;
@@ -50,15 +51,16 @@ mod shaking;
 mod torques;
 mod undeclared;
 mod wrenches;
+mod yardstick;
 mod zeros;
 
 pub use batch::{IdentifyError, Log, Options, Progress, identify};
 pub use export::parameters;
 pub use gate::UnitSet;
 pub use outcome::{
-    BaseParameterOutcome, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
-    FrictionOutcome, JointOutcome, LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, RotorOutcome,
-    SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome, Verdict, WeakDirection,
+    BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
+    FrictionOutcome, JointOutcome, LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Predicted, Role,
+    RotorOutcome, SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome, Verdict, WeakDirection,
 };
 
 /// The axes of a wrench as samples have them, in words.

@@ -7,7 +7,7 @@ use proprio_estimator::calibration::{Calibration, Unknown};
 use proprio_estimator::config::{Config, Gain, IdentificationInput, TorqueSide};
 use proprio_estimator::dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
 use proprio_estimator::identify::{
-    Finding, Log, LogOutcome, Options, Outcome, Role, Severity, Verdict, identify, parameters,
+    Finding, Log, LogOutcome, Options, Outcome, Predicted, Role, Severity, Verdict, identify, parameters,
 };
 use proprio_estimator::model::Model;
 use proprio_estimator::offline;
@@ -88,7 +88,7 @@ fn describe(o: &Outcome) {
         println!("  {:?} {} {}: {}", f.severity, f.code, f.subject, f.text);
     }
     for log in &o.logs {
-        let e = &log.relative_error;
+        let e = &log.fitted_error;
         println!(
             "  {} {:?}: used {} left out {:?}; relative error {:.4} {:.4} {:.4}",
             log.file,
@@ -153,7 +153,7 @@ fn kuka_one_predicts_the_other() {
             &[("train", Role::Train, train), ("test", Role::Validate, test)],
             &TORQUE,
         );
-        let error = &outcome.logs[1].relative_error;
+        let error = &outcome.logs[1].fitted_error;
         let codes = ["wrong_sign", "wrong_units", "frozen", "outliers", "time_offset"];
         let found = outcome
             .logs
@@ -190,7 +190,7 @@ fn kuka_half_a_log_predicts_the_other_half() {
             &[("train", Role::Train, train), ("test", Role::Validate, test)],
             &TORQUE,
         );
-        let error = &outcome.logs[1].relative_error;
+        let error = &outcome.logs[1].fitted_error;
         assert!(error.identified < 0.6 * error.cad_fitted, "{error:?}");
     }
 }
@@ -228,7 +228,7 @@ fn kuka_one_region_predicts_the_other() {
                 &[("train", Role::Train, train), ("test", Role::Validate, test)],
                 &TORQUE,
             );
-            let error = &outcome.logs[1].relative_error;
+            let error = &outcome.logs[1].fitted_error;
             assert!(
                 error.identified < 0.04 && error.identified < error.cad_fitted,
                 "{joint}: {error:?}"
@@ -268,7 +268,7 @@ fn kuka_touched_is_identified_all_the_same() {
         &[("touched", Role::Train, &touched), ("test", Role::Validate, &two)],
         &TORQUE,
     );
-    let error = &outcome.logs[1].relative_error;
+    let error = &outcome.logs[1].fitted_error;
     assert!(error.identified < 0.024, "{error:?}");
     let mut suspected = outcome.logs[0]
         .left_out
@@ -310,7 +310,7 @@ fn a_touch_in_held_out_data_is_told() {
     assert!((5.6..6.1).contains(&from) && (7.4..7.9).contains(&to), "{}", note.text);
     let [free, pushed] = [1, 2].map(|log| &outcome.logs[log]);
     assert_eq!((free.used, &free.left_out), (pushed.used, &pushed.left_out));
-    assert!(pushed.relative_error.identified > 3.0 * free.relative_error.identified);
+    assert!(pushed.fitted_error.identified > 3.0 * free.fitted_error.identified);
     // How true the stated deviations of held-out readings are.
     let coverage = free.sensors[0].coverage;
     assert!(
@@ -346,7 +346,7 @@ fn jumps_and_grips_in_held_out_data_are_told_apart() {
     );
     let breaks = |log: &LogOutcome| log.offsets[0].breaks.len();
     assert_eq!(outcome.logs.iter().map(breaks).collect::<Vec<_>>(), [0, 0, 1, 0]);
-    let [free, slipped] = [1, 2].map(|log| outcome.logs[log].relative_error.identified);
+    let [free, slipped] = [1, 2].map(|log| outcome.logs[log].fitted_error.identified);
     assert!(slipped < 1.3 * free, "{slipped}, without the jump {free}");
 }
 
@@ -439,7 +439,7 @@ fn a_jump_of_an_offset_is_told_and_does_no_harm() {
         // What a break and its moment cost in knowledge is little: of one noise, they come to other errors of the same size.
         let errors = [&free, &jumped].map(|outcome| {
             let (_, torque, ..) = torque_errors(&setup, &truth, outcome, 505);
-            [torque, outcome.logs[1].relative_error.identified]
+            [torque, outcome.logs[1].fitted_error.identified]
         });
         println!(
             "{slipped} of {sensors:?}: without the jump {:.5?}, with it {:.5?}",
@@ -462,6 +462,11 @@ fn nothing_is_suspected(outcome: &Outcome) {
 
 /// The iCub's leg between two sensors, beyond unknown forces on trunk and left leg.
 fn leg() -> Option<(Setup, String)> {
+    leg_with(|contact| !contact.starts_with("right"))
+}
+
+/// The same with some of the contacts.
+fn leg_with(keep: impl Fn(&str) -> bool) -> Option<(Setup, String)> {
     let table = data("icub_leg_24_44s.csv")?;
     let Some(models) = std::env::var_os("PROPRIO_ICUB_MODELS") else {
         println!("skipped: PROPRIO_ICUB_MODELS (robots of icub-models) is not set");
@@ -470,7 +475,7 @@ fn leg() -> Option<(Setup, String)> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/real_leg");
     let mut config = Config::load(&folder.join("estimator.toml")).expect("the configuration");
     config.model = PathBuf::from(models).join("iCubGenova02.urdf");
-    config.contact.retain(|contact| !contact.name().starts_with("right"));
+    config.contact.retain(|contact| keep(contact.name()));
     Some((Setup::new(&config).expect("configuration and model fit"), table))
 }
 
@@ -487,7 +492,7 @@ fn leg_torques_from_either_sensor_agree() {
     let log: &LogOutcome = &outcome.logs[1];
     assert_eq!(log.two_route.len(), 4);
     println!("{:#?}", log.two_route);
-    for (joint, bound) in [("r_knee", 0.15), ("r_ankle_pitch", 0.30), ("r_ankle_roll", 0.08)] {
+    for (joint, bound) in [("r_knee", 0.15), ("r_ankle_pitch", 0.30), ("r_ankle_roll", 0.09)] {
         let route = log
             .two_route
             .iter()
@@ -507,6 +512,145 @@ fn leg_torques_from_either_sensor_agree() {
     for route in &log.two_route {
         let (cad, own) = (route.rms_nm.cad_fitted, route.rms_nm.identified);
         assert!(own <= cad + (0.05 * cad).max(0.01), "{route:?}");
+    }
+}
+
+/// Every choice of training logs, and every log that was not trained on: the error of what the identified parameters predict, relative to
+/// CAD's. Prints the table.
+fn every_choice(setup: &Setup, logs: &[(&str, &str)], inputs: &[IdentificationInput]) -> Vec<(Vec<usize>, usize, f64)> {
+    let mut ratios = Vec::new();
+    let mut of_cad = vec![Vec::new(); logs.len()];
+    for choice in 1..1_usize << logs.len() {
+        let is_trained = |log: usize| choice >> log & 1 == 1;
+        let given: Vec<(&str, Role, &str)> = logs
+            .iter()
+            .enumerate()
+            .map(|(log, (file, table))| {
+                (
+                    *file,
+                    if is_trained(log) { Role::Train } else { Role::Validate },
+                    *table,
+                )
+            })
+            .collect();
+        let outcome = run(setup, &given, inputs);
+        let trained: Vec<usize> = (0..logs.len()).filter(|&log| is_trained(log)).collect();
+        for (log, (file, _)) in logs.iter().enumerate() {
+            let error = &outcome.logs[log].predicted.relative_error;
+            if inputs == [IdentificationInput::Wrench] {
+                of_cad[log].push(error.cad);
+            }
+            let ratio = error.identified / error.cad;
+            let how = if is_trained(log) { "trained on" } else { "held back" };
+            println!(
+                "| {trained:?} | {file} | {how} | {:.4} | {:.4} | {ratio:.3} |",
+                error.cad, error.identified
+            );
+            ratios.push((trained.clone(), log, ratio));
+        }
+    }
+    // CAD's figure of a log is that log's alone.
+    for errors in of_cad {
+        assert!(
+            errors.iter().all(|error| (error / errors[0] - 1.0).abs() < 1e-9),
+            "{errors:?}"
+        );
+    }
+    ratios
+}
+
+/// What is identified, gains of the sensors included, is not worse than CAD where it was not fitted, but for what the last log,
+/// in which the foot comes to stand, says of the quiet second one: there constant offsets are 5 % worse, drifting ones 10 % better.
+#[test]
+fn leg_parameters_are_never_worse_than_cad_on_other_logs() {
+    // The foot stood on the ground at the beginning of the first and at the end of the last.
+    let Some((setup, _)) = leg_with(|contact| contact != "right_leg") else {
+        return;
+    };
+    let files = ["icub_leg_12_24s.csv", "icub_leg_24_44s.csv", "icub_leg_57_70s.csv"];
+    let tables: Vec<String> = files.iter().filter_map(|file| data(file)).collect();
+    let logs: Vec<(&str, &str)> = files.into_iter().zip(tables.iter().map(String::as_str)).collect();
+    for (trained, log, ratio) in every_choice(&setup, &logs, &[IdentificationInput::Wrench]) {
+        let most = if (&trained[..], log) == (&[0][..], 1) {
+            1.25
+        } else {
+            1.02
+        };
+        assert!(ratio < most, "{trained:?}: {ratio} on {log}");
+        if trained == [0, 1] && log == 2 {
+            assert!(ratio < 0.92, "{ratio}");
+        }
+    }
+}
+
+#[test]
+fn kuka_parameters_are_better_than_cad_on_the_other_log() {
+    let (Some(one), Some(two), Some(setup)) = (data("kuka_lwr4_1.csv"), data("kuka_lwr4_2.csv"), kuka()) else {
+        return;
+    };
+    for (trained, log, ratio) in every_choice(&setup, &[("one", &one), ("two", &two)], &TORQUE) {
+        assert!(ratio < 0.42, "{trained:?}: {ratio} on {log}");
+    }
+}
+
+/// The figure that parameters are judged by knows nothing of constant offsets, and its second one nothing of linear drifts;
+/// without these, an offset that walks in a log shows in the first.
+#[test]
+fn offsets_and_drifts_are_no_fault_of_the_parameters() {
+    let Some((setup, table)) = leg() else { return };
+    let (first, second) = (between(&table, 24.0, 34.0), between(&table, 34.0, 45.0));
+    let changed = |per_second: f64| -> String {
+        let mut rows = second.lines();
+        let header = rows.next().expect("a header");
+        let columns: Vec<usize> = (header.split(',').enumerate())
+            .filter(|(_, name)| name.starts_with("wrench/r_leg_ft_sensor/f"))
+            .map(|(column, _)| column)
+            .collect();
+        let row = |row: &str| -> String {
+            let mut cells: Vec<String> = row.split(',').map(str::to_owned).collect();
+            let t: f64 = cells[0].parse().expect("a stamp");
+            for column in &columns {
+                if let Ok(value) = cells[*column].parse::<f64>() {
+                    cells[*column] = (value + 40.0 + per_second * (t - 40.0)).to_string();
+                }
+            }
+            cells.join(",") + "\n"
+        };
+        header.to_owned() + "\n" + &rows.map(row).collect::<String>()
+    };
+    let of = |table: &str| {
+        let logs = [("first", Role::Train, &first[..]), ("second", Role::Validate, table)];
+        let outcome = run(&setup, &logs, &[IdentificationInput::Wrench]);
+        outcome.logs[1].predicted.clone()
+    };
+    let [still, offset, drifting] = [second.clone(), changed(0.0), changed(1.0)].map(|table| of(&table));
+    let near = |a: f64, b: f64| (a / b - 1.0).abs() < 1e-5;
+    for (a, b) in [(&still, &offset), (&still, &drifting)] {
+        let (a, b) = (&a.relative_error_with_drift, &b.relative_error_with_drift);
+        // Of drifting readings the mean square about their mean is greater.
+        assert!(near(a.cad / b.cad, a.identified / b.identified), "{a:?} {b:?}");
+    }
+    let (a, b) = (&still.relative_error, &offset.relative_error);
+    assert!(near(a.cad, b.cad) && near(a.identified, b.identified), "{a:?} {b:?}");
+    let rms = |predicted: &Predicted| {
+        let own = predicted
+            .sensors
+            .iter()
+            .find(|(name, _)| name == "r_leg_ft_sensor")
+            .expect("it is compared");
+        own.1.cad[0]
+    };
+    let (a, b) = (rms(&still), rms(&drifting));
+    // A drift of 1 N/s over some ten seconds, about its mean, beside what there was.
+    assert!(b > 1.5 && b > a, "{a} {b}");
+    for (name, both) in &still.two_route {
+        let drifted = &drifting
+            .two_route
+            .iter()
+            .find(|(other, _)| other == name)
+            .expect("it is compared")
+            .1;
+        assert!(both.cad.is_finite() && drifted.cad.is_finite(), "{name}");
     }
 }
 
@@ -1226,7 +1370,7 @@ fn torques_of_a_rich_log_come_within_a_hundredth() {
     let given: Vec<(&str, Role, &str)> = logs.iter().map(|(role, log)| ("log", *role, &**log)).collect();
     let outcome = run(&setup, &given, &TORQUE);
     assert_eq!(outcome.verdict, Verdict::Identified);
-    let error = &outcome.logs[1].relative_error;
+    let error = &outcome.logs[1].fitted_error;
     assert!(error.identified < 0.011 && error.cad_fitted > 0.02, "{error:?}");
 }
 
@@ -1283,7 +1427,7 @@ fn rotors_are_identified_from_torques_of_motors() {
         let known = if rotor.joint == "j1" { 0.5 } else { 0.05 };
         assert!(rotor.deviation < known * truth.max(0.1), "{rotor:?}");
     }
-    let error = |outcome: &Outcome| outcome.logs[2].relative_error;
+    let error = |outcome: &Outcome| outcome.logs[2].fitted_error;
     let (right, wrong) = (error(&outcome), error(&wrong));
     assert!(3.0 * right.identified < wrong.identified, "{right:?} {wrong:?}");
     // CAD is not blamed for rotors.
@@ -1707,7 +1851,7 @@ fn gains_of_a_sensor_are_identified() {
     assert!(inside > 0.9 && missed < 0.85, "{inside} {missed}");
     assert!(deviation < 3.0 * fine, "{deviation} {fine}");
     // Held-out data are predicted better.
-    let rms = |outcome: &Outcome| outcome.logs[1].relative_error.identified;
+    let rms = |outcome: &Outcome| outcome.logs[1].fitted_error.identified;
     assert!(rms(&with) < 0.5 * rms(&without), "{} {}", rms(&with), rms(&without));
     // And the file says it all again.
     assert_eq!(Parameters::parse(&file.to_string()).expect("a file"), file);
@@ -1786,7 +1930,7 @@ fn cross_talk_of_a_sensor_is_identified() {
     let beyond = |bound: f64| errors.iter().filter(|error| error.abs() > bound).count();
     assert!(beyond(4.0) == 0 && beyond(2.0) <= 5, "{errors:?}");
     assert!(fine < 0.5 * rough && inside > 0.85, "{fine} {rough} {inside}");
-    let rms = |outcome: &Outcome| outcome.logs[1].relative_error.identified;
+    let rms = |outcome: &Outcome| outcome.logs[1].fitted_error.identified;
     assert!(rms(&with) < 0.3 * rms(&without), "{} {}", rms(&with), rms(&without));
 }
 

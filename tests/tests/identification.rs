@@ -1325,9 +1325,9 @@ fn a_swing_is_enough_to_identify_what_a_sensor_carries() {
                 assert!(joint.rms_nm.identified < joint.rms_nm.cad, "{name}: {joint:?}");
             }
             assert!(
-                log.relative_error.identified < log.relative_error.cad_fitted,
+                log.fitted_error.identified < log.fitted_error.cad_fitted,
                 "{name}: {:?}",
-                log.relative_error
+                log.fitted_error
             );
             assert!(
                 log.findings.iter().all(|finding| finding.severity == Severity::Note),

@@ -157,7 +157,7 @@ fn check_shape(summary: &Json, logs: &[(&str, &str)]) {
             (entry["file"].as_str(), entry["role"].as_str()),
             (Some(*file), Some(*role))
         );
-        three(&entry["relative_error"], 1, "relative_error");
+        three(&entry["fitted_error"], 1, "fitted_error");
         for (name, joint) in entry["joints"].as_object().expect("joints by name") {
             three(&joint["rms_nm"], 1, name);
         }
@@ -331,7 +331,7 @@ fn a_wrong_cad_is_put_right_from_logs_of_the_simulated_arm() {
     );
     assert_eq!(summary["verdict"], "identified");
     let validated = &summary["logs"][2];
-    let [fitted, identified] = ["cad_fitted", "identified"].map(|key| number(validated, &["relative_error", key]));
+    let [fitted, identified] = ["cad_fitted", "identified"].map(|key| number(validated, &["fitted_error", key]));
     assert!(identified < fitted / 3.0, "{identified} against {fitted}");
     let report = place.read("out/report.html");
     assert!(report.len() < 2_000_000 && report.contains("three.csv"));
@@ -407,7 +407,7 @@ fn an_arm_with_joint_torque_sensors() {
         let summary = place.summary();
         let name = |file: &str| file.rsplit('/').next().unwrap().to_owned();
         check_shape(&summary, &[(&name(train), "train"), (&name(validate), "validate")]);
-        let error = |key| number(&summary["logs"][1], &["relative_error", key]);
+        let error = |key| number(&summary["logs"][1], &["fitted_error", key]);
         println!(
             "{train} to {validate}: {} with the CAD, {} identified",
             error("cad_fitted"),

@@ -1,6 +1,6 @@
 //! What an outcome means, in plain words: whether to use the parameters, why, and what to do next.
 
-use proprio_estimator::identify::{Finding, LogOutcome, Outcome, Role, Severity, Three, Verdict};
+use proprio_estimator::identify::{Both, Finding, LogOutcome, Outcome, Role, Severity, Verdict};
 use std::collections::BTreeSet;
 
 /// Whether the identified parameters should be used.
@@ -132,10 +132,8 @@ impl Advice {
         let role = if validated { Role::Validate } else { Role::Train };
         let mut compared = false;
         for log in outcome.logs.iter().filter(|log| log.role == role) {
-            let Three {
-                cad_fitted, identified, ..
-            } = log.relative_error;
-            if !(cad_fitted.is_finite() && identified.is_finite()) {
+            let Both { cad, identified } = log.predicted.relative_error;
+            if !(cad.is_finite() && identified.is_finite()) {
                 if validated {
                     self.worsen(Grade::Care);
                     self.why
@@ -150,13 +148,18 @@ impl Advice {
                 ""
             };
             self.why.push(format!(
-                "On {}{how}, {} predicted with the identified parameters are {} off, with the CAD's parameters {} (offsets and friction fitted for both alike).",
+                "On {}{how}, {} predicted with the identified parameters are {} off, with the CAD's parameters {} ({}).",
                 log.file,
                 predicted(log),
                 percent(identified),
-                percent(cad_fitted),
+                percent(cad),
+                if log.predicted.sensors.is_empty() {
+                    "nothing was fitted to it"
+                } else {
+                    "nothing was fitted to it but a constant offset of each F/T channel, for both alike"
+                },
             ));
-            if identified > cad_fitted * (1.0 + NOTICEABLE) {
+            if identified > cad * (1.0 + NOTICEABLE) {
                 if validated {
                     self.worsen(Grade::Reject);
                     self.why.push("That is worse than the CAD: the parameters do not hold outside the motion that they were fitted to.".into());
@@ -168,7 +171,7 @@ impl Advice {
                     self.worsen(Grade::Care);
                     self.why.push("That is worse than the CAD.".into());
                 }
-            } else if validated && identified > cad_fitted * (1.0 - NOTICEABLE) {
+            } else if validated && identified > cad * (1.0 - NOTICEABLE) {
                 self.worsen(Grade::Care);
                 self.why.push("That is no better than the CAD.".into());
             }
@@ -347,7 +350,7 @@ mod tests {
     #[test]
     fn what_is_worse_than_cad_where_it_was_not_fitted_is_rejected() {
         let mut outcome = good();
-        outcome.logs[1].relative_error.identified = 0.07;
+        outcome.logs[1].predicted.relative_error.identified = 0.07;
         let advice = Advice::of(&outcome);
         assert_eq!(advice.grade, Grade::Reject);
         assert!(
@@ -356,7 +359,7 @@ mod tests {
             advice.next
         );
         // No better is not good enough to be accepted without a word.
-        outcome.logs[1].relative_error.identified = 0.064;
+        outcome.logs[1].predicted.relative_error.identified = 0.064;
         assert_eq!(Advice::of(&outcome).grade, Grade::Care);
     }
 
@@ -418,18 +421,17 @@ mod tests {
 
     #[test]
     fn what_was_compared_with_nothing_is_not_accepted() {
-        let nowhere = Three {
+        let nowhere = Both {
             cad: f64::NAN,
-            cad_fitted: f64::NAN,
             identified: f64::NAN,
         };
         let mut outcome = good();
-        outcome.logs[1].relative_error = nowhere;
+        outcome.logs[1].predicted.relative_error = nowhere;
         let advice = Advice::of(&outcome);
         assert_eq!(advice.grade, Grade::Care, "the log for validation: {advice:?}");
         outcome.logs.pop();
         assert_eq!(Advice::of(&outcome).grade, Grade::Accept);
-        outcome.logs[0].relative_error = nowhere;
+        outcome.logs[0].predicted.relative_error = nowhere;
         let advice = Advice::of(&outcome);
         assert_eq!(advice.grade, Grade::Care);
         assert!(

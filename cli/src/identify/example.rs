@@ -4,9 +4,9 @@ use proprio_estimator::calibration::{Calibration, Kind, Unknown, force_first, ga
 use proprio_estimator::config::Gain;
 use proprio_estimator::identify::instants::{Signal, TimeOffset};
 use proprio_estimator::identify::{
-    BaseParameterOutcome, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
-    FrictionOutcome, JointOutcome, LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Role, RotorOutcome,
-    SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome, Verdict, WeakDirection,
+    BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
+    FrictionOutcome, JointOutcome, LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Predicted, Role,
+    RotorOutcome, SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome, Verdict, WeakDirection,
 };
 use proprio_estimator::spatial::{RigidInertia, Wrench};
 use proprio_topics::Nanos;
@@ -20,6 +20,10 @@ fn three<T>(cad: T, cad_fitted: T, identified: T) -> Three<T> {
         cad_fitted,
         identified,
     }
+}
+
+fn both<T>(cad: T, identified: T) -> Both<T> {
+    Both { cad, identified }
 }
 
 fn at(seconds: f64) -> Nanos {
@@ -74,7 +78,14 @@ fn log(file: &str, role: Role) -> LogOutcome {
             LeftOut { reason: "contact declared: right_foot".into(), instants: 240, first: at(12.0), last: at(14.4) },
         ],
         onset: Some(at(4.0)),
-        relative_error: three(f64::NAN, 0.064, 0.0235),
+        predicted: Predicted {
+            relative_error: both(0.064, 0.0235),
+            relative_error_with_drift: both(0.06, 0.0225),
+            joints: vec![("r_knee".into(), both(0.24, 0.09))],
+            sensors: vec![("r_leg_ft_sensor".into(), both([0.6, 3.0, 0.6, 0.3, 0.2, 0.1], [0.5; 6]))],
+            two_route: vec![("r_knee".into(), both(0.25, 0.14))],
+        },
+        fitted_error: three(f64::NAN, 0.054, 0.0215),
         joints: JOINTS
             .iter()
             .map(|j| JointOutcome { name: (*j).into(), rms_nm: three(0.9, 0.2, 0.07), measured_rms_nm: 3.1, coverage: 0.946 })
@@ -235,7 +246,12 @@ pub(crate) fn nothing() -> Outcome {
     outcome.rotors.clear();
     for log in &mut outcome.logs {
         log.used = 0;
-        log.relative_error = three(f64::NAN, f64::NAN, f64::NAN);
+        log.predicted = Predicted {
+            relative_error: both(f64::NAN, f64::NAN),
+            relative_error_with_drift: both(f64::NAN, f64::NAN),
+            ..Predicted::default()
+        };
+        log.fitted_error = three(f64::NAN, f64::NAN, f64::NAN);
         log.joints.clear();
         log.sensors.clear();
         log.two_route.clear();

@@ -6,7 +6,8 @@ use crate::report::plot::{Axis, Ink, Plot, Series};
 use crate::report::{self, Cell, Table, escape, number, short};
 use proprio_estimator::calibration::{Unknown, swapped};
 use proprio_estimator::identify::{
-    BaseParameterOutcome, CalibrationOutcome, Curve, LogOutcome, Outcome, Role, Severity, Spectrum, Three, Verdict,
+    BaseParameterOutcome, Both, CalibrationOutcome, Curve, LogOutcome, Outcome, Predicted, Role, Severity, Spectrum,
+    Three, Verdict,
 };
 use proprio_topics::Nanos;
 
@@ -68,11 +69,11 @@ fn verdict(advice: &Advice) -> String {
 fn key_facts(outcome: &Outcome) -> String {
     let mut facts = Vec::new();
     for log in &outcome.logs {
-        let error = &log.relative_error;
+        let error = &log.predicted.relative_error;
         if error.identified.is_finite() {
             facts.push((
                 format!("error on {} ({})", log.file, role_words(log.role)),
-                format!("{}, CAD {}", percent(error.identified), percent(error.cad_fitted)),
+                format!("{}, CAD {}", percent(error.identified), percent(error.cad)),
             ));
         }
     }
@@ -148,7 +149,18 @@ fn logs(outcome: &Outcome) -> Option<String> {
         return None;
     }
     let mut relative = Table::new(
-        "Relative error of what the parameters predict: |predicted − measured| / |measured|",
+        "Relative error of what the parameters predict, |predicted − measured| / |measured|: friction and gains from the training logs, one constant offset of each F/T channel for the log (and a linear drift besides)",
+        &[
+            "log",
+            "role",
+            "identified",
+            "CAD",
+            "identified, with drift",
+            "CAD, with drift",
+        ],
+    );
+    let mut fitted = Table::new(
+        "The same with offsets that walk, and friction, fitted to the log",
         &[&["log", "role"], &ERRORS[..]].concat(),
     );
     let mut used = Table::new(
@@ -156,9 +168,22 @@ fn logs(outcome: &Outcome) -> Option<String> {
         &["log", "what became of them", "instants", "from [s]", "to [s]"],
     );
     for log in &outcome.logs {
-        let mut cells = vec![log.file.as_str().into(), role(log.role).into()];
-        cells.extend(errors(&log.relative_error, percent));
+        let of_log = || -> Vec<Cell> { vec![log.file.as_str().into(), role(log.role).into()] };
+        let mut cells = of_log();
+        let Predicted {
+            relative_error,
+            relative_error_with_drift,
+            ..
+        } = &log.predicted;
+        for Both { cad, identified } in [*relative_error, *relative_error_with_drift] {
+            let worst = cad.max(identified);
+            cells.push(Cell::Bar(percent(identified), identified / worst, Ink::Identified));
+            cells.push(Cell::Bar(percent(cad), cad / worst, Ink::Fitted));
+        }
         relative.row(cells);
+        let mut cells = of_log();
+        cells.extend(errors(&log.fitted_error, percent));
+        fitted.row(cells);
         let since = |t: Nanos| (t - log.span.0).seconds();
         let mut row = |what: &str, count: u64, from: f64, to: f64| {
             used.row(vec![
@@ -179,7 +204,10 @@ fn logs(outcome: &Outcome) -> Option<String> {
             );
         }
     }
-    Some(report::section("The logs", &[relative.html(), used.html()]))
+    Some(report::section(
+        "The logs",
+        &[relative.html(), fitted.html(), used.html()],
+    ))
 }
 
 /// The errors of the identified parameters and of the fitted CAD, with bars that can be compared; and of the CAD as it is.

@@ -34,16 +34,31 @@
 //! | `file`, `role` | its file name; `train` or `validate` |
 //! | `span_s`, `used`, `left_out` | its length; instants used; those not used: a list of {`reason`, `instants`, `first_s`, `last_s`} |
 //! | `onset_s` | when the robot began to move; `null`: from the start, or never |
-//! | `relative_error` | the three: norm of (predicted - measured) over norm of measured |
+//! | `predicted` | what the parameters are judged by: below |
+//! | `fitted_error` | the three: norm of (predicted - measured) over norm of measured, with offsets that walk, and friction, fitted to the log |
 //! | `joints` | {name: {`rms_nm`: the three, `measured_rms_nm`, `coverage`: share of instants within 1.96 sigma}}, of joints with a measured torque |
 //! | `sensors` | {name: {`rms`: the three, six numbers each; `coverage`: share of instants within 1.96 sigma, six numbers}} |
 //! | `two_route_rms_nm`, `two_route_rms_mean_removed_nm` | {joint: the three}: RMS of the difference between the torque from one side's F/T sensor and from the other's, and the same without its mean |
 //! | `offsets` | {sensor: {`start`, `end`, `deviation`, `rate`: six numbers each, `breaks_s`}} |
 //! | `friction` | {joint: {`coulomb_nm`, `viscous`: Nm s/rad, `offset_nm`, `deviation`: of the three}} |
+//!
+//! `predicted`, of the CAD and of the identified parameters, {`cad`, `identified`}: parameters, gains
+//! and friction are those from the training logs, and nothing is fitted to the log but one constant
+//! offset of each F/T channel. It depends on that log and the parameters alone.
+//!
+//! | key | what it is |
+//! |---|---|
+//! | `relative_error` | norm of (predicted - measured) over norm of measured: of joint torques if any was measured, else of F/T readings without their mean |
+//! | `relative_error_with_drift` | the same of F/T readings, a linear drift of each channel fitted, too |
+//! | `joints_rms_nm` | {name: RMS}, of joints with a measured torque |
+//! | `sensors_rms` | {name: RMS, six numbers}, of what each sensor reads less what all else predicts |
+//! | `two_route_rms_nm` | {joint: RMS}, of the difference between the torque from one side's F/T sensor and from the other's |
 
 use super::advice::{Advice, findings};
 use proprio_estimator::calibration::force_first;
-use proprio_estimator::identify::{CalibrationOutcome, LogOutcome, Outcome, Role, Severity, Three, Verdict};
+use proprio_estimator::identify::{
+    Both, CalibrationOutcome, LogOutcome, Outcome, Predicted, Role, Severity, Three, Verdict,
+};
 use proprio_topics::Nanos;
 use serde_json::{Map, Value as Json, json};
 use std::ops::Range;
@@ -156,12 +171,27 @@ fn log(log: &LogOutcome) -> Json {
         "file": log.file,
         "role": role(log.role),
         "span_s": since(log.span.1), "used": log.used, "left_out": left_out, "onset_s": log.onset.map(since),
-        "relative_error": three(&log.relative_error),
+        "predicted": predicted(&log.predicted), "fitted_error": three(&log.fitted_error),
         "joints": joints, "sensors": sensors,
         "two_route_rms_nm": object(&log.two_route, |t| (&t.joint, three(&t.rms_nm))),
         "two_route_rms_mean_removed_nm": object(&log.two_route, |t| (&t.joint, three(&t.rms_mean_removed_nm))),
         "offsets": offsets, "friction": friction,
     })
+}
+
+fn predicted(predicted: &Predicted) -> Json {
+    json!({
+        "relative_error": both(&predicted.relative_error),
+        "relative_error_with_drift": both(&predicted.relative_error_with_drift),
+        "joints_rms_nm": object(&predicted.joints, |(name, rms)| (name, both(rms))),
+        "sensors_rms": object(&predicted.sensors, |(name, rms)| (name, both(rms))),
+        "two_route_rms_nm": object(&predicted.two_route, |(name, rms)| (name, both(rms))),
+    })
+}
+
+/// The two sets of parameters by name.
+fn both<T: serde::Serialize>(both: &Both<T>) -> Json {
+    json!({ "cad": both.cad, "identified": both.identified })
 }
 
 /// The three sets of parameters by name.
@@ -209,8 +239,20 @@ mod tests {
         assert_eq!((&log["file"], &log["role"]), (&json!("walk_1.csv"), &json!("train")));
         assert_eq!(json["logs"][1]["role"], "validate");
         assert_eq!(
-            log["relative_error"],
-            json!({ "cad": null, "cad_fitted": 0.064, "identified": 0.0235 })
+            log["fitted_error"],
+            json!({ "cad": null, "cad_fitted": 0.054, "identified": 0.0215 })
+        );
+        assert_eq!(
+            log["predicted"],
+            json!({
+                "relative_error": { "cad": 0.064, "identified": 0.0235 },
+                "relative_error_with_drift": { "cad": 0.06, "identified": 0.0225 },
+                "joints_rms_nm": { "r_knee": { "cad": 0.24, "identified": 0.09 } },
+                "sensors_rms": {
+                    "r_leg_ft_sensor": { "cad": [0.6, 3.0, 0.6, 0.3, 0.2, 0.1], "identified": [0.5, 0.5, 0.5, 0.5, 0.5, 0.5] }
+                },
+                "two_route_rms_nm": { "r_knee": { "cad": 0.25, "identified": 0.14 } },
+            })
         );
         assert_eq!(
             log["joints"]["r_knee"]["rms_nm"],
@@ -267,6 +309,7 @@ mod tests {
             &json["logs"][0]["friction"]["r_knee"],
             &json["rotor_inertia"]["r_knee"],
             &json["logs"][0]["joints"]["r_knee"],
+            &json["logs"][0]["predicted"],
         ]);
         for object in objects {
             let object = object.as_object().expect("an object");

@@ -3,13 +3,14 @@
 use super::batch::{Identified, LEAST_FOLD, Prepared, bodies, feasibility, per_column, time_offsets, verdict};
 use super::gate::UnitSet;
 use super::outcome::{
-    BaseParameterOutcome, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
-    FrictionOutcome, JointOutcome, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, RotorOutcome, SensorOutcome,
-    Severity, Spectrum, Three, TwoRouteOutcome, Verdict, WeakDirection,
+    BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
+    FrictionOutcome, JointOutcome, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Predicted, RotorOutcome,
+    SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome, Verdict, WeakDirection,
 };
 use super::passes::{OFFSET_VARIANCE, Residuals, Told, leave, tell};
-use super::rows::{FRICTION, Further, Layout, RowMaker, Rows, WIDTH};
+use super::rows::{FRICTION, Further, Layout, RowMaker, Rows, WIDTH, friction_row};
 use super::session::Block;
+use super::yardstick::{self, Candidate, Errors, Yardstick};
 use super::{AXES, dot, parallel, torques, zeros};
 use crate::calibration::{Kind, Unknown, swapped};
 use crate::config::{Gain, IdentificationInput};
@@ -108,7 +109,12 @@ pub(super) fn nothing(setup: &Setup, prepared: &[Prepared], reason: String) -> O
         used: 0,
         left_out: log.left_out.clone(),
         onset: None,
-        relative_error: nan,
+        predicted: Predicted {
+            relative_error: both([f64::NAN; 2]),
+            relative_error_with_drift: both([f64::NAN; 2]),
+            ..Predicted::default()
+        },
+        fitted_error: nan,
         joints: Vec::new(),
         sensors: Vec::new(),
         two_route: Vec::new(),
@@ -252,9 +258,16 @@ pub(super) fn outcome(
     let (calibrations, told) = calibrations(setup, maker, identified, &root);
     findings.extend(told);
     let mut maker = maker.clone();
+    let sets = [identified.cad.clone(), identified.d.clone()];
+    let instants = training.iter().flat_map(|log| &log.instants);
+    let friction = yardstick::friction(&maker, instants, &sets);
+    let candidates = [0, 1].map(|set| Candidate {
+        course: vec![(Nanos::ZERO, sets[set].clone())],
+        friction: friction[set].clone(),
+    });
     let logs = prepared
         .iter()
-        .map(|log| log_outcome(&mut maker, log, identified, &root))
+        .map(|log| log_outcome(&mut maker, log, identified, &sets, &candidates, &root))
         .collect();
     Outcome {
         robot: setup.robot.clone(),
@@ -381,7 +394,7 @@ fn calibrations(
 ) -> (Vec<CalibrationOutcome>, Vec<Finding>) {
     let layout = &identified.layout;
     let (mut outcomes, mut findings) = (Vec::new(), Vec::new());
-    if setup.calibrated.is_empty() {
+    if identified.calibrated.is_empty() {
         return (outcomes, findings);
     }
     let precision = &layout.precision;
@@ -405,7 +418,7 @@ fn calibrations(
         let is_gain = |unknown: &Unknown| matches!(unknown, Unknown::Gain { .. });
         let kind = Kind {
             gain: if own.iter().any(|(_, unknown, _)| is_gain(unknown)) {
-                setup.calibrated.gain
+                identified.calibrated.gain
             } else {
                 Gain::None
             },
@@ -887,13 +900,46 @@ fn base_parameters(
     (out, confused, rank)
 }
 
-/// A degree of freedom; what is left of its torque with CAD, with CAD and friction, with identified parameters and friction; what was measured.
-type TorqueSeries = (usize, [Vec<f64>; 3], Vec<f64>);
+/// A degree of freedom; what is left of its torque with CAD, with CAD and friction fitted to the log,
+/// with identified parameters and friction fitted, with CAD and the training logs' friction, with
+/// identified parameters and the training logs' friction; what was measured.
+type TorqueSeries = (usize, [Vec<f64>; 5], Vec<f64>);
 
-fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified, root: &DMatrix<f64>) -> LogOutcome {
+/// What is left of a joint's torque with one set's friction from the training logs, in place of that
+/// which was fitted to the log.
+fn with_friction_of_training(
+    layout: &Layout,
+    instants: &[super::instants::Instant],
+    left: &Residuals,
+    (set, friction): (usize, &[[f64; FRICTION]]),
+    place: usize,
+) -> Vec<f64> {
+    let wrenches = 6 * layout.sensors.len();
+    let mut errors = left.noise[set][wrenches + place].clone();
+    for (range, block) in left.ranges.iter().zip(&left.session) {
+        for i in range.clone() {
+            for (k, share) in friction_row(instants[i].velocity[layout.joints[place]])
+                .into_iter()
+                .enumerate()
+            {
+                let fitted = block.x[(wrenches + FRICTION * place + k, set)];
+                errors[i] += share * (fitted - friction[place][k]);
+            }
+        }
+    }
+    errors
+}
+
+fn log_outcome(
+    maker: &mut RowMaker<'_>,
+    log: &Prepared,
+    identified: &Identified,
+    sets: &[DVector<f64>; 2],
+    candidates: &[Candidate; 2],
+    root: &DMatrix<f64>,
+) -> LogOutcome {
     let setup = maker.setup();
     let layout = &identified.layout;
-    let sets = [identified.cad.clone(), identified.d.clone()];
     let usable = !log.instants.is_empty() && !log.refused;
     let instants = if usable { log.instants.as_slice() } else { &[] };
     let left = leave(
@@ -903,7 +949,7 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
             breaks: &log.breaks,
         },
         &identified.noise,
-        &sets,
+        sets,
     );
     let times: Vec<f64> = instants.iter().map(|i| (i.t - log.span.0).seconds()).collect();
     let places = Places::new(&times);
@@ -916,14 +962,15 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         times[*i] >= first + EDGE && times[*i] <= last - EDGE
     };
     let wrenches = 6 * layout.sensors.len();
-    let compared = Compared::new(maker, instants, &left, identified, &sets);
-    let untouched = untouched(maker, log, identified, &sets);
+    let compared = Compared::new(maker, instants, &left, identified, sets);
+    let untouched = untouched(maker, log, identified, sets);
     let torques = left.noise[1].iter().skip(wrenches);
     let errors: Vec<&[f64]> = compared.errors[2].iter().chain(torques).map(Vec::as_slice).collect();
     let coverage = covered(maker, instants, &errors, identified, root);
 
     // Torques: identified from, or the truth beside F/T sensors.
     let mut joints = Vec::new();
+    let mut torques_predicted = Vec::new();
     let mut torque_share = Vec::new();
     let mut torque_series: Vec<TorqueSeries> = Vec::new();
     if layout.joints.is_empty() {
@@ -941,7 +988,9 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
             for (dof, cad) in errors[0].iter().enumerate() {
                 if cad.iter().any(|x| x.is_finite()) {
                     let measured = instants.iter().map(|i| i.torque[dof]).collect();
-                    torque_series.push((dof, [cad.clone(), cad.clone(), errors[1][dof].clone()], measured));
+                    let own = errors[1][dof].clone();
+                    let series = [cad.clone(), cad.clone(), own.clone(), cad.clone(), own];
+                    torque_series.push((dof, series, measured));
                 }
             }
         }
@@ -954,11 +1003,11 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
                 .zip(&left.predicted[channel])
                 .map(|(m, p)| m - p)
                 .collect();
-            torque_series.push((
-                dof,
-                [raw, left.noise[0][channel].clone(), left.noise[1][channel].clone()],
-                measured,
-            ));
+            let [cad, own] = [0, 1]
+                .map(|set| with_friction_of_training(layout, instants, &left, (set, &candidates[set].friction), place));
+            let fitted = [0, 1].map(|set| left.noise[set][channel].clone());
+            let [cad_fitted, own_fitted] = fitted;
+            torque_series.push((dof, [raw, cad_fitted, own_fitted, cad, own], measured));
         }
     }
     for (dof, errors, measured) in &torque_series {
@@ -967,16 +1016,19 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
             None => x.to_vec(),
         };
         let keep = |x: &[f64]| -> Vec<f64> { (0..x.len()).filter(inner).map(|i| x[i]).collect() };
-        let [cad, fitted, own] = errors.each_ref().map(|e| keep(&smooth(e)));
+        let errors = errors.each_ref().map(|e| keep(&smooth(e)));
+        let [cad, fitted, own, ..] = &errors;
         let measured = keep(&smooth(measured));
         let place = layout.joints.binary_search(dof).ok();
+        let of_training = both([3, 4].map(|set| rms(errors[set].iter().copied())));
+        torques_predicted.push((setup.model.dof_name(*dof).to_owned(), of_training));
         joints.push(JointOutcome {
             name: setup.model.dof_name(*dof).to_owned(),
-            rms_nm: three([&cad, &fitted, &own].map(|x| rms(x.iter().copied()))),
+            rms_nm: three([cad, fitted, own].map(|x| rms(x.iter().copied()))),
             measured_rms_nm: rms(measured.iter().copied()),
             coverage: place.map_or(f64::NAN, |place| coverage[wrenches + place]),
         });
-        torque_share.push(([cad, fitted, own], measured));
+        torque_share.push((errors, measured));
     }
 
     let mut sensors = Vec::new();
@@ -1005,6 +1057,8 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
                 errors[0].iter().map(|x| (x - raw_mean) * scale).collect::<Vec<_>>(),
                 errors[1].iter().map(|x| x * scale).collect(),
                 errors[2].iter().map(|x| x * scale).collect(),
+                Vec::new(),
+                Vec::new(),
             ];
             wrench_share.push((errors, load.iter().map(|x| (x - centre) * scale).collect::<Vec<_>>()));
         }
@@ -1014,11 +1068,8 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
             coverage: std::array::from_fn(|axis| coverage[channel_of(place, axis)]),
         });
     }
-    let share = if torque_share.is_empty() {
-        &wrench_share
-    } else {
-        &torque_share
-    };
+    let is_of_torque = !torque_share.is_empty();
+    let share = if is_of_torque { &torque_share } else { &wrench_share };
     let relative = |which: usize| {
         let (mut above, mut below) = (0.0, 0.0);
         for (errors, measured) in share {
@@ -1031,6 +1082,14 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         }
         (above / below).sqrt()
     };
+    let predicted = predicted(
+        setup,
+        instants,
+        identified,
+        candidates,
+        is_of_torque.then(|| both([3, 4].map(relative))),
+        torques_predicted,
+    );
     let deviations = session_deviations(maker, log, instants, identified, root);
     let (late, found) = if usable {
         time_offsets(layout, log, &compared)
@@ -1044,10 +1103,11 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         used: instants.len() as u64,
         left_out: log.left_out.clone(),
         onset: onset(instants),
-        relative_error: three([0, 1, 2].map(relative)),
+        predicted,
+        fitted_error: three([0, 1, 2].map(relative)),
         joints,
         sensors,
-        two_route: two_route(maker, instants, &left, &sets),
+        two_route: two_route(maker, instants, &left, sets),
         offsets: offsets(setup, layout, log, identified, &left, &deviations),
         friction: friction(setup, layout, &left, &deviations),
         time_offsets: late,
@@ -1055,6 +1115,61 @@ fn log_outcome(maker: &mut RowMaker<'_>, log: &Prepared, identified: &Identified
         curves: curves(maker, instants, &times, &compared, identified, root, &torque_series),
         spectra: spectra(setup, layout, places.as_ref(), &left),
     }
+}
+
+/// How well the parameters predict a log: joint torques as given, of what F/T sensors read by their
+/// yardstick.
+fn predicted(
+    setup: &Setup,
+    instants: &[super::instants::Instant],
+    identified: &Identified,
+    candidates: &[Candidate; 2],
+    of_torque: Option<Both<f64>>,
+    joints: Vec<(String, Both<f64>)>,
+) -> Predicted {
+    let Ok(yardstick) = Yardstick::of_record(setup, &identified.inputs, identified.calibrated, instants) else {
+        // Rows were made of these very instants before.
+        return Predicted::default();
+    };
+    let layout = yardstick.layout();
+    let errors = yardstick.errors(&identified.layout, candidates);
+    let wrenches = 6 * layout.sensors.len();
+    let (mut squares, mut all) = ([[0.0; 2]; 2], 0.0);
+    for channel in 0..wrenches {
+        let weighed = |values: &[f64]| -> f64 {
+            let finite = values.iter().filter(|x| x.is_finite());
+            finite.map(|x| (x * yardstick::scale(channel)).powi(2)).sum()
+        };
+        for ([constant, drifting], errors) in squares.iter_mut().zip(&errors) {
+            *constant += weighed(&errors.channels[channel]);
+            *drifting += weighed(&errors.drifting[channel]);
+        }
+        all += weighed(&yardstick.load(channel, &errors[0]));
+    }
+    let relative = |which: usize| both(squares.map(|of| (of[which] / all).sqrt()));
+    let series = |of: &dyn Fn(&Errors) -> f64| both([of(&errors[0]), of(&errors[1])]);
+    let of_channel = |channel: usize| series(&|errors| rms(errors.channels[channel].iter().copied()));
+    let of_sensor = |place: usize| {
+        let axes: [Both<f64>; 6] = std::array::from_fn(|axis| of_channel(channel_of(place, axis)));
+        both([axes.map(|axis| axis.cad), axes.map(|axis| axis.identified)])
+    };
+    let routes = (0..setup.model.dof_count()).map(|dof| {
+        let of_dof = series(&|errors| rms(errors.routes[dof].iter().copied()));
+        (setup.model.dof_name(dof).to_owned(), of_dof)
+    });
+    Predicted {
+        relative_error: of_torque.unwrap_or(relative(0)),
+        relative_error_with_drift: relative(1),
+        joints,
+        sensors: (layout.sensors.iter().enumerate())
+            .map(|(place, sensor)| (sensor_name(setup, *sensor), of_sensor(place)))
+            .collect(),
+        two_route: routes.filter(|(_, rms)| rms.cad.is_finite()).collect(),
+    }
+}
+
+fn both<T: Copy>([cad, identified]: [T; 2]) -> Both<T> {
+    Both { cad, identified }
 }
 
 fn three<T: Copy>(values: [T; 3]) -> Three<T> {
@@ -1187,7 +1302,7 @@ fn two_route(
     let layout = maker.layout().clone();
     let dofs = setup.model.dof_count();
     let configured = configured_session(setup, &layout);
-    let mut series = [vec![Vec::new(); dofs], vec![Vec::new(); dofs], vec![Vec::new(); dofs]];
+    let mut series = vec![[const { Vec::new() }; 3]; dofs];
     let mut rows = Rows::new(&layout);
     for (range, block) in left.ranges.iter().zip(&left.session) {
         let cases = cases(sets, &configured, block);
@@ -1195,24 +1310,22 @@ fn two_route(
             if layout.sensors.len() < 2 || maker.make(instant, &mut rows).is_err() {
                 continue;
             }
-            for (series, (d, session)) in series.iter_mut().zip(cases) {
-                let apart = maker.imbalance(instant, d.as_slice(), session);
-                series
-                    .iter_mut()
-                    .zip(apart)
-                    .filter(|(_, x)| x.is_finite())
-                    .for_each(|(s, x)| s.push(x));
+            for (dof, along) in maker.two_routes(&rows) {
+                for (series, (d, session)) in series[dof].iter_mut().zip(cases) {
+                    let left = |row: usize| rows.r(row) - dot(rows.a(row), d.as_slice()) - dot(rows.g(row), session);
+                    series.push(along.iter().enumerate().map(|(row, weight)| weight * left(row)).sum());
+                }
             }
         }
     }
     (0..dofs)
-        .filter(|&dof| !series[0][dof].is_empty())
+        .filter(|&dof| !series[dof][0].is_empty())
         .map(|dof| TwoRouteOutcome {
             joint: setup.model.dof_name(dof).to_owned(),
-            rms_nm: three([0, 1, 2].map(|set| rms(series[set][dof].iter().copied()))),
+            rms_nm: three([0, 1, 2].map(|set| rms(series[dof][set].iter().copied()))),
             rms_mean_removed_nm: three([0, 1, 2].map(|set| {
-                let centre = mean(&series[set][dof]);
-                rms(series[set][dof].iter().map(|x| x - centre))
+                let centre = mean(&series[dof][set]);
+                rms(series[dof][set].iter().map(|x| x - centre))
             })),
         })
         .collect()

@@ -7,21 +7,22 @@
 //!    alone it is ([`super::mounting`]).
 //! 3. What this fit says that something undeclared acted on is left out, jumps of offsets that it does not bear out are dropped, and the rounds repeated, until that stays ([`super::gate`]).
 //!    Then, where gains of sensors are asked for, fits with these unknown, too, and what is left out is asked again.
-//! 4. A check on data held out: pieces of the logs are predicted from the others. The change from CAD is shrunk where it gains nothing ([`held_out`]).
+//! 4. A check on data held out: pieces of the logs are predicted from the others. The change from CAD is shrunk where it gains nothing ([`super::guard`]).
 //! 5. Shaking that encoders do not show ([`super::shaking`]), where other sensors tell of it, is taken off; then 2 and 4 once more.
 //! 6. Figures for every log ([`super::assess`]), and what undeclared acted on the robot in those to validate with.
 
 use super::assess;
 use super::consistent;
 use super::gate::{self, UnitSet};
+use super::guard;
 use super::information::Information;
 use super::instants::{Break, Defect, Instant, Recording, RecordingError, Settings, Signal, TimeOffset};
 use super::mounting;
 use super::outcome::{Finding, LeftOut, Outcome, Role, Severity, Verdict};
 use super::parallel;
-use super::passes::{NoiseModel, Piece, Residuals, Told, leave, noise_of, tell};
+use super::passes::{NoiseModel, Piece, Told, Walks, leave, noise_of, tell};
 use super::prior::{Fit, Posterior, Prior, PriorError};
-use super::rows::{Further, Groups, Layout, RowMaker, Rows};
+use super::rows::{Further, Layout, RowMaker, Rows};
 use super::shaking::Shaking;
 use super::torques;
 use super::undeclared::{self, Undeclared};
@@ -105,8 +106,7 @@ const ROUNDS: usize = 14;
 /// Rounds end when the logarithm of no variance changes by more, from the last round or round a circle.
 const SETTLED: f64 = 0.03;
 
-/// Pieces of each log for the check on held-out data, and how many instants one has at least.
-const FOLDS: usize = 5;
+/// How many instants a fold of the check on held-out data has at least.
 pub(super) const LEAST_FOLD: usize = 50;
 
 /// Instants that noise, prior weight and the check on held-out data look at, at most, and in how many stretches of long logs.
@@ -146,6 +146,8 @@ impl Prepared {
 pub(super) struct Identified {
     pub layout: Layout,
     pub inputs: Vec<IdentificationInput>,
+    /// What of the sensors' calibrations was identified, too.
+    pub calibrated: Kind,
     pub prior: Prior,
     pub noise: NoiseModel,
     pub information: Information,
@@ -260,8 +262,13 @@ pub fn identify(
     };
     maker.calibrate(of_temperature, training.iter().flat_map(|log| log.instants.iter()));
     let mut gated = gated(setup, &maker, &mut prepared, &mut tell_progress)?;
-    if setup.calibrated.gain != Gain::None {
-        gated = with_gains(setup, &mut maker, &mut prepared, gated, &mut tell_progress)?;
+    let (gain, choice) = chosen_gain(&mut maker, &mut prepared, &gated.settled)?;
+    let calibrated = Kind {
+        gain,
+        ..setup.calibrated
+    };
+    if gain != Gain::None {
+        gated = with_gains(setup, &mut maker, &mut prepared, calibrated, gated, &mut tell_progress)?;
     }
     let maker = maker;
     let Gated {
@@ -271,7 +278,14 @@ pub fn identify(
     } = gated;
     undeclared.tell(&maker, &mut prepared, &settled);
     let training = used(&prepared);
-    let mut identified = fit(&maker, &training, inputs.clone(), settled, &mut tell_progress)?;
+    let mut identified = fit(
+        &maker,
+        &training,
+        inputs.clone(),
+        calibrated,
+        settled,
+        &mut tell_progress,
+    )?;
     tell_progress("shaking".into(), 0.8);
     if let Some(shaking) = Shaking::find(&maker, &sample(&maker, &training), &identified.noise, &identified.d) {
         for log in &mut prepared {
@@ -280,11 +294,19 @@ pub fn identify(
         // Once more, what encoders do not show taken off; it has been told how far along this is.
         let mut again = |step: String, _| tell_progress(format!("{step}, without shaking"), 0.8);
         let training = used(&prepared);
-        let settled = settle(setup, &maker, &training, Some(identified.noise), &mut again)?;
-        identified = fit(&maker, &training, inputs, settled, &mut again)?;
+        let settled = settle(
+            setup,
+            &maker,
+            &training,
+            Slow::OfSensors,
+            Some(identified.noise),
+            &mut again,
+        )?;
+        identified = fit(&maker, &training, inputs, calibrated, settled, &mut again)?;
         identified.findings.extend(shaken(&maker, &shaking));
     }
     identified.findings.extend(restless);
+    identified.findings.extend(choice);
     identified.findings.extend(asked_in_vain(setup, &identified.inputs));
     undeclared::tell_of_checks(&maker, &mut prepared, &identified);
     let training = used(&prepared);
@@ -305,7 +327,10 @@ fn asked_in_vain(setup: &Setup, inputs: &[IdentificationInput]) -> Vec<Finding> 
     let mut notes = Vec::new();
     if !setup.calibrated.is_empty() && !inputs.contains(&IdentificationInput::Wrench) {
         let asked = [
-            (setup.calibrated.gain != Gain::None, "identification.gain"),
+            (
+                !matches!(setup.calibrated.gain, Gain::None | Gain::Auto),
+                "identification.gain",
+            ),
             (setup.calibrated.temperature, "identification.temperature"),
         ];
         let asked: Vec<&str> = asked.iter().filter(|(is, _)| *is).map(|(_, key)| *key).collect();
@@ -676,14 +701,14 @@ pub(super) fn added(told: &[Told], unknowns: usize) -> Information {
     sum
 }
 
-fn posterior(prior: &Prior, layout: &Layout, information: &Information) -> Result<Posterior, IdentifyError> {
+pub(super) fn posterior(prior: &Prior, layout: &Layout, information: &Information) -> Result<Posterior, IdentifyError> {
     let (r, z) = information.to_triangle();
     Ok(Posterior::new(prior, &layout.links, &r, &z, &layout.precision)?)
 }
 
 /// CAD's bodies, and of what CAD says nothing ([`Further::lacks_cad`]) the values that go best with them, by their priors and by what these data tell; no rotor's inertia is negative. (Not from the log
 /// that CAD is compared on: these belong to the robot.)
-fn beside_cad(layout: &Layout, information: &Information) -> DVector<f64> {
+pub(super) fn beside_cad(layout: &Layout, information: &Information) -> DVector<f64> {
     let mut x = DVector::zeros(layout.unknowns());
     let mut columns = layout.beside_cad();
     let (r, z) = information.to_triangle();
@@ -722,7 +747,7 @@ fn is_rotor(layout: &Layout, column: usize) -> bool {
 }
 
 /// The most probable parameters of which no rotor's inertia is negative: what comes out negative is held at zero, and the rest fitted again.
-fn without_negative_rotors(
+pub(super) fn without_negative_rotors(
     prior: &Prior,
     layout: &Layout,
     information: &Information,
@@ -788,19 +813,20 @@ fn settle(
     setup: &Setup,
     maker: &RowMaker<'_>,
     training: &[&Prepared],
+    slow: Slow,
     from: Option<NoiseModel>,
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<Settled, IdentifyError> {
     let layout = maker.layout().clone();
     let prior = Prior::new(setup.model.inertias())?.expecting(setup.model_deviation());
     let least = least_variances(setup, &layout);
-    let bound = (super::passes::BLOCK / DRIFT_TIME).powi(2);
+    let walks = walks(setup, &layout, slow);
     let sampled = sample(maker, training);
     let noise_left = |noise: &NoiseModel, d: &DVector<f64>| {
         let left = over(maker, &sampled, |maker, _, piece| {
             leave(maker, piece, noise, std::slice::from_ref(d))
         });
-        noise_of(&layout, &left, 0, bound, &least)
+        noise_of(&layout, &left, 0, &walks, &least)
     };
     let has_cad = layout.beside_cad().is_empty();
     let noise = from.unwrap_or_else(|| {
@@ -856,12 +882,14 @@ fn gated(
     prepared: &mut [Prepared],
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<Gated, IdentifyError> {
-    let mut settled = settle(setup, maker, &used(prepared), None, progress)?;
+    let mut settled = settle(setup, maker, &used(prepared), Slow::All, None, progress)?;
     // It has been told how far along this is.
     let mut progress = |step: String, _| progress(step, 0.7);
     let mut undeclared = Undeclared::none(used_mut(prepared));
     let mut refused = 0;
     let mut stays = false;
+    // A load that comes or goes would pass for noise of everything beside offsets that hardly walk.
+    let mut slow = Slow::All;
     for _ in 0..GATES {
         progress("undeclared contacts".into(), 0.7);
         let training = used(prepared);
@@ -876,6 +904,7 @@ fn gated(
                 setup,
                 maker,
                 &used(prepared),
+                slow,
                 Some(settled.noise.clone()),
                 &mut progress,
             )?;
@@ -887,12 +916,17 @@ fn gated(
             refused += 1;
             undeclared.mark(used_mut(prepared));
         }
+        if let Slow::All = slow {
+            slow = Slow::OfSensors;
+            // Afresh: noise beside offsets that follow all is shared out otherwise.
+            settled = settle(setup, maker, &used(prepared), slow, None, &mut progress)?;
+        }
         let Settled { noise, fit, .. } = &settled;
         stays = undeclared.ask(maker, used_mut(prepared), noise, &fit.x);
         if stays {
             break;
         }
-        settled = settle(setup, maker, &used(prepared), Some(settled.noise), &mut progress)?;
+        settled = settle(setup, maker, &used(prepared), slow, Some(settled.noise), &mut progress)?;
     }
     Ok(Gated {
         settled,
@@ -901,17 +935,105 @@ fn gated(
     })
 }
 
+/// Which gains to find out, and what there is to say of that: those asked for; or, step by step from none,
+/// those with which data held out are predicted better than with fewer, by more than a standard error.
+/// Asked of the noise and the bodies that were found without gains, of which a gain's error is a small
+/// change.
+fn chosen_gain(
+    maker: &mut RowMaker<'_>,
+    prepared: &mut [Prepared],
+    settled: &Settled,
+) -> Result<(Gain, Option<Finding>), IdentifyError> {
+    let wanted = maker.setup().calibrated;
+    if wanted.gain != Gain::Auto {
+        return Ok((wanted.gain, None));
+    }
+    if maker.layout().sensors.is_empty() {
+        return Ok((Gain::None, None));
+    }
+    read_as_fitted(maker, prepared, settled);
+    let walks = walks(maker.setup(), maker.layout(), Slow::OfSensors);
+    let mut held = |gain: Gain| -> Result<guard::Held, IdentifyError> {
+        let training = used(prepared);
+        let instants = training.iter().flat_map(|log| log.instants.iter());
+        maker.calibrate(Kind { gain, ..wanted }, instants);
+        let sampled = sample(maker, &training);
+        let Settled { prior, noise, fit, .. } = settled;
+        Ok(guard::held_out(maker, prior, &sampled, noise, fit.tau, &walks)?.held)
+    };
+    let (mut chosen, mut best) = (Gain::None, held(Gain::None)?);
+    let mut better = 0.0;
+    for gain in [Gain::Diagonal, Gain::Full] {
+        let other = held(gain)?;
+        let (gained, error) = other.gain_over(&best);
+        if gained <= error {
+            break;
+        }
+        better = 1.0 - (1.0 - better) * other.relative_to(&best);
+        (chosen, best) = (gain, other);
+    }
+    // As the fit at hand has it.
+    let training = used(prepared);
+    let instants = training.iter().flat_map(|log| log.instants.iter());
+    let gain = Gain::None;
+    maker.calibrate(Kind { gain, ..wanted }, instants);
+    let what = match chosen {
+        Gain::Full => "all entries of the F/T sensors' gains are identified",
+        Gain::Diagonal => "a gain of each channel of the F/T sensors is identified",
+        Gain::Auto | Gain::None => {
+            for instant in used_mut(prepared).flat_map(|log| &mut log.instants) {
+                instant.fitted = Vec::new();
+            }
+            return Ok((Gain::None, None));
+        }
+    };
+    let text = format!(
+        "{what}: readings of data held out are predicted with {:.0} % less error than without (identification.gain = \"none\" leaves the workbench's gains as they are)",
+        100.0 * better
+    );
+    let note = Finding {
+        severity: Severity::Note,
+        code: "gain_chosen",
+        subject: "identification.gain".into(),
+        text,
+    };
+    Ok((chosen, Some(note)))
+}
+
+/// What of a slow change is an offset's.
+#[derive(Clone, Copy, Debug)]
+enum Slow {
+    /// All that is no faster than [`DRIFT_TIME`]: what stands out of the rest was something undeclared.
+    All,
+    /// What sensors do by themselves, by no more than their stated noise per square root of a second.
+    /// The rest is what the model lacks, and its noise: bodies that have been fitted beside an offset
+    /// which follows it predict other logs less well.
+    OfSensors,
+}
+
+fn walks(setup: &Setup, layout: &Layout, slow: Slow) -> Walks {
+    let rates = match slow {
+        Slow::All => vec![f64::INFINITY; 6 * layout.sensors.len()],
+        Slow::OfSensors => super::yardstick::stated_variances(setup, layout),
+    };
+    Walks {
+        relative: (super::passes::BLOCK / DRIFT_TIME).powi(2),
+        rates,
+    }
+}
+
 /// Gains of the sensors, too. What a gain that is off leaves where the robot carries much may have been taken for a contact: that is asked again when gains are known, and if it was otherwise, gains are
 /// fitted again, a few times at the most. (Each time some of what was left out comes back, and tells more of gains.)
 fn with_gains(
     setup: &Setup,
     maker: &mut RowMaker<'_>,
     prepared: &mut [Prepared],
+    calibrated: Kind,
     mut gated: Gated,
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<Gated, IdentifyError> {
     const AGAIN: usize = 4;
-    gated.settled = gains(setup, maker, prepared, gated.settled, progress)?;
+    gated.settled = gains(setup, maker, prepared, calibrated, gated.settled, progress)?;
     gated.restless = Some(undeclared::restless(AGAIN));
     for _ in 0..AGAIN {
         let Settled { noise, fit, .. } = &gated.settled;
@@ -919,7 +1041,7 @@ fn with_gains(
             gated.restless = None;
             break;
         }
-        gated.settled = gains(setup, maker, prepared, gated.settled, progress)?;
+        gated.settled = gains(setup, maker, prepared, calibrated, gated.settled, progress)?;
     }
     Ok(gated)
 }
@@ -929,6 +1051,7 @@ fn gains(
     setup: &Setup,
     maker: &mut RowMaker<'_>,
     prepared: &mut [Prepared],
+    calibrated: Kind,
     mut settled: Settled,
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<Settled, IdentifyError> {
@@ -938,10 +1061,17 @@ fn gains(
     let mut progress = |step: String, _| progress(format!("{step}, with gains"), 0.7);
     read_as_fitted(maker, prepared, &settled);
     let instants = used(prepared);
-    maker.calibrate(setup.calibrated, instants.iter().flat_map(|log| log.instants.iter()));
+    maker.calibrate(calibrated, instants.iter().flat_map(|log| log.instants.iter()));
     let mut last: Option<Vec<f64>> = None;
     for _ in 0..FITS {
-        settled = settle(setup, maker, &used(prepared), Some(settled.noise), &mut progress)?;
+        settled = settle(
+            setup,
+            maker,
+            &used(prepared),
+            Slow::OfSensors,
+            Some(settled.noise),
+            &mut progress,
+        )?;
         read_as_fitted(maker, prepared, &settled);
         let layout = maker.layout();
         let own = layout.precision.iter().copied().zip(layout.inertial()..);
@@ -988,6 +1118,7 @@ fn fit(
     maker: &RowMaker<'_>,
     training: &[&Prepared],
     inputs: Vec<IdentificationInput>,
+    calibrated: Kind,
     settled: Settled,
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<Identified, IdentifyError> {
@@ -1000,7 +1131,14 @@ fn fit(
     let information = added(&told, layout.unknowns());
     let fit = posterior(&prior, &layout, &information)?.weigh()?;
     progress("held-out data".into(), 0.75);
-    let mut guard = held_out(maker, &prior, training, &noise, fit.tau)?;
+    let mut guard = guard::held_out(
+        maker,
+        &prior,
+        &sample(maker, training),
+        &noise,
+        fit.tau,
+        &walks(maker.setup(), &layout, Slow::OfSensors),
+    )?;
     guard.findings.extend(unsettled(change));
     // Parameters have taken a part of the noise that they were fitted to, most of all where it is as slow as the motion.
     let noise = guard.noise;
@@ -1016,6 +1154,7 @@ fn fit(
     Ok(Identified {
         layout,
         inputs,
+        calibrated,
         prior,
         noise,
         information,
@@ -1114,191 +1253,6 @@ pub(super) fn sample<'a>(maker: &RowMaker<'_>, training: &[&'a Prepared]) -> Vec
         }
     }
     sampled
-}
-
-/// What held-out data say of the change from CAD.
-struct Guard {
-    /// Per link of the layout, then per further unknown.
-    share: Vec<f64>,
-    findings: Vec<Finding>,
-    /// Noise, corrected by what held-out data show of it.
-    noise: NoiseModel,
-}
-
-/// Predicts each of [`FOLDS`] pieces of every log with parameters from all other pieces, offsets and friction fitted to the piece for CAD and for them alike, and chooses how much of
-/// the change from CAD is kept, group by group of links that no measured channel tells apart ([`RowMaker::groups`]).
-///
-/// What counts is the group's mean square error, all of its channels together, each in units of its noise, less than CAD's: a parabola in the share that is kept. Kept is the
-/// greatest of 1, 0.9, ... 0.1 whose gain is within a standard error of the best share's, if it is more than a standard error itself; else nothing. Errors are summed over blocks of a
-/// second, between which they count as independent. A channel which alone gets worse, by two standard errors, is named.
-fn held_out(
-    maker: &RowMaker<'_>,
-    prior: &Prior,
-    training: &[&Prepared],
-    noise: &NoiseModel,
-    tau: f64,
-) -> Result<Guard, IdentifyError> {
-    let layout = maker.layout();
-    let mut pieces = Vec::new();
-    for log in training {
-        let count = (log.instants.len() / LEAST_FOLD).clamp(1, FOLDS);
-        for fold in 0..count {
-            let at = |k: usize| log.instants.len() * k / count;
-            // Of a very long log, the beginning of each piece.
-            let end = at(fold + 1).min(at(fold) + SAMPLE / FOLDS);
-            pieces.push(Piece {
-                instants: &log.instants[at(fold)..end],
-                breaks: &log.breaks,
-            });
-        }
-    }
-    if pieces.len() < 2 {
-        return Ok(Guard {
-            share: vec![0.0; layout.links.len() + layout.further.len()],
-            findings: vec![Finding {
-                severity: Severity::Warning,
-                code: "not_checked",
-                subject: String::new(),
-                text: format!(
-                    "the logs are too short to hold a part back and see whether identified parameters predict it: all links stay as in the URDF; record at least {} instants that can be used",
-                    2 * LEAST_FOLD
-                ),
-            }],
-            noise: noise.clone(),
-        });
-    }
-    let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, noise));
-    let columns: Vec<usize> = (0..layout.unknowns()).collect();
-    let mut sets = Vec::new();
-    for held in 0..pieces.len() {
-        let mut others = Information::new(layout.unknowns());
-        for (number, told) in told.iter().enumerate() {
-            if number != held {
-                let _ = others.merge(&told.information, &columns);
-            }
-        }
-        let own = posterior(prior, layout, &others)?.fit(tau)?;
-        // As they are given out.
-        let own = without_negative_rotors(prior, layout, &others, &own)?;
-        sets.push([beside_cad(layout, &others), own]);
-    }
-    let left: Vec<Residuals> = over(maker, &pieces, |maker, number, piece| {
-        leave(maker, piece, noise, &sets[number])
-    });
-    // Per channel and block: sums of e0 (e0 - e1) and of (e0 - e1)^2.
-    let mut sums: Vec<Vec<(f64, f64)>> = vec![Vec::new(); layout.channels()];
-    for (piece, left) in pieces.iter().zip(&left) {
-        let mut start = 0;
-        for i in 1..=piece.instants.len() {
-            if i < piece.instants.len() && (piece.instants[i].t - piece.instants[start].t).seconds() < 1.0 {
-                continue;
-            }
-            for (channel, sums) in sums.iter_mut().enumerate() {
-                let (mut cross, mut square) = (0.0, 0.0);
-                for (e0, e1) in left.noise[0][channel][start..i]
-                    .iter()
-                    .zip(&left.noise[1][channel][start..i])
-                {
-                    if e0.is_finite() && e1.is_finite() {
-                        cross += e0 * (e0 - e1);
-                        square += (e0 - e1).powi(2);
-                    }
-                }
-                sums.push((cross, square));
-            }
-            start = i;
-        }
-    }
-    let gain = |values: &[f64]| {
-        let n = values.len() as f64;
-        let mean = values.iter().sum::<f64>() / n;
-        let variance = values.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
-        (mean, (variance / n).sqrt())
-    };
-    let variances = noise.inflated();
-    let blocks = sums.first().map_or(0, Vec::len);
-    let Groups {
-        links,
-        further,
-        channels,
-    } = maker.groups();
-    let mut share = vec![0.0; links.len() + further.len()];
-    let mut findings = Vec::new();
-    let mut numbers: Vec<usize> = links.clone();
-    numbers.sort_unstable();
-    numbers.dedup();
-    for group in numbers {
-        let own: Vec<usize> = (0..layout.channels()).filter(|&c| channels[c] == group).collect();
-        let at = |share: f64, (cross, square): (f64, f64)| 2.0 * share * cross - share * share * square;
-        let total = |share: f64| {
-            let of = |block: usize| {
-                own.iter()
-                    .map(|&c| at(share, sums[c][block]) / variances[c])
-                    .sum::<f64>()
-            };
-            gain(&(0..blocks).map(of).collect::<Vec<f64>>())
-        };
-        let shares: Vec<f64> = (1..=10).rev().map(|tenth| f64::from(tenth) / 10.0).collect();
-        let best = shares
-            .iter()
-            .map(|s| total(*s))
-            .max_by(|a, b| a.0.total_cmp(&b.0))
-            .unwrap_or((0.0, 0.0));
-        let keeps = |share: &&f64| {
-            let (mean, error) = total(**share);
-            mean > error && mean >= best.0 - best.1
-        };
-        let kept = shares.iter().find(keeps).copied().unwrap_or(0.0);
-        let names = || {
-            let own = layout.links.iter().zip(links).filter(|(_, g)| **g == group);
-            let names: Vec<&str> = own.map(|(link, _)| maker.setup().model.link_name(*link)).collect();
-            names.join(", ")
-        };
-        if kept < 1.0 {
-            findings.push(Finding {
-                severity: Severity::Warning,
-                code: "shrunk",
-                subject: names(),
-                text: if kept > 0.0 {
-                    format!(
-                        "the full change from CAD predicts held-out data less well than a part of it: {:.0} % of it is kept for {}",
-                        100.0 * kept,
-                        names()
-                    )
-                } else {
-                    format!(
-                        "identified parameters predict held-out data no better than CAD: {} stay as in the URDF; record more, and more different, motion",
-                        names()
-                    )
-                },
-            });
-        }
-        for &channel in &own {
-            let values: Vec<f64> = sums[channel].iter().map(|s| at(kept, *s)).collect();
-            let (mean, error) = gain(&values);
-            if mean < -2.0 * error {
-                let (name, _) = assess::channel_name(maker.setup(), layout, channel);
-                findings.push(Finding {
-                    severity: Severity::Note,
-                    code: "channel_worse",
-                    text: format!(
-                        "{name}: held-out data are predicted a little worse than by CAD, though all channels of these links together are predicted better"
-                    ),
-                    subject: name,
-                });
-            }
-        }
-        let all = share.iter_mut().zip(links.iter().chain(further));
-        for (value, _) in all.filter(|(_, g)| **g == group) {
-            *value = kept;
-        }
-    }
-    let bound = (super::passes::BLOCK / DRIFT_TIME).powi(2);
-    Ok(Guard {
-        share,
-        findings,
-        noise: noise.midway(&noise_of(layout, &left, 1, bound, &noise.least)),
-    })
 }
 
 /// CAD moved by `d` in the columns of a layout: all links.

@@ -130,7 +130,8 @@ mod tests {
     use super::*;
     use crate::config::Config;
     use crate::identify::{
-        Consistency, CovarianceRoot, FrictionOutcome, LinkOutcome, OffsetOutcome, RotorOutcome, Three, Verdict,
+        Consistency, CovarianceRoot, FrictionOutcome, LinkOutcome, OffsetOutcome, Predicted, RotorOutcome, Three,
+        Verdict,
     };
     use crate::spatial::RigidInertia;
     use proprio_topics::Nanos;
@@ -181,7 +182,8 @@ mod tests {
             used: 1,
             left_out: vec![],
             onset: None,
-            relative_error: Three::default(),
+            predicted: Predicted::default(),
+            fitted_error: Three::default(),
             joints: vec![],
             sensors: vec![],
             two_route: vec![],

@@ -31,6 +31,36 @@ pub struct Three<T> {
     pub identified: T,
 }
 
+/// The same quantity for CAD's parameters and for the identified ones.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Both<T> {
+    /// With CAD's.
+    pub cad: T,
+    /// With the identified ones.
+    pub identified: T,
+}
+
+/// How well a log is predicted, by which parameters are judged: parameters, gains and friction are
+/// those found in the training logs (friction found with CAD's parameters for CAD), and nothing is
+/// fitted to the log but one constant offset of each F/T channel. It depends on the log and on the
+/// parameters alone. Of all instants, also of those left out because something undeclared acted.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Predicted {
+    /// Relative error. Of joint torques if the log has any: `|tau_hat - tau| / |tau|` over all joints
+    /// and samples. Else of F/T readings: the same over all channels of all sensors, the mean of the
+    /// readings removed, each force multiplied by [`crate::dynamics::Structure::LENGTH_SCALE`]. NaN
+    /// where there is nothing to compare.
+    pub relative_error: Both<f64>,
+    /// The same of F/T readings with a linear drift of each channel fitted, too; NaN without any.
+    pub relative_error_with_drift: Both<f64>,
+    /// Per joint with a measured torque: its name, RMS of measured less predicted torque \[Nm\].
+    pub joints: Vec<(String, Both<f64>)>,
+    /// Per F/T sensor: its name, RMS of read less predicted, `[fx fy fz tx ty tz]` [N, Nm].
+    pub sensors: Vec<(String, Both<[f64; 6]>)>,
+    /// Per joint that two sides tell ([`TwoRouteOutcome`]): its name, RMS of the difference \[Nm\].
+    pub two_route: Vec<(String, Both<f64>)>,
+}
+
 /// How serious a finding is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Severity {
@@ -318,11 +348,13 @@ pub struct LogOutcome {
     pub left_out: Vec<LeftOut>,
     /// When the robot began to move; none if it never did, or moved from the start.
     pub onset: Option<Nanos>,
-    /// Relative error: see [`LogOutcome`]'s fields `joints` and `sensors` for what it is made of.
+    /// How well the parameters predict it: what they are judged by.
+    pub predicted: Predicted,
+    /// Relative error with offsets that walk, and friction, fitted to the log: see [`LogOutcome`]'s fields `joints` and `sensors` for what it is made of.
     ///
     /// Joint torques: `|tau_hat - tau| / |tau|` over all joints and samples, edges cut. F/T sensors: the same over all channels of all sensors, means removed, each force multiplied by
     /// [`crate::dynamics::Structure::LENGTH_SCALE`]; of the reading with the fitted offset removed. NaN where there is nothing to compare.
-    pub relative_error: Three<f64>,
+    pub fitted_error: Three<f64>,
     /// Per joint with a measured torque.
     pub joints: Vec<JointOutcome>,
     /// Per F/T sensor that a contact-free sub-tree has.

@@ -38,9 +38,11 @@
 //! `tau^2 = D / gamma = d^T M d / (2 gamma)`, `M = hess D`; the mean of the Wishart distribution takes away what that form overstates: on bodies drawn from the prior with
 //! tau = 0.5 and 0.8 it finds 0.55 and 0.96, this rule 0.50 and 0.81 (medians; `tau 0.1`: 0.094 both).
 //!
-//! Two things are said of `tau` before any data: it is at most 1, for CAD is worth at least one sample per parameter; and `ln tau ~ N(ln tau_0, 1)`, worth half a parameter, where `tau_0` is
-//! how far CADs are from robots ([`Prior::expecting`]). So data that say nothing leave tau there, where D / gamma would be nothing by nothing. Of a CAD of which nothing is said `tau_0` is 1,
-//! the weakest claim.
+//! Two things are said of `tau` before any data. It is at most 1, for CAD is worth at least one sample
+//! per parameter. And `ln tau ~ N(ln tau_0, s^2)`, worth `1 / (2 s^2)` parameters, where `tau_0` is how
+//! far CADs are from robots and `s = ln 1.5` how well that is known ([`Prior::expecting`]). So data that
+//! say nothing leave tau there, where D / gamma would be nothing by nothing. Of a CAD of which nothing
+//! is said `tau_0` is 1, the weakest claim, and `s` is 1.
 //!
 //! # Speed
 //! One round grades, `O(n^3)` once, and takes some five Newton steps of a matrix product and a Cholesky factorization each; from where the last solution was, one or two. All factors are
@@ -74,8 +76,10 @@ const NOTHING: Expected = Expected {
     spread: 1.0,
 };
 
-/// How many times farther from the robot, or nearer to it, a CAD may well be than it is said to be.
-const FACTOR: f64 = std::f64::consts::E;
+/// How many times farther from the robot, or nearer to it, a CAD may well be than it is said to be: two
+/// of three are within it. It is worth three parameters that the data determine: a log of one slow motion,
+/// which determines two, does not make links of twice their mass credible.
+const FACTOR: f64 = 1.5;
 
 /// Below it `tau` is not followed: CAD right to a hundredth of a per cent.
 const LEAST_TAU: f64 = 1e-4;
@@ -225,7 +229,8 @@ impl Prior {
         })
     }
 
-    /// With what is known of CAD before any data: its masses and second moments are off by the share `relative`, to a factor of `e`.
+    /// With what is known of CAD before any data: its masses and second moments are off by the share `relative`, to a
+    /// factor of [`FACTOR`].
     /// That is `tau = relative / sqrt 2` ([`crate::parameters::cad_root`]). Zero: CAD is exact.
     #[must_use]
     pub fn expecting(self, relative: f64) -> Self {

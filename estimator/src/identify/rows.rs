@@ -25,6 +25,7 @@ use crate::dynamics::{DynamicsError, JointState, Kinematics};
 use crate::regressor::{Regressor, StackedRegressor, Weighting};
 use crate::setup::Setup;
 use crate::spatial::{Motion, Vec3, Wrench};
+use nalgebra::{DVector, Matrix6, Vector6};
 
 /// Speed over which the sign of Coulomb friction is smoothed [rad/s or m/s].
 pub(super) const COULOMB_SPEED: f64 = 0.02;
@@ -286,10 +287,20 @@ impl Rows {
         }
     }
 
+    /// The joint whose torque a row is of, if it is of one's; `offsets`: channels before those of joints.
+    pub(super) fn joint(&self, row: usize, offsets: usize) -> Option<usize> {
+        self.n(row)[offsets..].iter().position(|entry| *entry != 0.0)
+    }
+
     /// Whether any row has this channel's noise.
     pub(super) fn has(&self, channel: usize) -> bool {
         (0..self.count).any(|row| self.n(row)[channel] != 0.0)
     }
+}
+
+/// What Coulomb and viscous friction and the offset of a joint's torque are multiplied by in it.
+pub(super) fn friction_row(velocity: f64) -> [f64; FRICTION] {
+    [(velocity / COULOMB_SPEED).tanh(), velocity, 1.0]
 }
 
 /// What a sub-tree needs for a motion that its encoders do not show: [torque; force], zero where nothing is known of any.
@@ -588,27 +599,38 @@ impl<'a> RowMaker<'a> {
         Ok(())
     }
 
-    /// How far the two sides of each joint are apart: the imbalance of the joint's sub-tree along its axis, for these parameters and the log's own unknowns, after [`RowMaker::make`]. NaN
-    /// where there are not two sides with sensors and without contacts.
-    pub(super) fn imbalance(&self, instant: &Instant, d: &[f64], session: &[f64]) -> Vec<f64> {
+    /// Joints whose torque two sides tell, each with F/T sensors and without contacts: the degree of
+    /// freedom, and the combination of these rows (not whitened), made last, that is how far the two
+    /// are apart.
+    pub(super) fn two_routes(&self, rows: &Rows) -> Vec<(usize, DVector<f64>)> {
         let setup = self.setup;
-        let mut apart = vec![f64::NAN; setup.model.dof_count()];
+        let mut routes = Vec::new();
         for (number, subtree) in self.stacked.subtrees().iter().enumerate() {
-            if subtree.sensors().len() < 2 {
+            let own: Vec<usize> = (0..rows.count).filter(|&row| rows.units[row] == number).collect();
+            if subtree.sensors().len() < 2 || !subtree.contacts().is_empty() || own.len() < 6 {
                 continue;
             }
-            let Some(balance) = self.balance(instant, d, session, number) else {
+            // Rows are combinations of the six equations.
+            let combined = Matrix6::from_fn(|row, equation| subtree.projection(row)[equation]);
+            let Some(equations) = combined.try_inverse() else {
                 continue;
             };
-            let in_base = self.kinematics.pose(subtree.top()).wrench(&balance);
             for joint in setup.model.joints() {
                 let inside = setup.structure.subtree_of(joint.child) == Some(number) && joint.child != subtree.top();
                 if let (Some(dof), true, Some(axis)) = (joint.dof, inside, self.kinematics.joint_axis(joint)) {
-                    apart[dof] = axis.dot(&in_base);
+                    // The axis is in the base, equations are about the top link's origin in its axes.
+                    let along = self.kinematics.pose(subtree.top()).inverse().twist(&axis);
+                    let along = Vector6::from_iterator(along.angular.iter().chain(&along.linear).copied());
+                    let along = equations.tr_mul(&along);
+                    let mut all = DVector::zeros(rows.count);
+                    own.iter()
+                        .zip(along.iter())
+                        .for_each(|(row, weight)| all[*row] = *weight);
+                    routes.push((dof, all));
                 }
             }
         }
-        apart
+        routes
     }
 
     /// What a sub-tree needs for its motion less what its sensors measure, for these parameters and the log's own unknowns, after [`RowMaker::make`]: about its top link's origin, in that link's
@@ -737,11 +759,7 @@ impl<'a> RowMaker<'a> {
                 a[column] = instant.acceleration[dof];
             }
             let velocity = instant.velocity[dof];
-            g[6 * wrenches + FRICTION * place..][..FRICTION].copy_from_slice(&[
-                (velocity / COULOMB_SPEED).tanh(),
-                velocity,
-                1.0,
-            ]);
+            g[6 * wrenches + FRICTION * place..][..FRICTION].copy_from_slice(&friction_row(velocity));
             n[6 * wrenches + place] = 1.0;
         }
         Ok(())

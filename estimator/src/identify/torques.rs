@@ -343,7 +343,7 @@ fn delays(
                 }
             }
         };
-        tell_with(maker, piece, &identified.noise, width, &mut columns)
+        tell_with(maker, piece, &identified.noise, &[], width, &mut columns)
     });
     let (r, z) = added(&told, p + width).to_triangle();
     let mut precision = layout.precision.clone();
