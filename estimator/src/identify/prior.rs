@@ -230,7 +230,7 @@ impl Prior {
     }
 
     /// With what is known of CAD before any data: its masses and second moments are off by the share `relative`, to a
-    /// factor of [`FACTOR`].
+    /// factor of 1.5.
     /// That is `tau = relative / sqrt 2` ([`crate::parameters::cad_root`]). Zero: CAD is exact.
     #[must_use]
     pub fn expecting(self, relative: f64) -> Self {
