@@ -1,6 +1,8 @@
 //! The verbs that turn one file into another: decode, encode, estimate.
 
+use crate::identify::summary;
 use anyhow::{Context, bail};
+use proprio_estimator::assessment::{Assessment, Assessor, Coverage};
 use proprio_estimator::config::ConfigError;
 use proprio_estimator::files;
 use proprio_estimator::setup::Setup;
@@ -64,6 +66,9 @@ pub(crate) struct Estimate {
     /// The table of estimates to write; - for standard output
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
+    /// Say how good they are: readings predicted with the parameters in force beside CAD's, residuals and measured torques within what is stated
+    #[arg(long)]
+    assess: bool,
     /// Print what became of the log as JSON
     #[arg(long)]
     json: bool,
@@ -318,9 +323,14 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
             config.parameters = Some(parameters.clone());
         }
     })?;
+    let mut assessor = args.assess.then(|| assessor(args, &setup)).transpose()?;
     let log = input(&args.log)?;
     let mut out = Output::new(&args.out)?;
-    let report = match proprio_estimator::offline::estimate(setup, log, out.writer()) {
+    let report = match &mut assessor {
+        Some(assessor) => proprio_estimator::offline::assess(setup, log, out.writer(), assessor),
+        None => proprio_estimator::offline::estimate(setup, log, out.writer()),
+    };
+    let report = match report {
         Ok(report) => report,
         Err(error @ proprio_estimator::offline::OfflineError::MissingChannels(_)) => {
             // The log is what it is: the configuration does not fit it.
@@ -357,17 +367,24 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
             report.first_dropped.unwrap_or_default()
         );
     }
+    let assessment = assessor.map(Assessor::finish);
     if args.json {
-        let summary = json!({
+        let mut summary = json!({
             "estimates": report.estimates, "torques_withheld": report.withheld, "rows": report.log.rows,
             "bad_rows": report.log.bad_rows, "late": late, "backward": backward, "not_finite": not_finite,
         });
+        if let Some(assessment) = &assessment {
+            summary["assessment"] = assessment_json(assessment);
+        }
         tell_json(&args.out, &summary);
     } else {
         eprintln!(
             "{} estimates from {} rows; {} torques withheld",
             report.estimates, report.log.rows, report.withheld
         );
+        if let Some(assessment) = &assessment {
+            tell_assessment(assessment);
+        }
     }
     if report.estimates == 0 {
         bail!(
@@ -376,6 +393,67 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
         );
     }
     Ok(())
+}
+
+/// Reads the log once before the estimates.
+fn assessor(args: &Estimate, setup: &Setup) -> anyhow::Result<Assessor> {
+    if args.log == Path::new("-") {
+        bail!("--assess reads the log twice: give a file with --log, not standard input");
+    }
+    Assessor::new(setup, input(&args.log)?).with_context(|| args.log.display().to_string())
+}
+
+fn assessment_json(assessment: &Assessment) -> serde_json::Value {
+    let coverage = |of: &[(String, Coverage)]| -> serde_json::Map<_, _> {
+        let entry = |(name, c): &(String, Coverage)| {
+            let figures = json!({ "rms": c.rms, "within_two_deviations": c.covered, "count": c.count });
+            (name.clone(), figures)
+        };
+        of.iter().map(entry).collect()
+    };
+    json!({
+        "predicted": summary::predicted(&assessment.predicted), "changes": assessment.changes,
+        "residuals": coverage(&assessment.residuals), "torques": coverage(&assessment.torques),
+    })
+}
+
+fn tell_assessment(assessment: &Assessment) {
+    let Assessment {
+        predicted,
+        changes,
+        residuals,
+        torques,
+    } = assessment;
+    let [once, drifting] = [&predicted.relative_error, &predicted.relative_error_with_drift];
+    if once.cad.is_finite() {
+        let percent = [once.identified, once.cad, drifting.identified, drifting.cad].map(|x| 100.0 * x);
+        let [own, cad, own_drifting, cad_drifting] = percent;
+        let how = match changes {
+            0 => "the parameters given".to_owned(),
+            1 => "those in force (changed once)".to_owned(),
+            _ => format!("those in force (changed {changes} times)"),
+        };
+        eprintln!(
+            "F/T readings are predicted {own:.1} % off with {how}, {cad:.1} % with the CAD's; {own_drifting:.1} and {cad_drifting:.1} % beside offsets that drift"
+        );
+    } else {
+        eprintln!("no F/T reading can be predicted: a contact that is always present, or no usable sample");
+    }
+    for (top, c) in residuals {
+        eprintln!(
+            "residual at {top}: {:.1} % of {} within two deviations",
+            100.0 * c.covered,
+            c.count
+        );
+    }
+    for (joint, c) in torques {
+        eprintln!(
+            "torque of {joint}: {:.4} Nm (RMS) from what was measured, {:.1} % of {} within two deviations",
+            c.rms,
+            100.0 * c.covered,
+            c.count
+        );
+    }
 }
 
 /// JSON goes to standard output, unless the table itself does.

@@ -7,7 +7,7 @@ mod advice;
 #[cfg(test)]
 mod example;
 mod page;
-mod summary;
+pub(crate) mod summary;
 
 use crate::convert::blame_columns;
 use advice::{Advice, findings, sentence};

@@ -118,6 +118,17 @@ impl Calibration {
         Self::new(change * self.gain, wrench(&own) + *more, self.reference.or(reference))
     }
 
+    /// What [`Calibration::then`] was given to make this one of `first`: the gain's error `e` and the
+    /// further change per kelvin, [torque; force]. An error of zero where `first` has no inverse.
+    #[must_use]
+    pub fn after(&self, first: &Self) -> (Matrix6<f64>, [f64; 6]) {
+        let inverse = first.gain.try_inverse();
+        let change = inverse.map_or_else(Matrix6::identity, |inverse| self.gain * inverse);
+        let carried = wrench(&(change * Vector6::from(first.per_kelvin.torque_first())));
+        let more = (self.per_kelvin - carried).torque_first();
+        (change - Matrix6::identity(), more)
+    }
+
     /// The gain row by row, rows and columns [force; torque].
     #[must_use]
     pub fn gain_force_first(&self) -> [f64; 36] {
@@ -295,6 +306,13 @@ mod tests {
         for (a, b) in got.force_first().into_iter().zip(expected.force_first()) {
             assert!((a - b).abs() < 1e-12, "{a} {b}");
         }
+        let (e_again, more_again) = first.then(&e, &more, Some(99.0)).after(&first);
+        assert!((e_again - e).norm() < 1e-12);
+        let same = more_again
+            .iter()
+            .zip(more.torque_first())
+            .all(|(a, b)| (a - b).abs() < 1e-12);
+        assert!(same, "{more_again:?}");
         // A first one without a reference gets one.
         let plain = Calibration::default().then(&Matrix6::zeros(), &more, Some(20.0));
         assert_eq!(plain.apply(&raw, 21.0), raw - more);

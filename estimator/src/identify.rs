@@ -54,14 +54,16 @@ mod wrenches;
 mod yardstick;
 mod zeros;
 
+pub(crate) use batch::judged_instants;
 pub use batch::{IdentifyError, Log, Options, Progress, identify};
 pub use export::parameters;
 pub use gate::UnitSet;
 pub use outcome::{
     BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
-    FrictionOutcome, JointOutcome, LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Predicted, Role,
+    FrictionOutcome, InForce, JointOutcome, LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Predicted, Role,
     RotorOutcome, SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome, Verdict, WeakDirection,
 };
+pub(crate) use yardstick::predicted;
 
 /// The axes of a wrench as samples have them, in words.
 const AXES: [&str; 6] = ["fx", "fy", "fz", "tx", "ty", "tz"];

@@ -19,6 +19,7 @@
 //! - [`files`]: files that are replaced whole.
 //! - [`offline`]: a table of samples to a table of estimates; [`daemon`]: the same from and to shared memory.
 
+pub mod assessment;
 pub mod calibration;
 pub mod config;
 pub mod daemon;

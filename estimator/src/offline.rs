@@ -15,6 +15,7 @@
 //! | `residual/<link>/significance` | how rare that is if nothing unknown acts, in standard deviations of a normal variable; empty where nothing can be tested |
 //! | `residual/<link>/reason` | what it comes from: the contact that was detected there, or `unexplained` |
 
+use crate::assessment::Assessor;
 use crate::pipeline::{Estimate, Pipeline};
 use crate::setup::{Channel, Setup};
 use proprio_topics::csv::{Item, Reader, Report, Row, Series, Value, What};
@@ -66,6 +67,28 @@ fn solve(pipeline: &mut Pipeline) {
 /// # Errors
 /// [`OfflineError`]; a joint that the log lacks and the configuration does not lock is one.
 pub fn estimate(setup: Setup, log: impl Read, out: impl Write) -> Result<EstimateReport, OfflineError> {
+    estimate_with(setup, log, out, None)
+}
+
+/// The same, and `assessor`, which has read this log, gets the estimates, too.
+///
+/// # Errors
+/// As for [`estimate`].
+pub fn assess(
+    setup: Setup,
+    log: impl Read,
+    out: impl Write,
+    assessor: &mut Assessor,
+) -> Result<EstimateReport, OfflineError> {
+    estimate_with(setup, log, out, Some(assessor))
+}
+
+fn estimate_with(
+    setup: Setup,
+    log: impl Read,
+    out: impl Write,
+    mut assessor: Option<&mut Assessor>,
+) -> Result<EstimateReport, OfflineError> {
     let mut reader = Reader::new(log)?;
     let mut report = EstimateReport::default();
     let mut pipeline = Pipeline::new(setup);
@@ -92,6 +115,18 @@ pub fn estimate(setup: Setup, log: impl Read, out: impl Write) -> Result<Estimat
     let apart = pipeline.setup().max_silence + pipeline.setup().max_silence + Nanos(1);
     let (mut row, mut pseudo) = (Row::default(), Nanos::ZERO);
     let mut stamped = true;
+    let mut write = |pipeline: &mut Pipeline, stamped: bool| -> Result<(), OfflineError> {
+        while let Some(estimate) = pipeline.poll() {
+            table.write(estimate, stamped)?;
+            if let Some(assessor) = &mut assessor {
+                assessor.estimate(estimate);
+                let t = estimate.t;
+                assessor.parameters(t, pipeline);
+            }
+            solve(pipeline);
+        }
+        Ok(())
+    };
     while reader.next_row(&mut row)? {
         let t = row.t.unwrap_or_else(|| {
             stamped = false;
@@ -111,16 +146,10 @@ pub fn estimate(setup: Setup, log: impl Read, out: impl Write) -> Result<Estimat
         if report.first_dropped.is_none() && counts.late + counts.backward + counts.not_finite > 0 {
             report.first_dropped = Some(row.line);
         }
-        while let Some(estimate) = pipeline.poll() {
-            table.write(estimate, stamped)?;
-            solve(&mut pipeline);
-        }
+        write(&mut pipeline, stamped)?;
     }
     pipeline.finish();
-    while let Some(estimate) = pipeline.poll() {
-        table.write(estimate, stamped)?;
-        solve(&mut pipeline);
-    }
+    write(&mut pipeline, stamped)?;
     (report.estimates, report.withheld) = (table.rows, table.withheld);
     table.out.flush()?;
     let counts = pipeline.counts();

@@ -506,6 +506,18 @@ impl Setup {
         &self.workbench
     }
 
+    /// The same without what was identified: with the URDF's inertias, and calibrations and offsets as
+    /// configured.
+    #[must_use]
+    pub fn as_configured(&self) -> Self {
+        let mut configured = Self {
+            identified: None,
+            ..self.clone()
+        };
+        configured.settle();
+        configured
+    }
+
     /// Inertias of the links as the URDF has them, whatever was identified.
     #[must_use]
     pub fn cad(&self) -> &[RigidInertia] {

@@ -3,6 +3,7 @@
 use nalgebra::{Matrix4, Matrix6, Vector6};
 use nix::sched::{CpuSet, sched_getaffinity, sched_setaffinity};
 use nix::unistd::Pid;
+use proprio_estimator::assessment::Assessor;
 use proprio_estimator::calibration::{Calibration, Unknown};
 use proprio_estimator::config::{Config, Gain, IdentificationInput, TorqueSide};
 use proprio_estimator::dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
@@ -515,13 +516,24 @@ fn leg_torques_from_either_sensor_agree() {
     }
 }
 
-/// Every choice of training logs, and every log that was not trained on: the error of what the identified parameters predict, relative to
-/// CAD's. Prints the table.
-fn every_choice(setup: &Setup, logs: &[(&str, &str)], inputs: &[IdentificationInput]) -> Vec<(Vec<usize>, usize, f64)> {
+/// Every choice of some of so many logs.
+fn every_choice(logs: usize) -> Vec<Vec<usize>> {
+    let logs_of = |choice: usize| (0..logs).filter(|log| choice >> log & 1 == 1).collect();
+    (1..1_usize << logs).map(logs_of).collect()
+}
+
+/// For each of these choices of training logs, and for each log, the error of what the identified
+/// parameters predict, relative to CAD's. Prints the table.
+fn predicted_ratios(
+    setup: &Setup,
+    logs: &[(&str, &str)],
+    inputs: &[IdentificationInput],
+    choices: Vec<Vec<usize>>,
+) -> Vec<(Vec<usize>, usize, f64)> {
     let mut ratios = Vec::new();
     let mut of_cad = vec![Vec::new(); logs.len()];
-    for choice in 1..1_usize << logs.len() {
-        let is_trained = |log: usize| choice >> log & 1 == 1;
+    for trained in choices {
+        let is_trained = |log: usize| trained.contains(&log);
         let given: Vec<(&str, Role, &str)> = logs
             .iter()
             .enumerate()
@@ -534,7 +546,6 @@ fn every_choice(setup: &Setup, logs: &[(&str, &str)], inputs: &[IdentificationIn
             })
             .collect();
         let outcome = run(setup, &given, inputs);
-        let trained: Vec<usize> = (0..logs.len()).filter(|&log| is_trained(log)).collect();
         for (log, (file, _)) in logs.iter().enumerate() {
             let error = &outcome.logs[log].predicted.relative_error;
             if inputs == [IdentificationInput::Wrench] {
@@ -559,10 +570,9 @@ fn every_choice(setup: &Setup, logs: &[(&str, &str)], inputs: &[IdentificationIn
     ratios
 }
 
-/// What is identified, gains of the sensors included, is not worse than CAD where it was not fitted, but for what the last log,
-/// in which the foot comes to stand, says of the quiet second one: there constant offsets are 5 % worse, drifting ones 10 % better.
-#[test]
-fn leg_parameters_are_never_worse_than_cad_on_other_logs() {
+/// The right leg's parameters, gains of its sensors included, from these choices of the three logs, are
+/// at most so much worse than CAD's on each log that they were not fitted to.
+fn leg_is_never_worse(choices: Vec<Vec<usize>>) {
     // The foot stood on the ground at the beginning of the first and at the end of the last.
     let Some((setup, _)) = leg_with(|contact| contact != "right_leg") else {
         return;
@@ -570,9 +580,11 @@ fn leg_parameters_are_never_worse_than_cad_on_other_logs() {
     let files = ["icub_leg_12_24s.csv", "icub_leg_24_44s.csv", "icub_leg_57_70s.csv"];
     let tables: Vec<String> = files.iter().filter_map(|file| data(file)).collect();
     let logs: Vec<(&str, &str)> = files.into_iter().zip(tables.iter().map(String::as_str)).collect();
-    for (trained, log, ratio) in every_choice(&setup, &logs, &[IdentificationInput::Wrench]) {
-        let most = if (&trained[..], log) == (&[0][..], 1) {
-            1.25
+    for (trained, log, ratio) in predicted_ratios(&setup, &logs, &[IdentificationInput::Wrench], choices) {
+        // What the last log, in which the foot comes to stand, says of the quiet second one: with
+        // constant offsets 5 % worse, with drifting ones 9 % better.
+        let most = if (&trained[..], log) == (&[2][..], 1) {
+            1.07
         } else {
             1.02
         };
@@ -584,11 +596,24 @@ fn leg_parameters_are_never_worse_than_cad_on_other_logs() {
 }
 
 #[test]
+fn leg_parameters_are_not_worse_than_cad_on_another_log() {
+    leg_is_never_worse(vec![vec![2], vec![0, 1]]);
+}
+
+/// `cargo test -p proprio-estimator --test identify -- --ignored --nocapture never_worse`
+#[test]
+#[ignore = "minutes; prints the table of all choices of training logs"]
+fn leg_parameters_are_never_worse_than_cad_on_other_logs() {
+    leg_is_never_worse(every_choice(3));
+}
+
+#[test]
 fn kuka_parameters_are_better_than_cad_on_the_other_log() {
     let (Some(one), Some(two), Some(setup)) = (data("kuka_lwr4_1.csv"), data("kuka_lwr4_2.csv"), kuka()) else {
         return;
     };
-    for (trained, log, ratio) in every_choice(&setup, &[("one", &one), ("two", &two)], &TORQUE) {
+    let logs = [("one", &one[..]), ("two", &two[..])];
+    for (trained, log, ratio) in predicted_ratios(&setup, &logs, &TORQUE, vec![vec![0], vec![1]]) {
         assert!(ratio < 0.42, "{trained:?}: {ratio} on {log}");
     }
 }
@@ -1813,8 +1838,33 @@ fn with_gain(
     let outcome = run(&setup, &logs, &[IdentificationInput::Wrench]);
     let parameters = parameters(&outcome, &setup, "a test").expect("parameters");
     let torques = before_the_sensor(&setup, &parameters, truth, rest);
+    judged_alike(&setup, &parameters, rest, &outcome.logs[1].predicted);
     println!("{gain:?}: torque before the sensor {torques:?}");
     (outcome, parameters, torques)
+}
+
+/// The parameters, given to the estimator, are judged on a log as they were where they were identified.
+fn judged_alike(setup: &Setup, parameters: &Parameters, log: &str, predicted: &Predicted) {
+    let mut setup = setup.clone();
+    setup.apply(parameters).expect("its own parameters");
+    let mut assessor = Assessor::new(&setup, log.as_bytes()).expect("a log");
+    offline::assess(setup, log.as_bytes(), std::io::sink(), &mut assessor).expect("estimates");
+    let assessment = assessor.finish();
+    assert_eq!(assessment.changes, 0);
+    let of = |p: &Predicted| {
+        let [once, drifting] = [&p.relative_error, &p.relative_error_with_drift];
+        let each = p
+            .sensors
+            .iter()
+            .flat_map(|(_, rms)| rms.cad.into_iter().chain(rms.identified));
+        let whole = [once.cad, once.identified, drifting.cad, drifting.identified];
+        whole.into_iter().chain(each).collect::<Vec<f64>>()
+    };
+    let (own, other) = (of(&assessment.predicted), of(predicted));
+    assert_eq!((own.len(), other.len()), (16, 16));
+    for (own, other) in own.iter().zip(&other) {
+        assert!((own / other - 1.0).abs() < 1e-6, "{own} {other}");
+    }
 }
 
 #[test]

@@ -861,7 +861,31 @@ fn bad_rows_are_named_and_take_nothing_else_with_them() {
             ])
             .good()
     };
+    let assess = [
+        "estimate",
+        "--config",
+        "estimator.toml",
+        "--log",
+        "good.csv",
+        "--assess",
+    ];
+    let told = place.run(&[&assess[..], &["--out", "a.out"]].concat()).good();
+    // The hand may be touched all the time there.
+    assert!(told.err.contains("no F/T reading can be predicted"), "{}", told.err);
+    let told = place
+        .run(&[&assess[..], &["--out", "a.out", "--json"]].concat())
+        .good()
+        .json();
+    assert!(
+        told["assessment"]["predicted"]["relative_error"]["cad"].is_null(),
+        "{told}"
+    );
     let clean = estimate("good.csv", "good.out");
+    assert_eq!(
+        place.read("a.out"),
+        place.read("good.out"),
+        "figures change no estimate"
+    );
     assert!(clean.err.is_empty(), "{}", clean.err);
     let dirty = estimate("bad.csv", "bad.out");
     assert_eq!(
@@ -1021,6 +1045,11 @@ fn what_is_no_log_at_all_is_told_and_leaves_no_file() {
         estimate("empty").fails(1, &["empty: ", "must name the columns"]);
         estimate("text").fails(1, &["text: ", "must name the columns"]);
         estimate("noise").fails(1, &["noise: "]);
+        let assess = ["estimate", "--config", "estimator.toml", "--assess", "--out", out];
+        let assess = |log: &str| place.run(&[&assess[..], &["--log", log]].concat());
+        assess("none").fails(1, &["none: can not be read", "No such file"]);
+        assess("text").fails(1, &["text: ", "must name the columns"]);
+        assess("-").fails(1, &["--assess reads the log twice", "--log"]);
         estimate("header.csv").fails(2, &["header.csv", "no column for"]);
         let encode = |log: &str| place.run(&["encode", "--config", "gateway.toml", "--samples", log, "--out", out]);
         encode("none").fails(1, &["none: can not be read", "No such file"]);

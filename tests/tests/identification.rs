@@ -6,11 +6,12 @@
 //! Always the arm's sessions; an iCub's where somebody has made them: in `icub_sessions` beside the URDF that `PROPRIO_ICUB_MODELS` has
 //! (`tests/oracle/README.md` says how).
 
+use proprio_estimator::assessment::{Assessment, Assessor, Coverage};
 use proprio_estimator::config::{Config, ForceTorque, Presence};
 use proprio_estimator::identify::online::{Change, Counts, Paused, state};
 use proprio_estimator::identify::{Log, Options, Outcome, Role, Severity, Verdict, identify, parameters};
 use proprio_estimator::model::Model;
-use proprio_estimator::offline::estimate;
+use proprio_estimator::offline::{assess, estimate};
 use proprio_estimator::parameters::{Offset, Parameters, Provenance};
 use proprio_estimator::pipeline::{Estimate, Job, Pipeline};
 use proprio_estimator::setup::Setup;
@@ -534,6 +535,42 @@ fn on_line_the_torques_become_better_than_those_of_cad() {
     // From posture to posture, with pauses, there is less to learn from in 12 s, and CAD is nearly right in one wrist joint by chance.
     let (each, all) = after("validate");
     assert!(all > 2.0 && each.iter().all(|ratio| *ratio > 0.7), "{all} {each:?}");
+}
+
+/// Parameters that are learnt within a log are judged as they were in force: CAD's at first, then ever
+/// better ones. The torques that MuJoCo says are in the log as measured ones.
+#[test]
+fn a_run_that_learns_is_assessed_as_it_went() {
+    let sessions = arm();
+    let log = sessions.log("train");
+    let assessed = |setup: Setup, log: &str| {
+        let mut assessor = Assessor::new(&setup, log.as_bytes()).unwrap();
+        assess(setup, log.as_bytes(), std::io::sink(), &mut assessor).unwrap();
+        assessor.finish()
+    };
+    let learnt = assessed(learning(&sessions), &log);
+    println!("{learnt:?}");
+    let ratio = |assessment: &Assessment| {
+        let error = &assessment.predicted.relative_error;
+        error.identified / error.cad
+    };
+    assert!((0.45..0.8).contains(&ratio(&learnt)), "{}", ratio(&learnt));
+    assert!((3..20).contains(&learnt.changes), "{}", learnt.changes);
+    let figure = |of: &[(String, Coverage)], name: &str| of.iter().find(|(own, _)| own == name).unwrap().1;
+    let residual = figure(&learnt.residuals, "l_upper_arm");
+    assert!(residual.covered > 0.97 && residual.count > 1300, "{residual:?}");
+    let elbow = figure(&learnt.torques, "l_elbow");
+    assert!(elbow.covered > 0.9 && elbow.rms < 0.1 && elbow.count > 800, "{elbow:?}");
+    // CAD alone is as good as CAD; its torques are not those of the robot.
+    let cad = assessed(sessions.setup(Urdf::Cad, Some("train")), &log);
+    assert!((ratio(&cad) - 1.0).abs() < 1e-12 && cad.changes == 0);
+    // With the very parameters that the log was made with, nothing but noise is left.
+    let exact = assessed(sessions.setup(Urdf::True, Some("train")), &log);
+    let (elbow, of_cad) = (figure(&exact.torques, "l_elbow"), figure(&cad.torques, "l_elbow"));
+    assert!(
+        elbow.covered > 0.9 && 5.0 * elbow.rms < of_cad.rms,
+        "{elbow:?} {of_cad:?}"
+    );
 }
 
 #[test]

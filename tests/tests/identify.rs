@@ -345,9 +345,32 @@ fn a_wrong_cad_is_put_right_from_logs_of_the_simulated_arm() {
         let base = ["estimate", "--config", "estimator.toml", "--log", "three.csv", "--out"];
         let ran = place.run(&[&base[..], more].concat());
         assert!(ran.status.success(), "{}", String::from_utf8_lossy(&ran.stderr));
+        [ran.stdout, ran.stderr].map(|bytes| String::from_utf8(bytes).unwrap())
     };
     estimate(&["cad.csv"]);
-    estimate(&["identified.csv", "--parameters", "out/parameters.toml"]);
+    let with = ["identified.csv", "--parameters", "out/parameters.toml"];
+    estimate(&with);
+    let plain = place.read("identified.csv");
+    // Judged as identification judged it.
+    let [printed, _] = estimate(&[&with[..], &["--assess", "--json"]].concat());
+    assert_eq!(place.read("identified.csv"), plain, "figures change no estimate");
+    let assessment = &serde_json::from_str::<Json>(&printed).unwrap()["assessment"];
+    for set in ["cad", "identified"] {
+        let rms = |of: &Json| {
+            of["predicted"]["sensors_rms"]["l_arm_ft_sensor"][set]
+                .as_array()
+                .unwrap()
+                .clone()
+        };
+        for (own, other) in rms(assessment).iter().zip(rms(validated)) {
+            let [own, other] = [own, &other].map(|x| x.as_f64().unwrap());
+            assert!((own / other - 1.0).abs() < 1e-6, "{own} {other}");
+        }
+    }
+    let [_, told] = estimate(&[&with[..], &["--assess"]].concat());
+    for what in ["F/T readings are predicted ", "residual at l_upper_arm: "] {
+        assert!(told.contains(what), "{told}");
+    }
     assert_ne!(place.read("cad.csv"), place.read("identified.csv"));
     let config = place.read("estimator.toml");
     place.write(

@@ -179,7 +179,8 @@ fn log(log: &LogOutcome) -> Json {
     })
 }
 
-fn predicted(predicted: &Predicted) -> Json {
+/// How well a log is predicted.
+pub(crate) fn predicted(predicted: &Predicted) -> Json {
     json!({
         "relative_error": both(&predicted.relative_error),
         "relative_error_with_drift": both(&predicted.relative_error_with_drift),

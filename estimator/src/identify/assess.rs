@@ -10,7 +10,7 @@ use super::outcome::{
 use super::passes::{OFFSET_VARIANCE, Residuals, Told, leave, tell};
 use super::rows::{FRICTION, Further, Layout, RowMaker, Rows, WIDTH, friction_row};
 use super::session::Block;
-use super::yardstick::{self, Candidate, Errors, Yardstick};
+use super::yardstick::{self, Candidate, Yardstick};
 use super::{AXES, dot, parallel, torques, zeros};
 use crate::calibration::{Kind, Unknown, swapped};
 use crate::config::{Gain, IdentificationInput};
@@ -56,7 +56,7 @@ const UNREAD: f64 = 0.9 * OFFSET_VARIANCE;
 const PARAMETERS: [&str; 10] = ["m", "h_x", "h_y", "h_z", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz"];
 
 /// The channel of a sensor's quantity, given in the order of samples: channels have torques first.
-fn channel_of(sensor_place: usize, axis: usize) -> usize {
+pub(super) fn channel_of(sensor_place: usize, axis: usize) -> usize {
     6 * sensor_place + (axis + 3) % 6
 }
 
@@ -80,7 +80,7 @@ pub(super) fn channel_name(setup: &Setup, layout: &Layout, channel: usize) -> (S
     }
 }
 
-fn rms(values: impl Iterator<Item = f64>) -> f64 {
+pub(super) fn rms(values: impl Iterator<Item = f64>) -> f64 {
     let (mut sum, mut count) = (0.0, 0.0);
     for value in values.filter(|x| x.is_finite()) {
         sum += value * value;
@@ -1028,7 +1028,7 @@ fn log_outcome(
             measured_rms_nm: rms(measured.iter().copied()),
             coverage: place.map_or(f64::NAN, |place| coverage[wrenches + place]),
         });
-        torque_share.push((errors, measured));
+        torque_share.push((errors.to_vec(), measured));
     }
 
     let mut sensors = Vec::new();
@@ -1053,13 +1053,9 @@ fn log_outcome(
             let scale = if axis < 3 { Structure::LENGTH_SCALE } else { 1.0 };
             let load = &compared.load[channel];
             let (centre, raw_mean) = (mean(load), mean(errors[0]));
-            let errors = [
-                errors[0].iter().map(|x| (x - raw_mean) * scale).collect::<Vec<_>>(),
-                errors[1].iter().map(|x| x * scale).collect(),
-                errors[2].iter().map(|x| x * scale).collect(),
-                Vec::new(),
-                Vec::new(),
-            ];
+            let errors: Vec<Vec<f64>> = (errors.iter().zip([raw_mean, 0.0, 0.0]))
+                .map(|(errors, mean)| errors.iter().map(|x| (x - mean) * scale).collect())
+                .collect();
             wrench_share.push((errors, load.iter().map(|x| (x - centre) * scale).collect::<Vec<_>>()));
         }
         sensors.push(SensorOutcome {
@@ -1082,14 +1078,16 @@ fn log_outcome(
         }
         (above / below).sqrt()
     };
-    let predicted = predicted(
-        setup,
-        instants,
-        identified,
-        candidates,
-        is_of_torque.then(|| both([3, 4].map(relative))),
-        torques_predicted,
+    let yardstick = Yardstick::of_record(setup, &identified.inputs, identified.calibrated, instants);
+    // Rows were made of these very instants before.
+    let mut predicted = yardstick.map_or_else(
+        |_| Predicted::default(),
+        |yardstick| yardstick.predicted(layout, candidates),
     );
+    predicted.joints = torques_predicted;
+    if is_of_torque {
+        predicted.relative_error = both([3, 4].map(relative));
+    }
     let deviations = session_deviations(maker, log, instants, identified, root);
     let (late, found) = if usable {
         time_offsets(layout, log, &compared)
@@ -1117,58 +1115,7 @@ fn log_outcome(
     }
 }
 
-/// How well the parameters predict a log: joint torques as given, of what F/T sensors read by their
-/// yardstick.
-fn predicted(
-    setup: &Setup,
-    instants: &[super::instants::Instant],
-    identified: &Identified,
-    candidates: &[Candidate; 2],
-    of_torque: Option<Both<f64>>,
-    joints: Vec<(String, Both<f64>)>,
-) -> Predicted {
-    let Ok(yardstick) = Yardstick::of_record(setup, &identified.inputs, identified.calibrated, instants) else {
-        // Rows were made of these very instants before.
-        return Predicted::default();
-    };
-    let layout = yardstick.layout();
-    let errors = yardstick.errors(&identified.layout, candidates);
-    let wrenches = 6 * layout.sensors.len();
-    let (mut squares, mut all) = ([[0.0; 2]; 2], 0.0);
-    for channel in 0..wrenches {
-        let weighed = |values: &[f64]| -> f64 {
-            let finite = values.iter().filter(|x| x.is_finite());
-            finite.map(|x| (x * yardstick::scale(channel)).powi(2)).sum()
-        };
-        for ([constant, drifting], errors) in squares.iter_mut().zip(&errors) {
-            *constant += weighed(&errors.channels[channel]);
-            *drifting += weighed(&errors.drifting[channel]);
-        }
-        all += weighed(&yardstick.load(channel, &errors[0]));
-    }
-    let relative = |which: usize| both(squares.map(|of| (of[which] / all).sqrt()));
-    let series = |of: &dyn Fn(&Errors) -> f64| both([of(&errors[0]), of(&errors[1])]);
-    let of_channel = |channel: usize| series(&|errors| rms(errors.channels[channel].iter().copied()));
-    let of_sensor = |place: usize| {
-        let axes: [Both<f64>; 6] = std::array::from_fn(|axis| of_channel(channel_of(place, axis)));
-        both([axes.map(|axis| axis.cad), axes.map(|axis| axis.identified)])
-    };
-    let routes = (0..setup.model.dof_count()).map(|dof| {
-        let of_dof = series(&|errors| rms(errors.routes[dof].iter().copied()));
-        (setup.model.dof_name(dof).to_owned(), of_dof)
-    });
-    Predicted {
-        relative_error: of_torque.unwrap_or(relative(0)),
-        relative_error_with_drift: relative(1),
-        joints,
-        sensors: (layout.sensors.iter().enumerate())
-            .map(|(place, sensor)| (sensor_name(setup, *sensor), of_sensor(place)))
-            .collect(),
-        two_route: routes.filter(|(_, rms)| rms.cad.is_finite()).collect(),
-    }
-}
-
-fn both<T: Copy>([cad, identified]: [T; 2]) -> Both<T> {
+pub(super) fn both<T: Copy>([cad, identified]: [T; 2]) -> Both<T> {
     Both { cad, identified }
 }
 

@@ -535,6 +535,15 @@ pub(super) fn time_offsets(
     (offsets, findings)
 }
 
+/// The instants of a log by which parameters are judged: those at which motion is known.
+///
+/// # Errors
+/// As for [`Recording::read`].
+pub(crate) fn judged_instants(setup: &Setup, log: impl Read) -> Result<Vec<Instant>, RecordingError> {
+    let recording = Recording::read(setup, log)?;
+    Ok(usable(setup, String::new(), Role::Validate, recording).instants)
+}
+
 /// Keeps the instants at which motion is known.
 fn usable(setup: &Setup, file: String, role: Role, recording: Recording) -> Prepared {
     let found = recording.instants(setup, &Settings::default());
@@ -670,11 +679,7 @@ pub(super) fn finding(defect: &Defect) -> Finding {
 
 /// No variance is taken as less: a hundredth of the configured deviation of a sensor's channel, a ten thousandth of a newton metre of a torque.
 fn least_variances(setup: &Setup, layout: &Layout) -> Vec<f64> {
-    let mut least = Vec::new();
-    for &sensor in &layout.sensors {
-        let noise = setup.structure.sensors()[sensor].noise();
-        least.extend(noise.torque.iter().chain(&noise.force).map(|x| (0.01 * x).powi(2)));
-    }
+    let mut least: Vec<f64> = layout.stated(setup).map(|x| (0.01 * x).powi(2)).collect();
     least.resize(layout.channels(), 1e-8);
     least
 }
@@ -952,24 +957,22 @@ fn chosen_gain(
         return Ok((Gain::None, None));
     }
     read_as_fitted(maker, prepared, settled);
-    let walks = walks(maker.setup(), maker.layout(), Slow::OfSensors);
     let mut held = |gain: Gain| -> Result<guard::Held, IdentifyError> {
         let training = used(prepared);
         let instants = training.iter().flat_map(|log| log.instants.iter());
         maker.calibrate(Kind { gain, ..wanted }, instants);
         let sampled = sample(maker, &training);
         let Settled { prior, noise, fit, .. } = settled;
-        Ok(guard::held_out(maker, prior, &sampled, noise, fit.tau, &walks)?.held)
+        Ok(guard::held_out(maker, prior, &sampled, noise, fit.tau)?.held)
     };
-    let (mut chosen, mut best) = (Gain::None, held(Gain::None)?);
-    let mut better = 0.0;
+    let none = held(Gain::None)?;
+    let (mut chosen, mut best) = (Gain::None, none.clone());
     for gain in [Gain::Diagonal, Gain::Full] {
         let other = held(gain)?;
         let (gained, error) = other.gain_over(&best);
         if gained <= error {
             break;
         }
-        better = 1.0 - (1.0 - better) * other.relative_to(&best);
         (chosen, best) = (gain, other);
     }
     // As the fit at hand has it.
@@ -989,7 +992,7 @@ fn chosen_gain(
     };
     let text = format!(
         "{what}: readings of data held out are predicted with {:.0} % less error than without (identification.gain = \"none\" leaves the workbench's gains as they are)",
-        100.0 * better
+        100.0 * (1.0 - best.relative_to(&none))
     );
     let note = Finding {
         severity: Severity::Note,
@@ -1014,7 +1017,7 @@ enum Slow {
 fn walks(setup: &Setup, layout: &Layout, slow: Slow) -> Walks {
     let rates = match slow {
         Slow::All => vec![f64::INFINITY; 6 * layout.sensors.len()],
-        Slow::OfSensors => super::yardstick::stated_variances(setup, layout),
+        Slow::OfSensors => layout.stated(setup).map(|x| x * x).collect(),
     };
     Walks {
         relative: (super::passes::BLOCK / DRIFT_TIME).powi(2),
@@ -1131,17 +1134,12 @@ fn fit(
     let information = added(&told, layout.unknowns());
     let fit = posterior(&prior, &layout, &information)?.weigh()?;
     progress("held-out data".into(), 0.75);
-    let mut guard = guard::held_out(
-        maker,
-        &prior,
-        &sample(maker, training),
-        &noise,
-        fit.tau,
-        &walks(maker.setup(), &layout, Slow::OfSensors),
-    )?;
+    let sampled = sample(maker, training);
+    let mut guard = guard::held_out(maker, &prior, &sampled, &noise, fit.tau)?;
     guard.findings.extend(unsettled(change));
     // Parameters have taken a part of the noise that they were fitted to, most of all where it is as slow as the motion.
-    let noise = guard.noise;
+    let walks = walks(maker.setup(), &layout, Slow::OfSensors);
+    let noise = guard.noise(maker, &sampled, noise, &walks);
     let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, &noise));
     let information = added(&told, layout.unknowns());
     let fit = posterior(&prior, &layout, &information)?.weigh()?;

@@ -17,7 +17,7 @@ use super::outcome::{Finding, Severity};
 use super::passes::{NoiseModel, Piece, Residuals, Walks, leave, noise_of, tell_with};
 use super::prior::Prior;
 use super::rows::{Groups, RowMaker};
-use super::yardstick::{self, Candidate, Errors, Yardstick};
+use super::yardstick::{self, Candidate, Errors, Free, Yardstick};
 use super::{assess, parallel};
 use nalgebra::{DMatrix, DVector};
 use proprio_topics::Nanos;
@@ -34,10 +34,31 @@ pub(super) struct Guard {
     /// What is kept, per link of the layout, then per further unknown.
     pub share: Vec<f64>,
     pub findings: Vec<Finding>,
-    /// Noise, corrected by what held-out data show of it.
-    pub noise: NoiseModel,
     /// How well held-out data are predicted with what is kept.
     pub held: Held,
+    blocks: Vec<Block>,
+    /// Per fold, the parameters by all others.
+    sets: Vec<DVector<f64>>,
+}
+
+impl Guard {
+    /// Noise of the same pieces, corrected by what held-out data show of it.
+    pub(super) fn noise(
+        &self,
+        maker: &RowMaker<'_>,
+        pieces: &[Piece<'_>],
+        noise: NoiseModel,
+        walks: &Walks,
+    ) -> NoiseModel {
+        if self.sets.is_empty() {
+            return noise;
+        }
+        let left: Vec<Residuals> = over(maker, pieces, |maker, number, piece| {
+            let own = self.blocks.iter().filter(|block| block.piece == number);
+            each_from_its_fold(leave(maker, piece, &noise, &self.sets), own)
+        });
+        noise.midway(&noise_of(maker.layout(), &left, 0, walks, &noise.least))
+    }
 }
 
 /// Errors of held-out data.
@@ -80,13 +101,15 @@ struct Block {
 }
 
 /// Holds out fold after fold of these pieces of the training logs.
+///
+/// # Errors
+/// As for [`posterior`].
 pub(super) fn held_out(
     maker: &RowMaker<'_>,
     prior: &Prior,
     pieces: &[Piece<'_>],
     noise: &NoiseModel,
     tau: f64,
-    walks: &Walks,
 ) -> Result<Guard, IdentifyError> {
     let layout = maker.layout();
     let total: usize = pieces.iter().map(|piece| piece.instants.len()).sum();
@@ -95,12 +118,12 @@ pub(super) fn held_out(
         return Ok(Guard {
             share: vec![0.0; layout.links.len() + layout.further.len()],
             findings: vec![not_checked()],
-            noise: noise.clone(),
             held: Held::default(),
+            blocks: Vec::new(),
+            sets: Vec::new(),
         });
     }
     let blocks = blocks(pieces, count);
-    // Of each fold CAD and what the others say.
     let told = parallel::map_with(
         count * pieces.len(),
         || maker.clone(),
@@ -115,6 +138,9 @@ pub(super) fn held_out(
     );
     let mut sets: Vec<DVector<f64>> = Vec::new();
     let mut candidates: Vec<Candidate> = Vec::new();
+    // Of each fold, CAD and what the others say.
+    let mut pairs: Vec<[usize; 2]> = Vec::new();
+    let cad_is_one = layout.beside_cad().is_empty() && layout.joints.is_empty();
     for (fold, told) in told.chunks(pieces.len()).enumerate() {
         let others: Information = added(told, layout.unknowns());
         let own = posterior(prior, layout, &others)?.fit(tau)?;
@@ -124,21 +150,28 @@ pub(super) fn held_out(
         let of_others = blocks.iter().filter(|block| block.fold != fold);
         let instants = of_others.flat_map(|block| &pieces[block.piece].instants[block.range.clone()]);
         let friction = yardstick::friction(maker, instants, &both);
-        candidates.extend(both.iter().zip(friction).map(|(d, friction)| Candidate {
+        let both_judged = both.iter().zip(friction).map(|(d, friction)| Candidate {
             course: vec![(Nanos::ZERO, d.clone())],
             friction,
-        }));
+        });
+        let knows_cad = cad_is_one && fold > 0;
+        candidates.extend(both_judged.skip(usize::from(knows_cad)));
+        let last = candidates.len() - 1;
+        pairs.push([if knows_cad { 0 } else { last - 1 }, last]);
         sets.push(both.into_iter().nth(1).unwrap_or_default());
     }
     let errors: Vec<Vec<Errors>> = pieces
         .iter()
-        .map(|piece| Yardstick::of_fit(maker, piece.instants).errors(layout, &candidates))
+        .map(|piece| Yardstick::of_fit(maker, piece.instants).errors(layout, &candidates, Free::Constants))
         .collect();
     // Per channel and block: sums of e0 (e0 - e1), (e0 - e1)^2 and e0^2.
     let sums: Vec<Vec<Sums>> = (0..layout.channels())
         .map(|channel| {
             let of_block = |block: &Block| {
-                let of = |set: usize| &errors[block.piece][2 * block.fold + set].channels[channel][block.range.clone()];
+                let of = |set: usize| {
+                    let of_candidate = &errors[block.piece][pairs[block.fold][set]];
+                    &of_candidate.channels[channel][block.range.clone()]
+                };
                 let pairs = of(0)
                     .iter()
                     .zip(of(1))
@@ -157,25 +190,20 @@ pub(super) fn held_out(
     let (share, findings) = kept(maker, &folds, &sums);
     let squares = sums.iter().enumerate().map(|(channel, sums)| {
         let own = links_of(maker, channel).map_or(0.0, |place| share[place]);
-        let unit = unit(maker, channel).powi(2);
-        let left = |sums: &Sums| (unit * (sums.cad - sums.gain(own)), sums.count);
+        let scale = layout.scale(channel).powi(2);
+        let left = |sums: &Sums| (scale * (sums.cad - sums.gain(own)), sums.count);
         sums.iter().map(left).collect()
     });
     let held = Held {
         squares: squares.collect(),
         folds,
     };
-    let left: Vec<Residuals> = over(maker, pieces, |maker, _, piece| leave(maker, piece, noise, &sets));
-    let left: Vec<Residuals> = left
-        .into_iter()
-        .enumerate()
-        .map(|(piece, left)| each_from_its_fold(left, blocks.iter().filter(|b| b.piece == piece)))
-        .collect();
     Ok(Guard {
         share,
         findings,
-        noise: noise.midway(&noise_of(layout, &left, 0, walks, &noise.least)),
         held,
+        blocks,
+        sets,
     })
 }
 
@@ -195,15 +223,6 @@ impl Sums {
     /// By how much squares are less than CAD's with a share of the change.
     fn gain(&self, share: f64) -> f64 {
         2.0 * share * self.cross - share * share * self.square
-    }
-}
-
-/// What turns a channel's unit into Nm.
-fn unit(maker: &RowMaker<'_>, channel: usize) -> f64 {
-    if channel < 6 * maker.layout().sensors.len() {
-        yardstick::scale(channel)
-    } else {
-        1.0
     }
 }
 
@@ -313,7 +332,7 @@ fn kept(maker: &RowMaker<'_>, folds: &[usize], sums: &[Vec<Sums>]) -> (Vec<f64>,
             let of_block = |block: usize| -> f64 {
                 let each = some
                     .iter()
-                    .map(|&c| unit(maker, c).powi(2) * sums[c][block].gain(share));
+                    .map(|&c| layout.scale(c).powi(2) * sums[c][block].gain(share));
                 each.sum()
             };
             total(&(0..folds.len()).map(of_block).collect::<Vec<f64>>(), folds)

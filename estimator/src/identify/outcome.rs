@@ -61,6 +61,17 @@ pub struct Predicted {
     pub two_route: Vec<(String, Both<f64>)>,
 }
 
+/// Parameters that were in force from some instant on.
+#[derive(Clone, Debug, PartialEq)]
+pub struct InForce {
+    /// The first estimate that rested on them.
+    pub since: Nanos,
+    /// All links' inertias.
+    pub bodies: Vec<RigidInertia>,
+    /// All F/T sensors' calibrations.
+    pub calibrations: Vec<Calibration>,
+}
+
 /// How serious a finding is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Severity {

@@ -21,7 +21,7 @@ use super::instants::Instant;
 use super::{dot, factorise, forward};
 use crate::calibration::{Kind, Unknown};
 use crate::config::{IdentificationInput, TorqueSide};
-use crate::dynamics::{DynamicsError, JointState, Kinematics};
+use crate::dynamics::{DynamicsError, JointState, Kinematics, Structure};
 use crate::regressor::{Regressor, StackedRegressor, Weighting};
 use crate::setup::Setup;
 use crate::spatial::{Motion, Vec3, Wrench};
@@ -131,6 +131,23 @@ impl Layout {
         6 * self.sensors.len() + self.joints.len()
     }
 
+    /// What turns a channel's unit into Nm.
+    pub(super) fn scale(&self, channel: usize) -> f64 {
+        if channel < 6 * self.sensors.len() && channel % 6 >= 3 {
+            Structure::LENGTH_SCALE
+        } else {
+            1.0
+        }
+    }
+
+    /// Deviations of the channels of F/T sensors, as stated.
+    pub(super) fn stated<'a>(&'a self, setup: &'a Setup) -> impl Iterator<Item = f64> + 'a {
+        self.sensors.iter().flat_map(|&sensor| {
+            let noise = setup.structure.sensors()[sensor].noise();
+            noise.torque.into_iter().chain(noise.force)
+        })
+    }
+
     /// The session's unknown that a channel's offset is.
     pub(super) fn offset_of(&self, channel: usize) -> usize {
         let wrenches = 6 * self.sensors.len();
@@ -169,7 +186,7 @@ impl Rows {
         }
     }
 
-    fn clear(&mut self) {
+    pub(super) fn clear(&mut self) {
         self.count = 0;
         self.units.clear();
         for part in [&mut self.a, &mut self.r, &mut self.g, &mut self.n, &mut self.factor] {

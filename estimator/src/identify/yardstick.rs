@@ -9,22 +9,26 @@
 //!
 //! `M_k` lays all of what the rows leave to sensor `k` ([`laid_to`]), `E_k` is what is wrong with its
 //! gain: readings are predicted as the sensor gives them, for two sensors that are corrected to
-//! nothing would agree perfectly. `S` turns forces into moments ([`Structure::LENGTH_SCALE`]).
+//! nothing would agree perfectly. `S` turns forces into moments ([`Layout::scale`]).
 //! Parameters, gains and friction are as they were found in the training logs. Free are the offsets
 //! `s` alone: one constant for each channel and log; and, for a second figure, a linear drift besides.
 //! (An offset that walks takes up what the model has wrong, the more the faster it may walk.)
+//! Parameters found on-line are judged as they were in force: at each instant those that had been learnt
+//! by then, beside the offsets that these leave in the log as a whole ([`predicted`]).
 
-use super::assess::laid_to;
+use super::assess::{both, channel_of, laid_to, rms, sensor_name};
 use super::instants::Instant;
+use super::outcome::{Both, InForce, Predicted};
 use super::parallel;
 use super::passes::OFFSET_VARIANCE;
 use super::rows::{FRICTION, Further, Layout, RowMaker, Rows};
 use super::{add_multiple, dot};
 use crate::calibration::{Kind, Unknown};
-use crate::config::IdentificationInput;
-use crate::dynamics::{DynamicsError, Structure};
+use crate::config::{Gain, IdentificationInput};
+use crate::dynamics::DynamicsError;
 use crate::setup::Setup;
-use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3};
+use crate::spatial::RigidInertia;
+use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Matrix6xX, Vector3, Vector6};
 use proprio_topics::Nanos;
 
 /// Instants of a log that are looked at, at the most: its RMS is known from these to 1 %, and CAD's
@@ -49,10 +53,18 @@ pub(super) struct Candidate {
 pub(super) struct Errors {
     /// Per channel of the layout, readings with constant offsets, and torques.
     pub channels: Vec<Vec<f64>>,
-    /// Per channel of F/T sensors, with linear drifts.
+    /// Per channel of F/T sensors, with linear drifts; empty if these were not asked for.
     pub drifting: Vec<Vec<f64>>,
     /// Per degree of freedom whose torque two sides tell, their difference.
     pub routes: Vec<Vec<f64>>,
+}
+
+/// Which offsets are free.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Free {
+    Constants,
+    /// Once constants alone, once linear drifts besides.
+    WithDrifts,
 }
 
 /// A log to judge parameters by, and what rows can be made of it.
@@ -61,22 +73,103 @@ pub(super) struct Yardstick<'a> {
     instants: Vec<Instant>,
 }
 
-/// A candidate in the columns of the log's own layout.
-struct Own {
-    course: Vec<InForce>,
+/// The candidates in the columns of the log's own layout.
+struct Plan {
+    /// All parameters that any of them has in force at any time.
+    sets: Vec<Set>,
+    /// Distinct gains: what turns an error of what each sensor measures into one of what it reads.
+    gains: Vec<Vec<Matrix6<f64>>>,
+    courses: Vec<Course>,
+}
+
+/// What a candidate has in force.
+struct Course {
+    /// From when on which set.
+    sets: Vec<(Nanos, usize)>,
+    /// Of each joint.
     friction: Vec<[f64; FRICTION]>,
 }
 
-/// From when on, parameters, and what turns an error of what each sensor measures into one of what it
-/// reads.
-type InForce = (Nanos, DVector<f64>, Vec<Matrix6<f64>>);
+struct Set {
+    d: DVector<f64>,
+    /// Which gains.
+    gains: usize,
+}
+
+/// How well parameters that were in force at their times predict what F/T sensors read at the instants
+/// of a log, beside CAD's with the workbench's calibrations. `cad` is a setup without identified
+/// parameters, of which the instants were made; the course ascends in time, and its first parameters
+/// hold from the beginning.
+///
+/// # Errors
+/// Instants of another robot.
+pub(crate) fn predicted(cad: &Setup, instants: &[Instant], course: &[InForce]) -> Result<Predicted, DynamicsError> {
+    let has_gains = course.iter().any(|in_force| in_force.calibrations != cad.calibrations);
+    let kind = if has_gains {
+        Kind {
+            gain: Gain::Full,
+            temperature: true,
+        }
+    } else {
+        Kind::default()
+    };
+    let yardstick = Yardstick::of_record(cad, &[IdentificationInput::Wrench], kind, instants)?;
+    let layout = Layout {
+        links: (0..cad.model.link_count()).collect(),
+        further: (0..cad.calibrations.len())
+            .flat_map(|sensor| {
+                kind.unknowns()
+                    .map(move |unknown| Further::Calibration(sensor, unknown))
+            })
+            .collect(),
+        ..Layout::default()
+    };
+    let of_cad = vec![(Nanos::ZERO, DVector::zeros(layout.unknowns()))];
+    let own = course
+        .iter()
+        .map(|in_force| (in_force.since, beside(cad, &layout, in_force)));
+    let candidates = [of_cad, own.collect()].map(|course| Candidate {
+        course,
+        friction: Vec::new(),
+    });
+    Ok(yardstick.predicted(&layout, &candidates))
+}
+
+/// Parameters less CAD's, in the columns of a layout.
+fn beside(cad: &Setup, layout: &Layout, in_force: &InForce) -> DVector<f64> {
+    let mut d = DVector::zeros(layout.unknowns());
+    for (place, &link) in layout.links.iter().enumerate() {
+        let parameters = [&in_force.bodies[link], &cad.model.inertias()[link]].map(RigidInertia::parameters);
+        let change = parameters[0].iter().zip(parameters[1]).map(|(own, cad)| own - cad);
+        d.rows_mut(10 * place, 10)
+            .iter_mut()
+            .zip(change)
+            .for_each(|(d, change)| *d = change);
+    }
+    let changes: Vec<(Matrix6<f64>, [f64; 6])> = in_force
+        .calibrations
+        .iter()
+        .zip(&cad.calibrations)
+        .map(|(own, workbench)| own.after(workbench))
+        .collect();
+    for (further, value) in layout.further.iter().zip(d.iter_mut().skip(layout.inertial())) {
+        if let Further::Calibration(sensor, unknown) = *further {
+            let (gain, per_kelvin) = &changes[sensor];
+            *value = match unknown {
+                Unknown::Gain { channel, of } => gain[(channel, of)],
+                Unknown::Temperature { channel } => per_kelvin[channel],
+            };
+        }
+    }
+    d
+}
 
 /// One comparison of an instant.
 struct Comparison {
     of: Of,
-    /// What each candidate leaves without offsets.
+    /// What each set leaves without offsets.
     left: Vec<f64>,
-    /// What the offsets are multiplied by in it: by each candidate, or by all alike.
+    /// What the offsets are multiplied by in it, for each of the distinct gains.
     h: Vec<Vec<f64>>,
 }
 
@@ -123,12 +216,51 @@ impl<'a> Yardstick<'a> {
         }
     }
 
-    pub(super) fn layout(&self) -> &Layout {
+    fn layout(&self) -> &Layout {
         self.maker.layout()
     }
 
+    /// The figures of what F/T sensors read; none of joint torques.
+    pub(super) fn predicted(&self, layout: &Layout, candidates: &[Candidate; 2]) -> Predicted {
+        let setup = self.maker.setup();
+        let errors = self.errors(layout, candidates, Free::WithDrifts);
+        let layout = self.layout();
+        let (mut squares, mut all) = ([[0.0; 2]; 2], 0.0);
+        for channel in 0..6 * layout.sensors.len() {
+            let weighed = |values: &[f64]| -> f64 {
+                let finite = values.iter().filter(|x| x.is_finite());
+                finite.map(|x| (x * layout.scale(channel)).powi(2)).sum()
+            };
+            for ([constant, drifting], errors) in squares.iter_mut().zip(&errors) {
+                *constant += weighed(&errors.channels[channel]);
+                *drifting += weighed(&errors.drifting[channel]);
+            }
+            all += weighed(&self.load(channel, &errors[0]));
+        }
+        let relative = |which: usize| both(squares.map(|of| (of[which] / all).sqrt()));
+        let series = |of: &dyn Fn(&Errors) -> f64| both([of(&errors[0]), of(&errors[1])]);
+        let of_channel = |channel: usize| series(&|errors| rms(errors.channels[channel].iter().copied()));
+        let of_sensor = |place: usize| {
+            let axes: [Both<f64>; 6] = std::array::from_fn(|axis| of_channel(channel_of(place, axis)));
+            both([axes.map(|axis| axis.cad), axes.map(|axis| axis.identified)])
+        };
+        let routes = (0..setup.model.dof_count()).map(|dof| {
+            let of_dof = series(&|errors| rms(errors.routes[dof].iter().copied()));
+            (setup.model.dof_name(dof).to_owned(), of_dof)
+        });
+        Predicted {
+            relative_error: relative(0),
+            relative_error_with_drift: relative(1),
+            joints: Vec::new(),
+            sensors: (layout.sensors.iter().enumerate())
+                .map(|(place, sensor)| (sensor_name(setup, *sensor), of_sensor(place)))
+                .collect(),
+            two_route: routes.filter(|(_, rms)| rms.cad.is_finite()).collect(),
+        }
+    }
+
     /// Readings of a channel of F/T sensors, less their mean over the log, where errors are known.
-    pub(super) fn load(&self, channel: usize, errors: &Errors) -> Vec<f64> {
+    fn load(&self, channel: usize, errors: &Errors) -> Vec<f64> {
         let sensor = self.layout().sensors[channel / 6];
         let pairs = self.instants.iter().zip(&errors.channels[channel]);
         let read = pairs.filter(|(_, error)| error.is_finite());
@@ -140,35 +272,32 @@ impl<'a> Yardstick<'a> {
     }
 
     /// What each of the candidates, given in the columns of `layout`, leaves.
-    pub(super) fn errors(&self, layout: &Layout, candidates: &[Candidate]) -> Vec<Errors> {
+    pub(super) fn errors(&self, layout: &Layout, candidates: &[Candidate], free: Free) -> Vec<Errors> {
         let own = self.layout();
         let (offsets, channels) = (6 * own.sensors.len(), own.channels());
+        let drifts = if free == Free::WithDrifts { offsets } else { 0 };
+        let width = offsets + drifts;
         let dofs = self.maker.setup().model.dof_count();
-        let candidates: Vec<Own> = candidates.iter().map(|candidate| candidate.of(layout, own)).collect();
-        // Offsets are multiplied alike by all candidates but those that change gains.
-        let ways = if candidates.iter().any(Own::has_gains) {
-            candidates.len()
-        } else {
-            1
-        };
-        // First the offsets, then what they leave.
+        let plan = Plan::new(layout, own, candidates);
+        let all: Vec<usize> = (0..plan.sets.len()).collect();
+        // First the offsets, of each set in all of the log; then what the sets in force leave.
         let zero = || {
-            let normals = vec![DMatrix::zeros(2 * offsets, 2 * offsets); ways];
-            (normals, vec![DVector::zeros(2 * offsets); candidates.len()])
+            let normals = vec![DMatrix::zeros(width, width); plan.gains.len()];
+            (normals, vec![DVector::zeros(width); plan.sets.len()])
         };
-        let sums = self.over(&candidates, zero, |(normals, rights), late, compared| {
-            for Comparison { of, left, h } in compared {
+        let sums = self.over(zero, |(normals, rights), made| {
+            for Comparison { of, left, h } in comparisons(made, &plan, &all) {
                 let Of::Channel(channel) = of else { continue };
-                let square = scale(*channel).powi(2);
-                let lines: Vec<Vec<f64>> = h.iter().map(|h| twice(h, late)).collect();
-                for (normal, line) in normals.iter_mut().zip(lines.iter().cycle()) {
+                let square = own.scale(channel).powi(2);
+                let lines: Vec<Vec<f64>> = h.iter().map(|h| line(h, made.late, drifts)).collect();
+                for (normal, line) in normals.iter_mut().zip(&lines) {
                     for (i, x) in line.iter().enumerate().filter(|(_, x)| **x != 0.0) {
-                        let column = &mut normal.as_mut_slice()[2 * offsets * i..][..2 * offsets];
+                        let column = &mut normal.as_mut_slice()[width * i..][..width];
                         add_multiple(column, square * x, line);
                     }
                 }
-                for ((right, left), line) in rights.iter_mut().zip(left).zip(lines.iter().cycle()) {
-                    add_multiple(right.as_mut_slice(), square * left, line);
+                for ((right, left), set) in rights.iter_mut().zip(left).zip(&plan.sets) {
+                    add_multiple(right.as_mut_slice(), square * left, &lines[set.gains]);
                 }
             }
         });
@@ -178,28 +307,38 @@ impl<'a> Yardstick<'a> {
             (normals, rights)
         });
         let (normals, rights) = sums.unwrap_or_else(zero);
-        let fitted: Vec<[DVector<f64>; 2]> = rights
-            .iter()
-            .zip(normals.iter().cycle())
-            .map(|(right, normal)| [offsets, 2 * offsets].map(|count| solved(normal, right, count)))
+        let fitted: Vec<[DVector<f64>; 2]> = (rights.iter().zip(&plan.sets))
+            .map(|(right, set)| [offsets, width].map(|count| solved(&normals[set.gains], right, count)))
             .collect();
-        let width = channels + offsets + dofs;
-        let values = self.over(&candidates, Vec::new, |values: &mut Vec<f64>, late, compared| {
+        let width = channels + drifts + dofs;
+        let values = self.over(Vec::new, |values: &mut Vec<f64>, made| {
             let start = values.len();
             values.resize(start + candidates.len() * width, f64::NAN);
-            for Comparison { of, left, h } in compared {
-                let places = values[start..].chunks_exact_mut(width).zip(left).zip(&fitted);
-                for (((out, left), [constant, drifting]), h) in places.zip(h.iter().cycle()) {
+            let out = &mut values[start..];
+            let in_force = plan.in_force(made.instant.t);
+            for Comparison { of, left, h } in comparisons(made, &plan, &in_force) {
+                for ((out, left), &set) in out.chunks_exact_mut(width).zip(left).zip(&in_force) {
+                    let ([constant, drifting], h) = (&fitted[set], &h[plan.sets[set].gains]);
                     let remains = left - dot(h, constant.as_slice());
-                    match *of {
-                        Of::Route(dof) => out[channels + offsets + dof] = remains,
+                    match of {
+                        Of::Route(dof) => out[channels + drifts + dof] = remains,
                         Of::Channel(channel) => {
                             out[channel] = remains;
-                            if channel < offsets {
-                                out[channels + channel] = left - dot(&twice(h, late), drifting.as_slice());
+                            if channel < drifts {
+                                let line = line(h, made.late, drifts);
+                                out[channels + channel] = left - dot(&line, drifting.as_slice());
                             }
                         }
                     }
+                }
+            }
+            for (row, joint) in (0..made.rows.count).filter_map(|row| Some((row, made.rows.joint(row, offsets)?))) {
+                let share = &made.rows.g(row)[offsets + FRICTION * joint..][..FRICTION];
+                for ((out, &set), Course { friction, .. }) in
+                    out.chunks_exact_mut(width).zip(&in_force).zip(&plan.courses)
+                {
+                    let d = plan.sets[set].d.as_slice();
+                    out[offsets + joint] = made.rows.r(row) - dot(made.rows.a(row), d) - dot(share, &friction[joint]);
                 }
             }
         });
@@ -214,22 +353,16 @@ impl<'a> Yardstick<'a> {
         (0..candidates.len())
             .map(|which| Errors {
                 channels: (0..channels).map(|channel| column(which, channel)).collect(),
-                drifting: (channels..channels + offsets)
+                drifting: (channels..channels + drifts)
                     .map(|place| column(which, place))
                     .collect(),
-                routes: (channels + offsets..width).map(|place| column(which, place)).collect(),
+                routes: (channels + drifts..width).map(|place| column(which, place)).collect(),
             })
             .collect()
     }
 
-    /// Runs over all instants, on all cores, with something of its own for each part of the log: `each`
-    /// gets how late in the log an instant is, from -1 to 1, and what is compared there.
-    fn over<T: Send>(
-        &self,
-        candidates: &[Own],
-        make: impl Fn() -> T + Sync,
-        each: impl Fn(&mut T, f64, &[Comparison]) + Sync,
-    ) -> Vec<T> {
+    /// Runs over all instants, on all cores, with something of its own for each part of the log.
+    fn over<T: Send>(&self, make: impl Fn() -> T + Sync, each: impl Fn(&mut T, &Made<'_, '_>) + Sync) -> Vec<T> {
         let trusted = stated_variances(self.maker.setup(), self.layout());
         let (Some(first), Some(last)) = (self.instants.first(), self.instants.last()) else {
             return Vec::new();
@@ -242,12 +375,17 @@ impl<'a> Yardstick<'a> {
                 let mut own = make();
                 let end = self.instants.len().min(TOGETHER * (part + 1));
                 for instant in &self.instants[TOGETHER * part..end] {
-                    let late = (instant.t - first.t).seconds() / half - 1.0;
-                    let compared = match maker.make(instant, rows) {
-                        Ok(()) => comparisons(maker, rows, instant, &trusted, candidates),
-                        Err(_) => Vec::new(),
+                    if maker.make(instant, rows).is_err() {
+                        rows.clear();
+                    }
+                    let made = Made {
+                        late: (instant.t - first.t).seconds() / half - 1.0,
+                        instant,
+                        maker,
+                        rows,
+                        trusted: &trusted,
                     };
-                    each(&mut own, late, &compared);
+                    each(&mut own, &made);
                 }
                 own
             },
@@ -255,107 +393,104 @@ impl<'a> Yardstick<'a> {
     }
 }
 
-/// What is compared at an instant of which rows were made.
-fn comparisons(
-    maker: &RowMaker<'_>,
-    rows: &Rows,
-    instant: &Instant,
-    trusted: &[f64],
-    candidates: &[Own],
-) -> Vec<Comparison> {
-    let layout = maker.layout();
+/// An instant of which rows were made.
+struct Made<'a, 'b> {
+    instant: &'a Instant,
+    /// From -1 at the log's beginning to 1 at its end.
+    late: f64,
+    maker: &'a RowMaker<'b>,
+    rows: &'a Rows,
+    trusted: &'a [f64],
+}
+
+/// What is compared at an instant, with these sets: readings, and two routes to a torque.
+fn comparisons(made: &Made<'_, '_>, plan: &Plan, sets: &[usize]) -> Vec<Comparison> {
+    let (rows, layout) = (made.rows, made.maker.layout());
     let offsets = 6 * layout.sensors.len();
-    let in_force: Vec<&InForce> = candidates
+    let left: Vec<DVector<f64>> = sets
         .iter()
-        .map(|candidate| {
-            let at = candidate.course.partition_point(|(from, ..)| *from <= instant.t);
-            &candidate.course[at.saturating_sub(1)]
-        })
-        .collect();
-    let left: Vec<DVector<f64>> = in_force
-        .iter()
-        .map(|(_, d, _)| DVector::from_fn(rows.count, |row, _| rows.r(row) - dot(rows.a(row), d.as_slice())))
+        .map(|&set| &plan.sets[set].d)
+        .map(|d| DVector::from_fn(rows.count, |row, _| rows.r(row) - dot(rows.a(row), d.as_slice())))
         .collect();
     let g = DMatrix::from_fn(rows.count, offsets, |row, column| rows.g(row)[column]);
     let mut compared = Vec::new();
     for place in 0..layout.sensors.len() {
-        let Some(map) = laid_to(rows, trusted, 6 * place..6 * place + 6) else {
+        let Some(map) = laid_to(rows, made.trusted, 6 * place..6 * place + 6) else {
             continue;
         };
-        let h = &map * &g;
-        let row = |matrix: &DMatrix<f64>, k: usize| matrix.row(k).iter().copied().collect();
-        let (errors, ways): (Vec<DVector<f64>>, Vec<DMatrix<f64>>) = if candidates.iter().any(Own::has_gains) {
-            let each = left.iter().zip(&in_force);
-            each.map(|(left, (.., gains))| {
-                let gain = DMatrix::from_fn(6, 6, |i, j| gains[place][(i, j)]);
-                (&gain * (&map * left), gain * &h)
-            })
-            .unzip()
-        } else {
-            (left.iter().map(|left| &map * left).collect(), vec![h])
-        };
+        let maps: Vec<Matrix6xX<f64>> = plan.gains.iter().map(|gains| gains[place] * &map).collect();
+        let h: Vec<Matrix6xX<f64>> = maps.iter().map(|map| map * &g).collect();
+        let each = left.iter().zip(sets);
+        let errors: Vec<Vector6<f64>> = each.map(|(left, &set)| &maps[plan.sets[set].gains] * left).collect();
         for k in (0..6).filter(|k| rows.has(6 * place + k)) {
             compared.push(Comparison {
                 of: Of::Channel(6 * place + k),
                 left: errors.iter().map(|error| error[k]).collect(),
-                h: ways.iter().map(|h| row(h, k)).collect(),
+                h: h.iter().map(|h| h.row(k).iter().copied().collect()).collect(),
             });
         }
     }
-    for row in 0..rows.count {
-        if let Some(joint) = rows.joint(row, offsets) {
-            let share = &rows.g(row)[offsets + FRICTION * joint..][..FRICTION];
-            let each = left.iter().zip(candidates);
-            compared.push(Comparison {
-                of: Of::Channel(offsets + joint),
-                left: each
-                    .map(|(left, own)| left[row] - dot(share, &own.friction[joint]))
-                    .collect(),
-                h: vec![vec![0.0; offsets]],
-            });
-        }
-    }
-    for (dof, along) in maker.two_routes(rows) {
+    for (dof, along) in made.maker.two_routes(rows) {
         compared.push(Comparison {
             of: Of::Route(dof),
             left: left.iter().map(|left| along.dot(left)).collect(),
-            h: vec![g.tr_mul(&along).as_slice().to_vec()],
+            h: vec![g.tr_mul(&along).as_slice().to_vec(); plan.gains.len()],
         });
     }
     compared
 }
 
-impl Own {
-    fn has_gains(&self) -> bool {
-        let mut gains = self.course.iter().flat_map(|(.., gains)| gains);
-        gains.any(|gain| *gain != Matrix6::identity())
-    }
-}
-
-impl Candidate {
-    /// In the columns of another layout.
-    fn of(&self, from: &Layout, to: &Layout) -> Own {
-        let carried = |d: &DVector<f64>| carried(from, d, to);
-        let course = self.course.iter().map(|(t, d)| (*t, carried(d)));
-        let friction = |dof: &usize| {
-            let place = from.joints.binary_search(dof).ok();
-            place.map_or([0.0; FRICTION], |place| self.friction[place])
+impl Plan {
+    fn new(from: &Layout, to: &Layout, candidates: &[Candidate]) -> Self {
+        let mut plan = Self {
+            sets: Vec::new(),
+            gains: Vec::new(),
+            courses: Vec::new(),
         };
-        Own {
-            course: course.map(|(t, d)| (t, d.clone(), gains(to, &d))).collect(),
-            friction: to.joints.iter().map(friction).collect(),
+        for Candidate { course, friction } in candidates {
+            let mut own: Vec<(Nanos, usize)> = Vec::new();
+            for (since, d) in course {
+                let d = carried(from, d, to);
+                if own.last().is_some_and(|(_, set)| plan.sets[*set].d == d) {
+                    continue;
+                }
+                let gains = gains(to, &d);
+                let known = plan.gains.iter().position(|other| *other == gains);
+                let number = known.unwrap_or(plan.gains.len());
+                if known.is_none() {
+                    plan.gains.push(gains);
+                }
+                own.push((*since, plan.sets.len()));
+                plan.sets.push(Set { d, gains: number });
+            }
+            let of_joint = |dof: &usize| {
+                let place = from.joints.binary_search(dof).ok();
+                place.map_or([0.0; FRICTION], |place| friction[place])
+            };
+            plan.courses.push(Course {
+                sets: own,
+                friction: to.joints.iter().map(of_joint).collect(),
+            });
         }
+        plan
+    }
+
+    /// The set that each candidate has in force at an instant; the first from the beginning.
+    fn in_force(&self, t: Nanos) -> Vec<usize> {
+        let of_course = |Course { sets, .. }: &Course| {
+            let at = sets.partition_point(|(since, _)| *since <= t);
+            sets[at.saturating_sub(1)].1
+        };
+        self.courses.iter().map(of_course).collect()
     }
 }
 
-/// What turns the unit of a channel of F/T sensors into Nm.
-pub(super) fn scale(channel: usize) -> f64 {
-    if channel % 6 < 3 { 1.0 } else { Structure::LENGTH_SCALE }
-}
-
-/// A line for constants and drifts.
-fn twice(h: &[f64], late: f64) -> Vec<f64> {
-    h.iter().copied().chain(h.iter().map(|x| late * x)).collect()
+/// What constants are multiplied by, and after it so many drifts.
+fn line(h: &[f64], late: f64, drifts: usize) -> Vec<f64> {
+    h.iter()
+        .copied()
+        .chain(h.iter().take(drifts).map(|x| late * x))
+        .collect()
 }
 
 /// The first so many offsets that leave least. Those of which nothing shows are nought.
@@ -371,12 +506,8 @@ fn solved(normal: &DMatrix<f64>, right: &DVector<f64>, count: usize) -> DVector<
 
 /// The variances of readings as stated: which of several sensors takes what the rows leave must not
 /// depend on what was found in a log.
-pub(super) fn stated_variances(setup: &Setup, layout: &Layout) -> Vec<f64> {
-    let mut variances = Vec::new();
-    for &sensor in &layout.sensors {
-        let noise = setup.structure.sensors()[sensor].noise();
-        variances.extend(noise.torque.iter().chain(&noise.force).map(|x| x * x));
-    }
+fn stated_variances(setup: &Setup, layout: &Layout) -> Vec<f64> {
+    let mut variances: Vec<f64> = layout.stated(setup).map(|x| x * x).collect();
     variances.resize(layout.channels(), 1.0);
     variances
 }

@@ -274,6 +274,11 @@ impl SubTreeRegressor {
     }
 
     fn eliminate(&mut self, structure: &Structure, weighting: Weighting) {
+        self.remaining = 0;
+        // Where any wrench may act, nothing remains.
+        if self.contacts.iter().any(|contact| contact.unknowns == 6) {
+            return;
+        }
         let length = structure.length_scale();
         self.least.clear();
         for present in &self.contacts {
@@ -289,7 +294,6 @@ impl SubTreeRegressor {
             _ => scale_factor(length),
         };
         self.least.factorise(&lower);
-        self.remaining = 0;
         for weights in self.least.complement() {
             let out = &mut self.projected[self.known * self.remaining..][..self.known];
             out.fill(0.0);
