@@ -1,10 +1,12 @@
 //! The verbs that turn one file into another: decode, encode, estimate.
 
+use crate::identify::advice::sentence;
 use crate::identify::summary;
 use anyhow::{Context, bail};
 use proprio_estimator::assessment::{Assessment, Assessor, Coverage};
 use proprio_estimator::config::ConfigError;
 use proprio_estimator::files;
+use proprio_estimator::identify::implausible;
 use proprio_estimator::setup::Setup;
 use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
@@ -323,6 +325,7 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
             config.parameters = Some(parameters.clone());
         }
     })?;
+    tell_implausible(args, &setup);
     let mut assessor = args.assess.then(|| assessor(args, &setup)).transpose()?;
     let log = input(&args.log)?;
     let mut out = Output::new(&args.out)?;
@@ -393,6 +396,17 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
         );
     }
     Ok(())
+}
+
+/// Says what in the log can not be, before anything is made of it. A log that can not be read is told
+/// of where the estimates are made; of standard input, which passes once, nothing is asked.
+fn tell_implausible(args: &Estimate, setup: &Setup) {
+    let log = (args.log != Path::new("-"))
+        .then(|| File::open(&args.log).ok())
+        .flatten();
+    for finding in log.and_then(|log| implausible(setup, log).ok()).into_iter().flatten() {
+        eprintln!("warning: {}: {}", args.log.display(), sentence(&finding.text));
+    }
 }
 
 /// Reads the log once before the estimates.

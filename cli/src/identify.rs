@@ -3,7 +3,7 @@
 //! Writes into one folder, each file whole or not at all: `summary.json` (for programs: [`summary`]), `parameters.toml`, `identified.urdf` and `report.html` (for
 //! people). Where nothing can be identified there are a summary and a report that say why, and no parameters.
 
-mod advice;
+pub(crate) mod advice;
 #[cfg(test)]
 mod example;
 mod page;

@@ -19,6 +19,7 @@ macro_rules! say_part {
 mod convert;
 mod demo;
 mod doctor;
+mod estimator;
 mod identify;
 mod report;
 mod simulate;
@@ -48,7 +49,7 @@ enum Verb {
     /// The gateway daemon: CAN buses in, samples in shared memory out
     Gateway(Daemon),
     /// The estimator daemon: samples in, joint torques and contact wrenches out
-    Estimator(Daemon),
+    Estimator(estimator::Args),
     /// The simulated robot alone: its boards on a bus
     Simulate(simulate::Args),
     /// A recorded CAN log to a table of samples in SI units
@@ -83,7 +84,7 @@ fn main() -> ExitCode {
     let result = match args.verb {
         Verb::Demo(args) => demo::run(&args),
         Verb::Gateway(args) => proprio_gateway::daemon::run(&args.config, &domain, args.check),
-        Verb::Estimator(args) => proprio_estimator::daemon::run(&args.config, &domain, args.check),
+        Verb::Estimator(args) => estimator::run(&args, &domain),
         Verb::Simulate(args) => simulate::run(&args, &domain),
         Verb::Decode(args) => convert::decode(&args),
         Verb::Encode(args) => convert::encode(&args),

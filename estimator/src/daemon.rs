@@ -4,6 +4,7 @@
 //! that is not there yet is looked for now and then, so gateway and estimator can start in any order, and either can be
 //! killed and started again.
 
+use crate::check::Check;
 use crate::config::{Config, ConfigError};
 use crate::identify::online::{Paused, state};
 use crate::pipeline::{Job, Pipeline};
@@ -43,11 +44,16 @@ const INBOX: usize = <Sample as Topic>::QUALITY.buffer * <Sample as Topic>::QUAL
 /// # Errors
 /// One chain that says what, where and what to do; [`ConfigError`] at its root is a wrong configuration.
 pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<()> {
+    let file = config.to_owned();
     let (config, setup) = load(config, |_| {})?;
     if check {
         // Whoever reads it may stop early.
-        let _ = write!(std::io::stdout(), "{setup}");
-        return Ok(());
+        let checked = Check::of(&setup).context("the configuration can not be checked")?;
+        let _ = write!(std::io::stdout(), "{setup}{checked}");
+        return match checked.problem() {
+            Some(problem) => Err(ConfigError { file, problem }.into()),
+            None => Ok(()),
+        };
     }
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()

@@ -44,6 +44,7 @@ pub mod online;
 mod outcome;
 mod parallel;
 mod passes;
+mod plausible;
 pub mod prior;
 mod rows;
 mod session;
@@ -63,6 +64,7 @@ pub use outcome::{
     FrictionOutcome, InForce, JointOutcome, LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Predicted, Role,
     RotorOutcome, SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome, Verdict, WeakDirection,
 };
+pub use plausible::implausible;
 pub(crate) use yardstick::predicted;
 
 /// The axes of a wrench as samples have them, in words.

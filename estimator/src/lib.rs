@@ -21,6 +21,7 @@
 
 pub mod assessment;
 pub mod calibration;
+pub mod check;
 pub mod config;
 pub mod daemon;
 pub mod differentiate;

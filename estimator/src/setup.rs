@@ -578,6 +578,15 @@ impl Setup {
         self.contacts.iter().map(|c| c.name.as_str())
     }
 
+    /// The names of the F/T sensors' channels, in the order of the structure's sensors.
+    pub fn sensor_names(&self) -> impl Iterator<Item = &str> {
+        let sensors = 0..self.structure.sensors().len();
+        sensors.map(|sensor| {
+            let channel = self.channels.iter().find(|channel| channel.role == Use::Sensor(sensor));
+            channel.map_or("", |channel| channel.name.as_str())
+        })
+    }
+
     /// The names of the sub-trees, those of their top links, in the order of the estimates.
     pub fn subtree_names(&self) -> impl Iterator<Item = &str> {
         let subtrees = self.structure.subtrees().iter();
@@ -758,7 +767,7 @@ impl Setup {
     }
 
     /// The name of a contact for people.
-    fn contact_label(&self, contact: usize) -> &str {
+    pub(crate) fn contact_label(&self, contact: usize) -> &str {
         self.contacts
             .get(contact)
             .map_or("what the base stands on", |c| c.name.as_str())
@@ -827,7 +836,7 @@ fn worthless(model: &Model) -> Vec<f64> {
 
 /// Of each degree of freedom, what gravity makes at the most of the links beyond its joint:
 /// `g sum m d`, `d` along the joints' origins \[Nm or N\].
-fn gravity_loads(model: &Model) -> Vec<f64> {
+pub(crate) fn gravity_loads(model: &Model) -> Vec<f64> {
     let mut loads = vec![0.0; model.dof_count()];
     // Beyond each joint, from the tips on: mass, and its moment with the limb stretched out from the joint's origin.
     let mut beyond = vec![(0.0, 0.0); model.link_count()];

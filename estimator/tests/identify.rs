@@ -8,7 +8,7 @@ use proprio_estimator::calibration::{Calibration, Unknown};
 use proprio_estimator::config::{Config, Gain, IdentificationInput, TorqueSide};
 use proprio_estimator::dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
 use proprio_estimator::identify::{
-    Finding, Log, LogOutcome, Options, Outcome, Predicted, Role, Severity, Verdict, identify, parameters,
+    Finding, Log, LogOutcome, Options, Outcome, Predicted, Role, Severity, Verdict, identify, implausible, parameters,
 };
 use proprio_estimator::model::Model;
 use proprio_estimator::offline;
@@ -2200,6 +2200,46 @@ fn readings_in_other_units_are_no_heavy_bodies() {
         outcome.logs.iter().map(|log| log.used > 0).collect::<Vec<_>>(),
         [false, true]
     );
+}
+
+/// Before estimates, the same questions are asked of a log as before identification.
+#[test]
+fn what_can_not_be_is_said_of_a_log_that_is_only_estimated_from() {
+    let setup = arm();
+    let log = simulate(&setup, &real(&setup, 3), 6.0, 0.01, 3);
+    let of_all = |names: &[String], by: f64| {
+        let each = |log: String, name: &String| change(&log, name, |x| by * x);
+        names.iter().fold(log.clone(), each)
+    };
+    let wrench = AXES.map(|axis| format!("wrench/ft/{axis}"));
+    let angles = ARM_JOINTS.map(|joint| format!("joint/{joint}/position"));
+    let found = |log: &str| -> Vec<String> {
+        let findings = implausible(&setup, log.as_bytes()).expect("a log");
+        findings.iter().map(|finding| finding.code.to_owned()).collect()
+    };
+    assert_eq!(found(&log), Vec::<String>::new());
+    for (log, code) in [
+        (of_all(&wrench, -1.0), "wrong_sign"),
+        (of_all(&wrench, 0.001), "wrong_units"),
+        (of_all(&wrench, 10.0), "scale"),
+        (of_all(&wrench, 0.0), "frozen"),
+        (of_all(&angles, 57.3), "wrong_units"),
+        (of_all(&["t".to_owned()], 1000.0), "stamps"),
+    ] {
+        let found = found(&log);
+        assert!(found.iter().any(|own| own == code), "{code}: {found:?}");
+    }
+    // Too short to learn from is long enough to estimate from.
+    assert_eq!(found(&between(&log, -1.0, 0.5)), Vec::<String>::new());
+    // With parameters that were identified, the URDF's masses are still what is compared with.
+    let outcome = run(&setup, &[("log", Role::Train, &log)], &[]);
+    let mut identified = setup.clone();
+    identified
+        .apply(&parameters(&outcome, &setup, "a test").expect("parameters"))
+        .expect("its own");
+    let turned = of_all(&wrench, -1.0);
+    let codes = |setup: &Setup| implausible(setup, turned.as_bytes()).expect("a log");
+    assert_eq!(codes(&identified), codes(&setup));
 }
 
 /// What no parameters explain is said: an encoder that is dead, an axis with its sign turned, another robot's log.

@@ -509,6 +509,83 @@ fn a_wrong_estimator_toml_is_told_with_file_place_and_what_would_be_legal() {
         check.contains("beyond l_shoulder_pitch"),
         "which torques also rest on the URDF: {check}"
     );
+    for what in [
+        "mass of all links: ",
+        "F/T sensors would read",
+        "  l_arm_ft_sensor: force [",
+    ] {
+        assert!(check.contains(what), "{check}");
+    }
+    // A torque that nothing can ever tell is a mistake, after all that there is to say.
+    let stand = "[[contact]]\nname = \"forearm\"\nlink = \"l_forearm\"\n\n[[contact]]\nname = \"stand\"";
+    place.change(
+        "estimator.toml",
+        "hidden.toml",
+        &[("[[contact]]\nname = \"stand\"", stand)],
+    );
+    let ran = place.run(&["estimator", "--config", "hidden.toml", "--check"]);
+    assert!(ran.out.contains("mass of all links: "), "{}", ran.out);
+    ran.fails_in(
+        "hidden.toml",
+        &["l_wrist_yaw", "can never be determined", "forearm, hand", "possible"],
+    );
+}
+
+/// The two configurations of a robot are checked together.
+#[test]
+fn what_the_gateway_does_not_publish_is_told() {
+    let place = Place::new();
+    let check = |gateway: &str| {
+        let args = [
+            "estimator",
+            "--config",
+            "estimator.toml",
+            "--check",
+            "--gateway",
+            gateway,
+        ];
+        place.run(&args)
+    };
+    let told = check("gateway.toml").good().out;
+    assert!(
+        told.contains("gateway.toml publishes all that the estimator reads\n"),
+        "{told}"
+    );
+    let gateway = place.read("gateway.toml");
+    place.write("other.toml", &gateway.replace("l_elbow", "l_elbov"));
+    check("other.toml").fails_in(
+        "estimator.toml",
+        &["other.toml publishes no joint/l_elbow (it has l_elbov)"],
+    );
+    place.write(
+        "other.toml",
+        &gateway.replace("robot = \"icub_left_arm\"", "robot = \"another\""),
+    );
+    check("other.toml").fails_in("estimator.toml", &["\"another\"", "would not find each other"]);
+    place.write(
+        "locked.toml",
+        &(place.read("estimator.toml") + "\n[locked]\nl_wrist_yaw = 0.0\n"),
+    );
+    let args = [
+        "estimator",
+        "--config",
+        "locked.toml",
+        "--check",
+        "--gateway",
+        "gateway.toml",
+    ];
+    assert!(
+        place
+            .run(&args)
+            .good()
+            .out
+            .contains("it reads nothing of l_wrist_yaw\n")
+    );
+    check("none.toml").fails_in("none.toml", &["can not be read"]);
+    // To what end, without a check?
+    place
+        .run(&["estimator", "--config", "estimator.toml", "--gateway", "gateway.toml"])
+        .fails(2, &["--check"]);
 }
 
 #[test]

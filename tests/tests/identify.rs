@@ -101,6 +101,24 @@ fn free(seed: u64) -> Settings {
     }
 }
 
+/// A table with all numbers of the columns that begin so multiplied.
+fn change_all(table: &str, columns: &str, by: f64) -> String {
+    let mut rows = table.lines();
+    let header = rows.next().expect("a header");
+    let places: Vec<bool> = header.split(',').map(|name| name.starts_with(columns)).collect();
+    let row = |row: &str| {
+        let cells = row
+            .split(',')
+            .zip(&places)
+            .map(|(cell, is_one)| match cell.parse::<f64>() {
+                Ok(value) if *is_one => (by * value).to_string(),
+                _ => cell.to_owned(),
+            });
+        cells.collect::<Vec<_>>().join(",") + "\n"
+    };
+    header.to_owned() + "\n" + &rows.map(row).collect::<String>()
+}
+
 /// The URDF with the masses beyond the sensor, moments of inertia included, made `factor` times as large.
 fn heavier(urdf: &str, links: &[&str], factor: f64) -> String {
     let mut text = String::new();
@@ -379,6 +397,24 @@ fn a_wrong_cad_is_put_right_from_logs_of_the_simulated_arm() {
     );
     let ran = place.run(&["estimator", "--config", "identified.toml", "--check"]);
     assert!(ran.status.success(), "{}", String::from_utf8_lossy(&ran.stderr));
+
+    // What can not be is said of a log that is only estimated from, too.
+    let turned = change_all(&place.read("three.csv"), "wrench/", -1.0);
+    place.write("turned.csv", &turned);
+    let args = [
+        "estimate",
+        "--config",
+        "estimator.toml",
+        "--log",
+        "turned.csv",
+        "--out",
+        "t.csv",
+    ];
+    let told = String::from_utf8(place.run(&args).stderr).unwrap();
+    assert!(
+        told.contains("warning: turned.csv: wrench/l_arm_ft_sensor fits only with its sign turned"),
+        "{told}"
+    );
 
     // The same again gives the same, and --json prints what the file holds.
     let before = place.read("out/summary.json");

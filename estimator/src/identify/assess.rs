@@ -18,7 +18,7 @@ use crate::dynamics::Structure;
 use crate::regressor::identifiable::{
     BaseParameter, Column, Identifiable, JointMotion, Measured, Offsets, Scope, Term,
 };
-use crate::setup::{Setup, Use};
+use crate::setup::Setup;
 use crate::spatial::{RigidInertia, Wrench};
 use nalgebra::{DMatrix, DVector, Matrix6};
 use proprio_topics::Nanos;
@@ -61,8 +61,7 @@ pub(super) fn channel_of(sensor_place: usize, axis: usize) -> usize {
 }
 
 pub(super) fn sensor_name(setup: &Setup, sensor: usize) -> String {
-    let channel = setup.channels().iter().find(|c| c.role == Use::Sensor(sensor));
-    channel.map_or(String::new(), |c| c.name.clone())
+    setup.sensor_names().nth(sensor).unwrap_or_default().to_owned()
 }
 
 pub(super) fn channel_name(setup: &Setup, layout: &Layout, channel: usize) -> (String, &'static str) {

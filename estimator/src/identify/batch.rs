@@ -545,7 +545,7 @@ pub(crate) fn judged_instants(setup: &Setup, log: impl Read) -> Result<Vec<Insta
 }
 
 /// Keeps the instants at which motion is known.
-fn usable(setup: &Setup, file: String, role: Role, recording: Recording) -> Prepared {
+pub(super) fn usable(setup: &Setup, file: String, role: Role, recording: Recording) -> Prepared {
     let found = recording.instants(setup, &Settings::default());
     let mut findings: Vec<Finding> = found.defects.iter().map(finding).collect();
     let refused = found.defects.iter().any(|d| d.severity() == Severity::Refusal);
@@ -625,6 +625,16 @@ fn usable(setup: &Setup, file: String, role: Role, recording: Recording) -> Prep
     }
 }
 
+/// Says that a log's stamps are too far apart for any sample to hold until the next, if they are.
+pub(super) fn stamps_apart(setup: &Setup, recording: &Recording) -> Option<String> {
+    let (spacing, silence) = (recording.spacing(), setup.max_silence);
+    (recording.is_stamped() && spacing > silence).then(|| {
+        format!(
+            "its samples are {spacing} s apart, and a channel is silent after {silence} s (input.max_silence_ms): record faster, allow more, or, if t is in milliseconds or nanoseconds, convert it to seconds"
+        )
+    })
+}
+
 /// Why so few instants can be used.
 fn too_few(
     setup: &Setup,
@@ -633,11 +643,8 @@ fn too_few(
     left_out: &BTreeMap<String, LeftOut>,
     findings: &[Finding],
 ) -> String {
-    let (spacing, silence) = (recording.spacing(), setup.max_silence);
-    let why = if recording.is_stamped() && spacing > silence {
-        format!(
-            "its samples are {spacing} s apart, and a channel is silent after {silence} s (input.max_silence_ms): record faster, allow more, or, if t is in milliseconds or nanoseconds, convert it to seconds"
-        )
+    let why = if let Some(apart) = stamps_apart(setup, recording) {
+        apart
     } else if let Some(dead) = findings.iter().find(|f| ["frozen", "never_seen"].contains(&f.code)) {
         dead.text.clone()
     } else {

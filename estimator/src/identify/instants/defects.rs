@@ -250,7 +250,7 @@ impl fmt::Display for Defect {
             ),
             Self::Frozen { channel, from, to } => write!(
                 f,
-                "{channel} does not change from {from} s to {to} s while the robot moves: it is left out there; check its cable and its board"
+                "{channel} does not change from {from} s to {to} s while the robot moves: that is no measurement; check its cable and its board"
             ),
             Self::Still { channel } => write!(
                 f,
@@ -264,7 +264,7 @@ impl fmt::Display for Defect {
                 ..
             } if value.is_nan() => write!(
                 f,
-                "{channel} says that it is saturated in {samples} samples, the first at {first} s: they are left out; move more gently or use a larger range"
+                "{channel} says that it is saturated in {samples} samples, the first at {first} s: these are no measurement; move more gently or use a larger range"
             ),
             Self::Saturated {
                 channel,
@@ -274,7 +274,7 @@ impl fmt::Display for Defect {
                 value,
             } => write!(
                 f,
-                "{channel}: {axis} lies flat at {value} in {samples} samples, the first at {first} s: it is saturated there and left out; move more gently or use a larger range"
+                "{channel}: {axis} lies flat at {value} in {samples} samples, the first at {first} s: it is saturated there, which is no measurement; move more gently or use a larger range"
             ),
             Self::WrongUnits {
                 channels,
@@ -328,7 +328,7 @@ impl fmt::Display for Defect {
             ),
             Self::WrongSign { sensor } => write!(
                 f,
-                "wrench/{sensor} fits only with its sign turned (masses come out negative): check `direction` and `frame` in the configuration"
+                "wrench/{sensor} fits only with its sign turned (masses come out negative): check `direction` and `frame` in the configuration and, if an IMU tells gravity, that it is not upside down"
             ),
             Self::WrongFrame { sensor, instead } => write!(
                 f,
