@@ -6,6 +6,7 @@
 
 use crate::check::Check;
 use crate::config::{Config, ConfigError};
+use crate::first_look::FirstLook;
 use crate::identify::online::{Paused, state};
 use crate::pipeline::{Job, Pipeline};
 use crate::setup::Setup;
@@ -164,6 +165,7 @@ struct DataPlane {
     description_writer: Writer<Description>,
     health: EstimatorHealth,
     identifier: Option<Identifier>,
+    first_look: FirstLook,
     next_look: Nanos,
     next_health: Nanos,
     last_turn: Arc<AtomicI64>,
@@ -186,6 +188,7 @@ impl DataPlane {
         let contacts = Writer::create(&domain, robot, epoch)?;
         let now = monotonic();
         description_writer.send(&setup.description(), now)?;
+        let first_look = FirstLook::start(&setup)?;
         let mut pipeline = Pipeline::new(setup);
         if let Some(kept) = &kept {
             kept.resume(&mut pipeline);
@@ -205,6 +208,7 @@ impl DataPlane {
             robot: robot.to_owned(),
             pipeline,
             identifier,
+            first_look,
             samples: None,
             inbox: Vec::with_capacity(INBOX),
             descriptions: None,
@@ -291,8 +295,9 @@ impl DataPlane {
             }
             // A channel that the configuration does not name is not an error: the gateway may serve others.
             let Some(channel) = channel else { continue };
-            self.pipeline
-                .push(channel, sample.header.acquired, &sample.reading, sample.header.quality);
+            let (t, quality) = (sample.header.acquired, sample.header.quality);
+            self.first_look.see(channel, t, &sample.reading, quality);
+            self.pipeline.push(channel, t, &sample.reading, quality);
             while let Some(estimate) = self.pipeline.poll() {
                 let now = monotonic();
                 let sent = self.torques.send(&estimate.torques, now).is_ok()
@@ -351,9 +356,11 @@ impl DataPlane {
     fn take_declarations(&mut self) {
         while let Ok(Some(declared)) = self.declarations.try_take() {
             match self.pipeline.setup().contact(declared.contact.as_str()) {
-                Some(contact) => self
-                    .pipeline
-                    .declare(contact, declared.header.acquired, declared.active != 0),
+                Some(contact) => {
+                    let (t, active) = (declared.header.acquired, declared.active != 0);
+                    self.first_look.declare(contact, t, active);
+                    self.pipeline.declare(contact, t, active);
+                }
                 // Once: whoever misspells a name may do so a thousand times a second.
                 None if !self.told_of_contact => {
                     self.told_of_contact = true;

@@ -27,6 +27,7 @@ pub mod daemon;
 pub mod differentiate;
 pub mod dynamics;
 pub mod files;
+mod first_look;
 pub mod history;
 pub mod identify;
 pub mod model;

@@ -187,3 +187,38 @@ fn what_was_learnt_survives_the_process() {
     [&mut gateway, &mut simulator].into_iter().for_each(Process::end);
     rig.assert_nothing_left();
 }
+
+/// A daemon whose force/torque sensor is configured the wrong way round says so in its first minute.
+#[test]
+fn a_sensor_the_wrong_way_round_is_told_live() {
+    let rig = Rig::new();
+    let robot = proprio_simulator::Robot::find(ROBOT).expect("the robot of this repository");
+    let config = fs::read_to_string(robot.join("estimator.toml")).expect("a configuration");
+    let mut turned = config.clone();
+    for (from, to) in [
+        ("model = \"", format!("model = \"{}/", robot.display())),
+        (
+            "direction = \"child_to_parent\"",
+            "direction = \"parent_to_child\"".into(),
+        ),
+        ("link = \"l_hand\"", "link = \"l_hand\"\npresence = \"possible\"".into()),
+    ] {
+        assert_eq!(config.matches(from).count(), 1, "{from}");
+        turned = turned.replace(from, &to);
+    }
+    let file = rig.path("turned.toml");
+    fs::write(&file, turned).expect("a file");
+    let gateway = robot.join("gateway.toml");
+    let [gateway, file] = [&gateway, &file].map(|path| path.to_str().expect("a path in UTF-8"));
+    let mut simulator = rig.start(&["simulate", "--robot", ROBOT, "--skin"]);
+    let mut gateway = rig.start(&["gateway", "--config", gateway]);
+    let mut estimator = rig.start(&["estimator", "--config", file]);
+    let words = "l_arm_ft_sensor fits only with its sign turned";
+    let told = until(PATIENCE + Nanos::from_millis(20_000), || {
+        estimator.log().contains(words).then_some(())
+    });
+    assert!(told.is_some(), "{}", estimator.log());
+    [&mut estimator, &mut gateway, &mut simulator]
+        .into_iter()
+        .for_each(Process::end);
+}
