@@ -7,6 +7,7 @@ use proprio_estimator::assessment::{Assessment, Assessor, Coverage};
 use proprio_estimator::config::ConfigError;
 use proprio_estimator::files;
 use proprio_estimator::identify::implausible;
+use proprio_estimator::identify::instants::RecordingError;
 use proprio_estimator::setup::Setup;
 use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
@@ -398,23 +399,42 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// How much of a log is asked what can not be: half an hour of a robot's samples, which fits in memory.
+const ASKED: u64 = 256 << 20;
+
+/// Whether a log can be read again: a pipe passes once.
+fn is_file(log: &Path) -> bool {
+    log != Path::new("-") && std::fs::metadata(log).is_ok_and(|data| data.is_file())
+}
+
 /// Says what in the log can not be, before anything is made of it. A log that can not be read is told
-/// of where the estimates are made; of standard input, which passes once, nothing is asked.
+/// of where the estimates are made; of one that passes once nothing is asked.
 fn tell_implausible(args: &Estimate, setup: &Setup) {
-    let log = (args.log != Path::new("-"))
-        .then(|| File::open(&args.log).ok())
-        .flatten();
-    for finding in log.and_then(|log| implausible(setup, log).ok()).into_iter().flatten() {
+    let log = is_file(&args.log).then(|| File::open(&args.log).ok()).flatten();
+    let found = log.and_then(|log| implausible(setup, log.take(ASKED)).ok());
+    for finding in found.into_iter().flatten() {
         eprintln!("warning: {}: {}", args.log.display(), sentence(&finding.text));
     }
 }
 
 /// Reads the log once before the estimates.
 fn assessor(args: &Estimate, setup: &Setup) -> anyhow::Result<Assessor> {
-    if args.log == Path::new("-") {
-        bail!("--assess reads the log twice: give a file with --log, not standard input");
+    let log = input(&args.log)?;
+    if !is_file(&args.log) {
+        bail!("--assess reads the log twice: give a file with --log, not standard input or a pipe");
     }
-    Assessor::new(setup, input(&args.log)?).with_context(|| args.log.display().to_string())
+    Assessor::new(setup, log).map_err(|error| {
+        let problem = format!("{}: {error}", args.log.display());
+        match error {
+            // The log is what it is: the configuration does not fit it.
+            RecordingError::MissingChannels(_) => ConfigError {
+                file: args.config.clone(),
+                problem,
+            }
+            .into(),
+            _ => anyhow::anyhow!(problem),
+        }
+    })
 }
 
 fn assessment_json(assessment: &Assessment) -> serde_json::Value {
@@ -451,7 +471,7 @@ fn tell_assessment(assessment: &Assessment) {
             "F/T readings are predicted {own:.1} % off with {how}, {cad:.1} % with the CAD's; {own_drifting:.1} and {cad_drifting:.1} % beside offsets that drift"
         );
     } else {
-        eprintln!("no F/T reading can be predicted: a contact that is always present, or no usable sample");
+        eprintln!("no F/T reading can be predicted: no sensor, a contact that is always present, or no usable sample");
     }
     for (top, c) in residuals {
         eprintln!(

@@ -9,7 +9,8 @@
 //! What was identified on-line was learnt from the past alone, so each instant is one that the
 //! parameters were not fitted to. Where nothing unknown acts and deviations are right, 97.7 % of
 //! residuals are covered (theirs is one-sided, [`proprio_topics::Residual::significance`]), and 95.4 % of
-//! torques, less what the measured torque's own noise and friction take, which no deviation states.
+//! torques, less what the measured torque's own noise and friction (and, measured at the motor, the
+//! rotor's inertia) take, which no deviation states.
 
 use crate::identify::instants::{Instant, RecordingError};
 use crate::identify::{self, InForce, Predicted};

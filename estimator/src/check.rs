@@ -6,8 +6,8 @@
 //!   z axis is up, all joints at zero (or the limit nearest to it, or where they are locked), and
 //!   nothing touching it;
 //! - joints whose effort limit could not hold the limb beyond them: masses or limits in other units;
-//! - torques that can never be determined, for contacts that are always present leave more unknown
-//!   than the equations tell.
+//! - torques of sub-trees with an F/T sensor that can never be determined, for contacts that are always
+//!   present leave more unknown than the equations tell.
 
 use crate::config::STANDARD_GRAVITY;
 use crate::dynamics::{Certainty, DynamicsError, FrameMotion, InverseDynamics, JointState, Kinematics, Solver};
@@ -100,16 +100,16 @@ impl Check {
         let lost: Vec<usize> = (0..model.dof_count())
             .filter(|&dof| setup.locked[dof].is_nan() && certainty[dof] == Certainty::Assumed)
             .collect();
-        let subtrees = setup.structure.subtrees().iter().enumerate();
-        let hiding = subtrees.filter(|(number, _)| {
-            let own = |dof: &usize| {
-                setup
-                    .structure
-                    .link_of(*dof)
-                    .and_then(|link| setup.structure.subtree_of(link))
-            };
-            lost.iter().any(|dof| own(dof) == Some(*number))
-        });
+        let subtree_of = |dof: usize| {
+            let link = setup.structure.link_of(dof)?;
+            setup.structure.subtree_of(link)
+        };
+        let subtrees = setup.structure.subtrees();
+        // Who has no F/T sensor there wants no torques of it.
+        let is_measured = |dof: &usize| subtree_of(*dof).is_some_and(|number| !subtrees[number].sensors.is_empty());
+        let lost: Vec<usize> = lost.into_iter().filter(is_measured).collect();
+        let hiding = subtrees.iter().enumerate();
+        let hiding = hiding.filter(|(number, _)| lost.iter().any(|dof| subtree_of(*dof) == Some(*number)));
         let hiding = hiding.flat_map(|(_, subtree)| subtree.contacts.intersection(&setup.always).iter());
         Ok(Self {
             mass: bodies.iter().map(|body| body.mass).sum(),
@@ -125,8 +125,8 @@ impl Check {
     pub fn problem(&self) -> Option<String> {
         (!self.undetermined.is_empty()).then(|| {
             format!(
-                "the torque of {} can never be determined while {} are always present: their wrenches are more than six equations tell; give all but one \
-                 presence = \"possible\", or a kind with fewer unknowns, or put an F/T sensor between them",
+                "the torque of {} can never be determined while {} are present, as they always are unless declared absent: their wrenches are more than six \
+                 equations tell; give all but one presence = \"possible\", or a kind with fewer unknowns, or put an F/T sensor between them",
                 self.undetermined.join(", "),
                 self.hiding.join(", ")
             )
@@ -170,9 +170,6 @@ impl fmt::Display for Check {
                 f,
                 "note: {joint} has an effort limit of {effort} in the URDF, and a limb whose weight has a moment of up to {load:.1} Nm: one of the two is in other units"
             )?;
-        }
-        if let Some(problem) = self.problem() {
-            writeln!(f, "note: {problem}")?;
         }
         Ok(())
     }

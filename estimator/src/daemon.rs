@@ -249,11 +249,11 @@ impl DataPlane {
                 look(&mut self.samples, &self.domain, &self.robot);
                 look(&mut self.descriptions, &self.domain, &self.robot);
             }
-            self.take_declarations();
+            self.take_declarations(now);
             if let Some(job) = self.identifier.as_mut().and_then(Identifier::take) {
                 self.pipeline.give_back(job);
             }
-            let idle = !self.take_samples();
+            let idle = !self.take_samples(now);
             if now >= self.next_health {
                 self.next_health = now + HEALTH_PERIOD;
                 self.tell_health(now);
@@ -269,7 +269,7 @@ impl DataPlane {
     }
 
     /// Takes what is waiting and publishes what it completes; whether there was anything.
-    fn take_samples(&mut self) -> bool {
+    fn take_samples(&mut self, now: Nanos) -> bool {
         // Shared memory hands out all of one bus before the next one's. After a stall that would let the first bus run ahead by more
         // than an estimate waits, and what the others sent meanwhile would be late: so they are put in order first.
         self.inbox.clear();
@@ -296,7 +296,7 @@ impl DataPlane {
             // A channel that the configuration does not name is not an error: the gateway may serve others.
             let Some(channel) = channel else { continue };
             let (t, quality) = (sample.header.acquired, sample.header.quality);
-            self.first_look.see(channel, t, &sample.reading, quality);
+            self.first_look.see(now, channel, t, &sample.reading, quality);
             self.pipeline.push(channel, t, &sample.reading, quality);
             while let Some(estimate) = self.pipeline.poll() {
                 let now = monotonic();
@@ -353,12 +353,12 @@ impl DataPlane {
         }
     }
 
-    fn take_declarations(&mut self) {
+    fn take_declarations(&mut self, now: Nanos) {
         while let Ok(Some(declared)) = self.declarations.try_take() {
             match self.pipeline.setup().contact(declared.contact.as_str()) {
                 Some(contact) => {
                     let (t, active) = (declared.header.acquired, declared.active != 0);
-                    self.first_look.declare(contact, t, active);
+                    self.first_look.declare(now, contact, t, active);
                     self.pipeline.declare(contact, t, active);
                 }
                 // Once: whoever misspells a name may do so a thousand times a second.

@@ -5,7 +5,7 @@
 //! [`WINDOW`] is full; a thread looks, and gives the room back for the next window. The data plane
 //! never waits for it.
 
-use crate::identify::implausible;
+use crate::identify::{Finding, implausible};
 use crate::setup::Setup;
 use anyhow::Context;
 use proprio_topics::csv::{Columns, Series, Value, What, Writer};
@@ -27,9 +27,11 @@ type Seen = (usize, Nanos, Value);
 /// The data plane's end.
 pub(crate) struct FirstLook {
     room: Option<Vec<Seen>>,
-    /// When the window at hand began, and per channel when its last sample was taken.
+    /// When the window at hand, or the last one, began; and the stamp of each channel's last sample.
     began: Option<Nanos>,
     last: Vec<Nanos>,
+    /// What was said last of each contact, which holds in the next window, too.
+    said: Vec<Option<bool>>,
     full: mpsc::SyncSender<Vec<Seen>>,
     empty: mpsc::Receiver<Vec<Seen>>,
 }
@@ -41,18 +43,24 @@ impl FirstLook {
         let most = usize::try_from(WINDOW.0 / APART.0).unwrap_or(0);
         let (full, windows) = mpsc::sync_channel::<Vec<Seen>>(1);
         let (back, empty) = mpsc::sync_channel(1);
-        let setup = setup.as_configured();
+        let mut configured = setup.as_configured();
+        // Samples are left out: that is no silence.
+        configured.max_silence = configured.max_silence.max(APART + APART);
         let look = move || {
             let mut told = BTreeSet::new();
-            for _ in 0..WINDOWS {
+            for window_number in 1..=WINDOWS {
                 let Ok(mut window) = windows.recv() else { return };
-                for text in findings(&setup, &mut window) {
-                    if told.insert(text.clone()) {
+                for Finding {
+                    code, subject, text, ..
+                } in findings(&configured, &mut window)
+                {
+                    if told.insert((code, subject)) {
                         tracing::warn!("{text}");
                     }
                 }
                 window.clear();
-                if back.send(window).is_err() {
+                // The last one's room is freed here: without it nothing more is taken.
+                if window_number < WINDOWS && back.send(window).is_err() {
                     return;
                 }
             }
@@ -62,43 +70,54 @@ impl FirstLook {
             .spawn(look)
             .context("cannot start a thread")?;
         Ok(Self {
-            room: Some(Vec::with_capacity(most * channels)),
+            room: Some(Vec::with_capacity(most * channels + setup.contact_names().count())),
             began: None,
             last: vec![Nanos::MIN; channels],
+            said: vec![None; setup.contact_names().count()],
             full,
             empty,
         })
     }
 
-    /// Takes a sample, if it is time for it.
-    pub(crate) fn see(&mut self, channel: usize, t: Nanos, reading: &Reading, quality: Quality) {
-        let Some(last) = self.last.get_mut(channel) else { return };
+    /// Takes a sample that is received at `now`, by the daemon's clock, if it is time for it.
+    pub(crate) fn see(&mut self, now: Nanos, channel: usize, t: Nanos, reading: &Reading, quality: Quality) {
+        // Of a channel that also tells currents, say, only its motion is looked at.
+        let is_main = matches!(reading, Reading::Joint(_) | Reading::Wrench(_) | Reading::Imu(_));
+        let Some(last) = self.last.get_mut(channel).filter(|_| is_main) else {
+            return;
+        };
         // Stamps may jump back, with the boards' clocks.
         if *last == Nanos::MIN || t < *last || t - *last >= APART {
             *last = t;
-            self.take(channel, t, Value::Reading(*reading, quality));
+            self.take(now, (channel, t, Value::Reading(*reading, quality)));
         }
     }
 
-    /// Takes what was said of a contact.
-    pub(crate) fn declare(&mut self, contact: usize, t: Nanos, active: bool) {
-        self.take(self.last.len() + contact, t, Value::Active(active));
+    /// Takes what is said of a contact at `now`.
+    pub(crate) fn declare(&mut self, now: Nanos, contact: usize, t: Nanos, active: bool) {
+        let Some(said) = self.said.get_mut(contact) else { return };
+        // Whoever declares may do so a thousand times a second.
+        if said.replace(active) != Some(active) {
+            self.take(now, (self.last.len() + contact, t, Value::Active(active)));
+        }
     }
 
-    fn take(&mut self, number: usize, t: Nanos, value: Value) {
-        let began = *self.began.get_or_insert(t);
-        if self.room.is_none() {
-            if t - began < EVERY {
-                return;
-            }
-            // Gone for good after the last window.
+    fn take(&mut self, now: Nanos, seen: Seen) {
+        let began = *self.began.get_or_insert(now);
+        if self.room.is_none() && now - began >= EVERY {
             self.room = self.empty.try_recv().ok();
-            self.began = Some(t);
+            self.began = Some(now);
+            let (first, t) = (self.last.len(), seen.1);
+            for (contact, said) in self.said.iter().enumerate() {
+                if let (Some(active), Some(room)) = (said, &mut self.room) {
+                    room.push((first + contact, t, Value::Active(*active)));
+                }
+            }
         }
         if let Some(room) = self.room.as_mut().filter(|room| room.len() < room.capacity()) {
-            room.push((number, t, value));
+            room.push(seen);
         }
-        if t - self.began.unwrap_or(t) >= WINDOW
+        if now - self.began.unwrap_or(now) >= WINDOW
             && let Some(room) = self.room.take()
         {
             let _ = self.full.try_send(room);
@@ -107,7 +126,7 @@ impl FirstLook {
 }
 
 /// What in a window can not be.
-fn findings(setup: &Setup, window: &mut [Seen]) -> Vec<String> {
+fn findings(setup: &Setup, window: &mut [Seen]) -> Vec<Finding> {
     window.sort_by_key(|(_, t, ..)| *t);
     let channels = setup.channels().iter();
     let channels = channels.map(|channel| (What::Channel(channel.kind), channel.name.as_str()));
@@ -129,7 +148,7 @@ fn findings(setup: &Setup, window: &mut [Seen]) -> Vec<String> {
     };
     // A channel that is missing has been told of by the data plane.
     let found = table().ok().and_then(|table| implausible(setup, &table[..]).ok());
-    found.into_iter().flatten().map(|finding| finding.text).collect()
+    found.unwrap_or_default()
 }
 
 #[cfg(test)]
@@ -179,19 +198,19 @@ mod tests {
     #[test]
     fn a_sensor_the_wrong_way_round_is_said_of_a_window() {
         let setup = setup();
-        let texts = |by: f64| findings(&setup, &mut received(&setup, by, Nanos::ZERO));
-        assert_eq!(texts(1.0), Vec::<String>::new());
-        let [text] = &texts(-1.0)[..] else {
-            panic!("{:?}", texts(-1.0))
+        let of = |by: f64| findings(&setup, &mut received(&setup, by, Nanos::ZERO));
+        assert_eq!(of(1.0), Vec::<Finding>::new());
+        let [finding] = &of(-1.0)[..] else {
+            panic!("{:?}", of(-1.0))
         };
-        assert!(
-            text.contains("l_arm_ft_sensor fits only with its sign turned"),
-            "{text}"
+        assert_eq!(
+            (finding.code, finding.subject.as_str()),
+            ("wrong_sign", "l_arm_ft_sensor")
         );
         // Buses are read one after the other.
         let mut mixed = received(&setup, -1.0, Nanos::ZERO);
         mixed.sort_by_key(|(channel, ..)| *channel);
-        assert_eq!(findings(&setup, &mut mixed), texts(-1.0));
+        assert_eq!(findings(&setup, &mut mixed), of(-1.0));
     }
 
     #[test]
@@ -203,6 +222,7 @@ mod tests {
                 room: Some(Vec::with_capacity(100_000)),
                 began: None,
                 last: vec![Nanos::MIN; 2],
+                said: vec![None; 1],
                 full,
                 empty,
             };
@@ -216,16 +236,29 @@ mod tests {
         let mut run = |from: u32, to: u32| {
             for k in 1000 * from..1000 * to {
                 let t = Nanos::from_millis(i64::from(k) + 5_000);
-                look.see(0, t, &reading, Quality::default());
+                // The boards' clock is another.
+                let now = t + Nanos::from_millis(7_000_000);
+                // Its board tells its temperature as often, before it.
+                look.see(
+                    now,
+                    0,
+                    t,
+                    &Reading::Temperature(proprio_topics::Temperature { celsius: 30.0 }),
+                    Quality::default(),
+                );
+                look.see(now, 0, t, &reading, Quality::default());
                 if k % 10 == 0 {
-                    look.see(1, t, &reading, Quality::default());
+                    look.see(now, 1, t, &reading, Quality::default());
+                }
+                if k < 1000 {
+                    look.declare(now, 0, t, true);
                 }
             }
         };
         run(0, 30);
         let window = full.try_recv().expect("a window");
         let of = |channel: usize| window.iter().filter(|(own, ..)| *own == channel).count();
-        assert_eq!((of(0), of(1)), (2501, 2000));
+        assert_eq!((of(0), of(1), of(2)), (2501, 2000, 1));
         assert_eq!((window.capacity(), window[0].1), (100_000, Nanos::from_millis(5_000)));
         // The next minute; not before the room is back.
         let mut window = window;
@@ -235,10 +268,15 @@ mod tests {
         assert!(full.try_recv().is_err());
         run(79, 82);
         let window = full.try_recv().expect("another");
+        let began = (window[0].1 - Nanos::from_millis(65_000)).0.abs();
+        assert!(began < 1_000_000, "{:?}", window[0]);
+        // What was said of a contact in the first one still holds.
+        assert!(matches!(window[0], (2, _, Value::Active(true))), "{:?}", window[0]);
+        assert_eq!(window.iter().filter(|(own, ..)| *own == 2).count(), 1);
         assert!(
-            (window[0].1 - Nanos::from_millis(65_000)).0.abs() < 1_000_000,
-            "{:?}",
-            window[0].1
+            window
+                .iter()
+                .all(|(.., value)| !matches!(value, Value::Reading(Reading::Temperature(_), _)))
         );
     }
 }

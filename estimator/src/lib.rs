@@ -18,6 +18,8 @@
 //! - [`pipeline`]: samples in, estimates out; no input, no output, no clock.
 //! - [`files`]: files that are replaced whole.
 //! - [`offline`]: a table of samples to a table of estimates; [`daemon`]: the same from and to shared memory.
+//! - [`check`]: what a configuration comes to; [`assessment`]: how good a run of estimates was; `first_look`: what
+//!   can not be in what the daemon receives.
 
 pub mod assessment;
 pub mod calibration;

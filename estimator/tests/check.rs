@@ -6,7 +6,7 @@ use proprio_estimator::model::Model;
 use proprio_estimator::setup::Setup;
 
 /// A base, an F/T sensor that hangs below it, one joint, an arm with a hand: an arm of 2 kg, 0.1 m out
-/// along x, a hand of 1 kg 0.3 m further.
+/// along x, the wrist 0.4 m out, a hand of 1 kg whose centre of mass is 0.2 m beyond it.
 fn setup(contacts: &str, effort: f64, locked: &str) -> Setup {
     let link = |name: &str, mass: f64, x: f64| {
         format!(
@@ -26,7 +26,7 @@ fn setup(contacts: &str, effort: f64, locked: &str) -> Setup {
         link("base", 5.0, 0.0),
         link("mount", 0.5, 0.0),
         link("arm", 2.0, 0.1),
-        link("hand", 1.0, 0.0),
+        link("hand", 1.0, 0.2),
         joint("shoulder", "mount", "arm", 0.0, "lower=\"-2\" upper=\"2\""),
         // Zero is beyond its limits: it is taken at -0.5.
         joint("wrist", "arm", "hand", 0.4, "lower=\"-2\" upper=\"-0.5\""),
@@ -48,8 +48,9 @@ fn masses_and_readings_at_rest_are_those_of_a_balance() {
     };
     assert_eq!(sensor.name, "strain");
     assert!((sensor.mass - 3.5).abs() < 1e-12);
-    // The mount carries the weight upwards; about y, -g (2 * 0.1 + 1 * 0.4).
-    let expected = [0.0, 0.0, 3.5 * STANDARD_GRAVITY, 0.0, -0.6 * STANDARD_GRAVITY, 0.0];
+    // The mount carries the weight upwards; about y, -g (2 * 0.1 + 1 * (0.4 + 0.2 cos 0.5)).
+    let moment = (0.6 + 0.2 * 0.5_f64.cos()) * STANDARD_GRAVITY;
+    let expected = [0.0, 0.0, 3.5 * STANDARD_GRAVITY, 0.0, -moment, 0.0];
     for (read, expected) in sensor.reading.force_first().into_iter().zip(expected) {
         assert!((read - expected).abs() < 1e-9, "{:?}", sensor.reading);
     }
@@ -57,11 +58,11 @@ fn masses_and_readings_at_rest_are_those_of_a_balance() {
     let text = check.to_string();
     assert!(text.contains("mass of all links: 8.500 kg"), "{text}");
     assert!(
-        text.contains("strain: force [0, 0, 34.323] N, torque [0, -5.884, 0] Nm, of 3.500 kg"),
+        text.contains("strain: force [0, 0, 34.323] N, torque [0, -7.605, 0] Nm, of 3.500 kg"),
         "{text}"
     );
     // Locked elsewhere, the arm hangs straight down, and nothing turns.
-    let down = format!("[locked]\nshoulder = {}\n", std::f64::consts::FRAC_PI_2);
+    let down = format!("[locked]\nshoulder = {}\nwrist = 0\n", std::f64::consts::FRAC_PI_2);
     let check = Check::of(&setup("", 50.0, &down)).expect("numbers");
     assert!(
         check.sensors[0].reading.torque.norm() < 1e-9,
@@ -74,15 +75,15 @@ fn masses_and_readings_at_rest_are_those_of_a_balance() {
 #[test]
 fn an_arm_that_its_drives_could_not_hold_is_told() {
     let check = Check::of(&setup("", 0.05, "")).expect("numbers");
-    let [(joint, load, effort)] = &check.overloaded[..] else {
+    let [(joint, load, effort), (wrist, ..)] = &check.overloaded[..] else {
         panic!("{:?}", check.overloaded)
     };
-    assert_eq!((joint.as_str(), *effort), ("shoulder", 0.05));
-    assert!((load - 0.6 * STANDARD_GRAVITY).abs() < 1e-9, "{load}");
+    assert_eq!((joint.as_str(), wrist.as_str(), *effort), ("shoulder", "wrist", 0.05));
+    assert!((load - 0.8 * STANDARD_GRAVITY).abs() < 1e-9, "{load}");
     assert!(check.to_string().contains("in other units"));
     // Ten times what it can hold is what lengths that never lie in one line may add up to.
     assert!(
-        Check::of(&setup("", 0.06 * STANDARD_GRAVITY + 1e-9, ""))
+        Check::of(&setup("", 0.08 * STANDARD_GRAVITY + 1e-9, ""))
             .expect("numbers")
             .overloaded
             .is_empty()

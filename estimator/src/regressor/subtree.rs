@@ -282,11 +282,9 @@ impl SubTreeRegressor {
         let length = structure.length_scale();
         self.least.clear();
         for present in &self.contacts {
-            for (index, column) in (present.column..present.column + present.unknowns).enumerate() {
+            for column in present.column..present.column + present.unknowns {
                 let unit = Vector6::from_fn(|row, _| self.values[row * self.stride + column]);
-                // A wrench's first three unknowns are torques.
-                let is_torque = present.unknowns == 6 && index < 3;
-                self.least.push(unit, if is_torque { length } else { 1.0 });
+                self.least.push(unit, 1.0);
             }
         }
         let lower = match weighting {
