@@ -8,6 +8,7 @@ use proprio_estimator::config::ConfigError;
 use proprio_estimator::files;
 use proprio_estimator::identify::implausible;
 use proprio_estimator::identify::instants::RecordingError;
+use proprio_estimator::offline as estimates;
 use proprio_estimator::setup::Setup;
 use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
@@ -302,20 +303,18 @@ pub(crate) fn encode(args: &Encode) -> anyhow::Result<()> {
 /// A configuration that does not fit the log: the log is what it is.
 pub(crate) fn blame_columns(header: &[u8], log: &Path, config: &Path, setup: &Setup) -> anyhow::Result<()> {
     let reader = csv::Reader::new(header).with_context(|| log.display().to_string())?;
-    let missing = proprio_estimator::offline::missing_channels(setup, reader.series());
-    if missing.is_empty() {
-        return Ok(());
+    match estimates::missing_channels(setup, reader.series()) {
+        missing if missing.is_empty() => Ok(()),
+        missing => Err(unfit(config, log, &estimates::OfflineError::MissingChannels(missing)).into()),
     }
-    let problem = format!(
-        "{}: {}",
-        log.display(),
-        proprio_estimator::offline::OfflineError::MissingChannels(missing)
-    );
-    Err(ConfigError {
+}
+
+/// The log is what it is: the configuration does not fit it.
+fn unfit(config: &Path, log: &Path, error: &dyn std::error::Error) -> ConfigError {
+    ConfigError {
         file: config.to_owned(),
-        problem,
+        problem: format!("{}: {error}", log.display()),
     }
-    .into())
 }
 
 /// Estimates from a table.
@@ -331,21 +330,15 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
     let log = input(&args.log)?;
     let mut out = Output::new(&args.out)?;
     let report = match &mut assessor {
-        Some(assessor) => proprio_estimator::offline::assess(setup, log, out.writer(), assessor),
-        None => proprio_estimator::offline::estimate(setup, log, out.writer()),
+        Some(assessor) => estimates::assess(setup, log, out.writer(), assessor),
+        None => estimates::estimate(setup, log, out.writer()),
     };
     let report = match report {
         Ok(report) => report,
-        Err(error @ proprio_estimator::offline::OfflineError::MissingChannels(_)) => {
-            // The log is what it is: the configuration does not fit it.
-            let problem = format!("{}: {error}", args.log.display());
-            return Err(ConfigError {
-                file: args.config.clone(),
-                problem,
-            }
-            .into());
+        Err(error @ estimates::OfflineError::MissingChannels(_)) => {
+            return Err(unfit(&args.config, &args.log, &error).into());
         }
-        Err(proprio_estimator::offline::OfflineError::Write(error)) => {
+        Err(estimates::OfflineError::Write(error)) => {
             bail!("{}: can not be written: {error}", args.out.display())
         }
         Err(error) => return Err(error).with_context(|| args.log.display().to_string()),
@@ -423,17 +416,9 @@ fn assessor(args: &Estimate, setup: &Setup) -> anyhow::Result<Assessor> {
     if !is_file(&args.log) {
         bail!("--assess reads the log twice: give a file with --log, not standard input or a pipe");
     }
-    Assessor::new(setup, log).map_err(|error| {
-        let problem = format!("{}: {error}", args.log.display());
-        match error {
-            // The log is what it is: the configuration does not fit it.
-            RecordingError::MissingChannels(_) => ConfigError {
-                file: args.config.clone(),
-                problem,
-            }
-            .into(),
-            _ => anyhow::anyhow!(problem),
-        }
+    Assessor::new(setup, log).map_err(|error| match error {
+        RecordingError::MissingChannels(_) => unfit(&args.config, &args.log, &error).into(),
+        error => anyhow::Error::from(error).context(args.log.display().to_string()),
     })
 }
 

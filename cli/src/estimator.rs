@@ -2,7 +2,7 @@
 
 use proprio_estimator::config::ConfigError;
 use proprio_estimator::daemon;
-use proprio_estimator::setup::Setup;
+use proprio_estimator::setup::{Setup, nearest};
 use proprio_gateway::plan::Plan;
 use proprio_topics::ipc::DomainConfig;
 use std::path::{Path, PathBuf};
@@ -23,17 +23,19 @@ pub(crate) struct Args {
 
 /// Runs it, or checks.
 pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
-    daemon::run(&args.config, domain, args.check)?;
+    if !args.check {
+        return daemon::run(&args.config, domain);
+    }
+    let setup = daemon::check(&args.config)?;
     match &args.gateway {
-        Some(gateway) => fits(&args.config, gateway),
+        Some(gateway) => fits(&args.config, &setup, gateway),
         None => Ok(()),
     }
 }
 
 /// Says what the gateway publishes that the estimator reads, and what it does not.
-fn fits(config: &Path, gateway: &Path) -> anyhow::Result<()> {
+fn fits(config: &Path, setup: &Setup, gateway: &Path) -> anyhow::Result<()> {
     let plan = Plan::load(gateway)?;
-    let (_, setup) = daemon::load(config, |_| {})?;
     let wrong = |problem: String| ConfigError {
         file: config.to_owned(),
         problem,
@@ -46,7 +48,7 @@ fn fits(config: &Path, gateway: &Path) -> anyhow::Result<()> {
         ))
         .into());
     }
-    let missing = missing(&setup, &plan);
+    let missing = missing(setup, &plan);
     if !missing.is_empty() {
         let file = gateway.display();
         return Err(wrong(format!("{file} publishes no {}", missing.join(", no "))).into());
@@ -76,8 +78,7 @@ fn missing(setup: &Setup, plan: &Plan) -> Vec<String> {
             Some(other) => Some(format!("{}/{name} (it is {} there)", kind.word(), other.kind.word())),
             None => {
                 let alike = plan.channels.iter().filter(|other| other.kind == kind);
-                let nearest = alike.min_by_key(|other| strsim::damerau_levenshtein(name, &other.name));
-                let hint = nearest.map_or(String::new(), |other| format!(" (it has {})", other.name));
+                let hint = nearest(name, alike.map(|other| other.name.as_str()));
                 Some(format!("{}/{name}{hint}", kind.word()))
             }
         }

@@ -2,15 +2,15 @@
 //!
 //! | figure | meaning |
 //! |---|---|
-//! | predicted | error of what F/T sensors read, with the parameters that were in force at each instant, beside CAD's: [`Predicted`] |
-//! | residuals | per sub-tree, the share of instants at which F/T sensors contradict what is known by at most two standard deviations |
-//! | torques | per joint with a measured torque, how far the estimated one was from it, and the share within two stated deviations |
+//! | predicted | error of F/T readings predicted with the parameters in force: [`Predicted`] |
+//! | residuals | per sub-tree, the share within two standard deviations |
+//! | torques | per joint with a measured torque, the error of the estimated one, and its share |
 //!
 //! What was identified on-line was learnt from the past alone, so each instant is one that the
 //! parameters were not fitted to. Where nothing unknown acts and deviations are right, 97.7 % of
-//! residuals are covered (theirs is one-sided, [`proprio_topics::Residual::significance`]), and 95.4 % of
-//! torques, less what the measured torque's own noise and friction (and, measured at the motor, the
-//! rotor's inertia) take, which no deviation states.
+//! residuals are covered (theirs is one-sided, [`proprio_topics::Residual::significance`]), and
+//! 95.4 % of torques, less what the measured torque's own noise and friction (and, measured at the
+//! motor, the rotor's inertia) take, which no deviation states.
 
 use crate::identify::instants::{Instant, RecordingError};
 use crate::identify::{self, InForce, Predicted};
@@ -52,7 +52,8 @@ pub struct Assessment {
 /// How often errors were as little as stated.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Coverage {
-    /// RMS error: of torques \[Nm\]; of residuals, those that are more than usual, in standard deviations.
+    /// RMS error: of torques \[Nm\]; of residuals, those that are more than usual, in standard
+    /// deviations.
     pub rms: f64,
     /// The share within two stated standard deviations.
     pub covered: f64,

@@ -2,12 +2,12 @@
 //! before anything runs: `estimator --check` prints it after the plan.
 //!
 //! - masses: of the whole robot, and beyond each F/T sensor;
-//! - what the F/T sensors would read, offsets aside, with the robot held still by its root link, whose
-//!   z axis is up, all joints at zero (or the limit nearest to it, or where they are locked), and
-//!   nothing touching it;
+//! - what the F/T sensors would read, offsets aside, with the robot held still by its root link,
+//!   whose z axis is up, all joints at zero (or the limit nearest to it, or where they are locked),
+//!   and nothing touching it;
 //! - joints whose effort limit could not hold the limb beyond them: masses or limits in other units;
-//! - torques of sub-trees with an F/T sensor that can never be determined, for contacts that are always
-//!   present leave more unknown than the equations tell.
+//! - torques of sub-trees with an F/T sensor that can never be determined, for contacts that are
+//!   always present leave more unknown than the equations tell.
 
 use crate::config::STANDARD_GRAVITY;
 use crate::dynamics::{Certainty, DynamicsError, FrameMotion, InverseDynamics, JointState, Kinematics, Solver};
@@ -16,8 +16,8 @@ use crate::setup::{Setup, gravity_loads};
 use crate::spatial::{Vec3, Wrench};
 use std::fmt;
 
-/// The weight of a limb's links has this moment at the most, stretched out, of what its joint can hold:
-/// the bound adds up lengths that no posture has all in one line.
+/// The weight of a limb's links has this moment at the most, stretched out, of what its joint can
+/// hold: the bound adds up lengths that no posture has all in one line.
 const HOLDS: f64 = 10.0;
 
 /// The numbers.
@@ -27,8 +27,8 @@ pub struct Check {
     pub mass: f64,
     /// Per F/T sensor.
     pub sensors: Vec<AtRest>,
-    /// Joints that could not hold their limb: the name, the moment of the limb's weight, stretched out,
-    /// and the effort limit [Nm or N].
+    /// Joints that could not hold their limb: the name, the moment of the limb's weight, stretched
+    /// out, and the effort limit [Nm or N].
     pub overloaded: Vec<(String, f64, f64)>,
     /// Joints whose torque can not be determined while what is always present is.
     pub undetermined: Vec<String>,
@@ -60,16 +60,16 @@ impl Check {
             beyond[joint.parent] += beyond[joint.child];
         }
         let still = vec![0.0; model.dof_count()];
-        let mut kinematics = Kinematics::new(model, 0)?;
         let gravity = Vec3::new(0.0, 0.0, -STANDARD_GRAVITY);
-        let mut pose = |position: &[f64]| -> Result<Kinematics, DynamicsError> {
+        let pose = |position: &[f64]| -> Result<Kinematics, DynamicsError> {
+            let mut kinematics = Kinematics::new(model, 0)?;
             let state = JointState {
                 position,
                 velocity: &still,
                 acceleration: &still,
             };
             kinematics.update(model, state, &FrameMotion::standing(&gravity))?;
-            Ok(kinematics.clone())
+            Ok(kinematics)
         };
         let kinematics = pose(&positions(
             setup,
@@ -97,17 +97,17 @@ impl Check {
         let nothing = vec![Wrench::zero(); sensors.len()];
         solver.solve(model, &setup.structure, &kinematics, &nothing, &setup.always, &[])?;
         let certainty = solver.torque_certainty();
-        let lost: Vec<usize> = (0..model.dof_count())
-            .filter(|&dof| setup.locked[dof].is_nan() && certainty[dof] == Certainty::Assumed)
-            .collect();
         let subtree_of = |dof: usize| {
             let link = setup.structure.link_of(dof)?;
             setup.structure.subtree_of(link)
         };
         let subtrees = setup.structure.subtrees();
         // Who has no F/T sensor there wants no torques of it.
-        let is_measured = |dof: &usize| subtree_of(*dof).is_some_and(|number| !subtrees[number].sensors.is_empty());
-        let lost: Vec<usize> = lost.into_iter().filter(is_measured).collect();
+        let is_measured = |dof| subtree_of(dof).is_some_and(|number| !subtrees[number].sensors.is_empty());
+        let lost: Vec<usize> = (0..model.dof_count())
+            .filter(|&dof| setup.locked[dof].is_nan() && certainty[dof] == Certainty::Assumed)
+            .filter(|&dof| is_measured(dof))
+            .collect();
         let hiding = subtrees.iter().enumerate();
         let hiding = hiding.filter(|(number, _)| lost.iter().any(|dof| subtree_of(*dof) == Some(*number)));
         let hiding = hiding.flat_map(|(_, subtree)| subtree.contacts.intersection(&setup.always).iter());
@@ -125,8 +125,10 @@ impl Check {
     pub fn problem(&self) -> Option<String> {
         (!self.undetermined.is_empty()).then(|| {
             format!(
-                "the torque of {} can never be determined while {} are present, as they always are unless declared absent: their wrenches are more than six \
-                 equations tell; give all but one presence = \"possible\", or a kind with fewer unknowns, or put an F/T sensor between them",
+                "the torque of {} can never be determined while {} are present, as they always are \
+                 unless declared absent: their wrenches are more than six equations tell; give all but \
+                 one presence = \"possible\", or a kind with fewer unknowns, or put an F/T sensor \
+                 between them",
                 self.undetermined.join(", "),
                 self.hiding.join(", ")
             )
@@ -134,7 +136,8 @@ impl Check {
     }
 }
 
-/// Positions of all degrees of freedom: where they are locked, where `within` says of their limits, else `without`.
+/// Positions of all degrees of freedom: where they are locked, where `within` says of their limits,
+/// else `without`.
 fn positions(setup: &Setup, within: impl Fn(Limits) -> f64, without: f64) -> Vec<f64> {
     let mut positions = setup.locked.clone();
     for (number, joint) in setup.model.joints().iter().enumerate() {
@@ -152,7 +155,8 @@ impl fmt::Display for Check {
         if !self.sensors.is_empty() {
             writeln!(
                 f,
-                "held still by the root link, its z axis up, joints at zero, nothing touching, F/T sensors would read, offsets aside:"
+                "held still by the root link, its z axis up, joints at zero, nothing touching, \
+                 F/T sensors would read, offsets aside:"
             )?;
         }
         for AtRest { name, mass, reading } in &self.sensors {
@@ -168,7 +172,8 @@ impl fmt::Display for Check {
         for (joint, load, effort) in &self.overloaded {
             writeln!(
                 f,
-                "note: {joint} has an effort limit of {effort} in the URDF, and a limb whose weight has a moment of up to {load:.1} Nm: one of the two is in other units"
+                "note: {joint} has an effort limit of {effort} in the URDF, and a limb whose weight \
+                 has a moment of up to {load:.1} Nm: one of the two is in other units"
             )?;
         }
         Ok(())

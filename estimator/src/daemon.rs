@@ -40,22 +40,28 @@ const STUCK: Nanos = Nanos::from_millis(500);
 /// How many samples are taken at once, at the most: as many as may wait from all buses (6 MB).
 const INBOX: usize = <Sample as Topic>::QUALITY.buffer * <Sample as Topic>::QUALITY.publishers;
 
+/// Checks a configuration, and prints what would be estimated from what.
+///
+/// # Errors
+/// As for [`run`].
+pub fn check(config: &Path) -> anyhow::Result<Setup> {
+    let (_, setup) = load(config, |_| {})?;
+    let checked = Check::of(&setup).context("the configuration can not be checked")?;
+    // Whoever reads it may stop early.
+    let _ = write!(std::io::stdout(), "{setup}{checked}");
+    let file = config.to_owned();
+    match checked.problem() {
+        Some(problem) => Err(ConfigError { file, problem }.into()),
+        None => Ok(setup),
+    }
+}
+
 /// Runs the estimator until SIGTERM or SIGINT.
 ///
 /// # Errors
 /// One chain that says what, where and what to do; [`ConfigError`] at its root is a wrong configuration.
-pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<()> {
-    let file = config.to_owned();
+pub fn run(config: &Path, domain: &DomainConfig) -> anyhow::Result<()> {
     let (config, setup) = load(config, |_| {})?;
-    if check {
-        // Whoever reads it may stop early.
-        let checked = Check::of(&setup).context("the configuration can not be checked")?;
-        let _ = write!(std::io::stdout(), "{setup}{checked}");
-        return match checked.problem() {
-            Some(problem) => Err(ConfigError { file, problem }.into()),
-            None => Ok(()),
-        };
-    }
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()

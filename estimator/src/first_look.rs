@@ -1,5 +1,5 @@
-//! Looks at what the daemon receives for what can not be ([`crate::identify::implausible`]), and says
-//! it: in the first minutes, when somebody who set up the robot reads the log.
+//! Looks at what the daemon receives for what can not be ([`crate::identify::implausible`]), and
+//! says it: in the first minutes, when somebody who set up the robot reads the log.
 //!
 //! The data plane copies samples into room that was made before it began, and hands that over when
 //! [`WINDOW`] is full; a thread looks, and gives the room back for the next window. The data plane
@@ -13,9 +13,9 @@ use proprio_topics::{Nanos, Quality, Reading};
 use std::collections::BTreeSet;
 use std::sync::mpsc;
 
-/// How much of the samples is looked at at once: the units and signs of a robot that moves show in it.
+/// How much of the samples is looked at at once: units and signs of a robot that moves show in it.
 const WINDOW: Nanos = Nanos::from_millis(20_000);
-/// From the beginning of one to that of the next; and how many, for a robot that does not move at first.
+/// From the beginning of one to that of the next; and how many: a robot may not move at first.
 const EVERY: Nanos = Nanos::from_millis(60_000);
 const WINDOWS: u32 = 10;
 /// Of each channel samples further apart than this are enough.
@@ -159,8 +159,8 @@ mod tests {
     use std::path::Path;
 
     /// The samples of a recorded session, as they would be received; forces and torques `by` so many
-    /// times, all of it moved by `later`.
-    fn received(setup: &Setup, by: f64, later: Nanos) -> Vec<Seen> {
+    /// times.
+    fn received(setup: &Setup, by: f64) -> Vec<Seen> {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/oracle/sessions");
         let log = std::fs::read_to_string(folder.join("train.csv")).expect("a session");
         let mut reader = Reader::new(log.as_bytes()).expect("a log");
@@ -181,7 +181,7 @@ mod tests {
                         wrench.force = wrench.force.map(|x| by * x);
                         wrench.torque = wrench.torque.map(|x| by * x);
                     }
-                    seen.push((channel, t + later, Value::Reading(reading, *quality)));
+                    seen.push((channel, t, Value::Reading(reading, *quality)));
                 }
             }
         }
@@ -198,7 +198,7 @@ mod tests {
     #[test]
     fn a_sensor_the_wrong_way_round_is_said_of_a_window() {
         let setup = setup();
-        let of = |by: f64| findings(&setup, &mut received(&setup, by, Nanos::ZERO));
+        let of = |by: f64| findings(&setup, &mut received(&setup, by));
         assert_eq!(of(1.0), Vec::<Finding>::new());
         let [finding] = &of(-1.0)[..] else {
             panic!("{:?}", of(-1.0))
@@ -208,7 +208,7 @@ mod tests {
             ("wrong_sign", "l_arm_ft_sensor")
         );
         // Buses are read one after the other.
-        let mut mixed = received(&setup, -1.0, Nanos::ZERO);
+        let mut mixed = received(&setup, -1.0);
         mixed.sort_by_key(|(channel, ..)| *channel);
         assert_eq!(findings(&setup, &mut mixed), of(-1.0));
     }

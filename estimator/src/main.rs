@@ -27,7 +27,12 @@ fn main() -> ExitCode {
         .with_target(false)
         .with_writer(std::io::stderr)
         .init();
-    match daemon::run(&args.config, &DomainConfig::from_env(), args.check) {
+    let done = if args.check {
+        daemon::check(&args.config).map(|_| ())
+    } else {
+        daemon::run(&args.config, &DomainConfig::from_env())
+    };
+    match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");

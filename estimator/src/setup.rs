@@ -1039,7 +1039,7 @@ fn no_joint(model: &Model, name: &str) -> String {
 }
 
 /// A hint for somebody who misspelt a name.
-fn nearest<'a>(name: &str, names: impl Iterator<Item = &'a str>) -> String {
+pub fn nearest<'a>(name: &str, names: impl Iterator<Item = &'a str>) -> String {
     let mut names: Vec<_> = names.map(|n| (strsim::damerau_levenshtein(name, n), n)).collect();
     names.sort_unstable();
     match names.first() {

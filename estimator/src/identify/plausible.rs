@@ -1,6 +1,6 @@
-//! What of a log can not be, whatever is made of it: units, signs and frames of its channels, channels
-//! that are dead or lie at the end of their range. `proprio estimate` asks what identification asks
-//! before it fits anything.
+//! What of a log can not be, whatever is made of it: units, signs and frames of its channels,
+//! channels that are dead or lie at the end of their range. `proprio estimate` asks what
+//! identification asks before it fits anything.
 
 use super::batch::{LEAST_FOLD, stamps_apart, usable};
 use super::instants::{Defect, Recording, RecordingError};
@@ -11,8 +11,8 @@ use crate::config::IdentificationInput;
 use crate::setup::Setup;
 use std::io::Read;
 
-/// Findings that say that a log, or the configuration, is wrong, rather than that little can be learnt
-/// from it or that some instants are lost.
+/// Findings that say that a log, or the configuration, is wrong, rather than that little can be
+/// learnt from it or that some instants are lost.
 const WRONG: [&str; 5] = ["wrong_units", "derivative", "frozen", "saturated", "never_seen"];
 
 /// What in a log can not be.
