@@ -79,7 +79,7 @@ fn missing(setup: &Setup, plan: &Plan) -> Vec<String> {
             None => {
                 let alike = plan.channels.iter().filter(|other| other.kind == kind);
                 let hint = nearest(name, alike.map(|other| other.name.as_str()));
-                Some(format!("{}/{name}{hint}", kind.word()))
+                Some(format!("{}/{name} ({})", kind.word(), hint.trim_start_matches("; ")))
             }
         }
     });

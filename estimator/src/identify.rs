@@ -13,9 +13,12 @@
 //!     -> undeclared contacts, another load: left out, and again, until it stays                gate, undeclared
 //!     -> held-out data: what gains nothing is shrunk to CAD                                    guard
 //!     -> motion that only other F/T sensors feel, taken off; all of the fit again              shaking
-//!     -> Outcome: parameters, covariance, figures per log, joints whose zero is elsewhere, in words          assess, zeros, export
+//!     -> Outcome: parameters, covariance, figures per log, encoders turned or with another zero         assess, zeros, export
 //! ```
 //! [`identify`] does all of it. Parameters belong to the robot and are common to all logs; offsets and friction belong to a log.
+//!
+//! Whether something more than noise and parameters is in the data (a load, a jump of an offset, an
+//! encoder's zero or direction, a delay), one test says: `hypothesis`.
 //!
 //! The same while the robot works, once a second: [`online`], which the pipeline feeds.
 //!
@@ -35,6 +38,7 @@ pub mod consistent;
 mod export;
 mod gate;
 mod guard;
+mod hypothesis;
 pub mod information;
 pub mod instants;
 mod lanes;

@@ -1,4 +1,5 @@
-//! Chi-square variables as normal deviates: Wilson and Hilferty's cube root (1931).
+//! Quantiles: of normal variables, and of chi-square ones as normal deviates by Wilson and
+//! Hilferty's cube root (1931).
 //!
 //! Within 1 % of the quantile from three degrees of freedom on; a few per cent too large for one.
 
@@ -16,6 +17,17 @@ pub(crate) fn deviate(square: f64, freedom: usize) -> f64 {
     ((square / k).cbrt() - (1.0 - spread)) / spread.sqrt()
 }
 
+/// The standard normal deviate that is exceeded with this probability, from 1e-300 to 0.5.
+pub(crate) fn exceeded(probability: f64) -> f64 {
+    let (mut low, mut high) = (0.0, 40.0);
+    for _ in 0..60 {
+        let middle = 0.5 * (low + high);
+        let is_more = 0.5 * libm::erfc(middle * std::f64::consts::FRAC_1_SQRT_2) > probability;
+        *if is_more { &mut low } else { &mut high } = middle;
+    }
+    0.5 * (low + high)
+}
+
 fn cube(freedom: usize) -> (f64, f64) {
     let k = freedom.max(1) as f64;
     (k, 2.0 / (9.0 * k))
@@ -24,6 +36,15 @@ fn cube(freedom: usize) -> (f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Abramowitz and Stegun, tables 26.5 and 26.6.
+    #[test]
+    fn deviates_are_those_of_tables() {
+        for (probability, deviate) in [(0.5, 0.0), (0.025, 1.959_964), (1e-3, 3.090_232), (1e-6, 4.753_424)] {
+            let found = exceeded(probability);
+            assert!((found - deviate).abs() < 1e-6, "{probability}: {found}");
+        }
+    }
 
     /// Quantiles from tables (Abramowitz and Stegun, table 26.8).
     #[test]

@@ -2090,6 +2090,54 @@ fn joint_whose_zero_is_elsewhere_is_named() {
     }
 }
 
+/// An encoder that counts backwards: of one joint beyond the sensor, of one before it, of two at once. No other joint's
+/// zero is blamed.
+#[test]
+fn encoder_that_counts_backwards_is_named() {
+    let setup = arm();
+    let log = simulate(&setup, &real(&setup, 3), 12.0, 0.01, 3);
+    let names = |joints: &[&str]| -> Vec<String> {
+        let columns = ["position", "velocity", "acceleration"].map(|what| format!("/{what}"));
+        let header = log.lines().next().expect("a header").split(',');
+        let is_turned = |name: &&str| {
+            let mut own = joints.iter().map(|joint| format!("joint/{joint}"));
+            own.any(|joint| columns.iter().any(|column| *name == joint.clone() + column))
+        };
+        let turned = header
+            .filter(is_turned)
+            .fold(log.clone(), |log, column| change(&log, column, |x| -x));
+        let findings = run(&setup, &[("log", Role::Train, &turned)], &[]).findings.into_iter();
+        let own = findings.filter(|f| ["wrong_sign", "joint_zero"].contains(&f.code));
+        own.map(|f| f.subject).collect()
+    };
+    for joints in [&["j4"][..], &["j2"], &["j5"]] {
+        let expected: Vec<String> = joints.iter().map(|joint| format!("joint/{joint}")).collect();
+        assert_eq!(names(joints), expected);
+    }
+    let mut both = names(&["j3", "j5"]);
+    both.sort();
+    assert_eq!(both, ["joint/j3", "joint/j5"]);
+}
+
+/// Torques of all joints show what F/T sensors do not: the links before them.
+#[test]
+fn what_can_show_counts_torques_beside_wrenches() {
+    let setup = arm();
+    let truth = real(&setup, 3);
+    let log = with_torques(
+        &simulate(&setup, &truth, 6.0, 0.01, 6),
+        &simulate_torques(&setup, &truth, 6.0, 0.05, 6, |_, _| true),
+    );
+    let of = |inputs: &[IdentificationInput]| {
+        let outcome = run(&setup, &[("log", Role::Train, &log)], inputs);
+        (outcome.rank, outcome.structural_rank)
+    };
+    let (wrench, torque) = (IdentificationInput::Wrench, IdentificationInput::Torque);
+    let (own, both) = (of(&[wrench]), of(&[wrench, torque]));
+    assert_eq!(own.0, own.1);
+    assert!(both.1 > own.1 && both.0 <= both.1, "{own:?} {both:?}");
+}
+
 /// The zero of an incremental encoder is found anew with each start: it may be wrong in one log of several, or in all.
 #[test]
 fn joint_whose_zero_is_elsewhere_in_some_logs_is_named() {

@@ -555,7 +555,7 @@ fn what_the_gateway_does_not_publish_is_told() {
     place.write("other.toml", &gateway.replace("l_elbow", "l_elbov"));
     check("other.toml").fails_in(
         "estimator.toml",
-        &["other.toml publishes no joint/l_elbow (it has l_elbov)"],
+        &["other.toml publishes no joint/l_elbow (did you mean \"l_elbov\"?)"],
     );
     place.write(
         "other.toml",

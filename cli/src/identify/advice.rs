@@ -237,14 +237,12 @@ impl Advice {
         if !parts.is_empty() {
             self.why.push(format!("{}.", capital(&parts.join("; "))));
         }
-        // Links that the weakest directions are about, as they are named in them.
+        // Links that the weakest directions are about.
         let mut links: Vec<&str> = Vec::new();
         for weak in outcome.weakest.iter().filter(|w| w.prior_share > 0.9).take(5) {
-            for term in weak.expression.split_whitespace().filter(|t| t.contains('.')) {
-                let link = term.rsplit_once('.').map_or(term, |(link, _)| link);
-                let known = outcome.links.iter().any(|l| l.name == link);
-                if known && !links.contains(&link) {
-                    links.push(link);
+            for link in outcome.links.iter().filter(|l| weak.links.contains(&l.link)) {
+                if !links.contains(&link.name.as_str()) {
+                    links.push(&link.name);
                 }
             }
         }

@@ -176,6 +176,7 @@ pub(crate) fn outcome() -> Outcome {
         weakest: (0..20)
             .map(|i| WeakDirection {
                 expression: format!("r_foot.I_zz - 0.4{i} r_lower_leg.h_z"),
+                links: vec![],
                 relative: 1e-5 * f64::from(i + 1),
                 prior_share: 1.0 - 0.02 * f64::from(i),
             })

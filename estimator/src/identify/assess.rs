@@ -216,8 +216,10 @@ pub(super) fn outcome(
     let weakest = order[..rank].iter().rev().take(5).map(|&i| {
         let direction = directions.row(i).transpose();
         let value = svd.singular_values[i];
+        let (expression, links) = expression(setup, layout, &spread, &direction);
         WeakDirection {
-            expression: expression(setup, layout, &spread, &direction),
+            expression,
+            links,
             relative: value / greatest,
             prior_share: 1.0 / (1.0 + value * value),
         }
@@ -783,8 +785,13 @@ fn upper(m: &DMatrix<f64>) -> DMatrix<f64> {
 }
 
 /// The combination of parameters that a direction `v`, in units of the prior's spread `S`, is: `v . S^-1 d`, in words. Up to four terms, those which weigh most by the prior's spread of
-/// each parameter; the factors are those of the parameters in their own units, the first one's 1.
-fn expression(setup: &Setup, layout: &Layout, spread: &[DMatrix<f64>], direction: &DVector<f64>) -> String {
+/// each parameter; the factors are those of the parameters in their own units, the first one's 1. And the links that these are of.
+fn expression(
+    setup: &Setup,
+    layout: &Layout,
+    spread: &[DMatrix<f64>],
+    direction: &DVector<f64>,
+) -> (String, Vec<usize>) {
     let mut parts: Vec<(usize, f64, f64)> = Vec::new();
     for (place, spread) in spread.iter().enumerate() {
         let Some(inverse) = spread.clone().try_inverse() else {
@@ -805,15 +812,15 @@ fn expression(setup: &Setup, layout: &Layout, spread: &[DMatrix<f64>], direction
             PARAMETERS[column % WIDTH]
         ),
     };
-    let mut terms = parts.iter().take(4).filter(|part| part.2 >= 0.1 * parts[0].2).map(term);
+    let told: Vec<_> = parts.iter().take(4).filter(|part| part.2 >= 0.1 * parts[0].2).collect();
+    let mut links: Vec<usize> = told.iter().map(|part| layout.links[part.0 / WIDTH]).collect();
+    links.dedup();
+    let mut terms = told.into_iter().map(term);
     let Some(kept) = terms.next() else {
-        return String::new();
+        return (String::new(), links);
     };
-    BaseParameter {
-        kept,
-        terms: terms.collect(),
-    }
-    .to_string()
+    let terms = terms.collect();
+    (BaseParameter { kept, terms }.to_string(), links)
 }
 
 /// What can show at all with the joints that moved in the logs.
@@ -832,8 +839,18 @@ fn subspace(setup: &Setup, training: &[&Prepared], identified: &Identified) -> O
         return Identifiable::new(&setup.model, Scope::Tree, &regime, Measured::Torques, Offsets::Known).ok();
     }
     regime.contacts = setup.always;
-    let scope = Scope::SubTrees(&setup.structure);
-    Identifiable::new(&setup.model, scope, &regime, Measured::Wrench, Offsets::Unknown).ok()
+    let of = |measured| {
+        let scope = Scope::SubTrees(&setup.structure);
+        Identifiable::new(&setup.model, scope, &regime, measured, Offsets::Unknown).ok()
+    };
+    // Torques of all joints that move tell something beside F/T sensors; what those of some do is not known.
+    let is_measured =
+        |dof| matches!(regime.joints[dof], JointMotion::Locked(_)) || identified.layout.joints.contains(&dof);
+    let both = (0..regime.joints.len())
+        .all(is_measured)
+        .then(|| of(Measured::Both))
+        .flatten();
+    both.or_else(|| of(Measured::Wrench))
 }
 
 fn base_parameters(
@@ -1990,14 +2007,14 @@ mod tests {
         assert_eq!(
             expression(&setup, &layout, &[plain.clone(), mixed.clone()], &direction),
             // m / 1 - 0.5 h_y / 0.1, and too little of I_xx.
-            format!("{first}.m - 5 {first}.h_y")
+            (format!("{first}.m - 5 {first}.h_y"), vec![layout.links[0]])
         );
         // h_x / 0.1 of what h_x is beside its share of m: (h_x - 0.05 m) / 0.1.
         let direction = DVector::from_fn(20, |k, _| f64::from(u8::from(k == 11)));
         let second = setup.model.link_name(5);
         assert_eq!(
             expression(&setup, &layout, &[plain, mixed], &direction),
-            format!("{second}.h_x - 0.05 {second}.m")
+            (format!("{second}.h_x - 0.05 {second}.m"), vec![layout.links[1]])
         );
     }
 

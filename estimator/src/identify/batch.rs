@@ -15,6 +15,7 @@ use super::assess;
 use super::consistent;
 use super::gate::{self, UnitSet};
 use super::guard;
+use super::hypothesis;
 use super::information::Information;
 use super::instants::{Break, Defect, Instant, Recording, RecordingError, Settings, Signal, TimeOffset};
 use super::mounting;
@@ -97,7 +98,8 @@ const GATES: usize = 12;
 const LOADS: usize = 4;
 const REFUSED: usize = 2;
 
-/// A load is believed if without its side of the log the noise is less, by this factor of the variances (geometric mean over the channels).
+/// A load is believed if without its side of the log the noise of its part of the robot is less, by this
+/// factor of the variances (geometric mean over the channels there).
 const QUIETER: f64 = 2.0;
 
 /// Most rounds of noise and prior.
@@ -109,7 +111,8 @@ const SETTLED: f64 = 0.03;
 /// How many instants a fold of the check on held-out data has at least.
 pub(super) const LEAST_FOLD: usize = 50;
 
-/// Instants that noise, prior weight and the check on held-out data look at, at most, and in how many stretches of long logs.
+/// Instants that noise, prior weight and the check on held-out data look at, at most, and in how many
+/// stretches of long logs. Shorter stretches would not show how slow noise is: of many logs some are taken.
 const SAMPLE: usize = 10_000;
 const SAMPLE_STRETCHES: usize = 10;
 
@@ -783,19 +786,18 @@ pub(super) fn without_negative_rotors(
 
 /// Rotors whose inertia comes out negative, and not by chance.
 fn negative_rotors(setup: &Setup, layout: &Layout, fit: &Fit) -> Vec<Finding> {
-    /// Standard deviations: one in seven hundred is farther below zero by chance.
-    const DEVIATIONS: f64 = 3.0;
     if layout.further.is_empty() {
         return Vec::new();
     }
     let root = fit.covariance_root();
     let mut findings = Vec::new();
+    let farther = hypothesis::deviations(layout.further.len());
     for (further, column) in layout.further.iter().zip(layout.inertial()..) {
         let Further::RotorInertia(dof) = *further else {
             continue;
         };
         let (value, deviation) = (fit.x[column], root.row(column).norm());
-        if value < -DEVIATIONS * deviation {
+        if value < -farther * deviation {
             let joint = setup.model.dof_name(dof).to_owned();
             findings.push(Finding {
                 severity: Severity::Warning,
@@ -910,6 +912,7 @@ fn gated(
             .flatten();
         if let Some(load) = load {
             let before = undeclared.loads.clone();
+            let channels = maker.channels_of(&load.units);
             undeclared.carry(load);
             undeclared.mark(used_mut(prepared));
             let without = settle(
@@ -920,7 +923,7 @@ fn gated(
                 Some(settled.noise.clone()),
                 &mut progress,
             )?;
-            if without.noise.quieter(&settled.noise) > QUIETER {
+            if without.noise.quieter(&settled.noise, &channels) > QUIETER {
                 settled = without;
                 continue;
             }
@@ -1215,12 +1218,16 @@ pub(super) fn sample<'a>(maker: &RowMaker<'_>, training: &[&'a Prepared]) -> Vec
         return chunks(training, usize::MAX);
     }
     let pieces = chunks(training, total / SAMPLE_STRETCHES);
-    let length = SAMPLE / pieces.len();
+    let least = SAMPLE / SAMPLE_STRETCHES;
+    let in_stretches: usize = pieces.iter().map(|piece| piece.instants.len().min(least)).sum();
+    let every = ((in_stretches + SAMPLE / 2) / SAMPLE).max(1);
+    let length = SAMPLE / pieces.len().div_ceil(every);
     let stretch = |piece: &Piece<'a>, start: usize| Piece {
         instants: &piece.instants[start..piece.instants.len().min(start + length)],
         ..*piece
     };
-    let mut sampled: Vec<Piece<'a>> = pieces.iter().map(|piece| stretch(piece, 0)).collect();
+    let taken = pieces.iter().step_by(every);
+    let mut sampled: Vec<Piece<'a>> = taken.map(|piece| stretch(piece, 0)).collect();
     // How often each channel shows, as far as it matters: without any of it, its noise would be taken to be nothing.
     let (mut maker, mut rows) = (maker.clone(), Rows::new(maker.layout()));
     let mut heard = vec![0; maker.layout().channels()];
@@ -1243,8 +1250,8 @@ pub(super) fn sample<'a>(maker: &RowMaker<'_>, training: &[&'a Prepared]) -> Vec
             listen(instant, &mut heard);
         }
     }
-    for piece in &pieces {
-        let mut i = length;
+    for (number, piece) in pieces.iter().enumerate() {
+        let mut i = if number % every == 0 { length } else { 0 };
         while i < piece.instants.len() && heard.iter().any(|heard| *heard < LEAST_FOLD) {
             if listen(&piece.instants[i], &mut heard) {
                 let further = stretch(piece, i);
@@ -1315,5 +1322,76 @@ pub(super) fn verdict(identified: &Identified) -> Verdict {
         Verdict::Identified
     } else {
         Verdict::NoBetterThanCad
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::passes::tests::{between_two_sensors, readings};
+    use super::*;
+
+    /// A log of these instants.
+    fn log(instants: &[Instant]) -> Prepared {
+        Prepared {
+            file: String::new(),
+            role: Role::Train,
+            span: (instants[0].t, instants[instants.len() - 1].t),
+            torque_rate: 0.0,
+            instants: instants.to_vec(),
+            breaks: Vec::new(),
+            left_out: Vec::new(),
+            findings: Vec::new(),
+            refused: false,
+            touched: Vec::new(),
+            recording: None,
+        }
+    }
+
+    /// Noise that is as slow as a few seconds shows in stretches that are longer than that, of however many logs.
+    #[test]
+    fn stretches_of_many_logs_are_not_short() {
+        let setup = between_two_sensors();
+        let all = readings(&setup, 15_000, &[0.1; 12], &[0.0; 12]);
+        for (count, instants) in [(1, 15_000), (4, 12_000), (60, 1000), (100, 300)] {
+            let logs: Vec<Prepared> = (0..count).map(|_| log(&all[..instants])).collect();
+            let logs: Vec<&Prepared> = logs.iter().collect();
+            let wrench = [IdentificationInput::Wrench];
+            let all = logs.iter().flat_map(|log| &log.instants);
+            let maker = RowMaker::survey(&setup, &wrench, all).expect("rows");
+            let lengths: Vec<usize> = sample(&maker, &logs).iter().map(|piece| piece.instants.len()).collect();
+            let sum: usize = lengths.iter().sum();
+            assert!((SAMPLE / 2..=SAMPLE).contains(&sum), "{count} logs: {sum} instants");
+            let least = lengths.iter().min().copied().unwrap_or(0);
+            assert!(
+                least >= if instants < 1000 { 290 } else { 700 },
+                "{count} logs: {least} at once"
+            );
+        }
+    }
+
+    /// Whether a limb is quieter without a load is asked of its own sensors.
+    #[test]
+    fn a_load_is_asked_for_where_it_is() {
+        let setup = between_two_sensors();
+        let log = log(&readings(&setup, 200, &[0.1; 12], &[0.0; 12]));
+        let wrench = [IdentificationInput::Wrench];
+        let maker = RowMaker::survey(&setup, &wrench, log.instants.iter()).expect("rows");
+        let channels_of = |link: &str| {
+            let link = (0..setup.model.link_count()).find(|&number| setup.model.link_name(number) == link);
+            let mut units = UnitSet::default();
+            units.insert(setup.structure.subtree_of(link.expect("a link")).expect("its sub-tree"));
+            maker.channels_of(&units)
+        };
+        let thigh = channels_of("thigh");
+        assert_eq!(thigh, (0..12).collect::<Vec<_>>());
+        let foot = channels_of("foot");
+        assert_eq!(foot.len(), 6);
+        let noise = NoiseModel::unknown(vec![1e-6; 12]);
+        let mut quieter = noise.clone();
+        for &channel in &foot {
+            (quieter.square[channel], quieter.block[channel]) = (0.25, 0.25);
+        }
+        assert!((quieter.quieter(&noise, &foot) - 4.0).abs() < 1e-9);
+        assert!((quieter.quieter(&noise, &thigh) - 2.0).abs() < 1e-9);
     }
 }

@@ -23,15 +23,9 @@
 
 use nalgebra::{DMatrix, DVector, Matrix4, SymmetricEigen, Vector4};
 
+use super::hypothesis::needed;
 use super::prior::{CENTRED, Posterior, Prior, PriorError};
 use crate::spatial::{RigidInertia, Vec3};
-use crate::statistics::chi_square;
-
-/// The chance that bodies which exist are called impossible is at most this.
-pub const LEVEL: f64 = 1e-3;
-
-/// The standard normal deviate that is exceeded with probability [`LEVEL`].
-const DEVIATE: f64 = 3.090_232_306_167_813;
 
 /// Of two links that bind, the one that matters less than this share of all is not named.
 const LEAST_SHARE: f64 = 0.05;
@@ -186,7 +180,7 @@ fn follow(posterior: &Posterior, further: usize) -> Result<Consistent, PriorErro
     let excess = state.excess();
     let fit = posterior.finish(state, descent, (0.5 / weight).sqrt());
     let rank = posterior.rank().saturating_sub(further);
-    let limit = chi_square(rank, DEVIATE);
+    let limit = needed(rank, 1);
     let verdict = if excess <= limit {
         Verdict::Feasible
     } else if least > limit {

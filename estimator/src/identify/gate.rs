@@ -9,6 +9,7 @@
 //! - [`load`]: from some instant on, everything fails in the same way, and the ten parameters of one body at the end of a limb explain it.
 
 use super::batch::{LONG, Prepared, over};
+use super::hypothesis::needed;
 use super::information::Information;
 use super::instants::{Break, Instant};
 use super::passes::{NoiseModel, Piece, blocks, follow, leave, tell};
@@ -16,17 +17,25 @@ use super::prior::Prior;
 use super::rows::{Layout, RowMaker, Rows, WIDTH};
 use super::session::{Block, smooth_with};
 use crate::dynamics::BitSet;
+use crate::statistics::chi_square;
 use nalgebra::{DMatrix, DVector, Matrix6, SMatrix, SVector, Vector6};
 use proprio_topics::Nanos;
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-/// Squares of a block so many times the usual ones are no chance: Gaussian noise in six channels comes to ten times. (Real logs without contacts, a leg of cables and a torque-controlled arm, come to
-/// 12 to 24 times; pushes of 5 N at a hand with the arm's board to 80 and more.)
-const FACTOR: f64 = 40.0;
+/// What stands out of a block's squares, as the deviate of a normal variable: one block in three million by
+/// chance. By so many times the usual variance model errors vary where the robot moves as much; and of more
+/// channels than a wrench has, they are no freer. (Of six channels, 39 times the usual square. Real logs
+/// without contacts, a leg of cables and a torque-controlled arm, come to 12 to 24 times; pushes of 5 N at a
+/// hand with the arm's board to 80 and more.)
+const STANDS_OUT: f64 = 5.0;
+const VARIES: f64 = 3.5;
+const FREE: usize = 6;
 
-/// The quantile that is called usual: three in ten, so that contact may be most of the time.
+/// The quantile that is called usual: three in ten, so that contact may be most of the time; and the normal
+/// deviate below which as many are.
 const USUAL: f64 = 0.3;
+const USUAL_DEVIATE: f64 = -0.524_400_5;
 
 /// Blocks before and after what stands out that are left out too: a touch begins and ends softly.
 const MARGIN: usize = 2;
@@ -37,9 +46,8 @@ const ROUNDS: usize = 20;
 /// The level of less than this is not asked for [blocks].
 const SHORT: usize = 10;
 
-/// A whitened square of six channels that no two values of one offset are apart: one in twenty thousand by chance. So many times less of a variance is to be known better. And what lasts
-/// longer than this between two breaks is no touch \[s\].
-const STEP: f64 = 30.0;
+/// So many times less of a variance is to be known better. And what lasts longer than this between two
+/// breaks is no touch \[s\].
 const BETTER: f64 = 100.0;
 const TOUCH: f64 = 10.0;
 
@@ -56,13 +64,9 @@ const PIECE: f64 = 1.0;
 /// Pieces on either side of the change at least.
 const LEAST_PIECES: usize = 3;
 
-/// A change of load is believed if its mass is so many standard deviations from nothing, it is at least so heavy [kg], and its centre at most so far from its link's origin [m].
-const DEVIATIONS: f64 = 4.0;
+/// A load is at least so heavy [kg], and its centre at most so far from its link's origin [m].
 const LEAST_MASS: f64 = 0.02;
 const REACH: f64 = 1.0;
-
-/// Whitened squares that ten parameters must explain to be a load: one in two hundred by chance, and what is left has the load in it yet. Whether it is quieter without decides.
-const GAIN: f64 = 25.0;
 
 /// Parts of the robot whose equations hold or fail together: numbers of sub-trees, and [`Instant::TORQUES`].
 pub type UnitSet = BitSet<2>;
@@ -212,13 +216,13 @@ struct Level {
 
 impl Level {
     /// Whether it can not be another one's that went on, walking. `shared`: the covariance of the other one with this one.
-    fn is_other(&self, before: &Self, shared: &Matrix6<f64>, walk: &Vector6<f64>) -> bool {
+    fn is_other(&self, before: &Self, shared: &Matrix6<f64>, walk: &Vector6<f64>, needed: f64) -> bool {
         let step = self.value - before.value;
         let walked = Matrix6::from_diagonal(&(walk * (self.t - before.t).seconds().max(0.0)));
         let covariance = self.covariance + before.covariance - shared - shared.transpose() + walked;
         covariance
             .cholesky()
-            .is_none_or(|factor| step.dot(&factor.solve(&step)) > STEP)
+            .is_none_or(|factor| step.dot(&factor.solve(&step)) > needed)
     }
 
     /// Whether more is known of it than of another one, clearly.
@@ -236,6 +240,7 @@ fn new_levels(
     walk: &Vector6<f64>,
 ) -> Vec<bool> {
     let mut is_new = vec![true; levels.len()];
+    let needed = needed(6, levels.len());
     let mut number = 0;
     let mut known: Option<usize> = None;
     while number < levels.len() {
@@ -245,7 +250,11 @@ fn new_levels(
         // As far as possible.
         let last = (number..levels.len())
             .take_while(|&k| k == number || (levels[k].1.t - own.t).seconds() < TOUCH)
-            .filter(|&k| !levels[k].1.is_other(&levels[before].0, &shared(before, k), walk))
+            .filter(|&k| {
+                !levels[k]
+                    .1
+                    .is_other(&levels[before].0, &shared(before, k), walk, needed)
+            })
             .last();
         known = last.map(|_| before);
         if let Some(last) = last {
@@ -378,6 +387,8 @@ fn stands_out(series: &[&[f64]], starts: &[usize], motion: &[f64], least: &[f64]
         return odd;
     }
     let mut levels: Vec<Vec<f64>> = series.iter().map(|series| medians(series, starts)).collect();
+    let of_channels = |deviate: f64| chi_square(series.len().min(FREE), deviate);
+    let most = VARIES * of_channels(STANDS_OUT) / of_channels(USUAL_DEVIATE);
     for _ in 0..ROUNDS {
         let mut squares = vec![0.0; count];
         let mut seen = vec![false; count];
@@ -392,7 +403,7 @@ fn stands_out(series: &[&[f64]], starts: &[usize], motion: &[f64], least: &[f64]
             }
         }
         let usual = usual(&squares, &seen, motion);
-        let fails: Vec<bool> = (0..count).map(|k| seen[k] && squares[k] > FACTOR * usual[k]).collect();
+        let fails: Vec<bool> = (0..count).map(|k| seen[k] && squares[k] > most * usual[k]).collect();
         let mut next = vec![false; count];
         for k in (0..count).filter(|&k| fails[k]) {
             next[k.saturating_sub(MARGIN)..(k + MARGIN + 1).min(count)].fill(true);
@@ -519,7 +530,8 @@ impl Added {
     fn is_a_body(&self) -> bool {
         let mass = self.parameters[0];
         let centre = self.parameters.fixed_rows::<3>(1) / mass;
-        mass.abs() > LEAST_MASS && mass.abs() > DEVIATIONS * self.covariance[(0, 0)].sqrt() && centre.norm() < REACH
+        let is_sure = mass * mass > needed(1, 1) * self.covariance[(0, 0)];
+        mass.abs() > LEAST_MASS && is_sure && centre.norm() < REACH
     }
 }
 
@@ -567,6 +579,8 @@ pub(super) fn load(
     let ends: Vec<usize> = (0..layout.links.len())
         .filter(|&place| model.joints().iter().all(|joint| joint.parent != layout.links[place]))
         .collect();
+    // As if one were tried: the noise has the load in it yet. Whether it is quieter without decides.
+    let least = needed(WIDTH, 1);
     let mut best: Option<(f64, f64, usize, usize, usize)> = None;
     for (log, range) in of_log.iter().enumerate() {
         if range.len() < 2 * LEAST_PIECES {
@@ -592,7 +606,7 @@ pub(super) fn load(
                 };
                 let (later, earlier) = (of(&after), of(&before));
                 let gain = later.max(earlier);
-                if gain > GAIN && best.is_none_or(|best| gain > best.0.max(best.1)) {
+                if gain > least && best.is_none_or(|best| gain > best.0.max(best.1)) {
                     best = Some((later, earlier, log, at, place));
                 }
             }
@@ -695,7 +709,7 @@ mod tests {
 
     fn found(series: &[Vec<f64>], starts: &[usize], motion: &[f64]) -> Vec<bool> {
         let series: Vec<&[f64]> = series.iter().map(Vec::as_slice).collect();
-        stands_out(&series, starts, motion, &[1e-6; 6])
+        stands_out(&series, starts, motion, &vec![1e-6; series.len()])
     }
 
     #[test]
@@ -707,6 +721,22 @@ mod tests {
                 0,
                 "seed {seed}"
             );
+        }
+    }
+
+    /// Of few channels chance alone makes squares many times the usual ones.
+    #[test]
+    fn the_chance_of_few_channels_is_no_contact() {
+        for channels in 1..=3 {
+            for seed in 0..20 {
+                let (mut series, starts, motion) = usual_log(seed);
+                series.truncate(channels);
+                let odd = found(&series, &starts, &motion);
+                assert_eq!(odd.iter().filter(|odd| **odd).count(), 0, "{channels}, seed {seed}");
+                series[0][90..140].iter_mut().for_each(|x| *x += 60.0);
+                let odd = found(&series, &starts, &motion);
+                assert!(odd[90..140].iter().all(|odd| *odd), "{channels}, seed {seed}");
+            }
         }
     }
 

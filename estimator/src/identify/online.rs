@@ -823,7 +823,7 @@ impl Component {
             scratch: Scratch {
                 covariance: vec![0.0; most * most],
                 mean: vec![0.0; unknowns + 1],
-                projected: vec![0.0; most * unknowns],
+                projected: vec![0.0; most * (unknowns + session)],
                 innovations: vec![0.0; most],
             },
             kinds,
@@ -916,7 +916,7 @@ impl Component {
     fn close(&mut self, t: Nanos, known: &ComponentSolution) {
         let elapsed = (t - self.drifted).seconds().clamp(0.0, 60.0);
         self.drifted = t;
-        if !self.gathered.is_empty() && self.judges && self.is_odd(known) {
+        if !self.gathered.is_empty() && self.judges && self.is_odd(known, t) {
             self.lasts = self.is_suspected;
             if !self.is_suspected {
                 self.is_suspected = true;
@@ -1012,8 +1012,11 @@ impl Component {
     }
 
     /// Whether the mean innovation of the gathered block is beyond what noise and the uncertainty of what is in force explain.
-    fn is_odd(&mut self, known: &ComponentSolution) -> bool {
+    /// (And how far offsets have wandered by `t`, since the data that this is found from.)
+    fn is_odd(&mut self, known: &ComponentSolution, t: Nanos) -> bool {
         let unknowns = self.kinds.unknowns();
+        let (session, wandered) = (self.offsets.len(), (t - known.data).seconds().max(0.0).sqrt());
+        let projected_width = unknowns + session;
         if known.estimate.len() != unknowns || known.spread.shape() != (unknowns, unknowns) {
             return false;
         }
@@ -1045,21 +1048,27 @@ impl Component {
                 }
                 let (row, right) = mean.split_at(kind.columns.len());
                 innovations[m] = kind.left(row, right[0], &known.estimate);
+                let (to, walk) = projected[m * projected_width..][..projected_width].split_at_mut(unknowns);
+                walk.fill(0.0);
+                for (value, &channel) in row.iter().zip(&kind.columns[..kind.offsets]) {
+                    walk[channel] = value * self.wander[channel] * wandered;
+                }
                 // U a: the columns of U are [d | s].
                 Arch::new().dispatch(Project {
                     root: &known.spread,
-                    session: self.offsets.len(),
+                    session,
                     columns: &kind.columns,
                     row,
-                    to: &mut projected[m * unknowns..][..unknowns],
+                    to,
                 });
                 m += 1;
             }
         }
         for i in 0..m {
             for j in 0..=i {
-                let (a, b) = (&projected[i * unknowns..], &projected[j * unknowns..]);
-                covariance[i * m + j] = dot(&a[..unknowns], &b[..unknowns]) + f64::from(u8::from(i == j));
+                let (a, b) = (&projected[i * projected_width..], &projected[j * projected_width..]);
+                let (a, b) = (&a[..projected_width], &b[..projected_width]);
+                covariance[i * m + j] = dot(a, b) + f64::from(u8::from(i == j));
             }
         }
         factorise(covariance, m);

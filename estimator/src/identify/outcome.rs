@@ -148,6 +148,8 @@ pub struct CovarianceRoot {
 pub struct WeakDirection {
     /// In words, factors in the units of the parameters: `right_hand.m - 0.41 right_forearm.h_z`. Terms that weigh little by the prior's spread are left out.
     pub expression: String,
+    /// The links that these are of.
+    pub links: Vec<usize>,
     /// Its singular value relative to the greatest, columns scaled to the prior's spread.
     pub relative: f64,
     /// Share of its variance that is the prior's: 1: the log says nothing, 0: the log says it all.

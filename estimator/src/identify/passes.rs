@@ -127,11 +127,11 @@ impl NoiseModel {
         Some(greatest)
     }
 
-    /// By how much the variances are less than those of another model: the geometric mean over the channels.
-    pub(super) fn quieter(&self, other: &Self) -> f64 {
+    /// By how much the variances of these channels are less than those of another model: the geometric mean.
+    pub(super) fn quieter(&self, other: &Self, channels: &[usize]) -> f64 {
         let (own, others) = (self.inflated(), other.inflated());
-        let sum: f64 = own.iter().zip(&others).map(|(own, other)| (other / own).ln()).sum();
-        (sum / own.len().max(1) as f64).exp()
+        let sum: f64 = channels.iter().map(|&c| (others[c] / own[c]).ln()).sum();
+        (sum / channels.len().max(1) as f64).exp()
     }
 
     fn steps(&self, layout: &Layout, seconds: f64) -> Vec<f64> {
@@ -607,7 +607,7 @@ fn alike(layout: &Layout, pieces: &[Residuals], model: &NoiseModel) -> Vec<f64> 
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::super::gate::UnitSet;
     use super::super::normals;
     use super::*;
@@ -642,7 +642,7 @@ mod tests {
     }
 
     /// Three links between two F/T sensors, a foot beyond that stands on something: the readings of both sensors are in the same six equations.
-    fn between_two_sensors() -> Setup {
+    pub(in crate::identify) fn between_two_sensors() -> Setup {
         let link = |name: &str| {
             format!(
                 "<link name=\"{name}\"><inertial><origin xyz=\"0.02 -0.01 0.1\" rpy=\"0 0 0\"/><mass value=\"1.5\"/><inertia ixx=\"0.01\" ixy=\"0\" ixz=\"0\" iyy=\"0.012\" iyz=\"0\" izz=\"0.005\"/></inertial></link>"
@@ -670,7 +670,12 @@ mod tests {
     }
 
     /// What both sensors read at 100 Hz while CAD is right, with these deviations of their channels and of their offsets' steps, [torque; force] of both.
-    fn readings(setup: &Setup, count: usize, noise: &[f64; 12], walk: &[f64; 12]) -> Vec<Instant> {
+    pub(in crate::identify) fn readings(
+        setup: &Setup,
+        count: usize,
+        noise: &[f64; 12],
+        walk: &[f64; 12],
+    ) -> Vec<Instant> {
         // Of each of twelve channels, a step of its offset and its noise.
         let mut deviates = normals(7, 24 * count).into_iter();
         let mut normal = || deviates.next().expect("enough");

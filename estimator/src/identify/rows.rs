@@ -17,6 +17,7 @@
 //! `-r`, or the temperature. There `r` is what the sensor would have read without noise, by an earlier fit ([`Instant::fitted`]). For with the noise in it, a gain of nothing and bodies without mass
 //! would leave nothing of any row: mass and gain grow together, so that only priors would speak against it, and noise, of which there is the more the longer a log is, for it.
 
+use super::gate::UnitSet;
 use super::instants::Instant;
 use super::{dot, factorise, forward};
 use crate::calibration::{Kind, Unknown};
@@ -693,6 +694,24 @@ impl<'a> RowMaker<'a> {
     pub(super) fn sensors_of_subtrees(&self) -> Vec<Vec<usize>> {
         let each = self.stacked.subtrees().iter();
         each.map(|subtree| subtree.sensors().collect()).collect()
+    }
+
+    /// The layout's channels that rows of these units have.
+    pub(super) fn channels_of(&self, units: &UnitSet) -> Vec<usize> {
+        let (layout, subtrees) = (self.layout(), self.stacked.subtrees());
+        let is_read = |sensor: usize| {
+            let mut own = subtrees
+                .iter()
+                .enumerate()
+                .filter(|(number, _)| units.contains(*number));
+            own.any(|(_, subtree)| subtree.sensors().any(|other| other == sensor))
+        };
+        let sensors = (0..layout.sensors.len()).filter(|&place| is_read(layout.sensors[place]));
+        let of_sensors = sensors.flat_map(|place| 6 * place..6 * place + 6);
+        let of_joints = 6 * layout.sensors.len()..layout.channels();
+        of_sensors
+            .chain(of_joints.filter(|_| units.contains(Instant::TORQUES)))
+            .collect()
     }
 
     /// What a sub-tree needs for accelerating as if its joints were locked, by CAD, after [`RowMaker::make`]: for a unit of each of [angular; linear], about its top link's origin and in that

@@ -15,6 +15,7 @@
 //! together, as one more unknown of the fit; and of each, where one stands out from others that are all on time.
 
 use super::batch::{Identified, Prepared, added, over, sample};
+use super::hypothesis;
 use super::outcome::{Finding, LeftOut, Severity};
 use super::passes::{Residuals, leave, tell_with};
 use super::prior::Posterior;
@@ -249,8 +250,7 @@ const SPREAD: f64 = 0.05;
 /// Friction that is not as the model has it makes each joint seem late by a time of its own. So one is named only if it seems later (or earlier) than the others have in common by far more than any of these,
 /// and these others, together, are on time: who is late is told by the encoders, and not by a majority.
 pub(super) fn late(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Identified) -> Vec<Finding> {
-    /// It is said if it is so many standard deviations long, and so long \[s\].
-    const DEVIATIONS: f64 = 4.0;
+    /// It is said if it is so long \[s\], and not by chance.
     const LEAST_DELAY: f64 = 2e-3;
     /// ... and of one joint, if so many times as long as that of any other (of a real arm with joint torque sensors, whose friction makes them seem late, up to 3.7 times).
     const ALONE: f64 = 8.0;
@@ -266,7 +266,9 @@ pub(super) fn late(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Id
         ),
         subject,
     };
-    let is_long = |seconds: f64, deviation: f64| seconds.abs() > LEAST_DELAY.max(DEVIATIONS * deviation);
+    // Each joint's by itself, and all of them together.
+    let farther = hypothesis::deviations(joints.len() + 1);
+    let is_long = |seconds: f64, deviation: f64| seconds.abs() > LEAST_DELAY.max(farther * deviation);
     let mut findings = Vec::new();
     let each = delays(maker, training, identified, true).unwrap_or_default();
     // Those of which the logs tell more than was known before.

@@ -1,4 +1,14 @@
-//! Joints whose zero is elsewhere than the model's: a constant error of the position that explains more than inertial parameters can, at the prior's weight.
+//! Joints whose position is another than the model's: counted the other way round, or with its zero
+//! elsewhere. What explains more than inertial parameters can, at the prior's weight
+//! ([`super::hypothesis`]).
+//!
+//! # Direction
+//! All of what is fitted is fitted again to the logs with a joint's position, velocity and acceleration turned:
+//! joint by joint, and what lessens the cost the most is taken, then what else does. Zeros are not asked
+//! for beside that: an encoder that counts backwards looks as zeros of other joints that are elsewhere.
+//!
+//! # Zeros
+//! A constant error of the position.
 //!
 //! Of joints beyond sensors, or between them, and of those between the base and them: an error of these tilts all that is seen, otherwise in every posture, unless it is the joint at the base,
 //! which looks as a base that is not level does. In all logs, or in one of several: incremental encoders find their zeros anew with each start.
@@ -7,20 +17,18 @@
 //! then what else remains.
 
 use super::batch::{Identified, Prepared, added, over};
+use super::hypothesis::needed;
 use super::information::Information;
 use super::outcome::{Finding, Severity};
 use super::parallel;
-use super::passes::{Piece, tell_angles};
+use super::passes::{Piece, tell, tell_angles};
 use super::prior::{Fit, Posterior};
-use super::rows::RowMaker;
+use super::rows::{Layout, RowMaker};
 use crate::model::JointKind;
 use nalgebra::{DMatrix, DVector};
 
 /// A position is expected to be off by this much \[rad\], one standard deviation, before anything is measured.
 const SPREAD: f64 = 0.1;
-
-/// Squared deviations that must be gained: one joint in a thousand gains more by chance (chi-square, one degree).
-const GAIN: f64 = 10.83;
 
 /// Less than this matters to nobody \[rad\]; of a joint before the sensors: less is what floors and bases have.
 const LEAST: f64 = 0.01;
@@ -51,27 +59,16 @@ struct Search<'a> {
     /// The information's triangle over the angles, log by log, then the parameters; and its right side.
     r: DMatrix<f64>,
     z: DVector<f64>,
-    /// As [`GAIN`], for so many that might be.
+    /// What one of them must gain.
     gain: f64,
 }
 
 impl<'a> Search<'a> {
     fn new(maker: &RowMaker<'_>, training: &[&Prepared], identified: &'a Identified, dofs: &[usize]) -> Self {
-        let share = (ENOUGH / training.len().max(1)).max(LEAST_OF_LOG);
         let (logs, joints, unknowns) = (training.len(), dofs.len(), identified.layout.unknowns());
         let mut sum = Information::new(joints * logs + unknowns);
         for (number, log) in training.iter().enumerate() {
-            let stretches = if log.instants.len() > share { STRETCHES } else { 1 };
-            let count = log.instants.len().min(share) / stretches;
-            let piece = |stretch: usize| {
-                // From the first to the last.
-                let start = (log.instants.len() - count) * stretch / (stretches - 1).max(1);
-                Piece {
-                    instants: &log.instants[start..start + count],
-                    breaks: &log.breaks,
-                }
-            };
-            let pieces: Vec<Piece<'_>> = (0..stretches).map(piece).collect();
+            let pieces = stretches(log, logs);
             let told = over(maker, &pieces, |maker, _, piece| {
                 tell_angles(maker, piece, &identified.noise, dofs, identified.fit.x.as_slice())
             });
@@ -89,7 +86,7 @@ impl<'a> Search<'a> {
             logs,
             r,
             z,
-            gain: GAIN + 2.0 * f64::ln(places.len() as f64),
+            gain: needed(1, joints * places.len()),
             places,
         }
     }
@@ -126,9 +123,7 @@ impl<'a> Search<'a> {
         precision.resize(layout.further.len() + zeros.len(), SPREAD.powi(-2));
         let posterior = Posterior::new(prior, &layout.links, &self.columns(zeros), &self.z, &precision);
         let fit = posterior.ok()?.fit(fit.tau).ok()?;
-        let further = fit.x.iter().skip(layout.inertial());
-        let further: f64 = further.zip(&precision).map(|(x, precision)| x * x * precision).sum();
-        Some((fit.residual_square + fit.divergence / fit.tau.powi(2) + further, fit))
+        Some((cost(layout, &fit, &precision), fit))
     }
 
     /// What is worth trying beside these zeros, whose fit this is: what gains the most if the prior were quadratic; and the same joints in all logs.
@@ -200,7 +195,84 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Says which joints' zeros are elsewhere.
+/// What a fit leaves of the data, squared, and twice what it costs by the priors.
+fn cost(layout: &Layout, fit: &Fit, precision: &[f64]) -> f64 {
+    let further = fit.x.iter().skip(layout.inertial());
+    let further: f64 = further.zip(precision).map(|(x, precision)| x * x * precision).sum();
+    fit.residual_square + fit.divergence / fit.tau.powi(2) + further
+}
+
+/// Some of a log's instants, one of so many, in stretches from the first to the last.
+fn stretches(log: &Prepared, logs: usize) -> Vec<Piece<'_>> {
+    let share = (ENOUGH / logs.max(1)).max(LEAST_OF_LOG);
+    let stretches = if log.instants.len() > share { STRETCHES } else { 1 };
+    let count = log.instants.len().min(share) / stretches;
+    let piece = |stretch: usize| {
+        let start = (log.instants.len() - count) * stretch / (stretches - 1).max(1);
+        Piece {
+            instants: &log.instants[start..start + count],
+            breaks: &log.breaks,
+        }
+    };
+    (0..stretches).map(piece).collect()
+}
+
+/// Of these joints, those whose encoders count the other way round.
+fn turned(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Identified, dofs: &[usize]) -> Vec<usize> {
+    let Identified {
+        layout,
+        prior,
+        noise,
+        fit,
+        ..
+    } = identified;
+    let pieces: Vec<Piece<'_>> = (training.iter())
+        .flat_map(|log| stretches(log, training.len()))
+        .collect();
+    let cost_with = |turned: &[usize]| {
+        let (mut maker, mut all) = (maker.clone(), Information::new(layout.unknowns()));
+        let columns: Vec<usize> = (0..layout.unknowns()).collect();
+        for piece in &pieces {
+            let mut instants = piece.instants.to_vec();
+            for instant in &mut instants {
+                for &dof in turned {
+                    instant.position[dof] *= -1.0;
+                    instant.velocity[dof] *= -1.0;
+                    instant.acceleration[dof] *= -1.0;
+                }
+            }
+            let (instants, breaks) = (&instants[..], piece.breaks);
+            let _ = all.merge(
+                &tell(&mut maker, Piece { instants, breaks }, noise).information,
+                &columns,
+            );
+        }
+        let (r, z) = all.to_triangle();
+        let posterior = Posterior::new(prior, &layout.links, &r, &z, &layout.precision);
+        let fit = posterior.ok()?.fit(fit.tau).ok()?;
+        Some(all.residual_square() + cost(layout, &fit, &layout.precision))
+    };
+    let mut turned: Vec<usize> = Vec::new();
+    let Some(mut least) = cost_with(&[]) else { return turned };
+    loop {
+        let rest: Vec<usize> = dofs.iter().copied().filter(|dof| !turned.contains(dof)).collect();
+        let costs = parallel::map(rest.len(), |number| {
+            let with: Vec<usize> = turned.iter().copied().chain([rest[number]]).collect();
+            cost_with(&with)
+        });
+        let found = rest.iter().zip(costs).filter_map(|(dof, cost)| Some((*dof, cost?)));
+        let best = found.min_by(|a, b| a.1.total_cmp(&b.1));
+        match best.filter(|best| least - best.1 > needed(1, dofs.len())) {
+            Some((dof, cost)) => {
+                turned.push(dof);
+                least = cost;
+            }
+            None => return turned,
+        }
+    }
+}
+
+/// Says which joints' positions are others.
 pub(super) fn joint_zeros(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Identified) -> Vec<Finding> {
     let setup = maker.setup();
     let layout = &identified.layout;
@@ -220,6 +292,21 @@ pub(super) fn joint_zeros(maker: &RowMaker<'_>, training: &[&Prepared], identifi
     let dofs: Vec<usize> = (0..setup.model.dof_count())
         .filter(|&dof| setup.locked[dof].is_nan() && joint(dof).is_some())
         .collect();
+    let turned = turned(maker, training, identified, &dofs);
+    if !turned.is_empty() {
+        let finding = |dof: &usize| {
+            let joint = format!("joint/{}", setup.model.dof_name(*dof));
+            Finding {
+                severity: Severity::Warning,
+                code: "wrong_sign",
+                text: format!(
+                    "{joint} fits only with its position turned: its encoder counts the other way round, or its axis in the URDF points the other way"
+                ),
+                subject: joint,
+            }
+        };
+        return turned.iter().map(finding).collect();
+    }
     let search = Search::new(maker, training, identified, &dofs);
     let Some((cost, zeros)) = search.run() else {
         return Vec::new();

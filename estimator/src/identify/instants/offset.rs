@@ -15,6 +15,7 @@
 //! information `I` (the sandwich estimator; White 1980, in blocks: Liang, Zeger 1986), if that is more than what noise gives with its autocorrelation time.
 
 use super::{Recording, Stream, cubic};
+use crate::identify::hypothesis::deviations;
 use crate::identify::{add_multiple, dot, parallel};
 use proprio_topics::Nanos;
 use std::collections::BTreeMap;
@@ -29,9 +30,7 @@ const SLOW: f64 = 0.5;
 const STRETCH: f64 = 2.0;
 /// Standard deviation of the smoothing of both sides, in samples of the one that has fewer.
 const SMOOTH: f64 = 2.0;
-/// Significant is what exceeds this many standard deviations ...
-const DEVIATIONS: f64 = 4.0;
-/// ... and this \[s\]: less than that does no harm and is not worth moving a stream for.
+/// Significant is what is no chance, and exceeds this \[s\]: less than that does no harm and is not worth moving a stream for.
 const LEAST: f64 = 0.5e-3;
 
 /// A stream whose stamps are compared with the encoders'.
@@ -88,7 +87,7 @@ impl Recording {
             },
             seconds,
             deviation,
-            significant: seconds.abs() > DEVIATIONS * deviation && seconds.abs() > LEAST,
+            significant: seconds.abs() > deviations(self.channels.len()) * deviation && seconds.abs() > LEAST,
         })
     }
 }
