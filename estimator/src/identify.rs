@@ -13,7 +13,7 @@
 //!     -> undeclared contacts, another load: left out, and again, until it stays                gate, undeclared
 //!     -> held-out data: what gains nothing is shrunk to CAD                                    guard
 //!     -> motion that only other F/T sensors feel, taken off; all of the fit again              shaking
-//!     -> Outcome: parameters, covariance, figures per log, encoders turned or with another zero         assess, zeros, export
+//!     -> Outcome: parameters, covariance, figures per log, encoders turned or with another zero  assess, zeros, delay, export
 //! ```
 //! [`identify`] does all of it. Parameters belong to the robot and are common to all logs; offsets and friction belong to a log.
 //!
@@ -35,6 +35,7 @@
 mod assess;
 mod batch;
 pub mod consistent;
+mod delay;
 mod export;
 mod gate;
 mod guard;
@@ -66,7 +67,7 @@ pub use gate::UnitSet;
 pub use outcome::{
     BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
     FrictionOutcome, InForce, JointOutcome, LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Predicted, Role,
-    RotorOutcome, SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome, Verdict, WeakDirection,
+    RotorOutcome, SensorOutcome, Severity, Spectrum, Three, TimeOffset, TwoRouteOutcome, Verdict, WeakDirection,
 };
 pub use plausible::implausible;
 pub(crate) use yardstick::predicted;

@@ -1203,7 +1203,7 @@ fn readings_of_two_sensors_are_compared_as_they_are() {
             }
         }
         // Both are stamped as the encoders are.
-        let late = &outcome.logs[0].time_offsets;
+        let late = &outcome.time_offsets;
         assert!(late.iter().all(|late| !late.significant), "{late:?}");
     }
 }
@@ -1605,6 +1605,50 @@ fn change_rows(log: &str, column: &str, mut by: impl FnMut(usize, f64) -> f64) -
         **row += 1;
         by(**row - 1, x)
     })
+}
+
+/// F/T readings that are stamped late, or early, by a part of a row's time or by some: how much is found, with its
+/// deviation.
+#[test]
+fn late_readings_are_found_with_their_deviation() {
+    let setup = arm();
+    let log = simulate(&setup, &real(&setup, 3), 20.0, 0.01, 3);
+    // A column as it was so many rows before, between rows on a line.
+    let shifted = |log: &str, column: &str, rows: f64| {
+        let mut values = Vec::new();
+        change_rows(log, column, |_, x| {
+            values.push(x);
+            x
+        });
+        change_rows(log, column, |i, _| {
+            let at = (i as f64 - rows).clamp(0.0, values.len() as f64 - 1.001);
+            let (before, share) = (at.floor() as usize, at.fract());
+            values[before] + share * (values[before + 1] - values[before])
+        })
+    };
+    let axes = ["fx", "fy", "fz", "tx", "ty", "tz"].map(|axis| format!("wrench/ft/{axis}"));
+    for late in [0.0, 0.7, -1.2, 3.0] {
+        let log = axes.iter().fold(log.clone(), |log, axis| shifted(&log, axis, late));
+        let outcome = run(&setup, &[("log", Role::Train, &log)], &[]);
+        let [offset] = &outcome.time_offsets[..] else {
+            panic!("{:?}", outcome.time_offsets)
+        };
+        println!("{late} rows: {offset:?}");
+        assert_eq!(
+            (offset.channel.as_str(), offset.significant),
+            ("wrench/ft", late != 0.0)
+        );
+        let (off, deviation) = (offset.seconds - 0.01 * late, offset.deviation);
+        assert!(
+            off.abs() < 4.0 * deviation + 0.03 * 0.01 * late.abs() && deviation < 2e-3,
+            "{offset:?}"
+        );
+        let told = outcome.findings.iter().filter(|f| f.code == "time_offset");
+        let told: Vec<&str> = told.map(|f| f.text.as_str()).collect();
+        assert_eq!(told.len(), usize::from(late != 0.0), "{told:?}");
+        let word = if late > 0.0 { "behind" } else { "ahead of" };
+        assert!(told.iter().all(|text| text.contains(word)), "{told:?}");
+    }
 }
 
 /// Joint torques with each of the faults that torque channels have: named, and what is wrong left out, so that the rest is identified as well as without it.

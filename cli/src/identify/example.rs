@@ -2,11 +2,10 @@
 
 use proprio_estimator::calibration::{Calibration, Kind, Unknown, force_first, gain_from_force_first};
 use proprio_estimator::config::Gain;
-use proprio_estimator::identify::instants::{Signal, TimeOffset};
 use proprio_estimator::identify::{
     BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
     FrictionOutcome, JointOutcome, LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Predicted, Role,
-    RotorOutcome, SensorOutcome, Severity, Spectrum, Three, TwoRouteOutcome, Verdict, WeakDirection,
+    RotorOutcome, SensorOutcome, Severity, Spectrum, Three, TimeOffset, TwoRouteOutcome, Verdict, WeakDirection,
 };
 use proprio_estimator::spatial::{RigidInertia, Wrench};
 use proprio_topics::Nanos;
@@ -109,7 +108,6 @@ fn log(file: &str, role: Role) -> LogOutcome {
             breaks: vec![at(17.3)],
         }],
         friction: vec![FrictionOutcome { joint: "r_knee".into(), coulomb_nm: 0.41, viscous: 0.08, offset_nm: -0.02, deviation: [0.01, 0.004, 0.02] }],
-        time_offsets: vec![TimeOffset { signal: Signal::Wrench(0), channel: "wrench/r_leg_ft_sensor".into(), seconds: 0.0061, deviation: 0.0004, significant: true }],
         findings: vec![Finding {
             severity: Severity::Warning,
             code: "jump",
@@ -194,6 +192,7 @@ pub(crate) fn outcome() -> Outcome {
                 drift: 0.01,
             })
             .collect(),
+        time_offsets: vec![TimeOffset { channel: "wrench/r_leg_ft_sensor".into(), seconds: 0.0061, deviation: 0.0004, significant: true }],
         consistency: Consistency { feasible: Some(true), deviations: 0.4, links: vec![], text: "bodies exist that have what the logs say".into() },
         logs: vec![log("walk_1.csv", Role::Train), log("walk_2.csv", Role::Validate)],
         findings: vec![Finding {
@@ -260,7 +259,6 @@ pub(crate) fn nothing() -> Outcome {
         log.spectra.clear();
         log.offsets.clear();
         log.friction.clear();
-        log.time_offsets.clear();
         log.findings = vec![Finding {
             severity: Severity::Refusal,
             code: "no_motion",

@@ -752,22 +752,19 @@ fn sessions(outcome: &Outcome) -> Option<String> {
     let mut body = Vec::new();
     let mut times = Table::new(
         "Time offset of each stream against the encoders; late is positive",
-        &["log", "channel", "offset [ms]", ""],
+        &["channel", "offset [ms]", ""],
     );
-    for log in &outcome.logs {
-        for o in &log.time_offsets {
-            times.row(vec![
-                log.file.as_str().into(),
-                o.channel.as_str().into(),
-                Cell::Uncertain(o.seconds * 1e3, o.deviation * 1e3),
-                if o.significant {
-                    "more than chance"
-                } else {
-                    "may be chance"
-                }
-                .into(),
-            ]);
-        }
+    for o in &outcome.time_offsets {
+        times.row(vec![
+            o.channel.as_str().into(),
+            Cell::Uncertain(o.seconds * 1e3, o.deviation * 1e3),
+            if o.significant {
+                "more than chance"
+            } else {
+                "may be chance"
+            }
+            .into(),
+        ]);
     }
     body.push(times.html());
     let mut rotors = Table::new(

@@ -18,7 +18,7 @@
 //! | `condition`, `singular_values` | of what the logs tell, columns scaled by the prior's spread |
 //! | `weakest` | worst first: {`expression`, `relative`: singular value over the greatest, `prior_share`: share of its variance that is the prior's} |
 //! | `confused` | what the motion of the logs can not tell apart, in words |
-//! | `time_offsets` | {`log`, `channel`, `seconds` (late is positive), `deviation`, `significant`}: told, not removed |
+//! | `time_offsets` | {`channel`, `seconds` (late is positive), `deviation`, `significant`}: told, not removed |
 //! | `consistency` | {`feasible`: whether bodies exist that have what the logs say (`null`: not decided), `deviations`: by how many sigma not, `links`, `text`} |
 //! | `findings` | what is wrong, in words: {`log` or `null`, `severity`: `note`, `warning`, `refusal`; `code`: one word; `subject`: a channel, joint or link; `text`} |
 //! | `links` | {`name`, `seen`, `kept`: which share of the change from CAD was kept after the held-out check, `significance`, `cad`, `identified`, `deviation`: ten numbers each, m h_x h_y h_z I_xx I_xy I_xz I_yy I_yz I_zz about the link's origin} |
@@ -71,12 +71,9 @@ pub(crate) fn summary(outcome: &Outcome, advice: &Advice) -> Json {
         Verdict::Nothing(reason) => ("nothing", Some(reason)),
     };
     let time_offsets: Vec<Json> = outcome
-        .logs
+        .time_offsets
         .iter()
-        .flat_map(|log| log.time_offsets.iter().map(move |offset| (log, offset)))
-        .map(|(log, o)| {
-            json!({ "log": log.file, "channel": o.channel, "seconds": o.seconds, "deviation": o.deviation, "significant": o.significant })
-        })
+        .map(|o| json!({ "channel": o.channel, "seconds": o.seconds, "deviation": o.deviation, "significant": o.significant }))
         .collect();
     let found: Vec<Json> = findings(outcome)
         .map(|(log, f)| {

@@ -1,6 +1,6 @@
 //! Figures: what is left of every log with CAD, with CAD and fitted offsets, and with the identified parameters; and what is known of the parameters, in numbers and words.
 
-use super::batch::{Identified, LEAST_FOLD, Prepared, bodies, feasibility, per_column, time_offsets, verdict};
+use super::batch::{Identified, LEAST_FOLD, Prepared, bodies, feasibility, per_column, verdict};
 use super::gate::UnitSet;
 use super::outcome::{
     BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
@@ -11,7 +11,7 @@ use super::passes::{OFFSET_VARIANCE, Residuals, Told, leave, tell};
 use super::rows::{FRICTION, Further, Layout, RowMaker, Rows, WIDTH, friction_row};
 use super::session::Block;
 use super::yardstick::{self, Candidate, Yardstick};
-use super::{AXES, dot, parallel, torques, zeros};
+use super::{AXES, delay, dot, parallel, zeros};
 use crate::calibration::{Kind, Unknown, swapped};
 use crate::config::{Gain, IdentificationInput};
 use crate::dynamics::Structure;
@@ -119,7 +119,6 @@ pub(super) fn nothing(setup: &Setup, prepared: &[Prepared], reason: String) -> O
         two_route: Vec::new(),
         offsets: Vec::new(),
         friction: Vec::new(),
-        time_offsets: Vec::new(),
         findings: log.all_findings(),
         curves: Vec::new(),
         spectra: Vec::new(),
@@ -152,6 +151,7 @@ pub(super) fn nothing(setup: &Setup, prepared: &[Prepared], reason: String) -> O
         confused: Vec::new(),
         base_parameters: Vec::new(),
         channels: Vec::new(),
+        time_offsets: Vec::new(),
         consistency: Consistency {
             feasible: None,
             deviations: 0.0,
@@ -241,7 +241,8 @@ pub(super) fn outcome(
         })
         .collect();
     findings.extend(zeros::joint_zeros(maker, training, identified));
-    findings.extend(torques::late(maker, training, identified));
+    let (time_offsets, late) = delay::delays(maker, training, identified);
+    findings.extend(late);
     let consistency = feasibility(setup, identified);
     if consistency.feasible != Some(true) {
         findings.push(Finding {
@@ -296,6 +297,7 @@ pub(super) fn outcome(
         confused,
         base_parameters,
         channels: channels(setup, identified, training),
+        time_offsets,
         consistency,
         logs,
         findings,
@@ -1105,11 +1107,6 @@ fn log_outcome(
         predicted.relative_error = both([3, 4].map(relative));
     }
     let deviations = session_deviations(maker, log, instants, identified, root);
-    let (late, found) = if usable {
-        time_offsets(layout, log, &compared)
-    } else {
-        Default::default()
-    };
     LogOutcome {
         file: log.file.clone(),
         role: log.role,
@@ -1124,8 +1121,7 @@ fn log_outcome(
         two_route: two_route(maker, instants, &left, sets),
         offsets: offsets(setup, layout, log, identified, &left, &deviations),
         friction: friction(setup, layout, &left, &deviations),
-        time_offsets: late,
-        findings: log.all_findings().into_iter().chain(found).chain(findings).collect(),
+        findings: log.all_findings().into_iter().chain(findings).collect(),
         curves: curves(maker, instants, &times, &compared, identified, root, &torque_series),
         spectra: spectra(setup, layout, places.as_ref(), &left),
     }

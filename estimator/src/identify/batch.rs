@@ -17,7 +17,7 @@ use super::gate::{self, UnitSet};
 use super::guard;
 use super::hypothesis;
 use super::information::Information;
-use super::instants::{Break, Defect, Instant, Recording, RecordingError, Settings, Signal, TimeOffset};
+use super::instants::{Break, Defect, Instant, Recording, RecordingError, Settings};
 use super::mounting;
 use super::outcome::{Finding, LeftOut, Outcome, Role, Severity, Verdict};
 use super::parallel;
@@ -133,8 +133,6 @@ pub(super) struct Prepared {
     pub refused: bool,
     /// Of a log to validate with: per instant, what something undeclared was found to act on; empty where none was looked for. No [`Instant::suspected`], for figures are of all of such a log.
     pub touched: Vec<UnitSet>,
-    /// None if it can not be read.
-    recording: Option<Recording>,
 }
 
 impl Prepared {
@@ -421,7 +419,6 @@ fn prepare(setup: &Setup, log: Log<'_>) -> Result<Prepared, IdentifyError> {
             findings: vec![refusal("unreadable", problem.to_string())],
             refused: true,
             touched: Vec::new(),
-            recording: None,
         }),
         Err(problem) => Err(IdentifyError::Log {
             file: log.file,
@@ -496,46 +493,6 @@ fn no_log(prepared: &[Prepared]) -> String {
     let more = if reasons.len() > NAMED { "; ..." } else { "" };
     let named: Vec<&str> = reasons.iter().take(NAMED).map(String::as_str).collect();
     format!("no log can be identified from: {}{more}", named.join("; "))
-}
-
-/// How far each F/T stream is behind the encoders, against what the identified parameters predict: told, not removed, for what looks like a delay may be a model that is wrong.
-pub(super) fn time_offsets(
-    layout: &Layout,
-    log: &Prepared,
-    compared: &assess::Compared,
-) -> (Vec<TimeOffset>, Vec<Finding>) {
-    let times: Vec<Nanos> = log.instants.iter().map(|i| i.t).collect();
-    let (mut offsets, mut findings) = (Vec::new(), Vec::new());
-    for (place, &sensor) in layout.sensors.iter().enumerate() {
-        let mut predicted = vec![f64::NAN; 6 * times.len()];
-        for axis in 0..6 {
-            let channel = 6 * place + axis;
-            let pairs = compared.load[channel].iter().zip(&compared.errors[2][channel]);
-            for (i, (load, error)) in pairs.enumerate() {
-                predicted[6 * i + axis] = load - error;
-            }
-        }
-        let recording = log.recording.as_ref();
-        let Some(offset) = recording.and_then(|r| r.time_offset(Signal::Wrench(sensor), &times, &predicted)) else {
-            continue;
-        };
-        if offset.significant {
-            findings.push(Finding {
-                severity: Severity::Warning,
-                code: "time_offset",
-                subject: offset.channel.clone(),
-                text: format!(
-                    "{} seems to be stamped {:.1} ms {} the encoders (+- {:.1} ms); it was used as it is: compare the clocks, or the filters of the sensors",
-                    offset.channel,
-                    1e3 * offset.seconds.abs(),
-                    if offset.seconds > 0.0 { "behind" } else { "ahead of" },
-                    1e3 * offset.deviation
-                ),
-            });
-        }
-        offsets.push(offset);
-    }
-    (offsets, findings)
 }
 
 /// The instants of a log by which parameters are judged: those at which motion is known.
@@ -624,7 +581,6 @@ pub(super) fn usable(setup: &Setup, file: String, role: Role, recording: Recordi
         left_out: reasons.into_values().collect(),
         findings,
         touched: Vec::new(),
-        recording: Some(recording),
     }
 }
 
@@ -1343,7 +1299,6 @@ mod tests {
             findings: Vec::new(),
             refused: false,
             touched: Vec::new(),
-            recording: None,
         }
     }
 

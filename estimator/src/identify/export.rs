@@ -196,7 +196,6 @@ mod tests {
                 breaks: vec![],
             }],
             friction: vec![],
-            time_offsets: vec![],
             findings: vec![],
             curves: vec![],
             spectra: vec![],
@@ -230,6 +229,7 @@ mod tests {
             confused: vec![],
             base_parameters: vec![],
             channels: vec![],
+            time_offsets: vec![],
             consistency,
             logs: vec![
                 log("train.csv", Role::Train, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),

@@ -15,12 +15,10 @@
 //! Readings are corrected as configured ([`crate::calibration`]), but configured offsets are not taken off, since identification determines what a sensor reads with no load.
 
 mod defects;
-mod offset;
 mod reading;
 mod smooth;
 
 pub use defects::{Break, Defect, Units};
-pub use offset::{Signal, TimeOffset};
 
 use super::gate::UnitSet;
 use super::{add_multiple, parallel};
@@ -344,22 +342,6 @@ impl Recording {
         spacings.filter(|s| *s > 0.0).map(f64::recip).fold(0.0, f64::max)
     }
 
-    /// Puts a channel's stamps where its samples belong: takes `offset.seconds` off them.
-    pub fn shift(&mut self, offset: &TimeOffset) {
-        let by = Nanos::from_seconds(offset.seconds);
-        let each = |t: &mut Vec<Nanos>| t.iter_mut().for_each(|t| *t = *t - by);
-        match offset.signal {
-            Signal::Wrench(sensor) => self.sensors.get_mut(sensor).into_iter().for_each(|s| s.shift(each)),
-            Signal::Torque(dof) => self.joints.get_mut(dof).into_iter().for_each(|j| j.torque.shift(each)),
-            Signal::AngularVelocity => {
-                self.imu.proper_acceleration.shift(each);
-                self.imu.angular_velocity.shift(each);
-                self.imu.angular_acceleration.shift(each);
-            }
-        }
-        self.span();
-    }
-
     /// The instants of the log.
     #[must_use]
     pub fn instants(&self, setup: &Setup, settings: &Settings) -> Instants {
@@ -663,16 +645,6 @@ impl<const D: usize> Stream<D> {
         self.t.retain(|_| *flags.next().unwrap_or(&true));
         let mut flags = kept.iter();
         self.value.retain(|_| *flags.next().unwrap_or(&true));
-    }
-
-    fn shift(&mut self, each: impl Fn(&mut Vec<Nanos>)) {
-        each(&mut self.t);
-        let mut disowned: Vec<Nanos> = self.disowned.iter().map(|(t, _)| *t).collect();
-        each(&mut disowned);
-        self.disowned
-            .iter_mut()
-            .zip(disowned)
-            .for_each(|((t, _), new)| *t = new);
     }
 
     fn column(&self, axis: usize) -> Vec<f64> {

@@ -4,7 +4,6 @@
 //! F/T sensor is in the order of samples and logs, `[fx fy fz tx ty tz]` [N, Nm]; ten parameters of a link are `[m, h_x, h_y, h_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz]` about its origin
 //! ([`crate::spatial`]).
 
-use super::instants::TimeOffset;
 use crate::calibration::{Calibration, Kind, Unknown};
 use crate::regressor::identifiable::Column;
 use crate::spatial::RigidInertia;
@@ -154,6 +153,19 @@ pub struct WeakDirection {
     pub relative: f64,
     /// Share of its variance that is the prior's: 1: the log says nothing, 0: the log says it all.
     pub prior_share: f64,
+}
+
+/// How late a stream's stamps are against the encoders'.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TimeOffset {
+    /// The stream: the channel of an F/T sensor, or `joint torques`.
+    pub channel: String,
+    /// What happens at `t` is stamped `t + seconds` \[s\].
+    pub seconds: f64,
+    /// Its standard deviation \[s\].
+    pub deviation: f64,
+    /// Whether it is no chance, and large enough to matter.
+    pub significant: bool,
 }
 
 /// A base parameter: a combination that shows, CAD's value and the identified one.
@@ -378,8 +390,6 @@ pub struct LogOutcome {
     pub offsets: Vec<OffsetOutcome>,
     /// Friction, per joint with a measured torque.
     pub friction: Vec<FrictionOutcome>,
-    /// How late each F/T stream is against what encoders (and, between two sensors, the other sensor) predict: told, not removed.
-    pub time_offsets: Vec<TimeOffset>,
     /// What is wrong with the log.
     pub findings: Vec<Finding>,
     /// For plots: measured joint torques, then F/T channels.
@@ -428,6 +438,8 @@ pub struct Outcome {
     pub base_parameters: Vec<BaseParameterOutcome>,
     /// Noise of each measured number.
     pub channels: Vec<ChannelNoise>,
+    /// How late streams are against the encoders: told, not removed.
+    pub time_offsets: Vec<TimeOffset>,
     /// Whether bodies exist that have what the logs say.
     pub consistency: Consistency,
     /// Per log, in the order given.

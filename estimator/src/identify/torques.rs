@@ -9,16 +9,9 @@
 //! - `|y| < |x| / 30`: thousands of newton metres, or nothing at all.
 //!
 //! No CAD is wrong by thirty times. Such a torque is left out of its log, and said.
-//!
-//! And after the fit: whether all torques are stamped late against the encoders ([`late`]). Asked of one joint alone, friction that is not as the model has it looks the same (a real arm with
-//! joint torque sensors: 10 to 95 ms, each joint its own, where together they say none); and friction and masses that were fitted to late torques hide most of it. So it is asked of all torques
-//! together, as one more unknown of the fit; and of each, where one stands out from others that are all on time.
 
-use super::batch::{Identified, Prepared, added, over, sample};
-use super::hypothesis;
+use super::batch::Prepared;
 use super::outcome::{Finding, LeftOut, Severity};
-use super::passes::{Residuals, leave, tell_with};
-use super::prior::Posterior;
 use super::rows::{FRICTION, RowMaker, Rows};
 use crate::config::{IdentificationInput, TorqueSide};
 use crate::dynamics::DynamicsError;
@@ -240,122 +233,6 @@ fn leave_out(log: &mut Prepared, dof: usize, joint: &str, slides: bool, fault: F
         subject: format!("joint/{joint}/torque"),
         text,
     });
-}
-
-/// Expected of a delay before anything is measured, one standard deviation \[s\].
-const SPREAD: f64 = 0.05;
-
-/// Whether what parameters were identified from is stamped otherwise than the encoders: all joint torques, by the same time, or that of one joint by itself.
-///
-/// Friction that is not as the model has it makes each joint seem late by a time of its own. So one is named only if it seems later (or earlier) than the others have in common by far more than any of these,
-/// and these others, together, are on time: who is late is told by the encoders, and not by a majority.
-pub(super) fn late(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Identified) -> Vec<Finding> {
-    /// It is said if it is so long \[s\], and not by chance.
-    const LEAST_DELAY: f64 = 2e-3;
-    /// ... and of one joint, if so many times as long as that of any other (of a real arm with joint torque sensors, whose friction makes them seem late, up to 3.7 times).
-    const ALONE: f64 = 8.0;
-    let joints = &identified.layout.joints;
-    let finding = |subject: String, seem: &str, seconds: f64, deviation: f64| Finding {
-        severity: Severity::Warning,
-        code: "time_offset",
-        text: format!(
-            "{seem} to be stamped {:.1} ms {} the encoders (+- {:.1} ms); nothing was corrected, and friction and parameters have taken up a part of it: compare the clocks, or the filters of the sensors, and correct the stamps",
-            1e3 * seconds.abs(),
-            if seconds > 0.0 { "behind" } else { "ahead of" },
-            1e3 * deviation
-        ),
-        subject,
-    };
-    // Each joint's by itself, and all of them together.
-    let farther = hypothesis::deviations(joints.len() + 1);
-    let is_long = |seconds: f64, deviation: f64| seconds.abs() > LEAST_DELAY.max(farther * deviation);
-    let mut findings = Vec::new();
-    let each = delays(maker, training, identified, true).unwrap_or_default();
-    // Those of which the logs tell more than was known before.
-    let known: Vec<usize> = (0..each.len()).filter(|&k| each[k].1 < 0.5 * SPREAD).collect();
-    for &place in known.iter().filter(|_| known.len() > 2) {
-        let others = || known.iter().filter(|&&k| k != place).map(|&k| each[k]);
-        let weight: f64 = others().map(|(_, deviation)| deviation.powi(-2)).sum();
-        let common = others()
-            .map(|(seconds, deviation)| seconds * deviation.powi(-2))
-            .sum::<f64>()
-            / weight;
-        let farthest = others()
-            .map(|(seconds, _)| (seconds - common).abs())
-            .fold(0.0, f64::max);
-        let uncertain = weight.sqrt().recip();
-        let (own, deviation) = each[place];
-        let apart = own - common;
-        let is_alone = is_long(apart, deviation.hypot(uncertain)) && apart.abs() > ALONE * farthest;
-        if is_alone && is_long(own, deviation) && !is_long(common, uncertain) {
-            let joint = format!("joint/{}/torque", maker.setup().model.dof_name(joints[place]));
-            let seems = format!("{joint}, unlike the other torques, seems");
-            findings.push(finding(joint, &seems, own, deviation));
-        }
-    }
-    // One that is late by itself is what all together seem late by.
-    if findings.is_empty()
-        && let Some(&[(seconds, deviation)]) = delays(maker, training, identified, false).as_deref()
-        && is_long(seconds, deviation)
-    {
-        let all = "the joint torques seem";
-        findings.push(finding("joint torques".into(), all, seconds, deviation));
-    }
-    findings
-}
-
-/// How long after the encoders all joint torques are stamped, or each one's if they are taken `apart`, with standard deviations \[s\]. The torque that is predicted at `t` is measured at `t + delay`,
-/// so rows get a column more for each delay, less the rate at which the prediction changes; the fit with it says how long it is and how sure that is.
-fn delays(
-    maker: &RowMaker<'_>,
-    training: &[&Prepared],
-    identified: &Identified,
-    apart: bool,
-) -> Option<Vec<(f64, f64)>> {
-    /// Rates are taken over this time before and after \[s\]: friction changes its sign at once.
-    const REACH: f64 = 0.03;
-    let layout = &identified.layout;
-    if layout.joints.is_empty() {
-        return None;
-    }
-    let (first, p) = (6 * layout.sensors.len(), layout.unknowns());
-    let width = if apart { layout.joints.len() } else { 1 };
-    let pieces = sample(maker, training);
-    let told = over(maker, &pieces, |maker, _, piece| {
-        let left: Residuals = leave(maker, piece, &identified.noise, std::slice::from_ref(&identified.d));
-        let count = piece.instants.len();
-        let rate = |place: usize, number: usize| -> f64 {
-            let t = |i: usize| (piece.instants[i].t - piece.instants[number].t).seconds();
-            let before = (0..number).rev().take_while(|&i| t(i) >= -REACH).last();
-            let after = (number + 1..count).take_while(|&i| t(i) <= REACH).last();
-            // A log with rows farther apart: the next ones.
-            let (low, high) = (
-                before.unwrap_or(number.saturating_sub(1)),
-                after.unwrap_or((number + 1).min(count - 1)),
-            );
-            let predicted = |i: usize| piece.instants[i].torque[layout.joints[place]] - left.noise[0][first + place][i];
-            let span = t(high) - t(low);
-            let rate = (predicted(high) - predicted(low)) / span;
-            if rate.is_finite() && span < 0.2 { rate } else { 0.0 }
-        };
-        let mut columns = |_: &mut RowMaker<'_>, number: usize, rows: &Rows, slopes: &mut [f64]| {
-            for (row, slopes) in slopes.chunks_exact_mut(width).enumerate() {
-                if let Some(place) = rows.n(row)[first..].iter().position(|x| *x != 0.0) {
-                    slopes[place % width] = -rate(place, number);
-                }
-            }
-        };
-        tell_with(maker, piece, &identified.noise, &[], width, &mut columns)
-    });
-    let (r, z) = added(&told, p + width).to_triangle();
-    let mut precision = layout.precision.clone();
-    precision.resize(layout.further.len() + width, SPREAD.powi(-2));
-    let fit = Posterior::new(&identified.prior, &layout.links, &r, &z, &precision)
-        .ok()?
-        .fit(identified.fit.tau)
-        .ok()?;
-    let root = fit.covariance_root();
-    Some((p..p + width).map(|k| (fit.x[k], root.row(k).norm())).collect())
 }
 
 #[cfg(test)]

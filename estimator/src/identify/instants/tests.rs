@@ -902,68 +902,6 @@ fn an_imu_tells_how_the_base_moves() {
     assert!(defects[0].to_string().contains("is not near 9.8"), "{}", defects[0]);
 }
 
-/// What CAD predicts at the instants, row by row; NaN where the motion is not known. Wrong by `scale`.
-fn predicted(setup: &Setup, instants: &Instants, scale: f64) -> (Vec<Nanos>, Vec<f64>) {
-    let mut kinematics = Kinematics::new(&setup.model, setup.base_link).unwrap();
-    let mut dynamics = InverseDynamics::new(&setup.model);
-    let cut = setup.structure.sensors()[0];
-    let rows = instants.instants.iter().map(|i| {
-        if !i.has_motion(setup.channels()) {
-            return (i.t, [f64::NAN; 6]);
-        }
-        let state = JointState {
-            position: &i.position,
-            velocity: &i.velocity,
-            acceleration: &i.acceleration,
-        };
-        kinematics.update(&setup.model, state, &i.base).unwrap();
-        dynamics.update(&setup.model, &kinematics, &[]).unwrap();
-        let w = cut.reading(&dynamics.transmitted(&kinematics, cut.joint()));
-        let ([tx, ty, tz], [fx, fy, fz]): ([f64; 3], [f64; 3]) = (w.torque.into(), w.force.into());
-        (i.t, [tx, ty, tz, fx, fy, fz].map(|v| v * scale))
-    });
-    let (times, rows): (Vec<_>, Vec<_>) = rows.unzip();
-    (times, rows.concat())
-}
-
-#[test]
-fn a_late_stream_is_found_with_its_deviation_and_put_right() {
-    let setup = setup("");
-    let mut within = 0;
-    for (seed, late) in [(1, 0.0), (2, 0.007), (3, -0.012), (4, 0.03), (5, 0.0), (6, 0.002)] {
-        let mut recording = log(&setup, 20.0, 100.0, 0.3, late, seed).recording(&setup);
-        let instants = recording.instants(&setup, &Settings::default());
-        let (times, rows) = predicted(&setup, &instants, 1.2);
-        let offset = recording
-            .time_offset(Signal::Wrench(0), &times, &rows)
-            .expect("an offset");
-        println!("{late}: {:.5} +- {:.5} s", offset.seconds, offset.deviation);
-        assert_eq!(offset.channel, "wrench/ft");
-        assert_eq!(offset.significant, late != 0.0, "{offset:?}");
-        assert!((offset.seconds - late).abs() < 4.0 * offset.deviation && offset.deviation < 1e-3);
-        within += usize::from((offset.seconds - late).abs() < 2.0 * offset.deviation);
-        recording.shift(&offset);
-        let again = recording.instants(&setup, &Settings::default());
-        let (times, rows) = predicted(&setup, &again, 1.2);
-        let rest = recording
-            .time_offset(Signal::Wrench(0), &times, &rows)
-            .expect("an offset");
-        assert!(!rest.significant && rest.seconds.abs() < 1e-3, "{rest:?}");
-    }
-    assert!(within >= 4, "{within} of 6 within two deviations");
-    // Noise alone tells nothing.
-    let mut random = Random(8);
-    let mut still = log(&setup, 20.0, 100.0, 0.0, 0.0, 1);
-    still.rows.iter_mut().for_each(|(_, r)| {
-        r[2..]
-            .iter_mut()
-            .for_each(|v| *v = if v.is_nan() { *v } else { random.normal() })
-    });
-    let recording = still.recording(&setup);
-    let (times, rows) = predicted(&setup, &recording.instants(&setup, &Settings::default()), 1.0);
-    assert_eq!(recording.time_offset(Signal::Wrench(0), &times, &rows), None);
-}
-
 /// A recorded log, or nothing if it is not at hand.
 fn data(file: &str) -> Option<PathBuf> {
     let Some(folder) = std::env::var_os("PROPRIO_DATA") else {
