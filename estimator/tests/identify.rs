@@ -2088,6 +2088,32 @@ fn a_gain_that_no_motion_tells_stays_the_workbenchs() {
     assert!(text.contains("the gain of fz"), "{text}");
 }
 
+/// Gains that choose themselves: only where readings are off by more than the workbench's deviation, which is
+/// what they cost. All masses may be other than the CAD's.
+#[test]
+fn gains_are_found_out_only_where_readings_ask_for_them() {
+    let setup = arm_with(&["ft", "wrist"]);
+    assert_eq!(setup.calibrated.gain, Gain::Auto);
+    let mut truth = real(&setup, 3);
+    for link in 1..truth.link_count() {
+        let light = truth.inertias()[link].parameters().map(|x| 0.75 * x);
+        truth
+            .set_inertia(link, RigidInertia::from_parameters(&light))
+            .expect("a body");
+    }
+    let log = simulate(&setup, &truth, 12.0, 0.01, 3);
+    let calibrated = |gain: f64| {
+        let log = ["fz", "tx"].iter().fold(log.clone(), |log, axis| {
+            change(&log, &format!("wrench/ft/{axis}"), |x| gain * x)
+        });
+        let outcome = run(&setup, &[("log", Role::Train, &log)], &[]);
+        let is_told = outcome.findings.iter().any(|f| f.code == "gain_chosen");
+        assert_eq!(is_told, !outcome.calibrations.is_empty());
+        is_told
+    };
+    assert_eq!([1.0, 1.04, 1.4].map(calibrated), [false, false, true]);
+}
+
 /// What is asked for of measurements that nothing is identified from is said to be asked in vain, and nothing else is.
 #[test]
 fn what_is_asked_for_in_vain_is_said() {

@@ -907,9 +907,10 @@ fn gated(
 }
 
 /// Which gains to find out, and what there is to say of that: those asked for; or, step by step from none,
-/// those with which data held out are predicted better than with fewer, by more than a standard error.
-/// Asked of the noise and the bodies that were found without gains, of which a gain's error is a small
-/// change.
+/// those with which data held out are predicted better than with fewer, by more than a standard error and by
+/// more than they cost. That is the workbench's deviation: what all gains have in common is no other
+/// than that of all masses in any reading, but it is in every torque. Asked of the noise and the
+/// bodies that were found without gains, of which a gain's error is a small change.
 fn chosen_gain(
     maker: &mut RowMaker<'_>,
     prepared: &mut [Prepared],
@@ -922,6 +923,7 @@ fn chosen_gain(
     if maker.layout().sensors.is_empty() {
         return Ok((Gain::None, None));
     }
+    let workbench = maker.setup().gain_deviation;
     read_as_fitted(maker, prepared, settled);
     let mut held = |gain: Gain| -> Result<guard::Held, IdentifyError> {
         let training = used(prepared);
@@ -932,11 +934,16 @@ fn chosen_gain(
         Ok(guard::held_out(maker, prior, &sampled, noise, fit.tau)?.held)
     };
     let none = held(Gain::None)?;
+    let cost = workbench.powi(2);
     let (mut chosen, mut best) = (Gain::None, none.clone());
     for gain in [Gain::Diagonal, Gain::Full] {
+        let may_gain = best.relative_error().powi(2);
+        if may_gain <= cost {
+            break;
+        }
         let other = held(gain)?;
         let (gained, error) = other.gain_over(&best);
-        if gained <= error {
+        if gained <= error || may_gain - other.relative_error().powi(2) <= cost {
             break;
         }
         (chosen, best) = (gain, other);

@@ -68,6 +68,8 @@ pub(super) struct Held {
     folds: Vec<usize>,
     /// Per channel and block, the sum of squares, and of how many instants \[Nm^2\].
     squares: Vec<Vec<(f64, usize)>>,
+    /// Of F/T sensors' readings, less their means, the sum of squares \[Nm^2\].
+    load: f64,
 }
 
 impl Held {
@@ -88,8 +90,16 @@ impl Held {
 
     /// The RMS error, relative to that of others.
     pub(super) fn relative_to(&self, other: &Self) -> f64 {
-        let sum = |held: &Self| held.squares.iter().flatten().map(|(square, _)| square).sum::<f64>();
-        (sum(self) / sum(other)).sqrt()
+        (self.sum() / other.sum()).sqrt()
+    }
+
+    /// The RMS error, relative to what F/T sensors read.
+    pub(super) fn relative_error(&self) -> f64 {
+        (self.sum() / self.load).sqrt()
+    }
+
+    fn sum(&self) -> f64 {
+        self.squares.iter().flatten().map(|(square, _)| square).sum()
     }
 }
 
@@ -160,10 +170,17 @@ pub(super) fn held_out(
         pairs.push([if knows_cad { 0 } else { last - 1 }, last]);
         sets.push(both.into_iter().nth(1).unwrap_or_default());
     }
-    let errors: Vec<Vec<Errors>> = pieces
-        .iter()
-        .map(|piece| Yardstick::of_fit(maker, piece.instants).errors(layout, &candidates, Free::Constants))
-        .collect();
+    let mut load = 0.0;
+    let mut errors: Vec<Vec<Errors>> = Vec::new();
+    for piece in pieces {
+        let yardstick = Yardstick::of_fit(maker, piece.instants);
+        let own = yardstick.errors(layout, &candidates, Free::Constants);
+        for channel in 0..6 * layout.sensors.len() {
+            let read = yardstick.load(channel, &own[0]);
+            load += layout.scale(channel).powi(2) * read.iter().map(|x| x * x).sum::<f64>();
+        }
+        errors.push(own);
+    }
     // Per channel and block: sums of e0 (e0 - e1), (e0 - e1)^2 and e0^2.
     let sums: Vec<Vec<Sums>> = (0..layout.channels())
         .map(|channel| {
@@ -197,6 +214,7 @@ pub(super) fn held_out(
     let held = Held {
         squares: squares.collect(),
         folds,
+        load,
     };
     Ok(Guard {
         share,

@@ -260,7 +260,7 @@ impl<'a> Yardstick<'a> {
     }
 
     /// Readings of a channel of F/T sensors, less their mean over the log, where errors are known.
-    fn load(&self, channel: usize, errors: &Errors) -> Vec<f64> {
+    pub(super) fn load(&self, channel: usize, errors: &Errors) -> Vec<f64> {
         let sensor = self.layout().sensors[channel / 6];
         let pairs = self.instants.iter().zip(&errors.channels[channel]);
         let read = pairs.filter(|(_, error)| error.is_finite());

@@ -37,6 +37,10 @@ const LEAST_BEFORE: f64 = 0.02;
 /// Instants that are looked at, at least so many of each log, in stretches: offsets and noise need what follows each other, and each stretch pays for offsets of its own.
 const ENOUGH: usize = 2000;
 const LEAST_OF_LOG: usize = 400;
+
+/// ... and for directions, which show at once.
+const ENOUGH_TURNED: usize = 600;
+const LEAST_TURNED: usize = 150;
 const STRETCHES: usize = 4;
 
 /// Of all that might be, these are looked at closely in each round.
@@ -68,7 +72,7 @@ impl<'a> Search<'a> {
         let (logs, joints, unknowns) = (training.len(), dofs.len(), identified.layout.unknowns());
         let mut sum = Information::new(joints * logs + unknowns);
         for (number, log) in training.iter().enumerate() {
-            let pieces = stretches(log, logs);
+            let pieces = stretches(log, (ENOUGH / logs.max(1)).max(LEAST_OF_LOG));
             let told = over(maker, &pieces, |maker, _, piece| {
                 tell_angles(maker, piece, &identified.noise, dofs, identified.fit.x.as_slice())
             });
@@ -202,9 +206,8 @@ fn cost(layout: &Layout, fit: &Fit, precision: &[f64]) -> f64 {
     fit.residual_square + fit.divergence / fit.tau.powi(2) + further
 }
 
-/// Some of a log's instants, one of so many, in stretches from the first to the last.
-fn stretches(log: &Prepared, logs: usize) -> Vec<Piece<'_>> {
-    let share = (ENOUGH / logs.max(1)).max(LEAST_OF_LOG);
+/// Some of a log's instants, in stretches from the first to the last.
+fn stretches(log: &Prepared, share: usize) -> Vec<Piece<'_>> {
     let stretches = if log.instants.len() > share { STRETCHES } else { 1 };
     let count = log.instants.len().min(share) / stretches;
     let piece = |stretch: usize| {
@@ -226,9 +229,8 @@ fn turned(maker: &RowMaker<'_>, training: &[&Prepared], identified: &Identified,
         fit,
         ..
     } = identified;
-    let pieces: Vec<Piece<'_>> = (training.iter())
-        .flat_map(|log| stretches(log, training.len()))
-        .collect();
+    let share = (ENOUGH_TURNED / training.len().max(1)).max(LEAST_TURNED);
+    let pieces: Vec<Piece<'_>> = training.iter().flat_map(|log| stretches(log, share)).collect();
     let cost_with = |turned: &[usize]| {
         let (mut maker, mut all) = (maker.clone(), Information::new(layout.unknowns()));
         let columns: Vec<usize> = (0..layout.unknowns()).collect();
