@@ -14,7 +14,7 @@
 use super::assess;
 use super::consistent;
 use super::gate::{self, UnitSet};
-use super::guard;
+use super::guard::{self, Guard};
 use super::hypothesis;
 use super::information::Information;
 use super::instants::{Break, Defect, Instant, Recording, RecordingError, Settings};
@@ -105,8 +105,9 @@ const QUIETER: f64 = 2.0;
 /// Most rounds of noise and prior.
 const ROUNDS: usize = 14;
 
-/// Rounds end when the logarithm of no variance changes by more, from the last round or round a circle.
-const SETTLED: f64 = 0.03;
+/// Rounds end when the logarithm of no variance changes by more, from the last round or round a circle:
+/// a deviation by a twentieth.
+const SETTLED: f64 = 0.1;
 
 /// How many instants a fold of the check on held-out data has at least.
 pub(super) const LEAST_FOLD: usize = 50;
@@ -263,7 +264,7 @@ pub fn identify(
     };
     maker.calibrate(of_temperature, training.iter().flat_map(|log| log.instants.iter()));
     let mut gated = gated(setup, &maker, &mut prepared, &mut tell_progress)?;
-    let (gain, choice) = chosen_gain(&mut maker, &mut prepared, &gated.settled)?;
+    let Choice { gain, told, guard } = chosen_gain(&mut maker, &mut prepared, &gated.settled)?;
     let calibrated = Kind {
         gain,
         ..setup.calibrated
@@ -285,6 +286,7 @@ pub fn identify(
         inputs.clone(),
         calibrated,
         settled,
+        guard,
         &mut tell_progress,
     )?;
     tell_progress("shaking".into(), 0.8);
@@ -303,11 +305,11 @@ pub fn identify(
             Some(identified.noise),
             &mut again,
         )?;
-        identified = fit(&maker, &training, inputs, calibrated, settled, &mut again)?;
+        identified = fit(&maker, &training, inputs, calibrated, settled, None, &mut again)?;
         identified.findings.extend(shaken(&maker, &shaking));
     }
     identified.findings.extend(restless);
-    identified.findings.extend(choice);
+    identified.findings.extend(told);
     identified.findings.extend(asked_in_vain(setup, &identified.inputs));
     undeclared::tell_of_checks(&maker, &mut prepared, &identified);
     let training = used(&prepared);
@@ -889,8 +891,11 @@ fn gated(
         }
         if let Slow::All = slow {
             slow = Slow::OfSensors;
-            // Afresh: noise beside offsets that follow all is shared out otherwise.
-            settled = settle(setup, maker, &used(prepared), slow, None, &mut progress)?;
+            let rates = walks(setup, maker.layout(), slow).rates;
+            if settled.noise.drift.iter().zip(&rates).any(|(found, most)| found > most) {
+                // Afresh: noise beside offsets that follow all is shared out otherwise.
+                settled = settle(setup, maker, &used(prepared), slow, None, &mut progress)?;
+            }
         }
         let Settled { noise, fit, .. } = &settled;
         stays = undeclared.ask(maker, used_mut(prepared), noise, &fit.x);
@@ -906,7 +911,26 @@ fn gated(
     })
 }
 
-/// Which gains to find out, and what there is to say of that: those asked for; or, step by step from none,
+/// Which gains to find out.
+struct Choice {
+    gain: Gain,
+    /// What there is to say of it.
+    told: Option<Finding>,
+    /// The check on held-out data without gains, if it was made and there are none.
+    guard: Option<Guard>,
+}
+
+impl From<Gain> for Choice {
+    fn from(gain: Gain) -> Self {
+        Self {
+            gain,
+            told: None,
+            guard: None,
+        }
+    }
+}
+
+/// Which gains to find out: those asked for; or, step by step from none,
 /// those with which data held out are predicted better than with fewer, by more than a standard error and by
 /// more than they cost. That is the workbench's deviation: what all gains have in common is no other
 /// than that of all masses in any reading, but it is in every torque. Asked of the noise and the
@@ -915,25 +939,26 @@ fn chosen_gain(
     maker: &mut RowMaker<'_>,
     prepared: &mut [Prepared],
     settled: &Settled,
-) -> Result<(Gain, Option<Finding>), IdentifyError> {
+) -> Result<Choice, IdentifyError> {
     let wanted = maker.setup().calibrated;
     if wanted.gain != Gain::Auto {
-        return Ok((wanted.gain, None));
+        return Ok(wanted.gain.into());
     }
     if maker.layout().sensors.is_empty() {
-        return Ok((Gain::None, None));
+        return Ok(Gain::None.into());
     }
     let workbench = maker.setup().gain_deviation;
     read_as_fitted(maker, prepared, settled);
-    let mut held = |gain: Gain| -> Result<guard::Held, IdentifyError> {
+    let mut checked = |gain: Gain| -> Result<Guard, IdentifyError> {
         let training = used(prepared);
         let instants = training.iter().flat_map(|log| log.instants.iter());
         maker.calibrate(Kind { gain, ..wanted }, instants);
         let sampled = sample(maker, &training);
         let Settled { prior, noise, fit, .. } = settled;
-        Ok(guard::held_out(maker, prior, &sampled, noise, fit.tau)?.held)
+        guard::held_out(maker, prior, &sampled, noise, fit.tau)
     };
-    let none = held(Gain::None)?;
+    let guard = checked(Gain::None)?;
+    let none = &guard.held;
     let cost = workbench.powi(2);
     let (mut chosen, mut best) = (Gain::None, none.clone());
     for gain in [Gain::Diagonal, Gain::Full] {
@@ -941,7 +966,7 @@ fn chosen_gain(
         if may_gain <= cost {
             break;
         }
-        let other = held(gain)?;
+        let other = checked(gain)?.held;
         let (gained, error) = other.gain_over(&best);
         if gained <= error || may_gain - other.relative_error().powi(2) <= cost {
             break;
@@ -960,12 +985,15 @@ fn chosen_gain(
             for instant in used_mut(prepared).flat_map(|log| &mut log.instants) {
                 instant.fitted = Vec::new();
             }
-            return Ok((Gain::None, None));
+            return Ok(Choice {
+                guard: Some(guard),
+                ..Gain::None.into()
+            });
         }
     };
     let text = format!(
         "{what}: readings of data held out are predicted with {:.0} % less error than without (identification.gain = \"none\" leaves the workbench's gains as they are)",
-        100.0 * (1.0 - best.relative_to(&none))
+        100.0 * (1.0 - best.relative_to(none))
     );
     let note = Finding {
         severity: Severity::Note,
@@ -973,7 +1001,10 @@ fn chosen_gain(
         subject: "identification.gain".into(),
         text,
     };
-    Ok((chosen, Some(note)))
+    Ok(Choice {
+        told: Some(note),
+        ..chosen.into()
+    })
 }
 
 /// What of a slow change is an offset's.
@@ -1096,19 +1127,24 @@ fn fit(
     inputs: Vec<IdentificationInput>,
     calibrated: Kind,
     settled: Settled,
+    guard: Option<Guard>,
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<Identified, IdentifyError> {
     let layout = maker.layout().clone();
     let pieces = chunks(training, LONG);
     let Settled {
-        prior, noise, change, ..
+        prior,
+        noise,
+        fit: settled,
+        change,
+        ..
     } = settled;
-    let told = over(maker, &pieces, |maker, _, piece| tell(maker, piece, &noise));
-    let information = added(&told, layout.unknowns());
-    let fit = posterior(&prior, &layout, &information)?.weigh()?;
     progress("held-out data".into(), 0.75);
     let sampled = sample(maker, training);
-    let mut guard = guard::held_out(maker, &prior, &sampled, &noise, fit.tau)?;
+    let mut guard = match guard {
+        Some(guard) => guard,
+        None => guard::held_out(maker, &prior, &sampled, &noise, settled.tau)?,
+    };
     guard.findings.extend(unsettled(change));
     // Parameters have taken a part of the noise that they were fitted to, most of all where it is as slow as the motion.
     let walks = walks(maker.setup(), &layout, Slow::OfSensors);
