@@ -1727,7 +1727,13 @@ fn torques_that_can_not_be_are_named_and_left_out() {
         }
         late
     };
-    for (joints, subject) in [(&ARM_JOINTS[..], "joint torques"), (&["j4"], "joint/j4/torque")] {
+    // (The torque of j2 is large: all together seem late with it.)
+    let cases = [
+        (&ARM_JOINTS[..], "joint torques"),
+        (&["j4"], "joint/j4/torque"),
+        (&["j2"], "joint/j2/torque"),
+    ];
+    for (joints, subject) in cases {
         let (outcome, names) = named(&late(joints));
         assert_eq!(names, [format!("time_offset {subject}")]);
         let finding = outcome.findings.iter().find(|f| f.code == "time_offset").expect("it");

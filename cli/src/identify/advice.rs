@@ -319,6 +319,7 @@ fn capital(text: &str) -> String {
 mod tests {
     use super::super::example;
     use super::*;
+    use proprio_estimator::identify::WeakDirection;
 
     /// Nothing to complain of.
     fn good() -> Outcome {
@@ -451,6 +452,21 @@ mod tests {
             advice.why.iter().any(|n| n.starts_with("Of r_ankle_1 the logs")),
             "{advice:?}"
         );
+    }
+
+    #[test]
+    fn links_that_the_logs_say_least_about_are_named() {
+        let mut outcome = good();
+        outcome.weakest = vec![WeakDirection {
+            expression: "a direction".into(),
+            links: vec![outcome.links[1].link],
+            relative: 1e-4,
+            prior_share: 1.0,
+        }];
+        let (named, other) = (&outcome.links[1].name, &outcome.links[2].name);
+        let next = Advice::of(&outcome).next.join(" ");
+        assert!(next.contains(&format!("The logs say least about {named}:")), "{next}");
+        assert!(!next.contains(other.as_str()), "{next}");
     }
 
     #[test]

@@ -1328,6 +1328,7 @@ pub(super) fn verdict(identified: &Identified) -> Verdict {
 mod tests {
     use super::super::passes::tests::{between_two_sensors, readings};
     use super::*;
+    use crate::dynamics::ContactSet;
 
     /// A log of these instants.
     fn log(instants: &[Instant]) -> Prepared {
@@ -1371,25 +1372,33 @@ mod tests {
     #[test]
     fn a_load_is_asked_for_where_it_is() {
         let setup = between_two_sensors();
-        let log = log(&readings(&setup, 200, &[0.1; 12], &[0.0; 12]));
-        let wrench = [IdentificationInput::Wrench];
-        let maker = RowMaker::survey(&setup, &wrench, log.instants.iter()).expect("rows");
-        let channels_of = |link: &str| {
+        let mut instants = readings(&setup, 200, &[0.1; 12], &[0.0; 12]);
+        for instant in &mut instants {
+            (instant.torque, instant.active) = (vec![0.1; 2], ContactSet::default());
+        }
+        let both = [IdentificationInput::Wrench, IdentificationInput::Torque];
+        let maker = RowMaker::survey(&setup, &both, instants.iter()).expect("rows");
+        let of_link = |link: &str| {
             let link = (0..setup.model.link_count()).find(|&number| setup.model.link_name(number) == link);
             let mut units = UnitSet::default();
             units.insert(setup.structure.subtree_of(link.expect("a link")).expect("its sub-tree"));
-            maker.channels_of(&units)
+            units
         };
+        let channels_of = |link: &str| maker.channels_of(&of_link(link));
         let thigh = channels_of("thigh");
         assert_eq!(thigh, (0..12).collect::<Vec<_>>());
         let foot = channels_of("foot");
         assert_eq!(foot.len(), 6);
-        let noise = NoiseModel::unknown(vec![1e-6; 12]);
+        let mut with_torques = of_link("foot");
+        with_torques.insert(Instant::TORQUES);
+        assert_eq!(maker.channels_of(&with_torques), [foot.clone(), vec![12, 13]].concat());
+        let noise = NoiseModel::unknown(vec![1e-6; 14]);
         let mut quieter = noise.clone();
+        quieter.square.fill(100.0);
         for &channel in &foot {
             (quieter.square[channel], quieter.block[channel]) = (0.25, 0.25);
         }
         assert!((quieter.quieter(&noise, &foot) - 4.0).abs() < 1e-9);
-        assert!((quieter.quieter(&noise, &thigh) - 2.0).abs() < 1e-9);
+        assert!((quieter.quieter(&noise, &thigh) - 0.2).abs() < 1e-9);
     }
 }

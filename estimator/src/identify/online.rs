@@ -1736,6 +1736,78 @@ mod tests {
         Online::new(model, structure, model.inertias(), &offsets, &none, 0, period, 0.2).unwrap()
     }
 
+    /// So many instants, ten milliseconds apart, of a robot thrown about, with readings that go with nothing.
+    fn observe(model: &Model, count: usize, instants: i64, online: &mut [&mut Online]) {
+        let mut kinematics = Kinematics::new(model, 0).unwrap();
+        let dofs = model.dof_count();
+        let (joints, fine) = (vec![Reason::None; dofs], vec![Reason::None; count]);
+        for instant in 0..instants {
+            let numbers = normals(instant as u64, 3 * dofs + 6 * count + 9);
+            let (of_joints, rest) = numbers.split_at(3 * dofs);
+            let [position, velocity, acceleration] = [0, 1, 2].map(|m| &of_joints[m * dofs..(m + 1) * dofs]);
+            let state = JointState {
+                position,
+                velocity,
+                acceleration,
+            };
+            let motion = FrameMotion {
+                angular_velocity: Vec3::new(rest[0], rest[1], rest[2]),
+                angular_acceleration: Vec3::new(rest[3], rest[4], rest[5]),
+                proper_acceleration: Vec3::new(rest[6], rest[7], 9.81 + rest[8]),
+            };
+            kinematics.update(model, state, &motion).unwrap();
+            let six = |six: &[f64]| Wrench::from_parts([six[0], six[1], six[2]], [six[3], six[4], six[5]]);
+            let readings: Vec<Wrench> = rest[9..].chunks_exact(6).map(six).collect();
+            for online in &mut *online {
+                let observation = Observation {
+                    t: Nanos::from_millis(10 * instant),
+                    kinematics: &kinematics,
+                    readings: &readings,
+                    active: &ContactSet::default(),
+                    base: Reason::None,
+                    joints: &joints,
+                    moved: &DofSet::default(),
+                    is_base_moved: true,
+                    sensors: &fine,
+                };
+                online.observe(&observation).unwrap();
+            }
+        }
+    }
+
+    /// An offset that may have wandered since the data that is known is not odd.
+    #[test]
+    fn what_offsets_may_have_wandered_is_not_odd() {
+        let (model, sensors) = robot();
+        let mut online = online(&model, &structure(&model, &sensors));
+        let mut known = online.job.as_ref().unwrap().solution.components[0].clone();
+        observe(&model, sensors.len(), 1, &mut [&mut online]);
+        let component = &mut online.components[0];
+        // What explains the instant, but for an offset.
+        let (unknowns, mut a, mut y) = (component.kinds.unknowns(), Vec::new(), Vec::new());
+        for (kind, rows) in component.kinds.iter().zip(component.gathered.iter()) {
+            for row in rows.values().chunks_exact(kind.columns.len() + 1) {
+                let mut whole = vec![0.0; unknowns];
+                for (&column, value) in kind.columns.iter().zip(row) {
+                    whole[column] = *value;
+                }
+                a.extend(whole);
+                y.push(row[kind.columns.len()]);
+            }
+        }
+        let a = DMatrix::from_row_slice(y.len(), unknowns, &a);
+        let explains = a.svd(true, true).solve(&DVector::from_vec(y), 1e-12).unwrap();
+        known.estimate = explains.as_slice().to_vec();
+        known.spread = DMatrix::zeros(unknowns, unknowns);
+        component.wander.fill(1e5);
+        let now = Nanos::from_seconds(100.0);
+        for (offset, since, is_odd) in [(0.0, 0.0, false), (1e5, 0.0, true), (1e5, 100.0, false)] {
+            known.estimate[3] = explains[3] + offset;
+            known.data = Nanos::from_seconds(100.0 - since);
+            assert_eq!(component.is_odd(&known, now), is_odd, "{offset} N after {since} s");
+        }
+    }
+
     /// What can not be solved is told, with what was known before in force; and that it is over.
     #[test]
     fn a_failure_is_told_until_it_is_over() {
@@ -1765,41 +1837,7 @@ mod tests {
         let [mut apart, mut together] = [(); 2].map(|()| online(&model, &structure));
         assert_eq!((apart.components.len(), apart.components[0].limbs.len()), (1, 5));
         together.components[0].limbs.clear();
-        let mut kinematics = Kinematics::new(&model, 0).unwrap();
-        let (dofs, count) = (model.dof_count(), sensors.len());
-        let (joints, fine) = (vec![Reason::None; dofs], vec![Reason::None; count]);
-        for instant in 0..260_i64 {
-            let numbers = normals(instant as u64, 3 * dofs + 6 * count + 9);
-            let (of_joints, rest) = numbers.split_at(3 * dofs);
-            let [position, velocity, acceleration] = [0, 1, 2].map(|m| &of_joints[m * dofs..(m + 1) * dofs]);
-            let state = JointState {
-                position,
-                velocity,
-                acceleration,
-            };
-            let motion = FrameMotion {
-                angular_velocity: Vec3::new(rest[0], rest[1], rest[2]),
-                angular_acceleration: Vec3::new(rest[3], rest[4], rest[5]),
-                proper_acceleration: Vec3::new(rest[6], rest[7], 9.81 + rest[8]),
-            };
-            kinematics.update(&model, state, &motion).unwrap();
-            let six = |six: &[f64]| Wrench::from_parts([six[0], six[1], six[2]], [six[3], six[4], six[5]]);
-            let readings: Vec<Wrench> = rest[9..].chunks_exact(6).map(six).collect();
-            for online in [&mut apart, &mut together] {
-                let observation = Observation {
-                    t: Nanos::from_millis(10 * instant),
-                    kinematics: &kinematics,
-                    readings: &readings,
-                    active: &ContactSet::default(),
-                    base: Reason::None,
-                    joints: &joints,
-                    moved: &DofSet::default(),
-                    is_base_moved: true,
-                    sensors: &fine,
-                };
-                online.observe(&observation).unwrap();
-            }
-        }
+        observe(&model, sensors.len(), 260, &mut [&mut apart, &mut together]);
         // Thirty of 36 rows of an instant, of those since the last full second.
         let component = &mut apart.components[0];
         let by_limbs: u64 = component.limbs.iter().map(|limb| limb.information.rows()).sum();

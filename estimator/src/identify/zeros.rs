@@ -39,8 +39,8 @@ const ENOUGH: usize = 2000;
 const LEAST_OF_LOG: usize = 400;
 
 /// ... and for directions, which show at once.
-const ENOUGH_TURNED: usize = 600;
-const LEAST_TURNED: usize = 150;
+const ENOUGH_TURNED: usize = 1200;
+const LEAST_TURNED: usize = 300;
 const STRETCHES: usize = 4;
 
 /// Of all that might be, these are looked at closely in each round.
