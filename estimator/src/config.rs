@@ -291,7 +291,9 @@ pub struct Identification {
     pub model_std: f64,
     /// Whether `proprio identify` also finds out how far the gain of each force/torque sensor is off, and which entries.
     pub gain: Gain,
-    /// How far a gain may be off before anything is measured: relative standard deviation of a channel. Of what one force reads of another, or one torque of another, the same; of
+    /// How far a gain may be off before anything is measured: relative standard deviation of a channel.
+    /// With `gain = "auto"` also what gains must gain: at some sensor, the error's mean square in data held
+    /// out falls by more than this squared times the mean square of what the sensor reads. Of what one force reads of another, or one torque of another, the same; of
     /// what a force reads of a torque, this divided by the sensor's length, and of what a torque reads of a force, times that length: the ratio of its RMS `noise_nm` to its RMS `noise_n`,
     /// which is about the ratio of its full scales.
     pub gain_std: f64,

@@ -1727,7 +1727,6 @@ fn torques_that_can_not_be_are_named_and_left_out() {
         }
         late
     };
-    // (The torque of j2 is large: all together seem late with it.)
     let cases = [
         (&ARM_JOINTS[..], "joint torques"),
         (&["j4"], "joint/j4/torque"),
@@ -2064,6 +2063,10 @@ fn the_drift_of_a_sensor_with_temperature_is_identified() {
     for (deviation, truth) in found.deviation.iter().zip(per_kelvin.torque_first()) {
         assert!(*deviation < 0.4 * truth.abs(), "{deviation} of {truth}");
     }
+    // Gains that were asked for in vain change nothing.
+    let chosen = text(&log, &setup);
+    setup.calibrated.gain = Gain::None;
+    assert_eq!(chosen, text(&log, &setup));
     // Without a word from the configuration it counts from the mean, and the offset is that of there.
     let reference = found.identified.reference().expect("a reference");
     assert!((34.0..37.0).contains(&reference), "{reference}");
@@ -2094,11 +2097,11 @@ fn a_gain_that_no_motion_tells_stays_the_workbenchs() {
     assert!(text.contains("the gain of fz"), "{text}");
 }
 
-/// Gains that choose themselves: only where readings are off by more than the workbench's deviation, which is
-/// what they cost. All masses may be other than the CAD's.
+/// Gains that choose themselves: only where readings of a sensor are off by more than the workbench's
+/// deviation, which is what they cost. All masses may be other than the CAD's.
 #[test]
 fn gains_are_found_out_only_where_readings_ask_for_them() {
-    let setup = arm_with(&["ft", "wrist"]);
+    let mut setup = arm_with(&["ft", "wrist"]);
     assert_eq!(setup.calibrated.gain, Gain::Auto);
     let mut truth = real(&setup, 3);
     for link in 1..truth.link_count() {
@@ -2108,16 +2111,65 @@ fn gains_are_found_out_only_where_readings_ask_for_them() {
             .expect("a body");
     }
     let log = simulate(&setup, &truth, 12.0, 0.01, 3);
-    let calibrated = |gain: f64| {
-        let log = ["fz", "tx"].iter().fold(log.clone(), |log, axis| {
-            change(&log, &format!("wrench/ft/{axis}"), |x| gain * x)
+    let of_both = ["ft/fz", "ft/tx"];
+    // The sensor that carries less, alone.
+    let of_wrist = ["wrist/fz", "wrist/tx"];
+    for (channels, gain, noise, workbench, expected) in [
+        (&of_both[..], 1.0, 0.0, 0.05, false),
+        (&of_both, 1.04, 0.0, 0.05, false),
+        (&of_both, 1.4, 0.0, 0.05, true),
+        (&of_both, 1.04, 0.0, 0.005, true),
+        // What is off, but no gain explains.
+        (&of_both, 1.04, 0.3, 0.05, false),
+        (&of_wrist, 1.4, 0.0, 0.05, true),
+    ] {
+        setup.gain_deviation = workbench;
+        let mut normal = Noise(5);
+        let log = channels.iter().fold(log.clone(), |log, channel| {
+            let column = format!("wrench/{channel}");
+            let size = rms(&log, &column);
+            change_rows(&log, &column, |_, x| gain * x + noise * size * normal.normal())
         });
         let outcome = run(&setup, &[("log", Role::Train, &log)], &[]);
         let is_told = outcome.findings.iter().any(|f| f.code == "gain_chosen");
         assert_eq!(is_told, !outcome.calibrations.is_empty());
-        is_told
-    };
-    assert_eq!([1.0, 1.04, 1.4].map(calibrated), [false, false, true]);
+        assert_eq!(is_told, expected, "{channels:?} {gain} {noise} {workbench}");
+    }
+}
+
+/// RMS of a column about its mean.
+fn rms(log: &str, column: &str) -> f64 {
+    let mut values = Vec::new();
+    change_rows(log, column, |_, x| {
+        values.push(x);
+        x
+    });
+    let mean = values.iter().sum::<f64>() / values.len() as f64;
+    (values.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / values.len() as f64).sqrt()
+}
+
+/// No offset is given more of a slow change than sensors do by themselves, however it walked.
+#[test]
+fn no_offset_walks_faster_than_its_noise() {
+    let setup = arm();
+    let log = simulate(&setup, &real(&setup, 3), 12.0, 0.01, 3);
+    let noise = setup.structure.sensors()[0].noise();
+    let stated: Vec<f64> = noise.force.into_iter().chain(noise.torque).collect();
+    let mut normal = Noise(5);
+    let log = AXES.iter().zip(&stated).fold(log, |log, (axis, stated)| {
+        let mut offset = 0.0;
+        change_rows(&log, &format!("wrench/ft/{axis}"), |_, x| {
+            offset += 3.0 * stated * 0.1 * normal.normal();
+            x + offset
+        })
+    });
+    let outcome = run(&setup, &[("log", Role::Train, &log)], &[]);
+    for (axis, stated) in AXES.iter().zip(&stated) {
+        let name = format!("wrench/ft/{axis}");
+        let mut channels = outcome.channels.iter();
+        let found = channels.find(|c| c.name == name).expect("a channel").drift;
+        assert!(found <= 1.001 * stated, "{axis}: {found} of {stated}");
+    }
 }
 
 /// What is asked for of measurements that nothing is identified from is said to be asked in vain, and nothing else is.

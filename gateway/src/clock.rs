@@ -185,8 +185,18 @@ mod tests {
         let mut times = RealtimeToMonotonic::default();
         times.refresh();
         let before = times.now();
-        let converted = times.convert(read(ClockId::CLOCK_REALTIME));
-        assert_eq!(converted, before, "read after the refresh, so limited to it");
+        // A minute on either side, for both clocks can not be read at once.
+        let (wall, minute) = (read(ClockId::CLOCK_REALTIME), 60_000_000_000);
+        assert_eq!(
+            times.convert(Nanos(wall.0 + minute)),
+            before,
+            "not later than the refresh"
+        );
+        let converted = times.convert(Nanos(wall.0 - minute));
+        assert!(
+            (converted.0 + minute - before.0).abs() < minute / 2,
+            "{converted:?} {before:?}"
+        );
         assert_eq!(times.limit(Nanos(before.0 - 5)), Nanos(before.0 - 5));
         assert_eq!(times.limit(Nanos(before.0 - 9)), Nanos(before.0 - 5));
         assert_eq!(times.limit(Nanos::MAX), before);

@@ -2145,7 +2145,7 @@ fn a_demonstration_learns_what_its_urdf_has_wrong() {
     let error = |phase: &str, whose: &str, joint: &str| identification[phase][whose][joint].as_f64().unwrap();
     // The wrist's links are light: on a busy machine, whose frames are stamped late, noise is as large as what the CAD has wrong.
     for (joint, times, noise) in [
-        ("l_elbow", 1.5, 0.01),
+        ("l_elbow", 1.2, 0.01),
         ("l_wrist_prosup", 1.0, 0.03),
         ("l_wrist_pitch", 1.0, 0.03),
         ("l_wrist_yaw", 1.0, 0.03),

@@ -457,12 +457,14 @@ mod tests {
     #[test]
     fn links_that_the_logs_say_least_about_are_named() {
         let mut outcome = good();
-        outcome.weakest = vec![WeakDirection {
+        // Of the second the logs say half.
+        let weak = |link: usize, prior_share: f64| WeakDirection {
             expression: "a direction".into(),
-            links: vec![outcome.links[1].link],
+            links: vec![outcome.links[link].link],
             relative: 1e-4,
-            prior_share: 1.0,
-        }];
+            prior_share,
+        };
+        outcome.weakest = vec![weak(1, 1.0), weak(2, 0.5)];
         let (named, other) = (&outcome.links[1].name, &outcome.links[2].name);
         let next = Advice::of(&outcome).next.join(" ");
         assert!(next.contains(&format!("The logs say least about {named}:")), "{next}");

@@ -1,8 +1,10 @@
 //! Several recorded logs to one set of parameters.
 //!
 //! 1. Each log becomes instants ([`super::instants`]), each instant rows ([`super::rows`]).
-//! 2. Rounds. With the noise that the last parameters leave: what each log tells of the parameters, its own unknowns eliminated ([`super::passes`]); logs added up; the most
-//!    probable bodies under the prior and its weight ([`super::prior`]). With these bodies: what is left, and from it the noise ([`super::noise`]). Until both stay.
+//! 2. Rounds. With the noise that the last parameters leave: what each log tells of the parameters, its
+//!    own unknowns eliminated ([`super::passes`]); logs added up; the most probable bodies under the prior
+//!    and its weight ([`super::prior`]). With these bodies: the residuals, and from them the noise
+//!    ([`super::noise`]). Until noise stays; once more where an offset walked further than sensors do.
 //!    Before the first of them: logs that repeat another one, or whose readings are no newtons ([`super::wrenches`]), are refused; so is a sensor that is mounted the wrong way, or the log in which
 //!    alone it is ([`super::mounting`]).
 //! 3. What this fit says that something undeclared acted on is left out, jumps of offsets that it does not bear out are dropped, and the rounds repeated, until that stays ([`super::gate`]).
@@ -105,8 +107,8 @@ const QUIETER: f64 = 2.0;
 /// Most rounds of noise and prior.
 const ROUNDS: usize = 14;
 
-/// Rounds end when the logarithm of no variance changes by more, from the last round or round a circle:
-/// a deviation by a twentieth.
+/// Rounds end when the logarithm of no variance changes by more than this in a round, or round a circle
+/// of them: a deviation by a twentieth.
 const SETTLED: f64 = 0.1;
 
 /// How many instants a fold of the check on held-out data has at least.
@@ -893,7 +895,8 @@ fn gated(
             slow = Slow::OfSensors;
             let rates = walks(setup, maker.layout(), slow).rates;
             if settled.noise.drift.iter().zip(&rates).any(|(found, most)| found > most) {
-                // Afresh: noise beside offsets that follow all is shared out otherwise.
+                // Afresh: noise beside offsets that follow all is shared out otherwise. Where none walked
+                // further than sensors do, the bound would have changed nothing.
                 settled = settle(setup, maker, &used(prepared), slow, None, &mut progress)?;
             }
         }
@@ -920,8 +923,8 @@ struct Choice {
     guard: Option<Guard>,
 }
 
-impl From<Gain> for Choice {
-    fn from(gain: Gain) -> Self {
+impl Choice {
+    const fn of(gain: Gain) -> Self {
         Self {
             gain,
             told: None,
@@ -930,11 +933,12 @@ impl From<Gain> for Choice {
     }
 }
 
-/// Which gains to find out: those asked for; or, step by step from none,
-/// those with which data held out are predicted better than with fewer, by more than a standard error and by
-/// more than they cost. That is the workbench's deviation: what all gains have in common is no other
-/// than that of all masses in any reading, but it is in every torque. Asked of the noise and the
-/// bodies that were found without gains, of which a gain's error is a small change.
+/// Which gains to find out: those asked for; or, step by step from none, those with which data held out
+/// are predicted better than with fewer, by more than a standard error and, at some sensor, by more than
+/// they cost. A gain common to all channels reads as a mass common to all links, so it stays as uncertain
+/// as the workbench left it, and it is in every torque: the cost is the square of that, relative to the
+/// square of what the sensor reads. Asked of the noise and the bodies that were found without gains, of
+/// which a gain's error is a small change.
 fn chosen_gain(
     maker: &mut RowMaker<'_>,
     prepared: &mut [Prepared],
@@ -942,12 +946,12 @@ fn chosen_gain(
 ) -> Result<Choice, IdentifyError> {
     let wanted = maker.setup().calibrated;
     if wanted.gain != Gain::Auto {
-        return Ok(wanted.gain.into());
+        return Ok(Choice::of(wanted.gain));
     }
     if maker.layout().sensors.is_empty() {
-        return Ok(Gain::None.into());
+        return Ok(Choice::of(Gain::None));
     }
-    let workbench = maker.setup().gain_deviation;
+    let cost = maker.setup().gain_deviation.powi(2);
     read_as_fitted(maker, prepared, settled);
     let mut checked = |gain: Gain| -> Result<Guard, IdentifyError> {
         let training = used(prepared);
@@ -959,16 +963,17 @@ fn chosen_gain(
     };
     let guard = checked(Gain::None)?;
     let none = &guard.held;
-    let cost = workbench.powi(2);
     let (mut chosen, mut best) = (Gain::None, none.clone());
     for gain in [Gain::Diagonal, Gain::Full] {
-        let may_gain = best.relative_error().powi(2);
-        if may_gain <= cost {
+        let before = best.relative_squares();
+        if !before.iter().any(|square| *square > cost) {
             break;
         }
         let other = checked(gain)?.held;
+        let after = other.relative_squares();
+        let is_worth = before.iter().zip(after).any(|(before, after)| before - after > cost);
         let (gained, error) = other.gain_over(&best);
-        if gained <= error || may_gain - other.relative_error().powi(2) <= cost {
+        if !(is_worth && gained > error) {
             break;
         }
         (chosen, best) = (gain, other);
@@ -985,9 +990,10 @@ fn chosen_gain(
             for instant in used_mut(prepared).flat_map(|log| &mut log.instants) {
                 instant.fitted = Vec::new();
             }
+            let guard = Some(guard);
             return Ok(Choice {
-                guard: Some(guard),
-                ..Gain::None.into()
+                guard,
+                ..Choice::of(Gain::None)
             });
         }
     };
@@ -995,15 +1001,15 @@ fn chosen_gain(
         "{what}: readings of data held out are predicted with {:.0} % less error than without (identification.gain = \"none\" leaves the workbench's gains as they are)",
         100.0 * (1.0 - best.relative_to(none))
     );
-    let note = Finding {
+    let told = Some(Finding {
         severity: Severity::Note,
         code: "gain_chosen",
         subject: "identification.gain".into(),
         text,
-    };
+    });
     Ok(Choice {
-        told: Some(note),
-        ..chosen.into()
+        told,
+        ..Choice::of(chosen)
     })
 }
 
@@ -1135,7 +1141,7 @@ fn fit(
     let Settled {
         prior,
         noise,
-        fit: settled,
+        fit: Fit { tau, .. },
         change,
         ..
     } = settled;
@@ -1143,7 +1149,7 @@ fn fit(
     let sampled = sample(maker, training);
     let mut guard = match guard {
         Some(guard) => guard,
-        None => guard::held_out(maker, &prior, &sampled, &noise, settled.tau)?,
+        None => guard::held_out(maker, &prior, &sampled, &noise, tau)?,
     };
     guard.findings.extend(unsettled(change));
     // Parameters have taken a part of the noise that they were fitted to, most of all where it is as slow as the motion.
@@ -1181,9 +1187,9 @@ pub(super) fn per_column(layout: &Layout, values: &[f64]) -> Vec<f64> {
     of_links.chain(further.iter().copied()).collect()
 }
 
-/// Says that rounds ended before noise and prior's weight stayed, if the last one still changed a variance by more than a tenth.
+/// Says that rounds ended before noise and prior's weight stayed.
 fn unsettled(change: f64) -> Option<Finding> {
-    (change > 0.1).then(|| Finding {
+    (change > 0.0).then(|| Finding {
         severity: Severity::Warning,
         code: "unsettled",
         subject: String::new(),

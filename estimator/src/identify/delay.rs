@@ -68,12 +68,11 @@ pub(super) fn delays(
         .and_then(|each| alone(&each[sensors..], is_long));
     let mut findings = Vec::new();
     for offset in offsets.iter().filter(|offset| offset.significant) {
-        let is_of_torques = offset.channel == "joint torques";
-        // One that is late by itself is what all together seem late by.
-        if is_of_torques && alone.is_some() {
-            continue;
-        }
-        let seem = if is_of_torques { "seem" } else { "seems" };
+        let seem = if offset.channel == "joint torques" {
+            "seem"
+        } else {
+            "seems"
+        };
         let seem = format!("{} {seem}", offset.channel);
         findings.push(finding(
             offset.channel.clone(),

@@ -68,8 +68,10 @@ pub(super) struct Held {
     folds: Vec<usize>,
     /// Per channel and block, the sum of squares, and of how many instants \[Nm^2\].
     squares: Vec<Vec<(f64, usize)>>,
-    /// Of F/T sensors' readings, less their means, the sum of squares \[Nm^2\].
-    load: f64,
+    /// Per F/T sensor, the sum of squares of its readings, less their means \[Nm^2\].
+    loads: Vec<f64>,
+    /// ... and of its stated noise.
+    noises: Vec<f64>,
 }
 
 impl Held {
@@ -90,17 +92,23 @@ impl Held {
 
     /// The RMS error, relative to that of others.
     pub(super) fn relative_to(&self, other: &Self) -> f64 {
-        (self.sum() / other.sum()).sqrt()
+        (sum(&self.squares) / sum(&other.squares)).sqrt()
     }
 
-    /// The RMS error, relative to what F/T sensors read.
-    pub(super) fn relative_error(&self) -> f64 {
-        (self.sum() / self.load).sqrt()
+    /// Per F/T sensor, the mean square of its error beyond its stated noise, relative to that of what it
+    /// reads.
+    pub(super) fn relative_squares(&self) -> Vec<f64> {
+        let errors = self.squares.chunks(6).map(sum);
+        let sizes = self.loads.iter().zip(&self.noises);
+        errors
+            .zip(sizes)
+            .map(|(error, (load, noise))| (error - noise) / load)
+            .collect()
     }
+}
 
-    fn sum(&self) -> f64 {
-        self.squares.iter().flatten().map(|(square, _)| square).sum()
-    }
+fn sum(squares: &[Vec<(f64, usize)>]) -> f64 {
+    squares.iter().flatten().map(|(square, _)| square).sum()
 }
 
 /// Some instants of a piece that follow each other, and the fold that they belong to.
@@ -170,14 +178,17 @@ pub(super) fn held_out(
         pairs.push([if knows_cad { 0 } else { last - 1 }, last]);
         sets.push(both.into_iter().nth(1).unwrap_or_default());
     }
-    let mut load = 0.0;
+    let mut loads = vec![0.0; layout.sensors.len()];
+    let mut noises = loads.clone();
     let mut errors: Vec<Vec<Errors>> = Vec::new();
     for piece in pieces {
         let yardstick = Yardstick::of_fit(maker, piece.instants);
         let own = yardstick.errors(layout, &candidates, Free::Constants);
-        for channel in 0..6 * layout.sensors.len() {
+        for (channel, stated) in layout.stated(maker.setup()).enumerate() {
             let read = yardstick.load(channel, &own[0]);
-            load += layout.scale(channel).powi(2) * read.iter().map(|x| x * x).sum::<f64>();
+            let scale = layout.scale(channel).powi(2);
+            loads[channel / 6] += scale * read.iter().map(|x| x * x).sum::<f64>();
+            noises[channel / 6] += scale * read.len() as f64 * stated * stated;
         }
         errors.push(own);
     }
@@ -214,7 +225,8 @@ pub(super) fn held_out(
     let held = Held {
         squares: squares.collect(),
         folds,
-        load,
+        loads,
+        noises,
     };
     Ok(Guard {
         share,

@@ -1801,7 +1801,12 @@ mod tests {
         known.spread = DMatrix::zeros(unknowns, unknowns);
         component.wander.fill(1e5);
         let now = Nanos::from_seconds(100.0);
-        for (offset, since, is_odd) in [(0.0, 0.0, false), (1e5, 0.0, true), (1e5, 100.0, false)] {
+        for (offset, since, is_odd) in [
+            (0.0, 0.0, false),
+            (1e5, 0.0, true),
+            (1e5, 100.0, false),
+            (3e7, 100.0, true),
+        ] {
             known.estimate[3] = explains[3] + offset;
             known.data = Nanos::from_seconds(100.0 - since);
             assert_eq!(component.is_odd(&known, now), is_odd, "{offset} N after {since} s");

@@ -34,14 +34,15 @@ const SPREAD: f64 = 0.1;
 const LEAST: f64 = 0.01;
 const LEAST_BEFORE: f64 = 0.02;
 
-/// Instants that are looked at, at least so many of each log, in stretches: offsets and noise need what follows each other, and each stretch pays for offsets of its own.
+/// Instants that are looked at, at least so many of each log, in so many stretches: offsets and noise need
+/// instants that follow each other, and each stretch pays for offsets of its own.
 const ENOUGH: usize = 2000;
 const LEAST_OF_LOG: usize = 400;
+const STRETCHES: usize = 4;
 
-/// ... and for directions, which show at once.
+/// The same for directions: an encoder that counts backwards shows in fewer.
 const ENOUGH_TURNED: usize = 1200;
 const LEAST_TURNED: usize = 300;
-const STRETCHES: usize = 4;
 
 /// Of all that might be, these are looked at closely in each round.
 const TRIED: usize = 6;
