@@ -1204,7 +1204,7 @@ impl Parameters {
     /// ```text
     /// P = (1 - k) P_1 + k P_2 + k (1 - k) (d_2 - d_1) (d_2 - d_1)^T
     /// ```
-    fn between(first: &Self, second: &Self, share: f64) -> Self {
+    fn between(first: &Self, second: &Self, share: f64) -> Result<Self, InformationError> {
         let mixed = |a: f64, b: f64| a + share * (b - a);
         let bodies: Vec<RigidInertia> = (first.bodies.iter().zip(&second.bodies))
             .map(|(a, b)| {
@@ -1212,28 +1212,37 @@ impl Parameters {
                 RigidInertia::from_parameters(&std::array::from_fn(|i| mixed(a[i], b[i])))
             })
             .collect();
-        let (rows, columns) = first.root.shape();
-        let mut root = DMatrix::zeros(rows + second.root.nrows() + 1, columns);
-        root.rows_mut(0, rows).copy_from(&(&first.root * (1.0 - share).sqrt()));
-        root.rows_mut(rows, second.root.nrows())
-            .copy_from(&(&second.root * share.sqrt()));
-        let between = (share * (1.0 - share)).sqrt();
-        let pairs = first.change.iter().zip(&second.change);
-        for (to, (a, b)) in root.row_mut(rows + second.root.nrows()).iter_mut().zip(pairs) {
-            *to = between * (b - a);
+        // The triangle of three roots below each other, by what absorbs rows of measurements: several
+        // times as fast as a QR decomposition that knows nothing of the processor.
+        let apart = DMatrix::from_iterator(
+            1,
+            first.change.len(),
+            second.change.iter().zip(&first.change).map(|(b, a)| b - a),
+        );
+        let mut all = Information::new(first.change.len());
+        for (root, weight) in [
+            (&first.root, 1.0 - share),
+            (&second.root, share),
+            (&apart, share * (1.0 - share)),
+        ] {
+            let mut panel = Panel::new(root.ncols(), root.nrows());
+            for row in (root * weight.sqrt()).row_iter() {
+                panel.push_row(row.transpose().as_slice(), 0.0)?;
+            }
+            all.absorb(&mut panel)?;
         }
-        Self {
+        Ok(Self {
             change: first
                 .change
                 .iter()
                 .zip(&second.change)
                 .map(|(a, b)| mixed(*a, *b))
                 .collect(),
-            root: root.qr().r(),
+            root: all.to_triangle().0,
             bodies,
             tau: second.tau,
             effective: second.effective,
-        }
+        })
     }
 }
 
@@ -1372,7 +1381,11 @@ impl Part {
         for (number, (t, _)) in left.first().into_iter().flatten().enumerate() {
             self.contest.take(*t, left.iter().map(|own| own[number].1.as_slice()));
         }
-        self.contest.decide(Parameters::between);
+        // Those in force stay if what won is no number: nothing that was solved is.
+        let between = |old: &Parameters, new: &Parameters, share| {
+            Parameters::between(old, new, share).unwrap_or_else(|_| old.clone())
+        };
+        self.contest.decide(between);
     }
 
     /// What each channel has left of the second's rows for these parameters, in the mean of each block: when that was, and per channel.
@@ -1810,6 +1823,28 @@ mod tests {
             known.estimate[3] = explains[3] + offset;
             known.data = Nanos::from_seconds(100.0 - since);
             assert_eq!(component.is_odd(&known, now), is_odd, "{offset} N after {since} s");
+        }
+    }
+
+    /// The covariance of a mixture is that of its definition.
+    #[test]
+    fn between_two_sets_is_their_mixture() {
+        let set = |seed: u64| Parameters {
+            change: normals(seed, 3),
+            root: DMatrix::from_vec(4, 3, normals(seed + 1, 12)),
+            bodies: Vec::new(),
+            tau: 1.0,
+            effective: 1.0,
+        };
+        let (first, second) = (set(1), set(3));
+        let [a, b] = [&first, &second].map(|set| DVector::from_column_slice(&set.change));
+        for share in [0.0, 0.3, 1.0] {
+            let mixed = Parameters::between(&first, &second, share).unwrap();
+            let [p, p1, p2] = [&mixed, &first, &second].map(|set| set.root.tr_mul(&set.root));
+            let apart = (&b - &a) * (&b - &a).transpose() * (share * (1.0 - share));
+            assert!((p - p1 * (1.0 - share) - p2 * share - apart).amax() < 1e-12, "{share}");
+            let mean = &a * (1.0 - share) + &b * share;
+            assert!((DVector::from_vec(mixed.change) - mean).amax() < 1e-12, "{share}");
         }
     }
 
