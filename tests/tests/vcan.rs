@@ -876,7 +876,10 @@ fn skewed_buses([force_torque, imu, motors]: [i64; 3], max_wait: f64, skew: Nano
     }
     let valid = recorder.estimates.values().filter(|e| all_valid(&e.torques)).count();
     let least = recorder.estimates.len() * 9 / 10;
-    assert!(valid > least, "{valid} valid of {}", recorder.estimates.len());
+    if valid <= least {
+        // Frames that come late are stamped late: motion is as uncertain as that.
+        return Err(format!("{valid} valid of {}", recorder.estimates.len()));
+    }
     let triggers = recorder
         .taken
         .iter()
