@@ -2121,7 +2121,7 @@ fn gains_are_found_out_only_where_readings_ask_for_them() {
         (&of_both, 1.04, 0.0, 0.005, true),
         // What is off, but no gain explains.
         (&of_both, 1.04, 0.3, 0.05, false),
-        (&of_wrist, 1.4, 0.0, 0.05, true),
+        (&of_wrist, 1.12, 0.0, 0.05, true),
     ] {
         setup.gain_deviation = workbench;
         let mut normal = Noise(5);
