@@ -1,17 +1,16 @@
-//! The verbs that turn one file into another: decode, encode, estimate.
+//! The subcommands that convert files: decode, encode, estimate.
 
 use crate::identify::advice::sentence;
 use crate::identify::summary;
 use anyhow::{Context, bail};
 use proprio_estimator::assessment::{Assessment, Assessor, Coverage};
 use proprio_estimator::config::ConfigError;
-use proprio_estimator::files;
-use proprio_estimator::identify::implausible;
-use proprio_estimator::identify::instants::RecordingError;
-use proprio_estimator::offline as estimates;
+use proprio_estimator::reading::{self, ReadingError};
 use proprio_estimator::setup::Setup;
+use proprio_estimator::{files, offline as estimates};
 use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
+use proprio_identification::{Role, implausible};
 use proprio_topics::csv::{self, Columns, Report};
 use serde_json::json;
 use std::fs::File;
@@ -21,7 +20,7 @@ use std::path::{Path, PathBuf};
 /// `proprio decode`.
 #[derive(clap::Args)]
 pub(crate) struct Decode {
-    /// gateway.toml: which devices there are; its sources are not opened
+    /// gateway.toml, which lists the devices; its sources are not opened
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
     /// The recorded log, in any of candump's formats; - for standard input
@@ -30,10 +29,11 @@ pub(crate) struct Decode {
     /// The table to write; - for standard output
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Also what an estimator does not read: currents, temperatures, gauges, orientation, motor states
+    /// Also write columns that the estimator does not read: currents, temperatures, gauges,
+    /// orientation, motor states
     #[arg(long)]
     all: bool,
-    /// Print what became of the log as JSON
+    /// Print a summary of the conversion as JSON
     #[arg(long)]
     json: bool,
 }
@@ -41,7 +41,7 @@ pub(crate) struct Decode {
 /// `proprio encode`.
 #[derive(clap::Args)]
 pub(crate) struct Encode {
-    /// gateway.toml: which devices there are
+    /// gateway.toml, which lists the devices
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
     /// The table of samples; - for standard input
@@ -50,7 +50,7 @@ pub(crate) struct Encode {
     /// The log to write, in candump's log format; - for standard output
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Print what became of the table as JSON
+    /// Print a summary of the conversion as JSON
     #[arg(long)]
     json: bool,
 }
@@ -61,7 +61,8 @@ pub(crate) struct Estimate {
     /// estimator.toml
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// Identified parameters and offsets (parameters.toml) to use instead of the URDF's, estimator.toml's, and those that it names
+    /// Identified parameters and offsets (parameters.toml) to use instead of those of the URDF, of
+    /// estimator.toml, and of the file that it names
     #[arg(long, value_name = "FILE")]
     parameters: Option<PathBuf>,
     /// The table of samples; - for standard input
@@ -70,10 +71,11 @@ pub(crate) struct Estimate {
     /// The table of estimates to write; - for standard output
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Say how good they are: readings predicted with the parameters in force beside CAD's, residuals and measured torques within what is stated
+    /// Assess the estimates: F/T readings predicted with the parameters in use and with the CAD's;
+    /// residuals and errors to measured torques against the stated standard deviations
     #[arg(long)]
     assess: bool,
-    /// Print what became of the log as JSON
+    /// Print a summary of the conversion as JSON
     #[arg(long)]
     json: bool,
 }
@@ -82,9 +84,9 @@ fn input(path: &Path) -> anyhow::Result<Box<dyn Read>> {
     if path == Path::new("-") {
         return Ok(Box::new(std::io::stdin().lock()));
     }
-    let file = File::open(path).with_context(|| format!("{}: can not be read", path.display()))?;
+    let file = File::open(path).with_context(|| format!("{}: cannot be read", path.display()))?;
     let length = file.metadata().map(|m| m.len()).unwrap_or(0);
-    // Long work shows its progress where somebody looks.
+    // Show progress if standard error is a terminal.
     if length > 64 << 20 && std::io::stderr().is_terminal() {
         let bar = indicatif::ProgressBar::new(length).with_style(
             indicatif::ProgressStyle::with_template("{bar:40} {bytes}/{total_bytes} {eta}")
@@ -95,14 +97,14 @@ fn input(path: &Path) -> anyhow::Result<Box<dyn Read>> {
     Ok(Box::new(file))
 }
 
-/// The file that a conversion writes. It gets its name when it is complete: an error leaves no half table, and an input
-/// that is also the output is not destroyed before it is read.
+/// The output file of a conversion. It is renamed to its final name when complete: an error leaves
+/// no partial table, and a file that is both input and output is not destroyed before it is read.
 struct Output {
     writer: Option<BufWriter<Marked>>,
     new: Option<(tempfile::NamedTempFile, PathBuf)>,
 }
 
-/// Why an output could not be written, kept apart from why an input could not be read.
+/// A write error, to distinguish it from a read error of the input.
 #[derive(Debug)]
 struct Unwritable(std::io::Error);
 
@@ -114,7 +116,7 @@ impl std::fmt::Display for Unwritable {
 
 impl std::error::Error for Unwritable {}
 
-/// Marks what goes wrong with an output.
+/// Records errors of the output.
 struct Marked(Box<dyn Write>);
 
 impl Write for Marked {
@@ -125,15 +127,21 @@ impl Write for Marked {
     }
 
     fn flush(&mut self) -> std::io::Result<()> {
-        self.0.flush().map_err(|e| std::io::Error::new(e.kind(), Unwritable(e)))
+        self.0
+            .flush()
+            .map_err(|e| std::io::Error::new(e.kind(), Unwritable(e)))
     }
 }
 
-/// A conversion's error with the file that it is about.
+/// A conversion's error with the file concerned.
 fn blame(error: offline::OfflineError, input: &Path, output: &Path) -> anyhow::Error {
     match error {
-        offline::OfflineError::Io(e) if e.get_ref().and_then(|e| e.downcast_ref::<Unwritable>()).is_some() => {
-            anyhow::anyhow!("{}: can not be written: {e}", output.display())
+        offline::OfflineError::Io(e)
+            if e.get_ref()
+                .and_then(|e| e.downcast_ref::<Unwritable>())
+                .is_some() =>
+        {
+            anyhow::anyhow!("{}: cannot be written: {e}", output.display())
         }
         error => anyhow::Error::from(error).context(input.display().to_string()),
     }
@@ -142,11 +150,11 @@ fn blame(error: offline::OfflineError, input: &Path, output: &Path) -> anyhow::E
 impl Output {
     fn new(path: &Path) -> anyhow::Result<Self> {
         let special = std::fs::metadata(path).is_ok_and(|m| !m.is_file());
-        let unwritable = || format!("{}: can not be written", path.display());
+        let unwritable = || format!("{}: cannot be written", path.display());
         let (writer, new): (Box<dyn Write>, _) = if path == Path::new("-") {
             (Box::new(std::io::stdout().lock()), None)
         } else if special {
-            // A pipe or /dev/null: nothing to replace.
+            // A pipe or /dev/null: write directly, there is nothing to replace.
             (Box::new(File::create(path).with_context(unwritable)?), None)
         } else {
             let new = files::begin(path).with_context(unwritable)?;
@@ -160,7 +168,10 @@ impl Output {
     }
 
     fn writer(&mut self) -> &mut BufWriter<Marked> {
-        #[allow(clippy::expect_used, reason = "taken only by finish, which consumes self")]
+        #[allow(
+            clippy::expect_used,
+            reason = "taken only by finish, which consumes self"
+        )]
         self.writer
             .as_mut()
             .expect("an output that is not finished has a writer")
@@ -168,11 +179,12 @@ impl Output {
 
     fn finish(mut self) -> anyhow::Result<()> {
         if let Some(mut writer) = self.writer.take() {
-            writer.flush().context("can not be written")?;
+            writer.flush().context("cannot be written")?;
         }
         if let Some((new, path)) = self.new.take() {
-            // A result is for whoever may read the folder.
-            files::end(new, &path, 0o644).with_context(|| format!("{}: can not be written", path.display()))?;
+            // The result gets the permissions of a normal new file.
+            files::end(new, &path, 0o644)
+                .with_context(|| format!("{}: cannot be written", path.display()))?;
         }
         Ok(())
     }
@@ -180,7 +192,12 @@ impl Output {
 
 fn tell_table(log: &Path, report: &Report) {
     for bad in &report.bad {
-        eprintln!("{}: line {}: skipped: {}", log.display(), bad.line, bad.reason);
+        eprintln!(
+            "{}: line {}: skipped: {}",
+            log.display(),
+            bad.line,
+            bad.reason
+        );
     }
     if report.bad_rows > report.bad.len() as u64 {
         eprintln!("{}: {} rows skipped in all", log.display(), report.bad_rows);
@@ -199,24 +216,34 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
     let plan = Plan::load(&args.config)?;
     let log = BufReader::with_capacity(1 << 18, input(&args.log)?);
     let mut out = Output::new(&args.out)?;
-    let columns = if args.all { Columns::All } else { Columns::Main };
-    let report = offline::decode(&plan, log, out.writer(), columns).map_err(|e| blame(e, &args.log, &args.out))?;
-    // A result without a row replaces nothing.
+    let columns = if args.all {
+        Columns::All
+    } else {
+        Columns::Main
+    };
+    let report = offline::decode(&plan, log, out.writer(), columns)
+        .map_err(|e| blame(e, &args.log, &args.out))?;
+    // A result without rows does not replace an existing file.
     if report.samples > 0 {
-        out.finish().with_context(|| args.out.display().to_string())?;
+        out.finish()
+            .with_context(|| args.out.display().to_string())?;
     }
     for bad in &report.bad {
         eprintln!("{}: skipped: {bad}", args.log.display());
     }
     if report.dropped > 0 {
         eprintln!(
-            "{}: {} frames were lost while it was recorded, as candump says in it",
+            "{}: {} frames were lost during the recording, as candump reports in it",
             args.log.display(),
             report.dropped
         );
     }
     if report.bad_lines > report.bad.len() as u64 {
-        eprintln!("{}: {} lines skipped in all", args.log.display(), report.bad_lines);
+        eprintln!(
+            "{}: {} lines skipped in all",
+            args.log.display(),
+            report.bad_lines
+        );
     }
     for device in &report.devices {
         if let Some(refusal) = &device.refusal {
@@ -231,28 +258,45 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
             .devices
             .iter()
             .map(|d| {
-                let counts: serde_json::Map<_, _> = d.counts.iter().map(|(c, n)| (c.word().to_owned(), json!(n))).collect();
-                json!({ "name": d.name, "frames": d.frames, "readings": d.readings, "counts": counts, "refusal": d.refusal })
+                let counts = d.counts.iter();
+                let counts: serde_json::Map<_, _> = counts
+                    .map(|(c, n)| (c.word().to_owned(), json!(n)))
+                    .collect();
+                json!({
+                    "name": d.name, "frames": d.frames, "readings": d.readings, "counts": counts,
+                    "refusal": d.refusal,
+                })
             })
             .collect();
         let summary = json!({
-            "frames": report.frames, "samples": report.samples, "unclaimed": report.unclaimed, "bad_lines": report.bad_lines,
-            "other_interfaces": report.other_interfaces, "error_frames": report.error_frames, "dropped": report.dropped, "out_of_order": report.out_of_order, "devices": devices,
+            "frames": report.frames, "samples": report.samples, "unclaimed": report.unclaimed,
+            "bad_lines": report.bad_lines, "other_interfaces": report.other_interfaces,
+            "error_frames": report.error_frames, "dropped": report.dropped,
+            "out_of_order": report.out_of_order, "devices": devices,
         });
         tell_json(&args.out, &summary);
     } else {
         eprintln!(
-            "{} frames, {} samples; {} frames of no device, {} of other interfaces, {} lines skipped",
-            report.frames, report.samples, report.unclaimed, report.other_interfaces, report.bad_lines
+            "{} frames, {} samples; {} frames of unknown devices, {} of other interfaces, {} lines \
+             skipped",
+            report.frames,
+            report.samples,
+            report.unclaimed,
+            report.other_interfaces,
+            report.bad_lines
         );
     }
     if report.samples == 0 {
         let hint = if report.other_interfaces == report.frames {
-            "its interfaces are none of the configuration's buses"
+            "its interfaces are not buses of the configuration"
         } else {
-            "are the addresses right?"
+            "are the devices' addresses in gateway.toml right?"
         };
-        bail!("{}: no sample in {} frames: {hint}", args.log.display(), report.frames);
+        bail!(
+            "{}: no sample in {} frames: {hint}",
+            args.log.display(),
+            report.frames
+        );
     }
     Ok(())
 }
@@ -262,9 +306,11 @@ pub(crate) fn encode(args: &Encode) -> anyhow::Result<()> {
     let plan = Plan::load(&args.config)?;
     let samples = input(&args.samples)?;
     let mut out = Output::new(&args.out)?;
-    let report = offline::encode(&plan, samples, out.writer()).map_err(|e| blame(e, &args.samples, &args.out))?;
+    let report = offline::encode(&plan, samples, out.writer())
+        .map_err(|e| blame(e, &args.samples, &args.out))?;
     if report.samples > 0 {
-        out.finish().with_context(|| args.out.display().to_string())?;
+        out.finish()
+            .with_context(|| args.out.display().to_string())?;
     }
     tell_table(&args.samples, &report.table);
     if !report.unknown_channels.is_empty() {
@@ -277,39 +323,51 @@ pub(crate) fn encode(args: &Encode) -> anyhow::Result<()> {
     }
     if let Some(first) = &report.first_refusal {
         eprintln!(
-            "{}: {} samples not encoded; the first: {first}",
+            "{}: {} samples not encoded; the first is {first}",
             args.samples.display(),
             report.refused
         );
     }
     if args.json {
         let summary = json!({
-            "frames": report.frames, "samples": report.samples, "refused": report.refused, "rows": report.table.rows,
-            "bad_rows": report.table.bad_rows, "unknown_channels": report.unknown_channels,
+            "frames": report.frames, "samples": report.samples, "refused": report.refused,
+            "rows": report.table.rows, "bad_rows": report.table.bad_rows,
+            "unknown_channels": report.unknown_channels,
         });
         tell_json(&args.out, &summary);
     } else {
         eprintln!("{} samples, {} frames", report.samples, report.frames);
     }
     if report.samples == 0 {
-        bail!("{}: not one sample could be encoded", args.samples.display());
+        bail!("{}: no sample could be encoded", args.samples.display());
     }
     Ok(())
 }
 
-/// Whether a table's header (its first line) has a column for every channel that an estimator reads.
+/// Checks that a table's header (its first line) has a column for every channel that the estimator
+/// reads.
 ///
 /// # Errors
-/// A configuration that does not fit the log: the log is what it is.
-pub(crate) fn blame_columns(header: &[u8], log: &Path, config: &Path, setup: &Setup) -> anyhow::Result<()> {
+/// A [`ConfigError`]: the configuration does not match the log.
+pub(crate) fn blame_columns(
+    header: &[u8],
+    log: &Path,
+    config: &Path,
+    setup: &Setup,
+) -> anyhow::Result<()> {
     let reader = csv::Reader::new(header).with_context(|| log.display().to_string())?;
     match estimates::missing_channels(setup, reader.series()) {
         missing if missing.is_empty() => Ok(()),
-        missing => Err(unfit(config, log, &estimates::OfflineError::MissingChannels(missing)).into()),
+        missing => Err(unfit(
+            config,
+            log,
+            &estimates::OfflineError::MissingChannels(missing),
+        )
+        .into()),
     }
 }
 
-/// The log is what it is: the configuration does not fit it.
+/// The error that the configuration does not match the log.
 fn unfit(config: &Path, log: &Path, error: &dyn std::error::Error) -> ConfigError {
     ConfigError {
         file: config.to_owned(),
@@ -320,7 +378,7 @@ fn unfit(config: &Path, log: &Path, error: &dyn std::error::Error) -> ConfigErro
 /// Estimates from a table.
 pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
     let (_, setup) = proprio_estimator::daemon::load(&args.config, |config| {
-        // What the command line names counts.
+        // The command line overrides the configuration.
         if let Some(parameters) = &args.parameters {
             config.parameters = Some(parameters.clone());
         }
@@ -339,12 +397,13 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
             return Err(unfit(&args.config, &args.log, &error).into());
         }
         Err(estimates::OfflineError::Write(error)) => {
-            bail!("{}: can not be written: {error}", args.out.display())
+            bail!("{}: cannot be written: {error}", args.out.display())
         }
         Err(error) => return Err(error).with_context(|| args.log.display().to_string()),
     };
     if report.estimates > 0 {
-        out.finish().with_context(|| args.out.display().to_string())?;
+        out.finish()
+            .with_context(|| args.out.display().to_string())?;
     }
     tell_table(&args.log, &report.log);
     if !report.unused_channels.is_empty() {
@@ -358,8 +417,9 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
     let [late, backward, not_finite] = report.dropped;
     if late + backward + not_finite > 0 {
         eprintln!(
-            "{}: samples dropped, the first in line {}: {late} late (stamped before an estimate that was made already), {backward} not later than their \
-             channel's last, {not_finite} not finite",
+            "{}: samples dropped, the first in line {}: {late} late (stamped before an estimate \
+             that was already made), {backward} not later than their channel's last, \
+             {not_finite} not finite",
             args.log.display(),
             report.first_dropped.unwrap_or_default()
         );
@@ -367,8 +427,9 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
     let assessment = assessor.map(Assessor::finish);
     if args.json {
         let mut summary = json!({
-            "estimates": report.estimates, "torques_withheld": report.withheld, "rows": report.log.rows,
-            "bad_rows": report.log.bad_rows, "late": late, "backward": backward, "not_finite": not_finite,
+            "estimates": report.estimates, "torques_withheld": report.withheld,
+            "rows": report.log.rows, "bad_rows": report.log.bad_rows, "late": late,
+            "backward": backward, "not_finite": not_finite,
         });
         if let Some(assessment) = &assessment {
             summary["assessment"] = assessment_json(assessment);
@@ -392,32 +453,43 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// How much of a log is asked what can not be: half an hour of a robot's samples, which fits in memory.
-const ASKED: u64 = 256 << 20;
+/// The part of a log that is checked for implausible channels \[bytes\]: half an hour of a robot's
+/// samples, which fits in memory.
+const CHECKED: u64 = 256 << 20;
 
-/// Whether a log can be read again: a pipe passes once.
+/// Whether a log can be read twice; a pipe cannot.
 fn is_file(log: &Path) -> bool {
     log != Path::new("-") && std::fs::metadata(log).is_ok_and(|data| data.is_file())
 }
 
-/// Says what in the log can not be, before anything is made of it. A log that can not be read is told
-/// of where the estimates are made; of one that passes once nothing is asked.
+/// Warns of implausible channels in the log before the estimation. Errors of reading are reported
+/// by the estimation itself; a log that can be read only once is not checked.
 fn tell_implausible(args: &Estimate, setup: &Setup) {
-    let log = is_file(&args.log).then(|| File::open(&args.log).ok()).flatten();
-    let found = log.and_then(|log| implausible(setup, log.take(ASKED)).ok());
+    let log = is_file(&args.log)
+        .then(|| File::open(&args.log).ok())
+        .flatten();
+    let robot = &setup.robot;
+    let read = |log: File| reading::dataset(robot, "", Role::Validate, log.take(CHECKED)).ok();
+    let found = log
+        .and_then(read)
+        .map(|dataset| implausible(robot, dataset));
     for finding in found.into_iter().flatten() {
-        eprintln!("warning: {}: {}", args.log.display(), sentence(&finding.text));
+        eprintln!(
+            "warning: {}: {}",
+            args.log.display(),
+            sentence(&finding.text)
+        );
     }
 }
 
-/// Reads the log once before the estimates.
+/// Reads the log once before the estimation.
 fn assessor(args: &Estimate, setup: &Setup) -> anyhow::Result<Assessor> {
     let log = input(&args.log)?;
     if !is_file(&args.log) {
         bail!("--assess reads the log twice: give a file with --log, not standard input or a pipe");
     }
     Assessor::new(setup, log).map_err(|error| match error {
-        RecordingError::MissingChannels(_) => unfit(&args.config, &args.log, &error).into(),
+        ReadingError::MissingChannels(_) => unfit(&args.config, &args.log, &error).into(),
         error => anyhow::Error::from(error).context(args.log.display().to_string()),
     })
 }
@@ -425,7 +497,8 @@ fn assessor(args: &Estimate, setup: &Setup) -> anyhow::Result<Assessor> {
 fn assessment_json(assessment: &Assessment) -> serde_json::Value {
     let coverage = |of: &[(String, Coverage)]| -> serde_json::Map<_, _> {
         let entry = |(name, c): &(String, Coverage)| {
-            let figures = json!({ "rms": c.rms, "within_two_deviations": c.covered, "count": c.count });
+            let figures =
+                json!({ "rms": c.rms, "within_two_deviations": c.covered, "count": c.count });
             (name.clone(), figures)
         };
         of.iter().map(entry).collect()
@@ -443,31 +516,40 @@ fn tell_assessment(assessment: &Assessment) {
         residuals,
         torques,
     } = assessment;
-    let [once, drifting] = [&predicted.relative_error, &predicted.relative_error_with_drift];
+    let [once, drifting] = [
+        &predicted.relative_error,
+        &predicted.relative_error_with_drift,
+    ];
     if once.cad.is_finite() {
-        let percent = [once.identified, once.cad, drifting.identified, drifting.cad].map(|x| 100.0 * x);
+        let percent =
+            [once.identified, once.cad, drifting.identified, drifting.cad].map(|x| 100.0 * x);
         let [own, cad, own_drifting, cad_drifting] = percent;
         let how = match changes {
-            0 => "the parameters given".to_owned(),
-            1 => "those in force (changed once)".to_owned(),
-            _ => format!("those in force (changed {changes} times)"),
+            0 => "the given parameters".to_owned(),
+            1 => "the parameters in use (changed once)".to_owned(),
+            _ => format!("the parameters in use (changed {changes} times)"),
         };
         eprintln!(
-            "F/T readings are predicted {own:.1} % off with {how}, {cad:.1} % with the CAD's; {own_drifting:.1} and {cad_drifting:.1} % beside offsets that drift"
+            "F/T prediction error: {own:.1} % with {how}, {cad:.1} % with the CAD's; \
+             {own_drifting:.1} % and {cad_drifting:.1} % with drifting offsets"
         );
     } else {
-        eprintln!("no F/T reading can be predicted: no sensor, a contact that is always present, or no usable sample");
+        eprintln!(
+            "no F/T reading can be predicted: no sensor, a contact that is always present, or no \
+             usable sample"
+        );
     }
     for (top, c) in residuals {
         eprintln!(
-            "residual at {top}: {:.1} % of {} within two deviations",
+            "residual at {top}: {:.1} % of {} within two standard deviations",
             100.0 * c.covered,
             c.count
         );
     }
     for (joint, c) in torques {
         eprintln!(
-            "torque of {joint}: {:.4} Nm (RMS) from what was measured, {:.1} % of {} within two deviations",
+            "torque of {joint}: {:.4} Nm (RMS) from the measured torque, {:.1} % of {} within two \
+             standard deviations",
             c.rms,
             100.0 * c.covered,
             c.count

@@ -1,4 +1,4 @@
-//! `proprio doctor`: what this machine lacks, and what would give it.
+//! `proprio doctor`: checks this machine and names a remedy for every problem.
 
 use anyhow::bail;
 use nix::sys::resource::{Resource, getrlimit};
@@ -20,14 +20,14 @@ pub(crate) struct Args {
     json: bool,
 }
 
-/// How a check went.
+/// The result of a check.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Verdict {
-    /// As it should be.
+    /// No problem.
     Ok,
-    /// It works, but not as well as it could.
+    /// It works with limitations.
     Lacking,
-    /// Proprio can not run like this.
+    /// Proprio cannot run.
     Failed,
 }
 
@@ -38,7 +38,7 @@ struct Finding {
     hint: String,
 }
 
-/// Looks at everything; fails if something is missing without which nothing runs.
+/// Runs all checks; fails if one finds that Proprio cannot run.
 pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     let findings = [
         can(),
@@ -52,7 +52,11 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     if args.json {
         let rows: Vec<_> = findings
             .iter()
-            .map(|f| json!({ "check": f.what, "verdict": word(f.verdict), "says": f.says, "hint": f.hint }))
+            .map(|f| {
+                json!({
+                    "check": f.what, "verdict": word(f.verdict), "says": f.says, "hint": f.hint,
+                })
+            })
             .collect();
         say!("{}", serde_json::Value::from(rows));
     } else {
@@ -71,7 +75,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     if failed.is_empty() {
         Ok(())
     } else {
-        bail!("this machine can not run proprio: {}", failed.join(", "))
+        bail!("this machine cannot run proprio: {}", failed.join(", "))
     }
 }
 
@@ -97,24 +101,35 @@ fn finding(what: &'static str, verdict: Verdict, says: impl Into<String>, hint: 
 }
 
 fn can() -> Finding {
-    // SockProtocol has no CAN_RAW; family and type are enough to learn whether the kernel has CAN at all.
-    match nix::sys::socket::socket(AddressFamily::Can, SockType::Raw, SockFlag::SOCK_CLOEXEC, None) {
-        Ok(_) => finding("kernel CAN", Verdict::Ok, "the kernel has raw CAN sockets", ""),
-        // A family that is there refuses protocol 0; a family that is not there says so.
+    // SockProtocol has no CAN_RAW; family and type suffice to test whether the kernel has CAN.
+    match nix::sys::socket::socket(
+        AddressFamily::Can,
+        SockType::Raw,
+        SockFlag::SOCK_CLOEXEC,
+        None,
+    ) {
+        Ok(_) => finding(
+            "kernel CAN",
+            Verdict::Ok,
+            "the kernel has raw CAN sockets",
+            "",
+        ),
+        // An existing family refuses protocol 0; a missing family returns a different error.
         Err(nix::Error::EPROTONOSUPPORT | nix::Error::EPROTOTYPE) => {
             finding("kernel CAN", Verdict::Ok, "the kernel has CAN", "")
         }
         Err(nix::Error::EPERM | nix::Error::EACCES) => finding(
             "kernel CAN",
             Verdict::Lacking,
-            "the kernel has CAN, but this user may not open it",
+            "the kernel has CAN, but this user has no permission to open it",
             "give the process CAP_NET_RAW, or run it as another user",
         ),
         Err(error) => finding(
             "kernel CAN",
             Verdict::Lacking,
             format!("the kernel has no CAN ({error})"),
-            "`modprobe can-raw` where the kernel has it as a module; else use the virtual bus: source = { kind = \"virtual\", name = \"...\" }",
+            "`modprobe can-raw` if the kernel has it as a module; otherwise use the virtual bus: \
+             source = { kind = \"virtual\", name = \"...\" }",
         ),
     }
 }
@@ -122,7 +137,11 @@ fn can() -> Finding {
 fn interfaces() -> Finding {
     const ARPHRD_CAN: &str = "280";
     let mut names = Vec::new();
-    for entry in fs::read_dir("/sys/class/net").into_iter().flatten().flatten() {
+    for entry in fs::read_dir("/sys/class/net")
+        .into_iter()
+        .flatten()
+        .flatten()
+    {
         let read = |file: &str| {
             fs::read_to_string(entry.path().join(file))
                 .unwrap_or_default()
@@ -139,9 +158,10 @@ fn interfaces() -> Finding {
         }
     }
     if names.is_empty() {
-        let hint = "`ip link add dev vcan0 type vcan && ip link set vcan0 up` makes a virtual one; \
-                    `ip link set can0 up type can bitrate 1000000 restart-ms 100` brings a real one up";
-        return finding("CAN interfaces", Verdict::Lacking, "there is none", hint);
+        let hint = "`ip link add dev vcan0 type vcan && ip link set vcan0 up` creates a virtual \
+                    one; `ip link set can0 up type can bitrate 1000000 restart-ms 100` brings a \
+                    real one up";
+        return finding("CAN interfaces", Verdict::Lacking, "no CAN interface", hint);
     }
     finding("CAN interfaces", Verdict::Ok, names.join(", "), "")
 }
@@ -204,7 +224,11 @@ fn shared_memory(domain: &DomainConfig) -> Finding {
 
 fn buffers() -> Finding {
     const WANTED: u64 = 4 << 20;
-    let number = |path: &str| fs::read_to_string(path).ok().and_then(|t| t.trim().parse::<u64>().ok());
+    let number = |path: &str| {
+        fs::read_to_string(path)
+            .ok()
+            .and_then(|t| t.trim().parse::<u64>().ok())
+    };
     let most = number("/proc/sys/net/core/rmem_max").unwrap_or(0);
     if most >= WANTED || has_capability(CAP_NET_ADMIN) {
         return finding(
@@ -218,10 +242,10 @@ fn buffers() -> Finding {
         "receive buffers",
         Verdict::Lacking,
         format!(
-            "at most {most} bytes: some {} frames wait while the gateway does not run",
+            "at most {most} bytes: room for about {} frames while the gateway is not scheduled",
             most / 768
         ),
-        "`sysctl -w net.core.rmem_max=4194304`, or give the gateway CAP_NET_ADMIN",
+        "`sysctl -w net.core.rmem_max=4194304`, or grant the gateway CAP_NET_ADMIN",
     )
 }
 
@@ -251,13 +275,19 @@ fn realtime() -> Finding {
         "not a PREEMPT_RT kernel"
     };
     if limit > 0 || has_capability(CAP_SYS_NICE) {
-        return finding("real-time", Verdict::Ok, format!("SCHED_FIFO is allowed; {kernel}"), "");
+        return finding(
+            "real-time",
+            Verdict::Ok,
+            format!("SCHED_FIFO is allowed; {kernel}"),
+            "",
+        );
     }
     finding(
         "real-time",
         Verdict::Lacking,
         format!("SCHED_FIFO is not allowed; {kernel}"),
-        "LimitRTPRIO=80 in the unit, or `ulimit -r 80`; needed only for realtime = { priority = ... }",
+        "LimitRTPRIO=80 in the systemd unit, or `ulimit -r 80`; needed only for realtime = \
+         { priority = ... }",
     )
 }
 
@@ -271,6 +301,7 @@ fn locked_memory() -> Finding {
         "locked memory",
         Verdict::Lacking,
         format!("at most {limit} bytes can be locked"),
-        "LimitMEMLOCK=infinity in the unit, or `ulimit -l unlimited`; needed only for realtime = { priority = ... }",
+        "LimitMEMLOCK=infinity in the systemd unit, or `ulimit -l unlimited`; needed only for \
+         realtime = { priority = ... }",
     )
 }

@@ -1,4 +1,4 @@
-//! `proprio estimator`: the daemon, and the check of its configuration beside the gateway's.
+//! `proprio estimator`: runs the daemon, or checks its configuration against the gateway's.
 
 use proprio_estimator::config::ConfigError;
 use proprio_estimator::daemon;
@@ -13,15 +13,16 @@ pub(crate) struct Args {
     /// The configuration file
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// Print the plan, masses and what F/T sensors should read at rest, and end
+    /// Check the configuration, print the plan, masses and expected F/T readings at rest, and exit
     #[arg(long)]
     check: bool,
-    /// With --check: whether this gateway.toml publishes all that the estimator reads
+    /// With --check: also check that this gateway.toml publishes all channels that the estimator
+    /// reads
     #[arg(long, value_name = "FILE", requires = "check")]
     gateway: Option<PathBuf>,
 }
 
-/// Runs it, or checks.
+/// Runs the daemon, or checks the configuration.
 pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     if !args.check {
         return daemon::run(&args.config, domain);
@@ -33,18 +34,18 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     }
 }
 
-/// Says what the gateway publishes that the estimator reads, and what it does not.
+/// Checks that the gateway publishes all channels that the estimator reads; prints the result.
 fn fits(config: &Path, setup: &Setup, gateway: &Path) -> anyhow::Result<()> {
     let plan = Plan::load(gateway)?;
     let wrong = |problem: String| ConfigError {
         file: config.to_owned(),
         problem,
     };
-    if plan.robot != setup.robot {
-        let (own, other) = (&setup.robot, &plan.robot);
+    if plan.robot != setup.robot.name {
+        let (own, other) = (&setup.robot.name, &plan.robot);
         let file = gateway.display();
         return Err(wrong(format!(
-            "robot = {own:?}, but {other:?} in {file}: they would not find each other"
+            "robot = {own:?}, but robot = {other:?} in {file}: they would not find each other"
         ))
         .into());
     }
@@ -53,7 +54,13 @@ fn fits(config: &Path, setup: &Setup, gateway: &Path) -> anyhow::Result<()> {
         let file = gateway.display();
         return Err(wrong(format!("{file} publishes no {}", missing.join(", no "))).into());
     }
-    let reads = |name: &str| setup.channels().iter().any(|channel| channel.name == name);
+    let reads = |name: &str| {
+        setup
+            .robot
+            .channels
+            .iter()
+            .any(|channel| channel.name == name)
+    };
     let unread: Vec<&str> = plan
         .channels
         .iter()
@@ -62,24 +69,35 @@ fn fits(config: &Path, setup: &Setup, gateway: &Path) -> anyhow::Result<()> {
         .collect();
     let more = match unread.as_slice() {
         [] => String::new(),
-        names => format!("; it reads nothing of {}", names.join(", ")),
+        names => format!("; it does not read {}", names.join(", ")),
     };
-    say!("{} publishes all that the estimator reads{more}", gateway.display());
+    say!(
+        "{} publishes all channels that the estimator reads{more}",
+        gateway.display()
+    );
     Ok(())
 }
 
-/// What the estimator reads and the gateway does not publish, in words.
+/// The channels that the estimator reads and the gateway does not publish, as text.
 fn missing(setup: &Setup, plan: &Plan) -> Vec<String> {
-    let absent = setup.channels().iter().filter_map(|channel| {
+    let absent = setup.robot.channels.iter().filter_map(|channel| {
         let (kind, name) = (channel.kind, &channel.name);
         let published = plan.channels.iter().find(|other| other.name == *name);
         match published {
             Some(other) if other.kind == kind => None,
-            Some(other) => Some(format!("{}/{name} (it is {} there)", kind.word(), other.kind.word())),
+            Some(other) => Some(format!(
+                "{}/{name} (it is {} there)",
+                kind.word(),
+                other.kind.word()
+            )),
             None => {
                 let alike = plan.channels.iter().filter(|other| other.kind == kind);
                 let hint = nearest(name, alike.map(|other| other.name.as_str()));
-                Some(format!("{}/{name} ({})", kind.word(), hint.trim_start_matches("; ")))
+                Some(format!(
+                    "{}/{name} ({})",
+                    kind.word(),
+                    hint.trim_start_matches("; ")
+                ))
             }
         }
     });

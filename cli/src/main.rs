@@ -1,6 +1,6 @@
-//! The `proprio` command: every verb in one program. `proprio --help` lists them.
+//! The `proprio` command with all subcommands. `proprio --help` lists them.
 
-/// `println!` for people who pipe into `head`: an output that nobody reads any more is not an error.
+/// `println!` that ignores a closed standard output, so that piping into `head` is not an error.
 macro_rules! say {
     ($($text:tt)*) => {{
         use std::io::Write as _;
@@ -8,7 +8,7 @@ macro_rules! say {
     }};
 }
 
-/// The same without a line's end.
+/// The same without a line break.
 macro_rules! say_part {
     ($($text:tt)*) => {{
         use std::io::Write as _;
@@ -29,38 +29,40 @@ use proprio_topics::ipc::DomainConfig;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// A robot's proprioception over CAN: joint torques and contact wrenches from encoders, IMUs and force/torque sensors.
+/// Robot proprioception over CAN: joint torques and contact wrenches from encoders, IMUs and
+/// force/torque sensors.
 ///
-/// Exit codes: 0 success, 2 a wrong configuration or command line, 1 any other failure.
+/// Exit codes: 0 success, 2 wrong configuration or command line, 1 any other failure.
 #[derive(Parser)]
 #[command(name = "proprio", version, about)]
 struct Args {
     #[command(subcommand)]
     verb: Verb,
-    /// The shared-memory domain: processes of one domain see each other, others do not [env: PROPRIO_DOMAIN] [default: default]
+    /// The shared-memory domain: only processes of one domain see each other [env: PROPRIO_DOMAIN]
+    /// [default: default]
     #[arg(long, global = true, value_name = "NAME")]
     domain: Option<String>,
 }
 
 #[derive(Subcommand)]
 enum Verb {
-    /// Run a simulated robot through gateway and estimator, as three processes, and compare with the truth
+    /// Run a simulated robot, gateway and estimator as three processes and compare with the truth
     Demo(demo::Args),
-    /// The gateway daemon: CAN buses in, samples in shared memory out
+    /// Run the gateway daemon: read CAN buses, publish samples in shared memory
     Gateway(Daemon),
-    /// The estimator daemon: samples in, joint torques and contact wrenches out
+    /// Run the estimator daemon: read samples, publish joint torques and contact wrenches
     Estimator(estimator::Args),
-    /// The simulated robot alone: its boards on a bus
+    /// Run only the simulated robot: its boards on a bus
     Simulate(simulate::Args),
-    /// A recorded CAN log to a table of samples in SI units
+    /// Convert a recorded CAN log to a table of samples in SI units
     Decode(convert::Decode),
-    /// A table of samples to a CAN log: the inverse of decode
+    /// Convert a table of samples to a CAN log: the inverse of decode
     Encode(convert::Encode),
-    /// A table of samples to a table of joint torques and contact wrenches
+    /// Estimate joint torques and contact wrenches from a table of samples
     Estimate(convert::Estimate),
-    /// Recorded tables of samples to inertial parameters, with a report
+    /// Identify inertial parameters from recorded tables of samples and write a report
     Identify(identify::Args),
-    /// What this machine lacks: CAN, rights, shared memory, buffers, real-time limits
+    /// Check this machine: CAN, permissions, shared memory, buffers, real-time limits
     Doctor(doctor::Args),
 }
 
@@ -69,7 +71,7 @@ struct Daemon {
     /// The configuration file
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// Print the plan and end
+    /// Check the configuration, print the resulting plan and exit
     #[arg(long)]
     check: bool,
 }
@@ -98,7 +100,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// Tells an error as one chain; 2 if a wrong configuration is at its root, else 1.
+/// Prints an error chain; exit code 2 if its root is a wrong configuration, else 1.
 fn fail(error: &anyhow::Error) -> ExitCode {
     eprintln!("error: {error:#}");
     let configuration = proprio_simulator::is_configuration(error)

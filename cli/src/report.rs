@@ -1,18 +1,24 @@
-//! Parts of a report: one self-contained HTML file (no script, nothing from the network) with plots and tables, readable on a
-//! telephone and on a desk, by day and by night. `demo` and `identify` put their pages together from these.
+//! Parts of a report: one self-contained HTML file (no scripts, no network access) with plots and
+//! tables. It is readable on narrow and wide screens, in light and dark mode. `demo` and `identify`
+//! build their pages from these parts.
 
+mod escape;
 pub(crate) mod plot;
+
+pub(crate) use escape::escape;
 
 use std::fmt::Write as _;
 
-/// The style sheet. Colours: after Okabe and Ito, told apart by the colour-blind too.
+/// The style sheet. Colours after Okabe and Ito, which the colour-blind can distinguish.
 const STYLE: &str = include_str!("report/style.css");
 
 /// A page from blocks of HTML.
 pub(crate) fn page(title: &str, blocks: &[String]) -> String {
     let mut html = format!(
-        "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width, \
-         initial-scale=1\"><meta name=\"color-scheme\" content=\"light dark\"><title>{0}</title><style>{STYLE}</style></head>\n<body><main><h1>{0}</h1>\n",
+        "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
+         <meta name=\"color-scheme\" content=\"light dark\"><title>{0}</title>\
+         <style>{STYLE}</style></head>\n<body><main><h1>{0}</h1>\n",
         escape(title)
     );
     for block in blocks {
@@ -23,12 +29,16 @@ pub(crate) fn page(title: &str, blocks: &[String]) -> String {
     html
 }
 
-/// A heading with what follows it.
+/// A section: a heading and its contents.
 pub(crate) fn section(title: &str, body: &[String]) -> String {
-    format!("<section><h2>{}</h2>\n{}</section>", escape(title), body.join("\n"))
+    format!(
+        "<section><h2>{}</h2>\n{}</section>",
+        escape(title),
+        body.join("\n")
+    )
 }
 
-/// A part that is unfolded by whoever wants it.
+/// A folded part, which the reader can unfold.
 pub(crate) fn folded(title: &str, open: bool, body: &[String]) -> String {
     let open = if open { " open" } else { "" };
     format!(
@@ -43,7 +53,7 @@ pub(crate) fn paragraph(text: &str) -> String {
     format!("<p>{}</p>", escape(text))
 }
 
-/// A list of plain texts; nothing if there is none.
+/// A list of plain texts; empty HTML if there is none.
 pub(crate) fn list<S: AsRef<str>>(items: impl IntoIterator<Item = S>) -> String {
     let items: String = items
         .into_iter()
@@ -65,13 +75,14 @@ pub(crate) fn figures<'a>(plots: impl IntoIterator<Item = &'a plot::Plot>) -> St
 /// One cell of a table.
 #[derive(Debug, Clone)]
 pub(crate) enum Cell {
-    /// Words; those of the first column head their row.
+    /// Text; in the first column it is the row's heading.
     Text(String),
-    /// A number, with three digits.
+    /// A number with three significant digits.
     Number(f64),
-    /// A number that is written already, such as a percentage.
+    /// An already formatted number, such as a percentage.
     Written(String),
-    /// A written number with a bar behind it: the share of the cell that the bar covers, and its colour.
+    /// A formatted number with a bar behind it: the fraction of the cell that the bar covers, and
+    /// its colour.
     Bar(String, f64, plot::Ink),
     /// A number and its standard deviation.
     Uncertain(f64, f64),
@@ -95,7 +106,7 @@ impl From<f64> for Cell {
     }
 }
 
-/// A table, which scrolls sideways by itself where the page is too narrow for it.
+/// A table, which scrolls horizontally if the page is too narrow for it.
 #[derive(Debug, Clone)]
 pub(crate) struct Table {
     caption: String,
@@ -126,7 +137,7 @@ impl Table {
             return String::new();
         };
         let mut html = String::new();
-        // Outside of what scrolls, so that it is as wide as the page and not as the table.
+        // Outside the scrolling part, so that it is as wide as the page, not as the table.
         if !self.caption.is_empty() {
             let _ = write!(html, "<p class=\"caption\">{}</p>", escape(&self.caption));
         }
@@ -149,13 +160,16 @@ impl Table {
             html.push_str("<tr>");
             for (i, cell) in row.iter().enumerate() {
                 let _ = match cell {
-                    Cell::Text(text) if i == 0 => write!(html, "<th scope=\"row\">{}</th>", escape(text)),
+                    Cell::Text(text) if i == 0 => {
+                        write!(html, "<th scope=\"row\">{}</th>", escape(text))
+                    }
                     Cell::Text(text) => write!(html, "<td>{}</td>", escape(text)),
                     Cell::Number(value) => write!(html, "<td class=\"n\">{}</td>", number(*value)),
                     Cell::Written(text) => write!(html, "<td class=\"n\">{}</td>", escape(text)),
                     Cell::Bar(text, share, ink) => write!(
                         html,
-                        "<td class=\"n bar\"><i class=\"{}\" style=\"width:{:.0}%\"></i><span>{}</span></td>",
+                        "<td class=\"n bar\"><i class=\"{}\" \
+                         style=\"width:{:.0}%\"></i><span>{}</span></td>",
                         ink.class(),
                         if share.is_finite() {
                             share.clamp(0.0, 1.0) * 100.0
@@ -181,7 +195,7 @@ impl Table {
     }
 }
 
-/// A table of facts: a name and what it is.
+/// A list of facts: names and values.
 pub(crate) fn facts(facts: &[(&str, String)]) -> String {
     let rows: String = facts
         .iter()
@@ -197,7 +211,7 @@ pub(crate) fn number(value: f64) -> String {
     digits(value, 3)
 }
 
-/// A number with two significant digits: of deviations.
+/// A number with two significant digits, for standard deviations.
 pub(crate) fn short(value: f64) -> String {
     digits(value, 2)
 }
@@ -210,10 +224,16 @@ fn digits(value: f64, count: i32) -> String {
         return "–".into();
     }
     if value.is_infinite() {
-        return if value > 0.0 { "∞".into() } else { "−∞".into() };
+        return if value > 0.0 {
+            "∞".into()
+        } else {
+            "−∞".into()
+        };
     }
-    // Rounding first may make one digit more: 9.996 is 10.0.
-    let rounded: f64 = format!("{value:.*e}", (count - 1) as usize).parse().unwrap_or(value);
+    // Rounding may add a digit: 9.996 becomes 10.0.
+    let rounded: f64 = format!("{value:.*e}", (count - 1) as usize)
+        .parse()
+        .unwrap_or(value);
     let power = rounded.abs().log10().floor() as i32;
     let text = if (-4..=5).contains(&power) {
         format!("{rounded:.*}", (count - 1 - power).max(0) as usize)
@@ -221,14 +241,6 @@ fn digits(value: f64, count: i32) -> String {
         format!("{rounded:.*e}", (count - 1) as usize)
     };
     text.replace('-', "−")
-}
-
-/// Text that is safe in HTML.
-pub(crate) fn escape(text: &str) -> String {
-    text.replace('&', "&amp;")
-        .replace('<', "&lt;")
-        .replace('>', "&gt;")
-        .replace('"', "&quot;")
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! `proprio simulate`: the simulated robot alone, its boards on a bus.
+//! `proprio simulate`: runs only the simulated robot, its boards on a bus.
 
 use anyhow::Context;
 use proprio_simulator::{Fault, Options, Robot, Settings, parse_bus};
@@ -14,28 +14,30 @@ pub(crate) struct Args {
     /// The robot: a folder in config/, or a path
     #[arg(long, value_name = "NAME", default_value = "icub_left_arm")]
     robot: String,
-    /// Where its buses are, in the order of its gateway.toml: can0 or virtual:NAME; default: as gateway.toml says
+    /// Its buses, in the order of its gateway.toml: can0 or virtual:NAME; default: the sources in
+    /// gateway.toml
     #[arg(long, value_name = "BUS")]
     bus: Vec<String>,
-    /// How long it runs [s]; default: until it is told to stop
+    /// Duration [s]; default: until it is stopped
     #[arg(long, value_name = "N")]
     seconds: Option<f64>,
     /// The seed of trajectory and noise
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// How long the robot stands still before it moves [s]
+    /// Duration without motion at the start [s]
     #[arg(long, value_name = "N", default_value_t = 1.0, value_parser = still)]
     still: f64,
     /// Declare touches of the robot on ROBOT/contact/declared, as a skin does
     #[arg(long)]
     skin: bool,
-    /// A fault: "lost:0.01", "silent:BOARD@3..4", "saturate:BOARD@5..5.5", "spike:BOARD@6", "late_half:BOARD@2..8", "push:LINK=20@8..9"; may be repeated
+    /// A fault: "lost:0.01", "silent:BOARD@3..4", "saturate:BOARD@5..5.5", "spike:BOARD@6",
+    /// "late_half:BOARD@2..8", "push:LINK=20@8..9"; may be repeated
     #[arg(long, value_name = "FAULT")]
     fault: Vec<String>,
-    /// Where to write the truth at the end: a table of joint torques, wrenches and motion
+    /// The file for the truth, written at the end: a table of joint torques, wrenches and motion
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    /// Print what became of the run as JSON
+    /// Print a summary of the run as JSON
     #[arg(long)]
     json: bool,
 }
@@ -56,7 +58,11 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
         .map(|f| f.parse::<Fault>())
         .collect::<Result<Vec<_>, _>>()?;
     let options = Options {
-        buses: args.bus.iter().map(|b| parse_bus(b)).collect::<Result<_, _>>()?,
+        buses: args
+            .bus
+            .iter()
+            .map(|b| parse_bus(b))
+            .collect::<Result<_, _>>()?,
         domain: domain.name.clone(),
         seconds: args.seconds,
         settings: Settings {
@@ -80,7 +86,8 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
             skin.tell(contact, at, active);
         }
     };
-    let summary = proprio_simulator::run_with_skin(&robot, &options, args.skin.then_some(&mut tell), &stop)?;
+    let summary =
+        proprio_simulator::run_with_skin(&robot, &options, args.skin.then_some(&mut tell), &stop)?;
     if args.json {
         say!("{}", serde_json::to_string(&summary)?);
     } else {
@@ -89,7 +96,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Tells who wants to know what touches the robot.
+/// Publishes the touches of the robot as contact declarations.
 struct Teller(Writer<ContactDeclaration>);
 
 impl Teller {

@@ -1,19 +1,20 @@
-//! The two sides of a device's protocol as sans-I/O state machines: [`Device`] on the host, [`Board`] on the device.
+//! The two sides of a device's protocol as sans-I/O state machines: [`Device`] on the host,
+//! [`Board`] on the device.
 
 use crate::{Frame, Id};
 use alloc::boxed::Box;
 use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, StampKind};
 
-/// A set of identifiers that a device takes.
+/// A set of identifiers whose frames a device receives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Claim {
     /// The identifier to compare with.
     pub id: Id,
-    /// The bits that are compared; all ones is this one identifier.
+    /// The bits to compare; all ones matches only `id`.
     pub mask: u32,
-    /// Whether no other device may claim one of these: true for streams, false where several devices of one board listen
-    /// to the same replies.
+    /// Whether no other device may claim one of these: true for streams, false where several
+    /// devices of one board listen to the same replies.
     pub exclusive: bool,
 }
 
@@ -38,7 +39,7 @@ impl Claim {
         }
     }
 
-    /// Whether `id` is one of these.
+    /// Whether `id` is in the set.
     #[must_use]
     pub fn matches(&self, id: Id) -> bool {
         matches!(
@@ -57,57 +58,58 @@ impl Claim {
     }
 }
 
-/// A reading that a device has completed.
+/// A complete reading of a device.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Output {
-    /// Which of the device's outputs it belongs to: 0 for a sensor, the device's own channel number for joint devices.
+    /// The device's output: 0 for a sensor, the device's own channel number for joint devices.
     pub output: u8,
-    /// When its first frame was received \[ns\].
+    /// Receive time of its first frame \[ns\].
     pub acquired: Nanos,
-    /// Where that stamp comes from.
+    /// The source of that stamp.
     pub stamp: StampKind,
-    /// The device's own sequence number where it has one (then `quality` has DEVICE_COUNTER).
+    /// The device's own sequence number if it has one (then `quality` has DEVICE_COUNTER).
     pub device_counter: u32,
-    /// What is known against it.
+    /// Its quality flags.
     pub quality: Quality,
-    /// What was measured.
+    /// The measured quantities.
     pub reading: Reading,
 }
 
-/// Something wrong in the frames of a device: to be counted, never to stop for.
+/// A fault in the frames of a device. It is counted and never stops the gateway.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Fault {
-    /// What it is counted as: one of the reasons from [`Counter::Length`] on.
+    /// The counter to increase: one from [`Counter::Length`] on.
     pub counter: Counter,
-    /// How many at once, e.g. how many readings were lost.
+    /// The increment, such as the number of lost readings.
     pub count: u32,
-    /// The identifier in whose frame it showed.
+    /// The identifier of the frame that showed it.
     pub id: Id,
 }
 
-/// What one frame yields.
+/// The result of decoding one frame.
 #[derive(Debug, Default)]
 pub struct Decoded {
-    /// Readings that it completes.
+    /// Readings that the frame completes.
     pub readings: ArrayVec<Output, 8>,
-    /// What is wrong with it. Readings beside it are good all the same.
+    /// Faults in the frame. They do not affect the readings.
     pub faults: ArrayVec<Fault, 4>,
 }
 
 impl Decoded {
-    /// Nothing yet.
+    /// An empty result.
     #[must_use]
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Forgets everything, to be used again.
+    /// Clears the result for reuse.
     pub fn clear(&mut self) {
         self.readings.clear();
         self.faults.clear();
     }
 
-    /// Adds a reading; one that does not fit (no protocol here yields so many) is counted as lost.
+    /// Adds a reading; one that does not fit is counted as lost (no protocol here yields that
+    /// many).
     pub fn push(&mut self, output: Output, id: Id) {
         if self.readings.try_push(output).is_err() {
             self.fault(Counter::Lost, 1, id);
@@ -116,12 +118,12 @@ impl Decoded {
 
     /// Adds a fault.
     pub fn fault(&mut self, counter: Counter, count: u32, id: Id) {
-        // A fault that finds no room has four companions that will be seen.
+        // If there is no room, four other faults are reported already.
         let _ = self.faults.try_push(Fault { counter, count, id });
     }
 }
 
-/// A frame to send, and until when it makes sense to.
+/// A frame to send before a deadline.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Transmit {
     /// The frame.
@@ -130,23 +132,23 @@ pub struct Transmit {
     pub deadline: Nanos,
 }
 
-/// Where the bring-up of a device stands.
+/// The state of a device's bring-up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
 pub enum State {
-    /// Keeping silent, as boards want it after power-on.
+    /// The host keeps silent, as boards require after power-on.
     Waiting = 0,
-    /// Asking for its configuration.
+    /// The host asks for the board's configuration.
     Asking = 1,
-    /// Told to start; nothing received yet.
+    /// The board was started; no reading received yet.
     Starting = 2,
-    /// Readings come.
+    /// Readings arrive.
     Streaming = 3,
-    /// No reading for longer than it may be silent; being started again.
+    /// No reading for longer than the maximum silence; the board is started again.
     Silent = 4,
     /// Not usable: see the refusal.
     Refused(Refusal) = 5,
-    /// Told to stop.
+    /// The board was stopped.
     Stopped = 6,
 }
 
@@ -165,7 +167,7 @@ impl State {
         }
     }
 
-    /// The word for state number `code` of `DeviceHealth`.
+    /// The name of state number `code` of `DeviceHealth`.
     #[must_use]
     pub const fn word(code: u32) -> &'static str {
         match code {
@@ -184,14 +186,14 @@ impl State {
 /// Why a device is not usable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Refusal {
-    /// It did not tell its full scales in time, and the configuration gives none.
+    /// It did not report its full scales in time, and the configuration has none.
     NoFullScale,
     /// It reports a full scale of zero for this channel.
     ZeroFullScale {
         /// The channel, 0 to 5.
         channel: u8,
     },
-    /// It tells another configuration than before: what it sent since can not be trusted.
+    /// It reports a different configuration than before: its readings since then cannot be trusted.
     Changed,
 }
 
@@ -225,24 +227,29 @@ impl core::fmt::Display for Refusal {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match self {
             Self::NoFullScale => f.write_str(
-                "it did not tell its full scales; check its power, cable and address, or give full_scale_n and full_scale_nm",
+                "it did not report its full scales; check its power, cable and address, or set \
+                 full_scale_n and full_scale_nm",
             ),
             Self::ZeroFullScale { channel } => write!(
                 f,
-                "it reports a full scale of zero for channel {channel}; its memory needs repair, or give full_scale_n and full_scale_nm"
+                "it reports a full scale of zero for channel {channel}; its memory needs repair, \
+                 or set full_scale_n and full_scale_nm"
             ),
-            Self::Changed => f.write_str("it tells another configuration than before; restart the gateway once that is settled"),
+            Self::Changed => f.write_str(
+                "it reports a different configuration than before; check the board, then restart \
+                 the gateway",
+            ),
         }
     }
 }
 
-/// How a device's replies and silences are treated.
+/// Whether the host commands a device or only listens.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mode {
-    /// Live: ask, start, watch, restart, stop. A reply counts only while it is asked for.
+    /// Live: ask, start, watch, restart, stop. A reply is accepted only after a question.
     Supervise,
-    /// Never transmit: a recorded log, or a bus whose boards somebody else commands. Replies to others' questions count;
-    /// a later one that differs is a fault all the same.
+    /// Never transmit: for a recorded log, or a bus whose boards another program commands. Replies
+    /// to other programs' questions are accepted; a later one that differs is a fault.
     Listen,
 }
 
@@ -250,20 +257,20 @@ pub enum Mode {
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Outputs(pub ArrayVec<u8, 16>);
 
-/// What every driver is told, whatever its family.
+/// The settings common to all drivers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Spec {
-    /// The device's address, as its protocol counts.
+    /// The device's address, as its protocol defines it.
     pub address: u32,
-    /// How long it may be silent \[ns\].
+    /// Maximum silence \[ns\].
     pub max_silence: Nanos,
-    /// Who is in command.
+    /// Whether to command the device or only listen.
     pub mode: Mode,
     /// The device channels that are joints; empty for sensors.
     pub outputs: Outputs,
 }
 
-/// A configuration that a driver can not work with.
+/// A configuration that a driver cannot use.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum SpecError {
@@ -277,7 +284,7 @@ pub enum SpecError {
         /// The highest.
         most: u32,
     },
-    /// A key has a value that the driver can not work with.
+    /// A key has an invalid value.
     #[error("{key} = {value} must be {expected}")]
     Key {
         /// The key.
@@ -287,7 +294,7 @@ pub enum SpecError {
         /// What would be legal.
         expected: &'static str,
     },
-    /// A key that is not a number, or a combination of keys, that the driver can not work with.
+    /// A key that is not a number, or a combination of keys, is invalid.
     #[error("{key} must be {expected}")]
     Keys {
         /// The key.
@@ -295,15 +302,15 @@ pub enum SpecError {
         /// What would be legal.
         expected: &'static str,
     },
-    /// Of two keys that belong together one is missing.
-    #[error("{missing} is missing: it goes with {given}")]
+    /// Two keys belong together and one is missing.
+    #[error("{missing} is missing: it is needed together with {given}")]
     Incomplete {
-        /// The key that is there.
+        /// The key that is given.
         given: &'static str,
-        /// The key that is not.
+        /// The key that is missing.
         missing: &'static str,
     },
-    /// A joint's channel is not one that the device has.
+    /// A joint's channel does not exist in the device.
     #[error("joint channel {channel} does not exist; this device has channels {least} to {most}")]
     Channel {
         /// What was given.
@@ -320,72 +327,85 @@ pub enum SpecError {
 
 /// The host's side of a device: decoder and bring-up in one state machine.
 ///
-/// It never reads a clock: frames carry their stamps, and the caller says what time it is.
+/// It never reads a clock: frames carry their stamps, and the caller passes the time.
 pub trait Device: Send {
-    /// What its main reading is.
+    /// The kind of its main reading.
     fn kind(&self) -> Kind;
 
-    /// The identifiers it takes. The gateway refuses a plan in which two exclusive claims overlap and sets the kernel's
-    /// filters from them.
+    /// The identifiers it receives. The gateway rejects a plan with overlapping exclusive claims
+    /// and sets the kernel's filters from the claims.
     fn claims(&self) -> &[Claim];
 
-    /// Takes a frame of one of its identifiers and adds what it yields to `out`. Total: any frame is legal input.
+    /// Decodes a frame with one of its identifiers and adds the result to `out`. Any frame is legal
+    /// input.
     fn on_frame(&mut self, frame: &Frame, out: &mut Decoded);
 
     /// The next frame to send at `now`; call until `None`. Never anything in [`Mode::Listen`].
     ///
-    /// What only the passing of time shows (a silence, a start) is added to `out`, in [`Mode::Listen`] too.
+    /// Events that only the passing of time shows (a silence, a start) are added to `out`, also in
+    /// [`Mode::Listen`].
     fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit>;
 
     /// When to call [`Device::poll_transmit`] again even if no frame comes \[ns\].
     fn next_wake(&self) -> Option<Nanos>;
 
-    /// Where its bring-up stands.
+    /// The state of its bring-up.
     fn state(&self) -> State;
 
-    /// Begins to stop: [`Device::poll_transmit`] yields the stop commands, then the state is [`State::Stopped`].
+    /// Begins to stop: [`Device::poll_transmit`] yields the stop commands, then the state is
+    /// [`State::Stopped`].
     fn stop(&mut self, now: Nanos);
 
-    /// The link was lost and is back: the board may have been reset, so begin again at `now`.
+    /// Starts again at `now` after a link loss, because the board may have been reset.
     fn restart(&mut self, now: Nanos);
 }
 
 /// Frames that a board sends at once.
 pub type Frames = ArrayVec<Frame, 16>;
 
-/// A reading that a board can not put into frames.
+/// Why a board cannot encode a reading.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum EncodeError {
-    /// The reading is of a kind that this family does not have.
+    /// The family has no reading of this kind.
     #[error("this device has no such reading")]
     Kind,
     /// The output number is not one of the board's.
     #[error("this device has no output {0}")]
     Output(u8),
-    /// A full scale is needed to encode and the configuration gives none.
+    /// A full scale is needed to encode, and the configuration has none.
     #[error("full_scale_n and full_scale_nm are needed to encode")]
     NoFullScale,
-    /// A value that is not finite where the protocol has no sign for absence.
+    /// A value is not finite, and the protocol cannot mark it as absent.
     #[error("a value is not finite")]
     NotFinite,
 }
 
-/// The device's own side of its protocol: answers commands, encodes readings. What the hardware does, without hardware.
+/// The device's own side of its protocol: answers commands and encodes readings, as the hardware
+/// does.
 pub trait Board: Send {
-    /// Takes a frame from the bus and adds the answers to `out`. Frames meant for others are ignored.
+    /// Takes a frame from the bus and adds the answers to `out`. Frames for other boards are
+    /// ignored.
     fn on_frame(&mut self, frame: &Frame, out: &mut Frames);
 
-    /// The period with which it streams its main reading now \[ns\]; `None` while it does not.
+    /// The current streaming period of its main reading \[ns\]; `None` while it does not stream.
     fn period(&self) -> Option<Nanos>;
 
-    /// Encodes a reading of output `output`, quantised and limited as the board does it, and adds its frames to `out`.
+    /// Encodes a reading of output `output`, quantised and limited as the board does, and adds its
+    /// frames to `out`.
     ///
-    /// `quality` sets what the protocol can carry: saturation per axis, faults. A value beyond the range is limited to it.
+    /// `quality` sets the flags that the protocol can carry: saturation per axis, faults. Values
+    /// beyond the range are limited.
     ///
     /// # Errors
-    /// [`EncodeError`]: a reading, output or number that the protocol does not have.
-    fn encode(&mut self, output: u8, reading: &Reading, quality: Quality, out: &mut Frames) -> Result<(), EncodeError>;
+    /// [`EncodeError`]: a reading, output or value that the protocol cannot carry.
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError>;
 }
 
 /// A device built by [`crate::Options::device`].

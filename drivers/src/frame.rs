@@ -1,9 +1,10 @@
-//! A CAN frame with the instant of its arrival.
+//! A CAN frame with its time of arrival.
 
 use core::fmt;
 use proprio_topics::{Nanos, StampKind};
 
-/// A CAN identifier. Standard and extended identifiers of the same number are different identifiers.
+/// A CAN identifier. Standard and extended identifiers of the same number are different
+/// identifiers.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Id {
     /// 11 bits.
@@ -13,13 +14,13 @@ pub enum Id {
 }
 
 impl Id {
-    /// A standard identifier, its excess bits cut off.
+    /// A standard identifier from the low 11 bits.
     #[must_use]
     pub const fn standard(id: u16) -> Self {
         Self::Standard(id & 0x7FF)
     }
 
-    /// An extended identifier, its excess bits cut off.
+    /// An extended identifier from the low 29 bits.
     #[must_use]
     pub const fn extended(id: u32) -> Self {
         Self::Extended(id & 0x1FFF_FFFF)
@@ -36,7 +37,8 @@ impl Id {
 }
 
 impl fmt::Display for Id {
-    /// As can-utils write it: three hexadecimal digits for a standard identifier, eight for an extended one.
+    /// As can-utils write it: three hexadecimal digits for a standard identifier, eight for an
+    /// extended one.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Standard(id) => write!(f, "{id:03X}"),
@@ -63,24 +65,25 @@ pub enum Format {
         /// The sender is error passive (ESI).
         error_state: bool,
     },
-    /// A remote transmission request: no data, `len` is the length asked for.
+    /// A remote transmission request: no data; `len` is the requested length.
     Remote,
-    /// An error frame of the SocketCAN interface: the identifier holds the error classes (linux/can/error.h).
+    /// An error frame of the SocketCAN interface: the identifier holds the error classes
+    /// (linux/can/error.h).
     Error,
 }
 
 /// One frame.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Frame {
-    /// When it was received, or when it is to be sent \[ns\].
+    /// Time of reception, or time to send it \[ns\].
     pub t: Nanos,
     /// Its identifier.
     pub id: Id,
-    /// Where `t` comes from.
+    /// The source of `t`.
     pub stamp: StampKind,
     /// What kind of frame it is.
     pub format: Format,
-    /// How many bytes of `data` count.
+    /// Number of valid bytes in `data`.
     len: u8,
     data: [u8; 64],
 }
@@ -89,13 +92,15 @@ impl Frame {
     /// The longest payload \[bytes\].
     pub const MAX_LEN: usize = 64;
 
-    /// A classic data frame with the first 8 bytes of `data`, no stamp yet.
+    /// A classic data frame with the first 8 bytes of `data`, without a stamp.
     #[must_use]
     pub fn new(id: Id, data: &[u8]) -> Self {
-        Self::with_format(id, Format::Classic, data.get(..8).unwrap_or(data)).unwrap_or_else(|| unreachable_frame(id))
+        Self::with_format(id, Format::Classic, data.get(..8).unwrap_or(data))
+            .unwrap_or_else(|| unreachable_frame(id))
     }
 
-    /// A frame of `format`; `None` if `data` is longer than that format allows (8 bytes; 64 for CAN FD).
+    /// A frame of `format`; `None` if `data` is longer than that format allows (8 bytes; 64 for CAN
+    /// FD).
     #[must_use]
     pub fn with_format(id: Id, format: Format, data: &[u8]) -> Option<Self> {
         let most = if matches!(format, Format::Fd { .. }) {
@@ -132,7 +137,7 @@ impl Frame {
         }
     }
 
-    /// The same frame, received or to be sent at `t`.
+    /// The same frame with stamp `t`.
     #[must_use]
     pub const fn at(mut self, t: Nanos, stamp: StampKind) -> Self {
         self.t = t;
@@ -150,7 +155,7 @@ impl Frame {
         }
     }
 
-    /// The payload's length, or the length that a remote request asks for.
+    /// The payload's length, or the requested length of a remote request.
     #[must_use]
     pub const fn len(&self) -> usize {
         self.len as usize
@@ -163,7 +168,7 @@ impl Frame {
     }
 }
 
-/// At most 8 bytes always fit, so [`Frame::new`] never comes here; an empty frame keeps it free of panics.
+/// Never used by [`Frame::new`], because 8 bytes always fit; it avoids a panic.
 const fn unreachable_frame(id: Id) -> Frame {
     Frame {
         t: Nanos::ZERO,
@@ -176,7 +181,8 @@ const fn unreachable_frame(id: Id) -> Frame {
 }
 
 impl fmt::Display for Frame {
-    /// As can-utils' log format writes a frame, without stamp and interface: `31A#E380B76A1887`, `123##1AABB`, `123#R4`.
+    /// As can-utils' log format writes a frame, without stamp and interface: `31A#E380B76A1887`,
+    /// `123##1AABB`, `123#R4`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.format {
             Format::Classic => write!(f, "{}#", self.id)?,
@@ -193,7 +199,7 @@ impl fmt::Display for Frame {
             }
             Format::Remote if self.len == 0 => return write!(f, "{}#R", self.id),
             Format::Remote => return write!(f, "{}#R{}", self.id, self.len),
-            // The error flag is part of the identifier there: 20000000 + classes.
+            // In that format the error flag is part of the identifier: 20000000 + classes.
             Format::Error => write!(f, "{:08X}#", self.id.raw() | 0x2000_0000)?,
         }
         for byte in self.data() {
@@ -220,7 +226,10 @@ mod tests {
             Frame::new(Id::standard(0x31A), &[0xE3, 0x80, 0xB7]).to_string(),
             "31A#E380B7"
         );
-        assert_eq!(Frame::remote(Id::extended(0x123), 4).to_string(), "00000123#R4");
+        assert_eq!(
+            Frame::remote(Id::extended(0x123), 4).to_string(),
+            "00000123#R4"
+        );
         let fd = Format::Fd {
             bit_rate_switch: true,
             error_state: false,

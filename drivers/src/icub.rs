@@ -1,33 +1,44 @@
-//! What all boards of the iCub, R1 and ergoCub CAN protocol have in common: identifiers, commands, bring-up, management.
+//! Common parts of the CAN protocol of iCub, R1 and ergoCub boards: identifiers, commands,
+//! bring-up, management.
 //!
 //! | part of the 11-bit identifier | bits | meaning |
 //! |---|---|---|
 //! | CLS | 10:8 | class: [`class`] |
 //! | SRC | 7:4 | address of the sender: 0 the host, 1 to 14 the boards |
-//! | X | 3:0 | in a command class (0, 2, 7) the address of the receiver, 15 is everyone; in a streaming class the type |
+//! | X | 3:0 | command class (0, 2, 7): address of the receiver, 15 for all |
+//! | | | streaming class: type of the stream |
 //!
-//! In a command class the first byte is the command and a reply swaps sender and receiver: `20A` asks board 10, `2A0`
-//! answers. In a streaming class there is no command byte. Most commands that set or start something are not acknowledged.
+//! In a command class the first byte is the command and a reply swaps sender and receiver: `20A`
+//! asks board 10, `2A0` answers. In a streaming class there is no command byte. Most commands that
+//! set or start something are not acknowledged.
 //!
-//! Sources: robotology/icub-firmware `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12 (25 Nov 2024) and the firmware
-//! under `emBODY/eBcode/arch-arm/embot` at b4299211; robotology/icub-firmware-shared `can/canProtocolLib` at 62f2818a; the
-//! hosts in robotology/icub-main at 24c1a003. Certain: document and independent code agree, unless a line says otherwise.
+//! Sources: robotology/icub-firmware `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12 (25 Nov
+//! 2024) and the firmware under `emBODY/eBcode/arch-arm/embot` at b4299211;
+//! robotology/icub-firmware-shared `can/canProtocolLib` at 62f2818a; the hosts in
+//! robotology/icub-main at 24c1a003. Certain (document and independent code agree), unless stated
+//! otherwise.
 //!
 //! # Bring-up
-//! `Bringup` is the part of a [`crate::Device`] that asks, starts, watches, restarts and stops a board:
+//! `Bringup` is the part of a [`crate::Device`] that asks, starts, watches, restarts and stops a
+//! board:
 //!
 //! ```text
 //! Waiting --power_on_silence--> Asking --answers--> Starting --first reading--> Streaming
-//!                                 ^                    | no reading: again,         | no reading for max_silence:
-//!                                 |                    v doubling the wait          v counted once
-//!                                 +--------------------+<------------------------ Silent
+//!                                 ^                    |                          | (2)
+//!                                 |                    v (1)                      v
+//!                                 +--------------------+<----------------------- Silent
 //! ```
-//! After power-up these boards wait 5 s in their bootloader, and *any* frame on the bus makes them stay there. Where boards
-//! are powered together with the host, `power_on_silence_ms = 6000` keeps this host silent that long, at start and before
-//! each attempt to wake a silent board; it can not keep others silent. A reading ends the waiting at once: a board that
-//! streams has left its bootloader.
+//! (1) No reading: again, doubling the wait. (2) No reading for `max_silence`: counted once.
+//!
+//! After power-up these boards wait 5 s in their bootloader, and *any* frame on the bus makes them
+//! stay there. If boards are powered together with the host, set `power_on_silence_ms = 6000`: this
+//! host then stays silent that long at start and before each attempt to wake a silent board. It
+//! cannot keep other senders silent. A reading ends the wait at once, because a board that streams
+//! has left its bootloader.
 
-use crate::{Claim, Decoded, Format, Frame, Frames, Id, Mode, Refusal, Spec, SpecError, State, Transmit};
+use crate::{
+    Claim, Decoded, Format, Frame, Frames, Id, Mode, Refusal, Spec, SpecError, State, Transmit,
+};
 use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Nanos, StampKind};
 
@@ -53,11 +64,13 @@ pub mod class {
 pub mod command {
     /// Class 2: start or stop streaming, `[07, mode]`.
     pub const SET_TXMODE: u8 = 0x07;
-    /// Class 2: period of the streams, `[08, ms]`. (The document's drawing shows 07; its example, the header and the code 08.)
+    /// Class 2: period of the streams, `[08, ms]`. (The document's drawing shows 07; its example,
+    /// the header and the code 08.)
     pub const SET_CANDATARATE: u8 = 0x08;
     /// Class 2: `[18, set << 4 | channel]`, answered by `[18, set << 4 | channel, high, low]`.
     pub const GET_FULL_SCALES: u8 = 0x18;
-    /// Class 2: `[1C, protocol major, minor]`, answered by `[1C, board, major, minor, build, protocol major, minor, fits]`.
+    /// Class 2: `[1C, protocol major, minor]`, answered by `[1C, board, major, minor, build,
+    /// protocol major, minor, fits]`.
     pub const GET_FIRMWARE_VERSION: u8 = 0x1C;
     /// Class 2: `[33]`, answered by 8 bytes like those of [`IMU_CONFIG_SET`].
     pub const IMU_CONFIG_GET: u8 = 0x33;
@@ -65,7 +78,7 @@ pub mod command {
     pub const IMU_CONFIG_SET: u8 = 0x34;
     /// Class 2: `[35, period in ms]`, 0 stops.
     pub const IMU_TRANSMIT: u8 = 0x35;
-    /// Class 2: `[39, mask]`: which thermometers.
+    /// Class 2: `[39, mask]`: the thermometers in use.
     pub const THERMOMETER_CONFIG_SET: u8 = 0x39;
     /// Class 2: `[3A, period in s]`, 0 stops.
     pub const THERMOMETER_TRANSMIT: u8 = 0x3A;
@@ -132,7 +145,7 @@ pub fn address(spec: &Spec) -> Result<u8, SpecError> {
     }
 }
 
-/// The silence after power-on from its key `power_on_silence_ms`.
+/// The silence after power-on, from the key `power_on_silence_ms`.
 ///
 /// # Errors
 /// [`SpecError::Key`] above a minute.
@@ -147,7 +160,7 @@ pub(crate) fn power_on_silence(ms: u32) -> Result<Nanos, SpecError> {
     Ok(Nanos::from_millis(i64::from(ms)))
 }
 
-/// A period in ms that a byte holds.
+/// A period in ms that fits in a byte.
 ///
 /// # Errors
 /// [`SpecError::Key`] outside 1 to 255.
@@ -162,7 +175,7 @@ pub(crate) fn period_ms(key: &'static str, ms: u32) -> Result<u8, SpecError> {
     }
 }
 
-/// That a sensor has no joints.
+/// Checks that a sensor has no joints.
 ///
 /// # Errors
 /// [`SpecError::Joints`].
@@ -192,11 +205,12 @@ pub(crate) fn u32_le(data: &[u8], at: usize) -> u32 {
     u32::from(u16_le(data, at)) | u32::from(u16_le(data, at + 2)) << 16
 }
 
-/// `value` in units of `lsb`, rounded to the nearest integer and limited to `least..=most`. `value` must be finite.
+/// `value` in units of `lsb`, rounded to the nearest integer and limited to `least..=most`. `value`
+/// must be finite.
 #[allow(clippy::cast_possible_truncation)]
 pub(crate) fn quantise(value: f64, lsb: f64, least: i64, most: i64) -> i64 {
     let scaled = value / lsb;
-    // The cast truncates towards zero and saturates: half a unit away from zero makes it round.
+    // The cast truncates towards zero and saturates: adding half a unit away from zero rounds.
     let nearest = (scaled + if scaled < 0.0 { -0.5 } else { 0.5 }) as i64;
     nearest.clamp(least, most)
 }
@@ -207,7 +221,7 @@ pub(crate) fn quantise_i16(value: f64, lsb: f64) -> i16 {
     quantise(value, lsb, i64::from(i16::MIN), i64::from(i16::MAX)) as i16
 }
 
-/// Whether `later` came no more than `most` after `earlier`. Without stamps nothing expires.
+/// Whether `later` is at most `most` after `earlier`. Without stamps nothing expires.
 pub(crate) fn within(earlier: (Nanos, StampKind), later: (Nanos, StampKind), most: Nanos) -> bool {
     if earlier.1 == StampKind::None || later.1 == StampKind::None {
         return true;
@@ -216,44 +230,47 @@ pub(crate) fn within(earlier: (Nanos, StampKind), later: (Nanos, StampKind), mos
     passed >= Nanos::ZERO && passed <= most
 }
 
-/// What a stream that two halves make up does with the half that came.
+/// The result of adding a half to a [`Pairing`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Paired<T> {
-    /// It waits for its other half.
+    /// The half waits for its other half.
     Waiting,
-    /// It completes this one, whose frame has this stamp.
+    /// The half completes this one, whose frame has this stamp.
     With(Nanos, StampKind, T),
-    /// It can not be used.
+    /// The half cannot be used.
     Alone,
 }
 
-/// Puts the two halves of a reading together where the protocol numbers neither, and never puts halves of two readings
-/// together.
+/// Combines the two halves of a reading in a protocol without sequence numbers. Never combines
+/// halves of different readings.
 ///
-/// A board sends the two halves back to back, the first always first. So a second half belongs to the first half before
-/// it, if that came no longer ago than `timeout`. When a first half follows a first half, the missing second half is lost
-/// *or late*, and the next second half may be either the late one or the right one: nothing in it tells which. So that one
-/// is dropped together with its first half: one reading more is lost, none is wrong. After that a second half must come
-/// as soon after its first as is usual on this bus, until one does or a surplus second half shows that one was late.
+/// A board sends the two halves back to back, always in the same order. So a second half belongs to
+/// the first half before it, if that arrived no longer than `timeout` ago. If a first half follows
+/// a first half, the missing second half is lost *or late*, and the next second half may be the
+/// late one or the right one: its contents do not show which. Therefore it is dropped together with
+/// its first half: one more reading is lost, but none is wrong. After that a second half must
+/// follow its first as quickly as usual on this bus, until one does or a surplus second half shows
+/// that one was late.
 ///
-/// Not to be told apart from a good pair: a second half that arrives just between a first half and its own second half,
-/// and is late by more than two periods, or had lost its first half, or is not the only late one in a row.
+/// One case cannot be distinguished from a good pair: a second half that arrives between a first
+/// half and its own second half and is late by more than two periods, or had lost its first half,
+/// or is not the only late one in a row.
 #[derive(Debug)]
 pub(crate) struct Pairing<T> {
     /// The longest time from the first half to the second.
     timeout: Nanos,
-    /// Whether the first half always comes first. If not, whichever comes first waits for the other.
+    /// Whether the first half always comes first. If not, either half waits for the other.
     ordered: bool,
     pending: Option<(bool, Nanos, StampKind, T)>,
-    /// A second half is missing and may still come.
+    /// A second half is missing and may still arrive.
     owed: bool,
-    /// One may still come, unless the pair that was dropped held it.
+    /// A second half may still arrive, unless it was in the dropped pair.
     doubt: bool,
-    /// How long second halves usually take: a running mean.
+    /// Usual delay of second halves: a running mean.
     usual: Option<Nanos>,
 }
 
-/// What a second half may take beyond twice what is usual: the length of a frame on the bus.
+/// Margin beyond twice the usual delay: the duration of a frame on the bus.
 const USUAL_SLACK: Nanos = Nanos::from_micros(125);
 
 impl<T: Copy> Pairing<T> {
@@ -268,12 +285,18 @@ impl<T: Copy> Pairing<T> {
         }
     }
 
-    /// Takes a half that came in `frame` and counts the halves that are now known to stay alone.
-    pub(crate) fn push(&mut self, second: bool, frame: &Frame, half: T, unpaired: &mut u32) -> Paired<T> {
+    /// Adds the half in `frame` and counts the halves that are now known to be unpaired.
+    pub(crate) fn push(
+        &mut self,
+        second: bool,
+        frame: &Frame,
+        half: T,
+        unpaired: &mut u32,
+    ) -> Paired<T> {
         let waiting = (second, frame.t, frame.stamp, half);
         let Some((was_second, t, stamp, other)) = self.pending.take() else {
             if second && self.ordered {
-                // Either its first half was lost, or it is the one that was owed.
+                // Either its first half was lost, or it is the missing second half.
                 self.owed = false;
                 self.doubt = false;
                 *unpaired += 1;
@@ -293,7 +316,10 @@ impl<T: Copy> Pairing<T> {
             Some(usual) => usual + usual + USUAL_SLACK,
             None => Nanos(self.timeout.0 / 2),
         };
-        if in_time && !self.owed && (!self.doubt || within((t, stamp), (frame.t, frame.stamp), usual)) {
+        if in_time
+            && !self.owed
+            && (!self.doubt || within((t, stamp), (frame.t, frame.stamp), usual))
+        {
             self.doubt = false;
             let (passed, usual) = ((frame.t - t).0, self.usual.unwrap_or(frame.t - t).0);
             self.usual = Some(Nanos(usual + (passed - usual) / 8));
@@ -310,7 +336,7 @@ impl<T: Copy> Pairing<T> {
         Paired::Waiting
     }
 
-    /// Forgets the half that waits.
+    /// Drops the waiting half.
     pub(crate) fn reset(&mut self) {
         self.pending = None;
         self.owed = false;
@@ -318,15 +344,15 @@ impl<T: Copy> Pairing<T> {
     }
 }
 
-/// Questions that have to be answered before a board can be started.
+/// The questions that a board must answer before it can be started.
 pub(crate) trait Inquiry {
-    /// Begins anew: the board may have been reset or replaced.
+    /// Starts again: the board may have been reset or replaced.
     fn begin(&mut self);
-    /// What to do at `now`.
+    /// The next step at `now`.
     fn poll(&mut self, now: Nanos) -> Ask;
-    /// When to poll again.
+    /// Time of the next poll.
     fn wake(&self) -> Option<Nanos>;
-    /// Why the board can not be used.
+    /// Why the board cannot be used.
     fn refusal(&self) -> Option<Refusal>;
 }
 
@@ -337,11 +363,11 @@ pub(crate) enum Ask {
     Send(Frame),
     /// Wait for the answer.
     Wait,
-    /// All is known.
+    /// All questions are answered.
     Done,
 }
 
-/// Nothing to ask.
+/// An inquiry without questions.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct NoInquiry;
 
@@ -358,27 +384,29 @@ impl Inquiry for NoInquiry {
     }
 }
 
-/// How long a question may wait for its answer before it is asked again: a board answers within a few ms, and icub-main
-/// repeats after 20 ms.
+/// Time to wait for an answer before the question is repeated. A board answers within a few ms;
+/// icub-main repeats after 20 ms.
 pub(crate) const ANSWER_TIMEOUT: Nanos = Nanos::from_millis(20);
-/// How often a question is asked at that pace, as icub-main does; then the board counts as not answering.
+/// Number of attempts at that pace, as in icub-main; then the board counts as not answering.
 pub(crate) const ATTEMPTS: u8 = 15;
-/// The pace after that: a board that gets power later comes up within this time, at a frame or two a second.
+/// Interval between attempts after that: a board that is powered later starts within this time, at
+/// the cost of one or two frames a second.
 pub(crate) const SLOW_ATTEMPT: Nanos = Nanos::from_millis(500);
-/// How long after a question its answer still counts: slow boards answer the first attempt after the second was sent.
+/// How long after a question its answer is accepted: slow boards answer the first attempt after the
+/// second was sent.
 pub(crate) const ANSWER_COUNTS: Nanos = Nanos::from_millis(1000);
-/// How long a started board may take to its first reading, beyond the silence that it is allowed anyway: an IMU changes
-/// its fusion mode meanwhile. Doubled with each attempt up to [`START_PATIENCE_MOST`].
+/// Time from start to first reading, in addition to the maximum silence: an IMU changes its fusion
+/// mode meanwhile. Doubled with each attempt up to [`START_PATIENCE_MOST`].
 const START_PATIENCE: Nanos = Nanos::from_millis(250);
 /// The longest time between two attempts to start.
 const START_PATIENCE_MOST: Nanos = Nanos::from_millis(500);
-/// A command that could not be sent for so long is not sent at all; it comes again with the next attempt.
+/// A command that could not be sent for this long is dropped; the next attempt sends it again.
 const SEND_WITHIN: Nanos = Nanos::from_millis(100);
 
-/// Where the conversation stands.
+/// The phase of the bring-up.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Phase {
-    /// Nothing has been done yet.
+    /// Not begun.
     Fresh,
     /// Keeping silent.
     Waiting { until: Nanos },
@@ -386,7 +414,7 @@ enum Phase {
     Asking,
     /// Sending the start commands.
     Starting { next: usize },
-    /// All sent; to be repeated if no reading has come.
+    /// All start commands sent; repeated if no reading arrives.
     Watching { until: Nanos },
     /// Sending the stop commands.
     Stopping { next: usize },
@@ -394,7 +422,7 @@ enum Phase {
     Stopped,
 }
 
-/// Asks, starts, watches, restarts and stops one board (the state machine in the module's documentation).
+/// Asks, starts, watches, restarts and stops one board (state machine in the module documentation).
 #[derive(Debug)]
 pub(crate) struct Bringup {
     mode: Mode,
@@ -402,14 +430,14 @@ pub(crate) struct Bringup {
     power_on_silence: Nanos,
     start: ArrayVec<Frame, 8>,
     stop: ArrayVec<Frame, 4>,
-    /// The stream that is watched: named in the faults.
+    /// The stream that is watched, for the faults.
     watched: Id,
     phase: Phase,
     patience: Nanos,
-    /// When the last reading came, while they come.
+    /// Time of the last reading; `None` while the board is silent.
     last: Option<Nanos>,
     silent: bool,
-    /// A start sequence was begun since power-on, as far as we know.
+    /// Whether a start sequence was begun since the last known power-on.
     begun: bool,
 }
 
@@ -430,13 +458,16 @@ impl Bringup {
         }
     }
 
-    /// Adds a command that starts the board.
+    /// Adds a start command.
     pub(crate) fn start_with(&mut self, id: Id, data: &[u8]) {
         let fits = self.start.try_push(Frame::new(id, data));
-        debug_assert!(fits.is_ok(), "no family here has more than 8 start commands");
+        debug_assert!(
+            fits.is_ok(),
+            "no family here has more than 8 start commands"
+        );
     }
 
-    /// Adds a command that stops it.
+    /// Adds a stop command.
     pub(crate) fn stop_with(&mut self, id: Id, data: &[u8]) {
         let fits = self.stop.try_push(Frame::new(id, data));
         debug_assert!(fits.is_ok(), "no family here has more than 4 stop commands");
@@ -451,22 +482,27 @@ impl Bringup {
         self.silent
     }
 
-    /// Whether frames are still of interest.
+    /// Whether frames are still processed.
     pub(crate) const fn active(&self) -> bool {
         !matches!(self.phase, Phase::Stopping { .. } | Phase::Stopped)
     }
 
-    /// Notes that a reading came at `t`. Returns whether it is the first after a silence.
+    /// Records a reading at `t`. Returns whether it is the first after a silence.
     pub(crate) fn reading(&mut self, t: Nanos) -> bool {
         self.last = Some(t);
         if let Phase::Waiting { .. } = self.phase {
-            // It streams, so it is past its bootloader.
+            // A board that streams has left its bootloader.
             self.phase = Phase::Waiting { until: Nanos::MIN };
         }
         core::mem::take(&mut self.silent)
     }
 
-    pub(crate) fn poll(&mut self, now: Nanos, inquiry: &mut impl Inquiry, out: &mut Decoded) -> Option<Transmit> {
+    pub(crate) fn poll(
+        &mut self,
+        now: Nanos,
+        inquiry: &mut impl Inquiry,
+        out: &mut Decoded,
+    ) -> Option<Transmit> {
         if self.active()
             && let Some(last) = self.last
             && now - last > self.max_silence
@@ -479,10 +515,12 @@ impl Bringup {
                 self.phase = Phase::Fresh;
             }
         }
-        // Each turn either returns or goes on to a later phase, so this ends.
+        // Each turn returns or advances to a later phase, so the loop ends.
         loop {
             match self.phase {
-                Phase::Fresh if self.mode == Mode::Listen => self.phase = Phase::Watching { until: Nanos::MAX },
+                Phase::Fresh if self.mode == Mode::Listen => {
+                    self.phase = Phase::Watching { until: Nanos::MAX }
+                }
                 Phase::Fresh => {
                     let until = if self.power_on_silence > Nanos::ZERO {
                         now + self.power_on_silence
@@ -546,7 +584,9 @@ impl Bringup {
             Phase::Fresh | Phase::Starting { .. } | Phase::Stopping { .. } => Some(Nanos::MIN),
             Phase::Waiting { until } => Some(until),
             Phase::Asking => inquiry.wake(),
-            Phase::Watching { until } => (self.last.is_none() && until < Nanos::MAX).then_some(until),
+            Phase::Watching { until } => {
+                (self.last.is_none() && until < Nanos::MAX).then_some(until)
+            }
             Phase::Stopped => return None,
         };
         match (silence, phase) {
@@ -568,16 +608,19 @@ impl Bringup {
             Phase::Fresh if self.mode == Mode::Listen => State::Starting,
             Phase::Fresh | Phase::Waiting { .. } => State::Waiting,
             Phase::Asking => State::Asking,
-            Phase::Starting { .. } | Phase::Watching { .. } | Phase::Stopping { .. } | Phase::Stopped => {
-                State::Starting
-            }
+            Phase::Starting { .. }
+            | Phase::Watching { .. }
+            | Phase::Stopping { .. }
+            | Phase::Stopped => State::Starting,
         }
     }
 
     pub(crate) fn stop(&mut self) {
-        // A board that was promised silence gets none of our frames; one that only others command is theirs to stop.
+        // Sends nothing while the bus must be silent, or to a board that another program commands.
         let waiting = matches!(self.phase, Phase::Fresh | Phase::Waiting { .. });
-        let quiet = self.mode == Mode::Listen || !self.begun || (waiting && self.power_on_silence > Nanos::ZERO);
+        let quiet = self.mode == Mode::Listen
+            || !self.begun
+            || (waiting && self.power_on_silence > Nanos::ZERO);
         if self.active() {
             self.phase = if quiet {
                 Phase::Stopped
@@ -606,7 +649,8 @@ pub(crate) const fn stream_type(id: Id, class: u16, address: u8) -> Option<u8> {
     }
 }
 
-/// The payload of a classic data frame. Everything else is counted; an error frame is nobody's.
+/// The payload of a classic data frame. Other frames are counted, except error frames, which belong
+/// to no device.
 pub(crate) fn payload<'f>(frame: &'f Frame, out: &mut Decoded) -> Option<&'f [u8]> {
     match frame.format {
         Format::Classic => return Some(frame.data()),
@@ -626,20 +670,31 @@ pub(crate) fn claims<const N: usize>(class: u16, address: u8, kinds: &[u8]) -> A
         .collect()
 }
 
-/// The command for board `address` in `frame`, if it is one of class `class`: its bytes, the command first.
+/// The bytes of a command of class `class` to board `address` in `frame`, starting with the command
+/// byte.
 pub(crate) fn command_for(frame: &Frame, class: u16, address: u8) -> Option<&[u8]> {
     let broadcast = to_board(class, BROADCAST);
     let ours = frame.id == to_board(class, address) || frame.id == broadcast;
     (ours && frame.format == Format::Classic && !frame.is_empty()).then(|| frame.data())
 }
 
-/// Answers what every board answers: who it is and what firmware it has (a plausible one: 2.0.8, protocol 2.0).
-pub(crate) fn answer_management(frame: &Frame, class: u16, address: u8, board: u8, out: &mut Frames) {
+/// Answers the management requests: board type and firmware version (a plausible one: 2.0.8,
+/// protocol 2.0).
+pub(crate) fn answer_management(
+    frame: &Frame,
+    class: u16,
+    address: u8,
+    board: u8,
+    out: &mut Frames,
+) {
     const FIRMWARE: [u8; 3] = [2, 0, 8];
     let [major, minor, build] = FIRMWARE;
     if let Some([command::DISCOVER]) = command_for(frame, class::MANAGEMENT, address) {
         let id = to_host(class::MANAGEMENT, address);
-        let _ = out.try_push(Frame::new(id, &[command::DISCOVER, board, major, minor, build]));
+        let _ = out.try_push(Frame::new(
+            id,
+            &[command::DISCOVER, board, major, minor, build],
+        ));
     }
     let version = if class == class::POLLING_MOTOR {
         command::MOTOR_GET_FIRMWARE_VERSION

@@ -1,4 +1,5 @@
-//! iCub motor boards 2foc, amcbldc, amc2c and amcfoc: position, velocity and current of the motor shaft, status and faults.
+//! iCub motor boards 2foc, amcbldc, amc2c and amcfoc: position, velocity and current of the motor
+//! shaft, status and faults.
 //!
 //! Streams of address `a`, little-endian, class 1:
 //!
@@ -9,33 +10,35 @@
 //! | `1aC` | ADDITIONAL_STATUS | 4 | 2 bytes unused, motor temperature i16, raw |
 //! | `1a5` | OVERFLOW | any | the board lost frames that it should have received |
 //!
-//! - 1 icubdeg = 360 / 65536 deg = 0.0054931640625 deg, of the *motor shaft*: `ratio` in the joint's table makes it the
-//!   joint's. A step of velocity is 5.4931640625 deg/s of the shaft.
-//! - The motor temperature's scale is stated nowhere: the frame is checked for its length and yields no reading.
-//! - `mode`: 0 idle, 1 position, 6 current, 9 forced idle, 0x0A voltage, 0x50 open loop, 0xA0 hardware fault, 0xB0 not
-//!   configured.
+//! - 1 icubdeg = 360 / 65536 deg = 0.0054931640625 deg, of the *motor shaft*: `ratio` in the
+//!   joint's table makes it the joint's. A step of velocity is 5.4931640625 deg/s of the shaft.
+//! - The scale of the motor temperature is not documented: the frame's length is checked, but it
+//!   yields no reading.
+//! - `mode`: 0 idle, 1 position, 6 current, 9 forced idle, 0x0A voltage, 0x50 open loop, 0xA0
+//!   hardware fault, 0xB0 not configured.
 //! - `encoder`, bits: 0 dirty, 1 stuck, 2 index broken, 3 phase broken, 4 not calibrated.
 //! - `faults`: bit numbers in [`fault`].
 //!
-//! STATUS yields an actuator reading and tells the quality of the joint readings after it: DEVICE_FAULT for mode 0xA0, for
-//! encoder bits 0 to 3 and for every fault bit except those that only speak of the bus ([`fault::BUS`]); NOT_CALIBRATED for
-//! encoder bit 4 and for mode 0xB0.
+//! STATUS yields an actuator reading and sets the quality of the joint readings after it:
+//! DEVICE_FAULT for mode 0xA0, for encoder bits 0 to 3 and for every fault bit except those that
+//! concern only the bus ([`fault::BUS`]); NOT_CALIBRATED for encoder bit 4 and for mode 0xB0.
 //!
-//! These boards are commanded by somebody else, once a millisecond (`10F`, four target currents, which triggers the answers
-//! above): this driver never transmits. It watches for silence.
+//! Another program commands these boards once a millisecond (`10F`, four target currents, which
+//! triggers the answers above). This driver never transmits; it only detects silence.
 //!
-//! Sources: `TSD-ICUBUNIT-canprotocol-motorboards.docx` (icub-firmware b4299211), `iCubCanProto_motorControlMessages.h`
-//! (icub-firmware-shared 62f2818a). Certain.
+//! Sources: `TSD-ICUBUNIT-canprotocol-motorboards.docx` (icub-firmware b4299211),
+//! `iCubCanProto_motorControlMessages.h` (icub-firmware-shared 62f2818a). Certain.
 //!
 //! # Keys
 //! ```toml
-//! period_ms = 1      # 1 to 255; what its commander makes of it: the pace of a simulated board
-//! velocity = true    # false: the board's velocity is not passed on (it is coarse where `ratio` is small), and encoded as 0
+//! period_ms = 1      # 1 to 255; set by its commander; used by the simulated board
+//! velocity = true    # false: ignore the board's velocity (coarse if `ratio` is small), encode 0
 //! ```
 
 use crate::icub::{self, Bringup, NoInquiry, class};
 use crate::{
-    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Spec, SpecError, State, Transmit, device,
+    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Spec, SpecError, State,
+    Transmit, device,
 };
 use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
@@ -66,17 +69,18 @@ pub mod fault {
     pub const OVER_VOLTAGE: u32 = 1 << 5;
     /// Supply below its limit.
     pub const UNDER_VOLTAGE: u32 = 1 << 6;
-    /// The emergency button.
+    /// Emergency button pressed.
     pub const EXTERNAL: u32 = 1 << 7;
     /// Temperature above its limit.
     pub const OVER_HEATING: u32 = 1 << 9;
-    /// The position encoder.
+    /// Position encoder fault.
     pub const ENCODER: u32 = 1 << 19;
     /// Mean current above its limit.
     pub const I2T: u32 = 1 << 22;
-    /// Bits that speak of the bus and of commands on it, not of the motor or its encoder: 10 to 13 (warning and passive
-    /// states), 15 (buffer overrun), 27 to 31 (illegal length, past states, remote requests). They alone do not make a
-    /// position doubtful, and the past states stay set until the board is reset.
+    /// Bits that concern the bus and its commands, not the motor or its encoder: 10 to 13 (warning
+    /// and passive states), 15 (buffer overrun), 27 to 31 (illegal length, past states, remote
+    /// requests). They do not make a position doubtful, and past states stay set until the board is
+    /// reset.
     pub const BUS: u32 = 0b1111 << 10 | 1 << 15 | 0b11111 << 27;
 }
 
@@ -88,11 +92,11 @@ pub mod encoder {
     pub const NOT_CALIBRATED: u32 = 1 << 4;
 }
 
-/// Values of `Actuator::mode` that bear on quality.
+/// Values of `Actuator::mode` that affect the quality.
 pub mod mode {
     /// The power stage or its supervision failed.
     pub const HARDWARE_FAULT: u32 = 0xA0;
-    /// The board has not been told its motor's parameters.
+    /// The board has not received its motor's parameters.
     pub const NOT_CONFIGURED: u32 = 0xB0;
 }
 
@@ -109,9 +113,9 @@ const DUTY_PER_LSB: f64 = 1.0 / 32000.0;
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
-    /// Period at which its commander makes it answer \[ms\], 1 to 255; default 1.
+    /// Period of its commander's requests \[ms\], 1 to 255; default 1.
     pub period_ms: u32,
-    /// Whether the board's velocity is passed on; default true.
+    /// Whether readings contain the board's velocity; default true.
     pub velocity: bool,
 }
 
@@ -124,7 +128,7 @@ impl Default for Options {
     }
 }
 
-/// That channel 0, the only one, is a joint.
+/// Checks that channel 0, the only one, is a joint.
 fn one_joint(spec: &Spec) -> Result<(), SpecError> {
     if spec.outputs.0.is_empty() {
         return Err(SpecError::Joints(
@@ -141,7 +145,7 @@ fn one_joint(spec: &Spec) -> Result<(), SpecError> {
     }
 }
 
-/// What a status tells of the readings beside it.
+/// The quality flags of the readings after a status frame.
 fn quality_of(actuator: &Actuator) -> Quality {
     let mut quality = Quality::GOOD;
     let broken = actuator.encoder & encoder::BROKEN != 0;
@@ -161,23 +165,29 @@ pub struct Motor {
     claims: ArrayVec<Claim, 4>,
     bringup: Bringup,
     velocity: bool,
-    /// What the last status told.
+    /// The quality from the last status.
     status: Quality,
-    /// A reading has been given: from then on a restart leaves a gap.
+    /// Whether there was a reading: from then on a restart leaves a gap.
     seen: bool,
     gap: bool,
 }
 
 impl Motor {
-    /// A board that nothing is known of yet.
+    /// A device in its initial state.
     ///
     /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, no joint, a joint's channel that is not 0, a period out of range.
+    /// [`SpecError`]: an address outside 1 to 14, no joint, a joint's channel that is not 0, a
+    /// period out of range.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
         one_joint(spec)?;
         icub::period_ms("period_ms", options.period_ms)?;
-        let kinds = [kind::TWO_FOC, kind::STATUS, kind::ADDITIONAL_STATUS, kind::OVERFLOW];
+        let kinds = [
+            kind::TWO_FOC,
+            kind::STATUS,
+            kind::ADDITIONAL_STATUS,
+            kind::OVERFLOW,
+        ];
         let watched = icub::stream(class::PERIODIC_MOTOR, address, kind::TWO_FOC);
         Ok(Self {
             address,
@@ -219,7 +229,10 @@ impl Motor {
             reserved: 0,
         };
         self.status = quality_of(&actuator);
-        out.push(output(frame, self.status, Reading::Actuator(actuator)), frame.id);
+        out.push(
+            output(frame, self.status, Reading::Actuator(actuator)),
+            frame.id,
+        );
     }
 }
 
@@ -257,7 +270,9 @@ impl Device for Motor {
         ) {
             return;
         }
-        let Some(data) = icub::payload(frame, out) else { return };
+        let Some(data) = icub::payload(frame, out) else {
+            return;
+        };
         match (stream, data.len()) {
             (kind::TWO_FOC, 8) => self.motion(data, frame, out),
             (kind::STATUS, 8) => self.status(data, frame, out),
@@ -290,24 +305,25 @@ impl Device for Motor {
     }
 }
 
-/// The board's own side: it streams by itself, as if it were commanded once a period.
+/// The board's own side: it streams without commands, as if it were commanded once a period.
 #[derive(Debug)]
 pub struct MotorBoard {
     address: u8,
     period: Nanos,
     velocity: bool,
-    /// What its last status told.
+    /// The quality in its last status.
     status: Quality,
 }
 
 impl MotorBoard {
-    /// A board that is being commanded.
+    /// A board that streams at once.
     ///
     /// # Errors
     /// As [`Motor::new`].
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         one_joint(spec)?;
-        let period = Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));
+        let period =
+            Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));
         Ok(Self {
             address: icub::address(spec)?,
             period,
@@ -323,7 +339,8 @@ impl MotorBoard {
         #[allow(clippy::cast_possible_truncation)] // both are bytes on the wire
         let (mode, encoder) = (actuator.mode as u8, actuator.encoder as u8);
         #[allow(clippy::cast_possible_truncation)] // limited to 16 bits
-        let [d0, d1] = (icub::quantise(actuator.duty, DUTY_PER_LSB, -32000, 32000) as i16).to_le_bytes();
+        let [d0, d1] =
+            (icub::quantise(actuator.duty, DUTY_PER_LSB, -32000, 32000) as i16).to_le_bytes();
         let [f0, f1, f2, f3] = actuator.faults.to_le_bytes();
         let id = icub::stream(class::PERIODIC_MOTOR, self.address, kind::STATUS);
         let _ = out.try_push(Frame::new(id, &[mode, encoder, d0, d1, f0, f1, f2, f3]));
@@ -334,16 +351,28 @@ impl MotorBoard {
 
 impl Board for MotorBoard {
     fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
-        icub::answer_management(frame, class::POLLING_MOTOR, self.address, icub::board::TWO_FOC, out);
+        icub::answer_management(
+            frame,
+            class::POLLING_MOTOR,
+            self.address,
+            icub::board::TWO_FOC,
+            out,
+        );
     }
 
     fn period(&self) -> Option<Nanos> {
         Some(self.period)
     }
 
-    /// A joint reading with other faults than the last status told is preceded by a status that tells them. Torque and
-    /// acceleration have no place in the frame; a current that is absent is sent as 0.
-    fn encode(&mut self, output: u8, reading: &Reading, quality: Quality, out: &mut Frames) -> Result<(), EncodeError> {
+    /// If the faults differ from the last status, a status frame precedes the joint reading. The
+    /// frame has no field for torque and acceleration; an absent current is sent as 0.
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
         if output != 0 {
             return Err(EncodeError::Output(output));
         }
@@ -370,10 +399,19 @@ impl Board for MotorBoard {
                     }
                     self.send_status(&actuator, out)?;
                 }
-                let current = if joint.current.is_finite() { joint.current } else { 0.0 };
+                let current = if joint.current.is_finite() {
+                    joint.current
+                } else {
+                    0.0
+                };
                 let [c0, c1] = icub::quantise_i16(current, AMPERE_PER_LSB).to_le_bytes();
                 let [v0, v1] = icub::quantise_i16(velocity, RAD_PER_S_PER_LSB).to_le_bytes();
-                let position = icub::quantise(joint.position, RAD_PER_LSB, i64::from(i32::MIN), i64::from(i32::MAX));
+                let position = icub::quantise(
+                    joint.position,
+                    RAD_PER_LSB,
+                    i64::from(i32::MIN),
+                    i64::from(i32::MAX),
+                );
                 #[allow(clippy::cast_possible_truncation)] // limited to 32 bits
                 let [p0, p1, p2, p3] = (position as i32).to_le_bytes();
                 let id = icub::stream(class::PERIODIC_MOTOR, self.address, kind::TWO_FOC);

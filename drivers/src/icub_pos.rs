@@ -6,34 +6,38 @@
 //! |---|---|---|---|
 //! | `3a1` | POS | 8 | type u8, label << 4 \| n, then three values i16 of which the first n count |
 //!
-//! - Type 0: 0.1 deg; type 1: 0.1 mm. Value k belongs to label + k: that is the `channel` of a joint.
+//! - Type 0: 0.1 deg; type 1: 0.1 mm. Value k belongs to label + k: that is the `channel` of a
+//!   joint.
 //! - A psc sends both its sensors in one frame, n = 2.
 //!
 //! Commands on `20a`, neither acknowledged:
 //!
 //! | bytes | meaning |
 //! |---|---|
-//! | `52 id<<4\|type S0 S1` | configuration; S: enabled, inverted, rotation (2 bits: 0, 180, 90, -90 deg), label (4 bits), zero i16 in 0.1 deg |
+//! | `52 id<<4\|type S0 S1` | configuration of sensors S0, S1 |
 //! | `53 ms` | period, 0 stops |
 //!
-//! The board then sends ((v + rotation) mod 360 deg) - ((zero + rotation) mod 360 deg), negated if inverted.
+//! S: enabled, inverted, rotation (2 bits: 0, 180, 90, -90 deg), label (4 bits), zero (i16, 0.1
+//! deg). The board then sends ((v + rotation) mod 360 deg) - ((zero + rotation) mod 360 deg),
+//! negated if inverted.
 //!
-//! Sources: `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12, `embot_prot_can_analog_periodic.cpp` (icub-firmware
-//! b4299211). Certain.
+//! Sources: `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12,
+//! `embot_prot_can_analog_periodic.cpp` (icub-firmware b4299211). Certain.
 //!
 //! # Keys
 //! ```toml
 //! period_ms = 10            # 1 to 255
-//! quantity = "angle"        # "angle" (rad) or "length" (m): what the board must send
+//! quantity = "angle"        # "angle" (rad) or "length" (m): the quantity that the board sends
 //! power_on_silence_ms = 0   # see `crate::icub`
-//! listen = false            # true: somebody else commands this board; never transmit
-//! # What to configure a psc's one or two sensors to; without it the board keeps what it has.
+//! listen = false            # true: another program commands this board; never transmit
+//! # Configuration of a psc's one or two sensors; without it the board keeps its own.
 //! sensors = [{ label = 0, inverted = false, rotation_deg = 0, zero_deg = 0.0 }, { label = 1 }]
 //! ```
 
 use crate::icub::{self, Bringup, NoInquiry, class, command};
 use crate::{
-    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Outputs, Spec, SpecError, State, Transmit, device,
+    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Outputs, Spec, SpecError,
+    State, Transmit, device,
 };
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
@@ -77,13 +81,13 @@ impl Quantity {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Sensor {
-    /// The label it is sent under: the joint's channel.
+    /// Its label, which is the joint's channel.
     pub label: u8,
     /// Negate its value; default false.
     pub inverted: bool,
-    /// Added before the zero is taken off \[deg\]: 0, 90, 180 or -90; default 0.
+    /// Added before the zero is subtracted \[deg\]: 0, 90, 180 or -90; default 0.
     pub rotation_deg: i32,
-    /// What counts as zero \[deg\]; default 0.
+    /// The zero position \[deg\]; default 0.
     pub zero_deg: f64,
 }
 
@@ -133,13 +137,13 @@ impl Sensor {
 pub struct Options {
     /// Period \[ms\], 1 to 255; default 10.
     pub period_ms: u32,
-    /// What the board must send; default angles.
+    /// The quantity that the board sends; default angles.
     pub quantity: Quantity,
     /// Silence kept after power-on \[ms\]; default 0.
     pub power_on_silence_ms: u32,
-    /// Somebody else commands this board; default false.
+    /// Another program commands this board; default false.
     pub listen: bool,
-    /// What to configure its sensors to, at most two; default: what the board has.
+    /// Configuration of its sensors, at most two; default: keep the board's own.
     pub sensors: Option<Vec<Sensor>>,
 }
 
@@ -158,7 +162,9 @@ impl Default for Options {
 impl Options {
     /// The bytes of POS_CONFIG_SET, if the sensors are to be configured.
     fn configuration(&self) -> Result<Option<[u8; 8]>, SpecError> {
-        let Some(sensors) = &self.sensors else { return Ok(None) };
+        let Some(sensors) = &self.sensors else {
+            return Ok(None);
+        };
         let (first, second) = match sensors.as_slice() {
             [first] => (first.bytes()?, [0; 3]),
             [first, second] => (first.bytes()?, second.bytes()?),
@@ -184,7 +190,7 @@ impl Options {
     }
 }
 
-/// That there are joints, and all are labels.
+/// Checks that there are joints and that all channels are labels.
 fn joints(spec: &Spec) -> Result<(), SpecError> {
     if spec.outputs.0.is_empty() {
         return Err(SpecError::Joints(
@@ -216,16 +222,21 @@ pub struct Pos {
 }
 
 impl Pos {
-    /// A board that nothing is known of yet.
+    /// A device in its initial state.
     ///
     /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, no joint or one whose channel is not 0 to 15, a key out of range.
+    /// [`SpecError`]: an address outside 1 to 14, no joint or one whose channel is not 0 to 15, a
+    /// key out of range.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
         joints(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
         let silence = icub::power_on_silence(options.power_on_silence_ms)?;
-        let mode = if options.listen { Mode::Listen } else { spec.mode };
+        let mode = if options.listen {
+            Mode::Listen
+        } else {
+            spec.mode
+        };
         let watched = icub::stream(class::PERIODIC_ANALOG, address, POS);
         let mut bringup = Bringup::new(spec, mode, silence, watched);
         let id = icub::to_board(class::POLLING_ANALOG, address);
@@ -257,10 +268,14 @@ impl Device for Pos {
     }
 
     fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
-        if !self.bringup.active() || icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address) != Some(POS) {
+        if !self.bringup.active()
+            || icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address) != Some(POS)
+        {
             return;
         }
-        let Some(data) = icub::payload(frame, out) else { return };
+        let Some(data) = icub::payload(frame, out) else {
+            return;
+        };
         let &[quantity, label_and_count, ref values @ ..] = data else {
             return out.fault(Counter::Length, 1, frame.id);
         };
@@ -275,7 +290,10 @@ impl Device for Pos {
         if self.bringup.reading(frame.t) {
             self.gap = self.seen;
         }
-        for (output, value) in (label..).zip(values.chunks_exact(2)).take(usize::from(count)) {
+        for (output, value) in (label..)
+            .zip(values.chunks_exact(2))
+            .take(usize::from(count))
+        {
             if !self.outputs.0.contains(&output) {
                 continue;
             }
@@ -326,7 +344,8 @@ impl Device for Pos {
     }
 }
 
-/// The board's own side. It sends each value in a frame of its own (n = 1), which the protocol allows.
+/// The board's own side. It sends each value in a separate frame (n = 1), which the protocol
+/// allows.
 #[derive(Debug)]
 pub struct PosBoard {
     address: u8,
@@ -336,14 +355,15 @@ pub struct PosBoard {
 }
 
 impl PosBoard {
-    /// A board just powered. With `listen` somebody else has started it already.
+    /// A board after power-on. With `listen` another program has already started it.
     ///
     /// # Errors
     /// As [`Pos::new`].
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         joints(spec)?;
         options.configuration()?;
-        let period = Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));
+        let period =
+            Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));
         Ok(Self {
             address: icub::address(spec)?,
             period,
@@ -355,8 +375,16 @@ impl PosBoard {
 
 impl Board for PosBoard {
     fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
-        icub::answer_management(frame, class::POLLING_ANALOG, self.address, icub::board::PSC, out);
-        if let Some(&[command::POS_TRANSMIT, ms]) = icub::command_for(frame, class::POLLING_ANALOG, self.address) {
+        icub::answer_management(
+            frame,
+            class::POLLING_ANALOG,
+            self.address,
+            icub::board::PSC,
+            out,
+        );
+        if let Some(&[command::POS_TRANSMIT, ms]) =
+            icub::command_for(frame, class::POLLING_ANALOG, self.address)
+        {
             self.streaming = ms > 0;
             if ms > 0 {
                 self.period = Nanos::from_millis(i64::from(ms));
@@ -387,7 +415,10 @@ impl Board for PosBoard {
         let (code, lsb) = self.quantity.code_and_lsb();
         let [low, high] = icub::quantise_i16(joint.position, lsb).to_le_bytes();
         let id = icub::stream(class::PERIODIC_ANALOG, self.address, POS);
-        let _ = out.try_push(Frame::new(id, &[code, output << 4 | 1, low, high, 0, 0, 0, 0]));
+        let _ = out.try_push(Frame::new(
+            id,
+            &[code, output << 4 | 1, low, high, 0, 0, 0, 0],
+        ));
         Ok(())
     }
 }

@@ -1,18 +1,20 @@
-//! CAN frames to SI readings and back: one file per device family, without input or output, without a clock, `no_std`.
+//! Converts CAN frames to SI readings and back. One module per device family; no input or output,
+//! no clock, `no_std`.
 //!
 //! | driver | devices | reading |
 //! |---|---|---|
 //! | [`icub_strain`] | iCub F/T boards strain, strain2, strain2c | wrench, gauges, temperature |
-//! | [`icub_imu`] | the IMU of strain2, strain2c, mtb4, mtb4c, rfe; legacy gyroscope and accelerometer frames | imu |
+//! | [`icub_imu`] | IMU of strain2, strain2c, mtb4, mtb4c, rfe; legacy frames of mtb | imu |
 //! | [`icub_motor`] | 2FOC and its successors amcbldc, amc2c, amcfoc | joint, actuator |
 //! | [`icub_pos`] | POS encoders: psc, mtb4fap | joint |
 //!
-//! Each family has two sides. A [`Device`] is the host's side: it takes the frames of its identifiers, yields readings,
-//! and brings its board up. A [`Board`] is the board's own side: it answers commands and encodes readings; the simulator
-//! and `proprio encode` are built on it, and so are the round-trip tests.
+//! Each family has two sides. A [`Device`] is the host's side: it decodes the frames of its
+//! identifiers into readings and starts its board. A [`Board`] is the board's own side: it answers
+//! commands and encodes readings. The simulator, `proprio encode` and the round-trip tests use it.
 //!
-//! To add a family: write one file with an `Options` type (its keys in gateway.toml, documented at its top), a `Device`
-//! and a `Board`, and add it to [`Options`] in `registry.rs`; the compiler names the places that remain.
+//! To add a family, write a module with an `Options` type (its keys in gateway.toml, documented at
+//! the top of the module), a `Device` and a `Board`. Add it to [`Options`] in `registry.rs`; the
+//! compiler lists the other places to extend.
 #![no_std]
 extern crate alloc;
 #[cfg(test)]
@@ -28,8 +30,8 @@ pub mod icub_strain;
 mod registry;
 
 pub use device::{
-    Board, Claim, Decoded, Device, EncodeError, Fault, Frames, Mode, Output, Outputs, Refusal, Spec, SpecError, State,
-    Transmit,
+    Board, Claim, Decoded, Device, EncodeError, Fault, Frames, Mode, Output, Outputs, Refusal,
+    Spec, SpecError, State, Transmit,
 };
 pub use frame::{Format, Frame, Id};
 pub use registry::{DRIVERS, Options, OptionsError};

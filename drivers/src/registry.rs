@@ -1,4 +1,4 @@
-//! Which driver goes by which name: the one place that lists all families.
+//! The names of the drivers: the one place that lists all families.
 
 use crate::{Board, Device, Spec, SpecError, icub_imu, icub_motor, icub_pos, icub_strain};
 use alloc::boxed::Box;
@@ -22,7 +22,7 @@ pub enum Options {
     IcubPos(icub_pos::Options),
 }
 
-/// Why a driver's keys could not be read.
+/// Why a driver's keys cannot be read.
 #[derive(Debug, Clone, PartialEq)]
 pub enum OptionsError<E> {
     /// There is no driver of that name; [`DRIVERS`] lists them.
@@ -35,7 +35,8 @@ impl Options {
     /// Reads the keys of driver `driver`.
     ///
     /// # Errors
-    /// [`OptionsError`]: no such driver, or an unknown key or wrong value in the deserializer's own words.
+    /// [`OptionsError`]: no such driver, or an unknown key or wrong value (the deserializer's
+    /// message).
     pub fn deserialize<'de, D: serde::Deserializer<'de>>(
         driver: &str,
         keys: D,
@@ -50,7 +51,7 @@ impl Options {
         .map_err(OptionsError::Keys)
     }
 
-    /// What the devices of this driver measure.
+    /// The kind of the main reading of this driver's devices.
     #[must_use]
     pub const fn kind(&self) -> Kind {
         match self {
@@ -63,7 +64,7 @@ impl Options {
     /// The host's side of one device.
     ///
     /// # Errors
-    /// [`SpecError`]: an address, channel or value that the family can not have.
+    /// [`SpecError`]: an address, channel or value that is invalid for the family.
     pub fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
         Ok(match self {
             Self::IcubStrain(o) => Box::new(icub_strain::Strain::new(spec, o)?),

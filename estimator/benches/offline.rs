@@ -1,22 +1,26 @@
-//! What identification from a recorded log takes, on all the cores that it is given: a table of samples in memory to the outcome.
+//! Time of identification from a recorded log, on all available cores: from a table of samples in
+//! memory to the outcome.
 //!
-//! `cargo bench -p proprio-estimator --bench offline`, or on one core `taskset -c 1 cargo bench ...`
+//! `cargo bench -p proprio-estimator --bench offline`, or on one core `taskset -c 1 cargo bench
+//! ...`
 //!
-//! Items are samples, that is rows of the table: a leg of four joints beyond one F/T sensor on a base that stands, at 1 kHz, positions of encoders and the sensor's six numbers. Bodies are up
-//! to a tenth off CAD. A million samples are a quarter of an hour.
+//! Items are samples, that is rows of the table: a leg of four joints beyond one F/T sensor on a
+//! fixed base, at 1 kHz, with encoder positions and the sensor's six numbers. The inertial
+//! parameters differ from CAD by up to a tenth. A million samples are a quarter of an hour.
 
-#[path = "../tests/common/mod.rs"]
+#[path = "../dynamics/tests/common/mod.rs"]
 mod common;
 
 use common::Random;
 use divan::Bencher;
 use divan::counter::ItemsCount;
+use proprio_dynamics::model::Model;
+use proprio_dynamics::spatial::{RigidInertia, Vec3};
+use proprio_dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
 use proprio_estimator::config::Config;
-use proprio_estimator::dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
-use proprio_estimator::identify::{Log, Options, Role, Verdict, identify};
-use proprio_estimator::model::Model;
+use proprio_estimator::reading;
 use proprio_estimator::setup::Setup;
-use proprio_estimator::spatial::{RigidInertia, Vec3};
+use proprio_identification::{Options, Role, Verdict, identify};
 use std::fmt::Write as _;
 
 fn main() {
@@ -41,28 +45,48 @@ name = "foot"
 link = "l4"
 presence = "possible"
 "#;
-/// Of the sensor, as configured; step of the encoders [rad].
+/// Noise of the sensor, as configured; step of the encoders [rad].
 const NOISE: [f64; 6] = [0.08, 0.09, 0.18, 0.002, 0.003, 0.0015];
 const STEP: f64 = 5e-5;
 
 fn setup() -> Setup {
     let mut urdf = String::from("<robot name=\"leg\"><link name=\"world\"/>");
-    let bodies = [(1.5, -0.08), (1.0, 0.08), (2.0, -0.08), (1.2, -0.1), (0.6, -0.05)];
+    let bodies = [
+        (1.5, -0.08),
+        (1.0, 0.08),
+        (2.0, -0.08),
+        (1.2, -0.1),
+        (0.6, -0.05),
+    ];
     for (number, (mass, z)) in bodies.into_iter().enumerate() {
         let [x, y, w] = [0.006, 0.005, 0.004].map(|radius| radius * mass);
         let _ = write!(
             urdf,
-            "<link name=\"l{number}\"><inertial><origin xyz=\"0.01 0.02 {z}\"/><mass value=\"{mass}\"/>\
-             <inertia ixx=\"{x}\" ixy=\"0\" ixz=\"0\" iyy=\"{y}\" iyz=\"0\" izz=\"{w}\"/></inertial></link>"
+            "<link name=\"l{number}\"><inertial><origin xyz=\"0.01 0.02 {z}\"/><mass \
+             value=\"{mass}\"/>\
+             <inertia ixx=\"{x}\" ixy=\"0\" ixz=\"0\" iyy=\"{y}\" iyz=\"0\" izz=\"{w}\"/>\
+             </inertial></link>"
         );
     }
-    urdf += "<joint name=\"ft\" type=\"fixed\"><parent link=\"world\"/><child link=\"l0\"/></joint>";
-    let places = ["0 0 0.05", "0.02 0.05 -0.2", "0.02 -0.03 -0.2", "0.01 0.02 -0.15"];
-    for (number, (axis, place)) in ["1 0 0", "0 1 0", "0 0 1", "1 0 0"].into_iter().zip(places).enumerate() {
+    urdf +=
+        "<joint name=\"ft\" type=\"fixed\"><parent link=\"world\"/><child link=\"l0\"/></joint>";
+    let places = [
+        "0 0 0.05",
+        "0.02 0.05 -0.2",
+        "0.02 -0.03 -0.2",
+        "0.01 0.02 -0.15",
+    ];
+    for (number, (axis, place)) in ["1 0 0", "0 1 0", "0 0 1", "1 0 0"]
+        .into_iter()
+        .zip(places)
+        .enumerate()
+    {
         let _ = write!(
             urdf,
-            "<joint name=\"j{number}\" type=\"revolute\"><parent link=\"l{number}\"/><child link=\"l{}\"/><origin xyz=\"{place}\"/>\
-             <axis xyz=\"{axis}\"/><limit lower=\"-3\" upper=\"3\" effort=\"99\" velocity=\"9\"/></joint>",
+            "<joint name=\"j{number}\" type=\"revolute\"><parent link=\"l{number}\"/><child \
+             link=\"l{}\"/><origin xyz=\"{place}\"/>\
+             <axis xyz=\"{axis}\"/><limit lower=\"-3\" upper=\"3\" effort=\"99\" velocity=\"9\"/>\
+             </joint>",
             number + 1
         );
     }
@@ -73,19 +97,27 @@ fn setup() -> Setup {
 
 /// Each joint on a sum of four sines of up to 1.2 Hz.
 fn log(setup: &Setup, samples: usize) -> String {
-    let (mut model, mut random) = (setup.model.clone(), Random::new(5));
+    let (mut model, mut random) = (setup.robot.model.clone(), Random::new(5));
     for link in 0..model.link_count() {
         let factor = 1.0 + random.real(0.1);
-        let body = RigidInertia::from_parameters(&model.inertias()[link].parameters().map(|p| factor * p));
+        let body =
+            RigidInertia::from_parameters(&model.inertias()[link].parameters().map(|p| factor * p));
         model.set_inertia(link, body).expect("a body");
     }
     let waves: Vec<[(f64, f64); 4]> = (0..JOINTS)
-        .map(|_| std::array::from_fn(|_| (std::f64::consts::TAU * (0.65 + random.real(0.55)), random.real(3.0))))
+        .map(|_| {
+            std::array::from_fn(|_| {
+                (
+                    std::f64::consts::TAU * (0.65 + random.real(0.55)),
+                    random.real(3.0),
+                )
+            })
+        })
         .collect();
     let base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.80665));
-    let mut kinematics = Kinematics::new(&model, setup.base_link).expect("the base");
+    let mut kinematics = Kinematics::new(&model, setup.robot.base_link).expect("the base");
     let mut dynamics = InverseDynamics::new(&model);
-    let cut = &setup.structure.sensors()[0];
+    let cut = &setup.robot.structure.sensors()[0];
     let mut text = String::from("t");
     (0..JOINTS).for_each(|joint| text += &format!(",joint/j{joint}/position"));
     ["fx", "fy", "fz", "tx", "ty", "tz"]
@@ -94,7 +126,9 @@ fn log(setup: &Setup, samples: usize) -> String {
     for i in 0..samples {
         let t = i as f64 * 1e-3;
         let of = |f: fn(f64, f64, f64) -> f64| -> Vec<f64> {
-            let sum = |waves: &[(f64, f64); 4]| waves.iter().map(|(w, phase)| 0.25 * f(*w, *phase, t)).sum();
+            let sum = |waves: &[(f64, f64); 4]| {
+                waves.iter().map(|(w, phase)| 0.25 * f(*w, *phase, t)).sum()
+            };
             waves.iter().map(sum).collect()
         };
         let position = of(|w, phase, t| (w * t + phase).sin());
@@ -111,7 +145,7 @@ fn log(setup: &Setup, samples: usize) -> String {
             let _ = write!(text, ",{:.6}", (q / STEP).round() * STEP);
         }
         for (value, deviation) in reading.force_first().into_iter().zip(NOISE) {
-            // Of variance 1: three from -1 to 1.
+            // Variance 1: the sum of three uniform numbers from -1 to 1.
             let noise = random.reals(3, 1.0).iter().sum::<f64>();
             let _ = write!(text, ",{:.5}", value + deviation * noise);
         }
@@ -124,12 +158,15 @@ fn identify_a_log(bencher: Bencher<'_, '_>, samples: usize) {
     let setup = setup();
     let text = log(&setup, samples);
     bencher.counter(ItemsCount::new(samples)).bench_local(|| {
-        let log = Log {
-            file: "log.csv".into(),
-            role: Role::Train,
-            samples: &mut text.as_bytes(),
-        };
-        let outcome = identify(&setup, vec![log], &Options::default(), &mut |_| ()).expect("an outcome");
+        let log = text.as_bytes();
+        let dataset = reading::dataset(&setup.robot, "log.csv", Role::Train, log).expect("a log");
+        let outcome = identify(
+            &setup.robot,
+            vec![dataset],
+            &Options::default(),
+            &mut |_| (),
+        )
+        .expect("an outcome");
         assert_eq!(outcome.verdict, Verdict::Identified);
         outcome
     });

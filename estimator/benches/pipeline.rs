@@ -1,25 +1,31 @@
-//! What the whole estimator costs of one core: a second of a full iCub's samples (32 joints, six F/T sensors, an IMU) at 1 kHz each, torques and contacts at 1 kHz.
+//! Load of the whole estimator on one core: a second of a full iCub's samples (32 joints, six F/T
+//! sensors, an IMU) at 1 kHz each, torques and contacts at 1 kHz.
 //!
 //! `PROPRIO_ICUB_MODELS=... taskset -c 1 cargo bench -p proprio-estimator --bench pipeline`
 //!
-//! An item is a second of the robot's time: 100 ms of it are 10 % of a core. The robot is iCub V2.5 where `PROPRIO_ICUB_MODELS` names the folder with iCubGazeboV2_5.urdf (of the
-//! PyPI package icub-models 3.2.0), else a generated one of as many joints and sensors. Readings are the robot's own, with noise, so that the gate lets them pass.
+//! An item is a second of the robot's time: 100 ms are 10 % of a core. The robot is iCub V2.5 if
+//! `PROPRIO_ICUB_MODELS` names the folder with iCubGazeboV2_5.urdf (of the PyPI package icub-models
+//! 3.2.0), else a generated robot with the same number of joints and sensors. Readings are
+//! simulated with noise, so that they pass the gate of identification.
 //!
-//! `Standing`: on a fixed base that carries it, so that the trunk tells nothing, and limbs are identified each by itself. `Free`: balancing on one foot beyond its F/T sensor,
-//! kinematics from an IMU: all of it is one group of 426 unknowns, the most there can be. The links are a tenth heavier or lighter than CAD has them.
+//! `Standing`: on a fixed base, so that the trunk is not identifiable and each limb is a component
+//! of its own. `Free`: balancing on one foot beyond its F/T sensor, kinematics from an IMU: the
+//! robot is one component of 426 unknowns, the largest possible. The links are a tenth heavier or
+//! lighter than in CAD.
 
-#[path = "../tests/common/mod.rs"]
+#[path = "../dynamics/tests/common/mod.rs"]
 mod common;
 
 use common::Random;
 use divan::Bencher;
 use divan::counter::ItemsCount;
+use proprio_dynamics::model::{Frame, Model};
+use proprio_dynamics::spatial::{Pose, RigidInertia, Vec3, Wrench};
+use proprio_dynamics::{ExternalWrench, FrameMotion, InverseDynamics, JointState, Kinematics};
 use proprio_estimator::config::Config;
-use proprio_estimator::dynamics::{ExternalWrench, FrameMotion, InverseDynamics, JointState, Kinematics};
-use proprio_estimator::model::{Frame, Model};
 use proprio_estimator::pipeline::Pipeline;
-use proprio_estimator::setup::{Setup, Use};
-use proprio_estimator::spatial::{Pose, RigidInertia, Vec3, Wrench};
+use proprio_estimator::setup::Setup;
+use proprio_identification::robot::ChannelRole;
 use proprio_topics::{Imu, JointState as Encoder, Nanos, Quality, Reading, Wrench as ForceTorque};
 use std::path::Path;
 
@@ -47,9 +53,16 @@ struct Bench {
 
 fn robot() -> (String, Vec<String>) {
     if let Some(folder) = std::env::var_os("PROPRIO_ICUB_MODELS") {
-        let text = std::fs::read_to_string(Path::new(&folder).join("iCubGazeboV2_5.urdf")).expect("the robot's file");
-        let sensors = Model::from_urdf(&text, &[]).expect("the robot").sensors().to_vec();
-        return (text, sensors.into_iter().map(|sensor| sensor.joint).collect());
+        let text = std::fs::read_to_string(Path::new(&folder).join("iCubGazeboV2_5.urdf"))
+            .expect("the robot's file");
+        let sensors = Model::from_urdf(&text, &[])
+            .expect("the robot")
+            .sensors()
+            .to_vec();
+        return (
+            text,
+            sensors.into_iter().map(|sensor| sensor.joint).collect(),
+        );
     }
     common::humanoid()
 }
@@ -61,9 +74,12 @@ fn setup(base: Base, rate_hz: Option<f64>) -> Setup {
     let root = model.link_name(0);
     let mut toml = String::from("schema = 1\nrobot = \"bench\"\nmodel = \"robot.urdf\"\n");
     toml += &match base {
-        Base::Standing => format!("[base]\nkind = \"fixed\"\nlink = \"{root}\"\ngravity_mps2 = [0.0, 0.0, -9.80665]\n"),
+        Base::Standing => format!(
+            "[base]\nkind = \"fixed\"\nlink = \"{root}\"\ngravity_mps2 = [0.0, 0.0, -9.80665]\n"
+        ),
         Base::Free => format!(
-            "[base]\nkind = \"imu\"\nsensor = \"imu\"\nlink = \"{root}\"\n[[contact]]\nname = \"trunk\"\nlink = \"{root}\"\npresence = \"possible\"\n"
+            "[base]\nkind = \"imu\"\nsensor = \"imu\"\nlink = \"{root}\"\n[[contact]]\nname = \
+             \"trunk\"\nlink = \"{root}\"\npresence = \"possible\"\n"
         ),
     };
     for (number, joint) in sensors.iter().enumerate() {
@@ -71,7 +87,8 @@ fn setup(base: Base, rate_hz: Option<f64>) -> Setup {
             .joint_links(model.joint(joint).expect("its joint"))
             .expect("its links");
         toml += &format!(
-            "[[force_torque]]\nsensor = \"ft{number}\"\njoint = \"{joint}\"\nframe = \"child\"\ndirection = \"child_to_parent\"\n\
+            "[[force_torque]]\nsensor = \"ft{number}\"\njoint = \"{joint}\"\nframe = \"child\"\n\
+             direction = \"child_to_parent\"\n\
              [[contact]]\nname = \"touch{number}\"\nlink = \"{child}\"\npresence = \"possible\"\n"
         );
     }
@@ -90,14 +107,16 @@ fn setup(base: Base, rate_hz: Option<f64>) -> Setup {
 impl Bench {
     fn new(base: Base, rate_hz: Option<f64>) -> Self {
         let setup = setup(base, rate_hz);
-        let (mut model, mut random) = (setup.model.clone(), Random::new(1));
+        let (mut model, mut random) = (setup.robot.model.clone(), Random::new(1));
         for link in 0..model.link_count() {
             let factor = 1.0 + random.real(0.1);
-            let body = RigidInertia::from_parameters(&model.inertias()[link].parameters().map(|p| factor * p));
+            let body = RigidInertia::from_parameters(
+                &model.inertias()[link].parameters().map(|p| factor * p),
+            );
             model.set_inertia(link, body).expect("a body");
         }
         let model = &model;
-        // The foot: the outermost of the links that follow a sensor.
+        // The foot: the last of the links after a sensor.
         let depth = |mut link: usize| {
             let mut depth = 0;
             while link > 0 {
@@ -105,10 +124,10 @@ impl Bench {
             }
             depth
         };
-        let sensors = setup.structure.sensors();
+        let sensors = setup.robot.structure.sensors();
         let stance = (0..sensors.len()).max_by_key(|&number| depth(sensors[number].joint() + 1));
         let stance = stance.filter(|_| matches!(base, Base::Free));
-        let mut kinematics = Kinematics::new(model, setup.base_link).expect("the base");
+        let mut kinematics = Kinematics::new(model, setup.robot.base_link).expect("the base");
         let mut inverse = InverseDynamics::new(model);
         let dofs = model.dof_count();
         let waves: Vec<(f64, f64, f64)> = (0..dofs)
@@ -120,7 +139,9 @@ impl Bench {
         let readings = (0..PERIOD)
             .map(|millisecond| {
                 let t = millisecond as f64 * 1e-3;
-                let of = |f: fn(&(f64, f64, f64), f64) -> f64| waves.iter().map(|wave| f(wave, t)).collect::<Vec<_>>();
+                let of = |f: fn(&(f64, f64, f64), f64) -> f64| {
+                    waves.iter().map(|wave| f(wave, t)).collect::<Vec<_>>()
+                };
                 let position = of(|(a, w, p), t| a * (w * t + p).sin());
                 let velocity = of(|(a, w, p), t| a * w * (w * t + p).cos());
                 let acceleration = of(|(a, w, p), t| -a * w * w * (w * t + p).sin());
@@ -129,7 +150,7 @@ impl Bench {
                     velocity: &velocity,
                     acceleration: &acceleration,
                 };
-                // Free, it swings to and fro as it pleases the IMU.
+                // With a free base, the base swings to and fro, and the IMU measures it.
                 let swing = match base {
                     Base::Standing => 0.0,
                     Base::Free => 0.5 * (std::f64::consts::TAU * 0.25 * t).sin(),
@@ -137,11 +158,15 @@ impl Bench {
                 let down = Vec3::new(9.80665 * f64::sin(swing), 0.0, -9.80665 * f64::cos(swing));
                 let motion = FrameMotion::standing(&down);
                 kinematics.update(model, state, &motion).expect("a state");
-                inverse.update(model, &kinematics, &[]).expect("no wrenches");
+                inverse
+                    .update(model, &kinematics, &[])
+                    .expect("no wrenches");
                 if let Some(number) = stance {
-                    // What would carry the base carries the foot instead.
+                    // The ground reaction acts on the foot instead of the base.
                     let link = sensors[number].joint() + 1;
-                    let in_world = kinematics.pose(kinematics.base()).wrench(&inverse.base_wrench());
+                    let in_world = kinematics
+                        .pose(kinematics.base())
+                        .wrench(&inverse.base_wrench());
                     let carried = ExternalWrench {
                         frame: Frame {
                             link,
@@ -149,33 +174,41 @@ impl Bench {
                         },
                         wrench: kinematics.pose(link).wrench_back(&in_world),
                     };
-                    inverse.update(model, &kinematics, &[carried]).expect("a wrench");
+                    inverse
+                        .update(model, &kinematics, &[carried])
+                        .expect("a wrench");
                     assert!(inverse.base_wrench().force.norm() < 1e-6);
                 }
-                let reading = |role: Use| match role {
-                    Use::Joint(dof) => Reading::Joint(Encoder {
+                let reading = |role: ChannelRole| match role {
+                    ChannelRole::Joint(dof) => Reading::Joint(Encoder {
                         position: position[dof],
                         ..Encoder::ABSENT
                     }),
-                    Use::Sensor(number) => {
-                        let cut = &setup.structure.sensors()[number];
-                        let Wrench { torque, force } = cut.reading(&inverse.transmitted(&kinematics, cut.joint()));
+                    ChannelRole::Sensor(number) => {
+                        let cut = &setup.robot.structure.sensors()[number];
+                        let Wrench { torque, force } =
+                            cut.reading(&inverse.transmitted(&kinematics, cut.joint()));
                         Reading::Wrench(ForceTorque {
                             force: force.into(),
                             torque: torque.into(),
                         })
                     }
-                    Use::Base => Reading::Imu(Imu {
+                    ChannelRole::Base => Reading::Imu(Imu {
                         proper_acceleration: motion.proper_acceleration.into(),
                         angular_velocity: [0.0; 3],
                         angular_acceleration: [0.0; 3],
                         ..Imu::ABSENT
                     }),
                 };
-                setup.channels().iter().map(|channel| reading(channel.role)).collect()
+                setup
+                    .robot
+                    .channels
+                    .iter()
+                    .map(|channel| reading(channel.role))
+                    .collect()
             })
             .collect();
-        let touch = stance.and_then(|number| setup.contact(&format!("touch{number}")));
+        let touch = stance.and_then(|number| setup.robot.contact(&format!("touch{number}")));
         assert_eq!(touch.is_some(), stance.is_some());
         let mut pipeline = Pipeline::new(setup);
         if let Some(contact) = touch {
@@ -190,7 +223,7 @@ impl Bench {
         if rate_hz.is_some() {
             assert!(bench.pipeline.identification_refused().is_none());
         }
-        // Until solutions judge rows, and noise is known.
+        // Until the gate uses solutions and the noise is known.
         (0..4).for_each(|_| bench.second(true));
         bench
     }
@@ -203,7 +236,7 @@ impl Bench {
                 let mut reading = *reading;
                 if let Reading::Wrench(wrench) = &mut reading {
                     let six = wrench.force.iter_mut().chain(&mut wrench.torque);
-                    // Of a uniform distribution with that deviation.
+                    // Uniform distribution with this standard deviation.
                     six.zip(NOISE)
                         .for_each(|(x, noise)| *x += self.random.real(1.732 * noise));
                 }
@@ -219,7 +252,7 @@ impl Bench {
         }
     }
 
-    /// What was learnt from, in every group: or the benchmark measures something else.
+    /// Checks that every component uses its rows: otherwise the benchmark measures something else.
     fn check(&self) {
         let online = self.pipeline.identification().expect("it identifies");
         for group in 0..online.component_count() {
@@ -241,8 +274,12 @@ fn a_estimates(bencher: Bencher<'_, '_>, base: Base) {
         .bench_local(|| bench.second(false));
 }
 
-/// With identification: rows at this rate, and what solves for the parameters once a second, in whatever thread.
-#[divan::bench(args = [(Base::Standing, 100.0), (Base::Free, 100.0)], sample_count = 10, sample_size = 1)]
+/// With identification: rows at this rate, and the solver once a second, in any thread.
+#[divan::bench(
+    args = [(Base::Standing, 100.0), (Base::Free, 100.0)],
+    sample_count = 10,
+    sample_size = 1
+)]
 fn b_estimates_and_learns(bencher: Bencher<'_, '_>, (base, rate): (Base, f64)) {
     let mut bench = Bench::new(base, Some(rate));
     bencher
@@ -251,8 +288,12 @@ fn b_estimates_and_learns(bencher: Bencher<'_, '_>, (base, rate): (Base, f64)) {
     bench.check();
 }
 
-/// Of that what the data plane does: without the solutions.
-#[divan::bench(args = [(Base::Standing, 100.0), (Base::Free, 100.0)], sample_count = 10, sample_size = 1)]
+/// The part of that in the data plane: without the solver.
+#[divan::bench(
+    args = [(Base::Standing, 100.0), (Base::Free, 100.0)],
+    sample_count = 10,
+    sample_size = 1
+)]
 fn c_of_which_in_the_data_plane(bencher: Bencher<'_, '_>, (base, rate): (Base, f64)) {
     let mut bench = Bench::new(base, Some(rate));
     bencher

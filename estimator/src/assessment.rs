@@ -1,35 +1,36 @@
-//! How good a run of estimates over a recorded log was: `proprio estimate --assess`.
+//! Accuracy of the estimates of a recorded log: `proprio estimate --assess`.
 //!
 //! | figure | meaning |
 //! |---|---|
-//! | predicted | error of F/T readings predicted with the parameters in force: [`Predicted`] |
+//! | predicted | error of F/T readings predicted with the parameters in use: [`Predicted`] |
 //! | residuals | per sub-tree, the share within two standard deviations |
-//! | torques | per joint with a measured torque, the error of the estimated one, and its share |
+//! | torques | per joint with a measured torque, the error of the estimate, and the same share |
 //!
-//! What was identified on-line was learnt from the past alone, so each instant is one that the
-//! parameters were not fitted to. Where nothing unknown acts and deviations are right, 97.7 % of
-//! residuals are covered (theirs is one-sided, [`proprio_topics::Residual::significance`]), and
-//! 95.4 % of torques, less what the measured torque's own noise and friction (and, measured at the
-//! motor, the rotor's inertia) take, which no deviation states.
+//! Parameters identified on-line depend on the past alone, so they were not fitted to the instant
+//! at which they are assessed. Without disturbances and with correct standard deviations, 97.7 % of
+//! residuals are covered (the test is one-sided, [`proprio_topics::Residual::significance`]), and
+//! 95.4 % of torques. The share of torques is smaller if the measured torque contains noise and
+//! friction (and, at the motor, the rotor's inertia), which the standard deviations do not include.
 
-use crate::identify::instants::{Instant, RecordingError};
-use crate::identify::{self, InForce, Predicted};
 use crate::pipeline::{Estimate, Pipeline};
+use crate::reading::{self, ReadingError};
 use crate::setup::Setup;
+use proprio_identification::dataset::observation::Observation;
+use proprio_identification::{InForce, Predicted, Robot, Role, judged, predicted};
 use proprio_topics::{JointTorque, Nanos};
 use std::io::Read;
 
 /// Standard deviations within which an error counts as covered.
 const WITHIN: f64 = 2.0;
 
-/// Collects, estimate by estimate, what the figures need.
+/// Collects the figures, estimate by estimate.
 pub struct Assessor {
-    /// Without identified parameters.
-    cad: Setup,
-    instants: Vec<Instant>,
+    /// The robot with the URDF's parameters.
+    robot: Robot,
+    instants: Vec<Observation>,
     /// The first instant that no estimate has reached yet.
     next: usize,
-    /// The last estimate: when, and the torques.
+    /// The last estimate: its instant and torques.
     last: Option<(Nanos, Vec<JointTorque>)>,
     course: Vec<InForce>,
     joints: Vec<Tally>,
@@ -39,25 +40,24 @@ pub struct Assessor {
 /// The figures of a log.
 #[derive(Clone, Debug)]
 pub struct Assessment {
-    /// How well readings are predicted by CAD's parameters and by those in force.
+    /// Prediction errors of the readings, with the CAD parameters and with those in use.
     pub predicted: Predicted,
-    /// How often other parameters came into force.
+    /// How often the parameters in use changed.
     pub changes: usize,
-    /// Per sub-tree that can be tested, the name of its top link.
+    /// Per sub-tree that can be tested: the name of its top link, and its coverage.
     pub residuals: Vec<(String, Coverage)>,
-    /// Per joint with a measured torque, its name.
+    /// Per joint with a measured torque: its name, and its coverage.
     pub torques: Vec<(String, Coverage)>,
 }
 
-/// How often errors were as little as stated.
+/// How often errors were within the stated standard deviations.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Coverage {
-    /// RMS error: of torques \[Nm\]; of residuals, those that are more than usual, in standard
-    /// deviations.
+    /// RMS error: of torques \[Nm\]; of residuals, the positive deviates, in standard deviations.
     pub rms: f64,
     /// The share within two stated standard deviations.
     pub covered: f64,
-    /// How many numbers.
+    /// Number of values.
     pub count: u64,
 }
 
@@ -86,20 +86,20 @@ impl Tally {
 }
 
 impl Assessor {
-    /// Reads the log, once before estimates are made of it.
+    /// Reads the log. Call it before the estimates are computed.
     ///
     /// # Errors
     /// The log can not be read.
-    pub fn new(setup: &Setup, log: impl Read) -> Result<Self, RecordingError> {
-        let cad = setup.as_configured();
+    pub fn new(setup: &Setup, log: impl Read) -> Result<Self, ReadingError> {
+        let robot = setup.robot.clone();
         Ok(Self {
-            instants: identify::judged_instants(&cad, log)?,
+            instants: judged(&robot, reading::dataset(&robot, "", Role::Validate, log)?),
             next: 0,
             last: None,
             course: vec![in_force(setup, Nanos::MIN)],
-            joints: vec![Tally::default(); setup.joint_names().count()],
-            subtrees: vec![Tally::default(); setup.subtree_names().count()],
-            cad,
+            joints: vec![Tally::default(); setup.robot.joint_names().count()],
+            subtrees: vec![Tally::default(); setup.robot.subtree_names().count()],
+            robot,
         })
     }
 
@@ -111,15 +111,19 @@ impl Assessor {
             }
         }
         let (t, joints) = (estimate.t, estimate.torques.joints());
-        while let Some(instant) = self.instants.get(self.next).filter(|instant| instant.t <= t) {
+        while let Some(instant) = self
+            .instants
+            .get(self.next)
+            .filter(|instant| instant.t <= t)
+        {
             self.next += 1;
             let (before, earlier) = match &self.last {
                 Some((before, earlier)) if instant.t < t => (*before, &earlier[..]),
-                // This very instant.
+                // Exactly this instant.
                 _ if instant.t == t => (t, joints),
                 _ => continue,
             };
-            if t - before > self.cad.max_silence {
+            if t - before > self.robot.max_silence {
                 continue;
             }
             let late = if t > before {
@@ -148,14 +152,18 @@ impl Assessor {
         }
     }
 
-    /// Asks whether the estimate at `t` was the first with other parameters.
+    /// Records the parameters in use if the estimate at `t` is the first with other ones.
     pub(crate) fn parameters(&mut self, t: Nanos, pipeline: &mut Pipeline) {
         if pipeline.inertia().is_none() {
             return;
         }
         let now = in_force(pipeline.setup(), t);
-        // Offsets alone may have changed.
-        if self.course.last().is_none_or(|last| last.bodies != now.bodies) {
+        // It may be that only offsets have changed.
+        if self
+            .course
+            .last()
+            .is_none_or(|last| last.bodies != now.bodies)
+        {
             self.course.push(now);
         }
     }
@@ -170,20 +178,20 @@ impl Assessor {
                 .collect()
         };
         Assessment {
-            // Instants of this very robot are not refused.
-            predicted: identify::predicted(&self.cad, &self.instants, &self.course).unwrap_or_default(),
+            // No error: the observations are of the same robot.
+            predicted: predicted(&self.robot, &self.instants, &self.course).unwrap_or_default(),
             changes: self.course.len() - 1,
-            residuals: named(self.cad.subtree_names().collect(), &self.subtrees),
-            torques: named(self.cad.joint_names().collect(), &self.joints),
+            residuals: named(self.robot.subtree_names().collect(), &self.subtrees),
+            torques: named(self.robot.joint_names().collect(), &self.joints),
         }
     }
 }
 
-/// What a setup works with, from `since` on.
+/// The parameters of a setup, in use from `since` on.
 fn in_force(setup: &Setup, since: Nanos) -> InForce {
     InForce {
         since,
-        bodies: setup.model.inertias().to_vec(),
-        calibrations: setup.calibrations.clone(),
+        bodies: setup.state.model.inertias().to_vec(),
+        calibrations: setup.state.calibrations.clone(),
     }
 }

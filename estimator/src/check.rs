@@ -1,59 +1,62 @@
-//! What a configuration comes to, in numbers that somebody who knows the robot can compare with it
-//! before anything runs: `estimator --check` prints it after the plan.
+//! Plausibility figures of a configuration, for a person who knows the robot: `estimator --check`
+//! prints them after the setup.
 //!
 //! - masses: of the whole robot, and beyond each F/T sensor;
-//! - what the F/T sensors would read, offsets aside, with the robot held still by its root link,
-//!   whose z axis is up, all joints at zero (or the limit nearest to it, or where they are locked),
-//!   and nothing touching it;
-//! - joints whose effort limit could not hold the limb beyond them: masses or limits in other units;
-//! - torques of sub-trees with an F/T sensor that can never be determined, for contacts that are
-//!   always present leave more unknown than the equations tell.
+//! - the readings of the F/T sensors without offsets, with the robot held at rest by its root link,
+//!   whose z axis is up, all joints at zero (or the nearest limit, or their locked position), and
+//!   without contacts;
+//! - joints whose effort limit could not hold the limb beyond them: masses or limits are in other
+//!   units;
+//! - joints of sub-trees with an F/T sensor whose torque can never be determined, because the
+//!   contacts that are always present have more unknowns than there are equations.
 
 use crate::config::STANDARD_GRAVITY;
-use crate::dynamics::{Certainty, DynamicsError, FrameMotion, InverseDynamics, JointState, Kinematics, Solver};
-use crate::model::Limits;
 use crate::setup::{Setup, gravity_loads};
-use crate::spatial::{Vec3, Wrench};
+use proprio_dynamics::model::Limits;
+use proprio_dynamics::spatial::{Vec3, Wrench};
+use proprio_dynamics::{
+    Certainty, DynamicsError, FrameMotion, InverseDynamics, JointState, Kinematics, Solver,
+};
 use std::fmt;
 
-/// The weight of a limb's links has this moment at the most, stretched out, of what its joint can
-/// hold: the bound adds up lengths that no posture has all in one line.
+/// Largest credible gravity load of a limb, stretched out, as a multiple of its joint's effort
+/// limit. It is above one because no posture has all lengths in one line.
 const HOLDS: f64 = 10.0;
 
-/// The numbers.
+/// The plausibility figures.
 #[derive(Clone, Debug)]
 pub struct Check {
-    /// Of all links \[kg\].
+    /// Mass of all links \[kg\].
     pub mass: f64,
-    /// Per F/T sensor.
+    /// Per F/T sensor, its load at rest.
     pub sensors: Vec<AtRest>,
-    /// Joints that could not hold their limb: the name, the moment of the limb's weight, stretched
+    /// Joints that could not hold their limb: the name, the gravity load of the limb, stretched
     /// out, and the effort limit [Nm or N].
     pub overloaded: Vec<(String, f64, f64)>,
-    /// Joints whose torque can not be determined while what is always present is.
+    /// Joints whose torque cannot be determined while all always present contacts are there.
     pub undetermined: Vec<String>,
-    /// Contacts that are always present on a sub-tree that has such joints.
+    /// The always present contacts of the sub-trees with such joints.
     pub hiding: Vec<String>,
 }
 
-/// What an F/T sensor carries at rest.
+/// The load of an F/T sensor at rest.
 #[derive(Clone, Debug)]
 pub struct AtRest {
     /// Its channel.
     pub name: String,
-    /// Of the links beyond it, seen from the root \[kg\].
+    /// Mass of the links beyond it, seen from the root \[kg\].
     pub mass: f64,
-    /// What it would read without offset, in its measurement frame.
+    /// Its reading without offset, in its measurement frame.
     pub reading: Wrench,
 }
 
 impl Check {
-    /// Of a configuration.
+    /// The figures of a configuration.
     ///
     /// # Errors
-    /// Not with a [`Setup`] that was built by its own constructors.
+    /// Never with a [`Setup`] from its own constructors.
     pub fn of(setup: &Setup) -> Result<Self, DynamicsError> {
-        let model = &setup.model;
+        let model = &setup.state.model;
         let bodies = model.inertias();
         let mut beyond: Vec<f64> = bodies.iter().map(|body| body.mass).collect();
         for joint in model.joints().iter().rev() {
@@ -78,7 +81,12 @@ impl Check {
         ))?;
         let mut dynamics = InverseDynamics::new(model);
         dynamics.update(model, &kinematics, &[])?;
-        let cuts = setup.structure.sensors().iter().zip(setup.sensor_names());
+        let cuts = setup
+            .robot
+            .structure
+            .sensors()
+            .iter()
+            .zip(setup.robot.sensor_names());
         let sensors = cuts.map(|(cut, name)| AtRest {
             name: name.to_owned(),
             mass: beyond[cut.joint() + 1],
@@ -86,49 +94,69 @@ impl Check {
         });
         let sensors: Vec<AtRest> = sensors.collect();
         let loads = gravity_loads(model);
-        let overloaded = model.joints().iter().enumerate().filter_map(|(number, joint)| {
-            let (dof, effort) = (joint.dof?, model.effort(number)?);
-            (loads[dof] > HOLDS * effort).then(|| (model.dof_name(dof).to_owned(), loads[dof], effort))
-        });
-        // In no particular posture: where axes meet, more can seem determined, or less.
+        let overloaded = model
+            .joints()
+            .iter()
+            .enumerate()
+            .filter_map(|(number, joint)| {
+                let (dof, effort) = (joint.dof?, model.effort(number)?);
+                (loads[dof] > HOLDS * effort)
+                    .then(|| (model.dof_name(dof).to_owned(), loads[dof], effort))
+            });
+        // A general posture: where axes are aligned, the result would be a special case.
         let somewhere = |limits: Limits| limits.lower + 0.618 * (limits.upper - limits.lower);
         let kinematics = pose(&positions(setup, somewhere, 0.7))?;
-        let mut solver = Solver::new(&setup.structure);
+        let mut solver = Solver::new(&setup.robot.structure);
         let nothing = vec![Wrench::zero(); sensors.len()];
-        solver.solve(model, &setup.structure, &kinematics, &nothing, &setup.always, &[])?;
+        solver.solve(
+            model,
+            &setup.robot.structure,
+            &kinematics,
+            &nothing,
+            &setup.robot.always,
+            &[],
+        )?;
         let certainty = solver.torque_certainty();
         let subtree_of = |dof: usize| {
-            let link = setup.structure.link_of(dof)?;
-            setup.structure.subtree_of(link)
+            let link = setup.robot.structure.link_of(dof)?;
+            setup.robot.structure.subtree_of(link)
         };
-        let subtrees = setup.structure.subtrees();
-        // Who has no F/T sensor there wants no torques of it.
-        let is_measured = |dof| subtree_of(dof).is_some_and(|number| !subtrees[number].sensors.is_empty());
+        let subtrees = setup.robot.structure.subtrees();
+        // Sub-trees without an F/T sensor are not expected to give torques.
+        let is_measured =
+            |dof| subtree_of(dof).is_some_and(|number| !subtrees[number].sensors.is_empty());
         let lost: Vec<usize> = (0..model.dof_count())
-            .filter(|&dof| setup.locked[dof].is_nan() && certainty[dof] == Certainty::Assumed)
+            .filter(|&dof| setup.robot.locked[dof].is_nan() && certainty[dof] == Certainty::Assumed)
             .filter(|&dof| is_measured(dof))
             .collect();
         let hiding = subtrees.iter().enumerate();
-        let hiding = hiding.filter(|(number, _)| lost.iter().any(|dof| subtree_of(*dof) == Some(*number)));
-        let hiding = hiding.flat_map(|(_, subtree)| subtree.contacts.intersection(&setup.always).iter());
+        let hiding =
+            hiding.filter(|(number, _)| lost.iter().any(|dof| subtree_of(*dof) == Some(*number)));
+        let hiding = hiding
+            .flat_map(|(_, subtree)| subtree.contacts.intersection(&setup.robot.always).iter());
         Ok(Self {
             mass: bodies.iter().map(|body| body.mass).sum(),
             sensors,
             overloaded: overloaded.collect(),
-            hiding: hiding.map(|contact| setup.contact_label(contact).to_owned()).collect(),
-            undetermined: lost.into_iter().map(|dof| model.dof_name(dof).to_owned()).collect(),
+            hiding: hiding
+                .map(|contact| setup.robot.contact_label(contact).to_owned())
+                .collect(),
+            undetermined: lost
+                .into_iter()
+                .map(|dof| model.dof_name(dof).to_owned())
+                .collect(),
         })
     }
 
-    /// Why it can not be what is meant, and what to do; none if it can.
+    /// The problem and what to do about it; none if there is no problem.
     #[must_use]
     pub fn problem(&self) -> Option<String> {
         (!self.undetermined.is_empty()).then(|| {
             format!(
-                "the torque of {} can never be determined while {} are present, as they always are \
-                 unless declared absent: their wrenches are more than six equations tell; give all but \
-                 one presence = \"possible\", or a kind with fewer unknowns, or put an F/T sensor \
-                 between them",
+                "the torque of {} can never be determined: the contacts {} are always present \
+                 unless declared absent, and their wrenches have more unknowns than the six \
+                 equations of the sub-tree; give all but one presence = \"possible\", or a kind \
+                 with fewer unknowns, or put an F/T sensor between them",
                 self.undetermined.join(", "),
                 self.hiding.join(", ")
             )
@@ -136,13 +164,17 @@ impl Check {
     }
 }
 
-/// Positions of all degrees of freedom: where they are locked, where `within` says of their limits,
-/// else `without`.
+/// Positions of all degrees of freedom: the locked position; else `within` of the limits; else,
+/// without limits, `without`.
 fn positions(setup: &Setup, within: impl Fn(Limits) -> f64, without: f64) -> Vec<f64> {
-    let mut positions = setup.locked.clone();
-    for (number, joint) in setup.model.joints().iter().enumerate() {
+    let mut positions = setup.robot.locked.clone();
+    for (number, joint) in setup.state.model.joints().iter().enumerate() {
         if let Some(dof) = joint.dof.filter(|&dof| positions[dof].is_nan()) {
-            let limits = setup.model.limits(number).filter(|limits| limits.upper > limits.lower);
+            let limits = setup
+                .state
+                .model
+                .limits(number)
+                .filter(|limits| limits.upper > limits.lower);
             positions[dof] = limits.map_or(without, &within);
         }
     }
@@ -155,25 +187,31 @@ impl fmt::Display for Check {
         if !self.sensors.is_empty() {
             writeln!(
                 f,
-                "held still by the root link, its z axis up, joints at zero, nothing touching, \
-                 F/T sensors would read, offsets aside:"
+                "readings of the F/T sensors without offsets, robot held at rest by the root link \
+                 (z axis up), joints at zero, no contacts:"
             )?;
         }
-        for AtRest { name, mass, reading } in &self.sensors {
-            // Without the sign of what is nothing.
+        for AtRest {
+            name,
+            mass,
+            reading,
+        } in &self.sensors
+        {
+            // Adding 0.0 turns -0 into 0.
             let list = |three: Vec3| three.map(|x| (1e3 * x).round() / 1e3 + 0.0);
             let ([fx, fy, fz], [tx, ty, tz]): ([f64; 3], [f64; 3]) =
                 (list(reading.force).into(), list(reading.torque).into());
             writeln!(
                 f,
-                "  {name}: force [{fx}, {fy}, {fz}] N, torque [{tx}, {ty}, {tz}] Nm, of {mass:.3} kg beyond it"
+                "  {name}: force [{fx}, {fy}, {fz}] N, torque [{tx}, {ty}, {tz}] Nm, from \
+                 {mass:.3} kg beyond it"
             )?;
         }
         for (joint, load, effort) in &self.overloaded {
             writeln!(
                 f,
-                "note: {joint} has an effort limit of {effort} in the URDF, and a limb whose weight \
-                 has a moment of up to {load:.1} Nm: one of the two is in other units"
+                "note: {joint} has an effort limit of {effort} in the URDF, but the weight of its \
+                 limb has a moment of up to {load:.1} Nm; check the units of both"
             )?;
         }
         Ok(())

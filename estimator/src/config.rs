@@ -1,13 +1,18 @@
-//! estimator.toml: as typed ([`Config`]), with every key's meaning and default.
+//! estimator.toml as typed ([`Config`]), with the meaning and default of every key.
 //!
-//! [`crate::setup`] checks it against the model and resolves names; nothing after that sees this form.
+//! [`crate::setup`] checks it against the model and resolves names; the rest of the estimator uses
+//! that form.
 
-use crate::calibration::{Calibration, UNKNOWN_OFFSET, gain_from_force_first};
-use crate::spatial::Wrench;
+use proprio_dynamics::calibration::{Calibration, Gain, UNKNOWN_OFFSET, gain_from_force_first};
+use proprio_dynamics::spatial::Wrench;
+use proprio_identification::robot::{IdentificationInput, TorqueSide};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+
+/// Keys that had another name in an earlier version.
+const RENAMED: [(&str, &str); 1] = [("model_std", "urdf_relative_std")];
 
 /// A configuration that can not be used: exit 2.
 #[derive(Debug, thiserror::Error)]
@@ -15,7 +20,7 @@ use std::path::{Path, PathBuf};
 pub struct ConfigError {
     /// The file.
     pub file: PathBuf,
-    /// Where in it, what is wrong, and what would be legal.
+    /// Where in the file, what is wrong, and what is allowed.
     pub problem: String,
 }
 
@@ -23,19 +28,20 @@ pub struct ConfigError {
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// The version of this form: 1.
+    /// The version of the file format: 1.
     pub schema: u32,
     /// The robot's name: the first part of every service's name.
     pub robot: String,
     /// The URDF, relative to this file.
     pub model: PathBuf,
-    /// Identified parameters and offsets ([`crate::parameters`]), relative to this file: they win over the URDF's inertias and this file's offsets.
+    /// Identified parameters and offsets ([`crate::parameters`]), relative to this file. They
+    /// replace the URDF's inertias and this file's offsets.
     pub parameters: Option<PathBuf>,
     /// How the estimator's thread is scheduled.
     pub realtime: Option<Realtime>,
     /// Where kinematics start.
     pub base: Base,
-    /// Joints nobody measures, and where they are \[rad or m\].
+    /// Joints that are not measured, and their fixed positions \[rad or m\].
     #[serde(default)]
     pub locked: BTreeMap<String, f64>,
     /// The force/torque sensors, at which the tree is cut.
@@ -44,13 +50,13 @@ pub struct Config {
     /// The unknown external wrenches.
     #[serde(default)]
     pub contact: Vec<Contact>,
-    /// What is identified from which measurements.
+    /// What is identified, and from which measurements.
     #[serde(default)]
     pub identification: Identification,
-    /// How velocities and accelerations are had.
+    /// How positions and angular velocities are differentiated.
     #[serde(default)]
     pub differentiation: Differentiation,
-    /// How samples are taken in.
+    /// How samples are accepted.
     #[serde(default)]
     pub input: Input,
     /// When and what is published.
@@ -72,7 +78,7 @@ pub struct Realtime {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
 pub enum Base {
-    /// A link that stands still. It implies an unknown wrench on that link: what it stands on.
+    /// A link at rest. It implies an unknown wrench on that link: the ground reaction.
     Fixed {
         /// The link or folded frame.
         link: String,
@@ -80,7 +86,7 @@ pub enum Base {
         #[serde(default = "standard_gravity", deserialize_with = "exactly")]
         gravity_mps2: [f64; 3],
     },
-    /// One of several links stands still, which one changes: the feet of a walking robot.
+    /// One of several links is at rest, and which one changes: the feet of a walking robot.
     Stance {
         /// The links, in order of preference: the first whose contact is present is the base.
         foot: Vec<Foot>,
@@ -89,32 +95,34 @@ pub enum Base {
     Imu {
         /// Its channel.
         sensor: String,
-        /// The link or folded frame it sits on.
+        /// The link or folded frame that it is mounted on.
         link: String,
         /// Its origin in that frame \[m\].
         #[serde(default, deserialize_with = "exactly")]
         xyz_m: [f64; 3],
-        /// Its axes in that frame: roll, pitch, yaw about fixed axes, as URDF has it \[rad\].
+        /// Its axes in that frame: roll, pitch, yaw about fixed axes, as in URDF \[rad\].
         #[serde(default, deserialize_with = "exactly")]
         rpy_rad: [f64; 3],
     },
 }
 
-/// A link that stands still while its contact is present.
+/// A link that is at rest while its contact is present.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Foot {
     /// The link or folded frame.
     pub link: String,
-    /// Physical gravity, pointing down, in the axes of `link` while it stands \[m/s^2\].
+    /// Physical gravity, pointing down, in the axes of `link` while it is at rest \[m/s^2\].
     #[serde(default = "standard_gravity", deserialize_with = "exactly")]
     pub gravity_mps2: [f64; 3],
     /// The name of the contact, of kind `wrench` and on this link, that carries the robot there.
     pub contact: String,
 }
 
-/// Exactly so many numbers: an array alone takes the first ones of more.
-pub(crate) fn exactly<'de, D: Deserializer<'de>, const N: usize>(deserializer: D) -> Result<[f64; N], D::Error> {
+/// Exactly `N` numbers: a plain array would silently take the first `N` of more.
+pub(crate) fn exactly<'de, D: Deserializer<'de>, const N: usize>(
+    deserializer: D,
+) -> Result<[f64; N], D::Error> {
     let numbers = Vec::<f64>::deserialize(deserializer)?;
     let given = numbers.len();
     numbers
@@ -122,7 +130,9 @@ pub(crate) fn exactly<'de, D: Deserializer<'de>, const N: usize>(deserializer: D
         .map_err(|_| D::Error::custom(format!("{given} numbers where {N} are needed")))
 }
 
-fn exactly_if_given<'de, D: Deserializer<'de>, const N: usize>(deserializer: D) -> Result<Option<[f64; N]>, D::Error> {
+fn exactly_if_given<'de, D: Deserializer<'de>, const N: usize>(
+    deserializer: D,
+) -> Result<Option<[f64; N]>, D::Error> {
     exactly(deserializer).map(Some)
 }
 
@@ -139,47 +149,57 @@ const fn standard_gravity() -> [f64; 3] {
 pub struct ForceTorque {
     /// Its channel.
     pub sensor: String,
-    /// The URDF joint that it sits in; the tree is cut here.
+    /// The URDF joint that it is mounted in; the tree is cut here.
     pub joint: String,
-    /// Whose axes and whose origin its reading has; default: as the URDF's sensor element says, else `child`.
+    /// The measurement frame: axes and origin of its reading; default: that of the URDF's sensor
+    /// element, else `child`.
     pub frame: Option<SensorFrame>,
-    /// Whose wrench on whom it is; default: as the URDF's sensor element says, else `child_to_parent`.
+    /// The measurement direction: which link acts on which; default: that of the URDF's sensor
+    /// element, else `child_to_parent`.
     pub direction: Option<Direction>,
     /// With `frame = "sensor"`: the sensor's origin in the child link's frame \[m\].
     #[serde(default, deserialize_with = "exactly_if_given")]
     pub xyz_m: Option<[f64; 3]>,
-    /// With `frame = "sensor"`: the sensor's axes in the child link's frame: roll, pitch, yaw \[rad\].
+    /// With `frame = "sensor"`: the sensor's axes in the child link's frame: roll, pitch, yaw
+    /// \[rad\].
     #[serde(default, deserialize_with = "exactly_if_given")]
     pub rpy_rad: Option<[f64; 3]>,
-    /// Standard deviation of its forces, `gain` applied \[N\]. The default is an iCub arm's sensor, robot still.
+    /// Standard deviation of its forces, after `gain` \[N\]. The default is that of an iCub arm's
+    /// sensor with the robot at rest.
     #[serde(default = "default_noise_n", deserialize_with = "exactly")]
     pub noise_n: [f64; 3],
-    /// Standard deviation of its torques \[Nm\]. The default as above.
+    /// Standard deviation of its torques, after `gain` \[Nm\]. The default is that of the same
+    /// sensor.
     #[serde(default = "default_noise_nm", deserialize_with = "exactly")]
     pub noise_nm: [f64; 3],
-    /// What it reads with no load: forces \[N\]. Default: nobody knows ([`UNKNOWN_OFFSET`]).
+    /// Offset of its forces: its reading without load \[N\]. Default: unknown
+    /// ([`UNKNOWN_OFFSET`]).
     #[serde(default, deserialize_with = "exactly_if_given")]
     pub offset_n: Option<[f64; 3]>,
-    /// What it reads with no load: torques \[Nm\]. Default: nobody knows ([`UNKNOWN_OFFSET`]).
+    /// Offset of its torques: its reading without load \[Nm\]. Default: unknown
+    /// ([`UNKNOWN_OFFSET`]).
     #[serde(default, deserialize_with = "exactly_if_given")]
     pub offset_nm: Option<[f64; 3]>,
-    /// Standard deviation of `offset_n` \[N\]; default: it is exact, if it is given.
+    /// Standard deviation of `offset_n` \[N\]; default: 0 if `offset_n` is given.
     #[serde(default, deserialize_with = "exactly_if_given")]
     pub offset_std_n: Option<[f64; 3]>,
-    /// Standard deviation of `offset_nm` \[Nm\]; default: it is exact, if it is given.
+    /// Standard deviation of `offset_nm` \[Nm\]; default: 0 if `offset_nm` is given.
     #[serde(default, deserialize_with = "exactly_if_given")]
     pub offset_std_nm: Option<[f64; 3]>,
-    /// What its readings are multiplied with before everything else, beyond what its board does ([`crate::calibration`]): 36 numbers row by row, rows and columns
-    /// `fx fy fz tx ty tz`, or the 6 of a diagonal; default: nothing.
+    /// Gain matrix that its readings are multiplied with first, in addition to the calibration in
+    /// its board ([`proprio_dynamics::calibration`]): 36 numbers row by row, rows and columns
+    /// `fx fy fz tx ty tz`, or the 6 of a diagonal; default: the identity.
     #[serde(default, deserialize_with = "gain_numbers")]
     pub gain: Option<Vec<f64>>,
-    /// By how much its forces change per kelvin that its board is warmer than `reference_celsius` [N/K]: that is taken off. Default: not at all.
+    /// Temperature drift of its forces, which is subtracted: change per kelvin of its board above
+    /// `reference_celsius` [N/K]. Default: none.
     #[serde(default, deserialize_with = "exactly")]
     pub temperature_n_per_k: [f64; 3],
-    /// By how much its torques do [Nm/K].
+    /// Temperature drift of its torques [Nm/K].
     #[serde(default, deserialize_with = "exactly")]
     pub temperature_nm_per_k: [f64; 3],
-    /// The temperature that its offset belongs to \[degrees Celsius\]; where temperature is identified and this is not given: the training logs' mean.
+    /// The board temperature at which its offset is valid \[degrees Celsius\]. If temperature drift
+    /// is identified and this is not given, it is the mean of the training logs.
     pub reference_celsius: Option<f64>,
 }
 
@@ -201,7 +221,7 @@ const fn default_noise_nm() -> [f64; 3] {
     [0.002, 0.003, 0.0015]
 }
 
-/// Whose axes and whose origin a force/torque reading has.
+/// The measurement frame of a force/torque sensor: axes and origin of its reading.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum SensorFrame {
@@ -213,7 +233,7 @@ pub enum SensorFrame {
     Sensor,
 }
 
-/// Whose wrench on whom a force/torque reading is.
+/// The measurement direction of a force/torque sensor: which link acts on which.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Direction {
@@ -229,7 +249,8 @@ pub enum Direction {
 pub struct Contact {
     /// Its name in tables and services; default: `link`.
     pub name: Option<String>,
-    /// The link or folded frame that it acts on; its result is in that frame's axes, about that frame's origin.
+    /// The link or folded frame that it acts on. Its wrench is given in the axes and at the origin
+    /// of that frame.
     pub link: String,
     /// How many unknowns it has.
     #[serde(default)]
@@ -237,7 +258,8 @@ pub struct Contact {
     /// The direction of a `force_along`, in the frame's axes.
     #[serde(default, deserialize_with = "exactly_if_given")]
     pub direction: Option<[f64; 3]>,
-    /// Where it acts, in the frame's axes \[m\]. A touch of a possible contact is told from others by this place.
+    /// The point where it acts, in the frame's axes \[m\]. Possible contacts are distinguished by
+    /// this point.
     #[serde(default, deserialize_with = "exactly")]
     pub position_m: [f64; 3],
     /// Whether it is always there.
@@ -262,10 +284,10 @@ pub enum ContactKind {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Presence {
-    /// It is.
+    /// It is always present, unless it is declared absent.
     #[default]
     Always,
-    /// It is taken as absent unless somebody declares it, or F/T readings show it.
+    /// It is absent unless it is declared present, or F/T readings show it.
     Possible,
 }
 
@@ -277,48 +299,42 @@ pub struct Identification {
     pub enabled: bool,
     /// From which measurements; default: the force/torque sensors. On-line they alone are used.
     pub inputs: Vec<IdentificationInput>,
-    /// Where joint torques are measured that parameters are identified from; default: beyond the gears.
+    /// Where the joint torques used for identification are measured; default: on the link side of
+    /// the gears.
     pub torque_side: TorqueSide,
-    /// At how many instants a second on-line identification looks, at the most; the trigger's rate if that is less \[Hz\].
+    /// Largest rate of on-line identification instants \[Hz\]; the trigger's rate if that is less.
     pub rate_hz: f64,
-    /// Where what was identified on-line is kept between runs of the daemon, relative to this file; default: nowhere. It wins over
-    /// `parameters`. A file that does not fit is renamed, and identification begins without it.
+    /// The file that keeps the state of on-line identification between runs of the daemon, relative
+    /// to this file; default: none. It has priority over `parameters`. A state that cannot be used
+    /// is renamed, and identification starts without it.
     pub state: Option<PathBuf>,
-    /// How often it is written \[s\]; at the end, too.
+    /// How often the state is written \[s\]. It is also written when the daemon ends.
     pub save_every_s: f64,
-    /// How far the URDF's inertias may be off, where nothing was identified: the relative standard deviation of a link's mass, and likewise of its mass
-    /// distribution ([`crate::parameters::cad_root`]). Torques that rest on such links are as uncertain as this makes them. 0: they are exact.
-    pub model_std: f64,
-    /// Whether `proprio identify` also finds out how far the gain of each force/torque sensor is off, and which entries.
+    /// Uncertainty of the URDF's inertial parameters of links that were not identified: the
+    /// relative standard deviation of a link's mass, and of its mass distribution
+    /// ([`proprio_identification::prior::cad_root`]). Torques that depend on such links get the
+    /// corresponding standard deviation. 0: they are exact.
+    pub urdf_relative_std: f64,
+    /// Whether `proprio identify` also identifies the gain error of each force/torque sensor, and
+    /// which entries of it.
     pub gain: Gain,
-    /// How far a gain may be off before anything is measured: relative standard deviation of a channel.
-    /// With `gain = "auto"` also what gains must gain: at some sensor, the error's mean square in data held
-    /// out falls by more than this squared times the mean square of what the sensor reads. Of what one force reads of another, or one torque of another, the same; of
-    /// what a force reads of a torque, this divided by the sensor's length, and of what a torque reads of a force, times that length: the ratio of its RMS `noise_nm` to its RMS `noise_n`,
-    /// which is about the ratio of its full scales.
+    /// Prior standard deviation of a gain error, relative. It holds for diagonal entries, and for
+    /// force-force and torque-torque cross-talk. For cross-talk of a torque into a force it is
+    /// divided by the sensor's length, for a force into a torque multiplied by it. The length is
+    /// the ratio of RMS `noise_nm` to RMS `noise_n`, which is about the ratio of the full scales.
+    /// With `gain = "auto"` it is also the required improvement: at one sensor or more, the mean
+    /// square error in held-out data must fall by more than the square of this number times the
+    /// mean square of the sensor's readings.
     pub gain_std: f64,
-    /// Whether `proprio identify` also finds out how readings change with the temperature of the sensor's board, where that was recorded.
+    /// Whether `proprio identify` also identifies the drift of readings with the temperature of the
+    /// sensor's board, if that was recorded.
     pub temperature: bool,
-}
-
-/// Which entries of a gain are found out.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Gain {
-    /// As many as predict data held out better than fewer do.
-    #[default]
-    Auto,
-    /// None: the workbench's gain is right.
-    None,
-    /// One for each channel.
-    Diagonal,
-    /// All 36.
-    Full,
 }
 
 impl Default for Identification {
     fn default() -> Self {
-        // What CAD leaves out (cables, screws, motors' insides) is a tenth to a third of a link's mass.
+        // Parts missing in CAD (cables, screws, insides of motors) are a tenth to a third of a
+        // link's mass.
         Self {
             enabled: false,
             inputs: Vec::new(),
@@ -326,34 +342,12 @@ impl Default for Identification {
             rate_hz: 100.0,
             state: None,
             save_every_s: 60.0,
-            model_std: 0.2,
+            urdf_relative_std: 0.2,
             gain: Gain::Auto,
             gain_std: 0.05,
             temperature: false,
         }
     }
-}
-
-/// A measurement that parameters are identified from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum IdentificationInput {
-    /// The force/torque sensors.
-    Wrench,
-    /// Measured joint torques.
-    Torque,
-}
-
-/// Where joint torques are measured.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum TorqueSide {
-    /// Between gear and link: by a joint torque sensor. Without the rotor's inertia.
-    #[default]
-    Link,
-    /// At the motor, by its current, times torque constant and gear ratio: so the rotor's inertia is in it, and is identified, one number per joint (each is taken to have a motor
-    /// of its own). As torque of the joint \[Nm; N if it slides\], like the other. Where torques are no input of identification, they are compared as they are.
-    Motor,
 }
 
 /// `[differentiation]`: velocities and accelerations from samples, by adaptive windows.
@@ -370,7 +364,8 @@ pub struct Differentiation {
 
 impl Default for Differentiation {
     fn default() -> Self {
-        // Half of 0.055 deg, iCub's coarsest encoders; and three times the noise density of a BNO055 at 100 Hz.
+        // Half of 0.055 deg, iCub's coarsest encoders; and three times the noise density of a
+        // BNO055 at 100 Hz.
         Self {
             position_noise_rad: 4.8e-4,
             angular_velocity_noise_radps: 5e-3,
@@ -379,17 +374,20 @@ impl Default for Differentiation {
     }
 }
 
-/// `[input]`: how samples are taken in.
+/// `[input]`: how samples are accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Input {
-    /// How long a channel may be silent before what depends on it is withheld \[ms\].
+    /// Longest time without a sample of a channel \[ms\]; after it, estimates that depend on the
+    /// channel are withheld.
     pub max_silence_ms: f64,
 }
 
 impl Default for Input {
     fn default() -> Self {
-        Self { max_silence_ms: 50.0 }
+        Self {
+            max_silence_ms: 50.0,
+        }
     }
 }
 
@@ -397,14 +395,16 @@ impl Default for Input {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Output {
-    /// The channel each of whose stamps gives one estimate; default: the first force/torque sensor, else the first joint.
+    /// The trigger channel: each of its stamps gives one estimate. Default: the first force/torque
+    /// sensor, else the first joint.
     pub trigger: Option<String>,
-    /// How long, counted in stamps, an estimate waits for the other channels to pass its instant \[ms\]: at the most 32 periods of
-    /// the fastest channel. A channel that has died costs this wait. The order of arrival does not matter as long as no sample
-    /// comes more than half of it behind a later one.
+    /// How long an estimate waits for the samples of other channels, counted in stamps \[ms\]; at
+    /// most 32 periods of the fastest channel. A dead channel costs this wait. The order of arrival
+    /// does not matter, provided that no sample arrives more than half of this behind a later one.
     pub max_wait_ms: f64,
-    /// A joint torque whose predicted standard deviation exceeds this is withheld \[Nm\]; default: the most that gravity can make of the links beyond the joint
-    /// ([`crate::setup::Setup::max_deviation`]).
+    /// A joint torque whose standard deviation exceeds this is withheld \[Nm\]; default: the
+    /// largest gravity load of the links beyond the joint, or a quarter of its effort limit if that
+    /// is more ([`crate::setup::Setup::max_deviation`]).
     pub max_torque_std_nm: Option<f64>,
 }
 
@@ -428,7 +428,8 @@ impl Config {
             file: file.to_owned(),
             problem,
         };
-        let text = std::fs::read_to_string(file).map_err(|e| error(format!("can not be read: {e}")))?;
+        let text =
+            std::fs::read_to_string(file).map_err(|e| error(format!("can not be read: {e}")))?;
         let mut config = Self::parse(&text).map_err(error)?;
         let folder = file.parent().unwrap_or(Path::new("."));
         config.model = folder.join(&config.model);
@@ -440,9 +441,17 @@ impl Config {
     /// Reads and checks a configuration given as text.
     ///
     /// # Errors
-    /// What is wrong, where, and what would be legal.
+    /// A text that states what is wrong, where, and what is allowed.
     pub fn parse(text: &str) -> Result<Self, String> {
-        let config: Self = toml::from_str(text).map_err(|e| e.to_string())?;
+        let config: Self = toml::from_str(text).map_err(|e| {
+            let problem = e.to_string();
+            RENAMED
+                .iter()
+                .find(|(old, _)| problem.contains(&format!("unknown field `{old}`")))
+                .map_or(problem.clone(), |(old, new)| {
+                    format!("{problem}\n`{old}` is now called `{new}`: rename it")
+                })
+        })?;
         config.check()?;
         Ok(config)
     }
@@ -480,13 +489,19 @@ impl Config {
             self.differentiation.angular_velocity_noise_radps,
             10.0,
         )?;
-        positive("differentiation.max_window_ms", self.differentiation.max_window_ms, 1e4)?;
-        self.output
-            .max_torque_std_nm
-            .map_or(Ok(()), |bound| positive("output.max_torque_std_nm", bound, f64::MAX))?;
-        let relative = self.identification.model_std;
+        positive(
+            "differentiation.max_window_ms",
+            self.differentiation.max_window_ms,
+            1e4,
+        )?;
+        self.output.max_torque_std_nm.map_or(Ok(()), |bound| {
+            positive("output.max_torque_std_nm", bound, f64::MAX)
+        })?;
+        let relative = self.identification.urdf_relative_std;
         if !(0.0..=2.0).contains(&relative) {
-            return Err(format!("identification.model_std = {relative} must be 0 to 2"));
+            return Err(format!(
+                "identification.urdf_relative_std = {relative} must be 0 to 2"
+            ));
         }
         let rate = self.identification.rate_hz;
         if !(1.0..=1000.0).contains(&rate) {
@@ -494,10 +509,13 @@ impl Config {
         }
         let every = self.identification.save_every_s;
         if !(1.0..=1e6).contains(&every) {
-            return Err(format!("identification.save_every_s = {every} must be 1 to 1000000"));
+            return Err(format!(
+                "identification.save_every_s = {every} must be 1 to 1000000"
+            ));
         }
         positive("identification.gain_std", self.identification.gain_std, 1.0)?;
-        // What may come while an instant waits is kept: 32 samples of a channel beside those of its window, 256 instants.
+        // Buffers for a waiting instant: 32 samples of a channel beside those of its window, and
+        // 256 instants.
         if !(self.output.max_wait_ms >= 0.0 && self.output.max_wait_ms <= 250.0) {
             return Err(format!(
                 "output.max_wait_ms = {} must be 0 to 250",
@@ -512,10 +530,17 @@ impl Config {
             Base::Fixed { gravity_mps2, .. } => finite("base.gravity_mps2", gravity_mps2)?,
             Base::Stance { foot } => {
                 if foot.is_empty() {
-                    return Err("base.foot is empty; give each link that may stand still one [[base.foot]]".into());
+                    return Err(
+                        "base.foot is empty; add one [[base.foot]] for each link that may be at \
+                         rest"
+                            .into(),
+                    );
                 }
                 for foot in foot {
-                    finite(&format!("base.foot {:?}: gravity_mps2", foot.link), &foot.gravity_mps2)?;
+                    finite(
+                        &format!("base.foot {:?}: gravity_mps2", foot.link),
+                        &foot.gravity_mps2,
+                    )?;
                 }
             }
             Base::Imu { xyz_m, rpy_rad, .. } => {
@@ -529,15 +554,25 @@ impl Config {
         for ft in &self.force_torque {
             let at = |key: &str| format!("force_torque {:?}: {key}", ft.sensor);
             for (key, noise) in [("noise_n", ft.noise_n), ("noise_nm", ft.noise_nm)] {
-                if let Some(value) = noise.into_iter().find(|v| v.is_nan() || *v <= 0.0 || v.is_infinite()) {
+                if let Some(value) = noise
+                    .into_iter()
+                    .find(|v| v.is_nan() || *v <= 0.0 || v.is_infinite())
+                {
                     return Err(format!(
                         "{} has the value {value}; a standard deviation must be above 0",
                         at(key)
                     ));
                 }
             }
-            for (key, deviation) in [("offset_std_n", ft.offset_std_n), ("offset_std_nm", ft.offset_std_nm)] {
-                if let Some(value) = deviation.into_iter().flatten().find(|v| !(*v >= 0.0 && v.is_finite())) {
+            for (key, deviation) in [
+                ("offset_std_n", ft.offset_std_n),
+                ("offset_std_nm", ft.offset_std_nm),
+            ] {
+                if let Some(value) = deviation
+                    .into_iter()
+                    .flatten()
+                    .find(|v| !(*v >= 0.0 && v.is_finite()))
+                {
                     return Err(format!(
                         "{} has the value {value}; a standard deviation can not be negative",
                         at(key)
@@ -547,7 +582,10 @@ impl Config {
             if let Some(numbers) = &ft.gain {
                 finite(&at("gain"), numbers)?;
                 if gain_from_force_first(numbers).is_none_or(|gain| !gain.is_invertible()) {
-                    return Err(format!("{} is singular: some wrench would never show", at("gain")));
+                    return Err(format!(
+                        "{} is singular: some wrenches would give no reading; check its numbers",
+                        at("gain")
+                    ));
                 }
             }
             finite(&at("temperature_n_per_k"), &ft.temperature_n_per_k)?;
@@ -556,7 +594,8 @@ impl Config {
             let drifts = ft.temperature_n_per_k != [0.0; 3] || ft.temperature_nm_per_k != [0.0; 3];
             if drifts && ft.reference_celsius.is_none() {
                 return Err(format!(
-                    "{} is missing: temperature_n_per_k and temperature_nm_per_k count from it",
+                    "{} is missing: temperature_n_per_k and temperature_nm_per_k are relative to \
+                     it",
                     at("reference_celsius")
                 ));
             }
@@ -581,7 +620,12 @@ impl Config {
                         return Err(format!("{} must not be zero", at("direction")));
                     }
                 }
-                (_, Some(_)) => return Err(format!("{} belongs to kind = \"force_along\" only", at("direction"))),
+                (_, Some(_)) => {
+                    return Err(format!(
+                        "{} is allowed with kind = \"force_along\" only",
+                        at("direction")
+                    ));
+                }
                 (_, None) => {}
             }
         }
@@ -590,7 +634,7 @@ impl Config {
 }
 
 impl ForceTorque {
-    /// What it reads with no load, and the standard deviations of that [torque; force] \[Nm, N\].
+    /// Its offset, and the standard deviations of it [torque; force] \[Nm, N\].
     #[must_use]
     pub fn offset(&self) -> (Wrench, [f64; 6]) {
         let of = |value: Option<[f64; 3]>, deviation: Option<[f64; 3]>, unknown: f64| {
@@ -603,7 +647,7 @@ impl ForceTorque {
         (Wrench::from_parts(force, torque), [tx, ty, tz, fx, fy, fz])
     }
 
-    /// How its readings are corrected.
+    /// Its calibration.
     #[must_use]
     pub fn calibration(&self) -> Calibration {
         let gain = self.gain.as_deref().and_then(gain_from_force_first);
@@ -616,7 +660,7 @@ impl ForceTorque {
 }
 
 impl Contact {
-    /// Its name: as given, else its link's.
+    /// Its name if given, else that of its link.
     #[must_use]
     pub fn name(&self) -> &str {
         self.name.as_deref().unwrap_or(&self.link)
@@ -681,7 +725,7 @@ mod tests {
         assert_eq!(config.contact[0].kind, ContactKind::Wrench);
         assert_eq!(config.contact[0].presence, Presence::Always);
         assert!(!config.identification.enabled);
-        assert_eq!(config.identification.model_std, 0.2);
+        assert_eq!(config.identification.urdf_relative_std, 0.2);
         assert_eq!(config.identification.rate_hz, 100.0);
         assert_eq!(config.identification.gain, Gain::Auto);
         assert_eq!(config.identification.gain_std, 0.05);
@@ -713,7 +757,7 @@ mod tests {
             (
                 "link = \"l_hand\"",
                 "link = \"l_hand\"\ndirection = [0.0, 0.0, 1.0]",
-                "belongs to kind = \"force_along\" only",
+                "is allowed with kind = \"force_along\" only",
             ),
             (
                 "joint = \"ft_joint\"",
@@ -722,8 +766,8 @@ mod tests {
             ),
             (
                 "[output]",
-                "[identification]\nmodel_std = -0.1\n[output]",
-                "identification.model_std = -0.1 must be 0 to 2",
+                "[identification]\nurdf_relative_std = -0.1\n[output]",
+                "identification.urdf_relative_std = -0.1 must be 0 to 2",
             ),
             (
                 "[output]",
@@ -760,7 +804,11 @@ mod tests {
                 "[identification]\nsave_every_s = 0\n[output]",
                 "identification.save_every_s = 0 must be 1 to",
             ),
-            ("trigger = \"ft\"", "triger = \"ft\"", "unknown field `triger`"),
+            (
+                "trigger = \"ft\"",
+                "triger = \"ft\"",
+                "unknown field `triger`",
+            ),
             (
                 "trigger = \"ft\"",
                 "max_wait_ms = -1.0",

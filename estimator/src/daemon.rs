@@ -1,53 +1,56 @@
-//! The estimator daemon: one data-plane thread from samples to estimates, and a control plane that looks after it.
+//! The estimator daemon: one data-plane thread turns samples into estimates, and a control plane
+//! supervises it.
 //!
-//! The data-plane thread polls shared memory; it takes no lock and allocates nothing once its ports are open. A service
-//! that is not there yet is looked for now and then, so gateway and estimator can start in any order, and either can be
-//! killed and started again.
+//! The data-plane thread polls shared memory. It takes no lock and allocates nothing once its ports
+//! are open. It retries services that are not there yet, so gateway and estimator can start in any
+//! order, and either can be killed and started again.
 
 use crate::check::Check;
 use crate::config::{Config, ConfigError};
+use crate::files;
 use crate::first_look::FirstLook;
-use crate::identify::online::{Paused, state};
 use crate::pipeline::{Job, Pipeline};
 use crate::setup::Setup;
 use anyhow::{Context, anyhow};
-use proprio_topics::ipc::{Domain, DomainConfig, DomainError, PortError, Reader, Topic, Writer, monotonic};
-use proprio_topics::realtime;
+use proprio_identification::online::Paused;
+use proprio_topics::ipc::{
+    Domain, DomainConfig, DomainError, PortError, Reader, Topic, Writer, monotonic,
+};
 use proprio_topics::{
-    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, IdentificationHealth, InertiaEstimate, Nanos,
-    Publisher, Role, Sample, TorqueEstimate,
+    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, IdentificationHealth,
+    InertiaEstimate, Nanos, Publisher, Role, Sample, TorqueEstimate, realtime,
 };
 use sd_notify::NotifyState;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::Ordering::{Acquire, Relaxed, Release};
 use std::sync::atomic::{AtomicBool, AtomicI64};
-use std::sync::mpsc;
+use std::sync::{Arc, mpsc};
 use std::time::Duration;
 use tokio::signal::unix::{SignalKind, signal};
 
-/// How long the data plane sleeps when there is nothing to do.
-const NAP: Duration = Duration::from_micros(100);
-/// How often a service that is not there is looked for.
-const LOOK: Nanos = Nanos::from_millis(50);
-/// How often health is sent.
+/// How long the data plane sleeps when no sample is waiting.
+const IDLE_SLEEP: Duration = Duration::from_micros(100);
+/// How often the data plane tries to open services that are not open yet.
+const CONNECT_PERIOD: Nanos = Nanos::from_millis(50);
+/// How often the health message is published.
 const HEALTH_PERIOD: Nanos = Nanos::from_millis(100);
-/// For how many of these a temperature must have been missing before that is worth a line: boards send it every few seconds at the best.
-const COLD: u32 = 100;
-/// A data plane that has not turned for so long is stuck.
-const STUCK: Nanos = Nanos::from_millis(500);
-/// How many samples are taken at once, at the most: as many as may wait from all buses (6 MB).
+/// A missing temperature is reported after this number of health periods: boards send it every few
+/// seconds at best.
+const MISSING_TEMPERATURE: u32 = 100;
+/// A data plane whose loop has not run for this long is stalled.
+const STALLED: Nanos = Nanos::from_millis(500);
+/// Most samples taken at once: as many as can be queued from all buses (6 MB).
 const INBOX: usize = <Sample as Topic>::QUALITY.buffer * <Sample as Topic>::QUALITY.publishers;
 
-/// Checks a configuration, and prints what would be estimated from what.
+/// Checks a configuration, and prints what the estimator would read and estimate (`--check`).
 ///
 /// # Errors
 /// As for [`run`].
 pub fn check(config: &Path) -> anyhow::Result<Setup> {
     let (_, setup) = load(config, |_| {})?;
     let checked = Check::of(&setup).context("the configuration can not be checked")?;
-    // Whoever reads it may stop early.
+    // The reader of a pipe may close it early.
     let _ = write!(std::io::stdout(), "{setup}{checked}");
     let file = config.to_owned();
     match checked.problem() {
@@ -59,7 +62,8 @@ pub fn check(config: &Path) -> anyhow::Result<Setup> {
 /// Runs the estimator until SIGTERM or SIGINT.
 ///
 /// # Errors
-/// One chain that says what, where and what to do; [`ConfigError`] at its root is a wrong configuration.
+/// One error chain that states what is wrong, where, and what to do. [`ConfigError`] in the chain
+/// means a wrong configuration.
 pub fn run(config: &Path, domain: &DomainConfig) -> anyhow::Result<()> {
     let (config, setup) = load(config, |_| {})?;
     let runtime = tokio::runtime::Builder::new_current_thread()
@@ -69,7 +73,8 @@ pub fn run(config: &Path, domain: &DomainConfig) -> anyhow::Result<()> {
     runtime.block_on(serve(&config, setup, domain))
 }
 
-/// Reads a configuration, changed by `adjust` before anything else is read, and what it names: model, identified parameters. Tells warnings to the log.
+/// Reads a configuration, applies `adjust` to it, then reads the files that it names (model,
+/// identified parameters). Logs the warnings.
 ///
 /// # Errors
 /// [`ConfigError`].
@@ -86,11 +91,14 @@ pub fn load(file: &Path, adjust: impl FnOnce(&mut Config)) -> Result<(Config, Se
     Ok((config, setup))
 }
 
-/// Whether an error that [`run`] ended with is a wrong configuration: exit 2, else 1.
+/// Whether an error of [`run`] is a wrong configuration: then the exit code is 2, else 1.
 pub fn is_configuration(error: &anyhow::Error) -> bool {
-    error
-        .chain()
-        .any(|cause| cause.is::<ConfigError>() || cause.downcast_ref().is_some_and(DomainError::is_configuration))
+    error.chain().any(|cause| {
+        cause.is::<ConfigError>()
+            || cause
+                .downcast_ref()
+                .is_some_and(DomainError::is_configuration)
+    })
 }
 
 async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::Result<()> {
@@ -100,7 +108,7 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
     let last_turn = Arc::new(AtomicI64::new(monotonic().0));
     let (ready, is_ready) = mpsc::channel();
     let (robot, realtime, domain) = (config.robot.clone(), config.realtime, domain.clone());
-    let kept = config.identification.state.clone().map(|file| Kept {
+    let state_file = config.identification.state.clone().map(|file| StateFile {
         file,
         every: Nanos::from_seconds(config.identification.save_every_s),
     });
@@ -108,16 +116,21 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
     let thread = std::thread::Builder::new()
         .name("estimate".into())
         .spawn(move || {
-            let mut plane = match DataPlane::open(&domain, &robot, setup, kept, turn_there) {
+            let mut plane = match DataPlane::open(&domain, &robot, setup, state_file, turn_there) {
                 Ok(plane) => plane,
                 Err(error) => return drop(ready.send(Err(error))),
             };
-            let refused = realtime.map(|r| realtime::apply(r.cpu, r.priority)).unwrap_or_default();
+            let refused = realtime
+                .map(|r| realtime::apply(r.cpu, r.priority))
+                .unwrap_or_default();
             let _ = ready.send(Ok(refused));
             plane.run(&stop_there);
         })
         .context("cannot start a thread")?;
-    for refusal in is_ready.recv().map_err(|_| anyhow!("the data plane ended at once"))?? {
+    for refusal in is_ready
+        .recv()
+        .map_err(|_| anyhow!("the data plane ended at once"))??
+    {
         tracing::warn!("real-time scheduling not granted: {refusal}");
     }
     tracing::info!(robot = config.robot, "running");
@@ -134,7 +147,7 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
         if thread.is_finished() {
             break "the data plane has ended";
         }
-        if watchdog.is_some() && monotonic() - Nanos(last_turn.load(Relaxed)) < STUCK {
+        if watchdog.is_some() && monotonic() - Nanos(last_turn.load(Relaxed)) < STALLED {
             let _ = sd_notify::notify(&[NotifyState::Watchdog]);
         }
     };
@@ -143,7 +156,7 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
     stop.store(true, Release);
     thread
         .join()
-        .map_err(|_| anyhow!("the data plane panicked; this is a mistake in the program"))
+        .map_err(|_| anyhow!("the data plane panicked; this is a bug in the program: report it"))
 }
 
 /// What the data-plane thread owns.
@@ -152,27 +165,28 @@ struct DataPlane {
     robot: String,
     pipeline: Pipeline,
     samples: Option<Reader<Sample>>,
-    /// What was waiting, to be put in order; never grows.
+    /// The samples taken at once, to be sorted by stamp; never grows.
     inbox: Vec<Sample>,
     descriptions: Option<Reader<Description>>,
     declarations: Reader<ContactDeclaration>,
-    told_of_contact: bool,
-    /// For how many healths in a row a sensor has been without the temperature that its calibration wants.
-    cold: u32,
-    /// Per channel number of the gateway: the pipeline's channel.
+    unknown_contact_reported: bool,
+    /// Consecutive health periods in which a sensor lacked the temperature that its calibration
+    /// needs.
+    without_temperature: u32,
+    /// Per channel number of the gateway, the pipeline's channel.
     map: Vec<Option<usize>>,
     /// The gateway's epoch that `map` belongs to.
-    mapped: u64,
+    map_epoch: u64,
     torques: Writer<TorqueEstimate>,
     contacts: Writer<ContactEstimate>,
-    /// Where something is identified.
+    /// The identified parameters; none if identification is off.
     inertias: Option<Writer<InertiaEstimate>>,
     health_writer: Writer<EstimatorHealth>,
     description_writer: Writer<Description>,
     health: EstimatorHealth,
-    identifier: Option<Identifier>,
+    identification: Option<IdentificationThread>,
     first_look: FirstLook,
-    next_look: Nanos,
+    next_connect: Nanos,
     next_health: Nanos,
     last_turn: Arc<AtomicI64>,
 }
@@ -182,12 +196,13 @@ impl DataPlane {
         domain: &DomainConfig,
         robot: &str,
         setup: Setup,
-        kept: Option<Kept>,
+        state_file: Option<StateFile>,
         last_turn: Arc<AtomicI64>,
     ) -> anyhow::Result<Self> {
         let domain = Domain::open(domain)?;
         let epoch = domain.epoch();
-        // The health first: it admits one writer, which is how a second estimator of this robot finds out.
+        // The health topic first: it admits one writer, so a second estimator of this robot fails
+        // here.
         let health_writer = Writer::create(&domain, robot, epoch)?;
         let mut description_writer = Writer::<Description>::create(&domain, robot, epoch)?;
         let torques = Writer::create(&domain, robot, epoch)?;
@@ -196,39 +211,39 @@ impl DataPlane {
         description_writer.send(&setup.description(), now)?;
         let first_look = FirstLook::start(&setup)?;
         let mut pipeline = Pipeline::new(setup);
-        if let Some(kept) = &kept {
-            kept.resume(&mut pipeline);
+        if let Some(state_file) = &state_file {
+            state_file.resume(&mut pipeline);
         }
         if let Some(refusal) = pipeline.identification_refused() {
             tracing::warn!("identification.enabled: {refusal}");
         }
-        let identifier = pipeline
+        let identification = pipeline
             .identification()
-            .map(|online| Identifier::start(online.component_count(), kept))
+            .map(|online| IdentificationThread::start(online.component_count(), state_file))
             .transpose()?;
-        let inertias = match identifier {
+        let inertias = match identification {
             Some(_) => Some(Writer::create(&domain, robot, epoch)?),
             None => None,
         };
         Ok(Self {
             robot: robot.to_owned(),
             pipeline,
-            identifier,
+            identification,
             first_look,
             samples: None,
             inbox: Vec::with_capacity(INBOX),
             descriptions: None,
-            // Its service is created here, so that it need not be looked for: whoever declares comes when he likes.
+            // Create the service here: then the reader is open before any program declares.
             declarations: {
                 let creator = Writer::<ContactDeclaration>::create(&domain, robot, epoch)?;
                 let reader = Reader::open(&domain, robot)?;
                 drop(creator);
                 reader
             },
-            told_of_contact: false,
-            cold: 0,
+            unknown_contact_reported: false,
+            without_temperature: 0,
             map: Vec::with_capacity(proprio_topics::MAX_CHANNELS),
-            mapped: 0,
+            map_epoch: 0,
             torques,
             contacts,
             inertias,
@@ -238,7 +253,7 @@ impl DataPlane {
                 started: now,
                 ..EstimatorHealth::default()
             },
-            next_look: Nanos::ZERO,
+            next_connect: Nanos::ZERO,
             next_health: Nanos::ZERO,
             last_turn,
             domain,
@@ -250,34 +265,40 @@ impl DataPlane {
             let now = monotonic();
             self.last_turn.store(now.0, Relaxed);
             self.health.last_turn = now;
-            if now >= self.next_look {
-                self.next_look = now + LOOK;
-                look(&mut self.samples, &self.domain, &self.robot);
-                look(&mut self.descriptions, &self.domain, &self.robot);
+            if now >= self.next_connect {
+                self.next_connect = now + CONNECT_PERIOD;
+                connect(&mut self.samples, &self.domain, &self.robot);
+                connect(&mut self.descriptions, &self.domain, &self.robot);
             }
             self.take_declarations(now);
-            if let Some(job) = self.identifier.as_mut().and_then(Identifier::take) {
+            if let Some(job) = self
+                .identification
+                .as_mut()
+                .and_then(IdentificationThread::finished_job)
+            {
                 self.pipeline.give_back(job);
             }
             let idle = !self.take_samples(now);
             if now >= self.next_health {
                 self.next_health = now + HEALTH_PERIOD;
-                self.tell_health(now);
+                self.publish_health(now);
             }
             if idle {
-                std::thread::sleep(NAP);
+                std::thread::sleep(IDLE_SLEEP);
             }
         }
-        self.tell_health(monotonic());
-        if self.identifier.is_some() {
-            tracing::info!("instants of identification: {}", self.health.identification);
+        self.publish_health(monotonic());
+        if self.identification.is_some() {
+            tracing::info!("identification instants: {}", self.health.identification);
         }
     }
 
-    /// Takes what is waiting and publishes what it completes; whether there was anything.
+    /// Takes all waiting samples and publishes the estimates that they complete. False if there
+    /// were none.
     fn take_samples(&mut self, now: Nanos) -> bool {
-        // Shared memory hands out all of one bus before the next one's. After a stall that would let the first bus run ahead by more
-        // than an estimate waits, and what the others sent meanwhile would be late: so they are put in order first.
+        // Shared memory delivers all samples of one bus before those of the next. After a stall the
+        // first bus would run ahead by more than an estimate waits, and the samples of the others
+        // would be late. So sort by stamp first.
         self.inbox.clear();
         while self.inbox.len() < INBOX
             && let Some(Ok(Some(sample))) = self.samples.as_mut().map(Reader::try_take)
@@ -291,18 +312,20 @@ impl DataPlane {
             let Some(sample) = self.inbox.get(at).copied() else {
                 break;
             };
-            if sample.header.epoch != self.mapped {
+            if sample.header.epoch != self.map_epoch {
                 self.take_descriptions();
             }
             let channel = self.map.get(sample.channel as usize).copied().flatten();
-            if sample.header.epoch != self.mapped {
+            if sample.header.epoch != self.map_epoch {
                 self.health.unknown_channel += 1;
                 continue;
             }
-            // A channel that the configuration does not name is not an error: the gateway may serve others.
+            // A channel that the configuration does not name is ignored: the gateway may serve
+            // other programs.
             let Some(channel) = channel else { continue };
             let (t, quality) = (sample.header.acquired, sample.header.quality);
-            self.first_look.see(now, channel, t, &sample.reading, quality);
+            self.first_look
+                .see(now, channel, t, &sample.reading, quality);
             self.pipeline.push(channel, t, &sample.reading, quality);
             while let Some(estimate) = self.pipeline.poll() {
                 let now = monotonic();
@@ -310,17 +333,22 @@ impl DataPlane {
                     & self.contacts.send(&estimate.contacts, now).is_ok();
                 self.health.estimates += 1;
                 self.health.publish_failures += u64::from(!sent);
-                self.health.withheld += u64::from(estimate.torques.joints().iter().any(|j| j.valid != 1));
+                self.health.withheld +=
+                    u64::from(estimate.torques.joints().iter().any(|j| j.valid != 1));
                 self.health.last_estimate = estimate.t;
                 if let Some(inertias) = &mut self.inertias
                     && let Some(inertia) = self.pipeline.inertia()
                 {
                     self.health.publish_failures += u64::from(inertias.send(inertia, now).is_err());
                 }
-                if let Some(jobs) = self.identifier.as_ref().and_then(|identifier| identifier.jobs.as_ref())
+                if let Some(jobs) = self
+                    .identification
+                    .as_ref()
+                    .and_then(|identification| identification.jobs.as_ref())
                     && let Some(job) = self.pipeline.take_job()
                 {
-                    // There is one job, so there is room; a thread that ended has told why.
+                    // There is one job, so the queue has room. If the thread has ended, the error
+                    // is reported elsewhere.
                     let _ = jobs.try_send(job);
                 }
             }
@@ -328,7 +356,7 @@ impl DataPlane {
         !self.inbox.is_empty()
     }
 
-    /// Reads who is who from the gateway.
+    /// Maps the channel numbers of the gateway's description to the pipeline's channels.
     fn take_descriptions(&mut self) {
         while let Some(Ok(Some(description))) = self.descriptions.as_mut().map(Reader::try_take) {
             if description.publisher != Publisher::Gateway {
@@ -340,20 +368,25 @@ impl DataPlane {
                     .ok()
                     .and_then(|n| description.find(Role::Channel, n));
                 self.map
-                    .push(entry.and_then(|e| self.pipeline.setup().channel(e.kind, e.name.as_str())));
+                    .push(entry.and_then(|e| {
+                        self.pipeline.setup().robot.channel(e.kind, e.name.as_str())
+                    }));
             }
-            self.mapped = description.header.epoch;
-            let missing = (0..self.pipeline.setup().channels().len()).filter(|c| !self.map.contains(&Some(*c)));
+            self.map_epoch = description.header.epoch;
+            let missing = (0..self.pipeline.setup().robot.channels.len())
+                .filter(|c| !self.map.contains(&Some(*c)));
             for channel in missing {
                 let name = self
                     .pipeline
                     .setup()
-                    .channels()
+                    .robot
+                    .channels
                     .get(channel)
                     .map_or("", |c| c.name.as_str());
                 tracing::error!(
                     channel = name,
-                    "the gateway has no such channel: what depends on it is withheld; measure it, or lock it in [locked]"
+                    "the gateway does not have this channel: estimates that depend on it are \
+                     withheld; add the channel to the gateway, or lock the joint in [locked]"
                 );
             }
         }
@@ -361,18 +394,23 @@ impl DataPlane {
 
     fn take_declarations(&mut self, now: Nanos) {
         while let Ok(Some(declared)) = self.declarations.try_take() {
-            match self.pipeline.setup().contact(declared.contact.as_str()) {
+            match self
+                .pipeline
+                .setup()
+                .robot
+                .contact(declared.contact.as_str())
+            {
                 Some(contact) => {
                     let (t, active) = (declared.header.acquired, declared.active != 0);
                     self.first_look.declare(now, contact, t, active);
                     self.pipeline.declare(contact, t, active);
                 }
-                // Once: whoever misspells a name may do so a thousand times a second.
-                None if !self.told_of_contact => {
-                    self.told_of_contact = true;
+                // Report once: a program may repeat a misspelt name a thousand times a second.
+                None if !self.unknown_contact_reported => {
+                    self.unknown_contact_reported = true;
                     tracing::warn!(
                         contact = declared.contact.as_str(),
-                        "a contact was declared that the configuration does not have"
+                        "a contact was declared that is not in estimator.toml; check its name"
                     );
                 }
                 None => {}
@@ -380,38 +418,45 @@ impl DataPlane {
         }
     }
 
-    /// Says once that a sensor's temperature is missing, and once that none is any more.
-    fn tell_temperatures(&mut self) {
+    /// Reports once that a sensor's temperature is missing, and once that all are there again.
+    fn report_temperatures(&mut self) {
         if self.pipeline.without_temperature().next().is_none() {
-            if std::mem::replace(&mut self.cold, 0) >= COLD {
-                tracing::info!("the temperatures that calibrations want are there again");
+            if std::mem::replace(&mut self.without_temperature, 0) >= MISSING_TEMPERATURE {
+                tracing::info!("all temperatures that the calibrations need are received again");
             }
             return;
         }
-        self.cold = self.cold.saturating_add(1);
-        if self.cold == COLD {
+        self.without_temperature = self.without_temperature.saturating_add(1);
+        if self.without_temperature == MISSING_TEMPERATURE {
             for sensor in self.pipeline.without_temperature() {
                 tracing::warn!(
                     sensor,
-                    "its calibration wants the temperature of its board, which has not been told yet, or not for a minute: torques that rest on it are less certain; have the board send it"
+                    "the calibration needs the temperature of the sensor's board, but none was \
+                     received in the last minute: torques that depend on this sensor are less \
+                     certain; let the board send its temperature"
                 );
             }
         }
     }
 
-    fn tell_health(&mut self, now: Nanos) {
-        self.tell_temperatures();
+    fn publish_health(&mut self, now: Nanos) {
+        self.report_temperatures();
         let counts = self.pipeline.counts();
-        (self.health.late, self.health.backward, self.health.not_finite) =
-            (counts.late, counts.backward, counts.not_finite);
+        (
+            self.health.late,
+            self.health.backward,
+            self.health.not_finite,
+        ) = (counts.late, counts.backward, counts.not_finite);
         self.health.lost = self.samples.as_ref().map_or(0, Reader::lost);
         self.health.epochs = self.samples.as_ref().map_or(0, Reader::epochs);
-        if let (Some(identifier), Some(online)) = (&mut self.identifier, self.pipeline.identification()) {
+        if let (Some(identification), Some(online)) =
+            (&mut self.identification, self.pipeline.identification())
+        {
             let mut sum = IdentificationHealth {
-                groups: u32::try_from(identifier.told.len()).unwrap_or(0),
+                groups: u32::try_from(identification.reported.len()).unwrap_or(0),
                 ..IdentificationHealth::default()
             };
-            for (component, (told, changes)) in identifier.told.iter_mut().enumerate() {
+            for (component, (reported, changes)) in identification.reported.iter_mut().enumerate() {
                 let Some((paused, counts)) = online.state(component) else {
                     continue;
                 };
@@ -428,10 +473,10 @@ impl DataPlane {
                 sum.offset_changes += counts.offset_changes;
                 sum.load_changes += counts.load_changes;
                 sum.unknown_changes += counts.changes - counts.offset_changes - counts.load_changes;
-                // One for all of them.
+                // Common to all components.
                 sum.late = counts.late;
                 sum.failed += counts.failed;
-                if std::mem::replace(told, paused) != paused {
+                if std::mem::replace(reported, paused) != paused {
                     tracing::info!(component, "{paused}");
                 }
                 if std::mem::replace(changes, counts.changes) != counts.changes
@@ -442,95 +487,111 @@ impl DataPlane {
             }
             self.health.identification = sum;
         }
-        // Who can not be reached now gets the next one.
+        // A failed send is not repeated: the next health message follows soon.
         let _ = self.health_writer.send(&self.health, now);
         let _ = self.description_writer.update_connections();
         let _ = self.inertias.as_mut().map(Writer::update_connections);
     }
 }
 
-/// Where what was identified is kept.
-struct Kept {
+/// The file that keeps the state of identification between runs.
+struct StateFile {
     file: PathBuf,
     every: Nanos,
 }
 
-impl Kept {
-    /// Goes on from the file, if it is there; one that does not fit is set aside.
+impl StateFile {
+    /// Resumes from the file, if there is one. A file that cannot be used is renamed.
     fn resume(&self, pipeline: &mut Pipeline) {
         let file = self.file.display();
         let text = match std::fs::read(&self.file) {
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return,
             Err(error) => {
-                return tracing::error!("{file}: can not be read: {error}; identification begins without it");
+                return tracing::error!(
+                    "{file}: can not be read: {error}; identification starts without it"
+                );
             }
             Ok(bytes) => String::from_utf8_lossy(&bytes).into_owned(),
         };
         match pipeline.resume(&text) {
-            Ok(()) => tracing::info!("{file}: identification goes on where it was"),
-            Err(error) => match state::set_aside(&self.file) {
+            Ok(()) => tracing::info!("{file}: identification resumes from this state"),
+            Err(error) => match files::set_aside(&self.file) {
                 Ok(aside) => tracing::error!(
-                    "{file}: {error}; renamed to {}, identification begins without it",
+                    "{file}: {error}; renamed to {}, identification starts without it",
                     aside.display()
                 ),
                 Err(other) => {
-                    tracing::error!("{file}: {error}; it can not be renamed ({other}), and will be overwritten");
+                    tracing::error!(
+                        "{file}: {error}; it can not be renamed ({other}) and will be overwritten"
+                    );
                 }
             },
         }
     }
 
     fn write(&self, text: &str) {
-        if let Err(error) = state::write(&self.file, text) {
-            tracing::error!("{}: {error}", self.file.display());
+        if let Err(error) = files::replace(&self.file, text, 0o600) {
+            tracing::error!(
+                "{}: the state of identification can not be written: {error}; check the folder and \
+                 its permissions",
+                self.file.display()
+            );
         }
     }
 }
 
-/// The thread that solves for the parameters, and what was last told of it. The data plane never waits for it.
-struct Identifier {
+/// The thread that solves for the parameters, and the state that was last reported. The data plane
+/// never waits for it.
+struct IdentificationThread {
     jobs: Option<mpsc::SyncSender<Job>>,
     done: mpsc::Receiver<Job>,
     thread: Option<std::thread::JoinHandle<()>>,
-    /// Per component: why it pauses, and how many changes it has seen.
-    told: Vec<(Paused, u64)>,
+    /// Per component, what was last reported: why it pauses, and its number of changes.
+    reported: Vec<(Paused, u64)>,
 }
 
-impl Identifier {
-    /// Starts the thread; it ends with this, and then keeps what it knows.
-    fn start(components: usize, kept: Option<Kept>) -> anyhow::Result<Self> {
-        let (jobs, waiting) = mpsc::sync_channel::<Job>(1);
-        let (back, done) = mpsc::sync_channel(1);
+impl IdentificationThread {
+    /// Starts the thread. It ends when this is dropped, and then writes its state.
+    fn start(components: usize, state_file: Option<StateFile>) -> anyhow::Result<Self> {
+        let (jobs, queue) = mpsc::sync_channel::<Job>(1);
+        let (results, done) = mpsc::sync_channel(1);
         let work = move || {
             let (mut unwritten, mut written) = (None, monotonic());
             let mut failing = vec![false; components];
-            while let Ok(mut job) = waiting.recv() {
+            while let Ok(mut job) = queue.recv() {
                 job.run();
-                for (component, (fails, failure)) in failing.iter_mut().zip(job.failures()).enumerate() {
+                for (component, (fails, failure)) in
+                    failing.iter_mut().zip(job.failures()).enumerate()
+                {
                     match failure {
                         Some(error) if !*fails => tracing::error!(
                             component,
-                            "identification can not solve for the parameters: {error}; what was known before stays in force"
+                            "identification can not solve for the parameters: {error}; the earlier \
+                             parameters stay in use"
                         ),
-                        None if *fails => tracing::info!(component, "identification solves for the parameters again"),
+                        None if *fails => tracing::info!(
+                            component,
+                            "identification solves for the parameters again"
+                        ),
                         _ => {}
                     }
                     *fails = failure.is_some();
                 }
-                let text = kept.as_ref().map(|_| job.state());
-                // Before the disk, which may be slow: what it found has to be in force in time. Who has ended needs no solution any more.
-                let _ = back.send(job);
-                if let (Some(kept), Some(text)) = (&kept, text) {
-                    if monotonic() - written >= kept.every {
-                        kept.write(&text);
+                let text = state_file.as_ref().map(|_| job.state());
+                // Send before writing to the disk, which may be slow: the solution must be in use
+                // in time. A receiver that is gone needs none.
+                let _ = results.send(job);
+                if let (Some(state_file), Some(text)) = (&state_file, text) {
+                    if monotonic() - written >= state_file.every {
+                        state_file.write(&text);
                         (unwritten, written) = (None, monotonic());
                     } else {
                         unwritten = Some(text);
                     }
                 }
             }
-            if let (Some(kept), Some(text)) = (&kept, unwritten) {
-                kept.write(&text);
+            if let (Some(state_file), Some(text)) = (&state_file, unwritten) {
+                state_file.write(&text);
             }
         };
         let thread = std::thread::Builder::new()
@@ -541,21 +602,23 @@ impl Identifier {
             jobs: Some(jobs),
             done,
             thread: Some(thread),
-            told: vec![(Paused::No, 0); components],
+            reported: vec![(Paused::No, 0); components],
         })
     }
 }
 
-impl Identifier {
-    /// A job that is done. Says once if there will be no more.
-    fn take(&mut self) -> Option<Job> {
+impl IdentificationThread {
+    /// A job that has been run. Reports once if the thread has ended.
+    fn finished_job(&mut self) -> Option<Job> {
         match self.done.try_recv() {
             Ok(job) => Some(job),
             Err(mpsc::TryRecvError::Empty) => None,
             Err(mpsc::TryRecvError::Disconnected) => {
                 if self.jobs.take().is_some() {
                     tracing::error!(
-                        "the thread that identifies has panicked: what is in force stays so and nothing is learnt any more; restart the estimator, and report this"
+                        "the identification thread has panicked: the parameters in use stay as \
+                         they are and are no longer updated; restart the estimator and report this \
+                         bug"
                     );
                 }
                 None
@@ -564,16 +627,16 @@ impl Identifier {
     }
 }
 
-impl Drop for Identifier {
+impl Drop for IdentificationThread {
     fn drop(&mut self) {
         self.jobs = None;
-        // The job that is done takes the room of the channel: none is waited for longer than one takes.
+        // The channel has room for the result of the last job, so this waits for one job at most.
         let _ = self.thread.take().map(std::thread::JoinHandle::join);
     }
 }
 
-/// Opens a service that is not open yet, if it is there.
-fn look<T: Topic>(reader: &mut Option<Reader<T>>, domain: &Domain, robot: &str) {
+/// Opens a service that is not open yet, if it exists.
+fn connect<T: Topic>(reader: &mut Option<Reader<T>>, domain: &Domain, robot: &str) {
     if reader.is_none() {
         match Reader::open(domain, robot) {
             Ok(opened) => *reader = Some(opened),
@@ -588,28 +651,28 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_thread_that_panics_is_told_once_and_asked_for_nothing_more() {
-        let (jobs, waiting) = mpsc::sync_channel::<Job>(1);
-        let (back, done) = mpsc::sync_channel::<Job>(1);
+    fn a_thread_that_panics_is_reported_once_and_gets_no_more_jobs() {
+        let (jobs, queue) = mpsc::sync_channel::<Job>(1);
+        let (results, done) = mpsc::sync_channel::<Job>(1);
         let work = move || {
-            let _ends = (waiting, back);
+            let _ends = (queue, results);
             panic!("as a fault in identification would");
         };
         let thread = std::thread::spawn(work);
-        let mut identifier = Identifier {
+        let mut identification = IdentificationThread {
             jobs: Some(jobs),
             done,
             thread: Some(thread),
-            told: Vec::new(),
+            reported: Vec::new(),
         };
-        while !identifier
+        while !identification
             .thread
             .as_ref()
             .is_some_and(std::thread::JoinHandle::is_finished)
         {
             std::thread::yield_now();
         }
-        assert!(identifier.take().is_none() && identifier.jobs.is_none());
-        assert!(identifier.take().is_none());
+        assert!(identification.finished_job().is_none() && identification.jobs.is_none());
+        assert!(identification.finished_job().is_none());
     }
 }

@@ -1,11 +1,13 @@
-//! The last samples of one channel, for values that are used as measured: exactly at an instant, or between two samples.
+//! The last samples of one channel, for values that are used as measured: the sample of an instant,
+//! or a linear interpolation between two samples.
 
 use proprio_topics::{Nanos, Quality};
 
-/// How many samples are kept: what a channel can send while an estimate waits for the others, and what identification, which looks further back, needs.
+/// Number of samples kept: enough for an estimate that waits for other channels, and for
+/// identification, whose instants lie further back.
 pub const KEPT: usize = 1024;
 
-/// The last samples of one channel. `D` numbers each; NaN where one is absent.
+/// The last samples of one channel, `D` numbers each; NaN where one is absent.
 #[derive(Debug, Clone)]
 pub struct History<const D: usize> {
     samples: Box<[Entry<D>; KEPT]>,
@@ -20,14 +22,14 @@ struct Entry<const D: usize> {
     quality: Quality,
 }
 
-/// What a channel says about one instant.
+/// The value of a channel at one instant.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Held<const D: usize> {
+pub struct ChannelValue<const D: usize> {
     /// The value.
     pub value: [f64; D],
-    /// What is known against the samples it rests on, together.
+    /// The combined quality flags of the samples it comes from.
     pub quality: Quality,
-    /// How long before the instant the last sample up to it lies \[ns\].
+    /// Age of the last sample up to the instant \[ns\].
     pub age: Nanos,
     /// Whether a sample is stamped with the instant itself.
     pub exact: bool,
@@ -64,6 +66,7 @@ impl<const D: usize> History<D> {
         self.get(0).map(|e| e.t)
     }
 
+    /// The sample that has `age` later ones.
     fn get(&self, age: usize) -> Option<&Entry<D>> {
         if age >= self.count.min(KEPT) {
             return None;
@@ -71,8 +74,12 @@ impl<const D: usize> History<D> {
         self.samples.get((self.count - 1 - age) % KEPT)
     }
 
-    /// The samples stamped `from` to `to`, newest first; of those that are kept.
-    pub fn within(&self, from: Nanos, to: Nanos) -> impl Iterator<Item = (Nanos, &[f64; D], Quality)> {
+    /// The kept samples stamped `from` to `to`, newest first.
+    pub fn within(
+        &self,
+        from: Nanos,
+        to: Nanos,
+    ) -> impl Iterator<Item = (Nanos, &[f64; D], Quality)> {
         (0..KEPT)
             .map_while(|age| self.get(age))
             .skip_while(move |entry| entry.t > to)
@@ -80,12 +87,13 @@ impl<const D: usize> History<D> {
             .map(|entry| (entry.t, &entry.value, entry.quality))
     }
 
-    /// What it says about `t`: the sample of that instant; else a straight line between the last before and the first after,
-    /// provided that is stamped `until` or earlier; else the last before, held. `None` if there is none up to `t`.
+    /// The value at `t`: the sample of that instant; else a linear interpolation between the last
+    /// sample before and the first after, if that is stamped `until` or earlier; else the last
+    /// sample before, held. `None` if there is no sample up to `t`.
     ///
-    /// It depends on stamps alone: a sample that came early counts no more than one that came in time.
+    /// It depends on stamps alone, not on the time of arrival.
     #[must_use]
-    pub fn at(&self, t: Nanos, until: Nanos) -> Option<Held<D>> {
+    pub fn at(&self, t: Nanos, until: Nanos) -> Option<ChannelValue<D>> {
         let mut after = None;
         let mut age = 0;
         let before = loop {
@@ -97,7 +105,7 @@ impl<const D: usize> History<D> {
             age += 1;
         };
         let since = t - before.t;
-        let held = Held {
+        let held = ChannelValue {
             value: before.value,
             quality: before.quality,
             age: since,
@@ -111,7 +119,7 @@ impl<const D: usize> History<D> {
                 for (v, next) in value.iter_mut().zip(after.value) {
                     *v += part * (next - *v);
                 }
-                Some(Held {
+                Some(ChannelValue {
                     value,
                     quality: before.quality | after.quality,
                     interpolated: true,
@@ -128,7 +136,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn exact_between_and_held() {
+    fn a_value_is_exact_interpolated_or_held() {
         let mut history = History::<1>::default();
         assert!(history.at(Nanos(5), Nanos(9)).is_none());
         history.push(Nanos(10), [1.0], Quality::GOOD);
@@ -142,13 +150,14 @@ mod tests {
         };
         assert_eq!(at(10, 100), Some((1.0, Quality::GOOD, true, false)));
         assert_eq!(at(15, 100), Some((2.0, Quality::SATURATED, false, true)));
-        // The next sample is later than allowed: held, whether it has come or not.
+        // The next sample is later than allowed: the last one is held, whether the next has arrived
+        // or not.
         assert_eq!(at(15, 19), Some((1.0, Quality::GOOD, false, false)));
         assert_eq!(at(35, 100), Some((9.0, Quality::GOOD, false, false)));
     }
 
     #[test]
-    fn the_oldest_give_way() {
+    fn the_oldest_samples_are_dropped() {
         let mut history = History::<1>::default();
         for i in 0..5000 {
             history.push(Nanos(i), [0.0], Quality::GOOD);

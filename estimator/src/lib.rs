@@ -1,42 +1,49 @@
-//! Samples in, joint torques and contact wrenches out.
+//! The estimator: samples of joints, IMU and force/torque (F/T) sensors in, joint torques and
+//! contact wrenches out, with their standard deviations and whether they are valid.
 //!
-//! ```text
-//! samples -> Pipeline: every channel at each stamp T of the trigger channel
-//!                -> Kinematics -> net wrenches -> Solver, sub-tree by sub-tree -> torques, contact wrenches
-//! ```
+//! # Stages
+//! 1. Samples: each channel sends stamped readings. [`daemon`] takes them from shared memory,
+//!    [`offline`] from a log.
+//! 2. Pipeline ([`pipeline::Pipeline`]): each stamp `t` of the trigger channel is an instant. The
+//!    pipeline waits for the other channels, then interpolates or differentiates each one at `t`,
+//!    corrects F/T readings for calibration, temperature and offset, and tests their residuals.
+//! 3. Kinematics ([`proprio_dynamics::Kinematics`]): pose, motion and net wrench of every link.
+//! 4. Solver ([`proprio_dynamics::Solver`]): balances each sub-tree between F/T sensors and solves
+//!    for its contact wrenches.
+//! 5. Torques: the solver's joint torques, with standard deviations from noise, parameters
+//!    ([`propagation`]) and motion, are published if they are valid.
 //!
-//! - [`config`]: estimator.toml, as typed; [`setup`]: the same, checked against the URDF and resolved.
-//! - [`calibration`]: gain and temperature of an F/T sensor, before its offset.
-//! - [`spatial`]: motion and force vectors, rigid transforms, rigid-body inertia; the notation page of the crate.
-//! - [`model`]: an undirected tree of links from a URDF; massless frames folded; F/T joints kept.
-//! - [`dynamics`]: kinematics from any base, sub-trees cut at the F/T sensors, reordered recursive Newton-Euler.
-//! - [`regressor`]: wrenches and torques as linear functions of the inertial parameters, and which of these can be identified at all.
-//! - [`identify`]: the parameters themselves, from what the sensors measure while the robot moves.
-//! - [`parameters`]: what was identified, as a file, and as a URDF; how uncertain it is.
-//! - [`differentiate`]: position, velocity and acceleration at any instant from noisy, quantised samples; [`history`]: what
-//!   is used as measured.
-//! - [`pipeline`]: samples in, estimates out; no input, no output, no clock.
-//! - [`files`]: files that are replaced whole.
-//! - [`offline`]: a table of samples to a table of estimates; [`daemon`]: the same from and to shared memory.
-//! - [`check`]: what a configuration comes to; [`assessment`]: how good a run of estimates was; `first_look`: what
-//!   can not be in what the daemon receives.
+//! With identification on, the pipeline also feeds [`proprio_identification::online`], which
+//! updates inertial parameters and F/T offsets once a second.
+//!
+//! # Modules
+//! - Input: [`config`] is estimator.toml as typed, [`setup`] is the same checked against the URDF
+//!   with every name resolved, and [`reading`] reads logs.
+//! - Pipeline: [`pipeline`] does no input or output and reads no clock. [`history`] interpolates,
+//!   [`differentiate`] differentiates.
+//! - Parameters: [`inertial`] holds the parameters in use, [`parameters`] is the file
+//!   parameters.toml, [`export`] writes it from an identification result.
+//! - Uncertainty: [`propagation`] turns the covariance of the parameters into standard deviations.
+//! - Programs: [`daemon`] and [`offline`] run the pipeline, [`check`] and `description` print what
+//!   `--check` shows, [`assessment`] measures the accuracy of a run, `first_look` tests the first
+//!   samples for implausible readings, [`files`] replaces files atomically.
+//!
+//! Notation, frames and signs: [`proprio_dynamics::spatial`].
 
 pub mod assessment;
-pub mod calibration;
 pub mod check;
 pub mod config;
 pub mod daemon;
+mod description;
 pub mod differentiate;
-pub mod dynamics;
+pub mod export;
 pub mod files;
 mod first_look;
 pub mod history;
-pub mod identify;
-pub mod model;
+pub mod inertial;
 pub mod offline;
 pub mod parameters;
 pub mod pipeline;
-pub mod regressor;
+pub mod propagation;
+pub mod reading;
 pub mod setup;
-pub mod spatial;
-mod statistics;

@@ -1,4 +1,4 @@
-//! The estimator daemon: `proprio estimator` without the rest of the command.
+//! The estimator daemon as a program of its own; the same as `proprio estimator`.
 
 use clap::Parser;
 use proprio_estimator::daemon;
@@ -6,14 +6,14 @@ use proprio_topics::ipc::DomainConfig;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// Samples in, joint torques and contact wrenches out.
+/// Estimates joint torques and contact wrenches from the samples of a robot's sensors.
 #[derive(Parser)]
 #[command(version, about)]
 struct Args {
     /// The configuration: estimator.toml.
     #[arg(long)]
     config: PathBuf,
-    /// Print what would be estimated from what, and end.
+    /// Check the configuration, print what is read and estimated, and exit.
     #[arg(long)]
     check: bool,
 }
@@ -36,7 +36,11 @@ fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
-            ExitCode::from(if daemon::is_configuration(&error) { 2 } else { 1 })
+            ExitCode::from(if daemon::is_configuration(&error) {
+                2
+            } else {
+                1
+            })
         }
     }
 }

@@ -1,28 +1,35 @@
-//! A table of samples to a table of estimates: `proprio estimate`. The same [`Pipeline`] as in the daemon.
+//! Estimates of a recorded log: a table of samples to a table of estimates, `proprio estimate`. It
+//! uses the same [`Pipeline`] as the daemon.
 //!
 //! | column | meaning |
 //! |---|---|
 //! | `t` | the instant, as in the log |
 //! | `torque/<joint>` | \[Nm\], by the parent link on the child link along the URDF axis |
-//! | `torque_std/<joint>` | its standard deviation: from F/T noise, and from what is uncertain of inertial parameters and F/T offsets |
-//! | `contact/<name>/fx fy fz tx ty tz` | \[N, Nm\], on the link by the environment, axes and origin of the frame that `link` names |
+//! | `torque_std/<joint>` | its standard deviation ([`crate::pipeline`]) |
+//! | `contact/<name>/fx fy fz tx ty tz` | \[N, Nm\], by the environment on the link; see below |
 //! | `contact/<name>/fx_std fy_std fz_std tx_std ty_std tz_std` | their standard deviations |
-//! | `contact/<name>/valid`, `contact/<name>/reason` | as below, of the contact |
-//! | `contact/<name>/detected` | 1 if nobody declared it and F/T readings show it, else 0 |
-//! | `valid/<joint>` | 1 if it may be used, else 0 |
-//! | `reason/<joint>` | why not: a word, and the channel to blame behind a colon |
-//! | `residual/<link>/fx fy fz tx ty tz` | \[N, Nm\], what links, sensors and known contacts leave unexplained in the sub-tree with this top link, at its origin and in its axes |
-//! | `residual/<link>/significance` | how rare that is if nothing unknown acts, in standard deviations of a normal variable; empty where nothing can be tested |
-//! | `residual/<link>/reason` | what it comes from: the contact that was detected there, or `unexplained` |
+//! | `contact/<name>/valid`, `contact/<name>/reason` | as for a joint |
+//! | `contact/<name>/detected` | 1 if F/T readings show it without a declaration, else 0 |
+//! | `valid/<joint>` | 1 if the torque is valid, else 0 |
+//! | `reason/<joint>` | why it is not valid: a word, and the channel at fault after a colon |
+//! | `residual/<link>/fx fy fz tx ty tz` | \[N, Nm\], the residual of a sub-tree; see below |
+//! | `residual/<link>/significance` | its normal deviate; empty where it cannot be tested |
+//! | `residual/<link>/reason` | its cause: the contact detected there, or `unexplained` |
+//!
+//! A contact wrench is given in the axes and at the origin of the frame that `link` names. The
+//! residual of a sub-tree is the wrench that links, sensors and known contacts do not explain, at
+//! the origin and in the axes of its top link, which `<link>` names. Its significance is the normal
+//! deviate with the same probability, if no unknown wrench acts.
 
 use crate::assessment::Assessor;
 use crate::pipeline::{Estimate, Pipeline};
-use crate::setup::{Channel, Setup};
+use crate::setup::Setup;
+use proprio_identification::robot::Channel;
 use proprio_topics::csv::{Item, Reader, Report, Row, Series, Value, What};
 use proprio_topics::{ContactWrench, JointTorque, Kind, NO_CAUSE, Nanos, Reason, Residual};
 use std::io::{self, Read, Write};
 
-/// Why a log gives no estimates.
+/// Why a log cannot be estimated.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum OfflineError {
@@ -37,16 +44,16 @@ pub enum OfflineError {
     MissingChannels(Vec<String>),
 }
 
-/// What became of a log.
+/// Counts and remarks of the estimates of a log.
 #[derive(Debug, Clone, Default)]
 pub struct EstimateReport {
     /// Estimates written.
     pub estimates: u64,
-    /// Torques in them that are withheld.
+    /// Withheld torques in them.
     pub withheld: u64,
-    /// What the log's reader skipped.
+    /// The rows that the reader skipped.
     pub log: Report,
-    /// Samples dropped: late, not later than the last, not finite.
+    /// Samples dropped: late, stamped no later than the last one, not finite.
     pub dropped: [u64; 3],
     /// The line of the first row with a dropped sample.
     pub first_dropped: Option<u64>,
@@ -54,8 +61,9 @@ pub struct EstimateReport {
     pub unused_channels: Vec<String>,
 }
 
-/// Identification's share, if it is on and it is time for it: at once, so that it is always in time.
-fn solve(pipeline: &mut Pipeline) {
+/// Runs a job of on-line identification if one is due. It runs immediately, so that its solution is
+/// always in time.
+fn run_due_job(pipeline: &mut Pipeline) {
     if let Some(mut job) = pipeline.take_job() {
         job.run();
         pipeline.give_back(job);
@@ -66,11 +74,15 @@ fn solve(pipeline: &mut Pipeline) {
 ///
 /// # Errors
 /// [`OfflineError`]; a joint that the log lacks and the configuration does not lock is one.
-pub fn estimate(setup: Setup, log: impl Read, out: impl Write) -> Result<EstimateReport, OfflineError> {
+pub fn estimate(
+    setup: Setup,
+    log: impl Read,
+    out: impl Write,
+) -> Result<EstimateReport, OfflineError> {
     estimate_with(setup, log, out, None)
 }
 
-/// The same, and `assessor`, which has read this log, gets the estimates, too.
+/// The same, and also passes the estimates to `assessor`, which has read this log.
 ///
 /// # Errors
 /// As for [`estimate`].
@@ -101,8 +113,12 @@ fn estimate_with(
         .iter()
         .map(|s| {
             let target = match s.what {
-                What::Channel(kind) => pipeline.setup().channel(kind, &s.name).map(Target::Channel),
-                What::Contact => pipeline.setup().contact(&s.name).map(Target::Contact),
+                What::Channel(kind) => pipeline
+                    .setup()
+                    .robot
+                    .channel(kind, &s.name)
+                    .map(Target::Channel),
+                What::Contact => pipeline.setup().robot.contact(&s.name).map(Target::Contact),
             };
             if target.is_none() {
                 report.unused_channels.push(s.name.clone());
@@ -111,8 +127,9 @@ fn estimate_with(
         })
         .collect();
     let mut table = Table::new(out, pipeline.setup())?;
-    // Rows of a log without stamps are so far apart that nothing is carried from one to the next.
-    let apart = pipeline.setup().max_silence + pipeline.setup().max_silence + Nanos(1);
+    // Rows of a log without stamps are spaced so far that none affects the next.
+    let spacing =
+        pipeline.setup().robot.max_silence + pipeline.setup().robot.max_silence + Nanos(1);
     let (mut row, mut pseudo) = (Row::default(), Nanos::ZERO);
     let mut stamped = true;
     let mut write = |pipeline: &mut Pipeline, stamped: bool| -> Result<(), OfflineError> {
@@ -123,14 +140,14 @@ fn estimate_with(
                 let t = estimate.t;
                 assessor.parameters(t, pipeline);
             }
-            solve(pipeline);
+            run_due_job(pipeline);
         }
         Ok(())
     };
     while reader.next_row(&mut row)? {
         let t = row.t.unwrap_or_else(|| {
             stamped = false;
-            pseudo += apart;
+            pseudo += spacing;
             pseudo
         });
         for Item { series, value } in &row.items {
@@ -138,7 +155,9 @@ fn estimate_with(
                 (Some(Target::Channel(channel)), Value::Reading(reading, quality)) => {
                     pipeline.push(*channel, t, reading, *quality);
                 }
-                (Some(Target::Contact(contact)), Value::Active(active)) => pipeline.declare(*contact, t, *active),
+                (Some(Target::Contact(contact)), Value::Active(active)) => {
+                    pipeline.declare(*contact, t, *active);
+                }
                 _ => {}
             }
         }
@@ -158,7 +177,8 @@ fn estimate_with(
     Ok(report)
 }
 
-/// The channels that `setup` reads and a log with these columns does not have: each with what to do about it, in words.
+/// The channels that `setup` reads and a log with these columns does not have, each with a hint
+/// what to do.
 pub fn missing_channels(setup: &Setup, series: &[Series]) -> Vec<String> {
     let there = |channel: &Channel| {
         series
@@ -166,7 +186,8 @@ pub fn missing_channels(setup: &Setup, series: &[Series]) -> Vec<String> {
             .any(|s| s.what == What::Channel(channel.kind) && s.name == channel.name)
     };
     setup
-        .channels()
+        .robot
+        .channels
         .iter()
         .filter(|channel| !there(channel))
         .map(|channel| {
@@ -205,22 +226,27 @@ impl<W: Write> Table<W> {
     /// # Errors
     /// If `out` can not be written.
     pub fn new(mut out: W, setup: &Setup) -> io::Result<Self> {
-        let joints: Vec<&str> = setup.joint_names().collect();
-        let contacts: Vec<&str> = setup.contact_names().collect();
+        let joints: Vec<&str> = setup.robot.joint_names().collect();
+        let contacts: Vec<&str> = setup.robot.contact_names().collect();
         let mut header = String::from("t");
         for part in ["torque", "torque_std"] {
-            joints.iter().for_each(|j| header.push_str(&format!(",{part}/{j}")));
+            joints
+                .iter()
+                .for_each(|j| header.push_str(&format!(",{part}/{j}")));
         }
         for contact in &contacts {
-            let columns = "fx fy fz tx ty tz fx_std fy_std fz_std tx_std ty_std tz_std valid reason detected";
+            let columns =
+                "fx fy fz tx ty tz fx_std fy_std fz_std tx_std ty_std tz_std valid reason detected";
             columns
                 .split(' ')
                 .for_each(|c| header.push_str(&format!(",contact/{contact}/{c}")));
         }
         for part in ["valid", "reason"] {
-            joints.iter().for_each(|j| header.push_str(&format!(",{part}/{j}")));
+            joints
+                .iter()
+                .for_each(|j| header.push_str(&format!(",{part}/{j}")));
         }
-        let subtrees: Vec<&str> = setup.subtree_names().collect();
+        let subtrees: Vec<&str> = setup.robot.subtree_names().collect();
         for top in &subtrees {
             "fx fy fz tx ty tz significance reason"
                 .split(' ')
@@ -228,7 +254,12 @@ impl<W: Write> Table<W> {
         }
         header.push('\n');
         out.write_all(header.as_bytes())?;
-        let channels = setup.channels().iter().map(|c| c.name.clone()).collect();
+        let channels = setup
+            .robot
+            .channels
+            .iter()
+            .map(|c| c.name.clone())
+            .collect();
         Ok(Self {
             out,
             channels,
@@ -241,13 +272,21 @@ impl<W: Write> Table<W> {
         })
     }
 
-    /// Writes one estimate; `stamped` says whether its instant means anything.
+    /// Writes one estimate, with its instant if the log is `stamped`.
     ///
     /// # Errors
     /// If the output can not be written.
     pub fn write(&mut self, estimate: &Estimate, stamped: bool) -> io::Result<()> {
-        let joints =
-            || (0..self.joints).map(|i| estimate.torques.joints().get(i).copied().unwrap_or(JointTorque::ABSENT));
+        let joints = || {
+            (0..self.joints).map(|i| {
+                estimate
+                    .torques
+                    .joints()
+                    .get(i)
+                    .copied()
+                    .unwrap_or(JointTorque::ABSENT)
+            })
+        };
         self.text.clear();
         if stamped {
             write!(self.text, "{}", estimate.t)?;
@@ -272,7 +311,12 @@ impl<W: Write> Table<W> {
                 .chain(contact.standard_deviation)
                 .for_each(|v| number(&mut self.text, v));
             flag(&mut self.text, contact.valid);
-            reason(&mut self.text, &self.channels, contact.reason, contact.cause);
+            reason(
+                &mut self.text,
+                &self.channels,
+                contact.reason,
+                contact.cause,
+            );
             flag(&mut self.text, contact.detected);
         }
         for joint in joints() {
@@ -294,16 +338,20 @@ impl<W: Write> Table<W> {
                 .chain([residual.significance])
                 .for_each(|v| number(&mut self.text, v));
             self.text.push(b',');
-            let contact = self.contacts.get(residual.contact as usize).map(String::as_str);
+            let contact = self
+                .contacts
+                .get(residual.contact as usize)
+                .map(String::as_str);
             let contact = contact.or((residual.unexplained == 1).then_some("unexplained"));
-            self.text.extend_from_slice(contact.unwrap_or_default().as_bytes());
+            self.text
+                .extend_from_slice(contact.unwrap_or_default().as_bytes());
         }
         self.text.push(b'\n');
         self.rows += 1;
         self.out.write_all(&self.text)
     }
 
-    /// Gives the output back.
+    /// Returns the output.
     pub fn into_inner(self) -> W {
         self.out
     }
@@ -314,7 +362,7 @@ fn flag(text: &mut Vec<u8>, value: u32) {
     text.extend_from_slice(if value == 1 { b",1" } else { b",0" });
 }
 
-/// A cell: why something is withheld, and the channel to blame behind a colon; empty if it is valid.
+/// A cell: why a value is not valid, and the channel at fault after a colon; empty if it is valid.
 fn reason(text: &mut Vec<u8>, channels: &[String], reason: Reason, cause: u32) {
     text.push(b',');
     if reason == Reason::None {

@@ -1,6 +1,8 @@
-//! Window: exact where it must be, bounded where it can only be bounded, and refusals instead of panics.
+//! Tests of `Window`: exact results where possible, error bounds elsewhere, and errors instead of
+//! panics.
 //!
-//! Angles are in degrees here, as in the figures of the module's head: the window has no unit of its own.
+//! Angles are in degrees here, as in the figures of the module's documentation: the window has no
+//! unit of its own.
 
 use nalgebra::{DMatrix, DVector};
 use proprio_estimator::differentiate::{
@@ -13,7 +15,7 @@ use std::f64::consts::TAU;
 /// Position, velocity, acceleration at a time \[s\].
 type Motion<'a> = &'a dyn Fn(f64) -> [f64; 3];
 
-/// A small generator of its own: the benchmarks are the same numbers everywhere.
+/// A small random generator, so that the numbers are the same everywhere.
 struct Random(u64);
 
 impl Random {
@@ -24,7 +26,7 @@ impl Random {
         (self.0 >> 11) as f64 / (1_u64 << 53) as f64
     }
 
-    /// Standard normal, by the sum of twelve.
+    /// Standard normal, by the sum of twelve uniform numbers.
     fn normal(&mut self) -> f64 {
         (0..12).map(|_| self.uniform()).sum::<f64>() - 6.0
     }
@@ -33,13 +35,13 @@ impl Random {
 /// How a benchmark samples its motion.
 #[derive(Clone, Copy)]
 struct Sampling {
-    /// Intervals are spread evenly between these \[s\].
+    /// Intervals are uniformly distributed between these \[s\].
     interval: [f64; 2],
     quantum: f64,
-    /// Standard deviation of what is added before quantisation \[quanta\].
+    /// Standard deviation of the noise added before quantisation \[quanta\].
     jitter: f64,
     capacity: usize,
-    /// Where the estimate is wanted, after the newest sample \[s\].
+    /// Time of the estimate after the newest sample \[s\].
     after: f64,
 }
 
@@ -51,12 +53,12 @@ const COARSE: Sampling = Sampling {
     after: 0.0,
 };
 
-/// Errors of value, velocity, acceleration over a run; what the window said of itself beside them.
+/// Errors of value, velocity and acceleration over a run, and the stated standard deviations.
 #[derive(Debug, Default)]
 struct Errors {
     rms: [f64; 3],
     worst: [f64; 3],
-    /// Share of errors within two of the standard deviations given.
+    /// Share of errors within two of the stated standard deviations.
     covered: [f64; 3],
 }
 
@@ -89,14 +91,17 @@ fn run(motions: &[Motion<'_>], sampling: Sampling, seconds: f64) -> Errors {
             if now > 1.0 {
                 let at = now + sampling.after;
                 let estimate = window.at(Nanos::from_seconds(at)).unwrap();
-                for (m, ([e, std], truth)) in channels(&estimate).into_iter().zip(motion(at)).enumerate() {
+                for (m, ([e, std], truth)) in
+                    channels(&estimate).into_iter().zip(motion(at)).enumerate()
+                {
                     errors.rms[m] += (e - truth).powi(2);
                     errors.worst[m] = errors.worst[m].max((e - truth).abs());
                     errors.covered[m] += f64::from((e - truth).abs() < 2.0 * std);
                 }
                 count += 1.0;
             }
-            now += sampling.interval[0] + (sampling.interval[1] - sampling.interval[0]) * random.uniform();
+            now += sampling.interval[0]
+                + (sampling.interval[1] - sampling.interval[0]) * random.uniform();
         }
     }
     errors.rms = errors.rms.map(|sum| (sum / count).sqrt());
@@ -118,7 +123,7 @@ fn arm(j: f64, t: f64) -> [f64; 3] {
     std::array::from_fn(|m| a[m] + b[m] + c[m])
 }
 
-/// At rest until 1.5 s, then 40 deg in 0.8 s with the least jerk, then at rest.
+/// At rest until 1.5 s, then a minimum-jerk motion of 40 deg in 0.8 s, then at rest.
 fn reach(offset: f64, t: f64) -> [f64; 3] {
     let (whole, amplitude) = (0.8, 40.0);
     let u = ((t - 1.5) / whole).clamp(0.0, 1.0);
@@ -150,16 +155,24 @@ fn reaching(sampling: Sampling) -> Errors {
     run(&motions.each_ref().map(|m| m as Motion<'_>), sampling, 3.5)
 }
 
-// What other adaptive windows reach on a sine of 20 deg, 0.5 Hz at 100 Hz with 0.055 deg, velocity RMS error moving / at
-// rest: 6.39 / 0.13 (line), 3.92 / 0.77 (line through the ends), 5.61 / 0.12 (best line), 2.43 / 0.26 deg/s (quadratic).
-// The bounds below are the figures reached, rounded up.
+// Other adaptive windows on a sine of 20 deg, 0.5 Hz at 100 Hz with 0.055 deg: velocity RMS error
+// moving / at rest 6.39 / 0.13 (line), 3.92 / 0.77 (line through the ends), 5.61 / 0.12 (best
+// line), 2.43 / 0.26 deg/s (quadratic). The bounds below are the figures of `Window`, rounded up.
 
 #[test]
 fn a_sine_seen_by_a_coarse_encoder() {
     let motion = |t| sine(20.0, 0.5, 0.0, t);
     for (what, sampling, velocity, acceleration) in [
         ("at the newest sample", COARSE, 0.7, 16.0),
-        ("window of 64", Sampling { capacity: 64, ..COARSE }, 0.8, 19.0),
+        (
+            "window of 64",
+            Sampling {
+                capacity: 64,
+                ..COARSE
+            },
+            0.8,
+            19.0,
+        ),
         (
             "half a period back",
             Sampling {
@@ -169,8 +182,24 @@ fn a_sine_seen_by_a_coarse_encoder() {
             0.65,
             15.0,
         ),
-        ("half a period ahead", Sampling { after: 0.005, ..COARSE }, 0.75, 17.0),
-        ("0.3 quanta of noise", Sampling { jitter: 0.3, ..COARSE }, 0.8, 20.0),
+        (
+            "half a period ahead",
+            Sampling {
+                after: 0.005,
+                ..COARSE
+            },
+            0.75,
+            17.0,
+        ),
+        (
+            "0.3 quanta of noise",
+            Sampling {
+                jitter: 0.3,
+                ..COARSE
+            },
+            0.8,
+            20.0,
+        ),
         (
             "irregular stamps",
             Sampling {
@@ -186,7 +215,10 @@ fn a_sine_seen_by_a_coarse_encoder() {
             errors.rms[1] < velocity && errors.rms[2] < acceleration,
             "{what}: {errors:?}"
         );
-        assert!(errors.covered.iter().all(|share| *share > 0.7), "{what}: {errors:?}");
+        assert!(
+            errors.covered.iter().all(|share| *share > 0.7),
+            "{what}: {errors:?}"
+        );
     }
 }
 
@@ -202,8 +234,11 @@ fn nothing_moves_at_rest() {
             errors.rms[1] < velocity && errors.rms[2] < acceleration,
             "{what}: {errors:?}"
         );
-        // One tick in neighbouring samples is 550 deg/s^2 to a plain second difference.
-        assert!(errors.worst[1] < 0.5 && errors.worst[2] < 3.0, "{what}: {errors:?}");
+        // A plain second difference gives 550 deg/s^2 for one tick in neighbouring samples.
+        assert!(
+            errors.worst[1] < 0.5 && errors.worst[2] < 3.0,
+            "{what}: {errors:?}"
+        );
     }
     let short = at_rest(Sampling {
         jitter: 0.3,
@@ -221,16 +256,25 @@ fn an_arm_with_fine_encoders() {
         ..COARSE
     };
     let errors = with_arm(fine(0.004), 4.0);
-    assert!(errors.rms[1] < 0.01 && errors.rms[2] < 1.6, "250 Hz: {errors:?}");
+    assert!(
+        errors.rms[1] < 0.01 && errors.rms[2] < 1.6,
+        "250 Hz: {errors:?}"
+    );
     let errors = with_arm(fine(0.001), 2.0);
-    assert!(errors.rms[1] < 0.01 && errors.rms[2] < 1.4, "1 kHz: {errors:?}");
+    assert!(
+        errors.rms[1] < 0.01 && errors.rms[2] < 1.4,
+        "1 kHz: {errors:?}"
+    );
 }
 
 #[test]
 fn the_onset_of_motion_is_not_overshot() {
-    // The motion's own peaks: 93.75 deg/s and 360.8 deg/s^2.
+    // The peaks of the motion: 93.75 deg/s and 360.8 deg/s^2.
     let coarse = reaching(COARSE);
-    assert!(coarse.worst[1] < 10.0 && coarse.worst[2] < 360.8, "{coarse:?}");
+    assert!(
+        coarse.worst[1] < 10.0 && coarse.worst[2] < 360.8,
+        "{coarse:?}"
+    );
     let fine = reaching(Sampling {
         interval: [0.001; 2],
         quantum: 5.5e-5,
@@ -254,7 +298,8 @@ fn stamps(start: i64, intervals: &[i64]) -> Vec<Nanos> {
 }
 
 proptest! {
-    /// Any polynomial up to the second degree comes back, whatever the stamps, at a sample, between two and beyond.
+    /// Any polynomial up to the second degree is reproduced with any stamps: at a sample, between
+    /// two samples and beyond them.
     #[test]
     fn quadratics_are_exact(
         start in -1_000_000_000_000_000_i64..1_000_000_000_000_000,
@@ -281,20 +326,29 @@ proptest! {
             let e = window.at(t).unwrap();
             let scale = 1e-12 * (1.0 + c[0].abs() + c[1].abs() + c[2].abs());
             for (m, ([got, std], want)) in channels(&e).into_iter().zip(signal(t)).enumerate() {
-                // What rounding the samples to doubles costs, through the noise gain of the window.
+                // The rounding error of the samples, times the noise gain of the window.
                 let allowed = scale / (span / 4.0).powi(i32::try_from(m).unwrap());
-                prop_assert!((got - want).abs() <= allowed, "{m}: {got} for {want}, allowed {allowed}");
+                prop_assert!(
+                    (got - want).abs() <= allowed,
+                    "{m}: {got} for {want}, allowed {allowed}"
+                );
                 prop_assert!(std > 0.0);
             }
             prop_assert_eq!(e.ahead, window.newest_for(t, Nanos::MAX).unwrap() - t);
         }
     }
 
-    /// No input panics, and no estimate is given that is not finite.
+    /// No input causes a panic, and every estimate is finite.
     #[test]
     fn whatever_comes_is_refused_or_finite(
-        samples in prop::collection::vec((any::<i64>(), prop::array::uniform3(any::<f64>())), 0..40),
-        close in prop::collection::vec((1_i64..2_000, prop::array::uniform3(-1e200..1e200_f64)), 0..200),
+        samples in prop::collection::vec(
+            (any::<i64>(), prop::array::uniform3(any::<f64>())),
+            0..40,
+        ),
+        close in prop::collection::vec(
+            (1_i64..2_000, prop::array::uniform3(-1e200..1e200_f64)),
+            0..200,
+        ),
         instants in prop::collection::vec((any::<i64>(), any::<i64>()), 1..10),
     ) {
         let mut window = Window::<3>::new(Settings::new(1e-3)).unwrap();
@@ -317,7 +371,8 @@ proptest! {
         ask.extend(instants.into_iter().map(|(t, until)| (Nanos(t), Nanos(until))));
         for (t, until) in ask {
             if let Ok(e) = window.at_using(t, until) {
-                for v in [e.value, e.first, e.second, e.value_std, e.first_std, e.second_std].as_flattened() {
+                let all = [e.value, e.first, e.second, e.value_std, e.first_std, e.second_std];
+                for v in all.as_flattened() {
                     prop_assert!(v.is_finite());
                 }
                 prop_assert!(e.samples.iter().all(|n| (3..=MAX_SAMPLES).contains(n)));
@@ -325,8 +380,9 @@ proptest! {
         }
     }
 
-    /// What is told is the least-squares polynomial of the samples that it is said to be of, of the degree whose windows may be that long: by a decomposition of the plain
-    /// matrix of powers. And what neighbours share of their stamps, of the same or others, changes not a bit.
+    /// The estimate is the least-squares polynomial of the reported samples, of the degree whose
+    /// windows may be that long; the reference is a decomposition of the matrix of powers. Sharing
+    /// a grid between channels, with equal or other stamps, does not change a bit.
     #[test]
     fn estimates_are_least_squares_polynomials_of_the_samples_named(
         start in -1_000_000_000_000_000_000_i64..1_000_000_000_000_000_000,
@@ -355,8 +411,9 @@ proptest! {
         let newest = last + estimate.ahead + (t - last);
         let skipped = stamps.iter().filter(|stamp| **stamp > newest).count();
         let at = (t - newest).seconds();
+        let derivatives = channels(&estimate).into_iter().zip(estimate.samples);
         for (m, (([got, std], length), gain)) in
-            channels(&estimate).into_iter().zip(estimate.samples).zip([1.0, 10.0, 100.0]).enumerate()
+            derivatives.zip([1.0, 10.0, 100.0]).enumerate()
         {
             let used = &samples[samples.len() - skipped - length..samples.len() - skipped];
             let span = (used[length - 1].0 - used[0].0).max(1e-9);
@@ -376,22 +433,29 @@ proptest! {
             });
             let nearest = fits.map(|fit| (fit - got).abs()).fold(f64::INFINITY, f64::min);
             let allowed = 1e-9 * gain / span.powi(i32::try_from(m).unwrap());
-            prop_assert!(nearest <= allowed, "{m}: off by {nearest}, allowed {allowed}, of {length} samples, std {std}");
+            prop_assert!(
+                nearest <= allowed,
+                "{m}: off by {nearest}, allowed {allowed}, of {length} samples, std {std}"
+            );
         }
         let mut grid = Grid::new();
         prop_assert!(other.at_sharing(t, last, &mut grid).is_ok());
         prop_assert_eq!(window.at_sharing(t, last, &mut grid), Ok(estimate));
-        // The same stamps, and another instant; an instant with other samples; fewer samples.
+        // The same stamps with another instant; an instant with other samples; fewer samples.
         prop_assert_eq!(window.at_sharing(last, last, &mut grid), window.at_using(last, last));
-        prop_assert_eq!(window.at_sharing(stamps[100], last, &mut grid), window.at_using(stamps[100], last));
+        prop_assert_eq!(
+            window.at_sharing(stamps[100], last, &mut grid),
+            window.at_using(stamps[100], last)
+        );
         prop_assert_eq!(window.at_sharing(t, last, &mut grid), Ok(estimate));
-        let mut shorter = Window::<1>::new(Settings { capacity: capacity - 7, ..settings }).unwrap();
+        let mut shorter =
+            Window::<1>::new(Settings { capacity: capacity - 7, ..settings }).unwrap();
         for (t, error) in stamps.iter().zip(&errors) {
             shorter.push(*t, [error * noise]).unwrap();
         }
         prop_assert_eq!(shorter.at_sharing(t, last, &mut grid), shorter.at_using(t, last));
         prop_assert_eq!(window.at_sharing(t, last, &mut grid), Ok(estimate));
-        // One stamp is another, and the number is the same.
+        // One stamp differs; the number of samples is the same.
         other.clear();
         for (number, (t, error)) in stamps.iter().zip(&errors).enumerate() {
             let late = Nanos(i64::from(number + 5 + skipped == stamps.len()));
@@ -401,7 +465,7 @@ proptest! {
         prop_assert_eq!(window.at_sharing(t, last, &mut grid), Ok(estimate));
     }
 
-    /// Three components in one window are three windows of one.
+    /// One window of three components gives the same as three windows of one.
     #[test]
     fn components_do_not_mix(
         intervals in prop::collection::vec(1_000_i64..9_000, 20..100),
@@ -426,8 +490,8 @@ proptest! {
         }
     }
 
-    /// An estimate depends on the samples up to its instant and the first later one alone: what was pushed before them
-    /// and fell out, and what was pushed after them, changes not a bit.
+    /// An estimate depends on the samples up to its instant and the first later one alone. Samples
+    /// that were dropped before, and samples pushed later, do not change a bit.
     #[test]
     fn only_the_samples_that_may_count_count(
         intervals in prop::collection::vec(1_000_i64..9_000, 60..120),
@@ -441,7 +505,7 @@ proptest! {
         let cut = stamps.len() - later;
         let t = stamps[cut - 1] + Nanos::from_micros(offset_us.min(intervals[cut] - 1));
         let until = t + Nanos::from_micros(wait_us);
-        // All that may count: one more if it is there and not too late.
+        // The samples that may be used: one more if it is there and not too late.
         let counted = if stamps[cut] <= until { cut + 1 } else { cut };
         let mut expected = Window::<1>::new(Settings { capacity: 30 - later, ..settings }).unwrap();
         for (t, v) in stamps.iter().zip(&values).take(counted).skip(counted - (30 - later)) {
@@ -474,14 +538,26 @@ fn a_gap_starts_anew() {
     }
     assert_eq!(window.at(ms(590)).unwrap().value[0], 5.0);
     assert_eq!(window.at(ms(591)), Err(Unavailable::Stale { by: ms(101) }));
-    assert_eq!(window.push(ms(591), [7.0]), Ok(Pushed::Restarted { gap: ms(101) }));
-    assert_eq!(window.at(ms(591)), Err(Unavailable::Starting { samples: 1 }));
+    assert_eq!(
+        window.push(ms(591), [7.0]),
+        Ok(Pushed::Restarted { gap: ms(101) })
+    );
+    assert_eq!(
+        window.at(ms(591)),
+        Err(Unavailable::Starting { samples: 1 })
+    );
     assert_eq!(window.at(ms(590)), Err(Unavailable::Before { by: ms(1) }));
     window.push(ms(601), [7.0]).unwrap();
-    assert_eq!(window.at(ms(601)), Err(Unavailable::Starting { samples: 2 }));
+    assert_eq!(
+        window.at(ms(601)),
+        Err(Unavailable::Starting { samples: 2 })
+    );
     window.push(ms(611), [7.0]).unwrap();
     let e = window.at(ms(611)).unwrap();
-    assert_eq!((e.value, e.first, e.second, e.samples), ([7.0], [0.0], [0.0], [3; 3]));
+    assert_eq!(
+        (e.value, e.first, e.second, e.samples),
+        ([7.0], [0.0], [0.0], [3; 3])
+    );
 }
 
 #[test]
@@ -494,8 +570,10 @@ fn old_samples_go() {
     let mut window = Window::<1>::new(settings).unwrap();
     let ms = Nanos::from_millis;
     for i in 0..1000 {
-        // A constant that changes: only what is recent counts.
-        window.push(ms(i * 10), [if i < 990 { 1.0 } else { 2.0 }]).unwrap();
+        // A constant that changes: only recent samples count.
+        window
+            .push(ms(i * 10), [if i < 990 { 1.0 } else { 2.0 }])
+            .unwrap();
         assert_eq!(window.len(), 128.min(usize::try_from(i).unwrap() + 1));
         assert_eq!(window.oldest().unwrap().0, ms((i - 127).max(0) * 10));
     }
@@ -503,7 +581,10 @@ fn old_samples_go() {
     assert_eq!(window.exactly(ms(9_981)), None);
     let e = window.at(ms(9_990)).unwrap();
     // Within 50 ms: six samples, all of the new value.
-    assert_eq!((e.value, e.first, e.second, e.samples), ([2.0], [0.0], [0.0], [6; 3]));
+    assert_eq!(
+        (e.value, e.first, e.second, e.samples),
+        ([2.0], [0.0], [0.0], [6; 3])
+    );
     assert_eq!(window.at(ms(8_719)), Err(Unavailable::Before { by: ms(1) }));
 }
 
@@ -550,7 +631,11 @@ fn what_is_wrong_is_refused_and_said() {
     }
     let zero = Nanos::ZERO;
     assert_eq!(
-        Window::<1>::new(Settings { max_gap: zero, ..good }).unwrap_err(),
+        Window::<1>::new(Settings {
+            max_gap: zero,
+            ..good
+        })
+        .unwrap_err(),
         SettingsError::Duration(zero)
     );
     let mut window = Window::<1>::new(good).unwrap();
@@ -559,7 +644,10 @@ fn what_is_wrong_is_refused_and_said() {
     for got in [Nanos(10), Nanos(9), Nanos::MIN] {
         assert_eq!(
             window.push(got, [2.0]),
-            Err(Refused::NotLater { newest: Nanos(10), got })
+            Err(Refused::NotLater {
+                newest: Nanos(10),
+                got
+            })
         );
     }
     for v in [f64::NAN, f64::INFINITY] {
@@ -584,7 +672,7 @@ fn instants_before_a_gap_keep_their_samples_whenever_the_gap_ends() {
         window.push(ms(i), [1000.0 - i as f64]).unwrap();
     }
     assert_eq!(window.at_using(ms(19), ms(20)).unwrap(), before);
-    // What comes after it does not look across.
+    // Samples after the gap are not fitted together with those before.
     let after = window.at(ms(202)).unwrap();
     assert!(
         (after.first[0] + 1000.0).abs() < 1e-3 && after.samples == [3; 3],
@@ -592,11 +680,15 @@ fn instants_before_a_gap_keep_their_samples_whenever_the_gap_ends() {
     );
     window.interrupt();
     window.push(ms(203), [0.0]).unwrap();
-    assert_eq!(window.at(ms(203)), Err(Unavailable::Starting { samples: 1 }));
+    assert_eq!(
+        window.at(ms(203)),
+        Err(Unavailable::Starting { samples: 1 })
+    );
     assert_eq!(window.at_using(ms(202), ms(202)).unwrap(), after);
 }
 
-/// Noise is seen in motion and at rest, late stamps as noise of what moves, and the motion itself as none.
+/// Noise is measured in motion and at rest. Jitter of stamps counts as noise of a moving signal;
+/// the motion itself does not.
 #[test]
 fn noise_shows_in_the_samples_late_stamps_included() {
     let found = |noise: f64, late: f64, amplitude: f64| {
@@ -623,19 +715,20 @@ fn noise_shows_in_the_samples_late_stamps_included() {
         let ratio = found(1e-3, 0.0, amplitude) / 1e-3;
         assert!((0.8..1.2).contains(&ratio), "{amplitude}: {ratio}");
     }
-    // |N(0, 1 ms)| varies by 0.6 ms, and the signal changes by 2.1 /s in the root mean square.
+    // |N(0, 1 ms)| has a standard deviation of 0.6 ms, and the signal's RMS velocity is 2.1 /s.
     let ratio = found(0.0, 1e-3, 1.0) / (0.6e-3 * 2.1);
     assert!((0.6..1.6).contains(&ratio), "{ratio}");
     assert!(found(0.0, 1e-3, 0.0) < 1e-9);
 }
 
-/// Who begins later finds the same noise: it is of the longest window alone, however slow the samples come.
+/// A replay that begins later measures the same noise: it depends on the longest window alone, at
+/// any sample rate.
 #[test]
 fn noise_is_of_the_longest_window_alone() {
     let begun = |at: i64| {
         let mut window = Window::<1>::new(Settings::new(1e-6)).unwrap();
         for k in at..60 {
-            // Rough at first, then less and less so.
+            // Large noise at first, then decreasing.
             let value = if k % 2 == 0 { 1.0 / k as f64 } else { 0.0 };
             window.push(Nanos::from_millis(40 * k), [value]).unwrap();
         }

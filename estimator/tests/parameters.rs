@@ -1,23 +1,29 @@
-//! What is identified, from the file to the torques' standard deviations: covariance carried to the estimates, by another route and by drawing parameters;
-//! parameters.toml read, written, cut and foreign; URDFs with other inertias.
+//! Identified parameters, from the file to the standard deviations of torques: propagation of the
+//! covariance, against another method and against random draws; parameters.toml read, written,
+//! truncated, and of another robot; URDFs with other inertias.
 
+#[path = "../dynamics/tests/common/mod.rs"]
 mod common;
 
 use common::{Random, RandomRobot, State, contact, gap, humanoid, motion, size};
 use nalgebra::{DMatrix, DVector, Matrix4, Matrix6, SMatrix};
-use proprio_estimator::calibration::{Calibration, Kind, Unknown};
-use proprio_estimator::config::{Config, Gain};
-use proprio_estimator::dynamics::{
-    ContactKind, ContactSet, ContactSpec, DynamicsError, FrameMotion, Kinematics, Noise, SensorCut, Solver, Structure,
+use proprio_dynamics::calibration::{Calibration, Gain, Kind, Unknown};
+use proprio_dynamics::model::{Frame, Model, ModelError};
+use proprio_dynamics::regressor::EstimateRows;
+use proprio_dynamics::spatial::{Mat3, Pose, RigidInertia, Vec3, Wrench};
+use proprio_dynamics::{
+    ContactKind, ContactSet, ContactSpec, DynamicsError, FrameMotion, Kinematics, Noise, SensorCut,
+    Solver, Structure,
 };
-use proprio_estimator::model::{Frame, Model, ModelError};
+use proprio_estimator::config::Config;
+use proprio_estimator::inertial::PosteriorBlock;
 use proprio_estimator::offline;
 use proprio_estimator::parameters::{
-    Calibrated, Friction, Offset, Parameters, ParametersError, Provenance, Rotor, Span, cad_root,
+    Calibrated, Friction, Offset, Parameters, ParametersError, Provenance, Rotor, Span,
 };
-use proprio_estimator::regressor::{Covariance, EstimateRows, Propagation};
-use proprio_estimator::setup::{Learnt, Setup};
-use proprio_estimator::spatial::{Mat3, Pose, RigidInertia, Vec3, Wrench};
+use proprio_estimator::propagation::{Covariance, Propagation};
+use proprio_estimator::setup::Setup;
+use proprio_identification::prior::cad_root;
 use proprio_topics::Nanos;
 use proptest::prelude::*;
 use std::collections::HashMap;
@@ -25,11 +31,13 @@ use std::path::{Path, PathBuf};
 
 // ---------------------------------------------------------------- covariance to deviations
 
-/// A covariance of some links and sensors: one large block, blocks of single links, and what is exact.
+/// A covariance of some links and sensors: one large block, blocks of single links, and exact
+/// parameters.
 fn covariance(structure: &Structure, random: &mut Random) -> Covariance {
     let (links, sensors) = (structure.link_count(), structure.sensors().len());
     let mut covariance = Covariance::exact(links, sensors);
-    let mut root = |rows: usize, columns: usize| DMatrix::from_fn(rows, columns, |_, _| random.real(0.1));
+    let mut root =
+        |rows: usize, columns: usize| DMatrix::from_fn(rows, columns, |_, _| random.real(0.1));
     let (mut correlated, mut with) = (Vec::new(), Vec::new());
     for link in 0..links {
         match link % 4 {
@@ -45,7 +53,7 @@ fn covariance(structure: &Structure, random: &mut Random) -> Covariance {
             _ => {}
         }
     }
-    // Given in any order; sometimes of lower rank than columns.
+    // In any order; sometimes the rank is lower than the number of columns.
     correlated.reverse();
     let columns = 10 * correlated.len() + 6 * with.len();
     let rows = if links.is_multiple_of(3) {
@@ -53,24 +61,29 @@ fn covariance(structure: &Structure, random: &mut Random) -> Covariance {
     } else {
         columns
     };
-    covariance.add(&correlated, &with, root(rows, columns)).unwrap();
+    covariance
+        .add(&correlated, &with, root(rows, columns))
+        .unwrap();
     covariance
 }
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// The same as `T P T^T`, row by row; whatever contacts are present.
+    /// The result equals `T P T^T`, computed row by row, with any contacts present.
     #[test]
     fn deviations_are_those_of_the_estimates_rows(links in 1..=24_usize, seed in any::<u64>()) {
         let mut random = Random::new(seed);
         let robot = RandomRobot::new(links, &mut random);
         let model = robot.model();
         let sensors = robot.sensors(&model, &mut random);
-        let contacts: Vec<ContactSpec> = (0..random.below(5)).map(|_| contact(&model, &mut random).0).collect();
+        let contacts: Vec<ContactSpec> =
+            (0..random.below(5)).map(|_| contact(&model, &mut random).0).collect();
         let structure = Structure::new(&model, &sensors, &contacts, 0.1).unwrap();
         let mut kinematics = Kinematics::new(&model, random.below(model.link_count())).unwrap();
-        kinematics.update(&model, State::new(&model, &mut random).get(), &motion(&mut random)).unwrap();
+        kinematics
+            .update(&model, State::new(&model, &mut random).get(), &motion(&mut random))
+            .unwrap();
         let readings: Vec<Wrench> = sensors.iter().map(|_| random.wrench()).collect();
         let active: ContactSet = (0..contacts.len()).filter(|_| random.chance(60)).collect();
         let mut solver = Solver::new(&structure);
@@ -78,7 +91,7 @@ proptest! {
 
         let mut covariance = covariance(&structure, &mut random);
         let mut all = covariance.dense();
-        // The first sensor's offset wandered for four seconds.
+        // The first sensor's offset has drifted for four seconds.
         if !sensors.is_empty() {
             let rate = [0.1, 0.2, 0.3, 1.0, 2.0, 3.0];
             covariance.set_drift(0, rate, Nanos::from_seconds(7.0)).unwrap();
@@ -92,25 +105,40 @@ proptest! {
 
         let rows = EstimateRows::new(&structure, &solver, &kinematics).unwrap();
         let deviation = |subtree: usize, write: &dyn Fn(&mut [f64])| {
-            let (mut own, mut row) = (vec![0.0; rows.column_count(subtree).unwrap()], vec![0.0; rows.stacked_column_count()]);
+            let (mut own, mut row) = (
+                vec![0.0; rows.column_count(subtree).unwrap()],
+                vec![0.0; rows.stacked_column_count()],
+            );
             write(&mut own);
             rows.expand(subtree, &own, &mut row).unwrap();
             let row = DVector::from_vec(row);
-            // What rounding may leave of a sum that vanishes.
+            // The rounding error of a sum that vanishes.
             let scale = row.abs().dot(&(all.abs() * row.abs()));
             (row.dot(&(&all * &row)), scale)
         };
         for dof in 0..model.dof_count() {
-            let (variance, scale) = deviation(rows.torque_subtree(dof).unwrap(), &|own| rows.torque_row(dof, own).unwrap());
+            let (variance, scale) = deviation(rows.torque_subtree(dof).unwrap(), &|own| {
+                rows.torque_row(dof, own).unwrap();
+            });
             let got = propagation.torque()[dof].powi(2);
-            // Single precision, of the deviation.
-            prop_assert!((got - variance).abs() < 1e-5 * variance + 1e-10 * (1.0 + scale), "dof {}: {} not {}", dof, got, variance);
+            // The deviation has single precision.
+            prop_assert!(
+                (got - variance).abs() < 1e-5 * variance + 1e-10 * (1.0 + scale),
+                "dof {}: {} not {}", dof, got, variance
+            );
         }
         for contact in 0..contacts.len() {
-            for (component, got) in [3, 4, 5, 0, 1, 2].into_iter().zip(propagation.contacts()[contact]) {
+            let components = [3, 4, 5, 0, 1, 2];
+            for (component, got) in components.into_iter().zip(propagation.contacts()[contact]) {
                 let (variance, scale) =
-                    deviation(rows.contact_subtree(contact).unwrap(), &|own| rows.contact_row(contact, component, own).unwrap());
-                prop_assert!((got.powi(2) - variance).abs() < 1e-5 * variance + 1e-10 * (1.0 + scale), "{}: {} not {}", component, got.powi(2), variance);
+                    deviation(rows.contact_subtree(contact).unwrap(), &|own| {
+                        rows.contact_row(contact, component, own).unwrap();
+                    });
+                let square = got.powi(2);
+                prop_assert!(
+                    (square - variance).abs() < 1e-5 * variance + 1e-10 * (1.0 + scale),
+                    "{}: {} not {}", component, square, variance
+                );
             }
         }
     }
@@ -119,20 +147,25 @@ proptest! {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(32))]
 
-    /// An unknown of a calibration is as an offset, by as much as is read: the same as if its columns of the root were added to those of the offset.
+    /// An unknown of a calibration acts like an offset with a factor that depends on the reading:
+    /// the result is the same as with its columns added to those of the offset.
     #[test]
-    fn an_uncertain_calibration_is_an_offset_by_what_is_read(links in 2..=16_usize, seed in any::<u64>()) {
+    fn an_uncertain_calibration_acts_like_an_offset(links in 2..=16_usize, seed in any::<u64>()) {
         let mut random = Random::new(seed);
         let robot = RandomRobot::new(links, &mut random);
         let model = robot.model();
         let sensors = robot.sensors(&model, &mut random);
-        let contacts: Vec<ContactSpec> = (0..random.below(4)).map(|_| contact(&model, &mut random).0).collect();
+        let contacts: Vec<ContactSpec> =
+            (0..random.below(4)).map(|_| contact(&model, &mut random).0).collect();
         let structure = Structure::new(&model, &sensors, &contacts, 0.1).unwrap();
         let mut kinematics = Kinematics::new(&model, random.below(model.link_count())).unwrap();
-        kinematics.update(&model, State::new(&model, &mut random).get(), &motion(&mut random)).unwrap();
+        kinematics
+            .update(&model, State::new(&model, &mut random).get(), &motion(&mut random))
+            .unwrap();
         let readings: Vec<Wrench> = sensors.iter().map(|_| random.wrench()).collect();
         let mut solver = Solver::new(&structure);
-        solver.solve(&model, &structure, &kinematics, &readings, &(0..contacts.len()).collect(), &[]).unwrap();
+        let present = (0..contacts.len()).collect();
+        solver.solve(&model, &structure, &kinematics, &readings, &present, &[]).unwrap();
 
         let all: Vec<usize> = (0..model.link_count()).filter(|_| random.chance(70)).collect();
         let with: Vec<usize> = (0..sensors.len()).collect();
@@ -140,7 +173,9 @@ proptest! {
         let kinds: Vec<(usize, Kind)> = with
             .iter()
             .rev()
-            .map(|&sensor| (sensor, Kind { gain: gains[random.below(3)], temperature: random.chance(50) }))
+            .map(|&sensor| {
+                (sensor, Kind { gain: gains[random.below(3)], temperature: random.chance(50) })
+            })
             .collect();
         let plain = 10 * all.len() + 6 * with.len();
         let columns = plain + kinds.iter().map(|(_, kind)| kind.count()).sum::<usize>();
@@ -168,7 +203,7 @@ proptest! {
         expected.add(&all, &with, together).unwrap();
         let mut got = Propagation::new(&structure, &calibrated).unwrap();
         let mut want = Propagation::new(&structure, &expected).unwrap();
-        // What was read before is forgotten.
+        // Earlier readings have no effect.
         for (sensor, _) in readings.iter().enumerate() {
             got.set_reading(sensor, &random.wrench(), 3.0);
         }
@@ -189,7 +224,7 @@ proptest! {
 }
 
 #[test]
-fn what_does_not_fit_is_refused() {
+fn wrong_sizes_and_indices_are_refused() {
     let (text, sensors) = humanoid();
     let keep: Vec<&str> = sensors.iter().map(String::as_str).collect();
     let model = Model::from_urdf(&text, &keep).unwrap();
@@ -197,23 +232,37 @@ fn what_does_not_fit_is_refused() {
     let mut covariance = Covariance::exact(model.link_count(), 0);
     let root = |columns| DMatrix::from_element(3, columns, 0.1);
     assert!(covariance.add(&[0], &[], root(9)).is_err(), "another width");
-    assert!(covariance.add(&[39], &[], root(10)).is_err(), "no such link");
+    assert!(
+        covariance.add(&[39], &[], root(10)).is_err(),
+        "no such link"
+    );
     assert!(covariance.add(&[1, 1], &[], root(20)).is_err(), "twice");
-    assert!(covariance.add(&[], &[0], root(6)).is_err(), "no such sensor");
-    assert!(covariance.add(&[0], &[], root(10) * f64::NAN).is_err(), "not a number");
+    assert!(
+        covariance.add(&[], &[0], root(6)).is_err(),
+        "no such sensor"
+    );
+    assert!(
+        covariance.add(&[0], &[], root(10) * f64::NAN).is_err(),
+        "not a number"
+    );
     assert_eq!(
         covariance,
         Covariance::exact(model.link_count(), 0),
         "and nothing is changed"
     );
     covariance.add(&[1], &[], root(10)).unwrap();
-    assert!(covariance.add(&[1], &[], root(10)).is_err(), "has one already");
+    assert!(
+        covariance.add(&[1], &[], root(10)).is_err(),
+        "has one already"
+    );
     let kind = Kind {
         gain: Gain::Diagonal,
         temperature: false,
     };
     assert!(
-        covariance.add_calibrated(&[2], &[], &[(0, kind)], root(16)).is_err(),
+        covariance
+            .add_calibrated(&[2], &[], &[(0, kind)], root(16))
+            .is_err(),
         "a calibration without an offset"
     );
     assert!(covariance.has_link(1) && !covariance.has_link(0));
@@ -227,7 +276,8 @@ fn what_does_not_fit_is_refused() {
     );
 }
 
-/// Draws of [phi; o] from `P` through the solver itself: their spread is what is stated.
+/// The spread of the solver's results with [phi; o] drawn from `P`: it must equal the stated
+/// standard deviations.
 fn spread(
     model: &Model,
     structure: &Structure,
@@ -239,14 +289,20 @@ fn spread(
     let mut kinematics = Kinematics::new(model, 0).unwrap();
     let (state, base) = (State::new(model, random), motion(random));
     kinematics.update(model, state.get(), &base).unwrap();
-    let readings: Vec<Wrench> = structure.sensors().iter().map(|_| random.wrench()).collect();
+    let readings: Vec<Wrench> = structure
+        .sensors()
+        .iter()
+        .map(|_| random.wrench())
+        .collect();
     let mut solver = Solver::new(structure);
     solver
         .solve(model, structure, &kinematics, &readings, active, &[])
         .unwrap();
     let mut propagation = Propagation::new(structure, covariance).unwrap();
-    // When the offsets are known: nothing has drifted.
-    propagation.update(structure, &solver, &kinematics, KNOWN).unwrap();
+    // At the instant of the offsets: no drift.
+    propagation
+        .update(structure, &solver, &kinematics, KNOWN)
+        .unwrap();
     let stated: Vec<f64> = propagation
         .torque()
         .iter()
@@ -262,19 +318,26 @@ fn spread(
         solver.torque().iter().copied().chain(contacts).collect()
     };
     let mean = results(&solver);
-    // Any root does for drawing; this one is not the one that was used.
+    // Any root can be used for drawing; this one differs from the one that was propagated.
     let eigen = covariance.dense().symmetric_eigen();
-    let root = &eigen.eigenvectors * DMatrix::from_diagonal(&eigen.eigenvalues.map(|value| value.max(0.0).sqrt()));
+    let root = &eigen.eigenvectors
+        * DMatrix::from_diagonal(&eigen.eigenvalues.map(|value| value.max(0.0).sqrt()));
     let mut squares = vec![0.0; mean.len()];
     for _ in 0..draws {
-        // Normal enough: the sum of twelve uniform numbers.
-        let z = DVector::from_fn(root.ncols(), |_, _| (0..12).map(|_| random.real(0.5)).sum::<f64>());
+        // Nearly normal: the sum of twelve uniform numbers.
+        let z = DVector::from_fn(root.ncols(), |_, _| {
+            (0..12).map(|_| random.real(0.5)).sum::<f64>()
+        });
         let error = &root * z;
         let mut other = model.clone();
         for (link, inertia) in model.inertias().iter().enumerate() {
             let mut phi = inertia.parameters();
-            phi.iter_mut().enumerate().for_each(|(i, p)| *p += error[10 * link + i]);
-            other.set_inertia(link, RigidInertia::from_parameters(&phi)).unwrap();
+            phi.iter_mut()
+                .enumerate()
+                .for_each(|(i, p)| *p += error[10 * link + i]);
+            other
+                .set_inertia(link, RigidInertia::from_parameters(&phi))
+                .unwrap();
         }
         let first = 10 * model.link_count();
         let shifted: Vec<Wrench> = readings
@@ -307,11 +370,14 @@ fn spread(
     assert!(compared > mean.len() / 2, "{compared} of {}", mean.len());
 }
 
-/// When offsets were identified.
+/// The instant of the identified offsets.
 const KNOWN: Nanos = Nanos::from_millis(1500);
 
 fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_owned()
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .parent()
+        .unwrap()
+        .to_owned()
 }
 
 fn arm_with(change: impl FnOnce(&mut Config)) -> Setup {
@@ -327,30 +393,33 @@ fn arm() -> Setup {
 #[test]
 fn parameters_drawn_from_the_covariance_spread_the_torques_as_stated() {
     let mut random = Random::new(2015);
-    // The arm, as it comes: the URDF's links are uncertain; and with parameters that were identified.
+    // The arm as configured, with the uncertainty of the URDF; and with identified parameters.
     let mut setup = arm();
-    let active = setup.always;
+    let active = setup.robot.always;
     spread(
-        &setup.model,
-        &setup.structure,
+        &setup.state.model,
+        &setup.robot.structure,
         &active,
-        &setup.covariance,
+        &setup.state.covariance,
         &mut random,
         4000,
     );
     setup.apply(&identified(&setup, &mut random)).unwrap();
     spread(
-        &setup.model,
-        &setup.structure,
+        &setup.state.model,
+        &setup.robot.structure,
         &active,
-        &setup.covariance,
+        &setup.state.covariance,
         &mut random,
         4000,
     );
     // The walker, whose torques come from both sides of a joint, in the air and on a foot.
     let text = std::fs::read_to_string(root().join("tests/oracle/walker.urdf")).unwrap();
     let elements = Model::from_urdf(&text, &[]).unwrap().sensors().to_vec();
-    let keep: Vec<&str> = elements.iter().map(|element| element.joint.as_str()).collect();
+    let keep: Vec<&str> = elements
+        .iter()
+        .map(|element| element.joint.as_str())
+        .collect();
     let model = Model::from_urdf(&text, &keep).unwrap();
     let noise = Noise {
         force: [0.1; 3],
@@ -375,9 +444,9 @@ fn parameters_drawn_from_the_covariance_spread_the_torques_as_stated() {
     }
 }
 
-/// CAD's own uncertainty, by its definition and by what does not change it.
+/// The prior covariance of CAD: its definition, and its invariance to the frame.
 #[test]
-fn the_uncertainty_of_a_urdf_is_relative_and_knows_no_frame() {
+fn the_uncertainty_of_a_urdf_is_relative_and_does_not_depend_on_the_frame() {
     let relative = 0.2;
     let body = RigidInertia::from_centroidal(
         3.0,
@@ -389,8 +458,12 @@ fn the_uncertainty_of_a_urdf_is_relative_and_knows_no_frame() {
         root.transpose() * root
     };
     let p = covariance(&body);
-    assert!((p[(0, 0)].sqrt() - relative * 3.0).abs() < 1e-12, "the mass");
-    // Its quadratic form is that of the log-det divergence at CAD: d^T P^-1 d = tr((J^-1 dJ)^2) / relative^2.
+    assert!(
+        (p[(0, 0)].sqrt() - relative * 3.0).abs() < 1e-12,
+        "the mass"
+    );
+    // Its quadratic form is that of the log-det divergence at CAD: d^T P^-1 d = tr((J^-1 dJ)^2) /
+    // relative^2.
     let mut random = Random::new(4);
     let inverse = body.pseudo_inertia().try_inverse().unwrap();
     let form = p.try_inverse().unwrap();
@@ -402,20 +475,29 @@ fn the_uncertainty_of_a_urdf_is_relative_and_knows_no_frame() {
         let got = d.dot(&(form * d));
         assert!((got - expected).abs() < 1e-9 * expected, "{got} {expected}");
     }
-    // Parameters go from frame to frame by a matrix; the covariance goes with it.
+    // A change of frame transforms the parameters by a matrix, and the covariance accordingly.
     let pose = Pose::from_xyz_rpy([0.5, -0.4, 0.2], [0.3, 1.0, -2.0]);
-    let unit = |i: usize| RigidInertia::from_parameters(&std::array::from_fn(|j| f64::from(u8::from(i == j))));
+    let unit = |i: usize| {
+        RigidInertia::from_parameters(&std::array::from_fn(|j| f64::from(u8::from(i == j))))
+    };
     let columns: Vec<_> = (0..10)
         .map(|i| SMatrix::<f64, 10, 1>::from_row_slice(&unit(i).transformed(&pose).parameters()))
         .collect();
     let change = SMatrix::<f64, 10, 10>::from_columns(&columns);
-    let (moved, expected) = (covariance(&body.transformed(&pose)), change * p * change.transpose());
+    let (moved, expected) = (
+        covariance(&body.transformed(&pose)),
+        change * p * change.transpose(),
+    );
     assert!((moved - expected).amax() < 1e-12 * expected.amax());
-    // A point mass, a frame without mass, a body that can not be: something finite, and not nothing.
+    // A point mass, a frame without mass, an inconsistent body: the root is finite and not zero.
     for odd in [
         RigidInertia::from_centroidal(1.0, &Vec3::new(0.1, 0.0, 0.0), &Mat3::zeros()),
         RigidInertia::zero(),
-        RigidInertia::from_centroidal(1.0, &Vec3::zeros(), &Mat3::from_diagonal(&Vec3::new(0.1, 0.01, 0.01))),
+        RigidInertia::from_centroidal(
+            1.0,
+            &Vec3::zeros(),
+            &Mat3::from_diagonal(&Vec3::new(0.1, 0.01, 0.01)),
+        ),
     ] {
         let p = covariance(&odd);
         assert!(p.iter().all(|x| x.is_finite()) && p.diagonal().iter().all(|x| *x > 0.0));
@@ -425,7 +507,7 @@ fn the_uncertainty_of_a_urdf_is_relative_and_knows_no_frame() {
 
 // ---------------------------------------------------------------- the setup and the pipeline
 
-/// Something identified of the links beyond the arm's sensor: each 10 % heavier, and the offsets.
+/// Identified parameters of the links beyond the arm's sensor, each 10 % heavier, and offsets.
 fn identified(setup: &Setup, random: &mut Random) -> Parameters {
     let provenance = Provenance {
         program: "proprio 0.0.0 \"test\"".into(),
@@ -436,12 +518,14 @@ fn identified(setup: &Setup, random: &mut Random) -> Parameters {
             end: Nanos(123_456_789_999_999),
         }],
     };
-    let mut parameters = Parameters::new(setup, provenance);
-    let top = setup.structure.subtrees().last().unwrap().top;
-    let links: Vec<(usize, RigidInertia)> = (top..setup.cad().len())
+    let mut parameters = Parameters::new(&setup.robot, provenance);
+    let top = setup.robot.structure.subtrees().last().unwrap().top;
+    let links: Vec<(usize, RigidInertia)> = (top..setup.robot.model.inertias().len())
         .rev()
         .map(|link| {
-            let numbers = setup.cad()[link].parameters().map(|p| 1.1 * p);
+            let numbers = setup.robot.model.inertias()[link]
+                .parameters()
+                .map(|p| 1.1 * p);
             (link, RigidInertia::from_parameters(&numbers))
         })
         .collect();
@@ -454,7 +538,8 @@ fn identified(setup: &Setup, random: &mut Random) -> Parameters {
         calibrated: None,
     };
     let columns = 10 * links.len() + 6;
-    // Masses known to grams, moments of inertia to a thousandth of that, offsets to centinewtons; all correlated.
+    // Masses known to grams, moments of inertia to a thousandth of that, offsets to centinewtons;
+    // all correlated.
     let scale = |column: usize| match column % 10 {
         _ if column >= 10 * links.len() => 0.02,
         0 => 5e-3,
@@ -483,67 +568,90 @@ fn identified(setup: &Setup, random: &mut Random) -> Parameters {
 type Table = HashMap<String, Vec<f64>>;
 
 fn estimates(setup: Setup) -> Table {
-    let log = std::fs::read_to_string(root().join("tests/oracle/icub_left_arm_mujoco.csv")).unwrap();
+    let log =
+        std::fs::read_to_string(root().join("tests/oracle/icub_left_arm_mujoco.csv")).unwrap();
     let mut out = Vec::new();
     offline::estimate(setup, log.as_bytes(), &mut out).unwrap();
     let mut reader = csv::Reader::from_reader(out.as_slice());
-    let names: Vec<String> = reader.headers().unwrap().iter().map(str::to_owned).collect();
+    let names: Vec<String> = reader
+        .headers()
+        .unwrap()
+        .iter()
+        .map(str::to_owned)
+        .collect();
     let mut columns: Table = names.iter().map(|n| (n.clone(), vec![])).collect();
     for record in reader.records() {
         for (name, cell) in names.iter().zip(record.unwrap().iter()) {
-            columns.get_mut(name).unwrap().push(cell.parse().unwrap_or(f64::NAN));
+            columns
+                .get_mut(name)
+                .unwrap()
+                .push(cell.parse().unwrap_or(f64::NAN));
         }
     }
     columns
 }
 
 #[test]
-fn identified_parameters_take_the_place_of_the_urdfs() {
+fn identified_parameters_replace_those_of_the_urdf() {
     let plain = arm();
     let parameters = identified(&plain, &mut Random::new(3));
     let mut setup = arm();
     setup.apply(&parameters).unwrap();
-    let top = setup.structure.subtrees().last().unwrap().top;
-    for (link, (cad, now)) in setup.cad().iter().zip(setup.model.inertias()).enumerate() {
+    let top = setup.robot.structure.subtrees().last().unwrap().top;
+    for (link, (cad, now)) in setup
+        .robot
+        .model
+        .inertias()
+        .iter()
+        .zip(setup.state.model.inertias())
+        .enumerate()
+    {
         let factor = if link < top { 1.0 } else { 1.1 };
         assert!((now.mass - factor * cad.mass).abs() < 1e-12, "{link}");
         assert_eq!(parameters.inertia(link).is_some(), link >= top);
     }
     assert_eq!(
-        setup.offsets,
+        setup.state.offsets,
         [Wrench::from_parts([1.0, 2.0, 3.0], [0.1, 0.2, 0.3])],
         "the file wins"
     );
     let text = setup.to_string();
     for expected in [
-        "identified by proprio 0.0.0 \"test\" from a log.csv (prior's weight tau = 0.58): 5 of 9 links",
+        "identified by proprio 0.0.0 \"test\" from a log.csv (prior's weight tau = 0.58): 5 of 9 \
+         links",
         "the URDF's, taken as known to 20 %: chest",
         "offset of l_arm_ft_sensor",
     ] {
         assert!(text.contains(expected), "{expected}:\n{text}");
     }
     let text = plain.to_string();
-    let expected = "inertial parameters: the URDF's, taken as known to 20 % (identification.model_std)";
+    let expected = "inertial parameters: the URDF's, taken as known to 20 % \
+                    (identification.urdf_relative_std)";
     assert!(text.contains(expected), "{text}");
 
-    // Torques move where they must, and the better known links make them more certain. Twice applied is once applied.
+    // Torques change where they depend on the links, and are more certain. Applying the parameters
+    // twice gives the same as once.
     setup.apply(&parameters).unwrap();
     let (before, after) = (estimates(plain), estimates(setup));
-    let mean = |table: &Table, name: &str| table[name].iter().sum::<f64>() / table[name].len() as f64;
+    let mean =
+        |table: &Table, name: &str| table[name].iter().sum::<f64>() / table[name].len() as f64;
     for joint in ["l_elbow", "l_wrist_pitch", "l_shoulder_pitch"] {
-        let moved = gap(&before[&format!("torque/{joint}")], &after[&format!("torque/{joint}")]);
+        let moved = gap(
+            &before[&format!("torque/{joint}")],
+            &after[&format!("torque/{joint}")],
+        );
         assert!(moved > 1e-3, "{joint}");
     }
     let deviation = format!("torque_std/{}", "l_wrist_pitch");
     assert!(mean(&after, &deviation) < 0.5 * mean(&before, &deviation));
 }
 
-/// A torque that rests on no F/T sensor has a deviation too: that of the URDF's figures.
+/// A torque that depends on no F/T sensor has the standard deviation of the URDF's parameters.
 #[test]
 fn a_torque_without_a_sensor_is_as_uncertain_as_the_model() {
-    let contact_free = |model_std: f64| {
+    let contact_free = |urdf_relative_std: f64| {
         arm_with(|config| {
-            config.identification.model_std = model_std;
+            config.identification.urdf_relative_std = urdf_relative_std;
             config.contact.retain(|c| c.name() != "hand");
         })
     };
@@ -552,10 +660,10 @@ fn a_torque_without_a_sensor_is_as_uncertain_as_the_model() {
         estimates(contact_free(0.1)),
         estimates(contact_free(0.0)),
     );
-    // Beyond the elbow: a free end, so the wrist's torques come from the links beyond it alone.
+    // Beyond the elbow the arm has a free end: the wrist's torques depend on its links alone.
     let name = "torque_std/l_wrist_yaw";
     for row in 0..loose[name].len() {
-        // Beside the model, what is uncertain of the motion is in all three.
+        // Beside the model's uncertainty, all three contain that of the motion.
         let [loose, tight, exact] = [&loose, &tight, &exact].map(|of| of[name][row].powi(2));
         let (twice, once) = (loose - exact, tight - exact);
         assert!(
@@ -565,7 +673,7 @@ fn a_torque_without_a_sensor_is_as_uncertain_as_the_model() {
         assert!((twice - 4.0 * once).abs() < 1e-9 * loose, "proportional");
     }
     assert_eq!(loose["torque/l_wrist_yaw"], exact["torque/l_wrist_yaw"]);
-    // What rests on a sensor only gains by it.
+    // A torque that depends on a sensor is more certain with exact parameters.
     let shoulder = "torque_std/l_shoulder_pitch";
     assert!(
         loose[shoulder]
@@ -578,7 +686,9 @@ fn a_torque_without_a_sensor_is_as_uncertain_as_the_model() {
 #[test]
 fn an_uncertain_offset_makes_torques_uncertain_and_drift_makes_them_more_so() {
     let known = estimates(arm());
-    let unsure = estimates(arm_with(|config| config.force_torque[0].offset_std_nm = Some([3.0; 3])));
+    let unsure = estimates(arm_with(|config| {
+        config.force_torque[0].offset_std_nm = Some([3.0; 3]);
+    }));
     let shoulder = "torque_std/l_shoulder_pitch";
     assert!(
         known[shoulder]
@@ -586,7 +696,7 @@ fn an_uncertain_offset_makes_torques_uncertain_and_drift_makes_them_more_so() {
             .zip(&unsure[shoulder])
             .all(|(a, b)| b * b > a * a + 8.0)
     );
-    // Offsets that wander, known at the end of a log: from its first stamp to its last.
+    // Offsets that drift, identified from a log with this first and last stamp.
     let of_log = |drift: f64, first: f64, last: f64| {
         let mut setup = arm();
         let from = identified(&setup, &mut Random::new(3));
@@ -606,8 +716,10 @@ fn an_uncertain_offset_makes_torques_uncertain_and_drift_makes_them_more_so() {
             logs: vec![span],
             ..from.provenance().clone()
         };
-        let mut parameters = Parameters::new(&setup, provenance);
-        parameters.set_identified(&links, &[offset], &from.root()).unwrap();
+        let mut parameters = Parameters::new(&setup.robot, provenance);
+        parameters
+            .set_identified(&links, &[offset], &from.root())
+            .unwrap();
         setup.apply(&parameters).unwrap();
         estimates(setup)
     };
@@ -615,16 +727,25 @@ fn an_uncertain_offset_makes_torques_uncertain_and_drift_makes_them_more_so() {
     let begun = still["t"][0];
     let table = of_log(1.0, -30.0, -20.0);
     for (first, last, elapsed) in [
-        // A clock that is not there yet is another one: what counts is how long the robot has run.
-        (1e6, 1e6 + 30.0, &(|t: f64| t - begun) as &dyn Fn(f64) -> f64),
-        // One that is about there may be the same, or not.
-        (begun - 10.0, begun + 1.0, &|t| (t - begun - 1.0).abs().max(t - begun)),
+        // A clock before the log is another clock: the time since the run began counts.
+        (
+            1e6,
+            1e6 + 30.0,
+            &(|t: f64| t - begun) as &dyn Fn(f64) -> f64,
+        ),
+        // A clock with similar stamps may be the same, or another one.
+        (begun - 10.0, begun + 1.0, &|t| {
+            (t - begun - 1.0).abs().max(t - begun)
+        }),
     ] {
         let other = of_log(1.0, first, last);
         for (row, t) in still["t"].iter().enumerate() {
             let grown = |table: &Table| table[shoulder][row].powi(2) - still[shoulder][row].powi(2);
             let (found, expected) = (grown(&other) / grown(&table), elapsed(*t) / (t + 20.0));
-            assert!((found - expected).abs() < 1e-4, "{last} at {t}: {found} {expected}");
+            assert!(
+                (found - expected).abs() < 1e-4,
+                "{last} at {t}: {found} {expected}"
+            );
         }
     }
 }
@@ -655,17 +776,28 @@ fn a_file_reads_back_as_what_was_written() {
         .collect();
     assert!(older.len() < text.len());
     let older = Parameters::parse(&older).unwrap();
-    assert_eq!((older.friction()[0].rotor, older.friction()[0].coulomb), (None, 0.4));
-    // Nothing identified is a file too.
-    let nothing = Parameters::new(&setup, Provenance::default());
+    assert_eq!(
+        (older.friction()[0].rotor, older.friction()[0].coulomb),
+        (None, 0.4)
+    );
+    // A file with nothing identified is valid, too.
+    let nothing = Parameters::new(&setup.robot, Provenance::default());
     assert_eq!(Parameters::parse(&nothing.to_string()).unwrap(), nothing);
-    // The numbers that were given come out again: deviations to rounding, the covariance to a billionth of them.
+    // The given numbers are reproduced: deviations to rounding, the covariance to a billionth of
+    // them.
     let mut random = Random::new(3);
-    let columns = 10 * setup.cad().len();
+    let columns = 10 * setup.robot.model.inertias().len();
     let root = DMatrix::from_fn(columns, columns, |_, j| {
         random.real(if j % 10 < 4 { 1e-2 } else { 1e-6 })
     });
-    let links: Vec<_> = setup.cad().iter().copied().enumerate().collect();
+    let links: Vec<_> = setup
+        .robot
+        .model
+        .inertias()
+        .iter()
+        .copied()
+        .enumerate()
+        .collect();
     let mut parameters = nothing;
     parameters.set_identified(&links, &[], &root).unwrap();
     let (expected, got) = (
@@ -693,7 +825,11 @@ fn with_calibration(setup: &Setup, kind: Kind) -> Parameters {
         }
     });
     let per_kelvin = Wrench::from_parts([0.05, -0.02, 0.1], [1e-3, 2e-3, -3e-3]);
-    let per_kelvin = if kind.temperature { per_kelvin } else { Wrench::zero() };
+    let per_kelvin = if kind.temperature {
+        per_kelvin
+    } else {
+        Wrench::zero()
+    };
     let mut offset = plain.offsets()[0].clone();
     offset.calibrated = Some(Calibrated {
         calibration: Calibration::new(gain, per_kelvin, kind.temperature.then_some(31.5)),
@@ -714,7 +850,7 @@ fn with_calibration(setup: &Setup, kind: Kind) -> Parameters {
             0.0
         }
     });
-    let mut parameters = Parameters::new(setup, plain.provenance().clone());
+    let mut parameters = Parameters::new(&setup.robot, plain.provenance().clone());
     parameters.set_identified(&links, &[offset], &root).unwrap();
     parameters
 }
@@ -738,33 +874,41 @@ fn a_calibration_reads_back_and_is_used() {
         assert_eq!(read.to_string(), text);
         let deviations = read.calibration_deviation(0);
         assert_eq!(deviations.len(), kind.count());
-        // In the file channels are in the order of logs: what the z force reads of itself is the last of the first three.
+        // In the file channels are in the order of logs: the gain of the z force on itself is the
+        // last of the first three.
         let table: toml::Table = text.parse().unwrap();
         let sensor = &table["sensor"][0];
         let number = |key: &str, at: usize| sensor[key][at].as_float().unwrap();
         assert!((number("gain", 14) - 1.05).abs() < 1e-15);
-        assert_eq!(number("gain", 3), -0.0 + 0.03, "fx of tx: internal row 3, column 0");
+        assert_eq!(
+            number("gain", 3),
+            -0.0 + 0.03,
+            "fx of tx: internal row 3, column 0"
+        );
         match gain {
             Gain::Auto | Gain::None => assert!(sensor.get("gain_std").is_none()),
             Gain::Diagonal => assert_eq!(number("gain_std", 2), deviations[5]),
             Gain::Full => assert_eq!(number("gain_std", 3), deviations[6 * 3]),
         }
         if temperature {
-            assert_eq!(number("temperature_std_n_per_k", 0), deviations[deviations.len() - 3]);
+            assert_eq!(
+                number("temperature_std_n_per_k", 0),
+                deviations[deviations.len() - 3]
+            );
             assert_eq!(sensor["reference_celsius"].as_float(), Some(31.5));
         }
-        // It wins over the configuration.
+        // It replaces the one of the configuration.
         let calibration = parameters.offsets()[0].calibrated.unwrap().calibration;
-        assert_ne!(setup.calibrations[0], calibration);
+        assert_ne!(setup.state.calibrations[0], calibration);
         setup.apply(&parameters).unwrap();
-        assert_eq!(setup.calibrations[0], calibration);
-        assert_eq!(setup.workbench()[0].gain_force_first()[0], 2.0);
-        // And its uncertainty reaches the torques.
+        assert_eq!(setup.state.calibrations[0], calibration);
+        assert_eq!(setup.robot.calibrations[0].gain_force_first()[0], 2.0);
+        // Its uncertainty is part of the torques' standard deviations.
         let certain = {
             let plain = identified(&setup, &mut Random::new(3));
             let mut certain = arm();
             certain.apply(&plain).unwrap();
-            certain.calibrations[0] = calibration;
+            certain.state.calibrations[0] = calibration;
             estimates(certain)
         };
         let unsure = estimates(setup);
@@ -773,19 +917,26 @@ fn a_calibration_reads_back_and_is_used() {
             .iter()
             .zip(&unsure[shoulder])
             .filter(|(a, b)| **b > 1.01 * **a);
-        let expected = if gain == Gain::None { 0 } else { certain[shoulder].len() };
+        let expected = if gain == Gain::None {
+            0
+        } else {
+            certain[shoulder].len()
+        };
         assert_eq!(
             grown.count(),
             expected,
             "{kind:?}: without a temperature there is nothing to be unsure of"
         );
-        assert_eq!(certain["torque/l_shoulder_pitch"], unsure["torque/l_shoulder_pitch"]);
+        assert_eq!(
+            certain["torque/l_shoulder_pitch"],
+            unsure["torque/l_shoulder_pitch"]
+        );
     }
 }
 
-/// What is learnt on-line says nothing of the calibration, which stays as uncertain as it was found to be.
+/// On-line identification does not determine the calibration, which keeps its covariance.
 #[test]
-fn an_uncertain_calibration_stays_uncertain_while_parameters_are_learnt() {
+fn an_uncertain_calibration_stays_uncertain_during_on_line_identification() {
     let mut setup = arm_with(|config| config.identification.enabled = true);
     let plain = identified(&setup, &mut Random::new(3));
     let kind = Kind {
@@ -810,36 +961,47 @@ fn an_uncertain_calibration_stays_uncertain_while_parameters_are_learnt() {
             _ => 0.0,
         }
     });
-    let mut parameters = Parameters::new(&setup, plain.provenance().clone());
+    let mut parameters = Parameters::new(&setup.robot, plain.provenance().clone());
     parameters.set_identified(&links, &[known], &root).unwrap();
     setup.apply(&parameters).unwrap();
-    // A group that has learnt something and one as it begins, with an offset as large as an iCub's.
+    // A group with a solution and one without, with an offset as large as an iCub's.
     let offset = [Wrench::from_parts([200.0, -100.0, 50.0], [3.0, 2.0, 1.0])];
     let load = Wrench::from_parts([10.0, 20.0, -30.0], [1.0, 2.0, -0.5]);
     let root = DMatrix::from_diagonal_element(6, 6, 1e-3);
-    let mut kinematics = Kinematics::new(&setup.model, setup.base_link).unwrap();
-    let zeros = vec![0.0; setup.model.dof_count()];
-    let state = proprio_estimator::dynamics::JointState {
+    let mut kinematics = Kinematics::new(&setup.robot.model, setup.robot.base_link).unwrap();
+    let zeros = vec![0.0; setup.robot.model.dof_count()];
+    let state = proprio_dynamics::JointState {
         position: &zeros,
         velocity: &zeros,
         acceleration: &zeros,
     };
     kinematics
-        .update(&setup.model, state, &FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.81)))
+        .update(
+            &setup.robot.model,
+            state,
+            &FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.81)),
+        )
         .unwrap();
-    let mut solver = Solver::new(&setup.structure);
+    let mut solver = Solver::new(&setup.robot.structure);
     solver
-        .solve(&setup.model, &setup.structure, &kinematics, &[load], &setup.always, &[])
+        .solve(
+            &setup.state.model,
+            &setup.robot.structure,
+            &kinematics,
+            &[load],
+            &setup.robot.always,
+            &[],
+        )
         .unwrap();
     let torques = |covariance: &Covariance| {
-        let mut propagation = Propagation::new(&setup.structure, covariance).unwrap();
+        let mut propagation = Propagation::new(&setup.robot.structure, covariance).unwrap();
         propagation.set_reading(0, &(load + offset[0]), 0.0);
         propagation
-            .update(&setup.structure, &solver, &kinematics, Nanos::ZERO)
+            .update(&setup.robot.structure, &solver, &kinematics, Nanos::ZERO)
             .unwrap();
         propagation.torque().to_vec()
     };
-    let group = Learnt {
+    let group = PosteriorBlock {
         links: &[],
         sensors: &[0],
         root: Some(&root),
@@ -847,7 +1009,7 @@ fn an_uncertain_calibration_stays_uncertain_while_parameters_are_learnt() {
         drift: &[[0.0; 6]],
         known: Nanos::ZERO,
     };
-    let links: Vec<usize> = (0..setup.cad().len()).collect();
+    let links: Vec<usize> = (0..setup.robot.model.inertias().len()).collect();
     let exact = DMatrix::zeros(1, 10 * links.len());
     let expected = |of: &dyn Fn(usize) -> f64| {
         let mut covariance = Covariance::exact(links.len(), 1);
@@ -861,9 +1023,9 @@ fn an_uncertain_calibration_stays_uncertain_while_parameters_are_learnt() {
             .unwrap();
         torques(&covariance)
     };
-    // Beside a group of exact links, so that only the sensor counts.
-    let got = |group: Learnt<'_>| {
-        let others = Learnt {
+    // Beside a group of exact links, so that only the sensor matters.
+    let got = |group: PosteriorBlock<'_>| {
+        let others = PosteriorBlock {
             links: &links,
             sensors: &[],
             root: Some(&exact),
@@ -871,24 +1033,37 @@ fn an_uncertain_calibration_stays_uncertain_while_parameters_are_learnt() {
             drift: &[],
             known: Nanos::ZERO,
         };
-        torques(&setup.covariance_with([others, group].into_iter()))
+        torques(
+            &setup
+                .state
+                .covariance_with(&setup.robot, [others, group].into_iter()),
+        )
     };
     let of_load = |i: usize| (0.03 * load.torque_first()[i]).hypot(1e-3);
     let raw = (load + offset[0]).torque_first();
     let of_nothing = |i: usize| (0.03 * raw[i]).hypot(if i < 3 { 100.0 } else { 1000.0 });
     for (got, expected) in [
         (got(group), expected(&of_load)),
-        (got(Learnt { root: None, ..group }), expected(&of_nothing)),
+        (
+            got(PosteriorBlock {
+                root: None,
+                ..group
+            }),
+            expected(&of_nothing),
+        ),
     ] {
         assert!(expected.iter().any(|deviation| *deviation > 0.05));
         for (got, expected) in got.iter().zip(&expected) {
-            assert!((got - expected).abs() <= 1e-4 * expected, "{got} {expected}");
+            assert!(
+                (got - expected).abs() <= 1e-4 * expected,
+                "{got} {expected}"
+            );
         }
     }
 }
 
 #[test]
-fn half_a_calibration_is_refused() {
+fn an_incomplete_calibration_is_refused() {
     let text = with_calibration(
         &arm(),
         Kind {
@@ -899,10 +1074,16 @@ fn half_a_calibration_is_refused() {
     .to_string();
     for (key, expected) in [
         ("gain", "gain is missing"),
-        ("reference_celsius", "what is said of temperature goes together"),
-        ("temperature_nm_per_k", "what is said of temperature goes together"),
-        ("temperature_std_n_per_k", "what is said of temperature goes together"),
-        ("gain_std", "correlation.root has not the"),
+        ("reference_celsius", "the temperature keys are incomplete"),
+        (
+            "temperature_nm_per_k",
+            "the temperature keys are incomplete",
+        ),
+        (
+            "temperature_std_n_per_k",
+            "the temperature keys are incomplete",
+        ),
+        ("gain_std", "correlation.root must have"),
     ] {
         let cut: String = text
             .lines()
@@ -915,20 +1096,32 @@ fn half_a_calibration_is_refused() {
     }
 }
 
-/// Nine digits are enough where it is hardest: a combination known a million times better than its parameters.
+/// Nine digits are enough for the hardest case: a combination known a million times better than its
+/// parameters.
 #[test]
-fn the_file_keeps_what_is_known_of_combinations() {
+fn the_file_keeps_the_variance_of_combinations() {
     let setup = arm();
-    let links: Vec<_> = setup.cad().iter().copied().enumerate().collect();
+    let links: Vec<_> = setup
+        .robot
+        .model
+        .inertias()
+        .iter()
+        .copied()
+        .enumerate()
+        .collect();
     let columns = 10 * links.len();
     let mut random = Random::new(8);
     let direction = DVector::from_fn(columns, |_, _| random.real(1.0)).normalize();
     let all = DMatrix::from_fn(columns, columns, |_, _| random.real(1.0));
-    let narrow = DMatrix::identity(columns, columns) - &direction * direction.transpose() * (1.0 - 1e-6);
+    let narrow =
+        DMatrix::identity(columns, columns) - &direction * direction.transpose() * (1.0 - 1e-6);
     let root = all.clone() * narrow;
-    let mut parameters = Parameters::new(&setup, Provenance::default());
+    let mut parameters = Parameters::new(&setup.robot, Provenance::default());
     parameters.set_identified(&links, &[], &root).unwrap();
-    let (got, expected) = ((parameters.root() * &direction).norm(), (root * &direction).norm());
+    let (got, expected) = (
+        (parameters.root() * &direction).norm(),
+        (root * &direction).norm(),
+    );
     assert!(expected < 2e-6 * (all * &direction).norm());
     assert!((got - expected).abs() < 5e-3 * expected, "{got} {expected}");
 }
@@ -938,8 +1131,10 @@ fn an_icubs_file_is_less_than_a_megabyte() {
     let (text, sensors) = humanoid();
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("model.urdf"), text).unwrap();
-    let mut config =
-        String::from("schema = 1\nrobot = \"r\"\nmodel = \"model.urdf\"\n[base]\nkind = \"fixed\"\nlink = \"link0\"\n");
+    let mut config = String::from(
+        "schema = 1\nrobot = \"r\"\nmodel = \"model.urdf\"\n[base]\nkind = \"fixed\"\nlink = \
+         \"link0\"\n",
+    );
     for joint in &sensors {
         config += &format!("[[force_torque]]\nsensor = \"{joint}\"\njoint = \"{joint}\"\n");
     }
@@ -947,8 +1142,15 @@ fn an_icubs_file_is_less_than_a_megabyte() {
     std::fs::write(&file, config).unwrap();
     let mut config = Config::load(&file).unwrap();
     let setup = Setup::new(&config).unwrap();
-    let mut parameters = Parameters::new(&setup, Provenance::default());
-    let links: Vec<_> = setup.cad().iter().copied().enumerate().collect();
+    let mut parameters = Parameters::new(&setup.robot, Provenance::default());
+    let links: Vec<_> = setup
+        .robot
+        .model
+        .inertias()
+        .iter()
+        .copied()
+        .enumerate()
+        .collect();
     let offsets: Vec<Offset> = sensors
         .iter()
         .map(|sensor| Offset {
@@ -969,14 +1171,17 @@ fn an_icubs_file_is_less_than_a_megabyte() {
     let bytes = std::fs::metadata(&written).unwrap().len();
     assert!(bytes < 1_000_000, "{bytes}");
     config.parameters = Some(written);
-    assert_eq!(Setup::new(&config).unwrap().identified(), Some(&parameters));
+    assert_eq!(
+        Setup::new(&config).unwrap().state.identified(),
+        Some(&parameters)
+    );
 }
 
 #[test]
-fn a_file_that_is_cut_or_changed_is_refused_with_a_sentence() {
+fn a_file_that_is_truncated_or_changed_is_refused_with_a_sentence() {
     let setup = arm();
     let text = identified(&setup, &mut Random::new(3)).to_string();
-    // Whatever is cut off, down to the last bracket.
+    // Truncated at any place, down to the last bracket.
     let mut lengths: Vec<usize> = text
         .match_indices('\n')
         .map(|(at, _)| at + 1)
@@ -987,7 +1192,10 @@ fn a_file_that_is_cut_or_changed_is_refused_with_a_sentence() {
     for length in lengths {
         let error = Parameters::parse(&text[..length]).unwrap_err();
         let sentence = error.to_string();
-        assert!(matches!(error, ParametersError::Damaged(_)), "{length}: {sentence}");
+        assert!(
+            matches!(error, ParametersError::Damaged(_)),
+            "{length}: {sentence}"
+        );
         assert!(
             sentence.contains("identify again") && !sentence.contains('\n'),
             "{sentence}"
@@ -995,30 +1203,39 @@ fn a_file_that_is_cut_or_changed_is_refused_with_a_sentence() {
     }
     let first_column = text.find("[1000000000]").unwrap();
     let mut half = text.clone();
-    half.replace_range(first_column.."[1000000000]".len() + first_column, "[500000000]");
+    half.replace_range(
+        first_column.."[1000000000]".len() + first_column,
+        "[500000000]",
+    );
     for (changed, expected) in [
         (half, "correlation.root: column 0 has length 0.5, not 1"),
-        (text.replace("program =", "programme ="), "unknown field `programme`"),
+        (
+            text.replace("program =", "programme ="),
+            "unknown field `programme`",
+        ),
         (
             text.replacen("identified = [", "identified = [nan, ", 1),
             "11 numbers where 10 are needed",
         ),
-        (text.replacen("std_n = [", "std_n = [-", 1), "correlation.root: column"),
+        (
+            text.replacen("std_n = [", "std_n = [-", 1),
+            "correlation.root: column",
+        ),
         (
             text.replacen("coulomb_nm = 0.4", "coulomb_nm = inf", 1),
             "joint l_elbow: a number is not finite",
         ),
         (
             text.replacen("rotor_inertia_std_kgm2 = 0.002", "", 1),
-            "joint l_elbow: rotor_inertia_kgm2 and rotor_inertia_std_kgm2 go together",
+            "joint l_elbow: only one of rotor_inertia_kgm2 and rotor_inertia_std_kgm2 is given",
         ),
         (
             text.replacen("identified = [", "identified = [-", 1),
-            "no body has these ten parameters: its mass is -",
+            "no rigid body has these ten parameters: its mass is -",
         ),
         (
             text.replacen("name = \"l_elbow_1\"", "name = \"l_forearm\"", 1),
-            "link l_forearm is there twice",
+            "link l_forearm is given twice",
         ),
         ("\u{0}\u{1}garbage".into(), "line 1"),
         (String::new(), "missing field `schema`"),
@@ -1031,17 +1248,24 @@ fn a_file_that_is_cut_or_changed_is_refused_with_a_sentence() {
     let schema = Parameters::parse("schema = 2\nnew = true\n").unwrap_err();
     assert_eq!(
         schema.to_string(),
-        "has schema = 2; this version reads schema = 1: identify again, or use the version that wrote it"
+        "has schema = 2; this version reads schema = 1: identify again, or use the version that \
+         wrote it"
     );
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("p.toml");
-    assert!(matches!(Parameters::load(&file), Err(ParametersError::Read(_))));
+    assert!(matches!(
+        Parameters::load(&file),
+        Err(ParametersError::Read(_))
+    ));
     std::fs::write(&file, [0xff, 0xfe, 0x00]).unwrap();
-    assert!(matches!(Parameters::load(&file), Err(ParametersError::Damaged(_))));
+    assert!(matches!(
+        Parameters::load(&file),
+        Err(ParametersError::Damaged(_))
+    ));
 }
 
 #[test]
-fn what_belongs_to_another_robot_is_refused_and_the_first_difference_named() {
+fn parameters_of_another_robot_are_refused_with_the_first_difference() {
     let setup = arm();
     let parameters = identified(&setup, &mut Random::new(3));
     let text = parameters.to_string();
@@ -1051,28 +1275,38 @@ fn what_belongs_to_another_robot_is_refused_and_the_first_difference_named() {
         let mut setup = setup.clone();
         let error = setup.apply(&other).unwrap_err().to_string();
         assert_eq!(
-            (setup.identified(), &setup.offsets),
-            (None, &arm().offsets),
+            (setup.state.identified(), &setup.state.offsets),
+            (None, &arm().state.offsets),
             "nothing is changed"
         );
         error
     };
     assert_eq!(
         refused("robot = \"icub_left_arm\"", "robot = \"icub_right_arm\""),
-        "is of robot \"icub_right_arm\", not of \"icub_left_arm\": parameters belong to one robot"
+        "belongs to robot \"icub_right_arm\", not to \"icub_left_arm\"; use the parameters of \
+         \"icub_left_arm\", or identify again"
     );
     let sensor = refused("name = \"l_arm_ft_sensor\"", "name = \"r_arm_ft_sensor\"");
     assert!(
-        sensor.contains("has force/torque sensor \"r_arm_ft_sensor\", which the configuration has not"),
+        sensor.contains(
+            "has force/torque sensor \"r_arm_ft_sensor\", which the configuration does not have"
+        ),
         "{sensor}"
     );
-    let joint = refused("[[joint]]\nname = \"l_elbow\"", "[[joint]]\nname = \"l_elbw\"");
+    let joint = refused(
+        "[[joint]]\nname = \"l_elbow\"",
+        "[[joint]]\nname = \"l_elbw\"",
+    );
     assert!(joint.contains("has joint \"l_elbw\""), "{joint}");
 
     // Another URDF: a heavier hand, a longer arm, a link more.
     let urdf = std::fs::read_to_string(root().join("config/icub_left_arm/model.urdf")).unwrap();
-    let hand = setup.model.link_name(setup.cad().len() - 1).to_owned();
-    let mut inertias = setup.cad().to_vec();
+    let hand = setup
+        .robot
+        .model
+        .link_name(setup.robot.model.inertias().len() - 1)
+        .to_owned();
+    let mut inertias = setup.robot.model.inertias().to_vec();
     inertias.last_mut().unwrap().mass *= 1.01;
     let keep = ["l_arm_ft_sensor"];
     let heavier = Model::rewrite_urdf(&urdf, &keep, &inertias).unwrap();
@@ -1083,20 +1317,22 @@ fn what_belongs_to_another_robot_is_refused_and_the_first_difference_named() {
     let more = urdf.replace(
         "</robot>",
         &format!(
-            "<link name=\"tip\"><inertial><mass value=\"1\"/><inertia ixx=\"1\" ixy=\"0\" ixz=\"0\" iyy=\"1\" iyz=\"0\" izz=\"1\"/></inertial></link>\
-             <joint name=\"j\" type=\"continuous\"><parent link=\"{hand}\"/><child link=\"tip\"/><axis xyz=\"0 0 1\"/></joint></robot>"
+            "<link name=\"tip\"><inertial><mass value=\"1\"/><inertia ixx=\"1\" ixy=\"0\" \
+             ixz=\"0\" iyy=\"1\" iyz=\"0\" izz=\"1\"/></inertial></link>\
+             <joint name=\"j\" type=\"continuous\"><parent link=\"{hand}\"/><child link=\"tip\"/>\
+             <axis xyz=\"0 0 1\"/></joint></robot>"
         ),
     );
     for (urdf, expected) in [
         (
             heavier,
-            format!("link {hand} has other inertial parameters in its URDF"),
+            format!("link {hand} has other inertial parameters in that URDF"),
         ),
         (longer, "has another frame or axis there".into()),
-        (more, "the URDF has link tip, which it has not".into()),
+        (more, "the URDF has link tip, which it does not have".into()),
         (
             urdf.replace("\"l_shoulder_2\"", "\"l_shoulder_two\""),
-            "where it has link l_shoulder_2, the URDF has l_shoulder_two".into(),
+            "it has link l_shoulder_2 where the URDF has l_shoulder_two".into(),
         ),
     ] {
         let folder = tempfile::tempdir().unwrap();
@@ -1117,7 +1353,7 @@ fn what_belongs_to_another_robot_is_refused_and_the_first_difference_named() {
 }
 
 #[test]
-fn a_setup_says_which_file_it_could_not_use() {
+fn a_setup_names_the_file_that_it_could_not_use() {
     let mut config = Config::load(&root().join("config/icub_left_arm/estimator.toml")).unwrap();
     config.parameters = Some("nowhere/p.toml".into());
     let problem = Setup::new(&config).unwrap_err();
@@ -1128,18 +1364,18 @@ fn a_setup_says_which_file_it_could_not_use() {
 }
 
 #[test]
-fn what_can_not_be_is_not_taken() {
+fn inconsistent_or_infinite_parameters_are_refused() {
     let setup = arm();
     let mut parameters = identified(&setup, &mut Random::new(3));
     let before = parameters.clone();
-    let (good, root) = (setup.cad()[3], DMatrix::identity(10, 10));
+    let (good, root) = (setup.robot.model.inertias()[3], DMatrix::identity(10, 10));
     let mut negative = good;
     negative.mass = -1.0;
     let mut no_number = root.clone();
     no_number[(3, 3)] = f64::NAN;
     let twice = DMatrix::identity(20, 20);
     for (links, root, expected) in [
-        (vec![(3, negative)], &root, "no body has these"),
+        (vec![(3, negative)], &root, "no rigid body has these"),
         (
             vec![(3, good)],
             &twice,
@@ -1149,11 +1385,18 @@ fn what_can_not_be_is_not_taken() {
         (
             vec![(99, good)],
             &root,
-            "link 99 is given twice, or is none of the 9 links",
+            "link 99 is given twice, or is not one of the 9 links",
         ),
-        (vec![(3, good)], &no_number, "the covariance: a number is not finite"),
+        (
+            vec![(3, good)],
+            &no_number,
+            "the covariance: a number is not finite",
+        ),
     ] {
-        let error = parameters.set_identified(&links, &[], root).unwrap_err().to_string();
+        let error = parameters
+            .set_identified(&links, &[], root)
+            .unwrap_err()
+            .to_string();
         assert!(error.contains(expected), "{expected}: {error}");
     }
     let friction = Friction {
@@ -1177,7 +1420,7 @@ fn what_can_not_be_is_not_taken() {
 
 // ---------------------------------------------------------------- URDFs
 
-/// A body that can exist, near another one.
+/// A physically consistent body near another one.
 fn near(inertia: &RigidInertia, random: &mut Random) -> RigidInertia {
     let stretch = Matrix4::identity() + Matrix4::from_fn(|_, _| random.real(0.15));
     let pseudo = stretch * inertia.pseudo_inertia() * stretch.transpose();
@@ -1195,11 +1438,15 @@ fn check_same(urdf: &str, keep: &[&str], expected: &[RigidInertia]) {
     for (link, (got, expected)) in model.inertias().iter().zip(expected).enumerate() {
         let (got, expected) = (got.parameters(), expected.parameters());
         let gap = gap(&got, &expected);
-        assert!(gap < 1e-12 * size(&expected), "{}: {gap:e}", model.link_name(link));
+        assert!(
+            gap < 1e-12 * size(&expected),
+            "{}: {gap:e}",
+            model.link_name(link)
+        );
     }
 }
 
-/// The text without its inertias, to compare what must stay.
+/// The text without its inertias, to compare the rest.
 fn without_inertials(text: &str) -> String {
     let mut rest = text;
     let mut kept = String::new();
@@ -1228,18 +1475,20 @@ proptest! {
         let new = Model::rewrite_urdf(&text, &keep, &wanted).unwrap();
         check_same(&new, &keep, &wanted);
         prop_assert_eq!(without_inertials(&new), without_inertials(&text));
-        // Every share is that of a body that can exist.
+        // Every share is physically consistent.
         let read = urdf_rs::read_from_string(&new).unwrap();
         for link in &read.links {
             let (i, m) = (&link.inertial.inertia, link.inertial.mass.value);
             let tensor = Mat3::new(i.ixx, i.ixy, i.ixz, i.ixy, i.iyy, i.iyz, i.ixz, i.iyz, i.izz);
-            prop_assert!(RigidInertia::from_centroidal(m, &Vec3::zeros(), &tensor).check(1e-9).is_ok(), "{}", link.name);
+            let share = RigidInertia::from_centroidal(m, &Vec3::zeros(), &tensor);
+            prop_assert!(share.check(1e-9).is_ok(), "{}", link.name);
         }
-        prop_assert_eq!(Model::rewrite_urdf(&text, &keep, model.inertias()).unwrap(), text, "nothing to change");
+        let same = Model::rewrite_urdf(&text, &keep, model.inertias()).unwrap();
+        prop_assert_eq!(same, text, "nothing to change");
     }
 }
 
-/// The forms in which an inertial may be there or not.
+/// The forms of an inertial element, and of a link without one.
 #[test]
 fn everything_but_the_inertials_stays_byte_for_byte() {
     let urdf = r#"<?xml version="1.0"?>
@@ -1254,19 +1503,35 @@ fn everything_but_the_inertials_stays_byte_for_byte() {
         <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.04"/>
       </inertial>
     </link>
-  <joint name="swing" type="continuous"><parent link="body"/><child link="frame"/><axis xyz="0 1 0"/></joint>
+  <joint name="swing" type="continuous">
+    <parent link="body"/><child link="frame"/><axis xyz="0 1 0"/>
+  </joint>
   <link name="frame"> <!-- nothing --> </link>
-  <joint name="fixed1" type="fixed"><parent link="frame"/><child link="a"/><origin xyz="0 0 0.3" rpy="0.1 0 0"/></joint>
-  <link name="a"><inertial><mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
-  <joint name="fixed2" type="fixed"><parent link="a"/><child link="b"/><origin xyz="0.2 0 0"/></joint>
-  <link name="b"><inertial><mass value="0.5"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.002" iyz="0" izz="0.002"/></inertial></link>
+  <joint name="fixed1" type="fixed">
+    <parent link="frame"/><child link="a"/><origin xyz="0 0 0.3" rpy="0.1 0 0"/>
+  </joint>
+  <link name="a">
+    <inertial><mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/>
+    </inertial>
+  </link>
+  <joint name="fixed2" type="fixed">
+    <parent link="a"/><child link="b"/><origin xyz="0.2 0 0"/>
+  </joint>
+  <link name="b">
+    <inertial><mass value="0.5"/>
+    <inertia ixx="0.001" ixy="0" ixz="0" iyy="0.002" iyz="0" izz="0.002"/></inertial>
+  </link>
   <transmission name="t"><type>x</type></transmission>
   <gazebo reference="b"><sensor type="camera" name="c"/></gazebo>
 </robot>
 "#;
     let model = Model::from_urdf(urdf, &[]).unwrap();
     let mut random = Random::new(1);
-    let wanted: Vec<RigidInertia> = model.inertias().iter().map(|i| near(i, &mut random)).collect();
+    let wanted: Vec<RigidInertia> = model
+        .inertias()
+        .iter()
+        .map(|i| near(i, &mut random))
+        .collect();
     let new = Model::rewrite_urdf(urdf, &[], &wanted).unwrap();
     check_same(&new, &[], &wanted);
     assert_eq!(without_inertials(&new), without_inertials(urdf));
@@ -1275,56 +1540,88 @@ fn everything_but_the_inertials_stays_byte_for_byte() {
         3,
         "frames without mass stay what they are:\n{new}"
     );
-    // In the style of what was there.
-    assert!(new.contains("\n      <inertial>\n        <origin xyz=\""), "{new}");
+    // In the style of the old element.
+    assert!(
+        new.contains("\n      <inertial>\n        <origin xyz=\""),
+        "{new}"
+    );
     // Masses change by one factor within a body.
     let read = urdf_rs::read_from_string(&new).unwrap();
-    let mass = |name: &str| read.links.iter().find(|l| l.name == name).unwrap().inertial.mass.value;
+    let mass = |name: &str| {
+        read.links
+            .iter()
+            .find(|l| l.name == name)
+            .unwrap()
+            .inertial
+            .mass
+            .value
+    };
     assert!((mass("a") / mass("b") - 2.0).abs() < 1e-12);
 
-    // A body that has weighed nothing, on a link that is written in one tag, in two, or with something in it.
+    // A body without mass, on a link that is written as one tag, as two, or with content.
     for link in [
         "<link name=\"tip\"/>",
         "<link name=\"tip\"></link>",
         "<link name=\"tip\"><visual/></link>",
     ] {
-        let joint = "<joint name=\"j\" type=\"fixed\"><parent link=\"b\"/><child link=\"tip\"/></joint>";
+        let joint =
+            "<joint name=\"j\" type=\"fixed\"><parent link=\"b\"/><child link=\"tip\"/></joint>";
         let text = urdf.replace("</robot>", &format!("{joint}{link}</robot>"));
-        // Kept, it is a body of its own, whose inertial is missing: on top of something else it need not have one.
+        // If its joint is kept, it is a separate body without an inertial element. If it is folded,
+        // it does not need one.
         let text = text.replace(
             "type=\"fixed\"><parent link=\"b\"/><child link=\"tip\"",
             "type=\"fixed\"><parent link=\"b\"/><child link=\"tip2\"",
         );
         let text = text.replace(
             "</robot>",
-            "<link name=\"tip2\"><inertial><mass value=\"0\"/><inertia ixx=\"0\" ixy=\"0\" ixz=\"0\" iyy=\"0\" iyz=\"0\" izz=\"0\"/></inertial></link>\
-             <joint name=\"k\" type=\"fixed\"><parent link=\"tip2\"/><child link=\"tip\"/></joint></robot>",
+            "<link name=\"tip2\"><inertial><mass value=\"0\"/><inertia ixx=\"0\" ixy=\"0\" \
+             ixz=\"0\" iyy=\"0\" iyz=\"0\" izz=\"0\"/></inertial></link>\
+             <joint name=\"k\" type=\"fixed\"><parent link=\"tip2\"/><child link=\"tip\"/></joint>\
+             </robot>",
         );
         let model = Model::from_urdf(&text, &["j"]).unwrap();
         let mut wanted = model.inertias().to_vec();
         let body = model.frame("tip").unwrap().link;
-        wanted[body] = RigidInertia::from_centroidal(0.3, &Vec3::new(0.0, 0.1, 0.0), &(Mat3::identity() * 1e-3));
-        check_same(&Model::rewrite_urdf(&text, &["j"], &wanted).unwrap(), &["j"], &wanted);
+        wanted[body] = RigidInertia::from_centroidal(
+            0.3,
+            &Vec3::new(0.0, 0.1, 0.0),
+            &(Mat3::identity() * 1e-3),
+        );
+        check_same(
+            &Model::rewrite_urdf(&text, &["j"], &wanted).unwrap(),
+            &["j"],
+            &wanted,
+        );
     }
-    // The root, which has no inertial on any link at first, in each way of writing it.
+    // The root, without an inertial element on any of its links, in each form.
     for link in [
         "<link name=\"world\"/>",
         "<link name=\"world\"></link>",
         "<link name=\"world\"> <visual/></link>",
     ] {
-        let text = urdf
-            .replace("<link name=\"base\"/>", &format!("<link name=\"base\"/>{link}<joint name=\"up\" type=\"continuous\"><parent link=\"world\"/><child link=\"base\"/></joint>"));
+        let text = urdf.replace(
+            "<link name=\"base\"/>",
+            &format!(
+                "<link name=\"base\"/>{link}<joint \
+                name=\"up\" type=\"continuous\"><parent link=\"world\"/><child link=\"base\"/>\
+                </joint>"
+            ),
+        );
         let model = Model::from_urdf(&text, &[]).unwrap();
         let mut wanted = model.inertias().to_vec();
         wanted[0] = wanted[1];
         let new = Model::rewrite_urdf(&text, &[], &wanted).unwrap();
         check_same(&new, &[], &wanted);
-        // A tag that closed itself is opened for it.
-        let plain =
-            |text: &str| without_inertials(text).replace("<link name=\"world\"></link>", "<link name=\"world\"/>");
+        // A self-closing tag is opened for it.
+        let plain = |text: &str| {
+            without_inertials(text)
+                .replace("<link name=\"world\"></link>", "<link name=\"world\"/>")
+        };
         assert_eq!(plain(&new), plain(&text));
     }
-    // One whose figures no body has: all goes to the link on top that has mass, and the others lose theirs.
+    // A body with inconsistent shares: the top link with mass gets all of it, and the other links
+    // lose theirs.
     let broken = urdf.replace("ixx=\"0.001\"", "ixx=\"0.1\"");
     let new = Model::rewrite_urdf(&broken, &[], &wanted).unwrap();
     check_same(&new, &[], &wanted);
@@ -1340,7 +1637,10 @@ fn everything_but_the_inertials_stays_byte_for_byte() {
     let model = Model::from_urdf(urdf, &[]).unwrap();
     assert_eq!(
         Model::rewrite_urdf(urdf, &[], &model.inertias()[..1]),
-        Err(ModelError::InertiaCount { given: 1, needed: 2 })
+        Err(ModelError::InertiaCount {
+            given: 1,
+            needed: 2
+        })
     );
     let mut infinite = model.inertias().to_vec();
     infinite[1].mass = f64::INFINITY;
@@ -1352,27 +1652,31 @@ fn everything_but_the_inertials_stays_byte_for_byte() {
 }
 
 #[test]
-fn the_urdf_of_identified_parameters_is_loaded_again() {
+fn the_urdf_of_identified_parameters_can_be_loaded() {
     let setup = arm();
     let parameters = identified(&setup, &mut Random::new(3));
     let text = std::fs::read_to_string(root().join("config/icub_left_arm/model.urdf")).unwrap();
-    let new = parameters.urdf(&text, &setup).unwrap();
+    let new = parameters.urdf(&text, &setup.robot).unwrap();
     let mut applied = arm();
     applied.apply(&parameters).unwrap();
-    check_same(&new, &["l_arm_ft_sensor"], applied.model.inertias());
+    check_same(&new, &["l_arm_ft_sensor"], applied.state.model.inertias());
     assert_eq!(without_inertials(&new), without_inertials(&text));
     let base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.81));
     let model = Model::from_urdf(&new, &["l_arm_ft_sensor"]).unwrap();
     let still = vec![0.0; model.dof_count()];
     let weigh = |model: &Model| {
         let mut kinematics = Kinematics::new(model, 0).unwrap();
-        let state = proprio_estimator::dynamics::JointState {
+        let state = proprio_dynamics::JointState {
             position: &still,
             velocity: &still,
             acceleration: &still,
         };
         kinematics.update(model, state, &base).unwrap();
-        kinematics.net_wrenches().iter().map(|w| w.force.norm()).sum::<f64>()
+        kinematics
+            .net_wrenches()
+            .iter()
+            .map(|w| w.force.norm())
+            .sum::<f64>()
     };
-    assert!((weigh(&model) - weigh(&applied.model)).abs() < 1e-12 * weigh(&model));
+    assert!((weigh(&model) - weigh(&applied.state.model)).abs() < 1e-12 * weigh(&model));
 }

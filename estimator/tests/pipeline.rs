@@ -1,22 +1,27 @@
-//! The pipeline on a robot whose truth three other libraries agree about, and its rules: stamps alone decide, what is
-//! missing withholds only what depends on it, bad samples are counted and lose nothing else.
+//! The pipeline on a robot for which three other libraries agree, and its rules: estimates depend
+//! on stamps alone, a missing channel affects only the estimates that depend on it, and bad samples
+//! are counted and affect nothing else.
 
-use proprio_estimator::calibration::Calibration;
+use proprio_dynamics::calibration::Calibration;
+use proprio_dynamics::spatial::Wrench as Wrench6;
 use proprio_estimator::config::{Config, Direction, Presence, SensorFrame};
 use proprio_estimator::offline;
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
-use proprio_estimator::spatial::Wrench as Wrench6;
 use proprio_topics::csv::{Reader, Row, Value, What};
 use proprio_topics::{JointState, Kind, Nanos, Quality, Reading, Reason, Wrench};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_owned()
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .parent()
+        .unwrap()
+        .to_owned()
 }
 
-/// The configuration of the arm, with no sensor offset (the golden files have none) and `more` at the end.
+/// The configuration of the arm, with no sensor offset (the golden files have none) and `more` at
+/// the end.
 fn setup(change: impl FnOnce(&mut Config)) -> Setup {
     let mut config = Config::load(&root().join("config/icub_left_arm/estimator.toml")).unwrap();
     for ft in &mut config.force_torque {
@@ -33,8 +38,14 @@ fn golden(name: &str) -> String {
 /// A table of numbers by column name.
 fn table(text: &str) -> HashMap<String, Vec<String>> {
     let mut reader = csv::Reader::from_reader(text.as_bytes());
-    let names: Vec<String> = reader.headers().unwrap().iter().map(str::to_owned).collect();
-    let mut columns: HashMap<String, Vec<String>> = names.iter().map(|n| (n.clone(), vec![])).collect();
+    let names: Vec<String> = reader
+        .headers()
+        .unwrap()
+        .iter()
+        .map(str::to_owned)
+        .collect();
+    let mut columns: HashMap<String, Vec<String>> =
+        names.iter().map(|n| (n.clone(), vec![])).collect();
     for record in reader.records() {
         for (name, cell) in names.iter().zip(record.unwrap().iter()) {
             columns.get_mut(name).unwrap().push(cell.to_owned());
@@ -44,7 +55,7 @@ fn table(text: &str) -> HashMap<String, Vec<String>> {
 }
 
 #[test]
-fn estimates_from_a_file_are_those_of_other_libraries() {
+fn estimates_from_a_file_equal_those_of_other_libraries() {
     for (name, base_is_imu) in [
         ("icub_left_arm_mujoco.csv", true),
         ("icub_left_arm_mujoco.csv", false),
@@ -60,7 +71,7 @@ fn estimates_from_a_file_are_those_of_other_libraries() {
                 config.contact.retain(|c| c.name() != "stand");
             }
         });
-        let joints: Vec<String> = setup.joint_names().map(str::to_owned).collect();
+        let joints: Vec<String> = setup.robot.joint_names().map(str::to_owned).collect();
         let (log, mut out) = (golden(name), Vec::new());
         let report = offline::estimate(setup, log.as_bytes(), &mut out).unwrap();
         let (want, got) = (table(&log), table(std::str::from_utf8(&out).unwrap()));
@@ -68,7 +79,10 @@ fn estimates_from_a_file_are_those_of_other_libraries() {
         assert_eq!(want["t"].len(), got["t"].len());
         let number = |s: &String| s.parse::<f64>().unwrap();
         assert!(
-            want["t"].iter().zip(&got["t"]).all(|(a, b)| number(a) == number(b)),
+            want["t"]
+                .iter()
+                .zip(&got["t"])
+                .all(|(a, b)| number(a) == number(b)),
             "the same instants"
         );
         for joint in &joints {
@@ -89,32 +103,46 @@ fn estimates_from_a_file_are_those_of_other_libraries() {
             let column = format!("contact/hand/{part}");
             for (row, got) in got[&column].iter().enumerate() {
                 let want = want.get(&column).map_or(0.0, |w| number(&w[row]));
-                assert!((want - number(got)).abs() < 1e-9, "{name} {column} {row}: {want} {got}");
+                assert!(
+                    (want - number(got)).abs() < 1e-9,
+                    "{name} {column} {row}: {want} {got}"
+                );
             }
         }
     }
 }
 
-/// The arm's log as a sensor with cross-talk, whose board warms up, would have sent it; and how to put that right.
+/// The arm's log as sent by a sensor with cross-talk whose board warms up; and the temperatures.
 fn miscalibrated(log: &str, change: &Calibration) -> (String, Vec<f64>) {
     let inverse = change.gain().try_inverse().unwrap();
     let mut reader = csv::Reader::from_reader(log.as_bytes());
-    let names: Vec<String> = reader.headers().unwrap().iter().map(str::to_owned).collect();
-    let parts = ["fx", "fy", "fz", "tx", "ty", "tz"].map(|part| format!("wrench/l_arm_ft_sensor/{part}"));
+    let names: Vec<String> = reader
+        .headers()
+        .unwrap()
+        .iter()
+        .map(str::to_owned)
+        .collect();
+    let parts =
+        ["fx", "fy", "fz", "tx", "ty", "tz"].map(|part| format!("wrench/l_arm_ft_sensor/{part}"));
     let places = parts.map(|part| names.iter().position(|name| *name == part).unwrap());
     let mut text = format!("{},wrench/l_arm_ft_sensor/temperature\n", names.join(","));
     let (mut temperatures, mut last) = (Vec::new(), change.reference().unwrap());
     for (row, record) in reader.records().enumerate() {
         let mut cells: Vec<String> = record.unwrap().iter().map(str::to_owned).collect();
         let [fx, fy, fz, tx, ty, tz] = places.map(|place| cells[place].parse::<f64>().unwrap());
-        let warm = Wrench6::from_parts([fx, fy, fz], [tx, ty, tz]) + *change.per_kelvin() * change.warmth(last);
+        let warm = Wrench6::from_parts([fx, fy, fz], [tx, ty, tz])
+            + *change.per_kelvin() * change.warmth(last);
         let raw = inverse * nalgebra::Vector6::from(warm.torque_first());
         for (place, axis) in places.into_iter().zip([3, 4, 5, 0, 1, 2]) {
             cells[place] = raw[axis].to_string();
         }
         // Every tenth row has a temperature, which holds from the next row on.
         let now = 25.0 + 0.05 * row as f64;
-        let cell = if row % 10 == 0 { now.to_string() } else { String::new() };
+        let cell = if row % 10 == 0 {
+            now.to_string()
+        } else {
+            String::new()
+        };
         temperatures.push(last);
         last = if row % 10 == 0 { now } else { last };
         text += &format!("{},{cell}\n", cells.join(","));
@@ -147,7 +175,7 @@ fn calibrate(config: &mut Config, change: &Calibration) {
 }
 
 #[test]
-fn corrected_readings_give_the_estimates_of_right_ones() {
+fn corrected_readings_give_the_same_estimates_as_exact_ones() {
     let log = golden("icub_left_arm_mujoco_contact.csv");
     let change = calibration();
     let (wrong, temperatures) = miscalibrated(&log, &change);
@@ -167,8 +195,11 @@ fn corrected_readings_give_the_estimates_of_right_ones() {
         "contact/hand/fz",
         "torque_std/l_elbow",
     ] {
-        // Before the first row nothing was told of the temperature.
-        let rows = right[column].iter().zip(&corrected[column]).zip(&uncorrected[column]);
+        // Before the first row no temperature was received.
+        let rows = right[column]
+            .iter()
+            .zip(&corrected[column])
+            .zip(&uncorrected[column]);
         for ((right, corrected), uncorrected) in rows.skip(usize::from(column.contains("std"))) {
             let number = |s: &String| s.parse::<f64>().unwrap();
             assert!(
@@ -179,7 +210,7 @@ fn corrected_readings_give_the_estimates_of_right_ones() {
         }
     }
     assert!(off > 1.0, "{off}");
-    // Not a bit changes where there is nothing to correct, temperatures or not.
+    // Without corrections not a bit changes, with temperatures or without.
     let with_temperatures: String = log
         .lines()
         .zip(wrong.lines())
@@ -189,7 +220,8 @@ fn corrected_readings_give_the_estimates_of_right_ones() {
     assert_eq!(run(setup(|_| {}), &with_temperatures), right);
 }
 
-/// A temperature may come later than the wrench that is stamped after it, by half the wait, and nothing changes; live is a replay.
+/// A temperature may arrive up to half the wait after a wrench with a later stamp, and nothing
+/// changes: a live run equals a replay.
 #[test]
 fn temperatures_count_by_their_stamps() {
     let change = calibration();
@@ -205,8 +237,9 @@ fn temperatures_count_by_their_stamps() {
         while reader.next_row(&mut row).unwrap() {
             for item in &row.items {
                 let of = &series[item.series];
-                if let (What::Channel(kind), Value::Reading(reading, quality)) = (of.what, &item.value)
-                    && let Some(channel) = pipeline.setup().channel(kind, &of.name)
+                if let (What::Channel(kind), Value::Reading(reading, quality)) =
+                    (of.what, &item.value)
+                    && let Some(channel) = pipeline.setup().robot.channel(kind, &of.name)
                 {
                     let late = matches!(reading, Reading::Temperature(_));
                     let arrival = row.t.unwrap() + if late { delay } else { Nanos::ZERO };
@@ -227,7 +260,7 @@ fn temperatures_count_by_their_stamps() {
     let (prompt, late) = run(Nanos::ZERO);
     assert_eq!((prompt.len(), late), (201, 0));
     assert_eq!(run(Nanos::from_millis(20)), (prompt.clone(), 0));
-    // Later than that it is counted.
+    // Later than that it is counted as late.
     let (other, late) = run(Nanos::from_millis(80));
     assert!(late > 10, "{late}");
     assert_ne!(other, prompt);
@@ -237,25 +270,35 @@ fn temperature(celsius: f64) -> Reading {
     Reading::Temperature(proprio_topics::Temperature { celsius })
 }
 
-/// Of what a board says of its temperature, what is of no use leaves no trace.
+/// Temperatures that are not used have no effect.
 #[test]
-fn temperatures_count_only_where_they_can_be_trusted_and_are_wanted() {
+fn temperatures_count_only_if_trusted_and_needed() {
     let change = calibration();
     let wanting = || setup(|config| calibrate(config, &change));
     let plain = setup(|_| {});
-    let sensor = plain.channel(Kind::Wrench, "l_arm_ft_sensor").unwrap();
+    let sensor = plain
+        .robot
+        .channel(Kind::Wrench, "l_arm_ft_sensor")
+        .unwrap();
     let events = recording(&plain, 0.5);
     let with = |said: &[(f64, f64, Quality)]| {
         let said = said.iter();
-        let said = said.map(|(t, celsius, quality)| (sensor, Nanos::from_seconds(*t), temperature(*celsius), *quality));
-        // As they come: each before what is stamped as late as it.
+        let said = said.map(|(t, celsius, quality)| {
+            (
+                sensor,
+                Nanos::from_seconds(*t),
+                temperature(*celsius),
+                *quality,
+            )
+        });
+        // In the order of arrival: each before samples with the same stamp.
         let mut all = events.clone();
         for one in said {
             all.insert(all.partition_point(|other| other.1 < one.1), one);
         }
         all
     };
-    // Where nothing depends on it, not even what is wrong with it is counted.
+    // If no calibration depends on temperature, not even invalid temperatures are counted.
     let odd = with(&[
         (0.1, 30.0, Quality::GOOD),
         (0.1, 30.0, Quality::GOOD),
@@ -264,11 +307,14 @@ fn temperatures_count_only_where_they_can_be_trusted_and_are_wanted() {
     let ((without, before), (got, after)) = (run(plain.clone(), &events), run(plain, &odd));
     assert_eq!(bits(&got), bits(&without));
     assert_eq!(after.counts(), before.counts());
-    // Where it does, it is.
+    // If one does, they are.
     let (_, pipeline) = run(wanting(), &odd);
     let (taken, counts) = (before.counts().taken, pipeline.counts());
-    assert_eq!((counts.taken, counts.backward, counts.not_finite), (taken + 1, 1, 1));
-    // What the board distrusts itself is not taken.
+    assert_eq!(
+        (counts.taken, counts.backward, counts.not_finite),
+        (taken + 1, 1, 1)
+    );
+    // A temperature that the board marks as faulty is not taken.
     let good = (0.1, 26.0, Quality::GOOD);
     let faulty = (0.2, 900.0, Quality::DEVICE_FAULT);
     let (right, _) = run(wanting(), &with(&[good]));
@@ -279,11 +325,12 @@ fn temperatures_count_only_where_they_can_be_trusted_and_are_wanted() {
     assert_ne!(bits(&wrong), bits(&right));
 }
 
-/// Torques say it when nobody knows how warm a board is: as if the offset were as uncertain.
+/// If a board's temperature is unknown, the standard deviations of torques grow, as with an
+/// uncertain offset.
 #[test]
 fn without_a_temperature_torques_are_less_certain() {
     let change = calibration();
-    // All channels at rest at one instant, and a temperature so long before.
+    // All channels at rest at one instant, and a temperature of this age.
     let log = golden("icub_left_arm_mujoco.csv");
     let std = |age: Option<f64>, kelvin: f64| {
         let mut pipeline = Pipeline::new(setup(|config| {
@@ -294,8 +341,17 @@ fn without_a_temperature_torques_are_less_certain() {
         }));
         let t = Nanos::from_seconds(10_000.0);
         if let Some(age) = age {
-            let sensor = pipeline.setup().channel(Kind::Wrench, "l_arm_ft_sensor").unwrap();
-            pipeline.push(sensor, t - Nanos::from_seconds(age), &temperature(27.0), Quality::GOOD);
+            let sensor = pipeline
+                .setup()
+                .robot
+                .channel(Kind::Wrench, "l_arm_ft_sensor")
+                .unwrap();
+            pipeline.push(
+                sensor,
+                t - Nanos::from_seconds(age),
+                &temperature(27.0),
+                Quality::GOOD,
+            );
         }
         let mut reader = Reader::new(log.as_bytes()).unwrap();
         let series: Vec<_> = reader.series().to_vec();
@@ -304,7 +360,7 @@ fn without_a_temperature_torques_are_less_certain() {
         for item in &row.items {
             let of = &series[item.series];
             if let (What::Channel(kind), Value::Reading(reading, quality)) = (of.what, &item.value)
-                && let Some(channel) = pipeline.setup().channel(kind, &of.name)
+                && let Some(channel) = pipeline.setup().robot.channel(kind, &of.name)
             {
                 pipeline.push(channel, t, reading, *quality);
             }
@@ -312,7 +368,11 @@ fn without_a_temperature_torques_are_less_certain() {
         pipeline.finish();
         let torques = pipeline.poll().unwrap().torques;
         let told: Vec<&str> = pipeline.without_temperature().collect();
-        let deviations: Vec<f64> = torques.joints().iter().map(|j| j.standard_deviation).collect();
+        let deviations: Vec<f64> = torques
+            .joints()
+            .iter()
+            .map(|j| j.standard_deviation)
+            .collect();
         (deviations, told == ["l_arm_ft_sensor"])
     };
     let known = std(Some(30.0), 0.0);
@@ -323,24 +383,27 @@ fn without_a_temperature_torques_are_less_certain() {
         let (expected, _) = std(Some(30.0), kelvin);
         assert!(is_told, "{age:?}");
         for ((found, expected), known) in found.iter().zip(&expected).zip(&known.0) {
-            // The temperature is told as it was half of the wait before.
-            assert!((found / expected - 1.0).abs() < 1e-3, "{age:?}: {found} {expected}");
+            // The temperature is that of half the wait before.
+            assert!(
+                (found / expected - 1.0).abs() < 1e-3,
+                "{age:?}: {found} {expected}"
+            );
             assert!(found > known, "{age:?}: {found} {known}");
         }
     }
 }
 
-/// A triangle that was learnt through one gain says nothing true of what is read through another.
+/// Information gathered with one gain is not valid for readings with another gain.
 #[test]
-fn what_was_learnt_with_sensors_that_measured_otherwise_is_not_resumed() {
-    let learning = |change: &dyn Fn(&mut Config)| {
+fn a_state_identified_with_other_calibrations_is_not_resumed() {
+    let identifying = |change: &dyn Fn(&mut Config)| {
         Pipeline::new(setup(|config| {
             config.identification.enabled = true;
             config.contact.last_mut().unwrap().presence = Presence::Possible;
             change(config);
         }))
     };
-    let mut pipeline = learning(&|_| {});
+    let mut pipeline = identifying(&|_| {});
     let events = recording(pipeline.setup(), 3.0);
     let mut state = None;
     for (channel, t, reading, quality) in events {
@@ -353,9 +416,9 @@ fn what_was_learnt_with_sensors_that_measured_otherwise_is_not_resumed() {
         }
     }
     let state = state.expect("a job within three seconds");
-    learning(&|_| {}).resume(&state).unwrap();
-    // Offsets are not of it: a restart may change them.
-    learning(&|config| config.force_torque[0].offset_n = Some([5.0, 0.0, 0.0]))
+    identifying(&|_| {}).resume(&state).unwrap();
+    // Offsets are not compared: a restart may change them.
+    identifying(&|config| config.force_torque[0].offset_n = Some([5.0, 0.0, 0.0]))
         .resume(&state)
         .unwrap();
     let other: [&dyn Fn(&mut Config); 4] = [
@@ -373,12 +436,15 @@ fn what_was_learnt_with_sensors_that_measured_otherwise_is_not_resumed() {
         &|config| config.force_torque[0].frame = Some(SensorFrame::Parent),
     ];
     for (number, change) in other.into_iter().enumerate() {
-        let mut pipeline = learning(change);
+        let mut pipeline = identifying(change);
         let fresh = pipeline.identification().unwrap().solution().components[0]
             .bodies
             .clone();
         let error = pipeline.resume(&state).unwrap_err().to_string();
-        assert!(error.contains("mounting or calibration"), "{number}: {error}");
+        assert!(
+            error.contains("mounting or calibration"),
+            "{number}: {error}"
+        );
         let after = &pipeline.identification().unwrap().solution().components[0].bodies;
         assert_eq!(after, &fresh);
     }
@@ -411,8 +477,8 @@ fn a_log_without_stamps_keeps_its_order_and_its_estimates() {
 /// One sample of a recording: channel, stamp, reading, quality.
 type Event = (usize, Nanos, Reading, Quality);
 
-/// A recording at realistic, unequal rates, made from the golden trajectory: F/T at 1 kHz, joints at 250 Hz with positions
-/// only, IMU at 100 Hz; each channel with its own phase.
+/// A recording at realistic, unequal rates, made from the golden trajectory: F/T at 1 kHz, joints
+/// at 250 Hz with positions only, IMU at 100 Hz; each channel with its own phase.
 fn recording(setup: &Setup, seconds: f64) -> Vec<Event> {
     recording_with(setup, seconds, |channel| 0.0001 * channel as f64)
 }
@@ -421,7 +487,7 @@ fn recording(setup: &Setup, seconds: f64) -> Vec<Event> {
 fn recording_with(setup: &Setup, seconds: f64, phase: impl Fn(usize) -> f64) -> Vec<Event> {
     let mut reader = Reader::new(golden("icub_left_arm_mujoco.csv").leak().as_bytes()).unwrap();
     let channel = |s: &proprio_topics::csv::Series| match s.what {
-        What::Channel(kind) => setup.channel(kind, &s.name),
+        What::Channel(kind) => setup.robot.channel(kind, &s.name),
         What::Contact => None,
     };
     let series: Vec<_> = reader.series().iter().map(channel).collect();
@@ -452,7 +518,7 @@ fn recording_with(setup: &Setup, seconds: f64, phase: impl Fn(usize) -> f64) -> 
         }
     };
     let mut events = vec![];
-    for (number, channel) in setup.channels().iter().enumerate() {
+    for (number, channel) in setup.robot.channels.iter().enumerate() {
         let period = match channel.kind {
             Kind::Wrench => 1e-3,
             Kind::Joint => 4e-3,
@@ -506,19 +572,22 @@ fn bits(estimates: &[Estimate]) -> Vec<(Nanos, Vec<Bits>)> {
 
 #[test]
 fn every_trigger_stamp_gives_one_estimate_in_order() {
-    // However uncertain what is extrapolated is.
+    // Extrapolated values may be uncertain to any degree.
     let setup = setup(|config| config.output.max_torque_std_nm = Some(1000.0));
     let events = recording(&setup, 0.5);
-    let stamps: Vec<Nanos> = events.iter().filter(|e| e.0 == setup.trigger).map(|e| e.1).collect();
+    let stamps: Vec<Nanos> = events
+        .iter()
+        .filter(|e| e.0 == setup.robot.trigger)
+        .map(|e| e.1)
+        .collect();
     let (estimates, _) = run(setup, &events);
     assert_eq!(estimates.iter().map(|e| e.t).collect::<Vec<_>>(), stamps);
     // Once every channel has three samples, everything is valid.
     assert!(
-        estimates.iter().filter(|e| e.t > Nanos::from_millis(40)).all(|e| e
-            .torques
-            .joints()
+        estimates
             .iter()
-            .all(|j| j.valid == 1))
+            .filter(|e| e.t > Nanos::from_millis(40))
+            .all(|e| e.torques.joints().iter().all(|j| j.valid == 1))
     );
 }
 
@@ -534,14 +603,20 @@ fn the_order_of_arrival_does_not_matter_within_half_the_wait() {
     };
     for trial in 0..12 {
         let phases: Vec<f64> = base
-            .channels()
+            .robot
+            .channels
             .iter()
             .map(|_| (random() % 4_000_000) as f64 * 1e-9)
             .collect();
         let events = recording_with(&base, 0.25, |channel| phases[channel]);
         let (want, _) = run(base.clone(), &events);
-        // Each channel arrives late by its own delay, and a little more or less, but less than half of the wait of 1 ms.
-        let delays: Vec<i64> = base.channels().iter().map(|_| random() % 440_000).collect();
+        // Each channel arrives with its own delay and some jitter, below half the wait of 1 ms.
+        let delays: Vec<i64> = base
+            .robot
+            .channels
+            .iter()
+            .map(|_| random() % 440_000)
+            .collect();
         let mut arrivals: Vec<(i64, Event)> = events
             .iter()
             .map(|e| (e.1.0 + delays[e.0] + random() % 50_000, *e))
@@ -553,7 +628,11 @@ fn the_order_of_arrival_does_not_matter_within_half_the_wait() {
             events.iter().map(|e| e.0).collect::<Vec<_>>()
         );
         let (got, pipeline) = run(base.clone(), &shuffled);
-        assert_eq!(pipeline.counts().late + pipeline.counts().backward, 0, "trial {trial}");
+        assert_eq!(
+            pipeline.counts().late + pipeline.counts().backward,
+            0,
+            "trial {trial}"
+        );
         assert_eq!(bits(&got), bits(&want), "trial {trial}");
     }
 }
@@ -561,15 +640,16 @@ fn the_order_of_arrival_does_not_matter_within_half_the_wait() {
 #[test]
 fn a_stale_channel_withholds_only_what_depends_on_it() {
     let setup = setup(|_| {});
-    let elbow = setup.channel(Kind::Joint, "l_elbow").unwrap();
-    let names: Vec<String> = setup.joint_names().map(str::to_owned).collect();
+    let elbow = setup.robot.channel(Kind::Joint, "l_elbow").unwrap();
+    let names: Vec<String> = setup.robot.joint_names().map(str::to_owned).collect();
     let mut events = recording(&setup, 0.6);
     events.retain(|e| e.0 != elbow || e.1 < Nanos::from_millis(200));
     let (estimates, _) = run(setup, &events);
     let last = estimates.last().unwrap();
     for (name, joint) in names.iter().zip(last.torques.joints()) {
-        // With an unknown wrench on the hand, a torque rests on the F/T and on the links between it and the joint: the
-        // elbow's own angle decides about the links beyond it, which only the wrist's torques need.
+        // With an unknown wrench on the hand, a torque depends on the F/T sensor and on the links
+        // between it and the joint. The elbow's angle affects the links beyond the elbow, which
+        // only the wrist's torques need.
         let depends = name.starts_with("l_wrist");
         assert_eq!(joint.valid, u32::from(!depends), "{name}");
         assert_eq!(
@@ -577,7 +657,10 @@ fn a_stale_channel_withholds_only_what_depends_on_it() {
             if depends { Reason::Stale } else { Reason::None },
             "{name}"
         );
-        assert!(joint.torque.is_finite(), "a withheld torque keeps its number");
+        assert!(
+            joint.torque.is_finite(),
+            "a withheld torque keeps its number"
+        );
         if depends {
             assert_eq!(joint.cause, u32::try_from(elbow).unwrap());
         }
@@ -585,11 +668,14 @@ fn a_stale_channel_withholds_only_what_depends_on_it() {
 }
 
 #[test]
-fn saturation_withholds_and_a_channel_never_seen_gives_no_number() {
+fn saturation_withholds_and_a_channel_without_samples_gives_nan() {
     let setup = setup(|_| {});
     let (ft, imu) = (
-        setup.channel(Kind::Wrench, "l_arm_ft_sensor").unwrap(),
-        setup.channel(Kind::Imu, "chest_imu").unwrap(),
+        setup
+            .robot
+            .channel(Kind::Wrench, "l_arm_ft_sensor")
+            .unwrap(),
+        setup.robot.channel(Kind::Imu, "chest_imu").unwrap(),
     );
     let mut events = recording(&setup, 0.3);
     for event in &mut events {
@@ -598,7 +684,10 @@ fn saturation_withholds_and_a_channel_never_seen_gives_no_number() {
         }
     }
     let (estimates, _) = run(setup.clone(), &events);
-    let before = estimates.iter().find(|e| e.t > Nanos::from_millis(150)).unwrap();
+    let before = estimates
+        .iter()
+        .find(|e| e.t > Nanos::from_millis(150))
+        .unwrap();
     assert!(before.torques.joints().iter().all(|j| j.valid == 1));
     assert!(
         estimates
@@ -618,7 +707,7 @@ fn saturation_withholds_and_a_channel_never_seen_gives_no_number() {
 }
 
 #[test]
-fn bad_samples_are_counted_and_lose_nothing_else() {
+fn bad_samples_are_counted_and_affect_nothing_else() {
     let setup = setup(|_| {});
     let events = recording(&setup, 0.3);
     let (want, clean) = run(setup.clone(), &events);
@@ -629,7 +718,9 @@ fn bad_samples_are_counted_and_lose_nothing_else() {
         bad.push(*event);
         if i % 7 == 0 {
             // The same stamp again, with another value.
-            let Reading::Joint(state) = event.2 else { continue };
+            let Reading::Joint(state) = event.2 else {
+                continue;
+            };
             bad.push((
                 event.0,
                 event.1,
@@ -664,7 +755,7 @@ fn bad_samples_are_counted_and_lose_nothing_else() {
 #[test]
 fn a_channel_that_comes_too_late_is_dropped_and_counted() {
     let setup = setup(|_| {});
-    let elbow = setup.channel(Kind::Joint, "l_elbow").unwrap();
+    let elbow = setup.robot.channel(Kind::Joint, "l_elbow").unwrap();
     let events = recording(&setup, 0.3);
     let arrives = |e: &Event| {
         if e.0 == elbow && e.1 > Nanos::from_millis(200) {
@@ -679,9 +770,9 @@ fn a_channel_that_comes_too_late_is_dropped_and_counted() {
         .iter()
         .filter(|e| e.0 == elbow && e.1 > Nanos::from_millis(200))
         .count();
-    let triggers = events.iter().filter(|e| e.0 == setup.trigger).count();
+    let triggers = events.iter().filter(|e| e.0 == setup.robot.trigger).count();
     let (estimates, pipeline) = run(setup, &late);
-    // Those of the last 30 ms still find an instant that waits, or none.
+    // Samples of the last 30 ms may still be used by a waiting instant.
     assert!(
         (expected - 10..=expected).contains(&(pipeline.counts().late as usize)),
         "{:?} of {expected}",
@@ -697,14 +788,20 @@ fn a_gap_of_everything_does_not_reach_back() {
     let mut events = recording(&base, 0.6);
     events.retain(|e| e.1 < Nanos::from_millis(200) || e.1 > Nanos::from_millis(400));
     let (want, _) = run(base.clone(), &events);
-    let last = want.iter().rfind(|e| e.t < Nanos::from_millis(200)).unwrap();
+    let last = want
+        .iter()
+        .rfind(|e| e.t < Nanos::from_millis(200))
+        .unwrap();
     assert!(
         last.torques.joints().iter().all(|j| j.valid == 1),
         "the last instant before the gap: {:?}",
         last.torques.joints()
     );
-    // After the gap, whoever comes first.
-    let after = events.iter().position(|e| e.1 > Nanos::from_millis(400)).unwrap();
+    // After the gap, with each channel as the first.
+    let after = events
+        .iter()
+        .position(|e| e.1 > Nanos::from_millis(400))
+        .unwrap();
     for k in 1..6 {
         let mut other = events.clone();
         other[after..after + 9].rotate_left(k);
@@ -717,14 +814,17 @@ fn a_gap_of_everything_does_not_reach_back() {
 }
 
 #[test]
-fn what_an_uncalibrated_encoder_said_is_not_differentiated() {
+fn samples_of_an_uncalibrated_encoder_are_not_differentiated() {
     let setup = setup(|_| {});
-    let elbow = setup.channel(Kind::Joint, "l_elbow").unwrap();
-    let names: Vec<String> = setup.joint_names().map(str::to_owned).collect();
+    let elbow = setup.robot.channel(Kind::Joint, "l_elbow").unwrap();
+    let names: Vec<String> = setup.robot.joint_names().map(str::to_owned).collect();
     let events = recording(&setup, 0.6);
     let (clean, _) = run(setup.clone(), &events);
     let mut bad = events;
-    for event in bad.iter_mut().filter(|e| e.0 == elbow && e.1 < Nanos::from_millis(300)) {
+    for event in bad
+        .iter_mut()
+        .filter(|e| e.0 == elbow && e.1 < Nanos::from_millis(300))
+    {
         let Reading::Joint(state) = event.2 else {
             panic!("a joint")
         };
@@ -737,7 +837,11 @@ fn what_an_uncalibrated_encoder_said_is_not_differentiated() {
     let (estimates, _) = run(setup, &bad);
     let mut withheld = 0;
     for (estimate, clean) in estimates.iter().zip(&clean) {
-        for ((name, joint), right) in names.iter().zip(estimate.torques.joints()).zip(clean.torques.joints()) {
+        for ((name, joint), right) in names
+            .iter()
+            .zip(estimate.torques.joints())
+            .zip(clean.torques.joints())
+        {
             withheld += u32::from(joint.reason == Reason::DeviceFault);
             if joint.valid == 1 && right.valid == 1 {
                 let error = joint.torque - right.torque;
@@ -746,11 +850,19 @@ fn what_an_uncalibrated_encoder_said_is_not_differentiated() {
         }
     }
     assert!(withheld > 500);
-    assert!(estimates.last().unwrap().torques.joints().iter().all(|j| j.valid == 1));
+    assert!(
+        estimates
+            .last()
+            .unwrap()
+            .torques
+            .joints()
+            .iter()
+            .all(|j| j.valid == 1)
+    );
 }
 
 #[test]
-fn what_carries_a_fixed_base_can_not_be_declared_away() {
+fn the_ground_reaction_of_a_fixed_base_cannot_be_declared_absent() {
     let fixed = |presence| {
         move |config: &mut Config| {
             config.base = proprio_estimator::config::Base::Fixed {
@@ -768,7 +880,7 @@ fn what_carries_a_fixed_base_can_not_be_declared_away() {
     let mut torques = vec![];
     for presence in [Always, Possible] {
         let setup = setup(fixed(presence));
-        let stand = setup.contact("stand").unwrap();
+        let stand = setup.robot.contact("stand").unwrap();
         let events = recording(&setup, 0.2);
         let (want, _) = run(setup.clone(), &events);
         let mut pipeline = Pipeline::new(setup);
@@ -781,22 +893,28 @@ fn what_carries_a_fixed_base_can_not_be_declared_away() {
             }
         }
         let roll = 1;
-        let (want, got) = (want[150].torques.joints()[roll], got[150].torques.joints()[roll]);
+        let (want, got) = (
+            want[150].torques.joints()[roll],
+            got[150].torques.joints()[roll],
+        );
         assert_eq!((want.valid, got.valid), (1, 1));
         torques.extend([want.torque, got.torque]);
     }
-    assert!(torques.iter().all(|t| (t - torques[0]).abs() < 1e-9), "{torques:?}");
+    assert!(
+        torques.iter().all(|t| (t - torques[0]).abs() < 1e-9),
+        "{torques:?}"
+    );
 }
 
 #[test]
-fn whoever_repeats_a_declaration_says_nothing_new() {
+fn a_repeated_declaration_changes_nothing() {
     let setup = setup(|config| {
         for contact in config.contact.iter_mut().filter(|c| c.name() == "hand") {
             contact.presence = Presence::Possible;
         }
         config.output.max_wait_ms = 20.0;
     });
-    let hand = setup.contact("hand").unwrap();
+    let hand = setup.robot.contact("hand").unwrap();
     let events = recording(&setup, 0.3);
     let mut pipeline = Pipeline::new(setup);
     let mut next = Nanos::ZERO;
@@ -815,7 +933,7 @@ fn whoever_repeats_a_declaration_says_nothing_new() {
             );
         }
     }
-    // More changes than are remembered: the last one of those forgotten still holds.
+    // More changes than are kept: the last one of those dropped is still valid.
     for i in 0..40 {
         pipeline.declare(hand, Nanos::from_millis(400 + i), i % 2 == 0);
     }
@@ -829,7 +947,7 @@ fn a_possible_contact_is_absent_unless_declared() {
         }
     };
     let setup = setup(possible);
-    let hand = setup.contact("hand").unwrap();
+    let hand = setup.robot.contact("hand").unwrap();
     let events = recording(&setup, 0.3);
     let mut pipeline = Pipeline::new(setup);
     pipeline.declare(hand, Nanos::from_millis(200), true);
@@ -864,15 +982,17 @@ fn each_mistake_between_configuration_and_model_has_one_clear_message() {
     for (change, expected) in [
         (
             &|c: &mut Config| c.contact[1].link = "l_hnad".into(),
-            "contact \"hand\": link: \"l_hnad\" is not a link of the URDF; did you mean \"l_hand\"?",
+            "contact \"hand\": link: \"l_hnad\" is not a link of the URDF; did you mean \
+             \"l_hand\"?",
         ),
         (
             &|c: &mut Config| c.force_torque[0].joint = "l_arm_ft".into(),
-            "joint l_arm_ft, which is said to carry an F/T sensor, is not in the URDF; its fixed joints that could: l_arm_ft_sensor",
+            "joint l_arm_ft, named as the joint of an F/T sensor, is not in the URDF; fixed joints \
+             that could carry one: l_arm_ft_sensor",
         ),
         (
             &|c: &mut Config| c.force_torque[0].joint = "l_elbow".into(),
-            "joint l_elbow is said to carry an F/T sensor, but it moves",
+            "joint l_elbow is named as the joint of an F/T sensor, but it moves",
         ),
         (
             &|c: &mut Config| {
@@ -882,13 +1002,16 @@ fn each_mistake_between_configuration_and_model_has_one_clear_message() {
         ),
         (
             &|c: &mut Config| c.output.trigger = Some("nobody".into()),
-            "output.trigger = \"nobody\" is not a channel that is read",
+            "output.trigger = \"nobody\" is not a channel of this configuration",
         ),
         (
             &|c: &mut Config| c.contact[1].name = Some("stand".into()),
             "two contacts have this name",
         ),
-        (&|c: &mut Config| c.model = "nowhere.urdf".into(), "nowhere.urdf"),
+        (
+            &|c: &mut Config| c.model = "nowhere.urdf".into(),
+            "nowhere.urdf",
+        ),
     ] as [(&dyn Fn(&mut Config), &str); 7]
     {
         let problem = problem(change);
@@ -905,12 +1028,13 @@ fn each_mistake_between_configuration_and_model_has_one_clear_message() {
     );
 }
 
-/// A robot that stands on its chest, then on its hand, then on nothing: the base changes with what is declared, and the torques are the truth's.
+/// A robot that stands on its chest, then on its hand, then on nothing: the base follows the
+/// declarations, and the torques equal the true ones.
 #[test]
 fn the_base_is_the_link_that_stands() {
+    use proprio_dynamics::spatial::Vec3;
+    use proprio_dynamics::{FrameMotion, InverseDynamics, JointState as State, Kinematics};
     use proprio_estimator::config::{Base, Foot, Presence};
-    use proprio_estimator::dynamics::{FrameMotion, InverseDynamics, JointState as State, Kinematics};
-    use proprio_estimator::spatial::Vec3;
 
     const GRAVITY: [[f64; 3]; 2] = [[0.0, 0.0, -9.80665], [3.0, 0.0, -9.3]];
     let on = |config: &mut Config| {
@@ -920,15 +1044,21 @@ fn the_base_is_the_link_that_stands() {
             gravity_mps2,
         };
         config.base = Base::Stance {
-            foot: vec![foot("chest", "stand", GRAVITY[0]), foot("l_hand", "hand", GRAVITY[1])],
+            foot: vec![
+                foot("chest", "stand", GRAVITY[0]),
+                foot("l_hand", "hand", GRAVITY[1]),
+            ],
         };
         for contact in &mut config.contact {
             contact.presence = Presence::Possible;
         }
     };
     let setup = setup(on);
-    let (stand, hand) = (setup.contact("stand").unwrap(), setup.contact("hand").unwrap());
-    let dofs = setup.model.dof_count();
+    let (stand, hand) = (
+        setup.robot.contact("stand").unwrap(),
+        setup.robot.contact("hand").unwrap(),
+    );
+    let dofs = setup.robot.model.dof_count();
     let mut pipeline = Pipeline::new(setup.clone());
     let ms = Nanos::from_millis;
     for (contact, t, active) in [
@@ -942,32 +1072,41 @@ fn the_base_is_the_link_that_stands() {
     for step in 0..100 {
         let t = ms(step);
         let value = |dof: usize, factor: f64| (0.05 * step as f64 * factor + dof as f64).sin();
-        let states = [1.0, 2.0, 5.0].map(|factor| (0..dofs).map(|dof| value(dof, factor)).collect::<Vec<f64>>());
-        // While both are declared, the one that is listed first is the base.
+        let states = [1.0, 2.0, 5.0].map(|factor| {
+            (0..dofs)
+                .map(|dof| value(dof, factor))
+                .collect::<Vec<f64>>()
+        });
+        // While both are declared, the foot listed first is the base.
         let foot = usize::from(step >= 40);
-        let base = [setup.base_link, setup.model.frame("l_hand").unwrap().link][foot];
-        let mut truth = Kinematics::new(&setup.model, base).unwrap();
+        let base = [
+            setup.robot.base_link,
+            setup.robot.model.frame("l_hand").unwrap().link,
+        ][foot];
+        let mut truth = Kinematics::new(&setup.robot.model, base).unwrap();
         let state = State {
             position: &states[0],
             velocity: &states[1],
             acceleration: &states[2],
         };
         let standing = FrameMotion::standing(&Vec3::from(GRAVITY[foot]));
-        truth.update(&setup.model, state, &standing).unwrap();
-        let mut dynamics = InverseDynamics::new(&setup.model);
-        dynamics.update(&setup.model, &truth, &[]).unwrap();
-        let sensor = setup.structure.sensors()[0];
+        truth.update(&setup.robot.model, state, &standing).unwrap();
+        let mut dynamics = InverseDynamics::new(&setup.robot.model);
+        dynamics.update(&setup.robot.model, &truth, &[]).unwrap();
+        let sensor = setup.robot.structure.sensors()[0];
         let [fx, fy, fz, tx, ty, tz] = sensor
             .reading(&dynamics.transmitted(&truth, sensor.joint()))
             .force_first();
-        for (number, channel) in setup.channels().iter().enumerate() {
+        for (number, channel) in setup.robot.channels.iter().enumerate() {
             let reading = match channel.role {
-                proprio_estimator::setup::Use::Joint(dof) => Reading::Joint(JointState {
-                    position: states[0][dof],
-                    velocity: states[1][dof],
-                    acceleration: states[2][dof],
-                    ..JointState::ABSENT
-                }),
+                proprio_identification::robot::ChannelRole::Joint(dof) => {
+                    Reading::Joint(JointState {
+                        position: states[0][dof],
+                        velocity: states[1][dof],
+                        acceleration: states[2][dof],
+                        ..JointState::ABSENT
+                    })
+                }
                 _ => Reading::Wrench(Wrench {
                     force: [fx, fy, fz],
                     torque: [tx, ty, tz],
@@ -977,17 +1116,25 @@ fn the_base_is_the_link_that_stands() {
         }
         let estimate = pipeline.poll().expect("every channel has this instant");
         for (joint, want) in estimate.torques.joints().iter().zip(dynamics.torque()) {
-            // Both are declared from 30 to 40 ms: each half of the robot has one of them.
+            // Both are declared from 30 to 40 ms: one contact in each half of the robot.
             if step < 70 {
-                assert_eq!((joint.valid, joint.reason), (1, Reason::None), "at {step} ms");
+                assert_eq!(
+                    (joint.valid, joint.reason),
+                    (1, Reason::None),
+                    "at {step} ms"
+                );
                 assert!(
                     (joint.torque - want).abs() < 1e-10,
                     "at {step} ms: {} {want}",
                     joint.torque
                 );
             } else {
-                // Nothing tells how the base moves; and what carries the robot is not known either.
-                assert_eq!((joint.valid, joint.reason), (0, Reason::NoStance), "at {step} ms");
+                // The motion of the base is unknown, and so is the ground reaction.
+                assert_eq!(
+                    (joint.valid, joint.reason),
+                    (0, Reason::NoStance),
+                    "at {step} ms"
+                );
             }
         }
     }
@@ -1010,9 +1157,12 @@ fn a_foot_needs_a_contact_that_can_carry() {
     for (second, expected) in [
         (
             foot("l_hand", "hand"),
-            "contact \"stand\" is always present, so that no foot after this one would ever be the base",
+            "contact \"stand\" is always present, so no later foot could become the base",
         ),
-        (foot("chest", "stand"), "contact \"stand\" is always present"),
+        (
+            foot("chest", "stand"),
+            "contact \"stand\" is always present",
+        ),
     ] {
         let problem = problem(ContactKind::Wrench, vec![foot("chest", "stand"), second]);
         assert!(problem.contains(expected), "{expected}: {problem}");
@@ -1049,28 +1199,30 @@ fn a_foot_needs_a_contact_that_can_carry() {
 }
 
 #[test]
-fn the_plan_says_what_each_sensor_can_tell_of_the_links() {
+fn the_plan_states_how_many_parameters_each_sensor_can_identify() {
     use proprio_estimator::config::{Base, Presence};
     let possible = |config: &mut Config| {
         for contact in &mut config.contact {
             contact.presence = Presence::Possible;
         }
     };
-    // Four links and three revolute joints above the sensor, five and four beyond it; each joint hides three directions.
+    // Four links and three revolute joints above the sensor, five and four beyond it; each joint
+    // hides three directions.
     let text = setup(possible).to_string();
     for expected in [
-        "31 independent combinations of its 40 inertial parameters show",
-        "38 independent combinations of its 50 inertial parameters show",
+        "31 independent combinations of its 40 inertial parameters can be identified",
+        "38 independent combinations of its 50 inertial parameters can be identified",
     ] {
         assert!(text.contains(expected), "{expected}:\n{text}");
     }
-    // A contact that is always there takes up whatever the links make.
+    // The unknown wrench of an always present contact absorbs the effect of all parameters.
     let text = setup(|_| {}).to_string();
     for contact in ["stand", "hand"] {
-        let expected = format!("none of its inertial parameters shows in its F/T while {contact} is present");
+        let expected =
+            format!("none of its inertial parameters can be identified while {contact} is present");
         assert!(text.contains(&expected), "{expected}:\n{text}");
     }
-    // So does what carries a fixed base; and a locked joint makes one body of two.
+    // So does the ground reaction of a fixed base; and a locked joint joins two bodies.
     let less = setup(|config| {
         possible(config);
         config.base = Base::Fixed {
@@ -1081,8 +1233,9 @@ fn the_plan_says_what_each_sensor_can_tell_of_the_links() {
     });
     let text = less.to_string();
     for expected in [
-        "none of its inertial parameters shows in its F/T while what the base stands on is present",
-        "31 independent combinations of its 50 inertial parameters show",
+        "none of its inertial parameters can be identified while the support of the base is \
+         present",
+        "31 independent combinations of its 50 inertial parameters can be identified",
     ] {
         assert!(text.contains(expected), "{expected}:\n{text}");
     }
@@ -1096,9 +1249,17 @@ fn a_torque_that_is_too_uncertain_is_withheld() {
         run(setup, &events).0.pop().unwrap()
     };
     let wide = estimate(1.0);
-    let deviations: Vec<f64> = wide.torques.joints().iter().map(|j| j.standard_deviation).collect();
-    assert!(wide.torques.joints().iter().all(|j| j.valid == 1), "{deviations:?}");
-    // Between the least and the greatest: some are withheld and keep their numbers.
+    let deviations: Vec<f64> = wide
+        .torques
+        .joints()
+        .iter()
+        .map(|j| j.standard_deviation)
+        .collect();
+    assert!(
+        wide.torques.joints().iter().all(|j| j.valid == 1),
+        "{deviations:?}"
+    );
+    // A bound between the smallest and the largest: some are withheld, with the same values.
     let greatest = deviations.iter().copied().fold(0.0, f64::max);
     let narrow = estimate(0.9 * greatest);
     assert!(narrow.torques.joints().iter().any(|j| j.valid == 1));
@@ -1115,15 +1276,18 @@ fn a_torque_that_is_too_uncertain_is_withheld() {
     }
 }
 
-/// The hand may be touched, but nobody says when; the arm is known exactly.
-fn touchable(config: &mut Config) {
-    config.identification.model_std = 0.0;
-    let hand = config.contact.iter_mut().find(|contact| contact.name() == "hand");
+/// The hand's contact is possible but not declared; the arm's parameters are exact.
+fn possible_hand_contact(config: &mut Config) {
+    config.identification.urdf_relative_std = 0.0;
+    let hand = config
+        .contact
+        .iter_mut()
+        .find(|contact| contact.name() == "hand");
     hand.unwrap().presence = Presence::Possible;
 }
 
-/// What is estimated of a golden log, with so much added to what the F/T sensor reads from each row on [N, Nm].
-fn touched(
+/// The estimates of a golden log, with `add(row)` added to the F/T reading of each row [N, Nm].
+fn estimates_with_added(
     change: impl FnOnce(&mut Config),
     name: &str,
     add: impl Fn(usize) -> [f64; 6],
@@ -1133,7 +1297,10 @@ fn touched(
         .lines()
         .map(|line| line.split(',').map(str::to_owned).collect::<Vec<_>>());
     let header = rows.next().unwrap();
-    let first = header.iter().position(|c| c == "wrench/l_arm_ft_sensor/fx").unwrap();
+    let first = header
+        .iter()
+        .position(|c| c == "wrench/l_arm_ft_sensor/fx")
+        .unwrap();
     let mut text = header.join(",") + "\n";
     for (number, mut row) in rows.enumerate() {
         for (cell, more) in row[first..first + 6].iter_mut().zip(add(number)) {
@@ -1146,26 +1313,30 @@ fn touched(
     table(std::str::from_utf8(&out).unwrap())
 }
 
-/// MuJoCo pushes the hand, and nobody says so: the same torques and the same wrench as if somebody had.
+/// MuJoCo pushes the hand without a declaration: torques and wrench are the same as with one.
 #[test]
-fn a_touch_that_nobody_declares_is_detected() {
+fn an_undeclared_contact_is_detected() {
     let file = "icub_left_arm_mujoco_contact.csv";
-    let found = touched(touchable, file, |_| [0.0; 6]);
-    let told = touched(
+    let found = estimates_with_added(possible_hand_contact, file, |_| [0.0; 6]);
+    let told = estimates_with_added(
         |config| {
-            touchable(config);
+            possible_hand_contact(config);
             config.contact.last_mut().unwrap().presence = Presence::Always;
         },
         file,
         |_| [0.0; 6],
     );
-    // Where it hardly pushes but still turns, by 0.5 Nm, it is no touch of the hand.
-    let is_found: Vec<bool> = found["contact/hand/detected"].iter().map(|d| d == "1").collect();
+    // Where the force is small but the moment is 0.5 Nm, it is not a contact of the hand.
+    let is_found: Vec<bool> = found["contact/hand/detected"]
+        .iter()
+        .map(|d| d == "1")
+        .collect();
     let count = is_found.iter().filter(|found| **found).count();
     assert!(count > 190, "{count}");
     for (name, cells) in &told {
-        // Deviations hold on to the posture that contacts changed in.
-        if name.starts_with("residual/") || name.contains("_std") || name == "contact/hand/detected" {
+        // Standard deviations are those of the posture in which contacts changed.
+        if name.starts_with("residual/") || name.contains("_std") || name == "contact/hand/detected"
+        {
             continue;
         }
         let pairs = cells.iter().zip(&found[name]).zip(&is_found);
@@ -1180,48 +1351,86 @@ fn a_touch_that_nobody_declares_is_detected() {
             .into_iter()
             .all(|(name, is_found)| name == if *is_found { "hand" } else { "unexplained" })
     );
-    // What acts there is told with how uncertain it is, and nothing is told where it can not be tested.
+    // The residual has a significance where it can be tested, and none elsewhere.
     let stds = found["contact/hand/fx_std"].iter();
     assert!(
         stds.zip(&is_found)
             .all(|(std, is_found)| (std.parse::<f64>().unwrap() > 0.0) == *is_found)
     );
-    assert!(told["residual/l_upper_arm/significance"].iter().all(String::is_empty));
-    assert!(found["residual/chest/significance"].iter().all(String::is_empty));
+    assert!(
+        told["residual/l_upper_arm/significance"]
+            .iter()
+            .all(String::is_empty)
+    );
+    assert!(
+        found["residual/chest/significance"]
+            .iter()
+            .all(String::is_empty)
+    );
 }
 
 #[test]
-fn nothing_is_detected_where_nothing_acts() {
-    for model_std in [0.0, 0.2] {
+fn nothing_is_detected_without_a_disturbance() {
+    for urdf_relative_std in [0.0, 0.2] {
         let change = |config: &mut Config| {
-            touchable(config);
-            config.identification.model_std = model_std;
+            possible_hand_contact(config);
+            config.identification.urdf_relative_std = urdf_relative_std;
         };
-        let found = touched(change, "icub_left_arm_mujoco.csv", |_| [0.0; 6]);
-        assert!(found["residual/l_upper_arm/reason"].iter().all(String::is_empty));
+        let found = estimates_with_added(change, "icub_left_arm_mujoco.csv", |_| [0.0; 6]);
+        assert!(
+            found["residual/l_upper_arm/reason"]
+                .iter()
+                .all(String::is_empty)
+        );
         let significance = &found["residual/l_upper_arm/significance"];
         assert!(significance.iter().all(|s| s.parse::<f64>().unwrap() < 0.0));
         assert!(found["contact/hand/detected"].iter().all(|d| d == "0"));
     }
 }
 
-/// A moment without a force is no touch of the hand, and a force far from it is none either. Where it acts nobody knows.
+/// A moment without a force is not a contact of the hand, and neither is a force far from it. The
+/// place where it acts is unknown.
 #[test]
-fn what_no_contact_explains_withholds_the_torques_that_rest_on_it() {
-    let push = |number: usize| if (50..100).contains(&number) { 1.0 } else { 0.0 };
-    for far in [[0.0, 0.0, 0.0, 0.0, 8.0, 0.0], [0.0, 100.0, 0.0, 0.0, 0.0, 0.0]] {
-        let found = touched(touchable, "icub_left_arm_mujoco.csv", |n| far.map(|x| x * push(n)));
-        for (joint, sees) in [("l_elbow", true), ("l_wrist_yaw", true), ("l_shoulder_roll", false)] {
+fn an_unexplained_residual_withholds_the_torques_of_its_sub_tree() {
+    let push = |number: usize| {
+        if (50..100).contains(&number) {
+            1.0
+        } else {
+            0.0
+        }
+    };
+    for far in [
+        [0.0, 0.0, 0.0, 0.0, 8.0, 0.0],
+        [0.0, 100.0, 0.0, 0.0, 0.0, 0.0],
+    ] {
+        let found = estimates_with_added(possible_hand_contact, "icub_left_arm_mujoco.csv", |n| {
+            far.map(|x| x * push(n))
+        });
+        for (joint, sees) in [
+            ("l_elbow", true),
+            ("l_wrist_yaw", true),
+            ("l_shoulder_roll", false),
+        ] {
             let column = |what: &str| &found[&format!("{what}/{joint}")];
-            for (number, (reason, valid)) in column("reason").iter().zip(column("valid")).enumerate() {
+            for (number, (reason, valid)) in
+                column("reason").iter().zip(column("valid")).enumerate()
+            {
                 let is_pushed = sees && push(number) > 0.0;
-                let expected = if is_pushed { ("unexplained", "0") } else { ("", "1") };
-                assert_eq!((reason.as_str(), valid.as_str()), expected, "{joint} {number} {far:?}");
+                let expected = if is_pushed {
+                    ("unexplained", "0")
+                } else {
+                    ("", "1")
+                };
+                assert_eq!(
+                    (reason.as_str(), valid.as_str()),
+                    expected,
+                    "{joint} {number} {far:?}"
+                );
             }
         }
         let told = |number: usize| found["residual/l_upper_arm/reason"][number].as_str();
         assert!((0..201).all(|n| told(n) == if push(n) > 0.0 { "unexplained" } else { "" }));
-        // The residual is what was added: by the parent on the child it is the opposite.
+        // The residual is the added wrench, with opposite sign: it acts from parent to child.
         let force: f64 = ["fx", "fy", "fz"]
             .map(|axis| {
                 found[&format!("residual/l_upper_arm/{axis}")][60]
@@ -1235,18 +1444,19 @@ fn what_no_contact_explains_withholds_the_torques_that_rest_on_it() {
     }
 }
 
-/// Noise hides a small force from one reading, but not from the mean of many. And once it is over, it is over.
+/// A small force is below the noise of one reading, but significant in the mean of many. It is no
+/// longer reported after it ends.
 #[test]
-fn a_mean_shows_what_no_single_reading_does() {
+fn the_mean_shows_a_force_below_the_noise_of_one_reading() {
     let noisy = |config: &mut Config| {
-        touchable(config);
+        possible_hand_contact(config);
         config.force_torque[0].noise_n = [1.0; 3];
         config.force_torque[0].noise_nm = [0.1; 3];
         config.output.max_wait_ms = 20.0;
     };
     let setup = setup(noisy);
     let events = recording(&setup, 0.9);
-    let hand = setup.contact("hand").unwrap();
+    let hand = setup.robot.contact("hand").unwrap();
     let (from, to) = (Nanos::from_millis(400), Nanos::from_millis(700));
     let detected = |force: f64| {
         let mut pipeline = Pipeline::new(setup.clone());
@@ -1261,13 +1471,15 @@ fn a_mean_shows_what_no_single_reading_does() {
             pipeline.push(*channel, *t, &reading, *quality);
             while let Some(estimate) = pipeline.poll() {
                 let residuals = estimate.contacts.residuals();
-                let is_seen = residuals.iter().any(|r| r.unexplained == 1 || r.contact == hand as u32);
+                let is_seen = residuals
+                    .iter()
+                    .any(|r| r.unexplained == 1 || r.contact == hand as u32);
                 found.push((estimate.t, is_seen));
             }
         }
         found
     };
-    // 2.5 standard deviations of one reading; of some 50 that are averaged many more.
+    // 2.5 standard deviations of one reading, and many more of the mean of some 50.
     let found = detected(2.5);
     let first = found.iter().find(|(_, seen)| *seen).expect("it is seen").0;
     let last = found.iter().rev().find(|(_, seen)| *seen).unwrap().0;
@@ -1276,29 +1488,46 @@ fn a_mean_shows_what_no_single_reading_does() {
         "{first}"
     );
     assert!(last > to && last < to + Nanos::from_millis(150), "{last}");
-    // Ten of them are seen at once.
+    // Ten standard deviations are significant at once.
     let found = detected(10.0);
     let first = found.iter().find(|(_, seen)| *seen).expect("it is seen").0;
-    assert!(first >= from && first < from + Nanos::from_millis(2), "{first}");
+    assert!(
+        first >= from && first < from + Nanos::from_millis(2),
+        "{first}"
+    );
 }
 
-/// An offset that is neither configured nor identified may be anything: nothing contradicts it, and what rests on it says nothing.
+/// An offset that is neither configured nor identified is unknown: its residual is never
+/// significant, and the torques that depend on it are not valid.
 #[test]
-fn an_offset_that_nobody_states_is_unknown() {
+fn an_offset_that_is_not_configured_is_unknown() {
     let unknown = |config: &mut Config| {
-        touchable(config);
-        (config.force_torque[0].offset_n, config.force_torque[0].offset_nm) = (None, None);
+        possible_hand_contact(config);
+        (
+            config.force_torque[0].offset_n,
+            config.force_torque[0].offset_nm,
+        ) = (None, None);
     };
-    let found = touched(unknown, "icub_left_arm_mujoco.csv", |_| {
+    let found = estimates_with_added(unknown, "icub_left_arm_mujoco.csv", |_| {
         [100.0, -50.0, 20.0, 3.0, -2.0, 1.0]
     });
-    assert!(found["residual/l_upper_arm/reason"].iter().all(String::is_empty));
+    assert!(
+        found["residual/l_upper_arm/reason"]
+            .iter()
+            .all(String::is_empty)
+    );
     for (joint, reason) in [("l_shoulder_roll", "uncertain"), ("l_elbow", "")] {
         assert!(
-            found[&format!("reason/{joint}")].iter().all(|own| own == reason),
+            found[&format!("reason/{joint}")]
+                .iter()
+                .all(|own| own == reason),
             "{joint}"
         );
     }
-    let std = |joint: &str| found[&format!("torque_std/{joint}")][0].parse::<f64>().unwrap();
+    let std = |joint: &str| {
+        found[&format!("torque_std/{joint}")][0]
+            .parse::<f64>()
+            .unwrap()
+    };
     assert!(std("l_shoulder_roll") > 100.0 && std("l_elbow") < 0.1);
 }

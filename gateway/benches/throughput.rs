@@ -1,7 +1,8 @@
-//! How many frames a second one core takes: from a log to a table, and from a bus to shared memory.
+//! Frames per second on one core: from a log to a table, and from a bus to shared memory.
 //!
-//! `cargo bench -p proprio-gateway` prints times for one round of [`FRAMES`] frames and the rate. The bare loop reads the same
-//! datagrams from the same kind of socket and does nothing with them: the ratio to it is what the gateway adds.
+//! `cargo bench -p proprio-gateway` prints the time for one round of [`FRAMES`] frames and the
+//! rate. The bare loop only reads the same datagrams from the same kind of socket: the ratio shows
+//! the gateway's overhead.
 
 use divan::Bencher;
 use divan::counter::ItemsCount;
@@ -23,7 +24,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Frames in one round: well below what the receive buffer of a link holds.
+/// Frames in one round, well below the capacity of a link's receive buffer.
 const FRAMES: u64 = 2_000;
 
 const PLAN: &str = r#"
@@ -52,7 +53,7 @@ fn plan() -> Plan {
     Plan::parse(PLAN, Path::new(".")).unwrap()
 }
 
-/// A log of `frames` frames, of which two in three are halves of wrenches: that is what a robot's bus carries.
+/// A log of `frames` frames, two thirds of them halves of wrenches, as on a robot's bus.
 fn log(frames: u64) -> Vec<u8> {
     let mut table = String::from("t,joint/elbow/position,joint/elbow/velocity");
     ["fx", "fy", "fz", "tx", "ty", "tz"]
@@ -60,7 +61,10 @@ fn log(frames: u64) -> Vec<u8> {
         .for_each(|c| write!(table, ",wrench/ft/{c}").unwrap());
     table.push('\n');
     for i in 0..frames / 3 {
-        let (t, x) = (Nanos(i64::try_from(i).unwrap() * 1_000_000), (i as f64 * 0.01).sin());
+        let (t, x) = (
+            Nanos(i64::try_from(i).unwrap() * 1_000_000),
+            (i as f64 * 0.01).sin(),
+        );
         writeln!(
             table,
             "{t},{},{},{},{},{},{},{},{}",
@@ -123,7 +127,7 @@ fn fill(bus: &mut VirtualBus, frames: &[Frame]) {
     frames.iter().for_each(|f| bus.send(f, deadline).unwrap());
 }
 
-/// Reads what has arrived, and nothing else.
+/// Only reads the datagrams that have arrived.
 #[divan::bench(sample_count = 50)]
 fn bare_receive(bencher: Bencher<'_, '_>) {
     let domain = format!("bench{}", std::process::id());
@@ -142,7 +146,7 @@ fn bare_receive(bencher: Bencher<'_, '_>) {
         });
 }
 
-/// Frames waiting at the link to samples in shared memory: the whole of the data plane.
+/// From frames waiting at the link to samples in shared memory: the whole data plane.
 #[divan::bench(sample_count = 50)]
 fn frames_to_shared_memory(bencher: Bencher<'_, '_>) {
     let base = tempfile::tempdir().unwrap();
@@ -166,7 +170,7 @@ fn frames_to_shared_memory(bencher: Bencher<'_, '_>) {
         });
 }
 
-/// A link that never waits: what is measured is work, not waiting.
+/// A link that never waits, so that only work is measured.
 struct Waiting(VirtualBus);
 
 impl Link for Waiting {

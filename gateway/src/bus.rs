@@ -1,6 +1,6 @@
-//! The data plane of one bus: the loop that moves frames from the link through the devices to the sink, and sends what
-//! the devices want sent. One thread owns it all; it allocates nothing after start, takes no lock, and waits only for
-//! frames, at most [`MAX_TURN`] at a time.
+//! The data plane of one bus: the loop that moves frames from the link through the devices to the
+//! sink and sends the devices' frames. One thread owns it. After start it allocates nothing, takes
+//! no lock, and waits only for frames, at most [`MAX_TURN`] at a time.
 
 use crate::clock::Clock;
 use crate::decoder::Decoder;
@@ -11,34 +11,35 @@ use proprio_topics::{LinkState, Nanos};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 
-/// The longest that one turn of the loop waits: the watchdog wants a sign of life every 100 ms, frames or not.
+/// Maximum wait in one turn of the loop. The watchdog needs a sign of life every 100 ms, with or
+/// without frames.
 pub const MAX_TURN: Nanos = Nanos::from_millis(50);
 
-/// How long the devices get to stop before the link is closed all the same.
+/// Time for the devices to stop before the link is closed in any case.
 pub const STOP_TIME: Nanos = Nanos::from_millis(200);
 
-/// One bus, running.
+/// A running bus.
 pub struct Bus<S> {
     link: Box<dyn Link>,
     decoder: Decoder,
     sink: S,
     status: Arc<BusStatus>,
     link_was_up: bool,
-    /// The stamp of the frame taken last, as long as more may be waiting behind it.
+    /// The stamp of the last frame, as long as more frames may be waiting.
     heard: Option<Nanos>,
 }
 
-/// Whether there is more to come.
+/// Whether more frames can come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Turn {
-    /// Go on.
+    /// Continue with the next turn.
     Continue,
-    /// The log has come to its end.
+    /// The log has ended.
     Ended,
 }
 
 impl<S: Sink> Bus<S> {
-    /// Puts link, devices and sink together.
+    /// Combines link, devices and sink.
     pub fn new(link: Box<dyn Link>, decoder: Decoder, sink: S, status: Arc<BusStatus>) -> Self {
         let link_was_up = link.state() == LinkState::Up;
         Self {
@@ -51,7 +52,7 @@ impl<S: Sink> Bus<S> {
         }
     }
 
-    /// One turn: send what is due, wait for a frame, take it.
+    /// One turn: send the frames that are due, wait for a frame, process it.
     pub fn turn(&mut self, clock: &impl Clock) -> Turn {
         let now = clock.now();
         self.status.last_turn.store(now.0, Relaxed);
@@ -62,17 +63,21 @@ impl<S: Sink> Bus<S> {
                 self.decoder.restart(now);
             }
             let link = &mut self.link;
-            // After a stall old frames are waiting: a device is not silent as long as what it sent has not been read. So time passes
-            // for the devices as it does in the frames, and by the clock only once nothing is waiting.
+            // After a stall old frames are waiting, and a device is not silent while its frames
+            // have not been read. Therefore the devices' time follows the stamps of the frames, and
+            // the clock only when no frame is waiting.
             let then = self.heard.map_or(now, |t| t.min(now));
             let behind = now - then;
-            // A failure is counted by the link; what to do about it is the device's to decide when its reply stays out.
+            // The link counts failures. The device reacts when its reply does not arrive.
             self.decoder.poll_transmit(then, |t| {
                 let _ = link.send(&t.frame, t.deadline + behind);
             });
-            deadline = self.decoder.next_wake().map_or(deadline, |wake| wake.min(deadline));
+            deadline = self
+                .decoder
+                .next_wake()
+                .map_or(deadline, |wake| wake.min(deadline));
         } else if self.link_was_up {
-            // Nothing streams over a link that is lost, and its health should not say so.
+            // No device streams over a lost link, and the health must show that.
             self.link_was_up = false;
             self.decoder.restart(now);
         }
@@ -86,7 +91,9 @@ impl<S: Sink> Bus<S> {
                     .on_frame(&frame, |sample| match sink.publish(sample, clock.now()) {
                         Ok(connections) => {
                             status.published.fetch_add(1, Relaxed);
-                            status.connections.fetch_add(u64::from(connections), Relaxed);
+                            status
+                                .connections
+                                .fetch_add(u64::from(connections), Relaxed);
                         }
                         Err(_) => {
                             status.publish_failures.fetch_add(1, Relaxed);
@@ -96,11 +103,13 @@ impl<S: Sink> Bus<S> {
             Received::TimedOut => self.sink.idle(),
             Received::StateChanged => {}
             Received::Ended => {
-                self.status.set_link(LinkState::Ended, &self.link.counters());
+                self.status
+                    .set_link(LinkState::Ended, &self.link.counters());
                 return Turn::Ended;
             }
         }
-        self.status.set_link(self.link.state(), &self.link.counters());
+        self.status
+            .set_link(self.link.state(), &self.link.counters());
         Turn::Continue
     }
 
@@ -116,13 +125,13 @@ impl<S: Sink> Bus<S> {
         }
     }
 
-    /// What a person should know of the link at its end.
+    /// The link's closing note for the log, if any.
     #[must_use]
     pub fn link_note(&self) -> Option<String> {
         self.link.note()
     }
 
-    /// Gives the sink back.
+    /// Returns the sink.
     pub fn into_sink(self) -> S {
         self.sink
     }

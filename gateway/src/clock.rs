@@ -1,11 +1,12 @@
-//! The only place that reads a clock, and where kernel and adapter stamps become instants of CLOCK_MONOTONIC.
+//! The only place that reads a clock. It also converts kernel and adapter stamps to
+//! CLOCK_MONOTONIC.
 
 use nix::errno::Errno;
 use nix::sys::time::TimeSpec;
 use nix::time::{ClockId, ClockNanosleepFlags, clock_gettime, clock_nanosleep};
 use proprio_topics::Nanos;
 
-/// Tells the time.
+/// A source of time.
 pub trait Clock {
     /// The instant now \[ns\].
     fn now(&self) -> Nanos;
@@ -21,18 +22,18 @@ impl Clock for Monotonic {
     }
 }
 
-/// A clock that stands where it is put: for tests and for logs.
+/// A clock that is set by hand, for tests and logs.
 #[derive(Debug, Default)]
 pub struct Manual(std::cell::Cell<i64>);
 
 impl Manual {
-    /// A clock that stands at `now`.
+    /// A clock that shows `now`.
     #[must_use]
     pub fn new(now: Nanos) -> Self {
         Self(std::cell::Cell::new(now.0))
     }
 
-    /// Puts it to `now`.
+    /// Sets it to `now`.
     pub fn set(&self, now: Nanos) {
         self.0.set(now.0);
     }
@@ -45,25 +46,34 @@ impl Clock for Manual {
 }
 
 fn read(id: ClockId) -> Nanos {
-    // Linux has both clocks; a failure would need an unknown clock id.
-    clock_gettime(id).map_or(Nanos::ZERO, |t| Nanos(t.tv_sec() * 1_000_000_000 + t.tv_nsec()))
+    // Linux has both clocks; the call fails only for an unknown clock id.
+    clock_gettime(id).map_or(Nanos::ZERO, |t| {
+        Nanos(t.tv_sec() * 1_000_000_000 + t.tv_nsec())
+    })
 }
 
-/// Sleeps until CLOCK_MONOTONIC shows `instant`; not at all if it has passed.
+/// Sleeps until CLOCK_MONOTONIC shows `instant`; returns at once if it has passed.
 pub fn sleep_until(instant: Nanos) {
     if instant.0 <= 0 {
         return;
     }
     let until = TimeSpec::new(instant.0 / 1_000_000_000, instant.0 % 1_000_000_000);
-    // A signal wakes early; every other failure would need an unknown clock.
-    while clock_nanosleep(ClockId::CLOCK_MONOTONIC, ClockNanosleepFlags::TIMER_ABSTIME, &until) == Err(Errno::EINTR) {}
+    // A signal wakes early; any other failure needs an unknown clock id.
+    while clock_nanosleep(
+        ClockId::CLOCK_MONOTONIC,
+        ClockNanosleepFlags::TIMER_ABSTIME,
+        &until,
+    ) == Err(Errno::EINTR)
+    {}
 }
 
-/// Brings the kernel's receive stamps, which are CLOCK_REALTIME and step with it, to CLOCK_MONOTONIC.
+/// Converts the kernel's receive stamps, which are in CLOCK_REALTIME and step with it, to
+/// CLOCK_MONOTONIC.
 ///
-/// The offset is read once per batch of frames: `monotonic = realtime - offset`. A stamp can not be later than the
-/// moment it was read, nor (a step of the wall clock between receipt and reading) older than one given out before: it is
-/// limited to that interval, so that the stamps of one link never run backwards.
+/// The offset is read once per batch of frames: `monotonic = realtime - offset`. A stamp cannot be
+/// later than the moment it was read. A step of the wall clock between reception and reading could
+/// make it earlier than the previous stamp. Therefore it is limited to that interval: the stamps of
+/// one link never run backwards.
 #[derive(Debug, Default)]
 pub struct RealtimeToMonotonic {
     offset: i64,
@@ -72,8 +82,9 @@ pub struct RealtimeToMonotonic {
 }
 
 impl RealtimeToMonotonic {
-    /// Reads both clocks. The realtime clock is read between two readings of the monotonic one, so that a preemption in
-    /// between can not shift the offset by more than half of what it took; of three tries the quickest counts.
+    /// Reads both clocks. The realtime clock is read between two readings of the monotonic one, so
+    /// that a preemption in between shifts the offset by at most half of its duration. Of three
+    /// tries the quickest counts.
     pub fn refresh(&mut self) {
         let mut best = i64::MAX;
         for _ in 0..3 {
@@ -92,40 +103,42 @@ impl RealtimeToMonotonic {
         }
     }
 
-    /// The instant of CLOCK_MONOTONIC at which CLOCK_REALTIME showed `realtime` \[ns\], at the latest the last refresh.
+    /// The instant of CLOCK_MONOTONIC at which CLOCK_REALTIME showed `realtime` \[ns\], not later
+    /// than the last refresh.
     #[must_use]
     pub fn convert(&self, realtime: Nanos) -> Nanos {
         Nanos((realtime.0.saturating_sub(self.offset)).min(self.now.0))
     }
 
-    /// `stamp` \[ns\], an instant of CLOCK_MONOTONIC, limited to what it can be: neither before the one given out last nor
-    /// after the last refresh.
+    /// `stamp` (CLOCK_MONOTONIC \[ns\]), limited to the interval from the previous stamp to the
+    /// last refresh.
     pub fn limit(&mut self, stamp: Nanos) -> Nanos {
         self.last = self.last.max(stamp.min(self.now));
         self.last
     }
 
-    /// When the clocks were last read.
+    /// Time of the last refresh.
     #[must_use]
     pub const fn now(&self) -> Nanos {
         self.now
     }
 }
 
-/// Brings an adapter's receive stamps, in a clock of its own, to CLOCK_MONOTONIC.
+/// Converts an adapter's receive stamps, in the adapter's own clock, to CLOCK_MONOTONIC.
 ///
-/// Each frame has two stamps: the adapter's `h`, and the kernel's `s`, later by the time `d >= 0` that the frame took from
-/// one to the other: `s = h + offset + d`. The smallest `s - h` of the last second is the offset plus the shortest way
-/// there is. It follows the drift of the adapter's clock; with 50 ppm of drift it is wrong by 50 us at the most.
+/// Each frame has two stamps, the adapter's `h` and the kernel's `s`, with `s = h + offset + d`,
+/// where `d >= 0` is the frame's delay from adapter to kernel. The smallest `s - h` of the last
+/// second estimates the offset plus the shortest delay. The estimate follows the drift of the
+/// adapter's clock; with a drift of 50 ppm its error is at most 50 us.
 ///
-/// A frame whose two stamps disagree by more than [`HardwareToMonotonic::LONGEST_WAY`] is not converted: the adapter's clock has
-/// been set. Set forward (the difference falls), the estimate begins anew; set back, it has forgotten the old offset after a
-/// second.
+/// A frame whose stamps disagree by more than [`HardwareToMonotonic::LONGEST_WAY`] is not
+/// converted: the adapter's clock has been set. If it was set forward (the difference falls), the
+/// estimate starts again; if back, the old offset expires after a second.
 #[derive(Debug, Clone)]
 pub struct HardwareToMonotonic {
     /// The smallest difference of each eighth of the last second, `i64::MAX` for none.
     smallest: [i64; Self::PARTS],
-    /// Which eighth, counted from the origin of CLOCK_MONOTONIC, is the newest.
+    /// Number of the newest eighth, counted from the origin of CLOCK_MONOTONIC.
     newest: i64,
 }
 
@@ -141,36 +154,45 @@ impl Default for HardwareToMonotonic {
 impl HardwareToMonotonic {
     const PARTS: usize = 8;
     const PART: i64 = 125_000_000;
-    /// The longest time from the adapter to the kernel that is believed \[ns\].
+    /// The longest plausible delay from adapter to kernel \[ns\].
     pub const LONGEST_WAY: Nanos = Nanos(100_000_000);
 
-    /// The instant at which the adapter's clock showed `hardware`, given the kernel's stamp of the same frame (both \[ns\], the
-    /// latter CLOCK_MONOTONIC); never later than that. `None` if the two can not belong together.
+    /// The instant at which the adapter's clock showed `hardware`, given the kernel's stamp of the
+    /// same frame (both \[ns\], the latter CLOCK_MONOTONIC); never later than that. `None` if the
+    /// two stamps are inconsistent.
     pub fn convert(&mut self, hardware: Nanos, software: Nanos) -> Option<Nanos> {
         let difference = software.0.checked_sub(hardware.0)?;
         let part = software.0.div_euclid(Self::PART);
         let parts = Self::PARTS as i64;
         let known = self.smallest.iter().copied().min().unwrap_or(i64::MAX);
-        let set_forward = known != i64::MAX && difference < known.saturating_sub(Self::LONGEST_WAY.0);
+        let set_forward =
+            known != i64::MAX && difference < known.saturating_sub(Self::LONGEST_WAY.0);
         if set_forward || part < self.newest.saturating_sub(parts) {
             self.smallest = [i64::MAX; Self::PARTS];
             self.newest = part;
         } else if part > self.newest {
-            // What the second has left behind.
+            // Drop the parts older than one second.
             let passed = part.saturating_sub(self.newest).min(parts);
             for gone in 0..passed {
-                self.place((part - gone).rem_euclid(parts), |smallest| *smallest = i64::MAX);
+                self.place((part - gone).rem_euclid(parts), |smallest| {
+                    *smallest = i64::MAX;
+                });
             }
             self.newest = part;
         }
-        self.place(part.rem_euclid(parts), |smallest| *smallest = difference.min(*smallest));
+        self.place(part.rem_euclid(parts), |smallest| {
+            *smallest = difference.min(*smallest);
+        });
         let offset = self.smallest.iter().copied().min()?;
         let way = difference.checked_sub(offset)?;
         (way <= Self::LONGEST_WAY.0 && !set_forward).then(|| Nanos(software.0 - way))
     }
 
     fn place(&mut self, part: i64, change: impl FnOnce(&mut i64)) {
-        if let Some(smallest) = usize::try_from(part).ok().and_then(|at| self.smallest.get_mut(at)) {
+        if let Some(smallest) = usize::try_from(part)
+            .ok()
+            .and_then(|at| self.smallest.get_mut(at))
+        {
             change(smallest);
         }
     }
@@ -185,8 +207,9 @@ mod tests {
         let mut times = RealtimeToMonotonic::default();
         times.refresh();
         let before = times.now();
-        // A minute on either side, for both clocks can not be read at once.
+        // A minute on either side, because the two clocks cannot be read at the same instant.
         let (wall, minute) = (read(ClockId::CLOCK_REALTIME), 60_000_000_000);
+        let second = minute / 60;
         assert_eq!(
             times.convert(Nanos(wall.0 + minute)),
             before,
@@ -194,7 +217,7 @@ mod tests {
         );
         let converted = times.convert(Nanos(wall.0 - minute));
         assert!(
-            (converted.0 + minute - before.0).abs() < minute / 2,
+            (converted.0 + minute - before.0).abs() < second,
             "{converted:?} {before:?}"
         );
         assert_eq!(times.limit(Nanos(before.0 - 5)), Nanos(before.0 - 5));
@@ -202,7 +225,8 @@ mod tests {
         assert_eq!(times.limit(Nanos::MAX), before);
     }
 
-    /// Frames with a way of 20 us and up to 980 us of jitter, from an adapter whose clock drifts by `ppm`.
+    /// The largest error for frames with a delay of 20 us plus up to 980 us of jitter, from an
+    /// adapter whose clock drifts by `ppm`.
     fn worst(ppm: i64) -> i64 {
         let mut estimate = HardwareToMonotonic::default();
         let mut worst = 0;
@@ -214,7 +238,7 @@ mod tests {
                 return i64::MAX;
             };
             assert!(t.0 <= software);
-            // The first frames have seen too little.
+            // The first frames are too few for an estimate.
             if i > 200 {
                 worst = worst.max((t.0 - sent - 20_000).abs());
             }
@@ -237,7 +261,8 @@ mod tests {
             let (mut refused, mut recovered) = (0, None);
             for i in 0..3_000_i64 {
                 let software = 5_000_000_000 + i * 1_000_000;
-                let hardware = 4_000_000_000_000 + i * 1_000_000 - 30_000 + if i < 1_500 { 0 } else { jump };
+                let hardware =
+                    4_000_000_000_000 + i * 1_000_000 - 30_000 + if i < 1_500 { 0 } else { jump };
                 match estimate.convert(Nanos(hardware), Nanos(software)) {
                     Some(t) => {
                         assert_eq!(t.0, software);

@@ -1,4 +1,5 @@
-//! gateway.toml as it is typed. [`crate::plan`] checks it and resolves it; nothing else sees this form.
+//! The contents of gateway.toml, unchecked. [`crate::plan`] checks and resolves them; nothing else
+//! uses this form.
 
 use serde::Deserialize;
 use std::path::PathBuf;
@@ -8,7 +9,7 @@ use toml::Spanned;
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Raw {
-    /// The version of this form: 1.
+    /// The version of the file format: 1.
     pub schema: u32,
     /// The robot's name: the first part of every service's name.
     pub robot: String,
@@ -23,16 +24,16 @@ pub struct Raw {
 pub struct RawBus {
     /// Its name.
     pub name: String,
-    /// Where its frames come from.
+    /// The source of its frames.
     pub source: Source,
-    /// How its thread is scheduled.
+    /// Scheduling of its thread.
     pub realtime: Option<Realtime>,
     /// `[[bus.device]]`: common keys and the driver's own keys in one table.
     #[serde(default)]
     pub device: Vec<Spanned<toml::Table>>,
 }
 
-/// Where a bus's frames come from.
+/// The source of a bus's frames.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
 pub enum Source {
@@ -50,24 +51,24 @@ pub enum Source {
     Replay {
         /// The file, relative to the configuration.
         log: PathBuf,
-        /// How fast.
+        /// The replay speed.
         #[serde(default)]
         pace: Pace,
     },
 }
 
-/// How fast a log is replayed.
+/// The speed of a replay.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Pace {
-    /// As it was recorded; stamps are rebased to now.
+    /// As recorded; stamps are shifted to the present.
     #[default]
     Recorded,
-    /// As fast as it goes, with the log's own stamps; offline only.
+    /// As fast as possible, with the log's own stamps; offline only.
     Fast,
 }
 
-/// How a thread is scheduled.
+/// Scheduling of a thread.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Realtime {
@@ -77,19 +78,19 @@ pub struct Realtime {
     pub priority: Option<i32>,
 }
 
-/// The keys that every device has.
+/// The keys common to all devices.
 #[derive(Debug, Deserialize)]
 pub struct RawDevice {
-    /// Which driver.
+    /// The driver's name.
     pub driver: String,
-    /// Its name: the channel's name of a sensor.
+    /// Its name; for a sensor also the channel's name.
     pub name: String,
-    /// Its address as the driver counts.
+    /// Its address, as the driver defines it.
     pub address: u32,
-    /// How long it may be silent \[ms\].
+    /// Maximum silence \[ms\].
     #[serde(default = "default_max_silence_ms")]
     pub max_silence_ms: f64,
-    /// Never send to it: somebody else commands it.
+    /// Never send to it: another program commands it.
     #[serde(default)]
     pub listen_only: bool,
     /// `[[bus.device.joint]]`.
@@ -98,15 +99,23 @@ pub struct RawDevice {
 }
 
 impl RawDevice {
-    /// The names of the keys above; the others are the driver's.
-    pub const KEYS: [&str; 6] = ["driver", "name", "address", "max_silence_ms", "listen_only", "joint"];
+    /// The names of the keys above; all other keys are the driver's.
+    pub const KEYS: [&str; 6] = [
+        "driver",
+        "name",
+        "address",
+        "max_silence_ms",
+        "listen_only",
+        "joint",
+    ];
 }
 
 const fn default_max_silence_ms() -> f64 {
     100.0
 }
 
-/// `[[bus.device.joint]]`: which channel of the device is which joint: joint = sign * device / ratio + offset.
+/// `[[bus.device.joint]]`: the joint that a channel of the device measures: joint = sign * device /
+/// ratio + offset.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RawJoint {
@@ -121,7 +130,7 @@ pub struct RawJoint {
     /// 1 or -1.
     #[serde(default = "plus")]
     pub sign: i8,
-    /// The joint's angle where the device says zero \[rad\].
+    /// The joint's angle where the device reports zero \[rad\].
     #[serde(default)]
     pub offset_rad: f64,
 }

@@ -1,8 +1,9 @@
-//! The control plane: opens links and ports, starts one thread per bus, and looks after them until told to stop.
+//! The control plane: opens links and ports, starts one thread per bus, and supervises them until
+//! it is stopped.
 //!
-//! Nothing here is on the way of a sample. Signals are caught before the first port is made, so that even a start-up is
-//! ended in order. Ten times a second it sends the health, tells the log what is new in it, and feeds the watchdog as long
-//! as every bus thread turns.
+//! No sample passes through here. Signals are caught before the first port is created, so that a
+//! start-up can be stopped cleanly too. Ten times a second this thread sends the health, logs
+//! changes of it, and feeds the watchdog as long as every bus thread runs.
 
 use crate::bus::{Bus, Turn};
 use crate::clock::{Clock, Monotonic};
@@ -19,9 +20,7 @@ use anyhow::{Context, anyhow, bail};
 use proprio_drivers::{Claim, Mode, Refusal, State};
 use proprio_topics::ipc::{Domain, DomainConfig, DomainError, Writer};
 use proprio_topics::realtime;
-use proprio_topics::{
-    Counter, Description, DeviceHealth, GatewayHealth, Header, LinkState, MAX_CHANNELS, Nanos, Sample,
-};
+use proprio_topics::{Counter, Description, GatewayHealth, LinkState, Nanos, Sample};
 use sd_notify::NotifyState;
 use std::io::Write as _;
 use std::path::Path;
@@ -33,23 +32,28 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 use tokio::signal::unix::{SignalKind, signal};
 
-/// How often health is sent.
+/// Period of the health messages.
 const HEALTH_PERIOD: Duration = Duration::from_millis(100);
-/// How long after the start a replayed log begins.
+/// Delay from the start to the first frame of a replayed log.
 const REPLAY_DELAY: Nanos = Nanos::from_millis(200);
-/// A bus thread that has not turned for so long is stuck.
+/// A bus thread without a turn for this long is stuck.
 const STUCK: Nanos = Nanos::from_millis(500);
 
 /// Runs the gateway until SIGTERM, SIGINT, or the end of its logs.
 ///
 /// # Errors
-/// One chain that says what, where and what to do; [`ConfigError`] at its root is a wrong configuration.
+/// An error chain with cause, place and remedy; its root is a [`ConfigError`] if the configuration
+/// is wrong.
 pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<()> {
     let plan = Plan::load(config)?;
     for bus in &plan.buses {
-        if let Source::Replay { pace: Pace::Fast, .. } = bus.source {
+        if let Source::Replay {
+            pace: Pace::Fast, ..
+        } = bus.source
+        {
             let problem = format!(
-                "bus {:?}: pace = \"fast\" is for offline use (proprio decode); a daemon replays with pace = \"recorded\"",
+                "bus {:?}: pace = \"fast\" is for offline use (proprio decode); a daemon replays \
+                 with pace = \"recorded\"",
                 bus.name
             );
             return Err(ConfigError {
@@ -60,7 +64,7 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
         }
     }
     if check {
-        // Whoever reads it may stop early.
+        // The reader of standard output may close it early.
         let _ = write!(std::io::stdout(), "{plan}");
         return Ok(());
     }
@@ -71,11 +75,14 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
     runtime.block_on(serve(&plan, domain))
 }
 
-/// Whether an error that [`run`] ended with is a wrong configuration: exit 2, else 1.
+/// Whether an error of [`run`] is a wrong configuration (exit code 2, otherwise 1).
 pub fn is_configuration(error: &anyhow::Error) -> bool {
-    error
-        .chain()
-        .any(|cause| cause.is::<ConfigError>() || cause.downcast_ref().is_some_and(DomainError::is_configuration))
+    error.chain().any(|cause| {
+        cause.is::<ConfigError>()
+            || cause
+                .downcast_ref()
+                .is_some_and(DomainError::is_configuration)
+    })
 }
 
 async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> {
@@ -85,13 +92,13 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
     let started = clock.now();
     let domain = Domain::open(domain_config)?;
     let epoch = domain.epoch();
-    // The health first: it admits one writer, which is how a second gateway of this robot finds out.
+    // Health first: it admits one writer, so this fails if the robot already has a gateway.
     let mut health_writer = Writer::<GatewayHealth>::create(&domain, &plan.robot, epoch)?;
     let mut description_writer = Writer::<Description>::create(&domain, &plan.robot, epoch)?;
     description_writer.send(&plan.description(), clock.now())?;
 
     let stop = Arc::new(AtomicBool::new(false));
-    // The buses of one log stay in step; by then all of them are open.
+    // A common start keeps the buses of one log in step; by then all of them are open.
     let replay_start = clock.now() + REPLAY_DELAY;
     let mut threads = Vec::new();
     let mut failure = None;
@@ -105,7 +112,7 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
         }
     }
     if let Some(error) = failure {
-        // Those that have begun must stop their boards and give back their ports.
+        // The threads that have started must stop their boards and release their ports.
         join(&mut threads, &stop);
         return Err(error);
     }
@@ -118,7 +125,7 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
     let _ = sd_notify::notify(&[NotifyState::Ready, NotifyState::Status("running")]);
     let watchdog = sd_notify::watchdog_enabled();
 
-    let mut health = Box::new(empty_health(started));
+    let mut health = Box::new(GatewayHealth::new(started));
     let mut diary = Diary::default();
     let mut ticks = tokio::time::interval(HEALTH_PERIOD);
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
@@ -131,18 +138,22 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
         let now = clock.now();
         fill_health(&mut health, &threads);
         diary.tell(&health);
-        // A reader that can not be reached now is not worth ending for; the next health comes in a tenth of a second.
+        // A reader that cannot be reached now is no reason to stop; the next health follows in 0.1
+        // s.
         let _ = health_writer.send(&health, now);
         let _ = description_writer.update_connections();
-        if threads.iter().any(|t| t.thread.is_finished() && !t.ended.load(Acquire)) {
+        if threads
+            .iter()
+            .any(|t| t.thread.is_finished() && !t.ended.load(Acquire))
+        {
             break "a bus thread has ended unexpectedly";
         }
         if threads.iter().all(|t| t.ended.load(Acquire)) {
-            break "the end of all logs";
+            break "all logs have ended";
         }
-        let stuck = threads
-            .iter()
-            .any(|t| !t.ended.load(Relaxed) && now - Nanos(t.status.last_turn.load(Relaxed)) > STUCK);
+        let stuck = threads.iter().any(|t| {
+            !t.ended.load(Relaxed) && now - Nanos(t.status.last_turn.load(Relaxed)) > STUCK
+        });
         if watchdog.is_some() && !stuck {
             let _ = sd_notify::notify(&[NotifyState::Watchdog]);
         }
@@ -154,11 +165,11 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
     let _ = health_writer.send(&health, clock.now());
     match panicked {
         None => Ok(()),
-        Some(bus) => bail!("the thread of bus {bus:?} panicked; this is a mistake in the program"),
+        Some(bus) => bail!("the thread of bus {bus:?} panicked: this is a bug in the program"),
     }
 }
 
-/// Stops all bus threads and waits for them; the name of the first that panicked.
+/// Stops all bus threads and waits for them; returns the name of the first that panicked.
 fn join(threads: &mut [BusThread], stop: &AtomicBool) -> Option<String> {
     stop.store(true, Release);
     let mut panicked = None;
@@ -172,7 +183,7 @@ fn join(threads: &mut [BusThread], stop: &AtomicBool) -> Option<String> {
     panicked
 }
 
-/// One bus thread, as the control plane sees it.
+/// The control plane's handle of a bus thread.
 struct BusThread {
     name: String,
     status: Arc<BusStatus>,
@@ -205,11 +216,17 @@ impl BusThread {
         replay_start: Nanos,
     ) -> anyhow::Result<Self> {
         let status = Arc::new(BusStatus::new(number, bus));
-        // The boards of a log answered whoever commanded them when it was recorded.
+        // A log is not interactive: its boards answered the program that commanded them during the
+        // recording.
         let mode = matches!(bus.source, Source::Replay { .. }).then_some(Mode::Listen);
         let decoder = Decoder::new(number, bus, mode, Arc::clone(&status))?;
         let link: Box<dyn Link> = if let Source::Replay { log, pace } = &bus.source {
-            let mut replay = Replay::open(log, *pace, plan.matching(number as usize), &decoder.claims())?;
+            let mut replay = Replay::open(
+                log,
+                *pace,
+                plan.matching(number as usize),
+                &decoder.claims(),
+            )?;
             replay.start_at(replay_start);
             Box::new(replay)
         } else {
@@ -218,14 +235,17 @@ impl BusThread {
         let ended = Arc::new(AtomicBool::new(false));
         let (ready, is_ready) = mpsc::channel();
         let (domain, robot, realtime) = (domain.clone(), plan.robot.clone(), bus.realtime);
-        let (stop, ended_there, status_there) = (Arc::clone(stop), Arc::clone(&ended), Arc::clone(&status));
+        let (stop, ended_there, status_there) =
+            (Arc::clone(stop), Arc::clone(&ended), Arc::clone(&status));
         let body = move || {
-            // A port belongs to the thread that makes it.
+            // A port belongs to the thread that creates it.
             let writer = match Writer::<Sample>::create(&domain, &robot, epoch) {
                 Ok(writer) => writer,
                 Err(error) => return drop(ready.send(Err(error))),
             };
-            let refused = realtime.map(|r| realtime::apply(r.cpu, r.priority)).unwrap_or_default();
+            let refused = realtime
+                .map(|r| realtime::apply(r.cpu, r.priority))
+                .unwrap_or_default();
             let _ = ready.send(Ok(refused));
             let clock = Monotonic;
             let mut bus = Bus::new(link, decoder, Shared(writer), status_there);
@@ -235,7 +255,8 @@ impl BusThread {
                         tracing::warn!("{note}");
                     }
                     ended_there.store(true, Release);
-                    // Readers may still be reading what was published last: the port stays until the end.
+                    // Readers may still read the last samples: keep the port until the gateway
+                    // stops.
                     while !stop.load(Acquire) {
                         std::thread::sleep(Duration::from_millis(20));
                     }
@@ -249,9 +270,14 @@ impl BusThread {
             .name(name)
             .spawn(body)
             .context("cannot start a thread")?;
-        let refused = is_ready.recv().map_err(|_| anyhow!("its thread ended at once"))??;
+        let refused = is_ready
+            .recv()
+            .map_err(|_| anyhow!("its thread ended at once"))??;
         for refusal in refused {
-            tracing::warn!(bus = bus.name, "real-time scheduling not granted: {refusal}");
+            tracing::warn!(
+                bus = bus.name,
+                "real-time scheduling not granted: {refusal}"
+            );
         }
         Ok(Self {
             name: bus.name.clone(),
@@ -262,45 +288,20 @@ impl BusThread {
     }
 }
 
-/// Opens the link that `bus` is configured for; of a log it takes every frame.
+/// Opens the link of `bus`; from a log it takes every frame.
 ///
 /// # Errors
-/// [`OpenError`], which says what to do.
-pub fn open_link(bus: &BusPlan, domain: &str, claims: &[Claim]) -> Result<Box<dyn Link>, OpenError> {
+/// [`OpenError`], with the remedy in its message.
+pub fn open_link(
+    bus: &BusPlan,
+    domain: &str,
+    claims: &[Claim],
+) -> Result<Box<dyn Link>, OpenError> {
     Ok(match &bus.source {
         Source::SocketCan { interface } => Box::new(SocketCan::open(interface, claims)?),
         Source::Virtual { name } => Box::new(VirtualBus::open(domain, name, claims)?),
         Source::Replay { log, pace } => Box::new(Replay::open(log, *pace, None, claims)?),
     })
-}
-
-fn empty_health(started: Nanos) -> GatewayHealth {
-    let bus = BusStatus::new(
-        0,
-        &BusPlan {
-            name: String::new(),
-            source: Source::Virtual { name: String::new() },
-            realtime: None,
-            devices: vec![],
-        },
-    )
-    .bus();
-    let device = DeviceHealth {
-        name: proprio_topics::Name::EMPTY,
-        counters: [0; Counter::ALL.len()],
-        state: 0,
-        refusal: 0,
-        bus: 0,
-        reserved: 0,
-    };
-    GatewayHealth {
-        header: Header::default(),
-        started,
-        bus_count: 0,
-        device_count: 0,
-        buses: [bus; proprio_topics::MAX_BUSES],
-        devices: [device; MAX_CHANNELS],
-    }
 }
 
 fn fill_health(health: &mut GatewayHealth, threads: &[BusThread]) {
@@ -319,18 +320,19 @@ fn fill_health(health: &mut GatewayHealth, threads: &[BusThread]) {
     }
 }
 
-/// Turns health into log lines: the first of a run of trouble, and its end.
+/// Turns health into log lines: one at the first of a series of problems, one at its end.
 #[derive(Default)]
 struct Diary {
     last: Option<Box<GatewayHealth>>,
-    /// Per device and counter, how many ticks in a row brought more; per bus likewise for drops.
+    /// Per device and counter, the number of ticks since the last increase, at most
+    /// [`Diary::REST`].
     quiet: Vec<[u32; Counter::ALL.len()]>,
-    /// Per bus, for how many more ticks a dropped frame is the same trouble as the last one.
+    /// Per bus, the remaining ticks in which a dropped frame belongs to the same problem.
     dropping: Vec<u32>,
 }
 
 impl Diary {
-    /// Trouble that has rested for so many ticks is new when it comes again.
+    /// After this many ticks without an increase, the next one is a new problem.
     const REST: u32 = 50;
 
     fn tell(&mut self, health: &GatewayHealth) {
@@ -344,8 +346,14 @@ impl Diary {
                 let name = bus.name.as_str();
                 match bus.link {
                     LinkState::Up => tracing::info!(bus = name, "the link is up again"),
-                    LinkState::Ended => tracing::info!(bus = name, frames = bus.frames, "the log has come to its end"),
-                    state => tracing::error!(bus = name, "the link is {}; waiting for it to come back", state.word()),
+                    LinkState::Ended => {
+                        tracing::info!(bus = name, frames = bus.frames, "the log has ended");
+                    }
+                    state => tracing::error!(
+                        bus = name,
+                        "the link is {}; waiting for it to come back",
+                        state.word()
+                    ),
                 }
             }
             let dropped = bus.dropped - before.map_or(0, |b| b.dropped.min(bus.dropped));
@@ -376,15 +384,23 @@ impl Diary {
                     None => tracing::info!(device = name, "{}", State::word(device.state)),
                 }
             }
-            let Some(quiet) = self.quiet.get_mut(i) else { continue };
+            let Some(quiet) = self.quiet.get_mut(i) else {
+                continue;
+            };
             for counter in Counter::ALL
                 .into_iter()
                 .filter(|c| !matches!(c, Counter::Frames | Counter::Readings | Counter::Starts))
             {
                 let at = counter as usize;
                 let count = device.counters.get(at).copied().unwrap_or(0);
-                let new = count - before.and_then(|b| b.counters.get(at).copied()).unwrap_or(0).min(count);
-                let Some(rest) = quiet.get_mut(at) else { continue };
+                let new = count
+                    - before
+                        .and_then(|b| b.counters.get(at).copied())
+                        .unwrap_or(0)
+                        .min(count);
+                let Some(rest) = quiet.get_mut(at) else {
+                    continue;
+                };
                 if new == 0 {
                     *rest = (*rest + 1).min(Self::REST);
                 } else {
@@ -392,7 +408,7 @@ impl Diary {
                         tracing::warn!(
                             device = name,
                             total = count,
-                            "{}: {new} (further ones are counted in health)",
+                            "{}: {new} (further ones are only counted, in health)",
                             counter.word()
                         );
                     }
@@ -403,10 +419,10 @@ impl Diary {
     }
 }
 
-/// Sends log lines to standard error; RUST_LOG chooses which, `info` by default.
+/// Sends log lines to standard error; RUST_LOG selects the level, `info` by default.
 pub fn start_logging() {
     use std::io::IsTerminal as _;
-    // neli tells every byte it sends or receives.
+    // neli logs every byte that it sends or receives.
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info,neli=warn"));
     let _ = tracing_subscriber::fmt()

@@ -1,4 +1,5 @@
-//! All devices of one bus: frames in, samples out, frames to send out. No link, no clock, no sink: live and offline alike.
+//! All devices of one bus: turns received frames into samples and collects the frames to send. It
+//! has no link, clock or sink, so it serves the live gateway and the offline tools alike.
 
 use crate::plan::{BusPlan, Route};
 use crate::status::BusStatus;
@@ -12,7 +13,7 @@ pub struct Decoder {
     bus: u32,
     devices: Vec<Running>,
     dispatch: Dispatch,
-    /// Per channel of the gateway, the stamp of its last main reading.
+    /// Stamp of the last main reading per channel.
     last: [Nanos; MAX_CHANNELS],
     decoded: Decoded,
     status: Arc<BusStatus>,
@@ -24,11 +25,17 @@ struct Running {
 }
 
 impl Decoder {
-    /// Builds the devices of bus number `bus`; `mode`, where given, overrides who is in command (logs only listen).
+    /// Builds the devices of bus number `bus`; `mode`, if given, overrides their mode (with logs,
+    /// devices only listen).
     ///
     /// # Errors
-    /// [`SpecError`]: a device that its driver can not build.
-    pub fn new(bus: u32, plan: &BusPlan, mode: Option<Mode>, status: Arc<BusStatus>) -> Result<Self, SpecError> {
+    /// [`SpecError`]: a device that its driver cannot build.
+    pub fn new(
+        bus: u32,
+        plan: &BusPlan,
+        mode: Option<Mode>,
+        status: Arc<BusStatus>,
+    ) -> Result<Self, SpecError> {
         let devices = plan
             .devices
             .iter()
@@ -55,7 +62,7 @@ impl Decoder {
         Ok(this)
     }
 
-    /// What the devices claim: the link's filters.
+    /// The identifiers that the devices claim: the link's filters.
     #[must_use]
     pub fn claims(&self) -> Vec<Claim> {
         let mut claims: Vec<Claim> = self
@@ -67,12 +74,13 @@ impl Decoder {
         claims
     }
 
-    /// Takes a frame; calls `publish` for every sample that it completes.
+    /// Processes a frame; calls `publish` for every sample that it completes.
     pub fn on_frame(&mut self, frame: &Frame, mut publish: impl FnMut(&mut Sample)) {
         self.status.frames.fetch_add(1, Relaxed);
         self.status.last_frame.store(frame.t.0, Relaxed);
         let mut claimed = false;
-        // The dispatch table is left alone while a device runs: its numbers are copied out, at most four a frame.
+        // Iterates over a copy of the device numbers (at most four), so that the dispatch table is
+        // not borrowed while a device runs.
         for number in self.dispatch.find(frame.id) {
             claimed = true;
             let Some(running) = self.devices.get_mut(usize::from(number)) else {
@@ -82,7 +90,8 @@ impl Decoder {
             running.device.on_frame(frame, &mut self.decoded);
             self.status.count(number, Counter::Frames, 1);
             for fault in &self.decoded.faults {
-                self.status.count(number, fault.counter, u64::from(fault.count));
+                self.status
+                    .count(number, fault.counter, u64::from(fault.count));
             }
             for output in &self.decoded.readings {
                 let Some(route) = running.routes.iter().find(|r| r.output == output.output) else {
@@ -133,7 +142,8 @@ impl Decoder {
                 continue;
             }
             self.decoded.clear();
-            // A device has a handful of frames to send at once; the bound keeps a faulty one from holding the loop.
+            // A device sends a few frames at once; the limit keeps a faulty one from blocking the
+            // loop.
             for _ in 0..64 {
                 let Some(transmit) = running.device.poll_transmit(now, &mut self.decoded) else {
                     break;
@@ -141,19 +151,23 @@ impl Decoder {
                 send(&transmit);
             }
             for fault in &self.decoded.faults {
-                self.status.count(number, fault.counter, u64::from(fault.count));
+                self.status
+                    .count(number, fault.counter, u64::from(fault.count));
             }
             self.status.set_state(number, running.device.state());
         }
     }
 
-    /// When a device next wants to be polled.
+    /// The earliest instant at which a device must be polled.
     #[must_use]
     pub fn next_wake(&self) -> Option<Nanos> {
-        self.devices.iter().filter_map(|d| d.device.next_wake()).min()
+        self.devices
+            .iter()
+            .filter_map(|d| d.device.next_wake())
+            .min()
     }
 
-    /// The link is back after a loss: every device begins again.
+    /// Restarts every device after a link loss.
     pub fn restart(&mut self, now: Nanos) {
         for running in &mut self.devices {
             running.device.restart(now);
@@ -172,7 +186,9 @@ impl Decoder {
     /// Whether every device has stopped.
     #[must_use]
     pub fn stopped(&self) -> bool {
-        self.devices.iter().all(|d| d.device.state() == State::Stopped)
+        self.devices
+            .iter()
+            .all(|d| d.device.state() == State::Stopped)
     }
 
     /// The devices' states, in the order of the plan.
@@ -187,14 +203,15 @@ impl Decoder {
     }
 }
 
-/// Which devices take which identifier: a table for the 2048 standard ones, a list for the extended.
+/// The devices that receive each identifier: a table for the 2048 standard identifiers, a list for
+/// the extended ones.
 struct Dispatch {
     /// Per standard identifier, at most [`SHARERS`] device numbers.
     standard: Vec<arrayvec::ArrayVec<u16, SHARERS>>,
     extended: Vec<(Claim, u16)>,
 }
 
-/// How many devices may listen to one identifier: those of one board.
+/// Maximum number of devices that receive one identifier: those of one board.
 const SHARERS: usize = 4;
 
 impl Dispatch {
@@ -210,7 +227,8 @@ impl Dispatch {
                     Id::Standard(_) => {
                         for (devices, id) in this.standard.iter_mut().zip(0_u16..) {
                             if claim.matches(Id::Standard(id)) && !devices.contains(&device) {
-                                // A fifth listener of one board is not served; no family here has so many.
+                                // A fifth listener of one board is not served; no supported board
+                                // has more than four.
                                 let _ = devices.try_push(device);
                             }
                         }
@@ -223,7 +241,11 @@ impl Dispatch {
 
     fn find(&self, id: Id) -> arrayvec::ArrayVec<u16, SHARERS> {
         match id {
-            Id::Standard(id) => self.standard.get(usize::from(id)).cloned().unwrap_or_default(),
+            Id::Standard(id) => self
+                .standard
+                .get(usize::from(id))
+                .cloned()
+                .unwrap_or_default(),
             Id::Extended(_) => {
                 let mut found = arrayvec::ArrayVec::new();
                 for (claim, device) in &self.extended {

@@ -1,4 +1,4 @@
-//! CAN buses in, SI samples in shared memory out.
+//! The gateway reads CAN buses and publishes SI samples in shared memory.
 //!
 //! ```text
 //! CAN bus <-> Link -> Frame -> Device -> Reading -> JointMap -> Sink -> shared memory
@@ -7,11 +7,14 @@
 //!             virtual bus
 //! ```
 //!
-//! - [`config`]: gateway.toml, as typed; [`plan`]: the same, checked and resolved. Nothing else sees the raw form.
-//! - [`link`]: one trait, three links to a bus; [`candump`]: the log format that replay, decode and encode share.
-//! - [`decoder`]: all devices of one bus, without input or output; [`bus`]: the loop that moves frames through it.
-//! - [`publish`]: where samples go; [`status`]: what a bus thread counts.
-//! - [`offline`]: a log to a table of samples and back, without a daemon.
+//! - [`config`]: the raw contents of gateway.toml; [`plan`]: the checked and resolved form, which
+//!   everything else uses.
+//! - [`link`]: one trait and three links to a bus; [`candump`]: the log format of replay, decode
+//!   and encode.
+//! - [`decoder`]: all devices of one bus, without input or output; [`bus`]: the loop that moves
+//!   frames through it.
+//! - [`publish`]: the destinations of samples; [`status`]: the counters of a bus thread.
+//! - [`offline`]: converts a log to a table of samples and back, without a daemon.
 //! - [`daemon`]: the control plane: threads, signals, health, watchdog.
 //! - [`clock`]: the only place that reads a clock.
 

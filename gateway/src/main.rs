@@ -1,4 +1,4 @@
-//! The gateway daemon: `proprio gateway` without the rest of the command.
+//! The gateway daemon alone: the same as `proprio gateway`.
 
 use clap::Parser;
 use proprio_gateway::daemon;
@@ -6,14 +6,14 @@ use proprio_topics::ipc::DomainConfig;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// CAN buses in, SI samples in shared memory out.
+/// Reads CAN buses and publishes SI samples in shared memory.
 #[derive(Parser)]
 #[command(version, about)]
 struct Args {
-    /// The configuration: gateway.toml.
+    /// The configuration file, gateway.toml.
     #[arg(long)]
     config: PathBuf,
-    /// Print the plan and end.
+    /// Check the configuration, print the resulting plan and exit.
     #[arg(long)]
     check: bool,
 }
@@ -25,7 +25,11 @@ fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
-            ExitCode::from(if daemon::is_configuration(&error) { 2 } else { 1 })
+            ExitCode::from(if daemon::is_configuration(&error) {
+                2
+            } else {
+                1
+            })
         }
     }
 }

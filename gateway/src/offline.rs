@@ -1,4 +1,5 @@
-//! A recorded log to a table of samples, and back: `proprio decode` and `proprio encode`. No daemon, no clock.
+//! Converts a recorded log to a table of samples and back: `proprio decode` and `proprio encode`.
+//! No daemon, no clock.
 
 use crate::candump;
 use crate::config::Source;
@@ -14,21 +15,21 @@ use std::io::{self, BufRead, Write};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 
-/// How far back in time a sample may lie behind one that came before it and still find its place in the table: a wrench
-/// is stamped by its first frame and complete with its second.
+/// Maximum delay of a sample that is still sorted into its place in the table. Samples can be late
+/// because a wrench has the stamp of its first frame but is complete only with its second.
 const REORDER: Nanos = Nanos::from_millis(100);
 
-/// Why a log or a table could not be converted at all.
+/// Why a log or table cannot be converted at all.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum OfflineError {
     /// A file could not be read or written.
     #[error(transparent)]
     Io(#[from] io::Error),
-    /// The table can not be read.
+    /// The table cannot be read.
     #[error(transparent)]
     Table(#[from] csv::Error),
-    /// A device can not be built.
+    /// A device cannot be built.
     #[error("{device}: {cause}")]
     Device {
         /// Its name.
@@ -41,47 +42,47 @@ pub enum OfflineError {
     NoFrame(String),
 }
 
-/// What became of a log.
+/// The result of decoding a log.
 #[derive(Debug, Clone, Default)]
 pub struct DecodeReport {
     /// Frames in the log.
     pub frames: u64,
-    /// Of these, frames of interfaces that belong to no bus of the configuration.
+    /// Of these, frames of an interface that is no bus of the configuration.
     pub other_interfaces: u64,
     /// Of these, frames that no device claims.
     pub unclaimed: u64,
     /// Of these, error frames of the interface.
     pub error_frames: u64,
-    /// Frames that candump says it lost while it recorded.
+    /// Frames that candump reports as lost while recording.
     pub dropped: u64,
     /// Samples written.
     pub samples: u64,
-    /// Samples that came so late that the table is not in order there.
+    /// Samples that were too late to be sorted: the table is out of order there.
     pub out_of_order: u64,
     /// Lines that are not frames.
     pub bad_lines: u64,
-    /// The first of them, with their line numbers.
+    /// The first bad lines, with line number and error.
     pub bad: Vec<String>,
-    /// Per device: its name, what was counted other than frames and readings, and why it could not be used, if so.
+    /// The result per device.
     pub devices: Vec<DeviceReport>,
 }
 
-/// What became of one device's frames.
+/// The result of decoding one device's frames.
 #[derive(Debug, Clone)]
 pub struct DeviceReport {
     /// Its name.
     pub name: String,
-    /// Frames of its identifiers.
+    /// Frames with its identifiers.
     pub frames: u64,
     /// Its readings.
     pub readings: u64,
-    /// What else was counted.
+    /// The other counters.
     pub counts: Vec<(Counter, u64)>,
-    /// Why it could not be used.
+    /// Why it was refused, if it was.
     pub refusal: Option<String>,
 }
 
-/// Holds samples back until no earlier one can come, so that the table is in order of time.
+/// Delays samples until no earlier one can come, so that the table is sorted by time.
 struct InOrder {
     waiting: VecDeque<Sample>,
     newest: Nanos,
@@ -90,7 +91,11 @@ struct InOrder {
 }
 
 impl InOrder {
-    fn push(&mut self, sample: Sample, mut write: impl FnMut(&Sample) -> io::Result<()>) -> io::Result<()> {
+    fn push(
+        &mut self,
+        sample: Sample,
+        mut write: impl FnMut(&Sample) -> io::Result<()>,
+    ) -> io::Result<()> {
         let t = sample.header.acquired;
         if sample.header.stamp == StampKind::None {
             return write(&sample);
@@ -116,10 +121,11 @@ impl InOrder {
 
 /// Decodes a log to a table of samples.
 ///
-/// With one bus in the plan every frame is its, whatever the interface; with several each takes the frames of its own.
+/// If the plan has one bus, it takes the frames of all interfaces; with several, each takes the
+/// frames of its own interface.
 ///
 /// # Errors
-/// [`OfflineError`]: a file that can not be read or written, or a log without a single frame.
+/// [`OfflineError`]: a file that cannot be read or written, or a log without a frame.
 pub fn decode(
     plan: &Plan,
     log: impl BufRead,
@@ -138,12 +144,12 @@ pub fn decode(
     let mut buses = Vec::new();
     for (bus, number) in plan.buses.iter().zip(0..) {
         let status = Arc::new(BusStatus::new(number, bus));
-        let decoder = Decoder::new(number, bus, Some(Mode::Listen), Arc::clone(&status)).map_err(|cause| {
-            OfflineError::Device {
+        let decoder = Decoder::new(number, bus, Some(Mode::Listen), Arc::clone(&status)).map_err(
+            |cause| OfflineError::Device {
                 device: bus.name.clone(),
                 cause,
-            }
-        })?;
+            },
+        )?;
         buses.push((plan.matching(number as usize), decoder, status));
     }
     let mut report = DecodeReport::default();
@@ -156,14 +162,16 @@ pub fn decode(
     let mut failure = None;
     let mut reader = candump::Reader::new(log);
     let mut last_bus = 0;
-    let takes = |matching: &Option<Matching>, interface: &str| matching.as_ref().is_none_or(|m| m.takes(interface));
+    let takes = |matching: &Option<Matching>, interface: &str| {
+        matching.as_ref().is_none_or(|m| m.takes(interface))
+    };
     while let Some(record) = reader.next_record()? {
         report.frames += 1;
         if record.frame.format == Format::Error {
             report.error_frames += 1;
             continue;
         }
-        // Frames of one interface come in runs: the bus of the last one is tried first.
+        // Frames of one interface come in series: try the bus of the last frame first.
         if buses
             .get(last_bus)
             .is_none_or(|(matching, ..)| !takes(matching, record.interface))
@@ -206,15 +214,20 @@ pub fn decode(
         .map(|(line, error)| format!("line {line}: {error}"))
         .collect();
     if report.frames == 0 {
-        let why = report
-            .bad
-            .first()
-            .map_or_else(|| "it is empty".to_owned(), |bad| format!("its first line: {bad}"));
+        let why = report.bad.first().map_or_else(
+            || "it is empty".to_owned(),
+            |bad| format!("the first bad line: {bad}"),
+        );
         return Err(OfflineError::NoFrame(why));
     }
     for ((_, decoder, status), bus) in buses.iter().zip(&plan.buses) {
         report.unclaimed += status.unclaimed.load(Relaxed);
-        for ((device, health), state) in bus.devices.iter().zip(status.devices()).zip(decoder.states()) {
+        for ((device, health), state) in bus
+            .devices
+            .iter()
+            .zip(status.devices())
+            .zip(decoder.states())
+        {
             let count = |c: Counter| health.counters.get(c as usize).copied().unwrap_or(0);
             report.devices.push(DeviceReport {
                 name: device.name.clone(),
@@ -246,36 +259,42 @@ fn write_sample<W: Write>(writer: &mut csv::Writer<W>, sample: &Sample) -> io::R
     )
 }
 
-/// What became of a table.
+/// The result of encoding a table.
 #[derive(Debug, Clone, Default)]
 pub struct EncodeReport {
     /// Frames written.
     pub frames: u64,
-    /// Samples that they carry.
+    /// Samples in these frames.
     pub samples: u64,
-    /// Samples that their device can not send, and why the first could not.
+    /// Samples that their device cannot send.
     pub refused: u64,
-    /// The first refusal.
+    /// Line and reason of the first of them.
     pub first_refusal: Option<String>,
-    /// Channels of the table that the configuration does not name.
+    /// Channels of the table that are not in the configuration.
     pub unknown_channels: Vec<String>,
-    /// What the table's reader skipped.
+    /// The report of the table's reader.
     pub table: csv::Report,
 }
 
-/// The time that a frame takes on a bus, about: what separates the frames of one reading in an encoded log.
+/// Approximate duration of a frame on the bus: the interval between the frames of one reading in an
+/// encoded log.
 const FRAME_TIME: Nanos = Nanos::from_micros(130);
 
-/// Encodes a table of samples as a CAN log, through the drivers' own encoders: the inverse of [`decode`].
+/// Encodes a table of samples as a CAN log, through the drivers' own encoders: the inverse of
+/// [`decode`].
 ///
-/// A reading's first frame has the row's stamp, the next ones follow at the time that a frame takes on the bus.
+/// A reading's first frame has the row's stamp; the others follow at the duration of a frame.
 ///
 /// # Errors
-/// [`OfflineError`]: a file that can not be read or written, or a device that can not be built.
-pub fn encode(plan: &Plan, table: impl io::Read, mut log: impl Write) -> Result<EncodeReport, OfflineError> {
+/// [`OfflineError`]: a file that cannot be read or written, or a device that cannot be built.
+pub fn encode(
+    plan: &Plan,
+    table: impl io::Read,
+    mut log: impl Write,
+) -> Result<EncodeReport, OfflineError> {
     let mut reader = csv::Reader::new(table)?;
     let mut report = EncodeReport::default();
-    // Per series: the bus, the board's number, its route.
+    // Per series: bus, device number and route.
     let mut targets = Vec::new();
     for series in reader.series() {
         let channel = plan
@@ -314,7 +333,8 @@ pub fn encode(plan: &Plan, table: impl io::Read, mut log: impl Write) -> Result<
     let mut frames = Frames::new();
     while reader.next_row(&mut row)? {
         for Item { series, value } in &row.items {
-            let (Some(Some((bus, device, route))), Value::Reading(reading, quality)) = (targets.get(*series), value)
+            let (Some(Some((bus, device, route))), Value::Reading(reading, quality)) =
+                (targets.get(*series), value)
             else {
                 continue;
             };
@@ -338,11 +358,14 @@ pub fn encode(plan: &Plan, table: impl io::Read, mut log: impl Write) -> Result<
             for frame in &frames {
                 report.frames += 1;
                 if row.t.is_none() {
-                    // The log format without its stamp: order is all that is known.
+                    // The log format without a stamp: only the order is known.
                     writeln!(log, "{} {frame}", interfaces.get(*bus).unwrap_or(&"can0"))?;
                     continue;
                 }
-                let at = waiting.iter().rposition(|(other, ..)| *other <= t).map_or(0, |i| i + 1);
+                let at = waiting
+                    .iter()
+                    .rposition(|(other, ..)| *other <= t)
+                    .map_or(0, |i| i + 1);
                 waiting.insert(at, (t, *bus, *frame));
                 t += FRAME_TIME;
             }
@@ -362,7 +385,7 @@ pub fn encode(plan: &Plan, table: impl io::Read, mut log: impl Write) -> Result<
     Ok(report)
 }
 
-/// The interface that frames of `bus` have in a log.
+/// The interface name of `bus` in a log.
 fn interface(bus: &BusPlan) -> &str {
     match &bus.source {
         Source::SocketCan { interface } => interface,

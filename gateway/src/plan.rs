@@ -1,19 +1,21 @@
-//! gateway.toml, checked and resolved: what the rest of the gateway works with.
+//! The checked and resolved form of gateway.toml, which the rest of the gateway uses.
 
 use crate::config::{Pace, Raw, RawBus, RawDevice, Realtime, Source};
 use crate::link::replay::Matching;
 use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, Spec};
-use proprio_topics::{Description, Entry, JointState, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, Role};
+use proprio_topics::{
+    Description, Entry, JointState, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, Role,
+};
 use std::fmt::{self, Write as _};
 use std::path::{Path, PathBuf};
 
-/// A configuration that can not be used: exit 2.
+/// An unusable configuration: exit code 2.
 #[derive(Debug, thiserror::Error)]
 #[error("{}: {problem}", .file.display())]
 pub struct ConfigError {
     /// The file.
     pub file: PathBuf,
-    /// Where in it, what is wrong, and what would be legal.
+    /// Place, error, and the legal values.
     pub problem: String,
 }
 
@@ -24,7 +26,7 @@ pub struct Plan {
     pub robot: String,
     /// The buses.
     pub buses: Vec<BusPlan>,
-    /// The channels that samples are numbered by.
+    /// The channels; `Sample::channel` is an index of this list.
     pub channels: Vec<ChannelPlan>,
 }
 
@@ -33,9 +35,9 @@ pub struct Plan {
 pub struct BusPlan {
     /// Its name.
     pub name: String,
-    /// Where its frames come from.
+    /// The source of its frames.
     pub source: Source,
-    /// How its thread is scheduled.
+    /// Scheduling of its thread.
     pub realtime: Option<Realtime>,
     /// Its devices.
     pub devices: Vec<DevicePlan>,
@@ -52,18 +54,18 @@ pub struct DevicePlan {
     pub options: Options,
     /// Address, silence, outputs.
     pub spec: Spec,
-    /// Which output is which channel.
+    /// The channel of each output.
     pub routes: Vec<Route>,
 }
 
 /// One output of a device.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Route {
-    /// The device's output.
+    /// The number of the device's output.
     pub output: u8,
-    /// The channel it becomes.
+    /// The number of the channel.
     pub channel: u32,
-    /// How a device angle becomes a joint angle; the identity for sensors.
+    /// The conversion from device angle to joint angle; the identity for sensors.
     pub map: JointMap,
 }
 
@@ -77,11 +79,14 @@ pub struct JointMap {
 }
 
 impl JointMap {
-    /// Nothing changes.
-    pub const IDENTITY: Self = Self { gain: 1.0, offset: 0.0 };
+    /// The identity.
+    pub const IDENTITY: Self = Self {
+        gain: 1.0,
+        offset: 0.0,
+    };
 
-    /// The joint's state from the device's: positions and their derivatives by gain and offset. Torque and current are
-    /// quantities of their own and pass unchanged.
+    /// The joint's state from the device's: gain and offset apply to position, the gain to its
+    /// derivatives. Torque and current pass unchanged.
     #[must_use]
     pub fn joint(&self, device: JointState) -> JointState {
         JointState {
@@ -123,20 +128,21 @@ impl Plan {
     /// Reads and checks a configuration file.
     ///
     /// # Errors
-    /// [`ConfigError`], naming file, place, value and what would be legal.
+    /// [`ConfigError`] with file, place, value and the legal values.
     pub fn load(file: &Path) -> Result<Self, ConfigError> {
         let error = |problem| ConfigError {
             file: file.to_owned(),
             problem,
         };
-        let text = std::fs::read_to_string(file).map_err(|e| error(format!("can not be read: {e}")))?;
+        let text =
+            std::fs::read_to_string(file).map_err(|e| error(format!("cannot be read: {e}")))?;
         Self::parse(&text, file.parent().unwrap_or(Path::new("."))).map_err(error)
     }
 
     /// Checks a configuration given as text; paths in it are relative to `folder`.
     ///
     /// # Errors
-    /// What is wrong, where, and what would be legal.
+    /// A message with the place, the error and the legal values.
     pub fn parse(text: &str, folder: &Path) -> Result<Self, String> {
         let raw: Raw = toml::from_str(text).map_err(|e| e.to_string())?;
         Builder {
@@ -151,8 +157,8 @@ impl Plan {
         .build(raw)
     }
 
-    /// What bus number `bus` takes of the log that its source replays, or of a log given for all buses: of a log that only this bus
-    /// replays, everything.
+    /// The frames that bus number `bus` takes from the log that its source replays, or from a log
+    /// given for all buses. If only this bus replays the log, it takes all frames.
     #[must_use]
     pub fn matching(&self, bus: usize) -> Option<Matching> {
         let own = self.buses.get(bus).map(|b| &b.source);
@@ -162,7 +168,11 @@ impl Plan {
             let interface = match (&other.source, own) {
                 (Source::SocketCan { interface }, _) => Some(interface.as_str()),
                 (Source::Virtual { name }, _) => Some(name.as_str()),
-                (Source::Replay { log, .. }, Some(Source::Replay { log: own, .. })) if log != own => continue,
+                (Source::Replay { log, .. }, Some(Source::Replay { log: own, .. }))
+                    if log != own =>
+                {
+                    continue;
+                }
                 (Source::Replay { .. }, _) => None,
             };
             if number == bus {
@@ -182,7 +192,7 @@ impl Plan {
             .and_then(|i| u32::try_from(i).ok())
     }
 
-    /// The plan as the description that goes with the samples.
+    /// The description of this plan's channels.
     #[must_use]
     pub fn description(&self) -> Box<Description> {
         let entries = self.channels.iter().zip(0..).map(|(channel, index)| Entry {
@@ -235,7 +245,8 @@ impl Builder<'_> {
         match &mut source {
             Source::SocketCan { interface } if interface.is_empty() || interface.len() > 15 => {
                 return Err(format!(
-                    "{place}: interface = {interface:?} must have 1 to 15 characters, such as \"can0\""
+                    "{place}: interface = {interface:?} must have 1 to 15 characters, such as \
+                     \"can0\""
                 ));
             }
             Source::Virtual { name } => check_name(&format!("{place}: source.name"), name)?,
@@ -245,7 +256,7 @@ impl Builder<'_> {
         for other in &self.plan.buses {
             if other.name == raw.name {
                 return Err(format!(
-                    "two buses are named {:?}; each needs a name of its own",
+                    "two buses are named {:?}; each bus needs a different name",
                     raw.name
                 ));
             }
@@ -255,7 +266,7 @@ impl Builder<'_> {
             };
             if same {
                 return Err(format!(
-                    "{place}: has the same source as bus {:?}: list its devices there",
+                    "{place}: same source as bus {:?}; list the devices of both under one [[bus]]",
                     other.name
                 ));
             }
@@ -266,7 +277,9 @@ impl Builder<'_> {
         }) = raw.realtime
             && !(1..=99).contains(&priority)
         {
-            return Err(format!("{place}: realtime.priority = {priority} must be 1 to 99"));
+            return Err(format!(
+                "{place}: realtime.priority = {priority} must be 1 to 99"
+            ));
         }
         self.plan.buses.push(BusPlan {
             name: raw.name,
@@ -292,7 +305,9 @@ impl Builder<'_> {
                 common.insert(key.to_owned(), value);
             }
         }
-        let raw: RawDevice = common.try_into().map_err(|e: toml::de::Error| one_line(&e))?;
+        let raw: RawDevice = common
+            .try_into()
+            .map_err(|e: toml::de::Error| one_line(&e))?;
         let name = &raw.name;
         check_name("name", name)?;
         let options = Options::deserialize(&raw.driver, table).map_err(|e| match e {
@@ -316,20 +331,24 @@ impl Builder<'_> {
         let mut spec = Spec {
             address: raw.address,
             max_silence,
-            mode: if raw.listen_only { Mode::Listen } else { Mode::Supervise },
+            mode: if raw.listen_only {
+                Mode::Listen
+            } else {
+                Mode::Supervise
+            },
             outputs: proprio_drivers::Outputs::default(),
         };
         let mut routes = Vec::new();
         match (kind, raw.joint.is_empty()) {
             (Kind::Joint, true) => {
                 return Err(format!(
-                    "{name:?}: {} measures joints: say which, in [[bus.device.joint]]",
+                    "{name:?}: {} measures joints; name them in [[bus.device.joint]]",
                     raw.driver
                 ));
             }
             (Kind::Wrench | Kind::Imu, false) => {
                 return Err(format!(
-                    "{name:?}: {} is a sensor: [[bus.device.joint]] does not belong here",
+                    "{name:?}: {} is a sensor; remove its [[bus.device.joint]]",
                     raw.driver
                 ));
             }
@@ -352,7 +371,10 @@ impl Builder<'_> {
                     let at = format!("{name:?}, joint {:?}", joint.name);
                     check_name(&at, &joint.name)?;
                     if !joint.ratio.is_finite() || joint.ratio == 0.0 {
-                        return Err(format!("{at}: ratio = {} must be a number other than 0", joint.ratio));
+                        return Err(format!(
+                            "{at}: ratio = {} must be a number other than 0",
+                            joint.ratio
+                        ));
                     }
                     if joint.sign.abs() != 1 {
                         return Err(format!("{at}: sign = {} must be 1 or -1", joint.sign));
@@ -364,7 +386,10 @@ impl Builder<'_> {
                         ));
                     }
                     if spec.outputs.0.contains(&joint.channel) {
-                        return Err(format!("{at}: channel = {} is already another joint", joint.channel));
+                        return Err(format!(
+                            "{at}: channel = {} is already another joint",
+                            joint.channel
+                        ));
                     }
                     if spec.outputs.0.try_push(joint.channel).is_err() {
                         return Err(format!(
@@ -391,8 +416,11 @@ impl Builder<'_> {
                 }
             }
         }
-        // Built once here so that a wrong address or value shows at --check; the bus thread builds its own.
-        options.device(&spec).map_err(|e| format!("{name:?}: {e}"))?;
+        // Built here once so that --check reports a wrong address or value; the bus thread builds
+        // its own.
+        options
+            .device(&spec)
+            .map_err(|e| format!("{name:?}: {e}"))?;
         let plan = DevicePlan {
             name: raw.name,
             driver: raw.driver,
@@ -412,7 +440,7 @@ impl Builder<'_> {
     fn channel(&mut self, channel: ChannelPlan) -> Result<u32, String> {
         if self.plan.channel(&channel.name).is_some() {
             return Err(format!(
-                "two channels are named {:?}; joints and sensors share their names' space",
+                "two channels are named {:?}; joints and sensors need different names",
                 channel.name
             ));
         }
@@ -423,7 +451,7 @@ impl Builder<'_> {
         u32::try_from(self.plan.channels.len() - 1).map_err(|e| e.to_string())
     }
 
-    /// No identifier may belong to two devices, unless both only listen to it.
+    /// Checks that no identifier belongs to two devices, unless both only listen to it.
     fn check_claims(&self, place: &str) -> Result<(), String> {
         let Some(bus) = self.plan.buses.last() else {
             return Ok(());
@@ -439,7 +467,8 @@ impl Builder<'_> {
                 {
                     if a.overlaps(b) && (a.exclusive || b.exclusive) {
                         return Err(format!(
-                            "{place}: devices {:?} and {other:?} both claim identifier {}: one of their addresses is wrong",
+                            "{place}: devices {:?} and {other:?} both claim identifier {}: one of \
+                             their addresses is wrong",
                             plan.name, a.id
                         ));
                     }
@@ -451,7 +480,7 @@ impl Builder<'_> {
     }
 }
 
-/// An error of one table, with the key that it is about.
+/// A TOML error in one line, with the key that it is about.
 fn one_line(error: &toml::de::Error) -> String {
     error
         .to_string()
@@ -463,16 +492,17 @@ fn one_line(error: &toml::de::Error) -> String {
 }
 
 fn check_name(place: &str, name: &str) -> Result<(), String> {
-    if name.is_empty() || name.len() > Name::CAPACITY || name.contains(['/', ',', '"', '\n', '\0']) {
+    if name.is_empty() || name.len() > Name::CAPACITY || name.contains(['/', ',', '"', '\n', '\0'])
+    {
         return Err(format!(
-            "{place} = {name:?} must have 1 to {} bytes, none of them / , \" or a line's end",
+            "{place} = {name:?} must have 1 to {} bytes, without / , \" or line breaks",
             Name::CAPACITY
         ));
     }
     Ok(())
 }
 
-/// Service names are 7-bit ASCII in the transport.
+/// Checks a name that is part of a service name: the transport allows only 7-bit ASCII.
 fn check_service_name(place: &str, name: &str) -> Result<(), String> {
     let fits = !name.is_empty() && name.len() <= Name::CAPACITY;
     if !fits
@@ -489,7 +519,7 @@ fn check_service_name(place: &str, name: &str) -> Result<(), String> {
 }
 
 impl fmt::Display for Plan {
-    /// A table for people: `proprio gateway --check` prints it.
+    /// A readable table; `proprio gateway --check` prints it.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,
@@ -506,21 +536,34 @@ impl fmt::Display for Plan {
                     format!(
                         "log {} ({})",
                         log.display(),
-                        if *pace == Pace::Fast { "fast" } else { "as recorded" }
+                        if *pace == Pace::Fast {
+                            "fast"
+                        } else {
+                            "as recorded"
+                        }
                     )
                 }
             };
             write!(f, "\nbus {}: {source}", bus.name)?;
             if let Some(realtime) = bus.realtime {
-                realtime.cpu.map_or(Ok(()), |cpu| write!(f, ", cpu {cpu}"))?;
-                realtime.priority.map_or(Ok(()), |p| write!(f, ", SCHED_FIFO {p}"))?;
+                realtime
+                    .cpu
+                    .map_or(Ok(()), |cpu| write!(f, ", cpu {cpu}"))?;
+                realtime
+                    .priority
+                    .map_or(Ok(()), |p| write!(f, ", SCHED_FIFO {p}"))?;
             }
             writeln!(f)?;
             for device in &bus.devices {
                 let mut ids = String::new();
                 if let Ok(built) = device.options.device(&device.spec) {
                     for claim in built.claims() {
-                        write!(ids, " {}{}", claim.id, if claim.exclusive { "" } else { "*" })?;
+                        write!(
+                            ids,
+                            " {}{}",
+                            claim.id,
+                            if claim.exclusive { "" } else { "*" }
+                        )?;
                     }
                 }
                 let listen = if device.spec.mode == Mode::Listen {
@@ -614,13 +657,21 @@ mod tests {
     fn each_mistake_has_one_clear_message() {
         for (from, to, expected) in [
             ("schema = 1", "schema = 2", "schema = 2 is not known"),
-            ("robot = \"icub\"", "robot = \"i cub\"", "robot = \"i cub\" must have"),
+            (
+                "robot = \"icub\"",
+                "robot = \"i cub\"",
+                "robot = \"i cub\" must have",
+            ),
             (
                 "robot = \"icub\"",
                 "robbot = \"icub\"",
                 "unknown field `robbot`, expected one of `schema`, `robot`, `bus`",
             ),
-            ("kind = \"virtual\"", "kind = \"virtuel\"", "unknown variant `virtuel`"),
+            (
+                "kind = \"virtual\"",
+                "kind = \"virtuel\"",
+                "unknown variant `virtuel`",
+            ),
             (
                 "\"icub_strain\"",
                 "\"icub_strian\"",
@@ -631,8 +682,16 @@ mod tests {
                 "max_silence_ms = 0",
                 "max_silence_ms = 0 must be above 0",
             ),
-            ("full_scale_n = ", "full_scale_N = ", "unknown field `full_scale_N`"),
-            ("address = 13", "address = 15", "address = 15 is outside 1 to 14"),
+            (
+                "full_scale_n = ",
+                "full_scale_N = ",
+                "unknown field `full_scale_N`",
+            ),
+            (
+                "address = 13",
+                "address = 15",
+                "address = 15 is outside 1 to 14",
+            ),
             ("address = 13", "", "missing field `address`"),
             ("sign = -1", "sign = 2", "sign = 2 must be 1 or -1"),
             (
@@ -640,7 +699,11 @@ mod tests {
                 "ratio = 0.0",
                 "ratio = 0 must be a number other than 0",
             ),
-            ("name = \"elbow\"", "name = \"ft\"", "two channels are named \"ft\""),
+            (
+                "name = \"elbow\"",
+                "name = \"ft\"",
+                "two channels are named \"ft\"",
+            ),
             (
                 "name = \"elbow_board\"",
                 "name = \"ft\"",
@@ -654,7 +717,8 @@ mod tests {
 
     #[test]
     fn two_devices_can_not_claim_one_identifier() {
-        let second = "[[bus.device]]\n driver = \"icub_strain\"\n name = \"ft2\"\n address = 13\n [[bus.device]]";
+        let second = "[[bus.device]]\n driver = \"icub_strain\"\n name = \"ft2\"\n \
+                      address = 13\n [[bus.device]]";
         let problem = problem("[[bus.device]]", second);
         assert!(
             problem.contains("\"ft\" and \"ft2\" both claim identifier 3DA"),

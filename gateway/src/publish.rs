@@ -1,30 +1,30 @@
-//! Where samples go: shared memory, or a vector in tests.
+//! Destinations of samples: shared memory, or a vector in tests.
 
 use proprio_topics::ipc::Writer;
 use proprio_topics::{Nanos, Sample};
 
-/// A sample that could not be handed on. It is lost; the next one is not affected.
+/// A sample could not be published. It is lost; the next one is not affected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("the sample could not be published")]
 pub struct SinkError;
 
-/// Takes samples. Never waits for whoever reads them.
+/// A destination of samples. Never waits for readers.
 pub trait Sink {
-    /// Hands on a sample at `now`; fills in its epoch, sequence number and publication stamp. Returns how many readers
-    /// were newly attached by this call.
+    /// Publishes a sample at `now`; fills in its epoch, sequence number and publication stamp.
+    /// Returns the number of readers that this call connected.
     ///
     /// # Errors
-    /// [`SinkError`]: the sample was not handed on.
+    /// [`SinkError`]: the sample was not published.
     fn publish(&mut self, sample: &mut Sample, now: Nanos) -> Result<u32, SinkError>;
 
-    /// Called when there was nothing to do for a while.
+    /// Called when there has been nothing to do for a while.
     fn idle(&mut self) {}
 }
 
 /// Keeps all samples: for tests.
 #[derive(Debug, Default)]
 pub struct Memory {
-    /// What was published, in order.
+    /// The published samples, in order.
     pub samples: Vec<Sample>,
 }
 
@@ -48,7 +48,8 @@ impl Sink for Shared {
     }
 
     fn idle(&mut self) {
-        // A reader that can not be connected now is connected, or counted, with the next sample.
+        // A reader that cannot be connected now is connected, or counted as a failure, with the
+        // next sample.
         let _ = self.0.update_connections();
     }
 }

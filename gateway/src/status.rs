@@ -1,4 +1,5 @@
-//! What a bus thread counts, readable by the control plane without a lock: one writer, relaxed atomics.
+//! The counters of a bus thread, which the control plane reads without a lock: one writer, relaxed
+//! atomics.
 
 use crate::link::LinkCounters;
 use crate::plan::BusPlan;
@@ -7,12 +8,12 @@ use proprio_topics::{BusHealth, Counter, DeviceHealth, LinkState, Name, Nanos};
 use std::sync::atomic::Ordering::Relaxed;
 use std::sync::atomic::{AtomicI64, AtomicU32, AtomicU64};
 
-/// One bus.
+/// The counters of one bus.
 #[derive(Debug)]
 pub struct BusStatus {
     name: Name,
     number: u32,
-    /// Frames handed to the devices.
+    /// Frames passed to the devices.
     pub frames: AtomicU64,
     /// Frames that no device claims.
     pub unclaimed: AtomicU64,
@@ -20,11 +21,11 @@ pub struct BusStatus {
     pub published: AtomicU64,
     /// Samples not published.
     pub publish_failures: AtomicU64,
-    /// Reader connections made inside a publication.
+    /// Reader connections made while publishing.
     pub connections: AtomicU64,
     /// Stamp of the last frame.
     pub last_frame: AtomicI64,
-    /// The last turn of the loop.
+    /// Time of the last turn of the loop.
     pub last_turn: AtomicI64,
     link: [AtomicU64; 5],
     link_state: AtomicU32,
@@ -40,7 +41,7 @@ struct DeviceStatus {
 }
 
 impl BusStatus {
-    /// Nothing counted yet on bus number `number`.
+    /// Zero counters for bus number `number`.
     #[must_use]
     pub fn new(number: u32, plan: &BusPlan) -> Self {
         let name = |n: &str| Name::new(n).unwrap_or(Name::EMPTY);
@@ -90,7 +91,7 @@ impl BusStatus {
         }
     }
 
-    /// Takes over what the link counts.
+    /// Copies the link's state and counters.
     pub fn set_link(&self, state: LinkState, counters: &LinkCounters) {
         let LinkCounters {
             dropped,
@@ -100,17 +101,17 @@ impl BusStatus {
             losses,
             received: _,
         } = *counters;
-        for (cell, value) in self
-            .link
-            .iter()
-            .zip([dropped, error_frames, sent, send_failures, losses])
+        for (cell, value) in
+            self.link
+                .iter()
+                .zip([dropped, error_frames, sent, send_failures, losses])
         {
             cell.store(value, Relaxed);
         }
         self.link_state.store(state as u32, Relaxed);
     }
 
-    /// The bus as its health tells it.
+    /// The bus's part of the health message.
     #[must_use]
     pub fn bus(&self) -> BusHealth {
         let [dropped, error_frames, sent, send_failures, link_losses] =
@@ -137,12 +138,15 @@ impl BusStatus {
             connections: self.connections.load(Relaxed),
             last_frame: Nanos(self.last_frame.load(Relaxed)),
             last_turn: Nanos(self.last_turn.load(Relaxed)),
-            link: states.into_iter().find(|s| *s as u32 == state).unwrap_or_default(),
+            link: states
+                .into_iter()
+                .find(|s| *s as u32 == state)
+                .unwrap_or_default(),
             reserved: 0,
         }
     }
 
-    /// The devices as the health tells them.
+    /// The devices' parts of the health message.
     pub fn devices(&self) -> impl Iterator<Item = DeviceHealth> + '_ {
         self.devices.iter().map(|d| {
             let mut counters = [0; Counter::ALL.len()];

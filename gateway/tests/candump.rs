@@ -1,4 +1,4 @@
-//! candump's text formats: lines that candump itself printed, and what is written comes back.
+//! candump's text formats: lines printed by candump itself, and round trips of written lines.
 
 use proprio_drivers::{Format, Frame, Id};
 use proprio_gateway::candump::{
@@ -8,7 +8,8 @@ use proprio_topics::{Nanos, StampKind};
 use proptest::prelude::*;
 use std::io::{BufReader, Cursor};
 
-/// What these were printed for: frames sent by cansend to vcan0, seen by candump 2020.11 under Linux 6.1.
+/// The frames of the lines below: sent by cansend to vcan0, printed by candump 2020.11 under Linux
+/// 6.1.
 fn frames() -> Vec<Frame> {
     let fd = |id, bit_rate_switch, error_state, data: &[u8]| {
         Frame::with_format(
@@ -21,7 +22,9 @@ fn frames() -> Vec<Frame> {
         )
         .unwrap()
     };
-    let error = |classes, data: &[u8]| Frame::with_format(Id::extended(classes), Format::Error, data).unwrap();
+    let error = |classes, data: &[u8]| {
+        Frame::with_format(Id::extended(classes), Format::Error, data).unwrap()
+    };
     let eight = [0x11, 0x22, 0x33, 0x44, 0x55, 0x66, 0x77, 0x88];
     vec![
         Frame::new(Id::standard(0x123), &[0xDE, 0xAD, 0xBE, 0xEF]),
@@ -35,7 +38,9 @@ fn frames() -> Vec<Frame> {
             Id::standard(0x123),
             true,
             true,
-            &[0x11, 0x22, 0x33, 0x44, 0x55, 0x66, 0x77, 0x88, 0x99, 0xAA, 0xBB, 0xCC],
+            &[
+                0x11, 0x22, 0x33, 0x44, 0x55, 0x66, 0x77, 0x88, 0x99, 0xAA, 0xBB, 0xCC,
+            ],
         ),
         fd(Id::extended(0x1234_5678), true, false, &[0xAA, 0xBB]),
         error(0x4, &[0, 8, 0, 0, 0, 0, 0x60, 0]),
@@ -140,7 +145,8 @@ const SCREEN_I: &str = "  vcan0  123   [4]  11011110 10101101 10111110 11101111
   vcan0       020   [5]  01001000 01100101 01101100 01101100 01101111
 ";
 
-const SCREEN_TA_X_A: &str = " (1795225394.431732)  vcan0  TX - -  123   [4]  DE AD BE EF               '....'
+const SCREEN_TA_X_A: &str =
+    " (1795225394.431732)  vcan0  TX - -  123   [4]  DE AD BE EF               '....'
  (1795225394.676422)  vcan0  TX - -  1F334455   [8]  11 22 33 44 55 66 77 88   '.\"3DUfw.'
  (1795225394.836206)  vcan0  TX - -       123   [0]  remote request
  (1795225394.995279)  vcan0  TX - -  00000123   [4]  remote request
@@ -184,7 +190,7 @@ const STAMPS_US: [i64; 12] = [
     1_795_225_397_825_087,
 ];
 
-/// What a record holds, without its borrow of the line.
+/// A record without its borrow of the line.
 #[derive(Debug, Clone, PartialEq)]
 struct Owned {
     stamp: Option<Nanos>,
@@ -213,7 +219,7 @@ fn read(log: &[u8]) -> (Vec<Owned>, Reader<Cursor<&[u8]>>) {
     (records, reader)
 }
 
-/// Frame, stamp and what a frame of the screen format without `-x` can not say: the flags of CAN FD.
+/// Frame and stamp, without the CAN FD flags, which the screen format shows only with `-x`.
 fn expected(stamped: bool, flags: bool, direction: Option<Direction>) -> Vec<Owned> {
     let without_flags = |frame: Frame| match frame.format {
         Format::Fd { .. } if !flags => {
@@ -225,7 +231,9 @@ fn expected(stamped: bool, flags: bool, direction: Option<Direction>) -> Vec<Own
         }
         _ => frame,
     };
-    let stamps = STAMPS_US.iter().map(|us| stamped.then_some(Nanos::from_micros(*us)));
+    let stamps = STAMPS_US
+        .iter()
+        .map(|us| stamped.then_some(Nanos::from_micros(*us)));
     frames()
         .into_iter()
         .map(without_flags)
@@ -256,7 +264,7 @@ fn what_candump_prints_is_read() {
         assert_eq!(records, expected, "{log}");
         assert_eq!(reader.report().bad, 0, "{log}");
         assert_eq!(reader.report().lines, log.lines().count() as u64);
-        // Line ends of another system.
+        // Line ends of Windows.
         assert_eq!(read(log.replace('\n', "\r\n").as_bytes()).0, expected);
     }
 }
@@ -271,8 +279,11 @@ fn what_is_written_is_what_candump_writes() {
     }
     assert_eq!(writer.frames(), 12);
     let written = String::from_utf8(writer.finish().unwrap()).unwrap();
-    // The flag that tells CAN FD (4) is in the number of bytes already; older candumps do not print it either.
-    let log = LOG.replace("##4", "##0").replace("##7", "##3").replace("##5", "##1");
+    // The CAN FD flag (4) follows from the format; older candumps do not print it either.
+    let log = LOG
+        .replace("##4", "##0")
+        .replace("##7", "##3")
+        .replace("##5", "##1");
     assert_eq!(written, log);
     for (line, frame) in written.lines().zip(frames()) {
         assert_eq!(
@@ -291,7 +302,10 @@ fn relative_stamps_are_told_apart() {
     ] {
         let (records, reader) = read(log.as_bytes());
         assert_eq!(
-            records.iter().map(|r| r.stamp.unwrap().0).collect::<Vec<_>>(),
+            records
+                .iter()
+                .map(|r| r.stamp.unwrap().0)
+                .collect::<Vec<_>>(),
             RELATIVE_US.map(|us| us * 1_000)
         );
         assert!(
@@ -302,14 +316,15 @@ fn relative_stamps_are_told_apart() {
         assert_eq!(reader.stamps(), stamps);
         assert_eq!(reader.report().backwards, 0);
     }
-    // Told outright, even where it looks otherwise.
+    // An explicit meaning is used even if the stamps look otherwise.
     let mut reader = Reader::with_stamps(Cursor::new(SCREEN_T_ZERO), Stamps::SincePrevious);
     let mut last = Nanos::ZERO;
     while let Some(record) = reader.next_record().unwrap() {
         last = record.stamp.unwrap();
     }
     assert_eq!(last, Nanos::from_micros(RELATIVE_US.iter().sum()));
-    // The log format has no stamps since the line before; other programs write short ones since the origin.
+    // The log format has no stamps since the previous line; other programs write short ones since
+    // the origin.
     let (records, reader) = read(b"(0.5) can0 123#\n(0.25) can0 123#\n(0.75) can0 123#\n");
     assert_eq!(
         records
@@ -324,9 +339,12 @@ fn relative_stamps_are_told_apart() {
 #[test]
 fn dates_are_taken_as_utc() {
     let (records, _) = read(SCREEN_T_DATE.as_bytes());
-    // The clock of that machine showed UTC, so its dates are the absolute stamps.
+    // That machine's clock showed UTC, so its dates equal the absolute stamps.
     assert_eq!(
-        records.iter().map(|r| r.stamp.unwrap().0).collect::<Vec<_>>(),
+        records
+            .iter()
+            .map(|r| r.stamp.unwrap().0)
+            .collect::<Vec<_>>(),
         [STAMPS_US[0] * 1_000, STAMPS_US[1] * 1_000]
     );
     for (date, seconds) in [
@@ -362,18 +380,30 @@ fn stamps_are_exact() {
     }
     let written = |ns| {
         let mut out = Vec::new();
-        write_log_line(&mut out, Nanos(ns), "can0", &Frame::new(Id::standard(1), &[])).unwrap();
+        write_log_line(
+            &mut out,
+            Nanos(ns),
+            "can0",
+            &Frame::new(Id::standard(1), &[]),
+        )
+        .unwrap();
         String::from_utf8(out).unwrap()
     };
     assert_eq!(written(12_000_001_000), "(0000000012.000001) can0 001#\n");
-    assert_eq!(written(12_000_001_001), "(0000000012.000001001) can0 001#\n");
+    assert_eq!(
+        written(12_000_001_001),
+        "(0000000012.000001001) can0 001#\n"
+    );
     assert_eq!(written(-1_500_000_000), "(-0000000001.500000) can0 001#\n");
     assert_eq!(written(i64::MIN), "(-9223372036.854775808) can0 001#\n");
 }
 
 #[test]
 fn other_forms_that_can_utils_know() {
-    let eight = Frame::new(Id::standard(0x123), &[0x11, 0x22, 0x33, 0x44, 0x55, 0x66, 0x77, 0x88]);
+    let eight = Frame::new(
+        Id::standard(0x123),
+        &[0x11, 0x22, 0x33, 0x44, 0x55, 0x66, 0x77, 0x88],
+    );
     for line in [
         "(1.0) can0 123#1122334455667788_E",
         "(1.0) can0 123#11.22.33.44.55.66.77.88",
@@ -385,13 +415,28 @@ fn other_forms_that_can_utils_know() {
         let Ok(Line::Record(record)) = Line::parse(line.as_bytes()) else {
             panic!("{line}: {:?}", Line::parse(line.as_bytes()))
         };
-        assert_eq!(record.frame, eight.at(Nanos(1_000_000_000), StampKind::Log), "{line}");
+        assert_eq!(
+            record.frame,
+            eight.at(Nanos(1_000_000_000), StampKind::Log),
+            "{line}"
+        );
     }
     let Ok(Line::Record(record)) = Line::parse(b"(1.0) can0 123#R8_C") else {
         panic!()
     };
-    assert_eq!((record.frame.format, record.frame.len()), (Format::Remote, 8));
-    for note in ["", "   ", "\r\n", "# comment", "; comment", "// comment", "\tbus-off"] {
+    assert_eq!(
+        (record.frame.format, record.frame.len()),
+        (Format::Remote, 8)
+    );
+    for note in [
+        "",
+        "   ",
+        "\r\n",
+        "# comment",
+        "; comment",
+        "// comment",
+        "\tbus-off",
+    ] {
         assert_eq!(Line::parse(note.as_bytes()), Ok(Line::Note), "{note:?}");
     }
     let lost = b"DROPCOUNT: dropped 14 CAN frames on 'can0' socket (total drops 20)";
@@ -419,7 +464,13 @@ fn faults_are_named() {
         ("(1.0) can0 #00", LineError::NoFrame),
         ("(1.0) can0 1234#00", LineError::Identifier { digits: 4 }),
         ("(1.0) can0 xyz#00", LineError::Identifier { digits: 0 }),
-        ("(1.0) can0 800#00", LineError::IdentifierRange { id: 0x800, bits: 11 }),
+        (
+            "(1.0) can0 800#00",
+            LineError::IdentifierRange {
+                id: 0x800,
+                bits: 11,
+            },
+        ),
         (
             "(1.0) can0 80000000#00",
             LineError::IdentifierRange {
@@ -430,7 +481,10 @@ fn faults_are_named() {
         ("(1.0) can0 123", LineError::Separator),
         ("(1.0) can0 123#0", LineError::Data),
         ("(1.0) can0 123#0G", LineError::Data),
-        ("(1.0) can0 123#112233445566778899", LineError::TooLong { most: 8 }),
+        (
+            "(1.0) can0 123#112233445566778899",
+            LineError::TooLong { most: 8 },
+        ),
         ("(1.0) can0 123##", LineError::Flags),
         ("(1.0) can0 123##X11", LineError::Flags),
         ("(1.0) can0 123###81:00:12345678#11223344", LineError::Xl),
@@ -443,30 +497,50 @@ fn faults_are_named() {
         ("  can0  123   [9]  11", LineError::Length),
         ("  can0  123  [65]  11", LineError::Length),
         ("  can0  123  [0012]  11", LineError::Xl),
-        ("  can0  123   [2]  11", LineError::Missing { declared: 2, found: 1 }),
+        (
+            "  can0  123   [2]  11",
+            LineError::Missing {
+                declared: 2,
+                found: 1,
+            },
+        ),
         ("  can0  123   [2]  11 2", LineError::Data),
         ("  can0  123   [1]  11 22", LineError::Trailing),
         ("  can0  123   [1]  11   ERRORFRAME", LineError::Trailing),
-        ("  can0  123  [04]  remote request", LineError::Contradiction),
+        (
+            "  can0  123  [04]  remote request",
+            LineError::Contradiction,
+        ),
     ] {
         assert_eq!(Line::parse(line.as_bytes()), Err(error), "{line}");
         assert!(!error.to_string().is_empty());
     }
-    assert_eq!(Line::parse(b"(1.0) \xFF\xFE 123#00"), Err(LineError::Interface));
+    assert_eq!(
+        Line::parse(b"(1.0) \xFF\xFE 123#00"),
+        Err(LineError::Interface)
+    );
 }
 
 #[test]
 fn bad_lines_are_counted_named_and_skipped() {
     let mut log = b"garbage\n(1.0) can0 123#11\n\n(2.0) can0 12#11\n# note\n".to_vec();
     log.extend(std::iter::repeat_n(b'x', 100_000));
-    log.extend(b"\n(3.0) can0 123#22\nDROPCOUNT: dropped 3 CAN frames on 'can0' socket (total drops 3)\n");
+    log.extend(
+        b"\n(3.0) can0 123#22\nDROPCOUNT: dropped 3 CAN frames on 'can0' socket (total drops 3)\n",
+    );
     let (records, reader) = read(&log);
     let report = reader.report();
     assert_eq!(
-        records.iter().map(|r| r.frame.data()[0]).collect::<Vec<_>>(),
+        records
+            .iter()
+            .map(|r| r.frame.data()[0])
+            .collect::<Vec<_>>(),
         [0x11, 0x22]
     );
-    assert_eq!((report.lines, report.records, report.bad, report.dropped), (8, 2, 3, 3));
+    assert_eq!(
+        (report.lines, report.records, report.bad, report.dropped),
+        (8, 2, 3, 3)
+    );
     let named: Vec<_> = report.first_bad.iter().copied().collect();
     assert_eq!(
         named,
@@ -489,15 +563,21 @@ fn a_log_cut_anywhere_yields_a_beginning_of_its_frames() {
         for end in 0..log.len() {
             let cut = &log.as_bytes()[..end];
             let (records, reader) = read(cut);
-            // All but the direction, which may be what is cut off.
-            let frames = |records: &[Owned]| records.iter().map(|r| (r.stamp, r.frame)).collect::<Vec<_>>();
+            // Everything but the direction, which may be cut off.
+            let frames = |records: &[Owned]| {
+                records
+                    .iter()
+                    .map(|r| (r.stamp, r.frame))
+                    .collect::<Vec<_>>()
+            };
             assert!(
                 frames(&whole).starts_with(&frames(&records)),
                 "cut after {:?}",
                 &log[..end]
             );
-            // Every finished line is there.
-            let finished = log[..end].lines().count() - usize::from(!log[..end].ends_with('\n') && end > 0);
+            // Every finished line is read.
+            let finished =
+                log[..end].lines().count() - usize::from(!log[..end].ends_with('\n') && end > 0);
             assert!(records.len() >= finished, "cut after {:?}", &log[..end]);
             assert!(reader.report().bad <= 1);
         }
@@ -548,7 +628,9 @@ fn any_frame() -> impl Strategy<Value = Frame> {
 proptest! {
     #[test]
     fn what_is_written_is_read(
-        records in proptest::collection::vec((any_frame(), any::<i64>(), "[a-z_.0-9A-Zäß-]{1,20}"), 0..20),
+        records in proptest::collection::vec(
+            (any_frame(), any::<i64>(), "[a-z_.0-9A-Zäß-]{1,20}"), 0..20
+        ),
         buffer in 1_usize..200,
     ) {
         let mut log = Vec::new();
@@ -573,7 +655,7 @@ proptest! {
         read(&bytes);
     }
 
-    /// Lines with one byte changed come closer to what a parser stumbles over than noise does.
+    /// Lines with one changed byte test a parser better than noise does.
     #[test]
     fn damaged_lines_are_legal_input(at in 0_usize..2_000, byte: u8) {
         for log in [LOG_X, SCREEN_SA, SCREEN_I, SCREEN_TA_X_A, SCREEN_T_DATE] {

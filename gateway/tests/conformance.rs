@@ -1,6 +1,8 @@
-//! What every link must do, as one suite of properties that runs against all three; and what each does beyond it.
+//! A conformance suite of properties that runs against all three links, and tests of each link's
+//! own features.
 //!
-//! The links to SocketCAN run on vcan0 if PROPRIO_VCAN=1 says that it is there (`tests/vcan/with-vcan` provides it).
+//! The SocketCAN link is tested on vcan0 if PROPRIO_VCAN=1 is set (`tests/vcan/with-vcan` provides
+//! vcan0).
 
 use proprio_drivers::{Claim, Format, Frame, Id};
 use proprio_gateway::candump::write_log_line;
@@ -14,9 +16,9 @@ use std::path::PathBuf;
 use std::process::Command;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-/// Long enough for anything to arrive on a machine that is busy; never waited for where all is well.
+/// Time-out for an arrival on a busy machine; not reached if all is well.
 const PATIENCE: Nanos = Nanos(20_000_000_000);
-/// How long to listen for what must not come.
+/// Time to listen for frames that must not arrive.
 const SILENCE: Nanos = Nanos(60_000_000);
 
 fn now() -> Nanos {
@@ -25,18 +27,22 @@ fn now() -> Nanos {
 
 fn unique() -> String {
     static COUNT: AtomicU32 = AtomicU32::new(0);
-    format!("{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed))
+    format!(
+        "{}-{}",
+        std::process::id(),
+        COUNT.fetch_add(1, Ordering::Relaxed)
+    )
 }
 
-/// A bus to test a kind of link on.
+/// A bus for testing one kind of link.
 trait Fixture {
-    /// Whether links of one bus send to each other, now; a log was recorded before.
+    /// Whether links of one bus can send to each other; a log's cannot.
     fn live(&self) -> bool;
 
-    /// A participant, where there can be several.
+    /// A participant, if there can be several.
     fn join(&self, claims: &[Claim]) -> Box<dyn Link>;
 
-    /// A participant that has been there when somebody else sent `frames`.
+    /// A participant that was open when another one sent `frames`.
     fn play(&self, claims: &[Claim], frames: &[Frame]) -> Box<dyn Link> {
         let link = self.join(claims);
         let mut peer = self.join(&[]);
@@ -48,7 +54,7 @@ trait Fixture {
     }
 }
 
-/// A virtual bus of its own for each test.
+/// A separate virtual bus for each test.
 struct Virtual {
     domain: String,
 }
@@ -71,13 +77,13 @@ impl Fixture for Virtual {
     }
 }
 
-/// A log of the frames that are played.
+/// A log of the frames that are sent.
 struct Log {
     folder: tempfile::TempDir,
     pace: Pace,
 }
 
-/// The recorded stamps are a millisecond apart, from here on.
+/// The recorded stamps start here and are a millisecond apart.
 const RECORDED: Nanos = Nanos(1_479_121_923_123_456_789);
 
 impl Log {
@@ -107,7 +113,13 @@ impl Fixture for Log {
     fn play(&self, claims: &[Claim], frames: &[Frame]) -> Box<dyn Link> {
         let mut log = Vec::new();
         for (i, frame) in frames.iter().enumerate() {
-            write_log_line(&mut log, RECORDED + Nanos::from_millis(i as i64), "can0", frame).unwrap();
+            write_log_line(
+                &mut log,
+                RECORDED + Nanos::from_millis(i as i64),
+                "can0",
+                frame,
+            )
+            .unwrap();
         }
         Box::new(Replay::open(&self.write(&log), self.pace, None, claims).unwrap())
     }
@@ -128,7 +140,7 @@ impl Fixture for Can {
     }
 }
 
-/// The next frame, however long it takes; anything else fails.
+/// The next frame, within the time-out; anything else fails.
 fn frame(link: &mut dyn Link) -> Frame {
     match link.recv(now() + PATIENCE) {
         Received::Frame(frame) => frame,
@@ -136,7 +148,7 @@ fn frame(link: &mut dyn Link) -> Frame {
     }
 }
 
-/// Exactly `count` frames: no other comes.
+/// Exactly `count` frames, and no more.
 fn exactly(link: &mut dyn Link, count: usize) -> Vec<Frame> {
     let frames = (0..count).map(|_| frame(link)).collect();
     silent(link);
@@ -182,7 +194,7 @@ fn variety() -> Vec<Frame> {
             frames.push(Frame::new(id, &bytes[..len]));
             frames.push(Frame::remote(id, len as u8));
         }
-        // The lengths that CAN FD has.
+        // The valid lengths of CAN FD.
         for len in [0, 1, 8, 12, 16, 20, 24, 32, 48, 64] {
             frames.push(fd(id, len % 3 == 0, len % 2 == 0, &bytes[..len]));
         }
@@ -262,15 +274,24 @@ fn exactly_the_claims_pass(bus: &dyn Fixture) {
         .collect();
     let mut link = bus.play(&claims, &sent);
     assert_eq!(
-        exactly(&mut *link, expected.len()).iter().map(bare).collect::<Vec<_>>(),
+        exactly(&mut *link, expected.len())
+            .iter()
+            .map(bare)
+            .collect::<Vec<_>>(),
         expected
     );
     assert_eq!(link.counters().received, expected.len() as u64);
 
     // More claims than the kernel takes filters.
-    let even: Vec<Claim> = (0..600).map(|i| Claim::exclusive(Id::standard(i * 2))).collect();
+    let even: Vec<Claim> = (0..600)
+        .map(|i| Claim::exclusive(Id::standard(i * 2)))
+        .collect();
     let sent: Vec<Frame> = (0..40).map(|i| Frame::new(Id::standard(i), &[])).collect();
-    let expected: Vec<Frame> = sent.iter().copied().filter(|f| f.id.raw() % 2 == 0).collect();
+    let expected: Vec<Frame> = sent
+        .iter()
+        .copied()
+        .filter(|f| f.id.raw() % 2 == 0)
+        .collect();
     assert_eq!(
         exactly(&mut *bus.play(&even, &sent), 20)
             .iter()
@@ -286,16 +307,24 @@ fn stamps_are_monotone_and_true(bus: &dyn Fixture) {
     let mut link = bus.play(&[], &sent);
     let received = exactly(&mut *link, sent.len());
     let after = now();
-    assert!(received.windows(2).all(|w| w[0].t <= w[1].t), "stamps run backwards");
+    assert!(
+        received.windows(2).all(|w| w[0].t <= w[1].t),
+        "stamps run backwards"
+    );
     if bus.live() {
         assert!(
             received
                 .iter()
                 .all(|f| matches!(f.stamp, StampKind::Software | StampKind::Hardware))
         );
-        // The kernel's clock is not the one that we read: what it takes to compare the two is what they may differ by.
+        // The kernel stamps with another clock; this tolerance covers the error of comparing the
+        // two.
         let tolerance = Nanos::from_millis(1);
-        assert!(received.iter().all(|f| f.t >= before - tolerance && f.t <= after));
+        assert!(
+            received
+                .iter()
+                .all(|f| f.t >= before - tolerance && f.t <= after)
+        );
     } else {
         assert!(received.iter().all(|f| f.stamp == StampKind::Log));
     }
@@ -309,14 +338,15 @@ fn deadlines_are_honoured(bus: &dyn Fixture) {
     for past in [deadline, Nanos::ZERO, Nanos(-5), Nanos::MIN] {
         assert_eq!(link.recv(past), Received::TimedOut);
     }
-    // What has arrived is handed out even if the deadline has passed.
+    // Frames that have arrived are returned even if the deadline has passed.
     let mut peer = bus.join(&[]);
-    peer.send(&Frame::new(Id::standard(1), &[]), now() + PATIENCE).unwrap();
+    peer.send(&Frame::new(Id::standard(1), &[]), now() + PATIENCE)
+        .unwrap();
     let give_up = now() + PATIENCE;
     while link.recv(Nanos::ZERO) == Received::TimedOut {
         assert!(now() < give_up, "it never arrives");
     }
-    // A frame whose time is over is not sent.
+    // A frame whose deadline has passed is not sent.
     let late = Frame::new(Id::standard(2), &[]);
     assert_eq!(peer.send(&late, now() - Nanos(1)), Err(SendError::Deadline));
     assert_eq!(peer.send(&late, Nanos::ZERO), Err(SendError::Deadline));
@@ -333,8 +363,14 @@ fn own_frames_do_not_come_back(bus: &dyn Fixture) {
         b.send(&of(2, i), now() + PATIENCE).unwrap();
     }
     let expected = |who| (0..40).map(|i| of(who, i)).collect::<Vec<_>>();
-    assert_eq!(exactly(&mut *a, 40).iter().map(bare).collect::<Vec<_>>(), expected(2));
-    assert_eq!(exactly(&mut *b, 40).iter().map(bare).collect::<Vec<_>>(), expected(1));
+    assert_eq!(
+        exactly(&mut *a, 40).iter().map(bare).collect::<Vec<_>>(),
+        expected(2)
+    );
+    assert_eq!(
+        exactly(&mut *b, 40).iter().map(bare).collect::<Vec<_>>(),
+        expected(1)
+    );
 }
 
 fn all_participants_see_the_same(bus: &dyn Fixture) {
@@ -359,7 +395,7 @@ fn all_participants_see_the_same(bus: &dyn Fixture) {
             "participant {i}"
         );
     }
-    // One that leaves does not disturb the others.
+    // A participant that leaves does not disturb the others.
     links.pop();
     links[0].send(&sent[0], now() + PATIENCE).unwrap();
     assert_eq!(bare(&frame(&mut *links[2])), sent[0]);
@@ -368,11 +404,14 @@ fn all_participants_see_the_same(bus: &dyn Fixture) {
 fn what_a_flood_drops_is_counted(bus: &dyn Fixture) {
     let mut link = bus.join(&[]);
     let mut peer = bus.join(&[]);
-    // More than the enlarged buffer holds; with fewer rights it is smaller.
+    // More than the enlarged buffer holds; without privileges it is smaller.
     let flood = 25_000_u64;
     for i in 0..flood {
-        peer.send(&Frame::new(Id::standard(1), &i.to_le_bytes()), now() + PATIENCE)
-            .unwrap();
+        peer.send(
+            &Frame::new(Id::standard(1), &i.to_le_bytes()),
+            now() + PATIENCE,
+        )
+        .unwrap();
     }
     let mut last = None;
     let mut drain = |link: &mut dyn Link| {
@@ -387,9 +426,12 @@ fn what_a_flood_drops_is_counted(bus: &dyn Fixture) {
     };
     let first = drain(&mut *link);
     assert!(first > 0 && first < flood, "{first} of {flood} fit");
-    // The count comes with what arrives after the loss.
-    peer.send(&Frame::new(Id::standard(1), &flood.to_le_bytes()), now() + PATIENCE)
-        .unwrap();
+    // The drop count arrives with the next frame after the loss.
+    peer.send(
+        &Frame::new(Id::standard(1), &flood.to_le_bytes()),
+        now() + PATIENCE,
+    )
+    .unwrap();
     assert_eq!(drain(&mut *link), 1);
     let counters = link.counters();
     assert_eq!(counters.received, first + 1);
@@ -400,7 +442,10 @@ fn what_a_flood_drops_is_counted(bus: &dyn Fixture) {
 fn what_can_not_be_sent_is_refused(bus: &dyn Fixture) {
     let mut link = bus.play(&[], &[]);
     let error = Frame::with_format(Id::extended(4), Format::Error, &[0; 8]).unwrap();
-    assert_eq!(link.send(&error, now() + PATIENCE), Err(SendError::Unsupported));
+    assert_eq!(
+        link.send(&error, now() + PATIENCE),
+        Err(SendError::Unsupported)
+    );
     if !bus.live() {
         assert_eq!(
             link.send(&Frame::new(Id::standard(1), &[]), now() + PATIENCE),
@@ -430,7 +475,7 @@ fn the_state_tells_whether_more_can_come(bus: &dyn Fixture) {
 
 type Property = fn(&dyn Fixture);
 
-/// What holds for every link.
+/// Properties of every link.
 const EVERY: [Property; 5] = [
     order_and_values_are_kept,
     exactly_the_claims_pass,
@@ -439,7 +484,7 @@ const EVERY: [Property; 5] = [
     the_state_tells_whether_more_can_come,
 ];
 
-/// What holds for links to a bus on which others are.
+/// Properties of links to a bus with other participants.
 const LIVE: [Property; 4] = [
     deadlines_are_honoured,
     own_frames_do_not_come_back,
@@ -468,7 +513,7 @@ fn the_virtual_bus_is_a_link() {
     }
 }
 
-/// Whether there are virtual CAN interfaces; says so if not.
+/// Whether there are virtual CAN interfaces; prints a note if not.
 fn vcan() -> bool {
     let there = std::env::var("PROPRIO_VCAN").is_ok_and(|v| v == "1");
     if !there {
@@ -488,7 +533,8 @@ fn socketcan_is_a_link() {
     }
 }
 
-// --- Replay alone --------------------------------------------------------------------------------------------------
+// --- Replay alone
+// --------------------------------------------------------------------------------------------
 
 #[test]
 fn a_log_at_its_pace_is_moved_to_now() {
@@ -509,11 +555,14 @@ fn a_log_at_its_pace_is_moved_to_now() {
     assert!(first.t >= before && first.t <= now());
     for ms in [5, 5] {
         let next = frame(&mut link);
-        assert_eq!((next.t - first.t, next.stamp), (Nanos::from_millis(ms), StampKind::Log));
+        assert_eq!(
+            (next.t - first.t, next.stamp),
+            (Nanos::from_millis(ms), StampKind::Log)
+        );
         assert!(now() >= next.t, "not before its time");
     }
     let deadline = now() + Nanos::from_millis(10);
-    // Unless the machine has slept, the last one is not due yet.
+    // Unless the machine was suspended, the last frame is not due yet.
     if deadline < first.t + Nanos::from_millis(200) {
         assert_eq!(link.recv(deadline), Received::TimedOut);
         assert!(now() >= deadline);
@@ -524,7 +573,7 @@ fn a_log_at_its_pace_is_moved_to_now() {
     assert_eq!(link.recv(now()), Received::Ended);
     assert_eq!(link.counters().received, 4);
 
-    // Several buses of one log stay in step, whenever each is first read.
+    // Several buses of one log stay in step, independent of when each is first read.
     let (start, path) = (now() - Nanos::from_millis(300), bus.write(&log));
     for _ in 0..2 {
         let mut link = Replay::open(&path, Pace::Recorded, None, &[]).unwrap();
@@ -537,10 +586,14 @@ fn a_log_at_its_pace_is_moved_to_now() {
 fn a_log_at_once_keeps_its_stamps_and_its_lack_of_them() {
     let bus = Log::new(Pace::Fast);
     let path = bus.write(
-        b"(1479121923.123456) can0 123#11\nrubbish\n  can0  123   [1]  22\n(1.5) can0 20000004#00\n(2.5) can0 123#33\n",
+        b"(1479121923.123456) can0 123#11\nrubbish\n  can0  123   [1]  22\n\
+          (1.5) can0 20000004#00\n(2.5) can0 123#33\n",
     );
     let mut link = Replay::open(&path, Pace::Fast, None, &[]).unwrap();
-    let stamps: Vec<_> = exactly(&mut link, 3).iter().map(|f| (f.t.0, f.stamp)).collect();
+    let stamps: Vec<_> = exactly(&mut link, 3)
+        .iter()
+        .map(|f| (f.t.0, f.stamp))
+        .collect();
     assert_eq!(
         stamps,
         [
@@ -550,10 +603,14 @@ fn a_log_at_once_keeps_its_stamps_and_its_lack_of_them() {
         ]
     );
     assert_eq!(
-        (link.report().bad, link.report().unstamped, link.counters().error_frames),
+        (
+            link.report().bad,
+            link.report().unstamped,
+            link.counters().error_frames
+        ),
         (1, 1, 1)
     );
-    // Without stamps there is no pace to keep.
+    // Without stamps the recorded pace is not possible.
     let path = bus.write(b"  can0  123   [1]  22\n");
     let error = Replay::open(&path, Pace::Recorded, None, &[]).unwrap_err();
     assert!(error.to_string().contains("no time stamps"), "{error}");
@@ -575,8 +632,14 @@ fn a_log_at_once_keeps_its_stamps_and_its_lack_of_them() {
 #[test]
 fn a_log_of_several_buses_is_taken_apart_by_interface_then_by_name() {
     let bus = Log::new(Pace::Fast);
-    let path = bus.write(b"(1.0) can0 001#\n(1.1) can1 002#\n(1.2) left 003#\n(1.3) other 004#\n(1.4) can0 005#\n");
-    let buses = [(Some("can0"), "left"), (Some("can1"), "can0"), (None, "right")];
+    let path = bus.write(
+        b"(1.0) can0 001#\n(1.1) can1 002#\n(1.2) left 003#\n(1.3) other 004#\n(1.4) can0 005#\n",
+    );
+    let buses = [
+        (Some("can0"), "left"),
+        (Some("can1"), "can0"),
+        (None, "right"),
+    ];
     let ids = |this, buses: &[_]| {
         let mut link = Replay::open(&path, Pace::Fast, Matching::of(buses, this), &[]).unwrap();
         let mut ids = Vec::new();
@@ -590,36 +653,50 @@ fn a_log_of_several_buses_is_taken_apart_by_interface_then_by_name() {
     assert_eq!(
         ids(1, &buses),
         [2],
-        "can0 is the other's interface, though it is this one's name"
+        "can0 is the other bus's interface, although it is this bus's name"
     );
     assert!(ids(2, &buses).is_empty());
     assert_eq!(ids(0, &buses[..1]), [1, 2, 3, 4, 5], "one bus takes all");
 }
 
-// --- The virtual bus alone -------------------------------------------------------------------------------------------
+// --- The virtual bus alone
+// -------------------------------------------------------------------------------------------
 
 #[test]
 fn virtual_buses_do_not_mix() {
     let domain = format!("mix-{}", unique());
-    let mut links: Vec<VirtualBus> = [(&*domain, "a"), (&*domain, "b"), ("another", "a"), (&*domain, "a")]
-        .into_iter()
-        .map(|(domain, name)| VirtualBus::open(domain, name, &[]).unwrap())
-        .collect();
+    let mut links: Vec<VirtualBus> = [
+        (&*domain, "a"),
+        (&*domain, "b"),
+        ("another", "a"),
+        (&*domain, "a"),
+    ]
+    .into_iter()
+    .map(|(domain, name)| VirtualBus::open(domain, name, &[]).unwrap())
+    .collect();
     links[0]
         .send(&Frame::new(Id::standard(1), &[]), now() + PATIENCE)
         .unwrap();
     assert_eq!(exactly(&mut links[3], 1).len(), 1);
     silent(&mut links[1]);
     silent(&mut links[2]);
-    for (domain, name) in [("d", ""), ("d", "a\0b"), ("a\0b", "c"), (&*"d".repeat(200), "a")] {
+    for (domain, name) in [
+        ("d", ""),
+        ("d", "a\0b"),
+        ("a\0b", "c"),
+        (&*"d".repeat(200), "a"),
+    ] {
         assert!(
-            matches!(VirtualBus::open(domain, name, &[]), Err(OpenError::System { .. })),
+            matches!(
+                VirtualBus::open(domain, name, &[]),
+                Err(OpenError::System { .. })
+            ),
             "{name:?}"
         );
     }
 }
 
-/// Where nothing is up but the loopback interface: no route for multicast leads anywhere.
+/// A namespace with only the loopback interface up: there is no route for multicast.
 #[test]
 fn the_virtual_bus_needs_only_the_loopback_interface() {
     const INSIDE: &str = "PROPRIO_TEST_LOOPBACK_ONLY";
@@ -645,7 +722,7 @@ fn the_virtual_bus_needs_only_the_loopback_interface() {
         &["--user", "--map-root-user"]
     };
     if !inside(unshare, &["true".as_ref()]).is_ok_and(|o| o.status.success()) {
-        println!("skipped: no right to make a network namespace");
+        println!("skipped: no permission to create a network namespace");
         return;
     }
     let me = std::env::current_exe().unwrap();
@@ -664,9 +741,10 @@ fn the_virtual_bus_needs_only_the_loopback_interface() {
     );
 }
 
-// --- SocketCAN alone -------------------------------------------------------------------------------------------------
+// --- SocketCAN alone
+// -------------------------------------------------------------------------------------------------
 
-/// An interface of this test's own, which it may take down.
+/// A separate interface for this test, which it may take down.
 struct OwnInterface {
     name: String,
 }
@@ -674,7 +752,11 @@ struct OwnInterface {
 impl OwnInterface {
     fn new() -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
-        let name = format!("pv{}.{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let name = format!(
+            "pv{}.{}",
+            std::process::id(),
+            COUNT.fetch_add(1, Ordering::Relaxed)
+        );
         let own = Self { name };
         own.create();
         own
@@ -689,7 +771,10 @@ impl OwnInterface {
         let words = words
             .split(' ')
             .map(|word| if word == "NAME" { &*self.name } else { word });
-        let path = format!("{}:/usr/sbin:/sbin", std::env::var("PATH").unwrap_or_default());
+        let path = format!(
+            "{}:/usr/sbin:/sbin",
+            std::env::var("PATH").unwrap_or_default()
+        );
         assert!(
             Command::new("ip")
                 .args(words)
@@ -725,7 +810,11 @@ fn changes_to(link: &mut dyn Link, state: LinkState) {
             matches!(received, Received::TimedOut | Received::StateChanged),
             "{received:?}"
         );
-        assert!(now() < give_up, "still {:?} instead of {state:?}", link.state());
+        assert!(
+            now() < give_up,
+            "still {:?} instead of {state:?}",
+            link.state()
+        );
     }
 }
 
@@ -745,7 +834,10 @@ fn a_lost_interface_is_told_and_found_again() {
     assert_eq!(link.state(), LinkState::Down);
     assert_eq!(link.send(&wanted, now() + PATIENCE), Err(SendError::NotUp));
     // Down from the start.
-    assert_eq!(SocketCan::open(&own.name, &[]).unwrap().state(), LinkState::Down);
+    assert_eq!(
+        SocketCan::open(&own.name, &[]).unwrap().state(),
+        LinkState::Down
+    );
     silent(&mut link);
     own.ip("link set dev NAME up");
     changes_to(&mut link, LinkState::Up);
@@ -771,14 +863,14 @@ fn a_lost_interface_is_told_and_found_again() {
         assert_eq!(bare(&frame(&mut link)), wanted);
         silent(&mut link);
     }
-    // Found by sending, told by receiving.
+    // Detected when sending, reported when receiving.
     own.ip("link del dev NAME");
     assert_eq!(link.send(&wanted, now() + PATIENCE), Err(SendError::NotUp));
     assert_eq!(
         (link.state(), link.recv(Nanos::ZERO)),
         (LinkState::Gone, Received::StateChanged)
     );
-    // Made anew, but down.
+    // Created again, but down.
     own.ip("link add dev NAME type vcan");
     changes_to(&mut link, LinkState::Down);
     own.ip("link set dev NAME mtu 16 up");
@@ -808,7 +900,7 @@ fn error_frames_set_the_state() {
     }
     let own = OwnInterface::new();
     let mut link = SocketCan::open(&own.name, &[Claim::exclusive(Id::standard(7))]).unwrap();
-    // The interface's driver sends these; on a virtual one anybody may.
+    // A driver sends these frames; on a virtual interface any program may.
     let error = |classes: &str| {
         let frame = format!("{classes}#0000000000000000");
         assert!(
@@ -821,7 +913,10 @@ fn error_frames_set_the_state() {
     };
     error("20000004");
     silent(&mut link);
-    assert_eq!((link.state(), link.counters().error_frames), (LinkState::Up, 1));
+    assert_eq!(
+        (link.state(), link.counters().error_frames),
+        (LinkState::Up, 1)
+    );
     error("20000040");
     assert_eq!(link.recv(now() + PATIENCE), Received::StateChanged);
     assert_eq!(link.state(), LinkState::BusOff);
@@ -832,12 +927,12 @@ fn error_frames_set_the_state() {
     error("20000100");
     assert_eq!(link.recv(now() + PATIENCE), Received::StateChanged);
     assert_eq!(link.state(), LinkState::Up);
-    // So does a controller that counts its errors again, having restarted by itself.
+    // A controller that has restarted automatically and counts errors again is up too.
     error("20000040");
     changes_to(&mut link, LinkState::BusOff);
     error("20000004");
     changes_to(&mut link, LinkState::Up);
-    // Frames that come tell it as well; none is lost for the telling.
+    // Received frames show it as well, and none of them is lost.
     error("20000040");
     changes_to(&mut link, LinkState::BusOff);
     let wanted = Frame::new(Id::standard(7), &[1]);
@@ -848,7 +943,10 @@ fn error_frames_set_the_state() {
     );
     assert_eq!(bare(&frame(&mut link)), wanted);
     let counters = link.counters();
-    assert_eq!((counters.error_frames, counters.losses, counters.received), (6, 3, 1));
+    assert_eq!(
+        (counters.error_frames, counters.losses, counters.received),
+        (6, 3, 1)
+    );
 }
 
 #[test]
@@ -856,9 +954,18 @@ fn what_can_not_be_opened_is_explained() {
     let missing = SocketCan::open("nosuchcan0", &[]).unwrap_err();
     assert!(missing.to_string().contains("virtual"), "{missing}");
     if vcan() {
-        assert!(matches!(missing, OpenError::NoInterface { .. }), "{missing}");
-        assert!(matches!(SocketCan::open("lo", &[]), Err(OpenError::NotCan { .. })));
-        assert!(matches!(SocketCan::open("", &[]), Err(OpenError::NoInterface { .. })));
+        assert!(
+            matches!(missing, OpenError::NoInterface { .. }),
+            "{missing}"
+        );
+        assert!(matches!(
+            SocketCan::open("lo", &[]),
+            Err(OpenError::NotCan { .. })
+        ));
+        assert!(matches!(
+            SocketCan::open("", &[]),
+            Err(OpenError::NoInterface { .. })
+        ));
         assert!(matches!(
             SocketCan::open("much-too-long-for-an-interface", &[]),
             Err(OpenError::NoInterface { .. })
@@ -868,7 +975,7 @@ fn what_can_not_be_opened_is_explained() {
 
 #[test]
 fn a_past_deadline_does_not_sleep() {
-    // `sleep_until` with instants that no clock will show again.
+    // `sleep_until` with instants in the past.
     for past in [Nanos::MIN, Nanos(-1), Nanos::ZERO, Nanos(1)] {
         sleep_until(past);
     }

@@ -1,4 +1,5 @@
-//! A bus loop that could not run for a while: what has arrived meanwhile is read before anybody is called silent.
+//! A stalled bus loop reads the frames that have arrived meanwhile before it reports a device as
+//! silent.
 
 use proprio_drivers::{Frame, Id};
 use proprio_gateway::bus::Bus;
@@ -13,7 +14,7 @@ use std::collections::VecDeque;
 use std::path::Path;
 use std::sync::Arc;
 
-/// A link that hands out what was put into it, and sends into the void.
+/// A link that returns prepared frames and discards sent ones.
 struct Script {
     frames: VecDeque<Frame>,
     sent: u64,
@@ -21,7 +22,9 @@ struct Script {
 
 impl Link for Script {
     fn recv(&mut self, _: Nanos) -> Received {
-        self.frames.pop_front().map_or(Received::TimedOut, Received::Frame)
+        self.frames
+            .pop_front()
+            .map_or(Received::TimedOut, Received::Frame)
     }
     fn send(&mut self, _: &Frame, _: Nanos) -> Result<(), SendError> {
         self.sent += 1;
@@ -63,9 +66,13 @@ fn a_backlog_is_no_silence() {
     // A second of wrenches, 10 ms apart; the loop runs for the first 0.2 s, then not for 0.8 s.
     let frames = (0..100).flat_map(|i| {
         let t = start + Nanos::from_millis(10 * i + 1);
-        let force = Frame::new(Id::standard(0x31A), &[0, 0x80, 0, 0x80, 0, 0x80]).at(t, StampKind::Software);
+        let force = Frame::new(Id::standard(0x31A), &[0, 0x80, 0, 0x80, 0, 0x80])
+            .at(t, StampKind::Software);
         let torque = Frame::new(Id::standard(0x31B), &[0, 0x80, 0, 0x80, 0, 0x80]);
-        [force, torque.at(t + Nanos::from_micros(130), StampKind::Software)]
+        [
+            force,
+            torque.at(t + Nanos::from_micros(130), StampKind::Software),
+        ]
     });
     let mut bus = Bus::new(
         Box::new(Script {
@@ -76,7 +83,12 @@ fn a_backlog_is_no_silence() {
         Memory::default(),
         Arc::clone(&status),
     );
-    let count = |counter: Counter| status.devices().next().map_or(0, |d| d.counters[counter as usize]);
+    let count = |counter: Counter| {
+        status
+            .devices()
+            .next()
+            .map_or(0, |d| d.counters[counter as usize])
+    };
     for i in 0..40 {
         clock.set(start + Nanos::from_millis(5 * i + 2));
         bus.turn(&clock);
@@ -87,9 +99,12 @@ fn a_backlog_is_no_silence() {
     for _ in 0..400 {
         bus.turn(&clock);
     }
-    assert_eq!((count(Counter::Silences), count(Counter::Starts)), (0, starts));
+    assert_eq!(
+        (count(Counter::Silences), count(Counter::Starts)),
+        (0, starts)
+    );
     assert_eq!(count(Counter::Readings), 100);
-    // A real silence is one.
+    // A real silence is reported.
     clock.set(start + Nanos::from_millis(1200));
     bus.turn(&clock);
     assert_eq!(count(Counter::Silences), 1);

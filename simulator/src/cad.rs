@@ -1,34 +1,40 @@
-//! A CAD that is wrong: the robot's URDF with other masses, first moments and inertias, each still of a body that can exist. For whoever wants to see what identification is worth:
-//! the robot has the URDF's inertias, the estimator is given these.
+//! A deliberately wrong CAD: the robot's URDF with other masses, first moments and inertias, each
+//! still physically possible. It shows the benefit of identification: the robot has the URDF's
+//! inertias, and the estimator gets these.
 
 use crate::noise::Random;
 use crate::robot::{Robot, RobotError};
-use crate::simulator::Settings;
+use crate::settings::Settings;
 use crate::truth::Simulation;
-use proprio_estimator::model::Model;
-use proprio_estimator::spatial::{Mat3, Pose, RigidInertia, Vec3};
+use proprio_dynamics::model::Model;
+use proprio_dynamics::spatial::{Mat3, Pose, RigidInertia, Vec3};
 
-/// How many such URDFs are drawn, at the most, until one is wrong enough.
+/// Maximum number of URDFs drawn until one is wrong enough.
 const DRAWS: usize = 300;
-/// The RMS error of each joint's torque by a URDF that is wrong enough, by the RMS of the torque: errors of neighbouring links may cancel, and there would be nothing to see.
+/// Minimum RMS error of each joint's torque, relative to the RMS of the torque, for a URDF that is
+/// wrong enough: errors of neighbouring links may cancel and would then not show.
 const ENOUGH: f64 = 0.1;
-/// At so many instants of the motion torques are compared, so far apart \[s\].
+/// Number of instants at which torques are compared, and their interval \[s\].
 const INSTANTS: (u32, f64) = (25, 0.9);
 
-/// The URDF of `robot` with every inertia off by the share `relative` (0 to 0.5), drawn from `settings.seed`: of each body its mass, each component of its first moment and each
-/// principal second moment about its centre of mass, up or down, and its principal axes turned by about as many radians. Bodies joined by fixed joints are one body.
+/// The URDF of `robot` with all inertias wrong by the fraction `relative` (0 to 0.5), up or down,
+/// drawn from `settings.seed`. This applies to each body's mass, each component of its first moment
+/// and each principal second moment about its centre of mass. Its principal axes are turned by
+/// about `relative` radians. Bodies connected by fixed joints are one body.
 ///
-/// Drawn again until, in every joint, the torques of the motion that `settings` describes are off by a tenth of their RMS (by `relative / 2` if that is less).
+/// Drawn again until, in every joint, the torques of the motion given by `settings` are wrong by a
+/// tenth of their RMS (by `relative / 2` if that is less).
 ///
 /// # Errors
-/// [`RobotError`]: the robot can not be simulated, or its URDF not be read.
+/// [`RobotError`]: the robot cannot be simulated, or its URDF cannot be read.
 pub fn wrong_urdf(robot: &Robot, settings: &Settings, relative: f64) -> Result<String, RobotError> {
     let file = &robot.config.model;
     let wrong = |cause| RobotError::Model {
         file: file.clone(),
         cause: Box::new(cause),
     };
-    let text = std::fs::read_to_string(file).map_err(|e| robot.mismatch(format!("{}: {e}", file.display())))?;
+    let text = std::fs::read_to_string(file)
+        .map_err(|e| robot.mismatch(format!("{}: {e}", file.display())))?;
     let truth = torques(robot, settings)?;
     let enough = ENOUGH.min(0.5 * relative);
     let mut best: Option<(f64, Model)> = None;
@@ -39,7 +45,7 @@ pub fn wrong_urdf(robot: &Robot, settings: &Settings, relative: f64) -> Result<S
             let body = another_body(inertia, relative, &mut random);
             other.model.set_inertia(link, body).map_err(wrong)?;
         }
-        // Of the joint whose torque is least wrong.
+        // The relative error of the joint with the smallest error.
         let least = torques(&other, settings)?
             .iter()
             .zip(&truth)
@@ -56,12 +62,17 @@ pub fn wrong_urdf(robot: &Robot, settings: &Settings, relative: f64) -> Result<S
             break;
         }
     }
-    let keep: Vec<&str> = robot.config.force_torque.iter().map(|ft| ft.joint.as_str()).collect();
+    let keep: Vec<&str> = robot
+        .config
+        .force_torque
+        .iter()
+        .map(|ft| ft.joint.as_str())
+        .collect();
     let model = best.map_or_else(|| robot.model.clone(), |(_, model)| model);
     Model::rewrite_urdf(&text, &keep, model.inertias()).map_err(wrong)
 }
 
-/// Per joint its torque at some instants of the motion, untouched.
+/// Per joint, its torque at the instants compared, without pushes.
 fn torques(robot: &Robot, settings: &Settings) -> Result<Vec<Vec<f64>>, RobotError> {
     let settings = Settings {
         push: false,
@@ -79,21 +90,34 @@ fn torques(robot: &Robot, settings: &Settings) -> Result<Vec<Vec<f64>>, RobotErr
     Ok(torques)
 }
 
-/// A body somewhat like this one, and as possible.
+/// A similar body that is also physically possible.
 fn another_body(body: &RigidInertia, relative: f64, random: &mut Random) -> RigidInertia {
-    let mut off = || if random.happens(0.5) { relative } else { -relative };
+    let mut off = || {
+        if random.happens(0.5) {
+            relative
+        } else {
+            -relative
+        }
+    };
     let Some(centre) = body.centre() else {
         return *body;
     };
     let mass = body.mass * (1.0 + off());
     let first_moment = body.first_moment.map(|h| h * (1.0 + off()));
-    let about_centre =
-        body.inertia - (Mat3::from_diagonal_element(centre.dot(&centre)) - centre * centre.transpose()) * body.mass;
-    // Second moments of the mass, not moments of inertia: whatever positive numbers these are, they are a body's.
+    let about_centre = body.inertia
+        - (Mat3::from_diagonal_element(centre.dot(&centre)) - centre * centre.transpose())
+            * body.mass;
+    // Second moments of the mass, not moments of inertia: any positive values are physically
+    // possible.
     let spread = Mat3::from_diagonal_element(about_centre.trace() / 2.0) - about_centre;
     let principal = spread.symmetric_eigen();
-    let extents: Vec3 = principal.eigenvalues.map(|extent| extent.max(0.0) * (1.0 + off()));
-    let turn = Pose::from_xyz_rpy([0.0; 3], [off(), off(), off()].map(|angle| angle / 3.0_f64.sqrt()));
+    let extents: Vec3 = principal
+        .eigenvalues
+        .map(|extent| extent.max(0.0) * (1.0 + off()));
+    let turn = Pose::from_xyz_rpy(
+        [0.0; 3],
+        [off(), off(), off()].map(|angle| angle / 3.0_f64.sqrt()),
+    );
     let axes = turn.rotation * principal.eigenvectors;
     let spread = axes * Mat3::from_diagonal(&extents) * axes.transpose();
     let inertia = Mat3::from_diagonal_element(spread.trace()) - spread;
@@ -105,7 +129,12 @@ mod tests {
     use super::*;
 
     fn model(robot: &Robot, text: &str) -> Model {
-        let keep: Vec<&str> = robot.config.force_torque.iter().map(|ft| ft.joint.as_str()).collect();
+        let keep: Vec<&str> = robot
+            .config
+            .force_torque
+            .iter()
+            .map(|ft| ft.joint.as_str())
+            .collect();
         Model::from_urdf(text, &keep).unwrap()
     }
 
@@ -115,23 +144,35 @@ mod tests {
         let text = wrong_urdf(&robot, &Settings::default(), 0.2).unwrap();
         let wrong = model(&robot, &text);
         assert_eq!(wrong.link_count(), robot.model.link_count());
-        for (link, (body, truth)) in wrong.inertias().iter().zip(robot.model.inertias()).enumerate() {
+        for (link, (body, truth)) in wrong
+            .inertias()
+            .iter()
+            .zip(robot.model.inertias())
+            .enumerate()
+        {
             let name = wrong.link_name(link);
             if truth.mass == 0.0 {
                 assert_eq!(body, truth, "{name}");
                 continue;
             }
-            body.check(1e-9).unwrap_or_else(|why| panic!("{name}: {why:?}"));
-            assert!(((body.mass / truth.mass - 1.0).abs() - 0.2).abs() < 1e-9, "{name}");
+            body.check(1e-9)
+                .unwrap_or_else(|why| panic!("{name}: {why:?}"));
+            assert!(
+                ((body.mass / truth.mass - 1.0).abs() - 0.2).abs() < 1e-9,
+                "{name}"
+            );
             for (h, true_h) in body.first_moment.iter().zip(&truth.first_moment) {
-                assert!(((h - true_h).abs() - 0.2 * true_h.abs()).abs() < 1e-9, "{name}");
+                assert!(
+                    ((h - true_h).abs() - 0.2 * true_h.abs()).abs() < 1e-9,
+                    "{name}"
+                );
             }
             assert!(
                 (body.inertia - truth.inertia).norm() > 0.01 * truth.inertia.norm(),
                 "{name}"
             );
         }
-        // Everything else is the robot's: geometry, limits, sensors.
+        // Everything else is unchanged: geometry, limits, sensors.
         assert_eq!(wrong.joints(), robot.model.joints());
     }
 
@@ -151,7 +192,10 @@ mod tests {
             );
             let mut other = robot.clone();
             other.model = model(&robot, &text);
-            let (wrong, truth) = (torques(&other, &settings).unwrap(), torques(&robot, &settings).unwrap());
+            let (wrong, truth) = (
+                torques(&other, &settings).unwrap(),
+                torques(&robot, &settings).unwrap(),
+            );
             for ((wrong, truth), joint) in wrong.iter().zip(&truth).zip(0..) {
                 let off: f64 = wrong.iter().zip(truth).map(|(a, b)| (a - b).powi(2)).sum();
                 let size: f64 = truth.iter().map(|b| b * b).sum();

@@ -1,17 +1,20 @@
-//! Faults on request: what the simulated boards and buses do wrong, and when.
+//! Faults of the simulated boards and buses on request.
 //!
-//! | text | what happens |
+//! | text | effect |
 //! |---|---|
-//! | `lost:0.01` | every frame is lost with this probability; with `@2..8` only then |
-//! | `silent:l_arm_ft_sensor@3..4` | the board neither sends nor listens; afterwards it goes on where it was |
-//! | `reboot:l_arm_ft_sensor@5` | the board is gone for half a second, then as after power-on: it waits to be started |
-//! | `saturate:l_arm_ft_sensor@5..5.5` | a gauge is at its upper end: flagged, and the values frozen, as strain boards do |
-//! | `spike:l_arm_ft_sensor@6` | one reading is off by 200 N and 5 Nm on every axis |
-//! | `late_half:l_arm_ft_sensor@2..8` | about one reading in ten has its second half come late: just behind the next reading's first; with `@6` one reading |
-//! | `push:l_forearm=20@8..9` | a force of 20 N pushes this link of the URDF, at its origin along its x axis, and nobody declares it |
+//! | `lost:0.01` | every frame is lost with this probability; with `@2..8` only in that time |
+//! | `silent:BOARD@3..4` | the board neither sends nor listens, then continues |
+//! | `reboot:BOARD@5` | the board is off for half a second, then waits to be started |
+//! | `saturate:BOARD@5..5.5` | a gauge is at its upper end: flagged, values frozen |
+//! | `spike:BOARD@6` | one reading is wrong by 200 N and 5 Nm on every axis |
+//! | `late_half:BOARD@2..8` | second halves of about one reading in ten are late |
+//! | `push:l_forearm=20@8..9` | an undeclared force of 20 N pushes this link of the URDF |
 //!
-//! Times are seconds since the simulation began; an end may be left out (`5..`). A board is named as in gateway.toml, or by
-//! one of its channels.
+//! A late half follows just after the next reading's first half; `late_half:BOARD@6` delays one
+//! reading. A push acts at the link's origin along its x axis.
+//!
+//! Times are seconds since the start of the simulation; the end may be omitted (`5..`). BOARD is
+//! the board's name in gateway.toml or the name of one of its channels.
 
 use std::fmt;
 use std::str::FromStr;
@@ -21,7 +24,7 @@ use std::str::FromStr;
 pub enum Fault {
     /// Frames are lost on all buses.
     Lost {
-        /// Of each frame, 0 to 1.
+        /// Probability for each frame, 0 to 1.
         probability: f64,
         /// When.
         window: Window,
@@ -47,82 +50,86 @@ pub enum Fault {
         /// When.
         window: Window,
     },
-    /// One F/T reading is far off.
+    /// One F/T reading is far from the truth.
     Spike {
         /// Whose.
         device: String,
         /// When \[s\].
         at: f64,
     },
-    /// Second halves of readings come late.
+    /// Second halves of readings are late.
     LateHalf {
         /// Whose.
         device: String,
         /// When.
         window: Window,
-        /// Only the first reading in it.
+        /// Only the first reading in the window.
         once: bool,
     },
-    /// Something pushes the robot, and nobody declares it.
+    /// An undeclared force pushes the robot.
     Push {
-        /// Which link of the URDF, at its origin and along its x axis.
+        /// The link of the URDF; the force acts at its origin along its x axis.
         link: String,
-        /// How hard \[N\].
+        /// The force \[N\].
         force: f64,
         /// When.
         window: Window,
     },
 }
 
-/// From when until when, in seconds since the simulation began; the end does not belong to it.
+/// A time window in seconds since the start of the simulation, excluding its end.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Window {
-    /// The first instant \[s\].
+    /// Start \[s\].
     pub from: f64,
-    /// The first instant after it \[s\]; infinite if it never ends.
+    /// End \[s\], excluded; infinite if the window never ends.
     pub until: f64,
 }
 
 impl Window {
-    /// All the time.
+    /// The whole simulation.
     pub const ALWAYS: Self = Self {
         from: 0.0,
         until: f64::INFINITY,
     };
 
-    /// Whether `t` \[s\] is in it.
+    /// Whether `t` \[s\] is in the window.
     #[must_use]
     pub fn contains(&self, t: f64) -> bool {
         t >= self.from && t < self.until
     }
 }
 
-/// A fault that can not be understood or can not happen to this robot.
+/// A fault that is not valid or not possible for this robot.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum FaultError {
-    /// No such fault.
+    /// The kind of fault is not known.
     #[error(
-        "fault {text:?}: {kind:?} is not known; there is lost, silent, reboot, saturate, spike, late_half, push; for example {EXAMPLES}"
+        "fault {text:?}: {kind:?} is not known; known are lost, silent, reboot, saturate, spike, \
+         late_half, push; for example {EXAMPLES}"
     )]
     Kind {
         /// What was typed.
         text: String,
-        /// Its first word.
+        /// Its kind.
         kind: String,
     },
-    /// It is not complete.
+    /// Its form is wrong.
     #[error("fault {text:?}: it must have the form {form}, for example {example}")]
     Form {
         /// What was typed.
         text: String,
-        /// What would be legal.
+        /// The legal form.
         form: &'static str,
         /// An example.
         example: &'static str,
     },
-    /// No such board.
-    #[error("fault {fault}: this robot has no board or channel {device:?}; there is {}", known.join(", "))]
+    /// The robot has no such board.
+    #[error(
+        "fault {fault}: this robot has no board or channel {device:?}; it has {}",
+        known.join(", ")
+    )]
     Device {
         /// The fault.
         fault: String,
@@ -131,22 +138,23 @@ pub enum FaultError {
         /// The boards.
         known: Vec<String>,
     },
-    /// A board to which this can not happen.
+    /// This fault is not possible for this board.
     #[error("fault {fault}: {device:?} is not {needed}")]
     NotPossible {
         /// The fault.
         fault: String,
         /// Whose it should be.
         device: String,
-        /// What it would have to be.
+        /// The kind of board that the fault needs.
         needed: &'static str,
     },
 }
 
-const EXAMPLES: &str = "\"lost:0.01\", \"silent:l_arm_ft_sensor@3..4\", \"spike:l_arm_ft_sensor@6\"";
+const EXAMPLES: &str =
+    "\"lost:0.01\", \"silent:l_arm_ft_sensor@3..4\", \"spike:l_arm_ft_sensor@6\"";
 
 impl Fault {
-    /// The board that it is about.
+    /// The board concerned.
     #[must_use]
     pub fn device(&self) -> Option<&str> {
         match self {
@@ -162,7 +170,10 @@ impl Fault {
 
 /// `5`, as seconds.
 fn instant(text: &str) -> Option<f64> {
-    text.trim().parse().ok().filter(|t: &f64| t.is_finite() && *t >= 0.0)
+    text.trim()
+        .parse()
+        .ok()
+        .filter(|t: &f64| t.is_finite() && *t >= 0.0)
 }
 
 /// `3..4` or `3..`.
@@ -200,7 +211,10 @@ impl FromStr for Fault {
                 let probability = what.parse().ok().filter(|p: &f64| (0.0..=1.0).contains(p));
                 let window = when.map_or(Some(Window::ALWAYS), window);
                 match (probability, window) {
-                    (Some(probability), Some(window)) => Ok(Self::Lost { probability, window }),
+                    (Some(probability), Some(window)) => Ok(Self::Lost {
+                        probability,
+                        window,
+                    }),
                     _ => Err(form(
                         "lost:PROBABILITY[@FROM..UNTIL] with a probability from 0 to 1",
                         "\"lost:0.01\"",
@@ -209,10 +223,20 @@ impl FromStr for Fault {
             }
             "silent" => span
                 .map(|window| Self::Silent { device, window })
-                .ok_or_else(|| form("silent:BOARD@FROM..UNTIL", "\"silent:l_arm_ft_sensor@3..4\"")),
+                .ok_or_else(|| {
+                    form(
+                        "silent:BOARD@FROM..UNTIL",
+                        "\"silent:l_arm_ft_sensor@3..4\"",
+                    )
+                }),
             "saturate" => span
                 .map(|window| Self::Saturate { device, window })
-                .ok_or_else(|| form("saturate:BOARD@FROM..UNTIL", "\"saturate:l_arm_ft_sensor@5..5.5\"")),
+                .ok_or_else(|| {
+                    form(
+                        "saturate:BOARD@FROM..UNTIL",
+                        "\"saturate:l_arm_ft_sensor@5..5.5\"",
+                    )
+                }),
             "reboot" => moment
                 .map(|at| Self::Reboot { device, at })
                 .ok_or_else(|| form("reboot:BOARD@TIME", "\"reboot:l_arm_ft_sensor@5\"")),
@@ -240,14 +264,21 @@ impl FromStr for Fault {
             },
             "push" => {
                 let (link, force) = what.split_once('=').unwrap_or_default();
-                let force = force.trim().parse().ok().filter(|force: &f64| force.is_finite());
+                let force = force
+                    .trim()
+                    .parse()
+                    .ok()
+                    .filter(|force: &f64| force.is_finite());
                 match (span, force) {
                     (Some(window), Some(force)) if !link.is_empty() => Ok(Self::Push {
                         link: link.to_owned(),
                         force,
                         window,
                     }),
-                    _ => Err(form("push:LINK=NEWTONS@FROM..UNTIL", "\"push:l_forearm=20@8..9\"")),
+                    _ => Err(form(
+                        "push:LINK=NEWTONS@FROM..UNTIL",
+                        "\"push:l_forearm=20@8..9\"",
+                    )),
                 }
             }
             _ => Err(FaultError::Kind {
@@ -269,11 +300,17 @@ impl fmt::Display for Window {
 }
 
 impl fmt::Display for Fault {
-    /// As it is typed.
+    /// The fault in its text form.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Lost { probability, window } if *window == Window::ALWAYS => write!(f, "lost:{probability}"),
-            Self::Lost { probability, window } => write!(f, "lost:{probability}@{window}"),
+            Self::Lost {
+                probability,
+                window,
+            } if *window == Window::ALWAYS => write!(f, "lost:{probability}"),
+            Self::Lost {
+                probability,
+                window,
+            } => write!(f, "lost:{probability}@{window}"),
             Self::Silent { device, window } => write!(f, "silent:{device}@{window}"),
             Self::Reboot { device, at } => write!(f, "reboot:{device}@{at}"),
             Self::Saturate { device, window } => write!(f, "saturate:{device}@{window}"),
@@ -288,7 +325,11 @@ impl fmt::Display for Fault {
                 window,
                 once: false,
             } => write!(f, "late_half:{device}@{window}"),
-            Self::Push { link, force, window } => write!(f, "push:{link}={force}@{window}"),
+            Self::Push {
+                link,
+                force,
+                window,
+            } => write!(f, "push:{link}={force}@{window}"),
         }
     }
 }
@@ -319,7 +360,10 @@ mod tests {
     #[test]
     fn each_mistake_is_answered_with_what_would_be_legal() {
         for (text, expected) in [
-            ("lose:0.1", "\"lose\" is not known; there is lost, silent, reboot"),
+            (
+                "lose:0.1",
+                "\"lose\" is not known; known are lost, silent, reboot",
+            ),
             ("lost:1.5", "lost:PROBABILITY"),
             ("lost", "lost:PROBABILITY"),
             ("lost:0.1@4..3", "lost:PROBABILITY"),

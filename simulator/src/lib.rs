@@ -1,17 +1,24 @@
-//! A simulated robot whose boards speak CAN: they answer the commands that start the real ones, stream with realistic rates,
-//! quantisation and noise, and fail on request. What really happens, torques included, is known.
+//! A simulated robot with CAN boards. The boards answer the start commands of the real ones, stream
+//! with realistic rates, quantisation and noise, and fail on request. The true motion, torques and
+//! wrenches are known.
 //!
 //! ```text
 //! Robot (gateway.toml, estimator.toml, URDF)
-//!   -> Trajectory, from a seed -> Simulation: the truth at any instant -> Simulator: boards, noise, faults -> buses
+//!   -> Trajectory, from a seed
+//!   -> Simulation: the truth at any instant
+//!   -> Simulator: boards, noise, faults
+//!   -> buses
 //! ```
 //!
-//! - [`robot`]: the three files, found by the robot's name.
-//! - [`trajectory`]: how the joints move; [`truth`]: what every sensor would read without noise, through the estimator's own
-//!   dynamics (which are checked against three others in `tests/oracle`).
-//! - [`simulator`]: the boards, without links and without a clock; [`fault`]: what can be made to go wrong.
-//! - [`mod@cad`]: a URDF that is wrong, for the estimator.
-//! - [`mod@run`]: live, on CAN interfaces or virtual buses; [`record`]: offline, a whole session as a CAN log.
+//! - [`robot`]: loads the three files by the robot's name.
+//! - [`trajectory`]: the motion of the joints; [`truth`]: the noise-free readings of all sensors,
+//!   computed with the estimator's own dynamics (which `tests/oracle` checks against three other
+//!   libraries).
+//! - [`settings`]: the settings of a simulation.
+//! - [`simulator`]: the boards, without links and without a clock; [`fault`]: faults on request.
+//! - [`mod@cad`]: a deliberately wrong URDF for the estimator.
+//! - [`mod@run`]: live, on CAN interfaces or virtual buses; [`record`]: offline, a whole session as
+//!   a CAN log.
 
 pub mod cad;
 pub mod fault;
@@ -19,6 +26,7 @@ mod noise;
 pub mod record;
 pub mod robot;
 pub mod run;
+pub mod settings;
 pub mod simulator;
 pub mod trajectory;
 pub mod truth;
@@ -26,6 +34,9 @@ pub mod truth;
 pub use cad::wrong_urdf;
 pub use fault::{Fault, FaultError};
 pub use robot::{Robot, RobotError};
-pub use run::{Options, OptionsError, Skin, Summary, is_configuration, parse_bus, run, run_with_skin};
-pub use simulator::{Settings, Simulator, SimulatorError};
+pub use run::{
+    Options, OptionsError, Skin, Summary, is_configuration, parse_bus, run, run_with_skin,
+};
+pub use settings::Settings;
+pub use simulator::{Simulator, SimulatorError};
 pub use truth::{Simulation, Touch, Truth};

@@ -1,18 +1,19 @@
-//! Random numbers from a seed: the same seed gives the same robot, motion and noise. Each user has a stream of its own, so
-//! that nothing depends on the order in which boards or threads draw.
+//! Random numbers from a seed: the same seed gives the same robot, motion and noise. Each purpose
+//! has a separate stream, so that the result does not depend on the order in which boards or
+//! threads draw.
 
 /// A stream of random numbers.
 #[derive(Debug, Clone)]
 pub(crate) struct Random {
     generator: fastrand::Rng,
-    /// Normal numbers come in pairs.
+    /// The second number of a pair of normal numbers.
     spare: Option<f64>,
 }
 
 impl Random {
     /// Stream number `stream` of `seed`, for purpose `purpose`.
     pub(crate) fn new(seed: u64, purpose: &str, stream: usize) -> Self {
-        // FNV-1a over all three: any difference gives another stream.
+        // FNV-1a over all three: any difference gives a different stream.
         let bytes = purpose
             .bytes()
             .chain(seed.to_le_bytes())
@@ -31,7 +32,7 @@ impl Random {
         from + (to - from) * self.generator.f64()
     }
 
-    /// Whether something of this probability happens.
+    /// True with this probability.
     pub(crate) fn happens(&mut self, probability: f64) -> bool {
         probability > 0.0 && self.generator.f64() < probability
     }
@@ -68,7 +69,11 @@ mod tests {
         let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / f64::from(n);
         let beyond_two = values.iter().filter(|v| v.abs() > 2.0).count() as f64 / f64::from(n);
         // Standard errors: 0.0032, 0.0045, 0.0007.
-        assert!(mean.abs() < 0.013 && (variance - 1.0).abs() < 0.018 && (beyond_two - 0.0455).abs() < 0.003);
+        assert!(
+            mean.abs() < 0.013
+                && (variance - 1.0).abs() < 0.018
+                && (beyond_two - 0.0455).abs() < 0.003
+        );
     }
 
     #[test]

@@ -1,8 +1,9 @@
-//! The simulated robot without any link: a whole session, host's commands included, straight into a CAN log, as fast as the
-//! machine goes. And its truth as a table.
+//! Records the simulated robot without any link: writes a whole session, including the host's
+//! commands, to a CAN log as fast as possible, and its truth as a table.
 
 use crate::robot::Robot;
-use crate::simulator::{BusCounts, Settings, Simulator, SimulatorError};
+use crate::settings::Settings;
+use crate::simulator::{BusCounts, Simulator, SimulatorError};
 use crate::truth::Simulation;
 use proprio_drivers::{Frame, State};
 use proprio_gateway::candump::write_log_line;
@@ -15,17 +16,18 @@ use std::collections::VecDeque;
 use std::io::{self, Write};
 use std::sync::Arc;
 
-/// The time that a frame takes on a bus at 1 Mbit/s, about: frames of one bus are at least that far apart in a log.
+/// Approximate duration of a frame on a bus at 1 Mbit/s: the minimum interval between frames of one
+/// bus in a log.
 const FRAME_TIME: Nanos = Nanos::from_micros(130);
 
-/// A session that could not be recorded.
+/// Why a session cannot be recorded.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum RecordError {
-    /// The robot can not be simulated as asked.
+    /// The robot cannot be simulated with these settings.
     #[error(transparent)]
     Simulator(#[from] SimulatorError),
-    /// A device can not be built.
+    /// A device cannot be built.
     #[error("bus {bus:?}: {cause}")]
     Device {
         /// Its bus.
@@ -34,26 +36,27 @@ pub enum RecordError {
         cause: proprio_drivers::SpecError,
     },
     /// The log could not be written.
-    #[error("the log can not be written")]
+    #[error("the log cannot be written")]
     Io(#[from] io::Error),
 }
 
-/// What a recorded session holds, per bus.
+/// The counts of a recorded session, per bus.
 #[derive(Debug, Clone)]
 pub struct Recorded {
     /// Frames that the boards sent.
     pub sent: u64,
     /// Frames that the host sent to them.
     pub commands: u64,
-    /// What else is known of the boards.
+    /// The boards' counters.
     pub counts: BusCounts,
-    /// Where the host's devices stand at the end.
+    /// The states of the host's devices at the end.
     pub states: Vec<State>,
 }
 
-/// Records `seconds` of a robot's life from `t0` on as a candump log: its boards, and a gateway's host side that starts them.
+/// Records `seconds` of the robot from `t0` on as a candump log: its boards, and a gateway's host
+/// side that starts them.
 ///
-/// The interface in the log is the one that the bus is configured for, or its name for a replayed one.
+/// The interface in the log is the bus's configured one, or the bus's name for a replayed one.
 ///
 /// # Errors
 /// [`RecordError`].
@@ -68,12 +71,11 @@ pub fn record(
     let end = t0 + Nanos::from_seconds(seconds);
     let mut hosts = Vec::new();
     for (plan, number) in robot.plan.buses.iter().zip(0..) {
-        let decoder = Decoder::new(number, plan, None, Arc::new(BusStatus::new(number, plan))).map_err(|cause| {
-            RecordError::Device {
+        let decoder = Decoder::new(number, plan, None, Arc::new(BusStatus::new(number, plan)))
+            .map_err(|cause| RecordError::Device {
                 bus: plan.name.clone(),
                 cause,
-            }
-        })?;
+            })?;
         hosts.push(Host {
             decoder,
             interface: interface(plan),
@@ -82,10 +84,14 @@ pub fn record(
             commands: 0,
         });
     }
-    // In order of their stamps; a frame that waits for its bus may be later than the next one of another bus.
+    // Sorted by stamp: a frame that waits for its bus may be later than the next one of another
+    // bus.
     let mut waiting: VecDeque<(Nanos, usize, Frame)> = VecDeque::new();
     let enqueue = |waiting: &mut VecDeque<(Nanos, usize, Frame)>, bus, frame: Frame| {
-        let at = waiting.iter().rposition(|(t, ..)| *t <= frame.t).map_or(0, |i| i + 1);
+        let at = waiting
+            .iter()
+            .rposition(|(t, ..)| *t <= frame.t)
+            .map_or(0, |i| i + 1);
         waiting.insert(at, (frame.t, bus, frame));
     };
     let mut now = t0;
@@ -102,7 +108,9 @@ pub fn record(
             }
         }
         while let Some((bus, frame)) = simulator.poll(now) {
-            let Some(host) = hosts.get_mut(bus) else { continue };
+            let Some(host) = hosts.get_mut(bus) else {
+                continue;
+            };
             let frame = host.transfer(frame, now);
             host.sent += 1;
             host.decoder.on_frame(&frame, |_| {});
@@ -111,21 +119,35 @@ pub fn record(
         while let Some((t, bus, frame)) = waiting.front()
             && *t <= now
         {
-            write_log_line(&mut log, *t, hosts.get(*bus).map_or("can0", |h| h.interface), frame)?;
+            write_log_line(
+                &mut log,
+                *t,
+                hosts.get(*bus).map_or("can0", |h| h.interface),
+                frame,
+            )?;
             waiting.pop_front();
         }
         let wakes = hosts
             .iter()
             .filter_map(|h| h.decoder.next_wake())
             .chain(simulator.next_wake());
-        // Whoever wants to be called at once has answered to something that just happened: the next nanosecond will do.
+        // A device that must be called at once is answering an event: the next nanosecond is early
+        // enough.
         now = wakes.min().unwrap_or(end).max(now + Nanos(1));
     }
     for (t, bus, frame) in waiting {
-        write_log_line(&mut log, t, hosts.get(bus).map_or("can0", |h| h.interface), &frame)?;
+        write_log_line(
+            &mut log,
+            t,
+            hosts.get(bus).map_or("can0", |h| h.interface),
+            &frame,
+        )?;
     }
     log.flush()?;
-    let counts = simulator.buses().iter().map(crate::simulator::BusSimulator::counts);
+    let counts = simulator
+        .buses()
+        .iter()
+        .map(crate::simulator::BusSimulator::counts);
     Ok(hosts
         .iter()
         .zip(counts)
@@ -141,16 +163,16 @@ pub fn record(
 struct Host<'a> {
     decoder: Decoder,
     interface: &'a str,
-    /// When the bus is free again.
+    /// Time when the bus is free again.
     free: Nanos,
     sent: u64,
     commands: u64,
 }
 
 impl Host<'_> {
-    /// The frame as it arrives: after those before it.
+    /// The frame with its time of arrival, after the earlier frames.
     fn transfer(&mut self, frame: Frame, now: Nanos) -> Frame {
-        // Whole microseconds, as candump writes them: some canplayers read no others.
+        // Whole microseconds, as candump writes them: some versions of canplayer read only these.
         let t = now.max(self.free);
         let t = Nanos(t.0 + (1000 - t.0.rem_euclid(1000)) % 1000);
         self.free = t + FRAME_TIME;
@@ -158,7 +180,7 @@ impl Host<'_> {
     }
 }
 
-/// The interface that frames of `bus` have in a log.
+/// The interface name of `bus` in a log.
 fn interface(bus: &BusPlan) -> &str {
     match &bus.source {
         Source::SocketCan { interface } => interface,
@@ -167,14 +189,16 @@ fn interface(bus: &BusPlan) -> &str {
     }
 }
 
-/// Writes the truth as a table, one row every `period` from `t0` on, as long as `until` is not passed; returns the rows.
+/// Writes the truth as a table, one row every `period` from `t0` to `until`; returns the number of
+/// rows.
 ///
-/// The columns are those of a sample log, velocities, accelerations and torques included, and the wrench of every contact:
-/// `contact/<name>/fx fy fz tx ty tz` \[N, Nm\], by the environment on the link, in the contact's frame. F/T readings hold
-/// their offset; nothing holds noise.
+/// The columns are those of a sample log, velocities, accelerations and torques included, and the
+/// wrench of every contact: `contact/<name>/fx fy fz tx ty tz` \[N, Nm\], exerted by the
+/// environment on the link, in the contact's frame. F/T readings contain their offset; there is no
+/// noise.
 ///
 /// # Errors
-/// If `out` can not be written.
+/// If `out` cannot be written.
 pub fn write_truth(
     simulation: &mut Simulation,
     t0: Nanos,
@@ -218,13 +242,22 @@ pub fn write_truth(
         };
         let truth = simulation.at((now - t0).seconds());
         for joint in &truth.joints {
-            [joint.position, joint.velocity, joint.acceleration, joint.torque]
-                .into_iter()
-                .for_each(&mut cell);
+            [
+                joint.position,
+                joint.velocity,
+                joint.acceleration,
+                joint.torque,
+            ]
+            .into_iter()
+            .for_each(&mut cell);
         }
         truth.wrenches.iter().flatten().copied().for_each(&mut cell);
         for imu in &truth.imus {
-            let parts = [imu.proper_acceleration, imu.angular_velocity, imu.angular_acceleration];
+            let parts = [
+                imu.proper_acceleration,
+                imu.angular_velocity,
+                imu.angular_acceleration,
+            ];
             parts.into_iter().flatten().for_each(&mut cell);
         }
         truth.contacts.iter().flatten().copied().for_each(&mut cell);

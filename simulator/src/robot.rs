@@ -1,11 +1,12 @@
-//! A robot as its configuration folder describes it: gateway.toml, estimator.toml and the URDF that the latter names.
+//! A robot, loaded from its configuration folder: gateway.toml, estimator.toml and the URDF that
+//! the latter names.
 
+use proprio_dynamics::model::{Model, ModelError};
 use proprio_estimator::config::Config;
-use proprio_estimator::model::{Model, ModelError};
 use proprio_gateway::plan::Plan;
 use std::path::{Path, PathBuf};
 
-/// One robot: what the simulator, the gateway and the estimator know of it.
+/// One robot: the configuration of simulator, gateway and estimator.
 #[derive(Debug, Clone)]
 pub struct Robot {
     /// The folder that it was loaded from.
@@ -18,19 +19,20 @@ pub struct Robot {
     pub model: Model,
 }
 
-/// A robot that can not be had: a wrong name or a wrong configuration.
+/// Why a robot cannot be loaded: a wrong name or a wrong configuration.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum RobotError {
-    /// No folder of that name.
+    /// There is no folder of that name.
     #[error(
-        "there is no robot {name:?}; looked for gateway.toml in {}; give the name of a folder there, or a path to one",
+        "there is no robot {name:?} (no gateway.toml in {}); give the name of a folder \
+         there, or a path to one",
         .tried.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", ")
     )]
     NotFound {
-        /// What was asked for.
+        /// The name requested.
         name: String,
-        /// Where it was looked for.
+        /// The folders searched.
         tried: Vec<PathBuf>,
     },
     /// gateway.toml is wrong.
@@ -44,34 +46,34 @@ pub enum RobotError {
     Model {
         /// The file.
         file: PathBuf,
-        /// What is wrong with it.
+        /// The error.
         cause: Box<ModelError>,
     },
-    /// The files do not fit each other.
+    /// The files do not match each other.
     #[error("{}: {problem}", .folder.display())]
     Mismatch {
         /// Their folder.
         folder: PathBuf,
-        /// What one says and the other does not.
+        /// The contradiction.
         problem: String,
     },
 }
 
 impl Robot {
-    /// The folders in which a robot called `name` may be, in order: `name` itself as a path; `config/NAME` of the working
-    /// directory, of the executable's folder and of those above it; of the source tree that this was built from;
-    /// `/usr/share/proprio/config/NAME`; `/etc/proprio/NAME`.
+    /// The folders to search for robot `name`, in order: `name` itself as a path; `config/NAME` in
+    /// the working directory, in the executable's folder and its parents, and in the source tree of
+    /// this build; `/usr/share/proprio/config/NAME`; `/etc/proprio/NAME`.
     #[must_use]
     pub fn candidates(name: &str) -> Vec<PathBuf> {
         let mut folders = vec![PathBuf::from(name)];
-        // With a slash it can only be a path.
+        // A name with a slash is a path.
         if name.contains('/') || name.is_empty() || name == ".." || name == "." {
             return folders;
         }
         let below = |root: &Path| root.join("config").join(name);
         folders.push(below(Path::new(".")));
         if let Ok(executable) = std::env::current_exe() {
-            // An executable in target/release has the source tree's config above it.
+            // For an executable in target/release, the source tree's config is in a parent folder.
             folders.extend(executable.ancestors().skip(1).take(4).map(below));
         }
         if let Some(tree) = Path::new(env!("CARGO_MANIFEST_DIR")).parent() {
@@ -91,10 +93,13 @@ impl Robot {
     /// Finds the folder of a robot by its name or path.
     ///
     /// # Errors
-    /// [`RobotError::NotFound`], with everything that was tried.
+    /// [`RobotError::NotFound`], with all folders searched.
     pub fn find(name: &str) -> Result<PathBuf, RobotError> {
         let tried = Self::candidates(name);
-        match tried.iter().find(|folder| folder.join("gateway.toml").is_file()) {
+        match tried
+            .iter()
+            .find(|folder| folder.join("gateway.toml").is_file())
+        {
             Some(folder) => Ok(folder.clone()),
             None => Err(RobotError::NotFound {
                 name: name.to_owned(),
@@ -103,7 +108,7 @@ impl Robot {
         }
     }
 
-    /// Finds a robot by name or path, and loads it.
+    /// Finds and loads a robot by name or path.
     ///
     /// # Errors
     /// [`RobotError`].
@@ -114,18 +119,23 @@ impl Robot {
     /// Loads the robot in `folder`.
     ///
     /// # Errors
-    /// [`RobotError`]: a file that can not be used, or files that do not fit each other.
+    /// [`RobotError`]: an unusable file, or files that do not match each other.
     pub fn load(folder: &Path) -> Result<Self, RobotError> {
         let plan = Plan::load(&folder.join("gateway.toml"))?;
         let config = Config::load(&folder.join("estimator.toml"))?;
-        let keep: Vec<&str> = config.force_torque.iter().map(|ft| ft.joint.as_str()).collect();
+        let keep: Vec<&str> = config
+            .force_torque
+            .iter()
+            .map(|ft| ft.joint.as_str())
+            .collect();
         let model = Model::from_file(&config.model, &keep).map_err(|cause| RobotError::Model {
             file: config.model.clone(),
             cause: Box::new(cause),
         })?;
         if plan.robot != config.robot {
             let problem = format!(
-                "gateway.toml says robot = {:?}, estimator.toml robot = {:?}: they would not find each other",
+                "gateway.toml has robot = {:?}, estimator.toml robot = {:?}: they would not find \
+                 each other",
                 plan.robot, config.robot
             );
             return Err(RobotError::Mismatch {
@@ -141,7 +151,7 @@ impl Robot {
         })
     }
 
-    /// Something that the files of this robot do not agree about.
+    /// The error for a contradiction between the files of this robot.
     pub(crate) fn mismatch(&self, problem: String) -> RobotError {
         RobotError::Mismatch {
             folder: self.folder.clone(),
@@ -159,7 +169,10 @@ mod tests {
         let robot = Robot::open("icub_left_arm").unwrap();
         assert_eq!(robot.plan.robot, "icub_left_arm");
         assert_eq!(robot.model.dof_count(), 7);
-        assert!(robot.model.joint("l_arm_ft_sensor").is_some(), "the F/T joint is kept");
+        assert!(
+            robot.model.joint("l_arm_ft_sensor").is_some(),
+            "the F/T joint is kept"
+        );
         let by_path = Robot::open(robot.folder.to_str().unwrap()).unwrap();
         assert_eq!(by_path.plan.channels, robot.plan.channels);
     }
@@ -175,8 +188,11 @@ mod tests {
         ] {
             assert!(message.contains(place), "{place}: {message}");
         }
-        // A path is not looked for anywhere else.
-        assert_eq!(Robot::candidates("some/where"), [PathBuf::from("some/where")]);
+        // A path is not searched for elsewhere.
+        assert_eq!(
+            Robot::candidates("some/where"),
+            [PathBuf::from("some/where")]
+        );
     }
 
     #[test]
@@ -188,7 +204,11 @@ mod tests {
         }
         let file = folder.path().join("estimator.toml");
         let text = std::fs::read_to_string(&file).unwrap();
-        std::fs::write(&file, text.replace("robot = \"icub_left_arm\"", "robot = \"other\"")).unwrap();
+        std::fs::write(
+            &file,
+            text.replace("robot = \"icub_left_arm\"", "robot = \"other\""),
+        )
+        .unwrap();
         let message = Robot::load(folder.path()).unwrap_err().to_string();
         assert!(message.contains("robot = \"other\""), "{message}");
         std::fs::write(folder.path().join("model.urdf"), "<robot").unwrap();

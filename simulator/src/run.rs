@@ -1,8 +1,10 @@
-//! The simulated robot alone, live: its boards on CAN interfaces or virtual buses, one thread per bus. `proprio simulate`.
+//! Runs the simulated robot live (`proprio simulate`): its boards on CAN interfaces or virtual
+//! buses, one thread per bus.
 
 use crate::record::write_truth;
 use crate::robot::Robot;
-use crate::simulator::{BusCounts, BusSimulator, Settings, Simulator};
+use crate::settings::Settings;
+use crate::simulator::{BusCounts, BusSimulator, Simulator};
 use crate::truth::{Simulation, Touch};
 use anyhow::Context as _;
 use proprio_gateway::clock::{Clock, Monotonic};
@@ -14,61 +16,70 @@ use serde::Serialize;
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::atomic::AtomicBool;
+use std::sync::atomic::Ordering::Relaxed;
 use std::thread;
 use std::time::Duration;
 
-/// The truth is written with one row per millisecond.
+/// Period of the rows of the truth: one millisecond.
 pub const TRUTH_PERIOD: Nanos = Nanos::from_millis(1);
 
-/// The longest that a bus thread waits: then it looks whether it should stop.
+/// Maximum wait of a bus thread before it checks whether to stop.
 const MOST_WAIT: Nanos = Nanos::from_millis(20);
-/// The most frames that are sent before the bus is listened to again. Where sending takes longer than the boards' periods something is always due, and neither a
-/// command nor the wish to stop would ever be heard.
+/// Maximum number of frames sent before the thread receives again. If sending takes longer than the
+/// boards' periods, a frame is always due; without this limit no command and no stop request would
+/// be received.
 const MOST_AT_ONCE: usize = 16;
-/// How far ahead the skin tells of a touch.
+/// How far ahead the skin declares a touch.
 const AHEAD: Nanos = Nanos::from_millis(100);
-/// How long a frame may wait for a full queue.
+/// Maximum wait of a frame for a full queue.
 const SEND_WITHIN: Nanos = Nanos::from_millis(20);
 
-/// How to run the simulated robot.
+/// The options of a run.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Options {
-    /// Where the buses are, in the order of gateway.toml: `can0` or `virtual:NAME` ([`parse_bus`]). Empty: the sources that
-    /// gateway.toml gives.
+    /// The buses, in the order of gateway.toml: `can0` or `virtual:NAME` ([`parse_bus`]). Empty:
+    /// the sources that gateway.toml gives.
     pub buses: Vec<Source>,
     /// The domain of virtual buses: the gateway's.
     pub domain: String,
-    /// How long; `None`: until it is told to stop.
+    /// Duration; `None`: until it is stopped.
     pub seconds: Option<f64>,
-    /// What the robot does. The push on its hand comes once in `seconds` if they are given, else once in `settings.cycle`.
+    /// The settings of the simulation. The hand is pushed once in `seconds` if given, else once in
+    /// every `settings.cycle`.
     pub settings: Settings,
-    /// Where to write the truth, once it is over.
+    /// The file for the truth, written at the end.
     pub truth: Option<PathBuf>,
 }
 
-/// Options that can not be followed: exit 2.
+/// Invalid options: exit code 2.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum OptionsError {
     /// A bus that is neither an interface nor a virtual bus.
-    #[error("bus {0:?}: it must be a CAN interface such as \"can0\", or a virtual bus such as \"virtual:left_arm\"")]
+    #[error(
+        "bus {0:?}: it must be a CAN interface such as \"can0\", or a virtual bus such as \
+         \"virtual:left_arm\""
+    )]
     Bus(String),
-    /// Not as many buses as the robot has.
-    #[error("{given} buses are given; the robot has {}: {}; give one for each, in this order, or none", names.len(), names.join(", "))]
+    /// A wrong number of buses.
+    #[error(
+        "{given} buses are given; the robot has {}: {}; give one for each, in this order, or none",
+        names.len(), names.join(", ")
+    )]
     BusCount {
-        /// How many.
+        /// The number given.
         given: usize,
-        /// The robot's.
+        /// The names of the robot's buses.
         names: Vec<String>,
     },
-    /// The same bus twice.
-    #[error("two buses of the robot have the same source; each needs one of its own")]
+    /// The same bus is given twice.
+    #[error("two buses of the robot have the same source; each needs a different one")]
     SameBus,
-    /// A bus on which nothing can be sent.
+    /// The bus is a log, on which nothing can be sent.
     #[error("bus {0:?} is a replayed log; give --bus with an interface or a virtual bus")]
     Replay(String),
-    /// A duration that is none.
+    /// The duration is not positive.
     #[error("seconds = {0} must be above 0")]
     Seconds(f64),
 }
@@ -79,28 +90,32 @@ pub enum OptionsError {
 /// [`OptionsError::Bus`].
 pub fn parse_bus(text: &str) -> Result<Source, OptionsError> {
     match text.split_once(':') {
-        Some(("virtual", name)) if !name.is_empty() => Ok(Source::Virtual { name: name.to_owned() }),
-        None if !text.is_empty() && text.len() <= 15 && text != "virtual" => Ok(Source::SocketCan {
-            interface: text.to_owned(),
+        Some(("virtual", name)) if !name.is_empty() => Ok(Source::Virtual {
+            name: name.to_owned(),
         }),
+        None if !text.is_empty() && text.len() <= 15 && text != "virtual" => {
+            Ok(Source::SocketCan {
+                interface: text.to_owned(),
+            })
+        }
         _ => Err(OptionsError::Bus(text.to_owned())),
     }
 }
 
-/// What became of a run.
+/// The result of a run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Summary {
     /// The robot's name.
     pub robot: String,
     /// The seed.
     pub seed: u64,
-    /// When the simulation began: CLOCK_MONOTONIC \[ns\].
+    /// Start of the simulation: CLOCK_MONOTONIC \[ns\].
     pub t0: i64,
-    /// How long it ran \[s\].
+    /// Duration \[s\].
     pub seconds: f64,
-    /// Frames that reached a bus, all together.
+    /// Total of frames that reached a bus.
     pub sent: u64,
-    /// Frames that a `lost` fault took, all together: not among those sent.
+    /// Total of frames lost by a `lost` fault; not counted as sent.
     pub lost_on_request: u64,
     /// The buses, in the order of gateway.toml.
     pub buses: Vec<BusSummary>,
@@ -108,12 +123,12 @@ pub struct Summary {
     pub truth_rows: u64,
 }
 
-/// What became of one bus.
+/// The result of one bus.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct BusSummary {
     /// Its name.
     pub name: String,
-    /// Where it is, as [`parse_bus`] reads it.
+    /// Its source, in the form of [`parse_bus`].
     pub source: String,
     /// Frames that reached the bus.
     pub sent: u64,
@@ -121,29 +136,31 @@ pub struct BusSummary {
     pub send_failures: u64,
     /// Frames received: commands to the boards.
     pub received: u64,
-    /// Frames that a `lost` fault took.
+    /// Frames lost by a `lost` fault.
     pub lost_on_request: u64,
-    /// Readings left out because this machine was too slow for them.
+    /// Readings skipped because this machine was too slow.
     pub skipped: u64,
     /// Readings that a board could not encode.
     pub refused: u64,
-    /// The longest that an emission was late \[s\].
+    /// The largest delay of an emission \[s\].
     pub latest: f64,
 }
 
-/// Runs `robot` until `options.seconds` are over or `stop` is set.
+/// Runs `robot` for `options.seconds` or until `stop` is set.
 ///
 /// # Errors
-/// One chain that says what, where and what to do: [`OptionsError`] and [`crate::SimulatorError`] at its root are wrong
-/// configurations ([`is_configuration`]); a bus that can not be opened; a file that can not be written.
+/// An error chain with cause, place and remedy. [`OptionsError`] and [`crate::SimulatorError`] at
+/// its root are wrong configurations ([`is_configuration`]); other causes are a bus that cannot be
+/// opened or a file that cannot be written.
 pub fn run(robot: &Robot, options: &Options, stop: &AtomicBool) -> anyhow::Result<Summary> {
     run_with_skin(robot, options, None, stop)
 }
 
-/// Somebody who is told, as by a skin, what touches the robot: the contact's name, from when on, and whether it is touched then.
+/// A receiver of touches, as from a skin: the contact's name, the instant of the change, and
+/// whether it is touched from then on.
 pub type Skin<'a> = &'a mut dyn FnMut(&str, Nanos, bool);
 
-/// As [`run`], and `skin` is told of touches, in this thread, a tenth of a second ahead.
+/// As [`run`]; also calls `skin` for every touch, in this thread, 0.1 s ahead.
 ///
 /// # Errors
 /// As [`run`].
@@ -158,7 +175,7 @@ pub fn run_with_skin(
     if let Some(seconds) = options.seconds {
         settings.cycle = seconds;
     }
-    // Whatever can be wrong shows before anything is sent.
+    // All errors are found before anything is sent.
     let mut simulation = Simulation::new(robot, &settings).map_err(crate::SimulatorError::from)?;
     let truth = options
         .truth
@@ -169,19 +186,21 @@ pub fn run_with_skin(
     for (plan, source) in robot.plan.buses.iter().zip(&buses) {
         let mut plan = plan.clone();
         plan.source = source.clone();
-        // No claims: boards hear everything, as on a real bus.
+        // No claims: boards receive all frames, as on a real bus.
         let link = open_link(&plan, &options.domain, &[]);
         links.push(link.with_context(|| format!("bus {:?} ({})", plan.name, source_text(source)))?);
     }
     let clock = Monotonic;
     let t0 = clock.now();
-    let end = options.seconds.map_or(Nanos::MAX, |s| t0 + Nanos::from_seconds(s));
+    let end = options
+        .seconds
+        .map_or(Nanos::MAX, |s| t0 + Nanos::from_seconds(s));
     let simulator = Simulator::new(robot, &settings, t0)?;
     tracing::info!(
         robot = robot.plan.robot,
         seed = settings.seed,
         buses = buses.len(),
-        "the simulated robot has power"
+        "the simulated robot is powered on"
     );
     let mut summaries = Vec::new();
     thread::scope(|scope| {
@@ -203,11 +222,9 @@ pub fn run_with_skin(
             let thread = thread
                 .context("cannot start a thread")
                 .inspect_err(|_| stop.store(true, Relaxed))?;
-            summaries.push(
-                thread
-                    .join()
-                    .map_err(|_| anyhow::anyhow!("a bus thread panicked; this is a mistake in the program"))?,
-            );
+            summaries.push(thread.join().map_err(|_| {
+                anyhow::anyhow!("a bus thread panicked: this is a bug in the program")
+            })?);
         }
         Ok::<_, anyhow::Error>(())
     })?;
@@ -247,7 +264,7 @@ pub fn run_with_skin(
     })
 }
 
-/// Whether an error that [`run`] or [`Robot::open`] ended with is a wrong configuration: exit 2.
+/// Whether an error of [`run`] or [`Robot::open`] is a wrong configuration (exit code 2).
 #[must_use]
 pub fn is_configuration(error: &anyhow::Error) -> bool {
     error.chain().any(|cause| {
@@ -258,7 +275,8 @@ pub fn is_configuration(error: &anyhow::Error) -> bool {
     })
 }
 
-/// The loop of one bus: send what is due, wait for a frame or for the next time that something is due.
+/// The loop of one bus: send the frames that are due, then wait for a frame or for the next due
+/// time.
 fn turn_until(
     mut bus: BusSimulator,
     mut link: Box<dyn Link>,
@@ -272,8 +290,10 @@ fn turn_until(
             break;
         }
         for _ in 0..MOST_AT_ONCE {
-            let Some(frame) = bus.poll(clock.now()) else { break };
-            // The link counts what it could not send.
+            let Some(frame) = bus.poll(clock.now()) else {
+                break;
+            };
+            // The link counts frames that it could not send.
             let _ = link.send(&frame, clock.now() + SEND_WITHIN);
         }
         let deadline = (clock.now() + MOST_WAIT)
@@ -288,8 +308,15 @@ fn turn_until(
     (bus.counts(), link.counters())
 }
 
-/// The loop of the skin, until nothing more will touch the robot.
-fn feel(simulation: &Simulation, t0: Nanos, skin: Skin<'_>, clock: &impl Clock, end: Nanos, stop: &AtomicBool) {
+/// The loop of the skin, until no more touch follows.
+fn feel(
+    simulation: &Simulation,
+    t0: Nanos,
+    skin: Skin<'_>,
+    clock: &impl Clock,
+    end: Nanos,
+    stop: &AtomicBool,
+) {
     let mut next = simulation.next_touch(0.0);
     while let Some(Touch { t, contact, begins }) = next {
         let at = t0 + Nanos::from_seconds(t);
@@ -303,7 +330,11 @@ fn feel(simulation: &Simulation, t0: Nanos, skin: Skin<'_>, clock: &impl Clock, 
             let wait = (at - AHEAD - clock.now()).clamp(Nanos::ZERO, MOST_WAIT);
             thread::sleep(Duration::from_nanos(wait.0.unsigned_abs()));
         }
-        skin(simulation.contact_names().nth(contact).unwrap_or_default(), at, begins);
+        skin(
+            simulation.contact_names().nth(contact).unwrap_or_default(),
+            at,
+            begins,
+        );
         next = simulation.next_touch(t);
     }
 }
@@ -364,7 +395,7 @@ mod tests {
     use std::sync::Arc;
     use std::sync::atomic::{AtomicI64, AtomicU64};
 
-    /// A clock that only a slow link moves.
+    /// A clock that only a slow link advances.
     #[derive(Clone, Default)]
     struct Slow(Arc<AtomicI64>);
 
@@ -374,7 +405,8 @@ mod tests {
         }
     }
 
-    /// A bus on which one frame takes longer than all boards' periods, with a gateway's decoder at its other end.
+    /// A bus on which a frame takes longer than all boards' periods, with a gateway's decoder at
+    /// its other end.
     struct SlowLink {
         clock: Slow,
         gateway: Decoder,
@@ -423,9 +455,16 @@ mod tests {
         let settings = Settings::default();
         let clock = Slow::default();
         let simulator = Simulator::new(&robot, &settings, clock.now()).unwrap();
-        for (bus, (plan, number)) in simulator.into_buses().into_iter().zip(robot.plan.buses.iter().zip(0..)) {
+        for (bus, (plan, number)) in simulator
+            .into_buses()
+            .into_iter()
+            .zip(robot.plan.buses.iter().zip(0..))
+        {
             let status = Arc::new(BusStatus::new(number, plan));
-            let (sent, stop) = (Arc::new(AtomicU64::new(0)), Arc::new(AtomicBool::new(false)));
+            let (sent, stop) = (
+                Arc::new(AtomicU64::new(0)),
+                Arc::new(AtomicBool::new(false)),
+            );
             let link = SlowLink {
                 clock: clock.clone(),
                 gateway: Decoder::new(number, plan, None, Arc::clone(&status)).unwrap(),
@@ -434,7 +473,7 @@ mod tests {
                 stop: Arc::clone(&stop),
             };
             turn_until(bus, Box::new(link), &clock, Nanos::MAX, &stop);
-            // Every board was started, in spite of those that stream.
+            // Every board was started, although others stream already.
             for device in status.devices() {
                 assert!(device.counters[Counter::Frames as usize] > 0, "{device:?}");
             }

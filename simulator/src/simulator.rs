@@ -1,98 +1,75 @@
-//! The robot's boards on its buses, without links and without a clock: frames in, frames out, time as an argument.
+//! The robot's boards on its buses, without links and without a clock: takes and returns frames;
+//! time is an argument.
 //!
 //! ```text
 //! commands --> on_frame --> Board (drivers) --> answers --\
-//!                             ^ encode                     >--> lost on request? --> poll --> the bus
+//!                             ^ encode                     >--> lost? --> poll --> the bus
 //! Simulation::at(now) --> measure: noise, faults --> frames /
 //! ```
 //!
-//! Every board has a clock of its own: it starts at a random phase, runs up to 30 ppm fast or slow, and each emission is up to
-//! 2 % of the period (0.1 ms at most) late. A reading is the truth *at the instant it is sent*: where the machine that simulates
-//! was held up, readings are missing, as if the board had skipped them, but none is old.
+//! Every board has its own clock: it starts at a random phase, runs up to 30 ppm fast or slow, and
+//! each emission is up to 2 % of the period (at most 0.1 ms) late. A reading is the truth *at the
+//! instant it is sent*: if the simulating machine was delayed, readings are missing, as if the
+//! board had skipped them, but none is old.
 
 use crate::fault::{Fault, FaultError, Window};
 use crate::noise::Random;
 use crate::robot::{Robot, RobotError};
+use crate::settings::Settings;
 use crate::truth::Simulation;
 use proprio_drivers::{Board, Decoded, Frame, Frames, Mode, Options, Spec};
 use proprio_gateway::plan::{DevicePlan, JointMap};
-use proprio_topics::{Actuator, Imu, JointState, Kind, Nanos, Quality, Reading, Saturation, StampKind, Wrench};
+use proprio_topics::{
+    Actuator, Imu, JointState, Kind, Nanos, Quality, Reading, Saturation, StampKind, Wrench,
+};
 use std::collections::VecDeque;
 
-/// Standard deviation of a simulated joint position: what gears and bearings add to the encoder's steps \[rad or m\].
+/// Standard deviation of a simulated joint position: the error of gears and bearings in addition to
+/// the encoder's steps \[rad or m\].
 pub const JOINT_NOISE: f64 = 2e-5;
 /// Standard deviation of a simulated IMU's acceleration \[m/s^2\].
 pub const ACCELERATION_NOISE: f64 = 0.03;
 /// Standard deviation of a simulated IMU's angular velocity \[rad/s\].
 pub const ANGULAR_VELOCITY_NOISE: f64 = 0.002;
 
-/// How far off a spike is, on every axis: \[N\] and \[Nm\].
+/// Error of a spike on every axis: \[N\] and \[Nm\].
 const SPIKE: (f64, f64) = (200.0, 5.0);
-/// How long a board is gone when it reboots \[s\].
+/// Duration of a reboot \[s\].
 const REBOOT: f64 = 0.5;
-/// How often a second half comes late while `late_half` lasts.
+/// Fraction of late second halves during `late_half`.
 const LATE_SHARE: f64 = 0.1;
-/// How often a motor board tells its status. (A real one does with every reading; that would double the frames for nothing.)
+/// Period of a motor board's status. (A real board sends it with every reading, which would double
+/// the number of frames without benefit.)
 const STATUS_PERIOD: Nanos = Nanos::from_millis(100);
-/// The mode that a simulated motor board tells: current control.
+/// The mode that a simulated motor board reports: current control.
 const CURRENT_CONTROL: u32 = 6;
-/// Most that a board's clock is off.
+/// Maximum relative error of a board's clock.
 const DRIFT: f64 = 30e-6;
-/// Most that an emission is late, as a share of the period, and at all \[ns\].
+/// Maximum delay of an emission: as a fraction of the period, and absolute \[ns\].
 const JITTER: (f64, f64) = (0.02, 100_000.0);
 
-/// What the simulated robot does.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Settings {
-    /// Motion, noise and faults are drawn from it.
-    pub seed: u64,
-    /// How long the robot stands still at first \[s\].
-    pub still: f64,
-    /// Whether something pushes its hand, from 40 % to 60 % of every cycle.
-    pub push: bool,
-    /// The length of a cycle \[s\].
-    pub cycle: f64,
-    /// Whether sensors are noisy. Without, only the boards' own quantisation is left.
-    pub noise: bool,
-    /// What goes wrong.
-    pub faults: Vec<Fault>,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self {
-            seed: 1,
-            still: 1.0,
-            push: true,
-            cycle: 20.0,
-            noise: true,
-            faults: Vec::new(),
-        }
-    }
-}
-
-/// A robot that can not be simulated as asked.
+/// Why a robot cannot be simulated with these settings.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum SimulatorError {
-    /// Its files are wrong or do not fit each other.
+    /// Its files are wrong or do not match each other.
     #[error(transparent)]
     Robot(#[from] RobotError),
-    /// A fault that can not happen to it.
+    /// A fault is not possible for it.
     #[error(transparent)]
     Fault(#[from] FaultError),
 }
 
-/// What one bus has done.
+/// The counters of one bus.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct BusCounts {
-    /// Frames that a `lost` fault took: they never reached the bus.
+    /// Frames lost by a `lost` fault before they reached the bus.
     pub lost_on_request: u64,
     /// Readings not sent because the boards were polled too late for them.
     pub skipped: u64,
     /// Readings that a board could not encode.
     pub refused: u64,
-    /// The longest that an emission was late \[ns\].
+    /// The largest delay of an emission \[ns\].
     pub latest: Nanos,
 }
 
@@ -103,10 +80,12 @@ pub struct Simulator {
 }
 
 impl Simulator {
-    /// The boards of `robot`, powered at `t0`. Those that need to be started stay silent until somebody does.
+    /// The boards of `robot`, powered at `t0`. Boards that need a start command stay silent until
+    /// they get one.
     ///
     /// # Errors
-    /// [`SimulatorError`]: files that do not fit each other, a fault that can not happen to this robot.
+    /// [`SimulatorError`]: files that do not match each other, or a fault that is not possible for
+    /// this robot.
     pub fn new(robot: &Robot, settings: &Settings, t0: Nanos) -> Result<Self, SimulatorError> {
         let simulation = Simulation::new(robot, settings)?;
         let mut buses = Vec::new();
@@ -140,7 +119,7 @@ impl Simulator {
         &self.buses
     }
 
-    /// The buses, each to be run by a thread of its own.
+    /// The buses, for running each in its own thread.
     #[must_use]
     pub fn into_buses(self) -> Vec<BusSimulator> {
         self.buses
@@ -169,14 +148,18 @@ impl Simulator {
 
     fn arrange(&mut self, robot: &Robot, fault: &Fault) -> Result<(), FaultError> {
         let Some(name) = fault.device() else {
-            if let Fault::Lost { probability, window } = fault {
+            if let Fault::Lost {
+                probability,
+                window,
+            } = fault
+            {
                 self.buses
                     .iter_mut()
                     .for_each(|bus| bus.losses.push((*probability, *window)));
             }
             return Ok(());
         };
-        // By the board's own name, else by the name of one of its channels.
+        // Search by the board's name, then by the names of its channels.
         let channel = robot.plan.channels.iter().find(|c| c.name == name);
         let place = robot.plan.buses.iter().enumerate().find_map(|(bus, plan)| {
             plan.devices
@@ -261,7 +244,7 @@ impl BusSimulator {
         &self.name
     }
 
-    /// What it has done.
+    /// Its counters.
     #[must_use]
     pub const fn counts(&self) -> BusCounts {
         self.counts
@@ -281,7 +264,7 @@ impl BusSimulator {
         self.post(&answers, t);
     }
 
-    /// The next frame that is due at `now`, stamped so; call until `None`.
+    /// The next frame that is due at `now`, with that stamp; call until `None`.
     pub fn poll(&mut self, now: Nanos) -> Option<Frame> {
         loop {
             if let Some(frame) = self.outbox.pop_front() {
@@ -308,14 +291,22 @@ impl BusSimulator {
         if !self.outbox.is_empty() {
             return Some(Nanos::MIN);
         }
-        let slots = self.nodes.iter().filter_map(|n| n.slots.as_ref().map(|s| s.due));
-        let reboots = self.nodes.iter().flat_map(|n| n.reboots.iter().map(|at| self.t0 + *at));
+        let slots = self
+            .nodes
+            .iter()
+            .filter_map(|n| n.slots.as_ref().map(|s| s.due));
+        let reboots = self
+            .nodes
+            .iter()
+            .flat_map(|n| n.reboots.iter().map(|at| self.t0 + *at));
         slots.chain(reboots).min()
     }
 
     /// Board `index` sends its reading of `now`.
     fn emit(&mut self, index: usize, now: Nanos) {
-        let Some(node) = self.nodes.get_mut(index) else { return };
+        let Some(node) = self.nodes.get_mut(index) else {
+            return;
+        };
         let Some(slots) = &mut node.slots else { return };
         self.counts.latest = self.counts.latest.max(now - slots.due);
         self.counts.skipped += slots.advance(now, &mut node.random);
@@ -324,7 +315,7 @@ impl BusSimulator {
         let refused = node.read(&mut self.simulation, t, now, &mut frames);
         self.counts.refused += refused;
         if node.is_silent(t) {
-            // What it measures meanwhile nobody gets to know; neither the half that was still to come.
+            // Readings during the silence are lost, and so is a half that was held back.
             node.held.clear();
             return;
         }
@@ -332,7 +323,7 @@ impl BusSimulator {
         self.post(&frames, t);
     }
 
-    /// Puts frames on the bus, but for those that a fault takes.
+    /// Puts frames on the bus, except those lost by a fault.
     fn post(&mut self, frames: &Frames, t: f64) {
         for frame in frames {
             let lost = self
@@ -348,7 +339,7 @@ impl BusSimulator {
     }
 }
 
-/// What an output of a board measures.
+/// The quantity that an output of a board measures.
 #[derive(Debug, Clone, Copy)]
 enum Source {
     /// Joint of this number in the simulation.
@@ -359,7 +350,7 @@ enum Source {
     Imu(usize),
 }
 
-/// One board, what it measures, and what is to go wrong with it.
+/// One board with its measured quantities and its faults.
 struct Node {
     kind: Kind,
     options: Options,
@@ -368,20 +359,20 @@ struct Node {
     outputs: Vec<(u8, JointMap, Source)>,
     noise: bool,
     random: Random,
-    /// Where in its period it begins, 0 to 1.
+    /// Its phase within the period, 0 to 1.
     phase: f64,
-    /// By how much its clock is off.
+    /// The relative error of its clock.
     drift: f64,
-    /// When it sends; `None` while it does not stream.
+    /// Its sending times; `None` while it does not stream.
     slots: Option<Slots>,
-    /// When a motor board next tells its status.
+    /// Time of a motor board's next status.
     status: Option<Nanos>,
     silences: Vec<Window>,
     saturations: Vec<Window>,
     spikes: Vec<f64>,
     reboots: Vec<Nanos>,
     late: Vec<(Window, bool)>,
-    /// The half that comes late.
+    /// The half that is held back.
     held: Frames,
 }
 
@@ -408,19 +399,29 @@ impl Node {
             let Some(channel) = robot.plan.channels.get(route.channel as usize) else {
                 continue;
             };
-            let missing = |problem: &str| robot.mismatch(format!("gateway.toml has {:?}: {problem}", channel.name));
+            let missing = |problem: &str| {
+                robot.mismatch(format!("gateway.toml has {:?}: {problem}", channel.name))
+            };
             let source = match channel.kind {
                 Kind::Joint => Source::Joint(
-                    simulation.joint(&channel.name).ok_or_else(|| missing("the URDF has no moving joint of that name"))?,
+                    simulation
+                        .joint(&channel.name)
+                        .ok_or_else(|| missing("the URDF has no moving joint of that name"))?,
                 ),
                 Kind::Wrench => {
                     let number = simulation.wrench(&channel.name);
-                    let number = number.ok_or_else(|| missing("estimator.toml has no [[force_torque]] with that sensor"))?;
-                    let ft = robot.config.force_torque.get(number).ok_or_else(|| missing("it is not configured"))?;
+                    let number = number.ok_or_else(|| {
+                        missing("estimator.toml has no [[force_torque]] with that sensor")
+                    })?;
+                    let ft = robot.config.force_torque.get(number);
+                    let ft = ft.ok_or_else(|| missing("it is not configured"))?;
                     Source::Wrench(number, ft.noise_n, ft.noise_nm)
                 }
                 Kind::Imu => Source::Imu(simulation.imu(&channel.name).ok_or_else(|| {
-                    missing("where it sits is not known: it is not the [base] of estimator.toml, and no link of the URDF has its name")
+                    missing(
+                        "its place is not known: it is not the [base] of estimator.toml, and no \
+                         link of the URDF has its name",
+                    )
                 })?),
             };
             outputs.push((route.output, route.map, source));
@@ -453,7 +454,7 @@ impl Node {
         self.silences.iter().any(|w| w.contains(t))
     }
 
-    /// Sends as its board has been told, from `now` on.
+    /// Applies the board's current streaming period from `now` on.
     fn follow(&mut self, now: Nanos) {
         match self.board.period() {
             None => self.slots = None,
@@ -478,8 +479,14 @@ impl Node {
         }
     }
 
-    /// Encodes what it measures at `t`; returns how many readings its board refused.
-    fn read(&mut self, simulation: &mut Simulation, t: f64, now: Nanos, frames: &mut Frames) -> u64 {
+    /// Encodes its readings at `t`; returns the number of readings that the board refused.
+    fn read(
+        &mut self,
+        simulation: &mut Simulation,
+        t: f64,
+        now: Nanos,
+        frames: &mut Frames,
+    ) -> u64 {
         let mut refused = 0;
         let mut quality = Quality::GOOD;
         if self.saturations.iter().any(|w| w.contains(t)) {
@@ -508,7 +515,8 @@ impl Node {
                     Reading::Joint(map.device(state))
                 }
                 Source::Wrench(number, noise_n, noise_nm) => {
-                    let Some(&[fx, fy, fz, tx, ty, tz]) = simulation.at(t).wrenches.get(number) else {
+                    let Some(&[fx, fy, fz, tx, ty, tz]) = simulation.at(t).wrenches.get(number)
+                    else {
                         continue;
                     };
                     let mut wrench = Wrench {
@@ -532,7 +540,7 @@ impl Node {
                     let mut imu = Imu {
                         proper_acceleration: truth.proper_acceleration,
                         angular_velocity: truth.angular_velocity,
-                        // Not simulated: constants for boards that are told to send them.
+                        // Not simulated: constants, for boards configured to send them.
                         magnetic_field: [2e-5, 0.0, -4e-5],
                         orientation: [1.0, 0.0, 0.0, 0.0],
                         ..Imu::ABSENT
@@ -546,7 +554,11 @@ impl Node {
                     Reading::Imu(imu)
                 }
             };
-            refused += u64::from(self.board.encode(*output, &reading, quality, frames).is_err());
+            refused += u64::from(
+                self.board
+                    .encode(*output, &reading, quality, frames)
+                    .is_err(),
+            );
         }
         if let Some(status) = self.status
             && status <= now
@@ -568,7 +580,8 @@ impl Node {
         refused
     }
 
-    /// Sends the half that was held back behind the first half of this reading, and perhaps holds this one's.
+    /// Sends the half that was held back after the first half of this reading, and may hold back
+    /// this reading's second half.
     fn delay_second_half(&mut self, t: f64, frames: &mut Frames) {
         let mut together = Frames::new();
         let mut own = std::mem::take(frames).into_iter();
@@ -591,7 +604,7 @@ impl Node {
     }
 }
 
-/// When a board sends.
+/// The sending times of a board.
 #[derive(Debug)]
 struct Slots {
     period: Nanos,
@@ -625,7 +638,7 @@ impl Slots {
         Nanos::from_seconds(random.uniform(0.0, most))
     }
 
-    /// Goes on to the first slot after `now`; returns how many were passed over.
+    /// Advances to the first slot after `now`; returns the number of slots skipped.
     fn advance(&mut self, now: Nanos, random: &mut Random) -> u64 {
         let mut skipped = 0;
         self.next += 1;
@@ -648,8 +661,12 @@ fn power_on(robot: &Robot, device: &DevicePlan) -> Result<Box<dyn Board>, RobotE
         .map_err(|e| robot.mismatch(format!("gateway.toml, {:?}: {e}", device.name)))
 }
 
-/// A board just powered. One that the gateway may only listen to is started right away, by playing whoever commands it.
-fn power_on_with(options: &Options, spec: &Spec) -> Result<Box<dyn Board>, proprio_drivers::SpecError> {
+/// A board after power-on. One that the gateway may only listen to is started at once, with the
+/// commands of the program that would command it.
+fn power_on_with(
+    options: &Options,
+    spec: &Spec,
+) -> Result<Box<dyn Board>, proprio_drivers::SpecError> {
     let mut board = options.board(spec)?;
     if spec.mode == Mode::Listen && board.period().is_none() {
         let mut host = options.device(&Spec {
@@ -658,7 +675,7 @@ fn power_on_with(options: &Options, spec: &Spec) -> Result<Box<dyn Board>, propr
         })?;
         let (mut decoded, mut answers) = (Decoded::new(), Frames::new());
         let mut now = Nanos::ZERO;
-        // A host asks for at most a dozen things, then starts the board.
+        // A host asks at most a dozen questions and then starts the board.
         for _ in 0..64 {
             decoded.clear();
             match host.poll_transmit(now, &mut decoded) {

@@ -1,14 +1,16 @@
-//! How the robot moves: every joint stands still, then follows a sum of sines, all of it analytic.
+//! The motion of the robot: every joint stands still, then follows a sum of sines. All derivatives
+//! are analytic.
 
 use crate::noise::Random;
-use proprio_estimator::model::Limits;
+use proprio_dynamics::model::Limits;
 use std::f64::consts::TAU;
 
 /// The joints' motion: `q(t) = rest + w(t) * sum_k a_k sin(omega_k t + phi_k)`.
 ///
-/// `w` is 0 while the robot stands still, 1 once it moves, and in between a polynomial with three continuous derivatives, so
-/// that acceleration and jerk begin at zero. Amplitudes are such that no joint leaves its range (a tenth of it stays free)
-/// or exceeds [`Trajectory::MOST_SPEED`].
+/// `w` is 0 while the robot stands still, 1 when it moves, and in between a polynomial with three
+/// continuous derivatives, so that acceleration and jerk begin at zero. The amplitudes are chosen
+/// so that no joint leaves its range (with a margin of a tenth) or exceeds
+/// [`Trajectory::MOST_SPEED`].
 #[derive(Debug, Clone)]
 pub struct Trajectory {
     joints: Vec<Motion>,
@@ -28,7 +30,7 @@ struct Sine {
     phase: f64,
 }
 
-/// Where a joint is and how it moves.
+/// Position, velocity and acceleration of a joint.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Point {
     /// \[rad or m\].
@@ -40,16 +42,17 @@ pub struct Point {
 }
 
 impl Trajectory {
-    /// No joint is faster \[rad/s or m/s\].
+    /// Maximum speed of a joint \[rad/s or m/s\].
     pub const MOST_SPEED: f64 = 1.2;
-    /// No joint goes further from its rest position \[rad or m\].
+    /// Maximum distance of a joint from its rest position \[rad or m\].
     pub const MOST_EXCURSION: f64 = 0.4;
-    /// How long it takes from standing still to moving in full \[s\].
+    /// Duration of the transition from rest to full motion \[s\].
     pub const BLEND: f64 = 2.0;
     /// Ranges of the three sines' frequencies \[Hz\].
     const BANDS: [(f64, f64); 3] = [(0.1, 0.25), (0.25, 0.5), (0.5, 0.9)];
 
-    /// Draws the motion of joints with these ranges (`None`: unlimited) from `seed`; it begins after `still` seconds.
+    /// Draws the motion of joints with these ranges (`None`: unlimited) from `seed`; it begins
+    /// after `still` seconds.
     ///
     /// Every joint rests in the middle of its range, one without a range at 0.
     #[must_use]
@@ -57,12 +60,15 @@ impl Trajectory {
         let joints = ranges.iter().enumerate().map(|(number, range)| {
             let mut random = Random::new(seed, "trajectory", number);
             let (rest, half) = match range {
-                Some(limits) => (0.5 * (limits.lower + limits.upper), 0.5 * (limits.upper - limits.lower)),
+                Some(limits) => (
+                    0.5 * (limits.lower + limits.upper),
+                    0.5 * (limits.upper - limits.lower),
+                ),
                 None => (0.0, f64::INFINITY),
             };
             let mut sines = Self::BANDS.map(|(from, to)| {
                 let frequency = random.uniform(from, to);
-                // The faster, the smaller: each sine has about the same speed.
+                // Smaller amplitudes for higher frequencies: each sine has about the same speed.
                 let amplitude = random.uniform(0.5, 1.0) / frequency;
                 Sine {
                     amplitude,
@@ -71,8 +77,8 @@ impl Trajectory {
                 }
             });
             let excursion: f64 = sines.iter().map(|s| s.amplitude).sum();
-            let speed: f64 =
-                sines.iter().map(|s| s.amplitude * s.omega).sum::<f64>() + excursion * window_steepest() / Self::BLEND;
+            let speed: f64 = sines.iter().map(|s| s.amplitude * s.omega).sum::<f64>()
+                + excursion * window_steepest() / Self::BLEND;
             let most = (0.9 * half).clamp(0.0, Self::MOST_EXCURSION);
             let scale = (most / excursion).min(Self::MOST_SPEED / speed);
             for sine in &mut sines {
@@ -112,7 +118,8 @@ impl Trajectory {
     }
 }
 
-/// From 0 to 1 while x goes from 0 to 1, with its first two derivatives; three derivatives are continuous at both ends.
+/// From 0 to 1 while x goes from 0 to 1, with its first two derivatives; three derivatives are
+/// continuous at both ends.
 pub(crate) fn window(x: f64) -> (f64, f64, f64) {
     if x <= 0.0 {
         return (0.0, 0.0, 0.0);
@@ -122,7 +129,11 @@ pub(crate) fn window(x: f64) -> (f64, f64, f64) {
     }
     let y = 1.0 - x;
     let value = x.powi(4) * (35.0 + x * (-84.0 + x * (70.0 - 20.0 * x)));
-    (value, 140.0 * (x * y).powi(3), 420.0 * (x * y).powi(2) * (y - x))
+    (
+        value,
+        140.0 * (x * y).powi(3),
+        420.0 * (x * y).powi(2) * (y - x),
+    )
 }
 
 /// The window's steepest slope, at 1/2.
@@ -146,7 +157,10 @@ mod tests {
                 upper: 0.45,
             }),
             None,
-            Some(Limits { lower: 0.1, upper: 0.1 }),
+            Some(Limits {
+                lower: 0.1,
+                upper: 0.1,
+            }),
         ]
     }
 
@@ -168,10 +182,14 @@ mod tests {
             let trajectory = Trajectory::new(&ranges(), seed, 1.0);
             let h = 1e-5;
             for joint in 0..ranges().len() {
-                let [before, at, after] = [t - h, t, t + h].map(|t| trajectory.at(joint, t).unwrap());
-                // Truncation: h^2 / 6 times the next derivative but one, well below 1e3 here.
-                prop_assert!(((after.position - before.position) / (2.0 * h) - at.velocity).abs() < 1e-7);
-                prop_assert!(((after.velocity - before.velocity) / (2.0 * h) - at.acceleration).abs() < 1e-7);
+                let states = [t - h, t, t + h].map(|t| trajectory.at(joint, t).unwrap());
+                let [before, at, after] = states;
+                // Truncation error: h^2 / 6 times the third derivative, which is well below 1e3
+                // here.
+                let velocity = (after.position - before.position) / (2.0 * h);
+                prop_assert!((velocity - at.velocity).abs() < 1e-7);
+                let acceleration = (after.velocity - before.velocity) / (2.0 * h);
+                prop_assert!((acceleration - at.acceleration).abs() < 1e-7);
             }
         }
     }
@@ -183,15 +201,16 @@ mod tests {
             let rest = trajectory.at(joint, 0.0).unwrap();
             assert_eq!((rest.velocity, rest.acceleration), (0.0, 0.0));
             assert_eq!(trajectory.at(joint, 1.5), Some(rest));
-            let furthest =
-                (0..600).map(|k| (trajectory.at(joint, f64::from(k) * 0.05).unwrap().position - rest.position).abs());
+            let furthest = (0..600).map(|k| {
+                (trajectory.at(joint, f64::from(k) * 0.05).unwrap().position - rest.position).abs()
+            });
             assert!(furthest.fold(0.0, f64::max) > 0.05);
         }
         assert_eq!(trajectory.at(4, 0.0), None);
         assert_ne!(
             trajectory.at(0, 5.0),
             Trajectory::new(&ranges(), 8, 1.5).at(0, 5.0),
-            "the seed counts"
+            "another seed gives another motion"
         );
     }
 

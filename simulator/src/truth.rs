@@ -1,53 +1,58 @@
-//! What really happens to the simulated robot at any instant: motion, joint torques, what ideal sensors read, contact wrenches.
+//! The truth of the simulated robot at any instant: motion, joint torques, readings of ideal
+//! sensors, contact wrenches.
 //!
-//! One link stands still and carries the robot: the fixed base, or with an IMU as base the link of the first contact that is on
-//! the IMU's link (else of the first contact that is not pushed). Gravity points down its frame's z axis, or as `gravity_mps2`
-//! says. What else touches the robot is one push on its hand, the contact named `hand`, else the last one that does not carry it; and what faults push ([`Fault::Push`]).
+//! One link stands still and carries the robot. It is the fixed base or, with an IMU as base, the
+//! link of the first contact on the IMU's link (else of the first contact that is not pushed).
+//! Gravity points along its frame's negative z axis, unless `gravity_mps2` is set. Other wrenches
+//! on the robot are a push on its hand (the contact named `hand`, else the last one that does not
+//! carry it) and the pushes of faults ([`Fault::Push`]).
 
 use crate::fault::{Fault, Window};
 use crate::noise::Random;
 use crate::robot::{Robot, RobotError};
-use crate::simulator::Settings;
+use crate::settings::Settings;
 use crate::trajectory::{Point, Trajectory, window};
-use proprio_estimator::config::{Base, Contact, ContactKind, Direction, ForceTorque, SensorFrame};
-use proprio_estimator::dynamics::{
-    DynamicsError, ExternalWrench, FrameMotion, InverseDynamics, JointState, Kinematics, Noise, SensorCut,
+use proprio_dynamics::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
+use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
+use proprio_dynamics::{
+    DynamicsError, ExternalWrench, FrameMotion, InverseDynamics, JointState, Kinematics, Noise,
+    SensorCut,
 };
-use proprio_estimator::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
-use proprio_estimator::spatial::{Pose, Vec3, Wrench};
+use proprio_estimator::config::{Base, Contact, ContactKind, Direction, ForceTorque, SensorFrame};
 use proprio_topics::Kind;
 
 /// Standard gravity \[m/s^2\].
 const GRAVITY: f64 = 9.80665;
-/// The push on the hand: how strong \[N\], and its torque \[Nm\].
+/// The push on the hand: force \[N\] and torque \[Nm\].
 const PUSH: (f64, f64) = (10.0, 0.3);
-/// When in a cycle it begins and ends, and what share of it each flank takes.
+/// Its start and end in a cycle, and the fraction of the push that each flank takes.
 const PUSH_TIME: (f64, f64, f64) = (0.4, 0.6, 0.25);
 
-/// Something begins or ceases to touch the robot.
+/// The beginning or end of a touch.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Touch {
-    /// When: seconds since the simulation began.
+    /// Time: seconds since the start of the simulation.
     pub t: f64,
-    /// The contact, by its number in estimator.toml.
+    /// The contact's number in estimator.toml.
     pub contact: usize,
-    /// Whether it begins.
+    /// Whether the touch begins.
     pub begins: bool,
 }
 
-/// What really happens at one instant.
+/// The truth at one instant.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Truth {
-    /// The instant: seconds since the simulation began.
+    /// The instant: seconds since the start of the simulation.
     pub t: f64,
     /// The joints, by degree of freedom.
     pub joints: Vec<JointTruth>,
-    /// What the F/T sensors read, their offsets included: fx fy fz tx ty tz \[N, Nm\], in the order of estimator.toml.
+    /// The F/T sensors' readings, including their offsets: fx fy fz tx ty tz \[N, Nm\], in the
+    /// order of estimator.toml.
     pub wrenches: Vec<[f64; 6]>,
-    /// What the IMUs read.
+    /// The IMUs' readings.
     pub imus: Vec<ImuTruth>,
-    /// The contacts' wrenches, by the environment on the link, in the axes and at the origin of the frame that `link` names:
-    /// fx fy fz tx ty tz \[N, Nm\], in the order of estimator.toml.
+    /// The contacts' wrenches, by the environment on the link, in the axes and at the origin of the
+    /// frame that `link` names: fx fy fz tx ty tz \[N, Nm\], in the order of estimator.toml.
     pub contacts: Vec<[f64; 6]>,
 }
 
@@ -60,11 +65,12 @@ pub struct JointTruth {
     pub velocity: f64,
     /// \[rad/s^2 or m/s^2\].
     pub acceleration: f64,
-    /// Along the URDF axis, by the parent on the child, without friction and rotor inertia \[Nm or N\].
+    /// Torque along the URDF axis, exerted by the parent on the child, without friction and rotor
+    /// inertia \[Nm or N\].
     pub torque: f64,
 }
 
-/// What an ideal IMU reads, in its axes.
+/// The readings of an ideal IMU, in its axes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ImuTruth {
     /// Classical acceleration of its origin minus gravity \[m/s^2\].
@@ -75,12 +81,13 @@ pub struct ImuTruth {
     pub angular_acceleration: [f64; 3],
 }
 
-/// The simulated robot's mechanics. Every thread has its own copy; all copies tell the same.
+/// The simulated robot's mechanics. Every thread has its own copy; all copies give the same
+/// results.
 #[derive(Debug, Clone)]
 pub struct Simulation {
     model: Model,
     joint_names: Vec<String>,
-    /// Where a joint stands that does not move.
+    /// The position of a joint that does not move.
     standing: Vec<Option<f64>>,
     trajectory: Trajectory,
     kinematics: Kinematics,
@@ -90,10 +97,10 @@ pub struct Simulation {
     sensors: Vec<Sensor>,
     imus: Vec<(String, Frame)>,
     contacts: Vec<(String, Frame)>,
-    /// Which contact carries the robot.
+    /// The contact that carries the robot.
     carries: Option<usize>,
     push: Option<Push>,
-    /// What pushes beside, and nobody declares; and when.
+    /// Undeclared pushes and their windows.
     pokes: Vec<(ExternalWrench, Window)>,
     state: [Vec<f64>; 3],
     truth: Truth,
@@ -110,13 +117,13 @@ struct Sensor {
 struct Push {
     contact: usize,
     frame: Frame,
-    /// At its strongest, at the frame's origin.
+    /// The peak wrench, at the frame's origin.
     wrench: Wrench,
     cycle: f64,
 }
 
 impl Push {
-    /// Its wrench at `t`, without any at the beginning and end of each cycle.
+    /// Its wrench at `t`; zero at the beginning and end of each cycle.
     fn at(&self, t: f64) -> Wrench {
         let (from, until, flank) = PUSH_TIME;
         let x = ((t / self.cycle).rem_euclid(1.0) - from) / (until - from);
@@ -127,9 +134,13 @@ impl Push {
     fn next_touch(&self, t: f64) -> Touch {
         let (from, until, _) = PUSH_TIME;
         let cycle = (t / self.cycle).floor();
-        // Rounding must not find the same one twice.
+        // The margin keeps rounding from finding the same one twice.
         let later = |x: &f64| *x > t + 1e-9 * self.cycle;
-        let changes = [(cycle + from, true), (cycle + until, false), (cycle + 1.0 + from, true)];
+        let changes = [
+            (cycle + from, true),
+            (cycle + until, false),
+            (cycle + 1.0 + from, true),
+        ];
         let times = changes.map(|(x, begins)| (x * self.cycle, begins));
         let (t, begins) = times
             .into_iter()
@@ -147,23 +158,30 @@ impl Simulation {
     /// The mechanics of `robot`.
     ///
     /// # Errors
-    /// [`RobotError::Mismatch`]: estimator.toml names a joint or link that the URDF lacks, or gives values that do not fit.
+    /// [`RobotError::Mismatch`]: estimator.toml names a joint or link that is not in the URDF, or
+    /// has inconsistent values.
     pub fn new(robot: &Robot, settings: &Settings) -> Result<Self, RobotError> {
         let model = robot.model.clone();
         let wrong = |problem: String| robot.mismatch(format!("estimator.toml, {problem}"));
         let frame = |place: &str, link: &str| {
-            model
-                .frame(link)
-                .ok_or_else(|| wrong(format!("{place}: link = {link:?} is not a link of the URDF")))
+            model.frame(link).ok_or_else(|| {
+                wrong(format!(
+                    "{place}: link = {link:?} is not a link of the URDF"
+                ))
+            })
         };
         let mut contacts = Vec::new();
         for contact in &robot.config.contact {
             let name = contact.name().to_owned();
-            contacts.push((name.clone(), frame(&format!("contact {name:?}"), &contact.link)?));
+            contacts.push((
+                name.clone(),
+                frame(&format!("contact {name:?}"), &contact.link)?,
+            ));
         }
         let mut sensors = Vec::new();
         for ft in &robot.config.force_torque {
-            let cut = sensor_cut(&model, ft).map_err(|e| wrong(format!("force_torque {:?}: {e}", ft.sensor)))?;
+            let cut = sensor_cut(&model, ft)
+                .map_err(|e| wrong(format!("force_torque {:?}: {e}", ft.sensor)))?;
             sensors.push(Sensor {
                 name: ft.sensor.clone(),
                 cut,
@@ -179,11 +197,17 @@ impl Simulation {
                 let carries = contacts.iter().position(|(_, f)| f.link == base.link);
                 (base, carries, Vec3::from(*gravity_mps2))
             }
-            // It does not walk: it stands on its first foot.
+            // The simulated robot does not walk: it stands on its first foot.
             Base::Stance { foot } => {
-                let foot = foot.first().ok_or_else(|| wrong("base.foot is empty".into()))?;
+                let foot = foot
+                    .first()
+                    .ok_or_else(|| wrong("base.foot is empty".into()))?;
                 let carries = contacts.iter().position(|(name, _)| *name == foot.contact);
-                (frame("base.foot", &foot.link)?, carries, Vec3::from(foot.gravity_mps2))
+                (
+                    frame("base.foot", &foot.link)?,
+                    carries,
+                    Vec3::from(foot.gravity_mps2),
+                )
             }
             Base::Imu {
                 sensor,
@@ -194,13 +218,15 @@ impl Simulation {
                 let mut imu = frame("base", link)?;
                 let beside = contacts.iter().position(|(_, f)| f.link == imu.link);
                 let carries = beside.or_else(|| (0..contacts.len()).find(|c| Some(*c) != hand));
-                let carrier = carries.and_then(|c| contacts.get(c)).map_or(imu, |(_, f)| *f);
+                let carrier = carries
+                    .and_then(|c| contacts.get(c))
+                    .map_or(imu, |(_, f)| *f);
                 imu.pose = imu.pose * Pose::from_xyz_rpy(*xyz_m, *rpy_rad);
                 imus.push((sensor.clone(), imu));
                 (carrier, carries, Vec3::new(0.0, 0.0, -GRAVITY))
             }
         };
-        // Other IMUs can only be where a link of their name is.
+        // Other IMUs must be on a link of the same name.
         for channel in robot.plan.channels.iter().filter(|c| c.kind == Kind::Imu) {
             if let Some(frame) = model.frame(&channel.name)
                 && imus.iter().all(|(name, _)| *name != channel.name)
@@ -212,7 +238,8 @@ impl Simulation {
         let push = on_hand
             .filter(|c| settings.push && Some(*c) != carries)
             .and_then(|contact| {
-                let (frame, config) = (contacts.get(contact)?.1, robot.config.contact.get(contact)?);
+                let (frame, config) =
+                    (contacts.get(contact)?.1, robot.config.contact.get(contact)?);
                 Some(Push {
                     contact,
                     frame,
@@ -223,9 +250,15 @@ impl Simulation {
 
         let mut pokes = Vec::new();
         for fault in &settings.faults {
-            if let Fault::Push { link, force, window } = fault {
+            if let Fault::Push {
+                link,
+                force,
+                window,
+            } = fault
+            {
                 let Some(frame) = model.frame(link) else {
-                    return Err(robot.mismatch(format!("fault {fault}: {link:?} is not a link of the URDF")));
+                    return Err(robot
+                        .mismatch(format!("fault {fault}: {link:?} is not a link of the URDF")));
                 };
                 let wrench = Wrench::from_parts([*force, 0.0, 0.0], [0.0; 3]);
                 pokes.push((ExternalWrench { frame, wrench }, *window));
@@ -233,20 +266,28 @@ impl Simulation {
         }
 
         let dofs = model.dof_count();
-        let joint_names: Vec<String> = (0..dofs).map(|dof| model.dof_name(dof).to_owned()).collect();
-        let ranges: Vec<_> = (0..dofs).map(|dof| model.limits(model.dof_joint(dof)?)).collect();
+        let joint_names: Vec<String> = (0..dofs)
+            .map(|dof| model.dof_name(dof).to_owned())
+            .collect();
+        let ranges: Vec<_> = (0..dofs)
+            .map(|dof| model.limits(model.dof_joint(dof)?))
+            .collect();
         let trajectory = Trajectory::new(&ranges, settings.seed, settings.still);
-        let standing = joint_names
-            .iter()
-            .enumerate()
-            .map(|(dof, name)| match robot.config.locked.get(name) {
-                Some(position) => Some(*position),
-                // Nobody would know where it is if it moved.
-                None if robot.plan.channel(name).is_none() => trajectory.at(dof, 0.0).map(|rest| rest.position),
-                None => None,
-            });
+        let standing =
+            joint_names
+                .iter()
+                .enumerate()
+                .map(|(dof, name)| match robot.config.locked.get(name) {
+                    Some(position) => Some(*position),
+                    // The position of a moving joint without a channel would be unknown.
+                    None if robot.plan.channel(name).is_none() => {
+                        trajectory.at(dof, 0.0).map(|rest| rest.position)
+                    }
+                    None => None,
+                });
         let standing = standing.collect();
-        let kinematics = Kinematics::new(&model, carrier.link).map_err(|e| wrong(format!("base: {e}")))?;
+        let kinematics =
+            Kinematics::new(&model, carrier.link).map_err(|e| wrong(format!("base: {e}")))?;
         let mut this = Self {
             base: FrameMotion::of_link_from_imu(&FrameMotion::standing(&gravity), &carrier.pose),
             dynamics: InverseDynamics::new(&model),
@@ -278,7 +319,7 @@ impl Simulation {
             push,
             pokes,
         };
-        // What does not fit shows here rather than as absent readings later.
+        // Inconsistencies are reported here, not as absent readings later.
         this.evaluate(0.0).map_err(|e| wrong(e.to_string()))?;
         Ok(this)
     }
@@ -321,19 +362,21 @@ impl Simulation {
         self.contacts.iter().map(|(name, _)| name.as_str())
     }
 
-    /// Which contact is pushed now and then, by its number in estimator.toml; `None` if nothing ever is.
+    /// The number in estimator.toml of the contact that is pushed in every cycle; `None` if there
+    /// is none.
     #[must_use]
     pub fn pushed(&self) -> Option<usize> {
         self.push.map(|push| push.contact)
     }
 
-    /// What begins or ceases to touch the robot next, later than `t` seconds; `None` if nothing ever does.
+    /// The next beginning or end of a touch after `t` seconds; `None` if there is none.
     #[must_use]
     pub fn next_touch(&self, t: f64) -> Option<Touch> {
         self.push.map(|push| push.next_touch(t))
     }
 
-    /// How joint `joint` moves at `t` seconds, without computing anything else; `None` if there is no such joint.
+    /// The motion of joint `joint` at `t` seconds, without computing anything else; `None` if there
+    /// is no such joint.
     #[must_use]
     pub fn motion(&self, joint: usize, t: f64) -> Option<Point> {
         match self.standing.get(joint)? {
@@ -346,12 +389,15 @@ impl Simulation {
         }
     }
 
-    /// The truth at `t` seconds. Everything that depends on forces is NaN where it can not be computed (never, for a robot
-    /// that could be built).
+    /// The truth at `t` seconds. Quantities that depend on forces are NaN if they cannot be
+    /// computed (which does not happen for a robot that was built).
     pub fn at(&mut self, t: f64) -> &Truth {
         #[allow(clippy::float_cmp)] // the very same instant, asked for again
         if self.truth.t != t && self.evaluate(t).is_err() {
-            self.truth.joints.iter_mut().for_each(|joint| joint.torque = f64::NAN);
+            self.truth
+                .joints
+                .iter_mut()
+                .for_each(|joint| joint.torque = f64::NAN);
             self.truth.wrenches.fill([f64::NAN; 6]);
             self.truth.imus.fill(ImuTruth::UNKNOWN);
             self.truth.contacts.fill([f64::NAN; 6]);
@@ -362,9 +408,13 @@ impl Simulation {
 
     fn evaluate(&mut self, t: f64) -> Result<(), DynamicsError> {
         for dof in 0..self.joint_names.len() {
-            let Some(point) = self.motion(dof, t) else { continue };
+            let Some(point) = self.motion(dof, t) else {
+                continue;
+            };
             let [position, velocity, acceleration] = &mut self.state;
-            let slots = [position, velocity, acceleration].into_iter().map(|v| v.get_mut(dof));
+            let slots = [position, velocity, acceleration]
+                .into_iter()
+                .map(|v| v.get_mut(dof));
             for (slot, value) in slots.zip([point.position, point.velocity, point.acceleration]) {
                 if let Some(slot) = slot {
                     *slot = value;
@@ -379,8 +429,12 @@ impl Simulation {
         Ok(())
     }
 
-    /// Fills in the truth for the joints' `state`, a push, and what else pushes.
-    fn solve(&mut self, push: Option<(Push, Wrench)>, poked: &[ExternalWrench]) -> Result<(), DynamicsError> {
+    /// Computes the truth for the joints' `state`, a push on the hand and other pushes.
+    fn solve(
+        &mut self,
+        push: Option<(Push, Wrench)>,
+        poked: &[ExternalWrench],
+    ) -> Result<(), DynamicsError> {
         let [position, velocity, acceleration] = &self.state;
         self.kinematics.update(
             &self.model,
@@ -395,14 +449,18 @@ impl Simulation {
             frame: push.frame,
             wrench,
         });
-        let external: Vec<ExternalWrench> = pushed.into_iter().chain(poked.iter().copied()).collect();
-        self.dynamics.update(&self.model, &self.kinematics, &external)?;
+        let external: Vec<ExternalWrench> =
+            pushed.into_iter().chain(poked.iter().copied()).collect();
+        self.dynamics
+            .update(&self.model, &self.kinematics, &external)?;
         let state = position
             .iter()
             .zip(velocity)
             .zip(acceleration)
             .zip(self.dynamics.torque());
-        for (joint, (((position, velocity), acceleration), torque)) in self.truth.joints.iter_mut().zip(state) {
+        for (joint, (((position, velocity), acceleration), torque)) in
+            self.truth.joints.iter_mut().zip(state)
+        {
             *joint = JointTruth {
                 position: *position,
                 velocity: *velocity,
@@ -411,7 +469,9 @@ impl Simulation {
             };
         }
         for (reading, sensor) in self.truth.wrenches.iter_mut().zip(&self.sensors) {
-            let transmitted = self.dynamics.transmitted(&self.kinematics, sensor.cut.joint());
+            let transmitted = self
+                .dynamics
+                .transmitted(&self.kinematics, sensor.cut.joint());
             *reading = sensor.cut.reading(&transmitted).force_first();
             reading
                 .iter_mut()
@@ -426,18 +486,29 @@ impl Simulation {
                 angular_acceleration: motion.angular_acceleration.into(),
             };
         }
-        for (number, (truth, (_, frame))) in self.truth.contacts.iter_mut().zip(&self.contacts).enumerate() {
+        for (number, (truth, (_, frame))) in self
+            .truth
+            .contacts
+            .iter_mut()
+            .zip(&self.contacts)
+            .enumerate()
+        {
             *truth = match push {
                 // The base of the kinematics is the body that carries the robot.
-                _ if self.carries == Some(number) => frame.pose.wrench_back(&self.dynamics.base_wrench()).force_first(),
+                _ if self.carries == Some(number) => frame
+                    .pose
+                    .wrench_back(&self.dynamics.base_wrench())
+                    .force_first(),
                 _ => {
                     let own = push.filter(|(push, _)| push.contact == number);
                     let of_push = own.map_or(Wrench::zero(), |(_, wrench)| wrench);
-                    // Whatever else pushes the same link.
+                    // Other pushes on the same link.
                     let others = poked.iter().filter(|other| other.frame.link == frame.link);
                     others
                         .fold(of_push, |sum, other| {
-                            sum + frame.pose.wrench_back(&other.frame.pose.wrench(&other.wrench))
+                            sum + frame
+                                .pose
+                                .wrench_back(&other.frame.pose.wrench(&other.wrench))
                         })
                         .force_first()
                 }
@@ -455,8 +526,12 @@ impl ImuTruth {
     };
 }
 
-/// The cut at an F/T sensor: what estimator.toml says of it, else what the URDF's sensor element does, else the usual.
-fn sensor_cut(model: &Model, ft: &ForceTorque) -> Result<SensorCut, proprio_estimator::dynamics::StructureError> {
+/// The cut at an F/T sensor: from estimator.toml, else from the URDF's sensor element, else the
+/// default.
+fn sensor_cut(
+    model: &Model,
+    ft: &ForceTorque,
+) -> Result<SensorCut, proprio_dynamics::StructureError> {
     let element = model.sensors().iter().find(|s| s.joint == ft.joint);
     let frame = match ft.frame {
         Some(SensorFrame::Child) => MeasurementFrame::Child,
@@ -486,7 +561,7 @@ fn sensor_cut(model: &Model, ft: &ForceTorque) -> Result<SensorCut, proprio_esti
     )
 }
 
-/// A push that a contact of this kind can exert, in a direction drawn from the seed.
+/// A push that is possible for a contact of this kind, in a direction drawn from the seed.
 fn push_wrench(contact: &Contact, seed: u64) -> Wrench {
     let mut random = Random::new(seed, "push", 0);
     let mut unit = || {
@@ -500,9 +575,12 @@ fn push_wrench(contact: &Contact, seed: u64) -> Wrench {
     };
     match (contact.kind, contact.direction) {
         (ContactKind::Wrench, _) => Wrench { force, torque },
-        (ContactKind::ForceAlong, Some(direction)) => {
-            through(Vec3::from(direction).try_normalize(1e-9).unwrap_or_else(Vec3::x) * PUSH.0)
-        }
+        (ContactKind::ForceAlong, Some(direction)) => through(
+            Vec3::from(direction)
+                .try_normalize(1e-9)
+                .unwrap_or_else(Vec3::x)
+                * PUSH.0,
+        ),
         (ContactKind::Force | ContactKind::ForceAlong, _) => through(force),
     }
 }
@@ -517,9 +595,11 @@ mod tests {
         Robot::open("icub_left_arm").unwrap()
     }
 
-    /// The rows of a golden table, as columns by name.
+    /// The columns of a golden table by name.
     fn golden(file: &str) -> Vec<HashMap<String, f64>> {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/oracle").join(file);
+        let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join("../tests/oracle")
+            .join(file);
         let text = std::fs::read_to_string(path).unwrap();
         let mut lines = text.lines();
         let names: Vec<&str> = lines.next().unwrap().split(',').collect();
@@ -534,7 +614,8 @@ mod tests {
             .collect()
     }
 
-    /// This crate's truth against MuJoCo's: `tests/oracle/README.md` says how those tables were made.
+    /// This crate's truth against MuJoCo's: `tests/oracle/README.md` describes how those tables
+    /// were made.
     fn agrees(file: &str, rows: usize) {
         let mut robot = robot();
         let offsets = robot.config.force_torque[0].clone();
@@ -548,20 +629,24 @@ mod tests {
         for row in table {
             let value = |column: String| row[&column];
             for (dof, name) in simulation.joint_names.clone().iter().enumerate() {
-                for (slot, part) in simulation
-                    .state
-                    .iter_mut()
-                    .zip(["position", "velocity", "acceleration"])
+                for (slot, part) in
+                    simulation
+                        .state
+                        .iter_mut()
+                        .zip(["position", "velocity", "acceleration"])
                 {
                     slot[dof] = value(format!("joint/{name}/{part}"));
                 }
             }
-            let six = |what: &str| parts.map(|part| row.get(&format!("{what}/{part}")).copied().unwrap_or(0.0));
+            let six = |what: &str| {
+                parts.map(|part| row.get(&format!("{what}/{part}")).copied().unwrap_or(0.0))
+            };
             let [fx, fy, fz, tx, ty, tz] = six("contact/hand");
             let hand = Wrench::from_parts([fx, fy, fz], [tx, ty, tz]);
             simulation.solve(Some((push, hand)), &[]).unwrap();
-            let close =
-                |ours: f64, theirs: f64, what: &str| assert!((ours - theirs).abs() < 1e-9, "{what}: {ours}, {theirs}");
+            let close = |ours: f64, theirs: f64, what: &str| {
+                assert!((ours - theirs).abs() < 1e-9, "{what}: {ours}, {theirs}");
+            };
             for (joint, name) in simulation.truth.joints.iter().zip(&simulation.joint_names) {
                 close(joint.torque, value(format!("joint/{name}/torque")), name);
             }
@@ -572,7 +657,11 @@ mod tests {
                 close(ours, theirs, "F/T");
             }
             let imu = simulation.truth.imus[0];
-            let ours = [imu.proper_acceleration, imu.angular_velocity, imu.angular_acceleration];
+            let ours = [
+                imu.proper_acceleration,
+                imu.angular_velocity,
+                imu.angular_acceleration,
+            ];
             for (ours, part) in ours
                 .into_iter()
                 .flatten()
@@ -582,16 +671,20 @@ mod tests {
             }
             assert_eq!(simulation.truth.contacts[1], [fx, fy, fz, tx, ty, tz]);
         }
-        // The offset is what estimator.toml says, on top of that.
+        // The offset of estimator.toml is added.
         let bare = simulation.at(3.0).wrenches[0];
         robot.config.force_torque[0] = offsets.clone();
         let mut simulation = Simulation::new(&robot, &Settings::default()).unwrap();
         let offset = offsets.offset().0.force_first();
         assert!(
             offset.iter().all(|o| *o != 0.0),
-            "a robot whose offsets are zero shows nothing"
+            "with zero offsets this test would show nothing"
         );
-        for ((with, without), offset) in simulation.at(3.0).wrenches[0].into_iter().zip(bare).zip(offset) {
+        for ((with, without), offset) in simulation.at(3.0).wrenches[0]
+            .into_iter()
+            .zip(bare)
+            .zip(offset)
+        {
             assert!((with - without - offset).abs() < 1e-12);
         }
     }
@@ -635,7 +728,10 @@ mod tests {
             },
         )
         .unwrap();
-        assert_eq!(simulation.contact_names().collect::<Vec<_>>(), ["stand", "hand"]);
+        assert_eq!(
+            simulation.contact_names().collect::<Vec<_>>(),
+            ["stand", "hand"]
+        );
         let mut force = |t: f64| {
             let [fx, fy, fz, ..] = simulation.at(t).contacts[1];
             (fx * fx + fy * fy + fz * fz).sqrt()
@@ -646,7 +742,7 @@ mod tests {
         for t in [5.0, 15.0] {
             assert!((force(t) - PUSH.0).abs() < 1e-9, "{t}");
         }
-        // What is told of it holds wherever there is a force, and for no longer.
+        // The declared touch covers exactly the time with a force.
         let simulation = Simulation::new(
             &robot(),
             &Settings {
@@ -663,15 +759,23 @@ mod tests {
         let told: Vec<_> = touches.iter().map(|t| (t.t, t.contact, t.begins)).collect();
         assert_eq!(
             told,
-            [(4.0, 1, true), (6.0, 1, false), (14.0, 1, true), (16.0, 1, false)]
+            [
+                (4.0, 1, true),
+                (6.0, 1, false),
+                (14.0, 1, true),
+                (16.0, 1, false)
+            ]
         );
         assert_eq!(simulation.pushed(), Some(1));
-        // It comes and goes smoothly.
+        // The push begins and ends smoothly.
         let steepest = (0..2000)
             .map(|k| f64::from(k) * 1e-3 + 4.0)
             .map(|t| (force(t + 1e-3) - force(t)).abs())
             .fold(0.0, f64::max);
-        assert!(steepest < 1e-3 * PUSH.0 * 140.0 / 64.0 / 0.5 * 1.01, "{steepest}");
+        assert!(
+            steepest < 1e-3 * PUSH.0 * 140.0 / 64.0 / 0.5 * 1.01,
+            "{steepest}"
+        );
     }
 
     #[test]
@@ -692,21 +796,27 @@ mod tests {
         robot.plan.channels.retain(|c| c.name != "l_elbow");
         let simulation = Simulation::new(&robot, &Settings::default()).unwrap();
         assert_eq!(simulation.motion(elbow, 7.0), simulation.motion(elbow, 0.0));
-        assert_ne!(simulation.motion(elbow + 1, 7.0), simulation.motion(elbow + 1, 0.0));
+        assert_ne!(
+            simulation.motion(elbow + 1, 7.0),
+            simulation.motion(elbow + 1, 0.0)
+        );
     }
 
     #[test]
     fn a_link_that_the_urdf_lacks_is_named() {
         let mut robot = robot();
         robot.config.contact[1].link = "left_hand".into();
-        let message = Simulation::new(&robot, &Settings::default()).unwrap_err().to_string();
+        let message = Simulation::new(&robot, &Settings::default())
+            .unwrap_err()
+            .to_string();
         assert!(
             message.contains("contact \"hand\": link = \"left_hand\" is not a link of the URDF"),
             "{message}"
         );
     }
 
-    /// What a fault pushes with is a wrench on that link, and shows in what the sensor reads and in the torques beyond as much as the link's contact says.
+    /// A fault's push is a wrench on that link. It changes the sensor's readings and the torques as
+    /// the same wrench at the link's contact would.
     #[test]
     fn a_push_by_a_fault_acts_where_it_is_typed() {
         let robot = robot();
@@ -718,8 +828,16 @@ mod tests {
             };
             Simulation::new(&robot, &settings).map(|mut simulation| simulation.at(t).clone())
         };
-        let hand = robot.config.contact.iter().position(|c| c.name() == "hand").unwrap();
-        let (free, pushed) = (at(&[], 1.5).unwrap(), at(&["push:l_hand=20@1..2"], 1.5).unwrap());
+        let hand = robot
+            .config
+            .contact
+            .iter()
+            .position(|c| c.name() == "hand")
+            .unwrap();
+        let (free, pushed) = (
+            at(&[], 1.5).unwrap(),
+            at(&["push:l_hand=20@1..2"], 1.5).unwrap(),
+        );
         assert_eq!(pushed.contacts[hand], [20.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
         let force = |truth: &Truth| Vec3::from_column_slice(&truth.wrenches[0][..3]);
         assert!(((force(&pushed) - force(&free)).norm() - 20.0).abs() < 1e-9);
@@ -729,11 +847,17 @@ mod tests {
                 .zip(&pushed.joints)
                 .any(|(a, b)| (a.torque - b.torque).abs() > 0.5)
         );
-        // Two at a time, on a frame of the same body; none before and after.
+        // Two pushes at a time, on frames of the same body; none before and after.
         let both = at(&["push:l_hand=20@1..2", "push:l_hand_palm=-5@1..2"], 1.5).unwrap();
         assert!((both.contacts[hand][0] - 20.0).hypot(both.contacts[hand][1]) > 1.0);
-        assert_eq!(at(&["push:l_hand=20@1..2"], 2.0).unwrap(), at(&[], 2.0).unwrap());
+        assert_eq!(
+            at(&["push:l_hand=20@1..2"], 2.0).unwrap(),
+            at(&[], 2.0).unwrap()
+        );
         let message = at(&["push:hnad=20@1..2"], 0.0).unwrap_err().to_string();
-        assert!(message.contains("\"hnad\" is not a link of the URDF"), "{message}");
+        assert!(
+            message.contains("\"hnad\" is not a link of the URDF"),
+            "{message}"
+        );
     }
 }

@@ -1,11 +1,13 @@
-//! The simulated boards against the gateway's own decoders, without links or clocks: what is decoded is the truth, boards need
-//! to be started, and each fault does what it says.
+//! The simulated boards against the gateway's own decoders, without links or clocks: decoded
+//! readings equal the truth, boards need to be started, and each fault has its effect.
 
 use proprio_drivers::{Frame, State};
 use proprio_gateway::decoder::Decoder;
 use proprio_gateway::plan::Plan;
 use proprio_gateway::status::BusStatus;
-use proprio_simulator::simulator::{ACCELERATION_NOISE, ANGULAR_VELOCITY_NOISE, BusCounts, BusSimulator, JOINT_NOISE};
+use proprio_simulator::simulator::{
+    ACCELERATION_NOISE, ANGULAR_VELOCITY_NOISE, BusCounts, BusSimulator, JOINT_NOISE,
+};
 use proprio_simulator::{Robot, Settings, Simulation, Simulator};
 use proprio_topics::{Counter, Nanos, Quality, Reading, Sample, StampKind};
 use std::collections::HashMap;
@@ -13,7 +15,8 @@ use std::sync::Arc;
 
 const T0: Nanos = Nanos::from_millis(5_000);
 
-/// Steps of the three families in this robot: icubdeg of the shaft through a ratio of 100; full scale / 32768; BNO055.
+/// Steps of the three families in this robot: icubdeg of the shaft through a ratio of 100; full
+/// scale / 32768; BNO055.
 const POSITION_LSB: f64 = std::f64::consts::TAU / 65536.0 / 100.0;
 const VELOCITY_LSB: f64 = POSITION_LSB * 1000.0;
 const FORCE_LSB: f64 = 1804.0 / 32768.0;
@@ -45,19 +48,19 @@ fn settings(faults: &[&str]) -> Settings {
     }
 }
 
-/// What came of a session.
+/// The result of a session.
 struct Session {
     samples: Vec<Sample>,
     /// Frames that reached the buses.
     frames: Vec<(usize, Frame)>,
     counts: Vec<BusCounts>,
     states: Vec<Vec<State>>,
-    /// Per device what its decoder counted.
+    /// Per device, its decoder's counters.
     health: HashMap<String, Vec<u64>>,
     channels: Vec<String>,
 }
 
-/// Seconds since the simulation began.
+/// Seconds since the start of the simulation.
 fn time_of(sample: &Sample) -> f64 {
     (sample.header.acquired - T0).seconds()
 }
@@ -78,7 +81,7 @@ impl Session {
     }
 }
 
-/// Runs boards and host against each other for `seconds`; the host begins at `start`.
+/// Runs boards and host for `seconds`; the host begins at `start`.
 fn session_from(robot: &Robot, settings: &Settings, seconds: f64, start: Nanos) -> Session {
     let mut simulator = Simulator::new(robot, settings, T0).expect("a simulator");
     let mut hosts: Vec<(Decoder, Arc<BusStatus>)> = Vec::new();
@@ -106,7 +109,9 @@ fn session_from(robot: &Robot, settings: &Settings, seconds: f64, start: Nanos) 
             frames.push((bus, frame));
             hosts[bus]
                 .0
-                .on_frame(&frame.at(now, StampKind::Software), |sample| samples.push(*sample));
+                .on_frame(&frame.at(now, StampKind::Software), |sample| {
+                    samples.push(*sample);
+                });
         }
         let wakes = hosts
             .iter()
@@ -142,9 +147,12 @@ fn boards_come_up_when_they_are_started_and_not_before() {
     }
     for channel in ["l_arm_ft_sensor", "chest_imu"] {
         let first = session.times(channel)[0];
-        assert!(first > 0.3 && first < 0.4, "{channel} streams from {first} s on");
+        assert!(
+            first > 0.3 && first < 0.4,
+            "{channel} streams from {first} s on"
+        );
     }
-    // Motor boards are commanded by somebody else.
+    // Motor boards are commanded by another program.
     let first = session.times("l_elbow")[0];
     assert!(first < 0.005, "{first}");
 }
@@ -171,7 +179,8 @@ fn a_gateway_that_knows_no_full_scale_asks_for_it() {
 
 #[test]
 fn a_board_that_the_gateway_only_listens_to_has_been_started_by_somebody() {
-    let robot = robot_with(|text| text.replacen("address = 13", "address = 13\nlisten_only = true", 1));
+    let robot =
+        robot_with(|text| text.replacen("address = 13", "address = 13\nlisten_only = true", 1));
     let session = session_from(&robot, &settings(&[]), 0.5, T0);
     assert!(session.of("l_arm_ft_sensor").count() > 450);
 }
@@ -181,16 +190,20 @@ fn what_is_decoded_is_the_truth_within_half_a_step_and_noise() {
     let robot = robot();
     let ft = &robot.config.force_torque[0];
     for noise in [false, true] {
-        let settings = Settings { noise, ..settings(&[]) };
+        let settings = Settings {
+            noise,
+            ..settings(&[])
+        };
         let session = session_from(&robot, &settings, 6.0, T0);
         let mut simulation = Simulation::new(&robot, &settings).unwrap();
-        // So many standard deviations are exceeded once in 10^13 normal numbers; there are some 10^5 here.
+        // Normal numbers exceed this many standard deviations once in 10^13; there are about 10^5
+        // here.
         let most = if noise { 7.5 } else { 0.0 };
         let near = |measured: f64, truth: f64, lsb: f64, deviation: f64| {
             let off = (measured - truth).abs();
             assert!(
                 off <= 0.5 * lsb + most * deviation + 1e-9,
-                "{measured} for {truth}: off by {off}"
+                "{measured} for {truth}: error {off}"
             );
         };
         let mut seen = HashMap::new();
@@ -206,8 +219,18 @@ fn what_is_decoded_is_the_truth_within_half_a_step_and_noise() {
                 }
                 Reading::Wrench(wrench) => {
                     for k in 0..3 {
-                        near(wrench.force[k], truth.wrenches[0][k], FORCE_LSB, ft.noise_n[k]);
-                        near(wrench.torque[k], truth.wrenches[0][k + 3], TORQUE_LSB, ft.noise_nm[k]);
+                        near(
+                            wrench.force[k],
+                            truth.wrenches[0][k],
+                            FORCE_LSB,
+                            ft.noise_n[k],
+                        );
+                        near(
+                            wrench.torque[k],
+                            truth.wrenches[0][k + 3],
+                            TORQUE_LSB,
+                            ft.noise_nm[k],
+                        );
                     }
                 }
                 Reading::Imu(imu) => {
@@ -231,7 +254,7 @@ fn what_is_decoded_is_the_truth_within_half_a_step_and_noise() {
                     assert_eq!(actuator.faults, 0);
                     continue;
                 }
-                other => panic!("nobody sends {other:?}"),
+                other => panic!("unexpected {other:?}"),
             }
             let quality = sample.header.quality;
             assert!(
@@ -277,7 +300,8 @@ fn noise_has_the_size_that_is_stated() {
     let stated = ft.noise_n.into_iter().chain(ft.noise_nm);
     let lsb = [FORCE_LSB; 3].into_iter().chain([TORQUE_LSB; 3]);
     for ((sum, stated), lsb) in sum.into_iter().zip(stated).zip(lsb) {
-        // Quantisation adds the variance of a uniform number; the standard error of the deviation is 1 % here.
+        // Quantisation adds the variance of a uniform number; the standard error of the deviation
+        // is 1 % here.
         let expected = f64::sqrt(stated * stated + lsb * lsb / 12.0);
         assert!(
             (f64::sqrt(sum / n) / expected - 1.0).abs() < 0.06,
@@ -313,7 +337,11 @@ fn boards_do_not_keep_step() {
     for joint in ["l_shoulder_pitch", "l_elbow", "l_wrist_yaw"] {
         let times = session.times(joint);
         phases.push(times[0]);
-        let gaps: Vec<f64> = times.windows(2).map(|w| w[1] - w[0]).filter(|g| *g > 0.0).collect();
+        let gaps: Vec<f64> = times
+            .windows(2)
+            .map(|w| w[1] - w[0])
+            .filter(|g| *g > 0.0)
+            .collect();
         let (least, most) = (
             gaps.iter().copied().fold(1.0, f64::min),
             gaps.iter().copied().fold(0.0, f64::max),
@@ -341,8 +369,11 @@ fn lost_frames_do_not_reach_the_bus_and_are_counted() {
         .filter(|(_, f)| (1.0..2.0).contains(&(f.t - T0).seconds()))
         .count() as f64;
     let share = lost as f64 / in_window;
-    assert!((share - 0.02).abs() < 5.0 * (0.02 / in_window).sqrt(), "{share}");
-    // Half a wrench is no wrench.
+    assert!(
+        (share - 0.02).abs() < 5.0 * (0.02 / in_window).sqrt(),
+        "{share}"
+    );
+    // Half a wrench yields no reading.
     assert!(lossy.count("l_arm_ft_sensor", Counter::Unpaired) > 0);
     assert!(
         lossy
@@ -357,7 +388,10 @@ fn a_silent_board_is_silent_and_others_are_not() {
     let session = session(&["silent:l_arm_ft_sensor@1..1.5"], 2.5);
     let times = session.times("l_arm_ft_sensor");
     assert!(times.iter().all(|t| !(1.0..1.5).contains(t)));
-    assert!(times.iter().any(|t| (1.5..1.6).contains(t)), "it goes on where it was");
+    assert!(
+        times.iter().any(|t| (1.5..1.6).contains(t)),
+        "it continues as before"
+    );
     assert_eq!(session.count("l_arm_ft_sensor", Counter::Silences), 1);
     assert!(session.of("l_elbow").count() > 600);
 }
@@ -373,7 +407,10 @@ fn a_rebooted_board_comes_back_because_it_is_started_again() {
     // A motor board needs no start.
     let motor = session(&["reboot:l_elbow@1"], 2.0);
     let times = motor.times("l_elbow");
-    assert!(times.iter().all(|t| !(1.0..1.5).contains(t)) && times.iter().any(|t| (1.5..1.52).contains(t)));
+    assert!(
+        times.iter().all(|t| !(1.0..1.5).contains(t))
+            && times.iter().any(|t| (1.5..1.52).contains(t))
+    );
 }
 
 #[test]
@@ -382,7 +419,10 @@ fn a_saturated_sensor_says_so_and_freezes() {
     let mut frozen = None;
     for sample in session.of("l_arm_ft_sensor") {
         let t = time_of(sample);
-        let saturated = sample.header.quality.contains(Quality::SATURATED | Quality::FROZEN);
+        let saturated = sample
+            .header
+            .quality
+            .contains(Quality::SATURATED | Quality::FROZEN);
         assert_eq!(saturated, (2.0..2.5).contains(&t), "{t}");
         if saturated {
             assert_eq!(*frozen.get_or_insert(sample.reading), sample.reading);
@@ -393,9 +433,15 @@ fn a_saturated_sensor_says_so_and_freezes() {
 
 #[test]
 fn a_spike_is_one_reading() {
-    let (plain, spiked) = (session(&[], 2.0), session(&["spike:l_arm_ft_sensor@1.5"], 2.0));
+    let (plain, spiked) = (
+        session(&[], 2.0),
+        session(&["spike:l_arm_ft_sensor@1.5"], 2.0),
+    );
     let mut off = 0;
-    for (sample, plain) in spiked.of("l_arm_ft_sensor").zip(plain.of("l_arm_ft_sensor")) {
+    for (sample, plain) in spiked
+        .of("l_arm_ft_sensor")
+        .zip(plain.of("l_arm_ft_sensor"))
+    {
         let (Reading::Wrench(a), Reading::Wrench(b)) = (sample.reading, plain.reading) else {
             panic!()
         };
@@ -428,10 +474,13 @@ fn a_late_half_comes_behind_the_next_first_half_and_is_never_paired_wrongly() {
         .map(|(_, f)| f.id.raw())
         .filter(|id| matches!(id, 0x3DA | 0x3DB))
         .collect();
-    // F F T T, once.
+    // The order F F T T occurs once.
     assert_eq!(order.windows(2).filter(|w| *w == [0x3DA, 0x3DA]).count(), 1);
     assert_eq!(
-        order.windows(4).filter(|w| *w == [0x3DA, 0x3DA, 0x3DB, 0x3DB]).count(),
+        order
+            .windows(4)
+            .filter(|w| *w == [0x3DA, 0x3DA, 0x3DB, 0x3DB])
+            .count(),
         1
     );
 
@@ -442,7 +491,8 @@ fn a_late_half_comes_behind_the_next_first_half_and_is_never_paired_wrongly() {
     let many = session_from(&robot(), &quiet, 6.0, T0);
     let late = many.count("l_arm_ft_sensor", Counter::Unpaired);
     assert!(late > 400, "{late}");
-    // Without noise a wrench is the truth at its stamp to half a step, or it is made of two readings.
+    // Without noise a wrench equals the truth at its stamp to half a step, unless it mixes two
+    // readings.
     let mut simulation = Simulation::new(&robot(), &quiet).unwrap();
     let mut off_by = |torque: [f64; 3], t: f64| {
         let truth = simulation.at(t).wrenches[0];
@@ -458,7 +508,8 @@ fn a_late_half_comes_behind_the_next_first_half_and_is_never_paired_wrongly() {
             continue;
         };
         assert!(off_by(wrench.torque, time_of(sample)) <= 0.5 * TORQUE_LSB + 1e-9);
-        told_apart += usize::from(off_by(wrench.torque, time_of(sample) - 1e-3) > 0.5 * TORQUE_LSB + 1e-9);
+        told_apart +=
+            usize::from(off_by(wrench.torque, time_of(sample) - 1e-3) > 0.5 * TORQUE_LSB + 1e-9);
     }
     assert!(
         told_apart > 500,
@@ -473,14 +524,18 @@ fn a_fault_that_can_not_happen_is_refused() {
             "spike:l_elbow@1",
             "fault spike:l_elbow@1: \"l_elbow\" is not an F/T sensor",
         ),
-        ("saturate:chest_imu@1..2", "\"chest_imu\" is not an F/T sensor"),
+        (
+            "saturate:chest_imu@1..2",
+            "\"chest_imu\" is not an F/T sensor",
+        ),
         (
             "late_half:l_elbow_motor@1",
             "\"l_elbow_motor\" is not a board that sends a reading in several frames",
         ),
         (
             "silent:r_arm_ft@1..2",
-            "no board or channel \"r_arm_ft\"; there is l_arm_ft_sensor, chest_imu, l_shoulder_pitch_motor",
+            "no board or channel \"r_arm_ft\"; it has l_arm_ft_sensor, chest_imu, \
+             l_shoulder_pitch_motor",
         ),
     ] {
         let message = Simulator::new(&robot(), &settings(&[fault]), T0)
@@ -498,7 +553,7 @@ fn a_stalled_machine_skips_readings_and_sends_no_old_ones() {
         ..settings(&[])
     };
     let mut simulator = Simulator::new(&robot, &quiet, T0).unwrap();
-    // Polled every 50 ms, 4 ms boards send one reading each time: that of now.
+    // Polled every 50 ms, boards with a period of 4 ms send one reading each time, the current one.
     for k in 1..=20 {
         let now = T0 + Nanos::from_millis(50 * k);
         let mut motions = 0;
@@ -508,7 +563,7 @@ fn a_stalled_machine_skips_readings_and_sends_no_old_ones() {
         }
         assert_eq!(motions, 7);
     }
-    // 250 readings of each board in that second, less the 20 that were sent.
+    // 250 readings of each board in that second, minus the 20 that were sent.
     let skipped = simulator.buses()[1].counts().skipped;
     assert!((7 * 228..=7 * 231).contains(&skipped), "{skipped}");
 }

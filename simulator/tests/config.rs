@@ -1,4 +1,4 @@
-//! Every configuration that comes with the project can be loaded, fits its URDF and can be simulated.
+//! Every configuration of the project can be loaded, matches its URDF and can be simulated.
 
 use proprio_simulator::{Robot, Settings, Simulator};
 use proprio_topics::Nanos;
@@ -22,11 +22,11 @@ fn every_robot_under_config_can_be_loaded_and_simulated() {
             robot.model.warnings()
         );
         Simulator::new(&robot, &Settings::default(), Nanos::ZERO).unwrap_or_else(|e| panic!("{e}"));
-        // What the estimator needs, the gateway delivers.
+        // The gateway publishes everything that the estimator needs.
         for ft in &robot.config.force_torque {
             assert!(
                 robot.plan.channel(&ft.sensor).is_some(),
-                "{}: nobody measures {:?}",
+                "{}: no channel for {:?}",
                 folder.display(),
                 ft.sensor
             );
@@ -35,18 +35,22 @@ fn every_robot_under_config_can_be_loaded_and_simulated() {
     assert!(robots > 0);
 }
 
-/// The load at worst of both buses of icub_left_arm, as its gateway.toml states it.
+/// The worst-case load of both buses of icub_left_arm, as stated in its gateway.toml.
 #[test]
 fn no_bus_carries_more_than_sixty_percent() {
     let robot = Robot::open("icub_left_arm").unwrap();
     let mut log = Vec::new();
-    proprio_simulator::record::record(&robot, &Settings::default(), 2.0, Nanos::ZERO, &mut log).unwrap();
+    proprio_simulator::record::record(&robot, &Settings::default(), 2.0, Nanos::ZERO, &mut log)
+        .unwrap();
     for bus in &robot.plan.buses {
-        // Of the second second: the boards stream by then.
+        // Bits in the second second, when the boards stream.
         let bits: usize = std::str::from_utf8(&log)
             .unwrap()
             .lines()
-            .filter(|l| l.starts_with("(0000000001.") && l.split_whitespace().nth(1) == Some(bus.name.as_str()))
+            .filter(|l| {
+                l.starts_with("(0000000001.")
+                    && l.split_whitespace().nth(1) == Some(bus.name.as_str())
+            })
             .map(|l| (l.rsplit_once('#').unwrap().1.len()) / 2)
             .map(|bytes| 47 + 8 * bytes + (33 + 8 * bytes) / 4)
             .sum();

@@ -9,7 +9,8 @@ use proprio_gateway::offline::decode;
 use proprio_gateway::status::BusStatus;
 use proprio_simulator::record::{record, write_truth};
 use proprio_simulator::{
-    Options, OptionsError, Robot, Settings, Simulation, is_configuration, parse_bus, run, run_with_skin,
+    Options, OptionsError, Robot, Settings, Simulation, is_configuration, parse_bus, run,
+    run_with_skin,
 };
 use proprio_topics::csv::{Columns, Reader, Row, Value};
 use proprio_topics::{Counter, Nanos, Reading};
@@ -34,29 +35,53 @@ fn a_recorded_session_decodes_to_what_was_sent() {
     let recorded = record(&robot, &settings, 3.0, T0, &mut log).unwrap();
     let report = decode(&robot.plan, &log[..], &mut table, Columns::All).unwrap();
     assert_eq!(
-        (report.bad_lines, report.other_interfaces, report.out_of_order),
+        (
+            report.bad_lines,
+            report.other_interfaces,
+            report.out_of_order
+        ),
         (0, 0, 0),
         "{:?}",
         report.bad
     );
     let frames: u64 = recorded.iter().map(|r| r.sent + r.commands).sum();
     assert_eq!(report.frames, frames);
-    assert_eq!(recorded[1].commands, 0, "motor boards are nobody's to command here");
+    assert_eq!(
+        recorded[1].commands, 0,
+        "nothing commands motor boards here"
+    );
     for device in &report.devices {
-        assert!(device.refusal.is_none() && device.counts.is_empty(), "{device:?}");
+        assert!(
+            device.refusal.is_none() && device.counts.is_empty(),
+            "{device:?}"
+        );
     }
-    let readings = |name: &str| report.devices.iter().find(|d| d.name == name).unwrap().readings;
-    assert!(readings("l_arm_ft_sensor") > 2900 && readings("chest_imu") > 280 && readings("l_wrist_yaw_motor") >= 750);
-    // In order, frame times apart on each bus.
+    let readings = |name: &str| {
+        report
+            .devices
+            .iter()
+            .find(|d| d.name == name)
+            .unwrap()
+            .readings
+    };
+    assert!(
+        readings("l_arm_ft_sensor") > 2900
+            && readings("chest_imu") > 280
+            && readings("l_wrist_yaw_motor") >= 750
+    );
+    // In order, and at least a frame's duration apart on each bus.
     let mut last: HashMap<&str, Nanos> = HashMap::new();
     let text = std::str::from_utf8(&log).unwrap();
     for line in text.lines() {
         let mut words = line.split_whitespace();
         let t = Nanos::parse_seconds(words.next().unwrap().trim_matches(['(', ')'])).unwrap();
         let before = last.insert(words.next().unwrap(), t);
-        assert!(before.is_none_or(|b| t - b >= Nanos::from_micros(130)), "{line}");
+        assert!(
+            before.is_none_or(|b| t - b >= Nanos::from_micros(130)),
+            "{line}"
+        );
     }
-    // The same seed, the same log.
+    // The same seed gives the same log.
     let mut again = Vec::new();
     record(&robot, &settings, 3.0, T0, &mut again).unwrap();
     assert!(again == log);
@@ -97,11 +122,21 @@ fn the_truth_is_a_sample_log() {
             match reading {
                 Reading::Joint(state) => {
                     let joint = truth.joints[simulation.joint(&series[item.series].name).unwrap()];
-                    assert_eq!((state.position, state.velocity), (joint.position, joint.velocity));
-                    assert_eq!((state.acceleration, state.torque), (joint.acceleration, joint.torque));
+                    assert_eq!(
+                        (state.position, state.velocity),
+                        (joint.position, joint.velocity)
+                    );
+                    assert_eq!(
+                        (state.acceleration, state.torque),
+                        (joint.acceleration, joint.torque)
+                    );
                 }
-                Reading::Wrench(wrench) => assert_eq!([wrench.force, wrench.torque].concat(), truth.wrenches[0]),
-                Reading::Imu(imu) => assert_eq!(imu.angular_acceleration, truth.imus[0].angular_acceleration),
+                Reading::Wrench(wrench) => {
+                    assert_eq!([wrench.force, wrench.torque].concat(), truth.wrenches[0]);
+                }
+                Reading::Imu(imu) => {
+                    assert_eq!(imu.angular_acceleration, truth.imus[0].angular_acceleration);
+                }
                 other => panic!("{other:?}"),
             }
         }
@@ -117,8 +152,15 @@ fn the_truth_is_a_sample_log() {
     );
 }
 
-/// A gateway's side of one virtual bus, until `stop`: returns frames received and what each device counted.
-fn listen(robot: &Robot, bus: usize, domain: &str, name: &str, stop: &AtomicBool) -> (u64, Vec<(String, Vec<u64>)>) {
+/// The gateway's side of one virtual bus until `stop`: returns the frames received and each
+/// device's counters.
+fn listen(
+    robot: &Robot,
+    bus: usize,
+    domain: &str,
+    name: &str,
+    stop: &AtomicBool,
+) -> (u64, Vec<(String, Vec<u64>)>) {
     let plan = &robot.plan.buses[bus];
     let status = Arc::new(BusStatus::new(0, plan));
     let mut decoder = Decoder::new(0, plan, None, Arc::clone(&status)).unwrap();
@@ -127,11 +169,13 @@ fn listen(robot: &Robot, bus: usize, domain: &str, name: &str, stop: &AtomicBool
     while !stop.load(Relaxed) {
         decoder.poll_transmit(clock.now(), |t| link.send(&t.frame, t.deadline).unwrap());
         let deadline = clock.now() + Nanos::from_millis(10);
-        if let Received::Frame(frame) = link.recv(decoder.next_wake().map_or(deadline, |w| w.min(deadline))) {
+        if let Received::Frame(frame) =
+            link.recv(decoder.next_wake().map_or(deadline, |w| w.min(deadline)))
+        {
             decoder.on_frame(&frame, |_| {});
         }
     }
-    // What is still in the buffer has been sent too.
+    // Read the rest of the buffer.
     while let Received::Frame(frame) = link.recv(clock.now() + Nanos::from_millis(100)) {
         decoder.on_frame(&frame, |_| {});
     }
@@ -148,10 +192,13 @@ fn live_on_virtual_buses_boards_are_started_and_every_frame_sent_arrives() {
     let robot = robot();
     let folder = tempfile::tempdir().unwrap();
     let truth = folder.path().join("truth.csv");
-    // Tests run in parallel: a domain of this one's own.
+    // A separate domain, because tests run in parallel.
     let domain = format!("simulator-{}", std::process::id());
     let options = Options {
-        buses: vec![parse_bus("virtual:one").unwrap(), parse_bus("virtual:two").unwrap()],
+        buses: vec![
+            parse_bus("virtual:one").unwrap(),
+            parse_bus("virtual:two").unwrap(),
+        ],
         domain: domain.clone(),
         seconds: Some(1.5),
         settings: Settings {
@@ -168,19 +215,29 @@ fn live_on_virtual_buses_boards_are_started_and_every_frame_sent_arrives() {
             .enumerate()
             .map(|(bus, name)| scope.spawn(move || listen(robot, bus, domain, name, over)))
             .collect();
-        // They have to be there first if nothing is to be missed.
+        // The gateways must listen before the boards start, so that no frame is missed.
         std::thread::sleep(std::time::Duration::from_millis(200));
         let summary = run(robot, &options, &AtomicBool::new(false));
         over.store(true, Relaxed);
         (
             summary.unwrap(),
-            listeners.into_iter().map(|l| l.join().unwrap()).collect::<Vec<_>>(),
+            listeners
+                .into_iter()
+                .map(|l| l.join().unwrap())
+                .collect::<Vec<_>>(),
         )
     });
     for (bus, (received, devices)) in summary.buses.iter().zip(&heard) {
-        assert_eq!((bus.sent, bus.send_failures, bus.refused), (*received, 0, 0), "{bus:?}");
+        assert_eq!(
+            (bus.sent, bus.send_failures, bus.refused),
+            (*received, 0, 0),
+            "{bus:?}"
+        );
         for (name, counters) in devices {
-            assert!(counters[Counter::Readings as usize] > 20, "{name}: {counters:?}");
+            assert!(
+                counters[Counter::Readings as usize] > 20,
+                "{name}: {counters:?}"
+            );
         }
     }
     assert_eq!(summary.sent, heard.iter().map(|(n, _)| n).sum::<u64>());
@@ -222,30 +279,45 @@ fn the_skin_tells_of_each_touch_ahead_of_it() {
     let mut skin = |contact: &str, at: Nanos, touches: bool| {
         told.push((contact.to_owned(), at, touches, Monotonic.now()));
     };
-    let summary = run_with_skin(&robot(), &options, Some(&mut skin), &AtomicBool::new(false)).unwrap();
+    let summary =
+        run_with_skin(&robot(), &options, Some(&mut skin), &AtomicBool::new(false)).unwrap();
     let told: Vec<_> = told
         .iter()
-        .map(|(contact, at, touches, heard)| (contact.as_str(), *at - Nanos(summary.t0), *touches, *at - *heard))
+        .map(|(contact, at, touches, heard)| {
+            (
+                contact.as_str(),
+                *at - Nanos(summary.t0),
+                *touches,
+                *at - *heard,
+            )
+        })
         .collect();
     let [(_, from, ..), (_, until, ..)] = told[..] else {
         panic!("{told:?}");
     };
     // The push of a run of 2 s, from 40 % to 60 % of it.
-    assert_eq!((from, until), (Nanos::from_millis(800), Nanos::from_millis(1200)));
-    assert!(told.iter().all(|(contact, ..)| *contact == "hand"), "{told:?}");
+    assert_eq!(
+        (from, until),
+        (Nanos::from_millis(800), Nanos::from_millis(1200))
+    );
+    assert!(
+        told.iter().all(|(contact, ..)| *contact == "hand"),
+        "{told:?}"
+    );
     assert_eq!([told[0].2, told[1].2], [true, false]);
     assert!(
         told.iter()
             .all(|(.., ahead)| (Nanos::ZERO..=Nanos::from_millis(100)).contains(ahead)),
         "{told:?}"
     );
-    // Whoever is told to stop meanwhile does.
+    // A stop request in the meantime is obeyed.
     let options = Options {
         seconds: Some(60.0),
         ..options
     };
     let mut skin = |_: &str, _, _| {};
-    let summary = run_with_skin(&robot(), &options, Some(&mut skin), &AtomicBool::new(true)).unwrap();
+    let summary =
+        run_with_skin(&robot(), &options, Some(&mut skin), &AtomicBool::new(true)).unwrap();
     assert!(summary.seconds < 10.0);
 }
 
@@ -301,7 +373,7 @@ fn options_that_can_not_be_followed_are_told() {
     );
     assert!(
         !is_configuration(&error),
-        "a machine without CAN is not a wrong configuration"
+        "missing CAN support is not a wrong configuration"
     );
     assert_eq!(parse_bus("virtual:left_arm"), Ok(virtual_bus("left_arm")));
     assert_eq!(

@@ -44,7 +44,12 @@ PROGRAMS = {
     "Eigen, native": ["peers-eigen"],
 }
 # Which build of ours is built as a peer is: the ratio to that one compares libraries, and not compilers' flags.
-BUILT_LIKE = {IDYNTREE: OURS_PORTABLE, "Pinocchio, native": OURS_NATIVE, "dynibo, native": OURS_NATIVE, "Eigen, native": OURS_NATIVE}
+BUILT_LIKE = {
+    IDYNTREE: OURS_PORTABLE,
+    "Pinocchio, native": OURS_NATIVE,
+    "dynibo, native": OURS_NATIVE,
+    "Eigen, native": OURS_NATIVE,
+}
 REFERENCE = OURS_PORTABLE
 TOLERANCE = 1e-9
 SHOWN_STATES = (0, 17, 63)
@@ -61,14 +66,20 @@ class Program:
         path, *arguments = PROGRAMS[name]
         try:
             self._process = subprocess.Popen(
-                [str(folder / path), *arguments], cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+                [str(folder / path), *arguments],
+                cwd=folder,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
             )
         except OSError as error:
             raise Failure(f"{name}: {error}") from error
         self.rows = self._ask("rows").split()
         unknown = set(self.rows) - set(ROWS)
         if unknown:
-            raise Failure(f"{name} has rows that drive.py does not know: {' '.join(sorted(unknown))}")
+            raise Failure(
+                f"{name} has rows that drive.py does not know: {' '.join(sorted(unknown))}"
+            )
 
     def _ask(self, line):
         try:
@@ -78,7 +89,9 @@ class Program:
         except BrokenPipeError:
             answer = ""
         if not answer:
-            raise Failure(f"{self.name} ended when asked '{line}', with status {self._process.wait()}")
+            raise Failure(
+                f"{self.name} ended when asked '{line}', with status {self._process.wait()}"
+            )
         return answer
 
     def time(self, row, calls):
@@ -87,7 +100,12 @@ class Program:
 
     def show(self, row, state):
         """What comes out, by name."""
-        return {name: float(value) for name, value in (pair.split("=") for pair in self._ask(f"show {row} {state}").split())}
+        return {
+            name: float(value)
+            for name, value in (
+                pair.split("=") for pair in self._ask(f"show {row} {state}").split()
+            )
+        }
 
     def close(self):
         self._process.stdin.close()
@@ -100,7 +118,12 @@ def largest_difference(values, reference):
         only = sorted(values.keys() ^ reference.keys())
         raise Failure(f"not the same outputs: {' '.join(only[:8]) or 'none'}")
     # Compared with a number that is none, anything would pass.
-    wrong = [name for output in (values, reference) for name, value in output.items() if not math.isfinite(value)]
+    wrong = [
+        name
+        for output in (values, reference)
+        for name, value in output.items()
+        if not math.isfinite(value)
+    ]
     if wrong:
         raise Failure(f"not finite: {' '.join(wrong[:8])}")
     size = {}
@@ -125,11 +148,15 @@ def check(row, programs):
             continue
         for state in SHOWN_STATES:
             try:
-                worst, where = largest_difference(program.show(row, state), reference.show(row, state))
+                worst, where = largest_difference(
+                    program.show(row, state), reference.show(row, state)
+                )
             except Failure as failure:
                 raise Failure(f"{row}, {program.name} and {reference.name}: {failure}") from failure
             if worst > TOLERANCE:
-                raise Failure(f"{row}, state {state}: {program.name} differs from {reference.name} by {worst:.1e} in {where}")
+                raise Failure(
+                    f"{row}, state {state}: {program.name} differs from {reference.name} by {worst:.1e} in {where}"
+                )
             found[program.name] = max(found.get(program.name, 0.0), worst)
     return found
 
@@ -138,7 +165,9 @@ def measure(rows, rounds):
     """Nanoseconds per call in each round, by row and program."""
     times = {row: {program.name: [] for program in programs} for row, programs in rows.items()}
     calls = {
-        (row, program.name): max(64, round(BATCH_NS / program.time(row, 64))) for row, programs in rows.items() for program in programs
+        (row, program.name): max(64, round(BATCH_NS / program.time(row, 64)))
+        for row, programs in rows.items()
+        for program in programs
     }
     for number in range(rounds):
         for row, programs in rows.items():
@@ -152,7 +181,9 @@ def measure(rows, rounds):
 def machine():
     """What the numbers were taken on."""
     try:
-        cpus = re.findall(r"^model name\s*: (.*)$", pathlib.Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+        cpus = re.findall(
+            r"^model name\s*: (.*)$", pathlib.Path("/proc/cpuinfo").read_text(), re.MULTILINE
+        )
     except OSError:
         cpus = []
     return {
@@ -178,8 +209,12 @@ def report(times, differences):
                     "min_us": low[name],
                     "median_us": middle[name],
                     # Times as long as ours.
-                    "ratio_min": {ours: low[name] / low[ours] for ours in (OURS_NATIVE, OURS_PORTABLE)},
-                    "ratio_median": {ours: middle[name] / middle[ours] for ours in (OURS_NATIVE, OURS_PORTABLE)},
+                    "ratio_min": {
+                        ours: low[name] / low[ours] for ours in (OURS_NATIVE, OURS_PORTABLE)
+                    },
+                    "ratio_median": {
+                        ours: middle[name] / middle[ours] for ours in (OURS_NATIVE, OURS_PORTABLE)
+                    },
                     "built_like": BUILT_LIKE.get(name),
                     "difference": differences[row].get(name),
                 }
@@ -208,12 +243,22 @@ def markdown(rows, rounds, at):
                 for ours in (OURS_NATIVE, OURS_PORTABLE)
             ]
             difference = "-" if entry["difference"] is None else f"{entry['difference']:.0e}"
-            table.append([entry["program"], f"{entry['min_us']:.2f}", f"{entry['median_us']:.2f}", *ratios, difference])
+            table.append(
+                [
+                    entry["program"],
+                    f"{entry['min_us']:.2f}",
+                    f"{entry['median_us']:.2f}",
+                    *ratios,
+                    difference,
+                ]
+            )
         widths = [max(len(line[column]) for line in table) for column in range(len(header))]
         table.insert(1, ["-" * width for width in widths])
         lines += [f"## {row}: {title}", ""]
         for number, cells in enumerate(table):
-            padded = [cells[0].ljust(widths[0])] + [cell.rjust(width) for cell, width in zip(cells[1:], widths[1:])]
+            padded = [cells[0].ljust(widths[0])] + [
+                cell.rjust(width) for cell, width in zip(cells[1:], widths[1:])
+            ]
             if number == 1:
                 padded[1:] = [cell[:-1] + ":" for cell in padded[1:]]
             lines.append("| " + " | ".join(padded) + " |")
@@ -225,7 +270,9 @@ def main():
     parser = argparse.ArgumentParser(description="see the top of this file")
     parser.add_argument("folder", type=pathlib.Path)
     parser.add_argument("--rounds", type=int, default=100)
-    parser.add_argument("--row", action="append", choices=ROWS, help="this row alone; may be repeated")
+    parser.add_argument(
+        "--row", action="append", choices=ROWS, help="this row alone; may be repeated"
+    )
     arguments = parser.parse_args()
     if arguments.rounds < 1:
         parser.error("--rounds: at least 1")
@@ -233,16 +280,26 @@ def main():
 
     at = machine()
     if at["load"] > 0.5:
-        print(f"drive.py: the machine is not idle (load {at['load']:.2f}): trust the least times alone, if any", file=sys.stderr)
+        print(
+            f"drive.py: the machine is not idle (load {at['load']:.2f}): trust the least times alone, if any",
+            file=sys.stderr,
+        )
     programs = [Program(name, folder) for name in PROGRAMS]
-    rows = {row: [p for p in programs if row in p.rows] for row in ROWS if row in (arguments.row or ROWS)}
+    rows = {
+        row: [p for p in programs if row in p.rows]
+        for row in ROWS
+        if row in (arguments.row or ROWS)
+    }
     rows = {row: having for row, having in rows.items() if having}
     for row, having in rows.items():
         if not {OURS_NATIVE, OURS_PORTABLE} <= {program.name for program in having}:
             raise Failure(f"{row}: not in both builds of ours, which all are compared with")
     differences = {row: check(row, having) for row, having in rows.items()}
     compared = sum(map(len, differences.values()))
-    print(f"drive.py: outputs agree in {compared} comparisons; now {arguments.rounds} rounds", file=sys.stderr)
+    print(
+        f"drive.py: outputs agree in {compared} comparisons; now {arguments.rounds} rounds",
+        file=sys.stderr,
+    )
     times = measure(rows, arguments.rounds)
     for program in programs:
         program.close()
@@ -250,7 +307,9 @@ def main():
     result = report(times, differences)
     text = markdown(result, arguments.rounds, at)
     (folder / "results.md").write_text(text)
-    (folder / "results.json").write_text(json.dumps({"machine": at, "rounds": arguments.rounds, "rows": result}, indent=1) + "\n")
+    (folder / "results.json").write_text(
+        json.dumps({"machine": at, "rounds": arguments.rounds, "rows": result}, indent=1) + "\n"
+    )
     print(text)
 
 

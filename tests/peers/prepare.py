@@ -10,7 +10,7 @@ Usage: python prepare.py FOLDER        (packages: requirements.txt; `run` calls 
                         joints N, their names                       sensors N, their names
                         bodies N, their names: the first is the URDF's root, the others are the links that moving joints and F/T joints move
                         contacts N, names of links, one for every piece between F/T sensors
-                        gravity, three numbers                      parameters, ten random numbers per body (their order: estimator/src/spatial.rs)
+                        gravity, three numbers                      parameters, ten random numbers per body (their order: estimator/dynamics/src/spatial.rs)
                         states N, then for each state:
                             positions, velocities, accelerations of the joints
                             motion of the base: angular velocity, velocity of the origin, angular acceleration, classical acceleration of the origin,
@@ -51,7 +51,12 @@ def states(moving, sensors, bodies):
     def reals(count, size):
         return [source.uniform(-size, size) for _ in range(count)]
 
-    out = names("joints", moving) + names("sensors", sensors) + names("bodies", bodies) + names("contacts", CONTACTS)
+    out = (
+        names("joints", moving)
+        + names("sensors", sensors)
+        + names("bodies", bodies)
+        + names("contacts", CONTACTS)
+    )
     out += f"gravity {text(GRAVITY)}\nparameters\n"
     for _ in bodies:
         out += text(reals(10, 1.0)) + "\n"
@@ -71,7 +76,11 @@ def rpy(rotation):
     cos = np.hypot(rotation[0, 0], rotation[1, 0])
     pitch = np.arctan2(-rotation[2, 0], cos)
     if cos > 1e-9:
-        return [np.arctan2(rotation[2, 1], rotation[2, 2]), pitch, np.arctan2(rotation[1, 0], rotation[0, 0])]
+        return [
+            np.arctan2(rotation[2, 1], rotation[2, 2]),
+            pitch,
+            np.arctan2(rotation[1, 0], rotation[0, 0]),
+        ]
     return [np.arctan2(-rotation[1, 2], rotation[1, 1]), pitch, 0.0]
 
 
@@ -79,7 +88,14 @@ def folded_link(name, inertia):
     i = inertia.inertia  # about the centre of mass
     moments = " ".join(
         f'{key}="{float(i[a, b])!r}"'
-        for key, a, b in (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2), ("izz", 2, 2))
+        for key, a, b in (
+            ("ixx", 0, 0),
+            ("ixy", 0, 1),
+            ("ixz", 0, 2),
+            ("iyy", 1, 1),
+            ("iyz", 1, 2),
+            ("izz", 2, 2),
+        )
     )
     return (
         f'<link name="{name}"><inertial><origin xyz="{text(inertia.lever)}" rpy="0 0 0"/>'
@@ -104,10 +120,19 @@ def main(folder):
     folded = folded_link(root, model.inertias[0])
     lines = f"{model.njoints - 1}\n{text(model.inertias[0].toDynamicParameters())}\n"
     for number in range(1, model.njoints):
-        name, placement, inertia = model.names[number], model.jointPlacements[number], model.inertias[number]
+        name, placement, inertia = (
+            model.names[number],
+            model.jointPlacements[number],
+            model.inertias[number],
+        )
         kind = model.joints[number].shortname()
-        if joints[name].get("type") not in ("revolute", "continuous") or model.joints[number].nq != 1:
-            sys.exit(f"prepare.py: joint {name} is a {kind}; only joints that turn are handed to Pinocchio")
+        if (
+            joints[name].get("type") not in ("revolute", "continuous")
+            or model.joints[number].nq != 1
+        ):
+            sys.exit(
+                f"prepare.py: joint {name} is a {kind}; only joints that turn are handed to Pinocchio"
+            )
         axis = np.array([float(x) for x in joints[name].find("axis").get("xyz").split()])
         axis /= np.linalg.norm(axis)
         parent = model.parents[number]

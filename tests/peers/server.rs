@@ -1,6 +1,8 @@
-//! What the Rust programs here share (the C++ ones have server.hpp): the states, and the conversation with `drive.py`.
+//! What the Rust programs here share (the C++ ones have server.hpp): the states, and the
+//! conversation with `drive.py`.
 //!
-//! A program offers rows by name. On standard input it is asked, one line each, and answers with one line:
+//! A program offers rows by name. On standard input it is asked, one line each, and answers with
+//! one line:
 //!
 //! ```text
 //! rows              the names of the rows it has
@@ -12,7 +14,8 @@ use std::io::{BufRead, Write};
 use std::str::FromStr;
 use std::time::Instant;
 
-/// The joints' state, the motion of the base and the sensors' readings at one instant; see prepare.py.
+/// The joints' state, the motion of the base and the sensors' readings at one instant; see
+/// prepare.py.
 pub struct State {
     pub position: Vec<f64>,
     pub velocity: Vec<f64>,
@@ -43,7 +46,8 @@ pub struct States {
     pub states: Vec<State>,
 }
 
-/// Words of a text, one after the other; a missing or wrong one ends the program, which can do nothing without it.
+/// Words of a text, one after the other; a missing or wrong one ends the program, which can do
+/// nothing without it.
 struct Words<'a>(std::str::SplitAsciiWhitespace<'a>);
 
 impl Words<'_> {
@@ -72,7 +76,8 @@ impl Words<'_> {
 
 impl States {
     pub fn read(path: &str) -> Self {
-        let text = std::fs::read_to_string(path).unwrap_or_else(|error| fail(&format!("{path}: {error}")));
+        let text =
+            std::fs::read_to_string(path).unwrap_or_else(|error| fail(&format!("{path}: {error}")));
         let mut words = Words(text.split_ascii_whitespace());
         let joints = words.names("joints");
         let sensors = words.names("sensors");
@@ -94,7 +99,10 @@ impl States {
                     angular_acceleration: words.array(),
                     acceleration: words.array(),
                 },
-                readings: sensors.iter().map(|_| [words.array(), words.array()]).collect(),
+                readings: sensors
+                    .iter()
+                    .map(|_| [words.array(), words.array()])
+                    .collect(),
             })
             .collect();
         Self {
@@ -112,10 +120,18 @@ impl States {
     pub fn in_order_of(mut self, names: &[&str]) -> Self {
         let places: Vec<usize> = names.iter().map(|name| place(&self.joints, name)).collect();
         if places.len() != self.joints.len() {
-            fail(&format!("{} joints instead of {}", places.len(), self.joints.len()));
+            fail(&format!(
+                "{} joints instead of {}",
+                places.len(),
+                self.joints.len()
+            ));
         }
         for state in &mut self.states {
-            for values in [&mut state.position, &mut state.velocity, &mut state.acceleration] {
+            for values in [
+                &mut state.position,
+                &mut state.velocity,
+                &mut state.acceleration,
+            ] {
                 *values = places.iter().map(|&at| values[at]).collect();
             }
         }
@@ -163,7 +179,11 @@ pub fn serve(states: usize, rows: &mut [(&str, Box<dyn Bench>)]) {
         let line = line.unwrap_or_else(|error| fail(&error.to_string()));
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
         let answer = match words[..] {
-            ["rows"] => rows.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(" "),
+            ["rows"] => rows
+                .iter()
+                .map(|(name, _)| *name)
+                .collect::<Vec<_>>()
+                .join(" "),
             [what @ ("time" | "show"), row, count] => {
                 let bench = rows.iter_mut().find(|(name, _)| *name == row);
                 let (Some((_, bench)), Ok(count)) = (bench, count.parse()) else {
@@ -189,8 +209,12 @@ pub fn serve(states: usize, rows: &mut [(&str, Box<dyn Bench>)]) {
     }
 }
 
-/// Nanoseconds per call. Every state comes once before, untimed: another program has just had the caches.
-#[expect(clippy::disallowed_methods, reason = "to measure time is what this is for")]
+/// Nanoseconds per call. Every state comes once before, untimed: another program has just had the
+/// caches.
+#[expect(
+    clippy::disallowed_methods,
+    reason = "to measure time is what this is for"
+)]
 fn nanoseconds(bench: &mut dyn Bench, states: usize, calls: usize) -> f64 {
     (0..states).for_each(|state| bench.run(state));
     let start = Instant::now();

@@ -1,11 +1,11 @@
-//! Variants of `config/icub_left_arm`: the same arm on other buses, at another pace, with another patience.
+//! Variants of `config/icub_left_arm` with other buses, periods and time-outs.
 
 use proprio_simulator::Robot;
 use std::fs;
 use std::path::Path;
 use toml::{Table, Value};
 
-/// The two files of the arm's configuration, to be changed and written.
+/// The two configuration files of the arm, which can be changed and written.
 #[derive(Debug, Clone)]
 pub struct Arm {
     /// gateway.toml.
@@ -24,7 +24,7 @@ impl Arm {
     /// The configuration as it is in the repository.
     ///
     /// # Panics
-    /// If it is not there.
+    /// If it cannot be read.
     #[must_use]
     pub fn new() -> Self {
         let folder = Robot::find("icub_left_arm").expect("the robot of this repository");
@@ -35,16 +35,23 @@ impl Arm {
                 .expect("it is TOML")
         };
         let (gateway, mut estimator) = (read("gateway.toml"), read("estimator.toml"));
-        let model = folder.join("model.urdf").canonicalize().expect("the robot's model");
-        estimator.insert("model".into(), model.to_str().expect("a path in UTF-8").into());
+        let model = folder
+            .join("model.urdf")
+            .canonicalize()
+            .expect("the robot's model");
+        estimator.insert(
+            "model".into(),
+            model.to_str().expect("a path in UTF-8").into(),
+        );
         Self { gateway, estimator }
     }
 
-    /// A pace for a single slow processor: F/T every 10 ms, joints and IMU every 20 ms, and patience to go with it.
+    /// Periods for a single slow processor: F/T every 10 ms, joints and IMU every 20 ms, with
+    /// suitable time-outs.
     #[must_use]
     pub fn slow() -> Self {
         let paced = Self::new().periods(10, 20, 20).patience(1000.0, 100.0);
-        // The halves of a wrench, too, may come far apart where everything shares one processor.
+        // The halves of a wrench may arrive far apart, too, if everything shares one processor.
         paced.each_device(|driver, device| {
             if driver == "icub_strain" {
                 device.insert("pair_timeout_ms".into(), 500.0.into());
@@ -65,7 +72,7 @@ impl Arm {
         })
     }
 
-    /// Sets how long devices and channels may be silent, and how long an estimate waits \[ms\].
+    /// Sets the maximum silence of devices and channels, and the wait of an estimate \[ms\].
     #[must_use]
     pub fn patience(self, max_silence_ms: f64, max_wait_ms: f64) -> Self {
         let mut this = self.each_device(|_, device| {
@@ -76,7 +83,7 @@ impl Arm {
         this
     }
 
-    /// Sets the peak error of joint positions that the estimator reckons with \[rad\].
+    /// Sets the peak error of joint positions that the estimator assumes \[rad\].
     #[must_use]
     pub fn position_noise(mut self, rad: f64) -> Self {
         self.set("differentiation", "position_noise_rad", rad);
@@ -84,17 +91,23 @@ impl Arm {
     }
 
     fn set(&mut self, table: &str, key: &str, value: f64) {
-        let table = self.estimator.entry(table).or_insert_with(|| Table::new().into());
-        table.as_table_mut().expect("a table").insert(key.into(), value.into());
+        let table = self
+            .estimator
+            .entry(table)
+            .or_insert_with(|| Table::new().into());
+        table
+            .as_table_mut()
+            .expect("a table")
+            .insert(key.into(), value.into());
     }
 
-    /// Puts the buses onto CAN interfaces.
+    /// Sets CAN interfaces as the buses' sources.
     #[must_use]
     pub fn on_interfaces(self, interfaces: [&str; 2]) -> Self {
         self.on("socketcan", "interface", interfaces)
     }
 
-    /// Puts the buses onto virtual buses of these names.
+    /// Sets virtual buses of these names as the buses' sources.
     #[must_use]
     pub fn on_virtual(self, names: [&str; 2]) -> Self {
         self.on("virtual", "name", names)
@@ -102,13 +115,16 @@ impl Arm {
 
     fn on(mut self, kind: &str, key: &str, names: [&str; 2]) -> Self {
         for (bus, name) in self.buses().zip(names) {
-            let source = Table::from_iter([("kind".to_owned(), kind.into()), (key.to_owned(), name.into())]);
+            let source = Table::from_iter([
+                ("kind".to_owned(), kind.into()),
+                (key.to_owned(), name.into()),
+            ]);
             bus.insert("source".into(), source.into());
         }
         self
     }
 
-    /// Changes every device, given its driver's name.
+    /// Applies a change to every device; the closure also gets the driver's name.
     #[must_use]
     pub fn each_device(mut self, mut change: impl FnMut(&str, &mut Table)) -> Self {
         for bus in self.buses() {
@@ -138,14 +154,24 @@ impl Arm {
     /// Writes both files into `folder` and loads them.
     ///
     /// # Panics
-    /// If they can not be written, or are no configuration.
+    /// If they cannot be written or are not valid configurations.
     #[must_use]
     pub fn write(&self, folder: &Path) -> Written {
         fs::create_dir_all(folder).expect("a folder for the configuration");
-        for (name, table) in [("gateway.toml", &self.gateway), ("estimator.toml", &self.estimator)] {
-            fs::write(folder.join(name), table.to_string()).expect("a configuration can be written");
+        for (name, table) in [
+            ("gateway.toml", &self.gateway),
+            ("estimator.toml", &self.estimator),
+        ] {
+            fs::write(folder.join(name), table.to_string())
+                .expect("a configuration can be written");
         }
-        let text = |name: &str| folder.join(name).to_str().expect("a path in UTF-8").to_owned();
+        let text = |name: &str| {
+            folder
+                .join(name)
+                .to_str()
+                .expect("a path in UTF-8")
+                .to_owned()
+        };
         Written {
             robot: Robot::load(folder).unwrap_or_else(|error| panic!("{error}")),
             folder: text(""),
@@ -158,7 +184,7 @@ impl Arm {
 /// A configuration on disk.
 #[derive(Debug, Clone)]
 pub struct Written {
-    /// It, loaded.
+    /// The loaded robot.
     pub robot: Robot,
     /// The path of its folder.
     pub folder: String,

@@ -1,18 +1,20 @@
-//! The tools of can-utils and iproute2, as a person would use them.
+//! The tools of can-utils and iproute2.
 
 use crate::{PATIENCE, Process, Rig, until};
 use proprio_drivers::{Claim, Id};
 use std::process::Command;
 
-/// Whether vcan0 and vcan1 are there and ours, and up; says so if not.
+/// Whether vcan0 and vcan1 exist, belong to this test and are up; prints a note if not.
 #[must_use]
 pub fn vcan() -> bool {
     let there = std::env::var("PROPRIO_VCAN").is_ok_and(|v| v == "1");
     if !there {
-        println!("skipped: PROPRIO_VCAN=1 is not set (tests/run --only vcan provides vcan0 and vcan1)");
+        println!(
+            "skipped: PROPRIO_VCAN=1 is not set (tests/run --only vcan provides vcan0 and vcan1)"
+        );
         return false;
     }
-    // A test that failed may have left them otherwise.
+    // An earlier, failed test may have changed them.
     for name in ["vcan0", "vcan1"] {
         if !std::path::Path::new("/sys/class/net").join(name).exists() {
             add_interface(name);
@@ -22,25 +24,30 @@ pub fn vcan() -> bool {
     true
 }
 
-/// A tool with its arguments, separated by spaces; found where an ordinary user's PATH does not lead, too.
+/// A tool with its arguments, separated by spaces; also searched in sbin folders, which may not be
+/// in PATH.
 ///
 /// # Panics
-/// On an empty line.
+/// If the line is empty.
 #[must_use]
 pub fn tool(line: &str) -> Command {
     let mut words = line.split_whitespace();
     let mut command = Command::new(words.next().expect("a tool's name"));
     let path = std::env::var("PATH").unwrap_or_default();
-    command.args(words).env("PATH", format!("{path}:/usr/sbin:/sbin"));
+    command
+        .args(words)
+        .env("PATH", format!("{path}:/usr/sbin:/sbin"));
     command
 }
 
-/// Runs a tool to its end, which must be a success.
+/// Runs a tool until it ends; it must succeed.
 ///
 /// # Panics
 /// If it fails.
 pub fn run(line: &str) {
-    let output = tool(line).output().unwrap_or_else(|error| panic!("{line}: {error}"));
+    let output = tool(line)
+        .output()
+        .unwrap_or_else(|error| panic!("{line}: {error}"));
     assert!(
         output.status.success(),
         "{line}: {}: {}",
@@ -49,38 +56,40 @@ pub fn run(line: &str) {
     );
 }
 
-/// Makes a virtual CAN interface with CAN FD, up.
+/// Creates a virtual CAN interface with CAN FD and brings it up.
 pub fn add_interface(name: &str) {
     run(&format!("ip link add dev {name} type vcan"));
     run(&format!("ip link set dev {name} mtu 72 up"));
 }
 
-/// candump's filter for what `claims` let pass: data frames of these identifiers alone.
+/// candump's filter for `claims`: only data frames of these identifiers.
 #[must_use]
 pub fn filter(claims: &[Claim]) -> String {
     let one = |claim: &Claim| match claim.id {
-        // The mask's upper bits: neither an extended identifier that ends alike, nor a remote request.
+        // The mask's upper bits exclude remote requests and extended identifiers with the same low
+        // bits.
         Id::Standard(id) => format!(",{id:03X}:{:08X}", claim.mask & 0x7FF | 0xC000_0000),
         Id::Extended(id) => format!(",{id:08X}:{:08X}", claim.mask & 0x1FFF_FFFF | 0xC000_0000),
     };
     claims.iter().map(one).collect()
 }
 
-/// candump, writing what it receives in the log format to its output.
+/// A candump process that writes received frames in the log format to its output.
 pub struct Candump {
     process: Process,
     probes: usize,
 }
 
 impl Candump {
-    /// Listens on `interface` with `filter`; returns once it does. `probe` is a frame that passes the filter: it is sent until candump has
-    /// it, and is not part of what [`Candump::log`] gives.
+    /// Listens on `interface` with `filter`; returns when it listens. `probe` is a frame that
+    /// passes the filter: it is sent until candump receives it, and is not part of
+    /// [`Candump::log`].
     ///
     /// # Panics
     /// If candump does not start to listen.
     #[must_use]
     pub fn start(rig: &Rig, interface: &str, filter: &str, probe: &str) -> Self {
-        // A buffer for a flood.
+        // A large buffer for many frames.
         let process = rig.spawn(
             tool(&format!("candump -d -L -r 8388608 {interface}{filter}")),
             "candump",
@@ -90,14 +99,18 @@ impl Candump {
             run(&format!("cansend {interface} {probe}"));
             (!this.process.output().is_empty()).then_some(())
         });
-        assert!(heard.is_some(), "candump does not listen: {}", this.process.log());
-        // Those that were on their way.
+        assert!(
+            heard.is_some(),
+            "candump does not listen: {}",
+            this.process.log()
+        );
+        // Wait for probes still in transit.
         std::thread::sleep(std::time::Duration::from_millis(200));
         this.probes = this.process.output().lines().count();
         this
     }
 
-    /// The frames since it was started, one a line.
+    /// The frames since its start, one per line.
     #[must_use]
     pub fn log(&self) -> String {
         self.process
@@ -108,7 +121,7 @@ impl Candump {
             .collect()
     }
 
-    /// How many these are.
+    /// The number of these frames.
     #[must_use]
     pub fn count(&self) -> usize {
         self.process.output().lines().count() - self.probes

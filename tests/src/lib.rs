@@ -1,13 +1,17 @@
-//! What the suites across processes share: running the built programs in a shared-memory domain of their own, variants of
-//! the robot's configuration, watching through shared memory as any consumer does, and the tools of can-utils.
+//! The test harness of the multi-process suites: runs the built programs in a separate
+//! shared-memory domain, creates variants of the robot's configuration, reads shared memory as any
+//! consumer does, and runs the tools of can-utils.
 //!
-//! - [`Rig`], [`Process`]: programs, their logs, their domain, and what they leave in shared memory.
-//! - [`Arm`]: `config/icub_left_arm` with other sources, periods and patience.
-//! - [`watch`]: health until it says something, the first valid estimate, everything that was published, the truth.
-//! - [`browse`]: a report, in a headless browser.
+//! - [`Rig`], [`Process`]: programs, their logs, their domain, and the files they leave in shared
+//!   memory.
+//! - [`Arm`]: `config/icub_left_arm` with other sources, periods and time-outs.
+//! - [`watch`]: waits for a health condition or the first valid estimate; records everything
+//!   published; reads the truth.
+//! - [`browse`]: checks a report in a headless browser.
 //! - [`can`]: candump, canplayer, cangen, cansend, ip.
 //!
-//! Every process that is started here is ended when its handle goes, by its number, whether a test passes or not.
+//! Every process started here is ended by its process id when its handle is dropped, whether the
+//! test passes or not.
 
 mod arm;
 mod browser;

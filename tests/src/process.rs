@@ -1,4 +1,5 @@
-//! Programs under test: found beside the test, run in a domain of their own, ended with it.
+//! Programs under test: found next to the test executable, run in a separate domain, and ended with
+//! the test.
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
@@ -11,23 +12,26 @@ use std::process::{Child, Command, ExitStatus, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::Duration;
 
-/// Long enough for anything that happens at all; never waited for where all is well.
+/// Time-out for any event; not reached if all is well.
 pub const PATIENCE: Nanos = Nanos::from_millis(120_000);
 
-/// The clock that all stamps are of.
+/// The clock of all stamps.
 #[must_use]
 pub fn now() -> Nanos {
     monotonic()
 }
 
-/// Whether this is user-mode Linux, where system calls take ten times as long or more: `tests/vcan/README.md`.
+/// Whether this is user-mode Linux, where system calls take ten times as long or more:
+/// `tests/vcan/README.md`.
 #[must_use]
 pub fn uml() -> bool {
     static UML: OnceLock<bool> = OnceLock::new();
-    *UML.get_or_init(|| fs::read_to_string("/proc/cpuinfo").is_ok_and(|text| text.contains("User Mode Linux")))
+    *UML.get_or_init(|| {
+        fs::read_to_string("/proc/cpuinfo").is_ok_and(|text| text.contains("User Mode Linux"))
+    })
 }
 
-/// Waits until `ask` gives something, at most `limit`; `None` if it never does.
+/// Waits at most `limit` until `ask` returns a value; `None` after that.
 pub fn until<R>(limit: Nanos, mut ask: impl FnMut() -> Option<R>) -> Option<R> {
     let end = now() + limit;
     loop {
@@ -44,7 +48,7 @@ pub fn until<R>(limit: Nanos, mut ask: impl FnMut() -> Option<R>) -> Option<R> {
 /// A folder and a shared-memory domain for one test.
 pub struct Rig {
     folder: tempfile::TempDir,
-    /// The domain of all processes that are started here.
+    /// The domain of all processes started here.
     pub domain: DomainConfig,
     prefix: OnceCell<String>,
     starts: Cell<u32>,
@@ -57,10 +61,10 @@ impl Default for Rig {
 }
 
 impl Rig {
-    /// A new one; removed when it goes.
+    /// A new rig; its files are removed when it is dropped.
     ///
     /// # Panics
-    /// Without a temporary folder.
+    /// If no temporary folder can be created.
     #[must_use]
     pub fn new() -> Self {
         let folder = tempfile::Builder::new()
@@ -85,11 +89,11 @@ impl Rig {
     /// The domain, opened by this process.
     ///
     /// # Panics
-    /// If it can not be.
+    /// If it cannot be opened.
     #[must_use]
     pub fn open(&self) -> Domain {
         let domain = Domain::open(&self.domain).expect("the test's domain");
-        // The name of its segments is known from now on.
+        // The prefix of its segments is known from now on.
         let _ = self.segments();
         domain
     }
@@ -131,26 +135,32 @@ impl Rig {
     /// Starts `proprio` with `arguments`.
     ///
     /// # Panics
-    /// If it can not be started.
+    /// If it cannot be started.
     #[must_use]
     pub fn start(&self, arguments: &[&str]) -> Process {
-        self.spawn(self.command(arguments), arguments.first().copied().unwrap_or("proprio"))
+        self.spawn(
+            self.command(arguments),
+            arguments.first().copied().unwrap_or("proprio"),
+        )
     }
 
     /// Starts any program; its output goes to files in the folder.
     ///
     /// # Panics
-    /// If it can not be started.
+    /// If it cannot be started.
     #[must_use]
     pub fn spawn(&self, mut command: Command, name: &str) -> Process {
         self.starts.set(self.starts.get() + 1);
         let output = self.path(&format!("{name}-{}.out", self.starts.get()));
         let log = self.path(&format!("{name}-{}.log", self.starts.get()));
         let file = |path: &Path| File::create(path).expect("a file in a temporary folder");
-        command.stdin(Stdio::null()).stdout(file(&output)).stderr(file(&log));
+        command
+            .stdin(Stdio::null())
+            .stdout(file(&output))
+            .stderr(file(&log));
         let child = command
             .spawn()
-            .unwrap_or_else(|error| panic!("{name} can not be started: {error}"));
+            .unwrap_or_else(|error| panic!("{name} cannot be started: {error}"));
         Process {
             name: name.to_owned(),
             child,
@@ -159,12 +169,15 @@ impl Rig {
         }
     }
 
-    /// Runs `proprio` with `arguments` to its end, which must be a success.
+    /// Runs `proprio` with `arguments` until it ends; it must succeed.
     ///
     /// # Panics
     /// If it fails.
     pub fn run(&self, arguments: &[&str]) -> Output {
-        let output = self.command(arguments).output().expect("proprio can be started");
+        let output = self
+            .command(arguments)
+            .output()
+            .expect("proprio can be started");
         let text = String::from_utf8_lossy(&output.stderr);
         assert!(
             output.status.success(),
@@ -175,10 +188,11 @@ impl Rig {
         output
     }
 
-    /// The domain's segments in shared memory, sorted. Somebody must be in the domain, or have been when this was called before.
+    /// The domain's segments in shared memory, sorted. A process must be in the domain, or must
+    /// have been at an earlier call.
     ///
     /// # Panics
-    /// If nobody has ever been.
+    /// If no process has been in the domain yet.
     #[must_use]
     pub fn segments(&self) -> Vec<String> {
         let prefix = self.prefix.get_or_init(|| {
@@ -187,7 +201,7 @@ impl Rig {
                 let (prefix, _) = name.strip_suffix(".node_monitor")?.rsplit_once('_')?;
                 Some(format!("{prefix}_"))
             });
-            prefix.expect("somebody is in the domain")
+            prefix.expect("a process is in the domain")
         });
         names(Path::new("/dev/shm"))
             .into_iter()
@@ -195,7 +209,7 @@ impl Rig {
             .collect()
     }
 
-    /// What is left of the domain: its files, and its segments in shared memory.
+    /// The remaining files and shared-memory segments of the domain.
     #[must_use]
     pub fn leftovers(&self) -> Vec<String> {
         let mut left = self.segments();
@@ -203,7 +217,8 @@ impl Rig {
         left
     }
 
-    /// Asserts that nothing is left of the domain. Everybody must have gone, this process included.
+    /// Asserts that nothing is left of the domain. All processes must have left it, including this
+    /// one.
     ///
     /// # Panics
     /// If something is left.
@@ -215,12 +230,12 @@ impl Rig {
 
 impl Drop for Rig {
     fn drop(&mut self) {
-        // A test that failed killed its processes: what they left would stay in shared memory.
+        // A failed test kills its processes; their segments would stay in shared memory.
         let _ = Domain::remove_if_unused(&self.domain);
     }
 }
 
-/// The names in a folder, sorted; none if it is not there.
+/// The names in a folder, sorted; none if it does not exist.
 fn names(folder: &Path) -> Vec<String> {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     let mut names: Vec<String> = entries
@@ -230,7 +245,7 @@ fn names(folder: &Path) -> Vec<String> {
     names
 }
 
-/// A process under test. It is killed, if it still runs, when this goes.
+/// A process under test. It is killed on drop if it still runs.
 pub struct Process {
     name: String,
     child: Child,
@@ -239,18 +254,20 @@ pub struct Process {
 }
 
 impl Process {
-    /// Its number.
+    /// Its process id.
     #[must_use]
     pub fn id(&self) -> u32 {
         self.child.id()
     }
 
-    /// How it ended, if it has.
+    /// Its exit status, if it has ended.
     ///
     /// # Panics
-    /// If the system can not tell.
+    /// If the system returns an error.
     pub fn ended(&mut self) -> Option<ExitStatus> {
-        self.child.try_wait().expect("one's own child can be asked after")
+        self.child
+            .try_wait()
+            .expect("the status of a child process is available")
     }
 
     /// Asserts that it runs.
@@ -263,16 +280,16 @@ impl Process {
         }
     }
 
-    /// Kills it at once, as nothing can prevent.
+    /// Kills it with SIGKILL.
     pub fn kill(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 
-    /// Asks it to end (SIGTERM) and waits; it must end as a success.
+    /// Sends SIGTERM and waits; it must end with success.
     ///
     /// # Panics
-    /// If it does not end, or not as a success.
+    /// If it does not end with success.
     pub fn end(&mut self) {
         if self.ended().is_none() {
             let id = Pid::from_raw(i32::try_from(self.child.id()).expect("a process number"));
@@ -281,23 +298,28 @@ impl Process {
         self.wait();
     }
 
-    /// Waits for its end, which must be a success.
+    /// Waits for its end; it must end with success.
     ///
     /// # Panics
-    /// If it does not end in [`PATIENCE`], or not as a success.
+    /// If it does not end with success within [`PATIENCE`].
     pub fn wait(&mut self) {
         let status = until(PATIENCE, || self.ended());
         let status = status.unwrap_or_else(|| panic!("{} does not end\n{}", self.name, self.log()));
-        assert!(status.success(), "{} ended with {status}\n{}", self.name, self.log());
+        assert!(
+            status.success(),
+            "{} ended with {status}\n{}",
+            self.name,
+            self.log()
+        );
     }
 
-    /// What it has written to its standard output so far.
+    /// Its standard output so far.
     #[must_use]
     pub fn output(&self) -> String {
         fs::read_to_string(&self.output).unwrap_or_default()
     }
 
-    /// What it has written to its standard error so far.
+    /// Its standard error so far.
     #[must_use]
     pub fn log(&self) -> String {
         fs::read_to_string(&self.log).unwrap_or_default()

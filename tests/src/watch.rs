@@ -1,4 +1,5 @@
-//! Watching through shared memory, as any consumer does: health, estimates, samples; and the simulator's truth to compare with.
+//! Reads health, estimates and samples from shared memory, as any consumer does, and the
+//! simulator's truth for comparison.
 
 use crate::{PATIENCE, now, until};
 use proprio_estimator::offline::Table;
@@ -6,16 +7,18 @@ use proprio_estimator::pipeline::Estimate;
 use proprio_estimator::setup::Setup;
 use proprio_topics::csv::{self, Columns, Series, Value, What};
 use proprio_topics::ipc::{Domain, Reader, Topic};
-use proprio_topics::{BusHealth, ContactEstimate, Counter, DeviceHealth, Kind, Nanos, Reading, Sample, TorqueEstimate};
+use proprio_topics::{
+    BusHealth, ContactEstimate, Counter, DeviceHealth, Kind, Nanos, Reading, Sample, TorqueEstimate,
+};
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufReader, Write};
 use std::path::Path;
 
-/// Opens a topic of `robot` as soon as it is there.
+/// Opens a topic of `robot` as soon as it exists.
 ///
 /// # Panics
-/// If it is not there within [`PATIENCE`].
+/// If it does not exist within [`PATIENCE`].
 #[must_use]
 pub fn open<T: Topic>(domain: &Domain, robot: &str) -> Reader<T> {
     let end = now() + PATIENCE;
@@ -26,14 +29,14 @@ pub fn open<T: Topic>(domain: &Domain, robot: &str) -> Reader<T> {
     opened.unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// The newest of a topic, kept.
+/// Keeps the newest payload of a topic.
 pub struct Newest<T: Topic> {
     reader: Reader<T>,
     last: Option<T>,
 }
 
 impl<T: Topic> Newest<T> {
-    /// Opens it as soon as it is there.
+    /// Opens the topic as soon as it exists.
     #[must_use]
     pub fn open(domain: &Domain, robot: &str) -> Self {
         Self {
@@ -42,10 +45,10 @@ impl<T: Topic> Newest<T> {
         }
     }
 
-    /// The newest, if there has been any.
+    /// The newest payload, if any.
     ///
     /// # Panics
-    /// If shared memory can not be read.
+    /// If shared memory cannot be read.
     pub fn get(&mut self) -> Option<&T> {
         if let Some(newest) = self.reader.latest().expect("shared memory can be read") {
             self.last = Some(newest);
@@ -53,21 +56,23 @@ impl<T: Topic> Newest<T> {
         self.last.as_ref()
     }
 
-    /// Waits until it fulfils `condition`, at most `limit`.
+    /// Waits at most `limit` until the newest payload fulfils `condition`.
     pub fn within(&mut self, limit: Nanos, mut condition: impl FnMut(&T) -> bool) -> Option<T> {
-        until(limit, || self.get().filter(|value| condition(value)).copied())
+        until(limit, || {
+            self.get().filter(|value| condition(value)).copied()
+        })
     }
 
-    /// Waits until it fulfils `condition`.
+    /// Waits until the newest payload fulfils `condition`.
     ///
     /// # Panics
-    /// If it never does; the message says `what` was expected.
+    /// After [`PATIENCE`]; the message contains `what` was expected.
     pub fn wait(&mut self, what: &str, condition: impl FnMut(&T) -> bool) -> T {
         let found = self.within(PATIENCE, condition);
         found.unwrap_or_else(|| panic!("never: {what}; the last: {:?}", self.last))
     }
 
-    /// One that was published from now on.
+    /// A payload published from now on.
     ///
     /// # Panics
     /// If none is.
@@ -89,7 +94,7 @@ pub fn bus<'a>(buses: &'a [BusHealth], name: &str) -> &'a BusHealth {
         .unwrap_or_else(|| panic!("no bus {name:?} in the health"))
 }
 
-/// The count `counter` of a device.
+/// The value of `counter` of a device.
 #[must_use]
 pub fn count(device: &DeviceHealth, counter: Counter) -> u64 {
     device.counters[counter as usize]
@@ -101,11 +106,16 @@ pub fn all_valid(estimate: &TorqueEstimate) -> bool {
     estimate.count > 0 && estimate.joints().iter().all(|joint| joint.valid == 1)
 }
 
-/// Waits for an estimate of an instant after `since` in which every torque is valid; `None` if there is none within `limit` from now.
+/// Waits for an estimate of an instant after `since` in which every torque is valid; `None` if
+/// there is none within `limit` from now.
 ///
 /// # Panics
-/// If shared memory can not be read.
-pub fn valid_since(torques: &mut Reader<TorqueEstimate>, since: Nanos, limit: Nanos) -> Option<TorqueEstimate> {
+/// If shared memory cannot be read.
+pub fn valid_since(
+    torques: &mut Reader<TorqueEstimate>,
+    since: Nanos,
+    limit: Nanos,
+) -> Option<TorqueEstimate> {
     until(limit, || {
         while let Some(estimate) = torques.try_take().expect("shared memory can be read") {
             if estimate.header.acquired > since && all_valid(&estimate) {
@@ -116,19 +126,19 @@ pub fn valid_since(torques: &mut Reader<TorqueEstimate>, since: Nanos, limit: Na
     })
 }
 
-/// Keeps everything that gateway and estimator publish.
+/// Records everything that gateway and estimator publish.
 pub struct Recorder {
     samples: Option<Reader<Sample>>,
     torques: Option<Reader<TorqueEstimate>>,
     contacts: Option<Reader<ContactEstimate>>,
-    /// The samples, in the order in which they came.
+    /// The samples, in order of arrival.
     pub taken: Vec<Sample>,
     /// The estimates by their instants.
     pub estimates: BTreeMap<Nanos, Estimate>,
 }
 
 impl Recorder {
-    /// Keeps the samples of `robot`.
+    /// Records the samples of `robot`.
     #[must_use]
     pub fn of_samples(domain: &Domain, robot: &str) -> Self {
         Self {
@@ -140,7 +150,7 @@ impl Recorder {
         }
     }
 
-    /// Keeps the samples and the estimates of `robot`.
+    /// Records the samples and the estimates of `robot`.
     #[must_use]
     pub fn of_all(domain: &Domain, robot: &str) -> Self {
         let (torques, contacts) = (Some(open(domain, robot)), Some(open(domain, robot)));
@@ -151,13 +161,16 @@ impl Recorder {
         }
     }
 
-    /// Takes what is there; to be called more often than a second's worth of samples is published.
+    /// Takes the waiting payloads; call it at least once a second.
     ///
     /// # Panics
-    /// If shared memory can not be read.
+    /// If shared memory cannot be read.
     pub fn take(&mut self) {
         fn next<T: Topic>(reader: &mut Option<Reader<T>>) -> Option<T> {
-            reader.as_mut()?.try_take().expect("shared memory can be read")
+            reader
+                .as_mut()?
+                .try_take()
+                .expect("shared memory can be read")
         }
         while let Some(sample) = next(&mut self.samples) {
             self.taken.push(sample);
@@ -171,10 +184,12 @@ impl Recorder {
     }
 
     fn estimate(&mut self, t: Nanos) -> &mut Estimate {
-        self.estimates.entry(t).or_insert_with(|| Estimate::absent(t))
+        self.estimates
+            .entry(t)
+            .or_insert_with(|| Estimate::absent(t))
     }
 
-    /// What was published but never arrived here.
+    /// The number of payloads lost.
     #[must_use]
     pub fn lost(&self) -> u64 {
         let samples = self.samples.as_ref().map_or(0, Reader::lost);
@@ -182,7 +197,8 @@ impl Recorder {
         samples + torques + self.contacts.as_ref().map_or(0, Reader::lost)
     }
 
-    /// The samples as text per channel number, in order, without their stamps: the reading, exactly, and its quality.
+    /// The samples as text per channel number, in order, without their stamps: the reading,
+    /// exactly, and its quality.
     #[must_use]
     pub fn by_channel(&self) -> BTreeMap<u32, Vec<String>> {
         let mut channels: BTreeMap<u32, Vec<String>> = BTreeMap::new();
@@ -195,10 +211,11 @@ impl Recorder {
         channels
     }
 
-    /// Writes the main readings as a table of samples in order of their stamps: what `proprio estimate` reads.
+    /// Writes the main readings as a table of samples in order of their stamps, for `proprio
+    /// estimate`.
     ///
     /// # Panics
-    /// If it can not be written.
+    /// If it cannot be written.
     pub fn write_samples(&self, channels: &[(Kind, String)], file: &Path) {
         let series: Vec<Series> = channels
             .iter()
@@ -208,12 +225,17 @@ impl Recorder {
             })
             .collect();
         let out = File::create(file).expect("a file in a temporary folder");
-        let mut writer = csv::Writer::new(out, &series, Columns::Main).expect("a table can be written");
+        let mut writer =
+            csv::Writer::new(out, &series, Columns::Main).expect("a table can be written");
         let mut samples: Vec<&Sample> = self.taken.iter().filter(|s| is_main(&s.reading)).collect();
         samples.sort_by_key(|s| s.header.acquired);
         for sample in samples {
             let value = Value::Reading(sample.reading, sample.header.quality);
-            let pushed = writer.push(Some(sample.header.acquired), sample.channel as usize, &value);
+            let pushed = writer.push(
+                Some(sample.header.acquired),
+                sample.channel as usize,
+                &value,
+            );
             pushed.expect("a table can be written");
         }
         writer
@@ -223,7 +245,8 @@ impl Recorder {
             .expect("a table can be written");
     }
 
-    /// The estimates as `proprio estimate` writes them: one row each, by their stamps as text; the header under `t`.
+    /// The estimates as `proprio estimate` writes them: one row each, by their stamps as text; the
+    /// header under `t`.
     ///
     /// # Panics
     /// Never: it writes to memory.
@@ -238,7 +261,10 @@ impl Recorder {
 }
 
 fn is_main(reading: &Reading) -> bool {
-    matches!(reading, Reading::Joint(_) | Reading::Wrench(_) | Reading::Imu(_))
+    matches!(
+        reading,
+        Reading::Joint(_) | Reading::Wrench(_) | Reading::Imu(_)
+    )
 }
 
 /// The rows of a table by their first cell.
@@ -253,13 +279,14 @@ fn exact(reading: &Reading, quality: proprio_topics::Quality) -> String {
     format!("{reading:?} {:#x}", quality.0)
 }
 
-/// What a table of samples holds per channel, in order: as [`Recorder::by_channel`], by the names in it.
+/// The contents of a table of samples per channel name, in order, as in [`Recorder::by_channel`].
 ///
 /// # Panics
 /// If it is not a table of samples.
 #[must_use]
 pub fn table_by_channel(file: &Path) -> BTreeMap<String, Vec<String>> {
-    let mut reader = csv::Reader::new(BufReader::new(File::open(file).expect("the table"))).expect("a table");
+    let mut reader =
+        csv::Reader::new(BufReader::new(File::open(file).expect("the table"))).expect("a table");
     let names: Vec<String> = reader.series().iter().map(|s| s.name.clone()).collect();
     let mut channels: BTreeMap<String, Vec<String>> = BTreeMap::new();
     let mut row = csv::Row::default();
@@ -284,13 +311,14 @@ pub struct Truth {
 }
 
 impl Truth {
-    /// Reads what `proprio simulate --truth` wrote, for `joints`.
+    /// Reads the output of `proprio simulate --truth` for `joints`.
     ///
     /// # Panics
-    /// If it is not that.
+    /// If it is not such a table.
     #[must_use]
     pub fn read(file: &Path, joints: &[&str]) -> Self {
-        let mut reader = csv::Reader::new(BufReader::new(File::open(file).expect("the truth"))).expect("a table");
+        let mut reader = csv::Reader::new(BufReader::new(File::open(file).expect("the truth")))
+            .expect("a table");
         let series: Vec<usize> = joints
             .iter()
             .map(|j| {
@@ -298,7 +326,7 @@ impl Truth {
                     .series()
                     .iter()
                     .position(|s| s.what == What::Channel(Kind::Joint) && s.name == *j);
-                found.unwrap_or_else(|| panic!("the truth knows {j}"))
+                found.unwrap_or_else(|| panic!("the truth has no joint {j}"))
             })
             .collect();
         let mut this = Self {
@@ -310,7 +338,9 @@ impl Truth {
             this.t.push(row.t.expect("a stamp"));
             for (torques, series) in this.torques.iter_mut().zip(&series) {
                 let torque = row.items.iter().find_map(|item| match item.value {
-                    Value::Reading(Reading::Joint(state), _) if item.series == *series => Some(state.torque),
+                    Value::Reading(Reading::Joint(state), _) if item.series == *series => {
+                        Some(state.torque)
+                    }
                     _ => None,
                 });
                 torques.push(torque.expect("a torque"));
@@ -319,7 +349,7 @@ impl Truth {
         this
     }
 
-    /// The torque of joint `joint` at `t`, on a straight line between two rows; `None` outside them.
+    /// The torque of joint `joint` at `t`, interpolated linearly; `None` outside the table.
     #[must_use]
     pub fn torque(&self, joint: usize, t: Nanos) -> Option<f64> {
         let after = self.t.partition_point(|x| *x < t).max(1);
@@ -330,7 +360,11 @@ impl Truth {
 
     /// The errors of joint `joint` in those of `estimates` that are within the truth's time \[Nm\].
     #[must_use]
-    pub fn errors<'a>(&self, joint: usize, estimates: impl Iterator<Item = &'a TorqueEstimate>) -> Vec<f64> {
+    pub fn errors<'a>(
+        &self,
+        joint: usize,
+        estimates: impl Iterator<Item = &'a TorqueEstimate>,
+    ) -> Vec<f64> {
         let error = |estimate: &TorqueEstimate| {
             let right = self.torque(joint, estimate.header.acquired)?;
             Some(estimate.joints().get(joint)?.torque - right)

@@ -1,26 +1,28 @@
-//! The data planes allocate nothing of their own once they run: a gateway's bus, from link to shared memory, bad frames
-//! included, and an estimator's pipeline, from samples to torques; nor does any part of the dynamics once it is built.
+//! The data planes do not allocate after start: a gateway's bus, from link to shared memory,
+//! including bad frames, and an estimator's pipeline, from samples to torques. Nor does any part of
+//! the dynamics after construction.
 //!
-//! Counted is what the thread under test asks the allocator for. The only thing it may ask for is iceoryx2's: one loan of
-//! 48 bytes per payload sent.
+//! The tests count the allocations of the thread under test. The only permitted one is iceoryx2's
+//! loan: 48 bytes per payload sent.
 
-// A global allocator can only be made with unsafe code.
+// A global allocator needs unsafe code.
 #![allow(unsafe_code)]
 
 use proprio_drivers::{Claim, Frame, Id, Mode};
+use proprio_dynamics::model::{self, Model};
+use proprio_dynamics::regressor::{
+    Actuator, Coupling, EstimateRows, MotorRegressor, Regressor, StackedRegressor, Transmission,
+    Weighting,
+};
+use proprio_dynamics::spatial::{self, Motion, Pose, Vec3};
+use proprio_dynamics::{
+    ContactKind, ContactSet, ContactSpec, DynamicsError, EquationOfMotion, ExternalWrench,
+    FrameMotion, InverseDynamics, JointState, Kinematics, Noise, SensorCut, Solver, Structure,
+};
 use proprio_estimator::config::Presence;
-use proprio_estimator::dynamics::{
-    ContactKind, ContactSet, ContactSpec, DynamicsError, EquationOfMotion, ExternalWrench, FrameMotion,
-    InverseDynamics, JointState, Kinematics, Noise, SensorCut, Solver, Structure,
-};
-use proprio_estimator::model::{self, Model};
 use proprio_estimator::pipeline::Pipeline;
-use proprio_estimator::regressor::{
-    Actuator, Coupling, Covariance, EstimateRows, MotorRegressor, Propagation, Regressor, StackedRegressor,
-    Transmission, Weighting,
-};
+use proprio_estimator::propagation::{Covariance, Propagation};
 use proprio_estimator::setup::Setup;
-use proprio_estimator::spatial::{self, Motion, Pose, Vec3};
 use proprio_gateway::bus::{Bus, Turn};
 use proprio_gateway::candump;
 use proprio_gateway::clock::{Clock, Monotonic};
@@ -50,8 +52,9 @@ fn count(bytes: usize) {
     let _ = COUNTED.try_with(|c| c.set((c.get().0 + 1, c.get().1 + bytes)));
 }
 
-// SAFETY: every call is passed on unchanged to the system's allocator, which upholds the contract; counting uses a
-// thread-local that is initialised at compile time, has no destructor and does not allocate.
+// SAFETY: every call is passed on unchanged to the system's allocator, which upholds the contract;
+// counting uses a thread-local that is initialised at compile time, has no destructor and does not
+// allocate.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         count(layout.size());
@@ -87,7 +90,10 @@ fn counted(run: impl FnOnce()) -> (usize, usize) {
 
 #[test]
 fn the_counter_counts() {
-    assert_eq!(counted(|| drop(std::hint::black_box(vec![1_u8; 8]))), (1, 8));
+    assert_eq!(
+        counted(|| drop(std::hint::black_box(vec![1_u8; 8]))),
+        (1, 8)
+    );
     assert_eq!(
         counted(|| drop(std::hint::black_box(vec![0_u8; 8]))),
         (1, 8),
@@ -96,7 +102,10 @@ fn the_counter_counts() {
     let mut grows = Vec::<u8>::with_capacity(1);
     assert_eq!(counted(|| grows.reserve_exact(100)), (1, 100));
     assert_eq!(
-        counted(|| drop(std::thread::spawn(|| drop(std::hint::black_box(vec![1_u8; 1 << 20]))).join())).1 >> 20,
+        counted(|| drop(
+            std::thread::spawn(|| drop(std::hint::black_box(vec![1_u8; 1 << 20]))).join()
+        ))
+        .1 >> 20,
         0
     );
 }
@@ -105,8 +114,8 @@ fn robot() -> Robot {
     Robot::open("icub_left_arm").expect("the robot of the source tree")
 }
 
-/// Frames that no device should like: right identifiers with wrong lengths and contents, extended and remote ones, and
-/// identifiers of nobody.
+/// Bad frames: right identifiers with wrong lengths and contents, extended and remote frames, and
+/// unknown identifiers.
 struct BadFrames {
     claims: Vec<Claim>,
     state: u64,
@@ -115,7 +124,13 @@ struct BadFrames {
 impl BadFrames {
     fn new(robot: &Robot, bus: usize) -> Self {
         let plan = &robot.plan.buses[bus];
-        let decoder = Decoder::new(0, plan, Some(Mode::Listen), Arc::new(BusStatus::new(0, plan))).expect("devices");
+        let decoder = Decoder::new(
+            0,
+            plan,
+            Some(Mode::Listen),
+            Arc::new(BusStatus::new(0, plan)),
+        )
+        .expect("devices");
         Self {
             claims: decoder.claims(),
             state: bus as u64,
@@ -144,13 +159,21 @@ impl BadFrames {
     }
 }
 
-/// One of the robot's buses, as the far end has it: its boards and, once `nonsense` is set, somebody who sends bad frames,
-/// three a millisecond. Until `stop`.
-fn far_end(robot: &Robot, number: usize, domain: &str, name: &str, nonsense: &AtomicBool, stop: &AtomicBool) {
+/// The far end of one of the robot's buses, until `stop`: its boards and, once `nonsense` is set,
+/// three bad frames per millisecond.
+fn far_end(
+    robot: &Robot,
+    number: usize,
+    domain: &str,
+    name: &str,
+    nonsense: &AtomicBool,
+    stop: &AtomicBool,
+) {
     let clock = Monotonic;
     let mut link = VirtualBus::open(domain, name, &[]).expect("a virtual bus");
     let mut bad = BadFrames::new(robot, number);
-    let mut simulator = Simulator::new(robot, &Settings::default(), clock.now()).expect("a simulator");
+    let mut simulator =
+        Simulator::new(robot, &Settings::default(), clock.now()).expect("a simulator");
     let patience = Nanos::from_millis(10);
     while !stop.load(Relaxed) {
         let now = clock.now();
@@ -168,16 +191,23 @@ fn far_end(robot: &Robot, number: usize, domain: &str, name: &str, nonsense: &At
     }
 }
 
-/// Runs the gateway's loop of bus `number` against its far end, with the sink that `sink` makes. Returns what the measured
-/// stretch allocated, how many samples it published, and the bus's status.
-fn run_bus<S: Sink>(number: usize, test: &str, sink: impl FnOnce() -> S) -> ((usize, usize), u64, Arc<BusStatus>) {
+/// Runs the gateway's loop of bus `number` against its far end, with the sink from `sink`. Returns
+/// the allocations of the measured part, the number of samples published, and the bus's status.
+fn run_bus<S: Sink>(
+    number: usize,
+    test: &str,
+    sink: impl FnOnce() -> S,
+) -> ((usize, usize), u64, Arc<BusStatus>) {
     const FRAMES: u64 = 8000;
     let robot = robot();
     let plan = &robot.plan.buses[number];
     let status = Arc::new(BusStatus::new(0, plan));
     let decoder = Decoder::new(0, plan, None, Arc::clone(&status)).expect("devices");
-    // Tests run in parallel, in this process and others: a bus of this one's own.
-    let (domain, name) = (format!("allocation-{}", std::process::id()), format!("{test}-{number}"));
+    // A separate bus, because tests run in parallel in this process and others.
+    let (domain, name) = (
+        format!("allocation-{}", std::process::id()),
+        format!("{test}-{number}"),
+    );
     let link = VirtualBus::open(&domain, &name, &decoder.claims()).expect("a virtual bus");
     let mut bus = Bus::new(Box::new(link), decoder, sink(), Arc::clone(&status));
     let clock = Monotonic;
@@ -190,7 +220,7 @@ fn run_bus<S: Sink>(number: usize, test: &str, sink: impl FnOnce() -> S) -> ((us
                 assert_eq!(bus.turn(&clock), Turn::Continue);
             }
         };
-        // Warm: every device has told something.
+        // Warm-up: every device has sent something.
         let readings = |d: &DeviceHealth| d.counters[Counter::Readings as usize];
         turn_until(&|| status.devices().all(|d| readings(&d) > 10));
         nonsense.store(true, Relaxed);
@@ -216,7 +246,7 @@ fn run_bus<S: Sink>(number: usize, test: &str, sink: impl FnOnce() -> S) -> ((us
     (allocated, published, status)
 }
 
-/// Whether the bad frames were seen for what they are.
+/// Asserts that the bad frames were counted as bad.
 fn bad_frames(status: &BusStatus) -> u64 {
     let count = |d: &DeviceHealth, c: Counter| d.counters[c as usize];
     status
@@ -247,7 +277,8 @@ fn a_bus_that_publishes_allocates_the_transports_loan_alone() {
     for number in 0..robot().plan.buses.len() {
         let mut reader = None;
         let (allocated, published, status) = run_bus(number, "shared", || {
-            let writer = Writer::<Sample>::create(&domain, &format!("bus{number}"), domain.epoch()).unwrap();
+            let writer =
+                Writer::<Sample>::create(&domain, &format!("bus{number}"), domain.epoch()).unwrap();
             reader = Some(Reader::<Sample>::open(&domain, &format!("bus{number}")).unwrap());
             Shared(writer)
         });
@@ -258,7 +289,7 @@ fn a_bus_that_publishes_allocates_the_transports_loan_alone() {
             "bus {number}: one loan of 48 bytes per sample"
         );
         assert!(bad_frames(&status) > 100 && status.publish_failures.load(Relaxed) == 0);
-        // They were really sent: the reader has the newest.
+        // The samples were really sent: the reader has the newest.
         let newest = reader.unwrap().latest().unwrap().expect("a sample");
         assert!(
             newest.header.sequence + 1 >= published,
@@ -268,7 +299,7 @@ fn a_bus_that_publishes_allocates_the_transports_loan_alone() {
     }
 }
 
-/// A recorded session: per frame the number of its bus, in order.
+/// A recorded session: the frames in order, with their bus numbers.
 fn session(robot: &Robot, seconds: f64) -> Vec<(usize, Frame)> {
     let mut log = Vec::new();
     record(
@@ -282,8 +313,15 @@ fn session(robot: &Robot, seconds: f64) -> Vec<(usize, Frame)> {
     let mut reader = candump::Reader::new(&log[..]);
     let mut frames = Vec::new();
     while let Some(record) = reader.next_record().unwrap() {
-        let takes = |bus: &usize| robot.plan.matching(*bus).is_none_or(|m| m.takes(record.interface));
-        let bus = (0..robot.plan.buses.len()).find(takes).expect("a bus of the robot");
+        let takes = |bus: &usize| {
+            robot
+                .plan
+                .matching(*bus)
+                .is_none_or(|m| m.takes(record.interface))
+        };
+        let bus = (0..robot.plan.buses.len())
+            .find(takes)
+            .expect("a bus of the robot");
         frames.push((bus, record.frame));
     }
     assert_eq!(reader.report().bad, 0);
@@ -294,7 +332,9 @@ fn decoders(robot: &Robot) -> Vec<Decoder> {
     let status = |(bus, number)| Arc::new(BusStatus::new(number, bus));
     let buses = robot.plan.buses.iter().zip(0..);
     buses
-        .map(|(bus, number)| Decoder::new(number, bus, Some(Mode::Listen), status((bus, number))).unwrap())
+        .map(|(bus, number)| {
+            Decoder::new(number, bus, Some(Mode::Listen), status((bus, number))).unwrap()
+        })
         .collect()
 }
 
@@ -303,9 +343,11 @@ fn decoding_allocates_nothing() {
     let robot = robot();
     let frames = session(&robot, 3.0);
     let mut decoders = decoders(&robot);
-    let mut bad: Vec<_> = (0..decoders.len()).map(|bus| BadFrames::new(&robot, bus)).collect();
+    let mut bad: Vec<_> = (0..decoders.len())
+        .map(|bus| BadFrames::new(&robot, bus))
+        .collect();
     let (mut samples, mut at) = (0_u64, Nanos::ZERO);
-    // From the very first frame on: nothing has to warm up.
+    // Measured from the first frame on: no warm-up is needed.
     let allocated = counted(|| {
         for (bus, frame) in &frames {
             decoders[*bus].on_frame(frame, |_| samples += 1);
@@ -332,7 +374,7 @@ fn identification_in_the_pipeline_allocates_nothing_but_in_its_jobs() {
     let robot = robot();
     let mut config = robot.config.clone();
     config.identification.enabled = true;
-    // Or the hand, always touched, leaves nothing to identify.
+    // Otherwise the hand counts as always touched and nothing can be identified.
     config.contact.iter_mut().for_each(|contact| {
         if contact.name() == "hand" {
             contact.presence = Presence::Possible;
@@ -340,8 +382,10 @@ fn identification_in_the_pipeline_allocates_nothing_but_in_its_jobs() {
     });
     let setup = Setup::new(&config).unwrap();
     let channels = robot.plan.channels.iter();
-    let channels: Vec<Option<usize>> = channels.map(|c| setup.channel(c.kind, &c.name)).collect();
-    let hand = setup.contact("hand").expect("the hand is a contact");
+    let channels: Vec<Option<usize>> = channels
+        .map(|c| setup.robot.channel(c.kind, &c.name))
+        .collect();
+    let hand = setup.robot.contact("hand").expect("the hand is a contact");
     let mut decoders = decoders(&robot);
     let mut samples = Vec::new();
     for (bus, frame) in session(&robot, 8.0) {
@@ -389,9 +433,9 @@ fn the_pipeline_allocates_nothing_once_it_runs() {
         .plan
         .channels
         .iter()
-        .map(|c| setup.channel(c.kind, &c.name))
+        .map(|c| setup.robot.channel(c.kind, &c.name))
         .collect();
-    let hand = setup.contact("hand").expect("the hand is a contact");
+    let hand = setup.robot.contact("hand").expect("the hand is a contact");
     let mut decoders = decoders(&robot);
     let mut samples = Vec::new();
     for (bus, frame) in session(&robot, 6.0) {
@@ -407,7 +451,8 @@ fn the_pipeline_allocates_nothing_once_it_runs() {
             };
             let t = sample.header.acquired;
             if trouble {
-                // Half a second without the first joint; contacts that come and go; samples twice, late and without sense.
+                // Half a second without the first joint; contacts that begin and end; samples that
+                // are repeated, late or invalid.
                 if number > 3000 && number < 5000 && sample.channel == 2 {
                     continue;
                 }
@@ -453,19 +498,23 @@ fn the_pipeline_allocates_nothing_once_it_runs() {
     );
 }
 
-/// Runs one call of a part of the dynamics, which must succeed, and sees that it allocates nothing.
+/// Runs one call of a part of the dynamics, which must succeed, and asserts that it does not
+/// allocate.
 fn allocates_nothing<E: std::fmt::Debug>(what: &str, call: impl FnOnce() -> Result<(), E>) {
     let mut outcome = Ok(());
     assert_eq!(counted(|| outcome = call()), (0, 0), "{what}");
     outcome.expect(what);
 }
 
-/// From the first call on, for every base, for any set of contacts; and what is refused is refused without allocating too.
+/// From the first call on, for every base and any set of contacts. Errors do not allocate either.
 #[test]
 fn the_dynamics_allocate_nothing_after_construction() {
     let text = std::fs::read_to_string(&robot().config.model).unwrap();
     let elements = Model::from_urdf(&text, &[]).unwrap().sensors().to_vec();
-    let keep: Vec<&str> = elements.iter().map(|sensor| sensor.joint.as_str()).collect();
+    let keep: Vec<&str> = elements
+        .iter()
+        .map(|sensor| sensor.joint.as_str())
+        .collect();
     let model = &Model::from_urdf(&text, &keep).unwrap();
     let noise = Noise {
         force: [0.1; 3],
@@ -475,7 +524,8 @@ fn the_dynamics_allocate_nothing_after_construction() {
         .iter()
         .map(|s| SensorCut::new(model, &s.joint, s.frame, s.direction, &s.pose, &noise).unwrap())
         .collect();
-    // One contact of each kind on every link: none, one full wrench, too few and too many unknowns can all be chosen.
+    // One contact of each kind on every link, so that no contact, one full wrench, and too few or
+    // too many unknowns can be selected.
     let frame = |link| model::Frame {
         link,
         pose: Pose::from_xyz_rpy([0.02, -0.01, 0.05], [0.1, -0.2, 0.3]),
@@ -496,7 +546,8 @@ fn the_dynamics_allocate_nothing_after_construction() {
         .take(ContactSet::CAPACITY)
         .collect();
     let structure = &Structure::new(model, &sensors, &contacts, Structure::LENGTH_SCALE).unwrap();
-    let readings = vec![spatial::Wrench::from_parts([10.0, -5.0, 40.0], [1.0, 0.5, -0.3]); sensors.len()];
+    let readings =
+        vec![spatial::Wrench::from_parts([10.0, -5.0, 40.0], [1.0, 0.5, -0.3]); sensors.len()];
     let push = spatial::Wrench::from_parts([1.0, 2.0, 3.0], [0.1, 0.2, 0.3]);
     let external = [ExternalWrench {
         frame: frame(model.link_count() - 1),
@@ -504,8 +555,13 @@ fn the_dynamics_allocate_nothing_after_construction() {
     }];
     assert!(sensors.len() == 1 && model.dof_count() > 5 && contacts.len() > 20);
 
-    let values = |scale: f64| (0..model.dof_count()).map(|dof| scale * (dof as f64).sin()).collect();
-    let (position, velocity, acceleration): (Vec<f64>, Vec<f64>, Vec<f64>) = (values(0.5), values(1.0), values(3.0));
+    let values = |scale: f64| {
+        (0..model.dof_count())
+            .map(|dof| scale * (dof as f64).sin())
+            .collect()
+    };
+    let (position, velocity, acceleration): (Vec<f64>, Vec<f64>, Vec<f64>) =
+        (values(0.5), values(1.0), values(3.0));
     let state = JointState {
         position: &position,
         velocity: &velocity,
@@ -526,7 +582,8 @@ fn the_dynamics_allocate_nothing_after_construction() {
     let mut equation = EquationOfMotion::new(model);
     let mut regressor = Regressor::new(model);
     let mut stacked = StackedRegressor::new(structure);
-    // A matrix of any size, had from one that is there: this crate does not depend on the library of matrices.
+    // A matrix of any size, derived from an existing one, because this crate does not depend on the
+    // matrix library.
     let matrix = |rows, columns, value| {
         equation
             .joint_inertia()
@@ -534,7 +591,7 @@ fn the_dynamics_allocate_nothing_after_construction() {
             .resize(0, 0, 0.0)
             .resize(rows, columns, value)
     };
-    // Two joints that share their motors, the others with one each.
+    // Two joints that share their motors; the others have one motor each.
     let mut shared = matrix(2, 2, 0.5);
     (shared[(0, 0)], shared[(1, 1)]) = (1.0, 1.0);
     let coupled = Coupling {
@@ -550,7 +607,12 @@ fn the_dynamics_allocate_nothing_after_construction() {
     };
     let dofs = model.dof_count();
     let transmission = Transmission::new(dofs, &[coupled]).unwrap();
-    let mut motors = MotorRegressor::new(regressor.column_count(), transmission, &vec![actuator; dofs]).unwrap();
+    let mut motors = MotorRegressor::new(
+        regressor.column_count(),
+        transmission,
+        &vec![actuator; dofs],
+    )
+    .unwrap();
     let mut covariance = Covariance::exact(model.link_count(), sensors.len());
     let sensor_numbers: Vec<usize> = (0..sensors.len()).collect();
     let columns = 20 + 6 * sensors.len();
@@ -567,7 +629,9 @@ fn the_dynamics_allocate_nothing_after_construction() {
     for base in 0..model.link_count() {
         allocates_nothing("set_base", || kinematics.set_base(model, base));
         allocates_nothing("kinematics", || kinematics.update(model, state, motion));
-        allocates_nothing("inverse dynamics", || inverse.update(model, &kinematics, &external));
+        allocates_nothing("inverse dynamics", || {
+            inverse.update(model, &kinematics, &external)
+        });
         allocates_nothing("equation of motion", || {
             equation.update(model, &kinematics, &Vec3::zeros())?;
             equation.update(model, &kinematics, &Vec3::new(0.0, 0.0, -9.81))?;
@@ -608,7 +672,9 @@ fn the_dynamics_allocate_nothing_after_construction() {
             allocates_nothing("estimate rows", || {
                 let rows = EstimateRows::new(structure, &solver, &kinematics)?;
                 for dof in 0..dofs {
-                    let width = rows.torque_subtree(dof).and_then(|subtree| rows.column_count(subtree));
+                    let width = rows
+                        .torque_subtree(dof)
+                        .and_then(|subtree| rows.column_count(subtree));
                     rows.torque_row(dof, &mut row[..width.unwrap_or(0)])?;
                     rows.torque_measured(dof, &readings, &external)?;
                 }
@@ -641,7 +707,12 @@ fn the_dynamics_allocate_nothing_after_construction() {
         motors.row(0),
     ];
     assert!(matrices.into_iter().flatten().all(|x| x.is_finite()));
-    assert!(stacked.subtrees().iter().any(|subtree| subtree.remaining() > 0));
+    assert!(
+        stacked
+            .subtrees()
+            .iter()
+            .any(|subtree| subtree.remaining() > 0)
+    );
 
     let unknown = [f64::NAN; 64];
     let wrong = JointState {
@@ -649,12 +720,24 @@ fn the_dynamics_allocate_nothing_after_construction() {
         ..state
     };
     let refused = counted(|| {
-        assert!(equation.update(model, &kinematics, &Vec3::repeat(f64::NAN)).is_err());
-        assert!(motors.update(|dof| regressor.joint_row(dof), wrong).is_err());
+        assert!(
+            equation
+                .update(model, &kinematics, &Vec3::repeat(f64::NAN))
+                .is_err()
+        );
+        assert!(
+            motors
+                .update(|dof| regressor.joint_row(dof), wrong)
+                .is_err()
+        );
         assert!(stacked.update(&kinematics, &[], &all, &[]).is_err());
         assert!(kinematics.update(model, wrong, motion).is_err());
         assert!(kinematics.set_base(model, model.link_count()).is_err());
-        assert!(solver.solve(model, structure, &kinematics, &[], &all, &[]).is_err());
+        assert!(
+            solver
+                .solve(model, structure, &kinematics, &[], &all, &[])
+                .is_err()
+        );
     });
     assert_eq!(refused, (0, 0));
 }

@@ -1,7 +1,7 @@
-//! The `proprio` command as its users meet it: help, exit codes, one clear message for whatever is wrong, files that are
-//! whole or not there, and the demonstration.
+//! The `proprio` command from the user's side: help, exit codes, one clear message per error,
+//! output files that are complete or absent, and the demonstration.
 
-use proprio_estimator::model::Model;
+use proprio_dynamics::model::Model;
 use proprio_gateway::offline;
 use proprio_simulator::record::record;
 use proprio_simulator::{Robot, Settings, Simulation};
@@ -10,13 +10,12 @@ use proprio_topics::Nanos;
 use serde_json::Value as Json;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
-use std::fs;
 use std::io::{Read as _, Write as _};
 use std::os::unix::fs::PermissionsExt as _;
 use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::thread;
+use std::{fs, thread};
 
 const VERBS: [&str; 9] = [
     "demo",
@@ -32,7 +31,7 @@ const VERBS: [&str; 9] = [
 
 // ---------------------------------------------------------------- running it
 
-/// How a run ended.
+/// The result of a run.
 struct Ran {
     code: Option<i32>,
     out: String,
@@ -47,8 +46,8 @@ impl Ran {
         self
     }
 
-    /// Asserts that it failed with `code` and one message, on one line, that holds all of `parts`, says nothing twice and
-    /// shows nothing of the program's inside.
+    /// Asserts that it failed with `code` and one message on one line that contains all of `parts`,
+    /// has no repetition and shows no internals of the program.
     fn fails(&self, code: i32, parts: &[&str]) {
         let Self { what, err, .. } = self;
         assert_eq!(self.code, Some(code), "{what}: {err}");
@@ -57,23 +56,40 @@ impl Ran {
             panic!("{what}: not one message: {err}")
         };
         for part in parts {
-            assert!(err.contains(part), "{what}: it does not say {part:?}: {err}");
+            assert!(
+                err.contains(part),
+                "{what}: the message lacks {part:?}: {err}"
+            );
         }
         let mut said = BTreeSet::new();
         for phrase in message.split(": ").filter(|p| p.len() > 12) {
-            assert!(said.insert(phrase), "{what}: it says {phrase:?} twice: {message}");
+            assert!(
+                said.insert(phrase),
+                "{what}: the message repeats {phrase:?}: {message}"
+            );
         }
-        for inside in ["panicked", "RUST_BACKTRACE", "Os {", "Err(", "Some(", ".tmp"] {
-            assert!(!err.contains(inside), "{what}: it says {inside:?}: {err}");
+        for inside in [
+            "panicked",
+            "RUST_BACKTRACE",
+            "Os {",
+            "Err(",
+            "Some(",
+            ".tmp",
+        ] {
+            assert!(
+                !err.contains(inside),
+                "{what}: the message contains {inside:?}: {err}"
+            );
         }
     }
 
     fn json(&self) -> Json {
-        serde_json::from_str(self.out.trim()).unwrap_or_else(|e| panic!("{}: {e}: {}", self.what, self.out))
+        serde_json::from_str(self.out.trim())
+            .unwrap_or_else(|e| panic!("{}: {e}: {}", self.what, self.out))
     }
 }
 
-/// A folder with a copy of the robot's configuration, in a shared-memory domain of its own.
+/// A folder with a copy of the robot's configuration, with a separate shared-memory domain.
 struct Place {
     rig: Rig,
 }
@@ -127,16 +143,18 @@ impl Place {
     fn command(&self, args: &[&str]) -> Command {
         let mut command = self.rig.command(args);
         fs::create_dir_all(self.path("tmp")).unwrap();
-        command.current_dir(self.path("")).env("TMPDIR", self.path("tmp"));
+        command
+            .current_dir(self.path(""))
+            .env("TMPDIR", self.path("tmp"));
         command
     }
 
-    /// Runs `proprio` to its end.
+    /// Runs `proprio` until it ends.
     fn run(&self, args: &[&str]) -> Ran {
         finish(self.command(args), b"", &args.join(" "))
     }
 
-    /// Runs `proprio` to its end, with `input` at its standard input.
+    /// Runs `proprio` until it ends, with `input` as its standard input.
     fn run_with(&self, args: &[&str], input: &[u8]) -> Ran {
         finish(self.command(args), input, &args.join(" "))
     }
@@ -192,7 +210,8 @@ fn finish(mut command: Command, input: &[u8], what: &str) -> Ran {
 fn table(text: &str) -> BTreeMap<String, Vec<f64>> {
     let mut lines = text.lines();
     let names: Vec<&str> = lines.next().expect("a header").split(',').collect();
-    let mut columns: BTreeMap<String, Vec<f64>> = names.iter().map(|n| ((*n).to_owned(), vec![])).collect();
+    let mut columns: BTreeMap<String, Vec<f64>> =
+        names.iter().map(|n| ((*n).to_owned(), vec![])).collect();
     for line in lines {
         let cells: Vec<&str> = line.split(',').collect();
         assert_eq!(cells.len(), names.len(), "{line}");
@@ -210,7 +229,7 @@ fn table(text: &str) -> BTreeMap<String, Vec<f64>> {
     columns
 }
 
-/// Asserts that two long texts are the same; shows the first line that is not.
+/// Asserts that two long texts are equal; prints the first line that differs.
 fn assert_same(one: &str, other: &str, what: &str) {
     if one != other {
         let at = one
@@ -219,18 +238,25 @@ fn assert_same(one: &str, other: &str, what: &str) {
             .position(|(a, b)| a != b)
             .unwrap_or(one.lines().count().min(other.lines().count()));
         let line = |text: &str| text.lines().nth(at).unwrap_or("(the end)").to_owned();
-        panic!("{what}: line {} is\n{}\nand\n{}", at + 1, line(one), line(other));
+        panic!(
+            "{what}: line {} is\n{}\nand\n{}",
+            at + 1,
+            line(one),
+            line(other)
+        );
     }
 }
 
 fn oracle(name: &str) -> String {
-    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("oracle").join(name);
+    let file = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("oracle")
+        .join(name);
     fs::read_to_string(&file).unwrap_or_else(|e| panic!("{}: {e}", file.display()))
 }
 
 const T0: Nanos = Nanos::from_millis(100_000);
 
-/// A recorded session of the simulated robot, as candump would have logged it.
+/// A recorded session of the simulated robot in candump's log format.
 fn session(seconds: f64, settings: &Settings) -> String {
     let robot = Robot::open("icub_left_arm").unwrap();
     let mut log = Vec::new();
@@ -254,15 +280,33 @@ fn every_verb_has_help() {
         .filter(|verb| *verb != "help")
         .collect();
     for verb in VERBS {
-        assert!(listed.contains(&verb), "{verb} is not in the help: {}", help.out);
+        assert!(
+            listed.contains(&verb),
+            "{verb} is not in the help: {}",
+            help.out
+        );
     }
     for verb in listed {
         let help = place.run(&[verb, "--help"]).good();
-        assert!(help.out.contains(&format!("Usage: proprio {verb}")), "{}", help.out);
+        assert!(
+            help.out.contains(&format!("Usage: proprio {verb}")),
+            "{}",
+            help.out
+        );
         assert!(help.err.is_empty(), "{}", help.err);
-        assert!(place.run(&["help", verb]).good().out.contains("Usage: proprio"));
-        // What an option is for stands beside it.
-        for option in help.out.lines().filter(|l| l.trim_start().starts_with("--")) {
+        assert!(
+            place
+                .run(&["help", verb])
+                .good()
+                .out
+                .contains("Usage: proprio")
+        );
+        // Every option has a description.
+        for option in help
+            .out
+            .lines()
+            .filter(|l| l.trim_start().starts_with("--"))
+        {
             let told = option
                 .trim_start()
                 .split("  ")
@@ -301,7 +345,7 @@ fn typing_mistakes_end_with_2_and_say_what_was_meant() {
     assert_eq!(place.run(&[]).code, Some(2));
     place
         .run(&["simulate", "--robot", "nobody"])
-        .fails(2, &["there is no robot \"nobody\"", "looked for gateway.toml in"]);
+        .fails(2, &["there is no robot \"nobody\"", "no gateway.toml in"]);
     place
         .run(&["simulate", "--seconds", "0"])
         .fails(2, &["seconds = 0 must be above 0"]);
@@ -323,7 +367,7 @@ fn typing_mistakes_end_with_2_and_say_what_was_meant() {
         !place.exists("proprio-demo"),
         "nothing is made before the arguments are right"
     );
-    // Inside the process that would have served: a domain's name and folder.
+    // Errors of the domain's name and folder.
     let gateway = ["gateway", "--config", "gateway.toml", "--domain"];
     place
         .run(&[&gateway[..], &["a b"]].concat())
@@ -364,11 +408,27 @@ fn a_wrong_gateway_toml_is_told_with_file_place_and_what_would_be_legal() {
             "address = 99",
             &["l_arm_ft_sensor", "address = 99", "1 to 14"],
         ),
-        ("max_silence_ms", "max_silence", &["l_arm_ft_sensor", "max_silence"]),
+        (
+            "max_silence_ms",
+            "max_silence",
+            &["l_arm_ft_sensor", "max_silence"],
+        ),
         ("schema = 1", "schema = 9", &["schema = 9", "schema = 1"]),
-        ("kind = \"virtual\"", "kind = \"usb\"", &["`usb`", "socketcan"]),
-        ("ratio = 100.0", "ratio = nan", &["l_shoulder_pitch", "ratio = NaN"]),
-        ("ratio = 100.0", "ratio = 0.0", &["l_shoulder_pitch", "ratio = 0"]),
+        (
+            "kind = \"virtual\"",
+            "kind = \"usb\"",
+            &["`usb`", "socketcan"],
+        ),
+        (
+            "ratio = 100.0",
+            "ratio = nan",
+            &["l_shoulder_pitch", "ratio = NaN"],
+        ),
+        (
+            "ratio = 100.0",
+            "ratio = 0.0",
+            &["l_shoulder_pitch", "ratio = 0"],
+        ),
         (
             "name = \"l_elbow\"",
             "name = \"l_wrist_yaw\"",
@@ -395,13 +455,21 @@ fn a_wrong_gateway_toml_is_told_with_file_place_and_what_would_be_legal() {
                 .run(&["gateway", "--config", "wrong.toml", "--check"])
                 .fails_in("wrong.toml", expected);
             place
-                .run(&["decode", "--config", "wrong.toml", "--log", "-", "--out", "o.csv"])
+                .run(&[
+                    "decode",
+                    "--config",
+                    "wrong.toml",
+                    "--log",
+                    "-",
+                    "--out",
+                    "o.csv",
+                ])
                 .fails_in("wrong.toml", expected);
         }
     }
     place
         .run(&["gateway", "--config", "none.toml"])
-        .fails(2, &["none.toml: can not be read", "No such file"]);
+        .fails(2, &["none.toml: cannot be read", "No such file"]);
     assert!(
         place
             .run(&["gateway", "--config", "gateway.toml", "--check"])
@@ -414,10 +482,12 @@ fn a_wrong_gateway_toml_is_told_with_file_place_and_what_would_be_legal() {
 impl Ran {
     /// As [`Ran::fails`] with 2, and the file is named first.
     fn fails_in(&self, file: &str, parts: &[&str]) {
-        // A message of the TOML reader shows the place in lines of its own.
+        // A message of the TOML parser shows the place in additional lines.
         self.fails(2, parts);
         assert!(
-            self.err.lines().any(|l| l.starts_with(&format!("error: {file}: "))),
+            self.err
+                .lines()
+                .any(|l| l.starts_with(&format!("error: {file}: "))),
             "{}: {}",
             self.what,
             self.err
@@ -493,7 +563,15 @@ fn a_wrong_estimator_toml_is_told_with_file_place_and_what_would_be_legal() {
             place.run(args).fails_in("wrong.toml", expected);
         }
         place
-            .run(&["estimate", "--config", "wrong.toml", "--log", "-", "--out", "o.csv"])
+            .run(&[
+                "estimate",
+                "--config",
+                "wrong.toml",
+                "--log",
+                "-",
+                "--out",
+                "o.csv",
+            ])
             .fails_in("wrong.toml", expected);
     }
     assert!(!place.exists("o.csv"));
@@ -507,17 +585,18 @@ fn a_wrong_estimator_toml_is_told_with_file_place_and_what_would_be_legal() {
     );
     assert!(
         check.contains("beyond l_shoulder_pitch"),
-        "which torques also rest on the URDF: {check}"
+        "which torques also depend on the URDF: {check}"
     );
     for what in [
         "mass of all links: ",
-        "F/T sensors would read",
+        "readings of the F/T sensors without offsets",
         "  l_arm_ft_sensor: force [",
     ] {
         assert!(check.contains(what), "{check}");
     }
-    // A torque that nothing can ever tell is a mistake, after all that there is to say.
-    let stand = "[[contact]]\nname = \"forearm\"\nlink = \"l_forearm\"\n\n[[contact]]\nname = \"stand\"";
+    // A torque that can never be determined is an error, reported after the plan.
+    let stand =
+        "[[contact]]\nname = \"forearm\"\nlink = \"l_forearm\"\n\n[[contact]]\nname = \"stand\"";
     place.change(
         "estimator.toml",
         "hidden.toml",
@@ -527,7 +606,12 @@ fn a_wrong_estimator_toml_is_told_with_file_place_and_what_would_be_legal() {
     assert!(ran.out.contains("mass of all links: "), "{}", ran.out);
     ran.fails_in(
         "hidden.toml",
-        &["l_wrist_yaw", "can never be determined", "forearm, hand", "possible"],
+        &[
+            "l_wrist_yaw",
+            "can never be determined",
+            "forearm, hand",
+            "possible",
+        ],
     );
 }
 
@@ -548,7 +632,7 @@ fn what_the_gateway_does_not_publish_is_told() {
     };
     let told = check("gateway.toml").good().out;
     assert!(
-        told.contains("gateway.toml publishes all that the estimator reads\n"),
+        told.contains("gateway.toml publishes all channels that the estimator reads\n"),
         "{told}"
     );
     let gateway = place.read("gateway.toml");
@@ -561,7 +645,10 @@ fn what_the_gateway_does_not_publish_is_told() {
         "other.toml",
         &gateway.replace("robot = \"icub_left_arm\"", "robot = \"another\""),
     );
-    check("other.toml").fails_in("estimator.toml", &["\"another\"", "would not find each other"]);
+    check("other.toml").fails_in(
+        "estimator.toml",
+        &["\"another\"", "would not find each other"],
+    );
     place.write(
         "locked.toml",
         &(place.read("estimator.toml") + "\n[locked]\nl_wrist_yaw = 0.0\n"),
@@ -579,12 +666,18 @@ fn what_the_gateway_does_not_publish_is_told() {
             .run(&args)
             .good()
             .out
-            .contains("it reads nothing of l_wrist_yaw\n")
+            .contains("it does not read l_wrist_yaw\n")
     );
-    check("none.toml").fails_in("none.toml", &["can not be read"]);
-    // To what end, without a check?
+    check("none.toml").fails_in("none.toml", &["cannot be read"]);
+    // --gateway requires --check.
     place
-        .run(&["estimator", "--config", "estimator.toml", "--gateway", "gateway.toml"])
+        .run(&[
+            "estimator",
+            "--config",
+            "estimator.toml",
+            "--gateway",
+            "gateway.toml",
+        ])
         .fails(2, &["--check"]);
 }
 
@@ -592,8 +685,12 @@ fn what_the_gateway_does_not_publish_is_told() {
 fn a_malformed_urdf_is_told_with_its_place() {
     let place = Place::new();
     let urdf = place.read("model.urdf");
-    place.change("estimator.toml", "wrong.toml", &[("model.urdf", "wrong.urdf")]);
-    // The first link with a mass that a joint moves, and the first joint.
+    place.change(
+        "estimator.toml",
+        "wrong.toml",
+        &[("model.urdf", "wrong.urdf")],
+    );
+    // The first moving link with a mass, and the first joint.
     let elbow = |from: &str, to: &str| {
         let at = urdf
             .find("<link name=\"l_forearm\"")
@@ -630,10 +727,17 @@ fn a_malformed_urdf_is_told_with_its_place() {
             &["line ", "1,5"],
         ),
         (
-            urdf.replacen(&format!("<mass value=\"{mass}\""), "<mass value=\"-1.0\"", 1),
+            urdf.replacen(
+                &format!("<mass value=\"{mass}\""),
+                "<mass value=\"-1.0\"",
+                1,
+            ),
             &["cannot be negative"],
         ),
-        (elbow("ixx=\"", "ixx=\"inf\" was=\""), &["line ", "ixx", "not finite"]),
+        (
+            elbow("ixx=\"", "ixx=\"inf\" was=\""),
+            &["line ", "ixx", "not finite"],
+        ),
         (elbow("ixx=\"", "ixx=\"-"), &["not positive semidefinite"]),
         (inertial, &["no <inertial>"]),
         (
@@ -670,7 +774,11 @@ fn a_joint_that_is_neither_measured_nor_locked_is_told() {
         .collect();
     let cut: String = log.lines().fold(String::new(), |mut text, line| {
         let cells: Vec<&str> = line.split(',').collect();
-        let _ = writeln!(text, "{}", keep.iter().map(|i| cells[*i]).collect::<Vec<_>>().join(","));
+        let _ = writeln!(
+            text,
+            "{}",
+            keep.iter().map(|i| cells[*i]).collect::<Vec<_>>().join(",")
+        );
         text
     });
     place.write("cut.csv", &cut);
@@ -688,11 +796,14 @@ fn a_joint_that_is_neither_measured_nor_locked_is_told() {
         &["cut.csv", "joint/l_wrist_yaw", "lock it in [locked]"],
     );
     assert!(!place.exists("o.csv"));
-    // What the message advises works.
+    // The remedy in the message works.
     place.change(
         "estimator.toml",
         "locked.toml",
-        &[("[differentiation]", "[locked]\nl_wrist_yaw = 0.1\n[differentiation]")],
+        &[(
+            "[differentiation]",
+            "[locked]\nl_wrist_yaw = 0.1\n[differentiation]",
+        )],
     );
     place
         .run(&[
@@ -705,19 +816,24 @@ fn a_joint_that_is_neither_measured_nor_locked_is_told() {
             "o.csv",
         ])
         .good();
-    // Two things that are missing make one message.
-    place.write("cut.csv", &cut.replacen("wrench/l_arm_ft_sensor/", "wrench/other/", 6));
-    place
-        .run(&args)
-        .fails_in("estimator.toml", &["wrench/l_arm_ft_sensor", "joint/l_wrist_yaw"]);
+    // Two missing channels give one message.
+    place.write(
+        "cut.csv",
+        &cut.replacen("wrench/l_arm_ft_sensor/", "wrench/other/", 6),
+    );
+    place.run(&args).fails_in(
+        "estimator.toml",
+        &["wrench/l_arm_ft_sensor", "joint/l_wrist_yaw"],
+    );
 }
 
 // ---------------------------------------------------------------- a machine that lacks something
 
-/// A configuration with one bus on an interface of the kernel.
+/// A configuration with one bus on a kernel interface.
 fn on_interface(place: &Place, name: &str) {
     let source = format!(
-        "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\nsource = {{ kind = \"socketcan\", interface = \"{name}\" }}\n"
+        "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\nsource = {{ kind = \"socketcan\", \
+         interface = \"{name}\" }}\n"
     );
     place.write("can.toml", &source);
 }
@@ -727,8 +843,16 @@ fn an_interface_that_is_not_there_is_told_and_so_is_a_kernel_without_can() {
     let place = Place::new();
     on_interface(&place, "nocan7");
     let ran = place.run(&["gateway", "--config", "can.toml"]);
-    let simulate = place.run(&["simulate", "--bus", "nocan7", "--bus", "nocan8", "--seconds", "1"]);
-    // The virtual bus, and the words that choose it.
+    let simulate = place.run(&[
+        "simulate",
+        "--bus",
+        "nocan7",
+        "--bus",
+        "nocan8",
+        "--seconds",
+        "1",
+    ]);
+    // The message recommends the virtual bus and its configuration.
     let expected = if has_can() {
         "there is no interface nocan7"
     } else {
@@ -737,11 +861,15 @@ fn an_interface_that_is_not_there_is_told_and_so_is_a_kernel_without_can() {
     for ran in [&ran, &simulate] {
         ran.fails(
             1,
-            &[expected, "virtual", "source = { kind = \"virtual\", name = \"...\" }"],
+            &[
+                expected,
+                "virtual",
+                "source = { kind = \"virtual\", name = \"...\" }",
+            ],
         );
     }
     assert!(ran.err.contains("bus \"b\""), "{}", ran.err);
-    // The message's advice is right.
+    // The remedy in the message works.
     place.change(
         "can.toml",
         "virtual.toml",
@@ -751,7 +879,8 @@ fn an_interface_that_is_not_there_is_told_and_so_is_a_kernel_without_can() {
         )],
     );
     let mut gateway = place.start(&["gateway", "--config", "virtual.toml"]);
-    until(PATIENCE, || gateway.log().contains("running").then_some(())).expect("the gateway runs on a virtual bus");
+    until(PATIENCE, || gateway.log().contains("running").then_some(()))
+        .expect("the gateway runs on a virtual bus");
     gateway.end();
     let demo = place.run(&["demo", "--bus", "nocan7", "--seconds", "2", "--out", "d"]);
     demo.fails(1, &[expected, "gateway"]);
@@ -774,11 +903,13 @@ fn has_can() -> bool {
 #[test]
 fn what_may_not_be_done_is_told() {
     let place = Place::new();
-    // The user called nobody, where this is root, whom nothing is forbidden.
+    // As root, run as user nobody, because root has all permissions.
     let nobody = nix::unistd::geteuid().is_root().then_some(65534);
-    let everybody = |path: &Path, mode: u32| fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
+    let everybody = |path: &Path, mode: u32| {
+        fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
+    };
     everybody(&place.path(""), 0o755);
-    // The program's own folder may be closed to others.
+    // The program's own folder may not be readable for others.
     let program = place.path("proprio");
     fs::copy(Rig::program(), &program).unwrap();
     everybody(&program, 0o755);
@@ -815,21 +946,38 @@ fn what_may_not_be_done_is_told() {
     for args in [gateway, estimator] {
         run(&args, "closed/domain/sub").fails(
             1,
-            &["cannot create directory", "Permission denied", "PROPRIO_RUNTIME_DIR"],
+            &[
+                "cannot create directory",
+                "Permission denied",
+                "PROPRIO_RUNTIME_DIR",
+            ],
         );
         run(&args, "closed/domain").fails(1, &["closed/domain"]);
     }
-    run(&["gateway", "--config", "closed/secret.toml"], "open")
-        .fails(2, &["closed/secret.toml: can not be read", "Permission denied"]);
-    let decode = ["decode", "--config", "gateway.toml", "--log", "log.log", "--out"];
+    run(&["gateway", "--config", "closed/secret.toml"], "open").fails(
+        2,
+        &["closed/secret.toml: cannot be read", "Permission denied"],
+    );
+    let decode = [
+        "decode",
+        "--config",
+        "gateway.toml",
+        "--log",
+        "log.log",
+        "--out",
+    ];
     run(&[&decode[..], &["closed/o.csv"]].concat(), "open")
-        .fails(1, &["closed/o.csv: can not be written", "ermission denied"]);
-    run(&["simulate", "--seconds", "1", "--truth", "closed/t.csv"], "open")
-        .fails(1, &["closed/t.csv", "Permission denied"]);
-    run(&["demo", "--out", "closed/d"], "open").fails(1, &["closed/d: can not be created", "Permission denied"]);
+        .fails(1, &["closed/o.csv: cannot be written", "ermission denied"]);
+    run(
+        &["simulate", "--seconds", "1", "--truth", "closed/t.csv"],
+        "open",
+    )
+    .fails(1, &["closed/t.csv", "Permission denied"]);
+    run(&["demo", "--out", "closed/d"], "open")
+        .fails(1, &["closed/d: cannot be created", "Permission denied"]);
     assert_eq!(fs::read_dir(place.path("closed")).unwrap().count(), 2);
     run(&[&decode[..], &["open/o.csv"]].concat(), "open").good();
-    // Somebody else's domain, where there are two users to have.
+    // Another user's domain, if there are two users.
     if nobody.is_some() {
         let mut ours = place.start(&gateway);
         until(PATIENCE, || ours.log().contains("running").then_some(())).expect("the gateway runs");
@@ -843,7 +991,8 @@ fn what_may_not_be_done_is_told() {
             .env("PROPRIO_RUNTIME_DIR", &place.rig.domain.base)
             .uid(65534)
             .gid(65534);
-        finish(command, b"", "another user's domain").fails(1, &["belongs to user id 0", "must run as the same user"]);
+        finish(command, b"", "another user's domain")
+            .fails(1, &["belongs to user id 0", "must run as the same user"]);
         ours.assert_runs();
         ours.end();
     }
@@ -888,15 +1037,17 @@ fn the_doctor_looks_at_everything() {
     assert_eq!(can["verdict"] == "ok", has_can(), "{can}");
     let words = place.run(&["doctor"]).good().out;
     assert!(checks.iter().all(|c| words.contains(c)), "{words}");
-    // Nothing runs without shared memory: that is a failure.
+    // Without shared memory nothing runs: this is a failure.
     let mut command = place.command(&["doctor"]);
     command.env("PROPRIO_RUNTIME_DIR", "/proc/nowhere");
-    finish(command, b"", "doctor without a place").fails(1, &["this machine can not run proprio", "shared memory"]);
+    finish(command, b"", "doctor without a place")
+        .fails(1, &["this machine cannot run proprio", "shared memory"]);
 }
 
-// ---------------------------------------------------------------- bad samples and half-written logs
+// ---------------------------------------------------------------- bad samples and half-written
+// logs
 
-/// The lines of a text, by their numbers from 1, without those of `drop`.
+/// The numbered lines of a text (from 1), without those in `drop`.
 fn without(text: &str, drop: &[usize]) -> String {
     text.lines()
         .zip(1..)
@@ -910,7 +1061,10 @@ fn bad_rows_are_named_and_take_nothing_else_with_them() {
     let log = oracle("icub_left_arm_mujoco.csv");
     let names: Vec<&str> = log.lines().next().unwrap().split(',').collect();
     let column = |name: &str| names.iter().position(|n| *n == name).unwrap();
-    let (elbow, fx) = (column("joint/l_elbow/position"), column("wrench/l_arm_ft_sensor/fx"));
+    let (elbow, fx) = (
+        column("joint/l_elbow/position"),
+        column("wrench/l_arm_ft_sensor/fx"),
+    );
     let mut lines: Vec<String> = log.lines().map(ToOwned::to_owned).collect();
     let set = |lines: &mut Vec<String>, line: usize, column: usize, to: &str| {
         let mut cells: Vec<&str> = lines[line - 1].split(',').collect();
@@ -946,9 +1100,15 @@ fn bad_rows_are_named_and_take_nothing_else_with_them() {
         "good.csv",
         "--assess",
     ];
-    let told = place.run(&[&assess[..], &["--out", "a.out"]].concat()).good();
-    // The hand may be touched all the time there.
-    assert!(told.err.contains("no F/T reading can be predicted"), "{}", told.err);
+    let told = place
+        .run(&[&assess[..], &["--out", "a.out"]].concat())
+        .good();
+    // In that configuration the hand may always be touched.
+    assert!(
+        told.err.contains("no F/T reading can be predicted"),
+        "{}",
+        told.err
+    );
     let told = place
         .run(&[&assess[..], &["--out", "a.out", "--json"]].concat())
         .good()
@@ -958,7 +1118,10 @@ fn bad_rows_are_named_and_take_nothing_else_with_them() {
         assessment["changes"] == 0 && assessment["torques"].is_object(),
         "{told}"
     );
-    assert!(assessment["predicted"]["relative_error"]["cad"].is_null(), "{told}");
+    assert!(
+        assessment["predicted"]["relative_error"]["cad"].is_null(),
+        "{told}"
+    );
     let clean = estimate("good.csv", "good.out");
     assert_eq!(
         place.read("a.out"),
@@ -970,7 +1133,7 @@ fn bad_rows_are_named_and_take_nothing_else_with_them() {
     assert_eq!(
         place.read("good.out"),
         place.read("bad.out"),
-        "what was not bad gives the same, bit for bit"
+        "good rows give the same result, bit for bit"
     );
     assert_eq!(
         (&dirty.json()["bad_rows"], &dirty.json()["rows"]),
@@ -990,7 +1153,11 @@ fn bad_rows_are_named_and_take_nothing_else_with_them() {
             .lines()
             .filter(|l| l.starts_with(&format!("bad.csv: line {line}: skipped: ")));
         let told: Vec<_> = told.collect();
-        assert!(told.len() == 1 && told[0].contains(what), "line {line}: {}", dirty.err);
+        assert!(
+            told.len() == 1 && told[0].contains(what),
+            "line {line}: {}",
+            dirty.err
+        );
     }
 }
 
@@ -999,7 +1166,7 @@ fn stamps_that_go_backwards_are_counted_and_take_nothing_else_with_them() {
     let place = Place::new();
     let log = oracle("icub_left_arm_mujoco.csv");
     let lines: Vec<&str> = log.lines().collect();
-    // Line 100 stands again behind line 120, and line 150 twice.
+    // Line 100 is repeated after line 120, and line 150 occurs twice.
     let mut worse: Vec<&str> = lines.clone();
     worse.insert(150, lines[149]);
     worse.insert(120, lines[99]);
@@ -1039,7 +1206,10 @@ fn stamps_that_go_backwards_are_counted_and_take_nothing_else_with_them() {
     // In a CAN log: the same frame with an earlier stamp.
     let log = session(0.5, &Settings::default());
     let mut lines: Vec<&str> = log.lines().collect();
-    let motor = lines.iter().rposition(|l| l.contains("left_arm_motors 140#")).unwrap();
+    let motor = lines
+        .iter()
+        .rposition(|l| l.contains("left_arm_motors 140#"))
+        .unwrap();
     let earlier = format!(
         "({}) {}",
         (T0 + Nanos::from_millis(100)).to_string().trim(),
@@ -1050,13 +1220,25 @@ fn stamps_that_go_backwards_are_counted_and_take_nothing_else_with_them() {
     place.write("bad.log", &(lines.join("\n") + "\n"));
     let decode = |log: &str, out: &str| {
         place
-            .run(&["decode", "--config", "gateway.toml", "--log", log, "--out", out])
+            .run(&[
+                "decode",
+                "--config",
+                "gateway.toml",
+                "--log",
+                log,
+                "--out",
+                out,
+            ])
             .good()
     };
     decode("good.log", "good.csv");
     let dirty = decode("bad.log", "bad.csv");
     assert_same(&place.read("good.csv"), &place.read("bad.csv"), "samples");
-    assert!(dirty.err.contains("l_elbow_motor: backward_stamp: 1"), "{}", dirty.err);
+    assert!(
+        dirty.err.contains("l_elbow_motor: backward_stamp: 1"),
+        "{}",
+        dirty.err
+    );
 }
 
 #[test]
@@ -1064,25 +1246,46 @@ fn a_log_cut_off_anywhere_gives_everything_before_the_cut() {
     let place = Place::new();
     let log = session(0.3, &Settings::default());
     let whole = log.len();
-    let args = ["decode", "--config", "gateway.toml", "--log", "-", "--out", "-"];
+    let args = [
+        "decode",
+        "--config",
+        "gateway.toml",
+        "--log",
+        "-",
+        "--out",
+        "-",
+    ];
     let last = log[..whole - 1].rfind('\n').unwrap() + 1;
     let before = place.run_with(&args, &log.as_bytes()[..last]).good().out;
     for cut in last + 1..whole {
         let ran = place.run_with(&args, &log.as_bytes()[..cut]).good();
-        // What came before the cut is there, to the last sample; what is made of half a line is nothing.
-        assert_same(&ran.out, &before, &format!("cut after {:?}", &log[last..cut]));
+        // All samples before the cut are decoded; half a line gives no sample.
+        assert_same(
+            &ran.out,
+            &before,
+            &format!("cut after {:?}", &log[last..cut]),
+        );
         assert!(
-            ran.err.contains(&format!("-: skipped: line {}: ", log.lines().count())),
+            ran.err
+                .contains(&format!("-: skipped: line {}: ", log.lines().count())),
             "cut after {:?}: {}",
             &log[last..cut],
             ran.err
         );
     }
-    // The same of a table.
+    // The same for a table.
     let table = oracle("icub_left_arm_mujoco.csv");
     let cut = &table[..table.len() / 2];
     let whole_lines = cut.lines().count() - 2;
-    let args = ["estimate", "--config", "estimator.toml", "--log", "-", "--out", "-"];
+    let args = [
+        "estimate",
+        "--config",
+        "estimator.toml",
+        "--log",
+        "-",
+        "--out",
+        "-",
+    ];
     let ran = place.run_with(&args, cut.as_bytes()).good();
     assert_eq!(ran.out.lines().count(), whole_lines + 1);
     assert!(
@@ -1114,25 +1317,62 @@ fn what_is_no_log_at_all_is_told_and_leaves_no_file() {
     };
     let there = names(&place);
     for out in ["new.csv", "keep.csv"] {
-        let decode = |log: &str| place.run(&["decode", "--config", "gateway.toml", "--log", log, "--out", out]);
-        decode("none").fails(1, &["none: can not be read", "No such file"]);
+        let decode = |log: &str| {
+            place.run(&[
+                "decode",
+                "--config",
+                "gateway.toml",
+                "--log",
+                log,
+                "--out",
+                out,
+            ])
+        };
+        decode("none").fails(1, &["none: cannot be read", "No such file"]);
         decode("empty").fails(1, &["empty: the log holds no frame", "it is empty"]);
         decode("text").fails(1, &["text: the log holds no frame", "line 1"]);
         decode("noise").fails(1, &["noise: the log holds no frame"]);
-        let estimate = |log: &str| place.run(&["estimate", "--config", "estimator.toml", "--log", log, "--out", out]);
-        estimate("none").fails(1, &["none: can not be read", "No such file"]);
+        let estimate = |log: &str| {
+            place.run(&[
+                "estimate",
+                "--config",
+                "estimator.toml",
+                "--log",
+                log,
+                "--out",
+                out,
+            ])
+        };
+        estimate("none").fails(1, &["none: cannot be read", "No such file"]);
         estimate("empty").fails(1, &["empty: ", "must name the columns"]);
         estimate("text").fails(1, &["text: ", "must name the columns"]);
         estimate("noise").fails(1, &["noise: "]);
-        let assess = ["estimate", "--config", "estimator.toml", "--assess", "--out", out];
+        let assess = [
+            "estimate",
+            "--config",
+            "estimator.toml",
+            "--assess",
+            "--out",
+            out,
+        ];
         let assess = |log: &str| place.run(&[&assess[..], &["--log", log]].concat());
-        assess("none").fails(1, &["none: can not be read", "No such file"]);
+        assess("none").fails(1, &["none: cannot be read", "No such file"]);
         assess("text").fails(1, &["text: ", "must name the columns"]);
         assess("-").fails(1, &["--assess reads the log twice", "--log"]);
         assess("header.csv").fails(2, &["header.csv", "no column for"]);
         estimate("header.csv").fails(2, &["header.csv", "no column for"]);
-        let encode = |log: &str| place.run(&["encode", "--config", "gateway.toml", "--samples", log, "--out", out]);
-        encode("none").fails(1, &["none: can not be read", "No such file"]);
+        let encode = |log: &str| {
+            place.run(&[
+                "encode",
+                "--config",
+                "gateway.toml",
+                "--samples",
+                log,
+                "--out",
+                out,
+            ])
+        };
+        encode("none").fails(1, &["none: cannot be read", "No such file"]);
         encode("empty").fails(1, &["empty: ", "must name the columns"]);
         encode("header.csv").fails(1, &["header.csv: ", "no rows"]);
         encode("noise").fails(1, &["noise: "]);
@@ -1160,12 +1400,23 @@ fn what_is_no_log_at_all_is_told_and_leaves_no_file() {
             "--out",
             "no/such/folder.csv",
         ])
-        .fails(1, &["no/such/folder.csv: can not be written", "No such file"]);
-    let parameters = ["--parameters", "p.toml", "--log", "empty", "--out", "new.csv"];
+        .fails(
+            1,
+            &["no/such/folder.csv: cannot be written", "No such file"],
+        );
+    let parameters = [
+        "--parameters",
+        "p.toml",
+        "--log",
+        "empty",
+        "--out",
+        "new.csv",
+    ];
     let with_parameters = [&["estimate", "--config", "estimator.toml"], &parameters[..]].concat();
-    place
-        .run(&with_parameters)
-        .fails(2, &["estimator.toml: parameters: p.toml can not be read: No such file"]);
+    place.run(&with_parameters).fails(
+        2,
+        &["estimator.toml: parameters: p.toml can not be read: No such file"],
+    );
     place.write("p.toml", "schema = 1\nrobot = \"icub_left_arm\"\n");
     place
         .run(&with_parameters)
@@ -1174,22 +1425,35 @@ fn what_is_no_log_at_all_is_told_and_leaves_no_file() {
         "p.toml",
         &parameters_file().replacen("icub_left_arm", "icub_right_arm", 1),
     );
-    place
-        .run(&with_parameters)
-        .fails(2, &["p.toml is of robot \"icub_right_arm\", not of \"icub_left_arm\""]);
-    // An output that is full.
+    place.run(&with_parameters).fails(
+        2,
+        &["p.toml belongs to robot \"icub_right_arm\", not to \"icub_left_arm\""],
+    );
+    // An output without free space.
     if Path::new("/dev/full").exists() {
         place.write("good.csv", &oracle("icub_left_arm_mujoco.csv"));
         place.write("good.log", &session(0.2, &Settings::default()));
         for input in [
-            ["estimate", "--config", "estimator.toml", "--log", "good.csv"],
-            ["encode", "--config", "gateway.toml", "--samples", "good.csv"],
+            [
+                "estimate",
+                "--config",
+                "estimator.toml",
+                "--log",
+                "good.csv",
+            ],
+            [
+                "encode",
+                "--config",
+                "gateway.toml",
+                "--samples",
+                "good.csv",
+            ],
             ["decode", "--config", "gateway.toml", "--log", "good.log"],
         ] {
             let args = [&input[..], &["--out", "/dev/full"]].concat();
             place
                 .run(&args)
-                .fails(1, &["/dev/full: can not be written", "No space left"]);
+                .fails(1, &["/dev/full: cannot be written", "No space left"]);
         }
     }
 }
@@ -1198,7 +1462,7 @@ fn what_is_no_log_at_all_is_told_and_leaves_no_file() {
 
 const HALF_JOINT: f64 = std::f64::consts::TAU / 65536.0 / 100.0 / 2.0;
 
-/// Half a step of each column: what encoding and decoding may change at the most.
+/// Half a step of each column: the maximum change by encoding and decoding.
 fn half_step(column: &str) -> f64 {
     let degree = std::f64::consts::PI / 180.0;
     let part = column.rsplit('/').next().unwrap();
@@ -1272,7 +1536,7 @@ fn encode_and_decode_are_inverses_within_half_a_step() {
         }
     }
     assert_eq!(compared, 201 * (1 + 14 + 6 + 6));
-    // Once quantised, nothing changes any more: not a bit of the log.
+    // Quantised values do not change any more: the log is equal bit for bit.
     place
         .run(&[
             "encode",
@@ -1284,15 +1548,19 @@ fn encode_and_decode_are_inverses_within_half_a_step() {
             "again.log",
         ])
         .good();
-    // (Frames of one instant stand in the order of the table's columns.)
+    // (Frames of one instant are in the order of the table's columns.)
     let sorted = |name: &str| {
         let text = place.read(name);
         let mut lines: Vec<&str> = text.lines().collect();
         lines.sort_unstable();
         lines.join("\n")
     };
-    assert_same(&sorted("again.log"), &sorted("session.log"), "the log again");
-    // A file may be its own input, and what is written can be read by everybody.
+    assert_same(
+        &sorted("again.log"),
+        &sorted("session.log"),
+        "the log again",
+    );
+    // Input and output may be the same file, and the output is readable for all users.
     place.write("same", &samples);
     place
         .run(&[
@@ -1307,7 +1575,11 @@ fn encode_and_decode_are_inverses_within_half_a_step() {
         .good();
     assert_same(&place.read("same"), &place.read("session.log"), "in place");
     assert_eq!(
-        fs::metadata(place.path("same")).unwrap().permissions().mode() & 0o444,
+        fs::metadata(place.path("same"))
+            .unwrap()
+            .permissions()
+            .mode()
+            & 0o444,
         0o444
     );
 }
@@ -1318,7 +1590,15 @@ fn standard_input_and_output_serve_as_files() {
     let samples = oracle("icub_left_arm_mujoco.csv");
     let encoded = place
         .run_with(
-            &["encode", "--config", "gateway.toml", "--samples", "-", "--out", "-"],
+            &[
+                "encode",
+                "--config",
+                "gateway.toml",
+                "--samples",
+                "-",
+                "--out",
+                "-",
+            ],
             samples.as_bytes(),
         )
         .good();
@@ -1351,12 +1631,20 @@ fn standard_input_and_output_serve_as_files() {
     );
     let estimated = place
         .run_with(
-            &["estimate", "--config", "estimator.toml", "--log", "-", "--out", "-"],
+            &[
+                "estimate",
+                "--config",
+                "estimator.toml",
+                "--log",
+                "-",
+                "--out",
+                "-",
+            ],
             decoded.out.as_bytes(),
         )
         .good();
     assert_eq!(estimated.out.lines().count(), 202);
-    // The same as through files.
+    // The same result as with files.
     place.write("samples.csv", &samples);
     place
         .run(&[
@@ -1370,7 +1658,15 @@ fn standard_input_and_output_serve_as_files() {
         ])
         .good();
     place
-        .run(&["decode", "--config", "gateway.toml", "--log", "a.log", "--out", "a.csv"])
+        .run(&[
+            "decode",
+            "--config",
+            "gateway.toml",
+            "--log",
+            "a.log",
+            "--out",
+            "a.csv",
+        ])
         .good();
     place
         .run(&[
@@ -1384,7 +1680,11 @@ fn standard_input_and_output_serve_as_files() {
         ])
         .good();
     assert_eq!(
-        (place.read("a.log"), place.read("a.csv"), place.read("e.csv")),
+        (
+            place.read("a.log"),
+            place.read("a.csv"),
+            place.read("e.csv")
+        ),
         (encoded.out, decoded.out, estimated.out)
     );
     let before = place.names();
@@ -1434,12 +1734,14 @@ fn a_decoded_session_is_the_simulators_truth() {
             "{device}"
         );
     }
-    let mut simulation = Simulation::new(&Robot::open("icub_left_arm").unwrap(), &settings).unwrap();
+    let mut simulation =
+        Simulation::new(&Robot::open("icub_left_arm").unwrap(), &settings).unwrap();
     let samples = table(&place.read("s.csv"));
     let (mut compared, mut moving) = (0_u32, 0_u32);
     for (row, t) in samples["t"].iter().enumerate() {
         let since = t - T0.seconds();
-        // Frames wait for their bus: what they hold is up to a few frame times older than their stamp.
+        // Frames wait for their bus, so values are up to a few frame durations older than their
+        // stamp.
         let late = (since - 1.5e-3).max(0.0);
         let (now, then) = (simulation.at(since).clone(), simulation.at(late).clone());
         let mut check = |name: &str, truth: f64, older: f64| {
@@ -1465,8 +1767,16 @@ fn a_decoded_session_is_the_simulators_truth() {
         ] {
             let joint = simulation.joint(name).unwrap();
             let (now, then) = (now.joints[joint], then.joints[joint]);
-            check(&format!("joint/{name}/position"), now.position, then.position);
-            check(&format!("joint/{name}/velocity"), now.velocity, then.velocity);
+            check(
+                &format!("joint/{name}/position"),
+                now.position,
+                then.position,
+            );
+            check(
+                &format!("joint/{name}/velocity"),
+                now.velocity,
+                then.velocity,
+            );
         }
         for (part, axis) in ["fx", "fy", "fz", "tx", "ty", "tz"].into_iter().zip(0..) {
             check(
@@ -1502,7 +1812,9 @@ fn formats(log: &str) -> Vec<(&'static str, bool, String)> {
         })
         .collect();
     let screen = |data: &str| {
-        let bytes: Vec<&str> = (0..data.len() / 2).map(|i| &data[2 * i..2 * i + 2]).collect();
+        let bytes: Vec<&str> = (0..data.len() / 2)
+            .map(|i| &data[2 * i..2 * i + 2])
+            .collect();
         format!("  [{}]  {}", bytes.len(), bytes.join(" "))
     };
     let text = |line: &dyn Fn(usize, &str, &str, &str, &str) -> String| {
@@ -1520,7 +1832,9 @@ fn formats(log: &str) -> Vec<(&'static str, bool, String)> {
         (
             "log with directions (-x)",
             true,
-            text(&|i, t, n, id, d| format!("({t}) {n} {id}#{d} {}", if i % 7 == 0 { "T" } else { "R" })),
+            text(&|i, t, n, id, d| {
+                format!("({t}) {n} {id}#{d} {}", if i % 7 == 0 { "T" } else { "R" })
+            }),
         ),
         (
             "screen, absolute (-t a)",
@@ -1535,7 +1849,9 @@ fn formats(log: &str) -> Vec<(&'static str, bool, String)> {
         (
             "screen, since the first (-t z)",
             false,
-            text(&|_, t, n, id, d| format!(" ({})  {n}  {id} {}", short(nanos(t) - first), screen(d))),
+            text(&|_, t, n, id, d| {
+                format!(" ({})  {n}  {id} {}", short(nanos(t) - first), screen(d))
+            }),
         ),
         (
             "screen, since the line before (-t d)",
@@ -1553,7 +1869,9 @@ fn formats(log: &str) -> Vec<(&'static str, bool, String)> {
         (
             "screen, with text (-a)",
             false,
-            text(&|_, _, n, id, d| format!("  {n}  {id} {}   '{}'", screen(d), ".".repeat(d.len() / 2))),
+            text(&|_, _, n, id, d| {
+                format!("  {n}  {id} {}   '{}'", screen(d), ".".repeat(d.len() / 2))
+            }),
         ),
         (
             "with comments and blank lines",
@@ -1564,12 +1882,12 @@ fn formats(log: &str) -> Vec<(&'static str, bool, String)> {
     ]
 }
 
-/// As candump writes short stamps: three digits of seconds.
+/// Short stamps as candump writes them: three digits of seconds.
 fn short(t: Nanos) -> String {
     format!("{:03}.{:09}", t.0 / 1_000_000_000, t.0 % 1_000_000_000)
 }
 
-/// A stamp of the first days of 1970 as candump writes dates.
+/// A stamp of the first days of 1970 in candump's date format.
 fn date(stamp: &str) -> String {
     let t = Nanos::parse_seconds(stamp).unwrap();
     let (s, ns) = (t.0 / 1_000_000_000, t.0 % 1_000_000_000);
@@ -1606,13 +1924,18 @@ fn every_candump_format_gives_the_same_samples() {
     };
     let reference = decode(&log).out;
     assert!(reference.lines().count() > 1000);
-    // Per column, its values in order: stamps aside, this is what every format must give.
+    // Per column, its values in order: every format must give these, apart from the stamps.
     let values = |csv: &str| {
         let mut columns = table(csv);
         columns.remove("t");
         columns
             .into_values()
-            .map(|c| c.into_iter().filter(|v| !v.is_nan()).map(f64::to_bits).collect())
+            .map(|c| {
+                c.into_iter()
+                    .filter(|v| !v.is_nan())
+                    .map(f64::to_bits)
+                    .collect()
+            })
             .collect::<Vec<Vec<u64>>>()
     };
     let wanted = values(&reference);
@@ -1649,7 +1972,10 @@ fn estimates_from_files_are_those_of_other_libraries() {
     let place = Place::new();
     let no_offsets = [
         ("offset_n = [6.0, -4.0, 11.0]", "offset_n = [0.0, 0.0, 0.0]"),
-        ("offset_nm = [0.2, -0.35, 0.1]", "offset_nm = [0.0, 0.0, 0.0]"),
+        (
+            "offset_nm = [0.2, -0.35, 0.1]",
+            "offset_nm = [0.0, 0.0, 0.0]",
+        ),
     ];
     place.change("estimator.toml", "imu.toml", &no_offsets);
     let fixed = [
@@ -1658,12 +1984,15 @@ fn estimates_from_files_are_those_of_other_libraries() {
             "kind = \"fixed\"\nlink = \"chest\"\ngravity_mps2 = [0.0, 0.0, -9.80665]",
         ),
         (
-            "[[contact]]\nname = \"stand\"        # what carries the robot\nlink = \"chest\"\n",
+            "[[contact]]\nname = \"stand\"        # the ground reaction\nlink = \"chest\"\n",
             "",
         ),
     ];
     place.change("imu.toml", "fixed.toml", &fixed);
-    for log in ["icub_left_arm_mujoco.csv", "icub_left_arm_mujoco_contact.csv"] {
+    for log in [
+        "icub_left_arm_mujoco.csv",
+        "icub_left_arm_mujoco_contact.csv",
+    ] {
         let text = oracle(log);
         let truth = table(&text);
         for config in ["imu.toml", "fixed.toml"] {
@@ -1696,8 +2025,15 @@ fn estimates_from_files_are_those_of_other_libraries() {
                 .keys()
                 .filter_map(|n| n.strip_prefix("joint/")?.strip_suffix("/torque"))
             {
-                check(&format!("torque/{name}"), truth.get(&format!("joint/{name}/torque")));
-                assert!(estimates[&format!("valid/{name}")].iter().all(|v| *v == 1.0));
+                check(
+                    &format!("torque/{name}"),
+                    truth.get(&format!("joint/{name}/torque")),
+                );
+                assert!(
+                    estimates[&format!("valid/{name}")]
+                        .iter()
+                        .all(|v| *v == 1.0)
+                );
                 assert!(
                     estimates[&format!("torque_std/{name}")]
                         .iter()
@@ -1713,14 +2049,17 @@ fn estimates_from_files_are_those_of_other_libraries() {
     }
 }
 
-/// Parameters of the arm's hand, which weighs a kilogram more than in the URDF, and the sensor's offsets.
+/// Parameters with the sensor's offsets and a hand that is a kilogram heavier than in the URDF.
 fn parameters_file() -> String {
+    use proprio_dynamics::spatial;
     use proprio_estimator::parameters::{Offset, Parameters, Provenance};
     use proprio_estimator::setup::Setup;
-    use proprio_estimator::spatial;
     let robot = Robot::open("icub_left_arm").expect("the robot of the source tree");
     let setup = Setup::new(&robot.config).expect("its model");
-    let (link, mut inertia) = (setup.cad().len() - 1, setup.cad()[setup.cad().len() - 1]);
+    let (link, mut inertia) = (
+        setup.robot.model.inertias().len() - 1,
+        setup.robot.model.inertias()[setup.robot.model.inertias().len() - 1],
+    );
     inertia.mass += 1.0;
     let offset = Offset {
         sensor: "l_arm_ft_sensor".into(),
@@ -1734,8 +2073,8 @@ fn parameters_file() -> String {
         program: "proprio test".into(),
         ..Provenance::default()
     };
-    let mut parameters = Parameters::new(&setup, provenance);
-    // Nothing is uncertain of them.
+    let mut parameters = Parameters::new(&setup.robot, provenance);
+    // They have no uncertainty.
     let root = parameters.root().resize(0, 16, 0.0);
     parameters
         .set_identified(&[(link, inertia)], &[offset], &root)
@@ -1769,11 +2108,12 @@ fn identified_parameters_take_the_place_of_the_urdfs() {
         let parts = ["fx", "fy", "fz"].map(|part| mean(estimates, &format!("contact/hand/{part}")));
         parts.iter().map(|x| x * x).sum::<f64>().sqrt()
     };
-    // The golden log has no offsets: with those of the file, zero, what the hand feels is a kilogram that it has not.
+    // The golden log has no offsets, and the file's are zero: the wrench at the hand then shows the
+    // weight of the additional kilogram.
     let felt = force(&with);
     assert!((felt - 9.8).abs() < 1.5, "{felt}");
     assert!(force(&plain) > 12.0, "the offsets of estimator.toml");
-    // The configuration may name them; the daemon says so.
+    // The configuration may name the file; the daemon reports it.
     place.change(
         "estimator.toml",
         "named.toml",
@@ -1790,7 +2130,10 @@ fn identified_parameters_take_the_place_of_the_urdfs() {
         check.contains("inertial parameters: identified by proprio test: 1 of 9 links"),
         "{check}"
     );
-    assert!(check.contains("the URDF's, taken as known to 20 %: "), "{check}");
+    assert!(
+        check.contains("the URDF's, taken as known to 20 %: "),
+        "{check}"
+    );
     let check = place
         .run(&["estimator", "--config", "estimator.toml", "--check"])
         .good()
@@ -1826,18 +2169,19 @@ fn a_second_gateway_or_estimator_is_refused_by_the_first_ones_number() {
         until(PATIENCE, || first.log().contains("running").then_some(()))
             .unwrap_or_else(|| panic!("{verb}: {}", first.log()));
         let number = format!("process {}", first.id());
-        place
-            .run(&[verb, "--config", config])
-            .fails(1, &[&number, "only one gateway and one estimator per robot"]);
+        place.run(&[verb, "--config", config]).fails(
+            1,
+            &[&number, "only one gateway and one estimator per robot"],
+        );
         first.assert_runs();
-        // Another robot's is welcome, and so is one in another domain.
+        // A gateway of another robot or in another domain is permitted.
         place.change(
             config,
             "other.toml",
             &[("robot = \"icub_left_arm\"", "robot = \"other\"")],
         );
         if verb == "gateway" {
-            // On buses of its own.
+            // On separate buses.
             place.change(
                 "other.toml",
                 "other.toml",
@@ -1856,10 +2200,10 @@ fn a_second_gateway_or_estimator_is_refused_by_the_first_ones_number() {
                 .unwrap_or_else(|| panic!("{args:?}: {}", other.log()));
             other.end();
         }
-        // SIGTERM ends it as a success, and it says so.
+        // SIGTERM ends it with success and a log line.
         first.end();
         assert!(first.log().contains("SIGTERM"), "{}", first.log());
-        // Once it has gone, its place is free.
+        // After its end, its place is free.
         let mut next = place.start(&[verb, "--config", config]);
         until(PATIENCE, || next.log().contains("running").then_some(()))
             .unwrap_or_else(|| panic!("{verb}: {}", next.log()));
@@ -1900,10 +2244,12 @@ fn the_simulator_tells_what_it_did_as_json() {
     );
     assert_eq!(told["truth_rows"], 501);
     assert_eq!(table(&place.read("truth.csv"))["t"].len(), 501);
-    // Until it is told to stop.
+    // It runs until it is stopped.
     let mut process = place.start(&["simulate", "--json"]);
-    until(PATIENCE, || process.log().contains("has power").then_some(()))
-        .unwrap_or_else(|| panic!("{}", process.log()));
+    until(PATIENCE, || {
+        process.log().contains("is powered on").then_some(())
+    })
+    .unwrap_or_else(|| panic!("{}", process.log()));
     process.end();
     assert!(
         serde_json::from_str::<Json>(&process.output()).is_ok(),
@@ -1912,15 +2258,24 @@ fn the_simulator_tells_what_it_did_as_json() {
     );
 }
 
-/// The beginnings of the names of the segments that process `id` has mapped: its shared-memory domains.
+/// The prefixes of the segments that process `id` has mapped, one per shared-memory domain.
 fn domains_of(id: u32) -> BTreeSet<String> {
     let maps = fs::read_to_string(format!("/proc/{id}/maps")).unwrap_or_default();
     maps.lines()
-        .filter_map(|l| Some(l.split_once("/dev/shm/proprio_")?.1.split_once('_')?.0.to_owned()))
+        .filter_map(|l| {
+            Some(
+                l.split_once("/dev/shm/proprio_")?
+                    .1
+                    .split_once('_')?
+                    .0
+                    .to_owned(),
+            )
+        })
         .collect()
 }
 
-/// Asserts that a demonstration that has ended left nothing but its results: no file, no segment, no process.
+/// Asserts that an ended demonstration left only its results: no other file, no segment, no
+/// process.
 fn assert_clean(place: &Place, domains: &BTreeSet<String>) {
     let left: Vec<_> = fs::read_dir(place.path("tmp"))
         .unwrap()
@@ -1936,7 +2291,11 @@ fn assert_clean(place: &Place, domains: &BTreeSet<String>) {
         .filter(|s| domains.iter().any(|d| s.contains(d.as_str())))
         .collect();
     assert!(left.is_empty(), "segments: {left:?}");
-    let folder = place.path("").to_string_lossy().trim_end_matches('/').to_owned();
+    let folder = place
+        .path("")
+        .to_string_lossy()
+        .trim_end_matches('/')
+        .to_owned();
     let processes = fs::read_dir("/proc").unwrap().flatten().filter_map(|e| {
         let line = fs::read(e.path().join("cmdline")).ok()?;
         let line = String::from_utf8_lossy(&line).replace('\0', " ");
@@ -1976,11 +2335,15 @@ fn demo(place: &Place, seconds: f64, more: &[&str]) -> Json {
         );
     }
     let report = place.read("d/report.html");
-    assert!(report.starts_with("<!doctype html>") && report.contains("<svg") && !report.contains("NaN"));
+    assert!(
+        report.starts_with("<!doctype html>") && report.contains("<svg") && !report.contains("NaN")
+    );
     for outside in ["http://", "https://", "src=", "<script"] {
-        // The SVG name space is a name, not an address that is fetched.
+        // The SVG name space is only a name and is not fetched.
         assert!(
-            !report.replace("http://www.w3.org/2000/svg", "").contains(outside),
+            !report
+                .replace("http://www.w3.org/2000/svg", "")
+                .contains(outside),
             "the report stands alone: {outside}"
         );
     }
@@ -2012,7 +2375,7 @@ fn demo(place: &Place, seconds: f64, more: &[&str]) -> Json {
     summary
 }
 
-/// The reasons of a table of estimates, each with how often it stands there.
+/// The reasons in a table of estimates, with their counts.
 fn reasons(place: &Place) -> BTreeMap<String, usize> {
     let text = place.read("d/estimates.csv");
     let names: Vec<&str> = text.lines().next().unwrap().split(',').collect();
@@ -2046,7 +2409,7 @@ fn a_demonstration_ends_well_and_leaves_nothing_behind() {
     assert_eq!(summary["lost"], 0, "{summary}");
     assert_eq!(summary["seed"], 4);
     browse(&place.path("d/report.html"));
-    // With a URDF that is wrong, and no time to learn: uncertain, and said so.
+    // With a wrong URDF and no time for identification the torques are uncertain and withheld.
     assert!(summary["valid_share"].as_f64().unwrap() > 0.2, "{summary}");
     for (joint, error) in summary["torque_rms_error_nm"].as_object().unwrap() {
         assert!(error.as_f64().unwrap() < 2.0, "{joint}: {summary}");
@@ -2056,7 +2419,10 @@ fn a_demonstration_ends_well_and_leaves_nothing_behind() {
         identification["after"].is_null() && identification["settled_since_s"].is_null(),
         "{summary}"
     );
-    assert!(identification["moving_since_s"].as_f64().unwrap() < 0.75, "{summary}");
+    assert!(
+        identification["moving_since_s"].as_f64().unwrap() < 0.75,
+        "{summary}"
+    );
     assert_eq!(
         identification["learning"]["cad"].as_object().unwrap().len(),
         7,
@@ -2071,7 +2437,8 @@ fn a_demonstration_ends_well_and_leaves_nothing_behind() {
     );
 }
 
-/// Its boards measure velocities, and positions that jitter by what gears leave: no motion that says anything of masses.
+/// A robot at rest whose boards measure velocities, and positions with the jitter of the gears: no
+/// motion that contains information about masses.
 #[test]
 fn an_arm_that_stands_still_learns_nothing_of_its_masses() {
     let place = Place::new();
@@ -2114,7 +2481,10 @@ fn an_arm_that_stands_still_learns_nothing_of_its_masses() {
         .good();
     let estimates = table(&place.read("e.csv"));
     let at = |column: &str, t: f64| {
-        let row = estimates["t"].iter().position(|x| *x > T0.seconds() + t).unwrap();
+        let row = estimates["t"]
+            .iter()
+            .position(|x| *x > T0.seconds() + t)
+            .unwrap();
         estimates[column][row]
     };
     for joint in ["l_elbow", "l_wrist_pitch", "l_shoulder_roll"] {
@@ -2137,35 +2507,50 @@ fn a_demonstration_learns_what_its_urdf_has_wrong() {
         "{summary}"
     );
     let share = |phase: &str, key: &str| identification[phase][key].as_f64().unwrap();
-    // Standing still it learns nothing: torques are by the CAD, and as uncertain as that.
+    // At rest nothing is identified: torques and their uncertainty are those of the CAD.
     assert!(share("before", "within_2_sigma") > 0.9, "{summary}");
-    assert!(summary["valid_share"].as_f64().unwrap() >= 0.95, "{summary}");
+    assert!(
+        summary["valid_share"].as_f64().unwrap() >= 0.95,
+        "{summary}"
+    );
     assert!(share("after", "valid_share") >= 0.95, "{summary}");
-    assert!(identification["solutions"].as_u64().unwrap() > 10, "{summary}");
-    let error = |phase: &str, whose: &str, joint: &str| identification[phase][whose][joint].as_f64().unwrap();
-    // The wrist's links are light: on a busy machine, whose frames are stamped late, noise is as large as what the CAD has wrong.
+    assert!(
+        identification["solutions"].as_u64().unwrap() > 10,
+        "{summary}"
+    );
+    let error = |phase: &str, whose: &str, joint: &str| {
+        identification[phase][whose][joint].as_f64().unwrap()
+    };
+    // The wrist's links are light. On a busy machine, with late stamps, the noise is as large as
+    // the CAD's error.
     for (joint, times, noise) in [
-        ("l_elbow", 1.2, 0.01),
+        ("l_elbow", 1.5, 0.01),
         ("l_wrist_prosup", 1.0, 0.03),
         ("l_wrist_pitch", 1.0, 0.03),
         ("l_wrist_yaw", 1.0, 0.03),
     ] {
-        let (identified, cad) = (error("after", "identified", joint), error("after", "cad", joint));
+        let (identified, cad) = (
+            error("after", "identified", joint),
+            error("after", "cad", joint),
+        );
         assert!(identified < (cad / times).max(noise), "{joint}: {summary}");
         assert_eq!(identified, summary["torque_rms_error_nm"][joint]);
     }
-    // Above the sensor it is the sensor that measures, as well with either.
+    // The torques above the sensor depend mainly on its reading, so both are equally good.
     for joint in ["l_shoulder_pitch", "l_shoulder_roll", "l_shoulder_yaw"] {
-        assert!(error("after", "identified", joint) < 0.2, "{joint}: {summary}");
+        assert!(
+            error("after", "identified", joint) < 0.2,
+            "{joint}: {summary}"
+        );
     }
-    // The report shows it, in any browser, and the URDF is the robot's but for its inertias.
+    // The report shows it, in any browser. The URDF equals the robot's except for its inertias.
     let report = place.read("d/report.html");
     for part in [
         "onset of motion",
         "withheld",
         "pushed",
         "± 2σ",
-        "What was learnt",
+        "Identified parameters",
         "l_hand: ",
     ] {
         assert!(report.contains(part), "{part}");
@@ -2174,10 +2559,14 @@ fn a_demonstration_learns_what_its_urdf_has_wrong() {
     let (cad, urdf) = (place.read("d/cad.urdf"), place.read("model.urdf"));
     assert_ne!(cad, urdf);
     for part in ["<joint", "<origin", "<limit", "<sensor"] {
-        assert_eq!(cad.matches(part).count(), urdf.matches(part).count(), "{part}");
+        assert_eq!(
+            cad.matches(part).count(),
+            urdf.matches(part).count(),
+            "{part}"
+        );
     }
     assert!(place.read("d/estimator.toml").contains("cad.urdf"));
-    // What it wrote is complete: the estimator runs with it.
+    // The output is complete: the estimator runs with it.
     place
         .run(&["estimator", "--config", "d/estimator.toml", "--check"])
         .good();
@@ -2186,7 +2575,7 @@ fn a_demonstration_learns_what_its_urdf_has_wrong() {
 #[test]
 fn a_demonstration_with_faults_says_so() {
     let place = Place::new();
-    // Every hundredth frame: made up for, and known.
+    // Every hundredth frame is lost: compensated and counted.
     let summary = demo(&place, 2.5, &["--fault", "lost:0.01"]);
     assert!(
         summary["simulator"]["lost_on_request"].as_u64().unwrap() > 20,
@@ -2196,19 +2585,20 @@ fn a_demonstration_with_faults_says_so() {
         summary["lost"], 0,
         "what never reached a bus was not lost on the way: {summary}"
     );
-    // A motor board that says nothing for a second: the torques beyond it are withheld, and say whose fault it is.
+    // A motor board is silent for a second: the torques beyond it are withheld, with the board as
+    // the cause.
     let summary = demo(&place, 3.0, &["--fault", "silent:l_elbow_motor@1..2"]);
     let share = summary["valid_share"].as_f64().unwrap();
     assert!(share > 0.2 && share < 0.95, "{summary}");
     let found = reasons(&place);
     assert!(found["stale:l_elbow"] > 100, "{found:?}");
-    // A force/torque sensor at its end: its frozen values are not passed off as measurements.
+    // A saturated force/torque sensor: its frozen values are not used as measurements.
     let summary = demo(&place, 3.0, &["--fault", "saturate:l_arm_ft_sensor@1..2"]);
     let share = summary["valid_share"].as_f64().unwrap();
     assert!(share > 0.2 && share < 0.95, "{summary}");
     let found = reasons(&place);
     assert!(found["saturated:l_arm_ft_sensor"] > 100, "{found:?}");
-    // The hand is pushed, and nobody says so: seen while it lasts.
+    // An undeclared push on the hand is detected while it lasts.
     demo(&place, 8.0, &["--fault", "push:l_hand=50@6..7"]);
     let table = place.read("d/estimates.csv");
     let column = |name: &str| {
@@ -2220,9 +2610,17 @@ fn a_demonstration_with_faults_says_so() {
             .position(|own| own == name)
             .unwrap()
     };
-    let (detected, told) = (column("contact/hand/detected"), column("residual/l_upper_arm/reason"));
-    let rows = table.lines().skip(1).map(|line| line.split(',').collect::<Vec<_>>());
-    let seen: Vec<bool> = rows.map(|row| row[detected] == "1" && row[told] == "hand").collect();
+    let (detected, told) = (
+        column("contact/hand/detected"),
+        column("residual/l_upper_arm/reason"),
+    );
+    let rows = table
+        .lines()
+        .skip(1)
+        .map(|line| line.split(',').collect::<Vec<_>>());
+    let seen: Vec<bool> = rows
+        .map(|row| row[detected] == "1" && row[told] == "hand")
+        .collect();
     let count = seen.iter().filter(|seen| **seen).count();
     assert!((700..1500).contains(&count), "{count} of {}", seen.len());
 }
@@ -2301,8 +2699,9 @@ fn the_machine_readable_summaries_of_files_are_json() {
             assert!(!json[*key].is_null(), "{key}: {json}");
         }
     }
-    // The library says the same.
+    // The library gives the same numbers.
     let robot = Robot::open("icub_left_arm").unwrap();
-    let report = offline::encode(&robot.plan, place.read("s.csv").as_bytes(), std::io::sink()).unwrap();
+    let report =
+        offline::encode(&robot.plan, place.read("s.csv").as_bytes(), std::io::sink()).unwrap();
     assert_eq!((report.samples, report.table.rows), (201 * 9, 201));
 }

@@ -1,7 +1,8 @@
-//! Every file under config/ works: it is loaded by what reads it on a robot, and none is left out.
+//! Every file under config/ works: the program that reads it on a robot loads it. No file is left
+//! untested.
 
+use proprio_dynamics::model::Model;
 use proprio_estimator::config::Config;
-use proprio_estimator::model::Model;
 use proprio_estimator::setup::Setup;
 use proprio_gateway::plan::Plan;
 use proprio_simulator::Robot;
@@ -52,7 +53,10 @@ fn no_file_is_left_out() {
 
 /// The names of the channels of one kind.
 fn names<'a>(channels: impl Iterator<Item = (Kind, &'a str)>, kind: Kind) -> BTreeSet<&'a str> {
-    channels.filter(|(k, _)| *k == kind).map(|(_, name)| name).collect()
+    channels
+        .filter(|(k, _)| *k == kind)
+        .map(|(_, name)| name)
+        .collect()
 }
 
 #[test]
@@ -71,14 +75,25 @@ fn every_robot_loads_and_its_files_fit_each_other() {
             "{at} has neither gateway.toml nor estimator.toml"
         );
         if let Some(plan) = &plan {
-            assert!(!plan.channels.is_empty(), "{at}: the gateway has no channel");
+            assert!(
+                !plan.channels.is_empty(),
+                "{at}: the gateway has no channel"
+            );
         }
         let Some(config) = config else { continue };
         if !config.model.is_file() {
-            // A URDF that is not ours to give is fetched: the file says from where.
+            // A URDF that may not be redistributed is fetched; a comment in the file gives its
+            // origin.
             let text = std::fs::read_to_string(&estimator).unwrap();
-            let name = config.model.file_name().unwrap().to_string_lossy().into_owned();
-            let told = text.lines().any(|l| l.starts_with('#') && l.contains(&name));
+            let name = config
+                .model
+                .file_name()
+                .unwrap()
+                .to_string_lossy()
+                .into_owned();
+            let told = text
+                .lines()
+                .any(|l| l.starts_with('#') && l.contains(&name));
             assert!(
                 told,
                 "{at}: there is no {}, and no comment says where it comes from",
@@ -90,10 +105,20 @@ fn every_robot_loads_and_its_files_fit_each_other() {
         assert!(setup.warnings().is_empty(), "{at}: {:?}", setup.warnings());
         let Some(plan) = plan else { continue };
         Robot::load(&folder).unwrap_or_else(|e| panic!("{e}"));
-        assert_eq!(plan.robot, setup.robot, "{at}");
+        assert_eq!(plan.robot, setup.robot.name, "{at}");
         for kind in [Kind::Joint, Kind::Wrench, Kind::Imu] {
-            let measured = names(plan.channels.iter().map(|c| (c.kind, c.name.as_str())), kind);
-            let read = names(setup.channels().iter().map(|c| (c.kind, c.name.as_str())), kind);
+            let measured = names(
+                plan.channels.iter().map(|c| (c.kind, c.name.as_str())),
+                kind,
+            );
+            let read = names(
+                setup
+                    .robot
+                    .channels
+                    .iter()
+                    .map(|c| (c.kind, c.name.as_str())),
+                kind,
+            );
             let missing: Vec<_> = read.difference(&measured).collect();
             assert!(
                 missing.is_empty(),
@@ -113,8 +138,9 @@ fn every_urdf_is_a_model() {
             .filter(|e| e.path().extension().is_some_and(|x| x == "urdf"))
         {
             let text = std::fs::read_to_string(entry.path()).unwrap();
-            // With no joint kept, F/T joints fold like any other fixed joint.
-            let model = Model::from_urdf(&text, &[]).unwrap_or_else(|e| panic!("{}: {e}", entry.path().display()));
+            // If no joint is kept, F/T joints are folded like other fixed joints.
+            let model = Model::from_urdf(&text, &[])
+                .unwrap_or_else(|e| panic!("{}: {e}", entry.path().display()));
             assert!(
                 model.warnings().is_empty(),
                 "{}: {:?}",
@@ -128,7 +154,7 @@ fn every_urdf_is_a_model() {
     assert!(count > 0);
 }
 
-/// A unit as sections of keys; a key may be there more than once.
+/// A unit as sections of keys; a key may occur more than once.
 type Unit = BTreeMap<String, Vec<(String, String)>>;
 
 fn parse(text: &str) -> Result<Unit, String> {
@@ -157,15 +183,19 @@ fn parse(text: &str) -> Result<Unit, String> {
     Ok(unit)
 }
 
-/// The one value of a key; empty if it is not there.
+/// The single value of a key; empty if the key is missing.
 fn value<'a>(unit: &'a Unit, section: &str, key: &str) -> &'a str {
-    let mut found = unit.get(section).into_iter().flatten().filter(|(k, _)| k == key);
+    let mut found = unit
+        .get(section)
+        .into_iter()
+        .flatten()
+        .filter(|(k, _)| k == key);
     let value = found.next().map_or("", |(_, v)| v.as_str());
     assert!(found.next().is_none(), "{key} is there twice");
     value
 }
 
-/// What a unit of a daemon lacks.
+/// The problems of a daemon's unit.
 fn problems(unit: &Unit, daemon: &str) -> Vec<String> {
     let mut problems = Vec::new();
     let mut expect = |key: &str, fits: &dyn Fn(&str) -> bool| {
@@ -177,7 +207,8 @@ fn problems(unit: &Unit, daemon: &str) -> Vec<String> {
     let program = format!("/usr/bin/proprio-{daemon}");
     let file = format!("/etc/proprio/{daemon}.toml");
     expect("ExecStart", &|v| {
-        v.split_whitespace().eq([program.as_str(), "--config", file.as_str()])
+        v.split_whitespace()
+            .eq([program.as_str(), "--config", file.as_str()])
     });
     expect("Type", &|v| v == "notify");
     expect("WatchdogSec", &|v| {
@@ -196,7 +227,7 @@ fn problems(unit: &Unit, daemon: &str) -> Vec<String> {
     expect("Environment", &|v| v == "PROPRIO_RUNTIME_DIR=/run/proprio");
     expect("LimitRTPRIO", &|v| v.parse::<u32>().is_ok_and(|p| p > 0));
     expect("LimitMEMLOCK", &|v| v == "infinity");
-    // It would forbid what LimitRTPRIO allows.
+    // It would forbid what LimitRTPRIO permits.
     expect("RestrictRealtime", &str::is_empty);
     expect("ProtectSystem", &|v| v == "strict");
     expect("ReadWritePaths", &|v| v == "/dev/shm");
@@ -216,7 +247,7 @@ fn problems(unit: &Unit, daemon: &str) -> Vec<String> {
     ] {
         expect(key, &|v| v == "yes");
     }
-    // A private one would be a domain of its own.
+    // A private one would be a separate domain.
     expect("PrivateIPC", &str::is_empty);
     expect("SystemCallFilter", &|v| v == "@system-service");
     let (rights, families) = match daemon {
@@ -241,29 +272,48 @@ fn problems(unit: &Unit, daemon: &str) -> Vec<String> {
 #[test]
 fn the_systemd_units_start_our_daemons_watched_and_in_a_sandbox() {
     let mut daemons = BTreeSet::new();
-    for entry in std::fs::read_dir(config().join("systemd")).unwrap().flatten() {
+    for entry in std::fs::read_dir(config().join("systemd"))
+        .unwrap()
+        .flatten()
+    {
         let name = entry.file_name().to_string_lossy().into_owned();
-        let daemon = name.strip_prefix("proprio-").and_then(|n| n.strip_suffix(".service"));
+        let daemon = name
+            .strip_prefix("proprio-")
+            .and_then(|n| n.strip_suffix(".service"));
         let daemon = daemon
             .unwrap_or_else(|| panic!("{name} is not proprio-*.service"))
             .to_owned();
         let text = std::fs::read_to_string(entry.path()).unwrap();
         let unit = parse(&text).unwrap_or_else(|e| panic!("{name}: {e}"));
         assert_eq!(problems(&unit, &daemon), [""; 0], "{name}");
-        // The program is one of this workspace's.
-        let manifest = std::fs::read_to_string(config().parent().unwrap().join(&daemon).join("Cargo.toml")).unwrap();
+        // The program is one of this workspace.
+        let manifest =
+            std::fs::read_to_string(config().parent().unwrap().join(&daemon).join("Cargo.toml"))
+                .unwrap();
         assert!(
             manifest.contains(&format!("[[bin]]\nname = \"proprio-{daemon}\"")),
             "{name}"
         );
-        // The check sees what is missing or too much.
+        // The check detects missing and surplus keys.
         for (from, to, expected) in [
             ("Type=notify", "Type=simple", "Type=simple"),
             ("\nWatchdogSec=2s", "", "WatchdogSec="),
             ("User=proprio", "DynamicUser=yes", "User="),
-            ("RuntimeDirectoryPreserve=yes", "", "RuntimeDirectoryPreserve="),
-            ("ProtectSystem=strict", "ProtectSystem=full", "ProtectSystem=full"),
-            ("LimitMEMLOCK=infinity", "RestrictRealtime=yes", "LimitMEMLOCK="),
+            (
+                "RuntimeDirectoryPreserve=yes",
+                "",
+                "RuntimeDirectoryPreserve=",
+            ),
+            (
+                "ProtectSystem=strict",
+                "ProtectSystem=full",
+                "ProtectSystem=full",
+            ),
+            (
+                "LimitMEMLOCK=infinity",
+                "RestrictRealtime=yes",
+                "LimitMEMLOCK=",
+            ),
         ] {
             assert!(text.contains(from), "{name}: {from}");
             let problems = problems(&parse(&text.replacen(from, to, 1)).unwrap(), &daemon);
@@ -275,5 +325,8 @@ fn the_systemd_units_start_our_daemons_watched_and_in_a_sandbox() {
         }
         daemons.insert(daemon);
     }
-    assert_eq!(daemons, BTreeSet::from(["estimator".to_owned(), "gateway".to_owned()]));
+    assert_eq!(
+        daemons,
+        BTreeSet::from(["estimator".to_owned(), "gateway".to_owned()])
+    );
 }

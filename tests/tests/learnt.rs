@@ -1,5 +1,6 @@
-//! What the estimator's process has learnt survives it: killed at once, asked to end, with a file that is damaged or of another robot. Gateway, simulator and estimator are
-//! processes, on virtual buses.
+//! The state of on-line identification survives the estimator's process: killed, stopped, with a
+//! damaged file, or with a file of another robot. Gateway, simulator and estimator are processes on
+//! virtual buses.
 #![allow(missing_docs)]
 
 use proprio_tests::watch::{Newest, open};
@@ -12,15 +13,19 @@ use toml::{Table, Value};
 
 const ROBOT: &str = "icub_left_arm";
 
-/// The arm, identified on-line, with the hand free; what it learns is kept in `state`, every so often.
+/// The arm with on-line identification and a free hand; the state is saved periodically in `state`.
 fn learning(state: &Path, save_every_s: f64) -> Arm {
     let mut arm = Arm::slow().on_virtual(["a", "b"]);
     let identification = Table::from_iter([
         ("enabled".to_owned(), true.into()),
-        ("state".to_owned(), state.to_str().expect("a path in UTF-8").into()),
+        (
+            "state".to_owned(),
+            state.to_str().expect("a path in UTF-8").into(),
+        ),
         ("save_every_s".to_owned(), save_every_s.into()),
     ]);
-    arm.estimator.insert("identification".into(), identification.into());
+    arm.estimator
+        .insert("identification".into(), identification.into());
     for contact in arm
         .estimator
         .get_mut("contact")
@@ -52,7 +57,7 @@ fn inertia(
     })
 }
 
-/// The first that an estimator tells which was started at `since`.
+/// The first inertia of an estimator that was started at `since`.
 fn first(domain: &Domain, since: Nanos) -> Box<InertiaEstimate> {
     let mut reader = open::<InertiaEstimate>(domain, ROBOT);
     inertia(&mut reader, since, |_| true).expect("an estimator that identifies tells so")
@@ -69,12 +74,20 @@ fn uncertainty(estimate: &InertiaEstimate) -> f64 {
 }
 
 fn masses(estimate: &InertiaEstimate) -> Vec<f64> {
-    estimate.links().iter().map(|link| link.parameters[0]).collect()
+    estimate
+        .links()
+        .iter()
+        .map(|link| link.parameters[0])
+        .collect()
 }
 
 fn wait_for(process: &Process, words: &str) {
     let found = until(PATIENCE, || process.log().contains(words).then_some(()));
-    assert!(found.is_some(), "nobody says {words:?}:\n{}", process.log());
+    assert!(
+        found.is_some(),
+        "the log does not contain {words:?}:\n{}",
+        process.log()
+    );
 }
 
 #[test]
@@ -90,43 +103,58 @@ fn what_was_learnt_survives_the_process() {
     let mut estimator = start(&often.estimator);
     let domain = rig.open();
     let mut reader = open::<InertiaEstimate>(&domain, ROBOT);
-    let start_of_all = inertia(&mut reader, began, |_| true).expect("something is told");
-    assert_ne!(start_of_all.header.acquired, Nanos::MIN, "there was nothing to resume");
+    let start_of_all = inertia(&mut reader, began, |_| true).expect("an inertia is published");
+    assert_ne!(
+        start_of_all.header.acquired,
+        Nanos::MIN,
+        "there was nothing to resume"
+    );
     let learnt = inertia(&mut reader, began, |e| {
-        e.links().iter().all(|link| link.accepted == 1 && link.motion > 2.0)
+        e.links()
+            .iter()
+            .all(|link| link.accepted == 1 && link.motion > 2.0)
     });
     let learnt = learnt.unwrap_or_else(|| {
         let newest = inertia(&mut reader, began, |_| true).map(|e| e.links().to_vec());
         let health = Newest::<EstimatorHealth>::open(&domain, ROBOT).wait("how it is", |_| true);
         panic!("nothing is learnt: {newest:?} {:?}", health.identification)
     });
-    // Two seconds of motion put nothing in force yet, so that at the most what CAD is worth is known.
+    // After two seconds of motion no solution is in use yet, so the certainty is at most that of
+    // the CAD.
     assert!(uncertainty(&learnt) <= uncertainty(&start_of_all));
-    // What health counts agrees with it.
+    // The health's counters agree.
     let mut health = Newest::<EstimatorHealth>::open(&domain, ROBOT);
     let counts = health
         .wait("instants are learnt from", |h| h.identification.learnt > 0)
         .identification;
-    assert_eq!((counts.groups, counts.contact, counts.failed), (1, 0, 0), "{counts:?}");
+    assert_eq!(
+        (counts.groups, counts.contact, counts.failed),
+        (1, 0, 0),
+        "{counts:?}"
+    );
     drop((health, reader));
     let written = || fs::metadata(&state).and_then(|m| m.modified()).ok();
     let before = written();
     let saved = until(PATIENCE, || (written() > before).then_some(()));
     assert!(saved.is_some(), "nothing is kept");
 
-    // Killed, with no chance to say anything.
+    // Killed without a chance to save.
     estimator.kill();
     let since = now();
     let mut estimator = start(&often.estimator);
     let resumed = first(&domain, since);
-    assert_eq!(resumed.header.acquired, Nanos::MIN, "it begins with what was kept");
+    assert_eq!(
+        resumed.header.acquired,
+        Nanos::MIN,
+        "it begins with what was kept"
+    );
     assert!(
         resumed
             .links()
             .iter()
             .all(|link| link.motion == 0.0 && link.accepted == 1)
     );
-    // The offset is asked anew, so it is a little less certain; CAD is far less so.
+    // The offset is estimated again, so it is a little less certain; the CAD is far less certain.
     assert!(uncertainty(&resumed) <= uncertainty(&start_of_all));
     let close = |to: &InertiaEstimate| {
         let deviation = uncertainty(&learnt).sqrt();
@@ -135,10 +163,15 @@ fn what_was_learnt_survives_the_process() {
             .zip(masses(to))
             .all(|(a, b)| (a - b).abs() < 3.0 * deviation)
     };
-    assert!(close(&learnt), "{:?} {:?}", masses(&resumed), masses(&learnt));
-    wait_for(&estimator, "identification goes on where it was");
+    assert!(
+        close(&learnt),
+        "{:?} {:?}",
+        masses(&resumed),
+        masses(&learnt)
+    );
+    wait_for(&estimator, "identification resumes from this state");
 
-    // Asked to end: it keeps what it knows, long before the next time that it would.
+    // Stopped: it saves its state, long before the next periodic time.
     estimator.end();
     let since = now();
     let mut estimator = start(&seldom.estimator);
@@ -150,21 +183,28 @@ fn what_was_learnt_survives_the_process() {
     estimator.end();
     let kept = fs::read_to_string(&state).expect("kept at the end");
     assert!(
-        estimator.log().contains("instants of identification: learnt"),
+        estimator.log().contains("identification instants: learnt"),
         "{}",
         estimator.log()
     );
 
-    // Damaged, by a disk that was full, say.
+    // A damaged file, for example after a full disk.
     fs::write(&state, &kept[..kept.len() / 2]).expect("a file");
     let since = now();
     let mut estimator = start(&seldom.estimator);
-    wait_for(&estimator, "identification begins without it");
+    wait_for(&estimator, "identification starts without it");
     let log = estimator.log();
-    assert!(log.contains("is damaged") && log.contains("learnt.bad-1"), "{log}");
+    assert!(
+        log.contains("is damaged") && log.contains("learnt.bad-1"),
+        "{log}"
+    );
     let aside = fs::read_to_string(rig.path("learnt.bad-1")).expect("set aside");
     assert_eq!(aside, kept[..kept.len() / 2]);
-    assert_ne!(first(&domain, since).header.acquired, Nanos::MIN, "from CAD");
+    assert_ne!(
+        first(&domain, since).header.acquired,
+        Nanos::MIN,
+        "from CAD"
+    );
     estimator.kill();
 
     // Another robot's.
@@ -177,18 +217,23 @@ fn what_was_learnt_survives_the_process() {
     wait_for(&estimator, "learnt.bad-2");
     let log = estimator.log();
     assert!(
-        log.contains("is of another robot: icub_left_arm, not right_arm"),
+        log.contains("is for another robot: icub_left_arm instead of right_arm"),
         "{log}"
     );
     estimator.end();
-    assert!(!state.exists(), "it has learnt nothing, and keeps nothing");
+    assert!(
+        !state.exists(),
+        "nothing is identified, so no state is saved"
+    );
 
     drop(domain);
-    [&mut gateway, &mut simulator].into_iter().for_each(Process::end);
+    [&mut gateway, &mut simulator]
+        .into_iter()
+        .for_each(Process::end);
     rig.assert_nothing_left();
 }
 
-/// A daemon whose force/torque sensor is configured the wrong way round says so in its first minute.
+/// A daemon with a wrong direction of a force/torque sensor reports it in its first minute.
 #[test]
 fn a_sensor_the_wrong_way_round_is_told_live() {
     let rig = Rig::new();
@@ -201,7 +246,10 @@ fn a_sensor_the_wrong_way_round_is_told_live() {
             "direction = \"child_to_parent\"",
             "direction = \"parent_to_child\"".into(),
         ),
-        ("link = \"l_hand\"", "link = \"l_hand\"\npresence = \"possible\"".into()),
+        (
+            "link = \"l_hand\"",
+            "link = \"l_hand\"\npresence = \"possible\"".into(),
+        ),
     ] {
         assert_eq!(config.matches(from).count(), 1, "{from}");
         turned = turned.replace(from, &to);
@@ -213,7 +261,7 @@ fn a_sensor_the_wrong_way_round_is_told_live() {
     let mut simulator = rig.start(&["simulate", "--robot", ROBOT, "--skin"]);
     let mut gateway = rig.start(&["gateway", "--config", gateway]);
     let mut estimator = rig.start(&["estimator", "--config", file]);
-    let words = "l_arm_ft_sensor fits only with its sign turned";
+    let words = "l_arm_ft_sensor fits only with the opposite sign";
     let told = until(PATIENCE + Nanos::from_millis(20_000), || {
         estimator.log().contains(words).then_some(())
     });

@@ -1,12 +1,14 @@
-//! `proprio estimate` through files against other libraries: the walker of `tests/oracle`, and the iCub where its files are at hand. A log with
-//! positions, velocities and accelerations given, kinematics from a standing link or from an IMU; torques and contact wrenches must be those of the
-//! golden files; or, for an iCub that stands, those of this project's inverse dynamics, which other tests hold against the libraries.
+//! Compares `proprio estimate` on files with other libraries: for the walker of `tests/oracle`, and
+//! for the iCub if its files are available. The log contains positions, velocities and
+//! accelerations; the kinematics start at a standing link or an IMU. Torques and contact wrenches
+//! must equal those of the golden files or, for a standing iCub, those of this project's inverse
+//! dynamics, which other tests compare with the libraries.
 
-use proprio_estimator::dynamics::{
+use proprio_dynamics::model::Model;
+use proprio_dynamics::spatial::{Vec3, Wrench};
+use proprio_dynamics::{
     ExternalWrench, FrameMotion, InverseDynamics, JointState, Kinematics, Noise, SensorCut,
 };
-use proprio_estimator::model::Model;
-use proprio_estimator::spatial::{Vec3, Wrench};
 use proprio_tests::Rig;
 use serde_json::{Value as Json, json};
 use std::collections::BTreeMap;
@@ -14,17 +16,23 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Of the largest magnitude of all torques, of all contact forces, of all contact torques of a log.
+/// Tolerance relative to the largest magnitude of all torques, contact forces or contact torques of
+/// a log.
 const NEAR: f64 = 1e-9;
 const WRENCH: [&str; 6] = ["fx", "fy", "fz", "tx", "ty", "tz"];
 const IMU: [&str; 9] = ["ax", "ay", "az", "gx", "gy", "gz", "alx", "aly", "alz"];
 
 fn oracle(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("oracle").join(name)
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("oracle")
+        .join(name)
 }
 
 fn read(file: &Path) -> Json {
-    serde_json::from_str(&fs::read_to_string(file).unwrap_or_else(|e| panic!("{}: {e}", file.display()))).unwrap()
+    serde_json::from_str(
+        &fs::read_to_string(file).unwrap_or_else(|e| panic!("{}: {e}", file.display())),
+    )
+    .unwrap()
 }
 
 fn items(value: &Json) -> &[Json] {
@@ -40,16 +48,19 @@ fn names(value: &Json) -> Vec<&str> {
 }
 
 fn numbers(value: &Json) -> Vec<f64> {
-    items(value).iter().map(|x| x.as_f64().expect("a number")).collect()
+    items(value)
+        .iter()
+        .map(|x| x.as_f64().expect("a number"))
+        .collect()
 }
 
-/// Where the kinematics start.
+/// The start of the kinematics.
 enum Base<'a> {
     Imu { link: &'a str },
     Fixed { link: &'a str, gravity: Vec<f64> },
 }
 
-/// A contact to be estimated.
+/// A contact to estimate.
 struct Contact<'a> {
     name: &'a str,
     link: &'a str,
@@ -58,7 +69,7 @@ struct Contact<'a> {
     direction: Option<Vec<f64>>,
 }
 
-/// One instant: what is measured, and what must come out.
+/// One instant: measurements and expected results.
 struct Row {
     /// Per joint: position, velocity, acceleration.
     joints: Vec<[f64; 3]>,
@@ -70,26 +81,38 @@ struct Row {
     contacts: Vec<Vec<f64>>,
 }
 
-/// A robot, as far as a run needs it.
+/// The parts of a robot that a run needs.
 struct Robot<'a> {
     urdf: &'a Path,
     joints: Vec<&'a str>,
-    /// Names and joints of the F/T sensors; frame and direction are those of the URDF's sensor elements.
+    /// Names and joints of the F/T sensors; frame and direction are those of the URDF's sensor
+    /// elements.
     sensors: Vec<(&'a str, String)>,
 }
 
 impl<'a> Robot<'a> {
     fn new(urdf: &'a Path, joints: &'a Json, sensors: &'a Json) -> Self {
         let model = Model::from_file(urdf, &[]).unwrap();
-        let joint = |name: &str| model.sensors().iter().find(|s| s.name == name).unwrap().joint.clone();
+        let joint = |name: &str| {
+            model
+                .sensors()
+                .iter()
+                .find(|s| s.name == name)
+                .unwrap()
+                .joint
+                .clone()
+        };
         Self {
             urdf,
             joints: names(joints),
-            sensors: names(sensors).into_iter().map(|name| (name, joint(name))).collect(),
+            sensors: names(sensors)
+                .into_iter()
+                .map(|name| (name, joint(name)))
+                .collect(),
         }
     }
 
-    /// What a sensor reads with no load: something else for each.
+    /// A sensor's reading without load: a different one for each.
     fn offset(&self, sensor: usize) -> Vec<f64> {
         (0..6)
             .map(|i| 0.25 * (sensor as f64 - 2.0) + 0.125 * f64::from(i))
@@ -97,11 +120,20 @@ impl<'a> Robot<'a> {
     }
 
     fn config(&self, base: &Base<'_>, contacts: &[Contact<'_>]) -> String {
-        let mut toml = format!("schema = 1\nrobot = \"robot\"\nmodel = {:?}\n[base]\n", self.urdf);
+        let mut toml = format!(
+            "schema = 1\nrobot = \"robot\"\nmodel = {:?}\n[base]\n",
+            self.urdf
+        );
         let _ = match base {
-            Base::Imu { link } => writeln!(toml, "kind = \"imu\"\nsensor = \"the_imu\"\nlink = {link:?}"),
+            Base::Imu { link } => writeln!(
+                toml,
+                "kind = \"imu\"\nsensor = \"the_imu\"\nlink = {link:?}"
+            ),
             Base::Fixed { link, gravity } => {
-                writeln!(toml, "kind = \"fixed\"\nlink = {link:?}\ngravity_mps2 = {gravity:?}")
+                writeln!(
+                    toml,
+                    "kind = \"fixed\"\nlink = {link:?}\ngravity_mps2 = {gravity:?}"
+                )
             }
         };
         for (number, (name, joint)) in self.sensors.iter().enumerate() {
@@ -109,11 +141,14 @@ impl<'a> Robot<'a> {
             let (force, torque) = offset.split_at(3);
             let _ = writeln!(
                 toml,
-                "[[force_torque]]\nsensor = {name:?}\njoint = {joint:?}\noffset_n = {force:?}\noffset_nm = {torque:?}"
+                "[[force_torque]]\nsensor = {name:?}\njoint = {joint:?}\noffset_n = \
+                 {force:?}\noffset_nm = {torque:?}"
             );
         }
         for contact in contacts {
-            let Contact { name, link, kind, .. } = contact;
+            let Contact {
+                name, link, kind, ..
+            } = contact;
             let _ = writeln!(
                 toml,
                 "[[contact]]\nname = {name:?}\nlink = {link:?}\nkind = {kind:?}\nposition_m = {:?}",
@@ -123,14 +158,17 @@ impl<'a> Robot<'a> {
                 let _ = writeln!(toml, "direction = {direction:?}");
             }
         }
-        // Every number is compared, however uncertain a URDF makes it.
+        // Every number is compared, even if it is uncertain because of the URDF.
         toml + "[output]\nmax_torque_std_nm = 1000.0\n"
     }
 
     fn log(&self, rows: &[Row]) -> String {
         let mut header = vec!["t".to_owned()];
         for joint in &self.joints {
-            header.extend(["position", "velocity", "acceleration"].map(|what| format!("joint/{joint}/{what}")));
+            header.extend(
+                ["position", "velocity", "acceleration"]
+                    .map(|what| format!("joint/{joint}/{what}")),
+            );
         }
         for (sensor, _) in &self.sensors {
             header.extend(WRENCH.map(|part| format!("wrench/{sensor}/{part}")));
@@ -139,10 +177,18 @@ impl<'a> Robot<'a> {
         let mut log = header.join(",");
         for (number, row) in rows.iter().enumerate() {
             let _ = write!(log, "\n0.{number:02}");
-            let readings = row.readings.iter().enumerate().flat_map(|(sensor, reading)| {
-                let offset = self.offset(sensor);
-                reading.iter().zip(offset).map(|(r, o)| r + o).collect::<Vec<_>>()
-            });
+            let readings = row
+                .readings
+                .iter()
+                .enumerate()
+                .flat_map(|(sensor, reading)| {
+                    let offset = self.offset(sensor);
+                    reading
+                        .iter()
+                        .zip(offset)
+                        .map(|(r, o)| r + o)
+                        .collect::<Vec<_>>()
+                });
             let cells = row
                 .joints
                 .iter()
@@ -157,8 +203,16 @@ impl<'a> Robot<'a> {
         log + "\n"
     }
 
-    /// Runs the program; compares everything that it estimates. `published` are the contacts of the configuration, by their number in a row.
-    fn check(&self, what: &str, base: &Base<'_>, contacts: &[Contact<'_>], published: &[usize], rows: &[Row]) {
+    /// Runs the program and compares all its estimates. `published` are the contacts of the
+    /// configuration, by their number in a row.
+    fn check(
+        &self,
+        what: &str,
+        base: &Base<'_>,
+        contacts: &[Contact<'_>],
+        published: &[usize],
+        rows: &[Row],
+    ) {
         let rig = Rig::new();
         fs::write(rig.path("estimator.toml"), self.config(base, contacts)).unwrap();
         fs::write(rig.path("log.csv"), self.log(rows)).unwrap();
@@ -179,9 +233,9 @@ impl<'a> Robot<'a> {
 
         let estimates = table(&fs::read_to_string(rig.path("estimates.csv")).unwrap());
         let column = |name: String| {
-            estimates
-                .get(&name)
-                .unwrap_or_else(|| panic!("{what}: the table has no {name}: {:?}", estimates.keys()))
+            estimates.get(&name).unwrap_or_else(|| {
+                panic!("{what}: the table has no {name}: {:?}", estimates.keys())
+            })
         };
         let near = |name: &str, got: Vec<f64>, expected: Vec<f64>| {
             assert_eq!(got.len(), expected.len(), "{what}: {name}");
@@ -198,11 +252,14 @@ impl<'a> Robot<'a> {
             .joints
             .iter()
             .flat_map(|joint| column(format!("torque/{joint}")).clone());
-        let expected = (0..self.joints.len()).flat_map(|joint| rows.iter().map(move |row| row.torque[joint]));
+        let expected =
+            (0..self.joints.len()).flat_map(|joint| rows.iter().map(move |row| row.torque[joint]));
         near("torque", torques.collect(), expected.collect());
         for joint in &self.joints {
             assert!(
-                column(format!("valid/{joint}")).iter().all(|valid| *valid == 1.0),
+                column(format!("valid/{joint}"))
+                    .iter()
+                    .all(|valid| *valid == 1.0),
                 "{what}: {joint}"
             );
         }
@@ -226,22 +283,26 @@ impl<'a> Robot<'a> {
     }
 }
 
-/// A table of numbers by column; what is no number is NaN.
+/// A table of numbers by column; text is NaN.
 fn table(text: &str) -> BTreeMap<String, Vec<f64>> {
     let mut lines = text.lines().map(|line| line.split(',').collect::<Vec<_>>());
     let names = lines.next().expect("a header");
-    let mut columns: BTreeMap<String, Vec<f64>> = names.iter().map(|n| ((*n).to_owned(), vec![])).collect();
+    let mut columns: BTreeMap<String, Vec<f64>> =
+        names.iter().map(|n| ((*n).to_owned(), vec![])).collect();
     for cells in lines {
         assert_eq!(cells.len(), names.len());
         for (name, cell) in names.iter().zip(cells) {
-            columns.get_mut(*name).unwrap().push(cell.parse().unwrap_or(f64::NAN));
+            columns
+                .get_mut(*name)
+                .unwrap()
+                .push(cell.parse().unwrap_or(f64::NAN));
         }
     }
     columns
 }
 
-/// Every scenario without known wrenches (files have no word for those): from the IMU; and where a link stands still also from there, with what it
-/// stands on declared as a contact, and without.
+/// Every scenario without known wrenches (which files cannot contain): from the IMU, and, if a link
+/// stands still, also from that link, with and without its support declared as a contact.
 fn check_scenarios(robot: &Robot<'_>, golden: &Json) -> [usize; 3] {
     let mut runs = [0; 3];
     for scenario in items(&golden["scenarios"]) {
@@ -264,10 +325,13 @@ fn check_scenarios(robot: &Robot<'_>, golden: &Json) -> [usize; 3] {
         let rows: Vec<Row> = items(&scenario["cases"])
             .iter()
             .map(|case| {
-                let [q, dq, ddq] = ["position", "velocity", "acceleration"].map(|what| numbers(&case[what]));
+                let [q, dq, ddq] =
+                    ["position", "velocity", "acceleration"].map(|what| numbers(&case[what]));
                 let lists = |what: &str| items(&case[what]).iter().map(numbers).collect::<Vec<_>>();
                 Row {
-                    joints: (0..q.len()).map(|joint| [q[joint], dq[joint], ddq[joint]]).collect(),
+                    joints: (0..q.len())
+                        .map(|joint| [q[joint], dq[joint], ddq[joint]])
+                        .collect(),
                     imu: numbers(&case["imu"]),
                     readings: lists("readings"),
                     torque: numbers(&case["torque"]),
@@ -279,7 +343,13 @@ fn check_scenarios(robot: &Robot<'_>, golden: &Json) -> [usize; 3] {
         let imu = Base::Imu {
             link: text(&golden["imu"]),
         };
-        robot.check(&format!("{name}, from the IMU"), &imu, &contacts(), &all, &rows);
+        robot.check(
+            &format!("{name}, from the IMU"),
+            &imu,
+            &contacts(),
+            &all,
+            &rows,
+        );
         runs[0] += 1;
         if text(&scenario["base"]["kind"]) != "fixed" {
             continue;
@@ -288,7 +358,13 @@ fn check_scenarios(robot: &Robot<'_>, golden: &Json) -> [usize; 3] {
             link: text(&scenario["base"]["link"]),
             gravity: numbers(&scenario["base"]["gravity"]),
         };
-        robot.check(&format!("{name}, standing"), &base, &contacts(), &all, &rows);
+        robot.check(
+            &format!("{name}, standing"),
+            &base,
+            &contacts(),
+            &all,
+            &rows,
+        );
         runs[1] += 1;
         let closing = text(&scenario["closing"]);
         let others: Vec<usize> = all
@@ -321,17 +397,18 @@ fn the_walker_through_files() {
     assert_eq!(check_scenarios(&robot, &golden), [6, 2, 2]);
 }
 
-/// The URDF of an iCub, which may not be redistributed here: `PROPRIO_ICUB_MODELS` names the folder with iCubGazeboV2_5.urdf (of the PyPI package
-/// icub-models 3.2.0).
+/// The URDF of an iCub, which may not be redistributed here: `PROPRIO_ICUB_MODELS` names the folder
+/// with iCubGazeboV2_5.urdf (of the PyPI package icub-models 3.2.0).
 fn icub() -> Option<PathBuf> {
     let folder = std::env::var_os("PROPRIO_ICUB_MODELS");
     if folder.is_none() {
-        println!("skipped: PROPRIO_ICUB_MODELS does not say where iCubGazeboV2_5.urdf is");
+        println!("skipped: PROPRIO_ICUB_MODELS (folder of iCubGazeboV2_5.urdf) is not set");
     }
     folder.map(|folder| Path::new(&folder).join("iCubGazeboV2_5.urdf"))
 }
 
-/// Against MuJoCo, Pinocchio and iDynTree, where somebody has made the golden file beside the URDF (`tests/oracle/README.md` says how).
+/// Comparison with MuJoCo, Pinocchio and iDynTree, if the golden file exists next to the URDF
+/// (`tests/oracle/README.md` describes how to make it).
 #[test]
 fn the_icub_through_files() {
     let Some(urdf) = icub() else { return };
@@ -345,11 +422,15 @@ fn the_icub_through_files() {
     assert_eq!(check_scenarios(&robot, &golden), [3, 2, 2]);
 }
 
-/// Scenarios of a standing robot as `walker_contacts.json` has them, each with `count` random states within the joints' limits: readings, torques, and
-/// the wrench that `closing` needs by this project's own inverse dynamics.
+/// Scenarios of a standing robot as `walker_contacts.json` has them, each with `count` random
+/// states within the joints' limits: readings, torques, and the wrench at `closing` from this
+/// project's own inverse dynamics.
 fn made_scenarios(urdf: &Path, imu: &str, mut scenarios: Json, count: usize) -> Json {
     let elements = Model::from_file(urdf, &[]).unwrap().sensors().to_vec();
-    let cut: Vec<&str> = elements.iter().map(|element| element.joint.as_str()).collect();
+    let cut: Vec<&str> = elements
+        .iter()
+        .map(|element| element.joint.as_str())
+        .collect();
     let model = Model::from_file(urdf, &cut).unwrap();
     let noise = Noise {
         force: [0.1; 3],
@@ -370,9 +451,14 @@ fn made_scenarios(urdf: &Path, imu: &str, mut scenarios: Json, count: usize) -> 
         let mut inverse = InverseDynamics::new(&model);
         let cases = (0..count).map(|_| {
             let limits = |dof| model.dof_joint(dof).and_then(|joint| model.limits(joint));
-            let ranges = (0..model.dof_count()).map(|dof| limits(dof).map_or((-3.0, 3.0), |l| (l.lower, l.upper)));
+            let ranges = (0..model.dof_count())
+                .map(|dof| limits(dof).map_or((-3.0, 3.0), |l| (l.lower, l.upper)));
             let position: Vec<f64> = ranges.map(|(lower, upper)| between(lower, upper)).collect();
-            let mut each = |size: f64| (0..model.dof_count()).map(|_| between(-size, size)).collect::<Vec<_>>();
+            let mut each = |size: f64| -> Vec<f64> {
+                (0..model.dof_count())
+                    .map(|_| between(-size, size))
+                    .collect()
+            };
             let (velocity, acceleration) = (each(2.0), each(10.0));
             let state = JointState {
                 position: &position,
@@ -386,13 +472,15 @@ fn made_scenarios(urdf: &Path, imu: &str, mut scenarios: Json, count: usize) -> 
             let mut acting: Vec<ExternalWrench> = contacts
                 .iter()
                 .map(|contact| {
-                    let (force, arm) = (triple(40.0), Vec3::from_row_slice(&numbers(&contact["position"])));
+                    let force = triple(40.0);
+                    let arm = Vec3::from_row_slice(&numbers(&contact["position"]));
                     let wrench = |force: Vec3, torque| Wrench { torque, force };
                     let wrench = match text(&contact["kind"]) {
                         "wrench" => wrench(force, triple(4.0)),
                         "force" => wrench(force, arm.cross(&force)),
                         "force_along" => {
-                            let along = Vec3::from_row_slice(&numbers(&contact["direction"])).normalize() * force.x;
+                            let direction = Vec3::from_row_slice(&numbers(&contact["direction"]));
+                            let along = direction.normalize() * force.x;
                             wrench(along, arm.cross(&along))
                         }
                         other => panic!("{other}"),
@@ -403,8 +491,11 @@ fn made_scenarios(urdf: &Path, imu: &str, mut scenarios: Json, count: usize) -> 
                     }
                 })
                 .collect();
-            // It stands on `closing`, which bears what the others leave.
-            let closing = contacts.iter().position(|c| text(&c["name"]) == closing).unwrap();
+            // It stands on `closing`, which carries the remaining wrench.
+            let closing = contacts
+                .iter()
+                .position(|c| text(&c["name"]) == closing)
+                .unwrap();
             assert_eq!(acting[closing].frame, start);
             acting[closing].wrench = Wrench::zero();
             inverse.update(&model, &kinematics, &acting).unwrap();
@@ -421,12 +512,15 @@ fn made_scenarios(urdf: &Path, imu: &str, mut scenarios: Json, count: usize) -> 
             let readings = cuts
                 .iter()
                 .map(|cut| cut.reading(&inverse.transmitted(&kinematics, cut.joint())));
+            let wrenches: Vec<[f64; 6]> = (acting.iter())
+                .map(|acting| acting.wrench.force_first())
+                .collect();
             json!({
                 "position": position, "velocity": velocity, "acceleration": acceleration,
                 "imu": felt.iter().flatten().collect::<Vec<_>>(),
                 "readings": readings.map(|reading| reading.force_first()).collect::<Vec<_>>(),
                 "torque": inverse.torque(),
-                "contacts": acting.iter().map(|acting| acting.wrench.force_first()).collect::<Vec<_>>(),
+                "contacts": wrenches,
             })
         });
         let cases: Vec<Json> = cases.collect();
@@ -435,25 +529,34 @@ fn made_scenarios(urdf: &Path, imu: &str, mut scenarios: Json, count: usize) -> 
     let names = (0..model.dof_count())
         .map(|dof| model.dof_name(dof))
         .collect::<Vec<_>>();
-    let sensors: Vec<&str> = elements.iter().map(|element| element.name.as_str()).collect();
+    let sensors: Vec<&str> = elements
+        .iter()
+        .map(|element| element.name.as_str())
+        .collect();
     json!({ "imu": imu, "joints": names, "sensors": sensors, "scenarios": scenarios })
 }
 
-/// What the golden file says of a standing iCub, as far as this project can say it: kinematics from a fixed base in the program, through files, where
-/// only the URDF is at hand. That the library is right about this robot, [`the_icub_through_files_as_others_have_it`] sees with kinematics from an IMU.
+/// Tests a standing iCub with kinematics from a fixed base, through files, with this project's
+/// inverse dynamics as reference, because only the URDF is available.
+/// [`the_icub_through_files_as_others_have_it`] compares the library with others for this robot,
+/// with kinematics from an IMU.
 #[test]
 fn a_standing_icub_through_files() {
     let Some(urdf) = icub() else { return };
-    let contact =
-        |name: &str, link: &str| json!({ "name": name, "link": link, "kind": "wrench", "position": [0.0, 0.0, 0.0] });
+    let contact = |name: &str, link: &str| {
+        json!({
+            "name": name, "link": link, "kind": "wrench", "position": [0.0, 0.0, 0.0],
+        })
+    };
     let scenarios = json!([
         {
             "name": "root held, every limb touched", "closing": "root",
             "base": { "kind": "fixed", "link": "root_link", "gravity": [0.6, -1.1, -9.7] },
             "contacts": [
                 contact("root", "root_link"),
-                contact("left hand", "l_hand"), contact("right hand", "r_hand"), contact("left foot", "l_foot"),
-                contact("right foot", "r_foot"), contact("left thigh", "l_upper_leg"), contact("right thigh", "r_upper_leg"),
+                contact("left hand", "l_hand"), contact("right hand", "r_hand"),
+                contact("left foot", "l_foot"), contact("right foot", "r_foot"),
+                contact("left thigh", "l_upper_leg"), contact("right thigh", "r_upper_leg"),
             ],
         },
         {
@@ -461,7 +564,10 @@ fn a_standing_icub_through_files() {
             "base": { "kind": "fixed", "link": "l_sole", "gravity": [0.1, 0.2, -9.8] },
             "contacts": [
                 contact("sole", "l_sole"),
-                { "name": "left hand", "link": "l_hand", "kind": "force", "position": [0.05, 0.01, 0.02] },
+                {
+                    "name": "left hand", "link": "l_hand", "kind": "force",
+                    "position": [0.05, 0.01, 0.02],
+                },
                 {
                     "name": "elbow", "link": "r_elbow_1", "kind": "force_along",
                     "position": [0.0, 0.02, 0.0], "direction": [0.2, 1.0, -0.3],
@@ -474,12 +580,12 @@ fn a_standing_icub_through_files() {
     assert_eq!(check_scenarios(&robot, &made), [2, 2, 2]);
 }
 
-/// Golden values of iDynTree's that are not made by this repository's generator: `PROPRIO_DATA` names the folder of the recorded logs, beside which
-/// they are.
+/// Golden values of iDynTree that this repository's generator does not make. `PROPRIO_DATA` names
+/// the folder of the recorded logs; the golden values are next to it.
 #[test]
 fn the_icub_through_files_as_others_have_it() {
     let (Some(urdf), Ok(data)) = (icub(), std::env::var("PROPRIO_DATA")) else {
-        println!("skipped: PROPRIO_DATA does not say where the golden file is");
+        println!("skipped: PROPRIO_DATA (folder next to the golden file) is not set");
         return;
     };
     let file = PathBuf::from(data).join("../oracle/icub_v25_idyntree.json");
@@ -511,14 +617,19 @@ fn the_icub_through_files_as_others_have_it() {
         .map(|case| {
             let [q, dq, ddq] = ["q", "dq", "ddq"].map(|what| numbers(&case[what]));
             Row {
-                joints: (0..q.len()).map(|joint| [q[joint], dq[joint], ddq[joint]]).collect(),
+                joints: (0..q.len())
+                    .map(|joint| [q[joint], dq[joint], ddq[joint]])
+                    .collect(),
                 imu: ["acc", "omega", "alpha"]
                     .iter()
                     .flat_map(|what| numbers(&case[what]))
                     .collect(),
                 readings: items(&case["ft"]).iter().map(numbers).collect(),
                 torque: numbers(&case["tau"]),
-                contacts: ends.iter().map(|link| numbers(&case["ext"][*link])).collect(),
+                contacts: ends
+                    .iter()
+                    .map(|link| numbers(&case["ext"][*link]))
+                    .collect(),
             }
         })
         .collect();

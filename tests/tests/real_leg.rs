@@ -1,16 +1,19 @@
-//! A real iCub's log, through every way there is: encoded to CAN frames and decoded again, from a file and, on vcan, played by canplayer
-//! through gateway and estimator. Needs the log (`PROPRIO_DATA`) and the folder of the robot's URDF (`PROPRIO_ICUB_MODELS`); says that it skips
-//! without.
+//! Processes a real iCub's log in every possible way: encoded to CAN frames and decoded again, from
+//! a file and, on vcan, played by canplayer through gateway and estimator. Needs the log
+//! (`PROPRIO_DATA`) and the folder of the robot's URDF (`PROPRIO_ICUB_MODELS`); skipped with a note
+//! without them.
 
 use proprio_estimator::config::{Config, Presence};
-use proprio_estimator::identify::{Log, Options, Role, identify, parameters};
+use proprio_estimator::export::parameters;
 use proprio_estimator::offline::estimate;
+use proprio_estimator::reading;
 use proprio_estimator::setup::Setup;
 use proprio_gateway::candump;
 use proprio_gateway::link::Link;
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::offline::{decode, encode};
 use proprio_gateway::plan::Plan;
+use proprio_identification::{Options, Role, identify};
 use proprio_tests::watch::{Newest, Recorder, rows};
 use proprio_tests::{Rig, can, now, uml};
 use proprio_topics::csv::{self, Columns, Row, Series, Value, What};
@@ -25,13 +28,16 @@ struct Leg {
     table: String,
 }
 
-/// The configuration and the log, or nothing if they are not at hand.
+/// The configuration and the log; `None` if they are not available.
 fn leg() -> Option<Leg> {
     let (Some(data), Some(models)) = (
         std::env::var_os("PROPRIO_DATA"),
         std::env::var_os("PROPRIO_ICUB_MODELS"),
     ) else {
-        println!("skipped: PROPRIO_DATA (recorded logs) or PROPRIO_ICUB_MODELS (robots of icub-models) is not set");
+        println!(
+            "skipped: PROPRIO_DATA (recorded logs) or PROPRIO_ICUB_MODELS (robots of icub-models) \
+             is not set"
+        );
         return None;
     };
     let log = PathBuf::from(data).join("icub_leg_24_44s.csv");
@@ -61,8 +67,11 @@ impl Leg {
         let text = String::from_utf8(out).expect("text");
         let mut lines = text.lines();
         let header: Vec<&str> = lines.next().expect("a header").split(',').collect();
-        let columns =
-            |part: &str| -> Vec<usize> { (0..header.len()).filter(|i| header[*i].starts_with(part)).collect() };
+        let columns = |part: &str| -> Vec<usize> {
+            (0..header.len())
+                .filter(|i| header[*i].starts_with(part))
+                .collect()
+        };
         let (torques, reasons) = (columns("torque/"), columns("reason/"));
         lines
             .map(|line| {
@@ -72,19 +81,26 @@ impl Leg {
                 (
                     t,
                     torques.iter().map(number).collect(),
-                    reasons.iter().map(|i| matches!(cells[*i], "" | "uncertain")).collect(),
+                    reasons
+                        .iter()
+                        .map(|i| matches!(cells[*i], "" | "uncertain"))
+                        .collect(),
                 )
             })
             .collect()
     }
 }
 
-/// Estimates by instant: the torques, and which of them are of good samples. Without offsets they are worth nothing, but they are the same every way.
+/// Estimates by instant: the torques, and whether they come from good samples. Without offsets the
+/// values are wrong, but every path must give the same ones.
 type Estimates = Vec<(Nanos, Vec<f64>, Vec<bool>)>;
 
-/// RMS difference per joint over the pairs of instants that are good in both, and how many these are.
+/// RMS difference per joint over the pairs of instants that are good in both, and the number of
+/// these pairs.
 fn rms(a: &Estimates, b: &Estimates, pairs: &[(Nanos, Nanos)]) -> (Vec<f64>, usize) {
-    let by_time = |e: &Estimates| -> HashMap<Nanos, usize> { e.iter().enumerate().map(|(i, x)| (x.0, i)).collect() };
+    let by_time = |e: &Estimates| -> HashMap<Nanos, usize> {
+        e.iter().enumerate().map(|(i, x)| (x.0, i)).collect()
+    };
     let (of_a, of_b) = (by_time(a), by_time(b));
     let (mut sums, mut count) = (vec![0.0; a[0].1.len()], 0);
     for (t, u) in pairs {
@@ -98,10 +114,15 @@ fn rms(a: &Estimates, b: &Estimates, pairs: &[(Nanos, Nanos)]) -> (Vec<f64>, usi
                 .for_each(|(s, (p, q))| *s += (p - q).powi(2));
         }
     }
-    (sums.into_iter().map(|s| (s / count as f64).sqrt()).collect(), count)
+    (
+        sums.into_iter()
+            .map(|s| (s / count as f64).sqrt())
+            .collect(),
+        count,
+    )
 }
 
-/// The instants of the trigger in `a` and in `b`, of which `a` may lack some: paired by what the sensor read.
+/// The instants of the trigger in `a` and `b`, paired by the sensor's reading; `a` may lack some.
 fn pairs(a: &str, b: &str) -> Vec<(Nanos, Nanos)> {
     let trigger = (Kind::Wrench, "r_leg_ft_sensor".to_owned());
     let (a, b) = (
@@ -110,7 +131,10 @@ fn pairs(a: &str, b: &str) -> Vec<(Nanos, Nanos)> {
     );
     let mut rest = b.iter();
     a.iter()
-        .filter_map(|(t, value)| rest.find(|(_, other)| other == value).map(|(u, _)| (*t, *u)))
+        .filter_map(|(t, value)| {
+            rest.find(|(_, other)| other == value)
+                .map(|(u, _)| (*t, *u))
+        })
         .collect()
 }
 
@@ -154,12 +178,21 @@ fn encoded_and_decoded_every_value_is_within_half_a_step() {
     let (mut log, mut decoded) = (Vec::new(), Vec::new());
     let report = encode(&leg.plan, leg.table.as_bytes(), &mut log).expect("encoded");
     assert_eq!(
-        (report.refused, report.table.bad_rows, report.unknown_channels.len()),
+        (
+            report.refused,
+            report.table.bad_rows,
+            report.unknown_channels.len()
+        ),
         (0, 0, 0)
     );
     let back = decode(&leg.plan, log.as_slice(), &mut decoded, Columns::Main).expect("decoded");
     assert_eq!(
-        (back.samples, back.unclaimed, back.bad_lines, back.other_interfaces),
+        (
+            back.samples,
+            back.unclaimed,
+            back.bad_lines,
+            back.other_interfaces
+        ),
         (report.samples, 0, 0, 0)
     );
     let decoded = String::from_utf8(decoded).expect("text");
@@ -171,7 +204,8 @@ fn encoded_and_decoded_every_value_is_within_half_a_step() {
         for ((t, want), (u, got)) in samples.iter().zip(others) {
             assert_eq!(t, u, "{channel:?}");
             for (i, (want, got)) in want.iter().zip(got).enumerate() {
-                // Half a step: of 16 bits over the full scale both ways; of 360/65536 degrees of the motor's shaft.
+                // Half a step: of 16 bits over the full scale both ways; of 360/65536 degrees of
+                // the motor's shaft.
                 let half = match channel.0 {
                     Kind::Wrench if i < 3 => 1804.0 / 32768.0 / 2.0,
                     Kind::Wrench => 31.0 / 32768.0 / 2.0,
@@ -187,9 +221,16 @@ fn encoded_and_decoded_every_value_is_within_half_a_step() {
     let (original, quantised) = (leg.estimates(&leg.table), leg.estimates(&decoded));
     assert_eq!(original.len(), quantised.len());
     let (differences, count) = rms(&original, &quantised, &pairs(&decoded, &decoded));
-    assert!(count * 10 > original.len() * 9, "{count} of {}", original.len());
+    assert!(
+        count * 10 > original.len() * 9,
+        "{count} of {}",
+        original.len()
+    );
     let worst = differences.iter().copied().fold(0.0, f64::max);
-    println!("RMS torque difference after quantisation to CAN frames: worst joint {worst:.4} Nm over {count} instants");
+    println!(
+        "RMS torque difference after quantisation to CAN frames: worst joint {worst:.4} Nm over \
+         {count} instants"
+    );
     // A step of the sensors is 0.055 N and 0.001 Nm; a leg is 0.7 m long.
     assert!(worst < 0.05, "{differences:?}");
 }
@@ -213,7 +254,7 @@ fn played_onto_vcan_the_live_estimates_are_those_of_the_samples_received() {
 #[test]
 fn played_onto_virtual_buses_the_live_estimates_are_those_of_the_samples_received() {
     if std::env::var_os("PROPRIO_VCAN").is_some() {
-        println!("skipped: this one is for a machine of its own speed");
+        println!("skipped: not for user-mode Linux, which is too slow");
         return;
     }
     let names = ["l", "r"].map(|side| format!("leg_{side}_{}", std::process::id()));
@@ -246,19 +287,24 @@ fn played_onto_virtual_buses_the_live_estimates_are_those_of_the_samples_receive
     });
 }
 
-/// Starts a player of a log; the answer tells whether it has ended.
+/// Starts a player of a log; the returned closure tests whether it has ended.
 type Play<'a> = &'a dyn Fn(&Rig, &str) -> Box<dyn FnMut() -> bool>;
 
-/// Plays the log's first six seconds, in slow motion where the machine is slow, onto two buses and compares what is estimated live with a replay of the samples received.
+/// Plays the log's first six seconds onto two buses, in slow motion on a slow machine, and compares
+/// the live estimates with a replay of the received samples.
 fn live_is_replay(buses: [&str; 2], play: impl Fn(&Rig, &str) -> Box<dyn FnMut() -> bool>) {
-    // A machine that is held up for longer than half the wait makes samples late; it may try again.
+    // If the machine stalls for longer than half the wait, samples are late; then try again.
     let tries = 5;
     if !(0..tries).any(|_| one_live_is_replay(buses, &play)) {
-        panic!("samples were late in each of {tries} tries: this machine is too slow for the configured wait");
+        panic!(
+            "samples were late in each of {tries} tries: this machine is too slow for the \
+             configured wait"
+        );
     }
 }
 
-/// A configuration whose times in ms are so many times longer, but for the wait, which is as long as it may be.
+/// The configuration with its times in ms multiplied by `slower`, except the wait, which gets its
+/// maximum.
 fn slow_motion(text: &str, slower: i64) -> String {
     let line = |line: &str| match line.split_once(" = ") {
         Some((key, value)) if key.ends_with("_ms") && key != "max_wait_ms" => {
@@ -273,17 +319,23 @@ fn slow_motion(text: &str, slower: i64) -> String {
     text.lines().map(line).collect()
 }
 
-/// One try; false if samples were late, so that nothing can be compared.
+/// One attempt; false if samples were late, so that no comparison is possible.
 fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
     let Some(mut leg) = leg() else { return true };
-    // Two thousand frames a second are more than user-mode Linux can carry: there it goes in slow motion.
+    // Two thousand frames a second are too many for user-mode Linux: use slow motion there.
     let slower = if uml() { 4 } else { 1 };
     let (begin, until) = (Nanos::from_millis(24_000), Nanos::from_millis(30_000));
     let mut table = String::new();
     for line in leg.table.lines() {
-        match line.split_once(',').map(|(t, rest)| (Nanos::parse_seconds(t), rest)) {
+        match line
+            .split_once(',')
+            .map(|(t, rest)| (Nanos::parse_seconds(t), rest))
+        {
             Some((Some(t), rest)) if t < until => {
-                table.push_str(&format!("{},{rest}\n", begin + Nanos((t - begin).0 * slower)));
+                table.push_str(&format!(
+                    "{},{rest}\n",
+                    begin + Nanos((t - begin).0 * slower)
+                ));
             }
             Some((Some(_), _)) => {}
             _ => table.push_str(&format!("{line}\n")),
@@ -340,7 +392,7 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
         .lines()
         .count() as u64;
     let mut ended = play(&rig, &file("leg.log"));
-    // What follows the end of the log is the last estimates, which wait for later samples.
+    // After the end of the log the last estimates follow, which wait for later samples.
     let mut quiet_since = now();
     let mut seen = 0;
     while !ended() || now() - quiet_since < Nanos::from_millis(1000) {
@@ -351,7 +403,12 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
         std::thread::sleep(std::time::Duration::from_millis(5));
     }
     gateway_health.fresh();
-    let received: u64 = gateway_health.fresh().buses().iter().map(|b| b.frames).sum();
+    let received: u64 = gateway_health
+        .fresh()
+        .buses()
+        .iter()
+        .map(|b| b.frames)
+        .sum();
     assert_eq!(received, frames, "every frame that was played");
     health.fresh();
     let told = health.fresh();
@@ -362,14 +419,19 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
     );
     gateway.end();
     estimator.end();
-    // User-mode Linux is held up again and again, for longer than half the wait.
+    // User-mode Linux often stalls for longer than half the wait.
     if told.late > 0 && !uml() {
         println!("{} samples were late: trying again", told.late);
         return false;
     }
 
     let setup = leg.setup();
-    let channels: Vec<(Kind, String)> = leg.plan.channels.iter().map(|c| (c.kind, c.name.clone())).collect();
+    let channels: Vec<(Kind, String)> = leg
+        .plan
+        .channels
+        .iter()
+        .map(|c| (c.kind, c.name.clone()))
+        .collect();
     let received = rig.path("received.csv");
     recorder.write_samples(&channels, &received);
     let received = std::fs::read_to_string(received).expect("the samples");
@@ -378,17 +440,27 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
     let offline = rows(&String::from_utf8(out).expect("text"));
     let live = recorder.estimate_rows(&setup);
     let stamp = |t: &str| Nanos::parse_seconds(t);
-    let first = live.keys().filter_map(|t| stamp(t)).min().expect("estimates");
-    // The estimator may find the samples a little later than the recorder, and the last instants may still have been waiting when it was stopped.
-    let before = offline.keys().filter(|t| stamp(t).is_some_and(|t| t < first)).count();
+    let first = live
+        .keys()
+        .filter_map(|t| stamp(t))
+        .min()
+        .expect("estimates");
+    // The estimator may connect a little later than the recorder, and the last instants may still
+    // have been waiting when it was stopped.
+    let before = offline
+        .keys()
+        .filter(|t| stamp(t).is_some_and(|t| t < first))
+        .count();
     assert!(
-        before * 10 < offline.len() && live.len() + before + 5 + told.late as usize >= offline.len(),
+        before * 10 < offline.len()
+            && live.len() + before + 5 + told.late as usize >= offline.len(),
         "{} live, {} offline, {before} of them before the first that is live",
         live.len(),
         offline.len()
     );
-    // Deviations hold on to a posture for a tenth of a second, derivatives are of the longest window
-    // that there is, and its noise of four samples more: who begins later begins with others.
+    // Standard deviations are kept for 0.1 s per posture, derivatives use the longest available
+    // window, and their noise four more samples. An estimator that begins later therefore begins
+    // with different values.
     let begun = first + Nanos::from_millis(if before > 0 { 1000 + 40 * slower } else { 100 });
     let mut differing = live
         .iter()
@@ -402,9 +474,14 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
         live.len(),
         told.late
     );
-    // Late samples make a stretch of estimates others than a replay's. What is further from them than the longest window is the same again.
+    // Late samples change the estimates around them. Beyond the longest window the estimates agree
+    // again.
     let may_differ = if told.late > 0 { live.len() * 2 / 3 } else { 0 };
-    assert!(different <= may_differ, "{different} of {} live estimates", live.len());
+    assert!(
+        different <= may_differ,
+        "{different} of {} live estimates",
+        live.len()
+    );
 
     let log = std::fs::read(file("leg.log")).expect("the log");
     let mut decoded = Vec::new();
@@ -414,17 +491,22 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
     let (differences, count) = rms(&quantised, &original, &pairs);
     let worst = differences.iter().copied().fold(0.0, f64::max);
     println!(
-        "{} live estimates; RMS torque difference to the original log: worst joint {worst:.4} Nm over {count} instants",
+        "{} live estimates; RMS torque difference to the original log: worst joint {worst:.4} Nm \
+         over {count} instants",
         live.len() - 1
     );
-    assert!(count * 10 > original.len() * 9, "{count} of {}", original.len());
+    assert!(
+        count * 10 > original.len() * 9,
+        "{count} of {}",
+        original.len()
+    );
     true
 }
 
 /// A torque and its standard deviation, of two estimates.
 type Pair = ((f64, f64), (f64, f64));
 
-/// Torques of some joints from 34 to 44 s, each with its standard deviation; none where it is not valid.
+/// Torques of some joints from 34 to 44 s with their standard deviations; `None` where not valid.
 fn swinging(setup: Setup, table: &str) -> Vec<[Option<(f64, f64)>; 4]> {
     let joints = ["r_hip_pitch", "r_hip_yaw", "r_knee", "r_ankle_pitch"];
     let mut out = Vec::new();
@@ -432,8 +514,15 @@ fn swinging(setup: Setup, table: &str) -> Vec<[Option<(f64, f64)>; 4]> {
     let text = String::from_utf8(out).expect("text");
     let mut lines = text.lines().map(|line| line.split(',').collect::<Vec<_>>());
     let header = lines.next().expect("a header");
-    let place = |name: String| header.iter().position(|column| *column == name).expect("a column");
-    let columns = joints.map(|joint| ["torque", "torque_std", "valid"].map(|what| place(format!("{what}/{joint}"))));
+    let place = |name: String| {
+        header
+            .iter()
+            .position(|column| *column == name)
+            .expect("a column")
+    };
+    let columns = joints.map(|joint| {
+        ["torque", "torque_std", "valid"].map(|what| place(format!("{what}/{joint}")))
+    });
     let number = |cell: &str| cell.parse::<f64>().unwrap_or(f64::NAN);
     lines
         .filter(|cells| (34.0..44.0).contains(&number(cells[0])))
@@ -445,13 +534,17 @@ fn swinging(setup: Setup, table: &str) -> Vec<[Option<(f64, f64)>; 4]> {
         .collect()
 }
 
-/// Identified on-line, from whichever moment on, what the swinging leg's torques are agrees with what identification from the log finds, and with the inverse dynamics of the CAD, which
-/// for a free limb is as right as the CAD is. Nobody says that the foot stands on the ground until 14 s, nor that its sensors were never tared.
+/// With on-line identification, started at any moment, the torques of the swinging leg agree with
+/// those from off-line identification and with the inverse dynamics of the CAD, which for a free
+/// limb is as accurate as the CAD. It is not declared that the foot stands on the ground until 14
+/// s, nor that the sensors were never tared.
 #[test]
 fn on_line_the_torques_of_a_real_leg_are_what_they_are_from_its_log() {
-    /// Medians of iDynTree's inverse dynamics of `iCubGenova02` \[Nm\], and the share that a CAD is off by.
+    /// Medians of iDynTree's inverse dynamics of `iCubGenova02` \[Nm\], and the assumed relative
+    /// error of the CAD.
     const CAD: [(f64, f64); 4] = [(0.44, 0.2), (-0.10, 0.2), (4.11, 0.2), (-0.36, 0.2)];
-    /// At the hip and the ankle the moments of the limb's parts cancel: two fifths of what is left are little beside a fifth of each \[Nm\].
+    /// At the hip and the ankle the moments of the limb's parts cancel, so two fifths of the sum
+    /// are less than a fifth of each moment \[Nm\].
     const LITTLE: f64 = 0.4;
     let Some(mut leg) = leg() else { return };
     let data = PathBuf::from(std::env::var_os("PROPRIO_DATA").expect("the logs"));
@@ -461,7 +554,9 @@ fn on_line_the_torques_of_a_real_leg_are_what_they_are_from_its_log() {
         return;
     };
     let texts = [first, second];
-    leg.config.contact.retain(|contact| contact.name() != "right_leg");
+    leg.config
+        .contact
+        .retain(|contact| contact.name() != "right_leg");
     let foot = leg
         .config
         .contact
@@ -470,16 +565,18 @@ fn on_line_the_torques_of_a_real_leg_are_what_they_are_from_its_log() {
     foot.expect("the foot's contact").presence = Presence::Possible;
 
     let identified = {
-        let mut reader = texts[1].as_bytes();
-        let log = Log {
-            file: spans[1].to_owned(),
-            role: Role::Train,
-            samples: &mut reader,
-        };
         let setup = leg.setup();
-        let outcome = identify(&setup, vec![log], &Options::default(), &mut |_| ()).expect("an outcome");
+        let log = texts[1].as_bytes();
+        let dataset = reading::dataset(&setup.robot, spans[1], Role::Train, log).expect("a log");
+        let outcome = identify(
+            &setup.robot,
+            vec![dataset],
+            &Options::default(),
+            &mut |_| (),
+        )
+        .expect("an outcome");
         let mut with = setup.clone();
-        with.apply(&parameters(&outcome, &setup, "this test").expect("parameters"))
+        with.apply(&parameters(&outcome, &setup.robot, "this test").expect("parameters"))
             .expect("they fit");
         swinging(with, &texts[1])
     };
@@ -501,7 +598,7 @@ fn on_line_the_torques_of_a_real_leg_are_what_they_are_from_its_log() {
             .collect::<String>();
         let own = swinging(leg.setup(), &table);
         for (joint, (cad, share)) in CAD.iter().enumerate() {
-            // Both are of the same instants, but for how the table begins.
+            // Both have the same instants, except at the beginning of the table.
             let from = identified.len().saturating_sub(own.len());
             let pairs: Vec<_> = (own.iter().rev().zip(identified[from..].iter().rev()))
                 .filter_map(|(own, other)| Some((own[joint]?, other[joint]?)))

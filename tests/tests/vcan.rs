@@ -1,8 +1,10 @@
-//! The whole chain on a kernel's CAN bus, with third-party tools on it: canplayer, cansend, candump, cangen, ip.
+//! The whole chain on a kernel CAN bus with third-party tools: canplayer, cansend, candump, cangen,
+//! ip.
 //!
-//! Runs where PROPRIO_VCAN=1 says that vcan0 and vcan1 are there and ours (`tests/run --only vcan` sees to that), one test at a
-//! time. In user-mode Linux, with its one slow processor, the robot is paced accordingly and recovery is given 15 s instead of 1 s;
-//! `recovery.rs` measures it without.
+//! Runs if PROPRIO_VCAN=1 is set, which means that vcan0 and vcan1 exist and belong to this test
+//! (`tests/run --only vcan` provides them), one test at a time. User-mode Linux has one slow
+//! processor: there the robot's periods are longer and the limit for recovery is 15 s instead of 1
+//! s. `recovery.rs` measures the recovery without it.
 #![allow(missing_docs)]
 
 use proprio_drivers::{Claim, Frame};
@@ -16,9 +18,13 @@ use proprio_gateway::plan::Plan;
 use proprio_gateway::status::BusStatus;
 use proprio_simulator::{Settings, record};
 use proprio_tests::can::{self, Candump, vcan};
-use proprio_tests::watch::{Newest, Recorder, Truth, all_valid, bus, count, open, rows, table_by_channel, valid_since};
+use proprio_tests::watch::{
+    Newest, Recorder, Truth, all_valid, bus, count, open, rows, table_by_channel, valid_since,
+};
 use proprio_tests::{Arm, PATIENCE, Process, Rig, Written, now, uml, until};
-use proprio_topics::{Counter, EstimatorHealth, GatewayHealth, LinkState, Nanos, Reading, TorqueEstimate};
+use proprio_topics::{
+    Counter, EstimatorHealth, GatewayHealth, LinkState, Nanos, Reading, TorqueEstimate,
+};
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{BufReader, BufWriter};
@@ -29,7 +35,7 @@ use std::time::Duration;
 const ROBOT: &str = "icub_left_arm";
 const INTERFACES: [&str; 2] = ["vcan0", "vcan1"];
 
-/// How long the chain may take to recover: a second; longer in user-mode Linux, see above.
+/// Maximum recovery time of the chain: a second; longer in user-mode Linux, see above.
 fn recovery() -> Nanos {
     Nanos::from_millis(if uml() { 15_000 } else { 1000 })
 }
@@ -38,7 +44,7 @@ fn text(path: &Path) -> &str {
     path.to_str().expect("a path in UTF-8")
 }
 
-/// A gateway that has its links open.
+/// A gateway with open links.
 fn gateway(rig: &Rig, arm: &Written) -> Process {
     rig.start(&["gateway", "--config", &arm.gateway])
 }
@@ -47,22 +53,25 @@ fn estimator(rig: &Rig, arm: &Written) -> Process {
     rig.start(&["estimator", "--config", &arm.estimator])
 }
 
-// --- A recorded log ----------------------------------------------------------------------------------------------------
+// --- A recorded log
+// --------------------------------------------------------------------------------
 
-/// A log played by canplayer gives the samples that `proprio decode` gives, value for value. The log holds the conversation
-/// with the boards: who only listens learns the full scales from it.
+/// A log played by canplayer gives the same samples as `proprio decode`, value for value. The log
+/// contains the conversation with the boards, from which a listening gateway gets the full scales.
 #[test]
 fn a_played_log_gives_what_decode_gives() {
     if !vcan() {
         return;
     }
     let rig = Rig::new();
-    let unscaled = Arm::slow().patience(5000.0, 100.0).each_device(|driver, device| {
-        if driver == "icub_strain" {
-            device.remove("full_scale_n");
-            device.remove("full_scale_nm");
-        }
-    });
+    let unscaled = Arm::slow()
+        .patience(5000.0, 100.0)
+        .each_device(|driver, device| {
+            if driver == "icub_strain" {
+                device.remove("full_scale_n");
+                device.remove("full_scale_nm");
+            }
+        });
     let recorded = unscaled
         .clone()
         .on_virtual(["board_a", "board_b"])
@@ -72,7 +81,10 @@ fn a_played_log_gives_what_decode_gives() {
     });
     let listening = listening.write(&rig.path("listening"));
     let log = rig.path("session.log");
-    let faults = ["saturate:l_arm_ft_sensor@1.2..1.4", "spike:l_arm_ft_sensor@1.7"];
+    let faults = [
+        "saturate:l_arm_ft_sensor@1.2..1.4",
+        "spike:l_arm_ft_sensor@1.7",
+    ];
     let settings = Settings {
         faults: faults.map(|f| f.parse().expect("a fault")).to_vec(),
         ..Settings::default()
@@ -92,7 +104,8 @@ fn a_played_log_gives_what_decode_gives() {
         "--all",
         "--json",
     ];
-    let decoded: serde_json::Value = serde_json::from_slice(&rig.run(&decode).stdout).expect("a summary");
+    let decoded: serde_json::Value =
+        serde_json::from_slice(&rig.run(&decode).stdout).expect("a summary");
     let samples = decoded["samples"].as_u64().expect("a number") as usize;
 
     let mut gateway = gateway(&rig, &listening);
@@ -102,19 +115,32 @@ fn a_played_log_gives_what_decode_gives() {
     health.wait("both links up", |h| {
         h.buses().iter().filter(|b| b.link == LinkState::Up).count() == 2
     });
-    let player = can::tool(&format!("canplayer -I {} vcan0=board_a vcan1=board_b", log.display()));
+    let player = can::tool(&format!(
+        "canplayer -I {} vcan0=board_a vcan1=board_b",
+        log.display()
+    ));
     let mut player = rig.spawn(player, "canplayer");
     let all = until(PATIENCE, || {
         recorder.take();
         (player.ended().is_some() && recorder.taken.len() >= samples).then_some(())
     });
     player.wait();
-    assert!(all.is_some(), "{} samples instead of {samples}", recorder.taken.len());
+    assert!(
+        all.is_some(),
+        "{} samples instead of {samples}",
+        recorder.taken.len()
+    );
     std::thread::sleep(Duration::from_millis(200));
     recorder.take();
     assert_eq!((recorder.taken.len(), recorder.lost()), (samples, 0));
 
-    let names: Vec<&str> = listening.robot.plan.channels.iter().map(|c| c.name.as_str()).collect();
+    let names: Vec<&str> = listening
+        .robot
+        .plan
+        .channels
+        .iter()
+        .map(|c| c.name.as_str())
+        .collect();
     let live: BTreeMap<String, Vec<String>> = recorder
         .by_channel()
         .into_iter()
@@ -122,7 +148,10 @@ fn a_played_log_gives_what_decode_gives() {
         .collect();
     let offline = table_by_channel(&table);
     assert_eq!(live.len(), 9);
-    assert_eq!(live.keys().collect::<Vec<_>>(), offline.keys().collect::<Vec<_>>());
+    assert_eq!(
+        live.keys().collect::<Vec<_>>(),
+        offline.keys().collect::<Vec<_>>()
+    );
     for (channel, values) in &live {
         assert_eq!(values.len(), offline[channel].len(), "{channel}");
         for (number, (live, offline)) in values.iter().zip(&offline[channel]).enumerate() {
@@ -135,7 +164,11 @@ fn a_played_log_gives_what_decode_gives() {
         .any(|s| s.header.quality.contains(proprio_topics::Quality::FROZEN));
     assert!(saturated, "the log has saturated samples");
     for (bus, sent) in health.fresh().buses().iter().zip([0, 0]) {
-        assert_eq!((bus.sent, bus.dropped), (sent, 0), "who only listens sends nothing");
+        assert_eq!(
+            (bus.sent, bus.dropped),
+            (sent, 0),
+            "a listening gateway sends nothing"
+        );
     }
     println!("{samples} samples of 9 channels, value for value");
     drop((recorder, health, domain));
@@ -143,7 +176,8 @@ fn a_played_log_gives_what_decode_gives() {
     rig.assert_nothing_left();
 }
 
-// --- The chain against the truth ---------------------------------------------------------------------------------------
+// --- The chain against the truth
+// --------------------------------------------------------------------------------
 
 #[test]
 fn torques_agree_with_the_truth() {
@@ -153,8 +187,8 @@ fn torques_agree_with_the_truth() {
     let rig = Rig::new();
     let mut arm = Arm::slow().on_interfaces(INTERFACES);
     if uml() {
-        // Where the one processor is taken from the simulator between measuring and sending, a stamp is late by milliseconds,
-        // and a position that changes by 1 rad/s wrong by as much.
+        // If the simulator is preempted between measuring and sending, a stamp is late by
+        // milliseconds, and a position that changes by 1 rad/s is wrong accordingly.
         arm = arm.position_noise(5e-3);
     }
     let arm = arm.write(&rig.path("robot"));
@@ -189,7 +223,11 @@ fn torques_agree_with_the_truth() {
     let sent = told["sent"].as_u64().expect("a number");
     let health = health.fresh();
     let frames: u64 = health.buses().iter().map(|b| b.frames).sum();
-    let dropped: u64 = health.buses().iter().map(|b| b.dropped + b.publish_failures).sum();
+    let dropped: u64 = health
+        .buses()
+        .iter()
+        .map(|b| b.dropped + b.publish_failures)
+        .sum();
     assert_eq!(
         (sent.abs_diff(frames), dropped),
         (0, 0),
@@ -197,14 +235,18 @@ fn torques_agree_with_the_truth() {
     );
     let estimator_health = estimator_health.fresh();
     assert_eq!(
-        (estimator_health.lost, estimator_health.backward, recorder.lost()),
+        (
+            estimator_health.lost,
+            estimator_health.backward,
+            recorder.lost()
+        ),
         (0, 0, 0)
     );
     let published: u64 = health.buses().iter().map(|b| b.published).sum();
     assert_eq!(recorder.taken.len() as u64, published);
 
     let setup = Setup::new(&arm.robot.config).expect("the robot's model");
-    let joints: Vec<&str> = setup.joint_names().collect();
+    let joints: Vec<&str> = setup.robot.joint_names().collect();
     let truth = Truth::read(&truth, &joints);
     let first = *recorder.estimates.keys().next().expect("estimates");
     let settled = || {
@@ -227,7 +269,10 @@ fn torques_agree_with_the_truth() {
         errors.sort_by(|a, b| a.abs().total_cmp(&b.abs()));
         let most = errors.len() * 98 / 100;
         let (most, number) = (rms(&errors[..most]), errors.len());
-        println!("  {name:<20} RMS error {all:.4} Nm over {number} estimates, {most:.4} Nm without the worst 2 %");
+        println!(
+            "  {name:<20} RMS error {all:.4} Nm over {number} estimates, {most:.4} Nm without the \
+             worst 2 %"
+        );
         let error = if uml() { most } else { all };
         assert!(
             number > 200 && error < 0.15,
@@ -244,7 +289,7 @@ fn rms(values: &[f64]) -> f64 {
     (values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64).sqrt()
 }
 
-/// The demonstration on kernel buses: two for two, and one for all devices.
+/// The demonstration on kernel buses: on two interfaces, and on one for all devices.
 #[test]
 fn the_demonstration_runs_on_interfaces() {
     if !vcan() {
@@ -254,8 +299,18 @@ fn the_demonstration_runs_on_interfaces() {
     let arm = Arm::slow().write(&rig.path("robot"));
     for interfaces in [&INTERFACES[..], &INTERFACES[..1]] {
         let out = rig.path("demo");
-        let mut arguments = vec!["demo", "--robot", &arm.folder, "--seconds", "3", "--out", text(&out)];
-        interfaces.iter().for_each(|i| arguments.extend(["--bus", i]));
+        let mut arguments = vec![
+            "demo",
+            "--robot",
+            &arm.folder,
+            "--seconds",
+            "3",
+            "--out",
+            text(&out),
+        ];
+        interfaces
+            .iter()
+            .for_each(|i| arguments.extend(["--bus", i]));
         rig.run(&arguments);
         let summary = fs::read_to_string(out.join("summary.json")).expect("a summary");
         let summary: serde_json::Value = serde_json::from_str(&summary).expect("JSON");
@@ -270,7 +325,9 @@ fn the_demonstration_runs_on_interfaces() {
         for key in ["p50", "p99", "p999"] {
             assert!(number(&summary["latency_us"], key) > 0.0, "{key}");
         }
-        let errors = summary["torque_rms_error_nm"].as_object().expect("an error per joint");
+        let errors = summary["torque_rms_error_nm"]
+            .as_object()
+            .expect("an error per joint");
         assert_eq!(errors.len(), 7);
         assert!(
             errors
@@ -295,9 +352,10 @@ fn the_demonstration_runs_on_interfaces() {
     }
 }
 
-// --- What goes wrong ---------------------------------------------------------------------------------------------------
+// --- What goes wrong
+// --------------------------------------------------------------------------------
 
-/// The chain, running on both interfaces, and what watches it.
+/// The running chain on both interfaces, and its readers.
 struct Chain {
     torques: proprio_topics::ipc::Reader<TorqueEstimate>,
     health: Newest<GatewayHealth>,
@@ -313,7 +371,9 @@ struct Chain {
 impl Chain {
     fn start() -> Self {
         let rig = Rig::new();
-        let arm = Arm::slow().on_interfaces(INTERFACES).write(&rig.path("robot"));
+        let arm = Arm::slow()
+            .on_interfaces(INTERFACES)
+            .write(&rig.path("robot"));
         let simulator = rig.start(&["simulate", "--robot", &arm.folder]);
         let (gateway, estimator) = (gateway(&rig, &arm), estimator(&rig, &arm));
         let domain = rig.open();
@@ -332,10 +392,14 @@ impl Chain {
         this
     }
 
-    /// How long from `since` until a valid estimate of a later instant comes.
+    /// Time from `since` until a valid estimate of a later instant arrives.
     fn recovers(&mut self, since: Nanos, limit: Nanos, what: &str) -> Nanos {
         let valid = valid_since(&mut self.torques, since, PATIENCE);
-        assert!(valid.is_some(), "{what}: no valid estimate; {:?}", self.health.get());
+        assert!(
+            valid.is_some(),
+            "{what}: no valid estimate; {:?}",
+            self.health.get()
+        );
         let took = now() - since;
         [&mut self.simulator, &mut self.gateway, &mut self.estimator]
             .into_iter()
@@ -357,7 +421,12 @@ impl Chain {
             rig,
             ..
         } = self;
-        drop((self.torques, self.health, self.estimator_health, self.domain));
+        drop((
+            self.torques,
+            self.health,
+            self.estimator_health,
+            self.domain,
+        ));
         [&mut simulator, &mut estimator, &mut gateway]
             .into_iter()
             .for_each(Process::end);
@@ -378,7 +447,9 @@ fn the_chain_recovers_from_kills() {
     let mut random = fastrand::Rng::with_seed(11);
     let startup = if uml() { 1500.0 } else { 15.0 };
     let begin = now();
-    chain.rig.run(&["gateway", "--config", &chain.arm.gateway, "--check"]);
+    chain
+        .rig
+        .run(&["gateway", "--config", &chain.arm.gateway, "--check"]);
     println!(
         "a program takes {:.0} ms to start, read its configuration and end",
         (now() - begin).seconds() * 1e3
@@ -420,7 +491,11 @@ fn the_chain_recovers_from_kills() {
             "{} killed {:.1} ms {}",
             ["gateway", "estimator"][victim],
             wait.as_secs_f64() * 1e3,
-            if at_startup { "after its start" } else { "while running" }
+            if at_startup {
+                "after its start"
+            } else {
+                "while running"
+            }
         );
         let took = chain.recovers(restarted, recovery(), &what);
         println!("{what}: recovered after {:.0} ms", took.seconds() * 1e3);
@@ -447,7 +522,14 @@ fn interfaces_go_and_come_back() {
         return;
     }
     let mut chain = Chain::start();
-    let names: Vec<String> = chain.arm.robot.plan.buses.iter().map(|b| b.name.clone()).collect();
+    let names: Vec<String> = chain
+        .arm
+        .robot
+        .plan
+        .buses
+        .iter()
+        .map(|b| b.name.clone())
+        .collect();
     let mut losses = [0, 0];
     for (interface, deleted) in [(1, false), (0, false), (1, true), (0, true), (1, false)] {
         let name = INTERFACES[interface];
@@ -460,15 +542,18 @@ fn interfaces_go_and_come_back() {
         };
         can::run(&format!("ip link {goes} {name}"));
         losses[interface] += 1;
-        let lost = chain
-            .health
-            .wait("the loss", |h| bus(h.buses(), &names[interface]).link == state);
-        assert_eq!(bus(lost.buses(), &names[interface]).link_losses, losses[interface]);
+        let lost = chain.health.wait("the loss", |h| {
+            bus(h.buses(), &names[interface]).link == state
+        });
+        assert_eq!(
+            bus(lost.buses(), &names[interface]).link_losses,
+            losses[interface]
+        );
         assert_eq!(bus(lost.buses(), other).link, LinkState::Up);
-        // The other bus goes on.
-        chain
-            .health
-            .wait("frames of the other bus", |h| bus(h.buses(), other).frames > before);
+        // The other bus continues.
+        chain.health.wait("frames of the other bus", |h| {
+            bus(h.buses(), other).frames > before
+        });
         std::thread::sleep(Duration::from_millis(300));
         if deleted {
             can::add_interface(name);
@@ -488,32 +573,47 @@ fn interfaces_go_and_come_back() {
         let healthy = chain.health.wait("the link up", |h| {
             bus(h.buses(), &names[interface]).link == LinkState::Up
         });
-        assert_eq!(bus(healthy.buses(), &names[interface]).link_losses, losses[interface]);
+        assert_eq!(
+            bus(healthy.buses(), &names[interface]).link_losses,
+            losses[interface]
+        );
         println!("{what}: recovered after {:.0} ms", took.seconds() * 1e3);
     }
     let log = chain.gateway.log();
-    for told in ["the link is down", "the link is gone", "the link is up again"] {
-        assert!(log.contains(told), "{told:?} is not in the gateway's log:\n{log}");
+    for told in [
+        "the link is down",
+        "the link is gone",
+        "the link is up again",
+    ] {
+        assert!(
+            log.contains(told),
+            "{told:?} is not in the gateway's log:\n{log}"
+        );
     }
     chain.end();
 }
 
-/// What the gateway claims on bus number `number`: what its filters let pass.
+/// The gateway's claims on bus number `number`, that is, its filters.
 fn claims(plan: &Plan, number: usize) -> Vec<Claim> {
     let bus = &plan.buses[number];
     let status = Arc::new(BusStatus::new(0, bus));
-    Decoder::new(0, bus, None, status).expect("devices").claims()
+    Decoder::new(0, bus, None, status)
+        .expect("devices")
+        .claims()
 }
 
-/// Random frames of every kind, and every configured identifier with every length: the gateway counts each that passes its
-/// filters, by the same reasons as `proprio decode` does with what candump saw, and goes on.
+/// Random frames of every kind, and every configured identifier with every length. The gateway
+/// counts each frame that passes its filters, for the same reasons as `proprio decode` on candump's
+/// log, and keeps running.
 #[test]
 fn floods_are_counted() {
     if !vcan() {
         return;
     }
     let rig = Rig::new();
-    let arm = Arm::slow().on_interfaces(INTERFACES).write(&rig.path("robot"));
+    let arm = Arm::slow()
+        .on_interfaces(INTERFACES)
+        .write(&rig.path("robot"));
     let plan = &arm.robot.plan;
     let dumps: Vec<Candump> = INTERFACES
         .iter()
@@ -539,7 +639,11 @@ fn floods_are_counted() {
     };
     let quiet = health.wait("readings of all", |h| readings(h).iter().all(|n| *n > 5));
     assert_eq!(
-        quiet.devices().iter().map(|d| count(d, Counter::Length)).sum::<u64>(),
+        quiet
+            .devices()
+            .iter()
+            .map(|d| count(d, Counter::Length))
+            .sum::<u64>(),
         0
     );
 
@@ -547,12 +651,19 @@ fn floods_are_counted() {
     let mut log = String::new();
     for (number, interface) in INTERFACES.iter().enumerate() {
         for kind in ["", "-e", "-R", "-e -R", "-f", "-m"] {
-            can::run(&format!("cangen {interface} -g 0 -p 100 -I r -L r -D r -n 1500 {kind}"));
+            can::run(&format!(
+                "cangen {interface} -g 0 -p 100 -I r -L r -D r -n 1500 {kind}"
+            ));
         }
         for claim in claims(plan, number) {
             for length in (0..=8).cycle().take(45) {
-                let bytes: String = (0..length).map(|_| format!("{:02X}", data.u8(..))).collect();
-                log.push_str(&format!("(0.000000) {interface} {:03X}#{bytes}\n", claim.id.raw()));
+                let bytes: String = (0..length)
+                    .map(|_| format!("{:02X}", data.u8(..)))
+                    .collect();
+                log.push_str(&format!(
+                    "(0.000000) {interface} {:03X}#{bytes}\n",
+                    claim.id.raw()
+                ));
             }
         }
     }
@@ -566,18 +677,24 @@ fn floods_are_counted() {
             .zip(readings(&flooded))
             .all(|(now, then)| *now > then + 5)
     });
-    // Each claimed identifier had 5 frames of each of the lengths 0 to 8, of which at most three are legal.
+    // Each claimed identifier had 5 frames of each of the lengths 0 to 8, of which at most three
+    // are legal.
     for device in continued.devices() {
         assert!(count(device, Counter::Length) >= 30, "{device:?}");
     }
     gateway.assert_runs();
     simulator.end();
 
-    // Everything has been received, and written, once both have the same number, which does not change any more.
+    // All frames have been received and written when both numbers are equal and stay constant.
     let mut last = None;
     until(PATIENCE, || {
         std::thread::sleep(Duration::from_millis(300));
-        let received: Vec<u64> = health.fresh().buses().iter().map(|b| b.frames + b.dropped).collect();
+        let received: Vec<u64> = health
+            .fresh()
+            .buses()
+            .iter()
+            .map(|b| b.frames + b.dropped)
+            .collect();
         let seen: Vec<u64> = dumps.iter().map(|dump| dump.count() as u64).collect();
         let equal = received == seen;
         (last.replace(seen.clone()) == Some(seen) && equal).then_some(())
@@ -597,7 +714,7 @@ fn floods_are_counted() {
         assert_eq!(bus.frames + bus.dropped, dump.count() as u64, "{bus:?}");
         assert_eq!(bus.unclaimed, 0);
     }
-    // By reason, as long as the gateway has seen all that candump has.
+    // Compare by reason, if the gateway has received all frames that candump has.
     if end.buses().iter().all(|b| b.dropped == 0) {
         let table = rig.path("flood.csv");
         let decode = [
@@ -610,15 +727,21 @@ fn floods_are_counted() {
             text(&table),
             "--json",
         ];
-        let decoded: serde_json::Value = serde_json::from_slice(&rig.run(&decode).stdout).expect("a summary");
+        let decoded: serde_json::Value =
+            serde_json::from_slice(&rig.run(&decode).stdout).expect("a summary");
         for (device, offline) in end
             .devices()
             .iter()
             .zip(decoded["devices"].as_array().expect("devices"))
         {
             assert_eq!(offline["name"], device.name.as_str());
-            assert_eq!(offline["frames"], count(device, Counter::Frames), "{offline}");
-            // What an IMU answers counts only while it is asked, and here decode listens instead of asking.
+            assert_eq!(
+                offline["frames"],
+                count(device, Counter::Frames),
+                "{offline}"
+            );
+            // The gateway accepts an IMU's answers only after a question, but `decode` only
+            // listens.
             if device.name.as_str() == "chest_imu" {
                 continue;
             }
@@ -627,7 +750,12 @@ fn floods_are_counted() {
                     .get(counter.word())
                     .and_then(serde_json::Value::as_u64)
                     .unwrap_or(0);
-                assert_eq!(counted, count(device, counter), "{} of {offline}", counter.word());
+                assert_eq!(
+                    counted,
+                    count(device, counter),
+                    "{} of {offline}",
+                    counter.word()
+                );
             }
         }
     }
@@ -637,7 +765,8 @@ fn floods_are_counted() {
     rig.assert_nothing_left();
 }
 
-// --- Order and time ----------------------------------------------------------------------------------------------------
+// --- Order and time
+// --------------------------------------------------------------------------------
 
 /// 31A 32A 31B 32B: two boards on one bus whose halves interleave.
 #[test]
@@ -649,28 +778,44 @@ fn interleaved_boards_keep_their_own_halves() {
     let config = rig.path("gateway.toml");
     let board = |address: u32, scale: u32| {
         format!(
-            "[[bus.device]]\ndriver = \"icub_strain\"\nname = \"ft{address}\"\naddress = {address}\nlisten_only = true\n\
-             max_silence_ms = 5000\npair_timeout_ms = 500.0\nfull_scale_n = [{scale}, {scale}, {scale}]\n\
+            "[[bus.device]]\ndriver = \"icub_strain\"\nname = \"ft{address}\"\naddress = {address}\n\
+             listen_only = true\nmax_silence_ms = 5000\npair_timeout_ms = 500.0\n\
+             full_scale_n = [{scale}, {scale}, {scale}]\n\
              full_scale_nm = [{scale}, {scale}, {scale}]\n"
         )
     };
-    // The first board counts in units of 1, the second in units of 2.
-    let source = "schema = 1\nrobot = \"pair\"\n[[bus]]\nname = \"bus\"\nsource = { kind = \"socketcan\", interface = \"vcan0\" }\n";
-    fs::write(&config, format!("{source}{}{}", board(1, 32768), board(2, 65535))).expect("a configuration");
+    // The first board has a step of 1, the second of 2.
+    let source = "schema = 1\nrobot = \"pair\"\n[[bus]]\nname = \"bus\"\n\
+                  source = { kind = \"socketcan\", interface = \"vcan0\" }\n";
+    fs::write(
+        &config,
+        format!("{source}{}{}", board(1, 32768), board(2, 65535)),
+    )
+    .expect("a configuration");
     let mut gateway = rig.start(&["gateway", "--config", text(&config)]);
     let domain = rig.open();
     let mut recorder = Recorder::of_samples(&domain, "pair");
     let mut health = Newest::<GatewayHealth>::open(&domain, "pair");
-    health.wait("the link up", |h| bus(h.buses(), "bus").link == LinkState::Up);
+    health.wait("the link up", |h| {
+        bus(h.buses(), "bus").link == LinkState::Up
+    });
 
     let (readings, mut log) = (200_u32, String::new());
     for k in 0..readings {
-        // Every half of a reading carries its number: force k, torque k + 1000; the second board's are 5000 higher.
-        for (n, (id, value)) in [(0x31A, k), (0x32A, k + 5000), (0x31B, k + 1000), (0x32B, k + 6000)]
-            .into_iter()
-            .enumerate()
+        // Every half contains its reading's number: force k, torque k + 1000; those of the second
+        // board are 5000 higher.
+        for (n, (id, value)) in [
+            (0x31A, k),
+            (0x32A, k + 5000),
+            (0x31B, k + 1000),
+            (0x32B, k + 6000),
+        ]
+        .into_iter()
+        .enumerate()
         {
-            let [low, high] = u16::try_from(0x8000 + value).expect("16 bits").to_le_bytes();
+            let [low, high] = u16::try_from(0x8000 + value)
+                .expect("16 bits")
+                .to_le_bytes();
             let t = 1.0 + 0.005 * f64::from(k) + 0.0002 * n as f64;
             log.push_str(&format!(
                 "({t:.6}) can7 {id:03X}#{}\n",
@@ -685,8 +830,15 @@ fn interleaved_boards_keep_their_own_halves() {
         recorder.take();
         (recorder.taken.len() >= 2 * readings as usize).then_some(())
     });
-    for (number, (first, unit)) in [(0.0, 1.0), (5000.0, 65535.0 / 32768.0)].into_iter().enumerate() {
-        let samples: Vec<_> = recorder.taken.iter().filter(|s| s.channel as usize == number).collect();
+    for (number, (first, unit)) in [(0.0, 1.0), (5000.0, 65535.0 / 32768.0)]
+        .into_iter()
+        .enumerate()
+    {
+        let samples: Vec<_> = recorder
+            .taken
+            .iter()
+            .filter(|s| s.channel as usize == number)
+            .collect();
         assert_eq!(samples.len(), readings as usize, "board {number}");
         for (k, sample) in samples.iter().enumerate() {
             let Reading::Wrench(wrench) = sample.reading else {
@@ -703,7 +855,9 @@ fn interleaved_boards_keep_their_own_halves() {
     }
     let end = health.fresh();
     assert!(
-        end.devices().iter().all(|d| count(d, Counter::Unpaired) == 0),
+        end.devices()
+            .iter()
+            .all(|d| count(d, Counter::Unpaired) == 0),
         "{:?}",
         end.devices()
     );
@@ -712,10 +866,13 @@ fn interleaved_boards_keep_their_own_halves() {
     rig.assert_nothing_left();
 }
 
-/// Plays `frames` (when, on which interface, what) at their times.
+/// Plays `frames` (time, interface, frame) at their times.
 fn play(frames: &[(Nanos, usize, Frame)], mut meanwhile: impl FnMut()) {
-    let mut links = INTERFACES.map(|interface| SocketCan::open(interface, &[]).expect("an interface"));
-    let Some((begin, ..)) = frames.first() else { return };
+    let mut links =
+        INTERFACES.map(|interface| SocketCan::open(interface, &[]).expect("an interface"));
+    let Some((begin, ..)) = frames.first() else {
+        return;
+    };
     let start = Monotonic.now() + Nanos::from_millis(50) - *begin;
     for (t, interface, frame) in frames {
         sleep_until(start + *t);
@@ -726,7 +883,7 @@ fn play(frames: &[(Nanos, usize, Frame)], mut meanwhile: impl FnMut()) {
     }
 }
 
-/// The frames of a log by interface, those of the second one later by `skew`, in order.
+/// The frames of a log in order, with those of the second interface delayed by `skew`.
 fn skewed(log: &Path, interfaces: [&str; 2], skew: Nanos) -> Vec<(Nanos, usize, Frame)> {
     let mut reader = candump::Reader::new(BufReader::new(File::open(log).expect("the log")));
     let mut frames = Vec::new();
@@ -742,18 +899,20 @@ fn skewed(log: &Path, interfaces: [&str; 2], skew: Nanos) -> Vec<(Nanos, usize, 
     frames
 }
 
-/// The second bus is half a millisecond later than the first, and later by more than an estimate waits: no value strays to
-/// another channel, every stamp of the trigger gives one estimate, and these are those of `proprio estimate`, bit for bit.
+/// The second bus is delayed, by half a millisecond and by more than the wait of an estimate. No
+/// value gets to a wrong channel, every stamp of the trigger gives one estimate, and the estimates
+/// equal those of `proprio estimate`, bit for bit.
 #[test]
 fn skewed_buses_are_not_mixed_up() {
     if !vcan() {
         return;
     }
-    // Periods of F/T, IMU and joints, how long an estimate waits, and the skew [ms]. In the first case each estimate has all
-    // channels; in the second the joints are later, and rarer, than an estimate waits. The wait ends as far before a stamp of
-    // the trigger as it can: what is released then does not depend on which bus's thread runs first.
+    // Periods of F/T, IMU and joints, how long an estimate waits, and the skew [ms]. In the first
+    // case each estimate has all channels; in the second the joints are later, and have a longer
+    // period, than the wait of an estimate. The wait ends as far before a stamp of the trigger as
+    // possible, so that the result does not depend on which bus's thread runs first.
     for (periods, max_wait, skew) in [([10, 20, 20], 250.0, 0.5), ([20, 20, 80], 41.0, 60.0)] {
-        // A machine that stalls for longer than the wait makes samples late: then the next attempt is due.
+        // If the machine stalls for longer than the wait, samples are late: then try again.
         let mut outcome = Ok(());
         for _ in 0..5 {
             outcome = skewed_buses(periods, max_wait, Nanos::from_seconds(skew * 1e-3));
@@ -766,8 +925,12 @@ fn skewed_buses_are_not_mixed_up() {
     }
 }
 
-/// Plays one session; an error is what may come of a stall.
-fn skewed_buses([force_torque, imu, motors]: [i64; 3], max_wait: f64, skew: Nanos) -> Result<(), String> {
+/// Plays one session; an error may be the result of a stall.
+fn skewed_buses(
+    [force_torque, imu, motors]: [i64; 3],
+    max_wait: f64,
+    skew: Nanos,
+) -> Result<(), String> {
     let rig = Rig::new();
     let arm = Arm::slow()
         .periods(force_torque, imu, motors)
@@ -779,21 +942,29 @@ fn skewed_buses([force_torque, imu, motors]: [i64; 3], max_wait: f64, skew: Nano
     let arm = arm.write(&rig.path("robot"));
     let log = rig.path("session.log");
     let out = BufWriter::new(File::create(&log).expect("a log"));
-    record::record(&arm.robot, &Settings::default(), 3.0, Nanos(1_000_000_000), out).expect("a session");
+    record::record(
+        &arm.robot,
+        &Settings::default(),
+        3.0,
+        Nanos(1_000_000_000),
+        out,
+    )
+    .expect("a session");
 
     let (mut gateway, mut estimator) = (gateway(&rig, &arm), estimator(&rig, &arm));
     let domain = rig.open();
     let mut recorder = Recorder::of_all(&domain, ROBOT);
     let mut health = Newest::<EstimatorHealth>::open(&domain, ROBOT);
-    // Motor states until the estimator knows who is who: they are no part of an estimate.
+    // Send motor states, which no estimate uses, until the estimator knows the channels.
     let mut before = None;
     health.wait("samples that the estimator knows", |h| {
         INTERFACES
             .iter()
             .for_each(|i| can::run(&format!("cansend {i} 113#0600000000000000")));
         std::thread::sleep(Duration::from_millis(150));
-        let known =
-            before.is_some_and(|b: EstimatorHealth| h.samples > b.samples && h.unknown_channel == b.unknown_channel);
+        let known = before.is_some_and(|b: EstimatorHealth| {
+            h.samples > b.samples && h.unknown_channel == b.unknown_channel
+        });
         before = Some(*h);
         known
     });
@@ -806,7 +977,7 @@ fn skewed_buses([force_torque, imu, motors]: [i64; 3], max_wait: f64, skew: Nano
     assert_eq!((health.lost, recorder.lost(), health.backward), (0, 0, 0));
     drop(domain);
 
-    // Each value is where decode has it.
+    // Each value is in the same channel as with decode.
     let table = rig.path("decoded.csv");
     rig.run(&[
         "decode",
@@ -832,7 +1003,11 @@ fn skewed_buses([force_torque, imu, motors]: [i64; 3], max_wait: f64, skew: Nano
     }
 
     let samples = rig.path("samples.csv");
-    let channels: Vec<_> = plan.channels.iter().map(|c| (c.kind, c.name.clone())).collect();
+    let channels: Vec<_> = plan
+        .channels
+        .iter()
+        .map(|c| (c.kind, c.name.clone()))
+        .collect();
     recorder.write_samples(&channels, &samples);
     let estimates = rig.path("estimates.csv");
     let estimate = [
@@ -845,7 +1020,8 @@ fn skewed_buses([force_torque, imu, motors]: [i64; 3], max_wait: f64, skew: Nano
         text(&estimates),
         "--json",
     ];
-    let summary: serde_json::Value = serde_json::from_slice(&rig.run(&estimate).stdout).expect("a summary");
+    let summary: serde_json::Value =
+        serde_json::from_slice(&rig.run(&estimate).stdout).expect("a summary");
     assert_eq!(summary["late"], 0);
     estimator.end();
     gateway.end();
@@ -862,7 +1038,8 @@ fn skewed_buses([force_torque, imu, motors]: [i64; 3], max_wait: f64, skew: Nano
     let setup = Setup::new(&arm.robot.config).expect("the robot's model");
     let offline = rows(&fs::read_to_string(&estimates).expect("estimates"));
     let live = recorder.estimate_rows(&setup);
-    // Header included; what waits for the next samples when they end is not estimated live.
+    // Including the header. The last instants, which still wait for samples at the end, are not
+    // estimated live.
     let rest = offline.len() - live.len();
     assert!(
         rest <= 3 + (max_wait / 10.0) as usize,
@@ -870,14 +1047,21 @@ fn skewed_buses([force_torque, imu, motors]: [i64; 3], max_wait: f64, skew: Nano
         live.len(),
         offline.len()
     );
-    let different = live.iter().filter(|(t, row)| offline.get(*t) != Some(row)).count();
+    let different = live
+        .iter()
+        .filter(|(t, row)| offline.get(*t) != Some(row))
+        .count();
     if different > 0 {
         return Err(format!("{different} of {} estimates differ", live.len()));
     }
-    let valid = recorder.estimates.values().filter(|e| all_valid(&e.torques)).count();
+    let valid = recorder
+        .estimates
+        .values()
+        .filter(|e| all_valid(&e.torques))
+        .count();
     let least = recorder.estimates.len() * 9 / 10;
     if valid <= least {
-        // Frames that come late are stamped late: motion is as uncertain as that.
+        // Late frames have late stamps, which makes the motion uncertain.
         return Err(format!("{valid} valid of {}", recorder.estimates.len()));
     }
     let triggers = recorder

@@ -1,11 +1,14 @@
-//! What the estimator would say without identification: a second pipeline, with the CAD's parameters, fed with the samples of the running demonstration.
+//! The estimates without identification: a second pipeline with the CAD's parameters, which
+//! processes the samples of the running demonstration.
 
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
 use proprio_topics::ipc::{Reader, TakeError};
-use proprio_topics::{ContactDeclaration, Description, MAX_CHANNELS, Nanos, Publisher, Role, Sample};
+use proprio_topics::{
+    ContactDeclaration, Description, MAX_CHANNELS, Nanos, Publisher, Role, Sample,
+};
 
-/// The second pipeline and what it reads.
+/// The second pipeline and its inputs.
 pub(super) struct Baseline {
     pipeline: Pipeline,
     samples: Reader<Sample>,
@@ -16,7 +19,7 @@ pub(super) struct Baseline {
     /// The gateway's epoch that `channels` belongs to.
     epoch: u64,
     inbox: Vec<Sample>,
-    /// As [`Baseline::finish`] gives them.
+    /// The results, as [`Baseline::finish`] returns them.
     torques: Vec<(Nanos, Box<[f64]>)>,
 }
 
@@ -39,21 +42,29 @@ impl Baseline {
         }
     }
 
-    /// Takes what is waiting.
+    /// Takes the waiting samples.
     pub(super) fn turn(&mut self) -> Result<(), TakeError> {
         while let Some(description) = self.descriptions.try_take()? {
             if description.publisher == Publisher::Gateway {
                 self.channels = (0..MAX_CHANNELS)
                     .map(|number| {
                         let entry = description.find(Role::Channel, u32::try_from(number).ok()?)?;
-                        self.pipeline.setup().channel(entry.kind, entry.name.as_str())
+                        self.pipeline
+                            .setup()
+                            .robot
+                            .channel(entry.kind, entry.name.as_str())
                     })
                     .collect();
                 self.epoch = description.header.epoch;
             }
         }
         while let Some(declared) = self.declarations.try_take()? {
-            if let Some(contact) = self.pipeline.setup().contact(declared.contact.as_str()) {
+            if let Some(contact) = self
+                .pipeline
+                .setup()
+                .robot
+                .contact(declared.contact.as_str())
+            {
                 self.pipeline
                     .declare(contact, declared.header.acquired, declared.active != 0);
             }
@@ -61,29 +72,44 @@ impl Baseline {
         while let Some(sample) = self.samples.try_take()? {
             self.inbox.push(sample);
         }
-        // Shared memory hands out all of one bus before the next one's; what comes too far behind others would be dropped.
+        // Shared memory returns all samples of one bus before those of the next; samples too far
+        // behind others would be dropped.
         self.inbox
             .sort_unstable_by_key(|s| (s.header.acquired, s.header.bus, s.header.sequence));
         for sample in std::mem::take(&mut self.inbox) {
-            let channel = self.channels.get(sample.channel as usize).copied().flatten();
+            let channel = self
+                .channels
+                .get(sample.channel as usize)
+                .copied()
+                .flatten();
             if let Some(channel) = channel.filter(|_| sample.header.epoch == self.epoch) {
-                self.pipeline
-                    .push(channel, sample.header.acquired, &sample.reading, sample.header.quality);
+                self.pipeline.push(
+                    channel,
+                    sample.header.acquired,
+                    &sample.reading,
+                    sample.header.quality,
+                );
                 self.keep();
             }
         }
         Ok(())
     }
 
-    /// Keeps what is estimated.
+    /// Stores the estimates.
     fn keep(&mut self) {
         while let Some(estimate) = self.pipeline.poll() {
-            let torques = estimate.torques.joints().iter().map(|joint| joint.torque).collect();
+            let torques = estimate
+                .torques
+                .joints()
+                .iter()
+                .map(|joint| joint.torque)
+                .collect();
             self.torques.push((estimate.t, torques));
         }
     }
 
-    /// The instants, ascending, with the joints' torques \[Nm\]; NaN where a channel was never seen.
+    /// The instants, ascending, with the joints' torques \[Nm\]; NaN where a channel was never
+    /// seen.
     pub(super) fn finish(mut self) -> Vec<(Nanos, Box<[f64]>)> {
         self.pipeline.finish();
         self.keep();
@@ -91,7 +117,7 @@ impl Baseline {
     }
 }
 
-/// What a [`Baseline`] reads.
+/// The inputs of a [`Baseline`].
 pub(super) struct Readers {
     pub(super) samples: Reader<Sample>,
     pub(super) descriptions: Reader<Description>,

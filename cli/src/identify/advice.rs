@@ -1,6 +1,8 @@
 //! What an outcome means, in plain words: whether to use the parameters, why, and what to do next.
 
-use proprio_estimator::identify::{Both, Finding, LogOutcome, Outcome, Role, Severity, Verdict};
+use proprio_identification::{
+    Both, Finding, FindingCode, LogOutcome, Outcome, Role, Severity, Verdict,
+};
 use std::collections::BTreeSet;
 
 /// Whether the identified parameters should be used.
@@ -8,14 +10,14 @@ use std::collections::BTreeSet;
 pub(crate) enum Grade {
     /// Yes.
     Accept,
-    /// They are sound as far as they go, but somebody should look at what is said first.
+    /// After a person has looked at the warnings.
     Care,
     /// No.
     Reject,
 }
 
 impl Grade {
-    /// As a word for programs.
+    /// The word for programs.
     pub(crate) fn word(self) -> &'static str {
         match self {
             Self::Accept => "accept",
@@ -24,7 +26,7 @@ impl Grade {
         }
     }
 
-    /// As a word for people.
+    /// The words for a person.
     pub(crate) fn headline(self) -> &'static str {
         match self {
             Self::Accept => "Accept",
@@ -37,7 +39,7 @@ impl Grade {
 /// An outcome in plain words.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Advice {
-    /// Use it or not.
+    /// Whether to use it.
     pub(crate) grade: Grade,
     /// Why: sentences that make one paragraph.
     pub(crate) why: Vec<String>,
@@ -45,7 +47,7 @@ pub(crate) struct Advice {
     pub(crate) next: Vec<String>,
 }
 
-/// A validation error so much larger than CAD's, relatively, is worse; so much smaller is better. Between the two they are equal.
+/// Relative difference of two validation errors below which they count as equal.
 const NOTICEABLE: f64 = 0.02;
 
 impl Advice {
@@ -58,34 +60,36 @@ impl Advice {
         };
         if let Verdict::Nothing(reason) = &outcome.verdict {
             this.grade = Grade::Reject;
-            this.why.push(format!("Nothing was identified: {}", stop(reason)));
             this.why
-                .push("No parameters were written; those in use stay as they are.".into());
+                .push(format!("Nothing was identified: {}", stop(reason)));
+            this.why.push("No parameters were written.".into());
             this.look_at_findings(outcome);
             return this;
         }
         this.say_errors(outcome);
         if outcome.verdict == Verdict::NoBetterThanCad {
             this.worsen(Grade::Care);
-            let why = if findings(outcome).any(|(_, f)| f.code == "not_checked") {
-                "The logs are too short to hold a part of them back and see what the parameters are worth there, so these were drawn back to the CAD's"
+            let why = if findings(outcome).any(|(_, f)| f.code == FindingCode::NotCrossValidated) {
+                "The logs are too short for cross-validation, so the parameters keep their CAD \
+                 values"
             } else {
-                "On stretches of the logs that were held back from the fit, the identified parameters did no better than the CAD's, so they were drawn back to these"
+                "In cross-validation the identified parameters predicted no better than the CAD's, \
+                 so the parameters keep their CAD values"
             };
-            this.why.push(format!(
-                "{why}: the offsets are worth having, the parameters are the CAD's."
-            ));
+            this.why
+                .push(format!("{why}; the offsets were identified."));
         } else {
             let back: Vec<&str> = outcome
                 .links
                 .iter()
-                .filter(|link| link.seen && link.kept == 0.0)
+                .filter(|link| link.seen && link.retained_fraction == 0.0)
                 .map(|link| link.name.as_str())
                 .collect();
             if !back.is_empty() {
                 this.worsen(Grade::Care);
                 this.why.push(format!(
-                    "Of {} the logs show no better parameters than the CAD's: these stay.",
+                    "{} keep their CAD parameters: in cross-validation the identified ones were no \
+                     better.",
                     back.join(", ")
                 ));
             }
@@ -93,17 +97,20 @@ impl Advice {
         if outcome.consistency.feasible.is_none() {
             this.worsen(Grade::Care);
             this.why
-                .push("Whether bodies exist that have what the logs say was not decided.".into());
+                .push("Physical consistency of the parameters could not be decided.".into());
         }
         if outcome.consistency.feasible == Some(false) {
-            // The parameters given are of bodies that can exist, the nearest; so it is what they are worth elsewhere that counts, if it is known.
+            // The parameters written are the nearest consistent ones; their validation error
+            // decides.
             this.worsen(Grade::Care);
             this.why.push(
-                "Taken alone, the logs ask for bodies that can not exist; the parameters are those of the nearest that can."
+                "The parameters that fit the logs best are physically inconsistent; the nearest \
+                 consistent ones were written."
                     .into(),
             );
             this.next.push(
-                "Check the signs, frames and units of the sensors and the joints' zero positions, and that no contact was left undeclared."
+                "Check the signs, frames and units of the sensors, the joints' zero positions, and \
+                 that every contact is declared."
                     .into(),
             );
         }
@@ -111,10 +118,16 @@ impl Advice {
         this.say_excitation(outcome);
         if this.grade != Grade::Reject {
             if !outcome.logs.iter().any(|log| log.role == Role::Validate) {
-                this.next.push("Record another motion, unlike these, and give it with --validate: only that shows how good the parameters are where they were not fitted.".into());
+                this.next.push(
+                    "Record a different motion and pass it with --validate: only that shows how \
+                     good the parameters are outside the training logs."
+                        .into(),
+                );
             }
             this.next.push(
-                "To use the result, name it in estimator.toml, parameters = \"parameters.toml\"; other programs load identified.urdf.".into(),
+                "To use the result, add parameters = \"parameters.toml\" to estimator.toml; other \
+                 programs load identified.urdf."
+                    .into(),
             );
         }
         this
@@ -126,29 +139,36 @@ impl Advice {
         }
     }
 
-    /// How far predictions are off: on the logs for validation, if there are any.
+    /// Prediction errors: on the validation logs, if there are any.
     fn say_errors(&mut self, outcome: &Outcome) {
         let validated = outcome.logs.iter().any(|log| log.role == Role::Validate);
-        let role = if validated { Role::Validate } else { Role::Train };
+        let role = if validated {
+            Role::Validate
+        } else {
+            Role::Train
+        };
         let mut compared = false;
         for log in outcome.logs.iter().filter(|log| log.role == role) {
             let Both { cad, identified } = log.predicted.relative_error;
             if !(cad.is_finite() && identified.is_finite()) {
                 if validated {
                     self.worsen(Grade::Care);
-                    self.why
-                        .push(format!("{} could not be compared with any prediction.", log.file));
+                    self.why.push(format!(
+                        "{} holds no measurement that can be compared with a prediction.",
+                        log.file
+                    ));
                 }
                 continue;
             }
             compared = true;
             let how = if validated {
-                ", which was not used for the fit"
+                ", which was not used for training"
             } else {
                 ""
             };
             self.why.push(format!(
-                "On {}{how}, {} predicted with the identified parameters are {} off, with the CAD's parameters {} ({}).",
+                "On {}{how}, the relative prediction error of {} is {} with the identified \
+                 parameters and {} with the CAD's ({}).",
                 log.file,
                 predicted(log),
                 percent(identified),
@@ -156,15 +176,20 @@ impl Advice {
                 if log.predicted.sensors.is_empty() {
                     "nothing was fitted to it"
                 } else {
-                    "nothing was fitted to it but a constant offset of each F/T channel, for both alike"
+                    "for both, only a constant offset of each F/T channel was fitted to it"
                 },
             ));
             if identified > cad * (1.0 + NOTICEABLE) {
                 if validated {
                     self.worsen(Grade::Reject);
-                    self.why.push("That is worse than the CAD: the parameters do not hold outside the motion that they were fitted to.".into());
+                    self.why.push(
+                        "That is worse than the CAD: the parameters are not valid outside the \
+                         training motion."
+                            .into(),
+                    );
                     self.next.push(format!(
-                        "Identify from richer motion: with {} among the training logs, or longer and faster ones.",
+                        "Identify from richer motion: add {} to the training logs, or record \
+                         longer and faster motion.",
                         log.file
                     ));
                 } else {
@@ -179,12 +204,13 @@ impl Advice {
         if !compared {
             self.worsen(Grade::Care);
             self.why.push(
-                "Nothing that was measured could be compared with what the parameters predict, so nothing shows what they are worth."
+                "No measurement could be compared with a prediction, so the quality of the \
+                 parameters is unknown."
                     .into(),
             );
         }
         if !validated {
-            self.why.push("No log was kept for validation.".into());
+            self.why.push("No validation log was given.".into());
         }
     }
 
@@ -196,12 +222,17 @@ impl Advice {
             return;
         }
         self.worsen(Grade::Care);
-        // What a fit to any motion would meet again; each once, although several logs may show it.
+        // Faults that every log of this robot would show; each once.
         let mut said = BTreeSet::new();
         for finding in all().filter(|f| {
             matches!(
                 f.code,
-                "wrong_sign" | "wrong_frame" | "joint_zero" | "units" | "wrong_units" | "scale" | "unexplained"
+                FindingCode::WrongSign
+                    | FindingCode::WrongFrame
+                    | FindingCode::EncoderOffset
+                    | FindingCode::WrongUnits
+                    | FindingCode::Scale
+                    | FindingCode::Unexplained
             )
         }) {
             if finding.severity >= Severity::Warning && said.insert(finding.text.as_str()) {
@@ -215,32 +246,32 @@ impl Advice {
             &format!("{total} findings")
         };
         self.next.push(format!(
-            "Look at the {what} listed under \"What was found\" before relying on the result."
+            "Read the {what} under \"Findings\" before you use the result."
         ));
     }
 
-    /// What the motion could not show.
+    /// What the motion did not excite.
     fn say_excitation(&mut self, outcome: &Outcome) {
-        let (rank, all) = (outcome.rank, outcome.structural_rank);
-        let mut parts = Vec::new();
-        if rank < all {
-            parts.push(format!(
-                "the motion shows {rank} of the {all} combinations of parameters that could show"
+        if outcome.effective.is_finite() && outcome.rank > 0 {
+            self.why.push(format!(
+                "Of {} identifiable combinations of inertial parameters the logs determine about \
+                 {:.0}; the CAD determines the others.",
+                outcome.structural_rank, outcome.effective
             ));
         }
-        if outcome.effective.is_finite() && rank > 0 {
-            parts.push(format!(
-                "the logs rather than the CAD decide about {:.0}",
-                outcome.effective
-            ));
-        }
-        if !parts.is_empty() {
-            self.why.push(format!("{}.", capital(&parts.join("; "))));
-        }
-        // Links that the weakest directions are about.
+        // Links in the least excited directions.
         let mut links: Vec<&str> = Vec::new();
-        for weak in outcome.weakest.iter().filter(|w| w.prior_share > 0.9).take(5) {
-            for link in outcome.links.iter().filter(|l| weak.links.contains(&l.link)) {
+        for weak in outcome
+            .weakest
+            .iter()
+            .filter(|w| w.prior_share > 0.9)
+            .take(5)
+        {
+            for link in outcome
+                .links
+                .iter()
+                .filter(|l| weak.links.contains(&l.link))
+            {
                 if !links.contains(&link.name.as_str()) {
                     links.push(&link.name);
                 }
@@ -249,7 +280,7 @@ impl Advice {
         links.truncate(4);
         if !links.is_empty() {
             self.next.push(format!(
-                "The logs say least about {}: motion that turns and shakes {} about more axes, and faster, would tell more.",
+                "The motion excites {} least: turn and accelerate {} about more axes, and faster.",
                 links.join(", "),
                 if links.len() == 1 { "it" } else { "them" }
             ));
@@ -257,7 +288,7 @@ impl Advice {
     }
 }
 
-/// All findings, with the log that each is about.
+/// All findings, each with its log if it concerns one.
 pub(crate) fn findings(outcome: &Outcome) -> impl Iterator<Item = (Option<&LogOutcome>, &Finding)> {
     let of_logs = outcome
         .logs
@@ -266,7 +297,7 @@ pub(crate) fn findings(outcome: &Outcome) -> impl Iterator<Item = (Option<&LogOu
     outcome.findings.iter().map(|f| (None, f)).chain(of_logs)
 }
 
-/// What a log lets be compared.
+/// What is compared with predictions in a log.
 fn predicted(log: &LogOutcome) -> &'static str {
     match (log.joints.is_empty(), log.sensors.is_empty()) {
         (false, true) => "joint torques",
@@ -291,7 +322,11 @@ pub(crate) fn percent(share: f64) -> String {
 /// With a full stop.
 fn stop(text: &str) -> String {
     let text = text.trim();
-    let stop = if text.ends_with(['.', '!', '?']) { "" } else { "." };
+    let stop = if text.ends_with(['.', '!', '?']) {
+        ""
+    } else {
+        "."
+    };
     format!("{text}{stop}")
 }
 
@@ -300,7 +335,8 @@ pub(crate) fn sentence(text: &str) -> String {
     capital(&stop(text))
 }
 
-/// With a capital letter, unless it starts with a name (which has a capital, a digit or an underscore in it).
+/// With a capital letter, unless it starts with a name (recognised by a digit, dot, slash or
+/// underscore).
 fn capital(text: &str) -> String {
     let first = text.split_whitespace().next().unwrap_or_default();
     if first
@@ -319,9 +355,9 @@ fn capital(text: &str) -> String {
 mod tests {
     use super::super::example;
     use super::*;
-    use proprio_estimator::identify::WeakDirection;
+    use proprio_identification::WeakDirection;
 
-    /// Nothing to complain of.
+    /// Without findings.
     fn good() -> Outcome {
         let mut outcome = example::outcome();
         outcome.logs.iter_mut().for_each(|log| log.findings.clear());
@@ -334,10 +370,13 @@ mod tests {
         assert_eq!(advice.grade, Grade::Accept, "{advice:?}");
         let why = advice.why.join(" ");
         assert!(
-            why.starts_with("On walk_2.csv, which was not used for the fit, "),
+            why.starts_with("On walk_2.csv, which was not used for training, "),
             "{why}"
         );
-        assert!(why.contains("2.35 % off, with the CAD's parameters 6.40 %"), "{why}");
+        assert!(
+            why.contains("is 2.35 % with the identified parameters and 6.40 % with the CAD's"),
+            "{why}"
+        );
         assert!(advice.next.iter().any(|n| n.contains("parameters.toml")));
         assert!(
             !advice.next.iter().any(|n| n.contains("--validate")),
@@ -347,7 +386,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_worse_than_cad_where_it_was_not_fitted_is_rejected() {
+    fn a_validation_error_above_the_cads_is_rejected() {
         let mut outcome = good();
         outcome.logs[1].predicted.relative_error.identified = 0.07;
         let advice = Advice::of(&outcome);
@@ -357,13 +396,13 @@ mod tests {
             "{:?}",
             advice.next
         );
-        // No better is not good enough to be accepted without a word.
+        // Equal to the CAD is not accepted without a remark.
         outcome.logs[1].predicted.relative_error.identified = 0.064;
         assert_eq!(Advice::of(&outcome).grade, Grade::Care);
     }
 
     #[test]
-    fn without_validation_that_is_the_next_thing_to_do() {
+    fn a_missing_validation_log_is_the_next_thing_to_do() {
         let mut outcome = good();
         outcome.logs.pop();
         let advice = Advice::of(&outcome);
@@ -372,11 +411,11 @@ mod tests {
             "{:?}",
             advice.next
         );
-        assert!(advice.why.iter().any(|n| n.contains("No log was kept for validation")));
+        assert!(advice.why.iter().any(|n| n.contains("No validation log")));
     }
 
     #[test]
-    fn impossible_bodies_findings_and_no_gain_each_lower_the_grade() {
+    fn inconsistency_findings_and_no_gain_each_lower_the_grade() {
         let mut outcome = good();
         outcome.consistency.feasible = Some(false);
         let advice = Advice::of(&outcome);
@@ -389,7 +428,7 @@ mod tests {
         let mut outcome = good();
         outcome.findings.push(Finding {
             severity: Severity::Warning,
-            code: "wrong_sign",
+            code: FindingCode::WrongSign,
             subject: "r_leg_ft_sensor".into(),
             text: "r_leg_ft_sensor seems to be mounted the wrong way round".into(),
         });
@@ -405,21 +444,24 @@ mod tests {
     }
 
     #[test]
-    fn what_no_parameters_explain_wants_care() {
+    fn an_unexplained_residual_lowers_the_grade() {
         let mut outcome = good();
         outcome.logs[0].findings.push(Finding {
             severity: Severity::Warning,
-            code: "unexplained",
+            code: FindingCode::Unexplained,
             subject: "wrench/r_leg_ft_sensor".into(),
             text: "wrench/r_leg_ft_sensor: 20 % is left".into(),
         });
         let advice = Advice::of(&outcome);
         assert_eq!(advice.grade, Grade::Care);
-        assert!(advice.next.iter().any(|n| n.contains("20 % is left")), "{advice:?}");
+        assert!(
+            advice.next.iter().any(|n| n.contains("20 % is left")),
+            "{advice:?}"
+        );
     }
 
     #[test]
-    fn what_was_compared_with_nothing_is_not_accepted() {
+    fn a_result_compared_with_nothing_is_not_accepted() {
         let nowhere = Both {
             cad: f64::NAN,
             identified: f64::NAN,
@@ -427,37 +469,44 @@ mod tests {
         let mut outcome = good();
         outcome.logs[1].predicted.relative_error = nowhere;
         let advice = Advice::of(&outcome);
-        assert_eq!(advice.grade, Grade::Care, "the log for validation: {advice:?}");
+        assert_eq!(
+            advice.grade,
+            Grade::Care,
+            "the log for validation: {advice:?}"
+        );
         outcome.logs.pop();
         assert_eq!(Advice::of(&outcome).grade, Grade::Accept);
         outcome.logs[0].predicted.relative_error = nowhere;
         let advice = Advice::of(&outcome);
         assert_eq!(advice.grade, Grade::Care);
         assert!(
-            advice.why.iter().any(|n| n.starts_with("Nothing that was measured")),
+            advice
+                .why
+                .iter()
+                .any(|n| n.starts_with("No measurement could")),
             "{advice:?}"
         );
     }
 
     #[test]
-    fn what_is_not_decided_or_partly_kept_is_said() {
+    fn undecided_consistency_and_partial_retention_are_reported() {
         let mut outcome = good();
         outcome.consistency.feasible = None;
         assert_eq!(Advice::of(&outcome).grade, Grade::Care);
         let mut outcome = good();
-        outcome.links[2].kept = 0.0;
+        outcome.links[2].retained_fraction = 0.0;
         let advice = Advice::of(&outcome);
         assert_eq!(advice.grade, Grade::Care);
         assert!(
-            advice.why.iter().any(|n| n.starts_with("Of r_ankle_1 the logs")),
+            advice.why.iter().any(|n| n.starts_with("r_ankle_1 keep")),
             "{advice:?}"
         );
     }
 
     #[test]
-    fn links_that_the_logs_say_least_about_are_named() {
+    fn the_least_excited_links_are_named() {
         let mut outcome = good();
-        // Of the second the logs say half.
+        // Half of the variance of the second is the prior's.
         let weak = |link: usize, prior_share: f64| WeakDirection {
             expression: "a direction".into(),
             links: vec![outcome.links[link].link],
@@ -467,7 +516,10 @@ mod tests {
         outcome.weakest = vec![weak(1, 1.0), weak(2, 0.5)];
         let (named, other) = (&outcome.links[1].name, &outcome.links[2].name);
         let next = Advice::of(&outcome).next.join(" ");
-        assert!(next.contains(&format!("The logs say least about {named}:")), "{next}");
+        assert!(
+            next.contains(&format!("The motion excites {named} least:")),
+            "{next}"
+        );
         assert!(!next.contains(other.as_str()), "{next}");
     }
 
@@ -475,7 +527,10 @@ mod tests {
     fn nothing_is_a_rejection_that_says_why() {
         let advice = Advice::of(&example::nothing());
         assert_eq!(advice.grade, Grade::Reject);
-        assert_eq!(advice.why[0], "Nothing was identified: no joint moved in any log.");
+        assert_eq!(
+            advice.why[0],
+            "Nothing was identified: no joint moved in any log."
+        );
     }
 
     #[test]

@@ -1,20 +1,23 @@
-//! An outcome made by hand for tests: something in every part of it, long names, numbers that are not there.
+//! An outcome made by hand for tests: something in every part of it, long names, numbers that are
+//! not there.
 
-use proprio_estimator::calibration::{Calibration, Kind, Unknown, force_first, gain_from_force_first};
-use proprio_estimator::config::Gain;
-use proprio_estimator::identify::{
-    BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot, Curve, Finding,
-    FrictionOutcome, JointOutcome, LeftOut, LinkOutcome, LogOutcome, OffsetOutcome, Outcome, Predicted, Role,
-    RotorOutcome, SensorOutcome, Severity, Spectrum, Three, TimeOffset, TwoRouteOutcome, Verdict, WeakDirection,
+use proprio_dynamics::calibration::{
+    Calibration, Gain, Kind, Unknown, force_first, gain_from_force_first,
 };
-use proprio_estimator::spatial::{RigidInertia, Wrench};
+use proprio_dynamics::spatial::{RigidInertia, Wrench};
+use proprio_identification::{
+    BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot,
+    Curve, Excluded, Finding, FindingCode, FrictionOutcome, JointOutcome, LinkOutcome, LogOutcome,
+    ModelComparison, OffsetOutcome, Outcome, Predicted, Role, RotorOutcome, SensorOutcome,
+    Severity, Spectrum, TimeOffset, TwoRouteOutcome, Verdict, WeakDirection,
+};
 use proprio_topics::Nanos;
 
 const JOINTS: [&str; 3] = ["r_hip_yaw", "r_knee", "r_ankle_pitch_with_a_long_name"];
 const LINKS: [&str; 4] = ["r_upper_leg", "r_lower_leg", "r_ankle_1", "r_foot"];
 
-fn three<T>(cad: T, cad_fitted: T, identified: T) -> Three<T> {
-    Three {
+fn three<T>(cad: T, cad_fitted: T, identified: T) -> ModelComparison<T> {
+    ModelComparison {
         cad,
         cad_fitted,
         identified,
@@ -57,10 +60,19 @@ fn curve(name: &str, unit: &'static str, n: usize) -> Curve {
             .iter()
             .map(|t| torque(*t) * 0.93 + 0.2 * (1.9 * t).cos() * moving(*t))
             .collect(),
-        identified: t.iter().map(|t| torque(*t) * 0.995 + 0.04 * (1.9 * t).cos()).collect(),
+        identified: t
+            .iter()
+            .map(|t| torque(*t) * 0.995 + 0.04 * (1.9 * t).cos())
+            .collect(),
         sigma: t
             .iter()
-            .map(|t| if *t < 4.0 { 3.0 } else { 0.05 + 0.4 / (t - 3.0) })
+            .map(|t| {
+                if *t < 4.0 {
+                    3.0
+                } else {
+                    0.05 + 0.4 / (t - 3.0)
+                }
+            })
             .collect(),
         t,
     }
@@ -72,26 +84,48 @@ fn log(file: &str, role: Role) -> LogOutcome {
         role,
         span: (at(0.0), at(30.0)),
         used: 2700,
-        left_out: vec![
-            LeftOut { reason: "too close to the beginning, the end or a gap for accelerations".into(), instants: 60, first: at(0.0), last: at(30.0) },
-            LeftOut { reason: "contact declared: right_foot".into(), instants: 240, first: at(12.0), last: at(14.4) },
+        excluded: vec![
+            Excluded {
+                reason: "too close to the beginning, the end or a gap for accelerations".into(),
+                instants: 60,
+                first: at(0.0),
+                last: at(30.0),
+            },
+            Excluded {
+                reason: "contact declared: right_foot".into(),
+                instants: 240,
+                first: at(12.0),
+                last: at(14.4),
+            },
         ],
         onset: Some(at(4.0)),
         predicted: Predicted {
             relative_error: both(0.064, 0.0235),
             relative_error_with_drift: both(0.06, 0.0225),
             joints: vec![("r_knee".into(), both(0.24, 0.09))],
-            sensors: vec![("r_leg_ft_sensor".into(), both([0.6, 3.0, 0.6, 0.3, 0.2, 0.1], [0.5; 6]))],
+            sensors: vec![(
+                "r_leg_ft_sensor".into(),
+                both([0.6, 3.0, 0.6, 0.3, 0.2, 0.1], [0.5; 6]),
+            )],
             two_route: vec![("r_knee".into(), both(0.25, 0.14))],
         },
         fitted_error: three(f64::NAN, 0.054, 0.0215),
         joints: JOINTS
             .iter()
-            .map(|j| JointOutcome { name: (*j).into(), rms_nm: three(0.9, 0.2, 0.07), measured_rms_nm: 3.1, coverage: 0.946 })
+            .map(|j| JointOutcome {
+                name: (*j).into(),
+                rms_nm: three(0.9, 0.2, 0.07),
+                measured_rms_nm: 3.1,
+                coverage: 0.946,
+            })
             .collect(),
         sensors: vec![SensorOutcome {
             name: "r_leg_ft_sensor".into(),
-            rms: three([f64::NAN; 6], [0.5, 2.9, 0.5, 0.22, 0.1, 0.04], [0.4, 0.9, 0.45, 0.1, 0.09, 0.04]),
+            rms: three(
+                [f64::NAN; 6],
+                [0.5, 2.9, 0.5, 0.22, 0.1, 0.04],
+                [0.4, 0.9, 0.45, 0.1, 0.09, 0.04],
+            ),
             coverage: [0.95, 0.94, 0.968, 0.95, 0.97, 0.93],
         }],
         two_route: vec![TwoRouteOutcome {
@@ -105,20 +139,35 @@ fn log(file: &str, role: Role) -> LogOutcome {
             end: [-289.0, 12.5, 3.1, 1.01, -2.1, 0.12],
             deviation: [0.1, 0.1, 0.2, 0.01, 0.01, 0.01],
             rate: [0.05, 0.04, 0.1, 0.002, 0.002, 0.001],
-            breaks: vec![at(17.3)],
+            offset_jumps: vec![at(17.3)],
         }],
-        friction: vec![FrictionOutcome { joint: "r_knee".into(), coulomb_nm: 0.41, viscous: 0.08, offset_nm: -0.02, deviation: [0.01, 0.004, 0.02] }],
+        friction: vec![FrictionOutcome {
+            joint: "r_knee".into(),
+            coulomb_nm: 0.41,
+            viscous: 0.08,
+            offset_nm: -0.02,
+            deviation: [0.01, 0.004, 0.02],
+        }],
         findings: vec![Finding {
             severity: Severity::Warning,
-            code: "jump",
+            code: FindingCode::OffsetJump,
             subject: "r_leg_ft_sensor".into(),
-            text: "r_leg_ft_sensor: fx jumps by 20.1 N at 17.30 s, which no motion explains (a cable, internal stress): its offset starts afresh there".into(),
+            text: "r_leg_ft_sensor: fx jumps by 20.1 N at 17.30 s, which no motion explains (a \
+                   cable, internal stress): its offset starts afresh there"
+                .into(),
         }],
-        curves: JOINTS.iter().enumerate().map(|(i, j)| curve(j, "Nm", i)).chain([curve("r_leg_ft_sensor fx", "N", 7)]).collect(),
+        curves: JOINTS
+            .iter()
+            .enumerate()
+            .map(|(i, j)| curve(j, "Nm", i))
+            .chain([curve("r_leg_ft_sensor fx", "N", 7)])
+            .collect(),
         spectra: vec![Spectrum {
             name: "joint/r_knee/torque".into(),
             frequency: (0..200).map(|i| f64::from(i) * 0.25).collect(),
-            cad_fitted: (0..200).map(|i| 0.1 / (1.0 + f64::from(i).powi(2))).collect(),
+            cad_fitted: (0..200)
+                .map(|i| 0.1 / (1.0 + f64::from(i).powi(2)))
+                .collect(),
             identified: (0..200).map(|i| 0.01 / (1.0 + f64::from(i))).collect(),
         }],
     }
@@ -128,7 +177,18 @@ fn log(file: &str, role: Role) -> LogOutcome {
 pub(crate) fn outcome() -> Outcome {
     let bodies = LINKS.iter().enumerate().map(|(i, name)| {
         let size = i as f64 + 1.0;
-        let cad = [1.0 / size, 0.01, -0.02, 0.03, 0.004, 0.0001, 0.0, 0.005, 0.0002, 0.003];
+        let cad = [
+            1.0 / size,
+            0.01,
+            -0.02,
+            0.03,
+            0.004,
+            0.0001,
+            0.0,
+            0.005,
+            0.0002,
+            0.003,
+        ];
         let identified = cad.map(|p| p * 1.12);
         LinkOutcome {
             link: i + 1,
@@ -137,7 +197,7 @@ pub(crate) fn outcome() -> Outcome {
             floored: (i == 2).then(|| RigidInertia::from_parameters(&cad)),
             identified: RigidInertia::from_parameters(&identified),
             deviation: cad.map(|p| p.abs() * 0.03 + 1e-4),
-            kept: 1.0,
+            retained_fraction: 1.0,
             significance: 4.2 / size,
             seen: i > 0,
         }
@@ -149,7 +209,9 @@ pub(crate) fn outcome() -> Outcome {
             _ => ("kg m^2", 0.004),
         };
         BaseParameterOutcome {
-            expression: format!("r_lower_leg.I_xx + r_ankle_1.I_yy - 0.25 r_foot.h_{i} + 0.0221 r_foot.m"),
+            expression: format!(
+                "r_lower_leg.I_xx + r_ankle_1.I_yy - 0.25 r_foot.h_{i} + 0.0221 r_foot.m"
+            ),
             unit,
             cad: size * noise(i),
             identified: size * (noise(i) + 0.2 * noise(i + 50)),
@@ -160,17 +222,27 @@ pub(crate) fn outcome() -> Outcome {
         robot: "icub_legs".into(),
         verdict: Verdict::Identified,
         links: bodies.collect(),
-        covariance: CovarianceRoot { columns: vec![], calibrations: vec![], root: Default::default() },
-        rotors: vec![RotorOutcome { joint: "r_knee".into(), inertia: 0.052, deviation: 0.003 }],
+        covariance: CovarianceRoot {
+            columns: vec![],
+            calibrations: vec![],
+            root: Default::default(),
+        },
+        rotors: vec![RotorOutcome {
+            joint: "r_knee".into(),
+            inertia: 0.052,
+            deviation: 0.003,
+        }],
         calibrations: vec![calibration()],
         tau: 0.58,
-        shrink: 1.0,
+        least_retained_fraction: 1.0,
         unknowns: 40,
         rank: 31,
         structural_rank: 38,
         effective: 14.3,
         condition: 3.2e5,
-        singular_values: (0..31).map(|i| 300.0 * 10f64.powf(-f64::from(i) * 0.18)).collect(),
+        singular_values: (0..31)
+            .map(|i| 300.0 * 10f64.powf(-f64::from(i) * 0.18))
+            .collect(),
         weakest: (0..20)
             .map(|i| WeakDirection {
                 expression: format!("r_foot.I_zz - 0.4{i} r_lower_leg.h_z"),
@@ -179,7 +251,11 @@ pub(crate) fn outcome() -> Outcome {
                 prior_share: 1.0 - 0.02 * f64::from(i),
             })
             .collect(),
-        confused: vec!["the offset of r_leg_ft_sensor along gravity and the mass of the leg: nothing turned about a horizontal axis".into()],
+        not_separable: vec![
+            "the offset of r_leg_ft_sensor along gravity and the mass of the leg: nothing turned \
+             about a horizontal axis"
+                .into(),
+        ],
         base_parameters: base.collect(),
         channels: ["fx", "fy", "fz", "tx", "ty", "tz"]
             .iter()
@@ -192,14 +268,28 @@ pub(crate) fn outcome() -> Outcome {
                 drift: 0.01,
             })
             .collect(),
-        time_offsets: vec![TimeOffset { channel: "wrench/r_leg_ft_sensor".into(), seconds: 0.0061, deviation: 0.0004, significant: true }],
-        consistency: Consistency { feasible: Some(true), deviations: 0.4, links: vec![], text: "bodies exist that have what the logs say".into() },
-        logs: vec![log("walk_1.csv", Role::Train), log("walk_2.csv", Role::Validate)],
+        time_offsets: vec![TimeOffset {
+            channel: "wrench/r_leg_ft_sensor".into(),
+            seconds: 0.0061,
+            deviation: 0.0004,
+            significant: true,
+        }],
+        consistency: Consistency {
+            feasible: Some(true),
+            deviations: 0.4,
+            links: vec![],
+            text: "bodies exist that have what the logs say".into(),
+        },
+        logs: vec![
+            log("walk_1.csv", Role::Train),
+            log("walk_2.csv", Role::Validate),
+        ],
         findings: vec![Finding {
             severity: Severity::Note,
-            code: "beyond",
+            code: FindingCode::InertiaRegularised,
             subject: "r_upper_leg".into(),
-            text: "r_upper_leg lies above r_leg_ft_sensor: nothing measured tells its parameters".into(),
+            text: "r_upper_leg lies above r_leg_ft_sensor: nothing measured tells its parameters"
+                .into(),
         }],
     }
 }
@@ -212,11 +302,18 @@ fn calibration() -> CalibrationOutcome {
     };
     let error: Vec<f64> = (0..12).map(|i| 0.05 * noise(i)).collect();
     let gain: Vec<f64> = force_first(&error[..6]).iter().map(|x| 1.0 + x).collect();
-    let per_kelvin = Wrench::from_parts([error[9], error[10], error[11]], [error[6], error[7], error[8]]);
+    let per_kelvin = Wrench::from_parts(
+        [error[9], error[10], error[11]],
+        [error[6], error[7], error[8]],
+    );
     CalibrationOutcome {
         sensor: "r_leg_ft_sensor".into(),
         workbench: Calibration::default(),
-        identified: Calibration::new(gain_from_force_first(&gain).unwrap(), per_kelvin, Some(31.2)),
+        identified: Calibration::new(
+            gain_from_force_first(&gain).unwrap(),
+            per_kelvin,
+            Some(31.2),
+        ),
         kind,
         deviation: error.iter().map(|x| 0.1 * x.abs() + 1e-4).collect(),
         prior: kind
@@ -237,7 +334,12 @@ fn calibration() -> CalibrationOutcome {
 pub(crate) fn nothing() -> Outcome {
     let mut outcome = outcome();
     outcome.verdict = Verdict::Nothing("no joint moved in any log".into());
-    (outcome.tau, outcome.rank, outcome.condition, outcome.effective) = (f64::NAN, 0, f64::NAN, 0.0);
+    (
+        outcome.tau,
+        outcome.rank,
+        outcome.condition,
+        outcome.effective,
+    ) = (f64::NAN, 0, f64::NAN, 0.0);
     outcome.singular_values.clear();
     outcome.weakest.clear();
     outcome.base_parameters.clear();
@@ -261,9 +363,11 @@ pub(crate) fn nothing() -> Outcome {
         log.friction.clear();
         log.findings = vec![Finding {
             severity: Severity::Refusal,
-            code: "no_motion",
+            code: FindingCode::NoMotion,
             subject: String::new(),
-            text: "no joint moved by more than its noise: nothing but an offset can be told from this log; record the robot moving".into(),
+            text: "no joint moved by more than its noise: nothing but an offset can be told from \
+                   this log; record the robot moving"
+                .into(),
         }];
     }
     outcome

@@ -1,63 +1,94 @@
 //! `summary.json`: an outcome for programs.
 //!
-//! A number that is not there (nothing to compare, not measured) is `null`. SI units; six numbers of an F/T sensor are in the order `fx fy fz tx ty tz` [N, Nm]; times within a log are
-//! seconds since its first stamp. Wherever three sets of parameters are compared, it is as {`cad`, `cad_fitted`, `identified`}: the CAD with the configured offsets, the CAD with
-//! offsets and friction fitted to that log, the identified parameters with offsets and friction fitted to that log.
+//! A number that is not there (nothing to compare, not measured) is `null`. SI units; six numbers
+//! of an F/T sensor are in the order `fx fy fz tx ty tz` [N, Nm]; times within a log are seconds
+//! since its first stamp. Wherever three sets of parameters are compared, it is as {`cad`,
+//! `cad_fitted`, `identified`}: the CAD with the configured offsets, the CAD with offsets and
+//! friction fitted to that log, the identified parameters with offsets and friction fitted to that
+//! log.
 //!
 //! | key | what it is |
 //! |---|---|
-//! | `schema` | 1 |
-//! | `robot`, `version` | the robot's name, this program's version |
-//! | `verdict` | `identified`; `no_better_than_cad` (held-out data showed no gain, or there was too little to hold any back: the parameters are the CAD's); `nothing` (no parameters at all) |
+//! | `schema` | 2 |
+//! | `robot`, `version` | the name of the robot, the version of this program |
+//! | `verdict` | `identified`, `no_better_than_cad` or `nothing` |
 //! | `reason` | why nothing was identified, in words; else `null` |
 //! | `advice` | {`grade`: `accept`, `care` or `reject`; `why`: sentences; `next`: what to do} |
-//! | `logs` | a list, in the order given on the command line: below |
-//! | `tau` | the prior's scale, chosen from the data: how far the CAD is from the robot, relatively; at most 1 |
-//! | `shrink` | the least share of the change from CAD that was kept of any link after the held-out check, 0 to 1 (`links`: of each) |
-//! | `unknowns`, `structural_rank`, `rank`, `effective` | inertial parameters; combinations of them that the robot's structure lets show; those that the logs show; how many the logs rather than the prior decide |
-//! | `condition`, `singular_values` | of what the logs tell, columns scaled by the prior's spread |
-//! | `weakest` | worst first: {`expression`, `relative`: singular value over the greatest, `prior_share`: share of its variance that is the prior's} |
-//! | `confused` | what the motion of the logs can not tell apart, in words |
-//! | `time_offsets` | {`channel`, `seconds` (late is positive), `deviation`, `significant`}: told, not removed |
-//! | `consistency` | {`feasible`: whether bodies exist that have what the logs say (`null`: not decided), `deviations`: by how many sigma not, `links`, `text`} |
-//! | `findings` | what is wrong, in words: {`log` or `null`, `severity`: `note`, `warning`, `refusal`; `code`: one word; `subject`: a channel, joint or link; `text`} |
-//! | `links` | {`name`, `seen`, `kept`: which share of the change from CAD was kept after the held-out check, `significance`, `cad`, `identified`, `deviation`: ten numbers each, m h_x h_y h_z I_xx I_xy I_xz I_yy I_yz I_zz about the link's origin} |
-//! | `base_parameters` | {`expression`, `unit`, `cad`, `identified`, `deviation`} |
-//! | `rotor_inertia` | {joint: {`kgm2`: of the rotor, times the square of the gear ratio (kg if the joint slides), `deviation`}}, of joints whose motors' torques were measured |
-//! | `calibration` | {sensor: {`gain`: all of it, 36 numbers row by row, rows and columns fx fy fz tx ty tz; `gain_error`: what was found wrong with the workbench's, relative to what that corrects, 6 numbers (a diagonal) or 36, `gain_deviation`, `gain_prior_deviation`: before any log; `per_kelvin`: six numbers, `per_kelvin_deviation`, `reference_celsius`}}, where it was asked for |
-//! | `channels` | noise of each measured number: {`name`, `unit`, `deviation`, `autocorrelation_s`, `drift`: `unit` per square root of second} |
+//! | `logs` | a list, in the order of the command line: below |
+//! | `tau` | scale of the prior, chosen from the data: relative error of the CAD, at most 1 |
+//! | `least_retained_fraction` | the least `retained_fraction` of `links` |
+//! | `parameters` | how many inertial parameters there are |
+//! | `structural_rank` | combinations of them that the robot's structure makes identifiable |
+//! | `rank` | combinations that the logs depend on, offsets drifting (above rounding) |
+//! | `effective_parameters` | combinations determined by the logs rather than the prior |
+//! | `condition`, `singular_values` | of the logs' information, scaled by the prior |
+//! | `weakest` | worst first: {`expression`, `relative`, `prior_share`}: below |
+//! | `not_separable` | combinations that the motion of the logs can not separate, in words |
+//! | `time_offsets` | {`channel`, `seconds` (> 0: late), `std`, `significant`}: not corrected |
+//! | `feasibility` | {`feasible`, `standard_deviations`, `links`, `text`}: below |
+//! | `findings` | {`log` or `null`, `severity`, `code`, `subject`, `text`}: below |
+//! | `links` | a list: below |
+//! | `base_parameters` | {`expression`, `unit`, `cad`, `identified`, `std`} |
+//! | `rotor_inertia` | {joint: {`kgm2`, `std`}}: inertia times the square of the gear ratio |
+//! | `calibration` | {sensor: ...}: below, where it was requested |
+//! | `channels` | noise: {`name`, `unit`, `std`, `autocorrelation_s`, `drift`: unit per s^½} |
+//!
+//! - `verdict`: `no_better_than_cad` if held-out data showed no gain, or there was too little to
+//!   hold any back: the parameters are those of the CAD then; `nothing`: there are no parameters.
+//! - `weakest`: `relative` is the singular value over the greatest; `prior_share` is the share of
+//!   the variance that is the prior's.
+//! - `feasibility`: `feasible` is whether physical bodies with the identified parameters exist
+//!   (`null`: not decided), `standard_deviations` how far the nearest physical bodies are.
+//! - `findings`: `severity` is `note`, `warning` or `refusal`; `code` one word
+//!   ([`proprio_identification::FindingCode`]); `subject` a channel, joint or link.
+//! - `links`: {`name`, `observed`, `retained_fraction`: share of the change from the CAD that is
+//!   retained after cross-validation, `significance`, `cad`, `identified`, `std`}; ten numbers
+//!   each, `m h_x h_y h_z I_xx I_xy I_xz I_yy I_yz I_zz` about the origin of the link.
+//! - `calibration`: {`gain`: 36 numbers row by row, rows and columns `fx fy fz tx ty tz`;
+//!   `gain_error`: error of the factory's gain, relative to corrected readings, 6 numbers (a
+//!   diagonal) or 36; `gain_std`; `gain_prior_std`: before any log; `per_kelvin`: six numbers;
+//!   `per_kelvin_std`; `reference_celsius`}.
 //!
 //! A log:
 //!
 //! | key | what it is |
 //! |---|---|
 //! | `file`, `role` | its file name; `train` or `validate` |
-//! | `span_s`, `used`, `left_out` | its length; instants used; those not used: a list of {`reason`, `instants`, `first_s`, `last_s`} |
+//! | `span_s`, `observations` | its length; how many observations are used |
+//! | `excluded` | those not used: {`reason`, `observations`, `first_s`, `last_s`} |
 //! | `onset_s` | when the robot began to move; `null`: from the start, or never |
-//! | `predicted` | what the parameters are judged by: below |
-//! | `fitted_error` | the three: norm of (predicted - measured) over norm of measured, with offsets that walk, and friction, fitted to the log |
-//! | `joints` | {name: {`rms_nm`: the three, `measured_rms_nm`, `coverage`: share of instants within 1.96 sigma}}, of joints with a measured torque |
-//! | `sensors` | {name: {`rms`: the three, six numbers each; `coverage`: share of instants within 1.96 sigma, six numbers}} |
-//! | `two_route_rms_nm`, `two_route_rms_mean_removed_nm` | {joint: the three}: RMS of the difference between the torque from one side's F/T sensor and from the other's, and the same without its mean |
-//! | `offsets` | {sensor: {`start`, `end`, `deviation`, `rate`: six numbers each, `breaks_s`}} |
-//! | `friction` | {joint: {`coulomb_nm`, `viscous`: Nm s/rad, `offset_nm`, `deviation`: of the three}} |
+//! | `predicted` | the prediction errors by which parameters are judged: below |
+//! | `fitted_error` | the three: relative error, with drifting offsets and friction fitted |
+//! | `joints` | {name: {`rms_nm`: the three, `measured_rms_nm`, `coverage`}} |
+//! | `sensors` | {name: {`rms`: the three, six numbers each; `coverage`: six numbers}} |
+//! | `two_route_rms_nm` | {joint: the three}: RMS of the difference between the two torques |
+//! | `two_route_rms_mean_removed_nm` | the same without the mean of the difference |
+//! | `offsets` | {sensor: {`start`, `end`, `std`, `rate`: six numbers each, `offset_jumps_s`}} |
+//! | `friction` | {joint: {`coulomb_nm`, `viscous`: Nm s/rad, `offset_nm`, `std`: of the three}} |
 //!
-//! `predicted`, of the CAD and of the identified parameters, {`cad`, `identified`}: parameters, gains
-//! and friction are those from the training logs, and nothing is fitted to the log but one constant
-//! offset of each F/T channel. It depends on that log and the parameters alone.
+//! `coverage` is the share of observations within 1.96 standard deviations. The two torques of
+//! `two_route` are those from the F/T sensors on either side of the joint.
+//!
+//! `predicted`, of the CAD and of the identified parameters, {`cad`, `identified`}: parameters,
+//! gains and friction are those from the training logs, and nothing is fitted to the log but one
+//! constant offset of each F/T channel. It depends on that log and the parameters alone.
 //!
 //! | key | what it is |
 //! |---|---|
-//! | `relative_error` | norm of (predicted - measured) over norm of measured: of joint torques if any was measured, else of F/T readings without their mean |
-//! | `relative_error_with_drift` | the same of F/T readings, a linear drift of each channel fitted, too |
+//! | `relative_error` | norm of (predicted - measured) over norm of measured |
+//! | `relative_error_with_drift` | the same with a linear drift of each F/T channel fitted, too |
 //! | `joints_rms_nm` | {name: RMS}, of joints with a measured torque |
-//! | `sensors_rms` | {name: RMS, six numbers}, of what each sensor reads less what all else predicts |
-//! | `two_route_rms_nm` | {joint: RMS}, of the difference between the torque from one side's F/T sensor and from the other's |
+//! | `sensors_rms` | {name: RMS, six numbers} of readings less predicted readings |
+//! | `two_route_rms_nm` | {joint: RMS}, of the difference between the two torques |
+//!
+//! `relative_error` is that of joint torques if any was measured, else of F/T readings without
+//! mean.
 
 use super::advice::{Advice, findings};
-use proprio_estimator::calibration::force_first;
-use proprio_estimator::identify::{
-    Both, CalibrationOutcome, LogOutcome, Outcome, Predicted, Role, Severity, Three, Verdict,
+use proprio_dynamics::calibration::force_first;
+use proprio_identification::{
+    Both, CalibrationOutcome, LogOutcome, ModelComparison, Outcome, Predicted, Role, Severity,
+    Verdict,
 };
 use proprio_topics::Nanos;
 use serde_json::{Map, Value as Json, json};
@@ -73,105 +104,154 @@ pub(crate) fn summary(outcome: &Outcome, advice: &Advice) -> Json {
     let time_offsets: Vec<Json> = outcome
         .time_offsets
         .iter()
-        .map(|o| json!({ "channel": o.channel, "seconds": o.seconds, "deviation": o.deviation, "significant": o.significant }))
+        .map(|o| {
+            json!({
+                "channel": o.channel, "seconds": o.seconds, "std": o.deviation,
+                "significant": o.significant,
+            })
+        })
         .collect();
     let found: Vec<Json> = findings(outcome)
         .map(|(log, f)| {
-            json!({ "log": log.map(|l| &l.file), "severity": severity(f.severity), "code": f.code, "subject": f.subject, "text": f.text })
+            json!({
+                "log": log.map(|l| &l.file), "severity": severity(f.severity),
+                "code": f.code.as_str(), "subject": f.subject, "text": f.text,
+            })
         })
         .collect();
     let weakest: Vec<Json> = outcome
         .weakest
         .iter()
-        .map(|w| json!({ "expression": w.expression, "relative": w.relative, "prior_share": w.prior_share }))
+        .map(|w| {
+            json!({
+                "expression": w.expression, "relative": w.relative, "prior_share": w.prior_share,
+            })
+        })
         .collect();
     let links: Vec<Json> = outcome
         .links
         .iter()
         .map(|l| {
             json!({
-                "name": l.name, "seen": l.seen, "kept": l.kept, "significance": l.significance,
-                "cad": l.cad.parameters(), "identified": l.identified.parameters(), "deviation": l.deviation,
+                "name": l.name, "observed": l.seen, "retained_fraction": l.retained_fraction,
+                "significance": l.significance,
+                "cad": l.cad.parameters(), "identified": l.identified.parameters(),
+                "std": l.deviation,
             })
         })
         .collect();
     let base: Vec<Json> = outcome
         .base_parameters
         .iter()
-        .map(|b| json!({ "expression": b.expression, "unit": b.unit, "cad": b.cad, "identified": b.identified, "deviation": b.deviation }))
+        .map(|b| json!({
+            "expression": b.expression, "unit": b.unit, "cad": b.cad, "identified": b.identified,
+            "std": b.deviation,
+        }))
         .collect();
     let channels: Vec<Json> = outcome
         .channels
         .iter()
-        .map(|c| json!({ "name": c.name, "unit": c.unit, "deviation": c.deviation, "autocorrelation_s": c.autocorrelation_seconds, "drift": c.drift }))
+        .map(|c| {
+            json!({
+                "name": c.name, "unit": c.unit, "std": c.deviation,
+                "autocorrelation_s": c.autocorrelation_seconds, "drift": c.drift,
+            })
+        })
         .collect();
     let rotors = object(&outcome.rotors, |r| {
-        (&r.joint, json!({ "kgm2": r.inertia, "deviation": r.deviation }))
+        (&r.joint, json!({ "kgm2": r.inertia, "std": r.deviation }))
     });
     let calibration = object(&outcome.calibrations, |c| (&c.sensor, calibration(c)));
     let c = &outcome.consistency;
     json!({
-        "schema": 1, "robot": outcome.robot, "version": env!("CARGO_PKG_VERSION"),
+        "schema": 2, "robot": outcome.robot, "version": env!("CARGO_PKG_VERSION"),
         "verdict": verdict, "reason": reason,
         "advice": { "grade": advice.grade.word(), "why": advice.why, "next": advice.next },
         "logs": outcome.logs.iter().map(log).collect::<Vec<_>>(),
-        "tau": outcome.tau, "shrink": outcome.shrink,
-        "unknowns": outcome.unknowns, "structural_rank": outcome.structural_rank, "rank": outcome.rank, "effective": outcome.effective,
+        "tau": outcome.tau, "least_retained_fraction": outcome.least_retained_fraction,
+        "parameters": outcome.unknowns, "structural_rank": outcome.structural_rank,
+        "rank": outcome.rank, "effective_parameters": outcome.effective,
         "condition": outcome.condition, "singular_values": outcome.singular_values,
-        "weakest": weakest, "confused": outcome.confused, "time_offsets": time_offsets,
-        "consistency": { "feasible": c.feasible, "deviations": c.deviations, "links": c.links, "text": c.text },
-        "findings": found, "links": links, "base_parameters": base, "rotor_inertia": rotors, "calibration": calibration, "channels": channels,
+        "weakest": weakest, "not_separable": outcome.not_separable, "time_offsets": time_offsets,
+        "feasibility": {
+            "feasible": c.feasible, "standard_deviations": c.deviations, "links": c.links,
+            "text": c.text,
+        },
+        "findings": found, "links": links, "base_parameters": base, "rotor_inertia": rotors,
+        "calibration": calibration, "channels": channels,
     })
 }
 
 fn calibration(c: &CalibrationOutcome) -> Json {
     let gains = c.kind.count() - 6 * usize::from(c.kind.temperature);
-    let part = |values: &[f64], range: Range<usize>| force_first(values.get(range).unwrap_or_default());
+    let part =
+        |values: &[f64], range: Range<usize>| force_first(values.get(range).unwrap_or_default());
     let of_gain = |values: &[f64]| part(values, 0..gains);
     let of_temperature = |values: &[f64]| part(values, gains..values.len());
     json!({
         "gain": c.identified.gain_force_first().to_vec(),
-        "gain_error": of_gain(&c.error), "gain_deviation": of_gain(&c.deviation), "gain_prior_deviation": of_gain(&c.prior),
-        "per_kelvin": c.identified.per_kelvin().force_first(), "per_kelvin_deviation": of_temperature(&c.deviation),
+        "gain_error": of_gain(&c.error), "gain_std": of_gain(&c.deviation),
+        "gain_prior_std": of_gain(&c.prior),
+        "per_kelvin": c.identified.per_kelvin().force_first(),
+        "per_kelvin_std": of_temperature(&c.deviation),
         "reference_celsius": c.identified.reference(),
     })
 }
 
 fn log(log: &LogOutcome) -> Json {
     let since = |t: Nanos| (t - log.span.0).seconds();
-    let left_out: Vec<Json> = log
-        .left_out
+    let excluded: Vec<Json> = log
+        .excluded
         .iter()
-        .map(|l| json!({ "reason": l.reason, "instants": l.instants, "first_s": since(l.first), "last_s": since(l.last) }))
+        .map(|l| {
+            json!({
+                "reason": l.reason, "observations": l.instants, "first_s": since(l.first),
+                "last_s": since(l.last),
+            })
+        })
         .collect();
     let joints = object(&log.joints, |j| {
-        let rest = json!({ "rms_nm": three(&j.rms_nm), "measured_rms_nm": j.measured_rms_nm, "coverage": j.coverage });
+        let rest = json!({
+            "rms_nm": three(&j.rms_nm), "measured_rms_nm": j.measured_rms_nm,
+            "coverage": j.coverage,
+        });
         (&j.name, rest)
     });
     let sensors = object(&log.sensors, |s| {
-        (&s.name, json!({ "rms": three(&s.rms), "coverage": s.coverage }))
+        (
+            &s.name,
+            json!({ "rms": three(&s.rms), "coverage": s.coverage }),
+        )
     });
     let offsets = object(&log.offsets, |o| {
-        let breaks: Vec<f64> = o.breaks.iter().map(|t| since(*t)).collect();
+        let jumps: Vec<f64> = o.offset_jumps.iter().map(|t| since(*t)).collect();
         (
             &o.sensor,
-            json!({ "start": o.start, "end": o.end, "deviation": o.deviation, "rate": o.rate, "breaks_s": breaks }),
+            json!({
+                "start": o.start, "end": o.end, "std": o.deviation, "rate": o.rate,
+                "offset_jumps_s": jumps,
+            }),
         )
     });
     let friction = object(&log.friction, |f| {
         (
             &f.joint,
-            json!({ "coulomb_nm": f.coulomb_nm, "viscous": f.viscous, "offset_nm": f.offset_nm, "deviation": f.deviation }),
+            json!({
+                "coulomb_nm": f.coulomb_nm, "viscous": f.viscous, "offset_nm": f.offset_nm,
+                "std": f.deviation,
+            }),
         )
     });
     json!({
         "file": log.file,
         "role": role(log.role),
-        "span_s": since(log.span.1), "used": log.used, "left_out": left_out, "onset_s": log.onset.map(since),
+        "span_s": since(log.span.1), "observations": log.used, "excluded": excluded,
+        "onset_s": log.onset.map(since),
         "predicted": predicted(&log.predicted), "fitted_error": three(&log.fitted_error),
         "joints": joints, "sensors": sensors,
         "two_route_rms_nm": object(&log.two_route, |t| (&t.joint, three(&t.rms_nm))),
-        "two_route_rms_mean_removed_nm": object(&log.two_route, |t| (&t.joint, three(&t.rms_mean_removed_nm))),
+        "two_route_rms_mean_removed_nm":
+            object(&log.two_route, |t| (&t.joint, three(&t.rms_mean_removed_nm))),
         "offsets": offsets, "friction": friction,
     })
 }
@@ -193,7 +273,7 @@ fn both<T: serde::Serialize>(both: &Both<T>) -> Json {
 }
 
 /// The three sets of parameters by name.
-fn three<T: serde::Serialize>(three: &Three<T>) -> Json {
+fn three<T: serde::Serialize>(three: &ModelComparison<T>) -> Json {
     json!({ "cad": three.cad, "cad_fitted": three.cad_fitted, "identified": three.identified })
 }
 
@@ -234,7 +314,10 @@ mod tests {
         let text = json.to_string();
         assert!(!text.contains("NaN") && serde_json::from_str::<Json>(&text).is_ok());
         let log = &json["logs"][0];
-        assert_eq!((&log["file"], &log["role"]), (&json!("walk_1.csv"), &json!("train")));
+        assert_eq!(
+            (&log["file"], &log["role"]),
+            (&json!("walk_1.csv"), &json!("train"))
+        );
         assert_eq!(json["logs"][1]["role"], "validate");
         assert_eq!(
             log["fitted_error"],
@@ -247,7 +330,10 @@ mod tests {
                 "relative_error_with_drift": { "cad": 0.06, "identified": 0.0225 },
                 "joints_rms_nm": { "r_knee": { "cad": 0.24, "identified": 0.09 } },
                 "sensors_rms": {
-                    "r_leg_ft_sensor": { "cad": [0.6, 3.0, 0.6, 0.3, 0.2, 0.1], "identified": [0.5, 0.5, 0.5, 0.5, 0.5, 0.5] }
+                    "r_leg_ft_sensor": {
+                        "cad": [0.6, 3.0, 0.6, 0.3, 0.2, 0.1],
+                        "identified": [0.5, 0.5, 0.5, 0.5, 0.5, 0.5],
+                    }
                 },
                 "two_route_rms_nm": { "r_knee": { "cad": 0.25, "identified": 0.14 } },
             })
@@ -270,14 +356,17 @@ mod tests {
         );
         assert_eq!(json["weakest"].as_array().map(Vec::len), Some(20));
         assert_eq!(json["time_offsets"][0]["channel"], "wrench/r_leg_ft_sensor");
-        assert_eq!(json["consistency"]["feasible"], true);
+        assert_eq!(json["feasibility"]["feasible"], true);
         assert_eq!(log["onset_s"], 4.0);
         assert_eq!(
-            log["left_out"][1],
-            json!({ "reason": "contact declared: right_foot", "instants": 240, "first_s": 12.0, "last_s": 14.4 })
+            log["excluded"][1],
+            json!({
+                "reason": "contact declared: right_foot", "observations": 240, "first_s": 12.0,
+                "last_s": 14.4,
+            })
         );
         assert_eq!(json["findings"][0]["log"], Json::Null);
-        assert_eq!(json["findings"][1]["code"], "jump");
+        assert_eq!(json["findings"][1]["code"], "offset_jump");
     }
 
     #[test]
@@ -300,7 +389,11 @@ mod tests {
         ] {
             objects.push(&json[list][0]);
         }
-        objects.extend([&json["consistency"], &json["advice"], &json["logs"][0]["left_out"][0]]);
+        objects.extend([
+            &json["feasibility"],
+            &json["advice"],
+            &json["logs"][0]["excluded"][0],
+        ]);
         objects.extend([
             &json["calibration"]["r_leg_ft_sensor"],
             &json["logs"][0]["offsets"]["r_leg_ft_sensor"],

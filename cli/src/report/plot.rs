@@ -1,24 +1,25 @@
-//! Plots as SVG inside HTML, for a page that is read on a telephone and on a desk alike.
+//! Plots as SVG inside HTML, for narrow and wide pages.
 //!
-//! Only the drawing is SVG, and it is stretched to the width of the page; everything that is read (ticks, legend, marks) is
-//! HTML placed over it in percent. So letters have the page's own size at any width, and colours come from the page's style sheet,
-//! which knows light and dark. Lines keep their width while they are stretched (`vector-effect`), dots are lines of no length with round
-//! ends. A drawing is made of integers between 0 and [`WIDE`], [`HIGH`], so that a curve costs some six bytes a point.
+//! Only the drawing is SVG, stretched to the width of the page. All text (ticks, legend, marks) is
+//! HTML placed over it in percent. So text has the page's font size at any width, and colours come
+//! from the page's style sheet, which supports light and dark mode. Lines keep their width when
+//! stretched (`vector-effect`); dots are lines of zero length with round ends. Coordinates are
+//! integers from 0 to [`WIDE`] and [`HIGH`], so that a curve needs about six bytes per point.
 
-use super::escape;
+use super::escape::escape;
 use std::fmt::Write as _;
 
-/// Units of the drawing from left to right.
+/// Width of the drawing in units.
 const WIDE: f64 = 4000.0;
-/// Units of the drawing from top to bottom.
+/// Height of the drawing in units.
 const HIGH: f64 = 1500.0;
-/// About so many ticks on an axis.
+/// Approximate number of ticks on an axis.
 const TICKS: usize = 6;
 
-/// What a curve shows; its colour follows from it, the same in all plots of a page.
+/// The meaning of a curve; it determines the colour, the same in all plots of a page.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Ink {
-    /// What was measured, or the truth.
+    /// A measurement, or the truth.
     Measured,
     /// The parameters of the CAD.
     Cad,
@@ -40,7 +41,7 @@ impl Ink {
     }
 }
 
-/// How something is drawn.
+/// The shape of a series.
 #[derive(Debug, Clone)]
 pub(crate) enum Shape {
     /// A line through points (x, y), ascending in x; a NaN breaks it.
@@ -51,14 +52,14 @@ pub(crate) enum Shape {
     Dots(Vec<(f64, f64, f64, f64)>),
 }
 
-/// One thing drawn.
+/// One series of a plot.
 #[derive(Debug, Clone)]
 pub(crate) struct Series {
     /// Its name in the legend; series without a name are not listed.
     pub(crate) name: String,
     /// Its colour.
     pub(crate) ink: Ink,
-    /// How it is drawn.
+    /// Its shape.
     pub(crate) shape: Shape,
 }
 
@@ -88,17 +89,17 @@ impl Series {
     }
 }
 
-/// What a stretch of a plot is shaded for.
+/// The meaning of a shaded stretch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Shade {
     /// An estimate is withheld.
     Withheld,
-    /// Something touches the robot.
+    /// The robot is touched.
     Touched,
 }
 
 impl Shade {
-    /// Its class in the style sheet, and what it is called in the legend.
+    /// Its class in the style sheet and its name in the legend.
     fn words(self) -> (&'static str, &'static str) {
         match self {
             Self::Withheld => ("withheld", "withheld"),
@@ -107,23 +108,23 @@ impl Shade {
     }
 }
 
-/// How numbers lie on an axis.
+/// The scale of an axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) enum Scale {
     #[default]
     Linear,
-    /// Decades; what is not above 0 is not drawn.
+    /// Logarithmic; values that are not positive are not drawn.
     Log,
 }
 
 /// One axis.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Axis {
-    /// What it counts, with its unit: `t [s]`.
+    /// Its label with the unit: `t [s]`.
     pub(crate) label: String,
-    /// How.
+    /// Its scale.
     pub(crate) scale: Scale,
-    /// From and to; none: from what is drawn.
+    /// Its range; `None`: from the data.
     pub(crate) range: Option<(f64, f64)>,
 }
 
@@ -146,21 +147,21 @@ impl Axis {
 /// A plot with its caption.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Plot {
-    /// What it is of.
+    /// Its title.
     pub(crate) title: String,
     /// One sentence under the title; may be empty.
     pub(crate) note: String,
-    /// Left to right.
+    /// The horizontal axis.
     pub(crate) x: Axis,
-    /// Bottom to top.
+    /// The vertical axis.
     pub(crate) y: Axis,
-    /// What is drawn, the first undermost.
+    /// The series; the first is drawn at the bottom.
     pub(crate) series: Vec<Series>,
-    /// Vertical lines: where, and what is there.
+    /// Vertical lines: position and label.
     pub(crate) marks: Vec<(f64, String)>,
     /// Stretches of x, shaded from top to bottom.
     pub(crate) shades: Vec<(Shade, Vec<(f64, f64)>)>,
-    /// At most so many points of a line are drawn: peaks are kept.
+    /// Maximum number of points per line; peaks are retained.
     pub(crate) most: usize,
 }
 
@@ -205,7 +206,8 @@ impl Plot {
         let (x_ticks, y_ticks) = (x.ticks(TICKS), y.ticks(TICKS));
         let _ = write!(
             html,
-            "<svg viewBox=\"0 0 {WIDE} {HIGH}\" preserveAspectRatio=\"none\" role=\"img\" aria-label=\"{}\">",
+            "<svg viewBox=\"0 0 {WIDE} {HIGH}\" preserveAspectRatio=\"none\" role=\"img\" \
+             aria-label=\"{}\">",
             escape(&self.title)
         );
         let mut grid = String::new();
@@ -227,10 +229,18 @@ impl Plot {
             let mut path = String::new();
             for (from, until) in stretches {
                 let [from, until] = [from, until].map(|t| (x.at(*t) * WIDE).clamp(0.0, WIDE));
-                let _ = write!(path, "M{from:.0} 0H{:.0}V{HIGH}H{from:.0}z", until.max(from + 4.0));
+                let _ = write!(
+                    path,
+                    "M{from:.0} 0H{:.0}V{HIGH}H{from:.0}z",
+                    until.max(from + 4.0)
+                );
             }
             if !path.is_empty() {
-                let _ = write!(html, "<path class=\"shade {}\" d=\"{path}\"/>", shade.words().0);
+                let _ = write!(
+                    html,
+                    "<path class=\"shade {}\" d=\"{path}\"/>",
+                    shade.words().0
+                );
             }
         }
         for series in &self.series {
@@ -238,7 +248,11 @@ impl Plot {
         }
         for (at, _) in &self.marks {
             if (x.from..=x.to).contains(at) {
-                let _ = write!(html, "<path class=\"mark\" d=\"M{:.0} 0V{HIGH}\"/>", x.at(*at) * WIDE);
+                let _ = write!(
+                    html,
+                    "<path class=\"mark\" d=\"M{:.0} 0V{HIGH}\"/>",
+                    x.at(*at) * WIDE
+                );
             }
         }
         html.push_str("</svg>");
@@ -261,7 +275,7 @@ impl Plot {
             if !(0.0..=1.0).contains(&place) {
                 continue;
             }
-            // Above the plot, written towards its middle, so that it does not leave it.
+            // Above the plot, extending towards its middle, so that the text stays inside.
             let (side, percent) = if place > 0.5 {
                 ("right", 1.0 - place)
             } else {
@@ -282,7 +296,7 @@ impl Plot {
         html
     }
 
-    /// The ranges of both axes; none if there is nothing to draw.
+    /// The ranges of both axes; `None` if there is nothing to draw.
     fn ranges(&self) -> Option<(Range, Range)> {
         let (mut x, mut y) = (Extent::default(), Extent::default());
         for series in &self.series {
@@ -295,7 +309,8 @@ impl Plot {
                         }
                     }
                 }
-                // A band may be so wide, before anything is known, that nothing else could be seen: it is cut by the plot.
+                // A band without information may be so wide that everything else would be
+                // invisible: it does not set the range and is clipped by the plot.
                 Shape::Band(points) => {
                     for &(px, low, high) in points {
                         if px.is_finite() && low.is_finite() && high.is_finite() {
@@ -337,14 +352,21 @@ impl Plot {
             Shape::Band(points) => {
                 let step = points
                     .len()
-                    .div_ceil(if self.most == 0 { 400 } else { (self.most / 2).max(60) })
+                    .div_ceil(if self.most == 0 {
+                        400
+                    } else {
+                        (self.most / 2).max(60)
+                    })
                     .max(1);
                 let points: Vec<_> = points.iter().step_by(step).collect();
                 let mut path = Path::default();
                 for run in points.split(|(_, low, high)| !low.is_finite() || !high.is_finite()) {
                     path.lift();
-                    run.iter().for_each(|(px, _, high)| path.to(place(*px, *high)));
-                    run.iter().rev().for_each(|(px, low, _)| path.to(place(*px, *low)));
+                    run.iter()
+                        .for_each(|(px, _, high)| path.to(place(*px, *high)));
+                    run.iter()
+                        .rev()
+                        .for_each(|(px, low, _)| path.to(place(*px, *low)));
                     if !run.is_empty() {
                         path.text.push('z');
                     }
@@ -360,7 +382,12 @@ impl Plot {
                     let (cx, cy) = place(px, py);
                     let _ = write!(dots, "M{cx:.0} {cy:.0}h0");
                     if low.is_finite() && high.is_finite() && low < high {
-                        let _ = write!(bars, "M{cx:.0} {:.0}V{:.0}", place(px, low).1, place(px, high).1);
+                        let _ = write!(
+                            bars,
+                            "M{cx:.0} {:.0}V{:.0}",
+                            place(px, low).1,
+                            place(px, high).1
+                        );
                     }
                 }
                 if !bars.is_empty() {
@@ -382,7 +409,8 @@ impl Shape {
     }
 }
 
-/// At most about `most` of `points`: of each stretch of x its lowest and its highest, in their order, so that no peak is lost.
+/// At most about `most` of `points`: the lowest and the highest of each stretch of x, in order, so
+/// that no peak is lost.
 fn thin(points: &[(f64, f64)], most: usize) -> Vec<(f64, f64)> {
     if points.len() <= most {
         return points.to_vec();
@@ -404,7 +432,7 @@ fn thin(points: &[(f64, f64)], most: usize) -> Vec<(f64, f64)> {
             Some((low, high)) => {
                 let (first, last) = (low.min(high), low.max(high));
                 thinned.extend(part.get(first));
-                // A gap between the two stays one.
+                // Keep a gap between the two.
                 if part
                     .get(first..last)
                     .is_some_and(|p| p.iter().any(|(_, y)| !y.is_finite()))
@@ -424,7 +452,7 @@ fn thin(points: &[(f64, f64)], most: usize) -> Vec<(f64, f64)> {
     thinned
 }
 
-/// SVG path data of whole numbers: the first point of a run in full, the others as steps.
+/// SVG path data in whole numbers: the first point of a run is absolute, the others relative.
 #[derive(Default)]
 struct Path {
     text: String,
@@ -433,7 +461,7 @@ struct Path {
 
 impl Path {
     fn to(&mut self, (x, y): (f64, f64)) {
-        // Far outside is as good as just outside: the plot cuts it.
+        // Clamp points far outside; the plot clips them.
         let next = (
             x.clamp(-WIDE, 2.0 * WIDE).round() as i64,
             y.clamp(-HIGH, 2.0 * HIGH).round() as i64,
@@ -451,7 +479,7 @@ impl Path {
     }
 }
 
-/// The least and the greatest of numbers.
+/// The minimum and maximum.
 struct Extent(f64, f64);
 
 impl Default for Extent {
@@ -467,15 +495,21 @@ impl Extent {
         }
     }
 
-    /// The axis' range, `margin` of it added at both ends.
+    /// The axis' range, extended by the fraction `margin` at both ends.
     fn range(&self, axis: &Axis, margin: f64) -> Option<Range> {
         let (from, to) = match axis.range {
             Some(range) => range,
             None if self.0 > self.1 => return None,
-            None if axis.scale == Scale::Log => ((self.0.log10() - 0.1).floor(), (self.1.log10() + 0.1).ceil()),
+            None if axis.scale == Scale::Log => (
+                (self.0.log10() - 0.1).floor(),
+                (self.1.log10() + 0.1).ceil(),
+            ),
             None => {
-                // One value alone still has a place to be in.
-                let room = (self.1 - self.0).max(self.1.abs().max(self.0.abs()) * 1e-9).max(1e-9) * margin;
+                // A single value still needs a range.
+                let room = (self.1 - self.0)
+                    .max(self.1.abs().max(self.0.abs()) * 1e-9)
+                    .max(1e-9)
+                    * margin;
                 (self.0 - room, self.1 + room)
             }
         };
@@ -487,7 +521,7 @@ impl Extent {
     }
 }
 
-/// From and to on an axis; decades on a logarithmic one.
+/// The range of an axis; in decades on a logarithmic one.
 #[derive(Debug, Clone, Copy)]
 struct Range {
     from: f64,
@@ -496,13 +530,17 @@ struct Range {
 }
 
 impl Range {
-    /// Where `value` lies: 0 at the start, 1 at the end.
+    /// The position of `value`: 0 at the start, 1 at the end.
     fn at(&self, value: f64) -> f64 {
-        let value = if self.scale == Scale::Log { value.log10() } else { value };
+        let value = if self.scale == Scale::Log {
+            value.log10()
+        } else {
+            value
+        };
         (value - self.from) / (self.to - self.from)
     }
 
-    /// About `count` round values with their texts.
+    /// About `count` round tick values with their texts.
     fn ticks(&self, count: usize) -> Vec<(f64, String)> {
         if self.scale == Scale::Log {
             let step = ((self.to - self.from) / count as f64).ceil().max(1.0) as i64;
@@ -518,7 +556,10 @@ impl Range {
                 .collect();
         }
         let step = self.step(count);
-        let (first, last) = ((self.from / step).ceil() as i64, (self.to / step).floor() as i64);
+        let (first, last) = (
+            (self.from / step).ceil() as i64,
+            (self.to / step).floor() as i64,
+        );
         let unit = 10f64.powi(self.power());
         let decimals = (-(step / unit).log10() - 1e-9).ceil().max(0.0) as usize;
         (first..=last)
@@ -539,10 +580,13 @@ impl Range {
         let rough = (self.to - self.from) / count as f64;
         let decade = 10f64.powf(rough.log10().floor());
         let steps = [1.0, 2.0, 5.0, 10.0].map(|m| m * decade);
-        steps.into_iter().find(|s| *s >= rough * 0.999).unwrap_or(decade)
+        steps
+            .into_iter()
+            .find(|s| *s >= rough * 0.999)
+            .unwrap_or(decade)
     }
 
-    /// The power of ten that all ticks are written in: 0 unless their texts would be long.
+    /// The common power of ten of all tick texts: 0 unless the texts would be long.
     fn power(&self) -> i32 {
         let largest = self.from.abs().max(self.to.abs());
         if self.scale == Scale::Log || (self.step(TICKS) >= 1e-3 && largest < 1e5) {
@@ -577,21 +621,33 @@ mod tests {
 
     #[test]
     fn a_line_goes_from_corner_to_corner_and_breaks_at_a_nan() {
-        let mut plot = line(vec![(0.0, 0.0), (1.0, 1.0), (2.0, f64::NAN), (3.0, 0.5), (4.0, 1.0)]);
+        let mut plot = line(vec![
+            (0.0, 0.0),
+            (1.0, 1.0),
+            (2.0, f64::NAN),
+            (3.0, 0.5),
+            (4.0, 1.0),
+        ]);
         plot.y.range = Some((0.0, 1.0));
         let html = plot.html();
         assert!(
             html.contains("<path class=\"line cad\" d=\"M0 1500l1000 -1500M3000 750l1000 -750\"/>"),
             "{html}"
         );
-        assert!(html.contains("a &lt; b") && html.contains(">t [s]<"), "{html}");
+        assert!(
+            html.contains("a &lt; b") && html.contains(">t [s]<"),
+            "{html}"
+        );
     }
 
     #[test]
     fn nothing_finite_is_said_in_words() {
         for points in [vec![], vec![(0.0, f64::NAN)], vec![(1.0, 1.0)]] {
             let html = line(points).html();
-            assert!(html.contains("No data.") && !html.contains("<svg"), "{html}");
+            assert!(
+                html.contains("No data.") && !html.contains("<svg"),
+                "{html}"
+            );
         }
     }
 
@@ -642,7 +698,9 @@ mod tests {
 
     #[test]
     fn thinning_keeps_peaks_and_gaps() {
-        let mut points: Vec<(f64, f64)> = (0..10_000).map(|i| (f64::from(i), f64::from(i).sin())).collect();
+        let mut points: Vec<(f64, f64)> = (0..10_000)
+            .map(|i| (f64::from(i), f64::from(i).sin()))
+            .collect();
         points[4321].1 = 20.0;
         points[7777].1 = -30.0;
         for point in &mut points[5000..5600] {
@@ -651,8 +709,16 @@ mod tests {
         let thinned = thin(&points, 500);
         assert!(thinned.len() <= 520, "{}", thinned.len());
         assert!(thinned.contains(&(4321.0, 20.0)) && thinned.contains(&(7777.0, -30.0)));
-        let gap = thinned.windows(2).any(|w| w[0].0 < 5000.0 && w[1].0 > 5599.0);
+        let gap = thinned
+            .windows(2)
+            .any(|w| w[0].0 < 5000.0 && w[1].0 > 5599.0);
         assert!(!gap, "a line across the gap");
-        assert!(thinned.iter().map(|p| p.0).filter(|x| !x.is_nan()).is_sorted());
+        assert!(
+            thinned
+                .iter()
+                .map(|p| p.0)
+                .filter(|x| !x.is_nan())
+                .is_sorted()
+        );
     }
 }

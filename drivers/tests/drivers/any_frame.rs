@@ -1,11 +1,12 @@
-//! Any frame, in any order, at any time: no panic, no endless loop, no number that is not finite in a wrench.
+//! Arbitrary frames in any order at any time cause no panic, no endless loop, and no non-finite
+//! number in a wrench.
 
 use crate::rig::{options, spec};
 use proprio_drivers::{Board, Decoded, Device, Format, Frame, Frames, Id, Mode};
 use proprio_topics::{Nanos, Quality, Reading, StampKind};
 use proptest::prelude::*;
 
-/// Every family, in every way it can be set up.
+/// Every family in all its configurations.
 const SETUPS: [(&str, &str, &[u8]); 9] = [
     ("icub_strain", "", &[]),
     (
@@ -13,11 +14,16 @@ const SETUPS: [(&str, &str, &[u8]); 9] = [
         "full_scale_n = [9, 9, 9]\nfull_scale_nm = [1, 1, 1]\ntemperature_period_s = 1",
         &[],
     ),
-    ("icub_strain", "stream = \"both\"\npower_on_silence_ms = 20", &[]),
+    (
+        "icub_strain",
+        "stream = \"both\"\npower_on_silence_ms = 20",
+        &[],
+    ),
     ("icub_imu", "", &[]),
     (
         "icub_imu",
-        r#"quantities = ["acceleration", "magnetic_field", "angular_velocity", "orientation", "status"]"#,
+        "quantities = [\"acceleration\", \"magnetic_field\", \"angular_velocity\", \
+         \"orientation\", \"status\"]",
         &[],
     ),
     ("icub_imu", r#"legacy = "mtb""#, &[]),
@@ -26,10 +32,10 @@ const SETUPS: [(&str, &str, &[u8]); 9] = [
     ("icub_pos", "", &[0, 1, 2, 15]),
 ];
 
-/// About 18 years: clocks jump, but not to where nanoseconds end.
+/// About 18 years: clocks may jump, but not to the limits of `i64` nanoseconds.
 const YEARS: i64 = 1 << 59;
 
-/// What the bus and the clock do.
+/// Events of the bus and the clock.
 #[derive(Debug, Clone)]
 enum Event {
     Frame {
@@ -50,12 +56,12 @@ enum Event {
 
 fn event() -> impl Strategy<Value = Event> {
     let data = prop_oneof![
-        // Lengths that the protocol has, mostly.
+        // Mostly lengths of the protocol.
         8 => proptest::collection::vec(any::<u8>(), 4..=8),
         1 => proptest::collection::vec(any::<u8>(), 0..=8),
     ];
-    // Streams and replies of address 1 in all classes, so that most frames concern the device.
-    // And commands to address 1 and to everyone, so that the board is driven too.
+    // Streams and replies of address 1 in all classes, so that most frames concern the device. Also
+    // commands to address 1 and to all boards, to exercise the board too.
     let id = prop_oneof![
         4 => (0_u16..8, 0_u16..16).prop_map(|(class, low)| class << 8 | 0x10 | low),
         1 => prop_oneof![Just(0x001), Just(0x201), Just(0x20F), Just(0x701), Just(0x70F)],
@@ -71,8 +77,12 @@ fn event() -> impl Strategy<Value = Event> {
     let any_id = proptest::option::weighted(0.1, any::<u32>());
     prop_oneof![
         40 => (id, any_id, 0_u8..20, data, command, proptest::bool::weighted(0.9))
-            .prop_map(|(id, any, format, data, command, stamped)| Event::Frame { id, any, format, data, command, stamped }),
-        10 => prop_oneof![0_i64..1_000_000, 0_i64..100_000_000, -5_000_000_i64..2_000_000_000, -YEARS..YEARS]
+            .prop_map(|(id, any, format, data, command, stamped)| {
+                Event::Frame { id, any, format, data, command, stamped }
+            }),
+        10 => prop_oneof![
+            0_i64..1_000_000, 0_i64..100_000_000, -5_000_000_i64..2_000_000_000, -YEARS..YEARS
+        ]
             .prop_map(|ns| Event::Pass { ns }),
         10 => Just(Event::Poll),
         1 => Just(Event::Restart),
@@ -106,13 +116,21 @@ fn to_frame(event: &Event, now: Nanos) -> Option<Frame> {
         2 => Format::Error,
         _ => Format::Classic,
     };
-    let stamp = if *stamped { StampKind::Software } else { StampKind::None };
+    let stamp = if *stamped {
+        StampKind::Software
+    } else {
+        StampKind::None
+    };
     Frame::with_format(id, format, &data).map(|frame| frame.at(now, stamp))
 }
 
 fn is_finite(reading: &Reading) -> bool {
     match reading {
-        Reading::Wrench(wrench) => wrench.force.iter().chain(&wrench.torque).all(|value| value.is_finite()),
+        Reading::Wrench(wrench) => wrench
+            .force
+            .iter()
+            .chain(&wrench.torque)
+            .all(|value| value.is_finite()),
         Reading::Imu(imu) => imu
             .proper_acceleration
             .iter()
@@ -132,7 +150,9 @@ fn drive(device: &mut dyn Device, board: &mut dyn Board, events: &[Event], liste
         out.clear();
         match event {
             Event::Frame { .. } => {
-                let Some(frame) = to_frame(event, now) else { continue };
+                let Some(frame) = to_frame(event, now) else {
+                    continue;
+                };
                 device.on_frame(&frame, &mut out);
                 let mut answers = Frames::new();
                 board.on_frame(&frame, &mut answers);
@@ -158,7 +178,7 @@ fn drive(device: &mut dyn Device, board: &mut dyn Board, events: &[Event], liste
         let _ = (device.state(), device.next_wake(), board.period());
         for output in &out.readings {
             assert!(is_finite(&output.reading), "{output:?}");
-            // What was decoded can be encoded again (a wrench only if its scale is known to this board).
+            // Decoded readings can be encoded again (a wrench only if the board knows its scale).
             let mut frames = Frames::new();
             let _ = board.encode(
                 output.output,
@@ -172,7 +192,10 @@ fn drive(device: &mut dyn Device, board: &mut dyn Board, events: &[Event], liste
 
 proptest! {
     #[test]
-    fn does_no_harm(setup in 0..SETUPS.len(), listens: bool, events in proptest::collection::vec(event(), 1..300)) {
+    fn does_no_harm(
+        setup in 0..SETUPS.len(), listens: bool,
+        events in proptest::collection::vec(event(), 1..300),
+    ) {
         let (driver, keys, outputs) = SETUPS[setup];
         let mode = if listens { Mode::Listen } else { Mode::Supervise };
         let options = options(driver, keys);
@@ -183,7 +206,8 @@ proptest! {
     }
 }
 
-/// Sensors, encoders and motors of one board can be configured side by side; two devices of a kind can not.
+/// Sensors, encoders and motors of one board can be configured together; two devices of the same
+/// kind cannot.
 #[test]
 fn claims_are_exclusive_within_a_kind_only() {
     let claims = |driver: &str, outputs: &[u8], address| {
@@ -193,8 +217,10 @@ fn claims_are_exclusive_within_a_kind_only() {
         device.claims().to_vec()
     };
     let collide = |a: &[proprio_drivers::Claim], b: &[proprio_drivers::Claim]| {
-        a.iter()
-            .any(|a| b.iter().any(|b| a.exclusive && b.exclusive && a.overlaps(b)))
+        a.iter().any(|a| {
+            b.iter()
+                .any(|b| a.exclusive && b.exclusive && a.overlaps(b))
+        })
     };
     let families: [(&str, &[u8]); 4] = [
         ("icub_strain", &[]),
@@ -210,7 +236,10 @@ fn claims_are_exclusive_within_a_kind_only() {
             "{driver} takes another address's streams"
         );
         for (other, outputs) in families.iter().skip(k + 1) {
-            assert!(!collide(&mine, &claims(other, outputs, 13)), "{driver} and {other}");
+            assert!(
+                !collide(&mine, &claims(other, outputs, 13)),
+                "{driver} and {other}"
+            );
         }
     }
 }

@@ -1,4 +1,5 @@
-//! Bring-up of each family against its own board: what is sent, what a loss does, silence, restart, refusal, stop.
+//! Bring-up of each family against its own board: frames sent, losses, silence, restart, refusal,
+//! stop.
 
 use crate::rig::{Rig, decode, frame, listener, options, spec};
 use proprio_drivers::{Mode, Options, Refusal, SpecError, State};
@@ -36,7 +37,8 @@ fn a_strain_board_is_asked_started_and_stopped() {
     assert_eq!(
         rig.sent,
         [
-            "201#1800", "201#1801", "201#1802", "201#1803", "201#1804", "201#1805", "201#080A", "201#0700"
+            "201#1800", "201#1801", "201#1802", "201#1803", "201#1804", "201#1805", "201#080A",
+            "201#0700"
         ]
     );
     assert_eq!(rig.device.state(), State::Streaming);
@@ -67,7 +69,7 @@ fn temperature_and_both_streams_are_started_too() {
     assert_eq!(
         rig.sent,
         ["201#080A", "201#3901", "201#3A02", "201#0704"],
-        "a configured scale is not asked for"
+        "a configured scale is not requested"
     );
     let kinds: Vec<bool> = rig
         .readings
@@ -97,7 +99,13 @@ fn lost_questions_and_answers_are_asked_again() {
     });
     rig.run(300);
     assert_eq!(rig.device.state(), State::Streaming);
-    assert_eq!(rig.sent.iter().filter(|text| text.starts_with("201#18")).count(), 18);
+    assert_eq!(
+        rig.sent
+            .iter()
+            .filter(|text| text.starts_with("201#18"))
+            .count(),
+        18
+    );
     assert_eq!(rig.count(Counter::Unexpected), 0);
 }
 
@@ -116,7 +124,7 @@ fn a_lost_start_is_repeated() {
     assert_eq!(
         rig.count(Counter::Silences),
         0,
-        "it was never heard, so it did not fall silent"
+        "a board that never sent does not become silent"
     );
 }
 
@@ -126,7 +134,10 @@ fn a_board_that_is_off_is_refused_and_comes_up_when_it_gets_power() {
     rig.host_loses = Box::new(|_, _| true);
     rig.run(5000);
     assert_eq!(rig.device.state(), State::Refused(Refusal::NoFullScale));
-    assert_eq!(rig.states, [State::Asking, State::Refused(Refusal::NoFullScale)]);
+    assert_eq!(
+        rig.states,
+        [State::Asking, State::Refused(Refusal::NoFullScale)]
+    );
     // 15 quick attempts, then two a second.
     assert!((20..=30).contains(&rig.sent.len()), "{}", rig.sent.len());
     rig.host_loses = Box::new(|_, _| false);
@@ -142,9 +153,15 @@ fn silence_is_kept_after_power_on() {
     assert_eq!(rig.device.state(), State::Waiting);
     rig.run(100);
     assert_eq!(rig.device.state(), State::Streaming);
-    // A board that streams already has left its bootloader: no need to wait.
+    // A board that streams already has left its bootloader, so the host need not wait.
     let keys = format!("{SCALES}power_on_silence_ms = 6000");
-    let mut rig = Rig::with_board("icub_strain", &keys, &format!("{SCALES}listen = true"), &[], wrench());
+    let mut rig = Rig::with_board(
+        "icub_strain",
+        &keys,
+        &format!("{SCALES}listen = true"),
+        &[],
+        wrench(),
+    );
     rig.run(30);
     assert_eq!(rig.device.state(), State::Streaming);
     assert_eq!(rig.sent.len(), 2);
@@ -165,14 +182,18 @@ fn a_silent_board_is_counted_once_and_started_again() {
     rig.run(100);
     assert_eq!(rig.device.state(), State::Streaming);
     assert!(rig.readings[before].quality.contains(Quality::GAP_BEFORE));
-    assert!(!rig.readings[before + 1].quality.contains(Quality::GAP_BEFORE));
+    assert!(
+        !rig.readings[before + 1]
+            .quality
+            .contains(Quality::GAP_BEFORE)
+    );
 }
 
 #[test]
 fn a_board_that_was_reset_is_brought_up_again() {
     let mut rig = strain();
     rig.run(100);
-    // Power cut: a fresh board that streams nothing.
+    // Power cut: a new board that streams nothing.
     rig.board = options("icub_strain", "")
         .board(&spec(1, Mode::Supervise, &[]))
         .unwrap();
@@ -211,7 +232,7 @@ fn a_scale_of_zero_is_refused_until_it_is_repaired() {
         .unwrap();
     rig.run(600);
     assert_eq!(rig.device.state(), State::Streaming);
-    // A value in the configuration overrides what the board has.
+    // The configuration overrides the board's value.
     let mut rig = Rig::with_board("icub_strain", SCALES, zero, &[], wrench());
     rig.run(100);
     assert_eq!(rig.device.state(), State::Streaming);
@@ -228,7 +249,10 @@ fn a_scale_that_changed_is_refused_for_good() {
     let before = rig.readings.len();
     rig.run(1000);
     assert_eq!(rig.device.state(), State::Refused(Refusal::Changed));
-    assert_eq!((rig.count(Counter::Changed), rig.readings.len()), (1, before));
+    assert_eq!(
+        (rig.count(Counter::Changed), rig.readings.len()),
+        (1, before)
+    );
     rig.device.restart(rig.now);
     rig.run(1000);
     assert_eq!(rig.device.state(), State::Refused(Refusal::Changed));
@@ -251,8 +275,11 @@ fn an_answer_counts_only_while_it_is_asked_for() {
         faults.iter().map(|f| f.counter).collect::<Vec<_>>(),
         [Counter::Changed, Counter::Unexpected]
     );
-    // Answers to what others ask of the board are none of this driver's business.
-    let (_, faults) = decode(&mut *rig.device, &[at("210#1C0C020008020001"), at("210#18100001")]);
+    // Answers to other programs' questions are ignored.
+    let (_, faults) = decode(
+        &mut *rig.device,
+        &[at("210#1C0C020008020001"), at("210#18100001")],
+    );
     assert!(faults.is_empty(), "{faults:?}");
     assert_eq!(rig.device.state(), state);
 }
@@ -260,36 +287,58 @@ fn an_answer_counts_only_while_it_is_asked_for() {
 #[test]
 fn a_listener_learns_the_scale_from_the_log() {
     let mut device = listener("icub_strain", "", &[]);
-    let pair = [frame("31A#E380B76A1887", 0.0), frame("31B#2184BE770881", 0.1)];
+    let pair = [
+        frame("31A#E380B76A1887", 0.0),
+        frame("31B#2184BE770881", 0.1),
+    ];
     assert_eq!(device.state(), State::Starting);
     let (readings, _) = decode(&mut *device, &pair);
     assert!(readings.is_empty(), "no reading without a scale");
     assert_eq!(device.state(), State::Refused(Refusal::NoFullScale));
-    let answers = ["1800070C", "1801070C", "1802070C", "1803001F", "1804001F", "1805001F"];
-    let answers: Vec<_> = answers.iter().map(|data| frame(&format!("210#{data}"), 1.0)).collect();
+    let answers = [
+        "1800070C", "1801070C", "1802070C", "1803001F", "1804001F", "1805001F",
+    ];
+    let answers: Vec<_> = answers
+        .iter()
+        .map(|data| frame(&format!("210#{data}"), 1.0))
+        .collect();
     let (_, faults) = decode(&mut *device, &answers);
     assert!(faults.is_empty(), "{faults:?}");
     let (readings, _) = decode(&mut *device, &pair);
     assert_eq!((readings.len(), device.state()), (1, State::Streaming));
-    // The same again is no news; another value makes everything doubtful.
+    // The same answer again changes nothing; a different value makes all readings doubtful.
     let (_, faults) = decode(&mut *device, &answers);
     assert!(faults.is_empty(), "{faults:?}");
     let (_, faults) = decode(&mut *device, &[frame("210#18000001", 2.0)]);
-    assert_eq!(faults.iter().map(|f| f.counter).collect::<Vec<_>>(), [Counter::Changed]);
+    assert_eq!(
+        faults.iter().map(|f| f.counter).collect::<Vec<_>>(),
+        [Counter::Changed]
+    );
     let (readings, _) = decode(&mut *device, &pair);
-    assert_eq!((readings.len(), device.state()), (0, State::Refused(Refusal::Changed)));
+    assert_eq!(
+        (readings.len(), device.state()),
+        (0, State::Refused(Refusal::Changed))
+    );
 }
 
 #[test]
 fn a_listener_watches_for_silence() {
-    let mut rig = Rig::new("icub_strain", &format!("{SCALES}listen = true"), &[], wrench());
+    let mut rig = Rig::new(
+        "icub_strain",
+        &format!("{SCALES}listen = true"),
+        &[],
+        wrench(),
+    );
     rig.run(100);
     assert_eq!(rig.device.state(), State::Streaming);
     let woken = rig.device.next_wake().unwrap();
     assert!(woken > rig.now && woken < rig.now + Nanos::from_millis(60));
     rig.board_loses = Box::new(|_, _| true);
     rig.run(500);
-    assert_eq!((rig.device.state(), rig.count(Counter::Silences)), (State::Silent, 1));
+    assert_eq!(
+        (rig.device.state(), rig.count(Counter::Silences)),
+        (State::Silent, 1)
+    );
     assert_eq!(rig.device.next_wake(), None);
     rig.board_loses = Box::new(|_, _| false);
     rig.run(20);
@@ -303,7 +352,10 @@ fn an_imu_is_told_asked_and_started_as_in_the_document() {
     rig.run(100);
     // The document's example: 201#3405800100000000, 201#350A.
     assert_eq!(rig.sent, ["201#3405800100000000", "201#33", "201#350A"]);
-    assert_eq!((rig.device.state(), rig.readings.len()), (State::Streaming, 10));
+    assert_eq!(
+        (rig.device.state(), rig.readings.len()),
+        (State::Streaming, 10)
+    );
     rig.device.stop(rig.now);
     rig.run(2);
     assert_eq!(
@@ -343,7 +395,9 @@ fn an_imu_that_does_not_answer_is_started_all_the_same() {
 fn a_silent_imu_is_started_again_and_its_counter_begins_anew() {
     let mut rig = Rig::new("icub_imu", "", &[], imu());
     rig.run(500);
-    rig.board = options("icub_imu", "").board(&spec(1, Mode::Supervise, &[])).unwrap();
+    rig.board = options("icub_imu", "")
+        .board(&spec(1, Mode::Supervise, &[]))
+        .unwrap();
     let before = rig.readings.len();
     rig.run(200);
     assert_eq!(
@@ -363,7 +417,10 @@ fn a_legacy_imu_is_started_with_its_own_command() {
     let mut rig = Rig::new("icub_imu", "legacy = \"mtb\"\nperiod_ms = 20", &[], imu());
     rig.run(100);
     assert_eq!(rig.sent, ["201#4F0614"]);
-    assert_eq!((rig.device.state(), rig.readings.len()), (State::Streaming, 5));
+    assert_eq!(
+        (rig.device.state(), rig.readings.len()),
+        (State::Streaming, 5)
+    );
     rig.device.stop(rig.now);
     rig.run(2);
     assert_eq!(
@@ -380,7 +437,12 @@ fn a_motor_board_is_only_listened_to() {
         current: 0.5,
         ..JointState::ABSENT
     };
-    let mut rig = Rig::new("icub_motor", "period_ms = 2", &[0], (0, Reading::Joint(joint)));
+    let mut rig = Rig::new(
+        "icub_motor",
+        "period_ms = 2",
+        &[0],
+        (0, Reading::Joint(joint)),
+    );
     rig.run(100);
     assert_eq!(
         (rig.device.state(), rig.readings.len(), rig.sent.len()),
@@ -388,7 +450,10 @@ fn a_motor_board_is_only_listened_to() {
     );
     rig.board_loses = Box::new(|_, _| true);
     rig.run(200);
-    assert_eq!((rig.device.state(), rig.count(Counter::Silences)), (State::Silent, 1));
+    assert_eq!(
+        (rig.device.state(), rig.count(Counter::Silences)),
+        (State::Silent, 1)
+    );
     rig.device.stop(rig.now);
     rig.run(2);
     assert_eq!((rig.device.state(), rig.sent.len()), (State::Stopped, 0));
@@ -403,13 +468,16 @@ fn a_pos_board_is_configured_and_started() {
             ..JointState::ABSENT
         }),
     );
-    let keys =
-        "sensors = [{ label = 2, inverted = true, rotation_deg = -90, zero_deg = 25.6 }, { label = 3 }]\nperiod_ms = 5";
+    let keys = "sensors = [{ label = 2, inverted = true, rotation_deg = -90, zero_deg = 25.6 }, \
+                { label = 3 }]\nperiod_ms = 5";
     let mut rig = Rig::new("icub_pos", keys, &[2], joint);
     rig.run(50);
     // F2: enabled, inverted, -90 deg, label 2; zero 0x0100. 83: enabled, label 3.
     assert_eq!(rig.sent, ["201#5200F20001830000", "201#5305"]);
-    assert_eq!((rig.device.state(), rig.readings.len()), (State::Streaming, 10));
+    assert_eq!(
+        (rig.device.state(), rig.readings.len()),
+        (State::Streaming, 10)
+    );
     rig.device.stop(rig.now);
     rig.run(2);
     assert_eq!(
@@ -427,15 +495,21 @@ fn configurations_that_can_not_work_are_named() {
             Ok(_) => panic!("{driver} accepts {keys:?}"),
         }
     };
-    assert_eq!(error("icub_strain", "", 0, &[]), "address = 0 is outside 1 to 14");
-    assert_eq!(error("icub_imu", "", 15, &[]), "address = 15 is outside 1 to 14");
+    assert_eq!(
+        error("icub_strain", "", 0, &[]),
+        "address = 0 is outside 1 to 14"
+    );
+    assert_eq!(
+        error("icub_imu", "", 15, &[]),
+        "address = 15 is outside 1 to 14"
+    );
     assert_eq!(
         error("icub_strain", "period_ms = 0", 1, &[]),
         "period_ms = 0 must be an integer from 1 to 255"
     );
     assert_eq!(
         error("icub_strain", "full_scale_n = [1, 2, 3]", 1, &[]),
-        "full_scale_nm is missing: it goes with full_scale_n"
+        "full_scale_nm is missing: it is needed together with full_scale_n"
     );
     assert_eq!(
         error(
@@ -466,7 +540,10 @@ fn configurations_that_can_not_work_are_named() {
         given: "a",
         missing: "b",
     };
-    assert_eq!(missing.to_string(), "b is missing: it goes with a");
+    assert_eq!(
+        missing.to_string(),
+        "b is missing: it is needed together with a"
+    );
     // Unknown keys are errors.
     for driver in proprio_drivers::DRIVERS {
         let table: toml::Table = "full_scale = 3".parse().unwrap();

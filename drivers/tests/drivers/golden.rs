@@ -1,9 +1,12 @@
-//! Golden bytes: the worked examples of the protocol's documents, and frames computed by hand from their tables.
+//! Golden bytes: the worked examples of the protocol's documents, and frames computed by hand from
+//! their tables.
 
 use crate::rig::{board, count, decode, encode, frame, listener};
 use proprio_drivers::icub_motor::{encoder, fault};
 use proprio_drivers::{Board, Frame, Frames};
-use proprio_topics::{Actuator, Counter, Imu, JointState, Quality, Reading, Saturation, Temperature, Wrench};
+use proprio_topics::{
+    Actuator, Counter, Imu, JointState, Quality, Reading, Saturation, Temperature, Wrench,
+};
 
 const SCALES: &str = "full_scale_n = [1804, 1804, 1804]\nfull_scale_nm = [31, 31, 31]";
 
@@ -20,7 +23,10 @@ fn answers(board: &mut dyn Board, text: &str) -> Vec<String> {
 fn assert_near(values: &[f64], expected: &[f64], tolerance: f64) {
     assert_eq!(values.len(), expected.len());
     for (value, expected) in values.iter().zip(expected) {
-        assert!((value - expected).abs() <= tolerance, "{values:?} is not {expected}");
+        assert!(
+            (value - expected).abs() <= tolerance,
+            "{values:?} is not {expected}"
+        );
     }
 }
 
@@ -37,20 +43,27 @@ fn the_worked_example_of_the_strain_board() {
     let mut device = listener("icub_strain", SCALES, &[]);
     let (readings, faults) = decode(
         &mut *device,
-        &[frame("31A#E380B76A1887", 3.0), frame("31B#2184BE770881", 3.2)],
+        &[
+            frame("31A#E380B76A1887", 3.0),
+            frame("31B#2184BE770881", 3.2),
+        ],
     );
     assert!(faults.is_empty(), "{faults:?}");
     assert_eq!(readings.len(), 1);
     let Reading::Wrench(decoded) = readings[0].reading else {
         panic!("{readings:?}")
     };
-    // The counts of the example, by the document's formula; and what was encoded, to half a step.
+    // The example's counts by the document's formula, and the encoded values to half a step.
     assert_near(
         &decoded.force,
         &[227.0, -5449.0, 1816.0].map(|count| count / 32768.0 * 1804.0),
         1e-12,
     );
-    assert_near(&decoded.force, &[12.5, -300.0, 100.0], 1804.0 / 32768.0 / 2.0);
+    assert_near(
+        &decoded.force,
+        &[12.5, -300.0, 100.0],
+        1804.0 / 32768.0 / 2.0,
+    );
     assert_near(&decoded.torque, &[1.0, -2.0, 0.25], 31.0 / 32768.0 / 2.0);
     assert_eq!(readings[0].acquired, frame("0#", 3.0).t);
     assert_eq!(readings[0].quality, Quality::GOOD);
@@ -60,7 +73,10 @@ fn the_worked_example_of_the_strain_board() {
 fn a_saturated_strain_board_names_its_gauges_and_is_frozen() {
     let mut device = listener("icub_strain", SCALES, &[]);
     // 05: flag, gauge 0 low. 81: flag, gauge 5 high.
-    let frames = [frame("31A#E380B76A188705", 0.0), frame("31B#2184BE77088181", 0.2)];
+    let frames = [
+        frame("31A#E380B76A188705", 0.0),
+        frame("31B#2184BE77088181", 0.2),
+    ];
     let (readings, faults) = decode(&mut *device, &frames);
     let quality = readings[0].quality;
     assert!(quality.contains(Quality::SATURATED) && quality.contains(Quality::FROZEN));
@@ -68,18 +84,30 @@ fn a_saturated_strain_board_names_its_gauges_and_is_frozen() {
     use Saturation::{High, Low, None};
     assert_eq!(gauges, [Low, None, None, None, None, High]);
     assert_eq!(count(&faults, Counter::Saturated), 1);
-    // Told in one frame alone it counts as well.
-    let frames = [frame("31A#E380B76A1887", 10.0), frame("31B#2184BE77088101", 10.2)];
+    // Saturation in only one of the frames counts as well.
+    let frames = [
+        frame("31A#E380B76A1887", 10.0),
+        frame("31B#2184BE77088101", 10.2),
+    ];
     let (readings, _) = decode(&mut *device, &frames);
     assert_eq!(readings[0].quality, Quality::SATURATED | Quality::FROZEN);
-    // Raw gauges are told as saturated, but they are not frozen.
-    let frames = [frame("318#E380B76A188705", 20.0), frame("319#2184BE77088181", 20.2)];
+    // Raw gauges are marked as saturated but are not frozen.
+    let frames = [
+        frame("318#E380B76A188705", 20.0),
+        frame("319#2184BE77088181", 20.2),
+    ];
     let (readings, _) = decode(&mut *device, &frames);
-    assert!(readings[0].quality.contains(Quality::SATURATED) && !readings[0].quality.contains(Quality::FROZEN));
+    assert!(
+        readings[0].quality.contains(Quality::SATURATED)
+            && !readings[0].quality.contains(Quality::FROZEN)
+    );
     let Reading::Gauges(gauges) = readings[0].reading else {
         panic!("{readings:?}")
     };
-    assert_eq!(gauges.counts, [0x80E3, 0x6AB7, 0x8718, 0x8421, 0x77BE, 0x8108]);
+    assert_eq!(
+        gauges.counts,
+        [0x80E3, 0x6AB7, 0x8718, 0x8421, 0x77BE, 0x8108]
+    );
 }
 
 #[test]
@@ -99,7 +127,7 @@ fn a_saturated_board_repeats_its_last_good_vector() {
     assert_eq!(texts(&frames), ["31A#E380B76A188709", "31B#2184BE77088111"]);
     let frames = encode(&mut *board, 0, &Reading::Wrench(good), Quality::GOOD);
     assert_eq!(texts(&frames), ["31A#E380B76A1887", "31B#2184BE770881"]);
-    // A recorded reading that is frozen already is encoded as it is.
+    // A recorded reading that is already frozen is encoded unchanged.
     let frozen = Reading::Wrench(Wrench {
         force: [0.0; 3],
         torque: [0.0; 3],
@@ -114,7 +142,10 @@ fn a_saturation_byte_that_contradicts_itself_is_counted() {
     let mut device = listener("icub_strain", SCALES, &[]);
     // No flag; a flag of 2; a gauge both low and high.
     for byte in ["00", "04", "02", "0D", "C1"] {
-        let (readings, faults) = decode(&mut *device, &[frame(&format!("31A#E380B76A1887{byte}"), 0.0)]);
+        let (readings, faults) = decode(
+            &mut *device,
+            &[frame(&format!("31A#E380B76A1887{byte}"), 0.0)],
+        );
         assert!(readings.is_empty());
         assert_eq!(count(&faults, Counter::Value), 1, "{byte}");
     }
@@ -147,15 +178,22 @@ fn temperatures_come_with_both_type_codes() {
 fn boards_say_who_they_are() {
     let mut strain = board("icub_strain", "", &[]);
     assert_eq!(answers(&mut *strain, "70F#FF"), ["710#FF0C020008"]);
-    assert_eq!(answers(&mut *strain, "201#1C0200"), ["210#1C0C020008020001"]);
+    assert_eq!(
+        answers(&mut *strain, "201#1C0200"),
+        ["210#1C0C020008020001"]
+    );
     assert_eq!(answers(&mut *strain, "201#1800"), ["210#1800070C"]);
     assert_eq!(answers(&mut *strain, "201#1805"), ["210#1805001F"]);
-    assert!(answers(&mut *strain, "202#1805").is_empty(), "meant for another");
+    assert!(
+        answers(&mut *strain, "202#1805").is_empty(),
+        "meant for another"
+    );
     let mut motor = board("icub_motor", "", &[0]);
     assert_eq!(answers(&mut *motor, "001#5B0100"), ["010#5B08020008020000"]);
 }
 
-const IMU: &str = r#"quantities = ["acceleration", "magnetic_field", "angular_velocity", "orientation", "status"]"#;
+const IMU: &str = "quantities = [\"acceleration\", \"magnetic_field\", \"angular_velocity\", \
+                   \"orientation\", \"status\"]";
 
 fn imu() -> Imu {
     Imu {
@@ -195,12 +233,19 @@ fn an_imu_acquisition() {
     let Reading::Imu(decoded) = readings[0].reading else {
         panic!("{readings:?}")
     };
-    assert_near(&decoded.proper_acceleration, &imu().proper_acceleration, 1e-9);
+    assert_near(
+        &decoded.proper_acceleration,
+        &imu().proper_acceleration,
+        1e-9,
+    );
     assert_near(&decoded.angular_velocity, &imu().angular_velocity, 1e-9);
     assert_near(&decoded.magnetic_field, &imu().magnetic_field, 1e-15);
     assert_near(&decoded.orientation, &imu().orientation, 1e-9);
     assert!(
-        decoded.angular_acceleration.iter().all(|value| value.is_nan()),
+        decoded
+            .angular_acceleration
+            .iter()
+            .all(|value| value.is_nan()),
         "absent is not zero"
     );
 }
@@ -209,7 +254,8 @@ fn an_imu_acquisition() {
 fn an_uncalibrated_sensor_in_use_is_told() {
     let keys = r#"quantities = ["angular_velocity", "status"]"#;
     let mut device = listener("icub_imu", keys, &[]);
-    // The gyroscope is at 3, accelerometer and magnetometer, not in use, at 0; then the gyroscope is at 0.
+    // First the gyroscope is at 3, and accelerometer and magnetometer, which are not used, at 0;
+    // then the gyroscope is at 0.
     let frames = [
         "513#0702A0050000F8FF",
         "515#0703000000000000",
@@ -219,7 +265,10 @@ fn an_uncalibrated_sensor_in_use_is_told() {
     let frames: Vec<Frame> = frames.iter().map(|text| frame(text, 0.0)).collect();
     let (readings, _) = decode(&mut *device, &frames);
     assert_eq!(readings[0].quality, Quality::DEVICE_COUNTER);
-    assert_eq!(readings[1].quality, Quality::DEVICE_COUNTER | Quality::NOT_CALIBRATED);
+    assert_eq!(
+        readings[1].quality,
+        Quality::DEVICE_COUNTER | Quality::NOT_CALIBRATED
+    );
 }
 
 #[test]
@@ -238,7 +287,10 @@ fn a_gap_in_seq_is_counted_and_told() {
         .collect();
     let (readings, faults) = decode(&mut *device, &frames);
     assert_eq!(
-        readings.iter().map(|r| r.device_counter).collect::<Vec<_>>(),
+        readings
+            .iter()
+            .map(|r| r.device_counter)
+            .collect::<Vec<_>>(),
         [254, 255, 0, 3]
     );
     assert_eq!(count(&faults, Counter::Lost), 2);
@@ -247,18 +299,28 @@ fn a_gap_in_seq_is_counted_and_told() {
         .map(|r| r.quality.contains(Quality::GAP_BEFORE))
         .collect();
     assert_eq!(gaps, [false, false, false, true]);
-    // An acquisition of which a frame is missing is never given, and a frame that comes too late is not mixed in.
+    // An acquisition with a missing frame is dropped, and a late frame is not mixed into the next
+    // one.
     let [acc, gyr] = acquisition(4, 40.0);
     let [acc5, gyr5] = acquisition(5, 50.0);
     let (readings, faults) = decode(&mut *device, &[acc, acc5, gyr, gyr5]);
-    assert_eq!(readings.iter().map(|r| r.device_counter).collect::<Vec<_>>(), [5]);
+    assert_eq!(
+        readings
+            .iter()
+            .map(|r| r.device_counter)
+            .collect::<Vec<_>>(),
+        [5]
+    );
     assert_eq!(count(&faults, Counter::Unpaired), 2);
     assert!(readings[0].quality.contains(Quality::GAP_BEFORE));
 }
 
 #[test]
 fn legacy_frames_have_the_scale_of_their_board() {
-    let frames = [frame("511#0040000000C0", 0.0), frame("510#00400000FFFF", 0.3)];
+    let frames = [
+        frame("511#0040000000C0", 0.0),
+        frame("510#00400000FFFF", 0.3),
+    ];
     for (keys, acceleration, degrees) in [
         (r#"legacy = "mtb""#, 9.80665, 125.0),
         (r#"legacy = "bno055""#, 163.84, 1024.0_f64),
@@ -269,10 +331,14 @@ fn legacy_frames_have_the_scale_of_their_board() {
         let Reading::Imu(imu) = readings[0].reading else {
             panic!("{readings:?}")
         };
-        assert_near(&imu.proper_acceleration, &[acceleration, 0.0, -acceleration], 1e-9);
+        assert_near(
+            &imu.proper_acceleration,
+            &[acceleration, 0.0, -acceleration],
+            1e-9,
+        );
         assert_near(&imu.angular_velocity[..1], &[degrees.to_radians()], 1e-9);
     }
-    // Without `legacy` their scale is unknown, and nothing is made of them.
+    // Without `legacy` their scale is unknown, and they are ignored.
     let (readings, _) = decode(&mut *listener("icub_imu", "", &[]), &frames);
     assert!(readings.is_empty());
 }
@@ -288,7 +354,12 @@ fn a_motor_board() {
     let mut board = board("icub_motor", "", &[0]);
     let text = "110#E803FFFF00000100";
     assert_eq!(
-        texts(&encode(&mut *board, 0, &Reading::Joint(joint), Quality::GOOD)),
+        texts(&encode(
+            &mut *board,
+            0,
+            &Reading::Joint(joint),
+            Quality::GOOD
+        )),
         [text]
     );
     let mut device = listener("icub_motor", "", &[0]);
@@ -305,7 +376,7 @@ fn a_motor_board() {
         decoded.torque.is_nan() && decoded.acceleration.is_nan(),
         "absent is not zero"
     );
-    // The raw motor temperature has no scale: legal, and no reading.
+    // The raw motor temperature has no known scale: a legal frame without a reading.
     let (readings, faults) = decode(&mut *device, &[frame("11C#00003412", 0.0)]);
     assert!(readings.is_empty() && faults.is_empty());
 }
@@ -316,7 +387,10 @@ fn the_faults_of_a_motor_board_are_those_of_the_document() {
     let mut device = listener("icub_motor", "", &[0]);
     let (readings, _) = decode(
         &mut *device,
-        &[frame("113#0610007D81400080", 0.0), frame("110#0000000000000000", 0.1)],
+        &[
+            frame("113#0610007D81400080", 0.0),
+            frame("110#0000000000000000", 0.1),
+        ],
     );
     let Reading::Actuator(actuator) = readings[0].reading else {
         panic!("{readings:?}")
@@ -333,8 +407,11 @@ fn the_faults_of_a_motor_board_are_those_of_the_document() {
             reserved: 0
         }
     );
-    assert_eq!(readings[1].quality, Quality::DEVICE_FAULT | Quality::NOT_CALIBRATED);
-    // What only speaks of the bus does not make a position doubtful; the rest does; then all is well.
+    assert_eq!(
+        readings[1].quality,
+        Quality::DEVICE_FAULT | Quality::NOT_CALIBRATED
+    );
+    // Bus faults do not make a position doubtful; other faults do; finally all is well.
     for (status, quality) in [
         ("113#0600000000BC00F8", Quality::GOOD),
         ("113#0600000010000000", Quality::DEVICE_FAULT),
@@ -343,14 +420,17 @@ fn the_faults_of_a_motor_board_are_those_of_the_document() {
         ("113#B000000000000000", Quality::NOT_CALIBRATED),
         ("113#0600000000000000", Quality::GOOD),
     ] {
-        let (readings, _) = decode(&mut *device, &[frame(status, 1.0), frame("110#0000000000000000", 1.1)]);
+        let (readings, _) = decode(
+            &mut *device,
+            &[frame(status, 1.0), frame("110#0000000000000000", 1.1)],
+        );
         assert_eq!(readings[1].quality, quality, "{status}");
     }
 }
 
 #[test]
 fn a_pos_frame_holds_several_joints() {
-    // Type 0, label 2, two values: 90.0 and -6.2 deg; the third does not count.
+    // Type 0, label 2, two values: 90.0 and -6.2 deg; the third is ignored.
     let mut device = listener("icub_pos", "", &[2, 3]);
     let (readings, faults) = decode(&mut *device, &[frame("311#00228403C2FF3412", 0.0)]);
     assert!(faults.is_empty(), "{faults:?}");

@@ -1,5 +1,6 @@
-//! What every driver promises, tested through its public face alone: golden bytes from the protocol's documents, decoding
-//! as the inverse of encoding, no harm from any frame, and bring-up against a board that answers like a real one.
+//! Tests of every driver through its public interface: golden bytes from the protocol's documents,
+//! decoding as the inverse of encoding, robustness against any frame, and bring-up against a board
+//! that answers like a real one.
 
 mod any_frame;
 mod bringup;

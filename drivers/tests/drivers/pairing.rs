@@ -1,4 +1,5 @@
-//! Force and torque frames carry no number: they must never be paired across readings, whatever is lost or late.
+//! Force and torque frames have no sequence number. They must never be paired across readings, even
+//! if frames are lost or late.
 
 use crate::rig::{board, count, decode, encode, listener};
 use proprio_drivers::{Frame, Id};
@@ -7,26 +8,31 @@ use proptest::prelude::*;
 
 const KEYS: &str = "full_scale_n = [32768, 32768, 32768]\nfull_scale_nm = [32768, 32768, 32768]";
 const PERIOD_US: i64 = 10_000;
-/// From a force frame to its torque frame on a bus without other traffic.
+/// Delay from a force frame to its torque frame on a bus without other traffic.
 const USUAL_US: i64 = 150;
 
-/// The two frames of reading `number`, which both say so: a step is 1 N or 1 Nm.
+/// The two frames of reading `number`; both contain that number, with a step of 1 N or 1 Nm.
 fn halves(number: u16) -> [Frame; 2] {
     let value = f64::from(number);
     let reading = Reading::Wrench(Wrench {
         force: [value; 3],
         torque: [value; 3],
     });
-    encode(&mut *board("icub_strain", KEYS, &[]), 0, &reading, Quality::GOOD)
-        .try_into()
-        .unwrap()
+    encode(
+        &mut *board("icub_strain", KEYS, &[]),
+        0,
+        &reading,
+        Quality::GOOD,
+    )
+    .try_into()
+    .unwrap()
 }
 
 fn at(frame: Frame, us: i64) -> Frame {
     frame.at(Nanos::from_micros(us), StampKind::Software)
 }
 
-/// The numbers of the readings that come out, which must be the same in force and torque.
+/// The numbers of the decoded readings, which must be equal in force and torque.
 fn numbers(frames: &[Frame]) -> (Vec<u16>, Vec<bool>, u32) {
     let (readings, faults) = decode(&mut *listener("icub_strain", KEYS, &[]), frames);
     let numbers = readings
@@ -48,7 +54,7 @@ fn numbers(frames: &[Frame]) -> (Vec<u16>, Vec<bool>, u32) {
     (numbers, gaps, count(&faults, Counter::Unpaired))
 }
 
-/// Frames named as `F1` or `T1`, at the times given in units of a period.
+/// Frames named `F1` or `T1`, at times in units of a period.
 fn sequence(items: &[(&str, f64)]) -> Vec<Frame> {
     items
         .iter()
@@ -76,7 +82,10 @@ fn a_late_torque_is_not_paired_with_the_next_force() {
         ("T3", 3.015),
     ]);
     let (numbers, gaps, unpaired) = numbers(&frames);
-    assert_eq!((numbers, gaps, unpaired), (vec![0, 3], vec![false, true], 4));
+    assert_eq!(
+        (numbers, gaps, unpaired),
+        (vec![0, 3], vec![false, true], 4)
+    );
 }
 
 #[test]
@@ -110,17 +119,24 @@ fn order_alone_decides_where_there_are_no_stamps() {
 
 #[test]
 fn a_torque_too_long_after_its_force_is_not_paired_either() {
-    let (numbers, _, unpaired) = numbers(&sequence(&[("F0", 0.0), ("T0", 0.6), ("F1", 1.0), ("T1", 1.015)]));
+    let (numbers, _, unpaired) = numbers(&sequence(&[
+        ("F0", 0.0),
+        ("T0", 0.6),
+        ("F1", 1.0),
+        ("T1", 1.015),
+    ]));
     assert_eq!((numbers, unpaired), (vec![1], 2));
 }
 
 #[test]
 fn two_boards_do_not_disturb_each_other() {
     let other = |frame: &Frame| {
-        let Id::Standard(id) = frame.id else { panic!("{frame}") };
+        let Id::Standard(id) = frame.id else {
+            panic!("{frame}")
+        };
         Frame::new(Id::standard(id + 0x10), frame.data()).at(frame.t, frame.stamp)
     };
-    // 31A 32A 31B 32B: each device is given all frames and takes its own.
+    // 31A 32A 31B 32B: each device gets all frames and uses its own.
     let mut frames = Vec::new();
     for number in 0..50_u16 {
         let [force, torque] = halves(number);
@@ -132,7 +148,7 @@ fn two_boards_do_not_disturb_each_other() {
     assert_eq!((numbers, unpaired), ((0..50).collect(), 0));
 }
 
-/// What happens to a torque frame.
+/// The fate of a torque frame.
 #[derive(Debug, Clone, Copy)]
 enum Fate {
     Comes,
@@ -149,7 +165,7 @@ proptest! {
             6 => Just(Fate::Comes),
             2 => Just(Fate::Lost),
             2 => (0_i64..2 * PERIOD_US - USUAL_US - 1).prop_map(Fate::Late),
-            // Just into the gap between the next force and its torque: the hardest place.
+            // Into the gap between the next force and its torque: the hardest case.
             2 => (PERIOD_US - USUAL_US..=PERIOD_US).prop_map(Fate::Late),
         ], 1..60,
     )) {
@@ -172,19 +188,23 @@ proptest! {
         let frames: Vec<Frame> = events.into_iter().map(|(_, frame)| frame).collect();
         let halves_in = u32::try_from(frames.len()).unwrap();
         let (numbers, gaps, unpaired) = numbers(&frames);
-        // In order, and every half is either in a reading, or counted, or (the last force) still waiting.
+        // The readings are in order, and every half is in a reading, counted, or (the last force)
+        // still waiting.
         prop_assert!(numbers.is_sorted());
         let paired = 2 * u32::try_from(numbers.len()).unwrap();
-        prop_assert!((halves_in - 1..=halves_in).contains(&(paired + unpaired)), "{} of {}", paired + unpaired, halves_in);
-        // Every reading that follows a lost one says so.
+        let seen = paired + unpaired;
+        prop_assert!((halves_in - 1..=halves_in).contains(&seen), "{} of {}", seen, halves_in);
+        // Every reading after a lost one has GAP_BEFORE.
         for (k, pair) in numbers.windows(2).enumerate() {
             prop_assert_eq!(gaps[k + 1], pair[1] != pair[0] + 1);
         }
     }
 
-    /// Losses alone cost at most one reading more than was hit.
+    /// Losses alone cost at most one more reading than the number of losses.
     #[test]
-    fn a_loss_costs_at_most_the_reading_after_it(lost in proptest::collection::vec(proptest::bool::weighted(0.2), 2..100)) {
+    fn a_loss_costs_at_most_the_reading_after_it(
+        lost in proptest::collection::vec(proptest::bool::weighted(0.2), 2..100)
+    ) {
         let mut frames = Vec::new();
         let mut expected = Vec::new();
         for (number, half_lost) in (0_u16..).zip(lost.chunks(2)) {

@@ -1,6 +1,9 @@
-//! Drivers and boards built from TOML as the gateway builds them, and a bus between the two that loses what it is told to.
+//! Drivers and boards built from TOML as in the gateway, and a bus between them that can lose
+//! frames.
 
-use proprio_drivers::{Board, Decoded, Device, Fault, Frame, Frames, Id, Mode, Options, Output, Outputs, Spec, State};
+use proprio_drivers::{
+    Board, Decoded, Device, Fault, Frame, Frames, Id, Mode, Options, Output, Outputs, Spec, State,
+};
 use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind};
 
 /// The keys of a driver, read from TOML.
@@ -12,7 +15,7 @@ pub(crate) fn options(driver: &str, keys: &str) -> Options {
     }
 }
 
-/// A device at `address` that may be silent for 50 ms.
+/// A device at `address` with a maximum silence of 50 ms.
 pub(crate) fn spec(address: u32, mode: Mode, outputs: &[u8]) -> Spec {
     let outputs = Outputs(outputs.iter().copied().collect());
     Spec {
@@ -37,7 +40,7 @@ pub(crate) fn board(driver: &str, keys: &str, outputs: &[u8]) -> Box<dyn Board> 
         .expect("a legal configuration")
 }
 
-/// The frame that can-utils write as `text`, received at `ms`.
+/// The frame `text` in can-utils' format, received at `ms`.
 pub(crate) fn frame(text: &str, ms: f64) -> Frame {
     let (id, data) = text.split_once('#').expect("id#data");
     let bytes: Vec<u8> = (0..data.len())
@@ -45,10 +48,11 @@ pub(crate) fn frame(text: &str, ms: f64) -> Frame {
         .map(|at| u8::from_str_radix(&data[at..at + 2], 16).unwrap())
         .collect();
     let id = u32::from_str_radix(id, 16).unwrap();
-    Frame::new(Id::standard(u16::try_from(id).unwrap()), &bytes).at(Nanos::from_seconds(ms * 1e-3), StampKind::Software)
+    Frame::new(Id::standard(u16::try_from(id).unwrap()), &bytes)
+        .at(Nanos::from_seconds(ms * 1e-3), StampKind::Software)
 }
 
-/// What `frames` yield, readings and faults in order.
+/// The readings and faults decoded from `frames`, in order.
 pub(crate) fn decode(device: &mut dyn Device, frames: &[Frame]) -> (Vec<Output>, Vec<Fault>) {
     let (mut readings, mut faults) = (Vec::new(), Vec::new());
     let mut out = Decoded::new();
@@ -61,7 +65,7 @@ pub(crate) fn decode(device: &mut dyn Device, frames: &[Frame]) -> (Vec<Output>,
     (readings, faults)
 }
 
-/// How often `counter` was counted.
+/// The total of `counter`.
 pub(crate) fn count(faults: &[Fault], counter: Counter) -> u32 {
     faults
         .iter()
@@ -71,7 +75,12 @@ pub(crate) fn count(faults: &[Fault], counter: Counter) -> u32 {
 }
 
 /// The frames that `reading` is encoded to.
-pub(crate) fn encode(board: &mut dyn Board, output: u8, reading: &Reading, quality: Quality) -> Vec<Frame> {
+pub(crate) fn encode(
+    board: &mut dyn Board,
+    output: u8,
+    reading: &Reading,
+    quality: Quality,
+) -> Vec<Frame> {
     let mut out = Frames::new();
     board
         .encode(output, reading, quality, &mut out)
@@ -79,26 +88,26 @@ pub(crate) fn encode(board: &mut dyn Board, output: u8, reading: &Reading, quali
     out.to_vec()
 }
 
-/// Whether the n-th frame of one side, which is this, is lost.
+/// Whether this frame, the n-th of one side, is lost.
 type Loss = Box<dyn FnMut(usize, &Frame) -> bool>;
 
-/// One device and one board on a bus with 1 ms to a turn.
+/// One device and one board on a bus, with turns of 1 ms.
 pub(crate) struct Rig {
     pub(crate) device: Box<dyn Device>,
     pub(crate) board: Box<dyn Board>,
-    /// What the board measures.
+    /// The board's measurement.
     pub(crate) reading: (u8, Reading),
     pub(crate) now: Nanos,
-    /// What the host sends in vain.
+    /// Frames of the host that are lost.
     pub(crate) host_loses: Loss,
-    /// What the board sends in vain.
+    /// Frames of the board that are lost.
     pub(crate) board_loses: Loss,
-    /// Everything that the host sent, lost or not.
+    /// All frames that the host sent, lost or not.
     pub(crate) sent: Vec<String>,
     pub(crate) received: usize,
     pub(crate) readings: Vec<Output>,
     pub(crate) faults: Vec<Fault>,
-    /// States that were passed, without repetition.
+    /// The sequence of states, without repetition.
     pub(crate) states: Vec<State>,
     due: Option<Nanos>,
 }
@@ -109,7 +118,7 @@ impl Rig {
         Self::with_board(driver, keys, keys, outputs, reading)
     }
 
-    /// A device and a board with keys of their own.
+    /// A device and a board with different keys.
     pub(crate) fn with_board(
         driver: &str,
         keys: &str,
@@ -119,8 +128,12 @@ impl Rig {
     ) -> Self {
         let spec = spec(1, Mode::Supervise, outputs);
         Self {
-            device: options(driver, keys).device(&spec).expect("a legal configuration"),
-            board: options(driver, board_keys).board(&spec).expect("a legal configuration"),
+            device: options(driver, keys)
+                .device(&spec)
+                .expect("a legal configuration"),
+            board: options(driver, board_keys)
+                .board(&spec)
+                .expect("a legal configuration"),
             reading,
             now: Nanos::from_millis(1000),
             host_loses: Box::new(|_, _| false),
@@ -141,7 +154,8 @@ impl Rig {
                 continue;
             }
             let mut out = Decoded::new();
-            self.device.on_frame(&frame.at(self.now, StampKind::Software), &mut out);
+            self.device
+                .on_frame(&frame.at(self.now, StampKind::Software), &mut out);
             self.readings.extend(out.readings);
             self.faults.extend(out.faults);
         }
@@ -159,7 +173,7 @@ impl Rig {
         for _ in 0..ms {
             let mut out = Decoded::new();
             while let Some(transmit) = self.device.poll_transmit(self.now, &mut out) {
-                assert!(transmit.deadline > self.now, "a frame that may not be sent any more");
+                assert!(transmit.deadline > self.now, "a frame after its deadline");
                 self.sent.push(transmit.frame.to_string());
                 assert!(self.sent.len() < 10_000, "it never stops sending");
                 if (self.host_loses)(self.sent.len(), &transmit.frame) {

@@ -1,10 +1,11 @@
-//! A link to a CAN bus: one trait, three implementations, one conformance suite for all of them (tests/conformance.rs).
+//! A link to a CAN bus: one trait, three implementations, one conformance suite for all
+//! (tests/conformance.rs).
 //!
 //! | link | the bus | stamps |
 //! |---|---|---|
 //! | [`socketcan`] | a CAN interface of the kernel | kernel, or the adapter's |
-//! | [`replay`] | a recorded log | the log's, rebased to now or as recorded |
-//! | [`virtual_bus`] | IPv4 multicast on the loopback interface, where the kernel has no CAN | kernel |
+//! | [`replay`] | a recorded log | the log's, shifted to the present or as recorded |
+//! | [`virtual_bus`] | IPv4 multicast on the loopback interface, without kernel CAN | kernel |
 
 use proprio_drivers::{Claim, Format, Frame};
 use proprio_topics::{LinkState, Nanos};
@@ -14,33 +15,33 @@ mod socket;
 pub mod socketcan;
 pub mod virtual_bus;
 
-/// What [`Link::recv`] brings.
+/// The result of [`Link::recv`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Received {
-    /// A frame, stamped with its arrival.
+    /// A frame, stamped with its time of arrival.
     Frame(Frame),
-    /// The deadline has passed without one.
+    /// The deadline has passed without a frame.
     TimedOut,
-    /// There will never be another one (the end of a log).
+    /// There will be no more frames (the end of a log).
     Ended,
-    /// The link's state has changed; ask [`Link::state`]. It looks after its own recovery.
+    /// The link's state has changed; see [`Link::state`]. The link recovers without help.
     StateChanged,
 }
 
-/// What a link counts.
+/// The counters of a link.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct LinkCounters {
-    /// Frames that passed the filters and were handed out.
+    /// Frames that passed the filters and were returned.
     pub received: u64,
     /// Frames that the kernel dropped because the receive buffer was full.
     pub dropped: u64,
-    /// Error frames received (not handed out as frames; they set the state).
+    /// Error frames received (they set the state and are not returned).
     pub error_frames: u64,
     /// Frames sent.
     pub sent: u64,
     /// Frames not sent before their deadline, or refused by the interface.
     pub send_failures: u64,
-    /// Times that the link was lost.
+    /// Number of link losses.
     pub losses: u64,
 }
 
@@ -48,26 +49,28 @@ pub struct LinkCounters {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum SendError {
-    /// Its deadline passed first: the queue was full, or it came too late.
+    /// The deadline passed first: the queue was full, or the call came too late.
     #[error("the deadline passed before the frame could be sent")]
     Deadline,
-    /// The link is down, gone or off the bus.
+    /// The link is down, gone or bus-off.
     #[error("the link is not up")]
     NotUp,
-    /// This link can not carry such a frame (CAN FD on a classic interface), or does not send at all.
-    #[error("this link can not send that frame")]
+    /// This link cannot carry such a frame (CAN FD on a classic interface), or does not send at
+    /// all.
+    #[error("this link cannot send such a frame")]
     Unsupported,
-    /// The system refused.
-    #[error("the system refused: {0}")]
+    /// The operating system refused.
+    #[error("the operating system refused it: errno {0}")]
     System(i32),
 }
 
-/// A bus to receive from and send to. Owned by one thread; allocates nothing after it is open.
+/// A bus to receive from and send to. Owned by one thread; allocates nothing after opening.
 pub trait Link: Send {
-    /// The next frame, or what else happened until `deadline` (CLOCK_MONOTONIC \[ns\]); blocks until then at the most.
+    /// The next frame or event until `deadline` (CLOCK_MONOTONIC \[ns\]); blocks at most until
+    /// then.
     ///
-    /// Frames that arrived together are read from the system together and handed out one by one. A deadline in the past
-    /// still hands out what has already arrived. Frames that this link sent itself do not come back.
+    /// Frames that have arrived are read from the system in batches and returned one by one, even
+    /// if the deadline is in the past. Frames that this link sent are not received.
     fn recv(&mut self, deadline: Nanos) -> Received;
 
     /// Sends a frame before `deadline`.
@@ -79,22 +82,23 @@ pub trait Link: Send {
     /// The link's state.
     fn state(&self) -> LinkState;
 
-    /// What it has counted since it was opened.
+    /// The counters since opening.
     fn counters(&self) -> LinkCounters;
 
-    /// What a person should know of it when it has ended: lines of a log that could not be read, say.
+    /// A note for the log when the link has ended, such as lines of a log that could not be read.
     fn note(&self) -> Option<String> {
         None
     }
 }
 
-/// A link that could not be opened.
+/// Why a link cannot be opened.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum OpenError {
     /// There is no such interface.
     #[error(
-        "there is no interface {interface}; `ip -br link` lists those there are, `ip link add dev {interface} type vcan` makes a \
+        "there is no interface {interface}; `ip -br link` lists the interfaces, \
+         `ip link add dev {interface} type vcan` creates a \
          virtual one, and source = {{ kind = \"virtual\", name = \"...\" }} needs none"
     )]
     NoInterface {
@@ -107,24 +111,25 @@ pub enum OpenError {
         /// Its name.
         interface: String,
     },
-    /// The kernel has no CAN.
+    /// The kernel has no CAN support.
     #[error(
-        "this kernel has no CAN (can and can-raw are not available: {cause}); use the virtual bus instead: source = {{ kind = \
+        "this kernel has no CAN (modules can and can-raw are not available: {cause}); \
+         use the virtual bus instead: source = {{ kind = \
          \"virtual\", name = \"...\" }}"
     )]
     NoCan {
-        /// What the system said.
+        /// The operating system's error.
         cause: std::io::Error,
     },
-    /// We may not.
+    /// This process lacks the permission.
     #[error("no permission to {action}: {cause}")]
     Permission {
         /// What was tried.
         action: String,
-        /// What the system said.
+        /// The operating system's error.
         cause: std::io::Error,
     },
-    /// A log that can not be read.
+    /// The log cannot be read.
     #[error("{path}: {cause}")]
     Log {
         /// The log.
@@ -132,18 +137,18 @@ pub enum OpenError {
         /// Why.
         cause: std::io::Error,
     },
-    /// Anything else.
+    /// Any other error.
     #[error("{action}: {cause}")]
     System {
         /// What was tried.
         action: String,
-        /// What the system said.
+        /// The operating system's error.
         cause: std::io::Error,
     },
 }
 
-/// Whether one of `claims` takes the frame, or there are none, which takes everything. Claims are about data frames: with
-/// any, remote requests do not pass.
+/// Whether one of `claims` matches the frame; without claims every frame passes. Claims match data
+/// frames only, so with claims remote requests do not pass.
 #[must_use]
 pub fn passes(claims: &[Claim], frame: &Frame) -> bool {
     let data = matches!(frame.format, Format::Classic | Format::Fd { .. });

@@ -1,12 +1,15 @@
-//! A recorded log as a link: candump's formats, at the recorded pace or as fast as they can be read.
+//! A recorded log as a link: candump's formats, replayed at the recorded pace or as fast as
+//! possible.
 //!
-//! | pace | when a frame is handed out | its stamp |
+//! | pace | when a frame is returned | its stamp |
 //! |---|---|---|
-//! | [`Pace::Recorded`] | at its stamp, the first stamp being the first call of [`Link::recv`] | the log's, moved to now |
+//! | [`Pace::Recorded`] | at its stamp | the log's, shifted to the present |
 //! | [`Pace::Fast`] | at once | the log's |
 //!
-//! A log answers nothing, so it takes nothing: [`Link::send`] is [`SendError::Unsupported`]. Devices that only listen
-//! never send.
+//! At the recorded pace the first stamp is the time of the first call of [`Link::recv`].
+//!
+//! A log does not answer, so [`Link::send`] fails with [`SendError::Unsupported`]. Devices that
+//! only listen never send.
 
 use super::{Link, LinkCounters, OpenError, Received, SendError, passes};
 use crate::candump::{Reader, Report};
@@ -18,10 +21,10 @@ use std::fs::File;
 use std::io::{self, BufReader};
 use std::path::Path;
 
-/// How much of the log is read at a time \[bytes\].
+/// Size of the read buffer \[bytes\].
 const BUFFER: usize = 1 << 16;
 
-/// Which frames of a log with several interfaces belong to one bus.
+/// Selects the frames of one bus from a log with several interfaces.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Matching {
     interface: Option<String>,
@@ -29,9 +32,10 @@ pub struct Matching {
 }
 
 impl Matching {
-    /// What bus number `this` of `buses`, each with its interface (if its source is one) and its name, takes of a log: with one
-    /// bus everything (`None`), with several the frames of its interface, and those of an interface that is called like the
-    /// bus and belongs to no other.
+    /// The selection of bus number `this` of `buses`, each given by its interface (if its source is
+    /// one) and name. A single bus takes everything (`None`). With several, a bus takes the frames
+    /// of its interface, and those of an interface with the bus's name that belongs to no other
+    /// bus.
     #[must_use]
     pub fn of(buses: &[(Option<&str>, &str)], this: usize) -> Option<Self> {
         let (interface, name) = buses.get(this).filter(|_| buses.len() > 1)?;
@@ -45,7 +49,7 @@ impl Matching {
         })
     }
 
-    /// Whether frames that the log shows on `interface` belong to it.
+    /// Whether frames of `interface` in the log belong to it.
     #[must_use]
     pub fn takes(&self, interface: &str) -> bool {
         self.interface.as_deref() == Some(interface) || self.name.as_deref() == Some(interface)
@@ -62,11 +66,11 @@ pub struct Replay {
     clock: Monotonic,
     /// The next frame: read, not yet due.
     pending: Option<Frame>,
-    /// The log's first stamp, whichever interface it is of.
+    /// The log's first stamp, of any interface.
     origin: Nanos,
-    /// What is added to the log's stamps, once known.
+    /// The shift added to the log's stamps, once known.
     shift: Option<Nanos>,
-    /// The stamp handed out last, for frames without.
+    /// The last stamp returned, for frames without a stamp.
     last: Nanos,
     ended: bool,
     failure: Option<io::ErrorKind>,
@@ -75,12 +79,18 @@ pub struct Replay {
 }
 
 impl Replay {
-    /// Opens the log at `path`, of which only frames that `interface` takes (all if `None`) and one of `claims` matches (all
-    /// if there are none) are handed out.
+    /// Opens the log at `path`. Only frames that `interface` takes (all if `None`) and that one of
+    /// `claims` matches (all if there are none) are returned.
     ///
     /// # Errors
-    /// [`OpenError::Log`]: it can not be read, or has no time stamps to keep the pace by.
-    pub fn open(path: &Path, pace: Pace, interface: Option<Matching>, claims: &[Claim]) -> Result<Self, OpenError> {
+    /// [`OpenError::Log`]: it cannot be read, or has no time stamps but the recorded pace needs
+    /// them.
+    pub fn open(
+        path: &Path,
+        pace: Pace,
+        interface: Option<Matching>,
+        claims: &[Claim],
+    ) -> Result<Self, OpenError> {
         let fail = |cause| OpenError::Log {
             path: path.to_owned(),
             cause,
@@ -101,7 +111,8 @@ impl Replay {
             unmatched: 0,
             counters: LinkCounters::default(),
         };
-        // The first frame of the whole log sets the origin, so that the buses of one log stay in step.
+        // The first frame of the whole log is the origin, so that the buses of one log stay in
+        // step.
         let matches = |interface: &str| replay.matching.as_ref().is_none_or(|m| m.takes(interface));
         let first = replay
             .log
@@ -110,7 +121,7 @@ impl Replay {
             .map(|r| (r.stamp, matches(r.interface), r.frame));
         match first {
             None => match replay.log.report().first_bad.first() {
-                // Nothing was recorded.
+                // The log is empty.
                 None => replay.ended = true,
                 Some((line, error)) => {
                     let why = format!("it is not a log: it holds no frame; line {line}: {error}");
@@ -118,8 +129,8 @@ impl Replay {
                 }
             },
             Some((None, ..)) if pace == Pace::Recorded => {
-                let cause =
-                    "it has no time stamps to keep the pace by; record with `candump -l`, or use pace = \"fast\"";
+                let cause = "it has no time stamps, which pace = \"recorded\" needs; record with \
+                     `candump -l`, or use pace = \"fast\"";
                 return Err(fail(io::Error::new(io::ErrorKind::InvalidData, cause)));
             }
             Some((stamp, matches, frame)) => {
@@ -131,31 +142,31 @@ impl Replay {
         Ok(replay)
     }
 
-    /// What the log's reader has seen so far: bad lines, frames without stamps.
+    /// The report of the log's reader so far: bad lines, frames without stamps.
     #[must_use]
     pub const fn report(&self) -> &Report {
         self.log.report()
     }
 
-    /// Puts the log's first stamp at `now`, rather than at the first call of [`Link::recv`]: so that several buses replayed from
-    /// one log stay in step.
+    /// Shifts the log's first stamp to `now` instead of the first call of [`Link::recv`], so that
+    /// several buses replayed from one log stay in step.
     pub const fn start_at(&mut self, now: Nanos) {
         self.shift = Some(now.saturating_sub(self.origin));
     }
 
-    /// Frames of interfaces that are not this bus.
+    /// Number of frames of other buses' interfaces.
     #[must_use]
     pub const fn unmatched(&self) -> u64 {
         self.unmatched
     }
 
-    /// What reading failed with, if the log ended for that reason.
+    /// The read error, if the log ended because of one.
     #[must_use]
     pub const fn failure(&self) -> Option<io::ErrorKind> {
         self.failure
     }
 
-    /// Whether a frame is to be handed out; counts it if not.
+    /// Returns the frame if it is for this bus; otherwise counts it.
     fn sort(&mut self, frame: Frame, matches: bool) -> Option<Frame> {
         if !matches {
             self.unmatched += 1;
@@ -168,7 +179,7 @@ impl Replay {
         passes(&self.claims, &frame).then_some(frame)
     }
 
-    /// The next frame to hand out, due or not.
+    /// The next frame to return, due or not.
     fn next(&mut self) -> Option<Frame> {
         if let Some(frame) = self.pending.take() {
             return Some(frame);
@@ -177,7 +188,9 @@ impl Replay {
             let (frame, matches) = match self.log.next_record() {
                 Ok(Some(record)) => (
                     record.frame,
-                    self.matching.as_ref().is_none_or(|m| m.takes(record.interface)),
+                    self.matching
+                        .as_ref()
+                        .is_none_or(|m| m.takes(record.interface)),
                 ),
                 Ok(None) => {
                     self.ended = true;
@@ -207,18 +220,21 @@ impl Link for Replay {
         }
         if let Some((line, error)) = report.first_bad.first() {
             notes.push(format!(
-                "{} lines of the log were skipped; the first, line {line}: {error}",
+                "{} lines of the log were skipped; the first is line {line}: {error}",
                 report.bad
             ));
         }
         if self.counters.received == 0 {
-            notes.push(format!("none of the log's {} frames is for this bus", report.records));
+            notes.push(format!(
+                "none of the log's {} frames is for this bus",
+                report.records
+            ));
         }
         (!notes.is_empty()).then(|| notes.join("; "))
     }
 
-    /// As [`Link::recv`]; a frame at the recorded pace that is not due by `deadline` is [`Received::TimedOut`], and handed out
-    /// by a later call.
+    /// As [`Link::recv`]. At the recorded pace, a frame that is not due by `deadline` gives
+    /// [`Received::TimedOut`] and is returned by a later call.
     fn recv(&mut self, deadline: Nanos) -> Received {
         let Some(frame) = self.next() else {
             return Received::Ended;
@@ -226,7 +242,7 @@ impl Link for Replay {
         let handed_out = match self.pace {
             Pace::Fast => frame,
             Pace::Recorded => {
-                // A line without a stamp among others comes with the one before it.
+                // A line without a stamp among others gets the stamp of the previous line.
                 let recorded = if frame.stamp == StampKind::None {
                     self.last
                 } else {
@@ -250,7 +266,7 @@ impl Link for Replay {
         Received::Frame(handed_out)
     }
 
-    /// Never sends: a log answers nothing.
+    /// Never sends: a log does not answer.
     fn send(&mut self, _frame: &Frame, _deadline: Nanos) -> Result<(), SendError> {
         self.counters.send_failures += 1;
         Err(SendError::Unsupported)

@@ -1,8 +1,10 @@
-//! What the two links over sockets share: receiving in batches with stamps and drop counts, waiting, buffer sizes.
+//! Common code of the two links over sockets: receiving in batches with stamps and drop counts,
+//! waiting, buffer sizes.
 //!
-//! Unsafe code of the links is here alone: `recvmmsg` and the query of an interface's flags. nix's `recvmmsg` does not
-//! serve: its `MultiHeaders` (0.31) keep the control length that the call before left, so that control data that come
-//! later, as the drop count does with the first drop, are cut off, and preallocating them anew allocates.
+//! All unsafe code of the links is here: `recvmmsg` and the query of an interface's flags. nix's
+//! `recvmmsg` is not suitable: its `MultiHeaders` (0.31) keep the control length of the previous
+//! call. Control data that appear later, such as the drop count after the first drop, are then cut
+//! off. New `MultiHeaders` per call would allocate.
 #![allow(unsafe_code)]
 
 use crate::clock::{Clock, Monotonic, RealtimeToMonotonic};
@@ -14,13 +16,14 @@ use proprio_topics::Nanos;
 use std::mem::MaybeUninit;
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd};
 
-/// How many datagrams one system call brings at the most.
+/// Maximum number of datagrams per system call.
 pub(super) const BATCH: usize = 32;
 
-/// The receive buffer that is asked for \[bytes\]; the kernel's default holds some 270 frames.
+/// The requested receive buffer \[bytes\]; the kernel's default holds about 270 frames.
 pub(super) const RECEIVE_BUFFER: usize = 4 << 20;
 
-/// Control data of one datagram: three time stamps (64 bytes), one time stamp (32), a drop count (24).
+/// Control data of one datagram: three time stamps (64 bytes), one time stamp (32), a drop count
+/// (24).
 const CONTROL: usize = 128;
 
 #[repr(align(8))]
@@ -47,11 +50,11 @@ pub(super) struct Batch<const SIZE: usize> {
 /// One datagram.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Message<'a> {
-    /// Its bytes, cut off at the batch's size.
+    /// Its bytes, truncated to the batch's size.
     pub(super) bytes: &'a [u8],
-    /// It, or its control data, were longer.
+    /// Whether the datagram or its control data were truncated.
     pub(super) truncated: bool,
-    /// What the kernel knows about it.
+    /// The kernel's control data.
     pub(super) control: Control,
 }
 
@@ -60,14 +63,14 @@ pub(super) struct Message<'a> {
 pub(super) struct Control {
     /// The kernel's stamp, CLOCK_REALTIME.
     pub(super) software: Option<Nanos>,
-    /// The adapter's stamp, in its own time.
+    /// The adapter's stamp, in the adapter's clock.
     pub(super) hardware: Option<Nanos>,
-    /// How many datagrams the socket has dropped so far, modulo 2^32.
+    /// Number of datagrams that the socket has dropped so far, modulo 2^32.
     pub(super) drops: Option<u32>,
 }
 
 impl<const SIZE: usize> Batch<SIZE> {
-    /// An empty one.
+    /// An empty batch.
     pub(super) fn new() -> Self {
         let slots = (0..BATCH)
             .map(|_| Slot {
@@ -83,13 +86,15 @@ impl<const SIZE: usize> Batch<SIZE> {
         }
     }
 
-    /// Replaces the contents by what waits in the socket, without waiting itself; gives their number.
+    /// Replaces the contents with the datagrams that wait in the socket, without blocking; returns
+    /// their number.
     ///
     /// # Errors
-    /// The system's; `EAGAIN` if nothing waits. The batch is empty then.
+    /// The system's error; `EAGAIN` if nothing waits. The batch is then empty.
     pub(super) fn receive(&mut self, socket: BorrowedFd<'_>) -> Result<usize, Errno> {
         (self.count, self.next) = (0, 0);
-        // SAFETY: iovec and mmsghdr are plain C structures of integers and pointers, for which all zeros is a valid value.
+        // SAFETY: iovec and mmsghdr are plain C structures of integers and pointers, for which all
+        // zeros is a valid value.
         let mut vectors: [libc::iovec; BATCH] = unsafe { MaybeUninit::zeroed().assume_init() };
         // SAFETY: as above.
         let mut headers: [libc::mmsghdr; BATCH] = unsafe { MaybeUninit::zeroed().assume_init() };
@@ -101,8 +106,9 @@ impl<const SIZE: usize> Batch<SIZE> {
             header.msg_hdr.msg_control = slot.control.as_mut_ptr().cast();
             header.msg_hdr.msg_controllen = CONTROL as _;
         }
-        // SAFETY: each header points to one vector and one control buffer with their true lengths; all of them, and the
-        // data they point to, live until this function returns, and nothing else refers to them meanwhile.
+        // SAFETY: each header points to one vector and one control buffer with their true lengths;
+        // all of them, and the data they point to, live until this function returns, and nothing
+        // else refers to them meanwhile.
         let received = unsafe {
             libc::recvmmsg(
                 socket.as_raw_fd(),
@@ -112,7 +118,9 @@ impl<const SIZE: usize> Batch<SIZE> {
                 std::ptr::null_mut(),
             )
         };
-        let received = usize::try_from(Errno::result(received)?).unwrap_or(0).min(BATCH);
+        let received = usize::try_from(Errno::result(received)?)
+            .unwrap_or(0)
+            .min(BATCH);
         for (filled, header) in self.filled.iter_mut().zip(&headers).take(received) {
             *filled = Filled {
                 len: (header.msg_len as usize).min(SIZE),
@@ -142,7 +150,8 @@ impl<const SIZE: usize> Batch<SIZE> {
 }
 
 impl Control {
-    /// Reads what the kernel writes: `struct cmsghdr { size_t len; int level; int type; }` and data, aligned to words.
+    /// Parses the kernel's `struct cmsghdr { size_t len; int level; int type; }` followed by data,
+    /// aligned to words.
     fn parse(mut rest: &[u8]) -> Self {
         const WORD: usize = size_of::<usize>();
         const HEADER: usize = (WORD + 8).next_multiple_of(WORD);
@@ -154,8 +163,12 @@ impl Control {
                     .and_then(|b| b.try_into().ok())
                     .map(i32::from_ne_bytes)
             };
-            let len = header.first_chunk::<WORD>().map_or(0, |b| usize::from_ne_bytes(*b));
-            let Some(data) = rest.get(HEADER..len) else { break };
+            let len = header
+                .first_chunk::<WORD>()
+                .map_or(0, |b| usize::from_ne_bytes(*b));
+            let Some(data) = rest.get(HEADER..len) else {
+                break;
+            };
             if word(WORD) == Some(libc::SOL_SOCKET) {
                 match word(WORD + 4) {
                     Some(libc::SO_TIMESTAMPNS) => control.software = timespec(data, 0),
@@ -164,7 +177,9 @@ impl Control {
                         control.software = timespec(data, 0);
                         control.hardware = timespec(data, 2);
                     }
-                    Some(libc::SO_RXQ_OVFL) => control.drops = data.first_chunk().map(|b| u32::from_ne_bytes(*b)),
+                    Some(libc::SO_RXQ_OVFL) => {
+                        control.drops = data.first_chunk().map(|b| u32::from_ne_bytes(*b));
+                    }
                     _ => {}
                 }
             }
@@ -183,23 +198,24 @@ fn timespec(data: &[u8], index: usize) -> Option<Nanos> {
         Some(i64::from(libc::c_long::from_ne_bytes(bytes)))
     };
     let (seconds, ns) = (long(index * 2 * LONG)?, long((index * 2 + 1) * LONG)?);
-    (seconds != 0 || ns != 0).then(|| Nanos(seconds.saturating_mul(1_000_000_000).saturating_add(ns)))
+    (seconds != 0 || ns != 0)
+        .then(|| Nanos(seconds.saturating_mul(1_000_000_000).saturating_add(ns)))
 }
 
-/// Receiving from a socket: batches, when to look for the next one, and what their control data say.
+/// Receives from a socket in batches and interprets their control data.
 pub(super) struct Receiver<const SIZE: usize> {
-    /// What has arrived.
+    /// The current batch.
     pub(super) batch: Batch<SIZE>,
-    /// What its stamps mean.
+    /// The conversion of its stamps.
     pub(super) times: RealtimeToMonotonic,
-    /// The last batch was not full, so the socket is probably empty: wait first, rather than ask in vain.
+    /// The last batch was not full, so the socket is probably empty: wait before the next read.
     empty: bool,
-    /// The drop count seen last.
+    /// The last drop count.
     pub(super) drops: u32,
 }
 
 impl<const SIZE: usize> Receiver<SIZE> {
-    /// For a new socket.
+    /// A receiver for a new socket.
     pub(super) fn new() -> Self {
         Self {
             batch: Batch::new(),
@@ -209,14 +225,15 @@ impl<const SIZE: usize> Receiver<SIZE> {
         }
     }
 
-    /// Begins anew with another socket.
+    /// Starts again with another socket.
     pub(super) const fn reset(&mut self) {
         (self.batch.count, self.batch.next) = (0, 0);
         self.empty = true;
         self.drops = 0;
     }
 
-    /// Fills the batch; waits until `deadline` if nothing is there. False if nothing came.
+    /// Fills the batch; waits until `deadline` if the socket is empty. Returns false if nothing
+    /// arrived.
     ///
     /// # Errors
     /// The system's.
@@ -247,7 +264,8 @@ impl<const SIZE: usize> Receiver<SIZE> {
     }
 }
 
-/// How many datagrams were dropped since `total` was seen last, given the running total with the newest one.
+/// Number of datagrams dropped since the last call: `total` is the last running total, `now` the
+/// newest.
 pub(super) const fn newly_dropped(total: &mut u32, now: Option<u32>) -> u64 {
     let Some(now) = now else { return 0 };
     let new = now.wrapping_sub(*total);
@@ -255,7 +273,7 @@ pub(super) const fn newly_dropped(total: &mut u32, now: Option<u32>) -> u64 {
     new as u64
 }
 
-/// Waits at most `timeout` \[ns\] until the socket can be read (or written), or has an error to tell.
+/// Waits at most `timeout` \[ns\] until the socket can be read (or written) or has an error.
 ///
 /// # Errors
 /// The system's; a signal counts as the end of the wait.
@@ -268,7 +286,7 @@ pub(super) fn wait(socket: BorrowedFd<'_>, events: PollFlags, timeout: Nanos) ->
     }
 }
 
-/// Makes the receive buffer hold `bytes`: beyond the system's limit where we may, else up to it.
+/// Sets the receive buffer to `bytes`: beyond the system's limit if permitted, else up to it.
 pub(super) fn enlarge_receive_buffer(socket: &impl AsFd, bytes: usize) {
     if setsockopt(socket, sockopt::RcvBufForce, &bytes).is_err() {
         // A smaller buffer only drops earlier, and drops are counted.
@@ -279,11 +297,11 @@ pub(super) fn enlarge_receive_buffer(socket: &impl AsFd, bytes: usize) {
 /// The flags (`IFF_UP` and so on) of network interface `name`.
 ///
 /// # Errors
-/// The system's; `ENODEV` if there is none of that name.
+/// The system's error; `ENODEV` if there is no interface of that name.
 pub(super) fn interface_flags(socket: BorrowedFd<'_>, name: &str) -> Result<libc::c_int, Errno> {
     // SAFETY: ifreq is a plain C structure, for which all zeros is a valid value.
     let mut request: libc::ifreq = unsafe { MaybeUninit::zeroed().assume_init() };
-    // One byte less than there is room for: the name ends with a zero.
+    // One byte less than the field: the name ends with a zero.
     let room = request.ifr_name.len() - 1;
     if name.len() > room {
         return Err(Errno::ENODEV);
@@ -291,8 +309,15 @@ pub(super) fn interface_flags(socket: BorrowedFd<'_>, name: &str) -> Result<libc
     for (to, from) in request.ifr_name.iter_mut().zip(name.bytes()) {
         *to = from as libc::c_char;
     }
-    // SAFETY: SIOCGIFFLAGS reads the name from and writes the flags to an ifreq, which lives across the call.
-    Errno::result(unsafe { libc::ioctl(socket.as_raw_fd(), libc::SIOCGIFFLAGS as _, &raw mut request) })?;
+    // SAFETY: SIOCGIFFLAGS reads the name from and writes the flags to an ifreq, which lives across
+    // the call.
+    Errno::result(unsafe {
+        libc::ioctl(
+            socket.as_raw_fd(),
+            libc::SIOCGIFFLAGS as _,
+            &raw mut request,
+        )
+    })?;
     // SAFETY: the call succeeded, so the kernel has set this member of the union; it is an integer.
     Ok(libc::c_int::from(unsafe { request.ifr_ifru.ifru_flags }))
 }
@@ -316,25 +341,37 @@ mod tests {
 
     #[test]
     fn control_data_are_told_apart() {
-        let mut bytes = message(libc::SOL_SOCKET, libc::SO_TIMESTAMPING, &times(&[7, 8, 0, 0, 3, 4]));
+        let mut bytes = message(
+            libc::SOL_SOCKET,
+            libc::SO_TIMESTAMPING,
+            &times(&[7, 8, 0, 0, 3, 4]),
+        );
         bytes.extend(message(libc::SOL_SOCKET, 9999, &[1, 2, 3]));
         bytes.extend(message(libc::SOL_IP, libc::SO_TIMESTAMPNS, &times(&[1, 1])));
-        bytes.extend(message(libc::SOL_SOCKET, libc::SO_RXQ_OVFL, &77_u32.to_ne_bytes()));
+        bytes.extend(message(
+            libc::SOL_SOCKET,
+            libc::SO_RXQ_OVFL,
+            &77_u32.to_ne_bytes(),
+        ));
         let expected = Control {
             software: Some(Nanos(7_000_000_008)),
             hardware: Some(Nanos(3_000_000_004)),
             drops: Some(77),
         };
         assert_eq!(Control::parse(&bytes), expected);
-        // Cut anywhere, it neither panics nor invents.
+        // Truncated anywhere, it neither panics nor returns wrong values.
         for end in 0..bytes.len() {
             let cut = Control::parse(&bytes[..end]);
             assert!(cut.software.is_none() || cut.software == expected.software);
             assert!(cut.drops.is_none() || cut.drops == expected.drops);
         }
-        let absent = message(libc::SOL_SOCKET, libc::SO_TIMESTAMPING, &times(&[7, 8, 0, 0, 0, 0]));
+        let absent = message(
+            libc::SOL_SOCKET,
+            libc::SO_TIMESTAMPING,
+            &times(&[7, 8, 0, 0, 0, 0]),
+        );
         assert_eq!(Control::parse(&absent).hardware, None);
-        // A length of nothing does not loop forever.
+        // A length of zero does not loop forever.
         assert_eq!(Control::parse(&[0; 64]), Control::default());
     }
 }

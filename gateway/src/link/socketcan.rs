@@ -1,19 +1,23 @@
 //! A CAN interface of the kernel.
 //!
-//! Identifiers are filtered by the kernel, frames come in batches with the adapter's stamps where it makes any and the
-//! kernel's otherwise, lost frames are counted, and frames that this link sent itself do not come back. CAN FD works where
-//! the interface has it on (`mtu 72`).
+//! The kernel filters identifiers. Frames are read in batches, with the adapter's stamps if it
+//! provides them and the kernel's otherwise. Lost frames are counted; frames that this link sent
+//! are not received. CAN FD works if the interface has it enabled (`mtu 72`).
 //!
-//! | what happens | state | how it comes back |
+//! | event | state | recovery |
 //! |---|---|---|
-//! | `ip link set can0 down` | [`LinkState::Down`] | by itself once the interface is up |
-//! | the adapter is pulled, the interface deleted | [`LinkState::Gone`] | a new socket once one of the same name is there |
-//! | too many errors: bus-off | [`LinkState::BusOff`] | the controller restarts (`restart-ms`, `type can restart`) |
+//! | `ip link set can0 down` | [`LinkState::Down`] | when the interface is up again |
+//! | adapter unplugged, interface deleted | [`LinkState::Gone`] | new socket when it is back |
+//! | too many errors: bus-off | [`LinkState::BusOff`] | controller restart (`restart-ms`) |
 //!
-//! Recovery happens inside [`Link::recv`], which looks every 50 ms. As long as the state is not up nothing is sent, so that
-//! no stale command waits in a queue for the bus to come back.
+//! `ip link set can0 type can restart` restarts a controller by hand.
+//!
+//! Recovery happens inside [`Link::recv`], which checks every 50 ms. While the state is not up
+//! nothing is sent, so that no stale command waits in a queue until the bus is back.
 
-use super::socket::{RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, interface_flags, newly_dropped, wait};
+use super::socket::{
+    RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, interface_flags, newly_dropped, wait,
+};
 use super::{Link, LinkCounters, OpenError, Received, SendError, passes};
 use crate::clock::{Clock, HardwareToMonotonic, Monotonic, sleep_until};
 use nix::errno::Errno;
@@ -25,16 +29,16 @@ use socketcan::{CanAddr, CanFdSocket, Socket, SocketOptions};
 use std::io;
 use std::os::fd::{AsFd, AsRawFd};
 
-/// How often a lost interface is looked for.
+/// Interval between checks for a lost interface.
 const RETRY: Nanos = Nanos::from_millis(50);
-/// How long to wait before a full transmit queue is tried again; the socket can not be polled for that.
+/// Interval between attempts when the transmit queue is full; the socket cannot be polled for that.
 const QUEUE_RETRY: Nanos = Nanos::from_micros(200);
-/// The most filters that the kernel takes (`CAN_RAW_FILTER_MAX`).
+/// Maximum number of kernel filters (`CAN_RAW_FILTER_MAX`).
 const MOST_FILTERS: usize = 512;
 /// Sizes of `struct can_frame` and `struct canfd_frame`.
 const CLASSIC: usize = 16;
 const FD: usize = 72;
-/// Where the data begin, in both.
+/// Offset of the data in both.
 const DATA: usize = 8;
 /// `CANFD_BRS`, `CANFD_ESI`.
 const BIT_RATE_SWITCH: u8 = 1;
@@ -46,16 +50,16 @@ pub struct SocketCan {
     socket: CanFdSocket,
     /// `struct can_filter`s as bytes.
     filters: Vec<u8>,
-    /// What to filter here, because the kernel does not take so many filters.
+    /// The claims to filter by in user space, because they exceed the kernel's maximum.
     claims: Vec<Claim>,
     receiver: Receiver<FD>,
     adapter: HardwareToMonotonic,
     state: LinkState,
-    /// The state has changed outside of `recv`, which is to say so.
+    /// The state has changed outside of `recv`, which must report it.
     changed: bool,
-    /// A frame that showed that the link is up again; handed out after the change was told.
+    /// A frame that showed that the link is up again; returned after the state change.
     pending: Option<Frame>,
-    /// When to look for the lost interface again.
+    /// Time of the next check for the lost interface.
     retry: Nanos,
     counters: LinkCounters,
 }
@@ -71,21 +75,32 @@ impl std::fmt::Debug for SocketCan {
 }
 
 impl SocketCan {
-    /// Opens `interface` and receives what one of `claims` matches (everything if there are none). The interface may be down.
+    /// Opens `interface` and receives frames that match one of `claims` (all if there are none).
+    /// The interface may be down.
     ///
     /// # Errors
-    /// [`OpenError`]: there is no such interface, it is not a CAN interface, the kernel has no CAN, or we may not.
+    /// [`OpenError`]: there is no such interface, it is not a CAN interface, the kernel has no CAN,
+    /// or permission is denied.
     pub fn open(interface: &str, claims: &[Claim]) -> Result<Self, OpenError> {
         let by_kernel = claims.len() <= MOST_FILTERS;
-        let filters = if by_kernel { filters(claims) } else { filters(&[]) };
+        let filters = if by_kernel {
+            filters(claims)
+        } else {
+            filters(&[])
+        };
         let mut receiver = Receiver::new();
-        let socket = open_socket(interface, &filters, &mut receiver).map_err(|e| open_error(interface, e))?;
+        let socket = open_socket(interface, &filters, &mut receiver)
+            .map_err(|e| open_error(interface, e))?;
         let state = current_state(&socket, interface);
         Ok(Self {
             interface: interface.to_owned(),
             socket,
             filters,
-            claims: if by_kernel { Vec::new() } else { claims.to_vec() },
+            claims: if by_kernel {
+                Vec::new()
+            } else {
+                claims.to_vec()
+            },
             receiver,
             adapter: HardwareToMonotonic::default(),
             state,
@@ -96,7 +111,7 @@ impl SocketCan {
         })
     }
 
-    /// Sets the state; tells whether it is another one.
+    /// Sets the state; returns whether it has changed.
     fn set_state(&mut self, state: LinkState) -> bool {
         if self.state == state {
             return false;
@@ -108,10 +123,10 @@ impl SocketCan {
         true
     }
 
-    /// Sets the state that a failure of the socket means; tells whether it is another one.
+    /// Sets the state after a failure of the socket; returns whether it has changed.
     fn lose(&mut self, error: Errno) -> bool {
         self.retry = Monotonic.now().saturating_add(RETRY);
-        // Whatever else may be wrong with the socket, it is looked at again.
+        // After any other error the socket is checked again.
         self.set_state(if matches!(error, Errno::ENODEV | Errno::ENXIO) {
             LinkState::Gone
         } else {
@@ -119,14 +134,15 @@ impl SocketCan {
         })
     }
 
-    /// Looks whether the lost interface is back, if it is time to; tells whether the state is another one.
+    /// Checks, if it is time to, whether the lost interface is back; returns whether the state has
+    /// changed.
     fn recover(&mut self) -> bool {
         let now = Monotonic.now();
         if now < self.retry {
             return false;
         }
         self.retry = now.saturating_add(RETRY);
-        // An interface that was deleted and made anew is another one, which the old socket knows nothing of.
+        // An interface that was deleted and created again needs a new socket.
         if self.state == LinkState::Gone {
             match open_socket(&self.interface, &self.filters, &mut self.receiver) {
                 Ok(socket) => self.socket = socket,
@@ -148,8 +164,11 @@ impl SocketCan {
                     self.counters.error_frames += 1;
                     let state = match self.state {
                         _ if classes & libc::CAN_ERR_BUSOFF != 0 => LinkState::BusOff,
-                        // Restarted; or counting errors again, as adapters that restart by themselves say it.
-                        LinkState::BusOff if classes & (libc::CAN_ERR_RESTARTED | libc::CAN_ERR_CRTL) != 0 => {
+                        // The controller has restarted, or counts errors again, as adapters that
+                        // restart automatically report.
+                        LinkState::BusOff
+                            if classes & (libc::CAN_ERR_RESTARTED | libc::CAN_ERR_CRTL) != 0 =>
+                        {
                             LinkState::Up
                         }
                         state => state,
@@ -174,8 +193,9 @@ impl SocketCan {
                 (None, None) => (times.now(), StampKind::User),
             };
             let frame = frame.at(times.limit(stamp), kind);
-            // Who receives is on the bus. Not so where the interface was lost: this frame may have been waiting since before
-            // then, and the system tells a loss only once.
+            // A controller that receives is on the bus. This does not hold if the interface was
+            // lost: the frame may have been waiting since before the loss, which the system reports
+            // only once.
             if self.state == LinkState::BusOff && self.set_state(LinkState::Up) {
                 self.pending = Some(frame);
                 return Some(Received::StateChanged);
@@ -187,7 +207,7 @@ impl SocketCan {
     }
 }
 
-/// `struct can_filter { id, mask }` for each claim; without claims the one that lets everything pass.
+/// `struct can_filter { id, mask }` for each claim; without claims a filter that passes everything.
 fn filters(claims: &[Claim]) -> Vec<u8> {
     let everything = [[0_u32, 0]];
     let claims = claims.iter().map(|claim| {
@@ -195,7 +215,8 @@ fn filters(claims: &[Claim]) -> Vec<u8> {
             Id::Standard(id) => (u32::from(id), claim.mask & libc::CAN_SFF_MASK),
             Id::Extended(id) => (id | libc::CAN_EFF_FLAG, claim.mask & libc::CAN_EFF_MASK),
         };
-        // Without the flags in the mask, a standard filter would pass extended identifiers that end alike, and remote requests.
+        // Without the flags in the mask, a standard filter would also pass remote requests and
+        // extended identifiers with the same low bits.
         [id, mask | libc::CAN_EFF_FLAG | libc::CAN_RTR_FLAG]
     });
     let all: Vec<[u32; 2]> = if claims.len() == 0 {
@@ -203,11 +224,18 @@ fn filters(claims: &[Claim]) -> Vec<u8> {
     } else {
         claims.collect()
     };
-    all.iter().flatten().flat_map(|word| word.to_ne_bytes()).collect()
+    all.iter()
+        .flatten()
+        .flat_map(|word| word.to_ne_bytes())
+        .collect()
 }
 
-/// A socket on `interface` with everything set, that has received nothing yet.
-fn open_socket(interface: &str, filters: &[u8], receiver: &mut Receiver<FD>) -> io::Result<CanFdSocket> {
+/// A socket on `interface` with all options set, that has received nothing yet.
+fn open_socket(
+    interface: &str,
+    filters: &[u8],
+    receiver: &mut Receiver<FD>,
+) -> io::Result<CanFdSocket> {
     let socket = CanFdSocket::open_addr(&CanAddr::from_iface(interface)?)?;
     socket.set_nonblocking(true)?;
     socket.set_socket_option_bytes(libc::SOL_CAN_RAW, libc::CAN_RAW_FILTER, filters)?;
@@ -222,12 +250,13 @@ fn open_socket(interface: &str, filters: &[u8], receiver: &mut Receiver<FD>) -> 
     })?;
     setsockopt(&socket, sockopt::RxqOvfl, &1)?;
     enlarge_receive_buffer(&socket, RECEIVE_BUFFER);
-    // What came between binding and filtering is not filtered. Nor is it waited for: the bus goes on.
+    // Discard the unfiltered frames that arrived between binding and filtering, without waiting for
+    // more.
     receiver.reset();
     for _ in 0..1_000 {
         match receiver.batch.receive(socket.as_fd()) {
             Ok(_) => {}
-            // A socket on an interface that is down says so once.
+            // A socket on an interface that is down reports this once.
             Err(_) => break,
         }
     }
@@ -244,15 +273,20 @@ fn current_state(socket: &CanFdSocket, interface: &str) -> LinkState {
     }
 }
 
-/// What a failure to open means for a person.
+/// Converts an error of opening a socket to an [`OpenError`].
 fn open_error(interface: &str, cause: io::Error) -> OpenError {
     let interface = interface.to_owned();
-    // Which of the two is missing, the interface or CAN altogether?
+    // Find out which is missing: the interface or CAN support.
     let can = CanFdSocket::open_iface(0).err();
     let no_can = |error: &io::Error| {
         matches!(
             error.raw_os_error(),
-            Some(libc::EAFNOSUPPORT | libc::EPROTONOSUPPORT | libc::ENOPROTOOPT | libc::ESOCKTNOSUPPORT)
+            Some(
+                libc::EAFNOSUPPORT
+                    | libc::EPROTONOSUPPORT
+                    | libc::ENOPROTOOPT
+                    | libc::ESOCKTNOSUPPORT
+            )
         )
     };
     match (can, cause.raw_os_error()) {
@@ -261,11 +295,12 @@ fn open_error(interface: &str, cause: io::Error) -> OpenError {
             action: format!("open {interface}"),
             cause,
         },
-        (_, Some(libc::ENODEV | libc::ENXIO | libc::EINVAL)) => match nix::net::if_::if_nametoindex(interface.as_str())
-        {
-            Ok(_) => OpenError::NotCan { interface },
-            Err(_) => OpenError::NoInterface { interface },
-        },
+        (_, Some(libc::ENODEV | libc::ENXIO | libc::EINVAL)) => {
+            match nix::net::if_::if_nametoindex(interface.as_str()) {
+                Ok(_) => OpenError::NotCan { interface },
+                Err(_) => OpenError::NoInterface { interface },
+            }
+        }
         _ => OpenError::System {
             action: format!("open {interface}"),
             cause,
@@ -275,7 +310,8 @@ fn open_error(interface: &str, cause: io::Error) -> OpenError {
 
 enum Decoded {
     Frame(Frame),
-    /// Error classes. Only two of them matter here, and socketcan's full decoding allocates from the third cause on.
+    /// Error classes. Only two of them are used here, and socketcan's full decoding allocates from
+    /// the third cause on.
     Error(u32),
 }
 
@@ -310,7 +346,8 @@ fn decode(bytes: &[u8]) -> Option<Decoded> {
     Some(Decoded::Frame(frame))
 }
 
-/// Puts a frame into a `struct can_frame` or `struct canfd_frame` and gives its size; `None` for an error frame.
+/// Writes a frame as `struct can_frame` or `struct canfd_frame` and returns its size; `None` for an
+/// error frame.
 fn encode(frame: &Frame, bytes: &mut [u8; FD]) -> Option<usize> {
     let id = match frame.id {
         Id::Standard(id) => u32::from(id),
@@ -323,7 +360,8 @@ fn encode(frame: &Frame, bytes: &mut [u8; FD]) -> Option<usize> {
             bit_rate_switch,
             error_state,
         } => {
-            let flags = if bit_rate_switch { BIT_RATE_SWITCH } else { 0 } | if error_state { ERROR_STATE } else { 0 };
+            let flags = if bit_rate_switch { BIT_RATE_SWITCH } else { 0 }
+                | if error_state { ERROR_STATE } else { 0 };
             (id, flags, FD)
         }
         Format::Error => return None,
@@ -354,14 +392,14 @@ impl Link for SocketCan {
             if matches!(self.state, LinkState::Down | LinkState::Gone) && self.recover() {
                 return Received::StateChanged;
             }
-            // Error frames without end must not hold the caller beyond its deadline.
+            // An endless series of error frames must not hold the caller beyond its deadline.
             if asked && Monotonic.now() >= deadline {
                 return Received::TimedOut;
             }
             asked = true;
             let until = match self.state {
                 LinkState::Gone => {
-                    // The old socket has said all it will ever say.
+                    // The old socket will not report anything more.
                     sleep_until(deadline.min(self.retry));
                     continue;
                 }
@@ -376,7 +414,7 @@ impl Link for SocketCan {
         }
     }
 
-    /// As [`Link::send`]. While the transmit queue of the interface is full it is tried again until the deadline.
+    /// As [`Link::send`]. Retries until the deadline while the interface's transmit queue is full.
     fn send(&mut self, frame: &Frame, deadline: Nanos) -> Result<(), SendError> {
         let mut bytes = [0; FD];
         let sent = match encode(frame, &mut bytes).and_then(|size| bytes.get(..size)) {
@@ -391,12 +429,17 @@ impl Link for SocketCan {
                     Ok(_) => break Ok(()),
                     Err(Errno::EINTR) => {}
                     Err(Errno::EAGAIN) => {
-                        if let Err(error) = wait(self.socket.as_fd(), PollFlags::POLLOUT, deadline.saturating_sub(now))
-                        {
+                        if let Err(error) = wait(
+                            self.socket.as_fd(),
+                            PollFlags::POLLOUT,
+                            deadline.saturating_sub(now),
+                        ) {
                             break Err(SendError::System(error as i32));
                         }
                     }
-                    Err(Errno::ENOBUFS) => sleep_until(deadline.min(now.saturating_add(QUEUE_RETRY))),
+                    Err(Errno::ENOBUFS) => {
+                        sleep_until(deadline.min(now.saturating_add(QUEUE_RETRY)));
+                    }
                     Err(error @ (Errno::ENETDOWN | Errno::ENODEV | Errno::ENXIO)) => {
                         self.changed |= self.lose(error);
                         break Err(SendError::NotUp);
@@ -448,7 +491,10 @@ mod tests {
     fn frames_are_laid_out_as_linux_can_h_says() {
         let mut bytes = [0; FD];
         assert_eq!(
-            encode(&Frame::new(Id::extended(0x18FF_0001), &[1, 2, 3]), &mut bytes),
+            encode(
+                &Frame::new(Id::extended(0x18FF_0001), &[1, 2, 3]),
+                &mut bytes
+            ),
             Some(CLASSIC)
         );
         assert_eq!(bytes[..4], 0x98FF_0001_u32.to_ne_bytes());
@@ -466,19 +512,21 @@ mod tests {
             any::<(bool, bool)>(),
             proptest::collection::vec(any::<u8>(), 0..=64),
         )
-            .prop_map(|(id, kind, (bit_rate_switch, error_state), data)| match kind {
-                0 => Frame::remote(id, (data.len() % 9) as u8),
-                1 => Frame::with_format(
-                    id,
-                    Format::Fd {
-                        bit_rate_switch,
-                        error_state,
-                    },
-                    &data,
-                )
-                .unwrap(),
-                _ => Frame::new(id, &data),
-            })
+            .prop_map(
+                |(id, kind, (bit_rate_switch, error_state), data)| match kind {
+                    0 => Frame::remote(id, (data.len() % 9) as u8),
+                    1 => Frame::with_format(
+                        id,
+                        Format::Fd {
+                            bit_rate_switch,
+                            error_state,
+                        },
+                        &data,
+                    )
+                    .unwrap(),
+                    _ => Frame::new(id, &data),
+                },
+            )
     }
 
     proptest! {

@@ -1,12 +1,15 @@
-//! A CAN bus in user space, for machines whose kernel has none: UDP multicast on the loopback interface.
+//! A CAN bus in user space, for machines whose kernel has no CAN: UDP multicast on the loopback
+//! interface.
 //!
-//! Any number of participants of one host (more exactly: of one network namespace) in any order, no daemon. Everyone but the
-//! sender gets each frame, with the kernel's receive stamp and a drop count, like a raw CAN socket. Nothing leaves the host:
-//! frames are sent through 127.0.0.1 with a time to live of 0.
+//! Any number of participants in one network namespace (usually: one host), opened in any order,
+//! without a daemon. All but the sender receive each frame, with the kernel's receive stamp and a
+//! drop count, as with a raw CAN socket. Nothing leaves the host: frames are sent through 127.0.0.1
+//! with a time to live of 0.
 //!
-//! The multicast group is 239.255.x.y and the port 16384 + z, with x.y the lowest 16 bits and z the next 14 bits of the
-//! FNV-1a hash (64 bits) of `DOMAIN NUL NAME`. Buses whose hashes collide do not mix: every datagram carries the full key.
-//! A domain keeps robots, users and tests of one host apart.
+//! The multicast group is 239.255.x.y and the port 16384 + z, with x.y the lowest 16 bits and z the
+//! next 14 bits of the FNV-1a hash (64 bits) of `DOMAIN NUL NAME`. Buses whose hashes collide do
+//! not mix: every datagram carries the full key. A domain keeps robots, users and tests of one host
+//! apart.
 //!
 //! One frame per datagram, numbers with the lowest byte first:
 //!
@@ -14,17 +17,18 @@
 //! |---|---|
 //! | 0..4 | `PRPB` |
 //! | 4 | version of this layout: 1 |
-//! | 5 | bits 0..2: 0 classic, 1 remote request, 2 CAN FD; 4: bit rate switch; 5: error state; 7: extended identifier |
-//! | 6 | length of the data, or the length a remote request asks for |
+//! | 5, bits 0..2 | 0 classic, 1 remote request, 2 CAN FD |
+//! | 5, bits 4, 5, 7 | bit rate switch, error state, extended identifier |
+//! | 6 | length of the data, or the requested length of a remote request |
 //! | 7 | length k of the key |
 //! | 8..16 | sender, a number drawn at random when it was opened |
 //! | 16..20 | identifier |
 //! | 20..20 + k | key: `DOMAIN NUL NAME` |
 //! | 20 + k.. | data; none in a remote request |
 //!
-//! A datagram with anything else is not a frame of this bus and is ignored. The kernel delivers the sender's own
-//! datagrams too; they are left out here, but a drop count may include some. There is no arbitration and no bit rate: frames
-//! arrive in the order in which the kernel took them, as fast as they are sent.
+//! Any other datagram is ignored. The kernel also delivers the sender's own datagrams; they are
+//! discarded here, but a drop count may include some. There is no arbitration and no bit rate:
+//! frames arrive in the order in which the kernel received them, as fast as they are sent.
 
 use super::socket::{RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, newly_dropped, wait};
 use super::{Link, LinkCounters, OpenError, Received, SendError, passes};
@@ -59,7 +63,7 @@ pub struct VirtualBus {
     socket: UdpSocket,
     receiver: Receiver<DATAGRAM>,
     group: SocketAddrV4,
-    /// A datagram with all that does not change from frame to frame.
+    /// A datagram with all fields that are the same in every frame.
     template: [u8; DATAGRAM],
     key_len: usize,
     sender: [u8; 8],
@@ -94,39 +98,54 @@ fn group(key: &[u8]) -> SocketAddrV4 {
 }
 
 impl VirtualBus {
-    /// Joins bus `name` of `domain` and receives what one of `claims` matches (everything if there are none).
+    /// Joins bus `name` of `domain` and receives frames that match one of `claims` (all if there
+    /// are none).
     ///
     /// # Errors
-    /// [`OpenError::System`]: domain and name are too long or contain a zero byte; the loopback interface is down or
-    /// missing; the port that follows from the names is taken by another program.
+    /// [`OpenError::System`]: domain and name are too long or contain a zero byte; the loopback
+    /// interface is down or missing; the port computed from the names is used by another program.
     pub fn open(domain: &str, name: &str, claims: &[Claim]) -> Result<Self, OpenError> {
         let fail = |action: String| move |cause: io::Error| OpenError::System { action, cause };
         let key = [domain.as_bytes(), &[0], name.as_bytes()].concat();
-        if key.len() > LONGEST_KEY || domain.contains('\0') || name.contains('\0') || name.is_empty() {
+        if key.len() > LONGEST_KEY
+            || domain.contains('\0')
+            || name.contains('\0')
+            || name.is_empty()
+        {
             let cause = format!(
-                "domain and name have {} bytes at most, the name at least one, and no zero byte",
+                "domain and name may have {} bytes in all, the name at least one, and no zero byte",
                 LONGEST_KEY - 1
             );
-            return Err(fail(format!("open virtual bus {name:?} in domain {domain:?}"))(
-                io::Error::new(io::ErrorKind::InvalidInput, cause),
-            ));
+            return Err(fail(format!(
+                "open virtual bus {name:?} in domain {domain:?}"
+            ))(io::Error::new(
+                io::ErrorKind::InvalidInput,
+                cause,
+            )));
         }
         let group = group(&key);
         let action = |what: &str| fail(format!("{what} for virtual bus {name}"));
 
-        let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP)).map_err(action("create a socket"))?;
-        // Every multicast datagram goes to all sockets that share the address this way. SO_REUSEPORT, beyond that, would ask all
-        // of them to belong to one user.
-        socket.set_reuse_address(true).map_err(action("share the address"))?;
-        // Bound to the group, so that nothing sent to this port of another group or of the host itself comes here. From here on
-        // the buffer fills, so what concerns the frames in it comes before.
-        setsockopt(&socket, sockopt::ReceiveTimestampns, &true).map_err(|e| action("enable time stamps")(e.into()))?;
-        setsockopt(&socket, sockopt::RxqOvfl, &1).map_err(|e| action("enable drop counts")(e.into()))?;
+        let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))
+            .map_err(action("create a socket"))?;
+        // Every multicast datagram goes to all sockets that share the address this way.
+        // SO_REUSEPORT would additionally require that all of them belong to one user.
+        socket
+            .set_reuse_address(true)
+            .map_err(action("share the address"))?;
+        // Bound to the group, so that datagrams to this port of another group or of the host do not
+        // arrive here. The buffer fills from here on, so options that concern its frames are set
+        // before.
+        setsockopt(&socket, sockopt::ReceiveTimestampns, &true)
+            .map_err(|e| action("enable time stamps")(e.into()))?;
+        setsockopt(&socket, sockopt::RxqOvfl, &1)
+            .map_err(|e| action("enable drop counts")(e.into()))?;
         enlarge_receive_buffer(&socket, RECEIVE_BUFFER);
         socket
             .bind(&group.into())
             .map_err(action(&format!("bind to {group}")))?;
-        // Through lo even where no route leads there, as in a fresh network namespace; and never through another interface.
+        // Always through lo, also without a route (as in a new network namespace), and never
+        // through another interface.
         let lo = "through 127.0.0.1 (is the loopback interface up? `ip link set lo up`)";
         socket
             .set_multicast_if_v4(&Ipv4Addr::LOCALHOST)
@@ -134,18 +153,33 @@ impl VirtualBus {
         socket
             .set_multicast_ttl_v4(0)
             .map_err(action("limit frames to this host"))?;
-        socket.set_multicast_loop_v4(true).map_err(action("reach this host"))?;
+        socket
+            .set_multicast_loop_v4(true)
+            .map_err(action("reach this host"))?;
         socket
             .join_multicast_v4(group.ip(), &Ipv4Addr::LOCALHOST)
             .map_err(action(&format!("join {group} {lo}")))?;
-        socket.set_nonblocking(true).map_err(action("set up the socket"))?;
+        socket
+            .set_nonblocking(true)
+            .map_err(action("set up the socket"))?;
 
-        // RandomState draws its keys from the system's random numbers, once per thread, and counts on from there.
-        let sender = std::hash::RandomState::new().build_hasher().finish().to_le_bytes();
+        // RandomState draws its keys from the system's random numbers once per thread and then
+        // increments them.
+        let sender = std::hash::RandomState::new()
+            .build_hasher()
+            .finish()
+            .to_le_bytes();
         let mut template = [0; DATAGRAM];
         #[allow(clippy::cast_possible_truncation)] // checked above
         let key_len = key.len() as u8;
-        let fixed = [&MAGIC[..], &[VERSION, 0, 0, key_len], &sender, &[0; 4], &key].concat();
+        let fixed = [
+            &MAGIC[..],
+            &[VERSION, 0, 0, key_len],
+            &sender,
+            &[0; 4],
+            &key,
+        ]
+        .concat();
         for (to, from) in template.iter_mut().zip(fixed) {
             *to = from;
         }
@@ -162,7 +196,7 @@ impl VirtualBus {
         })
     }
 
-    /// Records a failure of the system, which for a bound datagram socket means that the interface is gone.
+    /// Records a system error, which for a bound datagram socket means that the interface is gone.
     fn fail(&mut self) {
         if self.state == LinkState::Up {
             self.state = LinkState::Down;
@@ -171,8 +205,14 @@ impl VirtualBus {
     }
 }
 
-/// Reads a datagram that is a frame of the bus with the key in `template`, of another sender than `sender`.
-fn decode(bytes: &[u8], template: &[u8; DATAGRAM], key_len: usize, sender: [u8; 8]) -> Option<Frame> {
+/// Reads a datagram that is a frame of the bus with the key in `template`, of another sender than
+/// `sender`.
+fn decode(
+    bytes: &[u8],
+    template: &[u8; DATAGRAM],
+    key_len: usize,
+    sender: [u8; 8],
+) -> Option<Frame> {
     let (header, rest) = bytes.split_first_chunk::<HEADER>()?;
     let [m0, m1, m2, m3, version, flags, len, k, rest_of_header @ ..] = header;
     let (from, id) = rest_of_header.split_first_chunk::<8>()?;
@@ -207,7 +247,8 @@ fn decode(bytes: &[u8], template: &[u8; DATAGRAM], key_len: usize, sender: [u8; 
     Frame::with_format(id, format, data)
 }
 
-/// Puts a frame into `datagram`, a copy of the template, and gives the datagram's length; `None` for an error frame.
+/// Writes a frame into `datagram`, a copy of the template, and returns the datagram's length;
+/// `None` for an error frame.
 fn encode(frame: &Frame, datagram: &mut [u8; DATAGRAM], key_len: usize) -> Option<usize> {
     let format = match frame.format {
         Format::Classic => 0,
@@ -215,7 +256,10 @@ fn encode(frame: &Frame, datagram: &mut [u8; DATAGRAM], key_len: usize) -> Optio
         Format::Fd {
             bit_rate_switch,
             error_state,
-        } => FD | if bit_rate_switch { BIT_RATE_SWITCH } else { 0 } | if error_state { ERROR_STATE } else { 0 },
+        } => {
+            FD | if bit_rate_switch { BIT_RATE_SWITCH } else { 0 }
+                | if error_state { ERROR_STATE } else { 0 }
+        }
         Format::Error => return None,
     };
     let extended = if matches!(frame.id, Id::Extended(_)) {
@@ -225,7 +269,9 @@ fn encode(frame: &Frame, datagram: &mut [u8; DATAGRAM], key_len: usize) -> Optio
     };
     *datagram.get_mut(5)? = format | extended;
     *datagram.get_mut(6)? = u8::try_from(frame.len()).ok()?;
-    datagram.get_mut(16..20)?.copy_from_slice(&frame.id.raw().to_le_bytes());
+    datagram
+        .get_mut(16..20)?
+        .copy_from_slice(&frame.id.raw().to_le_bytes());
     let start = HEADER + key_len;
     let end = start + frame.data().len();
     datagram.get_mut(start..end)?.copy_from_slice(frame.data());
@@ -237,11 +283,13 @@ impl Link for VirtualBus {
         let mut asked = false;
         loop {
             while let Some(message) = self.receiver.batch.next() {
-                self.counters.dropped += newly_dropped(&mut self.receiver.drops, message.control.drops);
+                self.counters.dropped +=
+                    newly_dropped(&mut self.receiver.drops, message.control.drops);
                 if message.truncated {
                     continue;
                 }
-                let Some(frame) = decode(message.bytes, &self.template, self.key_len, self.sender) else {
+                let Some(frame) = decode(message.bytes, &self.template, self.key_len, self.sender)
+                else {
                     continue;
                 };
                 if !passes(&self.claims, &frame) {
@@ -255,7 +303,7 @@ impl Link for VirtualBus {
                 self.counters.received += 1;
                 return Received::Frame(frame.at(times.limit(stamp), kind));
             }
-            // A stream of frames that are not handed out must not hold the caller beyond its deadline.
+            // A stream of discarded frames must not hold the caller beyond its deadline.
             if asked && Monotonic.now() >= deadline {
                 return Received::TimedOut;
             }
@@ -281,7 +329,9 @@ impl Link for VirtualBus {
 
     fn send(&mut self, frame: &Frame, deadline: Nanos) -> Result<(), SendError> {
         let mut datagram = self.template;
-        let sent = match encode(frame, &mut datagram, self.key_len).and_then(|len| datagram.get(..len)) {
+        let sent = match encode(frame, &mut datagram, self.key_len)
+            .and_then(|len| datagram.get(..len))
+        {
             None => Err(SendError::Unsupported),
             Some(datagram) => loop {
                 let now = Monotonic.now();
@@ -294,11 +344,15 @@ impl Link for VirtualBus {
                         Some(libc::EINTR) => {}
                         Some(libc::EAGAIN) => {
                             let timeout = deadline.saturating_sub(now);
-                            if let Err(error) = wait(self.socket.as_fd(), PollFlags::POLLOUT, timeout) {
+                            if let Err(error) =
+                                wait(self.socket.as_fd(), PollFlags::POLLOUT, timeout)
+                            {
                                 break Err(SendError::System(error as i32));
                             }
                         }
-                        Some(libc::ENOBUFS) => sleep_until(deadline.min(now + Nanos::from_micros(200))),
+                        Some(libc::ENOBUFS) => {
+                            sleep_until(deadline.min(now + Nanos::from_micros(200)));
+                        }
                         Some(libc::ENETDOWN | libc::ENETUNREACH) => break Err(SendError::NotUp),
                         number => break Err(SendError::System(number.unwrap_or_default())),
                     },
@@ -366,7 +420,10 @@ mod tests {
         expected.extend(KEY);
         expected.extend([0xAA, 0xBB]);
         assert_eq!(datagram[..len], expected);
-        assert_eq!(decode(&datagram[..len], &template(1), KEY.len(), [1; 8]), Some(frame));
+        assert_eq!(
+            decode(&datagram[..len], &template(1), KEY.len(), [1; 8]),
+            Some(frame)
+        );
         assert_eq!(
             decode(&datagram[..len], &template(9), KEY.len(), [9; 8]),
             None,
@@ -392,7 +449,9 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_datagram_is_legal_input(mut bytes in proptest::collection::vec(any::<u8>(), 0..DATAGRAM), valid in 0_usize..30) {
+        fn any_datagram_is_legal_input(
+            mut bytes in proptest::collection::vec(any::<u8>(), 0..DATAGRAM), valid in 0_usize..30
+        ) {
             for (to, from) in bytes.iter_mut().zip(&template(2)[..valid]) {
                 *to = *from;
             }

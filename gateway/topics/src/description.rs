@@ -1,4 +1,5 @@
-//! What the numbers mean: which channel, joint or contact has which name, kind, bus and longest silence.
+//! The meaning of the numbers in the payloads: name, kind, bus and maximum silence of each channel,
+//! joint and contact.
 
 use crate::{Header, Kind, Nanos};
 use core::fmt;
@@ -25,14 +26,20 @@ impl Name {
         if text.len() > Self::CAPACITY || text.bytes().any(|b| b == 0) {
             return None;
         }
-        bytes.get_mut(..text.len())?.copy_from_slice(text.as_bytes());
+        bytes
+            .get_mut(..text.len())?
+            .copy_from_slice(text.as_bytes());
         Some(Self { bytes })
     }
 
     /// The text.
     #[must_use]
     pub fn as_str(&self) -> &str {
-        let end = self.bytes.iter().position(|&b| b == 0).unwrap_or(Self::CAPACITY);
+        let end = self
+            .bytes
+            .iter()
+            .position(|&b| b == 0)
+            .unwrap_or(Self::CAPACITY);
         let bytes = self.bytes.get(..end).unwrap_or_default();
         core::str::from_utf8(bytes).unwrap_or("?")
     }
@@ -50,18 +57,18 @@ impl fmt::Display for Name {
     }
 }
 
-/// Who sends a description.
+/// The sender of a description.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
 pub enum Publisher {
     /// The gateway: channels of `<robot>/samples`.
     Gateway = 0,
-    /// The estimator: joints of `<robot>/estimate/torque`, contacts of `<robot>/estimate/contact`, and the channels
-    /// that its reasons point to.
+    /// The estimator: joints of `<robot>/estimate/torque`, contacts of `<robot>/estimate/contact`,
+    /// and the channels that `cause` refers to.
     Estimator = 1,
 }
 
-/// What an entry's number counts.
+/// What an entry's number is an index of.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
 pub enum Role {
@@ -81,37 +88,40 @@ pub enum Role {
 pub struct Entry {
     /// Its name.
     pub name: Name,
-    /// For a contact or a sub-tree, the frame its wrench is expressed in: axes and point. Otherwise empty.
+    /// For a contact or a sub-tree, the frame its wrench is expressed in: axes and point. Otherwise
+    /// empty.
     pub frame: Name,
-    /// The longest time between two samples that is still normal \[ns\]; 0 where it has no meaning.
+    /// Maximum silence: the longest normal time between two samples \[ns\]; 0 where it has no
+    /// meaning.
     pub max_silence: Nanos,
-    /// What the number counts.
+    /// What `index` is an index of.
     pub role: Role,
-    /// The number.
+    /// The index.
     pub index: u32,
-    /// What it measures (channels), else `Kind::Joint` for a joint and `Kind::Wrench` for a contact or sub-tree.
+    /// The kind of a channel; `Kind::Joint` for a joint, `Kind::Wrench` for a contact or sub-tree.
     pub kind: Kind,
     /// The bus that a channel is on.
     pub bus: u32,
 }
 
-/// The names behind the numbers of one publisher: the payload of `<robot>/description`, of which late readers get the last.
+/// The names of all numbers of one publisher: the payload of `<robot>/description`. A reader that
+/// opens late receives the last one.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
 #[type_name("proprio/Description/2")]
 pub struct Description {
-    /// When, in which order; `epoch` is that of the publisher's samples.
+    /// Time stamps and sequence number; `epoch` is that of the publisher's other payloads.
     pub header: Header,
-    /// Who sends it.
+    /// The sender.
     pub publisher: Publisher,
-    /// How many of `entries` are set.
+    /// Number of valid entries in `entries`.
     pub count: u32,
     /// The entries.
     pub entries: [Entry; Self::CAPACITY],
 }
 
 impl Entry {
-    /// Names nothing.
+    /// An unused entry.
     pub const NONE: Self = Self {
         name: Name::EMPTY,
         frame: Name::EMPTY,
@@ -124,7 +134,8 @@ impl Entry {
 }
 
 impl Description {
-    /// The description that `publisher` sends; entries beyond [`Description::CAPACITY`] are left out.
+    /// The description that `publisher` sends; entries beyond [`Description::CAPACITY`] are
+    /// omitted.
     #[must_use]
     pub fn new(publisher: Publisher, entries: impl IntoIterator<Item = Entry>) -> Self {
         let mut description = Self {
@@ -140,19 +151,24 @@ impl Description {
         description
     }
 
-    /// The most entries.
-    pub const CAPACITY: usize = crate::MAX_CHANNELS + crate::MAX_JOINTS + crate::MAX_CONTACTS + crate::MAX_SUBTREES;
+    /// Maximum number of entries.
+    pub const CAPACITY: usize =
+        crate::MAX_CHANNELS + crate::MAX_JOINTS + crate::MAX_CONTACTS + crate::MAX_SUBTREES;
 
-    /// The entries that are set.
+    /// The valid entries.
     #[must_use]
     pub fn entries(&self) -> &[Entry] {
-        self.entries.get(..self.count as usize).unwrap_or(&self.entries)
+        self.entries
+            .get(..self.count as usize)
+            .unwrap_or(&self.entries)
     }
 
     /// The entry for number `index` of `role`.
     #[must_use]
     pub fn find(&self, role: Role, index: u32) -> Option<&Entry> {
-        self.entries().iter().find(|e| e.role == role && e.index == index)
+        self.entries()
+            .iter()
+            .find(|e| e.role == role && e.index == index)
     }
 
     /// The number that `name` has in `role`.
@@ -165,7 +181,9 @@ impl Description {
     }
 }
 
-const _: () = assert!(size_of::<Entry>() == 152 && size_of::<Description>() == 56 + 152 * Description::CAPACITY);
+const _: () = assert!(
+    size_of::<Entry>() == 152 && size_of::<Description>() == 56 + 152 * Description::CAPACITY
+);
 
 #[cfg(test)]
 mod tests {
@@ -174,9 +192,15 @@ mod tests {
 
     #[test]
     fn names_hold_63_bytes_of_utf8() {
-        assert_eq!(Name::new("l_elbow").map(|n| n.to_string()).as_deref(), Some("l_elbow"));
+        assert_eq!(
+            Name::new("l_elbow").map(|n| n.to_string()).as_deref(),
+            Some("l_elbow")
+        );
         let longest = "x".repeat(63);
-        assert_eq!(Name::new(&longest).as_ref().map(Name::as_str), Some(longest.as_str()));
+        assert_eq!(
+            Name::new(&longest).as_ref().map(Name::as_str),
+            Some(longest.as_str())
+        );
         assert!(Name::new(&"x".repeat(64)).is_none());
         assert!(Name::new("a\0b").is_none());
     }

@@ -1,11 +1,12 @@
-//! What the estimator tells: joint torques, contact wrenches, and what it is told of contacts.
+//! The estimator's output (joint torques, contact wrenches) and the declarations of contacts it
+//! receives.
 
-use crate::{Header, MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name};
+use crate::{Header, MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name, Quality};
 use core::fmt;
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
-/// Why an estimate is withheld: its number stands, but must not be used.
+/// Why an estimate is withheld. Its value is published but must not be used.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, ZeroCopySend)]
 pub enum Reason {
@@ -14,30 +15,45 @@ pub enum Reason {
     None = 0,
     /// A channel it depends on has never been seen.
     NeverSeen = 1,
-    /// A channel it depends on has been silent for longer than it may.
+    /// A channel it depends on has been silent for longer than its maximum.
     Stale = 2,
     /// A sensor it depends on is saturated.
     Saturated = 3,
     /// A device it depends on reports a fault.
     DeviceFault = 4,
-    /// The unknown contacts of its sub-tree outnumber the equations: the number rests on an assumption.
+    /// The unknown contact wrenches of its sub-tree outnumber the equations: the value depends on
+    /// an assumption.
     Undetermined = 5,
     /// Its predicted standard deviation exceeds the configured bound.
     Uncertain = 6,
-    /// The computation gave no finite number.
+    /// The result of the computation is not finite.
     NotFinite = 7,
     /// This contact is not present.
     Absent = 8,
-    /// Too few samples yet to tell a velocity and an acceleration of a channel it depends on.
+    /// A channel it depends on has too few samples yet for a velocity and an acceleration.
     Starting = 9,
-    /// It depends on how the base moves, and no link is declared to stand still.
+    /// It depends on the base motion, and no link is declared to stand still.
     NoStance = 10,
-    /// Neither the model nor a possible contact explains what the F/T sensors of its sub-tree read.
+    /// Neither the model nor a possible contact explains the readings of the F/T sensors of its
+    /// sub-tree.
     Unexplained = 11,
 }
 
 impl Reason {
-    /// The word for it in tables and logs.
+    /// The reason that `quality` gives, or [`Reason::None`]; `faults` are the flags that count as a
+    /// device fault.
+    #[must_use]
+    pub const fn of_quality(quality: Quality, faults: Quality) -> Self {
+        if quality.intersects(Quality(Quality::SATURATED.0 | Quality::FROZEN.0)) {
+            Self::Saturated
+        } else if quality.intersects(faults) {
+            Self::DeviceFault
+        } else {
+            Self::None
+        }
+    }
+
+    /// Its name in tables and logs.
     #[must_use]
     pub const fn word(self) -> &'static str {
         match self {
@@ -63,15 +79,15 @@ impl fmt::Display for Reason {
     }
 }
 
-/// `JointTorque::cause` and `ContactWrench::cause` where no single channel is to blame.
+/// `JointTorque::cause` and `ContactWrench::cause` if no single channel is the cause.
 pub const NO_CAUSE: u32 = u32::MAX;
 
 /// The estimated torque of one joint.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
 pub struct JointTorque {
-    /// Torque \[Nm\] (force \[N\] for a prismatic joint) by the parent link on the child link, along the URDF axis, on the
-    /// link side: without rotor inertia and friction.
+    /// Torque \[Nm\] (force \[N\] for a prismatic joint) exerted by the parent link on the child
+    /// link along the URDF axis. It is the link-side torque: without rotor inertia and friction.
     pub torque: f64,
     /// Its standard deviation \[Nm\]; NaN where it is not known.
     pub standard_deviation: f64,
@@ -79,7 +95,8 @@ pub struct JointTorque {
     pub valid: u32,
     /// Why it is withheld.
     pub reason: Reason,
-    /// The channel to blame: its number among the estimator's channels in `<robot>/description`, or [`NO_CAUSE`].
+    /// The channel that causes it: its number among the estimator's channels in
+    /// `<robot>/description`, or [`NO_CAUSE`].
     pub cause: u32,
     /// Unused, zero.
     pub reserved: u32,
@@ -102,9 +119,9 @@ impl JointTorque {
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
 #[type_name("proprio/TorqueEstimate/2")]
 pub struct TorqueEstimate {
-    /// When; `acquired` is the instant that the torques are of.
+    /// `acquired` is the instant that the torques refer to.
     pub header: Header,
-    /// How many of `joints` are set.
+    /// Number of valid entries in `joints`.
     pub count: u32,
     /// Unused, zero.
     pub reserved: u32,
@@ -113,14 +130,16 @@ pub struct TorqueEstimate {
 }
 
 impl TorqueEstimate {
-    /// The joints that are set.
+    /// The valid joints.
     #[must_use]
     pub fn joints(&self) -> &[JointTorque] {
-        self.joints.get(..self.count as usize).unwrap_or(&self.joints)
+        self.joints
+            .get(..self.count as usize)
+            .unwrap_or(&self.joints)
     }
 }
 
-/// The estimated external wrench at one contact: on the link, by the environment.
+/// The estimated external wrench at one contact, exerted by the environment on the link.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
 pub struct ContactWrench {
@@ -134,9 +153,9 @@ pub struct ContactWrench {
     pub valid: u32,
     /// Why it is withheld.
     pub reason: Reason,
-    /// The channel to blame, or [`NO_CAUSE`].
+    /// The channel that causes it, or [`NO_CAUSE`].
     pub cause: u32,
-    /// 1 if nobody declared it and F/T readings show that it is present, else 0.
+    /// 1 if the contact is not declared but F/T readings show that it is present, else 0.
     pub detected: u32,
 }
 
@@ -153,20 +172,24 @@ impl ContactWrench {
     };
 }
 
-/// What links, F/T sensors and the contacts that are known to be present leave unexplained in a sub-tree, one piece of the robot between F/T sensors.
+/// The residual of a sub-tree (a part of the robot between F/T sensors): the wrench that the model,
+/// the F/T sensors and the contacts known to be present do not explain.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
 pub struct Residual {
-    /// Force \[N\] that acts on the sub-tree and is not accounted for, in the axes of its top link.
+    /// Unexplained force \[N\] on the sub-tree, in the axes of its top link.
     pub force: [f64; 3],
     /// Torque \[Nm\], in the same axes, about that link's origin.
     pub torque: [f64; 3],
-    /// How rare this is if nothing unknown acts: as many standard deviations of a normal variable. NaN where nothing can be tested: no sensor, one that is at fault, or a contact
-    /// that may take up anything.
+    /// Significance of the residual as a number of standard deviations of a normal variable: how
+    /// improbable it is without an unknown wrench. NaN if no test is possible: no sensor, a faulty
+    /// sensor, or a contact that can explain any wrench.
     pub significance: f64,
-    /// The contact that explains it and is taken as present: its number in [`ContactEstimate::contacts`]; [`NO_CONTACT`] if there is none.
+    /// The contact that explains it and is therefore assumed present: its index in
+    /// [`ContactEstimate::contacts`]; [`NO_CONTACT`] if there is none.
     pub contact: u32,
-    /// 1 if it is significant and no possible contact explains it: the sub-tree's torques are withheld.
+    /// 1 if it is significant and no possible contact explains it: the sub-tree's torques are
+    /// withheld.
     pub unexplained: u32,
 }
 
@@ -184,16 +207,17 @@ impl Residual {
     };
 }
 
-/// The wrenches of all contacts at one instant, and what they leave unexplained: the payload of `<robot>/estimate/contact`.
+/// The wrenches of all contacts at one instant and the residuals of all sub-trees: the payload of
+/// `<robot>/estimate/contact`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
 #[type_name("proprio/ContactEstimate/3")]
 pub struct ContactEstimate {
-    /// When; `acquired` is the instant that the wrenches are of.
+    /// `acquired` is the instant that the wrenches refer to.
     pub header: Header,
-    /// How many of `contacts` are set.
+    /// Number of valid entries in `contacts`.
     pub count: u32,
-    /// How many of `residuals` are set.
+    /// Number of valid entries in `residuals`.
     pub residual_count: u32,
     /// The contacts, in the order of the estimator's description.
     pub contacts: [ContactWrench; MAX_CONTACTS],
@@ -202,13 +226,15 @@ pub struct ContactEstimate {
 }
 
 impl ContactEstimate {
-    /// The contacts that are set.
+    /// The valid contacts.
     #[must_use]
     pub fn contacts(&self) -> &[ContactWrench] {
-        self.contacts.get(..self.count as usize).unwrap_or(&self.contacts)
+        self.contacts
+            .get(..self.count as usize)
+            .unwrap_or(&self.contacts)
     }
 
-    /// The residuals that are set.
+    /// The valid residuals.
     #[must_use]
     pub fn residuals(&self) -> &[Residual] {
         self.residuals
@@ -217,22 +243,24 @@ impl ContactEstimate {
     }
 }
 
-/// Somebody who knows says whether a contact is present: the payload of `<robot>/contact/declared`.
+/// A declaration that a contact is present or absent, sent to the estimator: the payload of
+/// `<robot>/contact/declared`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
 #[type_name("proprio/ContactDeclaration/1")]
 pub struct ContactDeclaration {
-    /// When; `acquired` is the instant from which it holds.
+    /// `acquired` is the instant from which the declaration holds.
     pub header: Header,
     /// The contact's name in the estimator's configuration.
     pub contact: Name,
-    /// 1 from `header.acquired` on present, 0 absent.
+    /// 1: present from `header.acquired` on; 0: absent.
     pub active: u32,
     /// Unused, zero.
     pub reserved: u32,
 }
 
 const _: () = assert!(size_of::<JointTorque>() == 32 && size_of::<ContactWrench>() == 112);
-const _: () = assert!(size_of::<TorqueEstimate>() == 56 + 32 * MAX_JOINTS && size_of::<Residual>() == 64);
+const _: () =
+    assert!(size_of::<TorqueEstimate>() == 56 + 32 * MAX_JOINTS && size_of::<Residual>() == 64);
 const _: () = assert!(size_of::<ContactEstimate>() == 56 + 112 * MAX_CONTACTS + 64 * MAX_SUBTREES);
 const _: () = assert!(size_of::<ContactDeclaration>() == 120);

@@ -1,4 +1,5 @@
-//! How gateway and estimator are doing: the payloads of `<robot>/health/gateway` and `<robot>/health/estimator`.
+//! State and counters of gateway and estimator: the payloads of `<robot>/health/gateway` and
+//! `<robot>/health/estimator`.
 
 use core::fmt;
 
@@ -6,7 +7,7 @@ use crate::{Header, MAX_BUSES, MAX_CHANNELS, Name, Nanos};
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
-/// What a device's frames are counted by.
+/// The counters of one device.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, ZeroCopySend)]
 pub enum Counter {
@@ -14,25 +15,25 @@ pub enum Counter {
     Frames = 0,
     /// Readings published.
     Readings = 1,
-    /// Frames of a length that the protocol does not have.
+    /// Frames with a length that the protocol does not define.
     Length = 2,
-    /// Frames with a value that the protocol does not have.
+    /// Frames with a value that the protocol does not define.
     Value = 3,
-    /// Halves of a reading whose other half did not come.
+    /// Half readings (one of two frames) whose other half did not arrive.
     Unpaired = 4,
-    /// Readings that the device's own sequence number says were lost.
+    /// Lost readings, from gaps in the device's own sequence number.
     Lost = 5,
-    /// Replies that were not asked for.
+    /// Replies without a request.
     Unexpected = 6,
-    /// Configuration replies that contradict what was known: the device changed under us.
+    /// Configuration replies that contradict an earlier one: the device's settings have changed.
     Changed = 7,
     /// Readings with a saturated channel.
     Saturated = 8,
-    /// Readings with a fault of the device.
+    /// Readings with a device fault.
     DeviceFault = 9,
-    /// Times that the device was silent for longer than it may.
+    /// Number of silences longer than the device's maximum.
     Silences = 10,
-    /// Times that its start sequence was begun.
+    /// Number of start sequences begun.
     Starts = 11,
     /// Readings dropped because their stamp was not later than the last one's.
     Backward = 12,
@@ -56,7 +57,7 @@ impl Counter {
         Self::Backward,
     ];
 
-    /// The word for it in tables and logs.
+    /// Its name in tables and logs.
     #[must_use]
     pub const fn word(self) -> &'static str {
         match self {
@@ -81,21 +82,21 @@ impl Counter {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, ZeroCopySend)]
 pub enum LinkState {
-    /// Frames can come and go.
+    /// Frames can be received and sent.
     #[default]
     Up = 0,
-    /// The interface is there, but down.
+    /// The interface exists but is down.
     Down = 1,
-    /// The interface is not there.
+    /// The interface does not exist.
     Gone = 2,
-    /// The controller is off the bus after too many errors.
+    /// The controller is bus-off after too many errors.
     BusOff = 3,
-    /// The log that is replayed has come to its end.
+    /// The replayed log has ended.
     Ended = 4,
 }
 
 impl LinkState {
-    /// The word for it in tables and logs.
+    /// Its name in tables and logs.
     #[must_use]
     pub const fn word(self) -> &'static str {
         match self {
@@ -108,7 +109,7 @@ impl LinkState {
     }
 }
 
-/// One bus.
+/// Counters and state of one bus.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
 pub struct BusHealth {
@@ -116,9 +117,9 @@ pub struct BusHealth {
     pub name: Name,
     /// Frames received that passed the filters.
     pub frames: u64,
-    /// Of these, frames that no device claims.
+    /// Of these, frames with an identifier of no configured device.
     pub unclaimed: u64,
-    /// Frames that the kernel dropped because we did not read in time.
+    /// Frames that the kernel dropped because the gateway read them too late.
     pub dropped: u64,
     /// Error frames received.
     pub error_frames: u64,
@@ -126,17 +127,17 @@ pub struct BusHealth {
     pub sent: u64,
     /// Frames that could not be sent before their deadline.
     pub send_failures: u64,
-    /// Times that the link was lost (down, gone, bus-off).
+    /// Number of link losses (down, gone, bus-off).
     pub link_losses: u64,
     /// Samples published.
     pub published: u64,
     /// Samples that could not be published.
     pub publish_failures: u64,
-    /// Reader connections made inside a publication.
+    /// Reader connections made while publishing.
     pub connections: u64,
     /// Stamp of the last frame \[ns\]; [`Nanos::MIN`] before the first.
     pub last_frame: Nanos,
-    /// The last turn of the bus thread's loop \[ns\].
+    /// Time of the last turn of the bus thread's loop \[ns\].
     pub last_turn: Nanos,
     /// The link's state.
     pub link: LinkState,
@@ -144,17 +145,39 @@ pub struct BusHealth {
     pub reserved: u32,
 }
 
-/// One device.
+impl BusHealth {
+    /// Without a name and with all counts zero.
+    pub const EMPTY: Self = Self {
+        name: Name::EMPTY,
+        frames: 0,
+        unclaimed: 0,
+        dropped: 0,
+        error_frames: 0,
+        sent: 0,
+        send_failures: 0,
+        link_losses: 0,
+        published: 0,
+        publish_failures: 0,
+        connections: 0,
+        last_frame: Nanos::MIN,
+        last_turn: Nanos::MIN,
+        link: LinkState::Up,
+        reserved: 0,
+    };
+}
+
+/// Counters and state of one device.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
 pub struct DeviceHealth {
     /// Its name in the configuration.
     pub name: Name,
-    /// Counts by reason; index by `Counter as usize`.
+    /// The counters; index by `Counter as usize`.
     pub counters: [u64; Counter::ALL.len()],
-    /// Its state: see `proprio_drivers::State`; 0 waiting, 1 asking, 2 starting, 3 streaming, 4 silent, 5 refused, 6 stopped.
+    /// Its state (`proprio_drivers::State`): 0 waiting, 1 asking, 2 starting, 3 streaming, 4
+    /// silent, 5 refused, 6 stopped.
     pub state: u32,
-    /// Why it was refused: see `proprio_drivers::Refusal`; 0 if it was not.
+    /// Why it was refused (`proprio_drivers::Refusal`); 0 if it was not.
     pub refusal: u32,
     /// The number of its bus.
     pub bus: u32,
@@ -162,7 +185,7 @@ pub struct DeviceHealth {
     pub reserved: u32,
 }
 
-/// How the gateway is doing, ten times a second.
+/// State and counters of the gateway, published ten times a second.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
 #[type_name("proprio/GatewayHealth/1")]
@@ -171,9 +194,9 @@ pub struct GatewayHealth {
     pub header: Header,
     /// When the gateway started \[ns\].
     pub started: Nanos,
-    /// How many of `buses` are set.
+    /// Number of valid entries in `buses`.
     pub bus_count: u32,
-    /// How many of `devices` are set.
+    /// Number of valid entries in `devices`.
     pub device_count: u32,
     /// The buses.
     pub buses: [BusHealth; MAX_BUSES],
@@ -181,63 +204,95 @@ pub struct GatewayHealth {
     pub devices: [DeviceHealth; MAX_CHANNELS],
 }
 
+impl DeviceHealth {
+    /// Without a name and with all counts zero.
+    pub const EMPTY: Self = Self {
+        name: Name::EMPTY,
+        counters: [0; Counter::ALL.len()],
+        state: 0,
+        refusal: 0,
+        bus: 0,
+        reserved: 0,
+    };
+}
+
 impl GatewayHealth {
-    /// The buses that are set.
+    /// Without buses and devices.
     #[must_use]
-    pub fn buses(&self) -> &[BusHealth] {
-        self.buses.get(..self.bus_count as usize).unwrap_or(&self.buses)
+    pub fn new(started: Nanos) -> Self {
+        Self {
+            header: Header::default(),
+            started,
+            bus_count: 0,
+            device_count: 0,
+            buses: [BusHealth::EMPTY; MAX_BUSES],
+            devices: [DeviceHealth::EMPTY; MAX_CHANNELS],
+        }
     }
 
-    /// The devices that are set.
+    /// The valid buses.
+    #[must_use]
+    pub fn buses(&self) -> &[BusHealth] {
+        self.buses
+            .get(..self.bus_count as usize)
+            .unwrap_or(&self.buses)
+    }
+
+    /// The valid devices.
     #[must_use]
     pub fn devices(&self) -> &[DeviceHealth] {
-        self.devices.get(..self.device_count as usize).unwrap_or(&self.devices)
+        self.devices
+            .get(..self.device_count as usize)
+            .unwrap_or(&self.devices)
     }
 }
 
-/// What on-line identification has used and left out, and why, since the estimator started.
+/// Instants that on-line identification has used and excluded since the estimator's start, by
+/// reason.
 ///
-/// Counted are the instants of each group of links and sensors that is identified by itself: of two groups, one may pause while the other learns. There are at most
-/// `identification.rate_hz` instants a second.
+/// Instants are counted per group of links and sensors. Groups are identified independently: one
+/// may pause while another learns. There are at most `identification.rate_hz` instants a second.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ZeroCopySend)]
 pub struct IdentificationHealth {
-    /// How many groups there are; 0 if nothing is identified.
+    /// Number of groups; 0 if nothing is identified.
     pub groups: u32,
-    /// How many of them learn nothing at present.
+    /// Number of groups that are paused at present.
     pub paused: u32,
-    /// Learnt from.
+    /// Instants used.
     pub learnt: u64,
-    /// Of these, instants at which nothing moved, which teach little.
+    /// Of these, instants without motion, which contain little information.
     pub still: u64,
-    /// Left out: a contact was declared.
+    /// Excluded: a contact was declared.
     pub contact: u64,
-    /// Left out: readings did not fit what is known, but for no longer than an instant or a few.
+    /// Excluded: the prediction error was too large, for one or a few instants.
     pub outlier: u64,
-    /// Left out: readings did not fit what is known for longer: a contact that nobody declared, or a change.
+    /// Excluded: the prediction error was too large for longer: an undeclared contact or load, or a
+    /// change.
     pub suspected: u64,
-    /// Left out: a channel was silent.
+    /// Excluded: a channel was silent.
     pub stale: u64,
-    /// Left out: a sensor was saturated.
+    /// Excluded: a sensor was saturated.
     pub saturated: u64,
-    /// Left out: a device reported a fault.
+    /// Excluded: a device reported a fault.
     pub device_fault: u64,
-    /// Left out: a channel was not seen yet, had too few samples, or nothing was known of how the base moves.
+    /// Excluded: a channel was not seen yet or had too few samples, or the base motion was not
+    /// known.
     pub unseen: u64,
-    /// F/T offsets that have jumped and are learnt anew.
+    /// Offset jumps: the F/T offset is re-initialised.
     pub offset_changes: u64,
     /// Loads taken up or put down.
     pub load_changes: u64,
-    /// Changes that could not be explained, after which all is learnt anew.
+    /// Unexplained changes; each restarts the identification.
     pub unknown_changes: u64,
-    /// Solutions that came later than they should have.
+    /// Solutions that were late.
     pub late: u64,
-    /// Solutions that could not be found.
+    /// Solutions that failed.
     pub failed: u64,
 }
 
 impl IdentificationHealth {
-    /// Every count, with the word for it in tables and logs.
+    /// Every counter with its name in tables and logs.
     #[must_use]
     pub const fn counts(&self) -> [(&'static str, u64); 14] {
         [
@@ -260,7 +315,7 @@ impl IdentificationHealth {
 }
 
 impl fmt::Display for IdentificationHealth {
-    /// The counts that are not zero.
+    /// The counters that are not zero.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut gap = "";
         for (word, count) in self.counts().into_iter().filter(|(_, count)| *count > 0) {
@@ -271,7 +326,7 @@ impl fmt::Display for IdentificationHealth {
     }
 }
 
-/// How the estimator is doing, ten times a second.
+/// State and counters of the estimator, published ten times a second.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ZeroCopySend)]
 #[type_name("proprio/EstimatorHealth/2")]
@@ -282,13 +337,13 @@ pub struct EstimatorHealth {
     pub started: Nanos,
     /// Samples received.
     pub samples: u64,
-    /// Samples that sequence gaps say were lost between gateway and estimator.
+    /// Samples lost between gateway and estimator, from gaps in the sequence numbers.
     pub lost: u64,
-    /// Times that a new epoch of the gateway was seen (its restarts).
+    /// Number of gateway epochs seen (its starts).
     pub epochs: u64,
-    /// Samples of channels that the configuration does not name.
+    /// Samples of channels that are not in the configuration.
     pub unknown_channel: u64,
-    /// Samples dropped because they came after their instant had been estimated.
+    /// Samples dropped because they arrived after the estimate of their instant.
     pub late: u64,
     /// Samples dropped because their stamp was not later than their channel's last.
     pub backward: u64,
@@ -296,11 +351,11 @@ pub struct EstimatorHealth {
     pub not_finite: u64,
     /// Estimates published.
     pub estimates: u64,
-    /// Estimates in which at least one joint was withheld.
+    /// Estimates with at least one joint withheld.
     pub withheld: u64,
     /// Estimates that could not be published.
     pub publish_failures: u64,
-    /// The last turn of the loop \[ns\].
+    /// Time of the last turn of the loop \[ns\].
     pub last_turn: Nanos,
     /// The instant of the last estimate \[ns\]; 0 before the first.
     pub last_estimate: Nanos,
@@ -308,7 +363,10 @@ pub struct EstimatorHealth {
     pub identification: IdentificationHealth,
 }
 
-const _: () = assert!(size_of::<BusHealth>() == 64 + 13 * 8 && size_of::<DeviceHealth>() == 64 + 13 * 8 + 16);
-const _: () = assert!(size_of::<GatewayHealth>() == 64 + 168 * MAX_BUSES + 184 * MAX_CHANNELS);
 const _: () =
-    assert!(size_of::<IdentificationHealth>() == 15 * 8 && size_of::<EstimatorHealth>() == 48 + 13 * 8 + 15 * 8);
+    assert!(size_of::<BusHealth>() == 64 + 13 * 8 && size_of::<DeviceHealth>() == 64 + 13 * 8 + 16);
+const _: () = assert!(size_of::<GatewayHealth>() == 64 + 168 * MAX_BUSES + 184 * MAX_CHANNELS);
+const _: () = assert!(
+    size_of::<IdentificationHealth>() == 15 * 8
+        && size_of::<EstimatorHealth>() == 48 + 13 * 8 + 15 * 8
+);

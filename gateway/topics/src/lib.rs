@@ -1,24 +1,30 @@
-//! The contract between Proprio's processes: the samples they exchange, the names of the services that carry them and
-//! their quality of service. A consumer of Proprio depends on this crate alone.
+//! The interface between Proprio's processes: the samples and estimates they exchange, the names of
+//! the services that carry them, and their quality of service. A consumer of Proprio depends on
+//! this crate alone.
 //!
 //! - [`reading`]: what a device measured, in SI units: [`Reading`] and its variants.
-//! - [`sample`]: a reading with its channel and its [`Header`]: when, how well, which in the sequence.
-//! - [`estimate`]: joint torques and contact wrenches, each with its validity and the reason where it is not valid.
-//! - [`inertia`]: identified inertial parameters and F/T offsets, with their standard deviations and what they rest on.
+//! - [`sample`]: a reading with its channel number and its [`Header`] (time stamp, quality,
+//!   sequence number).
+//! - [`estimate`]: joint torques and contact wrenches, each with a validity flag and, if it is not
+//!   valid, the reason.
+//! - [`inertia`]: identified inertial parameters and F/T offsets, with their standard deviations
+//!   and the amount of data they come from.
 //! - [`description`]: what the channel, joint and contact numbers mean.
-//! - [`health`]: how gateway and estimator are doing.
-//! - [`time`]: instants as integer nanoseconds.
+//! - [`health`]: state and counters of gateway and estimator.
+//! - [`time`]: instants and durations as integer nanoseconds.
 //! - `csv` (feature `csv`): the same samples as a text table.
-//! - `ipc` (feature `ipc`): the ports: a domain in shared memory, writers and readers; `realtime`: how the threads that
-//!   use them are scheduled.
+//! - `ipc` (feature `ipc`): the ports: a domain in shared memory, writers and readers. `realtime`:
+//!   scheduling of the threads that use them.
 //!
-//! Every type that crosses a process boundary is `repr(C)`; its size is asserted here at compile time and its layout's
-//! version is part of its type name, because the transport itself compares names, sizes and alignments only.
+//! Every type that crosses a process boundary is `repr(C)`. Its size is asserted here at compile
+//! time. The version of its layout is part of its type name, because the transport compares only
+//! names, sizes and alignments.
 //!
 //! # Conventions
-//! Angles in rad, forces in N, torques in Nm, right-handed frames. *Absent is not zero*: a quantity that a device does
-//! not report is NaN, a sample that should have come and did not is a freshness of the reader, and an estimate that can
-//! not be trusted keeps its number with `valid = 0` and the reason.
+//! Angles in rad, forces in N, torques in Nm, right-handed frames. *Absent is not zero*: a quantity
+//! that a device does not report is NaN. Whether a missing sample is overdue is the reader's
+//! [`Freshness`](ipc::Freshness). An estimate that must not be used keeps its value, with `valid =
+//! 0` and the reason.
 #![no_std]
 #[cfg(any(feature = "std", test))]
 extern crate std;
@@ -39,26 +45,40 @@ pub mod time;
 
 pub use description::{Description, Entry, Name, Publisher, Role};
 pub use estimate::{
-    ContactDeclaration, ContactEstimate, ContactWrench, JointTorque, NO_CAUSE, NO_CONTACT, Reason, Residual,
-    TorqueEstimate,
+    ContactDeclaration, ContactEstimate, ContactWrench, JointTorque, NO_CAUSE, NO_CONTACT, Reason,
+    Residual, TorqueEstimate,
 };
-pub use health::{BusHealth, Counter, DeviceHealth, EstimatorHealth, GatewayHealth, IdentificationHealth, LinkState};
+pub use health::{
+    BusHealth, Counter, DeviceHealth, EstimatorHealth, GatewayHealth, IdentificationHealth,
+    LinkState,
+};
 pub use inertia::{InertiaEstimate, LinkInertia, SensorOffset};
 pub use reading::{Actuator, Gauges, Imu, JointState, Kind, Reading, Temperature, Wrench};
 pub use sample::{Header, Quality, Sample, Saturation, StampKind};
 pub use time::Nanos;
 
-/// The most channels one gateway serves.
+/// Maximum number of channels of one gateway.
 pub const MAX_CHANNELS: usize = 128;
-/// The most joints one estimate holds.
+/// Maximum number of joints in one estimate.
 pub const MAX_JOINTS: usize = 64;
-/// The most contacts one estimate holds.
+/// Maximum number of contacts in one estimate.
 pub const MAX_CONTACTS: usize = 16;
-/// The most links one estimate of inertial parameters holds.
+/// Maximum number of links in one estimate of inertial parameters.
 pub const MAX_LINKS: usize = 128;
-/// The most F/T sensors whose offsets one estimate holds.
+/// Maximum number of F/T sensors whose offsets are in one estimate.
 pub const MAX_SENSORS: usize = 32;
-/// The most sub-trees, pieces of the robot between F/T sensors, one estimate holds.
+/// Maximum number of sub-trees (the parts of the robot between F/T sensors) in one estimate.
 pub const MAX_SUBTREES: usize = MAX_SENSORS + 1;
-/// The most buses one gateway reads; also the most publishers of samples.
+/// Maximum number of buses of one gateway; also the maximum number of publishers of samples.
 pub const MAX_BUSES: usize = 16;
+
+/// The programs in README.md and in the documents compile.
+#[cfg(all(doctest, feature = "ipc"))]
+mod documents {
+    #[doc = include_str!("../../../README.md")]
+    struct Readme;
+    #[doc = include_str!("../../../docs/commissioning.md")]
+    struct Commissioning;
+    #[doc = include_str!("../../../docs/figures.md")]
+    struct Figures;
+}

@@ -1,4 +1,4 @@
-//! What a device measured, in SI units. One variant per kind of quantity; adding one makes the compiler list the places.
+//! A device's measurement in SI units, one variant per kind of quantity.
 
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
@@ -9,11 +9,12 @@ use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 pub struct JointState {
     /// Position \[rad, or m for a prismatic joint\]. NaN if this device does not report it.
     pub position: f64,
-    /// Velocity \[rad/s or m/s\] as the device reports it. NaN if it does not.
+    /// Velocity \[rad/s or m/s\] as the device reports it. NaN if not reported.
     pub velocity: f64,
     /// Acceleration \[rad/s^2 or m/s^2\]. NaN if not reported.
     pub acceleration: f64,
-    /// Measured torque \[Nm, or N\], by the parent link on the child link along the axis. NaN if not measured.
+    /// Measured torque \[Nm, or N\], by the parent link on the child link along the axis. NaN if
+    /// not measured.
     pub torque: f64,
     /// Motor current \[A\]. NaN if not reported.
     pub current: f64,
@@ -30,10 +31,12 @@ impl JointState {
     };
 }
 
-/// A six-axis force/torque sensor's reading, in the sensor's own axes and about the sensor's own origin.
+/// A six-axis force/torque sensor's reading, in the sensor's own axes and about the sensor's own
+/// origin.
 ///
-/// Which body it is exerted on, and where that frame sits in the robot, is the estimator's configuration
-/// (`[[force_torque]]`: `frame`, `direction`); the gateway passes on what the device says, in SI units.
+/// The gateway passes on the device's values in SI units. The body that the wrench acts on and the
+/// pose of the sensor frame are in the estimator's configuration (`[[force_torque]]`: `frame`,
+/// `direction`).
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
 pub struct Wrench {
@@ -47,7 +50,8 @@ pub struct Wrench {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
 pub struct Imu {
-    /// Proper acceleration of the IMU's origin \[m/s^2\]: classical acceleration minus gravity. At rest it points up.
+    /// Proper acceleration of the IMU's origin \[m/s^2\]: classical acceleration minus gravity. At
+    /// rest it points up.
     pub proper_acceleration: [f64; 3],
     /// Angular velocity \[rad/s\] with respect to an inertial frame.
     pub angular_velocity: [f64; 3],
@@ -55,7 +59,8 @@ pub struct Imu {
     pub angular_acceleration: [f64; 3],
     /// Magnetic field \[T\]. NaN if not reported.
     pub magnetic_field: [f64; 3],
-    /// Orientation as a unit quaternion w, x, y, z (world from IMU, by the device's own filter). NaN if not reported.
+    /// Orientation as a unit quaternion w, x, y, z (world from IMU, by the device's own filter).
+    /// NaN if not reported.
     pub orientation: [f64; 4],
 }
 
@@ -86,7 +91,7 @@ pub struct Temperature {
     pub celsius: f64,
 }
 
-/// What a motor board says of itself.
+/// A motor board's state.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
 pub struct Actuator {
@@ -120,20 +125,22 @@ pub enum Reading {
     Actuator(Actuator),
 }
 
-/// What a channel is: the kind of its main reading.
+/// The kind of a channel, after its main reading.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, ZeroCopySend)]
 pub enum Kind {
-    /// A joint: [`Reading::Joint`], and [`Reading::Actuator`] or [`Reading::Temperature`] of its motor.
+    /// A joint: [`Reading::Joint`], and [`Reading::Actuator`] or [`Reading::Temperature`] of its
+    /// motor.
     Joint = 0,
-    /// A force/torque sensor: [`Reading::Wrench`], and [`Reading::Gauges`], [`Reading::Temperature`].
+    /// A force/torque sensor: [`Reading::Wrench`], and [`Reading::Gauges`],
+    /// [`Reading::Temperature`].
     Wrench = 1,
     /// An inertial measurement unit: [`Reading::Imu`].
     Imu = 2,
 }
 
 impl Kind {
-    /// The word for it in configuration files and CSV columns.
+    /// Its name in configuration files and CSV columns.
     #[must_use]
     pub const fn word(self) -> &'static str {
         match self {
@@ -144,5 +151,6 @@ impl Kind {
     }
 }
 
-const _: () = assert!(size_of::<Imu>() == 128 && size_of::<Wrench>() == 48 && size_of::<JointState>() == 40);
+const _: () =
+    assert!(size_of::<Imu>() == 128 && size_of::<Wrench>() == 48 && size_of::<JointState>() == 40);
 const _: () = assert!(size_of::<Reading>() == 136 && align_of::<Reading>() == 8);

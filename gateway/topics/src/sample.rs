@@ -1,4 +1,4 @@
-//! A reading on its way: which channel, when it was acquired, how good it is, which in the sequence.
+//! A reading with its channel number, time stamp, quality and sequence number.
 
 use crate::{Nanos, Reading};
 use core::fmt;
@@ -6,24 +6,24 @@ use core::ops::{BitOr, BitOrAssign};
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
-/// Where an acquisition stamp comes from, best last.
+/// Source of an acquisition stamp, from worst to best.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, ZeroCopySend)]
 pub enum StampKind {
-    /// There is no stamp (a log without time stamps): order is all that is known.
+    /// No stamp (a log without time stamps): only the order is known.
     #[default]
     None = 0,
-    /// Read from the clock by the receiving program, after the fact.
+    /// Read from the clock by the receiving program, after reception.
     User = 1,
     /// As recorded in a log.
     Log = 2,
     /// The kernel's receive stamp.
     Software = 3,
-    /// The CAN adapter's receive stamp, brought to CLOCK_MONOTONIC.
+    /// The CAN adapter's receive stamp, converted to CLOCK_MONOTONIC.
     Hardware = 4,
 }
 
-/// How a six-axis sensor's channel is saturated.
+/// Saturation of one axis of a six-axis sensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Saturation {
     /// Within its range.
@@ -34,26 +34,30 @@ pub enum Saturation {
     High,
 }
 
-/// What is known against a sample: a set of bits, empty when nothing is.
+/// Quality flags of a sample; the empty set means that no problem is known.
 #[repr(C)]
 #[derive(Clone, Copy, Default, PartialEq, Eq, Hash, ZeroCopySend)]
 pub struct Quality(pub u32);
 
 impl Quality {
-    /// Nothing is known against it.
+    /// No flag is set.
     pub const GOOD: Self = Self(0);
     /// At least one reading of this channel was lost just before this one.
     pub const GAP_BEFORE: Self = Self(1);
     /// At least one channel of the sensor is at an end of its range; see [`Quality::saturation`].
     pub const SATURATED: Self = Self(1 << 1);
-    /// The device repeats its last value instead of measuring (iCub strain boards do so while saturated).
+    /// The device repeats its last value instead of measuring (iCub strain boards do so while
+    /// saturated).
     pub const FROZEN: Self = Self(1 << 2);
-    /// The device reports a fault of its own.
+    /// The device reports a fault.
     pub const DEVICE_FAULT: Self = Self(1 << 3);
-    /// The device says that it is not calibrated.
+    /// The device reports that it is not calibrated.
     pub const NOT_CALIBRATED: Self = Self(1 << 4);
-    /// `Header::device_counter` is the device's own sequence number.
+    /// `Header::device_counter` is valid: it is the device's own sequence number.
     pub const DEVICE_COUNTER: Self = Self(1 << 5);
+
+    /// The flags that make an encoder's position unusable.
+    pub const UNTRUSTED_ENCODER: Self = Self(Self::DEVICE_FAULT.0 | Self::NOT_CALIBRATED.0);
 
     const NAMED: [(Self, &'static str); 6] = [
         (Self::GAP_BEFORE, "gap_before"),
@@ -77,7 +81,8 @@ impl Quality {
         self.0 & other.0 != 0
     }
 
-    /// This set with axis `axis` (0 to 5: fx fy fz tx ty tz) marked as `saturation`; sets SATURATED too.
+    /// This set with the saturation of axis `axis` (0 to 5: fx fy fz tx ty tz) set; sets SATURATED
+    /// too.
     #[must_use]
     pub const fn with_saturation(self, axis: u32, saturation: Saturation) -> Self {
         let code = match saturation {
@@ -91,7 +96,7 @@ impl Quality {
         Self(self.0 | Self::SATURATED.0 | code << (Self::SATURATION_SHIFT + 2 * axis))
     }
 
-    /// How axis `axis` (0 to 5: fx fy fz tx ty tz) is saturated.
+    /// The saturation of axis `axis` (0 to 5: fx fy fz tx ty tz).
     #[must_use]
     pub const fn saturation(self, axis: u32) -> Saturation {
         if axis > 5 {
@@ -125,7 +130,7 @@ impl fmt::Debug for Quality {
 }
 
 impl fmt::Display for Quality {
-    /// The names of the bits joined by `|`, or `good`.
+    /// The names of the set flags joined by `|`, or `good`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut first = true;
         for (bit, name) in Self::NAMED {
@@ -139,25 +144,27 @@ impl fmt::Display for Quality {
     }
 }
 
-/// When and in which order: the same in everything that is published.
+/// Time stamps and sequence number; the same in every published payload.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ZeroCopySend)]
 pub struct Header {
-    /// New at each start of the publisher: a change means that `sequence` starts again.
+    /// Changes at each start of the publisher; `sequence` then starts again at 0.
     pub epoch: u64,
-    /// Counts what this publisher has sent on this service, from 0; a gap is a loss between publisher and reader.
+    /// Counts this publisher's payloads on this service, from 0. A gap is a loss between publisher
+    /// and reader.
     pub sequence: u64,
-    /// When the first CAN frame that this is made of was received \[ns\]; for an estimate, the instant it is of.
+    /// Receive time of the first CAN frame of this reading \[ns\]. For an estimate, the instant
+    /// that it refers to.
     pub acquired: Nanos,
-    /// Just before it was sent \[ns\].
+    /// Time just before sending \[ns\].
     pub published: Nanos,
-    /// The device's own sequence number where it has one (then `quality` has DEVICE_COUNTER), else 0.
+    /// The device's own sequence number if it has one (then `quality` has DEVICE_COUNTER), else 0.
     pub device_counter: u32,
-    /// What is known against this sample.
+    /// Quality flags of this sample.
     pub quality: Quality,
-    /// Where `acquired` comes from.
+    /// The source of `acquired`.
     pub stamp: StampKind,
-    /// The bus that it came from: its number in the gateway's configuration, from 0.
+    /// Number of the bus in the gateway's configuration, from 0.
     pub bus: u32,
 }
 
@@ -166,13 +173,13 @@ pub struct Header {
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
 #[type_name("proprio/Sample/1")]
 pub struct Sample {
-    /// When, in which order, how good.
+    /// Time stamps, sequence number, quality.
     pub header: Header,
-    /// The channel's number; `<robot>/description` tells its name and kind.
+    /// The channel's number; `<robot>/description` holds its name and kind.
     pub channel: u32,
     /// Unused, zero.
     pub reserved: u32,
-    /// What was measured.
+    /// The measured quantities.
     pub reading: Reading,
 }
 
@@ -194,6 +201,9 @@ mod tests {
         assert_eq!(q.saturation(1), Saturation::None);
         assert_eq!(q.to_string(), "saturated|frozen");
         assert_eq!(Quality::GOOD.to_string(), "good");
-        assert_eq!(Quality::GOOD.with_saturation(6, Saturation::High), Quality::GOOD);
+        assert_eq!(
+            Quality::GOOD.with_saturation(6, Saturation::High),
+            Quality::GOOD
+        );
     }
 }

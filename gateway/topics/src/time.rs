@@ -1,4 +1,4 @@
-//! Instants and durations as integer nanoseconds: exact, ordered, and never a floating-point number of seconds.
+//! Instants and durations as integer nanoseconds: exact and totally ordered.
 
 use core::fmt;
 use core::ops::{Add, AddAssign, Sub};
@@ -7,14 +7,15 @@ use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
 /// An instant of CLOCK_MONOTONIC, or the difference of two instants \[ns\].
 ///
-/// In a recorded log the origin is the log's own; only differences mean something. Floating point appears only in
-/// differences ([`Nanos::seconds`]): a double holds an instant since boot to no better than a microsecond after weeks.
+/// In a recorded log the origin is arbitrary, so only differences have a meaning. Floating point
+/// appears only in differences ([`Nanos::seconds`]): after weeks of uptime a double holds an
+/// instant since boot only to about a microsecond.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, ZeroCopySend)]
 pub struct Nanos(pub i64);
 
 impl Nanos {
-    /// No time at all.
+    /// A duration of zero.
     pub const ZERO: Self = Self(0);
     /// Later than every instant.
     pub const MAX: Self = Self(i64::MAX);
@@ -33,11 +34,13 @@ impl Nanos {
         Self(us.saturating_mul(1_000))
     }
 
-    /// A duration given in seconds, rounded to the nearest nanosecond; saturates, and NaN gives zero.
+    /// A duration given in seconds, rounded to the nearest nanosecond; saturates, and NaN gives
+    /// zero.
     #[must_use]
     pub fn from_seconds(s: f64) -> Self {
         let ns = s * 1e9;
-        // `as` truncates towards zero and saturates; adding half a nanosecond away from zero rounds.
+        // `as` truncates towards zero and saturates; adding half a nanosecond away from zero
+        // rounds.
         #[allow(clippy::cast_possible_truncation)]
         Self((ns + if ns < 0.0 { -0.5 } else { 0.5 }) as i64)
     }
@@ -55,16 +58,17 @@ impl Nanos {
         Self(self.0.saturating_add(other.0))
     }
 
-    /// `self - other`, kept in range.
+    /// `self - other`, clamped to the range of `i64`.
     #[must_use]
     pub const fn saturating_sub(self, other: Self) -> Self {
         Self(self.0.saturating_sub(other.0))
     }
 
-    /// Reads decimal seconds (`12`, `-0.5`, `1479121923.123456789`) as exact nanoseconds.
+    /// Parses decimal seconds (`12`, `-0.5`, `1479121923.123456789`) as exact nanoseconds.
     ///
-    /// Digits beyond the ninth decimal are rounded half up in magnitude. `None` if the text is not a decimal number or
-    /// is out of range. An exponent is accepted, as spreadsheets write one.
+    /// Digits beyond the ninth decimal are rounded half up in magnitude. `None` if the text is not
+    /// a decimal number or is out of range. An exponent (`1e-3`) is accepted, because spreadsheets
+    /// write it.
     #[must_use]
     pub fn parse_seconds(text: &str) -> Option<Self> {
         let (digits, exponent) = match text.find(['e', 'E']) {
@@ -80,7 +84,7 @@ impl Nanos {
             return None;
         }
         let (mut value, mut seen_point, mut any) = (0_i128, false, false);
-        // Decimals still to come before the nanosecond digit; below zero the digit only rounds.
+        // Remaining decimals up to the nanosecond digit; below zero, digits only round.
         let mut places = 9 + exponent;
         let mut rounded = false;
         for byte in digits.bytes() {
@@ -124,7 +128,8 @@ impl Nanos {
 }
 
 impl fmt::Display for Nanos {
-    /// Decimal seconds with as many decimals as needed; [`Nanos::parse_seconds`] reads it back exactly.
+    /// Decimal seconds with as many decimals as needed; [`Nanos::parse_seconds`] reads it back
+    /// exactly.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let magnitude = self.0.unsigned_abs();
         let (whole, mut rest) = (magnitude / 1_000_000_000, magnitude % 1_000_000_000);
@@ -200,7 +205,8 @@ mod tests {
         #[test]
         fn text_round_trips(ns: i64) {
             proptest::prop_assume!(ns != i64::MIN);
-            proptest::prop_assert_eq!(Nanos::parse_seconds(&Nanos(ns).to_string()), Some(Nanos(ns)));
+            let text = Nanos(ns).to_string();
+            proptest::prop_assert_eq!(Nanos::parse_seconds(&text), Some(Nanos(ns)));
         }
     }
 }

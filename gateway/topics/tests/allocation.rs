@@ -1,9 +1,12 @@
-//! Sending and taking allocate nothing of ours: one allocation of 48 bytes per payload sent is iceoryx2's loan.
-// A global allocator can only be made with unsafe code.
+//! Sending and taking allocate nothing, except one allocation of 48 bytes per payload sent in
+//! iceoryx2's loan.
+// A global allocator needs unsafe code.
 #![allow(missing_docs, unsafe_code, clippy::unwrap_used)]
 
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, TorqueReader, Writer, monotonic};
-use proprio_topics::{Header, JointState, JointTorque, MAX_JOINTS, Nanos, Reading, Reason, Sample, TorqueEstimate};
+use proprio_topics::{
+    Header, JointState, JointTorque, MAX_JOINTS, Nanos, Reading, Reason, Sample, TorqueEstimate,
+};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
@@ -13,8 +16,9 @@ thread_local! {
 
 struct Counting;
 
-// SAFETY: every call is passed on unchanged to the system's allocator, which upholds the contract; counting uses a
-// thread-local that is initialised at compile time, has no destructor and does not allocate.
+// SAFETY: every call is passed on unchanged to the system's allocator, which upholds the contract;
+// counting uses a thread-local that is initialised at compile time, has no destructor and does not
+// allocate.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         let _ = COUNTED.try_with(|c| c.set((c.get().0 + 1, c.get().1 + layout.size())));
@@ -39,7 +43,7 @@ fn counted(run: impl FnOnce()) -> (usize, usize) {
 }
 
 #[test]
-fn sending_and_taking_allocate_nothing_of_ours() {
+fn only_iceoryx2s_loan_allocates() {
     let base = tempfile::tempdir().unwrap();
     let domain = Domain::open(&DomainConfig::new(base.path(), "test")).unwrap();
     assert_ne!(
@@ -60,11 +64,18 @@ fn sending_and_taking_allocate_nothing_of_ours() {
     reader.latest().unwrap().unwrap();
 
     const N: usize = 5000; // more than the buffer: overflow included
-    let (count, bytes) =
-        counted(|| (0..N).for_each(|_| assert_eq!(writer.send(&sample, Nanos(0)).unwrap().readers, 1)));
-    assert_eq!((count, bytes), (N, 48 * N), "iceoryx2's loan alone");
-    assert_eq!(counted(|| assert_eq!(writer.update_connections(), Ok(0))), (0, 0));
-    assert_eq!(counted(|| while reader.try_take().unwrap().is_some() {}), (0, 0));
+    let (count, bytes) = counted(|| {
+        (0..N).for_each(|_| assert_eq!(writer.send(&sample, Nanos(0)).unwrap().readers, 1));
+    });
+    assert_eq!((count, bytes), (N, 48 * N), "iceoryx2's loan only");
+    assert_eq!(
+        counted(|| assert_eq!(writer.update_connections(), Ok(0))),
+        (0, 0)
+    );
+    assert_eq!(
+        counted(|| while reader.try_take().unwrap().is_some() {}),
+        (0, 0)
+    );
     assert!(reader.taken() > 2000);
 
     let mut estimates = Writer::<TorqueEstimate>::create(&domain, "icub", 1).unwrap();
@@ -95,5 +106,5 @@ fn sending_and_taking_allocate_nothing_of_ours() {
             assert_eq!(torques.torque_at(0).unwrap().torque, 1.0);
         }
     });
-    assert_eq!(counted, (1000, 48_000), "iceoryx2's loan alone");
+    assert_eq!(counted, (1000, 48_000), "iceoryx2's loan only");
 }

@@ -1,6 +1,8 @@
-//! Processes that die at any instant: the next start succeeds, whoever stays goes on, and nothing is left over.
+//! Processes that die at any instant: the next start succeeds, the other processes continue, and no
+//! files are left.
 //!
-//! `PROPRIO_KILLS=300 cargo test -p proprio-topics --features ipc --test crashes -- --nocapture` sweeps more finely and tells its figures.
+//! `PROPRIO_KILLS=300 cargo test -p proprio-topics --features ipc --test crashes -- --nocapture`
+//! uses more instants and prints the measured times.
 #![allow(missing_docs, clippy::unwrap_used)]
 
 use nix::fcntl::{FcntlArg, OFlag, fcntl};
@@ -11,7 +13,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 const ROLE: &str = "PROPRIO_TEST_ROLE";
-/// A start that takes longer than this hangs. Not a measure of speed.
+/// A start that takes longer than this is considered hung. Not a measure of speed.
 const HANGS: Nanos = Nanos::from_millis(20_000);
 
 fn sample() -> Sample {
@@ -23,19 +25,21 @@ fn sample() -> Sample {
     }
 }
 
-/// Not a test: what a child process does. The test executable runs itself with [`ROLE`] set.
+/// Not a test: the code of a child process. The test executable runs itself with [`ROLE`] set.
 #[test]
 fn child() {
-    let Ok(role) = std::env::var(ROLE) else { return };
+    let Ok(role) = std::env::var(ROLE) else {
+        return;
+    };
     let domain = Domain::open(&DomainConfig::from_env()).unwrap();
     let ready = |word: &str| {
-        // Not through the test harness, which captures.
+        // Written directly, because the test harness captures output.
         std::io::stderr().write_all(word.as_bytes()).unwrap();
     };
     let mut stdin = std::io::stdin();
     let flags = OFlag::from_bits_retain(fcntl(&stdin, FcntlArg::F_GETFL).unwrap());
     fcntl(&stdin, FcntlArg::F_SETFL(flags | OFlag::O_NONBLOCK)).unwrap();
-    // The end of its standard input asks a child to stop.
+    // A child stops at the end of its standard input.
     let mut go_on = || {
         std::thread::sleep(Duration::from_millis(1));
         !matches!(stdin.read(&mut [0; 1]), Ok(0))
@@ -80,7 +84,8 @@ fn spawn(role: &str, config: &DomainConfig) -> Child {
         .unwrap()
 }
 
-/// Waits until the child says that it is ready; meanwhile `work` is done every millisecond or so. Returns how long it took.
+/// Waits until the child reports that it is ready, and meanwhile calls `work` about every
+/// millisecond. Returns the time it took.
 fn await_ready(child: &mut Child, mut work: impl FnMut()) -> Nanos {
     let start = monotonic();
     let mut stderr = child.stderr.take().unwrap();
@@ -100,7 +105,7 @@ fn await_ready(child: &mut Child, mut work: impl FnMut()) -> Nanos {
         }
         assert!(
             monotonic() - start < HANGS,
-            "the child hangs in its start; it said: {}",
+            "the child hangs in its start; its output: {}",
             String::from_utf8_lossy(&said)
         );
         work();
@@ -124,7 +129,7 @@ fn kill(mut child: Child) {
     child.wait().unwrap();
 }
 
-/// Waits `delay` by the clock: sleeping is too coarse for a sweep in microseconds.
+/// Waits `delay` by polling the clock: sleeping is too coarse for steps of microseconds.
 fn pause(delay: Nanos) {
     let end = monotonic() + delay;
     while monotonic() < end {
@@ -167,7 +172,8 @@ fn summary(what: &str, times: &mut [Nanos]) {
     let ms = |n: Nanos| n.seconds() * 1e3;
     let at = |share: usize| ms(times[(times.len() - 1) * share / 100]);
     println!(
-        "{what}: {} kills, all recovered; next start ready after {:.1} ms (median), {:.1} (99 %), {:.1} (worst)",
+        "{what}: {} kills, all recovered; next start ready after {:.1} ms (median), {:.1} (99 %), \
+         {:.1} (worst)",
         times.len(),
         at(50),
         at(99),
@@ -186,12 +192,17 @@ fn a_reader_outlives_its_writer_and_a_restarted_one_is_not_refused() {
     let mut reader = Reader::<Sample>::open(&domain, "icub").unwrap();
     let mut second = spawn("refused", &config);
     let mut said = String::new();
-    second.stderr.take().unwrap().read_to_string(&mut said).unwrap();
+    second
+        .stderr
+        .take()
+        .unwrap()
+        .read_to_string(&mut said)
+        .unwrap();
     assert!(second.wait().unwrap().success(), "{said}");
     assert_eq!(
         said,
         format!("T{}", first.id()),
-        "a second gateway is told which process is the first"
+        "the error names the first gateway's process"
     );
     for epochs in 1..=5 {
         let mut taken = 0;
@@ -208,9 +219,11 @@ fn a_reader_outlives_its_writer_and_a_restarted_one_is_not_refused() {
     assert_nothing_left(&config, &prefix);
 }
 
-/// Kills a child of `role` at instants all over its start, each time followed by one that must come up.
+/// Kills a child of `role` at instants spread over its start. After each kill, another child must
+/// start successfully.
 ///
-/// `work` is what the process that stays does; it returns whether it has got something from a writer (if it reads).
+/// `work` is the work of the surviving process; it returns whether it has received something from a
+/// writer (if it reads).
 fn sweep_start(role: &str, kills: u32, config: &DomainConfig, mut work: impl FnMut() -> bool) {
     let mut child = spawn(role, config);
     let typical = await_ready(&mut child, || {
@@ -219,12 +232,13 @@ fn sweep_start(role: &str, kills: u32, config: &DomainConfig, mut work: impl FnM
     kill(child);
     let mut times = Vec::new();
     for k in 0..kills {
-        // Even steps over one and a half times a typical start, in a scattered order.
+        // Even steps over one and a half times a typical start, in a shuffled order.
         let part = i64::from(k * 7919 % kills);
         let victim = spawn(role, config);
         pause(Nanos(typical.0 * 3 / 2 * part / i64::from(kills)));
         kill(victim);
-        // Until what the victim may have sent is read: only then does the next writer's count.
+        // First read everything that the killed writer may have sent, so that only the next
+        // writer's payloads count.
         while work() {}
         let mut next = spawn(role, config);
         let mut got = false;
@@ -233,7 +247,7 @@ fn sweep_start(role: &str, kills: u32, config: &DomainConfig, mut work: impl FnM
         while !got && role == "writer" {
             assert!(
                 monotonic() - start < HANGS,
-                "the process that stayed gets nothing from the next writer"
+                "the surviving process receives nothing from the next writer"
             );
             got = work();
             std::thread::sleep(Duration::from_micros(300));
@@ -241,7 +255,10 @@ fn sweep_start(role: &str, kills: u32, config: &DomainConfig, mut work: impl FnM
         if k % 2 == 0 { kill(next) } else { stop(next) }
     }
     summary(
-        &format!("start of a {role} (typically {:.1} ms)", typical.seconds() * 1e3),
+        &format!(
+            "start of a {role} (typically {:.1} ms)",
+            typical.seconds() * 1e3
+        ),
         &mut times,
     );
 }
@@ -258,7 +275,9 @@ fn a_writer_killed_anywhere_in_its_start_hinders_nobody() {
         if reader.is_none() {
             reader = Reader::<Sample>::open(&domain, "icub").ok();
         }
-        let Some(reader) = &mut reader else { return false };
+        let Some(reader) = &mut reader else {
+            return false;
+        };
         let before = taken;
         while reader.try_take().unwrap().is_some() {
             taken += 1;
@@ -268,11 +287,11 @@ fn a_writer_killed_anywhere_in_its_start_hinders_nobody() {
     let reader = reader.unwrap();
     assert!(
         reader.epochs() >= u64::from(kills(40)),
-        "one at least of each that came up"
+        "at least one of each writer that started"
     );
     assert_eq!(reader.lost(), 0);
     println!(
-        "the reader that stayed took {taken} samples of {} epochs, lost none",
+        "the surviving reader took {taken} samples of {} epochs, lost none",
         reader.epochs()
     );
     drop((reader, domain));
@@ -296,7 +315,8 @@ fn a_reader_killed_anywhere_in_its_start_hinders_nobody() {
     assert_nothing_left(&config, &prefix);
 }
 
-/// With nobody else alive, and with the domain's own creation and removal among what is interrupted.
+/// No other process is alive, so that the creation and removal of the domain itself are interrupted
+/// too.
 #[test]
 fn a_lonely_process_killed_in_its_start_or_end_hinders_nobody() {
     let base = tempfile::tempdir().unwrap();
@@ -306,7 +326,7 @@ fn a_lonely_process_killed_in_its_start_or_end_hinders_nobody() {
     let prefix = prefix(&config);
     stop(first);
     assert_nothing_left(&config, &prefix);
-    // Whoever looks from outside leaves no trace either.
+    // Checking from outside leaves no files either.
     sweep_start("lonely writer", kills(20), &config, || false);
 
     let mut times = Vec::new();
@@ -314,7 +334,9 @@ fn a_lonely_process_killed_in_its_start_or_end_hinders_nobody() {
         let mut victim = spawn("writer", &config);
         await_ready(&mut victim, || ());
         drop(victim.stdin.take());
-        pause(Nanos::from_micros(i64::from(k) * 6000 / i64::from(kills(20))));
+        pause(Nanos::from_micros(
+            i64::from(k) * 6000 / i64::from(kills(20)),
+        ));
         kill(victim);
         let mut next = spawn("writer", &config);
         times.push(await_ready(&mut next, || ()));
@@ -343,7 +365,9 @@ fn a_writer_killed_in_its_end_hinders_nobody() {
             None
         };
         drop(victim.stdin.take());
-        pause(Nanos::from_micros(i64::from(k) * 6000 / i64::from(kills(20))));
+        pause(Nanos::from_micros(
+            i64::from(k) * 6000 / i64::from(kills(20)),
+        ));
         kill(victim);
         let mut next = spawn("writer", &config);
         times.push(await_ready(&mut next, || ()));
@@ -354,7 +378,8 @@ fn a_writer_killed_in_its_end_hinders_nobody() {
     assert_nothing_left(&config, &prefix);
 }
 
-/// What a kill leaves in the unlucky one of twelve cases, made on purpose: each alone makes iceoryx2 fail or hang for ever.
+/// Creates on purpose the files that a kill can leave behind: each alone makes iceoryx2 fail or
+/// hang for ever.
 #[test]
 fn what_is_half_made_is_removed_while_others_work() {
     let base = tempfile::tempdir().unwrap();
@@ -367,7 +392,10 @@ fn what_is_half_made_is_removed_while_others_work() {
 
     let kind = "0123456789abcdef0123456789abcdef01234567";
     let shm = |name: &str| std::path::Path::new("/dev/shm").join(format!("{prefix}{name}"));
-    let (nodes, services) = (base.path().join("test/nodes"), base.path().join("test/services"));
+    let (nodes, services) = (
+        base.path().join("test/nodes"),
+        base.path().join("test/services"),
+    );
     let live: Vec<_> = std::fs::read_dir(&services)
         .unwrap()
         .map(|e| e.unwrap().path())
@@ -382,25 +410,49 @@ fn what_is_half_made_is_removed_while_others_work() {
         make(&shm(&format!("{kind}_11.dynamic")), 0o200, b""),
         make(&shm(&format!("{kind}_12.data")), 0o200, b"0123456789abcdef"),
         make(&shm(&format!("{kind}_12_13.connection")), 0o600, b""),
-        // Finished, but nobody's.
-        make(&shm(&format!("{kind}_14.dynamic")), 0o600, b"0123456789abcdef"),
+        // Finished, but without an owner.
+        make(
+            &shm(&format!("{kind}_14.dynamic")),
+            0o600,
+            b"0123456789abcdef",
+        ),
         make(&shm(&format!("{kind}_15.data")), 0o600, b"0123456789abcdef"),
-        make(&shm(&format!("{kind}_15_16.connection")), 0o600, b"0123456789abcdef"),
-        make(&services.join(format!("{prefix}{kind}.service")), 0o600, b""),
+        make(
+            &shm(&format!("{kind}_15_16.connection")),
+            0o600,
+            b"0123456789abcdef",
+        ),
+        make(
+            &services.join(format!("{prefix}{kind}.service")),
+            0o600,
+            b"",
+        ),
         make(
             &services.join(format!("{prefix}f{}.service", &kind[1..])),
             0o400,
             b"service",
         ),
-        // Nodes that died before, in and after the making of their monitor.
+        // Nodes that died before, during and after the creation of their monitor file.
         {
             std::fs::create_dir(nodes.join("21")).unwrap();
-            make(&nodes.join("21").join(format!("{prefix}node.details")), 0o600, b"{");
+            make(
+                &nodes.join("21").join(format!("{prefix}node.details")),
+                0o600,
+                b"{",
+            );
             nodes.join("21")
         },
-        make(&nodes.join(format!("{prefix}22.node_monitor_context")), 0o200, b""),
+        make(
+            &nodes.join(format!("{prefix}22.node_monitor_context")),
+            0o200,
+            b"",
+        ),
         make(&nodes.join(format!("{prefix}23.node_monitor")), 0o600, b""),
-        make(&nodes.join(format!("{prefix}23.node_monitor_owner_lock")), 0o600, b""),
+        make(
+            &nodes.join(format!("{prefix}23.node_monitor_owner_lock")),
+            0o600,
+            b"",
+        ),
     ];
     let mut other = spawn("reader", &config);
     await_ready(&mut other, || {
@@ -428,7 +480,8 @@ fn what_is_half_made_is_removed_while_others_work() {
     assert_nothing_left(&config, &prefix);
 }
 
-/// Whoever dies while it clears away another may have removed a port's tag, and not yet freed the port's place in its service.
+/// A process that dies while it cleans up after another may have removed a port's tag without
+/// freeing the port's place in its service.
 #[test]
 fn a_place_is_freed_although_who_was_freeing_it_died() {
     let base = tempfile::tempdir().unwrap();
@@ -437,12 +490,15 @@ fn a_place_is_freed_although_who_was_freeing_it_died() {
     let prefix = prefix(&config);
     let nodes = || -> Vec<std::path::PathBuf> {
         let entries = std::fs::read_dir(base.path().join("test/nodes")).unwrap();
-        entries.map(|e| e.unwrap().path()).filter(|p| p.is_dir()).collect()
+        entries
+            .map(|e| e.unwrap().path())
+            .filter(|p| p.is_dir())
+            .collect()
     };
     let before = nodes();
     let mut writer = spawn("lonely writer", &config);
     await_ready(&mut writer, || {});
-    // The service stays, and with it the places of its ports.
+    // This reader keeps the service, and with it the places of its ports, alive.
     let reader = Reader::<GatewayHealth>::open(&domain, "icub").unwrap();
     kill(writer);
 
@@ -451,8 +507,11 @@ fn a_place_is_freed_although_who_was_freeing_it_died() {
     let [dead] = dead.as_slice() else {
         panic!("one node has died: {dead:?}")
     };
-    // A sweep that is killed after it has removed the first tags.
-    let kept = base.path().join("test/kept").join(dead.file_name().unwrap());
+    // The state after a sweep that was killed when it had removed the first tags.
+    let kept = base
+        .path()
+        .join("test/kept")
+        .join(dead.file_name().unwrap());
     std::fs::create_dir_all(&kept).unwrap();
     let mut tags = 0;
     for entry in std::fs::read_dir(dead).unwrap() {
@@ -466,7 +525,7 @@ fn a_place_is_freed_although_who_was_freeing_it_died() {
 
     let next = Writer::<GatewayHealth>::create(&domain, "icub", domain.epoch());
     assert!(next.is_ok(), "{}", next.unwrap_err());
-    assert!(!kept.exists(), "nothing is kept of what is gone");
+    assert!(!kept.exists(), "the kept tags are removed with their node");
     drop((next, reader, domain));
     assert_nothing_left(&config, &prefix);
 }
@@ -475,7 +534,10 @@ fn a_place_is_freed_although_who_was_freeing_it_died() {
 fn a_domain_in_use_is_not_removed() {
     let base = tempfile::tempdir().unwrap();
     let config = DomainConfig::new(base.path(), "test");
-    assert!(Domain::remove_if_unused(&config).unwrap(), "one that never was is gone");
+    assert!(
+        Domain::remove_if_unused(&config).unwrap(),
+        "a domain that never existed counts as removed"
+    );
     let mut writer = spawn("writer", &config);
     await_ready(&mut writer, || ());
     let prefix = prefix(&config);

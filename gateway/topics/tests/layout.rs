@@ -1,12 +1,18 @@
-//! The bytes of what the estimator has identified, as a reader in another language finds them in shared memory.
-// Bytes of a struct can only be looked at with unsafe code.
+//! The byte layout of `InertiaEstimate`, as a reader in another language finds it in shared memory.
+// Reading a struct's bytes needs unsafe code.
 #![allow(missing_docs, unsafe_code)]
 
 use proprio_topics::{Header, InertiaEstimate, LinkInertia, MAX_LINKS, Name, Nanos, SensorOffset};
 
 fn bytes_of(estimate: &InertiaEstimate) -> &[u8] {
-    // SAFETY: `repr(C)` without padding (its size is the sum of its fields' sizes, asserted beside it), so that every byte is initialised; borrowed as long as the estimate.
-    unsafe { std::slice::from_raw_parts(std::ptr::from_ref(estimate).cast(), size_of::<InertiaEstimate>()) }
+    // SAFETY: `repr(C)` without padding (its size is the sum of its fields' sizes, asserted beside
+    // it), so that every byte is initialised; borrowed as long as the estimate.
+    unsafe {
+        std::slice::from_raw_parts(
+            std::ptr::from_ref(estimate).cast(),
+            size_of::<InertiaEstimate>(),
+        )
+    }
 }
 
 #[test]
@@ -45,7 +51,9 @@ fn an_inertia_has_its_bytes_where_the_contract_says() {
     let word = |at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().expect("eight"));
     let half = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four"));
     let real = |at: usize| f64::from_bits(word(at));
-    let text = |at: usize| std::str::from_utf8(&bytes[at..at + 64]).map(|text| text.trim_end_matches('\0'));
+    let text = |at: usize| {
+        std::str::from_utf8(&bytes[at..at + 64]).map(|text| text.trim_end_matches('\0'))
+    };
 
     assert_eq!(
         (word(0), word(8), word(16), word(24)),
@@ -68,9 +76,11 @@ fn an_inertia_has_its_bytes_where_the_contract_says() {
     let numbers: Vec<f64> = (0..12).map(|i| real(sensor + 64 + 8 * i)).collect();
     assert_eq!(
         numbers,
-        [6.0, -4.0, 11.0, 0.2, -0.35, 0.1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+        [
+            6.0, -4.0, 11.0, 0.2, -0.35, 0.1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6
+        ]
     );
     assert_eq!((half(sensor + 160), half(sensor + 164)), (3, 1));
-    // One that is not set says nothing rather than zero.
+    // An entry that is not set holds NaN, not zero.
     assert!(real(56 + 64).is_nan() && half(56 + 244) == 0);
 }

@@ -1,15 +1,17 @@
-//! Ports within one process: order, overflow, loss, late readers, isolation, versions, limits, and what the errors say.
+//! Ports within one process: order, overflow, loss, late readers, isolation, versions, limits, and
+//! error messages.
 #![allow(missing_docs, clippy::unwrap_used)]
 
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 use proprio_topics::ipc::{
-    Domain, DomainConfig, DomainError, Freshness, NoTorque, PortError, QualityOfService, Reader, Topic, TorqueReader,
-    Writer, monotonic,
+    Domain, DomainConfig, DomainError, Freshness, NoTorque, PortError, QualityOfService, Reader,
+    Topic, TorqueReader, Writer, monotonic,
 };
 use proprio_topics::{
-    ContactDeclaration, Description, Entry, EstimatorHealth, GatewayHealth, Header, InertiaEstimate, JointState,
-    JointTorque, Kind, LinkInertia, MAX_JOINTS, Name, Nanos, Publisher, Reading, Reason, Role, Sample, TorqueEstimate,
+    ContactDeclaration, Description, Entry, EstimatorHealth, GatewayHealth, Header,
+    InertiaEstimate, JointState, JointTorque, Kind, LinkInertia, MAX_JOINTS, Name, Nanos,
+    Publisher, Reading, Reason, Role, Sample, TorqueEstimate,
 };
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
@@ -96,18 +98,27 @@ fn what_is_sent_arrives_in_order_and_nothing_remains() {
         }
         for channel in 0..100 {
             let got = reader.try_take().unwrap().unwrap();
-            assert_eq!((got.channel, got.header.sequence), (channel, u64::from(channel)));
+            assert_eq!(
+                (got.channel, got.header.sequence),
+                (channel, u64::from(channel))
+            );
             assert_eq!((got.header.epoch, got.header.published), (7, Nanos(5)));
             assert_eq!(got.reading, sample(channel).reading);
         }
         assert_eq!(reader.try_take().unwrap(), None);
-        assert_eq!((reader.lost(), reader.taken(), reader.epochs()), (0, 100, 1));
+        assert_eq!(
+            (reader.lost(), reader.taken(), reader.epochs()),
+            (0, 100, 1)
+        );
         prefix = our_segments(&config);
         assert!(!prefix.is_empty());
     }
     assert!(is_empty(base.path()), "files remain");
     for segment in prefix {
-        assert!(!Path::new("/dev/shm").join(&segment).exists(), "{segment} remains");
+        assert!(
+            !Path::new("/dev/shm").join(&segment).exists(),
+            "{segment} remains"
+        );
     }
 }
 
@@ -144,13 +155,16 @@ fn overflow_keeps_the_newest_and_the_writer_never_waits() {
         assert_eq!(reader.try_take().unwrap().unwrap().header.sequence, k);
     }
     assert_eq!(reader.try_take().unwrap(), None);
-    // The reader is older than the writer's first payload only in connection order: it joined late, so the first number seen is no loss ...
+    // The reader joined after the writer began, so the first sequence number seen is no loss ...
     assert_eq!(reader.lost(), 0);
-    // ... but a gap afterwards is.
+    // ... but a later gap is.
     for k in 0..buffer + 5 {
         writer.send(&sample(k as u32), Nanos(0)).unwrap();
     }
-    assert_eq!(reader.latest().unwrap().unwrap().header.sequence, sent + buffer + 4);
+    assert_eq!(
+        reader.latest().unwrap().unwrap().header.sequence,
+        sent + buffer + 4
+    );
     assert_eq!(reader.lost(), 5);
 }
 
@@ -191,9 +205,14 @@ fn sixteen_buses_are_counted_apart_and_a_seventeenth_is_refused() {
         taken[s.header.bus as usize] += 1;
     }
     assert_eq!(taken, [50; 16]);
-    assert_eq!((reader.lost(), reader.epochs(), reader.writers()), (0, 1, 16));
+    assert_eq!(
+        (reader.lost(), reader.epochs(), reader.writers()),
+        (0, 1, 16)
+    );
     match Writer::<Sample>::create(&domain, "icub", epoch) {
-        Err(PortError::Taken { most: 16, holder, .. }) => assert_eq!(holder, std::process::id() as i32),
+        Err(PortError::Taken {
+            most: 16, holder, ..
+        }) => assert_eq!(holder, std::process::id() as i32),
         other => panic!("{other:?}"),
     }
 }
@@ -205,10 +224,16 @@ fn a_late_reader_gets_the_last_description_of_each_publisher() {
     let mut gateway = Writer::<Description>::create(&domain, "icub", 1).unwrap();
     let mut estimator = Writer::<Description>::create(&domain, "icub", 2).unwrap();
     gateway
-        .send(&description(Publisher::Gateway, &[("old", Role::Channel, 0)]), Nanos(0))
+        .send(
+            &description(Publisher::Gateway, &[("old", Role::Channel, 0)]),
+            Nanos(0),
+        )
         .unwrap();
     gateway
-        .send(&description(Publisher::Gateway, &[("imu", Role::Channel, 0)]), Nanos(0))
+        .send(
+            &description(Publisher::Gateway, &[("imu", Role::Channel, 0)]),
+            Nanos(0),
+        )
         .unwrap();
     estimator
         .send(
@@ -220,7 +245,7 @@ fn a_late_reader_gets_the_last_description_of_each_publisher() {
     let mut reader = Reader::<Description>::open(&domain, "icub").unwrap();
     assert!(
         reader.try_take().unwrap().is_none(),
-        "history comes with the writer's next turn"
+        "the history arrives with the writer's next turn"
     );
     assert_eq!(gateway.update_connections().unwrap(), 1);
     assert_eq!(estimator.update_connections().unwrap(), 1);
@@ -238,9 +263,10 @@ fn a_late_reader_gets_the_last_description_of_each_publisher() {
 fn a_reader_before_the_writer_is_told_so_and_then_works() {
     let (_base, config) = place();
     let domain = Domain::open(&config).unwrap();
-    assert!(
-        matches!(Reader::<GatewayHealth>::open(&domain, "icub"), Err(PortError::NotYet { service }) if service == "icub/health/gateway")
-    );
+    assert!(matches!(
+        Reader::<GatewayHealth>::open(&domain, "icub"),
+        Err(PortError::NotYet { service }) if service == "icub/health/gateway"
+    ));
     let mut attempts = 0;
     let none = Reader::<Sample>::wait_open(&domain, "icub", |n| {
         attempts = n;
@@ -259,7 +285,7 @@ fn a_reader_before_the_writer_is_told_so_and_then_works() {
     assert_eq!(reader.latest().unwrap().unwrap().channel, 3);
     drop(writer.take());
     assert_eq!(reader.writers(), 0);
-    // The service lives on with its reader, and the next writer finds it.
+    // The reader keeps the service alive, and the next writer uses it.
     let mut writer = Writer::<Sample>::create(&domain, "icub", 2).unwrap();
     writer.send(&sample(4), Nanos(0)).unwrap();
     assert_eq!(reader.latest().unwrap().unwrap().channel, 4);
@@ -270,7 +296,10 @@ fn a_reader_before_the_writer_is_told_so_and_then_works() {
 fn domains_and_robots_are_isolated() {
     let (base, config) = place();
     let other = DomainConfig::new(base.path(), "other");
-    let (a, b) = (Domain::open(&config).unwrap(), Domain::open(&other).unwrap());
+    let (a, b) = (
+        Domain::open(&config).unwrap(),
+        Domain::open(&other).unwrap(),
+    );
     assert_ne!(a.epoch(), b.epoch());
     let mut here = Writer::<Sample>::create(&a, "icub", 1).unwrap();
     let mut there = Writer::<Sample>::create(&b, "icub", 2).unwrap();
@@ -299,7 +328,10 @@ fn a_second_gateway_of_a_robot_is_refused() {
     let second = Domain::open(&config).unwrap();
     let gateway = Writer::<GatewayHealth>::create(&first, "icub", 1).unwrap();
     let error = Writer::<GatewayHealth>::create(&second, "icub", 2).unwrap_err();
-    let PortError::Taken { most: 1, holder, .. } = error else {
+    let PortError::Taken {
+        most: 1, holder, ..
+    } = error
+    else {
         panic!("{error:?}")
     };
     assert_eq!(holder, std::process::id() as i32);
@@ -341,7 +373,7 @@ fn who_comes_late_finds_the_last_inertia_at_once() {
     assert!(reader.try_take().unwrap().is_none());
     assert!(
         Writer::<InertiaEstimate>::create(&domain, "icub", 4).is_err(),
-        "one estimator tells"
+        "there is one estimator"
     );
 }
 
@@ -375,12 +407,18 @@ fn another_version_is_told_apart_although_its_size_is_the_same() {
         Reader::<Sample>::open(&domain, "icub").unwrap_err(),
         Writer::<Sample>::create(&domain, "icub", 1).unwrap_err(),
     ] {
-        let PortError::Incompatible { offered, needed, .. } = error else {
+        let PortError::Incompatible {
+            offered, needed, ..
+        } = error
+        else {
             panic!("{error:?}")
         };
         assert_eq!(
             (offered.as_str(), needed.as_str()),
-            ("proprio/Sample/2 (192 bytes)", "proprio/Sample/1 (192 bytes)")
+            (
+                "proprio/Sample/2 (192 bytes)",
+                "proprio/Sample/1 (192 bytes)"
+            )
         );
     }
 }
@@ -398,7 +436,9 @@ fn names_are_checked() {
     }
     assert!(is_empty(base.path()));
     // The longest legal path works, ports included.
-    let longest = base.path().join("y".repeat(64 - base.path().as_os_str().len()));
+    let longest = base
+        .path()
+        .join("y".repeat(64 - base.path().as_os_str().len()));
     let domain = Domain::open(&DomainConfig::new(&longest, &"x".repeat(32))).unwrap();
     let robot = "r".repeat(64);
     let mut writer = Writer::<ContactDeclaration>::create(&domain, &robot, 1).unwrap();
@@ -443,7 +483,10 @@ fn anothers_domain_is_refused_by_name_of_its_owner() {
         ),
         "{error:?}"
     );
-    assert!(error.to_string().contains("must run as the same user"), "{error}");
+    assert!(
+        error.to_string().contains("must run as the same user"),
+        "{error}"
+    );
 }
 
 #[test]
@@ -451,7 +494,8 @@ fn a_base_that_is_a_file_is_said_to_be() {
     let file = tempfile::NamedTempFile::new().unwrap();
     let error = Domain::open(&DomainConfig::new(file.path(), "test")).unwrap_err();
     assert!(
-        matches!(error, DomainError::Io { .. }) && error.to_string().contains("PROPRIO_RUNTIME_DIR"),
+        matches!(error, DomainError::Io { .. })
+            && error.to_string().contains("PROPRIO_RUNTIME_DIR"),
         "{error}"
     );
 }
@@ -523,8 +567,11 @@ fn torques_come_with_a_reason_when_they_do_not_come() {
     assert_eq!(torques.torque("r_elbow"), Err(NoTorque::UnknownJoint));
     assert_eq!(torques.joints().collect::<Vec<_>>(), ["l_elbow", "l_wrist"]);
 
-    // It falls silent.
-    assert_eq!(torques.update(now + max_age), Freshness::Fresh { age: max_age });
+    // It becomes silent.
+    assert_eq!(
+        torques.update(now + max_age),
+        Freshness::Fresh { age: max_age }
+    );
     let late = now + max_age + Nanos(1);
     assert_eq!(
         torques.update(late),
@@ -532,9 +579,13 @@ fn torques_come_with_a_reason_when_they_do_not_come() {
             age: max_age + Nanos(1)
         }
     );
-    assert!(matches!(torques.torque("l_elbow"), Err(NoTorque::Stale { .. })));
+    assert!(matches!(
+        torques.torque("l_elbow"),
+        Err(NoTorque::Stale { .. })
+    ));
 
-    // It restarts, and numbers its joints the other way round: names must not be mixed up in between.
+    // It restarts and numbers its joints in reverse order: joints must not be mixed up in the
+    // meantime.
     drop((estimates, descriptions));
     let (mut estimates, mut descriptions) = start(2);
     now = late + step;
@@ -556,17 +607,22 @@ fn a_control_loop_does_not_wait_for_who_holds_the_lock() {
     let _estimates = Writer::<TorqueEstimate>::create(&domain, "icub", 1).unwrap();
     let _descriptions = Writer::<Description>::create(&domain, "icub", 1).unwrap();
     let mut torques = TorqueReader::new(&domain, "icub", Nanos::from_millis(50));
-    // The holder is this test: had the reader waited, it would have waited in vain and said so much later.
+    // This test holds the lock: a reader that waited for it would time out much later.
     let lock = std::fs::File::open(base.path().join("test.lock")).unwrap();
     lock.lock().unwrap();
     torques.update(Nanos(0));
     match torques.problem() {
-        Some(PortError::Domain(DomainError::Busy { holder, .. })) => assert_eq!(*holder, std::process::id()),
+        Some(PortError::Domain(DomainError::Busy { holder, .. })) => {
+            assert_eq!(*holder, std::process::id());
+        }
         other => panic!("{other:?}"),
     }
     drop(lock);
     torques.update(Nanos::from_millis(99));
-    assert!(torques.problem().is_some(), "the next look is after 100 ms");
+    assert!(
+        torques.problem().is_some(),
+        "the next attempt is after 100 ms"
+    );
     torques.update(Nanos::from_millis(100));
     assert!(torques.problem().is_none());
 }
@@ -580,7 +636,9 @@ fn ports_of_many_threads_share_one_domain() {
             let domain = domain.clone();
             scope.spawn(move || {
                 for turn in 0..5 {
-                    let mut writer = Writer::<Sample>::create(&domain, "icub", u64::from(turn * 8 + bus)).unwrap();
+                    let mut writer =
+                        Writer::<Sample>::create(&domain, "icub", u64::from(turn * 8 + bus))
+                            .unwrap();
                     let mut reader = Reader::<Sample>::open(&domain, "icub").unwrap();
                     writer.send(&sample(bus), Nanos(0)).unwrap();
                     let mut seen = false;

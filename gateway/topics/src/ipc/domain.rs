@@ -1,11 +1,11 @@
-//! One shared-memory domain: a directory and a name. Processes meet only inside one domain.
+//! A shared-memory domain: a directory and a name. Processes communicate only within one domain.
 
 use super::lock::{Lock, Patience};
 use super::sweep::{self, Place, SHM, Swept};
 use super::{DomainError, PortError};
 use iceoryx2::prelude::{
-    Config, FileName, LogLevel, Node, NodeBuilder, Path as IoxPath, SemanticString, ServiceName, SignalHandlingMode,
-    ipc, set_log_level_from_env_or,
+    Config, FileName, LogLevel, Node, NodeBuilder, Path as IoxPath, SemanticString, ServiceName,
+    SignalHandlingMode, ipc, set_log_level_from_env_or,
 };
 use nix::unistd::{AccessFlags, access, geteuid};
 use std::borrow::ToOwned;
@@ -16,10 +16,11 @@ use std::path::{Path, PathBuf};
 use std::string::{String, ToString};
 use std::sync::{Arc, Mutex, Once, PoisonError};
 
-/// Which domain: where its files are and what it is called.
+/// Directory and name of a domain.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DomainConfig {
-    /// The directory that holds the domains of this machine (or user, or test): absolute, at most 65 bytes.
+    /// The directory that holds the domains of this machine (or user, or test): absolute, at most
+    /// 65 bytes.
     pub base: PathBuf,
     /// The domain's name: 1 to 32 letters, digits, `-` or `_`.
     pub name: String,
@@ -35,26 +36,35 @@ impl DomainConfig {
         }
     }
 
-    /// The domain that the environment names, else the default one.
+    /// The domain that the environment variables name, else the default domain.
     ///
-    /// Name: `PROPRIO_DOMAIN`, else `default`. Base: `PROPRIO_RUNTIME_DIR`; else `/run/proprio` if it can be written (or
-    /// created), or if a domain of this name is there already; else `$XDG_RUNTIME_DIR/proprio`; else `/tmp/proprio-<uid>`.
+    /// Name: `PROPRIO_DOMAIN`, else `default`. Base: `PROPRIO_RUNTIME_DIR`; else `/run/proprio` if
+    /// it is writable (or can be created), or if it already holds a domain of this name; else
+    /// `$XDG_RUNTIME_DIR/proprio`; else `/tmp/proprio-<uid>`.
     #[must_use]
     pub fn from_env() -> Self {
         let set = |key| std::env::var_os(key).filter(|v| !v.is_empty());
-        let name = set("PROPRIO_DOMAIN").map_or_else(|| "default".to_owned(), |v| v.to_string_lossy().into_owned());
-        let base = set("PROPRIO_RUNTIME_DIR").map(PathBuf::from).unwrap_or_else(|| {
-            let system = PathBuf::from("/run/proprio");
-            let _ = DirBuilder::new().mode(0o755).create(&system);
-            // Somebody else's domain of that name is not passed over in silence: opening it tells whose it is.
-            if access(&system, AccessFlags::W_OK).is_ok() || system.join(format!("{name}.lock")).exists() {
-                return system;
-            }
-            match set("XDG_RUNTIME_DIR") {
-                Some(dir) => PathBuf::from(dir).join("proprio"),
-                None => PathBuf::from(format!("/tmp/proprio-{}", geteuid())),
-            }
-        });
+        let name = set("PROPRIO_DOMAIN").map_or_else(
+            || "default".to_owned(),
+            |v| v.to_string_lossy().into_owned(),
+        );
+        let base = set("PROPRIO_RUNTIME_DIR")
+            .map(PathBuf::from)
+            .unwrap_or_else(|| {
+                let system = PathBuf::from("/run/proprio");
+                let _ = DirBuilder::new().mode(0o755).create(&system);
+                // If another user owns a domain of this name there, do not silently choose another
+                // directory: opening it reports the owner.
+                if access(&system, AccessFlags::W_OK).is_ok()
+                    || system.join(format!("{name}.lock")).exists()
+                {
+                    return system;
+                }
+                match set("XDG_RUNTIME_DIR") {
+                    Some(dir) => PathBuf::from(dir).join("proprio"),
+                    None => PathBuf::from(format!("/tmp/proprio-{}", geteuid())),
+                }
+            });
         Self { base, name }
     }
 
@@ -65,7 +75,8 @@ impl DomainConfig {
                 name: self.name.clone(),
             });
         }
-        // iceoryx2's paths end at 255 bytes; a connection's name needs 157 of them, the domain's 33.
+        // iceoryx2 limits paths to 255 bytes; a connection's name needs 157 of them, the domain's
+        // 33.
         if !self.base.is_absolute() || self.base.to_str().is_none_or(|b| b.len() > 65) {
             return Err(DomainError::Base {
                 base: self.base.clone(),
@@ -91,7 +102,8 @@ impl DomainConfig {
         for path in [&root, &lock] {
             owned_by_us(path)?;
         }
-        // /tmp is everybody's: a directory that somebody else has put there first must not be trusted.
+        // /tmp is writable by everybody: a directory that another user has created there is not
+        // trusted.
         if self.base.starts_with("/tmp") && base.mode() & 0o1000 == 0 {
             owned_by_us(&self.base)?;
         }
@@ -99,7 +111,8 @@ impl DomainConfig {
             .map_err(|e| io("cannot write to directory")(e.into()))?;
         access(SHM, AccessFlags::W_OK | AccessFlags::X_OK)
             .map_err(|e| DomainError::NoSharedMemory { problem: e.into() })?;
-        // Two directories of the same path in different mount namespaces are two domains, though /dev/shm may be one.
+        // Directories of the same path in different mount namespaces are different domains, even if
+        // they share /dev/shm.
         let mut hash = Fnv::new();
         hash.add(root.as_os_str().as_encoded_bytes());
         hash.add(&base.dev().to_le_bytes());
@@ -124,8 +137,8 @@ fn owned_by_us(path: &Path) -> Result<(), DomainError> {
     }
 }
 
-/// An open domain. Clones share it; when the last of them and the last port are gone, so is its share of the domain,
-/// and with the last process the domain's files.
+/// An open domain. Clones share it. This process leaves the domain when its last clone and its last
+/// port are dropped; the last process that leaves removes the domain's files.
 #[derive(Debug, Clone)]
 pub struct Domain {
     inner: Arc<Inner>,
@@ -138,17 +151,19 @@ struct Inner {
     iceoryx: Config,
     epoch: u64,
     id: u128,
-    // `None` only while it is dropped.
+    // `None` only during `drop`.
     node: Mutex<Option<Node<ipc::Service>>>,
 }
 
 impl Domain {
-    /// Opens the domain; creates it if it is not there. Removes what dead processes have left in it.
+    /// Opens the domain, or creates it. Removes the files that dead processes have left in it.
     ///
-    /// Sets iceoryx2's log level of this process to `Fatal`, unless `IOX2_LOG_LEVEL` is set. Installs no signal handlers.
+    /// Sets iceoryx2's log level in this process to `Fatal`, unless `IOX2_LOG_LEVEL` is set.
+    /// Installs no signal handlers.
     ///
     /// # Errors
-    /// [`DomainError`]: a bad name or directory, no shared memory, no permission, another owner, or another process that holds the lock.
+    /// [`DomainError`]: a bad name or directory, no shared memory, no permission, another owner, or
+    /// another process that holds the lock.
     pub fn open(config: &DomainConfig) -> Result<Self, DomainError> {
         static QUIET: Once = Once::new();
         QUIET.call_once(|| set_log_level_from_env_or(LogLevel::Fatal));
@@ -179,22 +194,25 @@ impl Domain {
             id,
             node: Mutex::new(Some(node)),
         };
-        Ok(Self { inner: Arc::new(inner) })
+        Ok(Self {
+            inner: Arc::new(inner),
+        })
     }
 
-    /// Which domain it is.
+    /// Directory and name of this domain.
     #[must_use]
     pub fn config(&self) -> &DomainConfig {
         &self.inner.config
     }
 
-    /// A number that is new each time a domain is opened: the epoch for the writers of a publisher that starts now.
+    /// A number that differs each time a domain is opened: the epoch for the writers of a publisher
+    /// that starts now.
     #[must_use]
     pub fn epoch(&self) -> u64 {
         self.inner.epoch
     }
 
-    /// Removes what dead processes have left. Opening a domain or a port does it too.
+    /// Removes the files that dead processes have left. Opening a domain or a port does this too.
     ///
     /// # Errors
     /// As [`Domain::open`].
@@ -203,9 +221,10 @@ impl Domain {
         sweep::sweep(&self.inner.place, &self.inner.iceoryx)
     }
 
-    /// Removes all of a domain if nobody alive uses it; returns whether there is nothing left.
+    /// Removes a domain's files if no live process uses it; returns whether it did.
     ///
-    /// The last process to leave a domain does it by itself. This is for whoever kills processes: a test, a demonstration.
+    /// The last process that leaves a domain does this. Use it after killing processes, as in a
+    /// test or a demonstration.
     ///
     /// # Errors
     /// As [`Domain::open`].
@@ -227,15 +246,20 @@ impl Domain {
     ) -> Result<R, PortError> {
         let _lock = Lock::take(&self.inner.place.lock, patience)?;
         sweep::sweep(&self.inner.place, &self.inner.iceoryx)?;
-        match &*self.inner.node.lock().unwrap_or_else(PoisonError::into_inner) {
+        match &*self
+            .inner
+            .node
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+        {
             Some(node) => create(node),
             None => Err(self.gone().into()),
         }
     }
 
-    /// Drops a port under the domain's lock, so that nobody sees it half removed.
+    /// Drops a port under the domain's lock, so that no process sees it half removed.
     pub(super) fn drop_locked<P>(&self, port: P) {
-        // Without the lock after all, if somebody stopped holds it: a program must be able to end.
+        // If a stopped process holds the lock, drop without it: a program must be able to end.
         let _lock = Lock::take(&self.inner.place.lock, Patience::Normal);
         drop(port);
     }
@@ -261,7 +285,12 @@ impl Domain {
 impl Drop for Inner {
     fn drop(&mut self) {
         let lock = Lock::take(&self.place.lock, Patience::Normal);
-        drop(self.node.lock().unwrap_or_else(PoisonError::into_inner).take());
+        drop(
+            self.node
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner)
+                .take(),
+        );
         sweep::deregister(&self.place, self.id);
         if let Ok(lock) = lock
             && sweep::sweep(&self.place, &self.iceoryx).is_ok_and(|s| s.alive == 0)
@@ -286,7 +315,8 @@ pub(super) fn service_name(robot: &str, suffix: &str) -> Result<ServiceName, Por
     })
 }
 
-/// Every setting is explicit: iceoryx2's default reads `config/iceoryx2.toml` of whatever directory a consumer runs in.
+/// All settings are explicit, because iceoryx2's default reads `config/iceoryx2.toml` of the
+/// consumer's working directory.
 fn iceoryx(place: &Place) -> Result<Config, DomainError> {
     let failed = |problem: String| DomainError::Transport {
         root: place.root.clone(),
@@ -295,11 +325,12 @@ fn iceoryx(place: &Place) -> Result<Config, DomainError> {
     };
     let mut config = Config::default();
     let root = place.root.as_os_str().as_encoded_bytes();
-    config.global.prefix = FileName::new(place.prefix.as_bytes()).map_err(|e| failed(format!("{e:?}")))?;
+    config.global.prefix =
+        FileName::new(place.prefix.as_bytes()).map_err(|e| failed(format!("{e:?}")))?;
     config
         .global
         .set_root_path(&IoxPath::new(root).map_err(|e| failed(format!("{e:?}")))?);
-    // All cleaning is ours: theirs runs without the lock.
+    // `sweep` does all cleaning; iceoryx2's own runs without the lock.
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;

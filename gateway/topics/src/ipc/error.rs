@@ -1,4 +1,4 @@
-//! What can go wrong with a domain or a port, with the facts a person needs to put it right.
+//! Errors of domains and ports, with the information needed to correct them.
 
 use std::io;
 use std::path::PathBuf;
@@ -10,51 +10,64 @@ use thiserror::Error;
 #[non_exhaustive]
 pub enum DomainError {
     /// The name has characters that cannot be in it, or too many.
-    #[error("shared-memory domain {name:?}: a name is 1 to 32 letters, digits, `-` or `_` (PROPRIO_DOMAIN)")]
+    #[error(
+        "shared-memory domain {name:?}: a name is 1 to 32 letters, digits, `-` or `_` \
+         (PROPRIO_DOMAIN)"
+    )]
     Name {
         /// The name.
         name: String,
     },
     /// The directory's path is not absolute, is not UTF-8 or is too long.
     #[error(
-        "shared-memory domain: directory {} must be absolute, UTF-8 and at most 65 bytes long (PROPRIO_RUNTIME_DIR)", base.display()
+        "shared-memory domain: directory {} must be absolute, UTF-8 and at most 65 bytes long \
+         (PROPRIO_RUNTIME_DIR)", base.display()
     )]
     Base {
         /// The directory.
         base: PathBuf,
     },
-    /// There is no /dev/shm, or it cannot be written.
+    /// There is no /dev/shm, or it is not writable.
     #[error(
-        "no shared memory: /dev/shm {problem}; in a container, give it one that all processes share (--ipc=host or --shm-size)"
+        "no shared memory: /dev/shm {problem}; in a container, give it one that all processes \
+         share (--ipc=host or --shm-size)"
     )]
     NoSharedMemory {
-        /// What is wrong with it.
+        /// The error.
         problem: io::Error,
     },
-    /// The directory or a file in it belongs to somebody else. iceoryx2's files are for their owner alone.
+    /// The directory or a file in it belongs to another user. Only the owner of iceoryx2's files
+    /// can use them.
     #[error(
-        "shared-memory domain: {} belongs to user id {owner}, this process runs as {user}: gateway, estimator and consumers must run as the same user", path.display()
+        "shared-memory domain: {} belongs to user id {owner}, this process runs as {user}: \
+         gateway, estimator and consumers must run as the same user", path.display()
     )]
     ForeignOwner {
-        /// What belongs to somebody else.
+        /// The directory or file.
         path: PathBuf,
-        /// Whom it belongs to.
+        /// Its owner's user id.
         owner: u32,
-        /// Who we are.
+        /// This process's user id.
         user: u32,
     },
     /// A directory or file cannot be created, read or written.
-    #[error("shared-memory domain: {} {}: {cause} (PROPRIO_RUNTIME_DIR chooses another place)", doing, path.display())]
+    #[error(
+        "shared-memory domain: {} {}: {cause} (set PROPRIO_RUNTIME_DIR to use another directory)",
+        doing, path.display()
+    )]
     Io {
         /// What was tried.
         doing: &'static str,
-        /// With what.
+        /// The directory or file.
         path: PathBuf,
-        /// What the system says.
+        /// The operating system's error.
         cause: io::Error,
     },
-    /// Another process has been creating something for longer than it may.
-    #[error("shared-memory domain: process {holder} holds {} and does not let go; is it stopped?", path.display())]
+    /// Another process holds the domain's lock for too long.
+    #[error(
+        "shared-memory domain: process {holder} does not release the lock {}; is it stopped?",
+        path.display()
+    )]
     Busy {
         /// The lock file.
         path: PathBuf,
@@ -68,20 +81,21 @@ pub enum DomainError {
         root: PathBuf,
         /// What was tried.
         doing: &'static str,
-        /// What it says.
+        /// iceoryx2's message.
         problem: String,
     },
 }
 
 impl DomainError {
-    /// Whether it is a name or a directory that cannot be used on any machine: a wrong configuration, not a lack of this one.
+    /// Whether the configuration is wrong (a name or directory that is invalid on every machine),
+    /// as opposed to a problem of this machine.
     #[must_use]
     pub fn is_configuration(&self) -> bool {
         matches!(self, Self::Name { .. } | Self::Base { .. })
     }
 }
 
-/// Why a port cannot be had.
+/// Why a port cannot be opened or created.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum PortError {
@@ -91,46 +105,56 @@ pub enum PortError {
         /// The name.
         robot: String,
     },
-    /// Nobody offers the service yet: try again later.
-    #[error("service {service} does not exist (yet): is its publisher running, in this domain, for this robot?")]
+    /// The service does not exist yet: try again later.
+    #[error(
+        "service {service} does not exist yet: is its publisher running in this domain for \
+         this robot?"
+    )]
     NotYet {
         /// The service.
         service: String,
     },
-    /// The service is there with another type or another version of it, or with less room than this version needs.
+    /// The service exists with another payload type or version, or with less capacity than this
+    /// version needs.
     #[error(
-        "service {service} offers {offered}, this program needs {needed}: update both to the same version and restart all its users"
+        "service {service} offers {offered}, this program needs {needed}: update all its users to \
+         the same version and restart them"
     )]
     Incompatible {
         /// The service.
         service: String,
-        /// What is there.
+        /// The type of the existing service.
         offered: String,
-        /// What was asked for.
+        /// The type that this program needs.
         needed: String,
     },
-    /// All places for writers are taken; where there is one place, another gateway (estimator) serves this robot.
+    /// The service has its maximum number of writers. If the maximum is one, another gateway
+    /// (estimator) serves this robot.
     #[error(
-        "service {service} has its {most} writer(s) already (process {holder}): only one gateway and one estimator per robot"
+        "service {service} already has {most} writer(s) (process {holder}): only one gateway \
+         and one estimator per robot"
     )]
     Taken {
         /// The service.
         service: String,
-        /// How many writers it admits.
+        /// The maximum number of writers.
         most: usize,
         /// The process of one of them; 0 if it is not known.
         holder: i32,
     },
-    /// All places for readers or processes are taken.
-    #[error("service {service} has no place left for another {what}")]
+    /// The service has its maximum number of readers or processes.
+    #[error("service {service} has its maximum number of users; no {what} can be added")]
     Full {
         /// The service.
         service: String,
-        /// For what.
+        /// Reader or process.
         what: &'static str,
     },
-    /// Its resources belong to another user.
-    #[error("service {service}: permission denied: gateway, estimator and consumers must run as the same user")]
+    /// The service's files belong to another user.
+    #[error(
+        "service {service}: permission denied: gateway, estimator and consumers must run as the \
+         same user"
+    )]
     Denied {
         /// The service.
         service: String,
@@ -143,34 +167,35 @@ pub enum PortError {
     Transport {
         /// The service.
         service: String,
-        /// What it says.
+        /// iceoryx2's message.
         problem: String,
     },
 }
 
-/// Why a payload was not sent, or not to everybody. The writer goes on; the sequence number is used up.
+/// Why a payload was not sent, or not to all readers. The writer stays usable; the sequence number
+/// is used up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum SendError {
-    /// No payload is free in shared memory; should not happen with the sizes that the topics have.
+    /// No free payload in shared memory; does not happen with the topics' sizes.
     #[error("no free payload in shared memory")]
     OutOfMemory,
-    /// A connection to a reader could not be made or is broken; the other readers have it.
+    /// A connection to a reader could not be made or is broken; the other readers have the payload.
     #[error("a reader's connection failed")]
     Connection,
-    /// Anything else that iceoryx2 says of itself.
+    /// Any other error of iceoryx2.
     #[error("internal error of the transport")]
     Internal,
 }
 
-/// Why nothing could be taken.
+/// Why no payload could be taken.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum TakeError {
     /// A connection to a writer could not be made; try again.
     #[error("a writer's connection failed")]
     Connection,
-    /// Anything else that iceoryx2 says of itself.
+    /// Any other error of iceoryx2.
     #[error("internal error of the transport")]
     Internal,
 }

@@ -1,4 +1,5 @@
-//! The domain's file lock: whoever creates or removes a resource of the domain holds it; the kernel frees it when a process dies.
+//! The domain's file lock. A process holds it while it creates or removes a resource of the domain;
+//! the kernel frees it when the process dies.
 
 use super::DomainError;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -13,7 +14,7 @@ use std::time::Duration;
 pub(super) enum Patience {
     /// Not at all.
     None,
-    /// About five seconds: a hundred times what a creation takes on a busy machine.
+    /// About five seconds: a hundred times the duration of a creation on a busy machine.
     Normal,
 }
 
@@ -29,7 +30,7 @@ pub(super) struct Lock {
 }
 
 impl Lock {
-    /// Takes the lock at `path`, creating the file if need be.
+    /// Takes the lock at `path`; creates the file if it does not exist.
     pub(super) fn take(path: &Path, patience: Patience) -> Result<Self, DomainError> {
         let io = |doing| {
             move |cause| DomainError::Io {
@@ -65,10 +66,12 @@ impl Lock {
                     Err(TryLockError::Error(e)) => return Err(io("cannot lock")(e)),
                 }
             }
-            // The last user of a domain removes the lock file: what we have locked may no longer be the file at `path`.
+            // The last user of a domain removes the lock file, so the locked file may no longer be
+            // the one at `path`.
             let ours = file.metadata().map_err(io("cannot examine lock file"))?;
-            if std::fs::metadata(path).is_ok_and(|m| m.ino() == ours.ino() && m.dev() == ours.dev()) {
-                // Only for the message to whoever waits in vain.
+            if std::fs::metadata(path).is_ok_and(|m| m.ino() == ours.ino() && m.dev() == ours.dev())
+            {
+                // Only for the error message of a process that waits too long.
                 let _ = file
                     .set_len(0)
                     .and_then(|()| file.write_all(std::process::id().to_string().as_bytes()));
@@ -88,7 +91,10 @@ impl Lock {
 
 fn holder(file: &mut File) -> u32 {
     let mut text = [0; 16];
-    let read = file.rewind().and_then(|()| file.read(&mut text)).unwrap_or(0);
+    let read = file
+        .rewind()
+        .and_then(|()| file.read(&mut text))
+        .unwrap_or(0);
     let text = text.get(..read).unwrap_or_default();
     core::str::from_utf8(text)
         .ok()

@@ -1,23 +1,27 @@
-//! Ports in shared memory: what a process of Proprio, or a consumer, needs to send and to read.
+//! Ports in shared memory, with which Proprio's processes and consumers send and read payloads.
 //!
-//! - [`Domain`]: one shared-memory domain, a directory and a name. Processes meet only inside one domain.
-//! - [`Topic`]: the services, one per payload type, with their quality of service; here and nowhere else.
+//! - [`Domain`]: a shared-memory domain: a directory and a name. Processes communicate only within
+//!   one domain.
+//! - [`Topic`]: the services, one per payload type, with their quality of service.
 //! - [`Writer`]: sends a payload; never waits for a reader.
-//! - [`Reader`]: takes payloads in order, or the newest; counts what it lost; opens, never creates.
-//! - [`TorqueReader`]: what a control loop wants: the torque of a joint, or the reason why there is none.
-//! - [`Freshness`]: how old is what was read.
-//! - [`monotonic`]: the clock that all stamps are of, for the outermost loop of a consumer.
+//! - [`Reader`]: takes payloads in order, or the newest; counts losses; opens a service but never
+//!   creates one.
+//! - [`TorqueReader`]: for control loops: the torque of a joint, or the reason why there is none.
+//! - [`Freshness`]: the age of the last payload read.
+//! - [`monotonic`]: the clock of all stamps, for the outermost loop of a consumer.
 //!
 //! # Crashes
-//! iceoryx2 0.10 survives the death of a process at any time but one: killed while it creates something, it leaves
-//! files that make every later opening fail, or hang. Therefore everything here that creates or removes a resource does so
-//! while it holds the domain's file lock, which dies with its process; whatever looks unfinished to the next holder of
-//! the lock is then known to be a dead process's, and is removed at once ([`Swept`] counts it). `send` and `try_take` need no lock:
-//! both kinds of port make their connections before they register, so the other side only ever opens finished ones.
+//! iceoryx2 0.10 survives the death of a process except while it creates a resource: the unfinished
+//! files then make every later opening fail or hang. Therefore this module holds the domain's file
+//! lock whenever it creates or removes a resource. The lock dies with its process, so the next
+//! holder knows that an unfinished resource belongs to a dead process, and removes it at once
+//! ([`Swept`] counts it). `send` and `try_take` need no lock: both kinds of port make their
+//! connections before they register, so the other side opens only finished ones.
 //!
 //! # Threads
-//! A [`Domain`] can be cloned and sent to other threads. Ports cannot: a thread creates its own. That is what keeps `send` and
-//! `try_take` free of locks; iceoryx2's sendable ports take a mutex in every call.
+//! A [`Domain`] can be cloned and sent to other threads. Ports cannot: each thread creates its own.
+//! This keeps `send` and `try_take` free of locks; iceoryx2's sendable ports take a mutex in every
+//! call.
 
 mod clock;
 mod domain;

@@ -1,4 +1,4 @@
-//! Takes the payloads of one topic, and tells what was lost and how old the last one is.
+//! Takes the payloads of one topic, counts losses and reports the age of the last payload.
 
 use super::domain::service_name;
 use super::lock::Patience;
@@ -12,12 +12,12 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use std::string::ToString;
 use std::vec::Vec;
 
-/// How old is what was read last.
+/// Age of the last payload read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Freshness {
-    /// Nothing has ever been read.
+    /// Nothing has been read yet.
     NeverSeen,
-    /// It is no older than allowed.
+    /// It is not older than allowed.
     Fresh {
         /// Its age \[ns\], from its acquisition.
         age: Nanos,
@@ -30,7 +30,7 @@ pub enum Freshness {
 }
 
 impl Freshness {
-    /// The freshness at `now` of what was acquired at `acquired`, when `max_age` is still fresh.
+    /// The freshness at `now` of a payload acquired at `acquired`; up to `max_age` it is fresh.
     #[must_use]
     pub fn of(acquired: Option<Nanos>, now: Nanos, max_age: Nanos) -> Self {
         match acquired.map(|t| now.saturating_sub(t)) {
@@ -47,14 +47,17 @@ impl Freshness {
     }
 }
 
-type Ports<T> = (Subscriber<ipc::Service, T, ()>, PortFactory<ipc::Service, T, ()>);
+type Ports<T> = (
+    Subscriber<ipc::Service, T, ()>,
+    PortFactory<ipc::Service, T, ()>,
+);
 
 /// The receiving end of a topic. Belongs to one thread: open it where it is used.
 ///
-/// It stays open when its writers die and start again: what they send comes here.
+/// It stays open when its writers die, and receives from their successors.
 #[derive(Debug)]
 pub struct Reader<T: Topic> {
-    // Dropped under the domain's lock.
+    // `Some` until drop; dropped under the domain's lock.
     ports: Option<Ports<T>>,
     domain: Domain,
     tally: Tally,
@@ -62,21 +65,27 @@ pub struct Reader<T: Topic> {
 }
 
 impl<T: Topic> Reader<T> {
-    /// Opens `<robot>/<T::SUFFIX>`. Never creates it: the first to create a service fixes its quality, and that is the writer's to do.
+    /// Opens `<robot>/<T::SUFFIX>`. Never creates the service: its creator, always a writer, fixes
+    /// its quality of service.
     ///
     /// # Errors
-    /// [`PortError::NotYet`] if nobody offers it; [`PortError::Incompatible`] if it has another version; [`PortError::Full`];
-    /// [`PortError::Denied`]; others as [`Domain::open`].
+    /// [`PortError::NotYet`] if it does not exist; [`PortError::Incompatible`] if it has another
+    /// version; [`PortError::Full`]; [`PortError::Denied`]; others as [`Domain::open`].
     pub fn open(domain: &Domain, robot: &str) -> Result<Self, PortError> {
         Self::open_with(domain, robot, Patience::Normal)
     }
 
-    /// Opens it when it is there: tries, and calls `again` (with the number of attempts so far) after each attempt that found nothing yet,
-    /// until that returns false. `again` sleeps and minds the deadline; nothing here reads a clock.
+    /// Opens the service as soon as it exists. After each attempt that does not find it, calls
+    /// `again` with the number of attempts; stops when `again` returns false. `again` must sleep
+    /// and check the caller's deadline, because nothing here reads a clock.
     ///
     /// # Errors
     /// [`PortError::NotYet`] if `again` gave up; others as [`Reader::open`].
-    pub fn wait_open(domain: &Domain, robot: &str, mut again: impl FnMut(u32) -> bool) -> Result<Self, PortError> {
+    pub fn wait_open(
+        domain: &Domain,
+        robot: &str,
+        mut again: impl FnMut(u32) -> bool,
+    ) -> Result<Self, PortError> {
         let mut attempts = 0;
         loop {
             match Self::open(domain, robot) {
@@ -91,7 +100,11 @@ impl<T: Topic> Reader<T> {
         }
     }
 
-    pub(super) fn open_with(domain: &Domain, robot: &str, patience: Patience) -> Result<Self, PortError> {
+    pub(super) fn open_with(
+        domain: &Domain,
+        robot: &str,
+        patience: Patience,
+    ) -> Result<Self, PortError> {
         let name = service_name(robot, T::SUFFIX)?;
         let (subscriber, service, elders) = domain.locked(patience, |node| {
             let service = node
@@ -124,7 +137,8 @@ impl<T: Topic> Reader<T> {
         })
     }
 
-    /// The next payload of those waiting, in each writer's order; `None` if there is none. Never waits, never allocates.
+    /// The next waiting payload, in each writer's order; `None` if none is waiting. Never blocks,
+    /// never allocates.
     ///
     /// # Errors
     /// [`TakeError`]; the reader stays usable.
@@ -136,7 +150,9 @@ impl<T: Topic> Reader<T> {
             ReceiveError::ConnectionFailure(_) => TakeError::Connection,
             ReceiveError::ExceedsMaxBorrows => TakeError::Internal,
         })?;
-        let Some(sample) = sample else { return Ok(None) };
+        let Some(sample) = sample else {
+            return Ok(None);
+        };
         let value = *sample.payload();
         let writer = sample.header().publisher_id().value();
         drop(sample);
@@ -145,9 +161,10 @@ impl<T: Topic> Reader<T> {
         Ok(Some(value))
     }
 
-    /// Takes all that is waiting and returns the newest; `None` if nothing is waiting.
+    /// Takes all waiting payloads and returns the newest; `None` if none is waiting.
     ///
-    /// Ends even if a writer sends as fast as this reads: after as many payloads as can wait.
+    /// Takes at most as many payloads as the buffers hold, so it ends even if a writer sends as
+    /// fast as this reads.
     ///
     /// # Errors
     /// As [`Reader::try_take`].
@@ -162,36 +179,38 @@ impl<T: Topic> Reader<T> {
         Ok(newest)
     }
 
-    /// How old at `now` is what was taken last, when `max_age` is still fresh.
+    /// The freshness at `now` of the last payload taken; up to `max_age` it is fresh.
     #[must_use]
     pub fn freshness(&self, now: Nanos, max_age: Nanos) -> Freshness {
         Freshness::of(self.last.map(|h| h.acquired), now, max_age)
     }
 
-    /// How many payloads did not arrive: gaps in the writers' sequence numbers. What a writer sent before this reader opened is not counted.
+    /// Number of lost payloads, from gaps in the writers' sequence numbers. Payloads sent before
+    /// this reader opened are not counted.
     #[must_use]
     pub fn lost(&self) -> u64 {
         self.tally.lost
     }
 
-    /// How many payloads were taken.
+    /// Number of payloads taken.
     #[must_use]
     pub fn taken(&self) -> u64 {
         self.tally.taken
     }
 
-    /// How many different epochs were seen: 1, and 1 more for each restart of a publisher.
+    /// Number of different epochs seen: 1, plus 1 for each restart of a publisher.
     #[must_use]
     pub fn epochs(&self) -> u64 {
         self.tally.epochs
     }
 
-    /// How many writers there are now. One that died still counts until somebody opens a domain or a port.
+    /// Number of writers now. A dead writer still counts until some process opens a domain or a
+    /// port.
     #[must_use]
     pub fn writers(&self) -> usize {
-        self.ports
-            .as_ref()
-            .map_or(0, |(_, service)| service.dynamic_config().number_of_publishers())
+        self.ports.as_ref().map_or(0, |(_, service)| {
+            service.dynamic_config().number_of_publishers()
+        })
     }
 }
 
@@ -202,10 +221,12 @@ impl<T: Topic> Drop for Reader<T> {
     }
 }
 
-/// The last writers seen and what comes next from each; a fixed number of them, so that counting never allocates.
+/// The last writers seen with their next sequence numbers. Their number is fixed, so that counting
+/// never allocates.
 #[derive(Debug)]
 struct Tally {
-    /// Writers older than the reader: their first payload seen may have any number. All others begin at 0.
+    /// Writers older than the reader: the first payload seen may have any sequence number. All
+    /// others begin at 0.
     elders: Vec<u128>,
     writers: [Option<Seen>; Self::WRITERS],
     known_epochs: [u64; Self::WRITERS],
@@ -222,7 +243,7 @@ struct Seen {
 }
 
 impl Tally {
-    /// Twice the writers of the topic that has most.
+    /// Twice the largest number of writers of any topic.
     const WRITERS: usize = 2 * crate::MAX_BUSES;
 
     fn new(elders: Vec<u128>) -> Self {
@@ -240,15 +261,22 @@ impl Tally {
         self.taken += 1;
         if !self.known_epochs.contains(&header.epoch) || (header.epoch == 0 && self.epochs == 0) {
             let len = self.known_epochs.len() as u64;
-            // The oldest is forgotten.
+            // Replaces the oldest.
             if let Some(place) = self.known_epochs.get_mut((self.epochs % len) as usize) {
                 *place = header.epoch;
             }
             self.epochs += 1;
         }
         let next = header.sequence.saturating_add(1);
-        if let Some(seen) = self.writers.iter_mut().flatten().find(|s| s.writer == writer) {
-            self.lost = self.lost.saturating_add(header.sequence.saturating_sub(seen.next));
+        if let Some(seen) = self
+            .writers
+            .iter_mut()
+            .flatten()
+            .find(|s| s.writer == writer)
+        {
+            self.lost = self
+                .lost
+                .saturating_add(header.sequence.saturating_sub(seen.next));
             seen.next = next;
             seen.last_taken = self.taken;
             return;
@@ -256,8 +284,11 @@ impl Tally {
         if !self.elders.contains(&writer) {
             self.lost = self.lost.saturating_add(header.sequence);
         }
-        // A free place, else that of the writer not heard of for longest: it is dead.
-        let place = self.writers.iter_mut().min_by_key(|s| s.map_or(0, |s| s.last_taken));
+        // A free place, else the place of the writer that has been silent for longest: it is dead.
+        let place = self
+            .writers
+            .iter_mut()
+            .min_by_key(|s| s.map_or(0, |s| s.last_taken));
         if let Some(place) = place {
             *place = Some(Seen {
                 writer,

@@ -1,8 +1,10 @@
-//! Removes what dead processes have left. Everything here runs under the domain's lock, when nothing of a live process is half made.
+//! Removes the files of dead processes. Everything here runs under the domain's lock, so no live
+//! process has an unfinished resource.
 //!
-//! iceoryx2's own cleaning handles a process that died in steady state. It hangs on an empty segment, ignores a node that died
-//! before its monitor file was finished, and knows nothing of services whose last user died while it removed them. So the
-//! unfinished is removed first, then iceoryx2 cleans the dead nodes, then all that has no live owner goes.
+//! iceoryx2's own cleaning handles a process that died in steady state. It hangs on an empty
+//! segment, ignores a node that died before its monitor file was finished, and misses services
+//! whose last user died while removing them. Therefore a sweep removes unfinished files first, then
+//! lets iceoryx2 clean the dead nodes, then removes everything without a live owner.
 
 use super::DomainError;
 use iceoryx2::node::NodeView;
@@ -23,10 +25,10 @@ use std::time::Duration;
 use std::vec::Vec;
 
 pub(super) const SHM: &str = "/dev/shm";
-/// Beside iceoryx2's own directories: the tags of nodes that are being cleaned.
+/// Directory, next to iceoryx2's own, of the tags of nodes that are being cleaned.
 const KEPT: &str = "kept";
 
-/// What a sweep has removed.
+/// Counts of the files that a sweep has removed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Swept {
     /// Dead nodes (processes).
@@ -37,23 +39,24 @@ pub struct Swept {
     pub services: usize,
     /// Dead nodes that could not be removed; tried again next time.
     pub failures: usize,
-    /// Nodes that are alive, in this process and in others.
+    /// Live nodes, in this process and in others.
     pub alive: usize,
 }
 
-/// Where a domain's files are.
+/// The paths of a domain's files.
 #[derive(Debug, Clone)]
 pub(super) struct Place {
     /// `<base>/<name>`.
     pub(super) root: PathBuf,
     /// `<base>/<name>.lock`.
     pub(super) lock: PathBuf,
-    /// What the names of its segments and files begin with.
+    /// Prefix of the names of its segments and files.
     pub(super) prefix: String,
 }
 
-/// The nodes of this process: (prefix of the domain, number). Their files must never be opened here: closing any
-/// descriptor of a file frees all of the process's POSIX locks on it, and the locks are how others see that we live.
+/// The nodes of this process: (prefix of the domain, number). Never open their files here: closing
+/// any descriptor of a file frees all POSIX locks of the process on it, and by these locks other
+/// processes see that this one is alive.
 static OWN: Mutex<Vec<(String, u128)>> = Mutex::new(Vec::new());
 
 pub(super) fn register(place: &Place, node: u128) {
@@ -75,7 +78,7 @@ fn is_own(place: &Place, node: u128) -> bool {
         .any(|(p, n)| (p, *n) == (&place.prefix, node))
 }
 
-/// Removes what the dead have left; with nobody alive, everything (and the directory itself).
+/// Removes the files of dead processes; if no node is alive, all files and the directory itself.
 pub(super) fn sweep(place: &Place, config: &Config) -> Result<Swept, DomainError> {
     let mut swept = Swept::default();
     let nodes = place.nodes()?;
@@ -99,7 +102,8 @@ pub(super) fn sweep(place: &Place, config: &Config) -> Result<Swept, DomainError
         };
     }
 
-    // Unfinished, therefore dead: a segment is created with mode 0200 and no size, a service file with mode 0600.
+    // Unfinished files belong to dead processes: a segment is created with mode 0200 and no size, a
+    // service file with mode 0600.
     for (path, meta) in place.segments()? {
         if meta.len() == 0 || meta.permissions().mode() & 0o400 == 0 {
             swept.segments += usize::from(remove(&path));
@@ -124,7 +128,8 @@ fn clean_dead(place: &Place, config: &Config, dead: &[u128], swept: &mut Swept) 
     }
     let mut failed = BTreeSet::new();
     let _ = Node::<ipc::Service>::list(config, |state| {
-        // Without its details, iceoryx2 would take another domain's configuration; such a node has no ports any more.
+        // For a node without details iceoryx2 would use another domain's configuration. Such a node
+        // has no ports left.
         if let NodeState::Dead(view) = state
             && view.details().is_some()
         {
@@ -154,18 +159,20 @@ fn clean_dead(place: &Place, config: &Config, dead: &[u128], swept: &mut Swept) 
     }
 }
 
-/// Keeps a second link to a dead node's port tags until the node is gone, and puts back those that a sweep before has lost.
+/// Keeps a second link to a dead node's port tags until the node is removed, and restores tags that
+/// an earlier, interrupted sweep has lost.
 ///
-/// iceoryx2 frees a port's place in its service only if it finds the port's tag, and removes the tag first: a process that dies
-/// between the two would leave the place taken for ever, and a topic of one writer without a writer.
+/// iceoryx2 frees a port's place in its service only if it finds the port's tag, but removes the
+/// tag first. If the process dies between the two, the place stays taken for ever, and a topic of
+/// one writer can have no writer again.
 fn keep_tags(place: &Place, node: u128) {
     let (home, kept) = (place.node(node), place.kept(node));
-    // What fails here makes things no worse than they are without it: the node is cleaned all the same.
+    // Errors are ignored: the node is cleaned in any case.
     let _ = fs::create_dir_all(&kept);
     for (from, to) in [(&home, &kept), (&kept, &home)] {
         for (tag, _) in list(from).unwrap_or_default() {
             if let (Some((_, "port_tag")), Some(name)) = (place.strip(&tag), tag.file_name()) {
-                // It is there already, but for those that are missed.
+                // Fails for tags that exist already, as most do.
                 let _ = fs::hard_link(&tag, to.join(name));
             }
         }
@@ -180,7 +187,7 @@ fn remove_ownerless(place: &Place, config: &Config, swept: &mut Swept) -> Result
             let _ = fs::remove_dir_all(kept);
         }
     }
-    // A service without a tag of a live node, a segment without a tag of a live port.
+    // A service is ownerless without a tag of a live node, a segment without a tag of a live port.
     let (mut services, mut ports) = (BTreeSet::new(), BTreeSet::new());
     for node in nodes {
         for (path, _) in list(&place.node(node))? {
@@ -216,13 +223,20 @@ fn remove_ownerless(place: &Place, config: &Config, swept: &mut Swept) -> Result
     for (path, _) in segments {
         let ownerless = match place.strip_segment(&path) {
             Some((name, "data")) => number(name).is_some_and(|p| !ports.contains(&p)),
-            Some((name, "connection")) => match name.split_once('_').map(|(s, r)| (number(s), number(r))) {
-                Some((Some(sender), Some(receiver))) => !ports.contains(&sender) && !ports.contains(&receiver),
-                _ => false,
-            },
-            // Only when every service file could be read: otherwise one that is in use might look unknown.
+            Some((name, "connection")) => {
+                match name.split_once('_').map(|(s, r)| (number(s), number(r))) {
+                    Some((Some(sender), Some(receiver))) => {
+                        !ports.contains(&sender) && !ports.contains(&receiver)
+                    }
+                    _ => false,
+                }
+            }
+            // Only if every service file could be read: otherwise a service in use might look
+            // unknown.
             Some((name, "dynamic")) => {
-                dynamic > files && known.len() == files && number(name).is_some_and(|s| !known.contains(&s))
+                dynamic > files
+                    && known.len() == files
+                    && number(name).is_some_and(|s| !known.contains(&s))
             }
             _ => false,
         };
@@ -233,17 +247,18 @@ fn remove_ownerless(place: &Place, config: &Config, swept: &mut Swept) -> Result
     Ok(())
 }
 
-/// A name that is a number and nothing else; what looks otherwise is not ours to judge.
+/// The number that is the whole of `name`. Files with other names are left alone.
 fn number(name: &str) -> Option<u128> {
     name.parse().ok()
 }
 
-/// The process that holds the lock of a node's monitor file; `None` if the node is dead. 0 where it cannot be told.
+/// The process that holds the lock of a node's monitor file; `None` if the node is dead, 0 if it
+/// cannot be determined.
 fn monitor_holder(path: &Path) -> Option<i32> {
     let file = match OpenOptions::new().write(true).open(path) {
         Ok(file) => file,
         Err(e) if e.kind() == io::ErrorKind::NotFound => return None,
-        // What cannot be examined must not be removed.
+        // A file that cannot be examined must not be removed.
         Err(_) => return Some(0),
     };
     #[allow(
@@ -265,7 +280,7 @@ fn monitor_holder(path: &Path) -> Option<i32> {
     }
 }
 
-/// The process that runs a node of another process; 0 if it is not known.
+/// The process id of another process's node; 0 if it is not known.
 pub(super) fn holder_of(place: &Place, node: u128) -> i32 {
     if is_own(place, node) {
         return i32::try_from(std::process::id()).unwrap_or(0);
@@ -273,12 +288,12 @@ pub(super) fn holder_of(place: &Place, node: u128) -> i32 {
     monitor_holder(&place.monitor(node)).unwrap_or(0)
 }
 
-/// Whether the file is gone by our doing.
+/// Removes a file; returns whether this call removed it.
 fn remove(path: &Path) -> bool {
     fs::remove_file(path).is_ok()
 }
 
-/// The files of a directory; none if it is not there.
+/// The files of a directory; none if it does not exist.
 fn list(path: &Path) -> Result<Vec<(PathBuf, Metadata)>, DomainError> {
     let io = |cause| DomainError::Io {
         doing: "cannot list",
@@ -293,7 +308,7 @@ fn list(path: &Path) -> Result<Vec<(PathBuf, Metadata)>, DomainError> {
     let mut files = Vec::new();
     for entry in entries {
         let path = entry.map_err(io)?.path();
-        // It may be gone by now: /dev/shm is everybody's.
+        // It may have been removed meanwhile: all processes use /dev/shm.
         if let Ok(meta) = fs::symlink_metadata(&path) {
             files.push((path, meta));
         }
@@ -317,7 +332,7 @@ impl Place {
         self.root.join("nodes").join(name)
     }
 
-    /// The nodes that have left any trace.
+    /// The nodes of which any file exists.
     fn nodes(&self) -> Result<BTreeSet<u128>, DomainError> {
         let mut nodes = BTreeSet::new();
         for (path, meta) in list(&self.root.join("nodes"))? {

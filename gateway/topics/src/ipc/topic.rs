@@ -1,8 +1,8 @@
-//! The services: which payload travels under which name, and with which quality of service. Nowhere else.
+//! The services: payload type, name and quality of service of each.
 
 use crate::{
-    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth, Header, InertiaEstimate, Sample,
-    TorqueEstimate,
+    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth, Header,
+    InertiaEstimate, Sample, TorqueEstimate,
 };
 use core::fmt::Debug;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
@@ -12,22 +12,22 @@ use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 /// A publisher reserves `subscribers * (buffer + 2) + history` payloads in shared memory.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct QualityOfService {
-    /// The most writers at one time. 1 where a second writer would be a mistake.
+    /// Maximum number of writers at one time; 1 where a second writer would be a mistake.
     pub publishers: usize,
-    /// The most readers at one time.
+    /// Maximum number of readers at one time.
     pub subscribers: usize,
-    /// The most processes (domains opened) at one time, writers and readers together.
+    /// Maximum number of processes (open domains) at one time, writers and readers together.
     pub nodes: usize,
-    /// How many payloads of each writer wait for a reader; then the oldest is replaced.
+    /// Number of payloads of each writer that wait for a reader; when full, the oldest is replaced.
     pub buffer: usize,
-    /// How many of its last payloads a writer hands to a reader that comes late.
+    /// Number of its last payloads that a writer gives to a reader that opens late.
     pub history: usize,
 }
 
-/// A payload that has a service of its own: `<robot>/<SUFFIX>`.
+/// A payload type with its own service `<robot>/<SUFFIX>`.
 ///
-/// The version of its layout is in its type name (`proprio/Sample/1`): a reader of another version gets
-/// `PortError::Incompatible`, never a misread payload. The next service is one more implementation of this trait.
+/// The version of its layout is in its type name (`proprio/Sample/1`): a reader of another version
+/// gets `PortError::Incompatible`, never a misread payload. To add a service, implement this trait.
 pub trait Topic: ZeroCopySend + Copy + Debug + 'static {
     /// The service's name after the robot's.
     const SUFFIX: &'static str;
@@ -36,7 +36,7 @@ pub trait Topic: ZeroCopySend + Copy + Debug + 'static {
 
     /// The header.
     fn header(&self) -> &Header;
-    /// The header, to be filled by the writer.
+    /// The header, which the writer fills in.
     fn header_mut(&mut self) -> &mut Header;
 }
 
@@ -69,7 +69,7 @@ topic!(
         history: 0
     }
 );
-// The gateway's and the estimator's, and one more of each while a predecessor is still going.
+// One writer each in gateway and estimator, and one more of each while a predecessor still ends.
 topic!(
     Description,
     "description",
@@ -81,7 +81,8 @@ topic!(
         history: 1
     }
 );
-// A control loop wants the newest; 256 let a recorder pause for a quarter of a second at 1 kHz.
+// A control loop needs only the newest; 256 let a recorder pause for a quarter of a second at 1
+// kHz.
 topic!(
     TorqueEstimate,
     "estimate/torque",
@@ -104,7 +105,8 @@ topic!(
         history: 0
     }
 );
-// Once a second: who looks in every few seconds misses none; who comes late need not wait.
+// Sent once a second: a reader that reads every few seconds misses none, and one that opens late
+// need not wait.
 topic!(
     InertiaEstimate,
     "estimate/inertia",
@@ -127,7 +129,8 @@ topic!(
         history: 1
     }
 );
-// One gateway and one estimator per robot: the health service admits one publisher, so the second is refused.
+// One gateway and one estimator per robot: the health service admits one publisher, so the second
+// is refused.
 topic!(
     GatewayHealth,
     "health/gateway",

@@ -1,4 +1,5 @@
-//! What a control loop wants: the torque of a joint, or the reason why there is none. Never waits.
+//! The reader for control loops: the torque of a joint, or the reason why there is none. Never
+//! blocks.
 
 use super::lock::Patience;
 use super::{Domain, Freshness, PortError, Reader, Topic};
@@ -11,7 +12,8 @@ use std::string::String;
 /// A torque that may be used.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Torque {
-    /// Torque \[Nm\] (force \[N\] for a prismatic joint) by the parent link on the child link, along the URDF axis.
+    /// Torque \[Nm\] (force \[N\] for a prismatic joint) by the parent link on the child link,
+    /// along the URDF axis.
     pub torque: f64,
     /// Its standard deviation \[Nm\]; NaN where it is not known.
     pub standard_deviation: f64,
@@ -22,24 +24,24 @@ pub struct Torque {
 /// Why there is no torque to use.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum NoTorque {
-    /// No estimate has come since this reader was made.
+    /// No estimate has been received since this reader was created.
     NeverSeen,
     /// The last estimate is older than allowed.
     Stale {
         /// How old it is \[ns\].
         age: Nanos,
     },
-    /// The estimator has not yet told the names of what it estimates.
+    /// The estimator's description, with the names of its joints, has not been received yet.
     NotDescribed,
     /// The estimator has no such joint.
     UnknownJoint,
     /// The estimator withholds it.
     Withheld {
-        /// Why.
+        /// The reason.
         reason: Reason,
-        /// The channel to blame; empty where there is no single one.
+        /// The channel that causes it; empty if there is no single one.
         channel: Name,
-        /// The number that must not be used \[Nm\].
+        /// The withheld value \[Nm\]; do not use it for control.
         torque: f64,
     },
 }
@@ -51,21 +53,27 @@ impl fmt::Display for NoTorque {
             Self::Stale { age } => write!(f, "stale: {:.3} s old", age.seconds()),
             Self::NotDescribed => f.pad("not described yet"),
             Self::UnknownJoint => f.pad("unknown joint"),
-            Self::Withheld { reason, channel, .. } if channel.as_str().is_empty() => write!(f, "withheld: {reason}"),
-            Self::Withheld { reason, channel, .. } => write!(f, "withheld: {reason} ({channel})"),
+            Self::Withheld {
+                reason, channel, ..
+            } if channel.as_str().is_empty() => write!(f, "withheld: {reason}"),
+            Self::Withheld {
+                reason, channel, ..
+            } => write!(f, "withheld: {reason} ({channel})"),
         }
     }
 }
 
-/// How often a service that is not there is looked for.
+/// Interval between attempts to open a service that does not exist yet.
 const RETRY: Nanos = Nanos::from_millis(100);
 
 /// The newest torques of one robot, by joint name or number.
 ///
-/// [`TorqueReader::update`] once per cycle, then [`TorqueReader::torque`] for each joint. It may be made before the
-/// estimator runs; an estimator that dies and starts again is picked up again. While the estimator's services are not there, one
-/// cycle in 100 ms pays for a look (some file operations, a millisecond or so; it does not wait for a lock that somebody holds). Once attached, a cycle does no
-/// system call and no allocation, but for the one in which a new estimator is connected.
+/// Call [`TorqueReader::update`] once per cycle, then [`TorqueReader::torque`] for each joint. The
+/// reader may be created before the estimator runs, and it reconnects to an estimator that was
+/// restarted. While the estimator's services do not exist, one cycle in 100 ms tries to open them
+/// (some file operations, about a millisecond; it does not wait for a lock that another process
+/// holds). Once attached, a cycle makes no system call and no allocation, except the cycle in which
+/// a new estimator is connected.
 #[derive(Debug)]
 pub struct TorqueReader {
     domain: Domain,
@@ -81,7 +89,7 @@ pub struct TorqueReader {
 }
 
 impl TorqueReader {
-    /// A reader of `robot`'s torques, which it takes as stale when they are older than `max_age`. Looks for nothing yet.
+    /// A reader of `robot`'s torques; older than `max_age` they are stale. Opens nothing yet.
     #[must_use]
     pub fn new(domain: &Domain, robot: &str, max_age: Nanos) -> Self {
         Self {
@@ -98,17 +106,27 @@ impl TorqueReader {
         }
     }
 
-    /// Takes what has come, at `now` (CLOCK_MONOTONIC \[ns\], see [`super::monotonic`]).
+    /// Takes the waiting payloads at `now` (CLOCK_MONOTONIC \[ns\], see [`super::monotonic`]).
     pub fn update(&mut self, now: Nanos) -> Freshness {
         self.now = now;
         if (self.estimates.is_none() || self.descriptions.is_none()) && now >= self.next_look {
             self.next_look = now.saturating_add(RETRY);
             self.problem = None;
-            attach(&mut self.estimates, &self.domain, &self.robot, &mut self.problem);
-            attach(&mut self.descriptions, &self.domain, &self.robot, &mut self.problem);
+            attach(
+                &mut self.estimates,
+                &self.domain,
+                &self.robot,
+                &mut self.problem,
+            );
+            attach(
+                &mut self.descriptions,
+                &self.domain,
+                &self.robot,
+                &mut self.problem,
+            );
         }
         if let Some(reader) = &mut self.descriptions {
-            // The gateway describes its channels on the same service.
+            // The gateway sends its description on the same service.
             while let Ok(Some(description)) = reader.try_take() {
                 if description.publisher == Publisher::Estimator {
                     *self.description = Some(description);
@@ -123,7 +141,7 @@ impl TorqueReader {
         self.freshness()
     }
 
-    /// How old the newest estimate was at the last update.
+    /// The freshness of the newest estimate at the last update.
     #[must_use]
     pub fn freshness(&self) -> Freshness {
         Freshness::of(self.header().map(|h| h.acquired), self.now, self.max_age)
@@ -132,18 +150,21 @@ impl TorqueReader {
     /// The torque of the joint called `name`.
     ///
     /// # Errors
-    /// [`NoTorque`] says why there is none.
+    /// [`NoTorque`], the reason why there is none.
     pub fn torque(&self, name: &str) -> Result<Torque, NoTorque> {
         self.age()?;
         let description = self.described().ok_or(NoTorque::NotDescribed)?;
-        let index = description.index(Role::Joint, name).ok_or(NoTorque::UnknownJoint)?;
+        let index = description
+            .index(Role::Joint, name)
+            .ok_or(NoTorque::UnknownJoint)?;
         self.torque_at(index as usize)
     }
 
-    /// The torque of joint number `index`: its place in the estimator's description, which may be another after a restart of the estimator.
+    /// The torque of joint number `index`: its index in the estimator's description, which may
+    /// change when the estimator is restarted.
     ///
     /// # Errors
-    /// [`NoTorque`] says why there is none.
+    /// [`NoTorque`], the reason why there is none.
     pub fn torque_at(&self, index: usize) -> Result<Torque, NoTorque> {
         let age = self.age()?;
         let joints = self
@@ -171,9 +192,13 @@ impl TorqueReader {
         })
     }
 
-    /// The joints' names, in order of their numbers; none before the estimator has described them.
+    /// The joints' names, in order of their numbers; empty before the estimator's description is
+    /// received.
     pub fn joints(&self) -> impl Iterator<Item = &str> {
-        let entries = self.described().map(Description::entries).unwrap_or_default();
+        let entries = self
+            .described()
+            .map(Description::entries)
+            .unwrap_or_default();
         entries
             .iter()
             .filter(|e| e.role == Role::Joint)
@@ -186,7 +211,7 @@ impl TorqueReader {
         self.estimate.as_ref().as_ref()
     }
 
-    /// Why the estimator's services could not be opened at the last look; `None` when they are open.
+    /// Why the last attempt to open the estimator's services failed; `None` when they are open.
     #[must_use]
     pub fn problem(&self) -> Option<&PortError> {
         self.problem.as_ref()
@@ -204,7 +229,8 @@ impl TorqueReader {
         }
     }
 
-    /// The description that belongs to the estimate: after a restart the numbers may mean other joints.
+    /// The description of the same epoch as the estimate: after a restart the numbers may mean
+    /// other joints.
     fn described(&self) -> Option<&Description> {
         let epoch = self.header().map(|h| h.epoch);
         self.description
@@ -214,7 +240,12 @@ impl TorqueReader {
     }
 }
 
-fn attach<T: Topic>(reader: &mut Option<Reader<T>>, domain: &Domain, robot: &str, problem: &mut Option<PortError>) {
+fn attach<T: Topic>(
+    reader: &mut Option<Reader<T>>,
+    domain: &Domain,
+    robot: &str,
+    problem: &mut Option<PortError>,
+) {
     if reader.is_none() {
         match Reader::open_with(domain, robot, Patience::None) {
             Ok(opened) => *reader = Some(opened),

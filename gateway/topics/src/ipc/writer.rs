@@ -19,23 +19,27 @@ use iceoryx2::service::static_config::message_type_details::{TypeDetail, TypeVar
 use std::format;
 use std::string::{String, ToString};
 
-/// What became of a payload.
+/// The result of sending a payload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Sent {
-    /// Its number in `header.sequence`.
+    /// Its sequence number, as in `header.sequence`.
     pub sequence: u64,
-    /// How many readers have it.
+    /// Number of readers that received it.
     pub readers: usize,
-    /// How many reader connections were made for it: the only work in `send` that is not constant (a few mapped files each).
+    /// Number of reader connections made: the only work in `send` whose duration varies (a few
+    /// mapped files each).
     pub connected: usize,
 }
 
-type Ports<T> = (Publisher<ipc::Service, T, ()>, PortFactory<ipc::Service, T, ()>);
+type Ports<T> = (
+    Publisher<ipc::Service, T, ()>,
+    PortFactory<ipc::Service, T, ()>,
+);
 
 /// The sending end of a topic. Belongs to one thread: create it where it is used.
 #[derive(Debug)]
 pub struct Writer<T: Topic> {
-    // Dropped under the domain's lock.
+    // `Some` until drop; dropped under the domain's lock.
     ports: Option<Ports<T>>,
     domain: Domain,
     epoch: u64,
@@ -44,14 +48,16 @@ pub struct Writer<T: Topic> {
 }
 
 impl<T: Topic> Writer<T> {
-    /// A writer of `<robot>/<T::SUFFIX>`; creates the service if it is not there.
+    /// Creates a writer of `<robot>/<T::SUFFIX>`, and the service if it does not exist.
     ///
-    /// `epoch` goes into every header: one for all writers of a publisher, new at each of its starts ([`Domain::epoch`]).
-    /// A gateway (estimator) creates the writer of its health first: that is how it finds out that it is the only one of its robot.
+    /// `epoch` goes into every header. It is the same for all writers of a publisher and new at
+    /// each of its starts ([`Domain::epoch`]). A gateway (estimator) creates its health writer
+    /// first: this fails if the robot already has a gateway (estimator).
     ///
     /// # Errors
-    /// [`PortError::Taken`] if the topic has all the writers that it admits; [`PortError::Incompatible`] if somebody alive
-    /// uses another version of the topic; others as [`Domain::open`].
+    /// [`PortError::Taken`] if the topic has its maximum number of writers;
+    /// [`PortError::Incompatible`] if a live process uses another version of the topic; others as
+    /// [`Domain::open`].
     pub fn create(domain: &Domain, robot: &str, epoch: u64) -> Result<Self, PortError> {
         let name = service_name(robot, T::SUFFIX)?;
         let quality = T::QUALITY;
@@ -68,7 +74,9 @@ impl<T: Topic> Writer<T> {
                 .enable_safe_overflow(true)
                 .open_or_create()
                 .map_err(|e| match e {
-                    OpenOrCreateError::PublishSubscribeOpenError(e) => explain::<T>(domain, &name, e),
+                    OpenOrCreateError::PublishSubscribeOpenError(e) => {
+                        explain::<T>(domain, &name, e)
+                    }
                     e => PortError::Transport {
                         service: name.to_string(),
                         problem: e.to_string(),
@@ -109,10 +117,11 @@ impl<T: Topic> Writer<T> {
         })
     }
 
-    /// Sends a copy of `value`, with epoch, sequence number and `published` (now \[ns\]) in its header.
+    /// Sends a copy of `value`, with epoch, sequence number and `published` (now \[ns\]) in its
+    /// header.
     ///
-    /// A reader that does not keep up loses its oldest payloads. One allocation of 48 bytes in iceoryx2, none of our own; no system call
-    /// unless a reader has come or gone.
+    /// A reader that is too slow loses its oldest payloads. Allocates once, 48 bytes in iceoryx2.
+    /// Makes no system call unless a reader has opened or closed.
     ///
     /// # Errors
     /// [`SendError`]; the sequence number is used up, so that readers count the loss.
@@ -139,8 +148,8 @@ impl<T: Topic> Writer<T> {
         })
     }
 
-    /// Connects readers that have come since, and hands them the history: what a writer does while it has nothing to send.
-    /// Returns how many connections were made.
+    /// Connects new readers and gives them the history. Call it regularly while there is nothing to
+    /// send. Returns the number of connections made.
     ///
     /// # Errors
     /// [`SendError::Connection`] if one could not be made.
@@ -149,25 +158,28 @@ impl<T: Topic> Writer<T> {
         let Some((publisher, _)) = &self.ports else {
             return Err(SendError::Internal);
         };
-        publisher.update_connections().map_err(|_| SendError::Connection)?;
+        publisher
+            .update_connections()
+            .map_err(|_| SendError::Connection)?;
         Ok(connected)
     }
 
-    /// The number that the next payload gets.
+    /// The sequence number of the next payload.
     #[must_use]
     pub fn sequence(&self) -> u64 {
         self.sequence
     }
 
-    /// How many readers there are now.
+    /// Number of readers now.
     #[must_use]
     pub fn readers(&self) -> usize {
-        self.ports
-            .as_ref()
-            .map_or(0, |(_, service)| service.dynamic_config().number_of_subscribers())
+        self.ports.as_ref().map_or(0, |(_, service)| {
+            service.dynamic_config().number_of_subscribers()
+        })
     }
 
-    /// By how many the readers have increased. One that leaves while another comes is not seen.
+    /// Increase of the number of readers since the last call. A reader that opens while another
+    /// closes is not seen.
     fn newcomers(&mut self) -> usize {
         let before = self.readers;
         self.readers = self.readers();
@@ -185,18 +197,20 @@ impl<T: Topic> Drop for Writer<T> {
 fn send_error(e: IoxSendError) -> SendError {
     match e {
         IoxSendError::LoanError(LoanError::OutOfMemory) => SendError::OutOfMemory,
-        IoxSendError::ConnectionError(_) | IoxSendError::ConnectionCorrupted | IoxSendError::UnableToDeliver => {
-            SendError::Connection
-        }
+        IoxSendError::ConnectionError(_)
+        | IoxSendError::ConnectionCorrupted
+        | IoxSendError::UnableToDeliver => SendError::Connection,
         _ => SendError::Internal,
     }
 }
 
-/// Why a service cannot be opened, for a person. Called under the lock.
+/// Converts the reason why a service cannot be opened into a message. Called under the lock.
 pub(super) fn explain<T: Topic>(domain: &Domain, name: &ServiceName, e: OpenError) -> PortError {
     let service = name.to_string();
     match e {
-        OpenError::DoesNotExist | OpenError::IsMarkedForDestruction => PortError::NotYet { service },
+        OpenError::DoesNotExist | OpenError::IsMarkedForDestruction => {
+            PortError::NotYet { service }
+        }
         OpenError::InsufficientPermissions => PortError::Denied { service },
         OpenError::ExceedsMaxNumberOfNodes => PortError::Full {
             service,
@@ -214,7 +228,8 @@ pub(super) fn explain<T: Topic>(domain: &Domain, name: &ServiceName, e: OpenErro
         | OpenError::DoesNotSupportRequestedAmountOfSubscribers
         | OpenError::DoesNotSupportRequestedAmountOfNodes => {
             let needed = TypeDetail::new::<T>(TypeVariant::FixedSize);
-            let offered = ipc::Service::details(name, domain.iceoryx(), MessagingPattern::PublishSubscribe);
+            let offered =
+                ipc::Service::details(name, domain.iceoryx(), MessagingPattern::PublishSubscribe);
             let offered = match offered {
                 Ok(Some(details)) => {
                     let offered = details
@@ -223,7 +238,10 @@ pub(super) fn explain<T: Topic>(domain: &Domain, name: &ServiceName, e: OpenErro
                         .message_type_details()
                         .payload;
                     if offered == needed {
-                        format!("{} with another quality of service ({e:?})", describe(&offered))
+                        format!(
+                            "{} with a different quality of service ({e:?})",
+                            describe(&offered)
+                        )
                     } else {
                         describe(&offered)
                     }

@@ -20,7 +20,13 @@ impl Bench for Fixed {
     fn run(&mut self, state: usize) {
         let s = &self.states.states[state];
         self.robot
-            .inverse_dynamics(&s.position, &s.velocity, &s.acceleration, &[], &mut self.torque)
+            .inverse_dynamics(
+                &s.position,
+                &s.velocity,
+                &s.acceleration,
+                &[],
+                &mut self.torque,
+            )
             .unwrap_or_else(|error| fail(&error.to_string()));
     }
 
@@ -70,7 +76,8 @@ fn main() {
         fail("usage: peers-dynibo folded.urdf states.txt");
     };
     let robot = Robot::from_urdf(urdf).unwrap_or_else(|error| fail(&format!("{urdf}: {error}")));
-    let floating = FloatingRobot::from_urdf(urdf).unwrap_or_else(|error| fail(&format!("{urdf}: {error}")));
+    let floating =
+        FloatingRobot::from_urdf(urdf).unwrap_or_else(|error| fail(&format!("{urdf}: {error}")));
     let names: Vec<&str> = (0..robot.joint_count())
         .filter_map(|dof| robot.joint_name(dof).ok())
         .collect();

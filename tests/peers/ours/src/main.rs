@@ -1,4 +1,5 @@
-//! Times this project's estimator. Usage: peers-ours robot.urdf states.txt        (conversation: ../../server.rs)
+//! Times this project's estimator. Usage: peers-ours robot.urdf states.txt (conversation:
+//! ../../server.rs)
 
 #[path = "../../server.rs"]
 #[allow(dead_code, reason = "each program uses its own part")]
@@ -7,14 +8,14 @@ mod server;
 use std::fmt::Display;
 use std::rc::Rc;
 
-use proprio_estimator::dynamics::{
-    ContactKind, ContactSet, ContactSpec, FrameMotion, InverseDynamics, JointState, Kinematics, Noise, SensorCut,
-    Solver, Structure,
+use proprio_dynamics::model::Model;
+use proprio_dynamics::regressor::Regressor;
+use proprio_dynamics::spatial::{Vec3, Wrench};
+use proprio_dynamics::{
+    ContactKind, ContactSet, ContactSpec, FrameMotion, InverseDynamics, JointState, Kinematics,
+    Noise, SensorCut, Solver, Structure,
 };
-use proprio_estimator::identify::information::{Information, Panel, Posterior};
-use proprio_estimator::model::Model;
-use proprio_estimator::regressor::Regressor;
-use proprio_estimator::spatial::{Vec3, Wrench};
+use proprio_identification::linear::information::{Information, Panel};
 use server::{Bench, Output, States, fail};
 
 /// The result, or the end of the program.
@@ -33,7 +34,9 @@ struct Robot {
 impl Robot {
     fn new(urdf: &str, keep: &[&str], states: &str, floating: bool) -> Rc<Self> {
         let model = must(Model::from_urdf(urdf, keep));
-        let names: Vec<&str> = (0..model.dof_count()).map(|dof| model.dof_name(dof)).collect();
+        let names: Vec<&str> = (0..model.dof_count())
+            .map(|dof| model.dof_name(dof))
+            .collect();
         let states = States::read(states).in_order_of(&names);
         let gravity = Vec3::from(states.gravity);
         let bases = states
@@ -50,7 +53,11 @@ impl Robot {
                 }
             })
             .collect();
-        Rc::new(Self { model, states, bases })
+        Rc::new(Self {
+            model,
+            states,
+            bases,
+        })
     }
 
     fn update(&self, kinematics: &mut Kinematics, state: usize) {
@@ -104,10 +111,18 @@ impl Bench for Pass {
         for link in 1..self.robot.model.link_count() {
             let name = self.robot.model.link_name(link);
             let motion = self.kinematics.motion(link);
-            output.add3("position", name, self.kinematics.pose(link).translation.iter().copied());
+            output.add3(
+                "position",
+                name,
+                self.kinematics.pose(link).translation.iter().copied(),
+            );
             output.add3("omega", name, motion.angular_velocity.iter().copied());
             output.add3("alpha", name, motion.angular_acceleration.iter().copied());
-            output.add3("acceleration", name, motion.proper_acceleration.iter().copied());
+            output.add3(
+                "acceleration",
+                name,
+                motion.proper_acceleration.iter().copied(),
+            );
         }
     }
 }
@@ -123,7 +138,10 @@ struct Inverse {
 impl Bench for Inverse {
     fn run(&mut self, state: usize) {
         self.robot.update(&mut self.kinematics, state);
-        must(self.inverse.update(&self.robot.model, &self.kinematics, &[]));
+        must(
+            self.inverse
+                .update(&self.robot.model, &self.kinematics, &[]),
+        );
     }
 
     fn show(&self, output: &mut Output) {
@@ -161,15 +179,20 @@ impl Bench for Regression {
     fn show(&self, output: &mut Output) {
         let (model, parameters) = (&self.robot.model, self.robot.parameters());
         let times = |row: &[f64]| row.iter().zip(&parameters).map(|(a, b)| a * b).sum::<f64>();
-        output.add3("moment", "base", self.regressor.base_torque_rows().map(times));
+        output.add3(
+            "moment",
+            "base",
+            self.regressor.base_torque_rows().map(times),
+        );
         output.add3("force", "base", self.regressor.base_force_rows().map(times));
         let rows = (0..model.dof_count()).filter_map(|dof| self.regressor.joint_row(dof));
-        self.robot.show_torque(&rows.map(times).collect::<Vec<_>>(), output);
+        self.robot
+            .show_torque(&rows.map(times).collect::<Vec<_>>(), output);
     }
 }
 
-/// A pass of least squares over a log: the regressor of each sample, some samples' rows at once into `[R z]`. What was measured does not matter here: the
-/// velocities stand for it.
+/// A pass of least squares over a log: the regressor of each sample, some samples' rows at once
+/// into `[R z]`. What was measured does not matter here: the velocities stand for it.
 struct Identification {
     regression: Regression,
     information: Information,
@@ -177,13 +200,17 @@ struct Identification {
     last: usize,
 }
 
-/// As in ../../pinocchio.cpp. Fewer would make the peer slower: it computes with the zeros of `R` too, once per panel.
+/// As in ../../pinocchio.cpp. Fewer would make the peer slower: it computes with the zeros of `R`
+/// too, once per panel.
 const SAMPLES_IN_PASS: usize = 16;
 
 impl Identification {
     fn new(robot: &Rc<Robot>) -> Self {
         let regression = Regression::new(robot);
-        let (rows, columns) = (regression.regressor.row_count(), regression.regressor.column_count());
+        let (rows, columns) = (
+            regression.regressor.row_count(),
+            regression.regressor.column_count(),
+        );
         Self {
             regression,
             information: Information::new(columns),
@@ -204,7 +231,10 @@ impl Bench for Identification {
             .chain(&s.base.velocity)
             .chain(&s.velocity);
         for (row, right) in measured.enumerate() {
-            must(self.panel.push_row(self.regression.regressor.row(row), *right));
+            must(
+                self.panel
+                    .push_row(self.regression.regressor.row(row), *right),
+            );
         }
         if self.panel.rows() == self.panel.capacity() {
             must(self.information.absorb(&mut self.panel));
@@ -212,14 +242,18 @@ impl Bench for Identification {
         self.last = state;
     }
 
-    /// Of the log up to this state's panel, afresh: `|A x - y|^2` at the parameters and half its gradient, `A^T (A x - y)`. The signs of rows and what rounding leaves
-    /// where nothing is identifiable do not show in them.
+    /// Of the log up to this state's panel, afresh: `|A x - y|^2` at the parameters and half its
+    /// gradient, `A^T (A x - y)`. The signs of rows and what rounding leaves where nothing is
+    /// identifiable do not show in them.
     fn show(&self, output: &mut Output) {
         let robot = &self.regression.robot;
         let mut fresh = Self::new(robot);
         (0..(self.last / SAMPLES_IN_PASS + 1) * SAMPLES_IN_PASS).for_each(|state| fresh.run(state));
         let parameters = robot.parameters();
-        let (mut square, mut gradient) = (fresh.information.residual_square(), vec![0.0; parameters.len()]);
+        let (mut square, mut gradient) = (
+            fresh.information.residual_square(),
+            vec![0.0; parameters.len()],
+        );
         for k in 0..parameters.len() {
             let row = fresh.information.row(k);
             let with_right = parameters[k..].iter().chain([&-1.0]);
@@ -231,7 +265,11 @@ impl Bench for Identification {
         }
         output.add("square", "sum", square);
         for (link, gradient) in gradient.chunks(10).enumerate() {
-            let name = if link == 0 { "base" } else { robot.model.link_name(link) };
+            let name = if link == 0 {
+                "base"
+            } else {
+                robot.model.link_name(link)
+            };
             output.add("mass", name, gradient[0]);
             output.add3("moment", name, gradient[1..4].iter().copied());
             for (number, value) in gradient[4..].iter().enumerate() {
@@ -256,7 +294,8 @@ impl Cycle {
         let (model, states) = (&robot.model, &robot.states);
         let (mut cuts, mut columns) = (Vec::new(), Vec::new());
         for sensor in model.sensors() {
-            // Their size does not matter here: with one full wrench per sub-tree nothing is left to weigh.
+            // Their size does not matter here: with one full wrench per sub-tree nothing is left to
+            // weigh.
             let noise = Noise {
                 force: [0.1; 3],
                 torque: [0.003; 3],
@@ -275,13 +314,24 @@ impl Cycle {
             .contacts
             .iter()
             .map(|name| ContactSpec {
-                frame: model.frame(name).unwrap_or_else(|| fail(&format!("no link {name}"))),
+                frame: model
+                    .frame(name)
+                    .unwrap_or_else(|| fail(&format!("no link {name}"))),
                 kind: ContactKind::Wrench,
                 position: Vec3::zeros(),
             })
             .collect();
-        let structure = must(Structure::new(model, &cuts, &contacts, Structure::LENGTH_SCALE));
-        if structure.subtrees().iter().any(|subtree| subtree.contacts.len() != 1) {
+        let structure = must(Structure::new(
+            model,
+            &cuts,
+            &contacts,
+            Structure::LENGTH_SCALE,
+        ));
+        if structure
+            .subtrees()
+            .iter()
+            .any(|subtree| subtree.contacts.len() != 1)
+        {
             fail("not one contact in every sub-tree");
         }
         let readings = states
@@ -321,7 +371,13 @@ impl Bench for Cycle {
 
     fn show(&self, output: &mut Output) {
         self.robot.show_torque(self.solver.torque(), output);
-        for (name, contact) in self.robot.states.contacts.iter().zip(self.solver.contacts()) {
+        for (name, contact) in self
+            .robot
+            .states
+            .contacts
+            .iter()
+            .zip(self.solver.contacts())
+        {
             show_wrench(name, &contact.wrench, output);
         }
     }
@@ -361,14 +417,15 @@ struct Recursion {
     samples: Rc<Samples>,
     information: Information,
     panel: Panel,
-    posterior: Posterior,
+    estimate: Vec<f64>,
     last: usize,
 }
 
 impl Recursion {
     /// Starts from the row x = 0 of every unknown.
     fn new(samples: &Rc<Samples>, per_panel: usize) -> Self {
-        let (mut information, mut start) = (Information::new(UNKNOWNS), Panel::new(UNKNOWNS, UNKNOWNS));
+        let (mut information, mut start) =
+            (Information::new(UNKNOWNS), Panel::new(UNKNOWNS, UNKNOWNS));
         for k in 0..UNKNOWNS {
             let unit: [f64; UNKNOWNS] = std::array::from_fn(|i| f64::from(u8::from(i == k)));
             must(start.push_row(&unit, 0.0));
@@ -378,7 +435,7 @@ impl Recursion {
             samples: Rc::clone(samples),
             information,
             panel: Panel::new(UNKNOWNS, ROWS * per_panel),
-            posterior: Posterior::new(UNKNOWNS),
+            estimate: vec![0.0; UNKNOWNS],
             last: 0,
         }
     }
@@ -391,7 +448,11 @@ impl Bench for Recursion {
         }
         if self.panel.rows() == self.panel.capacity() {
             must(self.information.absorb(&mut self.panel));
-            must(self.posterior.update(&self.information, None));
+            let (r, z) = self.information.to_triangle();
+            match r.solve_upper_triangular(&z) {
+                Some(estimate) => self.estimate.copy_from_slice(estimate.as_slice()),
+                None => fail("the samples do not determine the unknowns"),
+            }
         }
         self.last = state;
     }
@@ -400,7 +461,7 @@ impl Bench for Recursion {
     fn show(&self, output: &mut Output) {
         let mut fresh = Self::new(&self.samples, self.panel.capacity() / ROWS);
         (0..(self.last / SAMPLES + 1) * SAMPLES).for_each(|state| fresh.run(state));
-        for (k, value) in fresh.posterior.estimate().iter().enumerate() {
+        for (k, value) in fresh.estimate.iter().enumerate() {
             output.add("unknown", &k.to_string(), *value);
         }
     }

@@ -1,0 +1,234 @@
+//! A demonstration compared with the simulator's truth: counts, errors, latencies, parameters.
+
+use super::compared::{Compared, Phase, Truth, ratio};
+use super::learnt::{Course, courses};
+use crate::demo::experiment::{Args, Experiment};
+use crate::demo::watching::Watched;
+use anyhow::{Context, bail};
+use proprio_topics::Nanos;
+use serde_json::{Value as Json, json};
+
+/// Errors are evaluated from this time after the first estimate on.
+const START: Nanos = Nanos::from_millis(1000);
+
+/// Counts of frames, samples and estimates.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) struct Counts {
+    pub(super) frames: u64,
+    pub(super) samples: u64,
+    /// Frames and samples lost on the way from the simulator to the estimator.
+    pub(super) lost: u64,
+    pub(super) foreign: u64,
+    pub(super) late: u64,
+    pub(super) estimates: usize,
+    pub(super) lost_estimates: u64,
+}
+
+impl Counts {
+    /// # Errors
+    /// The simulator did not count a bus.
+    fn of(watched: &Watched) -> anyhow::Result<Self> {
+        let mut this = Self {
+            frames: 0,
+            samples: 0,
+            lost: watched.estimator.lost,
+            foreign: 0,
+            late: watched.estimator.late,
+            estimates: watched.estimates.len(),
+            lost_estimates: watched.lost_estimates,
+        };
+        for bus in watched.gateway.buses() {
+            let of_simulator = watched.simulator["buses"]
+                .as_array()
+                .into_iter()
+                .flatten()
+                .find(|b| b["name"] == bus.name.as_str());
+            let sent = of_simulator
+                .and_then(|b| b["sent"].as_u64())
+                .with_context(|| format!("the simulator's count of bus {}", bus.name))?;
+            this.frames += bus.frames;
+            this.samples += bus.published;
+            // Per bus, so that surplus frames on one bus do not hide losses on another.
+            this.lost += sent.saturating_sub(bus.frames);
+            this.foreign += bus.frames.saturating_sub(sent);
+        }
+        Ok(this)
+    }
+}
+
+/// A demonstration compared with the simulator's truth.
+pub(super) struct Evaluation<'a> {
+    pub(super) args: &'a Args,
+    pub(super) experiment: &'a Experiment,
+    pub(super) watched: &'a Watched,
+    pub(super) counts: Counts,
+    pub(super) compared: Compared,
+    pub(super) before: Option<Phase>,
+    pub(super) learning: Option<Phase>,
+    pub(super) after: Option<Phase>,
+    /// The phase after learning, or the whole run if that is too short; and its begin in words.
+    pub(super) judged: Phase,
+    pub(super) since: &'static str,
+    /// Stamp of the last estimate.
+    pub(super) last: Nanos,
+    pub(super) rate_hz: f64,
+    /// From the stamp of the frame to the published torque \[us\], sorted.
+    pub(super) latency: Vec<f64>,
+    pub(super) parameters: Vec<Course>,
+    pub(super) offsets: Vec<Course>,
+}
+
+impl<'a> Evaluation<'a> {
+    pub(super) fn new(
+        args: &'a Args,
+        experiment: &'a Experiment,
+        watched: &'a Watched,
+        truth: &Truth,
+    ) -> anyhow::Result<Self> {
+        let compared = Compared::new(watched, truth, args.still())?;
+        let last = watched.estimates.last().map_or(Nanos::ZERO, |seen| seen.t);
+        let mut latency: Vec<f64> = watched
+            .estimates
+            .iter()
+            .map(|s| (s.published - s.t).seconds() * 1e6)
+            .collect();
+        latency.sort_by(f64::total_cmp);
+        let start = compared.first + START;
+        let after = compared.phase(compared.settled, Nanos::MAX);
+        let since = if after.is_some() {
+            "from 10 s of motion on"
+        } else {
+            "from one second on"
+        };
+        let Some(judged) = after.clone().or_else(|| compared.phase(start, Nanos::MAX)) else {
+            bail!(
+                "no estimate can be compared with the truth: the motion was too short, or no \
+                 estimate came after its first second"
+            );
+        };
+        let (parameters, offsets) = courses(experiment, watched, &compared);
+        Ok(Self {
+            args,
+            experiment,
+            watched,
+            counts: Counts::of(watched)?,
+            before: compared.phase(start, compared.moving),
+            learning: compared.phase(compared.moving, compared.settled),
+            after,
+            judged,
+            since,
+            last,
+            rate_hz: (watched.estimates.len() as f64 - 1.0) / compared.time(last),
+            latency,
+            parameters,
+            offsets,
+            compared,
+        })
+    }
+
+    /// The q-quantile of the latency \[us\].
+    pub(super) fn latency(&self, q: f64) -> f64 {
+        let at = ((self.latency.len() as f64 - 1.0) * q).round().max(0.0) as usize;
+        self.latency.get(at).copied().unwrap_or(f64::NAN)
+    }
+
+    /// The content of `summary.json`.
+    pub(super) fn summary(&self) -> Json {
+        let (args, watched, counts) = (self.args, self.watched, &self.counts);
+        let seconds = |t: Nanos| (t <= self.last).then(|| self.compared.time(t));
+        let errors: serde_json::Map<_, _> = (watched.joints.iter().zip(&self.judged.identified))
+            .map(|(name, error)| (name.clone(), json!(error)))
+            .collect();
+        json!({
+            "robot": self.experiment.setup.robot.name,
+            "seconds": args.seconds,
+            "seed": args.seed,
+            "frames": counts.frames,
+            "samples": counts.samples,
+            "lost": counts.lost,
+            "foreign": counts.foreign,
+            "estimates": counts.estimates,
+            "lost_estimates": counts.lost_estimates,
+            "late": counts.late,
+            "rate_hz": self.rate_hz,
+            "valid_share": self.judged.valid_share,
+            "latency_us": {
+                "p50": self.latency(0.5),
+                "p99": self.latency(0.99),
+                "p999": self.latency(0.999),
+            },
+            "torque_rms_error_nm": errors,
+            "identification": {
+                "cad_error": args.cad_error,
+                "refused": self.experiment.refused,
+                "max_torque_std_nm": self.experiment.most_std,
+                "moving_since_s": seconds(self.compared.moving),
+                "settled_since_s": seconds(self.compared.settled),
+                "solutions": watched.learnt.len(),
+                "parameters_within_2_sigma": within_2_sigma(&self.parameters),
+                "before": Phase::json(self.before.as_ref(), &watched.joints),
+                "learning": Phase::json(self.learning.as_ref(), &watched.joints),
+                "after": Phase::json(self.after.as_ref(), &watched.joints),
+            },
+            "simulator": watched.simulator,
+        })
+    }
+}
+
+/// The fraction of parameters whose last value is within two standard deviations of the truth.
+fn within_2_sigma(parameters: &[Course]) -> Option<f64> {
+    let within = parameters
+        .iter()
+        .filter(|course| course.is_within_2_sigma())
+        .count();
+    (!parameters.is_empty()).then(|| ratio(within, parameters.len()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proprio_topics::{BusHealth, EstimatorHealth, GatewayHealth, Name};
+
+    /// Surplus frames on one bus do not hide losses on another; what the estimator missed counts,
+    /// too.
+    #[test]
+    fn losses_add_up_over_buses_and_estimator() {
+        let mut gateway = Box::new(GatewayHealth::new(Nanos::ZERO));
+        gateway.bus_count = 2;
+        for (bus, (name, frames)) in gateway.buses.iter_mut().zip([("a", 90), ("b", 107)]) {
+            *bus = BusHealth {
+                name: Name::new(name).unwrap(),
+                frames,
+                published: 20,
+                ..BusHealth::EMPTY
+            };
+        }
+        let watched = Watched {
+            joints: vec![],
+            estimates: vec![],
+            baseline: vec![],
+            learnt: vec![],
+            lost_estimates: 5,
+            gateway,
+            estimator: EstimatorHealth {
+                lost: 3,
+                late: 4,
+                ..EstimatorHealth::default()
+            },
+            simulator: json!({ "buses": [
+                { "name": "b", "sent": 100 },
+                { "name": "a", "sent": 100 },
+            ] }),
+        };
+        let expected = Counts {
+            frames: 197,
+            samples: 40,
+            lost: 10 + 3,
+            foreign: 7,
+            late: 4,
+            estimates: 0,
+            lost_estimates: 5,
+        };
+        assert_eq!(Counts::of(&watched).unwrap(), expected);
+    }
+}

@@ -1,0 +1,117 @@
+//! Plots the joints' torques. Shades mark withheld torques and touches of the robot.
+
+use super::compared::{Compared, Instant};
+use crate::report::plot::{Axis, Ink, Plot, Series, Shade};
+
+/// Stretches of a plot with smaller gaps are merged \[s\].
+const GAP: f64 = 0.05;
+
+/// The stretches in which `is` holds; close ones are merged.
+fn stretches(instants: impl Iterator<Item = (f64, bool)>) -> Vec<(f64, f64)> {
+    let mut found: Vec<(f64, f64)> = vec![];
+    let mut last = f64::NAN;
+    for (t, is) in instants {
+        match found.last_mut() {
+            _ if !is => {}
+            Some((_, until)) if t - *until < GAP => *until = t,
+            // The stretch begins at the end of the last instant without it.
+            _ => found.push((if last.is_nan() { t } else { last }, t)),
+        }
+        last = t;
+    }
+    found
+}
+
+/// Figure 3 of the paper: the torque of a joint (true, with the CAD, and identified with its band),
+/// and its error.
+pub(super) fn torque_plots(
+    name: &str,
+    instants: &[Instant],
+    compared: &Compared,
+    touched: &[(f64, f64)],
+) -> [Plot; 2] {
+    let withheld = stretches(
+        instants
+            .iter()
+            .map(|i| (compared.time(i.t), i.estimate.valid != 1)),
+    );
+    let plot = |note: &str, quantity: &str, series| Plot {
+        title: name.to_owned(),
+        note: note.to_owned(),
+        x: Axis::new("t [s]"),
+        y: Axis::new(&format!("{quantity} [Nm]")),
+        series,
+        marks: vec![(compared.time(compared.moving), "onset of motion".to_owned())],
+        shades: vec![
+            (Shade::Withheld, withheld.clone()),
+            (Shade::Touched, touched.to_vec()),
+        ],
+        ..Plot::default()
+    };
+    let line = |of: &dyn Fn(&Instant) -> f64| -> Vec<(f64, f64)> {
+        instants
+            .iter()
+            .map(|i| (compared.time(i.t), of(i)))
+            .collect()
+    };
+    // Withheld torques have no line and no band, because consumers do not get these values.
+    let told = |i: &Instant, value: f64| {
+        if i.estimate.valid == 1 {
+            value
+        } else {
+            f64::NAN
+        }
+    };
+    let band = |of: &dyn Fn(&Instant) -> f64| -> Vec<(f64, f64, f64)> {
+        let around = instants
+            .iter()
+            .map(|i| (i, told(i, of(i)), 2.0 * i.estimate.standard_deviation));
+        around
+            .map(|(i, value, two)| (compared.time(i.t), value - two, value + two))
+            .collect()
+    };
+    [
+        plot(
+            "",
+            "torque",
+            vec![
+                Series::band("± 2σ", Ink::Identified, band(&|i| i.estimate.torque)),
+                Series::line("CAD", Ink::Cad, line(&|i| i.cad)),
+                Series::line(
+                    "identified",
+                    Ink::Identified,
+                    line(&|i| told(i, i.estimate.torque)),
+                ),
+                Series::line("truth", Ink::Measured, line(&|i| i.truth)),
+            ],
+        ),
+        plot(
+            "estimated − truth",
+            "error",
+            vec![
+                Series::band("± 2σ", Ink::Identified, band(&|_| 0.0)),
+                Series::line("CAD", Ink::Cad, line(&|i| i.cad - i.truth)),
+                Series::line("identified", Ink::Identified, line(&|i| told(i, i.error()))),
+            ],
+        ),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stretches_begin_where_the_last_good_one_was_and_close_ones_are_one() {
+        let flags = [
+            (0.0, false),
+            (0.01, true),
+            (0.02, false),
+            (0.03, true),
+            (0.2, false),
+            (0.3, true),
+        ];
+        assert_eq!(stretches(flags.into_iter()), [(0.0, 0.03), (0.2, 0.3)]);
+        assert_eq!(stretches([(1.0, true)].into_iter()), [(1.0, 1.0)]);
+    }
+}

@@ -1,0 +1,367 @@
+//! Collects and shows the outputs of the processes while the demonstration runs.
+
+use super::baseline::{Baseline, Readers};
+use super::experiment::{Args, Experiment};
+use super::processes::{PATIENCE, Processes};
+use anyhow::{Context, anyhow, bail};
+use indicatif::{ProgressBar, ProgressStyle};
+use proprio_simulator::Robot;
+use proprio_topics::ipc::{Domain, Reader, Topic, monotonic};
+use proprio_topics::{
+    ContactEstimate, ContactWrench, EstimatorHealth, GatewayHealth, InertiaEstimate, JointTorque,
+    LinkInertia, Nanos, Residual, SensorOffset, TorqueEstimate,
+};
+use serde_json::Value as Json;
+use std::fs::{self};
+use std::io::{IsTerminal, Write};
+use std::path::Path;
+use std::time::Duration;
+
+/// The data received through shared memory.
+pub(crate) struct Watched {
+    pub(crate) joints: Vec<String>,
+    pub(crate) estimates: Vec<Seen>,
+    /// The CAD's estimates from the same samples.
+    pub(crate) baseline: Vec<(Nanos, Box<[f64]>)>,
+    /// The identified parameters of each solution.
+    pub(crate) learnt: Vec<Learnt>,
+    pub(crate) lost_estimates: u64,
+    pub(crate) gateway: Box<GatewayHealth>,
+    pub(crate) estimator: EstimatorHealth,
+    pub(crate) simulator: Json,
+}
+
+/// The parameters identified from the data up to an instant.
+pub(crate) struct Learnt {
+    pub(crate) t: Nanos,
+    pub(crate) links: Box<[LinkInertia]>,
+    pub(crate) offsets: Box<[SensorOffset]>,
+}
+
+/// One estimate in compact form.
+pub(crate) struct Seen {
+    pub(crate) t: Nanos,
+    pub(crate) published: Nanos,
+    pub(crate) joints: Box<[JointTorque]>,
+    pub(crate) contacts: Box<[ContactWrench]>,
+    pub(crate) residuals: Box<[Residual]>,
+}
+
+pub(crate) fn open<T: Topic>(
+    domain: &Domain,
+    robot: &str,
+    processes: &mut Processes,
+) -> anyhow::Result<Reader<T>> {
+    let end = monotonic() + PATIENCE;
+    let mut ended = None;
+    let reader = Reader::wait_open(domain, robot, |_| {
+        std::thread::sleep(Duration::from_millis(5));
+        let failed = ["gateway", "estimator"]
+            .into_iter()
+            .find_map(|p| match processes.ended(p) {
+                Ok(false) => None,
+                Ok(true) => Some(anyhow!("{p} ended before the demonstration was over")),
+                Err(error) => Some(error),
+            });
+        ended = failed;
+        ended.is_none() && monotonic() < end
+    });
+    match (reader, ended) {
+        (Err(_), Some(error)) => Err(error),
+        (reader, _) => Ok(reader?),
+    }
+}
+
+/// Starts the processes and watches until the robot has stopped.
+pub(crate) fn watch(
+    args: &Args,
+    robot: &Robot,
+    experiment: &Experiment,
+    processes: &mut Processes,
+) -> anyhow::Result<Watched> {
+    let text = |p: &Path| {
+        p.to_str()
+            .map(ToOwned::to_owned)
+            .with_context(|| format!("{} is not UTF-8", p.display()))
+    };
+    let truth = text(&processes.private.join("truth.csv"))?;
+    let (duration, seed, still) = (
+        args.seconds.to_string(),
+        args.seed.to_string(),
+        args.still().to_string(),
+    );
+    let folder = text(&robot.folder)?;
+    let mut simulate = vec![
+        "--robot",
+        &folder,
+        "--seconds",
+        &duration,
+        "--seed",
+        &seed,
+        "--still",
+        &still,
+        "--skin",
+        "--truth",
+        &truth,
+        "--json",
+    ];
+    args.fault
+        .iter()
+        .for_each(|f| simulate.extend(["--fault", f.as_str()]));
+    let (gateway_toml, estimator_toml) = (
+        text(&robot.folder.join("gateway.toml"))?,
+        text(&experiment.config)?,
+    );
+    processes.start("gateway", &["--config", &gateway_toml])?;
+    processes.start("estimator", &["--config", &estimator_toml])?;
+
+    let domain = Domain::open(&processes.domain)?;
+    let name = robot.config.robot.clone();
+    let mut torques: Reader<TorqueEstimate> = open(&domain, &name, processes)?;
+    let mut contacts: Reader<ContactEstimate> = open(&domain, &name, processes)?;
+    // If nothing can be identified, the estimator does not publish the inertia.
+    let mut inertias: Option<Reader<InertiaEstimate>> = match experiment.refused {
+        None => Some(open(&domain, &name, processes)?),
+        Some(_) => None,
+    };
+    let mut gateway_health: Reader<GatewayHealth> = open(&domain, &name, processes)?;
+    let mut estimator_health: Reader<EstimatorHealth> = open(&domain, &name, processes)?;
+    // The gateway sends its first health message when all its links are open: from then on no frame
+    // is lost.
+    let gateway = Box::new(wait_for(&mut gateway_health, processes)?);
+    let readers = Readers {
+        samples: open(&domain, &name, processes)?,
+        descriptions: open(&domain, &name, processes)?,
+        declarations: open(&domain, &name, processes)?,
+    };
+    let mut baseline = Baseline::new(experiment.baseline.clone(), readers);
+    processes.start("simulate", &simulate)?;
+
+    let joints: Vec<String> = experiment
+        .setup
+        .robot
+        .joint_names()
+        .map(ToOwned::to_owned)
+        .collect();
+    let mut screen = Screen::new(args, &joints, experiment.refused.is_none());
+    let mut watched = Watched {
+        joints,
+        estimates: Vec::with_capacity((args.seconds * 1100.0) as usize),
+        baseline: vec![],
+        learnt: vec![],
+        lost_estimates: 0,
+        gateway,
+        estimator: EstimatorHealth::default(),
+        simulator: Json::Null,
+    };
+    let begin = monotonic();
+    let mut last_seen = begin;
+    loop {
+        let mut any = false;
+        while let Some(estimate) = torques.try_take()? {
+            any = true;
+            watched.estimates.push(Seen {
+                t: estimate.header.acquired,
+                published: estimate.header.published,
+                joints: estimate.joints().into(),
+                contacts: Box::default(),
+                residuals: Box::default(),
+            });
+        }
+        while let Some(estimate) = contacts.try_take()? {
+            // The contacts of an instant follow its torques immediately.
+            let seen = watched
+                .estimates
+                .iter_mut()
+                .rev()
+                .take(600)
+                .find(|s| s.t == estimate.header.acquired);
+            if let Some(seen) = seen {
+                seen.contacts = estimate.contacts().into();
+                seen.residuals = estimate.residuals().into();
+            }
+        }
+        while let Some(inertia) = inertias.as_mut().map_or(Ok(None), Reader::try_take)? {
+            // Before the first solution the CAD's parameters are in use.
+            if inertia.links().iter().any(|link| link.accepted == 1) {
+                watched.learnt.push(Learnt {
+                    t: inertia.header.acquired,
+                    links: inertia.links().into(),
+                    offsets: inertia.offsets().into(),
+                });
+            }
+        }
+        baseline.turn()?;
+        if let Some(health) = gateway_health.latest()? {
+            *watched.gateway = health;
+        }
+        if let Some(health) = estimator_health.latest()? {
+            watched.estimator = health;
+        }
+        let now = monotonic();
+        if any {
+            last_seen = now;
+            screen.show(watched.estimates.last(), now);
+        }
+        for process in ["gateway", "estimator"] {
+            if processes.ended(process)? {
+                bail!("{process} ended before the demonstration was over");
+            }
+        }
+        if processes.ended("simulate")? && now - last_seen > Nanos::from_millis(400) {
+            break;
+        }
+        // The simulator writes the truth after the motion, with a row per millisecond.
+        if now - begin > Nanos::from_seconds(1.5 * args.seconds) + PATIENCE {
+            bail!("the simulator does not end");
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    screen.end();
+    watched.baseline = baseline.finish();
+    watched.lost_estimates = torques.lost();
+    // Wait for the final counts: two more health messages of each process.
+    let end = monotonic() + Nanos::from_millis(300);
+    while monotonic() < end {
+        if let Some(health) = gateway_health.latest()? {
+            *watched.gateway = health;
+        }
+        if let Some(health) = estimator_health.latest()? {
+            watched.estimator = health;
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let told = fs::read_to_string(processes.private.join("simulate.json"))?;
+    watched.simulator =
+        serde_json::from_str(told.trim()).context("cannot read the simulator's summary")?;
+    if watched.estimates.is_empty() {
+        bail!("no estimate was published");
+    }
+    Ok(watched)
+}
+
+pub(crate) fn wait_for<T: Topic>(
+    reader: &mut Reader<T>,
+    processes: &mut Processes,
+) -> anyhow::Result<T> {
+    let end = monotonic() + PATIENCE;
+    loop {
+        if let Some(value) = reader.latest()? {
+            return Ok(value);
+        }
+        if processes.ended("gateway")? || monotonic() > end {
+            bail!("the gateway publishes no health messages");
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// The live table and the progress bar; one line per second if the output is not a terminal.
+pub(crate) struct Screen {
+    pub(crate) terminal: bool,
+    pub(crate) bar: ProgressBar,
+    pub(crate) joints: Vec<String>,
+    /// Start of the motion [s].
+    pub(crate) still: f64,
+    /// Whether anything can be identified.
+    pub(crate) learns: bool,
+    pub(crate) has_told: bool,
+    pub(crate) begin: Option<Nanos>,
+    pub(crate) next: Nanos,
+    pub(crate) lines: usize,
+}
+
+impl Screen {
+    pub(crate) fn new(args: &Args, joints: &[String], learns: bool) -> Self {
+        let terminal = std::io::stdout().is_terminal();
+        let bar = if terminal {
+            ProgressBar::new((args.seconds * 10.0) as u64)
+        } else {
+            ProgressBar::hidden()
+        };
+        bar.set_style(
+            ProgressStyle::with_template("{bar:40} {msg}")
+                .unwrap_or_else(|_| ProgressStyle::default_bar()),
+        );
+        Self {
+            terminal,
+            bar,
+            joints: joints.to_vec(),
+            still: args.still(),
+            learns,
+            has_told: false,
+            begin: None,
+            next: Nanos::ZERO,
+            lines: 0,
+        }
+    }
+
+    pub(crate) fn show(&mut self, last: Option<&Seen>, now: Nanos) {
+        let begin = *self.begin.get_or_insert(now);
+        let Some(last) = last.filter(|_| now >= self.next) else {
+            return;
+        };
+        self.next = now
+            + if self.terminal {
+                Nanos::from_millis(100)
+            } else {
+                Nanos::from_millis(1000)
+            };
+        let elapsed = (now - begin).seconds();
+        let of = |i: usize| last.joints.get(i);
+        let moves = elapsed >= self.still;
+        if !self.terminal {
+            if moves && !std::mem::replace(&mut self.has_told, true) {
+                say!("{elapsed:5.1} s  the robot begins to move");
+            }
+            let cells: Vec<_> = self
+                .joints
+                .iter()
+                .enumerate()
+                .map(|(i, j)| {
+                    of(i).map_or_else(String::new, |t| {
+                        if t.valid == 1 {
+                            format!("{j} {:.2}", t.torque)
+                        } else {
+                            format!("{j} withheld ({})", t.reason.word())
+                        }
+                    })
+                })
+                .collect();
+            say!("{elapsed:5.1} s  {}", cells.join("  "));
+            return;
+        }
+        let mut text = String::new();
+        for (i, joint) in self.joints.iter().enumerate() {
+            let Some(torque) = of(i) else { continue };
+            let state = if torque.valid == 1 {
+                "valid"
+            } else {
+                torque.reason.word()
+            };
+            text.push_str(&format!(
+                "\x1b[2K{joint:<20} {:>9.3} Nm  +- {:>6.3}  {state}\n",
+                torque.torque, torque.standard_deviation
+            ));
+        }
+        self.bar.suspend(|| {
+            if self.lines > 0 {
+                say_part!("\x1b[{}A", self.lines);
+            }
+            say_part!("{text}");
+            let _ = std::io::stdout().flush();
+        });
+        self.lines = self.joints.len();
+        let doing = match (moves, self.learns) {
+            (false, _) => "standing still",
+            (true, true) => "moving, identifying",
+            (true, false) => "moving",
+        };
+        self.bar.set_message(format!("{elapsed:.1} s, {doing}"));
+        self.bar.set_position((elapsed * 10.0) as u64);
+    }
+
+    pub(crate) fn end(&self) {
+        self.bar.finish_and_clear();
+    }
+}

@@ -1,0 +1,436 @@
+//! What was identified: the parameters, how well the motion excites them, and what belongs to no
+//! link: time offsets, rotors, calibrations, offsets and friction.
+
+use super::words::WRENCH;
+use crate::identify::advice::{percent, sentence};
+use crate::report::plot::{Axis, Ink, Plot, Series};
+use crate::report::{self, Cell, Table, number, short};
+use proprio_dynamics::calibration::{Unknown, swapped};
+use proprio_identification::{BaseParameterOutcome, CalibrationOutcome, Outcome};
+
+/// Number of weak directions listed at once; the others can be unfolded.
+const LISTED: usize = 12;
+
+pub(super) fn parameters(outcome: &Outcome) -> Option<String> {
+    let mut body = Vec::new();
+    let units = ["kg", "kg m", "kg m^2"];
+    let of_unit = |unit: &str| -> Vec<(usize, &BaseParameterOutcome)> {
+        outcome
+            .base_parameters
+            .iter()
+            .enumerate()
+            .filter(|(_, b)| b.unit == unit)
+            .map(|(i, b)| (i + 1, b))
+            .collect()
+    };
+    let plots: Vec<Plot> = units
+        .iter()
+        .map(|unit| (unit, of_unit(unit)))
+        .filter(|(_, some)| !some.is_empty())
+        .map(|(unit, some)| base_plot(unit, &some))
+        .chain((!outcome.base_parameters.is_empty()).then(|| change_plot(&outcome.base_parameters)))
+        .collect();
+    if !plots.is_empty() {
+        body.push(report::paragraph(
+            "Base parameters: the combinations of inertial parameters that the measurements depend \
+             on, numbered as in the table below. Bars are two standard deviations; where a bar \
+             spans the CAD's value, the logs do not contradict it.",
+        ));
+        body.push(report::figures(&plots));
+        let row = |(i, b): (usize, &BaseParameterOutcome)| -> Vec<Cell> {
+            vec![
+                Cell::Text((i + 1).to_string()),
+                b.expression.as_str().into(),
+                unit_text(b.unit).into(),
+                b.cad.into(),
+                Cell::Uncertain(b.identified, b.deviation),
+                Cell::Number((b.identified - b.cad).abs() / b.deviation),
+            ]
+        };
+        let mut table = Table::new(
+            "Base parameters; last column: change from the CAD in standard deviations",
+            &[
+                "no.",
+                "combination",
+                "unit",
+                "CAD",
+                "identified",
+                "change/σ",
+            ],
+        );
+        outcome
+            .base_parameters
+            .iter()
+            .enumerate()
+            .for_each(|entry| table.row(row(entry)));
+        body.push(report::folded(
+            &format!("All {} base parameters", outcome.base_parameters.len()),
+            false,
+            &[table.html()],
+        ));
+    }
+    let mut links = Table::new(
+        "Links that the logs observe: physically consistent parameters; directions that the \
+         logs do not determine keep their CAD values. Last column: change from the CAD in standard \
+         deviations (below 2: not significant)",
+        &[
+            "link",
+            "mass CAD [kg]",
+            "mass [kg]",
+            "centre of mass CAD [mm]",
+            "centre of mass [mm]",
+            "change/σ",
+        ],
+    );
+    for link in outcome.links.iter().filter(|l| l.seen) {
+        let centre = |body: &proprio_dynamics::spatial::RigidInertia| -> Cell {
+            if body.mass > 0.0 {
+                let [x, y, z] = [0, 1, 2].map(|i| {
+                    format!("{:.1}", body.first_moment[i] / body.mass * 1e3).replace('-', "−")
+                });
+                format!("{x}, {y}, {z}").into()
+            } else {
+                "–".into()
+            }
+        };
+        links.row(vec![
+            link.name.as_str().into(),
+            link.cad.mass.into(),
+            Cell::Uncertain(link.identified.mass, link.deviation[0]),
+            centre(&link.cad),
+            centre(&link.identified),
+            link.significance.into(),
+        ]);
+    }
+    body.push(links.html());
+    let floored: Vec<&str> = outcome
+        .links
+        .iter()
+        .filter(|l| l.floored.is_some())
+        .map(|l| l.name.as_str())
+        .collect();
+    if !floored.is_empty() {
+        body.push(report::paragraph(&format!(
+            "The CAD's inertia of {} is physically inconsistent or nearly zero; identification \
+             started from the nearest consistent inertia.",
+            floored.join(", ")
+        )));
+    }
+    let untouched = outcome.links.iter().filter(|l| !l.seen).count();
+    if untouched > 0 {
+        body.push(report::paragraph(&format!(
+            "The logs do not observe {} the CAD's parameters.",
+            if untouched == 1 {
+                "one other link; it keeps".to_owned()
+            } else {
+                format!("{untouched} other links; they keep")
+            }
+        )));
+    }
+    (!plots.is_empty() || !links.is_empty()).then(|| report::section("Parameters", &body))
+}
+
+fn unit_text(unit: &str) -> String {
+    unit.replace("^2", "²")
+}
+
+fn base_plot(unit: &str, some: &[(usize, &BaseParameterOutcome)]) -> Plot {
+    let (first, last) = (
+        some.first().map_or(0, |s| s.0),
+        some.last().map_or(0, |s| s.0),
+    );
+    let cad = some
+        .iter()
+        .map(|(i, b)| (*i as f64 - 0.15, b.cad, f64::NAN, f64::NAN))
+        .collect();
+    let identified = some
+        .iter()
+        .map(|(i, b)| {
+            (
+                *i as f64 + 0.15,
+                b.identified,
+                b.identified - 2.0 * b.deviation,
+                b.identified + 2.0 * b.deviation,
+            )
+        })
+        .collect();
+    let mut x = Axis::new("number of the base parameter");
+    x.range = Some((first as f64 - 0.7, last as f64 + 0.7));
+    Plot {
+        title: match unit {
+            "kg" => "Masses".into(),
+            "kg m" => "First moments".into(),
+            _ => "Moments of inertia".into(),
+        },
+        x,
+        y: Axis::new(&format!("[{}]", unit_text(unit))),
+        series: vec![
+            Series::dots("CAD", Ink::Cad, cad),
+            Series::dots("identified ± 2σ", Ink::Identified, identified),
+        ],
+        ..Plot::default()
+    }
+}
+
+/// Small parameters vanish beside large ones; in standard deviations all are comparable.
+fn change_plot(all: &[BaseParameterOutcome]) -> Plot {
+    let mut x = Axis::new("number of the base parameter");
+    let (from, to) = (0.3, all.len() as f64 + 0.7);
+    x.range = Some((from, to));
+    let change = |b: &BaseParameterOutcome| (b.identified - b.cad) / b.deviation;
+    let dots = (1..)
+        .zip(all)
+        .map(|(i, b): (u32, _)| (f64::from(i), change(b), f64::NAN, f64::NAN));
+    Plot {
+        title: "Change from CAD".into(),
+        note: "in standard deviations".into(),
+        x,
+        y: Axis::new("change / σ"),
+        series: vec![
+            Series::band(
+                "not significant",
+                Ink::Cad,
+                vec![(from, -2.0, 2.0), (to, -2.0, 2.0)],
+            ),
+            Series::dots("identified", Ink::Identified, dots.collect()),
+        ],
+        ..Plot::default()
+    }
+}
+
+pub(super) fn excitation(outcome: &Outcome) -> Option<String> {
+    let mut body = Vec::new();
+    let values = &outcome.singular_values;
+    if !values.is_empty() {
+        let dots = values
+            .iter()
+            .enumerate()
+            .map(|(i, v)| (i as f64 + 1.0, *v, f64::NAN, f64::NAN))
+            .collect();
+        let mut x = Axis::new("number of the combination, best excited first");
+        x.range = Some((0.3, values.len() as f64 + 0.7));
+        body.push(report::paragraph(&format!(
+            "Each dot is one combination of parameters. The logs determine those above 1; those \
+             below 1 keep their CAD values. {} are above 1. The robot's structure makes {} \
+             identifiable by a rich enough motion. Condition number: {}.",
+            values.iter().filter(|v| **v > 1.0).count(),
+            outcome.structural_rank,
+            number(outcome.condition)
+        )));
+        body.push(report::figures(&[Plot {
+            title: "Excitation spectrum".into(),
+            note: "singular values, relative to the prior standard deviation".into(),
+            x,
+            y: Axis::log("singular value"),
+            series: vec![
+                Series::line(
+                    "",
+                    Ink::Fitted,
+                    vec![(0.3, 1.0), (values.len() as f64 + 0.7, 1.0)],
+                ),
+                Series::dots("", Ink::Identified, dots),
+            ],
+            ..Plot::default()
+        }]));
+    }
+    let weak = |range: std::ops::Range<usize>| {
+        let mut table = Table::new(
+            "Least excited combinations, worst first, and the share of their variance that is the \
+             prior's",
+            &["combination", "relative excitation", "prior's share"],
+        );
+        for w in outcome
+            .weakest
+            .get(range.start.min(outcome.weakest.len())..range.end.min(outcome.weakest.len()))
+            .unwrap_or_default()
+        {
+            table.row(vec![
+                w.expression.as_str().into(),
+                w.relative.into(),
+                Cell::Bar(percent(w.prior_share), w.prior_share, Ink::Fitted),
+            ]);
+        }
+        table
+    };
+    body.push(weak(0..LISTED).html());
+    let rest = weak(LISTED..usize::MAX);
+    if !rest.is_empty() {
+        body.push(report::folded(
+            "More weak directions",
+            false,
+            &[rest.html()],
+        ));
+    }
+    if !outcome.not_separable.is_empty() {
+        body.push(format!(
+            "<h3>Not separable with this motion</h3>{}",
+            report::list(outcome.not_separable.iter().map(|text| sentence(text)))
+        ));
+        body.push(report::paragraph(
+            "While the robot moves as in these logs, torques do not depend on how each sum is \
+             divided. With another motion (a tilted base, for example) they do, and their standard \
+             deviation grows accordingly.",
+        ));
+    }
+    body.retain(|part| !part.is_empty());
+    (!body.is_empty()).then(|| report::section("Excitation by the motion", &body))
+}
+
+/// The calibration of a sensor, a row for each identified number.
+fn calibration(c: &CalibrationOutcome) -> Table {
+    let since = c.identified.reference().map_or(String::new(), |celsius| {
+        format!("; the change per kelvin counts from {celsius:.1} °C")
+    });
+    let mut table = Table::new(
+        &format!(
+            "{}: calibration in the robot: the wrench is (1 + error) times the reading after the \
+             factory calibration{since}",
+            c.sensor
+        ),
+        &["quantity", "identified", "prior σ"],
+    );
+    let word = |channel: usize| WRENCH[swapped(channel)].0;
+    for (((unknown, error), deviation), prior) in c
+        .kind
+        .unknowns()
+        .zip(&c.error)
+        .zip(&c.deviation)
+        .zip(&c.prior)
+    {
+        let (what, factor) = match unknown {
+            Unknown::Gain { channel, of } if channel == of => {
+                (format!("error of the gain of {} [%]", word(channel)), 100.0)
+            }
+            Unknown::Gain { channel, of } => {
+                let unit = |channel: usize| WRENCH[swapped(channel)].1;
+                (
+                    format!(
+                        "{} of {} [{}/{}]",
+                        word(channel),
+                        word(of),
+                        unit(channel),
+                        unit(of)
+                    ),
+                    1.0,
+                )
+            }
+            Unknown::Temperature { channel } => (
+                format!(
+                    "{} by temperature [{}/K]",
+                    word(channel),
+                    WRENCH[swapped(channel)].1
+                ),
+                1.0,
+            ),
+        };
+        table.row(vec![
+            what.into(),
+            Cell::Uncertain(factor * error, factor * deviation),
+            (factor * prior).into(),
+        ]);
+    }
+    table
+}
+
+/// Time offsets, rotors and calibrations, which belong to the robot; offsets and friction, which
+/// belong to a log.
+pub(super) fn sessions(outcome: &Outcome) -> Option<String> {
+    let mut body = Vec::new();
+    let mut times = Table::new(
+        "Time offset of each stream against the encoders; late is positive",
+        &["channel", "offset [ms]", ""],
+    );
+    for o in &outcome.time_offsets {
+        times.row(vec![
+            o.channel.as_str().into(),
+            Cell::Uncertain(o.seconds * 1e3, o.deviation * 1e3),
+            if o.significant {
+                "significant"
+            } else {
+                "not significant"
+            }
+            .into(),
+        ]);
+    }
+    body.push(times.html());
+    let mut rotors = Table::new(
+        "Rotor inertias, reflected to the joints; the same in all logs: measured torque = torque + \
+         rotor inertia · acceleration + friction",
+        &["joint", "rotor inertia [kg m², kg where it slides]"],
+    );
+    for r in &outcome.rotors {
+        rotors.row(vec![
+            r.joint.as_str().into(),
+            Cell::Uncertain(r.inertia, r.deviation),
+        ]);
+    }
+    if !rotors.is_empty() {
+        body.push(rotors.html());
+    }
+    for c in &outcome.calibrations {
+        body.push(calibration(c).html());
+    }
+    for log in &outcome.logs {
+        let mut offsets = Table::new(
+            &format!(
+                "{}: offsets of the F/T sensors (their reading without load)",
+                log.file
+            ),
+            &[
+                "channel",
+                "unit",
+                "at the start",
+                "at the end",
+                "rate [unit/√s]",
+                "offset jumps at [s]",
+            ],
+        );
+        for o in &log.offsets {
+            let breaks: Vec<String> = o
+                .offset_jumps
+                .iter()
+                .map(|t| short((*t - log.span.0).seconds()))
+                .collect();
+            for (i, (channel, unit)) in WRENCH.iter().enumerate() {
+                offsets.row(vec![
+                    format!("{} {channel}", o.sensor).into(),
+                    (*unit).into(),
+                    o.start[i].into(),
+                    Cell::Uncertain(o.end[i], o.deviation[i]),
+                    o.rate[i].into(),
+                    breaks.join(", ").into(),
+                ]);
+            }
+        }
+        let mut friction = Table::new(
+            &format!(
+                "{}: friction of the joints: coulomb · tanh(velocity / 0.02 rad/s) + viscous · \
+                 velocity + offset",
+                log.file
+            ),
+            &["joint", "Coulomb [Nm]", "viscous [Nm s/rad]", "offset [Nm]"],
+        );
+        for f in &log.friction {
+            friction.row(vec![
+                f.joint.as_str().into(),
+                Cell::Uncertain(f.coulomb_nm, f.deviation[0]),
+                Cell::Uncertain(f.viscous, f.deviation[1]),
+                Cell::Uncertain(f.offset_nm, f.deviation[2]),
+            ]);
+        }
+        let tables: Vec<String> = [offsets, friction]
+            .iter()
+            .filter(|t| !t.is_empty())
+            .map(Table::html)
+            .collect();
+        if !tables.is_empty() {
+            body.push(report::folded(
+                &format!("Offsets and friction: {}", log.file),
+                false,
+                &tables,
+            ));
+        }
+    }
+    body.retain(|part| !part.is_empty());
+    (!body.is_empty()).then(|| report::section("Offsets, friction and time, log by log", &body))
+}

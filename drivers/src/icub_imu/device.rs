@@ -1,0 +1,498 @@
+//! The host's side of an IMU. It configures and starts the board, and combines the frames of each
+//! acquisition into a reading.
+
+use super::frames::{
+    ACCELERATION_LSB, FIELD_LSB, Legacy, QUATERNION_LSB, Quantity, RATE_LSB, kind, sensor,
+};
+use super::options::{Options, Plan};
+use crate::icub::{self, Ask, Bringup, Inquiry, Paired, Pairing, class, command};
+use crate::{
+    Claim, Decoded, Device, Frame, Mode, Refusal, Spec, SpecError, State, Transmit, device,
+};
+use arrayvec::ArrayVec;
+use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, StampKind};
+
+/// A frame up to this many sequence numbers back is late; further back, the counter has restarted
+/// or there is a long gap.
+const LATE: u8 = 4;
+
+/// Sends a board its configuration and verifies it.
+#[derive(Debug)]
+struct Configure {
+    address: u8,
+    wanted: [u8; 8],
+    /// Legacy boards have no such configuration.
+    needed: bool,
+    /// The board has confirmed it, or does not answer.
+    settled: bool,
+    /// The configuration has been sent; the question follows.
+    told: bool,
+    attempts: u8,
+    ask_at: Nanos,
+    /// Answers may still arrive until then.
+    counts_until: Nanos,
+}
+
+impl Configure {
+    fn answer(&mut self, data: &[u8], mode: Mode, frame: &Frame, out: &mut Decoded) {
+        if mode == Mode::Listen {
+            return;
+        }
+        let &[_, ref has @ .., _, _, _] = data else {
+            return out.fault(Counter::Length, 1, frame.id);
+        };
+        let [_, wants @ .., _, _, _] = &self.wanted;
+        if has.len() != wants.len() {
+            return out.fault(Counter::Length, 1, frame.id);
+        }
+        if frame.t > self.counts_until {
+            return out.fault(Counter::Unexpected, 1, frame.id);
+        }
+        if self.settled {
+            // A late answer to an earlier question.
+            return;
+        }
+        let agrees = has == wants;
+        self.settled = agrees || self.attempts >= icub::ATTEMPTS;
+        if !agrees {
+            self.told = false;
+            self.ask_at = Nanos::MIN;
+            if self.settled {
+                out.fault(Counter::Changed, 1, frame.id);
+            }
+        }
+    }
+}
+
+impl Inquiry for Configure {
+    fn begin(&mut self) {
+        self.settled = !self.needed;
+        self.told = false;
+        self.attempts = 0;
+        self.ask_at = Nanos::MIN;
+    }
+
+    fn poll(&mut self, now: Nanos) -> Ask {
+        if self.settled {
+            return Ask::Done;
+        }
+        if now < self.ask_at {
+            return Ask::Wait;
+        }
+        let id = icub::to_board(class::POLLING_ANALOG, self.address);
+        if !self.told {
+            if self.attempts >= icub::ATTEMPTS {
+                self.settled = true;
+                return Ask::Done;
+            }
+            self.told = true;
+            return Ask::Send(Frame::new(id, &self.wanted));
+        }
+        self.told = false;
+        self.attempts += 1;
+        self.ask_at = now + icub::ANSWER_TIMEOUT;
+        self.counts_until = now + icub::ANSWER_COUNTS;
+        Ask::Send(Frame::new(id, &[command::IMU_CONFIG_GET]))
+    }
+
+    fn wake(&self) -> Option<Nanos> {
+        Some(self.ask_at)
+    }
+
+    fn refusal(&self) -> Option<Refusal> {
+        None
+    }
+}
+
+/// The current, incomplete acquisition.
+#[derive(Debug, Clone, Copy)]
+struct Acquisition {
+    open: bool,
+    acquired: Nanos,
+    stamp: StampKind,
+    /// The quantities received, as bits of the mask.
+    have: u16,
+    imu: Imu,
+}
+
+impl Acquisition {
+    const NONE: Self = Self {
+        open: false,
+        acquired: Nanos::ZERO,
+        stamp: StampKind::None,
+        have: 0,
+        imu: Imu::ABSENT,
+    };
+}
+
+/// The host's side of an IMU.
+#[derive(Debug)]
+pub struct ImuDevice {
+    plan: Plan,
+    claims: ArrayVec<Claim, 4>,
+    bringup: Bringup,
+    configure: Configure,
+    acquisition: Acquisition,
+    /// SEQ of the last acquisition begun.
+    sequence: Option<u8>,
+    /// The sensors in use that are not calibrated according to the last status.
+    not_calibrated: bool,
+    legacy: Pairing<[i16; 3]>,
+    /// Maximum duration of an acquisition.
+    together: Nanos,
+    gap: bool,
+    /// Whether there was a reading: from then on a restart leaves a gap.
+    seen: bool,
+}
+
+impl ImuDevice {
+    /// A device in its initial state.
+    ///
+    /// # Errors
+    /// [`SpecError`]: an address outside 1 to 14, joints, incompatible quantities, a key out of
+    /// range.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        let plan = Plan::new(spec, options)?;
+        let silence = icub::power_on_silence(options.power_on_silence_ms)?;
+        let mode = if options.listen {
+            Mode::Listen
+        } else {
+            spec.mode
+        };
+        let is_legacy = plan.legacy != Legacy::None;
+        let kinds: &[u8] = if is_legacy {
+            &[kind::LEGACY_ACCELEROMETER, kind::LEGACY_GYROSCOPE]
+        } else {
+            &[kind::TRIPLE, kind::QUATERNION, kind::STATUS]
+        };
+        let watched = icub::stream(
+            class::PERIODIC_INERTIAL,
+            plan.address,
+            *kinds.first().unwrap_or(&kind::TRIPLE),
+        );
+        let mut bringup = Bringup::new(spec, mode, silence, watched);
+        let id = icub::to_board(class::POLLING_ANALOG, plan.address);
+        let mut claims: ArrayVec<Claim, 4> =
+            icub::claims(class::PERIODIC_INERTIAL, plan.address, kinds);
+        if is_legacy {
+            bringup.start_with(
+                id,
+                &[command::ACC_GYRO_SETUP, plan.legacy_mask, plan.period_ms],
+            );
+            bringup.stop_with(id, &[command::ACC_GYRO_SETUP, 0, 0]);
+        } else {
+            bringup.start_with(id, &[command::IMU_TRANSMIT, plan.period_ms]);
+            bringup.stop_with(id, &[command::IMU_TRANSMIT, 0]);
+            claims.push(Claim::shared(icub::to_host(
+                class::POLLING_ANALOG,
+                plan.address,
+            )));
+        }
+        let together = Nanos::from_micros(i64::from(plan.period_ms) * 500);
+        Ok(Self {
+            claims,
+            bringup,
+            configure: Configure {
+                address: plan.address,
+                wanted: plan.configuration,
+                needed: !is_legacy,
+                settled: false,
+                told: false,
+                attempts: 0,
+                ask_at: Nanos::MIN,
+                counts_until: Nanos::MIN,
+            },
+            acquisition: Acquisition::NONE,
+            sequence: None,
+            not_calibrated: false,
+            // A BNO055 board sends the accelerometer first; the order of an mtb is not documented.
+            legacy: Pairing::new(together, plan.legacy == Legacy::Bno055),
+            together,
+            gap: false,
+            seen: false,
+            plan,
+        })
+    }
+
+    /// Whether a frame with `sequence` belongs to the open acquisition; a later `sequence` opens a
+    /// new one.
+    fn belongs(&mut self, sequence: u8, frame: &Frame, out: &mut Decoded) -> bool {
+        if let Some(last) = self.sequence {
+            match sequence.wrapping_sub(last) {
+                // If it is not open, it is complete, and this frame is not needed.
+                0 => return self.acquisition.open,
+                ahead if ahead <= u8::MAX - LATE => {
+                    self.abandon(frame, out);
+                    if ahead > 1 {
+                        out.fault(Counter::Lost, u32::from(ahead) - 1, frame.id);
+                        self.gap = true;
+                    }
+                }
+                _ => {
+                    out.fault(Counter::Unpaired, 1, frame.id);
+                    self.gap = true;
+                    return false;
+                }
+            }
+        }
+        self.sequence = Some(sequence);
+        self.acquisition = Acquisition {
+            open: true,
+            acquired: frame.t,
+            stamp: frame.stamp,
+            ..Acquisition::NONE
+        };
+        true
+    }
+
+    /// Drops an incomplete acquisition.
+    fn abandon(&mut self, frame: &Frame, out: &mut Decoded) {
+        if core::mem::take(&mut self.acquisition.open) {
+            out.fault(Counter::Unpaired, 1, frame.id);
+            self.gap = true;
+        }
+    }
+
+    /// Records that the acquisition has `bit`; outputs the reading when all wanted quantities are
+    /// present.
+    fn hold(&mut self, bit: u16, frame: &Frame, out: &mut Decoded) {
+        self.acquisition.have |= bit;
+        if self.acquisition.have & self.plan.want != self.plan.want {
+            return;
+        }
+        self.acquisition.open = false;
+        let Acquisition {
+            acquired,
+            stamp,
+            imu,
+            ..
+        } = self.acquisition;
+        let mut quality = Quality::DEVICE_COUNTER;
+        if self.not_calibrated {
+            quality |= Quality::NOT_CALIBRATED;
+        }
+        let counter = u32::from(self.sequence.unwrap_or(0));
+        self.give(imu, acquired, stamp, counter, quality, frame, out);
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn give(
+        &mut self,
+        imu: Imu,
+        acquired: Nanos,
+        stamp: StampKind,
+        device_counter: u32,
+        mut quality: Quality,
+        frame: &Frame,
+        out: &mut Decoded,
+    ) {
+        if core::mem::take(&mut self.gap) | self.bringup.reading(frame.t) {
+            quality |= Quality::GAP_BEFORE;
+        }
+        self.seen = true;
+        let reading = Reading::Imu(imu);
+        out.push(
+            device::Output {
+                output: 0,
+                acquired,
+                stamp,
+                device_counter,
+                quality,
+                reading,
+            },
+            frame.id,
+        );
+    }
+
+    fn triple(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+        let &[sequence, sensor, ..] = data else {
+            return;
+        };
+        if !matches!(
+            sensor,
+            sensor::ACCELERATION..=sensor::EULER | sensor::LINEAR_ACCELERATION | sensor::GRAVITY
+        ) {
+            return out.fault(Counter::Value, 1, frame.id);
+        }
+        let bit = 1_u16 << sensor;
+        if !self.belongs(sequence, frame, out) || self.plan.want & bit == 0 {
+            return;
+        }
+        let imu = &mut self.acquisition.imu;
+        let (field, lsb) = match sensor {
+            sensor::ACCELERATION => (&mut imu.proper_acceleration, ACCELERATION_LSB),
+            sensor::MAGNETIC_FIELD => (&mut imu.magnetic_field, FIELD_LSB),
+            // Other quantities are never wanted.
+            _ => (&mut imu.angular_velocity, RATE_LSB),
+        };
+        *field = vector(data, 2).map(|count| f64::from(count) * lsb);
+        self.hold(bit, frame, out);
+    }
+
+    fn quaternion(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+        let bit = Quantity::Orientation.bit();
+        if self.plan.want & bit == 0 {
+            return;
+        }
+        let begun = (self.acquisition.acquired, self.acquisition.stamp);
+        if !self.acquisition.open || !icub::within(begun, (frame.t, frame.stamp), self.together) {
+            out.fault(Counter::Unpaired, 1, frame.id);
+            self.gap = true;
+            return;
+        }
+        let [x, y, z] = vector(data, 2);
+        let w = icub::i16_le(data, 0);
+        self.acquisition.imu.orientation =
+            [w, x, y, z].map(|count| f64::from(count) * QUATERNION_LSB);
+        self.hold(bit, frame, out);
+    }
+
+    fn status(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+        let &[sequence, gyroscope, accelerometer, magnetometer, ..] = data else {
+            return;
+        };
+        if gyroscope > 3 || accelerometer > 3 || magnetometer > 3 {
+            return out.fault(Counter::Value, 1, frame.id);
+        }
+        let bit = Quantity::Status.bit();
+        if self.plan.want & bit == 0 || !self.belongs(sequence, frame, out) {
+            return;
+        }
+        let lacks = |quantity: Quantity, calibration| {
+            self.plan.want & quantity.bit() != 0 && calibration == 0
+        };
+        self.not_calibrated = lacks(Quantity::Acceleration, accelerometer)
+            || lacks(Quantity::AngularVelocity, gyroscope)
+            || lacks(Quantity::MagneticField, magnetometer);
+        self.hold(bit, frame, out);
+    }
+
+    fn legacy(&mut self, is_gyroscope: bool, data: &[u8], frame: &Frame, out: &mut Decoded) {
+        let quantity = if is_gyroscope {
+            Quantity::AngularVelocity
+        } else {
+            Quantity::Acceleration
+        };
+        if self.plan.want & quantity.bit() == 0 {
+            return;
+        }
+        let counts = vector(data, 0);
+        let mut imu = Imu::ABSENT;
+        let (mut acquired, mut stamp) = (frame.t, frame.stamp);
+        let [acceleration_lsb, rate_lsb] = self.plan.legacy.lsb();
+        let mut set = |is_gyroscope: bool, counts: [i16; 3]| {
+            if is_gyroscope {
+                imu.angular_velocity = counts.map(|count| f64::from(count) * rate_lsb);
+            } else {
+                imu.proper_acceleration = counts.map(|count| f64::from(count) * acceleration_lsb);
+            }
+        };
+        set(is_gyroscope, counts);
+        if self.plan.want != quantity.bit() {
+            let mut unpaired = 0;
+            let paired = self.legacy.push(is_gyroscope, frame, counts, &mut unpaired);
+            if unpaired > 0 {
+                out.fault(Counter::Unpaired, unpaired, frame.id);
+                self.gap = true;
+            }
+            let Paired::With(t, kind, first) = paired else {
+                return;
+            };
+            set(!is_gyroscope, first);
+            (acquired, stamp) = (t, kind);
+        }
+        self.give(imu, acquired, stamp, 0, Quality::GOOD, frame, out);
+    }
+
+    /// Drops the incomplete acquisition: the counter may restart.
+    fn reset(&mut self) {
+        self.acquisition.open = false;
+        self.sequence = None;
+        self.not_calibrated = false;
+        self.legacy.reset();
+        self.gap |= self.seen;
+    }
+}
+
+/// Three signed 16-bit numbers at `at`.
+fn vector(data: &[u8], at: usize) -> [i16; 3] {
+    [
+        icub::i16_le(data, at),
+        icub::i16_le(data, at + 2),
+        icub::i16_le(data, at + 4),
+    ]
+}
+
+impl Device for ImuDevice {
+    fn kind(&self) -> Kind {
+        Kind::Imu
+    }
+
+    fn claims(&self) -> &[Claim] {
+        &self.claims
+    }
+
+    fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
+        if !self.bringup.active() {
+            return;
+        }
+        let is_legacy = self.plan.legacy != Legacy::None;
+        if let Some(stream) =
+            icub::stream_type(frame.id, class::PERIODIC_INERTIAL, self.plan.address)
+        {
+            let expected = match stream {
+                kind::LEGACY_GYROSCOPE | kind::LEGACY_ACCELEROMETER if is_legacy => 6,
+                kind::TRIPLE | kind::QUATERNION | kind::STATUS if !is_legacy => 8,
+                _ => return,
+            };
+            let Some(data) = icub::payload(frame, out) else {
+                return;
+            };
+            match stream {
+                _ if data.len() != expected => out.fault(Counter::Length, 1, frame.id),
+                kind::TRIPLE => self.triple(data, frame, out),
+                kind::QUATERNION => self.quaternion(data, frame, out),
+                kind::STATUS => self.status(data, frame, out),
+                _ => self.legacy(stream == kind::LEGACY_GYROSCOPE, data, frame, out),
+            }
+        } else if !is_legacy
+            && frame.id == icub::to_host(class::POLLING_ANALOG, self.plan.address)
+            && let Some(data) = icub::payload(frame, out)
+        {
+            match data.first() {
+                Some(&command::IMU_CONFIG_GET) => {
+                    self.configure.answer(data, self.bringup.mode(), frame, out);
+                }
+                // Answers to other questions are for other devices.
+                Some(_) => {}
+                None => out.fault(Counter::Length, 1, frame.id),
+            }
+        }
+    }
+
+    fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
+        let was_silent = self.bringup.is_silent();
+        let transmit = self.bringup.poll(now, &mut self.configure, out);
+        if self.bringup.is_silent() && !was_silent {
+            self.reset();
+        }
+        transmit
+    }
+
+    fn next_wake(&self) -> Option<Nanos> {
+        self.bringup.next_wake(&self.configure)
+    }
+
+    fn state(&self) -> State {
+        self.bringup.state(&self.configure)
+    }
+
+    fn stop(&mut self, _now: Nanos) {
+        self.bringup.stop();
+    }
+
+    fn restart(&mut self, _now: Nanos) {
+        self.bringup.restart();
+        self.reset();
+    }
+}

@@ -1,0 +1,191 @@
+//! The F/T board's own side. It reports its full scales, executes the host's commands, and sends
+//! readings as frames.
+
+use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind, saturation_bytes};
+use super::options::{Options, Stream};
+use crate::icub::{self, class, command};
+use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
+use proprio_topics::{Nanos, Quality, Reading, Saturation, Temperature};
+
+/// Default full scales: the iCub's usual sensor \[N, Nm\]. A simulated board reports them on
+/// request.
+const USUAL_FULL_SCALE: [f64; 6] = [1804.0, 1804.0, 1804.0, 31.0, 31.0, 31.0];
+
+/// The board's own side.
+///
+/// It behaves as a strain2 with the unit calibration matrix: its raw gauges are its axes. Its
+/// memory holds the configured full scales, else 1804 N and 31 Nm.
+#[derive(Debug)]
+pub struct StrainBoard {
+    address: u8,
+    full_scale: [f64; 6],
+    /// Whether the host knows the scale: from the same configuration, or from the board's answer.
+    scale_known: bool,
+    period: Nanos,
+    /// The stream selected by the host; `None` while it is silent.
+    stream: Option<Stream>,
+    /// The counts of the last vector that was not saturated.
+    last_good: Option<[u16; 6]>,
+}
+
+impl StrainBoard {
+    /// A board after power-on. With `listen` another program has already started it.
+    ///
+    /// # Errors
+    /// As [`Strain::new`](super::Strain::new), but a full scale of zero is legal: a board with a
+    /// corrupt memory.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        let address = icub::address(spec)?;
+        icub::no_joints(spec)?;
+        let configured = options.full_scale(true)?;
+        let period =
+            Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));
+        Ok(Self {
+            address,
+            full_scale: configured.unwrap_or(USUAL_FULL_SCALE),
+            scale_known: configured.is_some(),
+            period,
+            stream: options.listen.then_some(options.stream),
+            last_good: None,
+        })
+    }
+
+    /// The frames of both halves.
+    fn send(&self, first_kind: u8, counts: [u16; 6], saturation: [u8; 2], out: &mut Frames) {
+        let [a, b, c, d, e, f] = counts;
+        for (kind, counts, saturation) in [
+            (first_kind, [a, b, c], saturation[0]),
+            (first_kind + 1, [d, e, f], saturation[1]),
+        ] {
+            let id = icub::stream(class::PERIODIC_ANALOG, self.address, kind);
+            let _ = out.try_push(Half { counts, saturation }.frame(id));
+        }
+    }
+}
+
+impl Board for StrainBoard {
+    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
+        icub::answer_management(
+            frame,
+            class::POLLING_ANALOG,
+            self.address,
+            icub::board::STRAIN2,
+            out,
+        );
+        match icub::command_for(frame, class::POLLING_ANALOG, self.address) {
+            Some(&[command::GET_FULL_SCALES, channel]) => {
+                let Some(&full_scale) = self.full_scale.get(usize::from(channel & 0xF)) else {
+                    return;
+                };
+                #[allow(clippy::cast_sign_loss, clippy::cast_possible_truncation)]
+                // limited to 16 bits
+                let [high, low] =
+                    (icub::quantise(full_scale, 1.0, 0, i64::from(u16::MAX)) as u16).to_be_bytes();
+                let id = icub::to_host(class::POLLING_ANALOG, self.address);
+                let _ = out.try_push(Frame::new(
+                    id,
+                    &[command::GET_FULL_SCALES, channel, high, low],
+                ));
+                self.scale_known = true;
+            }
+            Some(&[command::SET_CANDATARATE, ms]) if ms > 0 => {
+                self.period = Nanos::from_millis(i64::from(ms));
+            }
+            Some(&[command::SET_TXMODE, mode]) => self.stream = Stream::from_code(mode),
+            _ => {}
+        }
+    }
+
+    fn period(&self) -> Option<Nanos> {
+        self.stream.is_some().then_some(self.period)
+    }
+
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        if output != 0 {
+            return Err(EncodeError::Output(output));
+        }
+        match reading {
+            Reading::Wrench(wrench) => {
+                let ([fx, fy, fz], [tx, ty, tz]) = (wrench.force, wrench.torque);
+                let values = [fx, fy, fz, tx, ty, tz];
+                if !values.iter().all(|value| value.is_finite()) {
+                    return Err(EncodeError::NotFinite);
+                }
+                if !self.scale_known {
+                    return Err(EncodeError::NoFullScale);
+                }
+                let mut quality = quality;
+                let mut counts = [ZERO; 6];
+                for (axis, ((count, value), full_scale)) in
+                    (0..).zip(counts.iter_mut().zip(values).zip(self.full_scale))
+                {
+                    // With a full scale of zero (a corrupt memory) a board sends zero for any load.
+                    let per_step = if full_scale > 0.0 {
+                        full_scale / STEPS
+                    } else {
+                        f64::INFINITY
+                    };
+                    let steps =
+                        icub::quantise(value, per_step, i64::from(i32::MIN), i64::from(i32::MAX))
+                            + i64::from(ZERO);
+                    *count = u16::try_from(steps).unwrap_or_else(|_| {
+                        let high = steps > 0;
+                        quality = quality.with_saturation(
+                            axis,
+                            if high {
+                                Saturation::High
+                            } else {
+                                Saturation::Low
+                            },
+                        );
+                        if high { u16::MAX } else { 0 }
+                    });
+                }
+                let raw = counts;
+                if !quality.contains(Quality::SATURATED) {
+                    self.last_good = Some(counts);
+                } else if !quality.contains(Quality::FROZEN) {
+                    // (A reading with FROZEN is from a recording: it already is the last good
+                    // vector.)
+                    counts = self.last_good.unwrap_or(counts);
+                }
+                let saturation = saturation_bytes(quality);
+                // A board that was not started encodes a recording, in which a wrench is a
+                // calibrated reading.
+                let stream = self.stream.unwrap_or_default();
+                if stream != Stream::Uncalibrated {
+                    self.send(kind::FORCE, counts, saturation, out);
+                }
+                if stream != Stream::Calibrated {
+                    self.send(kind::RAW_FORCE, raw, saturation, out);
+                }
+            }
+            Reading::Gauges(gauges) => {
+                #[allow(clippy::cast_sign_loss, clippy::cast_possible_truncation)]
+                // limited to 16 bits
+                let counts = gauges
+                    .counts
+                    .map(|count| count.clamp(0, i32::from(u16::MAX)) as u16);
+                self.send(kind::RAW_FORCE, counts, saturation_bytes(quality), out);
+            }
+            Reading::Temperature(Temperature { celsius }) => {
+                if !celsius.is_finite() {
+                    return Err(EncodeError::NotFinite);
+                }
+                let [low, high] = icub::quantise_i16(*celsius, CELSIUS_PER_LSB).to_le_bytes();
+                let id = icub::stream(class::PERIODIC_ANALOG, self.address, kind::THERMOMETER);
+                let _ = out.try_push(Frame::new(id, &[1, low, high, 0, 0]));
+            }
+            Reading::Joint(_) | Reading::Imu(_) | Reading::Actuator(_) => {
+                return Err(EncodeError::Kind);
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,465 @@
+//! The host's side of an F/T board. It reads the full scales, starts the board, and combines the
+//! two halves of each reading.
+
+use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind};
+use super::options::{Options, Stream};
+use crate::icub::{self, Ask, Bringup, Inquiry, Paired, Pairing, class, command};
+use crate::{
+    Claim, Decoded, Device, Frame, Mode, Refusal, Spec, SpecError, State, Transmit, device,
+};
+use arrayvec::ArrayVec;
+use proprio_topics::{
+    Counter, Gauges, Kind, Nanos, Quality, Reading, StampKind, Temperature, Wrench,
+};
+
+/// The full scales: configured, requested axis by axis, or from replies to another program.
+#[derive(Debug)]
+struct FullScales {
+    /// The scale is configured, or not needed because only raw gauges are streamed: nothing to ask.
+    settled: bool,
+    /// N or Nm per step of the stream, once all six are known.
+    per_step: Option<[f64; 6]>,
+    told: [Option<u16>; 6],
+    refusal: Option<Refusal>,
+    address: u8,
+    /// The axis of the current question; 6: all answered.
+    axis: u8,
+    attempts: u8,
+    /// Earliest time of the next question.
+    ask_at: Nanos,
+    /// Questions per axis whose answers may still arrive, until `counts_until`.
+    open: [u8; 6],
+    counts_until: Nanos,
+}
+
+impl FullScales {
+    fn new(address: u8, configured: Option<[f64; 6]>, stream: Stream) -> Self {
+        Self {
+            settled: configured.is_some() || stream == Stream::Uncalibrated,
+            per_step: configured.map(|all| all.map(|full_scale| full_scale / STEPS)),
+            told: [None; 6],
+            refusal: None,
+            address,
+            axis: 0,
+            attempts: 0,
+            ask_at: Nanos::MIN,
+            open: [0; 6],
+            counts_until: Nanos::MIN,
+        }
+    }
+
+    /// Takes an answer of the board: `[18, axis, high, low]`.
+    fn answer(&mut self, data: &[u8], mode: Mode, frame: &Frame, out: &mut Decoded) {
+        let &[_, channel, high, low] = data else {
+            return out.fault(Counter::Length, 1, frame.id);
+        };
+        if channel >> 4 != 0 {
+            // This answer is about a stored regulation set, not the one in use.
+            if channel & 0xF > 5 || channel >> 4 > 3 {
+                out.fault(Counter::Value, 1, frame.id);
+            }
+            return;
+        }
+        let axis = usize::from(channel);
+        let (Some(told), Some(open)) = (self.told.get_mut(axis), self.open.get_mut(axis)) else {
+            return out.fault(Counter::Value, 1, frame.id);
+        };
+        let value = u16::from_be_bytes([high, low]);
+        let differs = told.is_some_and(|known| known != value);
+        if differs {
+            out.fault(Counter::Changed, 1, frame.id);
+        }
+        if mode == Mode::Supervise {
+            if *open == 0 || frame.t > self.counts_until {
+                return out.fault(Counter::Unexpected, 1, frame.id);
+            }
+            *open -= 1;
+        }
+        if self.settled || self.refusal == Some(Refusal::Changed) {
+            return;
+        }
+        if differs {
+            self.refusal = Some(Refusal::Changed);
+            self.per_step = None;
+            return;
+        }
+        if value == 0 {
+            self.refusal = Some(Refusal::ZeroFullScale { channel });
+            // Ask again slowly: the board may be repaired meanwhile.
+            self.attempts = icub::ATTEMPTS;
+            self.ask_at = frame.t + icub::SLOW_ATTEMPT;
+            return;
+        }
+        *told = Some(value);
+        if channel == self.axis {
+            self.axis += 1;
+            self.attempts = 0;
+            self.ask_at = Nanos::MIN;
+        }
+        match self.refusal {
+            Some(Refusal::ZeroFullScale { channel: refused }) if refused != channel => {}
+            _ => self.refusal = None,
+        }
+        if self.told.iter().all(Option::is_some) {
+            self.per_step = Some(self.told.map(|told| f64::from(told.unwrap_or(0)) / STEPS));
+            self.refusal = None;
+        }
+    }
+}
+
+impl Inquiry for FullScales {
+    fn begin(&mut self) {
+        self.axis = 0;
+        self.attempts = 0;
+        self.ask_at = Nanos::MIN;
+    }
+
+    fn poll(&mut self, now: Nanos) -> Ask {
+        if self.settled || self.axis > 5 {
+            return Ask::Done;
+        }
+        if self.refusal == Some(Refusal::Changed) || now < self.ask_at {
+            return Ask::Wait;
+        }
+        if self.attempts < icub::ATTEMPTS {
+            self.attempts += 1;
+            self.ask_at = now + icub::ANSWER_TIMEOUT;
+        } else {
+            if self.per_step.is_none() && self.refusal.is_none() {
+                self.refusal = Some(Refusal::NoFullScale);
+            }
+            self.ask_at = now + icub::SLOW_ATTEMPT;
+        }
+        if now > self.counts_until {
+            self.open = [0; 6];
+        }
+        if let Some(open) = self.open.get_mut(usize::from(self.axis)) {
+            *open = open.saturating_add(1);
+        }
+        self.counts_until = now + icub::ANSWER_COUNTS;
+        Ask::Send(Frame::new(
+            icub::to_board(class::POLLING_ANALOG, self.address),
+            &[command::GET_FULL_SCALES, self.axis],
+        ))
+    }
+
+    fn wake(&self) -> Option<Nanos> {
+        (self.refusal != Some(Refusal::Changed)).then_some(self.ask_at)
+    }
+
+    fn refusal(&self) -> Option<Refusal> {
+        self.refusal
+    }
+}
+
+/// Both halves of a reading.
+#[derive(Debug, Clone, Copy)]
+struct Whole {
+    acquired: Nanos,
+    stamp: StampKind,
+    first: Half,
+    second: Half,
+    quality: Quality,
+}
+
+/// One of the two streams: its halves, and whether a reading was lost since the last one.
+#[derive(Debug)]
+struct Pair {
+    pairing: Pairing<Half>,
+    gap: bool,
+}
+
+impl Pair {
+    const fn new(timeout: Nanos) -> Self {
+        Self {
+            pairing: Pairing::new(timeout, true),
+            gap: false,
+        }
+    }
+
+    /// Adds a half; returns both halves with their quality flags when complete.
+    fn push(
+        &mut self,
+        second: bool,
+        data: &[u8],
+        frame: &Frame,
+        out: &mut Decoded,
+    ) -> Option<Whole> {
+        let half = match Half::parse(data) {
+            Ok(half) => half,
+            Err(counter) => {
+                out.fault(counter, 1, frame.id);
+                self.gap = true;
+                return None;
+            }
+        };
+        let mut unpaired = 0;
+        let paired = self.pairing.push(second, frame, half, &mut unpaired);
+        if unpaired > 0 {
+            out.fault(Counter::Unpaired, unpaired, frame.id);
+            self.gap = true;
+        }
+        let Paired::With(acquired, stamp, first) = paired else {
+            return None;
+        };
+        let quality = half.mark(first.mark(Quality::GOOD, 0), 3);
+        Some(Whole {
+            acquired,
+            stamp,
+            first,
+            second: half,
+            quality,
+        })
+    }
+
+    /// GAP_BEFORE if something was lost since the last reading.
+    fn take_gap(&mut self) -> Quality {
+        if core::mem::take(&mut self.gap) {
+            Quality::GAP_BEFORE
+        } else {
+            Quality::GOOD
+        }
+    }
+}
+
+/// The host's side of an F/T board.
+#[derive(Debug)]
+pub struct Strain {
+    address: u8,
+    claims: ArrayVec<Claim, 7>,
+    bringup: Bringup,
+    scales: FullScales,
+    calibrated: Pair,
+    raw: Pair,
+    /// Whether there was a reading: from then on a restart leaves a gap.
+    seen: bool,
+}
+
+impl Strain {
+    /// A device in its initial state.
+    ///
+    /// # Errors
+    /// [`SpecError`]: an address outside 1 to 14, joints, a period or time out of range, a full
+    /// scale that is not positive or incomplete.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        let address = icub::address(spec)?;
+        icub::no_joints(spec)?;
+        let period = icub::period_ms("period_ms", options.period_ms)?;
+        let configured = options.full_scale(false)?;
+        let silence = icub::power_on_silence(options.power_on_silence_ms)?;
+        let timeout = match options.pair_timeout_ms {
+            None => Nanos::from_micros(i64::from(period) * 500),
+            Some(ms) if ms.is_finite() && ms > 0.0 && ms <= 1000.0 => {
+                Nanos::from_seconds(ms * 1e-3)
+            }
+            Some(value) => {
+                return Err(SpecError::Key {
+                    key: "pair_timeout_ms",
+                    value,
+                    expected: "above 0 and at most 1000",
+                });
+            }
+        };
+        let mode = if options.listen {
+            Mode::Listen
+        } else {
+            spec.mode
+        };
+        let (force, command_id) = (
+            icub::stream(class::PERIODIC_ANALOG, address, kind::FORCE),
+            icub::to_board(class::POLLING_ANALOG, address),
+        );
+        let watched = match options.stream {
+            Stream::Uncalibrated => icub::stream(class::PERIODIC_ANALOG, address, kind::RAW_FORCE),
+            Stream::Calibrated | Stream::Both => force,
+        };
+        let mut bringup = Bringup::new(spec, mode, silence, watched);
+        bringup.start_with(command_id, &[command::SET_CANDATARATE, period]);
+        if let Some(seconds) = options.temperature_period_s {
+            let seconds = icub::period_ms("temperature_period_s", seconds)?;
+            bringup.start_with(command_id, &[command::THERMOMETER_CONFIG_SET, 1]);
+            bringup.start_with(command_id, &[command::THERMOMETER_TRANSMIT, seconds]);
+            bringup.stop_with(command_id, &[command::THERMOMETER_TRANSMIT, 0]);
+        }
+        bringup.start_with(command_id, &[command::SET_TXMODE, options.stream.code()]);
+        bringup.stop_with(command_id, &[command::SET_TXMODE, 1]);
+        let mut claims: ArrayVec<Claim, 7> = icub::claims(
+            class::PERIODIC_ANALOG,
+            address,
+            &[
+                kind::FORCE,
+                kind::TORQUE,
+                kind::RAW_FORCE,
+                kind::RAW_TORQUE,
+                kind::THERMOMETER,
+                kind::THERMOMETER_FIRMWARE,
+            ],
+        );
+        claims.push(Claim::shared(icub::to_host(class::POLLING_ANALOG, address)));
+        Ok(Self {
+            address,
+            claims,
+            bringup,
+            scales: FullScales::new(address, configured, options.stream),
+            calibrated: Pair::new(timeout),
+            raw: Pair::new(timeout),
+            seen: false,
+        })
+    }
+
+    /// Outputs a reading from its two frames.
+    fn give(
+        &mut self,
+        whole: &Whole,
+        quality: Quality,
+        reading: Reading,
+        frame: &Frame,
+        out: &mut Decoded,
+    ) {
+        self.seen = true;
+        if quality.contains(Quality::SATURATED) {
+            out.fault(Counter::Saturated, 1, frame.id);
+        }
+        let gap = if self.bringup.reading(frame.t) {
+            Quality::GAP_BEFORE
+        } else {
+            Quality::GOOD
+        };
+        let output = device::Output {
+            output: 0,
+            acquired: whole.acquired,
+            stamp: whole.stamp,
+            device_counter: 0,
+            quality: quality | gap,
+            reading,
+        };
+        out.push(output, frame.id);
+    }
+
+    fn wrench(&mut self, second: bool, data: &[u8], frame: &Frame, out: &mut Decoded) {
+        let Some(whole) = self.calibrated.push(second, data, frame, out) else {
+            return;
+        };
+        let Some(per_step) = self.scales.per_step else {
+            if self.bringup.mode() == Mode::Listen
+                && !self.scales.settled
+                && self.scales.refusal.is_none()
+            {
+                // The board streams already, its scale is unknown, and no other program will
+                // request it for this host.
+                self.scales.refusal = Some(Refusal::NoFullScale);
+            }
+            return;
+        };
+        let [fx, fy, fz, tx, ty, tz] = per_step;
+        let value = |count: u16, per_step: f64| (f64::from(count) - f64::from(ZERO)) * per_step;
+        let ([a, b, c], [d, e, f]) = (whole.first.counts, whole.second.counts);
+        let reading = Reading::Wrench(Wrench {
+            force: [value(a, fx), value(b, fy), value(c, fz)],
+            torque: [value(d, tx), value(e, ty), value(f, tz)],
+        });
+        let frozen = if whole.quality.contains(Quality::SATURATED) {
+            Quality::FROZEN
+        } else {
+            Quality::GOOD
+        };
+        let quality = whole.quality | frozen | self.calibrated.take_gap();
+        self.give(&whole, quality, reading, frame, out);
+    }
+
+    fn gauges(&mut self, second: bool, data: &[u8], frame: &Frame, out: &mut Decoded) {
+        let Some(whole) = self.raw.push(second, data, frame, out) else {
+            return;
+        };
+        let ([a, b, c], [d, e, f]) = (whole.first.counts, whole.second.counts);
+        let reading = Reading::Gauges(Gauges {
+            counts: [a, b, c, d, e, f].map(i32::from),
+        });
+        let quality = whole.quality | self.raw.take_gap();
+        self.give(&whole, quality, reading, frame, out);
+    }
+}
+
+impl Device for Strain {
+    fn kind(&self) -> Kind {
+        Kind::Wrench
+    }
+
+    fn claims(&self) -> &[Claim] {
+        &self.claims
+    }
+
+    fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
+        if !self.bringup.active() {
+            return;
+        }
+        if let Some(stream) = icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address) {
+            let known = matches!(stream, kind::RAW_FORCE..=kind::TORQUE | kind::THERMOMETER..);
+            let Some(data) = known.then(|| icub::payload(frame, out)).flatten() else {
+                return;
+            };
+            match stream {
+                kind::FORCE => self.wrench(false, data, frame, out),
+                kind::TORQUE => self.wrench(true, data, frame, out),
+                kind::RAW_FORCE => self.gauges(false, data, frame, out),
+                kind::RAW_TORQUE => self.gauges(true, data, frame, out),
+                _ => temperature(data, frame, out),
+            }
+        } else if frame.id == icub::to_host(class::POLLING_ANALOG, self.address)
+            && let Some(data) = icub::payload(frame, out)
+        {
+            match data.first() {
+                Some(&command::GET_FULL_SCALES) => {
+                    self.scales.answer(data, self.bringup.mode(), frame, out);
+                }
+                // Answers to other questions are for other devices.
+                Some(_) => {}
+                None => out.fault(Counter::Length, 1, frame.id),
+            }
+        }
+    }
+
+    fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
+        self.bringup.poll(now, &mut self.scales, out)
+    }
+
+    fn next_wake(&self) -> Option<Nanos> {
+        self.bringup.next_wake(&self.scales)
+    }
+
+    fn state(&self) -> State {
+        self.bringup.state(&self.scales)
+    }
+
+    fn stop(&mut self, _now: Nanos) {
+        self.bringup.stop();
+    }
+
+    fn restart(&mut self, _now: Nanos) {
+        self.bringup.restart();
+        for pair in [&mut self.calibrated, &mut self.raw] {
+            pair.pairing.reset();
+            pair.gap |= self.seen;
+        }
+    }
+}
+
+/// The reading of a thermometer frame.
+fn temperature(data: &[u8], frame: &Frame, out: &mut Decoded) {
+    match *data {
+        [mask, _, _, _, _] if mask & 1 == 1 => {
+            let celsius = f64::from(icub::i16_le(data, 1)) * CELSIUS_PER_LSB;
+            let output = device::Output {
+                output: 0,
+                acquired: frame.t,
+                stamp: frame.stamp,
+                device_counter: 0,
+                quality: Quality::GOOD,
+                reading: Reading::Temperature(Temperature { celsius }),
+            };
+            out.push(output, frame.id);
+        }
+        [_, _, _, _, _] => out.fault(Counter::Value, 1, frame.id),
+        _ => out.fault(Counter::Length, 1, frame.id),
+    }
+}

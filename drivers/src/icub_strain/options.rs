@@ -1,0 +1,120 @@
+//! The keys of an F/T board in gateway.toml, for both sides of the driver.
+
+use crate::SpecError;
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer};
+
+/// The streamed quantities.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Stream {
+    /// Wrenches.
+    #[default]
+    Calibrated,
+    /// Raw gauges; needs no full scale.
+    Uncalibrated,
+    /// Both.
+    Both,
+}
+
+impl Stream {
+    /// The mode of SET_TXMODE.
+    pub(super) const fn code(self) -> u8 {
+        match self {
+            Self::Calibrated => 0,
+            Self::Uncalibrated => 3,
+            Self::Both => 4,
+        }
+    }
+
+    /// The stream of mode `code`; `None`: nothing is streamed.
+    pub(super) const fn from_code(code: u8) -> Option<Self> {
+        match code {
+            0 => Some(Self::Calibrated),
+            3 => Some(Self::Uncalibrated),
+            4 => Some(Self::Both),
+            _ => None,
+        }
+    }
+}
+
+/// Deserializes exactly three numbers; a plain array would ignore further ones.
+fn three<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<[f64; 3]>, D::Error> {
+    let numbers = alloc::vec::Vec::<f64>::deserialize(deserializer)?;
+    let three = <[f64; 3]>::try_from(numbers.as_slice());
+    three
+        .map(Some)
+        .map_err(|_| D::Error::invalid_length(numbers.len(), &"3 numbers"))
+}
+
+/// The keys of `driver = "icub_strain"`.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// Full scale of fx fy fz \[N\]; default: the board's own.
+    #[serde(deserialize_with = "three")]
+    pub full_scale_n: Option<[f64; 3]>,
+    /// Full scale of tx ty tz \[Nm\]; goes with `full_scale_n`.
+    #[serde(deserialize_with = "three")]
+    pub full_scale_nm: Option<[f64; 3]>,
+    /// Period \[ms\], 1 to 255; default 10.
+    pub period_ms: u32,
+    /// The streamed quantities; default calibrated.
+    pub stream: Stream,
+    /// Period of the temperature \[s\], 1 to 255; default none.
+    pub temperature_period_s: Option<u32>,
+    /// Longest time from a force frame to its torque frame \[ms\]; default half a period.
+    pub pair_timeout_ms: Option<f64>,
+    /// Silence kept after power-on \[ms\]; default 0.
+    pub power_on_silence_ms: u32,
+    /// Another program commands this board; default false.
+    pub listen: bool,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            full_scale_n: None,
+            full_scale_nm: None,
+            period_ms: 10,
+            stream: Stream::Calibrated,
+            temperature_period_s: None,
+            pair_timeout_ms: None,
+            power_on_silence_ms: 0,
+            listen: false,
+        }
+    }
+}
+
+impl Options {
+    /// The configured full scale, force then torque.
+    pub(super) fn full_scale(&self, zero_allowed: bool) -> Result<Option<[f64; 6]>, SpecError> {
+        let incomplete = |given, missing| Err(SpecError::Incomplete { given, missing });
+        let ([fx, fy, fz], [tx, ty, tz]) = match (self.full_scale_n, self.full_scale_nm) {
+            (None, None) => return Ok(None),
+            (Some(_), None) => return incomplete("full_scale_n", "full_scale_nm"),
+            (None, Some(_)) => return incomplete("full_scale_nm", "full_scale_n"),
+            (Some(force), Some(torque)) => (force, torque),
+        };
+        let all = [fx, fy, fz, tx, ty, tz];
+        for (axis, value) in all.into_iter().enumerate() {
+            // The upper limit is the largest value in the board's 16 bits.
+            let legal = value.is_finite()
+                && value <= f64::from(u16::MAX)
+                && (value > 0.0 || (zero_allowed && value == 0.0));
+            if !legal {
+                let key = if axis < 3 {
+                    "full_scale_n"
+                } else {
+                    "full_scale_nm"
+                };
+                return Err(SpecError::Key {
+                    key,
+                    value,
+                    expected: "above 0 and at most 65535",
+                });
+            }
+        }
+        Ok(Some(all))
+    }
+}

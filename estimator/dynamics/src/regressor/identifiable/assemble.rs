@@ -1,0 +1,529 @@
+//! Assembles an orthonormal basis of the whole identifiable subspace and its null vectors from the
+//! unobservable directions of each joint.
+//!
+//! The unknowns are *composites*: `theta_j` is the inertia of all bodies beyond joint `j`, frozen
+//! at the reference position, in the frame of its outer body. They are equivalent to the parameters
+//! of the links (`phi_p = theta_p - sum of theta_c, moved to p`), and the rows of each joint
+//! involve its own composite only. So the null space is a direct sum of pairs: `+theta` on the
+//! outer body of a joint, `-theta` moved to the inner body. Its complement is built from the leaves
+//! to the top. At each body ten directions are still open. The `n` null pairs of the joint towards
+//! the top involve `n` of them; the others are final.
+
+use nalgebra::{DMatrix, SMatrix, SymmetricEigen};
+
+use super::reach::{Span, coefficients};
+use crate::spatial::{Pose, RigidInertia};
+
+pub(super) type Matrix10 = SMatrix<f64, 10, 10>;
+
+/// Entries below this, relative to one, are rounding errors.
+const ROUNDING: f64 = 1e-13;
+
+/// Units in which geometry and motion are of order one; mass is in kg.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Scale {
+    /// [m]
+    pub(super) length: f64,
+    /// [m/s^2]
+    pub(super) acceleration: f64,
+}
+
+impl Scale {
+    /// Factor from a parameter in SI units to the scaled one.
+    fn parameter(&self, index: usize) -> f64 {
+        match index {
+            0 => 1.0,
+            1..=3 => 1.0 / self.length,
+            _ => 1.0 / (self.length * self.length),
+        }
+    }
+
+    /// Factor from a component of an offset, [torque; force], in SI units to the scaled one.
+    pub(super) fn offset(&self, component: usize) -> f64 {
+        if component < 3 {
+            1.0 / (self.acceleration * self.length)
+        } else {
+            1.0 / self.acceleration
+        }
+    }
+}
+
+/// The unobservable and observable parts, for the rows of one joint or of the top, of its composite
+/// `theta` and the offsets `O` beyond it; SI units, [torque; force].
+#[derive(Clone, Debug)]
+pub(super) struct Hidden {
+    /// Basis of the unobservable transfers, for any `O` that hides them, 10 x n: reduced to the
+    /// identity in the rows `pivots`.
+    pub(super) transfers: DMatrix<f64>,
+    pub(super) pivots: Vec<usize>,
+    /// With `theta = hiding * O` every row that involves `theta` vanishes.
+    hiding: SMatrix<f64, 10, 6>,
+    /// Independent rows on `O` alone.
+    offsets: Vec<[f64; 6]>,
+}
+
+impl Hidden {
+    pub(super) fn new(rows: &Span<16>, scale: &Scale, tolerance: f64) -> Self {
+        let mut rest: Vec<[f64; 16]> = rows.basis().iter().map(coefficients).collect();
+        // Gram-Schmidt on the parameter part, carrying the offset part along.
+        let inertial = |row: &[f64; 16]| row[..10].iter().map(|x| x * x).sum::<f64>();
+        let take_out = |row: &mut [f64; 16], unit: &[f64; 16]| {
+            let along: f64 = row[..10].iter().zip(&unit[..10]).map(|(a, b)| a * b).sum();
+            row.iter_mut().zip(unit).for_each(|(x, u)| *x -= along * u);
+        };
+        let mut kept: Vec<[f64; 16]> = Vec::new();
+        while kept.len() < 10
+            && let Some((most, _)) = rest
+                .iter()
+                .map(inertial)
+                .enumerate()
+                .max_by(|a, b| a.1.total_cmp(&b.1))
+        {
+            let mut unit = rest[most];
+            kept.iter().for_each(|old| take_out(&mut unit, old));
+            let norm = inertial(&unit).sqrt();
+            if norm <= tolerance {
+                break;
+            }
+            rest.swap_remove(most);
+            unit.iter_mut().for_each(|x| *x /= norm);
+            rest.iter_mut().for_each(|row| take_out(row, &unit));
+            kept.push(unit);
+        }
+        let offsets = rest
+            .iter()
+            .map(|row| std::array::from_fn(|i| clean(row[10 + i]) * scale.offset(i)))
+            .collect();
+
+        let rank = kept.len();
+        let inertial = DMatrix::from_fn(10, rank, |i, k| kept[k][i] * scale.parameter(i));
+        let (q, r) = householder(inertial);
+        let (transfers, pivots) = reduced(&q.columns(rank, 10 - rank).into_owned());
+        // The theta of least norm with inertial^T theta = -offset part.
+        let mut hiding = SMatrix::zeros();
+        for component in 0..6 {
+            let mut y: Vec<f64> = kept
+                .iter()
+                .map(|row| -clean(row[10 + component]) * scale.offset(component))
+                .collect();
+            for i in 0..rank {
+                let known: f64 = (0..i).map(|k| r[(k, i)] * y[k]).sum();
+                y[i] = (y[i] - known) / r[(i, i)];
+            }
+            for i in 0..10 {
+                hiding[(i, component)] = (0..rank).map(|k| q[(i, k)] * y[k]).sum();
+            }
+        }
+        Self {
+            transfers,
+            pivots,
+            hiding,
+            offsets,
+        }
+    }
+
+    pub(super) fn count(&self) -> usize {
+        self.pivots.len()
+    }
+}
+
+/// One body of a separately measured part of the robot.
+#[derive(Clone, Debug)]
+pub(super) struct Member {
+    /// Index of its block of ten columns: 0 for the first ten.
+    pub(super) block: usize,
+    /// Its inner member in the same part, and its pose in that member at the reference position;
+    /// `None` for a top.
+    pub(super) inner: Option<(usize, Pose)>,
+    pub(super) hidden: Hidden,
+    /// Offsets of sensors on this body: index of the six columns, and the 6 x 6 matrix that takes
+    /// them to wrenches in its frame.
+    pub(super) offsets: Vec<(usize, SMatrix<f64, 6, 6>)>,
+}
+
+/// Result of `assemble`.
+pub(super) struct Assembled {
+    /// Orthonormal columns.
+    pub(super) basis: DMatrix<f64>,
+    /// Sparse null vectors, each with its pivot: an entry 1 in a column that is zero in all earlier
+    /// null vectors.
+    pub(super) null: Vec<NullVector>,
+    /// Number of directions lost to the offsets.
+    pub(super) confused: usize,
+}
+
+/// A null vector: columns and entries, ascending; `pivot` is the column where its entry is 1.
+#[derive(Clone, Debug)]
+pub(super) struct NullVector {
+    pub(super) pivot: usize,
+    pub(super) entries: Vec<(usize, f64)>,
+}
+
+/// Assembles the members of all parts, each after its inner member and depth first, over
+/// `10 * members.len() + 6 * sensors` columns.
+pub(super) fn assemble(
+    members: &[Member],
+    sensors: usize,
+    scale: &Scale,
+    tolerance: f64,
+) -> Assembled {
+    let inertial = 10 * members.len();
+    let moved: Vec<Option<Matrix10>> = members
+        .iter()
+        .map(|member| member.inner.map(|(_, pose)| parameter_transform(&pose)))
+        .collect();
+    let mut null = null_pairs(members, &moved);
+    let rank = inertial - null.len();
+    let alone = complement(members, &moved, rank);
+    if sensors == 0 {
+        return Assembled {
+            basis: alone,
+            null,
+            confused: 0,
+        };
+    }
+
+    let count = 6 * sensors;
+    let (hiding, visible) = offset_maps(members, &moved, count);
+    // Rows on offsets alone, compared in scaled units; then made orthonormal in SI units.
+    let units: Vec<f64> = (0..count).map(|i| scale.offset(i % 6)).collect();
+    let found = independent_rows(visible, &units, tolerance);
+    let separate = found.len();
+    let (q, _) = householder(DMatrix::from_fn(count, separate, |i, k| found[k][i]));
+    let seen = q.columns(0, separate);
+    let unseen = q.columns(separate, count - separate).into_owned();
+    let (unseen, pivots) = reduced(&unseen);
+    for (k, &pivot) in pivots.iter().enumerate() {
+        let hidden = &hiding * unseen.column(k);
+        let parameters = hidden.iter().copied().enumerate();
+        let offsets = unseen.column(k);
+        let offsets = offsets.iter().enumerate().map(|(i, &x)| (inertial + i, x));
+        null.push(NullVector {
+            pivot: inertial + pivot,
+            entries: parameters
+                .chain(offsets)
+                .filter(|(_, x)| clean(*x) != 0.0)
+                .collect(),
+        });
+    }
+
+    // Rows [A | C] with A orthonormal: C follows from the null vectors (hiding o, o). The rows on
+    // offsets alone are subtracted, then the rows are made orthonormal: (1 + C C^T)^-1/2 = 1 + C
+    // g(C^T C) C^T with g(l) = -1 / (s (s + 1)), s = sqrt(1 + l).
+    let mut carried = -alone.tr_mul(&hiding);
+    let known = &carried * seen;
+    carried -= known * seen.transpose();
+    let mut basis = DMatrix::zeros(inertial + count, rank + separate);
+    basis.view_mut((0, 0), (inertial, rank)).copy_from(&alone);
+    if carried.iter().any(|x| clean(*x) != 0.0) {
+        let gram = carried.tr_mul(&carried);
+        let SymmetricEigen {
+            eigenvectors,
+            eigenvalues,
+        } = SymmetricEigen::new(gram.clone());
+        let g = eigenvalues.map(|value| {
+            let s = (1.0 + value.max(0.0)).sqrt();
+            -1.0 / (s * (s + 1.0))
+        });
+        let g = &eigenvectors * DMatrix::from_diagonal(&g) * eigenvectors.transpose();
+        let factor = g * carried.transpose();
+        let mut parameters = basis.view_mut((0, 0), (inertial, rank));
+        parameters += (&alone * &carried) * &factor;
+        let offsets = carried.transpose() + gram * factor;
+        basis
+            .view_mut((inertial, 0), (count, rank))
+            .copy_from(&offsets);
+    }
+    basis
+        .view_mut((inertial, rank), (count, separate))
+        .copy_from(&seen);
+    Assembled {
+        basis,
+        null,
+        confused: count - separate,
+    }
+}
+
+/// The pairs: a transfer on the outer body, its opposite on the inner.
+fn null_pairs(members: &[Member], moved: &[Option<Matrix10>]) -> Vec<NullVector> {
+    let mut null = Vec::new();
+    for (member, moved) in members.iter().zip(moved) {
+        for (k, &pivot) in member.hidden.pivots.iter().enumerate() {
+            let theta = member.hidden.transfers.column(k);
+            let mut entries: Vec<_> = theta
+                .iter()
+                .enumerate()
+                .map(|(i, &x)| (10 * member.block + i, x))
+                .collect();
+            if let (Some((inner, _)), Some(moved)) = (member.inner, moved) {
+                let opposite = -(moved * theta);
+                let first = 10 * members[inner].block;
+                entries.extend(opposite.iter().enumerate().map(|(i, &x)| (first + i, x)));
+            }
+            entries.retain(|(_, x)| clean(*x) != 0.0);
+            entries.sort_unstable_by_key(|&(column, _)| column);
+            null.push(NullVector {
+                pivot: 10 * member.block + pivot,
+                entries,
+            });
+        }
+    }
+    null
+}
+
+/// Orthonormal basis of the complement of all null pairs, `10 * members.len()` x `rank`.
+fn complement(members: &[Member], moved: &[Option<Matrix10>], rank: usize) -> DMatrix<f64> {
+    /// Data that a body passes to its inner body.
+    struct Open {
+        /// End of the range of members from this one on that are this one or beyond it.
+        end: usize,
+        /// Directions that its joint's null pairs involve, over ten entries per member beyond: 10
+        /// (end - member) x n.
+        directions: DMatrix<f64>,
+        /// The null pairs in these directions, n x n.
+        pairs: DMatrix<f64>,
+    }
+    let mut basis = DMatrix::zeros(10 * members.len(), rank);
+    let mut done = 0;
+    let mut open: Vec<Option<Open>> = members.iter().map(|_| None).collect();
+    let mut outer: Vec<Vec<usize>> = vec![Vec::new(); members.len()];
+    for (number, member) in members.iter().enumerate() {
+        if let Some((inner, _)) = member.inner {
+            outer[inner].push(number);
+        }
+    }
+    for (number, member) in members.iter().enumerate().rev() {
+        let beyond: Vec<(usize, Open)> = outer[number]
+            .iter()
+            .filter_map(|&child| open[child].take().map(|open| (child, open)))
+            .collect();
+        // Ten directions stay open throughout, at first the parameters of this body. The joints
+        // beyond are processed one by one: the null pairs of a joint, in these ten and in the
+        // directions passed up, remove as many directions as were passed up. One matrix for all
+        // joints would cost the third power of their number.
+        let mut own = DMatrix::identity(10, 10);
+        let mut turns = Vec::with_capacity(beyond.len());
+        for (child, open) in &beyond {
+            let n = open.pairs.ncols();
+            let mut local = DMatrix::zeros(10 + n, n);
+            if let Some(moved) = &moved[*child] {
+                let opposite = -(own.tr_mul(moved) * &members[*child].hidden.transfers);
+                local.rows_mut(0, 10).copy_from(&opposite);
+            }
+            local.rows_mut(10, n).copy_from(&open.pairs);
+            let (q, _) = householder(local);
+            let turn = q.view((0, n), (10, 10)).into_owned();
+            own *= &turn;
+            turns.push((turn, q.view((10, n), (n, 10)).into_owned()));
+        }
+        // The null pairs of the joint towards the top, or the unobservable directions of the top,
+        // among the ten directions still open.
+        let n = member.hidden.count();
+        let (mut turned, involved) = householder(own.tr_mul(&member.hidden.transfers));
+        own *= &turned;
+        let end = beyond
+            .iter()
+            .map(|(_, open)| open.end)
+            .max()
+            .unwrap_or(number + 1);
+        let finished = 10 - n;
+        let mut directions = DMatrix::zeros(10 * (end - number), n);
+        directions.rows_mut(0, 10).copy_from(&own.columns(0, n));
+        // The others are final.
+        let mut out = basis.columns_mut(done, finished);
+        out.rows_mut(10 * member.block, 10)
+            .copy_from(&own.columns(n, finished));
+        // The directions passed up by each joint are rotated with all joints after it.
+        for ((child, open), (turn, handed)) in beyond.iter().zip(&turns).rev() {
+            let part = &open.directions * (handed * &turned);
+            turned = turn * turned;
+            directions
+                .rows_mut(10 * (child - number), part.nrows())
+                .copy_from(&part.columns(0, n));
+            for (row, member) in members[*child..open.end].iter().enumerate() {
+                out.rows_mut(10 * member.block, 10)
+                    .copy_from(&part.view((10 * row, n), (10, finished)));
+            }
+        }
+        done += finished;
+        if member.inner.is_some() {
+            open[number] = Some(Open {
+                end,
+                directions,
+                pairs: involved,
+            });
+        }
+    }
+    basis
+}
+
+/// Per column of an offset, the parameters that hide it; and per row on offsets alone, its entries.
+fn offset_maps(
+    members: &[Member],
+    moved: &[Option<Matrix10>],
+    count: usize,
+) -> (DMatrix<f64>, Vec<Vec<f64>>) {
+    let mut hiding = DMatrix::zeros(10 * members.len(), count);
+    let mut rows = Vec::new();
+    // The offsets of the sensors at or beyond each member, as a wrench in its frame.
+    let mut beyond: Vec<Option<DMatrix<f64>>> = vec![None; members.len()];
+    for (number, member) in members.iter().enumerate().rev() {
+        for (sensor, carry) in &member.offsets {
+            let sum = beyond[number].get_or_insert_with(|| DMatrix::zeros(6, count));
+            let mut columns = sum.columns_mut(6 * sensor, 6);
+            columns += carry;
+        }
+        let Some(sum) = beyond[number].take() else {
+            continue;
+        };
+        for row in &member.hidden.offsets {
+            rows.push(
+                (0..count)
+                    .map(|k| (0..6).map(|i| row[i] * sum[(i, k)]).sum())
+                    .collect(),
+            );
+        }
+        let theta = member.hidden.hiding * &sum;
+        let mut own = hiding.rows_mut(10 * member.block, 10);
+        own += &theta;
+        if let (Some((inner, pose)), Some(moved)) = (member.inner, &moved[number]) {
+            let mut others = hiding.rows_mut(10 * members[inner].block, 10);
+            others -= moved * theta;
+            let at_inner = beyond[inner].get_or_insert_with(|| DMatrix::zeros(6, count));
+            *at_inner += wrench_transform(&pose) * sum;
+        }
+    }
+    (hiding, rows)
+}
+
+/// An independent subset with the same span. The remainder of a row after projection counts if its
+/// norm, with entries multiplied by 1 / `units`, exceeds `tolerance`.
+fn independent_rows(rows: Vec<Vec<f64>>, units: &[f64], tolerance: f64) -> Vec<Vec<f64>> {
+    let mut rest: Vec<Vec<f64>> = rows
+        .into_iter()
+        .map(|row| row.iter().zip(units).map(|(x, unit)| x / unit).collect())
+        .collect();
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let mut kept: Vec<Vec<f64>> = Vec::new();
+    while let Some((most, _)) = rest
+        .iter()
+        .map(|row| dot(row, row))
+        .enumerate()
+        .max_by(|a, b| a.1.total_cmp(&b.1))
+    {
+        let mut unit = rest.swap_remove(most);
+        for old in &kept {
+            let along = dot(&unit, old);
+            unit.iter_mut().zip(old).for_each(|(x, u)| *x -= along * u);
+        }
+        let norm = dot(&unit, &unit).sqrt();
+        if norm <= tolerance {
+            break;
+        }
+        unit.iter_mut().for_each(|x| *x /= norm);
+        for row in &mut rest {
+            let along = dot(row, &unit);
+            row.iter_mut().zip(&unit).for_each(|(x, u)| *x -= along * u);
+        }
+        kept.push(unit);
+    }
+    for row in &mut kept {
+        row.iter_mut().zip(units).for_each(|(x, unit)| *x *= unit);
+    }
+    kept
+}
+
+fn clean(x: f64) -> f64 {
+    if x.abs() < ROUNDING { 0.0 } else { x }
+}
+
+/// The matrix that takes the ten parameters of a body in `b` to those in `a`, given `x_ab`.
+fn parameter_transform(x_ab: &Pose) -> Matrix10 {
+    let mut matrix = Matrix10::zeros();
+    for k in 0..10 {
+        let mut unit = [0.0; 10];
+        unit[k] = 1.0;
+        let column = RigidInertia::from_parameters(&unit)
+            .transformed(x_ab)
+            .parameters();
+        matrix.set_column(k, &column.into());
+    }
+    matrix
+}
+
+/// The matrix that takes a wrench [torque; force] in `b` to `a`, given `x_ab`.
+pub(super) fn wrench_transform(x_ab: &Pose) -> SMatrix<f64, 6, 6> {
+    let r = &x_ab.rotation;
+    let mut matrix = SMatrix::<f64, 6, 6>::zeros();
+    matrix.fixed_view_mut::<3, 3>(0, 0).copy_from(r);
+    matrix.fixed_view_mut::<3, 3>(3, 3).copy_from(r);
+    matrix
+        .fixed_view_mut::<3, 3>(0, 3)
+        .copy_from(&(x_ab.translation.cross_matrix() * r));
+    matrix
+}
+
+/// Columns of the same span that are the identity in some rows, and these rows. The other entries
+/// stay small, because each step takes the row with the largest remainder, the first of equals.
+fn reduced(columns: &DMatrix<f64>) -> (DMatrix<f64>, Vec<usize>) {
+    let count = columns.ncols();
+    let mut rest = columns.clone();
+    let mut pivots = Vec::with_capacity(count);
+    for _ in 0..count {
+        let norms: Vec<f64> = rest.row_iter().map(|row| row.norm_squared()).collect();
+        let most = norms.iter().copied().fold(0.0, f64::max);
+        let pivot = norms
+            .iter()
+            .position(|&norm| norm >= most * (1.0 - 1e-6))
+            .unwrap_or(0);
+        pivots.push(pivot);
+        let unit = rest.row(pivot) / norms[pivot].sqrt();
+        for _ in 0..2 {
+            let along = &rest * unit.transpose();
+            rest -= along * &unit;
+        }
+        rest.row_mut(pivot).fill(0.0);
+    }
+    pivots.sort_unstable();
+    // Gauss-Jordan on the columns; these rows make it well-conditioned.
+    let mut out = columns.clone();
+    for (k, &pivot) in pivots.iter().enumerate() {
+        let most =
+            (k..count).max_by(|&a, &b| out[(pivot, a)].abs().total_cmp(&out[(pivot, b)].abs()));
+        out.swap_columns(k, most.unwrap_or(k));
+        let unit = out.column(k) / out[(pivot, k)];
+        let mut along = out.row(pivot).into_owned();
+        along[k] = 0.0;
+        out.ger(-1.0, &unit, &along.transpose(), 1.0);
+        out.set_column(k, &unit);
+        out.row_mut(pivot).fill(0.0);
+        out[(pivot, k)] = 1.0;
+    }
+    out.iter_mut().for_each(|x| *x = clean(*x));
+    (out, pivots)
+}
+
+/// Householder QR of a matrix with at least as many rows as columns: all of `Q`, square, and the
+/// square `R`.
+fn householder(mut a: DMatrix<f64>) -> (DMatrix<f64>, DMatrix<f64>) {
+    let (m, n) = a.shape();
+    let mut q = DMatrix::identity(m, m);
+    for k in 0..n {
+        let mut v = a.view((k, k), (m - k, 1)).into_owned();
+        let norm = v.norm();
+        if norm == 0.0 {
+            continue;
+        }
+        v[0] += norm.copysign(v[0]);
+        let norm = v.norm();
+        v /= norm;
+        let mut part = a.view_mut((k, k), (m - k, n - k));
+        let along = part.tr_mul(&v);
+        part.gemm(-2.0, &v, &along.transpose(), 1.0);
+        let mut part = q.columns_mut(k, m - k);
+        let along = &part * &v;
+        part.gemm(-2.0, &along, &v.transpose(), 1.0);
+    }
+    let r = a.rows(0, n).into_owned();
+    (q, r)
+}

@@ -1,0 +1,668 @@
+//! The six equations of every sub-tree as linear functions of parameters, sensor offsets and
+//! unknown contacts. Identification uses these equations.
+
+mod columns;
+
+use crate::regressor::subtree::columns::{contact_columns, put, wrench_columns};
+use nalgebra::{DMatrixView, Matrix6, Vector6};
+
+use crate::error::{DynamicsError, check_size};
+use crate::kinematics::{ExternalWrench, Kinematics, check_external, check_readings};
+use crate::least_squares::{LeastSquares, noise_factor, scale_factor};
+use crate::regressor::link::{WIDTH, WITH_FORCE, link_rows};
+use crate::regressor::tree::transposed_view;
+use crate::spatial::{Pose, Wrench};
+use crate::structure::{ContactSet, Structure};
+
+/// How forces are compared with torques when contact columns are eliminated. The remaining rows
+/// span the same space with either weighting: all rows to which no present contact contributes. The
+/// weighting chooses a basis of it, and so the weights of least squares on these rows. (Contacts
+/// count as dependent if a singular value of their columns, in the chosen weighting, is below 1e-8
+/// of the greatest. Near this limit the two weightings may disagree with each other and with the
+/// solver.)
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Weighting {
+    /// The noise of the sub-tree's F/T sensors: its rows are whitened, with unit covariance within
+    /// the sub-tree. (If the Cholesky factorisation of the covariance fails by rounding, only the
+    /// variances are used, as in the solver, and the covariance is only approximately unit.) A
+    /// sub-tree without sensors has no noise: it is treated as with `LengthScale`.
+    Noise,
+    /// The structure's length scale `d`, about the origin of the sub-tree's top link: rows `p` with
+    /// `p diag(d^2, d^2, d^2, 1, 1, 1) p'^T = 1 or 0`, orthonormal in newtons. They depend on that
+    /// point.
+    LengthScale,
+}
+
+/// A present contact and its columns.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PresentContact {
+    /// Its number in the structure.
+    pub contact: usize,
+    /// Its first column within the row of the sub-tree.
+    pub column: usize,
+    /// Number of its columns.
+    pub unknowns: usize,
+}
+
+/// One sub-tree's six equations, `[Y O -C] [phi; o; x] = measured`, at the origin and in the axes
+/// of its top link, rows [torque; force].
+///
+/// Columns of a row, in this order:
+/// - ten per link of the sub-tree ([`SubTreeRegressor::links`]): the net wrench of its links;
+/// - six per F/T sensor at its ends ([`SubTreeRegressor::sensors`]), its offset [torque; force] in
+///   its measurement frame;
+/// - those of each present contact ([`SubTreeRegressor::contacts`]), the unknown wrench on the
+///   link, in the axes of the contact's frame: [torque; force] at the frame's origin
+///   (`ContactKind::Wrench`); force at the contact's position (`Force`); its size along the
+///   direction (`ForceAlong`).
+#[derive(Clone, Debug)]
+pub struct SubTreeRegressor {
+    top: usize,
+    links: Vec<usize>,
+    /// Number of each sensor, and whether it is above the sub-tree.
+    sensors: Vec<(usize, bool)>,
+    contacts: Vec<PresentContact>,
+    /// Columns of links and offsets.
+    known: usize,
+    /// Columns of the present contacts.
+    unknown: usize,
+    /// Distance between rows: enough for the columns of all contacts.
+    stride: usize,
+    values: Vec<f64>,
+    measured: [f64; 6],
+    covariance: Matrix6<f64>,
+    least: LeastSquares,
+    /// The combinations of the six equations to which no contact contributes, their rows and right
+    /// sides, and their number.
+    projections: [[f64; 6]; 6],
+    projected: Vec<f64>,
+    projected_measured: [f64; 6],
+    remaining: usize,
+}
+
+impl SubTreeRegressor {
+    fn new(structure: &Structure, number: usize) -> Self {
+        let subtree = &structure.subtrees()[number];
+        let links: Vec<usize> = structure.links_of(number).collect();
+        let sensors: Vec<(usize, bool)> = subtree
+            .sensors
+            .iter()
+            .map(|sensor| {
+                (
+                    sensor,
+                    structure.sensors()[sensor].joint() + 1 == subtree.top,
+                )
+            })
+            .collect();
+        let known = WIDTH * links.len() + 6 * sensors.len();
+        let room = subtree
+            .contacts
+            .iter()
+            .map(|contact| structure.contacts()[contact].kind.unknowns())
+            .sum();
+        let stride = known + room;
+        Self {
+            top: subtree.top,
+            contacts: Vec::with_capacity(subtree.contacts.len()),
+            known,
+            unknown: 0,
+            stride,
+            values: vec![0.0; 6 * stride],
+            measured: [0.0; 6],
+            covariance: Matrix6::zeros(),
+            least: LeastSquares::with_capacity(room),
+            projections: [[0.0; 6]; 6],
+            projected: vec![0.0; 6 * known],
+            projected_measured: [0.0; 6],
+            remaining: 0,
+            links,
+            sensors,
+        }
+    }
+
+    /// The link at whose origin and in whose axes the six equations are written.
+    pub fn top(&self) -> usize {
+        self.top
+    }
+
+    /// Its links, ascending.
+    pub fn links(&self) -> &[usize] {
+        &self.links
+    }
+
+    /// The F/T sensors at its ends, ascending.
+    pub fn sensors(&self) -> impl ExactSizeIterator<Item = usize> {
+        self.sensors.iter().map(|&(sensor, _)| sensor)
+    }
+
+    /// Its contacts that were present at the last update, ascending.
+    pub fn contacts(&self) -> &[PresentContact] {
+        &self.contacts
+    }
+
+    /// Number of columns: `10 links + 6 sensors + unknowns of the present contacts`.
+    pub fn column_count(&self) -> usize {
+        self.known + self.unknown
+    }
+
+    /// First column of the sensors' offsets, after those of the links.
+    pub fn offset_column(&self) -> usize {
+        WIDTH * self.links.len()
+    }
+
+    /// First column of the contacts, after those of the offsets.
+    pub fn contact_column(&self) -> usize {
+        self.known
+    }
+
+    /// One of the six rows, [torque; force].
+    ///
+    /// # Panics
+    /// There is no such row.
+    pub fn row(&self, row: usize) -> &[f64] {
+        &self.values[self.stride * row..][..self.column_count()]
+    }
+
+    /// The six rows as the columns of a view.
+    pub fn transposed(&self) -> DMatrixView<'_, f64> {
+        transposed_view(&self.values, self.column_count(), 6, self.stride)
+    }
+
+    /// The right side: the raw readings of the sensors, as wrenches by the rest of the robot on
+    /// this sub-tree, and the known external wrenches.
+    pub fn measured(&self) -> &[f64; 6] {
+        &self.measured
+    }
+
+    /// Covariance of the six equations from F/T noise, rows and columns [torque; force]; zero
+    /// without sensors.
+    pub fn covariance(&self) -> &Matrix6<f64> {
+        &self.covariance
+    }
+
+    /// Number of rows that remain without contact columns: six minus the rank of these columns.
+    /// Zero before [`StackedRegressor::eliminate_contacts`].
+    pub fn remaining(&self) -> usize {
+        self.remaining
+    }
+
+    /// One of the remaining rows, over links and offsets only.
+    ///
+    /// # Panics
+    /// There is no such row; see [`SubTreeRegressor::remaining`].
+    pub fn projected_row(&self, row: usize) -> &[f64] {
+        assert!(row < self.remaining, "{} rows remain", self.remaining);
+        &self.projected[self.known * row..self.known * (row + 1)]
+    }
+
+    /// The combination `p` of the six equations that gives a remaining row:
+    /// `projected_row = p [Y O]`, and `p C = 0`.
+    ///
+    /// # Panics
+    /// There is no such row; see [`SubTreeRegressor::remaining`].
+    pub fn projection(&self, row: usize) -> &[f64; 6] {
+        &self.projections[..self.remaining][row]
+    }
+
+    /// Right sides of the remaining rows.
+    pub fn projected_measured(&self) -> &[f64] {
+        &self.projected_measured[..self.remaining]
+    }
+
+    fn update(
+        &mut self,
+        structure: &Structure,
+        kinematics: &Kinematics,
+        sensors: &[Signed],
+        active: &ContactSet,
+    ) {
+        let to_top = kinematics.pose(self.top).inverse();
+        let stride = self.stride;
+        for (place, &link) in self.links.iter().enumerate() {
+            let column = WIDTH * place;
+            // The pose of the top link is exactly the identity, without rounding from a transform
+            // to the base and back.
+            let x_tl = if link == self.top {
+                Pose::identity()
+            } else {
+                to_top * *kinematics.pose(link)
+            };
+            let rows = link_rows(&x_tl, kinematics.motion(link));
+            for (number, row) in rows.iter().enumerate() {
+                // The other columns of force rows are zero from the start.
+                let width = if number < 3 { WIDTH } else { WITH_FORCE };
+                self.values[number * stride + column..][..width].copy_from_slice(&row[..width]);
+            }
+        }
+        let mut column = WIDTH * self.links.len();
+        for &(sensor, is_above) in &self.sensors {
+            let Signed { child, x_cm, sign } = sensors[sensor];
+            // The child of a sensor's joint is the top of the sub-tree below the sensor.
+            let (x_tm, sign) = if is_above {
+                (x_cm, sign)
+            } else {
+                (to_top * *kinematics.pose(child) * x_cm, -sign)
+            };
+            wrench_columns(&x_tm, |unit| {
+                put(&mut self.values, stride, column, sign, &unit);
+                column += 1;
+            });
+        }
+        let subtree_contacts =
+            structure.subtrees()[structure.subtree_of(self.top).unwrap_or(0)].contacts;
+        self.contacts.clear();
+        for contact in subtree_contacts.intersection(active).iter() {
+            let spec = &structure.contacts()[contact];
+            let x_tf = to_top * *kinematics.pose(spec.frame.link) * spec.frame.pose;
+            let first = column;
+            contact_columns(spec, &x_tf, |unit| {
+                put(&mut self.values, stride, column, -1.0, &unit);
+                column += 1;
+            });
+            self.contacts.push(PresentContact {
+                contact,
+                column: first,
+                unknowns: column - first,
+            });
+        }
+        self.unknown = column - self.known;
+        self.remaining = 0;
+    }
+
+    /// Right side and covariance from raw readings and known wrenches, after the offset columns: a
+    /// reading enters as its offset does.
+    fn measure(
+        &mut self,
+        structure: &Structure,
+        kinematics: &Kinematics,
+        readings: &[Wrench],
+        external: &[ExternalWrench],
+        variances: &[[f64; 6]],
+    ) {
+        self.measured = [0.0; 6];
+        self.covariance = Matrix6::zeros();
+        for (place, &(sensor, _)) in self.sensors.iter().enumerate() {
+            let first = WIDTH * self.links.len() + 6 * place;
+            let reading = readings[sensor].torque_first();
+            for (channel, (value, variance)) in reading.iter().zip(&variances[sensor]).enumerate() {
+                let column =
+                    Vector6::from_fn(|row, _| self.values[row * self.stride + first + channel]);
+                for row in 0..6 {
+                    self.measured[row] += column[row] * value;
+                }
+                self.covariance += column * column.transpose() * *variance;
+            }
+        }
+        let number = structure.subtree_of(self.top);
+        for known in external {
+            if structure.subtree_of(known.frame.link) == number {
+                let in_top = kinematics
+                    .pose(self.top)
+                    .wrench_back(&known.in_base(kinematics));
+                for (sum, value) in self.measured.iter_mut().zip(in_top.torque_first()) {
+                    *sum += value;
+                }
+            }
+        }
+    }
+
+    fn eliminate(&mut self, structure: &Structure, weighting: Weighting) {
+        self.remaining = 0;
+        // With a full unknown wrench no row remains.
+        if self.contacts.iter().any(|contact| contact.unknowns == 6) {
+            return;
+        }
+        let length = structure.length_scale();
+        self.least.clear();
+        for present in &self.contacts {
+            for column in present.column..present.column + present.unknowns {
+                let unit = Vector6::from_fn(|row, _| self.values[row * self.stride + column]);
+                self.least.push(unit, 1.0);
+            }
+        }
+        let lower = match weighting {
+            Weighting::Noise if !self.sensors.is_empty() => noise_factor(self.covariance),
+            _ => scale_factor(length),
+        };
+        self.least.factorise(&lower);
+        for weights in self.least.complement() {
+            let out = &mut self.projected[self.known * self.remaining..][..self.known];
+            out.fill(0.0);
+            self.projected_measured[self.remaining] = 0.0;
+            for (number, &weight) in weights.iter().enumerate() {
+                let row = &self.values[number * self.stride..][..self.known];
+                for (sum, value) in out.iter_mut().zip(row) {
+                    *sum += weight * value;
+                }
+                self.projected_measured[self.remaining] += weight * self.measured[number];
+            }
+            self.projections[self.remaining] = weights.into();
+            self.remaining += 1;
+        }
+    }
+}
+
+/// A sensor's measurement frame in its child, and the sign with which its reading is the wrench by
+/// the parent on the child.
+#[derive(Clone, Copy, Debug)]
+struct Signed {
+    child: usize,
+    x_cm: Pose,
+    sign: f64,
+}
+
+/// The equations of all sub-trees of a structure.
+///
+/// Stacked, they are `6 K` rows over the columns
+/// `[10 N_B | 6 per sensor | unknowns of each present contact]`: links in the model's order,
+/// sensors in the structure's, contacts ascending. A link or a contact appears in one sub-tree
+/// only, a sensor's offset in the two that it separates.
+///
+/// # Noise between sub-trees
+/// A sensor is between two sub-trees, so its noise is in the equations of both, with opposite
+/// signs: the rows of neighbours are correlated, whitened or not. Least squares on all sub-trees
+/// needs the covariance of the whole stack ([`StackedRegressor::write_covariance`]), or of all rows
+/// that remain without contacts ([`StackedRegressor::write_projected_covariance`]). Rows of
+/// sub-trees that share no sensor are uncorrelated.
+///
+/// That covariance is singular if some combination of rows contains no sensor. Summed over all
+/// sub-trees, about one point, the six equations are those of the whole robot, where the wrench of
+/// every sensor cancels. These are six combinations without noise, so the covariance of the `6 K`
+/// equations of `K` sub-trees with `K - 1` sensors has rank `6 K - 6`. For the rows that remain
+/// without contacts the rank deficiency is `6 - r`, with `r` the rank of the columns of all present
+/// contacts together, about one point. It is zero as soon as one full wrench acts anywhere, or if
+/// the contacts would hold the robot if it were rigid. A combination without noise is an exact
+/// constraint on the parameters (of a robot in free fall, for example); its weight must come from
+/// another source, such as model errors.
+///
+/// The rows do not depend on the base of the kinematics. A sub-tree without sensors has its
+/// equations too; unless the robot is free, a contact (such as that of a fixed base) must be
+/// declared on it.
+#[derive(Clone, Debug)]
+pub struct StackedRegressor {
+    /// A copy, so that no call can pass a different structure.
+    structure: Structure,
+    subtrees: Vec<SubTreeRegressor>,
+    sensors: Vec<Signed>,
+    /// Variances of each sensor's channels [torque; force].
+    variances: Vec<[f64; 6]>,
+}
+
+impl StackedRegressor {
+    /// For a structure, of which it keeps a copy.
+    pub fn new(structure: &Structure) -> Self {
+        let sensors = structure.sensors();
+        Self {
+            subtrees: (0..structure.subtrees().len())
+                .map(|number| SubTreeRegressor::new(structure, number))
+                .collect(),
+            sensors: sensors
+                .iter()
+                .map(|cut| Signed {
+                    child: cut.joint() + 1,
+                    x_cm: *cut.pose(),
+                    sign: cut.sign(),
+                })
+                .collect(),
+            variances: sensors
+                .iter()
+                .map(|cut| {
+                    let noise = cut.noise();
+                    Wrench::from_parts(noise.force, noise.torque)
+                        .torque_first()
+                        .map(|deviation| deviation * deviation)
+                })
+                .collect(),
+            structure: structure.clone(),
+        }
+    }
+
+    /// Computes all rows, right sides and covariances. `readings` are the raw readings of the
+    /// structure's sensors, offsets *not* removed, in their measurement frames; contacts in
+    /// `active` are present; `external` wrenches are known.
+    ///
+    /// # Errors
+    /// Kinematics of a model with another number of links, wrong sizes, numbers that are not
+    /// finite. Nothing is changed in that case.
+    pub fn update(
+        &mut self,
+        kinematics: &Kinematics,
+        readings: &[Wrench],
+        active: &ContactSet,
+        external: &[ExternalWrench],
+    ) -> Result<(), DynamicsError> {
+        let (structure, links) = (&self.structure, self.structure.link_count());
+        check_size("links of the kinematics", kinematics.link_count(), links)?;
+        check_readings(readings, self.sensors.len())?;
+        check_external(external, links)?;
+        for subtree in &mut self.subtrees {
+            subtree.update(structure, kinematics, &self.sensors, active);
+            subtree.measure(structure, kinematics, readings, external, &self.variances);
+        }
+        Ok(())
+    }
+
+    /// Eliminates the contact columns from the rows of the last update: computes the combinations
+    /// of the six equations to which no present contact contributes, at most `6 - rank` per
+    /// sub-tree ([`SubTreeRegressor::projected_row`]). They are valid for any wrenches at the
+    /// contacts.
+    pub fn eliminate_contacts(&mut self, weighting: Weighting) {
+        for subtree in &mut self.subtrees {
+            subtree.eliminate(&self.structure, weighting);
+        }
+    }
+
+    /// The structure that it was made for.
+    pub fn structure(&self) -> &Structure {
+        &self.structure
+    }
+
+    /// The sub-trees, in the order of the structure.
+    pub fn subtrees(&self) -> &[SubTreeRegressor] {
+        &self.subtrees
+    }
+
+    /// Number of stacked rows, six per sub-tree.
+    pub fn row_count(&self) -> usize {
+        6 * self.subtrees.len()
+    }
+
+    /// First of the stacked columns of contacts, `10 N_B + 6 per sensor`: after those of all links
+    /// and offsets.
+    pub fn contact_column(&self) -> usize {
+        WIDTH * self.structure.link_count() + 6 * self.sensors.len()
+    }
+
+    /// Number of stacked columns:
+    /// `10 N_B + 6 per sensor + unknowns of the contacts present at the last update`.
+    pub fn column_count(&self) -> usize {
+        let unknown: usize = self.subtrees.iter().map(|subtree| subtree.unknown).sum();
+        self.contact_column() + unknown
+    }
+
+    /// Each present contact with its stacked columns, ascending.
+    pub fn contacts(&self) -> impl Iterator<Item = PresentContact> {
+        let present = |contact| {
+            let mut own = self.subtrees.iter().flat_map(|subtree| &subtree.contacts);
+            own.find(|present| present.contact == contact)
+        };
+        (0..self.structure.contacts().len())
+            .filter_map(present)
+            .scan(self.contact_column(), |column, present| {
+                let first = *column;
+                *column += present.unknowns;
+                Some(PresentContact {
+                    column: first,
+                    ..*present
+                })
+            })
+    }
+
+    /// Writes all rows, zeros included, one after the other into `out`: `row_count x column_count`
+    /// numbers.
+    ///
+    /// # Errors
+    /// The length of `out` is wrong. Nothing is changed in that case.
+    pub fn write_stacked(&self, out: &mut [f64]) -> Result<(), DynamicsError> {
+        let columns = self.column_count();
+        check_size(
+            "numbers of the stacked regressor",
+            out.len(),
+            self.row_count() * columns,
+        )?;
+        out.fill(0.0);
+        for (number, subtree) in self.subtrees.iter().enumerate() {
+            for row in 0..6 {
+                let (from, to) = (
+                    subtree.row(row),
+                    &mut out[(6 * number + row) * columns..][..columns],
+                );
+                spread(&self.structure, number, from, to);
+            }
+        }
+        for stacked in self.contacts() {
+            for (number, subtree) in self.subtrees.iter().enumerate() {
+                for own in subtree
+                    .contacts
+                    .iter()
+                    .filter(|own| own.contact == stacked.contact)
+                {
+                    for row in 0..6 {
+                        out[(6 * number + row) * columns + stacked.column..][..own.unknowns]
+                            .copy_from_slice(
+                                &subtree.row(row)[own.column..own.column + own.unknowns],
+                            );
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes the covariance of all stacked rows from F/T noise into `out`, `6 K x 6 K`, row by
+    /// row. Sub-trees that share a sensor are correlated: it enters the two with opposite signs.
+    ///
+    /// # Errors
+    /// The length of `out` is wrong. Nothing is changed in that case.
+    pub fn write_covariance(&self, out: &mut [f64]) -> Result<(), DynamicsError> {
+        check_size(
+            "numbers of the stacked covariance",
+            out.len(),
+            self.row_count() * self.row_count(),
+        )?;
+        self.covariance_of(|_| 6, SubTreeRegressor::row, out);
+        Ok(())
+    }
+
+    /// Number of rows that remain without contact columns, of all sub-trees. Zero before
+    /// [`StackedRegressor::eliminate_contacts`].
+    pub fn projected_row_count(&self) -> usize {
+        self.subtrees.iter().map(|subtree| subtree.remaining).sum()
+    }
+
+    /// Writes all rows that remain without contact columns, sub-tree by sub-tree, zeros included,
+    /// one after the other into `rows`: `projected_row_count x contact_column` numbers, over the
+    /// columns `[10 N_B | 6 per sensor]`; and their right sides into `measured`.
+    ///
+    /// # Errors
+    /// One of the two has the wrong length. Nothing is changed in that case.
+    pub fn write_projected(
+        &self,
+        rows: &mut [f64],
+        measured: &mut [f64],
+    ) -> Result<(), DynamicsError> {
+        let (count, columns) = (self.projected_row_count(), self.contact_column());
+        check_size("numbers of the projected rows", rows.len(), count * columns)?;
+        check_size("right sides of the projected rows", measured.len(), count)?;
+        rows.fill(0.0);
+        let mut next = 0;
+        for (number, subtree) in self.subtrees.iter().enumerate() {
+            for (row, value) in subtree.projected_measured().iter().enumerate() {
+                let to = &mut rows[columns * next..columns * (next + 1)];
+                spread(&self.structure, number, subtree.projected_row(row), to);
+                measured[next] = *value;
+                next += 1;
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes the covariance of the rows that remain without contact columns from F/T noise into
+    /// `out`, square, row by row. With [`Weighting::Noise`] it has identities on its diagonal, one
+    /// for each sub-tree with sensors; between sub-trees that share a sensor it is not zero.
+    ///
+    /// # Errors
+    /// The length of `out` is wrong. Nothing is changed in that case.
+    pub fn write_projected_covariance(&self, out: &mut [f64]) -> Result<(), DynamicsError> {
+        let count = self.projected_row_count();
+        check_size(
+            "numbers of the projected covariance",
+            out.len(),
+            count * count,
+        )?;
+        self.covariance_of(
+            SubTreeRegressor::remaining,
+            SubTreeRegressor::projected_row,
+            out,
+        );
+        Ok(())
+    }
+
+    /// Covariance of rows of each sub-tree, from their columns of offsets: noise enters as an
+    /// offset does.
+    fn covariance_of(
+        &self,
+        count: impl Fn(&SubTreeRegressor) -> usize,
+        row: impl for<'b> Fn(&'b SubTreeRegressor, usize) -> &'b [f64],
+        out: &mut [f64],
+    ) {
+        let rows: usize = self.subtrees.iter().map(&count).sum();
+        out.fill(0.0);
+        let mut top = 0;
+        for a in &self.subtrees {
+            let mut left = 0;
+            for b in &self.subtrees {
+                for (place_a, sensor) in a.sensors().enumerate() {
+                    let Some(place_b) = b.sensors().position(|other| other == sensor) else {
+                        continue;
+                    };
+                    let from_a = a.offset_column() + 6 * place_a;
+                    let from_b = b.offset_column() + 6 * place_b;
+                    for i in 0..count(a) {
+                        for j in 0..count(b) {
+                            let pairs = row(a, i)[from_a..from_a + 6]
+                                .iter()
+                                .zip(&row(b, j)[from_b..from_b + 6]);
+                            out[(top + i) * rows + left + j] += pairs
+                                .zip(&self.variances[sensor])
+                                .map(|((x, y), variance)| x * y * variance)
+                                .sum::<f64>();
+                        }
+                    }
+                }
+                left += count(b);
+            }
+            top += count(a);
+        }
+    }
+}
+
+/// Writes a row over the columns of a sub-tree's links and offsets to the stacked columns of all
+/// sub-trees. The contact columns that follow in the row are omitted; nothing else of `stacked` is
+/// written.
+pub(super) fn spread(structure: &Structure, subtree: usize, row: &[f64], stacked: &mut [f64]) {
+    let mut rest = row;
+    let mut put = |start: usize, width: usize| {
+        let (block, left) = rest.split_at(width);
+        stacked[start..start + width].copy_from_slice(block);
+        rest = left;
+    };
+    structure
+        .links_of(subtree)
+        .for_each(|link| put(WIDTH * link, WIDTH));
+    let offsets = WIDTH * structure.link_count();
+    let sensors = structure.subtrees()[subtree].sensors;
+    sensors
+        .iter()
+        .for_each(|sensor| put(offsets + 6 * sensor, 6));
+}

@@ -1,0 +1,701 @@
+//! The reordered recursive Newton-Euler algorithm: it computes joint torques and unknown contact
+//! wrenches from F/T readings.
+//!
+//! Per sub-tree, in base coordinates: sum the net wrenches of the links and subtract the wrenches
+//! of the F/T sensors and the known external wrenches. The sum over the whole sub-tree is the
+//! imbalance `b`; the sum over the links below joint `j` is `F_j`.
+//!
+//! ```text
+//! unknowns:  A x = b,  x = K b        weighted by C = sum over sensors of X Sigma X^T
+//! residual:  r = b - A K b            distributed over the sensors: e_k = C_k C^-1 r
+//! torque:    tau_j = s_j . (F_j - contacts and corrections below j) = s_j . F_j - h_j . b
+//! ```
+//!
+//! `K` is computed by `least_squares.rs`. The corrections `e_k` follow the noise of the sensors, so
+//! that the balance holds exactly.
+//!
+//! `h_j` depends on the side of the joint without unknown contacts ([`Route`]):
+//!
+//! - `0` from the side of the child;
+//! - `s_j` from that of the parent;
+//! - `C^-1 C_j s_j` fused;
+//! - `K^T A_j^T s_j + P C_j s_j` for the whole sub-tree, with `P = C^-1 (1 - A K)`. `A_j` and `C_j`
+//!   contain only the contacts and sensors below `j`.
+//!
+//! So the two sides of a joint give the same torque, and the noise of a torque is that of
+//! `s_j . F_j - h_j . b`: a sensor at `k` enters with the motion `h_j - [k below j] s_j`.
+//!
+//! Where both sides are usable, [`Sides`] has the two values; its documentation explains in what
+//! sense the fused torque is better than their mean.
+//!
+//! One full unknown wrench in a sub-tree, the paper's case, needs no linear solve: it is `b`, moved
+//! to the contact.
+
+mod estimates;
+
+pub use estimates::{Balance, Certainty, ContactEstimate, Disagreement, SideTorque, Sides};
+
+use nalgebra::{Matrix6, Vector6};
+
+use crate::error::{DynamicsError, check_size};
+use crate::kinematics::{ExternalWrench, Kinematics};
+use crate::kinematics::{check_external, check_readings};
+use crate::least_squares::{LeastSquares, noise_factor, scale_factor};
+use crate::model::Model;
+use crate::spatial::{Mat3, Motion, Pose, Vec3, Wrench, stack};
+use crate::structure::{ContactKind, ContactSet, ContactSpec, Route, SensorSet, Structure};
+
+/// A value counts as determined if at most this fraction of it comes from the least-norm choice.
+const UNDETERMINED: f64 = 1e-9;
+
+/// Torques and contact wrenches from F/T readings. It owns its results and all working storage.
+#[derive(Clone, Debug)]
+pub struct Solver {
+    // Results.
+    torque: Vec<f64>,
+    torque_deviation: Vec<f64>,
+    torque_certainty: Vec<Certainty>,
+    contacts: Vec<ContactEstimate>,
+    balances: Vec<Balance>,
+    // From `solve`, for `update_deviations` and `sides`, in base coordinates.
+    /// The contacts that were present; `None` before the first solution.
+    active: Option<ContactSet>,
+    /// Per link: `F_j`, the net wrench of it and of the links below it in its sub-tree, minus the
+    /// known wrenches.
+    wrenches: Vec<Wrench>,
+    axes: Vec<Motion>,
+    responses: Vec<Motion>,
+    gains: Vec<[Motion; 6]>,
+    sensor_poses: Vec<Pose>,
+    // Scratch.
+    least: LeastSquares,
+    columns: Vec<Vector6<f64>>,
+    owners: Vec<usize>,
+    starts: Vec<usize>,
+}
+
+impl Solver {
+    /// For a structure.
+    pub fn new(structure: &Structure) -> Self {
+        let (dofs, contacts) = (structure.dof_count(), structure.contacts().len());
+        let still = Motion::zero();
+        Self {
+            torque: vec![0.0; dofs],
+            torque_deviation: vec![0.0; dofs],
+            torque_certainty: vec![Certainty::Assumed; dofs],
+            contacts: vec![ContactEstimate::ABSENT; contacts],
+            balances: vec![
+                Balance {
+                    residual: Wrench::zero(),
+                    chi_square: None,
+                    degrees: 6
+                };
+                structure.subtrees().len()
+            ],
+            active: None,
+            wrenches: vec![Wrench::zero(); structure.link_count()],
+            axes: vec![still; dofs],
+            responses: vec![still; dofs],
+            gains: vec![[still; 6]; contacts],
+            sensor_poses: vec![Pose::identity(); structure.sensors().len()],
+            least: LeastSquares::with_capacity(6 * contacts),
+            columns: Vec::with_capacity(6 * contacts),
+            owners: Vec::with_capacity(6 * contacts),
+            starts: vec![0; contacts],
+        }
+    }
+
+    /// Solves all sub-trees. `readings` are those of the structure's sensors, offsets removed, in
+    /// their measurement frames; the contacts in `active` are present, the others are assumed
+    /// absent; `external` wrenches are known.
+    ///
+    /// Every set of contacts has a solution: least squares with fewer unknowns than equations,
+    /// least norm with more. [`Certainty`] states which values depend on the least-norm choice.
+    /// [`Balance`] has the part of the readings that no wrenches of the declared kinds explain.
+    /// Results are finite unless a number overflows (beyond about 1e100).
+    ///
+    /// # Errors
+    /// Objects made for another model or structure, wrong sizes, numbers that are not finite.
+    /// Results are unchanged in that case.
+    pub fn solve(
+        &mut self,
+        model: &Model,
+        structure: &Structure,
+        kinematics: &Kinematics,
+        readings: &[Wrench],
+        active: &ContactSet,
+        external: &[ExternalWrench],
+    ) -> Result<(), DynamicsError> {
+        check_size(
+            "links of the model",
+            model.link_count(),
+            self.wrenches.len(),
+        )?;
+        check_size(
+            "links of the kinematics",
+            kinematics.link_count(),
+            self.wrenches.len(),
+        )?;
+        self.check_structure(structure)?;
+        check_readings(readings, structure.sensors().len())?;
+        check_external(external, self.wrenches.len())?;
+
+        self.active = Some(*active);
+        self.wrenches.copy_from_slice(kinematics.net_wrenches());
+        for wrench in external {
+            self.wrenches[wrench.frame.link] -= wrench.in_base(kinematics);
+        }
+        for ((sensor, reading), x_bm) in structure
+            .sensors()
+            .iter()
+            .zip(readings)
+            .zip(&mut self.sensor_poses)
+        {
+            let child = sensor.joint() + 1;
+            let pose = kinematics.pose(child);
+            *x_bm = *pose * *sensor.pose();
+            let by_parent_on_child = pose.wrench(&sensor.transmitted(reading));
+            self.wrenches[child] -= by_parent_on_child;
+            self.wrenches[structure.places[child].parent] += by_parent_on_child;
+        }
+        for link in (1..self.wrenches.len()).rev() {
+            let place = &structure.places[link];
+            if !place.is_top {
+                let below = self.wrenches[link];
+                self.wrenches[place.parent] += below;
+            }
+        }
+        for number in 0..structure.subtrees().len() {
+            self.solve_subtree(number, model, structure, kinematics, active);
+        }
+        Ok(())
+    }
+
+    /// Checks that a structure has the sizes of the one that this was made for.
+    ///
+    /// # Errors
+    /// [`DynamicsError::Size`].
+    pub fn check_structure(&self, structure: &Structure) -> Result<(), DynamicsError> {
+        check_size(
+            "links of the structure",
+            structure.link_count(),
+            self.wrenches.len(),
+        )?;
+        check_size(
+            "degrees of freedom of the structure",
+            structure.dof_count(),
+            self.torque.len(),
+        )?;
+        check_size(
+            "contacts of the structure",
+            structure.contacts().len(),
+            self.contacts.len(),
+        )?;
+        check_size(
+            "sensors of the structure",
+            structure.sensors().len(),
+            self.sensor_poses.len(),
+        )?;
+        check_size(
+            "sub-trees of the structure",
+            structure.subtrees().len(),
+            self.balances.len(),
+        )
+    }
+
+    fn solve_subtree(
+        &mut self,
+        number: usize,
+        model: &Model,
+        structure: &Structure,
+        kinematics: &Kinematics,
+        active: &ContactSet,
+    ) {
+        let subtree = &structure.subtrees()[number];
+        let present = subtree.contacts.intersection(active);
+        for contact in subtree.contacts.difference(active).iter() {
+            self.contacts[contact] = ContactEstimate::ABSENT;
+            self.gains[contact] = [Motion::zero(); 6];
+        }
+        let b = self.wrenches[subtree.top];
+        let single = match (present.iter().next(), present.len()) {
+            (Some(contact), 1) if structure.contacts()[contact].kind == ContactKind::Wrench => {
+                Some(contact)
+            }
+            _ => None,
+        };
+        // The weight of the residual, and the point about which the six equations are written; a
+        // single full wrench needs neither.
+        let mut unexplained = None;
+        let mut point = Vec3::zeros();
+        if let Some(contact) = single {
+            let spec = &structure.contacts()[contact];
+            let x_bf = contact_pose(spec, kinematics);
+            self.contacts[contact] = ContactEstimate {
+                wrench: x_bf.wrench_back(&b),
+                deviation: [0.0; 6],
+                certainty: Certainty::Determined,
+            };
+            for axis in 0..3 {
+                let direction = x_bf.rotation.column(axis).into_owned();
+                self.gains[contact][axis] = Motion::translation(&direction);
+                self.gains[contact][axis + 3] = Motion::rotation(&direction, &x_bf.translation);
+            }
+            self.balances[number] = Balance {
+                residual: Wrench::zero(),
+                chi_square: None,
+                degrees: 0,
+            };
+            if !subtree.sensors.is_empty() {
+                self.balances[number].chi_square = Some(0.0);
+            }
+        } else {
+            point = self.reference_point(structure, kinematics, &subtree.sensors, &present);
+            unexplained = self.solve_unknowns(number, structure, kinematics, &present, &point);
+        }
+
+        for link in structure.links_of(number) {
+            if link == subtree.top {
+                continue;
+            }
+            let joint = &model.joints()[link - 1];
+            let (Some(dof), Some(axis)) = (joint.dof, kinematics.joint_axis(joint)) else {
+                continue;
+            };
+            let route = structure.route_above(link, active);
+            let mut certainty = Certainty::Determined;
+            let response = match route {
+                Route::Child => {
+                    if present.is_empty() && subtree.sensors.is_empty() {
+                        certainty = Certainty::Assumed;
+                    }
+                    Motion::zero()
+                }
+                Route::Parent => axis,
+                Route::Fused | Route::Whole => {
+                    let place = &structure.places[link];
+                    let about_point = Motion {
+                        angular: axis.angular,
+                        linear: axis.linear - point.cross(&axis.angular),
+                    };
+                    let s = stack(&about_point.angular, &about_point.linear);
+                    let mut h = Vector6::zeros();
+                    if let Some(weight) = &unexplained {
+                        let mut noise = Wrench::zero();
+                        for sensor in place.sensors_below.iter() {
+                            let x_bm = &self.sensor_poses[sensor];
+                            let scaled = structure.sensors()[sensor]
+                                .covariance_times(&x_bm.twist_back(&axis));
+                            noise += x_bm.wrench(&scaled);
+                        }
+                        let noise = noise.about(&point);
+                        h += weight * stack(&noise.torque, &noise.force);
+                    }
+                    if route == Route::Whole {
+                        let below = |j: usize| place.contacts_below.contains(self.owners[j]);
+                        for (j, column) in self.columns.iter().enumerate() {
+                            if below(j) {
+                                h += self.least.gain(j) * column.dot(&s);
+                            }
+                        }
+                        let gradient = |j: usize| {
+                            let column = &self.columns[j];
+                            if below(j) {
+                                (column.dot(&s), column.abs().dot(&s.abs()))
+                            } else {
+                                (0.0, 0.0)
+                            }
+                        };
+                        let balanced = self.least.rank() == 6 || unexplained.is_some();
+                        if !(balanced && self.least.determines(gradient, UNDETERMINED)) {
+                            certainty = Certainty::Assumed;
+                        }
+                    }
+                    about_origin(&h, &point)
+                }
+            };
+            self.torque[dof] = match route {
+                Route::Child => axis.dot(&self.wrenches[link]),
+                Route::Parent => axis.dot(&(self.wrenches[link] - b)),
+                _ => axis.dot(&self.wrenches[link]) - response.dot(&b),
+            };
+            self.torque_certainty[dof] = certainty;
+            self.axes[dof] = axis;
+            self.responses[dof] = response;
+        }
+    }
+
+    /// Mean position of the sensors, or of the contacts if there is no sensor: near them the
+    /// covariance is best conditioned. Their order matters only by rounding.
+    fn reference_point(
+        &self,
+        structure: &Structure,
+        kinematics: &Kinematics,
+        sensors: &ContactSet,
+        present: &ContactSet,
+    ) -> Vec3 {
+        let mean = |sum: Vec3, count: usize| if count == 0 { sum } else { sum / count as f64 };
+        if sensors.is_empty() {
+            let sum = present.iter().fold(Vec3::zeros(), |sum, contact| {
+                let spec = &structure.contacts()[contact];
+                sum + contact_pose(spec, kinematics).point(&spec.position)
+            });
+            mean(sum, present.len())
+        } else {
+            mean(
+                sensors.iter().fold(Vec3::zeros(), |sum, k| {
+                    sum + self.sensor_poses[k].translation
+                }),
+                sensors.len(),
+            )
+        }
+    }
+
+    /// Solves any set of contacts: least squares of least norm. Returns the weight of the residual,
+    /// if there are sensors over which to distribute it.
+    fn solve_unknowns(
+        &mut self,
+        number: usize,
+        structure: &Structure,
+        kinematics: &Kinematics,
+        present: &ContactSet,
+        point: &Vec3,
+    ) -> Option<Matrix6<f64>> {
+        let subtree = &structure.subtrees()[number];
+        let length = structure.length_scale;
+        self.least.clear();
+        self.columns.clear();
+        self.owners.clear();
+        for contact in present.iter() {
+            let spec = &structure.contacts()[contact];
+            self.starts[contact] = self.columns.len();
+            for (column, weight) in unknowns(spec, kinematics, point, length) {
+                self.columns.push(column);
+                self.owners.push(contact);
+                self.least.push(column, weight);
+            }
+        }
+
+        let measured = !subtree.sensors.is_empty();
+        let lower = measured.then(|| noise_factor(self.noise(structure, number, point)));
+        // Without sensors there is no covariance: the equations are weighted by the length scale,
+        // about the contacts.
+        let lower = lower.unwrap_or_else(|| scale_factor(length));
+        self.least.factorise(&lower);
+
+        let b = self.wrenches[subtree.top].about(point);
+        let b = stack(&b.torque, &b.force);
+        let mut residual = b;
+        for contact in present.iter() {
+            let spec = &structure.contacts()[contact];
+            let start = self.starts[contact];
+            let mut determined = self.least.rank() == 6 || measured;
+            // Force and torque about the contact's position, each as a motion whose product with b
+            // gives it.
+            let mut rows = [Vector6::zeros(); 6];
+            for i in 0..spec.kind.unknowns() {
+                let gain = self.least.gain(start + i);
+                residual -= self.columns[start + i] * gain.dot(&b);
+                determined &= self.least.determines(
+                    |j| {
+                        if j == start + i {
+                            (1.0, 1.0)
+                        } else {
+                            (0.0, 0.0)
+                        }
+                    },
+                    UNDETERMINED,
+                );
+                if let ContactKind::ForceAlong(direction) = spec.kind {
+                    (0..3).for_each(|axis| rows[axis] = gain * direction[axis]);
+                } else {
+                    rows[i] = gain;
+                }
+            }
+            // Torque from the contact's position to the frame's origin: n + position x f.
+            let p = &spec.position;
+            let force = [rows[0], rows[1], rows[2]];
+            for axis in 0..3 {
+                let (next, last) = ((axis + 1) % 3, (axis + 2) % 3);
+                rows[axis + 3] += force[last] * p[next] - force[next] * p[last];
+            }
+            let value = rows.map(|row| row.dot(&b));
+            self.contacts[contact] = ContactEstimate {
+                wrench: Wrench::from_parts(
+                    [value[0], value[1], value[2]],
+                    [value[3], value[4], value[5]],
+                ),
+                deviation: [0.0; 6],
+                certainty: if determined {
+                    Certainty::Determined
+                } else {
+                    Certainty::Assumed
+                },
+            };
+            self.gains[contact] = rows.map(|row| about_origin(&row, point));
+        }
+
+        let weight = self.least.unexplained();
+        let residual = Wrench {
+            torque: residual.fixed_rows::<3>(0).into_owned(),
+            force: residual.fixed_rows::<3>(3).into_owned(),
+        };
+        // From the reference point to base coordinates, then to the top link.
+        let residual = kinematics
+            .pose(subtree.top)
+            .wrench_back(&residual.about(&-point));
+        let chi_square = measured.then(|| (weight * b).dot(&b));
+        self.balances[number] = Balance {
+            residual,
+            chi_square,
+            degrees: 6 - self.least.rank(),
+        };
+        measured.then_some(weight)
+    }
+
+    /// Computes the standard deviations of torques and contact wrenches that F/T noise causes, for
+    /// the last solution. Inertial parameters are taken as exact; so are the least-norm choice and
+    /// the declared absence of a contact.
+    ///
+    /// # Errors
+    /// The structure is not the one that was solved.
+    pub fn update_deviations(&mut self, structure: &Structure) -> Result<(), DynamicsError> {
+        self.check_structure(structure)?;
+        let Self {
+            sensor_poses,
+            axes,
+            responses,
+            gains,
+            torque_deviation,
+            contacts,
+            ..
+        } = self;
+        let variance = |sensor: usize, motion: &Motion| {
+            variance(structure, sensor, &sensor_poses[sensor], motion)
+        };
+        for link in 1..structure.link_count() {
+            let Some(dof) = structure.dof_of(link) else {
+                continue;
+            };
+            let place = &structure.places[link];
+            let (s, h) = (axes[dof], responses[dof]);
+            let mut sum = 0.0;
+            for sensor in structure.subtrees()[place.subtree].sensors.iter() {
+                let motion = if place.sensors_below.contains(sensor) {
+                    h - s
+                } else {
+                    h
+                };
+                sum += variance(sensor, &motion);
+            }
+            torque_deviation[dof] = sum.sqrt();
+        }
+        for subtree in structure.subtrees() {
+            for contact in subtree.contacts.iter() {
+                let rows = &gains[contact];
+                contacts[contact].deviation = rows.map(|row| {
+                    subtree
+                        .sensors
+                        .iter()
+                        .map(|sensor| variance(sensor, &row))
+                        .sum::<f64>()
+                        .sqrt()
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// The torque of a degree of freedom from either side of its joint, in the last solution:
+    /// `s . F_j` and `s . (F_j - b)`, each with the standard deviation from F/T noise. Where
+    /// [`Route`] is `Child` or `Parent`, that side's torque equals [`Solver::torque`] to the last
+    /// bit. Where it is `Fused`, both sides exist and the torque is a weighted mean (see
+    /// [`Sides`]). Neither side exists before the first solution, or if there is no such degree of
+    /// freedom.
+    ///
+    /// All cost is in the call. It does not need [`Solver::update_deviations`].
+    ///
+    /// # Errors
+    /// The structure is not the one that was solved.
+    pub fn sides(&self, structure: &Structure, dof: usize) -> Result<Sides, DynamicsError> {
+        self.check_structure(structure)?;
+        let (Some(active), Some(link)) = (&self.active, structure.link_of(dof)) else {
+            return Ok(Sides::default());
+        };
+        let place = &structure.places[link];
+        let subtree = &structure.subtrees()[place.subtree];
+        let (axis, below) = (&self.axes[dof], self.wrenches[link]);
+        let side = |contacts: &ContactSet, sensors: SensorSet, wrench: Wrench| {
+            contacts
+                .intersection(active)
+                .is_empty()
+                .then(|| SideTorque {
+                    torque: axis.dot(&wrench),
+                    deviation: sensors
+                        .iter()
+                        .map(|sensor| variance(structure, sensor, &self.sensor_poses[sensor], axis))
+                        .sum::<f64>()
+                        .sqrt(),
+                    sensors,
+                })
+        };
+        Ok(Sides {
+            child: side(&place.contacts_below, place.sensors_below, below),
+            parent: side(
+                &subtree.contacts.difference(&place.contacts_below),
+                subtree.sensors.difference(&place.sensors_below),
+                below - self.wrenches[subtree.top],
+            ),
+        })
+    }
+
+    /// `s_j` and `h_j` of the last solution, in base coordinates: `tau_j = s_j . F_j - h_j . b`
+    /// (see the top of this file).
+    pub fn torque_motions(&self, dof: usize) -> (&Motion, &Motion) {
+        (&self.axes[dof], &self.responses[dof])
+    }
+
+    /// Rows `k` of the last solution in base coordinates, `x_i = k_i . b`, force first, as the
+    /// contact's wrench is reported.
+    pub fn contact_motions(&self, contact: usize) -> &[Motion; 6] {
+        &self.gains[contact]
+    }
+
+    /// Imbalance `b` of a sub-tree, in base coordinates: the net wrenches of its links minus its
+    /// sensors' and the known external wrenches, without contacts.
+    pub fn imbalance(&self, structure: &Structure, number: usize) -> Wrench {
+        self.wrenches[structure.subtrees()[number].top]
+    }
+
+    /// Covariance of `b` [torque; force] from F/T noise, about `point`.
+    pub fn noise(&self, structure: &Structure, number: usize, point: &Vec3) -> Matrix6<f64> {
+        let mut covariance = Matrix6::zeros();
+        for sensor in structure.subtrees()[number].sensors.iter() {
+            add_covariance(
+                &mut covariance,
+                structure,
+                sensor,
+                &self.sensor_poses[sensor],
+                point,
+            );
+        }
+        covariance
+    }
+
+    /// Whether the last solution is for these kinematics, judged by the poses of the F/T sensors.
+    /// False before the first solution.
+    pub fn is_solved(&self, structure: &Structure, kinematics: &Kinematics) -> bool {
+        // The same product of the same numbers has the same bits.
+        let mut poses = structure.sensors().iter().zip(&self.sensor_poses);
+        self.active.is_some()
+            && poses.all(|(sensor, x_bm)| {
+                *kinematics.pose(sensor.joint() + 1) * *sensor.pose() == *x_bm
+            })
+    }
+
+    /// Measurement frame of a sensor in base coordinates, `x_bm`, at the last solution.
+    pub fn sensor_pose(&self, sensor: usize) -> &Pose {
+        &self.sensor_poses[sensor]
+    }
+
+    /// Joint torques [Nm or N], by degree of freedom: along the URDF axis, exerted by the parent on
+    /// the child, on the link side.
+    pub fn torque(&self) -> &[f64] {
+        &self.torque
+    }
+
+    /// Standard deviations of the torques from F/T noise [Nm or N]; see
+    /// [`Solver::update_deviations`]. Zero where no sensor's reading enters: at a free end, or in a
+    /// sub-tree without sensors. The error of the torque is unknown there, and
+    /// [`Structure::torque_dependence`] names no sensor.
+    pub fn torque_deviation(&self) -> &[f64] {
+        &self.torque_deviation
+    }
+
+    /// The basis of each torque.
+    pub fn torque_certainty(&self) -> &[Certainty] {
+        &self.torque_certainty
+    }
+
+    /// The contact estimates, in the order of the structure's contacts.
+    pub fn contacts(&self) -> &[ContactEstimate] {
+        &self.contacts
+    }
+
+    /// The balance of each sub-tree, in the order of the structure's sub-trees.
+    pub fn balances(&self) -> &[Balance] {
+        &self.balances
+    }
+}
+
+/// Variance that a sensor at `x_bm` adds to `motion . wrench`.
+#[inline]
+fn variance(structure: &Structure, sensor: usize, x_bm: &Pose, motion: &Motion) -> f64 {
+    let in_sensor = x_bm.twist_back(motion);
+    in_sensor.dot(&structure.sensors()[sensor].covariance_times(&in_sensor))
+}
+
+fn contact_pose(spec: &ContactSpec, kinematics: &Kinematics) -> Pose {
+    *kinematics.pose(spec.frame.link) * spec.frame.pose
+}
+
+/// The columns [torque; force] about `point` of the unknowns of a contact, and their weights in the
+/// least norm: forces and torques at its position, along the axes of its frame.
+pub fn unknowns(
+    spec: &ContactSpec,
+    kinematics: &Kinematics,
+    point: &Vec3,
+    length: f64,
+) -> arrayvec::ArrayVec<(Vector6<f64>, f64), 6> {
+    let x_bf = contact_pose(spec, kinematics);
+    let arm = x_bf.point(&spec.position) - point;
+    let force = |direction: Vec3| (stack(&arm.cross(&direction), &direction), 1.0);
+    let torque = |direction: Vec3| (stack(&direction, &Vec3::zeros()), length);
+    let axis = |i: usize| x_bf.rotation.column(i).into_owned();
+    match spec.kind {
+        ContactKind::Wrench => (0..3)
+            .map(|i| force(axis(i)))
+            .chain((0..3).map(|i| torque(axis(i))))
+            .collect(),
+        ContactKind::Force => (0..3).map(|i| force(axis(i))).collect(),
+        ContactKind::ForceAlong(direction) => {
+            std::iter::once(force(x_bf.rotation * direction)).collect()
+        }
+    }
+}
+
+/// A row of motion coordinates about `point`, as a motion about the origin.
+fn about_origin(row: &Vector6<f64>, point: &Vec3) -> Motion {
+    let angular = row.fixed_rows::<3>(0).into_owned();
+    Motion {
+        angular,
+        linear: row.fixed_rows::<3>(3) + point.cross(&angular),
+    }
+}
+
+/// Adds `X Sigma X^T` of a sensor, about `point`.
+fn add_covariance(
+    covariance: &mut Matrix6<f64>,
+    structure: &Structure,
+    sensor: usize,
+    x_bm: &Pose,
+    point: &Vec3,
+) {
+    let (r, cut) = (&x_bm.rotation, &structure.sensors()[sensor]);
+    let units = cut.covariance_times(&Motion {
+        angular: Vec3::repeat(1.0),
+        linear: Vec3::repeat(1.0),
+    });
+    let turned = |variances: &Vec3| r * Mat3::from_diagonal(variances) * r.transpose();
+    let (torque, force) = (turned(&units.torque), turned(&units.force));
+    let arm = (x_bm.translation - point).cross_matrix();
+    let mixed = arm * force;
+    let mut add = |row: usize, column: usize, block: &Mat3| {
+        let mut view = covariance.fixed_view_mut::<3, 3>(row, column);
+        view += block;
+    };
+    add(0, 0, &(torque + mixed * arm.transpose()));
+    add(0, 3, &mixed);
+    add(3, 0, &mixed.transpose());
+    add(3, 3, &force);
+}

@@ -1,0 +1,563 @@
+//! The model: folding, numbering, sensor elements, and the message for each kind of error in a
+//! URDF.
+
+mod common;
+
+use common::{Random, RandomRobot};
+use proprio_dynamics::model::{
+    AxisKind, JointKind, MeasurementDirection, MeasurementFrame, Model, ModelError,
+};
+use proprio_dynamics::spatial::{Pose, RigidInertia, Vec3};
+use proptest::prelude::*;
+
+const INERTIAL: &str = "<inertial><origin xyz=\"0.1 0 0\"/><mass value=\"2\"/>\
+                        <inertia ixx=\"0.02\" ixy=\"0.001\" ixz=\"0\" iyy=\"0.03\" iyz=\"0\" \
+                        izz=\"0.04\"/></inertial>";
+
+/// base -(turn)- arm -(grip, fixed)- tool -(slide)- finger, with massless frames.
+fn robot() -> String {
+    format!(
+        "<robot name=\"r\">
+         <link name=\"base\">{INERTIAL}</link>
+         <link name=\"arm\">{INERTIAL}</link>
+         <link name=\"tool\">{INERTIAL}</link>
+         <link name=\"finger\">{INERTIAL}</link>
+         <link name=\"tip\"/>
+         <joint name=\"slide\" type=\"prismatic\"><parent link=\"tool\"/><child link=\"finger\"/>\
+         <origin xyz=\"0 0 0.1\"/><axis xyz=\"1 1 0\"/>\
+         <limit lower=\"0\" upper=\"0.1\" effort=\"1\" velocity=\"1\"/></joint>
+         <joint name=\"turn\" type=\"revolute\"><parent link=\"base\"/><child link=\"arm\"/>\
+         <origin xyz=\"0 0 0.5\" rpy=\"0 0 0.3\"/><axis xyz=\"0 0 -2\"/>\
+         <limit lower=\"-1\" upper=\"2\" effort=\"1\" velocity=\"1\"/></joint>
+         <joint name=\"grip\" type=\"fixed\"><parent link=\"arm\"/><child link=\"tool\"/>\
+         <origin xyz=\"0.2 0 0\" rpy=\"0 0.4 0\"/></joint>
+         <joint name=\"end\" type=\"fixed\"><parent link=\"finger\"/><child link=\"tip\"/>\
+         <origin xyz=\"0 0 0.05\"/></joint>
+         </robot>"
+    )
+}
+
+fn read(text: &str) -> Result<Model, ModelError> {
+    Model::from_urdf(text, &[])
+}
+
+/// The message for the robot with `from` replaced by `to`.
+fn message(from: &str, to: &str) -> String {
+    let text = robot();
+    assert!(text.contains(from), "nothing to break: {from}");
+    read(&text.replacen(from, to, 1))
+        .expect_err("broken")
+        .to_string()
+}
+
+#[test]
+fn fixed_joints_are_folded_unless_kept() {
+    let folded = read(&robot()).unwrap();
+    assert_eq!(
+        (
+            folded.link_count(),
+            folded.joint_count(),
+            folded.dof_count()
+        ),
+        (3, 2, 2)
+    );
+    assert_eq!(folded.joint("grip"), None);
+    assert!(folded.is_folded("grip") && !folded.is_folded("turn") && !folded.is_folded("nothing"));
+    // The body of the arm includes the tool: masses are added, and the tool's inertia is about the
+    // arm's origin.
+    let arm = folded.frame("arm").unwrap();
+    let tool = folded.frame("tool").unwrap();
+    assert_eq!(arm.link, tool.link);
+    assert_eq!(arm.pose, Pose::identity());
+    let alone = read(&robot()).unwrap().inertias()[0];
+    let sum = alone + alone.transformed(&tool.pose);
+    let body = folded.inertias()[arm.link];
+    assert_eq!(body.mass, 4.0);
+    assert!(
+        (body.inertia - sum.inertia).amax() < 1e-15
+            && (body.first_moment - sum.first_moment).amax() < 1e-15
+    );
+    // The tip is a frame of the finger.
+    let tip = folded.frame("tip").unwrap();
+    assert_eq!(
+        (tip.link, tip.pose.translation),
+        (
+            folded.frame("finger").unwrap().link,
+            Vec3::new(0.0, 0.0, 0.05)
+        )
+    );
+
+    let kept = Model::from_urdf(&robot(), &["grip"]).unwrap();
+    assert_eq!(
+        (kept.link_count(), kept.joint_count(), kept.dof_count()),
+        (4, 3, 2)
+    );
+    let grip = kept.joint("grip").unwrap();
+    assert_eq!(kept.joints()[grip].kind, JointKind::Fixed);
+    assert_eq!(kept.joint_links(grip), Some(("arm", "tool")));
+    assert_eq!(kept.frame("tool").unwrap().pose, Pose::identity());
+}
+
+#[test]
+fn dofs_are_numbered_as_listed_and_links_depth_first() {
+    let model = read(&robot()).unwrap();
+    assert_eq!([model.dof_name(0), model.dof_name(1)], ["slide", "turn"]);
+    assert_eq!(
+        (model.dof("turn"), model.dof("grip"), model.dof("nothing")),
+        (Some(1), None, None)
+    );
+    for (number, joint) in model.joints().iter().enumerate() {
+        assert_eq!(joint.child, number + 1);
+        assert!(joint.parent < joint.child);
+    }
+    let limits = model.limits(model.joint("turn").unwrap()).unwrap();
+    assert_eq!((limits.lower, limits.upper), (-1.0, 2.0));
+}
+
+#[test]
+fn axes_are_normalised() {
+    let model = read(&robot()).unwrap();
+    let kind = |name: &str| model.joints()[model.joint(name).unwrap()].kind;
+    let JointKind::Revolute(turn) = kind("turn") else {
+        panic!("revolute")
+    };
+    assert_eq!(
+        (turn.vector, turn.kind),
+        (Vec3::new(0.0, 0.0, -1.0), AxisKind::Z(-1.0))
+    );
+    let JointKind::Prismatic(slide) = kind("slide") else {
+        panic!("prismatic")
+    };
+    assert!((slide.vector.norm() - 1.0).abs() < 1e-15);
+    assert_eq!(slide.kind, AxisKind::Any);
+}
+
+/// The inertia of a link is about its origin and in its axes, for any `<inertial><origin>`.
+#[test]
+fn inertia_is_moved_to_the_link_origin() {
+    let text = robot().replacen(
+        "<origin xyz=\"0.1 0 0\"/>",
+        "<origin xyz=\"0.1 0.2 -0.3\" rpy=\"0.3 0.4 0.5\"/>",
+        1,
+    );
+    let got = read(&text).unwrap().inertias()[0];
+    let principal =
+        RigidInertia::from_parameters(&[2.0, 0.0, 0.0, 0.0, 0.02, 0.001, 0.0, 0.03, 0.0, 0.04]);
+    let expected = principal.transformed(&Pose::from_xyz_rpy([0.1, 0.2, -0.3], [0.3, 0.4, 0.5]));
+    assert!(
+        (got.inertia - expected.inertia).amax() < 1e-15
+            && (got.first_moment - expected.first_moment).amax() < 1e-15
+    );
+    assert_eq!(got.check(1e-9), Ok(()));
+}
+
+#[test]
+fn sensor_elements_of_both_forms_are_read() {
+    let plain = "<sensor name=\"s\" type=\"force_torque\"><parent joint=\"grip\"/><force_torque>\
+        <frame>sensor</frame>\
+                 <measure_direction>parent_to_child</measure_direction></force_torque>\
+                 <origin xyz=\"1 2 3\" rpy=\"0 0 0.5\"/></sensor>";
+    let gazebo = |pose: &str| {
+        format!(
+            "<gazebo reference=\"grip\"><sensor name=\"s\" type=\"force_torque\"><force_torque>\
+             <frame>sensor</frame>\
+             <measure_direction>parent_to_child</measure_direction></force_torque>\
+             <pose>{pose}</pose></sensor></gazebo>"
+        )
+    };
+    let with = |elements: &str| {
+        read(&robot().replace("</robot>", &format!("{elements}</robot>"))).unwrap()
+    };
+    for elements in [
+        plain.to_owned(),
+        gazebo("1 2 3 0 0 0.5"),
+        gazebo("1 2 3 0 0 0.5") + plain,
+    ] {
+        let model = with(&elements);
+        assert_eq!(model.sensors().len(), 1);
+        assert_eq!(model.warnings(), &[] as &[String]);
+        let sensor = &model.sensors()[0];
+        assert_eq!((sensor.name.as_str(), sensor.joint.as_str()), ("s", "grip"));
+        assert_eq!(
+            (sensor.frame, sensor.direction),
+            (
+                MeasurementFrame::Sensor,
+                MeasurementDirection::ParentToChild
+            )
+        );
+        assert_eq!(
+            sensor.pose,
+            Pose::from_xyz_rpy([1.0, 2.0, 3.0], [0.0, 0.0, 0.5])
+        );
+    }
+    // Two descriptions that differ: the plain one counts, with a warning.
+    let model = with(&(gazebo("9 9 9 0 0 0") + plain));
+    assert_eq!(
+        model.sensors()[0].pose.translation,
+        Vec3::new(1.0, 2.0, 3.0)
+    );
+    assert_eq!(
+        model.warnings(),
+        ["F/T sensor s is described twice, and differently; the first description counts"]
+    );
+    // Defaults: child, child to parent. Invalid values: ignored, with a warning.
+    let model =
+        with("<gazebo reference=\"grip\"><sensor name=\"g\" type=\"force_torque\"/></gazebo>");
+    assert_eq!(
+        (model.sensors()[0].frame, model.sensors()[0].direction),
+        (MeasurementFrame::Child, MeasurementDirection::ChildToParent)
+    );
+    let model = with(&plain.replace("sensor</frame>", "elsewhere</frame>"));
+    assert_eq!(model.sensors(), []);
+    assert_eq!(
+        model.warnings(),
+        [
+            "F/T sensor element s: its frame is elsewhere, not child, parent or sensor; it is \
+             ignored"
+        ]
+    );
+    // Other sensors and other Gazebo extensions are ignored.
+    assert_eq!(
+        with("<gazebo><plugin/></gazebo><sensor name=\"i\" type=\"imu\"/>").sensors(),
+        []
+    );
+}
+
+#[test]
+fn malformed_files_have_one_clear_message_each() {
+    let is = |from: &str, to: &str, expected: &str| assert_eq!(message(from, to), expected);
+    is(
+        "<child link=\"tip\"/>",
+        "<child link=\"tap\"/>",
+        "joint end: its child link tap is not in the URDF",
+    );
+    is(
+        "<parent link=\"tool\"/>",
+        "<parent link=\"toll\"/>",
+        "joint slide: its parent link toll is not in the URDF",
+    );
+    is(
+        "mass value=\"2\"",
+        "mass value=\"NaN\"",
+        "line 2: link base: <mass> value=\"NaN\" is not finite",
+    );
+    is(
+        "ixy=\"0.001\"",
+        "ixy=\"inf\"",
+        "line 2: link base: <inertia> ixy=\"inf\" is not finite",
+    );
+    is(
+        "rpy=\"0 0 0.3\"",
+        "rpy=\"0 0 nan\"",
+        "line 8: joint turn: <origin> rpy=\"0 0 nan\" is not finite",
+    );
+    is(
+        "xyz=\"0 0 0.5\"",
+        "xyz=\"0 0.5\"",
+        "line 8: joint turn: <origin> xyz=\"0 0.5\" is not three numbers",
+    );
+    is(
+        "upper=\"2\"",
+        "upper=\"two\"",
+        "line 8: joint turn: <limit> upper=\"two\" is not a number",
+    );
+    is(
+        "<axis xyz=\"0 0 -2\"/>",
+        "<axis xyz=\"0 0 0\"/>",
+        "joint turn: its axis is zero",
+    );
+    is(
+        "mass value=\"2\"",
+        "mass value=\"-2\"",
+        "link base: its mass is -2 kg; a mass cannot be negative",
+    );
+    is(
+        "<mass value=\"2\"/>",
+        "",
+        "line 2: link base: its <inertial> has no <mass>",
+    );
+    is(
+        "ixx=\"0.02\"",
+        "ixx=\"-0.02\"",
+        "link base: its inertia is not positive semidefinite (least principal moment -2.002e-2 kg \
+         m^2)",
+    );
+    is(
+        "<link name=\"tip\"/>",
+        "<link name=\"tip\"/><link name=\"tip\"/>",
+        "two links are named tip; names must be unique",
+    );
+    is(
+        "name=\"end\"",
+        "name=\"grip\"",
+        "two joints are named grip; names must be unique",
+    );
+    is(
+        "<child link=\"tip\"/>",
+        "<child link=\"arm\"/>",
+        "link arm is the child of two joints, turn and end; loops cannot be described, only trees",
+    );
+    is(
+        "type=\"prismatic\"",
+        "type=\"planar\"",
+        "joint slide: type planar is not supported (revolute, continuous, prismatic and fixed \
+         are); a floating base needs no joint",
+    );
+    is(
+        "type=\"prismatic\"",
+        "type=\"floating\"",
+        "joint slide: type floating is not supported (revolute, continuous, prismatic and fixed \
+         are); a floating base needs no joint",
+    );
+    is(
+        "<link name=\"tip\"/>",
+        "<link name=\"tip\"/><link name=\"loose\"/>",
+        "links base, loose have no parent; a robot has one root, connect the others to it by \
+         joints",
+    );
+    is(
+        &format!("<link name=\"finger\">{INERTIAL}</link>"),
+        "<link name=\"finger\"/>",
+        "link finger, moved by joint slide, has no <inertial>, nor has any link fixed to it: its \
+         mass is unknown; add one (with mass 0 and inertia 0 if it is meant to be massless)",
+    );
+    // A loop: tool is the parent of arm, which is the parent of tool.
+    is(
+        "<parent link=\"base\"/>",
+        "<parent link=\"tip\"/>",
+        "the joints above link arm form a loop; only trees can be described",
+    );
+    assert!(
+        message("</robot>", "</robt>").starts_with(
+            "the URDF is not well-formed XML: expected 'robot' tag, not 'robt' at 11:"
+        )
+    );
+    assert!(message("type=\"prismatic\"", "type=\"sliding\"").starts_with("not a URDF: "));
+    assert_eq!(
+        read("<sdf/>").unwrap_err().to_string(),
+        "not a URDF: its root element is <sdf>, not <robot>"
+    );
+    assert_eq!(
+        read("<robot name=\"r\"></robot>").unwrap_err(),
+        ModelError::NoLinks
+    );
+    assert!(
+        read("")
+            .unwrap_err()
+            .to_string()
+            .starts_with("the URDF is not well-formed XML: ")
+    );
+    let missing = Model::from_file(std::path::Path::new("/nowhere/model.urdf"), &[])
+        .unwrap_err()
+        .to_string();
+    assert!(
+        missing.starts_with("cannot read /nowhere/model.urdf: "),
+        "{missing}"
+    );
+}
+
+/// Elements that the dynamics do not need may be arbitrarily odd.
+#[test]
+fn shapes_and_extensions_are_not_read() {
+    let odd = "<visual><geometry><blob/></geometry><origin xyz=\"a\"/></visual></link>\
+        <transmission/><material/><link name=\"tip\">";
+    let model = read(
+        &robot()
+            .replace("<link name=\"tip\"/>", "<link name=\"tip\"></link>")
+            .replacen(
+                "<link name=\"tip\">",
+                &format!("<link name=\"side\">{odd}"),
+                1,
+            ),
+    );
+    assert!(
+        matches!(model, Err(ModelError::SeveralRoots(_))),
+        "side is a separate link"
+    );
+    let shaped = robot().replacen(
+        "<link name=\"tip\"/>",
+        "<link name=\"tip\"><visual><geometry><blob/></geometry></visual></link>",
+        1,
+    );
+    assert_eq!(read(&shaped).unwrap().warnings(), &[] as &[String]);
+}
+
+#[test]
+fn sensor_joints_must_be_there_and_fixed() {
+    let error = |keep: &str| Model::from_urdf(&robot(), &[keep]).unwrap_err().to_string();
+    assert_eq!(
+        error("grab"),
+        "joint grab, named as the joint of an F/T sensor, is not in the URDF; \
+         fixed joints that could carry one: grip, end"
+    );
+    assert_eq!(
+        error("turn"),
+        "joint turn is named as the joint of an F/T sensor, but it moves; a sensor sits in a \
+         fixed joint"
+    );
+}
+
+#[test]
+fn what_is_only_odd_is_a_warning() {
+    let warning = |from: &str, to: &str| {
+        let text = robot();
+        assert!(text.contains(from));
+        let model = read(&text.replacen(from, to, 1)).expect("only odd");
+        assert_eq!(model.warnings().len(), 1, "{:?}", model.warnings());
+        model.warnings()[0].clone()
+    };
+    assert!(warning("izz=\"0.04\"", "izz=\"0.08\"").contains("link base: principal moments"));
+    assert_eq!(
+        warning("lower=\"-1\"", "lower=\"3\""),
+        "joint turn: its lower limit 3 is above its upper limit 2"
+    );
+    assert_eq!(
+        warning(
+            "<axis xyz=\"0 0 -2\"/>",
+            "<axis xyz=\"0 0 1\"/><mimic joint=\"slide\"/>"
+        ),
+        "joint turn: <mimic> of slide is ignored; its position must be measured or locked"
+    );
+    assert!(
+        warning(
+            &format!("<link name=\"base\">{INERTIAL}</link>"),
+            "<link name=\"base\"/>"
+        )
+        .starts_with("root link base: neither it")
+    );
+    assert_eq!(
+        warning(
+            "<child link=\"tip\"/>",
+            "<child link=\"tip\"/><origin xyz=\"9 9 9\"/>"
+        ),
+        "joint end: <origin> occurs twice; the first one counts"
+    );
+    // Declared massless.
+    let nothing = "<link name=\"finger\"><inertial><mass value=\"0\"/>\
+        <inertia ixx=\"0\" ixy=\"0\" ixz=\"0\" iyy=\"0\" iyz=\"0\" izz=\"0\"/></inertial></link>";
+    assert_eq!(
+        warning(&format!("<link name=\"finger\">{INERTIAL}</link>"), nothing),
+        "link finger: the body that joint slide moves is massless"
+    );
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig {
+        cases: 400,
+        failure_persistence: None,
+        ..ProptestConfig::default()
+    })]
+
+    /// A damaged file gives a model or an error, never a panic.
+    #[test]
+    fn a_damaged_file_is_no_crash(
+        cuts in prop::collection::vec((any::<prop::sample::Index>(), 0..60_usize), 1..4),
+        swap in any::<prop::sample::Index>(),
+    ) {
+        let mut text = robot().into_bytes();
+        for (at, length) in cuts {
+            let start = at.index(text.len());
+            text.drain(start..(start + length).min(text.len()));
+        }
+        let at = swap.index(text.len());
+        text[at] = b'9';
+        let text = String::from_utf8(text).expect("ASCII");
+        if let Err(error) = Model::from_urdf(&text, &["grip"]) {
+            prop_assert!(!error.to_string().is_empty());
+        }
+    }
+
+    /// Folding keeps the pose of every link and the total mass.
+    #[test]
+    fn folding_keeps_places_and_masses((links, seed) in (1..=40_usize, any::<u64>())) {
+        use proprio_dynamics::{FrameMotion, JointState, Kinematics};
+        let mut random = Random::new(seed);
+        let robot = RandomRobot::new(links, &mut random);
+        let folded = Model::from_urdf(&robot.urdf(), &[]).unwrap();
+        // With every fixed joint kept, nothing is folded.
+        let fixed: Vec<String> = (0..links)
+            .map(|link| format!("joint{link}"))
+            .filter(|name| folded.is_folded(name))
+            .collect();
+        let keep: Vec<&str> = fixed.iter().map(String::as_str).collect();
+        let whole = Model::from_urdf(&robot.urdf(), &keep).unwrap();
+        prop_assert_eq!(whole.link_count(), links);
+        prop_assert_eq!(folded.link_count(), links - fixed.len());
+        prop_assert_eq!(folded.dof_count(), whole.dof_count());
+        let mass = |model: &Model| {
+            model
+                .inertias()
+                .iter()
+                .map(|inertia| inertia.mass)
+                .sum::<f64>()
+        };
+        prop_assert!((mass(&folded) - mass(&whole)).abs() < 1e-12 * mass(&whole));
+        let [q, zeros] = [
+            random.reals(folded.dof_count(), 2.0),
+            vec![0.0; folded.dof_count()],
+        ];
+        let state = JointState {
+            position: &q,
+            velocity: &zeros,
+            acceleration: &zeros,
+        };
+        let place = |model: &Model, name: &str| {
+            let mut kinematics = Kinematics::new(model, 0).unwrap();
+            kinematics
+                .update(model, state, &FrameMotion::standing(&Vec3::zeros()))
+                .unwrap();
+            let frame = model.frame(name).unwrap();
+            *kinematics.pose(frame.link) * frame.pose
+        };
+        for link in 0..links {
+            let name = format!("link{link}");
+            let (a, b) = (place(&folded, &name), place(&whole, &name));
+            prop_assert!(
+                (a.rotation - b.rotation).amax() < 1e-12
+                    && (a.translation - b.translation).amax() < 1e-12,
+                "{}",
+                name
+            );
+        }
+    }
+}
+
+/// An inertia is set only for an existing body, and only if it is finite.
+#[test]
+fn an_inertia_is_replaced_or_refused() {
+    let mut model = RandomRobot::new(6, &mut Random::new(1)).model();
+    let count = model.link_count();
+    let before = model.inertias().to_vec();
+    let new = RigidInertia::from_parameters(&[1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0]);
+    assert_eq!(
+        model.set_inertia(count, new),
+        Err(ModelError::NoLink(count))
+    );
+    for parameter in 0..10 {
+        for wrong in [f64::NAN, f64::INFINITY] {
+            let mut parameters = new.parameters();
+            parameters[parameter] = wrong;
+            let error = model
+                .set_inertia(1, RigidInertia::from_parameters(&parameters))
+                .unwrap_err();
+            assert_eq!(
+                error.to_string(),
+                format!(
+                    "link {}: the inertia given for it is not finite",
+                    model.link_name(1)
+                )
+            );
+        }
+    }
+    assert_eq!(model.inertias(), before);
+    model.set_inertia(1, new).unwrap();
+    assert_eq!(model.inertias()[1], new);
+    assert!(
+        model
+            .inertias()
+            .iter()
+            .zip(&before)
+            .enumerate()
+            .all(|(link, (now, old))| (now == old) == (link != 1))
+    );
+}

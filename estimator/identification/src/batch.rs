@@ -1,0 +1,760 @@
+//! Several recorded logs to one set of parameters: the stages of [`identify`].
+//!
+//! 1. Each log becomes observations ([`crate::dataset::recording`]). Joint torques with a wrong
+//!    sign or unit are excluded ([`crate::diagnose::torque_units`]), repeated logs are refused.
+//! 2. Each observation becomes rows ([`crate::measurement::model`]). Logs with F/T readings in
+//!    wrong units ([`crate::diagnose::wrench_units`]) are refused, and so is a wrong measurement
+//!    frame or direction of a sensor, in all logs or in one
+//!    ([`crate::diagnose::sensor_frame`]).
+//! 3. Noise and MAP estimate in turn, until the noise converges
+//!    ([`crate::fit::alternate_noise_and_map`]). After each such fit, undeclared disturbances are
+//!    excluded and offset jumps that the fit does not confirm are dropped
+//!    ([`crate::diagnose::disturbance`]); then the next fit, until neither changes.
+//! 4. Gains of the F/T sensors, if requested or worth it ([`gains`]): 3 again, with these unknown.
+//! 5. Cross-validation: segments of the logs are predicted from the others. The change from CAD is
+//!    shrunk where it does not improve the prediction ([`crate::cross_validation`]).
+//! 6. Structural vibration ([`crate::diagnose::structural_vibration`]), where other sensors observe
+//!    it, is subtracted; then the fit of 3 and the cross-validation of 5 once more.
+//! 7. Disturbances in validation logs, encoder errors and delays are reported
+//!    ([`crate::diagnose::encoder_offsets`], [`crate::diagnose::delay`]).
+//! 8. Figures for every log and the parameters' uncertainty ([`crate::report::assemble`]).
+
+mod gains;
+
+use crate::batch::gains::{GainChoice, choose_gain, fit_gains};
+use crate::cross_validation::{self, Retention};
+use crate::dataset::{Dataset, Role};
+use crate::diagnose::structural_vibration::StructuralVibration;
+use crate::diagnose::undeclared::{self, Undeclared};
+use crate::diagnose::{delay, encoder_offsets, load, sensor_frame, torque_units, wrench_units};
+use crate::finding::{Finding, FindingCode, Severity};
+use crate::fit::{
+    Identified, IdentifyError, LOAD_VARIANCE_RATIO, NoiseAndMap, OffsetDrift, added,
+    alternate_noise_and_map, beside_cad, negative_rotors, per_column, posterior, unsettled,
+    walk_limits, without_negative_rotors,
+};
+use crate::measurement::channels;
+use crate::measurement::model::MeasurementModel;
+use crate::measurement::reduction::reduce;
+use crate::prior::Fit;
+use crate::report::assemble::{self, Diagnosis};
+use crate::report::outcome::Outcome;
+use crate::robot::{IdentificationInput, Robot, TorqueSide};
+use crate::training::{
+    SEGMENT_INSTANTS, TrainingLog, map_segments, no_log, prepare, refuse_repeated, sample,
+    segments_of, training_logs, training_logs_mut,
+};
+use proprio_dynamics::calibration::{Gain, Kind};
+use std::ops::ControlFlow;
+
+/// What to identify from.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Options {
+    /// The measurements to use. Empty: the F/T sensors if the robot has any, else the measured
+    /// joint torques.
+    pub inputs: Vec<IdentificationInput>,
+}
+
+/// Progress of [`identify`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct Progress {
+    /// The current step, in a few words: `reading walk.csv`, `round 3`.
+    pub step: String,
+    /// Fraction done, 0 to 1.
+    pub done: f64,
+}
+
+/// Most fits after which the excluded disturbances may still change.
+const EXCLUSION_ROUNDS: usize = 12;
+
+/// Most loads that are looked for.
+const MAX_LOADS: usize = 4;
+
+/// After this many candidate loads were rejected, no more are looked for.
+const MAX_REJECTED_LOADS: usize = 2;
+
+/// Most rounds of contacts and gains.
+const GAIN_ROUNDS: usize = 4;
+
+/// Identifies the robot's parameters from logs.
+///
+/// # Errors
+/// [`IdentifyError`]: no log to train on, observations of another robot, numbers that no parameters
+/// can be fitted to.
+pub fn identify(
+    robot: &Robot,
+    datasets: Vec<Dataset>,
+    options: &Options,
+    progress: &mut dyn FnMut(&Progress),
+) -> Result<Outcome, IdentifyError> {
+    if !datasets.iter().any(|log| log.role == Role::Train) {
+        return Err(IdentifyError::NoLogs);
+    }
+    let mut report_progress = |step: String, done: f64| progress(&Progress { step, done });
+    let inputs = chosen_inputs(robot, options);
+
+    // 1. Logs.
+    let mut logs = prepare_logs(robot, datasets)?;
+
+    // 2. Measurement model, plausibility of units and frames.
+    let mut measurement = match plausible_model(robot, &inputs, &mut logs)? {
+        ControlFlow::Continue(measurement) => measurement,
+        ControlFlow::Break(outcome) => return Ok(*outcome),
+    };
+    let temperature_only = Kind {
+        gain: Gain::None,
+        ..robot.calibrated
+    };
+    measurement.calibrate(
+        temperature_only,
+        training_logs(&logs)
+            .iter()
+            .flat_map(|log| log.instants.iter()),
+    );
+
+    // 3. Noise and MAP estimate, without undeclared disturbances.
+    let mut clean = exclude_disturbed(robot, &measurement, &mut logs, &mut report_progress)?;
+
+    // 4. Gains of the F/T sensors.
+    let GainChoice {
+        gain,
+        finding: gain_finding,
+        retention,
+    } = choose_gain(&mut measurement, &mut logs, &clean.estimate)?;
+    let calibrated = Kind {
+        gain,
+        ..robot.calibrated
+    };
+    if gain != Gain::None {
+        clean = with_gains(
+            robot,
+            &mut measurement,
+            &mut logs,
+            calibrated,
+            clean,
+            &mut report_progress,
+        )?;
+    }
+    let measurement = measurement;
+    let CleanFit {
+        estimate,
+        undeclared,
+        not_converged,
+    } = clean;
+    undeclared.report(&measurement, &mut logs, &estimate);
+
+    // 5. Cross-validation.
+    let mut identified = cross_validated_fit(
+        &measurement,
+        &training_logs(&logs),
+        inputs.clone(),
+        calibrated,
+        estimate,
+        retention,
+        &mut report_progress,
+    )?;
+
+    // 6. Structural vibration.
+    report_progress("structural vibration".into(), 0.75);
+    identified = without_vibration(
+        &measurement,
+        &mut logs,
+        inputs,
+        calibrated,
+        identified,
+        &mut report_progress,
+    )?;
+    identified.findings.extend(not_converged);
+    identified.findings.extend(gain_finding);
+    identified
+        .findings
+        .extend(not_available(robot, &identified.inputs));
+
+    // 7. Disturbances in validation logs, encoder errors, delays.
+    undeclared::report_validation(&measurement, &mut logs, &identified);
+    let training = training_logs(&logs);
+    report_progress("figures".into(), 0.88);
+    let encoder_offsets = encoder_offsets::encoder_errors(&measurement, &training, &identified);
+    let (time_offsets, delays) = delay::delays(&measurement, &training, &identified);
+
+    // 8. Figures.
+    let diagnosis = Diagnosis {
+        encoder_offsets,
+        time_offsets,
+        delays,
+    };
+    let outcome = assemble::outcome(
+        robot,
+        &measurement,
+        &logs,
+        &training,
+        &identified,
+        diagnosis,
+    );
+    report_progress("done".into(), 1.0);
+    Ok(outcome)
+}
+
+/// The inputs that are configured, or else those that the robot has.
+fn chosen_inputs(robot: &Robot, options: &Options) -> Vec<IdentificationInput> {
+    if options.inputs.is_empty() {
+        vec![if robot.structure.sensors().is_empty() {
+            IdentificationInput::Torque
+        } else {
+            IdentificationInput::Wrench
+        }]
+    } else {
+        options.inputs.clone()
+    }
+}
+
+/// Logs of observations with known motion. Joint torques with a wrong sign or unit are excluded,
+/// repeated logs are refused.
+fn prepare_logs(robot: &Robot, datasets: Vec<Dataset>) -> Result<Vec<TrainingLog>, IdentifyError> {
+    let mut logs = Vec::new();
+    for dataset in datasets {
+        let mut log = prepare(robot, dataset);
+        for found in torque_units::faulty(robot, &log)? {
+            log.exclude_torque(found.dof, found.reason, found.finding);
+        }
+        logs.push(log);
+    }
+    refuse_repeated(&mut logs);
+    Ok(logs)
+}
+
+/// The measurement model of the training logs whose F/T readings have plausible units, frames and
+/// directions; other logs are refused. Breaks off with an outcome without parameters if no log
+/// remains, no row contains a link, or a sensor is wrong in all logs.
+fn plausible_model<'a>(
+    robot: &'a Robot,
+    inputs: &[IdentificationInput],
+    logs: &mut [TrainingLog],
+) -> Result<ControlFlow<Box<Outcome>, MeasurementModel<'a>>, IdentifyError> {
+    let nothing = |logs: &[TrainingLog], reason: String| {
+        Ok(ControlFlow::Break(Box::new(assemble::nothing(
+            robot, logs, reason,
+        ))))
+    };
+    let training = training_logs(logs);
+    if training.is_empty() {
+        return nothing(logs, no_log(logs));
+    }
+    let all = training.iter().flat_map(|log| log.instants.iter());
+    let mut measurement = MeasurementModel::survey(robot, inputs, all)?;
+    if measurement.unknowns().links.is_empty() {
+        let what = match inputs {
+            [IdentificationInput::Torque] => {
+                "no joint torque was measured while the links beyond the joint were free of \
+                 contacts"
+            }
+            [IdentificationInput::Wrench] => {
+                "no part of the robot beyond or between F/T sensors was measured while it was \
+                 free of unknown contacts"
+            }
+            _ => {
+                "no joint torque and no F/T sensor was measured while its part of the robot was \
+                 free of unknown contacts"
+            }
+        };
+        return nothing(
+            logs,
+            format!("no measurement contains the links' parameters: {what}"),
+        );
+    }
+
+    // Units.
+    let before = training.len();
+    for log in &mut *logs {
+        let wrong = wrench_units::wrong(&mut measurement, log);
+        log.add_findings(wrong);
+    }
+    if let Some(surveyed) = surveyed_again(robot, inputs, logs, before)? {
+        measurement = surveyed;
+    }
+    if measurement.unknowns().links.is_empty() {
+        return nothing(logs, no_log(logs));
+    }
+
+    // Measurement frames and directions, in all logs together.
+    let training = training_logs(logs);
+    let wrong = sensor_frame::wrong(&measurement, &training);
+    if !wrong.is_empty() {
+        let names: Vec<&str> = wrong.iter().map(|f| f.subject.as_str()).collect();
+        let mut outcome = assemble::nothing(
+            robot,
+            logs,
+            format!(
+                "{}: wrong measurement frame or direction; nothing was identified",
+                names.join(", ")
+            ),
+        );
+        outcome.findings.extend(wrong);
+        return Ok(ControlFlow::Break(Box::new(outcome)));
+    }
+
+    // ... and in each log alone.
+    let found = sensor_frame::wrong_alone(&measurement, &training, logs);
+    let before = training.len();
+    for (log, found) in logs.iter_mut().zip(found) {
+        log.refused |= !found.is_empty();
+        log.findings.extend(found);
+    }
+    if let Some(surveyed) = surveyed_again(robot, inputs, logs, before)? {
+        measurement = surveyed;
+    }
+    if measurement.unknowns().links.is_empty() {
+        return nothing(logs, no_log(logs));
+    }
+    Ok(ControlFlow::Continue(measurement))
+}
+
+/// A new survey of the training logs if they are not the `before` that there were; without any link
+/// if none remains.
+fn surveyed_again<'a>(
+    robot: &'a Robot,
+    inputs: &[IdentificationInput],
+    logs: &[TrainingLog],
+    before: usize,
+) -> Result<Option<MeasurementModel<'a>>, IdentifyError> {
+    let training = training_logs(logs);
+    if training.len() == before {
+        return Ok(None);
+    }
+    let instants = training.iter().flat_map(|log| log.instants.iter());
+    Ok(Some(MeasurementModel::survey(robot, inputs, instants)?))
+}
+
+/// Subtracts structural vibration, if other sensors observe it, from all logs and fits again.
+fn without_vibration(
+    measurement: &MeasurementModel<'_>,
+    logs: &mut [TrainingLog],
+    inputs: Vec<IdentificationInput>,
+    calibrated: Kind,
+    identified: Identified,
+    progress: &mut dyn FnMut(String, f64),
+) -> Result<Identified, IdentifyError> {
+    let Some(vibration) = StructuralVibration::find(
+        measurement,
+        &sample(measurement, &training_logs(logs)),
+        &identified.noise,
+        &identified.d,
+    ) else {
+        return Ok(identified);
+    };
+    for log in &mut *logs {
+        vibration.apply(measurement, &mut log.instants, &log.offset_jumps);
+    }
+    // Rounds start again here: their fraction done is not shown.
+    let mut progress = |step: String, _| progress(format!("{step}, vibration subtracted"), 0.75);
+    let training = training_logs(logs);
+    let estimate = alternate_noise_and_map(
+        measurement.robot(),
+        measurement,
+        &training,
+        OffsetDrift::AsStated,
+        Some(identified.noise),
+        &mut progress,
+    )?;
+    let mut identified = cross_validated_fit(
+        measurement,
+        &training,
+        inputs,
+        calibrated,
+        estimate,
+        None,
+        &mut progress,
+    )?;
+    identified
+        .findings
+        .extend(vibration_findings(measurement, &vibration));
+    Ok(identified)
+}
+
+/// What the configuration requests but the inputs do not contain.
+fn not_available(robot: &Robot, inputs: &[IdentificationInput]) -> Vec<Finding> {
+    let note = |code, key: &str, text: String| Finding {
+        severity: Severity::Note,
+        code,
+        subject: key.to_owned(),
+        text,
+    };
+    let mut notes = Vec::new();
+    if !robot.calibrated.is_empty() && !inputs.contains(&IdentificationInput::Wrench) {
+        let requested = [
+            (
+                !matches!(robot.calibrated.gain, Gain::None | Gain::Auto),
+                "identification.gain",
+            ),
+            (robot.calibrated.temperature, "identification.temperature"),
+        ];
+        let requested: Vec<&str> = requested
+            .iter()
+            .filter(|(is, _)| *is)
+            .map(|(_, key)| *key)
+            .collect();
+        let requested = requested.join(" and ");
+        let text = format!(
+            "{requested} requested but not available: F/T sensors are not among the inputs of \
+             identification, so none is calibrated; add \"wrench\" to the inputs"
+        );
+        notes.push(note(FindingCode::CalibrationNotAvailable, &requested, text));
+    }
+    if robot.torque_side == TorqueSide::Motor && !inputs.contains(&IdentificationInput::Torque) {
+        let key = "identification.torque_side";
+        let text = format!(
+            "{key} = \"motor\" requested but not available: joint torques are not among the \
+             inputs of identification, so no rotor inertia is identified; add \"torque\" to the \
+             inputs"
+        );
+        notes.push(note(FindingCode::RotorsNotAvailable, key, text));
+    }
+    notes
+}
+
+/// A note for each sub-tree whose structural vibration was subtracted.
+fn vibration_findings(
+    measurement: &MeasurementModel<'_>,
+    vibration: &StructuralVibration,
+) -> Vec<Finding> {
+    let robot = measurement.robot();
+    let names = |sensors: &[usize]| -> String {
+        let names: Vec<String> = sensors
+            .iter()
+            .map(|s| channels::sensor_name(robot, *s))
+            .collect();
+        names.join(" and ")
+    };
+    let own = measurement.sensors_of_subtrees();
+    let parts = vibration.parts.iter();
+    parts
+        .map(|part| Finding {
+            severity: Severity::Note,
+            code: FindingCode::StructuralVibration,
+            subject: names(&own[part.subtree]),
+            text: format!(
+                "structural vibration that the encoders do not show: {:.0} % of the fast part of \
+                 the imbalance at {} is observed by {}, and is subtracted",
+                100.0 * part.explained,
+                names(&own[part.subtree]),
+                names(&part.sensors)
+            ),
+        })
+        .collect()
+}
+
+/// An estimate from which undeclared disturbances are excluded.
+struct CleanFit {
+    estimate: NoiseAndMap,
+    undeclared: Undeclared,
+    /// Present if the excluded disturbances did not converge.
+    not_converged: Option<Finding>,
+}
+
+/// Fits, excludes what an undeclared disturbance acted on, and fits again, until the excluded set
+/// does not change.
+fn exclude_disturbed(
+    robot: &Robot,
+    measurement: &MeasurementModel<'_>,
+    logs: &mut [TrainingLog],
+    progress: &mut dyn FnMut(String, f64),
+) -> Result<CleanFit, IdentifyError> {
+    let mut estimate = alternate_noise_and_map(
+        robot,
+        measurement,
+        &training_logs(logs),
+        OffsetDrift::Free,
+        None,
+        progress,
+    )?;
+    // Rounds start again with each fit: their fraction done is not shown.
+    let mut progress = |step: String, _| progress(step, 0.62);
+    let mut undeclared = Undeclared::none(training_logs_mut(logs));
+    let mut rejected_loads = 0;
+    let mut converged = false;
+    // Offsets drift freely at first: with the limited drift, a load that comes or goes would look
+    // like noise of every channel.
+    let mut drift = OffsetDrift::Free;
+    for _ in 0..EXCLUSION_ROUNDS {
+        progress("undeclared contacts".into(), 0.62);
+        let training = training_logs(logs);
+        let load = (rejected_loads < MAX_REJECTED_LOADS && undeclared.loads.len() < MAX_LOADS)
+            .then(|| {
+                load::find(
+                    measurement,
+                    &estimate.prior,
+                    &training,
+                    &estimate.noise,
+                    estimate.fit.tau,
+                )
+            })
+            .flatten();
+        if let Some(load) = load {
+            let before = undeclared.loads.clone();
+            let channels = measurement.channels_of(&load.units);
+            undeclared.add_load(load);
+            undeclared.mark(training_logs_mut(logs));
+            let without = alternate_noise_and_map(
+                robot,
+                measurement,
+                &training_logs(logs),
+                drift,
+                Some(estimate.noise.clone()),
+                &mut progress,
+            )?;
+            let ratio = without.noise.variance_ratio(&estimate.noise, &channels);
+            if ratio > LOAD_VARIANCE_RATIO {
+                estimate = without;
+                continue;
+            }
+            undeclared.loads = before;
+            rejected_loads += 1;
+            undeclared.mark(training_logs_mut(logs));
+        }
+        if let OffsetDrift::Free = drift {
+            drift = OffsetDrift::AsStated;
+            let rates = walk_limits(robot, measurement.unknowns(), drift).rates;
+            if estimate
+                .noise
+                .drift
+                .iter()
+                .zip(&rates)
+                .any(|(found, most)| found > most)
+            {
+                // Without an initial noise model: with freely drifting offsets, noise is divided
+                // differently among the channels. Where no offset drifts faster than the bound, the
+                // bound changes nothing.
+                estimate = alternate_noise_and_map(
+                    robot,
+                    measurement,
+                    &training_logs(logs),
+                    drift,
+                    None,
+                    &mut progress,
+                )?;
+            }
+        }
+        let NoiseAndMap { noise, fit, .. } = &estimate;
+        converged = undeclared.update(measurement, training_logs_mut(logs), noise, &fit.x);
+        if converged {
+            break;
+        }
+        estimate = alternate_noise_and_map(
+            robot,
+            measurement,
+            &training_logs(logs),
+            drift,
+            Some(estimate.noise),
+            &mut progress,
+        )?;
+    }
+    Ok(CleanFit {
+        estimate,
+        undeclared,
+        not_converged: (!converged).then(|| undeclared::not_converged(EXCLUSION_ROUNDS)),
+    })
+}
+
+/// Fits gains of the F/T sensors, too. An error of a gain, where the robot carries much, may have
+/// been taken for a contact: with the gains known, contacts are looked for again, and if they
+/// differ, gains are fitted again, [`GAIN_ROUNDS`] times at most. (Each time some of the excluded
+/// instants come back, and add information about the gains.)
+fn with_gains(
+    robot: &Robot,
+    measurement: &mut MeasurementModel<'_>,
+    logs: &mut [TrainingLog],
+    calibrated: Kind,
+    mut clean: CleanFit,
+    progress: &mut dyn FnMut(String, f64),
+) -> Result<CleanFit, IdentifyError> {
+    clean.estimate = fit_gains(
+        robot,
+        measurement,
+        logs,
+        calibrated,
+        clean.estimate,
+        progress,
+    )?;
+    clean.not_converged = Some(undeclared::not_converged(GAIN_ROUNDS));
+    for _ in 0..GAIN_ROUNDS {
+        let NoiseAndMap { noise, fit, .. } = &clean.estimate;
+        if clean
+            .undeclared
+            .update(measurement, training_logs_mut(logs), noise, &fit.x)
+        {
+            clean.not_converged = None;
+            break;
+        }
+        clean.estimate = fit_gains(
+            robot,
+            measurement,
+            logs,
+            calibrated,
+            clean.estimate,
+            progress,
+        )?;
+    }
+    Ok(clean)
+}
+
+/// Cross-validates an estimate and fits all instants with the noise that this shows; the change
+/// from CAD is shrunk to the retained fraction. `retention`: the cross-validation, if it was done
+/// already.
+fn cross_validated_fit(
+    measurement: &MeasurementModel<'_>,
+    training: &[&TrainingLog],
+    inputs: Vec<IdentificationInput>,
+    calibrated: Kind,
+    estimate: NoiseAndMap,
+    retention: Option<Retention>,
+    progress: &mut dyn FnMut(String, f64),
+) -> Result<Identified, IdentifyError> {
+    let unknowns = measurement.unknowns().clone();
+    let segments = segments_of(training, SEGMENT_INSTANTS);
+    let NoiseAndMap {
+        prior,
+        noise,
+        fit: Fit { tau, .. },
+        change,
+        ..
+    } = estimate;
+    progress("cross-validation".into(), 0.69);
+    let sampled = sample(measurement, training);
+    let mut retention = match retention {
+        Some(retention) => retention,
+        None => cross_validation::held_out(measurement, &prior, &sampled, &noise, tau)?,
+    };
+    retention.findings.extend(unsettled(change));
+    // The fit has absorbed a part of the noise of its own data, most of all noise that is as slow
+    // as the motion.
+    let walk_limits = walk_limits(measurement.robot(), &unknowns, OffsetDrift::AsStated);
+    let noise = retention.noise(measurement, &sampled, noise, &walk_limits);
+    let reduced = map_segments(measurement, &segments, |measurement, _, segment| {
+        reduce(measurement, segment, &noise)
+    });
+    let information = added(&reduced, unknowns.parameters());
+    let fit = posterior(&prior, &unknowns, &information)?.maximise_evidence()?;
+    retention
+        .findings
+        .extend(negative_rotors(measurement.robot(), &unknowns, &fit));
+    let cad = beside_cad(&unknowns, &information);
+    let mut d = without_negative_rotors(&prior, &unknowns, &information, &fit)?;
+    for (column, share) in per_column(&unknowns, &retention.share)
+        .into_iter()
+        .enumerate()
+    {
+        d[column] = cad[column] + share * (d[column] - cad[column]);
+    }
+    Ok(Identified {
+        unknowns,
+        inputs,
+        calibrated,
+        prior,
+        noise,
+        information,
+        d,
+        cad,
+        retained: retention.share,
+        findings: retention.findings,
+        fit,
+        reduced,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::observation::{Annotated, Observation, UnitSet};
+    use crate::measurement::noise_model::NoiseModel;
+    use crate::measurement::reduction::tests::{between_two_sensors, readings};
+    use crate::training::SAMPLE_INSTANTS;
+    use proprio_dynamics::ContactSet;
+
+    /// A training log of these instants.
+    fn log(instants: &[Annotated]) -> TrainingLog {
+        TrainingLog {
+            file: String::new(),
+            role: Role::Train,
+            span: (instants[0].t, instants[instants.len() - 1].t),
+            torque_rate: 0.0,
+            instants: instants.to_vec(),
+            offset_jumps: Vec::new(),
+            excluded: Vec::new(),
+            findings: Vec::new(),
+            refused: false,
+            disturbed: Vec::new(),
+        }
+    }
+
+    /// Stretches must be longer than the correlation time of the noise, a few seconds, for any
+    /// number of logs.
+    #[test]
+    fn stretches_of_many_logs_are_not_short() {
+        let robot = between_two_sensors();
+        let all = readings(&robot, 15_000, &[0.1; 12], &[0.0; 12]);
+        for (count, instants) in [(1, 15_000), (4, 12_000), (60, 1000), (100, 300)] {
+            let logs: Vec<TrainingLog> = (0..count).map(|_| log(&all[..instants])).collect();
+            let logs: Vec<&TrainingLog> = logs.iter().collect();
+            let wrench = [IdentificationInput::Wrench];
+            let all = logs.iter().flat_map(|log| &log.instants);
+            let measurement = MeasurementModel::survey(&robot, &wrench, all).expect("rows");
+            let lengths: Vec<usize> = sample(&measurement, &logs)
+                .iter()
+                .map(|segment| segment.instants.len())
+                .collect();
+            let sum: usize = lengths.iter().sum();
+            assert!(
+                (SAMPLE_INSTANTS / 2..=SAMPLE_INSTANTS).contains(&sum),
+                "{count} logs: {sum} instants"
+            );
+            let least = lengths.iter().min().copied().unwrap_or(0);
+            assert!(
+                least >= if instants < 1000 { 290 } else { 700 },
+                "{count} logs: {least} at once"
+            );
+        }
+    }
+
+    /// The noise without a load is compared on the limb's own sensors.
+    #[test]
+    fn a_load_is_tested_on_its_own_channels() {
+        let robot = between_two_sensors();
+        let mut instants = readings(&robot, 200, &[0.1; 12], &[0.0; 12]);
+        for instant in &mut instants {
+            (instant.torque, instant.active) = (vec![0.1; 2], ContactSet::default());
+        }
+        let both = [IdentificationInput::Wrench, IdentificationInput::Torque];
+        let measurement = MeasurementModel::survey(&robot, &both, instants.iter()).expect("rows");
+        let of_link = |link: &str| {
+            let link =
+                (0..robot.model.link_count()).find(|&number| robot.model.link_name(number) == link);
+            let mut units = UnitSet::default();
+            units.insert(
+                robot
+                    .structure
+                    .subtree_of(link.expect("a link"))
+                    .expect("its sub-tree"),
+            );
+            units
+        };
+        let channels_of = |link: &str| measurement.channels_of(&of_link(link));
+        let thigh = channels_of("thigh");
+        assert_eq!(thigh, (0..12).collect::<Vec<_>>());
+        let foot = channels_of("foot");
+        assert_eq!(foot.len(), 6);
+        let mut with_torques = of_link("foot");
+        with_torques.insert(Observation::TORQUES);
+        assert_eq!(
+            measurement.channels_of(&with_torques),
+            [foot.clone(), vec![12, 13]].concat()
+        );
+        let noise = NoiseModel::unknown(vec![1e-6; 14]);
+        let mut less_noise = noise.clone();
+        less_noise.square.fill(100.0);
+        for &channel in &foot {
+            (less_noise.square[channel], less_noise.block[channel]) = (0.25, 0.25);
+        }
+        assert!((less_noise.variance_ratio(&noise, &foot) - 4.0).abs() < 1e-9);
+        assert!((less_noise.variance_ratio(&noise, &thigh) - 0.2).abs() < 1e-9);
+    }
+}

@@ -1,0 +1,169 @@
+//! Converts recorded channels to observations at common times, with velocities and accelerations,
+//! and finds defects of the log.
+//!
+//! ```text
+//! samples -> Recording                               recording
+//!     -> ordered stamps; repeats, spikes removed     cleaning, repeats
+//!     -> checks of single channels                   inspection
+//!     -> every channel at common times               resampling, stream, smooth
+//!     -> outliers and offset jumps of F/T readings   readings
+//!     -> Dataset: observations, defects
+//! ```
+
+mod cleaning;
+pub mod defects;
+mod inspection;
+pub mod observation;
+mod readings;
+pub mod recording;
+mod repeats;
+pub mod resampling;
+pub mod smooth;
+mod stream;
+
+use crate::robot::{ChannelRole, Robot};
+use defects::{Defect, OffsetJump};
+use observation::Observation;
+use proprio_topics::Nanos;
+use recording::Recording;
+use resampling::Settings;
+
+/// The use of a log.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Role {
+    /// Parameters are identified from it.
+    Train,
+    /// Only for assessment: its offsets and friction are fitted to it, for CAD and for the
+    /// identified parameters alike.
+    Validate,
+}
+
+/// Why no dataset can be made from a recording.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum DatasetError {
+    /// A channel that the kinematics need has no usable sample.
+    #[error("{0} has no usable sample")]
+    NoSamples(String),
+}
+
+/// A log, prepared for identification: every channel at common times.
+#[derive(Debug, Clone)]
+pub struct Dataset {
+    /// Its name in the outcome: its file name.
+    pub name: String,
+    /// Its use.
+    pub role: Role,
+    pub(crate) instants: Vec<Observation>,
+    pub(crate) offset_jumps: Vec<OffsetJump>,
+    pub(crate) defects: Vec<Defect>,
+    pub(crate) torque_rate: f64,
+    /// Sample spacing, if it exceeds the time that a channel may be silent.
+    pub(crate) apart: Option<Nanos>,
+}
+
+impl Dataset {
+    /// Prepares a recording.
+    ///
+    /// # Errors
+    /// [`DatasetError`]: a joint that is not locked, or the IMU of the base, has no sample. A
+    /// missing F/T sensor is a defect.
+    pub fn new(
+        robot: &Robot,
+        name: &str,
+        role: Role,
+        recording: Recording,
+    ) -> Result<Self, DatasetError> {
+        Self::with_settings(robot, name, role, recording, &Settings::default())
+    }
+
+    /// As [`Dataset::new`], with other settings such as the rate of observations.
+    ///
+    /// # Errors
+    /// As [`Dataset::new`].
+    pub fn with_settings(
+        robot: &Robot,
+        name: &str,
+        role: Role,
+        mut recording: Recording,
+        settings: &Settings,
+    ) -> Result<Self, DatasetError> {
+        recording
+            .declared
+            .iter_mut()
+            .for_each(|d| d.sort_by_key(|(t, _)| *t));
+        let temperatures = recording.temperatures.iter_mut();
+        temperatures.for_each(|own| own.sort_by_key(|(t, _)| *t));
+        cleaning::clean(&mut recording, robot);
+        recording.span();
+        for channel in &recording.channels {
+            let imu = &recording.imu;
+            let empty = match channel.role {
+                ChannelRole::Joint(dof) => recording
+                    .joints
+                    .get(dof)
+                    .is_none_or(|j| j.position.t.is_empty()),
+                ChannelRole::Base => {
+                    imu.proper_acceleration.t.is_empty() || imu.angular_velocity.t.is_empty()
+                }
+                ChannelRole::Sensor(_) => false,
+            };
+            if empty {
+                let label = cleaning::label(channel);
+                return Err(DatasetError::NoSamples(label));
+            }
+        }
+        inspection::inspect(&mut recording, robot);
+        let spacing = recording.spacing();
+        let mut found = recording.instants(robot, settings);
+        readings::inspect(&recording, robot, &mut found);
+        Ok(Self {
+            name: name.to_owned(),
+            role,
+            instants: found.instants,
+            offset_jumps: found.offset_jumps,
+            defects: found.defects,
+            torque_rate: recording.torque_rate(),
+            apart: (recording.is_stamped() && spacing > robot.max_silence).then_some(spacing),
+        })
+    }
+
+    /// A log that can not be used at all, with the reason. It is still part of the outcome.
+    #[must_use]
+    pub fn unreadable(name: &str, role: Role, reason: String) -> Self {
+        Self {
+            name: name.to_owned(),
+            role,
+            instants: Vec::new(),
+            offset_jumps: Vec::new(),
+            defects: vec![Defect::Unreadable { reason }],
+            torque_rate: 0.0,
+            apart: None,
+        }
+    }
+
+    /// All channels at each time.
+    #[must_use]
+    pub fn observations(&self) -> &[Observation] {
+        &self.instants
+    }
+
+    /// Where the offset of an F/T sensor seems to jump, judged by its readings alone.
+    #[must_use]
+    pub fn breaks(&self) -> &[OffsetJump] {
+        &self.offset_jumps
+    }
+
+    /// Samples of joint torques per second, from the median spacing of their stamps: the rate of
+    /// the fastest joint \[Hz\]; 0 if there are none. Gaps do not count.
+    #[must_use]
+    pub fn torque_rate(&self) -> f64 {
+        self.torque_rate
+    }
+
+    /// The defects of the log.
+    #[must_use]
+    pub fn defects(&self) -> &[Defect] {
+        &self.defects
+    }
+}

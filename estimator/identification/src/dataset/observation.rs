@@ -1,0 +1,178 @@
+//! Observations: the values of all channels at one time, and annotations by fits.
+
+use crate::robot::{BaseMotion, Channel, ChannelRole, Robot};
+use proprio_dynamics::spatial::Wrench;
+use proprio_dynamics::{BitSet, ContactSet, FrameMotion, SensorSet};
+use proprio_topics::{Nanos, Reason};
+
+/// Parts of the robot whose equations hold or fail together: numbers of sub-trees, and
+/// [`Observation::TORQUES`].
+pub type UnitSet = BitSet<2>;
+
+/// The values of all channels at one time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Observation {
+    /// Time by the log's clock.
+    pub t: Nanos,
+    /// Per degree of freedom \[rad or m\]; for a faulty channel the nearest known value, or 0.
+    pub position: Vec<f64>,
+    /// \[rad/s or m/s\]; 0 for a faulty channel.
+    pub velocity: Vec<f64>,
+    /// \[rad/s^2 or m/s^2\]; 0 for a faulty channel.
+    pub acceleration: Vec<f64>,
+    /// Measured joint torques \[Nm or N\], by the parent on the child along the axis; NaN where
+    /// there is none.
+    pub torque: Vec<f64>,
+    /// The link where kinematics start.
+    pub base_link: usize,
+    /// Its motion.
+    pub base: FrameMotion,
+    /// Per F/T sensor its reading, corrected as configured, offset included, in its measurement
+    /// frame; NaN where there is none.
+    pub readings: Vec<Wrench>,
+    /// The present contacts, as declared.
+    pub active: ContactSet,
+    /// Per channel, in the order of [`Robot::channels`]: its fault. A missing torque is no fault.
+    pub faults: Vec<Reason>,
+    /// Fault of the base motion, if no channel measures it.
+    pub base_fault: Reason,
+    /// Per F/T sensor the temperature of its board \[degrees Celsius\], interpolated linearly; the
+    /// first and the last sample are extrapolated as constants. NaN where none was recorded.
+    pub temperatures: Vec<f64>,
+    /// F/T sensors whose reading is an outlier (a blow or a glitch): the motion does not explain
+    /// it, and no offset jump does.
+    pub outliers: SensorSet,
+}
+
+impl Observation {
+    /// The unit of all measured joint torques, among the numbers of sub-trees.
+    pub const TORQUES: usize = UnitSet::CAPACITY - 1;
+
+    /// Starts kinematics at the standing link, unless an IMU measures the base motion.
+    pub(crate) fn stand(&mut self, robot: &Robot) {
+        match &robot.base {
+            BaseMotion::Standing(motion) => self.base = *motion,
+            BaseMotion::Imu(_) => {}
+            BaseMotion::Stance(stances) => {
+                let standing = stances.iter().find(|s| self.active.contains(s.contact));
+                if standing.is_none() {
+                    self.base_fault = Reason::NoStance;
+                }
+                if let Some(stance) = standing.or(stances.first()) {
+                    (self.base_link, self.base) = (stance.link, stance.motion);
+                }
+            }
+        }
+    }
+
+    /// Whether the motion of every joint and of the base is known.
+    #[must_use]
+    pub fn has_motion(&self, channels: &[Channel]) -> bool {
+        let known = |(c, fault): (&Channel, &Reason)| {
+            matches!(c.role, ChannelRole::Sensor(_)) || *fault == Reason::None
+        };
+        self.base_fault == Reason::None && channels.iter().zip(&self.faults).all(known)
+    }
+}
+
+impl Observation {
+    /// Removes the reading of an F/T sensor.
+    #[must_use]
+    pub(crate) fn without_reading(mut self, sensor: usize) -> Self {
+        self.readings[sensor] = Wrench::from_parts([f64::NAN; 3], [f64::NAN; 3]);
+        self
+    }
+
+    /// Removes the torque of a joint.
+    #[must_use]
+    pub(crate) fn without_torque(mut self, dof: usize) -> Self {
+        self.torque[dof] = f64::NAN;
+        self
+    }
+
+    /// Reverses the sign of these encoders.
+    #[must_use]
+    pub(crate) fn turned(mut self, dofs: &[usize]) -> Self {
+        for &dof in dofs {
+            self.position[dof] *= -1.0;
+            self.velocity[dof] *= -1.0;
+            self.acceleration[dof] *= -1.0;
+        }
+        self
+    }
+
+    /// Adds an offset to the position of a joint.
+    #[must_use]
+    pub(crate) fn moved(mut self, dof: usize, by: f64) -> Self {
+        self.position[dof] += by;
+        self
+    }
+}
+
+/// An observation with the annotations of fits. Dereferences to the observation, which never
+/// changes.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Annotated {
+    observation: Observation,
+    /// Per F/T sensor its noise-free reading by an earlier fit, as [`Observation::readings`]; not
+    /// finite where the fit has none. Empty before a fit.
+    pub fitted: Vec<Wrench>,
+    /// Units on which an undeclared disturbance (contact or load) was found to act: numbers of
+    /// sub-trees, and [`Observation::TORQUES`] for measured joint torques.
+    pub disturbed: UnitSet,
+    /// The wrenches that sub-trees need for structural vibration, which their encoders do not show,
+    /// where it is known: the sub-tree's number in the structure, and the wrench by all that it is
+    /// attached to, about its top link's origin and in that link's axes.
+    pub vibration: Vec<(usize, Wrench)>,
+}
+
+impl From<Observation> for Annotated {
+    /// No annotations yet.
+    fn from(observation: Observation) -> Self {
+        Self {
+            observation,
+            fitted: Vec::new(),
+            disturbed: UnitSet::default(),
+            vibration: Vec::new(),
+        }
+    }
+}
+
+impl Annotated {
+    /// The observation alone.
+    pub(crate) fn observation(&self) -> &Observation {
+        &self.observation
+    }
+
+    /// Removes the fitted readings.
+    #[must_use]
+    pub(crate) fn without_fitted(mut self) -> Self {
+        self.fitted.clear();
+        self
+    }
+
+    /// Changes the observation and keeps the annotations.
+    #[must_use]
+    pub(crate) fn map(self, change: impl FnOnce(Observation) -> Observation) -> Self {
+        Self {
+            observation: change(self.observation),
+            ..self
+        }
+    }
+}
+
+/// Tests build their own observations.
+#[cfg(test)]
+impl std::ops::DerefMut for Annotated {
+    fn deref_mut(&mut self) -> &mut Observation {
+        &mut self.observation
+    }
+}
+
+impl std::ops::Deref for Annotated {
+    type Target = Observation;
+
+    fn deref(&self) -> &Observation {
+        &self.observation
+    }
+}

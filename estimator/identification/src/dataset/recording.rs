@@ -1,0 +1,297 @@
+//! Samples of a log, channel by channel, as they were recorded.
+
+use crate::dataset::defects::Defect;
+use crate::dataset::repeats::Repeats;
+use crate::dataset::stream::{ImuTrack, JointTrack, MOTION, Stream};
+use crate::robot::{Channel, ChannelRole, Robot};
+use proprio_topics::{Nanos, Quality, Reading, Reason};
+
+/// Samples of one log, channel by channel, as they were recorded.
+///
+/// [`Recording::push`] and [`Recording::declare`] fill it, in any order of channels. Samples of one
+/// channel come in the order in which they were recorded. [`crate::Dataset::new`] converts it for
+/// identification.
+#[derive(Debug, Clone)]
+pub struct Recording {
+    /// The channels that the pipeline reads, in its order.
+    pub(crate) channels: Vec<Channel>,
+    /// By degree of freedom; empty for locked joints.
+    pub(crate) joints: Vec<JointTrack>,
+    pub(crate) sensors: Vec<Stream<6>>,
+    /// Per F/T sensor the temperature of its board [degrees Celsius], in the order of arrival until
+    /// sorted.
+    pub(crate) temperatures: Vec<Vec<(Nanos, f64)>>,
+    pub(crate) imu: ImuTrack,
+    /// Per contact, from which time on it is declared present or absent.
+    pub(crate) declared: Vec<Vec<(Nanos, bool)>>,
+    pub(crate) stamped: bool,
+    pub(crate) max_silence: Nanos,
+    pub(crate) first: Nanos,
+    pub(crate) last: Nanos,
+    pub(crate) rows: u64,
+    pub(crate) skipped: Option<SkippedRows>,
+    pub(crate) repeats: Repeats,
+    pub(crate) defects: Vec<Defect>,
+}
+
+/// Rows of a table that could not be read.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SkippedRows {
+    /// Number of rows.
+    pub rows: u64,
+    /// Line of the first.
+    pub line: u64,
+    /// The error in it.
+    pub reason: String,
+}
+
+impl Recording {
+    /// An empty recording.
+    #[must_use]
+    pub fn new(robot: &Robot) -> Self {
+        let sensors = robot.structure.sensors().len();
+        Self {
+            joints: vec![JointTrack::default(); robot.model.dof_count()],
+            sensors: vec![Stream::default(); sensors],
+            temperatures: vec![Vec::new(); sensors],
+            imu: ImuTrack::default(),
+            declared: vec![Vec::new(); robot.contacts.len()],
+            stamped: true,
+            max_silence: robot.max_silence,
+            first: Nanos::MAX,
+            last: Nanos::MIN,
+            rows: 0,
+            skipped: None,
+            repeats: Repeats::new(robot.channels.len()),
+            defects: Vec::new(),
+            channels: robot.channels.clone(),
+        }
+    }
+
+    /// Adds a sample of channel number `channel` (see [`Robot::channel`]), acquired at `t`. Samples
+    /// that their device or quality bits mark as faulty are excluded and reported. Readings of
+    /// another channel's kind are ignored.
+    pub fn push(&mut self, channel: usize, t: Nanos, reading: &Reading, quality: Quality) {
+        self.repeats.see(channel, t, reading);
+        let Some(role) = self.channels.get(channel).map(|c| c.role) else {
+            return;
+        };
+        match (role, reading) {
+            (ChannelRole::Joint(dof), Reading::Joint(j)) => {
+                let Some(track) = self.joints.get_mut(dof) else {
+                    return;
+                };
+                let fault = Reason::of_quality(quality, Quality::UNTRUSTED_ENCODER);
+                track.position.push(t, [j.position], fault);
+                track.velocity.push(t, [j.velocity], fault);
+                track.acceleration.push(t, [j.acceleration], fault);
+                track.torque.push(
+                    t,
+                    [j.torque],
+                    Reason::of_quality(quality, Quality::DEVICE_FAULT),
+                );
+            }
+            (ChannelRole::Sensor(number), Reading::Wrench(w)) => {
+                let ([fx, fy, fz], [tx, ty, tz]) = (w.force, w.torque);
+                if let Some(stream) = self.sensors.get_mut(number) {
+                    stream.push(
+                        t,
+                        [fx, fy, fz, tx, ty, tz],
+                        Reason::of_quality(quality, Quality::DEVICE_FAULT),
+                    );
+                }
+            }
+            (ChannelRole::Sensor(number), Reading::Temperature(temperature)) => {
+                let is_good =
+                    temperature.celsius.is_finite() && !quality.intersects(Quality::DEVICE_FAULT);
+                if let Some(own) = self.temperatures.get_mut(number).filter(|_| is_good) {
+                    own.push((t, temperature.celsius));
+                }
+            }
+            (ChannelRole::Base, Reading::Imu(i)) => {
+                let fault = Reason::of_quality(quality, Quality::DEVICE_FAULT);
+                self.imu
+                    .proper_acceleration
+                    .push(t, i.proper_acceleration, fault);
+                self.imu.angular_velocity.push(t, i.angular_velocity, fault);
+                self.imu
+                    .angular_acceleration
+                    .push(t, i.angular_acceleration, fault);
+            }
+            _ => {}
+        }
+    }
+
+    /// Declares contact number `contact` (see [`Robot::contact`]) present or absent from `t` on.
+    pub fn declare(&mut self, contact: usize, t: Nanos, present: bool) {
+        if let Some(declared) = self.declared.get_mut(contact) {
+            declared.push((t, present));
+        }
+    }
+
+    /// States that rows have no stamps of their own: each row stands alone, and no value is carried
+    /// to the next. Stamp them [`Recording::unstamped_spacing`] apart.
+    pub fn set_unstamped(&mut self) {
+        self.stamped = false;
+    }
+
+    /// The spacing of rows without stamps for which no value is carried to the next row.
+    #[must_use]
+    pub fn unstamped_spacing(&self) -> Nanos {
+        self.max_silence + self.max_silence + Nanos(1)
+    }
+
+    /// Sets the number of rows of the table that this was read from, and its unreadable rows.
+    pub fn set_rows(&mut self, rows: u64, skipped: Option<SkippedRows>) {
+        (self.rows, self.skipped) = (rows, skipped);
+    }
+
+    /// Appends the samples that follow these.
+    pub fn append(&mut self, next: Self) {
+        self.repeats.append(next.repeats);
+        for (own, next) in self.joints.iter_mut().zip(next.joints) {
+            own.position.append(next.position);
+            own.velocity.append(next.velocity);
+            own.acceleration.append(next.acceleration);
+            own.torque.append(next.torque);
+        }
+        let sensors = self.sensors.iter_mut().zip(next.sensors);
+        sensors.for_each(|(own, next)| own.append(next));
+        let temperatures = self.temperatures.iter_mut().zip(next.temperatures);
+        temperatures.for_each(|(own, next)| own.extend(next));
+        self.imu
+            .proper_acceleration
+            .append(next.imu.proper_acceleration);
+        self.imu.angular_velocity.append(next.imu.angular_velocity);
+        self.imu
+            .angular_acceleration
+            .append(next.imu.angular_acceleration);
+        let declared = self.declared.iter_mut().zip(next.declared);
+        declared.for_each(|(own, next)| own.extend(next));
+        self.stamped &= next.stamped;
+    }
+
+    pub(crate) fn span(&mut self) {
+        (self.first, self.last) = (Nanos::MAX, Nanos::MIN);
+        let (mut first, mut last) = (Nanos::MAX, Nanos::MIN);
+        self.each_stream(|t| {
+            first = first.min(t.first().copied().unwrap_or(Nanos::MAX));
+            last = last.max(t.last().copied().unwrap_or(Nanos::MIN));
+        });
+        (self.first, self.last) = (first, last);
+    }
+
+    fn each_stream(&self, mut f: impl FnMut(&[Nanos])) {
+        for j in &self.joints {
+            [&j.position, &j.velocity, &j.acceleration, &j.torque]
+                .iter()
+                .for_each(|s| f(&s.t));
+        }
+        self.sensors.iter().for_each(|s| f(&s.t));
+        [
+            &self.imu.proper_acceleration,
+            &self.imu.angular_velocity,
+            &self.imu.angular_acceleration,
+        ]
+        .iter()
+        .for_each(|s| f(&s.t));
+    }
+
+    /// Time from the first to the last sample; zero if the log has no stamps.
+    pub(crate) fn duration(&self) -> Nanos {
+        if self.stamped {
+            self.last - self.first
+        } else {
+            Nanos::ZERO
+        }
+    }
+
+    /// Median sample spacing of the joint or base that is sampled the fastest.
+    pub(crate) fn spacing(&self) -> Nanos {
+        let joints = self.joints.iter().map(|joint| joint.position.spacing);
+        let all = joints.chain([self.imu.angular_velocity.spacing]);
+        all.filter(|spacing| *spacing > Nanos::ZERO)
+            .min()
+            .unwrap_or(Nanos::ZERO)
+    }
+
+    /// Whether the log has stamps.
+    pub(crate) fn is_stamped(&self) -> bool {
+        self.stamped
+    }
+
+    /// Samples of joint torques per second, from the median spacing of their stamps: the rate of
+    /// the fastest joint \[Hz\]; 0 if there are none. Gaps do not count.
+    pub(crate) fn torque_rate(&self) -> f64 {
+        let spacings = self
+            .joints
+            .iter()
+            .map(|joint| joint.torque.spacing.seconds());
+        spacings
+            .filter(|s| *s > 0.0)
+            .map(f64::recip)
+            .fold(0.0, f64::max)
+    }
+}
+
+impl Recording {
+    /// Applies `f` to every stream of a channel.
+    pub(crate) fn streams(
+        &mut self,
+        role: ChannelRole,
+        one: &mut dyn FnMut(&mut Stream<1>),
+        three: &mut dyn FnMut(&mut Stream<3>),
+        six: &mut dyn FnMut(&mut Stream<6>),
+    ) {
+        match role {
+            ChannelRole::Joint(dof) => self.joints[dof].each(one),
+            ChannelRole::Sensor(number) => six(&mut self.sensors[number]),
+            ChannelRole::Base => [
+                &mut self.imu.proper_acceleration,
+                &mut self.imu.angular_velocity,
+                &mut self.imu.angular_acceleration,
+            ]
+            .into_iter()
+            .for_each(three),
+        }
+    }
+
+    /// The stamps of a channel's main stream.
+    pub(crate) fn stamps(&self, role: ChannelRole) -> (&[Nanos], Nanos, Nanos) {
+        fn of<const D: usize>(s: &Stream<D>) -> (&[Nanos], Nanos, Nanos) {
+            (&s.t, s.max_gap, s.spacing)
+        }
+        match role {
+            ChannelRole::Joint(dof) => of(&self.joints[dof].position),
+            ChannelRole::Sensor(number) => of(&self.sensors[number]),
+            ChannelRole::Base => of(&self.imu.angular_velocity),
+        }
+    }
+
+    /// Whether samples of a channel in between were excluded as faulty by their device.
+    pub(crate) fn has_faulty(&self, role: ChannelRole, from: Nanos, to: Nanos) -> bool {
+        match role {
+            ChannelRole::Joint(dof) => self.joints[dof].position.faulty(from, to).is_some(),
+            ChannelRole::Sensor(number) => self.sensors[number].faulty(from, to).is_some(),
+            ChannelRole::Base => self.imu.angular_velocity.faulty(from, to).is_some(),
+        }
+    }
+
+    /// Whether a joint other than `but` moves, or the base rotates.
+    pub(crate) fn moves(&self, from: Nanos, to: Nanos, but: Option<usize>) -> bool {
+        let joint = self
+            .joints
+            .iter()
+            .enumerate()
+            .any(|(dof, j)| Some(dof) != but && j.range(from, to) > MOTION);
+        let gyro = &self.imu.angular_velocity;
+        let (begin, end) = (
+            gyro.t.partition_point(|t| *t < from),
+            gyro.t.partition_point(|t| *t <= to),
+        );
+        joint
+            || gyro.value[begin..end.max(begin)]
+                .iter()
+                .any(|w| w.iter().map(|x| x * x).sum::<f64>() > 0.01)
+    }
+}

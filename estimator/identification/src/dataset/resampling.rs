@@ -1,0 +1,271 @@
+//! Resamples a log to observations: the values of all channels at common times, with velocities and
+//! accelerations, and the faults of each channel.
+//!
+//! The pipeline does this sample by sample from the past alone. Here the samples on both sides are
+//! available:
+//!
+//! - The times are the stamps of the trigger channel, or, if that is faster than the requested
+//!   rate, the middles of equal blocks.
+//! - Wrenches, torques, proper accelerations and given derivatives: a channel faster than the rate
+//!   is averaged over the block (the integral of the straight lines between its samples, so that
+//!   stamps may jitter). A slower channel is used directly if it has a sample at that time, and
+//!   interpolated by the cubic through four neighbours otherwise. (The error of a straight line is
+//!   an eighth of the squared period times the curvature: at 100 Hz more than the noise of a sensor
+//!   that carries a robot.) A log whose rows hold all channels is therefore used row by row.
+//! - Positions, and velocities and accelerations that are not given, come from polynomials around
+//!   the time. Their window and degree are chosen along the log ([`crate::dataset::smooth`]).
+//! - Each observation has the fault of each channel: silent for too long, saturated, faulty, too
+//!   close to the log's end for a derivative. An F/T reading far from the model and from its
+//!   neighbours is marked as an outlier.
+//!
+//! Readings are corrected as configured ([`proprio_dynamics::calibration`]). Configured offsets are
+//! not subtracted, since identification determines the reading without load.
+
+use crate::dataset::defects::{Defect, OffsetJump};
+use crate::dataset::observation::Observation;
+use crate::dataset::recording::Recording;
+use crate::dataset::smooth::{Scratch, Smoother};
+use crate::dataset::stream::{ImuTrack, JointAt, is_dense};
+use crate::parallel;
+use crate::robot::{BaseMotion, Channel, ChannelRole, Robot};
+use proprio_dynamics::spatial::{Vec3, Wrench};
+use proprio_dynamics::{ContactSet, FrameMotion, SensorSet};
+use proprio_topics::{Nanos, Reason};
+
+/// Settings of the resampling.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Settings {
+    /// Greatest number of observations per second \[Hz\]. A slower log keeps its own stamps.
+    pub rate: f64,
+    /// Length of signal required on either side of a time for its derivatives, unless the window is
+    /// narrower \[ns\].
+    pub edge: Nanos,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            rate: 100.0,
+            edge: Nanos::from_millis(300),
+        }
+    }
+}
+
+/// The observations of a log, and its defects.
+#[derive(Debug, Clone)]
+pub struct Observations {
+    /// In order of time.
+    pub instants: Vec<Observation>,
+    /// Where the offset of an F/T sensor seems to jump, judged by its readings alone. From there on
+    /// the offset is re-initialised, unless a fit contradicts.
+    pub offset_jumps: Vec<OffsetJump>,
+    /// All other defects of the log: those of single channels, and those found at common times.
+    pub defects: Vec<Defect>,
+}
+
+impl Recording {
+    /// The observations of the log.
+    pub(crate) fn instants(&self, robot: &Robot, settings: &Settings) -> Observations {
+        let period = Nanos::from_seconds(1.0 / settings.rate);
+        let times = self.times(robot, period);
+        let joints = self.joint_columns(&times, period, settings);
+        let imu = self.imu_column(robot, &times, period, settings);
+        let dofs = robot.model.dof_count();
+        let at_rest: Vec<f64> = robot
+            .locked
+            .iter()
+            .map(|q| if q.is_nan() { 0.0 } else { *q })
+            .collect();
+        let at = |number: usize| {
+            let t = times[number];
+            let mut observation = Observation {
+                t,
+                position: at_rest.clone(),
+                velocity: vec![0.0; dofs],
+                acceleration: vec![0.0; dofs],
+                torque: vec![f64::NAN; dofs],
+                base_link: robot.base_link,
+                base: FrameMotion::standing(&Vec3::zeros()),
+                readings: vec![
+                    Wrench::from_parts([f64::NAN; 3], [f64::NAN; 3]);
+                    self.sensors.len()
+                ],
+                active: self.active(robot, t),
+                faults: vec![Reason::None; self.channels.len()],
+                base_fault: Reason::None,
+                temperatures: self
+                    .temperatures
+                    .iter()
+                    .map(|own| temperature_at(own, t))
+                    .collect(),
+                outliers: SensorSet::default(),
+            };
+            observation.stand(robot);
+            for (channel, fault) in self.channels.iter().zip(&mut observation.faults) {
+                *fault = match channel.role {
+                    ChannelRole::Joint(dof) => {
+                        let state = &joints[dof][number];
+                        [
+                            observation.position[dof],
+                            observation.velocity[dof],
+                            observation.acceleration[dof],
+                        ] = state.motion;
+                        observation.torque[dof] = state.torque;
+                        state.fault
+                    }
+                    ChannelRole::Sensor(sensor) => match self.sensors[sensor].mean(t, period) {
+                        Ok([fx, fy, fz, tx, ty, tz]) => {
+                            observation.readings[sensor] = robot.calibrations[sensor].apply(
+                                &Wrench::from_parts([fx, fy, fz], [tx, ty, tz]),
+                                observation.temperatures[sensor],
+                            );
+                            Reason::None
+                        }
+                        Err(reason) => reason,
+                    },
+                    ChannelRole::Base => {
+                        observation.base = imu[number].0;
+                        imu[number].1
+                    }
+                };
+            }
+            observation
+        };
+        Observations {
+            instants: parallel::in_chunks(times.len(), |range| range.map(at).collect()),
+            offset_jumps: Vec::new(),
+            defects: self.defects.clone(),
+        }
+    }
+
+    /// The times of the observations.
+    fn times(&self, robot: &Robot, period: Nanos) -> Vec<Nanos> {
+        let stamps = |channel: &Channel| match channel.role {
+            ChannelRole::Joint(dof) => (
+                &self.joints[dof].position.t,
+                self.joints[dof].position.spacing,
+            ),
+            ChannelRole::Sensor(number) => (&self.sensors[number].t, self.sensors[number].spacing),
+            ChannelRole::Base => (
+                &self.imu.angular_velocity.t,
+                self.imu.angular_velocity.spacing,
+            ),
+        };
+        let trigger = self.channels.get(robot.trigger).map(stamps);
+        let there = trigger.filter(|(t, _)| !t.is_empty());
+        let Some((stamps, spacing)) = there.or_else(|| {
+            self.channels
+                .iter()
+                .map(stamps)
+                .find(|(t, _)| !t.is_empty())
+        }) else {
+            return Vec::new();
+        };
+        if !is_dense(spacing, period) {
+            return stamps.clone();
+        }
+        let (first, mut times) = (stamps.first().copied().unwrap_or_default(), Vec::new());
+        let mut block = -1;
+        for t in stamps {
+            let number = (*t - first).0 / period.0;
+            if number > block {
+                block = number;
+                times.push(first + Nanos(number * period.0 + period.0 / 2));
+            }
+        }
+        times
+    }
+
+    fn active(&self, robot: &Robot, t: Nanos) -> ContactSet {
+        let mut active = robot.always;
+        for (contact, declared) in self.declared.iter().enumerate() {
+            match declared
+                .partition_point(|(from, _)| *from <= t)
+                .checked_sub(1)
+                .and_then(|i| declared.get(i))
+            {
+                Some((_, true)) => active.insert(contact),
+                Some((_, false)) if robot.support != Some(contact) => active.remove(contact),
+                _ => {}
+            }
+        }
+        active
+    }
+
+    /// Per degree of freedom and time. Joints are independent, so they run on all cores.
+    fn joint_columns(
+        &self,
+        times: &[Nanos],
+        period: Nanos,
+        settings: &Settings,
+    ) -> Vec<Vec<JointAt>> {
+        parallel::map(self.joints.len(), |dof| {
+            self.joints[dof].at_all(times, period, settings.edge.seconds())
+        })
+    }
+
+    fn imu_column(
+        &self,
+        robot: &Robot,
+        times: &[Nanos],
+        period: Nanos,
+        settings: &Settings,
+    ) -> Vec<(FrameMotion, Reason)> {
+        let BaseMotion::Imu(pose) = &robot.base else {
+            return Vec::new();
+        };
+        let ImuTrack {
+            proper_acceleration,
+            angular_velocity,
+            angular_acceleration,
+        } = &self.imu;
+        let smoothers: Vec<Smoother> = if angular_acceleration.t.is_empty() {
+            (0..3).map(|axis| angular_velocity.smoother(axis)).collect()
+        } else {
+            Vec::new()
+        };
+        let mut scratch = Scratch::default();
+        let mut at = |t: Nanos| -> Result<FrameMotion, Reason> {
+            let (omega, alpha) = if smoothers.is_empty() {
+                (
+                    angular_velocity.mean(t, period)?,
+                    angular_acceleration.mean(t, period)?,
+                )
+            } else {
+                angular_velocity.mean(t, period)?;
+                let (mut omega, mut alpha) = ([0.0; 3], [0.0; 3]);
+                for (axis, smoother) in smoothers.iter().enumerate() {
+                    let both = smoother.at(t, 0..=1, settings.edge.seconds(), &mut scratch);
+                    [omega[axis], alpha[axis], _] = both.ok_or(Reason::Starting)?;
+                }
+                (omega, alpha)
+            };
+            let measured = FrameMotion {
+                angular_velocity: Vec3::from(omega),
+                angular_acceleration: Vec3::from(alpha),
+                proper_acceleration: Vec3::from(proper_acceleration.mean(t, period)?),
+            };
+            Ok(FrameMotion::of_link_from_imu(&measured, pose))
+        };
+        let standing = FrameMotion::standing(&Vec3::zeros());
+        times
+            .iter()
+            .map(|t| at(*t).map_or_else(|fault| (standing, fault), |m| (m, Reason::None)))
+            .collect()
+    }
+}
+
+/// The temperature at `t`, from samples sorted by stamp.
+fn temperature_at(samples: &[(Nanos, f64)], t: Nanos) -> f64 {
+    let after = samples.partition_point(|(stamp, _)| *stamp <= t);
+    match (
+        after.checked_sub(1).and_then(|i| samples.get(i)),
+        samples.get(after),
+    ) {
+        (Some((from, before)), Some((to, next))) => {
+            before + (t - *from).seconds() / (*to - *from).seconds() * (next - before)
+        }
+        (Some((_, only)), None) | (None, Some((_, only))) => *only,
+        (None, None) => f64::NAN,
+    }
+}

@@ -1,0 +1,455 @@
+//! Undeclared disturbances of the robot in a recorded log: contacts.
+//!
+//! The test follows a fit: a fit to all of the log absorbs most of CAD's errors, which therefore do
+//! not look like contacts. The scale is the log's own usual residual: model errors and structural
+//! vibration are present all the time and grow with motion; a contact is a temporary, large
+//! residual.
+//!
+//! Per part of the robot (*unit*: a sub-tree between F/T sensors, or all measured joint torques)
+//! and block of 0.1 s, the whitened square of the mean residual is compared with that of blocks in
+//! which the robot moves as much. Outlying blocks are excluded with a margin, and the fit is
+//! repeated ([`crate::batch`]) until the excluded set does not change.
+//!
+//! See also [`crate::diagnose::offset_jumps`] (sudden changes of a sensor's offset) and
+//! [`crate::diagnose::load`] (a body that is picked up or put down).
+
+use crate::dataset::observation::{Observation, UnitSet};
+use crate::diagnose::load::Load;
+use crate::measurement::model::MeasurementModel;
+use crate::measurement::noise_model::NoiseModel;
+use crate::measurement::reduction::{Segment, blocks, residuals};
+use crate::measurement::rows::Rows;
+use crate::statistics::chi_square;
+use crate::training::{SEGMENT_INSTANTS, TrainingLog, map_segments};
+use nalgebra::DVector;
+
+/// Normal deviate beyond which a block's square is outlying: one block in three million by chance.
+///
+/// With the two constants below, the threshold for six channels is 39 times the usual square. Real
+/// logs without contacts, a leg of cables and a torque-controlled arm, reach 12 to 24 times; pushes
+/// of 5 N at a hand with the arm's board 80 and more.
+const OUTLYING: f64 = 5.0;
+
+/// Factor by which the variance of model errors varies among blocks with the same motion.
+const VARIES: f64 = 3.5;
+
+/// Most degrees of freedom of a block's square, those of a wrench.
+const FREE: usize = 6;
+
+/// The quantile that is called usual, three in ten, so that contacts may last most of the time; and
+/// the normal deviate with this probability below it.
+const USUAL: f64 = 0.3;
+const USUAL_DEVIATE: f64 = -0.524_400_5;
+
+/// Blocks before and after an outlying one that are excluded, too: a contact begins and ends
+/// gradually.
+const MARGIN: usize = 2;
+
+/// Most rounds of level, scale and outlying blocks.
+const ROUNDS: usize = 20;
+
+/// Shortest stretch with a level of its own [blocks].
+const SHORTEST: usize = 10;
+
+/// Where a larger fraction of the blocks is outlying, no contact is reported: model and log are
+/// then not of the same robot.
+const MOST: f64 = 0.7;
+
+/// Half of the window whose median is the level of a channel [blocks]: an offset drifts more
+/// slowly, a contact is shorter.
+const WINDOW: usize = 150;
+
+/// Per log and instant, the units on which an undeclared contact acts. The spans of `loads` are not
+/// tested.
+pub(crate) fn contacts(
+    measurement: &MeasurementModel<'_>,
+    all: &[&TrainingLog],
+    loads: &[Load],
+    noise: &NoiseModel,
+    d: &DVector<f64>,
+) -> Vec<Vec<UnitSet>> {
+    // Long logs in parts, so that all cores have work; of at least a minute, so that a contact does
+    // not last for most of it.
+    let (mut segments, mut logs) = (Vec::new(), Vec::new());
+    for (number, log) in all.iter().enumerate() {
+        let minutes = ((log.span.1 - log.span.0).seconds() / 60.0) as usize;
+        let count = log
+            .instants
+            .len()
+            .div_ceil(SEGMENT_INSTANTS)
+            .min(minutes)
+            .max(1);
+        let at = |part: usize| log.instants.len() * part / count;
+        for part in 0..count {
+            segments.push(Segment {
+                instants: &log.instants[at(part)..at(part + 1)],
+                offset_jumps: &log.offset_jumps,
+            });
+            logs.push(number);
+        }
+    }
+    let found = map_segments(measurement, &segments, |measurement, number, segment| {
+        let own: Vec<&Load> = loads
+            .iter()
+            .filter(|load| load.log == logs[number])
+            .collect();
+        of_segment(measurement, segment, &own, noise, d)
+    });
+    let mut out = vec![Vec::new(); all.len()];
+    for (log, found) in logs.into_iter().zip(found) {
+        out[log].extend(found);
+    }
+    out
+}
+
+fn of_segment(
+    measurement: &mut MeasurementModel<'_>,
+    segment: Segment<'_>,
+    loads: &[&Load],
+    noise: &NoiseModel,
+    d: &DVector<f64>,
+) -> Vec<UnitSet> {
+    let unknowns = measurement.unknowns().clone();
+    let channels = unknowns.channels();
+    let variances = noise.following();
+    let residuals = residuals(measurement, segment, noise, std::slice::from_ref(d));
+    // The median of each offset over a stretch: the offset itself may have followed a contact, and
+    // would hide it.
+    let ranges = blocks(&unknowns, segment);
+    let starts_of = |counts: &dyn Fn(usize) -> bool| {
+        let jumps = (0..ranges.len()).filter(|&k| ranges[k].1.iter().any(|sensor| counts(*sensor)));
+        stretches(jumps, ranges.len())
+    };
+    let mut nuisance = vec![DVector::zeros(unknowns.nuisance()); ranges.len()];
+    for unknown in 0..unknowns.nuisance() {
+        // Six offsets per sensor, then friction, which is never re-initialised.
+        for stretch in starts_of(&|sensor| sensor == unknown / 6).windows(2) {
+            let own = residuals.nuisance[stretch[0]..stretch[1]].iter();
+            let middle = quantile(own.map(|block| block.x[(unknown, 0)]).collect(), 0.5);
+            nuisance[stretch[0]..stretch[1]]
+                .iter_mut()
+                .for_each(|x| x[unknown] = middle);
+        }
+    }
+    // Per unit, channel and block: the mean of the channel's most likely noise, offset drift
+    // included, from the unit's rows alone.
+    let units: Vec<usize> = (0..measurement.robot().structure.subtrees().len())
+        .chain([Observation::TORQUES])
+        .collect();
+    let mut series = vec![vec![vec![f64::NAN; ranges.len()]; channels]; units.len()];
+    let mut motion = vec![0.0; ranges.len()];
+    let (mut rows, mut own) = (Rows::new(&unknowns), Rows::new(&unknowns));
+    let (mut white, mut e) = (Vec::new(), vec![0.0; channels]);
+    measurement.include_disturbed(true);
+    for (block, (range, _)) in ranges.iter().enumerate() {
+        let mut sums = vec![(vec![0.0; channels], vec![0.0_f64; channels]); units.len()];
+        for instant in &segment.instants[range.clone()] {
+            motion[block] +=
+                instant.velocity.iter().map(|v| v * v).sum::<f64>() / range.len() as f64;
+            if measurement.make(instant, &mut rows).is_err() {
+                continue;
+            }
+            for (&unit, (sums, counts)) in units.iter().zip(&mut sums) {
+                if loads
+                    .iter()
+                    .any(|load| load.units.contains(unit) && load.has(instant.t))
+                {
+                    continue;
+                }
+                rows.copy_unit(unit, &mut own);
+                if own.count == 0 {
+                    continue;
+                }
+                white.clear();
+                white.extend((0..own.count).map(|row| {
+                    own.r(row)
+                        - crate::arithmetic::dot(own.a(row), d.as_slice())
+                        - crate::arithmetic::dot(own.g(row), nuisance[block].as_slice())
+                }));
+                own.whiten_with(&variances, &mut white, 1);
+                own.channel_noise(&variances, &mut white, &mut e);
+                for channel in (0..channels).filter(|&channel| own.has(channel)) {
+                    sums[channel] += e[channel];
+                    counts[channel] += 1.0;
+                }
+            }
+        }
+        for ((sums, counts), series) in sums.iter().zip(&mut series) {
+            for channel in (0..channels).filter(|&channel| counts[channel] > 0.0) {
+                series[channel][block] = sums[channel] / counts[channel];
+            }
+        }
+    }
+    measurement.include_disturbed(false);
+    let mut out = vec![UnitSet::default(); segment.instants.len()];
+    for (&unit, series) in units.iter().zip(&series) {
+        let seen: Vec<usize> = (0..channels)
+            .filter(|&c| series[c].iter().any(|x| x.is_finite()))
+            .collect();
+        let own: Vec<&[f64]> = seen.iter().map(|&c| series[c].as_slice()).collect();
+        let least: Vec<f64> = seen.iter().map(|&c| noise.least[c]).collect();
+        let starts = starts_of(&|sensor| seen.iter().any(|channel| channel / 6 == sensor));
+        let outlier = outlying(&own, &starts, &motion, &least);
+        let share =
+            outlier.iter().filter(|outlier| **outlier).count() as f64 / outlier.len().max(1) as f64;
+        if share > MOST {
+            continue;
+        }
+        for ((range, _), _) in ranges.iter().zip(&outlier).filter(|(_, outlier)| **outlier) {
+            out[range.clone()]
+                .iter_mut()
+                .for_each(|set| set.insert(unit));
+        }
+    }
+    out
+}
+
+/// First blocks of the stretches between these offset jumps, each with a level of its own, then the
+/// number of blocks. A stretch that is too short to separate its level from a contact is joined to
+/// its neighbour: during a contact, offset jumps of several sensors may follow each other.
+fn stretches(jumps: impl Iterator<Item = usize>, count: usize) -> Vec<usize> {
+    let mut starts = vec![0];
+    for at in jumps {
+        if at - starts[starts.len() - 1] >= SHORTEST {
+            starts.push(at);
+        }
+    }
+    if starts.len() > 1 && count - starts[starts.len() - 1] < SHORTEST {
+        starts.pop();
+    }
+    starts.push(count);
+    starts
+}
+
+/// Whether each block of some channels' means is outlying from a slowly drifting level. A new level
+/// begins at each of `starts`, which end with the number of blocks. `motion`: mean square velocity
+/// in each block. `least`: lower bounds of the channels' variances.
+fn outlying(series: &[&[f64]], starts: &[usize], motion: &[f64], least: &[f64]) -> Vec<bool> {
+    let count = motion.len();
+    let mut outlier = vec![false; count];
+    if series.is_empty() || count == 0 {
+        return outlier;
+    }
+    let mut levels: Vec<Vec<f64>> = series
+        .iter()
+        .map(|series| medians(series, starts))
+        .collect();
+    let of_channels = |deviate: f64| chi_square(series.len().min(FREE), deviate);
+    let most = VARIES * of_channels(OUTLYING) / of_channels(USUAL_DEVIATE);
+    for _ in 0..ROUNDS {
+        let mut squares = vec![0.0; count];
+        let mut seen = vec![false; count];
+        for ((series, level), least) in series.iter().zip(&levels).zip(least) {
+            let errors: Vec<f64> = series
+                .iter()
+                .zip(level)
+                .map(|(x, level)| (x - level).powi(2))
+                .collect();
+            let usual = errors
+                .iter()
+                .zip(&outlier)
+                .filter(|(x, outlier)| x.is_finite() && !**outlier);
+            // The median of the square of a normal deviate is 0.455.
+            let scale = (quantile(usual.map(|(x, _)| *x).collect(), 0.5) / 0.455).max(*least);
+            for (block, error) in errors
+                .iter()
+                .enumerate()
+                .filter(|(_, error)| error.is_finite())
+            {
+                squares[block] += error / scale;
+                seen[block] = true;
+            }
+        }
+        let usual = usual(&squares, &seen, motion);
+        let fails: Vec<bool> = (0..count)
+            .map(|k| seen[k] && squares[k] > most * usual[k])
+            .collect();
+        let mut next = vec![false; count];
+        for k in (0..count).filter(|&k| fails[k]) {
+            next[k.saturating_sub(MARGIN)..(k + MARGIN + 1).min(count)].fill(true);
+        }
+        if next == outlier {
+            break;
+        }
+        outlier = next;
+        for (series, level) in series.iter().zip(&mut levels) {
+            let clean: Vec<f64> = series
+                .iter()
+                .zip(&outlier)
+                .map(|(x, outlier)| if *outlier { f64::NAN } else { *x })
+                .collect();
+            // A level that follows faster would also follow a contact.
+            for (level, next) in level.iter_mut().zip(medians(&clean, starts)) {
+                if next.is_finite() {
+                    *level = next;
+                }
+            }
+        }
+    }
+    outlier
+}
+
+/// The usual square of each block: that of blocks with about the same motion, but not less than
+/// that of all blocks.
+fn usual(squares: &[f64], seen: &[bool], motion: &[f64]) -> Vec<f64> {
+    const STATIONS: usize = 40;
+    let mut order: Vec<usize> = (0..squares.len()).filter(|&k| seen[k]).collect();
+    order.sort_by(|&a, &b| motion[a].total_cmp(&motion[b]).then(a.cmp(&b)));
+    let of = |some: &[usize]| quantile(some.iter().map(|&k| squares[k]).collect(), USUAL);
+    let all = of(&order);
+    let mut out = vec![all; squares.len()];
+    // A third of the blocks at a time, so that a contact is not most of any. Among all thirds that
+    // contain a block the largest value counts: the residual may change at once where motion
+    // begins.
+    let width = order.len().div_ceil(3).max(25).min(order.len());
+    let stride = order.len().div_ceil(STATIONS).max(1);
+    let last = order.len() - width;
+    for start in (0..last).step_by(stride).chain([last]) {
+        let own = &order[start..start + width];
+        let near = of(own);
+        own.iter().for_each(|&k| out[k] = out[k].max(near));
+    }
+    out
+}
+
+/// Moving medians of a series, per stretch.
+fn medians(series: &[f64], starts: &[usize]) -> Vec<f64> {
+    const STRIDE: usize = 10;
+    let mut out = vec![f64::NAN; series.len()];
+    for stretch in starts.windows(2) {
+        for start in (stretch[0]..stretch[1]).step_by(STRIDE) {
+            let end = (start + STRIDE).min(stretch[1]);
+            let around =
+                start.saturating_sub(WINDOW).max(stretch[0])..(end + WINDOW).min(stretch[1]);
+            let own = series[around]
+                .iter()
+                .copied()
+                .filter(|x| x.is_finite())
+                .collect();
+            out[start..end].fill(quantile(own, 0.5));
+        }
+    }
+    out
+}
+
+/// A quantile of some numbers; NaN if there are none.
+fn quantile(mut values: Vec<f64>, share: f64) -> f64 {
+    if values.is_empty() {
+        return f64::NAN;
+    }
+    let place = (share * (values.len() - 1) as f64).round() as usize;
+    *values.select_nth_unstable_by(place, f64::total_cmp).1
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::arithmetic::normals;
+
+    /// Six channels of a robot that stands, moves slowly, moves fast, by turns, with a residual
+    /// that grows with the speed; offsets that drift and jump once.
+    fn usual_log(seed: u64) -> (Vec<Vec<f64>>, Vec<usize>, Vec<f64>) {
+        let count = 600;
+        let motion: Vec<f64> = (0..count).map(|k| [0.0, 0.3, 2.0][k / 40 % 3]).collect();
+        let series = (0..6)
+            .map(|channel| {
+                let noise = normals(10 * seed + channel, count);
+                let slope = 1e-3 * channel as f64;
+                let value = |k: usize| 7.0 + slope * k as f64 + if k < 350 { 0.0 } else { 20.0 };
+                (0..count)
+                    .map(|k| value(k) + (0.1 + motion[k]) * noise[k])
+                    .collect()
+            })
+            .collect();
+        (series, vec![0, 350, count], motion)
+    }
+
+    fn found(series: &[Vec<f64>], starts: &[usize], motion: &[f64]) -> Vec<bool> {
+        let series: Vec<&[f64]> = series.iter().map(Vec::as_slice).collect();
+        outlying(&series, starts, motion, &vec![1e-6; series.len()])
+    }
+
+    #[test]
+    fn errors_that_grow_with_motion_and_drift_are_no_contact() {
+        for seed in 0..20 {
+            let (series, starts, motion) = usual_log(seed);
+            assert_eq!(
+                found(&series, &starts, &motion)
+                    .iter()
+                    .filter(|outlier| **outlier)
+                    .count(),
+                0,
+                "seed {seed}"
+            );
+        }
+    }
+
+    /// With few channels, squares of many times the usual one occur by chance.
+    #[test]
+    fn noise_of_few_channels_is_no_contact() {
+        for channels in 1..=3 {
+            for seed in 0..20 {
+                let (mut series, starts, motion) = usual_log(seed);
+                series.truncate(channels);
+                let outlier = found(&series, &starts, &motion);
+                assert_eq!(
+                    outlier.iter().filter(|outlier| **outlier).count(),
+                    0,
+                    "{channels}, seed {seed}"
+                );
+                series[0][90..140].iter_mut().for_each(|x| *x += 60.0);
+                let outlier = found(&series, &starts, &motion);
+                assert!(
+                    outlier[90..140].iter().all(|outlier| *outlier),
+                    "{channels}, seed {seed}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn temporary_forces_are_contacts_while_they_last() {
+        for seed in 0..20 {
+            let (mut series, starts, motion) = usual_log(seed);
+            // A third of the time, in two directions, while the robot moves fast and while it
+            // stands.
+            let spans = [90..140, 200..260, 400..470, 540..555];
+            for (number, span) in spans.iter().enumerate() {
+                for (channel, size) in [(number, 60.0), (number + 1, -40.0)] {
+                    series[channel][span.clone()]
+                        .iter_mut()
+                        .for_each(|x| *x += size);
+                }
+            }
+            let outlier = found(&series, &starts, &motion);
+            for (k, outlier) in outlier.iter().enumerate() {
+                let in_contact = spans.iter().any(|span| span.contains(&k));
+                let near = spans
+                    .iter()
+                    .any(|span| k + MARGIN >= span.start && k < span.end + MARGIN);
+                assert!(*outlier || !in_contact, "seed {seed}: block {k} is touched");
+                assert!(!*outlier || near, "seed {seed}: block {k} is free");
+            }
+        }
+    }
+
+    /// Offset jumps of two sensors that follow each other, as where something is picked up: the
+    /// stretch between them has no level of its own, and a contact continues across it.
+    #[test]
+    fn a_contact_does_not_hide_between_offset_jumps() {
+        for seed in 0..20 {
+            let (mut series, _, motion) = usual_log(seed);
+            let span = 100..160;
+            for (channel, size) in [(0, 60.0), (3, -40.0)] {
+                series[channel][span.clone()]
+                    .iter_mut()
+                    .for_each(|x| *x += size);
+            }
+            let starts = stretches([127, 131, 350].into_iter(), motion.len());
+            assert_eq!(starts, [0, 127, 350, 600]);
+            let outlier = found(&series, &starts, &motion);
+            assert!(outlier[span].iter().all(|outlier| *outlier), "seed {seed}");
+        }
+        assert_eq!(stretches([4, 300, 595].into_iter(), 600), [0, 300, 600]);
+    }
+}

@@ -1,0 +1,317 @@
+//! A load that is picked up or put down within a log.
+
+use crate::dataset::observation::{Annotated, Observation, UnitSet};
+use crate::hypothesis::needed;
+use crate::linear::information::Information;
+use crate::measurement::model::MeasurementModel;
+use crate::measurement::noise_model::NoiseModel;
+use crate::measurement::reduction::{Segment, reduce};
+use crate::measurement::unknowns::{Unknowns, WIDTH};
+use crate::prior::Prior;
+use crate::training::{TrainingLog, map_segments};
+use nalgebra::{DMatrix, DVector, SMatrix, SVector};
+use proprio_topics::Nanos;
+use std::ops::Range;
+
+/// A log is divided into segments of a second, but at most this many, to find when a load changes.
+pub(crate) const SEGMENTS: usize = 64;
+
+/// Length of these segments \[s\].
+pub(crate) const SEGMENT_SECONDS: f64 = 1.0;
+
+/// Fewest segments on either side of the change.
+pub(crate) const LEAST_SEGMENTS: usize = 3;
+
+/// Smallest mass of a load \[kg\].
+pub(crate) const LEAST_MASS: f64 = 0.02;
+
+/// Largest distance of its centre of mass from its link's origin \[m\].
+pub(crate) const REACH: f64 = 1.0;
+
+/// A load that changes within a log.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Load {
+    /// Number of the training log.
+    pub log: usize,
+    /// Place of its link in the layout.
+    pub place: usize,
+    /// The side of the change that is excluded, first and last stamp.
+    pub span: (Nanos, Nanos),
+    /// The part of it that is not close to the change: there the load is constant.
+    pub clear: (Nanos, Nanos),
+    /// Uncertainty of the time of the change \[s\].
+    pub within: f64,
+    /// Whether the excluded side is that after the change.
+    pub is_after: bool,
+    /// The units whose equations contain it.
+    pub units: UnitSet,
+}
+
+impl Load {
+    /// Whether an instant of that log is in the excluded part.
+    pub(crate) fn has(&self, t: Nanos) -> bool {
+        self.span.0 <= t && t <= self.span.1
+    }
+}
+
+/// Inertial parameters that a load adds to a link, with their covariance.
+#[derive(Clone, Debug)]
+pub(crate) struct AddedBody {
+    pub parameters: SVector<f64, WIDTH>,
+    pub covariance: SMatrix<f64, WIDTH, WIDTH>,
+}
+
+/// Normal equations `[R^T R, R^T z]` of some information. They are used to search for a load, not
+/// for the final estimate.
+pub(crate) struct Normal {
+    pub(crate) matrix: DMatrix<f64>,
+    pub(crate) right: DVector<f64>,
+}
+
+impl Normal {
+    pub(crate) fn new(unknowns: usize) -> Self {
+        Self {
+            matrix: DMatrix::zeros(unknowns, unknowns),
+            right: DVector::zeros(unknowns),
+        }
+    }
+
+    pub(crate) fn add(&mut self, information: &Information) {
+        let (r, z) = information.to_triangle();
+        self.matrix += r.transpose() * &r;
+        self.right += r.transpose() * z;
+    }
+
+    pub(crate) fn add_prior(&mut self, prior: &Prior, unknowns: &Unknowns, tau: f64) {
+        for (place, &link) in unknowns.links.iter().enumerate() {
+            let mut own = self
+                .matrix
+                .fixed_view_mut::<WIDTH, WIDTH>(WIDTH * place, WIDTH * place);
+            own += prior.metric(link) / (2.0 * tau * tau);
+        }
+        for (precision, column) in unknowns
+            .precision
+            .iter()
+            .copied()
+            .zip(unknowns.inertial()..)
+        {
+            self.matrix[(column, column)] += precision;
+        }
+    }
+}
+
+/// The parameters of a body that is on the link at `place` in `some` of the data only, and by how
+/// much it reduces the squared residuals. `factor`: of all data and the prior; `x`: their solution.
+pub(crate) fn body(
+    prior: &Prior,
+    unknowns: &Unknowns,
+    place: usize,
+    some: &Normal,
+    factor: &nalgebra::Cholesky<f64, nalgebra::Dyn>,
+    x: &DVector<f64>,
+) -> Option<(AddedBody, f64)> {
+    let cross = some
+        .matrix
+        .fixed_columns::<WIDTH>(WIDTH * place)
+        .into_owned();
+    let own = cross.fixed_rows::<WIDTH>(WIDTH * place).into_owned();
+    // A weak prior: the body is known to three times the link's own size.
+    let weak = prior.metric(unknowns.links[place]) / 18.0;
+    let rest = own + weak - cross.transpose() * factor.solve(&cross);
+    let misfit = some.right.fixed_rows::<WIDTH>(WIDTH * place).into_owned() - cross.transpose() * x;
+    let covariance = rest.cholesky()?.inverse();
+    let parameters = covariance * misfit;
+    let gain = misfit.dot(&parameters);
+    Some((
+        AddedBody {
+            parameters,
+            covariance,
+        },
+        gain,
+    ))
+}
+
+impl AddedBody {
+    /// Whether these parameters are plausible for a load.
+    pub(crate) fn is_a_body(&self) -> bool {
+        let mass = self.parameters[0];
+        let centre = self.parameters.fixed_rows::<3>(1) / mass;
+        let is_sure = mass * mass > needed(1, 1) * self.covariance[(0, 0)];
+        mass.abs() > LEAST_MASS && is_sure && centre.norm() < REACH
+    }
+}
+
+/// Looks for a load that changes within one of the logs, given the noise and the prior's scale
+/// `tau` of a fit to all of them.
+///
+/// A log is divided into segments. For each boundary between two segments and each link at the end
+/// of a limb: the gain is the reduction of the squared residuals by a body on that link in the
+/// segments after the boundary only, or in those before it only. The side that is excluded: with
+/// several logs, the one with the larger gain; with a single log, the shorter one.
+pub(crate) fn find(
+    measurement: &MeasurementModel<'_>,
+    prior: &Prior,
+    training: &[&TrainingLog],
+    noise: &NoiseModel,
+    tau: f64,
+) -> Option<Load> {
+    let unknowns = measurement.unknowns();
+    let model = &measurement.robot().model;
+    let mut segments = Vec::new();
+    let mut of_log: Vec<Range<usize>> = Vec::new();
+    let segment_seconds = |log: &TrainingLog| {
+        ((log.span.1 - log.span.0).seconds() / SEGMENTS as f64).max(SEGMENT_SECONDS)
+    };
+    for log in training {
+        let first = segments.len();
+        let seconds = segment_seconds(log);
+        let mut start = 0;
+        for i in 1..=log.instants.len() {
+            let ends = log
+                .instants
+                .get(i)
+                .is_none_or(|instant| (instant.t - log.instants[start].t).seconds() >= seconds);
+            if ends {
+                segments.push(Segment {
+                    instants: &log.instants[start..i],
+                    offset_jumps: &log.offset_jumps,
+                });
+                start = i;
+            }
+        }
+        of_log.push(first..segments.len());
+    }
+    let reduced = map_segments(measurement, &segments, |measurement, _, segment| {
+        reduce(measurement, segment, noise).information
+    });
+    let mut all = Normal::new(unknowns.parameters());
+    reduced.iter().for_each(|reduced| all.add(reduced));
+    all.add_prior(prior, unknowns, tau);
+    let factor = all.matrix.clone().cholesky()?;
+    let x = factor.solve(&all.right);
+    let ends: Vec<usize> = (0..unknowns.links.len())
+        .filter(|&place| {
+            model
+                .joints()
+                .iter()
+                .all(|joint| joint.parent != unknowns.links[place])
+        })
+        .collect();
+    // The threshold is that of a single test, because the noise still includes the load. The noise
+    // of the fit without it decides.
+    let least = needed(WIDTH, 1);
+    let mut best: Option<(f64, f64, usize, usize, usize)> = None;
+    for (log, range) in of_log.iter().enumerate() {
+        if range.len() < 2 * LEAST_SEGMENTS {
+            continue;
+        }
+        let mut whole = Normal::new(unknowns.parameters());
+        reduced[range.clone()]
+            .iter()
+            .for_each(|reduced| whole.add(reduced));
+        let mut before = Normal::new(unknowns.parameters());
+        for at in range.start + 1..range.end + 1 - LEAST_SEGMENTS {
+            before.add(&reduced[at - 1]);
+            if at < range.start + LEAST_SEGMENTS {
+                continue;
+            }
+            let after = Normal {
+                matrix: &whole.matrix - &before.matrix,
+                right: &whole.right - &before.right,
+            };
+            for &place in &ends {
+                let of = |some: &Normal| {
+                    body(prior, unknowns, place, some, &factor, &x)
+                        .filter(|(added, _)| added.is_a_body())
+                        .map_or(0.0, |(_, gain)| gain)
+                };
+                let (later, earlier) = (of(&after), of(&before));
+                let gain = later.max(earlier);
+                if gain > least && best.is_none_or(|best| gain > best.0.max(best.1)) {
+                    best = Some((later, earlier, log, at, place));
+                }
+            }
+        }
+    }
+    let (later, earlier, log, at, place) = best?;
+    let range = &of_log[log];
+    let is_after = if training.len() > 1 {
+        later >= earlier
+    } else {
+        at - range.start >= range.end - at
+    };
+    let excluded = if is_after {
+        at..range.end
+    } else {
+        range.start..at
+    };
+    let first = segments[excluded.start].instants.first()?.t;
+    let last = segments[excluded.end - 1].instants.last()?.t;
+    // All units whose rows share links or channels with those of that link.
+    let structure = &measurement.robot().structure;
+    let groups = &measurement.groups().links;
+    let mut units = UnitSet::default();
+    for (other, group) in unknowns.links.iter().zip(groups) {
+        if *group == groups[place] {
+            units.insert(structure.subtree_of(*other).unwrap_or(0));
+            if !unknowns.joints.is_empty() {
+                units.insert(Observation::TORQUES);
+            }
+        }
+    }
+    // The change may be anywhere in the adjacent segment.
+    let (from, to) = if is_after {
+        (excluded.start + 1, excluded.end)
+    } else {
+        (excluded.start, excluded.end - 1)
+    };
+    let clear = (
+        segments[from].instants.first()?.t,
+        segments[to - 1].instants.last()?.t,
+    );
+    Some(Load {
+        log,
+        place,
+        span: (first, last),
+        clear,
+        within: segment_seconds(training[log]),
+        is_after,
+        units,
+    })
+}
+
+/// The inertial parameters of a load, from the part of the log that was excluded for it and from
+/// all used data.
+pub(crate) fn added_body(
+    measurement: &MeasurementModel<'_>,
+    prior: &Prior,
+    training: &[&TrainingLog],
+    load: &Load,
+    noise: &NoiseModel,
+    used: &Information,
+    tau: f64,
+) -> Option<AddedBody> {
+    let log = training.get(load.log)?;
+    let is_clear = |instant: &&Annotated| load.clear.0 <= instant.t && instant.t <= load.clear.1;
+    let first = log.instants.iter().position(|instant| is_clear(&instant))?;
+    let count = log.instants[first..].iter().take_while(is_clear).count();
+    let mut measurement = measurement.clone();
+    measurement.include_disturbed(true);
+    let segment = Segment {
+        instants: &log.instants[first..first + count],
+        offset_jumps: &log.offset_jumps,
+    };
+    let reduced = reduce(&mut measurement, segment, noise);
+    let unknowns = measurement.unknowns();
+    let mut some = Normal::new(unknowns.parameters());
+    some.add(&reduced.information);
+    let mut all = Normal {
+        matrix: some.matrix.clone(),
+        right: some.right.clone(),
+    };
+    all.add(used);
+    all.add_prior(prior, unknowns, tau);
+    let factor = all.matrix.clone().cholesky()?;
+    let x = factor.solve(&all.right);
+    body(prior, unknowns, load.place, &some, &factor, &x).map(|(added, _)| added)
+}

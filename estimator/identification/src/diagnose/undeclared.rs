@@ -1,0 +1,539 @@
+//! Undeclared disturbances in the logs: contacts and loads, and which offset jumps are real. They
+//! are updated after each fit ([`crate::diagnose::disturbance`], [`crate::diagnose::load`] and
+//! [`crate::diagnose::offset_jumps`] find them), marked in the logs so that the next fit excludes
+//! them, and reported at the end.
+
+use crate::dataset::Role;
+use crate::dataset::defects::OffsetJump;
+use crate::dataset::observation::UnitSet;
+use crate::diagnose::load::Load;
+use crate::diagnose::{disturbance, load, offset_jumps};
+use crate::finding::{Finding, FindingCode, Severity};
+use crate::fit::{Identified, NoiseAndMap};
+use crate::measurement::channels;
+use crate::measurement::model::MeasurementModel;
+use crate::measurement::noise_model::NoiseModel;
+use crate::robot::Robot;
+use crate::training::{Excluded, TrainingLog, training_logs, training_logs_mut};
+use nalgebra::DVector;
+use proprio_topics::Nanos;
+use std::ops::Range;
+
+/// Longest apparent contact at an offset jump of a sensor of that part that counts as the jump
+/// itself \[s\]: the time of a jump is known to half the gap between the samples around it, and
+/// excluded blocks have a margin.
+const LONGEST_JUMP: f64 = 1.2;
+
+/// ... if it begins or ends within this time of the jump \[s\].
+const NEAR_JUMP: f64 = 0.3;
+
+/// A contact within this time of a change of load is the hand that gives or takes the load \[s\]
+/// ...
+const NEAR_LOAD_CHANGE: f64 = 1.0;
+/// ... if it lasts no longer than this \[s\], or than the uncertainty of the time of the change, if
+/// that is longer. Two changes of load within this time are the same one.
+const LONGEST_HANDOVER: f64 = 3.0;
+
+/// Most rounds of disturbances and offset jumps of validation logs, for a given fit.
+const ROUNDS: usize = 4;
+
+/// Undeclared disturbances of some logs, and which of their offset jumps are real.
+pub(crate) struct Undeclared {
+    pub loads: Vec<Load>,
+    /// Per log and instant.
+    contacts: Vec<Vec<UnitSet>>,
+    /// All offset jumps that the readings suggest, per log.
+    jumps: Vec<Vec<OffsetJump>>,
+}
+
+impl Undeclared {
+    /// No disturbances, yet, of these logs.
+    pub(crate) fn none<'a>(logs: impl Iterator<Item = &'a mut TrainingLog>) -> Self {
+        let (mut contacts, mut jumps) = (Vec::new(), Vec::new());
+        for log in logs {
+            contacts.push(vec![UnitSet::default(); log.instants.len()]);
+            jumps.push(log.offset_jumps.clone());
+        }
+        Self {
+            loads: Vec::new(),
+            contacts,
+            jumps,
+        }
+    }
+
+    /// Adds a load. One that differs from another only by a slightly different time of change is
+    /// merged with it: that time is known only to a segment of the log.
+    pub(crate) fn add_load(&mut self, load: Load) {
+        let edge = |load: &Load| {
+            if load.is_after {
+                load.span.0
+            } else {
+                load.span.1
+            }
+        };
+        let is_same = |other: &&mut Load| {
+            let apart = (edge(other) - edge(&load)).seconds().abs();
+            (other.log, other.place, other.is_after) == (load.log, load.place, load.is_after)
+                && apart <= LONGEST_HANDOVER.max(1.5 * load.within)
+        };
+        match self.loads.iter_mut().find(is_same) {
+            Some(other) => {
+                other.span = (other.span.0.min(load.span.0), other.span.1.max(load.span.1));
+                other.clear = (
+                    other.clear.0.max(load.clear.0),
+                    other.clear.1.min(load.clear.1),
+                );
+            }
+            None => self.loads.push(load),
+        }
+    }
+
+    /// Updates contacts and offset jumps from the residuals of a fit, and marks the logs; true if
+    /// nothing changed.
+    pub(crate) fn update<'a>(
+        &mut self,
+        measurement: &MeasurementModel<'_>,
+        logs: impl Iterator<Item = &'a mut TrainingLog>,
+        noise: &NoiseModel,
+        d: &DVector<f64>,
+    ) -> bool {
+        let logs: Vec<&mut TrainingLog> = logs.collect();
+        let seen: Vec<&TrainingLog> = logs.iter().map(|log| &**log).collect();
+        let contacts = disturbance::contacts(measurement, &seen, &self.loads, noise, d);
+        // Tests all jumps again: one that the noise of a contact hid may show when the contact is
+        // excluded.
+        let confirmed = offset_jumps::confirmed(measurement, &seen, &self.jumps, noise, d);
+        let unchanged = contacts == self.contacts
+            && seen
+                .iter()
+                .zip(&confirmed)
+                .all(|(log, confirmed)| log.offset_jumps == *confirmed);
+        if !unchanged {
+            self.contacts = contacts;
+            let marked = logs.into_iter().zip(confirmed).map(|(log, confirmed)| {
+                log.offset_jumps = confirmed;
+                log
+            });
+            self.mark(marked);
+        }
+        unchanged
+    }
+
+    /// Marks the disturbed instants of the logs.
+    pub(crate) fn mark<'a>(&self, logs: impl Iterator<Item = &'a mut TrainingLog>) {
+        for (number, (log, contacts)) in logs.zip(&self.contacts).enumerate() {
+            for (instant, contact) in log.instants.iter_mut().zip(contacts) {
+                let carries = |load: &&Load| load.log == number && load.has(instant.t);
+                let loads = self.loads.iter().filter(carries);
+                instant.disturbed = loads.fold(*contact, |set, load| set.union(&load.units));
+            }
+        }
+    }
+
+    /// Reports in the logs what was excluded because of undeclared disturbances.
+    pub(crate) fn report(
+        &self,
+        measurement: &MeasurementModel<'_>,
+        logs: &mut [TrainingLog],
+        estimate: &NoiseAndMap,
+    ) {
+        let Self {
+            loads, contacts, ..
+        } = self;
+        let robot = measurement.robot();
+        let training = training_logs(logs);
+        let body = |load: &Load| {
+            let NoiseAndMap {
+                prior,
+                noise,
+                information,
+                fit,
+                ..
+            } = estimate;
+            load::added_body(
+                measurement,
+                prior,
+                &training,
+                load,
+                noise,
+                information,
+                fit.tau,
+            )
+        };
+        let bodies: Vec<Option<load::AddedBody>> = loads.iter().map(body).collect();
+        let training = training_logs_mut(logs);
+        for (number, (log, contacts)) in training.zip(contacts).enumerate() {
+            let own: Vec<(&Load, &Option<load::AddedBody>)> = loads
+                .iter()
+                .zip(&bodies)
+                .filter(|(load, _)| load.log == number)
+                .collect();
+            let loads: Vec<&Load> = own.iter().map(|(load, _)| *load).collect();
+            let apparent_contacts = apparent_contacts(robot, log, contacts, &loads);
+            for unit in units(contacts).iter() {
+                let of = |cause| {
+                    Tally::of(
+                        log,
+                        apparent_contacts
+                            .iter()
+                            .filter(|contact_span| contact_span.is(unit, cause)),
+                    )
+                };
+                let (jumps, contacts) = (of(Cause::Jump), of(Cause::Contact));
+                if let Some(jumps) = jumps {
+                    let reason = format!("offset jump: {}", part(robot, unit));
+                    log.excluded.push(jumps.excluded(reason));
+                }
+                let Some(contacts) = contacts else {
+                    continue;
+                };
+                let reason = format!("contact suspected: {}", part(robot, unit));
+                log.excluded.push(contacts.excluded(reason));
+                log.findings.push(Finding {
+                    severity: Severity::Warning,
+                    code: FindingCode::Disturbance,
+                    subject: part(robot, unit),
+                    text: format!(
+                        "{}: undeclared disturbance (contact or load) {}. These instants were \
+                         excluded; declare contacts where they occur",
+                        part(robot, unit),
+                        contacts.describe(log)
+                    ),
+                });
+            }
+            for (place, (load, body)) in own.into_iter().enumerate() {
+                let handovers = apparent_contacts
+                    .iter()
+                    .filter(|contact_span| contact_span.cause == Cause::Load(place));
+                report_load(measurement, log, load, body.as_ref(), handovers);
+            }
+        }
+    }
+}
+
+/// Reports that the load differed in a part of a log, which was excluded, and the inertial
+/// parameters of that load, if they are known. `handovers`: contacts of the hands that gave or took
+/// it.
+fn report_load<'a>(
+    measurement: &MeasurementModel<'_>,
+    log: &mut TrainingLog,
+    load: &Load,
+    body: Option<&load::AddedBody>,
+    handovers: impl Iterator<Item = &'a ApparentContact>,
+) {
+    let (robot, unknowns) = (measurement.robot(), measurement.unknowns());
+    let link = robot.model.link_name(unknowns.links[load.place]);
+    let since = |t: Nanos| (t - log.span.0).seconds();
+    let mut out: Vec<bool> = log
+        .instants
+        .iter()
+        .map(|instant| load.has(instant.t))
+        .collect();
+    for contact_span in handovers {
+        out[contact_span.instants.clone()].fill(true);
+    }
+    let out: Vec<Nanos> = (log.instants.iter().zip(out))
+        .filter(|(_, out)| *out)
+        .map(|(instant, _)| instant.t)
+        .collect();
+    let (Some(&first), Some(&last)) = (out.first(), out.last()) else {
+        return;
+    };
+    log.excluded.push(Excluded {
+        reason: format!("another load: {link}"),
+        instants: out.len() as u64,
+        first,
+        last,
+    });
+    let (when, at) = if load.is_after {
+        ("From", first)
+    } else {
+        ("Up to", last)
+    };
+    let what = body.map_or(String::new(), |body| {
+        let p = &body.parameters;
+        let sigma = |i: usize| body.covariance[(i, i)].sqrt();
+        format!(
+            ": {:+.3} +- {:.3} kg, first moment {:+.4}, {:+.4}, {:+.4} +- {:.4} kg m in the axes \
+             and about the origin of {link}",
+            p[0],
+            sigma(0),
+            p[1],
+            p[2],
+            p[3],
+            (1..4).map(sigma).fold(0.0, f64::max)
+        )
+    });
+    log.findings.push(Finding {
+        severity: Severity::Warning,
+        code: FindingCode::LoadChanged,
+        subject: link.to_owned(),
+        text: format!(
+            "{when} about {:.1} s after the log's start, {link} carried another load than in the \
+             rest of the data{what}. That part was excluded: the parameters are those without \
+             this load",
+            since(at)
+        ),
+    });
+}
+
+/// A warning that the excluded instants still change after `fits` fits.
+pub(crate) fn not_converged(fits: usize) -> Finding {
+    Finding {
+        severity: Severity::Warning,
+        code: FindingCode::DisturbancesNotConverged,
+        subject: String::new(),
+        text: format!(
+            "undeclared disturbances and offset jumps did not converge in {fits} fits: check the \
+             instants that the logs exclude, and declare contacts where they occurred"
+        ),
+    }
+}
+
+/// Description of the links of a unit.
+fn part(robot: &Robot, unit: usize) -> String {
+    match robot.structure.subtrees().get(unit) {
+        Some(subtree) => {
+            let sensors: Vec<String> = subtree
+                .sensors
+                .iter()
+                .map(|s| channels::sensor_name(robot, s))
+                .collect();
+            format!("the links at {}", sensors.join(", "))
+        }
+        None => "the links whose joint torques are measured".to_owned(),
+    }
+}
+
+/// An apparent contact: consecutive disturbed instants of a unit, and their cause.
+struct ApparentContact {
+    unit: usize,
+    instants: Range<usize>,
+    cause: Cause,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Cause {
+    Contact,
+    /// An offset jump of a sensor.
+    Jump,
+    /// The hand that gives or takes the load of this number.
+    Load(usize),
+}
+
+impl ApparentContact {
+    fn is(&self, unit: usize, cause: Cause) -> bool {
+        (self.unit, self.cause) == (unit, cause)
+    }
+}
+
+/// The union of these sets.
+fn units(contacts: &[UnitSet]) -> UnitSet {
+    contacts
+        .iter()
+        .fold(UnitSet::default(), |units, set| units.union(set))
+}
+
+/// The apparent contacts of a log with their causes; `loads`: loads whose hands may be one.
+fn apparent_contacts(
+    robot: &Robot,
+    log: &TrainingLog,
+    contacts: &[UnitSet],
+    loads: &[&Load],
+) -> Vec<ApparentContact> {
+    let mut apparent_contacts = Vec::new();
+    for unit in units(contacts).iter() {
+        let sensors = robot
+            .structure
+            .subtrees()
+            .get(unit)
+            .map(|subtree| &subtree.sensors);
+        let is_own = |b: &OffsetJump| sensors.is_some_and(|sensors| sensors.contains(b.sensor));
+        let mut begin = 0;
+        for instants in contacts.chunk_by(|a, b| a.contains(unit) == b.contains(unit)) {
+            let range = begin..begin + instants.len();
+            begin = range.end;
+            if !instants[0].contains(unit) {
+                continue;
+            }
+            let (first, last) = (log.instants[range.start].t, log.instants[range.end - 1].t);
+            let lasts = (last - first).seconds();
+            let is_near = |(from, to): (Nanos, Nanos), seconds: f64| {
+                (from - last).seconds() <= seconds && (first - to).seconds() <= seconds
+            };
+            let is_handed =
+                |load: &&Load| load.units.contains(unit) && is_near(load.span, NEAR_LOAD_CHANGE);
+            let is_jump = |b: &OffsetJump| is_own(b) && is_near((b.t, b.t), NEAR_JUMP);
+            let load = loads.iter().position(is_handed);
+            let load = load.filter(|&load| lasts <= LONGEST_HANDOVER.max(loads[load].within));
+            let cause = match load {
+                Some(number) => Cause::Load(number),
+                None if lasts <= LONGEST_JUMP && log.offset_jumps.iter().any(is_jump) => {
+                    Cause::Jump
+                }
+                None => Cause::Contact,
+            };
+            apparent_contacts.push(ApparentContact {
+                unit,
+                instants: range,
+                cause,
+            });
+        }
+    }
+    apparent_contacts
+}
+
+/// How often, how long and when a disturbance acted on a unit.
+struct Tally {
+    times: usize,
+    instants: usize,
+    first: Nanos,
+    last: Nanos,
+}
+
+impl Tally {
+    /// Of these contacts, in the order of time; none if there are none.
+    fn of<'a>(
+        log: &TrainingLog,
+        apparent_contacts: impl Iterator<Item = &'a ApparentContact>,
+    ) -> Option<Self> {
+        let apparent_contacts: Vec<&ApparentContact> = apparent_contacts.collect();
+        Some(Self {
+            times: apparent_contacts.len(),
+            instants: apparent_contacts
+                .iter()
+                .map(|contact_span| contact_span.instants.len())
+                .sum(),
+            first: log.instants[apparent_contacts.first()?.instants.start].t,
+            last: log.instants[apparent_contacts.last()?.instants.end - 1].t,
+        })
+    }
+
+    fn excluded(&self, reason: String) -> Excluded {
+        Excluded {
+            reason,
+            instants: self.instants as u64,
+            first: self.first,
+            last: self.last,
+        }
+    }
+
+    /// `2 times between 3.1 and 7.4 s after the log's start, 5.0 % of the log`.
+    fn describe(&self, log: &TrainingLog) -> String {
+        let since = |t: Nanos| (t - log.span.0).seconds();
+        format!(
+            "{} time{} between {:.1} and {:.1} s after the log's start, {:.1} % of the log",
+            self.times,
+            if self.times == 1 { "" } else { "s" },
+            since(self.first),
+            since(self.last),
+            100.0 * self.instants as f64 / log.instants.len() as f64
+        )
+    }
+}
+
+/// Reports undeclared disturbances of the validation logs, stores them in
+/// [`TrainingLog::disturbed`], and updates which of their offset jumps are real. The figures of
+/// these logs still include all rows: validation data must not be selected by the model that they
+/// validate.
+pub(crate) fn report_validation(
+    measurement: &MeasurementModel<'_>,
+    logs: &mut [TrainingLog],
+    identified: &Identified,
+) {
+    let is_checked = |log: &&mut TrainingLog| log.role == Role::Validate && !log.refused;
+    let robot = measurement.robot();
+    let mut undeclared = Undeclared::none(logs.iter_mut().filter(is_checked));
+    let converges = (0..ROUNDS).any(|_| {
+        let checked = logs.iter_mut().filter(is_checked);
+        undeclared.update(measurement, checked, &identified.noise, &identified.d)
+    });
+    let checked = logs.iter_mut().filter(is_checked);
+    for (log, contacts) in checked.zip(undeclared.contacts) {
+        let apparent_contacts = apparent_contacts(robot, log, &contacts, &[]);
+        for unit in units(&contacts).iter() {
+            let own = apparent_contacts
+                .iter()
+                .filter(|contact_span| contact_span.is(unit, Cause::Contact));
+            let Some(sum) = Tally::of(log, own) else {
+                continue;
+            };
+            let part = part(robot, unit);
+            log.findings.push(Finding {
+                severity: Severity::Note,
+                code: FindingCode::Disturbance,
+                text: format!(
+                    "{part}: residuals as of an undeclared disturbance (contact or load) {}. The \
+                     figures of this log include these instants",
+                    sum.describe(log)
+                ),
+                subject: part,
+            });
+        }
+        if !converges {
+            log.findings.push(Finding {
+                severity: Severity::Note,
+                code: FindingCode::DisturbancesNotConverged,
+                subject: String::new(),
+                text: format!(
+                    "undeclared disturbances and offset jumps of this log did not converge in \
+                     {ROUNDS} rounds: those reported are uncertain"
+                ),
+            });
+        }
+        log.instants
+            .iter_mut()
+            .for_each(|instant| instant.disturbed = UnitSet::default());
+        log.disturbed = contacts;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A load that comes at `from` \[s\], known to `within`, of a log of 100 s.
+    fn load(log: usize, place: usize, from: i64, within: f64) -> Load {
+        let at = |seconds: i64| Nanos::from_millis(1000 * seconds);
+        Load {
+            log,
+            place,
+            span: (at(from), at(100)),
+            clear: (at(from + 1), at(100)),
+            within,
+            is_after: true,
+            units: UnitSet::default(),
+        }
+    }
+
+    #[test]
+    fn two_findings_of_one_load_change_are_merged() {
+        let of = |loads: &[Load]| {
+            let mut undeclared = Undeclared::none(std::iter::empty());
+            loads
+                .iter()
+                .cloned()
+                .for_each(|load| undeclared.add_load(load));
+            undeclared.loads
+        };
+        let first = load(0, 3, 23, 1.0);
+        for sooner in [22, 24] {
+            let [one] = of(&[first.clone(), load(0, 3, sooner, 1.0)])
+                .try_into()
+                .unwrap();
+            // All instants that may have the load are excluded; those that surely have it give its
+            // parameters.
+            assert_eq!(one.span, load(0, 3, sooner.min(23), 1.0).span);
+            assert_eq!(one.clear, load(0, 3, sooner.max(23), 1.0).clear);
+        }
+        // In a long log the time of a change is known to a longer segment.
+        assert_eq!(of(&[load(0, 3, 40, 9.4), load(0, 3, 31, 9.4)]).len(), 1);
+        for other in [
+            load(1, 3, 22, 1.0),
+            load(0, 4, 22, 1.0),
+            load(0, 3, 18, 1.0),
+        ] {
+            assert_eq!(of(&[first.clone(), other.clone()]), [first.clone(), other]);
+        }
+    }
+}

@@ -1,0 +1,356 @@
+//! One fit: noise of every channel and maximum a posteriori (MAP) parameters in turn, until both
+//! converge.
+
+use crate::finding::{Finding, FindingCode, Severity};
+use crate::hypothesis;
+use crate::linear::information::Information;
+use crate::measurement::model::MeasurementModel;
+use crate::measurement::noise_estimate::estimate_noise;
+use crate::measurement::noise_model::{DriftLimits, NoiseModel};
+use crate::measurement::reduction::{ReducedLog, reduce, residuals};
+use crate::measurement::unknowns::{ExtraParameter, Unknowns};
+use crate::prior::{Fit, Posterior, Prior, PriorError};
+use crate::robot::{IdentificationInput, Robot};
+use crate::training::{TrainingLog, map_segments, sample};
+use nalgebra::DVector;
+use proprio_dynamics::DynamicsError;
+use proprio_dynamics::calibration::Kind;
+use proprio_dynamics::spatial::RigidInertia;
+
+/// Why there is no outcome at all. (Logs without information about the parameters do give one,
+/// which states the reason.)
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum IdentifyError {
+    /// No log to train on.
+    #[error("no log to identify from: give at least one training log")]
+    NoLogs,
+    /// The recorded motion does not fit the robot's model.
+    #[error("the logs do not fit the robot's model: {0}")]
+    Dynamics(#[from] DynamicsError),
+    /// The MAP parameters can not be computed.
+    #[error("no parameters can be fitted to the logs: {0}")]
+    Fit(#[from] PriorError),
+}
+
+/// Time constant of the fastest random walk of an offset \[s\]: the motion that excites the
+/// parameters is faster.
+pub(crate) const DRIFT_TIME: f64 = 1.0;
+
+/// A load is accepted if, without its side of the log, the noise variances of its part of the robot
+/// are smaller by this factor (geometric mean over the channels there).
+pub(crate) const LOAD_VARIANCE_RATIO: f64 = 2.0;
+
+/// Most rounds of noise and MAP estimate.
+const ROUNDS: usize = 14;
+
+/// Rounds end when no variance's logarithm changes by more than this in a round, or over a limit
+/// cycle of rounds: a standard deviation by a twentieth.
+const CONVERGED: f64 = 0.1;
+
+/// The identified parameters, noise and information, from which the report is made.
+pub(crate) struct Identified {
+    pub unknowns: Unknowns,
+    pub inputs: Vec<IdentificationInput>,
+    /// The calibration parameters that were identified, too.
+    pub calibrated: Kind,
+    pub prior: Prior,
+    pub noise: NoiseModel,
+    pub information: Information,
+    pub fit: Fit,
+    /// Identified parameters less CAD, after shrinking.
+    pub d: DVector<f64>,
+    /// CAD's parameters in the same columns: zero, except for parameters that CAD does not contain,
+    /// which have the values that best fit the data together with CAD ([`beside_cad`]).
+    pub cad: DVector<f64>,
+    /// Retained fraction of the change from CAD, per link of the layout, then per extra parameter.
+    pub retained: Vec<f64>,
+    pub findings: Vec<Finding>,
+    /// Per segment of the training logs, in order.
+    pub reduced: Vec<ReducedLog>,
+}
+
+/// Lower bounds of the variances. Standard deviations: a hundredth of the configured one for an F/T
+/// channel, 1e-4 Nm for a joint torque.
+pub(crate) fn least_variances(robot: &Robot, unknowns: &Unknowns) -> Vec<f64> {
+    let mut least: Vec<f64> = unknowns.stated(robot).map(|x| (0.01 * x).powi(2)).collect();
+    least.resize(unknowns.channels(), 1e-8);
+    least
+}
+
+/// The information of all segments together.
+pub(crate) fn added(reduced: &[ReducedLog], unknowns: usize) -> Information {
+    let columns: Vec<usize> = (0..unknowns).collect();
+    let mut sum = Information::new(unknowns);
+    for part in reduced {
+        let _ = sum.merge(&part.information, &columns);
+    }
+    sum
+}
+
+pub(crate) fn posterior(
+    prior: &Prior,
+    unknowns: &Unknowns,
+    information: &Information,
+) -> Result<Posterior, IdentifyError> {
+    let (r, z) = information.to_triangle();
+    Ok(Posterior::new(
+        prior,
+        &unknowns.links,
+        &r,
+        &z,
+        &unknowns.precision,
+    )?)
+}
+
+/// CAD's inertial parameters (`d = 0`); parameters that CAD does not contain
+/// ([`ExtraParameter::lacks_cad`]) have the values that best fit these data and their priors
+/// together with CAD. No rotor's inertia is negative. (These parameters belong to the robot, so
+/// they are not fitted to the log on which CAD is compared.)
+pub(crate) fn beside_cad(unknowns: &Unknowns, information: &Information) -> DVector<f64> {
+    let mut x = DVector::zeros(unknowns.parameters());
+    let mut columns = unknowns.beside_cad();
+    let (r, z) = information.to_triangle();
+    let (rows, precision) = (r.nrows(), &unknowns.precision);
+    while !columns.is_empty() {
+        let mut own = r
+            .select_columns(&columns)
+            .resize_vertically(rows + columns.len(), 0.0);
+        for (place, &column) in columns.iter().enumerate() {
+            own[(rows + place, place)] = precision[column - unknowns.inertial()].sqrt();
+        }
+        let qr = own.qr();
+        let right = qr
+            .q()
+            .tr_mul(&z.clone().resize_vertically(rows + columns.len(), 0.0));
+        let Some(values) = qr.r().solve_upper_triangular(&right) else {
+            break;
+        };
+        let is_negative = |column: usize, value: f64| value < 0.0 && is_rotor(unknowns, column);
+        let found = columns.iter().copied().zip(values.iter().copied());
+        let not_negative: Vec<usize> = found
+            .clone()
+            .filter(|(column, value)| !is_negative(*column, *value))
+            .map(|(column, _)| column)
+            .collect();
+        if not_negative.len() == columns.len() {
+            found.for_each(|(column, value)| x[column] = value);
+            break;
+        }
+        columns = not_negative;
+    }
+    x
+}
+
+fn is_rotor(unknowns: &Unknowns, column: usize) -> bool {
+    let extra = column
+        .checked_sub(unknowns.inertial())
+        .and_then(|k| unknowns.extra.get(k));
+    matches!(extra, Some(ExtraParameter::RotorInertia(_)))
+}
+
+/// The MAP parameters without negative rotor inertias: a negative one is fixed at zero, and the
+/// rest is fitted again.
+pub(crate) fn without_negative_rotors(
+    prior: &Prior,
+    unknowns: &Unknowns,
+    information: &Information,
+    fit: &Fit,
+) -> Result<DVector<f64>, IdentifyError> {
+    let mut x = fit.x.clone();
+    let mut keep: Vec<usize> = (0..unknowns.parameters()).collect();
+    let (r, z) = information.to_triangle();
+    let is_negative =
+        |x: &DVector<f64>, column: usize| x[column] < 0.0 && is_rotor(unknowns, column);
+    while keep.iter().any(|&column| is_negative(&x, column)) {
+        keep.retain(|&column| !is_negative(&x, column));
+        let precision = &unknowns.precision;
+        let of_kept = keep.iter().filter(|column| **column >= unknowns.inertial());
+        let precision: Vec<f64> = of_kept
+            .map(|column| precision[column - unknowns.inertial()])
+            .collect();
+        let own = Posterior::new(
+            prior,
+            &unknowns.links,
+            &r.select_columns(&keep),
+            &z,
+            &precision,
+        )?
+        .fit(fit.tau)?;
+        x = DVector::zeros(unknowns.parameters());
+        keep.iter()
+            .zip(&own.x)
+            .for_each(|(&column, value)| x[column] = *value);
+    }
+    Ok(x)
+}
+
+/// Rotors whose estimated inertia is significantly negative.
+pub(crate) fn negative_rotors(robot: &Robot, unknowns: &Unknowns, fit: &Fit) -> Vec<Finding> {
+    if unknowns.extra.is_empty() {
+        return Vec::new();
+    }
+    let root = fit.covariance_root();
+    let mut findings = Vec::new();
+    let significant = hypothesis::deviations(unknowns.extra.len());
+    for (extra, column) in unknowns.extra.iter().zip(unknowns.inertial()..) {
+        let ExtraParameter::RotorInertia(dof) = *extra else {
+            continue;
+        };
+        let (value, deviation) = (fit.x[column], root.row(column).norm());
+        if value < -significant * deviation {
+            let joint = robot.model.dof_name(dof).to_owned();
+            findings.push(Finding {
+                severity: Severity::Warning,
+                code: FindingCode::NegativeRotorInertia,
+                text: format!(
+                    "{joint}: its estimated rotor inertia is negative, {value:.4} +- \
+                     {deviation:.4}, and was set to 0. Check the sign of its torque, velocity and \
+                     acceleration, the time offset between its torque and its encoder, and \
+                     whether torques are measured at the motors (identification.torque_side)"
+                ),
+                subject: joint,
+            });
+        }
+    }
+    findings
+}
+
+/// Noise, prior and MAP estimate after the last round.
+pub(crate) struct NoiseAndMap {
+    pub(crate) prior: Prior,
+    pub(crate) noise: NoiseModel,
+    pub(crate) fit: Fit,
+    pub(crate) information: Information,
+    /// Largest change of a variance's logarithm in the last round if the rounds did not converge;
+    /// else 0.
+    pub(crate) change: f64,
+}
+
+/// Estimates noise and MAP parameters in turn until both converge. `from`: the initial noise, of a
+/// fit to nearly the same data; without it, the residuals of CAD give it.
+pub(crate) fn alternate_noise_and_map(
+    robot: &Robot,
+    measurement: &MeasurementModel<'_>,
+    training: &[&TrainingLog],
+    drift: OffsetDrift,
+    from: Option<NoiseModel>,
+    progress: &mut dyn FnMut(String, f64),
+) -> Result<NoiseAndMap, IdentifyError> {
+    let unknowns = measurement.unknowns().clone();
+    let prior = Prior::new(robot.model.inertias())?.expecting(robot.urdf_relative_std);
+    let least = least_variances(robot, &unknowns);
+    let limits = walk_limits(robot, &unknowns, drift);
+    let sampled = sample(measurement, training);
+    let noise_of_residuals = |noise: &NoiseModel, d: &DVector<f64>| {
+        let residuals = map_segments(measurement, &sampled, |measurement, _, segment| {
+            residuals(measurement, segment, noise, std::slice::from_ref(d))
+        });
+        estimate_noise(&unknowns, &residuals, 0, &limits, &least)
+    };
+    let has_cad = unknowns.beside_cad().is_empty();
+    let noise = from.unwrap_or_else(|| {
+        let unknown = NoiseModel::unknown(least.clone());
+        (0..3).fold(unknown, |noise, _| {
+            let cad = if has_cad {
+                DVector::zeros(unknowns.parameters())
+            } else {
+                let reduced = map_segments(measurement, &sampled, |measurement, _, segment| {
+                    reduce(measurement, segment, &noise)
+                });
+                beside_cad(&unknowns, &added(&reduced, unknowns.parameters()))
+            };
+            noise_of_residuals(&noise, &cad)
+        })
+    });
+    let mut rounds = vec![noise];
+    loop {
+        let round = rounds.len();
+        progress(
+            format!("round {round}"),
+            0.62 * (round - 1) as f64 / ROUNDS as f64,
+        );
+        let last = &rounds[round - 1];
+        let reduced = map_segments(measurement, &sampled, |measurement, _, segment| {
+            reduce(measurement, segment, last)
+        });
+        let information = added(&reduced, unknowns.parameters());
+        let fit = posterior(&prior, &unknowns, &information)?.maximise_evidence()?;
+        let next = noise_of_residuals(last, &fit.x);
+        let change = next.change(last);
+        rounds.push(next);
+        let (noise, change) = match NoiseModel::resolve_limit_cycle(&rounds, CONVERGED) {
+            Some(noise) => (noise, 0.0),
+            None if round == ROUNDS => (rounds.swap_remove(round), change),
+            None => continue,
+        };
+        return Ok(NoiseAndMap {
+            prior,
+            noise,
+            fit,
+            information,
+            change,
+        });
+    }
+}
+
+/// How fast an offset may drift (random walk).
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum OffsetDrift {
+    /// As fast as [`DRIFT_TIME`] allows: the residual then shows undeclared disturbances.
+    Free,
+    /// At most by the sensor's stated noise per square root of a second. Other slow changes are
+    /// model error and count as noise: parameters that are fitted together with offsets that follow
+    /// model error predict other logs less well.
+    AsStated,
+}
+
+pub(crate) fn walk_limits(robot: &Robot, unknowns: &Unknowns, drift: OffsetDrift) -> DriftLimits {
+    let rates = match drift {
+        OffsetDrift::Free => vec![f64::INFINITY; 6 * unknowns.sensors.len()],
+        OffsetDrift::AsStated => unknowns.stated(robot).map(|x| x * x).collect(),
+    };
+    DriftLimits {
+        relative: (crate::measurement::reduction::BLOCK / DRIFT_TIME).powi(2),
+        rates,
+    }
+}
+
+/// Values per link and per extra parameter, repeated for each column.
+pub(crate) fn per_column(unknowns: &Unknowns, values: &[f64]) -> Vec<f64> {
+    let (links, extra) = values.split_at(unknowns.links.len());
+    let of_links = links.iter().flat_map(|value| [*value; 10]);
+    of_links.chain(extra.iter().copied()).collect()
+}
+
+/// A warning that the rounds ended before noise and prior scale converged.
+pub(crate) fn unsettled(change: f64) -> Option<Finding> {
+    (change > 0.0).then(|| Finding {
+        severity: Severity::Warning,
+        code: FindingCode::NotConverged,
+        subject: String::new(),
+        text: format!(
+            "noise and the prior's scale did not converge in {ROUNDS} rounds: the last round \
+             changed a variance by {:.0} %, and the standard deviations are uncertain by as much; \
+             record longer logs",
+            100.0 * change.exp_m1()
+        ),
+    })
+}
+
+/// Inertias of all links: CAD plus `d`, given in the columns of `unknowns`.
+pub(crate) fn link_inertias(
+    robot: &Robot,
+    unknowns: &Unknowns,
+    d: &DVector<f64>,
+) -> Vec<RigidInertia> {
+    let mut inertias = robot.model.inertias().to_vec();
+    for (place, &link) in unknowns.links.iter().enumerate() {
+        let mut phi = inertias[link].parameters();
+        for (value, change) in phi.iter_mut().zip(d.rows(10 * place, 10).iter()) {
+            *value += change;
+        }
+        inertias[link] = RigidInertia::from_parameters(&phi);
+    }
+    inertias
+}

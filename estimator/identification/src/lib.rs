@@ -1,0 +1,101 @@
+//! Identifies a robot's inertial parameters, and the offsets and calibrations of its sensors, from
+//! what its sensors read while it moves.
+//!
+//! - Off-line, [`identify`]`(&`[`Robot`]`, Vec<`[`Dataset`]`>, ..)` takes recorded logs and returns
+//!   an [`Outcome`]: parameters, covariance, figures for each log, findings.
+//! - On-line, [`online`] does the same while the robot works, once a second.
+//!
+//! # Stages
+//! In the order in which the data pass them:
+//!
+//! 1. [`dataset`]: a log becomes observations of all channels at common instants, with derivatives
+//!    and a list of defects.
+//! 2. `diagnose::{torque_units, wrench_units, sensor_frame}`: joint torques and F/T readings with
+//!    wrong units or sign, F/T sensors with a wrong measurement frame or direction.
+//! 3. `measurement::model`: the rows of each observation, `A d + G s = r + N e`.
+//! 4. `measurement::reduction`: the nuisance parameters `s` are eliminated by a Kalman filter.
+//! 5. [`linear::information`]: `[R | z]`, the square-root information of all logs about `d`.
+//! 6. [`prior`]: the maximum a posteriori (MAP) parameters under a prior at CAD; the prior's scale
+//!    `tau` maximises the evidence.
+//! 7. `measurement::noise_estimate`: the noise of each channel, from its residuals. Stages 4 to 7
+//!    repeat until the noise converges (`fit::alternate_noise_and_map`).
+//! 8. `diagnose::undeclared`: undeclared contacts and loads are excluded, offset jumps are
+//!    confirmed or dropped. Stages 4 to 8 repeat until neither changes.
+//! 9. `batch::gains`: gains of the F/T sensors, if requested or worth it. Stages 4 to 8 again.
+//! 10. `cross_validation`: the change from CAD is shrunk where it does not improve the prediction
+//!     of held-out data.
+//! 11. `diagnose::structural_vibration`: vibration that other F/T sensors observe is subtracted.
+//!     Stages 4 to 7 and 10 again.
+//! 12. `diagnose::{encoder_offsets, delay}`: encoder signs, encoder offsets and time offsets. They
+//!     are reported, not corrected.
+//! 13. `report`: the [`Outcome`].
+//!
+//! One test, `hypothesis`, decides whether the data show more than parameters and noise: a load, an
+//! offset jump, an encoder offset, a delay.
+//!
+//! # Notation
+//! ```text
+//! A d + G s = r + N e
+//! ```
+//!
+//! - `d = phi - phi_CAD`: ten inertial parameters per link (mass \[kg\], first moments [kg m],
+//!   second moments [kg m^2], about the link's origin and in its axes), then the extra parameters
+//!   (rotor inertia, calibration). They belong to the robot and are common to all logs.
+//! - `s`: nuisance parameters of one log: six offsets per F/T sensor [Nm, N], each a random walk;
+//!   Coulomb friction, viscous friction and offset per measured joint torque.
+//! - `r`: measured less predicted by CAD [Nm, N].
+//! - `e`: noise of the channels, independent of each other; `N` distributes it over the rows.
+//!
+//! # What is estimated from what
+//! No weight is chosen by hand: noise comes from the residuals, the prior's scale from the
+//! evidence, by the same rules for every robot. Directions that the motion does not excite keep
+//! their CAD values, and their uncertainty. On a validation log only offsets and friction are
+//! fitted, for CAD and for the identified parameters alike.
+//!
+//! # Noise
+//! The residual of a channel is mostly model error: correlated in time, and larger when the robot
+//! moves. Taken as white noise it would be trusted far too much, and the evidence would let the
+//! data overrule CAD where they contain no information. So its variance is multiplied by its
+//! integrated autocorrelation time, or taken from the scatter of block means, whichever is larger.
+//!
+//! The offset of an F/T sensor drifts (random walk). Its rate maximises the likelihood of the block
+//! means, within bounds: the offset follows nothing faster than a second, or it would absorb motion
+//! and contacts; and in the final fit the rate is at most the sensor's stated noise per square root
+//! of a second, or it would absorb model error.
+//!
+//! Rows that a contact reaches, declared or found, are excluded. They influence neither parameters
+//! nor offsets.
+
+mod arithmetic;
+mod batch;
+mod cross_validation;
+pub mod dataset;
+mod diagnose;
+mod finding;
+mod fit;
+mod hypothesis;
+pub mod linear;
+mod measurement;
+pub mod online;
+pub mod parallel;
+pub mod prior;
+mod report;
+pub mod robot;
+pub mod statistics;
+mod training;
+
+pub use batch::{Options, Progress, identify};
+pub use dataset::recording::Recording;
+pub use dataset::{Dataset, Role};
+pub use diagnose::plausibility::implausible;
+pub use finding::{Finding, FindingCode, Severity};
+pub use fit::IdentifyError;
+pub use report::outcome::{
+    BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot,
+    Curve, FrictionOutcome, InForce, JointOutcome, LinkOutcome, LogOutcome, ModelComparison,
+    OffsetOutcome, Outcome, Predicted, RotorOutcome, SensorOutcome, Spectrum, TimeOffset,
+    TwoRouteOutcome, Verdict, WeakDirection,
+};
+pub use report::prediction::predicted;
+pub use robot::Robot;
+pub use training::{Excluded, judged};

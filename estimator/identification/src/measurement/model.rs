@@ -1,0 +1,652 @@
+//! The measurement model: the linear equations of one observation, and the noise in them.
+//!
+//! ```text
+//! A d + G s = r + N e
+//! ```
+//!
+//! - `d = phi - phi_CAD`: ten parameters per link that appears in any log ([`Unknowns::links`]),
+//!   then the extra parameters of the robot ([`Unknowns::extra`]);
+//! - `s`: the nuisance parameters of the log: six offsets [torque; force] per F/T sensor that
+//!   appears in a row; Coulomb friction, viscous friction and torque offset per joint whose torque
+//!   is measured;
+//! - `r`: the measurement minus the prediction by CAD;
+//! - `e`: the noise of the *channels*, independent of each other: six per F/T sensor, one per joint
+//!   torque.
+//!
+//! There are two kinds of rows. Rows of F/T sensors are the balances of sub-trees.
+//! [`StackedRegressor::eliminate_contacts`] keeps the combinations that no present contact reaches.
+//! Noise enters these rows as offsets do: `N = G`. Rows of joint torques come from the
+//! [`Regressor`] of the whole tree, for joints beyond which, seen from the base, nothing touches
+//! the robot. There `N = 1` and `G = [tanh(dq / v0), dq, 1]`. If torques are measured at the motor
+//! side, `A` has an extra column for the rotor inertia: its entry is the acceleration of the joint.
+//!
+//! If the calibrations of F/T sensors are unknown too ([`proprio_dynamics::calibration`]), a sensor
+//! measures `(1 + E) r - k (T - T0) - o`. `A` then has columns for `E` and `k`: the entries that
+//! `G` has for `o`, times `-r` or the temperature. Here `r` is the noise-free reading by an earlier
+//! fit ([`Annotated::fitted`]). The measured reading must not be used: a gain of zero with massless
+//! bodies would then make every row zero. Mass and gain scale together, so only the priors would
+//! speak against this solution, and the noise, which grows with the length of the log, for it.
+
+use crate::arithmetic::dot;
+use crate::dataset::observation::{Annotated, Observation, UnitSet};
+use crate::measurement::rows::Rows;
+use crate::measurement::unknowns::{ExtraParameter, FRICTION, Unknowns, WIDTH, friction_row};
+use crate::robot::{IdentificationInput, Robot, TorqueSide};
+use nalgebra::{DVector, Matrix6, Vector6};
+use proprio_dynamics::calibration::{Kind, Unknown};
+use proprio_dynamics::regressor::{Regressor, StackedRegressor, Weighting};
+use proprio_dynamics::spatial::{Motion, Vec3, Wrench};
+use proprio_dynamics::{DynamicsError, JointState, Kinematics};
+
+/// The wrench that a sub-tree needs for structural vibration (motion that its encoders do not
+/// show): [torque; force], zero where none is known.
+fn vibration_of(observation: &Annotated, subtree: usize) -> [f64; 6] {
+    let known = observation
+        .vibration
+        .iter()
+        .find(|(number, _)| *number == subtree);
+    known.map_or([0.0; 6], |(_, wrench)| wrench.torque_first())
+}
+
+/// The representative of a node's set (union-find).
+fn root_of(parent: &mut [usize], mut node: usize) -> usize {
+    while parent[node] != node {
+        parent[node] = parent[parent[node]];
+        node = parent[node];
+    }
+    node
+}
+
+/// The group of each unknown and channel. No row has unknowns or channels of two groups.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Groups {
+    /// Per link of the layout.
+    pub links: Vec<usize>,
+    /// Per extra parameter.
+    pub extra: Vec<usize>,
+    /// Per channel.
+    pub channels: Vec<usize>,
+}
+
+/// Computes the rows of observations.
+#[derive(Clone)]
+pub(crate) struct MeasurementModel<'a> {
+    robot: &'a Robot,
+    unknowns: Unknowns,
+    /// CAD's parameters of all links.
+    cad: Vec<f64>,
+    kinematics: Kinematics,
+    stacked: StackedRegressor,
+    tree: Regressor,
+    readings: Vec<Wrench>,
+    /// Per sensor, the unknowns of its calibration and their columns of `A`.
+    calibrations: Vec<Vec<(usize, Unknown)>>,
+    /// Per sensor, the reference temperature of its change per kelvin \[degrees Celsius\]; NaN if
+    /// none was recorded.
+    references: Vec<f64>,
+    wrench: bool,
+    torque: bool,
+    /// Whether rows are also made of units on which an undeclared disturbance acts.
+    includes_disturbed: bool,
+    groups: Groups,
+}
+
+impl<'a> MeasurementModel<'a> {
+    /// The model for these measurements. Its columns are the unknowns that appear in any of
+    /// `observations`.
+    ///
+    /// # Errors
+    /// The observations are of another robot.
+    pub(crate) fn survey<'b>(
+        robot: &'a Robot,
+        inputs: &[IdentificationInput],
+        observations: impl Iterator<Item = &'b Annotated>,
+    ) -> Result<Self, DynamicsError> {
+        let (links, sensors) = (robot.model.link_count(), robot.structure.sensors().len());
+        let (wrench, torque) = (
+            inputs.contains(&IdentificationInput::Wrench),
+            inputs.contains(&IdentificationInput::Torque),
+        );
+        let dofs = 0..robot.model.dof_count();
+        let has_rotors = torque && robot.torque_side == TorqueSide::Motor;
+        let extra: Vec<ExtraParameter> = if has_rotors {
+            dofs.clone().map(ExtraParameter::RotorInertia).collect()
+        } else {
+            Vec::new()
+        };
+        let all = Unknowns {
+            links: (0..links).collect(),
+            precision: extra.iter().map(|one| one.precision(robot)).collect(),
+            extra,
+            sensors: (0..sensors).collect(),
+            joints: dofs.collect(),
+        };
+        let mut measurement = Self {
+            robot,
+            unknowns: all,
+            cad: robot
+                .model
+                .inertias()
+                .iter()
+                .flat_map(proprio_dynamics::spatial::RigidInertia::parameters)
+                .collect(),
+            kinematics: Kinematics::new(&robot.model, robot.base_link)?,
+            stacked: StackedRegressor::new(&robot.structure),
+            tree: Regressor::new(&robot.model),
+            readings: vec![Wrench::zero(); sensors],
+            calibrations: vec![Vec::new(); sensors],
+            references: vec![f64::NAN; sensors],
+            wrench,
+            torque,
+            includes_disturbed: false,
+            groups: Groups::default(),
+        };
+        // Links, extra parameters and channels are joined if a row has both.
+        let (channels, nodes) = (
+            measurement.unknowns.channels(),
+            links + measurement.unknowns.extra.len(),
+        );
+        let mut parent: Vec<usize> = (0..nodes + channels).collect();
+        let mut rows = Rows::new(&measurement.unknowns);
+        let (mut seen, mut heard) = (vec![false; nodes], vec![false; channels]);
+        for observation in observations {
+            measurement.make(observation, &mut rows)?;
+            for row in 0..rows.count {
+                let mut first = None;
+                let mut join = |node: usize| {
+                    let own = root_of(&mut parent, node);
+                    let with = root_of(&mut parent, *first.get_or_insert(own));
+                    parent[own.max(with)] = own.min(with);
+                };
+                let (of_links, of_further) = rows.a(row).split_at(WIDTH * links);
+                let columns = of_links
+                    .chunks_exact(WIDTH)
+                    .chain(of_further.chunks_exact(1));
+                for (node, (seen, columns)) in seen.iter_mut().zip(columns).enumerate() {
+                    if columns.iter().any(|x| *x != 0.0) {
+                        *seen = true;
+                        join(node);
+                    }
+                }
+                for (channel, (heard, entry)) in heard.iter_mut().zip(rows.n(row)).enumerate() {
+                    if *entry != 0.0 {
+                        *heard = true;
+                        join(nodes + channel);
+                    }
+                }
+            }
+        }
+        let numbers = |flags: &[bool]| (0..flags.len()).filter(|&i| flags[i]).collect();
+        let (wrenches, torques) = heard.split_at(6 * sensors);
+        let sensing: Vec<bool> = wrenches.chunks(6).map(|six| six.contains(&true)).collect();
+        let (seen, shows) = seen.split_at(links);
+        let shown: Vec<usize> = numbers(shows);
+        measurement.unknowns = Unknowns {
+            links: numbers(seen),
+            extra: shown
+                .iter()
+                .map(|&place| measurement.unknowns.extra[place])
+                .collect(),
+            precision: shown
+                .iter()
+                .map(|&place| measurement.unknowns.precision[place])
+                .collect(),
+            sensors: numbers(&sensing),
+            joints: numbers(torques),
+        };
+        let unknowns = &measurement.unknowns;
+        let wrench_channels = unknowns.sensors.iter().flat_map(|s| 6 * s..6 * s + 6);
+        let channels: Vec<usize> = wrench_channels
+            .chain(unknowns.joints.iter().map(|j| 6 * sensors + j))
+            .collect();
+        let mut groups_of = |nodes: &mut dyn Iterator<Item = usize>| {
+            nodes.map(|node| root_of(&mut parent, node)).collect()
+        };
+        measurement.groups = Groups {
+            links: groups_of(&mut unknowns.links.iter().copied()),
+            extra: groups_of(&mut shown.into_iter().map(|place| links + place)),
+            channels: groups_of(&mut channels.into_iter().map(|channel| nodes + channel)),
+        };
+        Ok(measurement)
+    }
+
+    /// Makes these parameters of the calibrations of the visible sensors unknown, and no others. A
+    /// gain has all its entries. The change per kelvin is included where the temperature varies in
+    /// these observations. Its reference temperature is the configured one, else the mean.
+    pub(crate) fn calibrate<'b>(
+        &mut self,
+        wanted: Kind,
+        observations: impl Iterator<Item = &'b Annotated>,
+    ) {
+        /// Least temperature range that determines a change per kelvin [K].
+        const LEAST: f64 = 0.1;
+        let robot = self.robot;
+        // Calibration parameters come last.
+        let others = self.unknowns.extra.iter();
+        let others = others
+            .filter(|extra| !matches!(extra, ExtraParameter::Calibration(..)))
+            .count();
+        self.unknowns.extra.truncate(others);
+        self.unknowns.precision.truncate(others);
+        self.groups.extra.truncate(others);
+        self.calibrations.iter_mut().for_each(Vec::clear);
+        let mut temperatures = vec![Vec::new(); self.references.len()];
+        for observation in observations {
+            let measured = temperatures.iter_mut().zip(&observation.temperatures);
+            for (own, celsius) in measured.filter(|(_, celsius)| celsius.is_finite()) {
+                own.push(*celsius);
+            }
+        }
+        for (place, &sensor) in self.unknowns.sensors.iter().enumerate() {
+            let own = &temperatures[sensor];
+            let (low, high) = own.iter().fold((f64::MAX, f64::MIN), |(low, high), x| {
+                (low.min(*x), high.max(*x))
+            });
+            let mean = own.iter().sum::<f64>() / own.len() as f64;
+            self.references[sensor] = robot.calibrations[sensor].reference().unwrap_or(mean);
+            let kind = Kind {
+                temperature: wanted.temperature && high - low > LEAST,
+                ..wanted
+            };
+            for unknown in kind.unknowns() {
+                let extra = ExtraParameter::Calibration(sensor, unknown);
+                self.calibrations[sensor].push((
+                    WIDTH * self.unknowns.links.len() + self.unknowns.extra.len(),
+                    unknown,
+                ));
+                self.unknowns.extra.push(extra);
+                self.unknowns.precision.push(extra.precision(robot));
+                self.groups.extra.push(self.groups.channels[6 * place]);
+            }
+        }
+    }
+
+    /// The reference temperature of a sensor's change per kelvin \[degrees Celsius\], if one was
+    /// recorded or configured.
+    pub(crate) fn reference(&self, sensor: usize) -> Option<f64> {
+        self.references
+            .get(sensor)
+            .copied()
+            .filter(|celsius| celsius.is_finite())
+    }
+
+    /// Columns and entries of a sensor's calibration in a row, where its offset has the entries
+    /// `values`. An unknown of the calibration acts as an offset proportional to the reading.
+    fn calibration<'b>(
+        &'b self,
+        observation: &'b Annotated,
+        sensor: usize,
+        values: &'b [f64],
+    ) -> impl Iterator<Item = (usize, f64)> + 'b {
+        let celsius = observation
+            .temperatures
+            .get(sensor)
+            .copied()
+            .unwrap_or(f64::NAN);
+        let kelvin = Some(celsius - self.references[sensor]).filter(|kelvin| kelvin.is_finite());
+        let fitted = observation
+            .fitted
+            .get(sensor)
+            .filter(|fitted| fitted.is_finite());
+        let corrected = fitted.unwrap_or(&self.readings[sensor]).torque_first();
+        self.calibrations[sensor]
+            .iter()
+            .map(move |&(column, unknown)| {
+                let as_offset = unknown.as_offset(&corrected, kelvin.unwrap_or(0.0));
+                (column, values[unknown.channel()] * as_offset)
+            })
+    }
+
+    pub(crate) fn unknowns(&self) -> &Unknowns {
+        &self.unknowns
+    }
+
+    /// Groups of unknowns and channels. No row has two groups.
+    pub(crate) fn groups(&self) -> &Groups {
+        &self.groups
+    }
+
+    /// Whether rows are also made of [`Annotated::disturbed`] units from now on.
+    pub(crate) fn include_disturbed(&mut self, includes_disturbed: bool) {
+        self.includes_disturbed = includes_disturbed;
+    }
+
+    /// CAD's parameters in the columns of the rows; zero for extra parameters.
+    pub(crate) fn cad_of_unknowns(&self) -> Vec<f64> {
+        let links = self.unknowns.links.iter();
+        let of_links = links.flat_map(|link| self.cad[WIDTH * link..][..WIDTH].iter().copied());
+        of_links
+            .chain(self.unknowns.extra.iter().map(|_| 0.0))
+            .collect()
+    }
+
+    /// Measured minus predicted torque of every joint, for parameters `d` relative to CAD; NaN
+    /// where there is no torque, or where a contact or an undeclared disturbance may act beyond the
+    /// joint.
+    ///
+    /// # Errors
+    /// As for [`MeasurementModel::make`].
+    pub(crate) fn torque_errors(
+        &mut self,
+        observation: &Annotated,
+        d: &[f64],
+    ) -> Result<Vec<f64>, DynamicsError> {
+        let mut rows = Rows::new(&self.unknowns);
+        self.make(observation, &mut rows)?;
+        self.tree.update(&self.robot.model, &self.kinematics)?;
+        let blocked = self.blocked(observation);
+        let error = |dof: usize| {
+            let Some(row) = self.tree.joint_row(dof).filter(|_| !blocked[dof]) else {
+                return f64::NAN;
+            };
+            let own = self.unknowns.links.iter().enumerate().map(|(place, link)| {
+                dot(&row[WIDTH * link..][..WIDTH], &d[WIDTH * place..][..WIDTH])
+            });
+            observation.torque[dof] - dot(row, &self.cad) - own.sum::<f64>()
+        };
+        Ok((0..self.robot.model.dof_count()).map(error).collect())
+    }
+
+    pub(crate) fn robot(&self) -> &'a Robot {
+        self.robot
+    }
+
+    /// Computes the rows of an observation. Sub-trees with a missing reading, missing torques, and
+    /// units under an undeclared disturbance ([`Annotated::disturbed`]) have no rows.
+    ///
+    /// # Errors
+    /// The observation is of another robot, or a position, velocity or acceleration is not finite.
+    pub(crate) fn make(
+        &mut self,
+        observation: &Annotated,
+        rows: &mut Rows,
+    ) -> Result<(), DynamicsError> {
+        rows.clear();
+        if observation.base_link != self.kinematics.base() {
+            self.kinematics
+                .set_base(&self.robot.model, observation.base_link)?;
+        }
+        let state = JointState {
+            position: &observation.position,
+            velocity: &observation.velocity,
+            acceleration: &observation.acceleration,
+        };
+        self.kinematics
+            .update(&self.robot.model, state, &observation.base)?;
+        if self.wrench {
+            self.wrench_rows(observation, rows)?;
+        }
+        if self.torque {
+            self.torque_rows(observation, rows)?;
+        }
+        Ok(())
+    }
+
+    /// Joints whose torque can be computed from either side: both have F/T sensors and no contacts.
+    /// Returns the degree of freedom and the combination of the last rows (not whitened) that gives
+    /// the difference of the two torques.
+    pub(crate) fn two_routes(&self, rows: &Rows) -> Vec<(usize, DVector<f64>)> {
+        let robot = self.robot;
+        let mut routes = Vec::new();
+        for (number, subtree) in self.stacked.subtrees().iter().enumerate() {
+            let own: Vec<usize> = (0..rows.count)
+                .filter(|&row| rows.units[row] == number)
+                .collect();
+            if subtree.sensors().len() < 2 || !subtree.contacts().is_empty() || own.len() < 6 {
+                continue;
+            }
+            // Rows are combinations of the six equations.
+            let combined = Matrix6::from_fn(|row, equation| subtree.projection(row)[equation]);
+            let Some(equations) = combined.try_inverse() else {
+                continue;
+            };
+            for joint in robot.model.joints() {
+                let inside = robot.structure.subtree_of(joint.child) == Some(number)
+                    && joint.child != subtree.top();
+                if let (Some(dof), true, Some(axis)) =
+                    (joint.dof, inside, self.kinematics.joint_axis(joint))
+                {
+                    // The axis is given in the base; the equations are about the top link's origin
+                    // in its axes.
+                    let along = self.kinematics.pose(subtree.top()).inverse().twist(&axis);
+                    let along =
+                        Vector6::from_iterator(along.angular.iter().chain(&along.linear).copied());
+                    let along = equations.tr_mul(&along);
+                    let mut all = DVector::zeros(rows.count);
+                    own.iter()
+                        .zip(along.iter())
+                        .for_each(|(row, weight)| all[*row] = *weight);
+                    routes.push((dof, all));
+                }
+            }
+        }
+        routes
+    }
+
+    /// The wrench that a sub-tree needs for its motion, minus the measured one, for these
+    /// parameters and nuisance parameters, after [`MeasurementModel::make`]: about its top link's
+    /// origin, in that link's axes. None if a sensor has no reading, or an unknown contact acts on
+    /// it.
+    pub(crate) fn balance(
+        &self,
+        observation: &Annotated,
+        d: &[f64],
+        nuisance: &[f64],
+        number: usize,
+    ) -> Option<Wrench> {
+        let subtree = self.stacked.subtrees().get(number)?;
+        let unread = |sensor: usize| {
+            observation
+                .readings
+                .get(sensor)
+                .is_none_or(|r| !r.is_finite())
+        };
+        let is_disturbed = !self.includes_disturbed && observation.disturbed.contains(number);
+        if is_disturbed
+            || subtree.sensors().len() == 0
+            || subtree.sensors().any(unread)
+            || !subtree.contacts().is_empty()
+        {
+            return None;
+        }
+        let mut b = vibration_of(observation, number);
+        for (row, sum) in b.iter_mut().enumerate() {
+            let (links, offsets) = subtree.row(row).split_at(subtree.offset_column());
+            for (values, link) in links.chunks_exact(WIDTH).zip(subtree.links()) {
+                *sum += dot(values, &self.cad[WIDTH * link..][..WIDTH]);
+                if let Ok(place) = self.unknowns.links.binary_search(link) {
+                    *sum += dot(values, &d[WIDTH * place..][..WIDTH]);
+                }
+            }
+            for (values, sensor) in offsets.chunks_exact(6).zip(subtree.sensors()) {
+                if let Ok(place) = self.unknowns.sensors.binary_search(&sensor) {
+                    *sum += dot(values, &nuisance[6 * place..][..6]);
+                }
+                *sum += self
+                    .calibration(observation, sensor, values)
+                    .map(|(column, entry)| entry * d[column])
+                    .sum::<f64>();
+            }
+            *sum -= subtree.measured()[row];
+        }
+        Some(Wrench {
+            torque: Vec3::new(b[0], b[1], b[2]),
+            force: Vec3::new(b[3], b[4], b[5]),
+        })
+    }
+
+    /// The sensors at the boundary of each sub-tree.
+    pub(crate) fn sensors_of_subtrees(&self) -> Vec<Vec<usize>> {
+        let each = self.stacked.subtrees().iter();
+        each.map(|subtree| subtree.sensors().collect()).collect()
+    }
+
+    /// The channels (places in the layout) that appear in rows of these units.
+    pub(crate) fn channels_of(&self, units: &UnitSet) -> Vec<usize> {
+        let (unknowns, subtrees) = (self.unknowns(), self.stacked.subtrees());
+        let is_read = |sensor: usize| {
+            let mut own = subtrees
+                .iter()
+                .enumerate()
+                .filter(|(number, _)| units.contains(*number));
+            own.any(|(_, subtree)| subtree.sensors().any(|other| other == sensor))
+        };
+        let sensors = (0..unknowns.sensors.len()).filter(|&place| is_read(unknowns.sensors[place]));
+        let of_sensors = sensors.flat_map(|place| 6 * place..6 * place + 6);
+        let of_joints = 6 * unknowns.sensors.len()..unknowns.channels();
+        of_sensors
+            .chain(of_joints.filter(|_| units.contains(Observation::TORQUES)))
+            .collect()
+    }
+
+    /// The composite inertia of a sub-tree with locked joints, by CAD, after
+    /// [`MeasurementModel::make`]: the wrench for a unit acceleration along each of
+    /// [angular; linear], about its top link's origin and in that link's axes.
+    pub(crate) fn inertia_of_subtree(&self, number: usize) -> Option<[Wrench; 6]> {
+        let subtree = self.stacked.subtrees().get(number)?;
+        let to_top = self.kinematics.pose(subtree.top()).inverse();
+        let mut wrenches = [Wrench::zero(); 6];
+        for &link in subtree.links() {
+            let body = self.robot.model.inertias()[link]
+                .transformed(&(to_top * *self.kinematics.pose(link)));
+            for (k, sum) in wrenches.iter_mut().enumerate() {
+                let unit = |first: usize| Vec3::from_fn(|i, _| f64::from(u8::from(first + i == k)));
+                *sum += body.momentum(&Motion {
+                    angular: unit(0),
+                    linear: unit(3),
+                });
+            }
+        }
+        Some(wrenches)
+    }
+
+    fn wrench_rows(
+        &mut self,
+        observation: &Annotated,
+        rows: &mut Rows,
+    ) -> Result<(), DynamicsError> {
+        for (reading, given) in self.readings.iter_mut().zip(&observation.readings) {
+            *reading = if given.is_finite() {
+                *given
+            } else {
+                Wrench::zero()
+            };
+        }
+        self.stacked
+            .update(&self.kinematics, &self.readings, &observation.active, &[])?;
+        self.stacked.eliminate_contacts(Weighting::Noise);
+        for (unit, subtree) in self.stacked.subtrees().iter().enumerate() {
+            let unread = |sensor: usize| {
+                observation
+                    .readings
+                    .get(sensor)
+                    .is_none_or(|r| !r.is_finite())
+            };
+            let is_disturbed = !self.includes_disturbed && observation.disturbed.contains(unit);
+            if is_disturbed || subtree.sensors().len() == 0 || subtree.sensors().any(unread) {
+                continue;
+            }
+            let vibration = vibration_of(observation, unit);
+            for number in 0..subtree.remaining() {
+                let from = subtree.projected_row(number);
+                let (links, offsets) = from.split_at(subtree.offset_column());
+                let (a, r, g, n) = rows.push(unit);
+                *r = subtree.projected_measured()[number]
+                    - dot(subtree.projection(number), &vibration);
+                for (values, link) in links.chunks_exact(WIDTH).zip(subtree.links()) {
+                    let cad = &self.cad[WIDTH * link..][..WIDTH];
+                    *r -= values.iter().zip(cad).map(|(x, y)| x * y).sum::<f64>();
+                    if let Ok(place) = self.unknowns.links.binary_search(link) {
+                        a[WIDTH * place..][..WIDTH].copy_from_slice(values);
+                    }
+                }
+                for (values, sensor) in offsets.chunks_exact(6).zip(subtree.sensors()) {
+                    if let Ok(place) = self.unknowns.sensors.binary_search(&sensor) {
+                        g[6 * place..][..6].copy_from_slice(values);
+                        n[6 * place..][..6].copy_from_slice(values);
+                    }
+                    for (column, entry) in self.calibration(observation, sensor, values) {
+                        a[column] = entry;
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn torque_rows(
+        &mut self,
+        observation: &Annotated,
+        rows: &mut Rows,
+    ) -> Result<(), DynamicsError> {
+        if !self.includes_disturbed && observation.disturbed.contains(Observation::TORQUES) {
+            return Ok(());
+        }
+        self.tree.update(&self.robot.model, &self.kinematics)?;
+        let wrenches = self.unknowns.sensors.len();
+        let blocked = self.blocked(observation);
+        for (place, &dof) in self.unknowns.joints.iter().enumerate() {
+            let torque = observation.torque.get(dof).copied().unwrap_or(f64::NAN);
+            let Some(row) = self.tree.joint_row(dof) else {
+                continue;
+            };
+            if !torque.is_finite() || blocked[dof] {
+                continue;
+            }
+            let (a, r, g, n) = rows.push(Observation::TORQUES);
+            *r = torque - row.iter().zip(&self.cad).map(|(x, y)| x * y).sum::<f64>();
+            for (to, link) in a.chunks_exact_mut(WIDTH).zip(&self.unknowns.links) {
+                to.copy_from_slice(&row[WIDTH * link..][..WIDTH]);
+            }
+            if let Some(column) = self.unknowns.column(ExtraParameter::RotorInertia(dof)) {
+                a[column] = observation.acceleration[dof];
+            }
+            let velocity = observation.velocity[dof];
+            g[6 * wrenches + FRICTION * place..][..FRICTION]
+                .copy_from_slice(&friction_row(velocity));
+            n[6 * wrenches + place] = 1.0;
+        }
+        Ok(())
+    }
+
+    /// Per degree of freedom, whether a present contact lies beyond its joint, seen from the base:
+    /// the joint is on the path from the contact's link to the base. A disturbed sub-tree counts
+    /// with all its links, since the link of the contact is unknown.
+    fn blocked(&self, observation: &Annotated) -> Vec<bool> {
+        let model = &self.robot.model;
+        let mut blocked = vec![false; model.dof_count()];
+        let to_root = |mut link: usize| {
+            let mut joints = Vec::new();
+            while link > 0 {
+                joints.push(link - 1);
+                link = model.joints()[link - 1].parent;
+            }
+            joints
+        };
+        let base = to_root(self.kinematics.base());
+        let structure = &self.robot.structure;
+        let declared = observation
+            .active
+            .iter()
+            .filter_map(|contact| structure.contacts().get(contact));
+        let mut touched: Vec<usize> = declared.map(|spec| spec.frame.link).collect();
+        if !self.includes_disturbed {
+            let subtrees = observation
+                .disturbed
+                .iter()
+                .filter(|unit| *unit < structure.subtrees().len());
+            touched.extend(subtrees.flat_map(|unit| structure.links_of(unit)));
+        }
+        for link in touched {
+            let own = to_root(link);
+            let apart = own
+                .iter()
+                .filter(|j| !base.contains(j))
+                .chain(base.iter().filter(|j| !own.contains(j)));
+            for dof in apart.filter_map(|&joint| model.joints()[joint].dof) {
+                blocked[dof] = true;
+            }
+        }
+        blocked
+    }
+}

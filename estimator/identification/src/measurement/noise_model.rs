@@ -1,0 +1,126 @@
+//! The noise of all channels: its white and slow parts, and the drift rates of the offsets.
+
+use crate::measurement::unknowns::Unknowns;
+
+/// Upper limits of the drift rates of offsets (random walk).
+#[derive(Clone, Debug)]
+pub(crate) struct DriftLimits {
+    /// The greatest variance of a step between blocks, relative to that of a block's noise.
+    pub relative: f64,
+    /// Per channel of F/T sensors, the greatest rate [unit^2/s].
+    pub rates: Vec<f64>,
+}
+
+/// The noise of all channels.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct NoiseModel {
+    /// Per channel: mean square of the residual without the drifting offset.
+    pub square: Vec<f64>,
+    /// Per channel: integrated autocorrelation time of that residual, in observations.
+    pub time: Vec<f64>,
+    /// Per channel: rate of the offset's random walk [unit^2/s].
+    pub drift: Vec<f64>,
+    /// Per channel: variance of a row for which block means have the variance that was found for
+    /// them beside the random walk.
+    pub block: Vec<f64>,
+    /// Per channel: lower limit of its variance.
+    pub least: Vec<f64>,
+}
+
+impl NoiseModel {
+    /// The initial model: far above the lower limits, in their proportions.
+    pub(crate) fn unknown(least: Vec<f64>) -> Self {
+        let channels = least.len();
+        let start: Vec<f64> = least.iter().map(|least| 1e6 * least).collect();
+        Self {
+            square: start.clone(),
+            time: vec![1.0; channels],
+            drift: vec![0.0; channels],
+            block: start,
+            least,
+        }
+    }
+
+    /// Variances with which correlated rows may count as independent. They are used for estimating
+    /// parameters.
+    pub(crate) fn inflated(&self) -> Vec<f64> {
+        let each = self
+            .square
+            .iter()
+            .zip(&self.time)
+            .zip(&self.block)
+            .zip(&self.least);
+        each.map(|(((square, time), block), least)| (square * time).max(*block).max(*least))
+            .collect()
+    }
+
+    /// Variances for tracking the offsets.
+    pub(crate) fn following(&self) -> Vec<f64> {
+        self.block
+            .iter()
+            .zip(&self.least)
+            .map(|(x, y)| x.max(*y))
+            .collect()
+    }
+
+    /// The mean of this model, from the data that the parameters were fitted to, and one from
+    /// held-out data. To first order in the number of parameters, the first is below the noise by
+    /// as much as the second is above it, since held-out residuals contain the parameters' errors.
+    /// The drift rates are those of this model.
+    pub(crate) fn cross_validated_noise(&self, held_out: &Self) -> Self {
+        let mut midway = self.clone();
+        let (own, others) = (self.inflated(), held_out.inflated());
+        for (channel, time) in midway.time.iter_mut().enumerate() {
+            // Channels that are absent from the held-out data keep their noise.
+            if self.square[channel] > 0.0 && held_out.square[channel] > 0.0 {
+                *time = 0.5 * (own[channel] + others[channel]) / self.square[channel];
+            }
+        }
+        midway
+    }
+
+    /// The greatest relative change of a variance.
+    pub(crate) fn change(&self, other: &Self) -> f64 {
+        let pairs = self.inflated().into_iter().zip(other.inflated());
+        pairs.map(|(x, y)| (x / y).ln().abs()).fold(0.0, f64::max)
+    }
+
+    /// Ends a limit cycle of the iteration between noise and fit. If an earlier model is like the
+    /// newest (no variance changed by more than `within`, see [`NoiseModel::change`]), the result
+    /// has for each channel the greatest noise in between, so that no uncertainty is stated too
+    /// small. None if there is no cycle.
+    pub(crate) fn resolve_limit_cycle(rounds: &[Self], within: f64) -> Option<Self> {
+        let (newest, before) = rounds.split_last()?;
+        let back = before
+            .iter()
+            .rposition(|other| newest.change(other) < within)?;
+        let mut greatest = newest.clone();
+        for other in &before[back + 1..] {
+            let (own, others) = (greatest.inflated(), other.inflated());
+            for channel in (0..own.len()).filter(|&channel| others[channel] > own[channel]) {
+                greatest.square[channel] = other.square[channel];
+                greatest.time[channel] = other.time[channel];
+                greatest.drift[channel] = other.drift[channel];
+                greatest.block[channel] = other.block[channel];
+            }
+        }
+        Some(greatest)
+    }
+
+    /// The geometric mean of the ratio of another model's variances to this model's, over these
+    /// channels.
+    pub(crate) fn variance_ratio(&self, other: &Self, channels: &[usize]) -> f64 {
+        let (own, others) = (self.inflated(), other.inflated());
+        let sum: f64 = channels.iter().map(|&c| (others[c] / own[c]).ln()).sum();
+        (sum / channels.len().max(1) as f64).exp()
+    }
+
+    /// Variances of the steps of all nuisance parameters over this time.
+    pub(crate) fn steps(&self, unknowns: &Unknowns, seconds: f64) -> Vec<f64> {
+        let mut variances = vec![0.0; unknowns.nuisance()];
+        for (channel, rate) in self.drift.iter().enumerate() {
+            variances[unknowns.offset_of(channel)] = rate * seconds;
+        }
+        variances
+    }
+}

@@ -1,0 +1,756 @@
+//! Passes over a log's observations: the information about the parameters, and the residuals for
+//! given parameters.
+
+use crate::arithmetic::dot;
+use crate::dataset::defects::OffsetJump;
+use crate::dataset::observation::Annotated;
+use crate::linear::information::{Information, Panel};
+use crate::linear::nuisance::{Block, NuisanceFilter, smooth};
+use crate::measurement::model::MeasurementModel;
+use crate::measurement::noise_model::NoiseModel;
+use crate::measurement::rows::Rows;
+use crate::measurement::unknowns::Unknowns;
+use crate::parallel;
+use nalgebra::{DMatrix, DVector};
+use std::ops::Range;
+
+/// Offsets are constant within blocks of this length \[s\] and drift between blocks (random walk).
+pub(crate) const BLOCK: f64 = 0.1;
+
+/// Prior variance of an offset [N^2 or Nm^2]: no F/T offset exceeds 1000.
+pub(crate) const OFFSET_VARIANCE: f64 = 1e6;
+
+/// Prior variance of a friction coefficient [Nm^2]: none exceeds 100.
+const FRICTION_VARIANCE: f64 = 1e4;
+
+/// Rows that are absorbed at once.
+const PANEL: usize = 96;
+
+/// Blocks that one thread processes at a time.
+const TOGETHER: usize = 16;
+
+/// Number of such batches whose rows are kept in memory.
+const AT_ONCE: usize = 32;
+
+/// Consecutive observations of one log, with their own offsets and friction.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Segment<'a> {
+    pub instants: &'a [Annotated],
+    /// Where offsets are re-initialised.
+    pub offset_jumps: &'a [OffsetJump],
+}
+
+/// Prior variances of the nuisance parameters.
+pub(crate) fn nuisance_prior(unknowns: &Unknowns) -> Vec<f64> {
+    let mut prior = vec![OFFSET_VARIANCE; 6 * unknowns.sensors.len()];
+    prior.resize(unknowns.nuisance(), FRICTION_VARIANCE);
+    prior
+}
+
+/// A block of observations, and the sensors (places in the layout) whose offset jumps at its start.
+pub(crate) type BlockRange = (Range<usize>, Vec<usize>);
+
+/// The blocks of a segment.
+pub(crate) fn blocks(unknowns: &Unknowns, segment: Segment<'_>) -> Vec<BlockRange> {
+    let instants = segment.instants;
+    let mut out = Vec::new();
+    let mut start = 0;
+    let mut jumped_sensors = Vec::new();
+    for i in 1..=instants.len() {
+        let next: Vec<usize> = match instants.get(i) {
+            Some(observation) => segment
+                .offset_jumps
+                .iter()
+                .filter(|b| instants[i - 1].t < b.t && b.t <= observation.t)
+                .filter_map(|b| unknowns.sensors.binary_search(&b.sensor).ok())
+                .collect(),
+            None => Vec::new(),
+        };
+        let ends = instants
+            .get(i)
+            .is_none_or(|observation| (observation.t - instants[start].t).seconds() >= BLOCK);
+        if ends || !next.is_empty() {
+            out.push((start..i, std::mem::replace(&mut jumped_sensors, next)));
+            start = i;
+        }
+    }
+    out
+}
+
+/// Advances the filter to the next block. Returns the variances that were added, infinite for
+/// re-initialised offsets.
+fn advance(nuisance: &mut NuisanceFilter, steps: Vec<f64>, jumped_sensors: &[usize]) -> Vec<f64> {
+    let mut added = steps;
+    nuisance.drift(&added);
+    for sensor in jumped_sensors {
+        for (axis, added) in added[6 * sensor..6 * sensor + 6].iter_mut().enumerate() {
+            nuisance.reset(6 * sensor + axis, OFFSET_VARIANCE);
+            *added = f64::INFINITY;
+        }
+    }
+    added
+}
+
+/// The information about the parameters in a segment, and the nuisance parameters at its end.
+pub(crate) struct ReducedLog {
+    /// About `d`, with offsets and friction eliminated.
+    pub information: Information,
+    /// At the end of the segment `s = estimate - slope d`, with this covariance.
+    pub slope: DMatrix<f64>,
+    pub covariance: DMatrix<f64>,
+}
+
+/// Reduces a segment to its information about the parameters.
+pub(crate) fn reduce(
+    measurement: &mut MeasurementModel<'_>,
+    segment: Segment<'_>,
+    noise: &NoiseModel,
+) -> ReducedLog {
+    reduce_with(measurement, segment, noise, &[], 0, &mut |_, _, _, _| ())
+}
+
+/// As [`reduce`], with extra columns: the effect of a constant position error of these joints.
+pub(crate) fn reduce_with_angles(
+    measurement: &mut MeasurementModel<'_>,
+    segment: Segment<'_>,
+    noise: &NoiseModel,
+    angles: &[usize],
+    d: &[f64],
+) -> ReducedLog {
+    const ANGLE: f64 = 1e-5;
+    let mut perturbed = Rows::new(measurement.unknowns());
+    let mut columns = |measurement: &mut MeasurementModel<'_>,
+                       number: usize,
+                       rows: &Rows,
+                       slopes: &mut [f64]| {
+        for (place, &dof) in angles.iter().enumerate() {
+            let other = segment.instants[number]
+                .clone()
+                .map(|o| o.moved(dof, ANGLE));
+            if measurement.make(&other, &mut perturbed).is_err() || perturbed.count != rows.count {
+                continue;
+            }
+            for row in 0..rows.count {
+                // The row holds at the true position: the measured one minus the error. The
+                // small change of the offset terms is ignored.
+                let right = |r: &Rows| r.r(row) - dot(r.a(row), d);
+                slopes[row * angles.len() + place] = -(right(rows) - right(&perturbed)) / ANGLE;
+            }
+        }
+    };
+    reduce_with(measurement, segment, noise, &[], angles.len(), &mut columns)
+}
+
+/// Writes extra columns of an observation's rows, row by row, given its number in the segment and
+/// its rows.
+type Columns<'a> = dyn FnMut(&mut MeasurementModel<'_>, usize, &Rows, &mut [f64]) + 'a;
+
+/// As [`reduce`], without the observations flagged in `excluded` (all are used if it is empty), and
+/// with `width` extra columns after those of `d`.
+pub(crate) fn reduce_with(
+    measurement: &mut MeasurementModel<'_>,
+    segment: Segment<'_>,
+    noise: &NoiseModel,
+    excluded: &[bool],
+    width: usize,
+    columns: &mut Columns<'_>,
+) -> ReducedLog {
+    let unknowns = measurement.unknowns().clone();
+    let links = unknowns.parameters();
+    let p = links + width;
+    let variances = noise.inflated();
+    let mut nuisance = NuisanceFilter::new(&nuisance_prior(&unknowns), p + 1);
+    let mut rows = Rows::new(&unknowns);
+    let mut information = Information::new(p);
+    let mut panel = Panel::new(p, PANEL);
+    let mut line = vec![0.0; p + 1];
+    let mut slopes = Vec::new();
+    let mut last = None;
+    for (range, jumped_sensors) in blocks(&unknowns, segment) {
+        let t = segment.instants[range.start].t;
+        if let Some(last) = last.replace(t) {
+            advance(
+                &mut nuisance,
+                noise.steps(&unknowns, (t - last).seconds()),
+                &jumped_sensors,
+            );
+        }
+        for number in range {
+            if excluded.get(number) == Some(&true)
+                || measurement
+                    .make(&segment.instants[number], &mut rows)
+                    .is_err()
+            {
+                continue;
+            }
+            slopes.clear();
+            slopes.resize(rows.count * width, 0.0);
+            columns(measurement, number, &rows, &mut slopes);
+            rows.whiten_with(&variances, &mut slopes, width);
+            for row in 0..rows.count {
+                line[..links].copy_from_slice(rows.a(row));
+                line[links..p].copy_from_slice(&slopes[row * width..][..width]);
+                line[p] = rows.r(row);
+                nuisance.update(rows.g(row), &mut line);
+                if panel.rows() == panel.capacity() {
+                    let _ = information.absorb(&mut panel);
+                }
+                // Rows that are not finite are skipped.
+                let _ = panel.push_row(&line[..p], line[p]);
+            }
+        }
+    }
+    let _ = information.absorb(&mut panel);
+    let estimates = nuisance.estimates();
+    ReducedLog {
+        information,
+        slope: estimates.columns(0, links).into_owned(),
+        covariance: nuisance.covariance(),
+    }
+}
+
+/// The residuals of a segment, for several sets of parameters.
+pub(crate) struct Residuals {
+    /// Per set, per channel, per observation: noise; NaN if no row has the channel.
+    pub noise: Vec<Vec<Vec<f64>>>,
+    /// Per channel, per observation: the prediction by the first set without offsets and friction:
+    /// of an F/T sensor's reading, or of a joint's torque.
+    pub predicted: Vec<Vec<f64>>,
+    /// The corresponding measurement, minus the known structural vibration.
+    pub measured: Vec<Vec<f64>>,
+    /// Blocks of observations.
+    pub ranges: Vec<Range<usize>>,
+    /// Per block, the smoothed nuisance parameters, a column per set.
+    pub nuisance: Vec<Block>,
+    /// How noise is shared among channels ([`Rows::add_shares`]): the mean over observations, a row
+    /// per channel.
+    pub shares: DMatrix<f64>,
+    /// Per channel, the number of observations in which any row has it.
+    pub seen: Vec<f64>,
+}
+
+impl Residuals {
+    /// Whether any row had this channel.
+    pub(crate) fn has_channel(&self, channel: usize) -> bool {
+        self.measured[channel].iter().any(|x| x.is_finite())
+    }
+
+    /// The drift of a channel's offset about its mean since the last offset jump, per block. Drifts
+    /// of several sensors that rows mix are shared as their noise is. (Otherwise the sensor with
+    /// the greatest assumed drift rate would get all of it.)
+    pub(crate) fn offset_drift(&self, unknowns: &Unknowns, set: usize, channel: usize) -> Vec<f64> {
+        let mut sum = vec![0.0; self.nuisance.len()];
+        for other in 0..6 * unknowns.sensors.len() {
+            let share = self.shares[(channel, other)];
+            if share == 0.0 {
+                continue;
+            }
+            let unknown = unknowns.offset_of(other);
+            let mut start = 0;
+            for end in 1..=self.nuisance.len() {
+                if end < self.nuisance.len() && self.nuisance[end].drift[unknown].is_finite() {
+                    continue;
+                }
+                let own = &self.nuisance[start..end];
+                let mean =
+                    own.iter().map(|block| block.x[(unknown, set)]).sum::<f64>() / own.len() as f64;
+                for (sum, block) in sum[start..end].iter_mut().zip(own) {
+                    *sum += share * (block.x[(unknown, set)] - mean);
+                }
+                start = end;
+            }
+        }
+        sum
+    }
+}
+
+/// Fits offsets and friction for given parameters. Returns the blocks of observations, and the
+/// filtered (not smoothed) estimates at the end of each block, a column per set.
+pub(crate) fn filter_nuisance(
+    measurement: &MeasurementModel<'_>,
+    segment: Segment<'_>,
+    noise: &NoiseModel,
+    sets: &[DVector<f64>],
+) -> (Vec<BlockRange>, Vec<Block>) {
+    let unknowns = measurement.unknowns().clone();
+    let k = sets.len();
+    let variances = noise.following();
+    let mut nuisance = NuisanceFilter::new(&nuisance_prior(&unknowns), k);
+    let make = || (measurement.clone(), Rows::new(&unknowns));
+    let (mut states, mut last) = (Vec::new(), None);
+    let blocks = blocks(&unknowns, segment);
+    for some in blocks.chunks(AT_ONCE * TOGETHER) {
+        // Per row: the residual of every set, and the coefficients of the nuisance parameters.
+        let width = k + unknowns.nuisance();
+        let shares: Vec<_> = some.chunks(TOGETHER).collect();
+        let lines = parallel::map_with(
+            shares.len(),
+            make,
+            |(measurement, rows), number| -> Vec<Vec<f64>> {
+                let of_block = |(range, _): &BlockRange| {
+                    let mut lines = Vec::new();
+                    for observation in &segment.instants[range.clone()] {
+                        if measurement.make(observation, rows).is_err() {
+                            continue;
+                        }
+                        rows.whiten(&variances);
+                        for row in 0..rows.count {
+                            lines.extend(
+                                sets.iter()
+                                    .map(|set| rows.r(row) - dot(rows.a(row), set.as_slice())),
+                            );
+                            lines.extend_from_slice(rows.g(row));
+                        }
+                    }
+                    lines
+                };
+                shares[number].iter().map(of_block).collect()
+            },
+        );
+        for ((range, jumped_sensors), mut lines) in some.iter().zip(lines.into_iter().flatten()) {
+            let t = segment.instants[range.start].t;
+            let mut drift = vec![0.0; unknowns.nuisance()];
+            if let Some(last) = last.replace(t) {
+                drift = advance(
+                    &mut nuisance,
+                    noise.steps(&unknowns, (t - last).seconds()),
+                    jumped_sensors,
+                );
+            }
+            for line in lines.chunks_exact_mut(width) {
+                let (values, g) = line.split_at_mut(k);
+                nuisance.update(g, values);
+            }
+            states.push(Block {
+                x: nuisance.estimates(),
+                p: nuisance.covariance(),
+                drift,
+            });
+        }
+    }
+    (blocks, states)
+}
+
+/// As [`filter_nuisance`], smoothed over the whole segment, with the residuals.
+pub(crate) fn residuals(
+    measurement: &MeasurementModel<'_>,
+    segment: Segment<'_>,
+    noise: &NoiseModel,
+    sets: &[DVector<f64>],
+) -> Residuals {
+    let unknowns = measurement.unknowns().clone();
+    let (k, channels, count) = (sets.len(), unknowns.channels(), segment.instants.len());
+    let variances = noise.following();
+    let make = || (measurement.clone(), Rows::new(&unknowns));
+    let (blocks, mut states) = filter_nuisance(measurement, segment, noise, sets);
+    let ranges: Vec<Range<usize>> = blocks.into_iter().map(|(range, _)| range).collect();
+    smooth(&mut states);
+    let mut first = measurement.cad_of_unknowns();
+    if let Some(set) = sets.first() {
+        first
+            .iter_mut()
+            .zip(set)
+            .for_each(|(value, change)| *value += change);
+    }
+    let cad = measurement.cad_of_unknowns();
+    let number = |at: usize| at * TOGETHER..ranges.len().min((at + 1) * TOGETHER);
+    // For some blocks, per observation and channel: the residual of each set, the prediction of the
+    // first set, the measurement; then sums of shares, and counts of observations.
+    let parts = parallel::map_with(
+        ranges.len().div_ceil(TOGETHER),
+        make,
+        |(measurement, rows), at| {
+            let (mut white, mut e) = (Vec::new(), vec![0.0; channels]);
+            let (mut shares, mut seen) = (vec![0.0; channels * channels], vec![0.0_f64; channels]);
+            let mut values = Vec::new();
+            for (range, state) in ranges[number(at)].iter().zip(&states[number(at)]) {
+                for observation in &segment.instants[range.clone()] {
+                    let start = values.len();
+                    values.resize(start + (k + 2) * channels, f64::NAN);
+                    if measurement.make(observation, rows).is_err() {
+                        continue;
+                    }
+                    rows.whiten(&variances);
+                    rows.add_shares(&variances, &mut shares);
+                    let there: Vec<usize> =
+                        (0..channels).filter(|&channel| rows.has(channel)).collect();
+                    there.iter().for_each(|&channel| seen[channel] += 1.0);
+                    let mut give = |value: &dyn Fn(usize) -> f64, out: usize| {
+                        white.clear();
+                        white.extend((0..rows.count).map(value));
+                        rows.channel_noise(&variances, &mut white, &mut e);
+                        for &channel in &there {
+                            values[start + out * channels + channel] = e[channel];
+                        }
+                    };
+                    for (set, d) in sets.iter().enumerate() {
+                        let s = state.x.column(set);
+                        give(
+                            &|row| {
+                                rows.r(row)
+                                    - dot(rows.a(row), d.as_slice())
+                                    - dot(rows.g(row), s.as_slice())
+                            },
+                            set,
+                        );
+                    }
+                    give(&|row| dot(rows.a(row), &first), k);
+                    give(&|row| rows.r(row) + dot(rows.a(row), &cad), k + 1);
+                }
+            }
+            (values, shares, seen)
+        },
+    );
+    let mut left = vec![vec![vec![f64::NAN; count]; channels]; k + 2];
+    let (mut shares, mut seen) = (vec![0.0; channels * channels], vec![0.0_f64; channels]);
+    let mut i = 0;
+    for (values, of_part, seen_there) in parts {
+        for values in values.chunks_exact((k + 2) * channels) {
+            let columns = left.iter_mut().flatten();
+            columns
+                .zip(values)
+                .for_each(|(column, value)| column[i] = *value);
+            i += 1;
+        }
+        shares
+            .iter_mut()
+            .zip(of_part)
+            .for_each(|(sum, share)| *sum += share);
+        seen.iter_mut()
+            .zip(seen_there)
+            .for_each(|(sum, seen)| *sum += seen);
+    }
+    let measured = left.pop().unwrap_or_default();
+    let predicted = left.pop().unwrap_or_default();
+    Residuals {
+        noise: left,
+        predicted,
+        measured,
+        ranges,
+        nuisance: states,
+        shares: DMatrix::from_fn(channels, channels, |i, j| {
+            shares[i * channels + j] / seen[i].max(1.0)
+        }),
+        seen,
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::arithmetic::normals;
+    use crate::dataset::observation::Observation;
+    use crate::measurement::noise_estimate::estimate_noise;
+    use crate::measurement::noise_model::DriftLimits;
+    use crate::robot::{IdentificationInput, Robot};
+    use nalgebra::{Matrix6, Vector6};
+    use proprio_dynamics::model::{MeasurementDirection, MeasurementFrame, Model};
+    use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
+    use proprio_dynamics::{ContactKind, ContactSpec, FrameMotion, Noise, SensorCut, SensorSet};
+    use proprio_topics::{Nanos, Reason};
+
+    /// The iteration ends when the model stays, or returns to an earlier one; then with the
+    /// greatest noise of the cycle.
+    #[test]
+    fn limit_cycles_of_the_iteration_end() {
+        let noise = |squares: [f64; 2]| NoiseModel {
+            square: squares.to_vec(),
+            time: vec![2.0; 2],
+            block: vec![1e-3; 2],
+            drift: squares.map(|x| 0.01 * x).to_vec(),
+            least: vec![1e-9; 2],
+        };
+        let far = [[9.0, 9.0], [5.0, 7.0]].map(noise);
+        let of = |rounds: &[[f64; 2]]| {
+            let rounds: Vec<NoiseModel> = far
+                .iter()
+                .cloned()
+                .chain(rounds.iter().copied().map(noise))
+                .collect();
+            NoiseModel::resolve_limit_cycle(&rounds, 0.03)
+        };
+        assert_eq!(of(&[[1.0, 2.0], [1.2, 2.0], [1.5, 2.0]]), None);
+        assert_eq!(
+            of(&[[1.0, 2.0], [1.2, 2.0], [1.201, 2.0]]),
+            Some(noise([1.201, 2.0]))
+        );
+        let found = of(&[
+            [3.0, 3.0],
+            [1.0, 2.2],
+            [1.3, 2.0],
+            [1.1, 2.1],
+            [1.001, 2.201],
+        ])
+        .unwrap();
+        assert_eq!(found, noise([1.3, 2.201]));
+        assert_eq!(NoiseModel::resolve_limit_cycle(&far[..1], 0.03), None);
+    }
+
+    /// A leg with links between two F/T sensors and a foot beyond that stands on the ground. The
+    /// readings of both sensors are in the same six equations.
+    pub(crate) fn between_two_sensors() -> Robot {
+        let link = |name: &str| {
+            format!(
+                "<link name=\"{name}\"><inertial><origin xyz=\"0.02 -0.01 0.1\" rpy=\"0 0 \
+                 0\"/><mass value=\"1.5\"/><inertia ixx=\"0.01\" ixy=\"0\" ixz=\"0\" \
+                 iyy=\"0.012\" iyz=\"0\" izz=\"0.005\"/></inertial></link>"
+            )
+        };
+        let joint = |name: &str, parent: &str, child: &str, rest: &str| {
+            let kind = if rest.is_empty() { "fixed" } else { "revolute" };
+            format!(
+                "<joint name=\"{name}\" type=\"{kind}\"><parent link=\"{parent}\"/><child \
+                 link=\"{child}\"/><origin xyz=\"0 0.03 0.2\" rpy=\"0.3 0.1 0\"/>{rest}</joint>"
+            )
+        };
+        let turns = |axis: &str| {
+            format!(
+                "<axis xyz=\"{axis}\"/><limit lower=\"-3\" upper=\"3\" effort=\"9\" \
+                 velocity=\"9\"/>"
+            )
+        };
+        let urdf = ["base", "thigh", "knee", "shank", "foot"]
+            .map(link)
+            .concat()
+            + &joint("hip_ft", "base", "thigh", "")
+            + &joint("j1", "thigh", "knee", &turns("1 0 0"))
+            + &joint("j2", "knee", "shank", &turns("0 1 0"))
+            + &joint("foot_ft", "shank", "foot", "");
+        let urdf = format!("<robot name=\"leg\">{urdf}</robot>");
+        let model = Model::from_urdf(&urdf, &["hip_ft", "foot_ft"]).expect("a model");
+        let noise = Noise {
+            force: [0.08, 0.09, 0.18],
+            torque: [0.002, 0.003, 0.0015],
+        };
+        let cut = |joint: &str| {
+            let (frame, direction) = (MeasurementFrame::Child, MeasurementDirection::ChildToParent);
+            SensorCut::new(&model, joint, frame, direction, &Pose::identity(), &noise)
+                .expect("a sensor")
+        };
+        let floor = ContactSpec {
+            frame: model.frame("foot").expect("a link"),
+            kind: ContactKind::Wrench,
+            position: Vec3::zeros(),
+        };
+        let sensors = [("hip", cut("hip_ft")), ("foot", cut("foot_ft"))];
+        let gravity = Vec3::new(0.0, 0.0, -9.80665);
+        Robot::standing(
+            "leg",
+            model.clone(),
+            "base",
+            &gravity,
+            &sensors,
+            &[("floor", floor)],
+        )
+        .expect("it fits")
+    }
+
+    /// Readings of both sensors at 100 Hz with CAD as the true model, with these standard
+    /// deviations of the noise and of the offsets' steps, [torque; force] of both sensors.
+    pub(crate) fn readings(
+        robot: &Robot,
+        count: usize,
+        noise: &[f64; 12],
+        walk: &[f64; 12],
+    ) -> Vec<Annotated> {
+        // For each of the twelve channels: the step of its offset, and its noise.
+        let mut deviates = normals(7, 24 * count).into_iter();
+        let mut normal = || deviates.next().expect("enough");
+        let zero = Wrench::zero();
+        let mut instants: Vec<Annotated> = (0..count)
+            .map(|k| {
+                let t = 0.01 * k as f64;
+                let angles = [(1.3, 2.1, 0.4), (1.1, 1.4, 1.9)].map(
+                    |(size, rate, phase): (f64, f64, f64)| {
+                        let (s, c) = (rate * t + phase).sin_cos();
+                        [size * s, size * rate * c, -size * rate * rate * s]
+                    },
+                );
+                Annotated::from(Observation {
+                    t: Nanos::from_seconds(t),
+                    position: angles.iter().map(|a| a[0]).collect(),
+                    velocity: angles.iter().map(|a| a[1]).collect(),
+                    acceleration: angles.iter().map(|a| a[2]).collect(),
+                    torque: vec![f64::NAN; 2],
+                    base_link: robot.base_link,
+                    base: FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.80665)),
+                    readings: vec![zero; 2],
+                    active: robot.always,
+                    faults: vec![Reason::None; robot.channels.len()],
+                    base_fault: Reason::None,
+                    temperatures: Vec::new(),
+                    outliers: SensorSet::default(),
+                })
+            })
+            .collect();
+        let mut measurement =
+            MeasurementModel::survey(robot, &[IdentificationInput::Wrench], instants.iter())
+                .expect("rows");
+        let mut rows = Rows::new(measurement.unknowns());
+        let mut offset = [0.0; 12];
+        for observation in &mut instants {
+            // r = 0 for G m + r(0) = 0: the foot's reading is chosen, the hip's follows.
+            measurement.make(observation, &mut rows).expect("rows");
+            assert_eq!(rows.count, 6);
+            let g = |first: usize| Matrix6::from_fn(|i, j| rows.g(i)[first + j]);
+            let foot = Vector6::new(0.5, -0.3, 0.2, 3.0, -2.0, 20.0);
+            let hip = g(0).try_inverse().expect("a transform")
+                * (-Vector6::from_fn(|i, _| rows.r(i)) - g(6) * foot);
+            for (i, offset) in offset.iter_mut().enumerate() {
+                *offset += walk[i] * normal();
+            }
+            let mut noisy = |exact: &Vector6<f64>, first: usize| {
+                let value: [f64; 6] = std::array::from_fn(|i| {
+                    exact[i] + offset[first + i] + noise[first + i] * normal()
+                });
+                Wrench::from_parts(
+                    [value[3], value[4], value[5]],
+                    [value[0], value[1], value[2]],
+                )
+            };
+            observation.readings = vec![noisy(&hip, 0), noisy(&foot, 6)];
+        }
+        instants
+    }
+
+    fn noise_found(robot: &Robot, instants: &[Annotated], rounds: usize) -> NoiseModel {
+        let measurement =
+            MeasurementModel::survey(robot, &[IdentificationInput::Wrench], instants.iter())
+                .expect("rows");
+        let unknowns = measurement.unknowns().clone();
+        assert_eq!((unknowns.sensors.len(), unknowns.channels()), (2, 12));
+        let least: Vec<f64> = (0..12)
+            .map(|channel| if channel % 6 < 3 { 1e-10 } else { 1e-8 })
+            .collect();
+        let mut noise = NoiseModel::unknown(least.clone());
+        let segment = Segment {
+            instants,
+            offset_jumps: &[],
+        };
+        let zero = DVector::zeros(unknowns.parameters());
+        let walks = DriftLimits {
+            relative: 0.01,
+            rates: vec![f64::INFINITY; 12],
+        };
+        for _ in 0..rounds {
+            let left = residuals(&measurement, segment, &noise, std::slice::from_ref(&zero));
+            noise = estimate_noise(&unknowns, std::slice::from_ref(&left), 0, &walks, &least);
+        }
+        noise
+    }
+
+    /// A disturbance on the foot acts on every joint between it and the base, one on the base on
+    /// none. A disturbed sub-tree may be touched at any of its links, so beyond all of its joints.
+    #[test]
+    fn torques_are_not_used_if_a_disturbance_may_act_beyond() {
+        let robot = between_two_sensors();
+        let mut instants = readings(&robot, 3, &[0.1; 12], &[0.0; 12]);
+        for observation in &mut instants {
+            observation.active = proprio_dynamics::ContactSet::default();
+            observation.torque = vec![1.0, 2.0];
+        }
+        let inputs = [IdentificationInput::Wrench, IdentificationInput::Torque];
+        let mut measurement =
+            MeasurementModel::survey(&robot, &inputs, instants.iter()).expect("rows");
+        let zero = vec![0.0; measurement.unknowns().parameters()];
+        let of_link = |name: &str| {
+            let link =
+                (0..robot.model.link_count()).find(|&link| robot.model.link_name(link) == name);
+            link.and_then(|link| robot.structure.subtree_of(link))
+                .expect("a sub-tree")
+        };
+        let mut rows = Rows::new(measurement.unknowns());
+        for (disturbed, expected) in [
+            (None, 2),
+            (Some(of_link("base")), 2),
+            (Some(of_link("knee")), 0),
+            (Some(of_link("foot")), 0),
+            (Some(Observation::TORQUES), 0),
+        ] {
+            let mut observation = instants[1].clone();
+            disturbed
+                .into_iter()
+                .for_each(|unit| observation.disturbed.insert(unit));
+            measurement.make(&observation, &mut rows).expect("rows");
+            let mut own = Rows::new(measurement.unknowns());
+            rows.copy_unit(Observation::TORQUES, &mut own);
+            assert_eq!(own.count, expected, "rows with {disturbed:?}");
+            if disturbed != Some(Observation::TORQUES) {
+                let errors = measurement
+                    .torque_errors(&observation, &zero)
+                    .expect("errors");
+                let there = errors.iter().filter(|x| x.is_finite()).count();
+                assert_eq!(there, expected, "compared with {disturbed:?}");
+            }
+        }
+    }
+
+    const HIP_AND_FOOT: [f64; 12] = [
+        0.02, 0.03, 0.015, 0.4, 0.3, 0.5, 0.004, 0.006, 0.003, 0.1, 0.08, 0.15,
+    ];
+
+    #[test]
+    fn the_noise_of_two_sensors_is_separated() {
+        let robot = between_two_sensors();
+        let instants = readings(&robot, 6000, &HIP_AND_FOOT, &[0.0; 12]);
+        let noise = noise_found(&robot, &instants, 12);
+        // Lever arms separate the forces. Torques differ only by the rotation between the sensors,
+        // so that they are hardly separable; their sum is well determined.
+        let is_torque = |channel: &usize| channel % 6 < 3;
+        for channel in (0..12).filter(|channel| !is_torque(channel)) {
+            let ratio = noise.square[channel].sqrt() / HIP_AND_FOOT[channel];
+            println!(
+                "channel {channel}: {ratio:.3}, time {:.2}, drift {:.2e}",
+                noise.time[channel], noise.drift[channel]
+            );
+            // The quieter sensor has a quarter of the other's noise. Its lower limit is half of the
+            // mean noise of both.
+            let most = if channel < 6 { 1.05 } else { 1.5 };
+            assert!((0.95..most).contains(&ratio), "channel {channel}: {ratio}");
+        }
+        let of_torques =
+            |square: &dyn Fn(usize) -> f64| (0..12).filter(is_torque).map(square).sum::<f64>();
+        let ratio = of_torques(&|channel| noise.square[channel])
+            / of_torques(&|channel| HIP_AND_FOOT[channel].powi(2));
+        assert!((ratio - 1.0).abs() < 0.15, "{ratio}");
+        // No channel is without noise.
+        let relative =
+            |channel: usize| noise.inflated()[channel] / if channel % 6 < 3 { 1e-10 } else { 1e-8 };
+        for kind in [[0, 1, 2, 6, 7, 8], [3, 4, 5, 9, 10, 11]] {
+            let all: Vec<f64> = kind.into_iter().map(relative).collect();
+            let greatest = all.iter().copied().fold(0.0, f64::max);
+            assert!(
+                all.iter().all(|own| *own >= 0.25 * greatest / 6.0),
+                "{all:?}"
+            );
+        }
+    }
+
+    /// Rows that show only the sum of two offsets do not determine which of them drifts, but they
+    /// determine the total drift.
+    #[test]
+    fn the_total_drift_of_two_offsets_is_found() {
+        let robot = between_two_sensors();
+        let mut walk = [0.0; 12];
+        walk[3..6].fill(0.003);
+        walk[9..12].fill(0.003);
+        let instants = readings(&robot, 6000, &HIP_AND_FOOT, &walk);
+        let noise = noise_found(&robot, &instants, 12);
+        for (channel, (square, expected)) in noise.square.iter().zip(HIP_AND_FOOT).enumerate() {
+            println!(
+                "channel {channel}: {:.3}, drift {:.2e}",
+                square.sqrt() / expected,
+                noise.drift[channel]
+            );
+        }
+        let whole: f64 = [3, 4, 5, 9, 10, 11]
+            .map(|channel| noise.drift[channel])
+            .iter()
+            .sum();
+        let expected = 6.0 * 0.003 * 0.003 / 0.01;
+        assert!(
+            (0.5..2.0).contains(&(whole / expected)),
+            "{whole}, not {expected}"
+        );
+    }
+}

@@ -1,0 +1,424 @@
+//! Estimates the noise of an F/T channel and the drift rate of its offset from its own readings.
+//!
+//! ```text
+//! o_k+1 = o_k + w_k,   w_k ~ N(0, q^2 dt)         the offset, a random walk of the drift rate q
+//! y_k = o_k + v_k,     v_k ~ N(0, V / n + b_k)    mean of second k minus the bodies' prediction
+//! ```
+//!
+//! The unit of `q` is N/s^1/2 or Nm/s^1/2. `V` is the variance of one of the second's `n`
+//! observations that would give its mean this variance if they were independent. It contains the
+//! sensor's noise, its autocorrelation, jitter of stamps, vibration, and all other model errors.
+//! `b_k` is the variance of the mean by the uncertainty of the bodies. The bodies are those solved
+//! *before* the second, independent of its readings, so that overfitting does not hide noise.
+//!
+//! For each pair `(V, q)` of a grid a Kalman filter with one state gives the likelihood of the
+//! innovations `y_k - o_k|k-1`. An undeclared disturbance is no noise: each innovation has a
+//! mixture distribution, of which a share [`DISTURBED`] is uniform within [`RANGE`]. The estimates
+//! of `V` and `q^2` are means over the grid, weighted by likelihood and prior. Initially `V` is
+//! hundreds of times the stated variance: readings get their full weight only after their noise was
+//! observed.
+//!
+//! Source: the local level model, A. C. Harvey, "Forecasting, structural time series models and the
+//! Kalman filter", 1989, chapter 2.
+
+/// Grid of the noise: `V` over the stated variance, in half decades, `10^0 ... 10^5`. Readings
+/// beyond are no noise: the greatest value found on a real leg is 10^4.
+const LEVELS: usize = 11;
+/// Grid of the drift rate: `q` over the standard deviation of a second's mean, `(V dt)^1/2`. At 1
+/// the offset follows in about a second. As off-line, it may not be faster, or it would follow the
+/// motion that identifies.
+const RATES: [f64; 5] = [0.01, 0.03, 0.1, 0.3, 1.0];
+/// Prior of the drift rate: log-normal about this, its standard deviation a factor of three.
+const RATE: f64 = 0.1;
+const SPREAD: f64 = 1e3;
+/// Memory of the likelihood \[s\].
+const MEMORY: f64 = 60.0;
+/// Length of a pause after which the filters restart, since a contact may have changed the offset
+/// \[s\].
+const PAUSE: f64 = 3.0;
+/// Assumed share of seconds with an undeclared disturbance, and the range of its uniform
+/// distribution, in stated standard deviations.
+const DISTURBED: f64 = 0.02;
+const RANGE: f64 = 1000.0;
+/// Limit of the log-likelihood by data at rest, which say little of the noise in motion: `e^3`,
+/// odds of twenty.
+const AT_REST: f64 = 3.0;
+
+/// Initial correlation of consecutive innovations, and its weight in seconds.
+const CORRELATED: (f64, f64) = (0.0, 10.0);
+
+/// Limits of an innovation, in standard deviations, and of the correlation.
+const LARGE: f64 = 3.0;
+const GREATEST: f64 = 0.9;
+
+/// One filter: offset, its variance, log-likelihood.
+#[derive(Clone, Copy, Debug, Default)]
+struct Filter {
+    offset: f64,
+    variance: f64,
+    likelihood: f64,
+}
+
+/// The readings of a channel in one second.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct SecondMean {
+    /// Middle of the second \[s\].
+    pub t: f64,
+    /// Mean reading minus the bodies' prediction.
+    pub mean: f64,
+    /// Number of observations.
+    pub count: f64,
+    /// Variance of the mean by the uncertainty of the bodies.
+    pub of_bodies: f64,
+    /// Mean square of the observations about their mean.
+    pub scatter: f64,
+    /// Whether something moved.
+    pub is_moving: bool,
+}
+
+/// Estimator of one channel's noise and drift rate.
+#[derive(Clone, Debug)]
+pub(crate) struct Channel {
+    /// The stated variance of an observation.
+    stated: f64,
+    /// The time between observations \[s\].
+    period: f64,
+    /// Time of the last second \[s\]; None: the filters restart with the next.
+    last: Option<f64>,
+    filters: [[Filter; RATES.len()]; LEVELS],
+    /// Normalised innovation of the likeliest filter; the mean product of two consecutive ones, and
+    /// the mean square.
+    innovation: f64,
+    products: (f64, f64),
+    /// Mean square of observations about the mean of their second; None before the first.
+    scatter: Option<f64>,
+}
+
+impl Channel {
+    pub(crate) fn new(stated: f64, period: f64) -> Self {
+        Self {
+            stated,
+            period,
+            last: None,
+            filters: [[Filter::default(); RATES.len()]; LEVELS],
+            innovation: f64::NAN,
+            products: (CORRELATED.0 * CORRELATED.1, CORRELATED.1),
+            scatter: None,
+        }
+    }
+
+    /// `V` of a level.
+    fn level(&self, number: usize) -> f64 {
+        self.stated * 10f64.powf(0.5 * number as f64)
+    }
+
+    /// Shifts the offset after a change of the bodies that predict the mean.
+    pub(crate) fn shift(&mut self, by: f64) {
+        self.filters
+            .as_flattened_mut()
+            .iter_mut()
+            .for_each(|filter| filter.offset += by);
+    }
+
+    /// Restarts the filters with the next second.
+    pub(crate) fn interrupt(&mut self) {
+        self.last = None;
+    }
+
+    /// Takes in a second.
+    pub(crate) fn take(&mut self, second: &SecondMean) {
+        if !(second.mean.is_finite() && second.of_bodies.is_finite() && second.count > 0.0) {
+            return;
+        }
+        let since = (self.last.replace(second.t))
+            .map(|last| second.t - last)
+            .filter(|dt| (0.0..PAUSE).contains(dt));
+        let levels: [f64; LEVELS] = std::array::from_fn(|number| self.level(number));
+        let disturbed = DISTURBED / (RANGE * self.stated.sqrt());
+        // Of the most likely filter: the innovation, and its share of noise.
+        let mut best = (f64::NEG_INFINITY, (f64::NAN, 1.0));
+        for (row, level) in self.filters.iter_mut().zip(levels) {
+            let noise = level / second.count + second.of_bodies;
+            for (filter, rate) in row.iter_mut().zip(RATES) {
+                let innovation = match since {
+                    None => {
+                        (filter.offset, filter.variance) = (second.mean, noise);
+                        (f64::NAN, 1.0)
+                    }
+                    Some(dt) => {
+                        let walked = rate * rate * level * self.period * dt;
+                        filter.take((second.mean, noise), walked, dt, disturbed)
+                    }
+                };
+                if filter.likelihood >= best.0 {
+                    best = (filter.likelihood, innovation);
+                }
+            }
+        }
+        for filter in self.filters.as_flattened_mut() {
+            filter.likelihood -= best.0;
+            if !second.is_moving {
+                filter.likelihood = filter.likelihood.max(-AT_REST);
+            }
+        }
+        let (innovation, share) = best.1;
+        let scatter = self.scatter.unwrap_or(second.scatter);
+        self.scatter = Some(scatter + share * (second.scatter - scatter) / MEMORY);
+        let last = std::mem::replace(&mut self.innovation, innovation.clamp(-LARGE, LARGE));
+        if (last * self.innovation).is_finite() && second.is_moving {
+            let keep = 1.0 - 1.0 / MEMORY;
+            self.products.0 = self.products.0 * keep + last * self.innovation;
+            self.products.1 = self.products.1 * keep + self.innovation * self.innovation;
+        }
+    }
+
+    /// Variance of one reading about its prediction: the scatter within a second, and the changes
+    /// between seconds.
+    pub(crate) fn reading(&self) -> f64 {
+        let slow = self.noise().0 * self.period;
+        (self.scatter.unwrap_or(0.0) + slow).max(self.stated)
+    }
+
+    /// `V`, and the standard deviation of the drift in a second: means over the grid by likelihood
+    /// and prior.
+    pub(crate) fn noise(&self) -> (f64, f64) {
+        let best = (self.filters.as_flattened().iter())
+            .map(|filter| filter.likelihood)
+            .fold(f64::NEG_INFINITY, f64::max);
+        let (mut sums, mut weights) = ([0.0; 2], 0.0);
+        for (number, row) in self.filters.iter().enumerate() {
+            let level = self.level(number);
+            for (filter, rate) in row.iter().zip(RATES) {
+                let apart = (rate / RATE).ln() / SPREAD;
+                let weight = (filter.likelihood - best - 0.5 * apart * apart).exp();
+                sums[0] += weight * level;
+                sums[1] += weight * rate * rate * level * self.period;
+                weights += weight;
+            }
+        }
+        let correlation = (self.products.0 / self.products.1).clamp(0.0, GREATEST);
+        (
+            sums[0] / weights * (1.0 + correlation) / (1.0 - correlation),
+            (sums[1] / weights).sqrt(),
+        )
+    }
+}
+
+impl Filter {
+    /// Takes in a mean with its variance, `dt` seconds after the last one, in which the offset's
+    /// variance grew by `walked`; `disturbed` is the density of disturbances. Returns the
+    /// normalised innovation, and the probability that it is noise.
+    fn take(
+        &mut self,
+        (mean, noise): (f64, f64),
+        walked: f64,
+        dt: f64,
+        disturbed: f64,
+    ) -> (f64, f64) {
+        let grown = self.variance + walked;
+        let total = grown + noise;
+        let innovation = mean - self.offset;
+        let square = innovation * innovation / total;
+        let regular =
+            (1.0 - DISTURBED) * (-0.5 * square).exp() / (std::f64::consts::TAU * total).sqrt();
+        let share = regular / (regular + disturbed);
+        // A disturbance gives no information about the offset, which does not drift meanwhile, and
+        // does not age earlier innovations.
+        let gain = share * grown / total;
+        self.offset += gain * innovation;
+        self.variance = (self.variance + share * walked) * (1.0 - gain);
+        self.likelihood *= (-share * dt / MEMORY).exp();
+        self.likelihood += (regular + disturbed).ln();
+        (innovation / total.sqrt(), share)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::arithmetic::normals;
+
+    const PERIOD: f64 = 0.01;
+    const STATED: f64 = 0.0064;
+
+    /// A channel after some seconds of motion. Its noise is `factor` times the stated variance, its
+    /// drift rate is given in deviations of a second's mean, and `acts` is a disturbance.
+    fn after(
+        seconds: usize,
+        factor: f64,
+        rate: f64,
+        seed: u64,
+        acts: impl Fn(usize) -> f64,
+    ) -> Channel {
+        let mut channel = Channel::new(STATED, PERIOD);
+        let deviates = normals(seed, 2 * seconds);
+        let deviation = (factor * STATED * PERIOD).sqrt();
+        let mut offset = 11.0;
+        for second in 0..seconds {
+            offset += rate * deviation * deviates[2 * second];
+            channel.take(&SecondMean {
+                t: second as f64,
+                mean: offset + deviation * deviates[2 * second + 1] + acts(second),
+                count: 100.0,
+                of_bodies: 0.0,
+                scatter: factor * STATED,
+                is_moving: true,
+            });
+        }
+        channel
+    }
+
+    #[test]
+    fn noise_over_four_decades_and_a_drift_are_found() {
+        for seed in 1..=5 {
+            for factor in [1.0, 30.0, 1e3, 1e4] {
+                for rate in [0.01, 0.3, 1.0] {
+                    let (noise, walk) = after(300, factor, rate, seed, |_| 0.0).noise();
+                    let ratio = noise / (factor * STATED);
+                    assert!(
+                        (0.5..2.5).contains(&ratio),
+                        "noise {factor}, drift {rate}: {ratio} (seed {seed})"
+                    );
+                    let found = walk / (factor * STATED * PERIOD).sqrt();
+                    let expected = if rate < 0.1 {
+                        0.0..0.2
+                    } else {
+                        0.3 * rate..3.0 * rate
+                    };
+                    assert!(
+                        expected.contains(&found),
+                        "noise {factor}, drift {rate}: {found} (seed {seed})"
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_initial_noise_is_large_and_falls_quickly() {
+        let (noise, walk) = Channel::new(STATED, PERIOD).noise();
+        assert!(noise > 1e3 * STATED && walk > (STATED * PERIOD).sqrt());
+        // The estimate falls within some seconds.
+        assert!(after(10, 1.0, 0.01, 1, |_| 0.0).noise().0 < 30.0 * STATED);
+    }
+
+    #[test]
+    fn a_push_of_any_length_is_no_noise_but_a_noisy_sensor_is() {
+        let pushed = |from: usize, to: usize| {
+            move |second| {
+                if (from..to).contains(&second) {
+                    30.0
+                } else {
+                    0.0
+                }
+            }
+        };
+        let quiet = after(100, 1.0, 0.01, 3, |_| 0.0).noise().0;
+        for to in [102, 130, 220] {
+            let noise = after(to, 1.0, 0.01, 3, pushed(100, to)).noise().0;
+            // The noise over two minutes would be this large if the push were believed.
+            assert!(noise < 100.0 * quiet.max(STATED), "{to}: {noise}");
+        }
+        // Noise with a hundred times the variance is found after half a minute.
+        let mut channel = after(60, 1.0, 0.01, 5, |_| 0.0);
+        let deviates = normals(6, 40);
+        for (second, deviate) in deviates.iter().enumerate() {
+            channel.take(&SecondMean {
+                t: 60.0 + second as f64,
+                mean: 11.0 + (100.0 * STATED * PERIOD).sqrt() * deviate,
+                count: 100.0,
+                of_bodies: 0.0,
+                scatter: STATED,
+                is_moving: true,
+            });
+        }
+        assert!(channel.noise().0 > 30.0 * STATED);
+    }
+
+    /// Motion overrides the noise estimate at rest within a few seconds.
+    #[test]
+    fn rest_says_little_of_the_noise_in_motion() {
+        let mut channel = Channel::new(STATED, PERIOD);
+        let deviates = normals(7, 70);
+        for (second, deviate) in deviates.iter().enumerate() {
+            let is_moving = second >= 60;
+            let factor = if is_moving { 3e3 } else { 1.0 };
+            channel.take(&SecondMean {
+                t: second as f64,
+                mean: (factor * STATED * PERIOD).sqrt() * deviate,
+                count: 100.0,
+                of_bodies: 0.0,
+                scatter: STATED,
+                is_moving,
+            });
+        }
+        assert!(
+            channel.noise().0 > 500.0 * STATED,
+            "{}",
+            channel.noise().0 / STATED
+        );
+    }
+
+    #[test]
+    fn the_uncertainty_of_the_bodies_is_no_noise() {
+        let mut sure = Channel::new(STATED, PERIOD);
+        let mut unsure = sure.clone();
+        for (second, deviate) in normals(8, 60).iter().enumerate() {
+            for (channel, of_bodies) in [(&mut sure, 0.0), (&mut unsure, 0.04)] {
+                channel.take(&SecondMean {
+                    t: second as f64,
+                    mean: 0.2 * deviate,
+                    count: 100.0,
+                    of_bodies,
+                    scatter: STATED,
+                    is_moving: true,
+                });
+            }
+        }
+        assert!(
+            sure.noise().0 > 20.0 * unsure.noise().0,
+            "{:?} {:?}",
+            sure.noise(),
+            unsure.noise()
+        );
+    }
+
+    #[test]
+    fn a_jump_across_a_pause_is_no_drift_and_a_shift_moves_the_offset() {
+        let second = |t: f64, mean: f64| SecondMean {
+            t,
+            mean,
+            count: 100.0,
+            of_bodies: 0.0,
+            scatter: STATED,
+            is_moving: true,
+        };
+        let deviates = normals(9, 200);
+        let mut channels = [(); 3].map(|()| Channel::new(STATED, PERIOD));
+        for (number, deviate) in deviates.iter().enumerate() {
+            let (t, is_later) = (number as f64, number >= 100);
+            let mean = 0.008 * deviate + if is_later { 5.0 } else { 0.0 };
+            let [paused, shifted, jumped] = &mut channels;
+            paused.take(&second(if is_later { t + 5.0 } else { t }, mean));
+            if number == 100 {
+                shifted.shift(5.0);
+            }
+            shifted.take(&second(t, mean));
+            jumped.take(&second(t, mean));
+        }
+        let [paused, shifted, jumped] = channels.map(|channel| channel.noise().0 / STATED);
+        assert!(
+            jumped > 3.0,
+            "a jump that nothing explains is no quiet channel"
+        );
+        assert!(paused < 3.0 && shifted < 3.0, "{paused} {shifted}");
+    }
+
+    #[test]
+    fn the_variance_of_a_reading_has_scatter_and_drift() {
+        let quiet = after(100, 1.0, 0.01, 1, |_| 0.0).reading();
+        assert!((1.0..1.3).contains(&(quiet / STATED)), "{quiet}");
+        let loud = after(100, 100.0, 0.01, 1, |_| 0.0).reading();
+        assert!((70.0..130.0).contains(&(loud / STATED)), "{loud}");
+    }
+}

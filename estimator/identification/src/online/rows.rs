@@ -1,0 +1,384 @@
+//! Whitened rows of one or several observations. The rows of a sub-tree are stored over its own
+//! unknowns only.
+//!
+//! The rows of a humanoid's limb contain a sixth of its unknowns; the cost of all operations is
+//! proportional to that.
+
+use crate::arithmetic::{dot, factorise};
+use proprio_dynamics::regressor::StackedRegressor;
+
+/// The rows of one sub-tree.
+#[derive(Clone, Debug)]
+pub(crate) struct Kind {
+    /// The unknowns of these rows after whitening, ascending: the sub-tree's own, and those of
+    /// earlier sub-trees that noise of common sensors links to it.
+    pub(crate) columns: Vec<usize>,
+    /// Number of offsets among these, which come first.
+    pub(crate) offsets: usize,
+    subtree: usize,
+    /// Places of the sub-tree's regressor columns among `columns`.
+    own: Vec<usize>,
+    /// For each earlier kind, the places of its columns among `columns`; empty if not linked.
+    within: Vec<Vec<usize>>,
+}
+
+impl Kind {
+    /// The residual of a row for these unknowns, `[s | d]`.
+    pub(crate) fn residual(&self, row: &[f64], right: f64, unknowns: &[f64]) -> f64 {
+        let own = self.columns.iter().map(|&column| unknowns[column]);
+        right - own.zip(row).map(|(x, a)| x * a).sum::<f64>()
+    }
+}
+
+/// The kinds of a component's rows, over `[s | d]`.
+#[derive(Clone, Debug)]
+pub(crate) struct Kinds {
+    all: Vec<Kind>,
+    unknowns: usize,
+    /// Number of offsets, `s`.
+    offset_count: usize,
+}
+
+impl Kinds {
+    /// For these sub-trees, whose regressors have these columns.
+    pub(crate) fn new(
+        stacked: &StackedRegressor,
+        subtrees: &[usize],
+        columns: &[Vec<usize>],
+        (offset_count, unknowns): (usize, usize),
+    ) -> Self {
+        let mut all: Vec<Kind> = Vec::new();
+        // Linked sub-trees have the number of the last of them.
+        let mut group: Vec<usize> = Vec::new();
+        for (number, (&subtree, own)) in subtrees.iter().zip(columns).enumerate() {
+            let sensors: Vec<usize> = stacked.subtrees()[subtree].sensors().collect();
+            for earlier in 0..number {
+                let mut others = stacked.subtrees()[all[earlier].subtree].sensors();
+                let (shares, of) = (others.any(|s| sensors.contains(&s)), group[earlier]);
+                if shares && of != number {
+                    group
+                        .iter_mut()
+                        .filter(|g| **g == of)
+                        .for_each(|g| *g = number);
+                }
+            }
+            group.push(number);
+            let joined: Vec<bool> = (0..number)
+                .map(|earlier| group[earlier] == number)
+                .collect();
+            let of_joined = all.iter().zip(&joined).filter(|(_, is_joined)| **is_joined);
+            let mut joined_columns: Vec<usize> = of_joined
+                .flat_map(|(kind, _)| kind.columns.iter().copied())
+                .collect();
+            joined_columns.extend(own);
+            joined_columns.sort_unstable();
+            joined_columns.dedup();
+            let places = |of: &[usize]| {
+                of.iter()
+                    .filter_map(|column| joined_columns.binary_search(column).ok())
+                    .collect()
+            };
+            let within = all
+                .iter()
+                .zip(&joined)
+                .map(|(kind, is_joined)| match is_joined {
+                    true => places(&kind.columns),
+                    false => Vec::new(),
+                });
+            let kind = Kind {
+                offsets: joined_columns
+                    .iter()
+                    .filter(|column| **column < offset_count)
+                    .count(),
+                subtree,
+                own: places(own),
+                within: within.collect(),
+                columns: joined_columns,
+            };
+            all.push(kind);
+        }
+        Self {
+            all,
+            unknowns,
+            offset_count,
+        }
+    }
+
+    pub(crate) fn iter(&self) -> impl Iterator<Item = &Kind> {
+        self.all.iter()
+    }
+
+    pub(crate) fn unknowns(&self) -> usize {
+        self.unknowns
+    }
+
+    /// Greatest number of rows of an observation.
+    pub(crate) fn most(&self) -> usize {
+        6 * self.all.len()
+    }
+}
+
+/// Expands a row to all unknowns, without its right side.
+pub(crate) fn spread(kind: &Kind, row: &[f64], to: &mut [f64]) {
+    to.fill(0.0);
+    for (&column, &value) in kind.columns.iter().zip(row) {
+        to[column] = value;
+    }
+}
+
+/// The rows of one observation; reusable buffers.
+#[derive(Clone, Debug)]
+pub(crate) struct ObservationRows {
+    values: Vec<f64>,
+    /// Per row its kind, and its start.
+    places: Vec<(usize, usize)>,
+    /// Noise deviation per channel.
+    deviations: Vec<f64>,
+    noise: Vec<f64>,
+    covariance: Vec<f64>,
+}
+
+impl ObservationRows {
+    pub(crate) fn new(kinds: &Kinds) -> Self {
+        let most = kinds.most();
+        Self {
+            values: Vec::with_capacity(
+                kinds
+                    .all
+                    .iter()
+                    .map(|kind| 6 * (kind.columns.len() + 1))
+                    .sum(),
+            ),
+            places: Vec::with_capacity(most),
+            deviations: vec![0.0; kinds.offset_count],
+            noise: vec![0.0; most * kinds.offset_count],
+            covariance: vec![0.0; most * most],
+        }
+    }
+
+    /// Computes the whitened rows of the regressor's last update, relative to `reference`, given
+    /// the variance of each offset's channel. Returns their number.
+    pub(crate) fn make(
+        &mut self,
+        kinds: &Kinds,
+        stacked: &StackedRegressor,
+        reference: &[f64],
+        variances: &[f64],
+    ) -> usize {
+        self.values.clear();
+        self.places.clear();
+        for (number, kind) in kinds.all.iter().enumerate() {
+            let subtree = &stacked.subtrees()[kind.subtree];
+            for (index, measured) in subtree.projected_measured().iter().enumerate() {
+                let start = self.values.len();
+                self.values.resize(start + kind.columns.len() + 1, 0.0);
+                let (row, right) = self.values[start..].split_at_mut(kind.columns.len());
+                right[0] = *measured;
+                for (&place, value) in kind.own.iter().zip(subtree.projected_row(index)) {
+                    row[place] = *value;
+                    right[0] -= value * reference[kind.columns[place]];
+                }
+                self.places.push((number, start));
+            }
+        }
+        let count = self.places.len();
+        if self.values.iter().any(|value| !value.is_finite()) {
+            self.values.clear();
+            self.places.clear();
+            return 0;
+        }
+        for (deviation, variance) in self.deviations.iter_mut().zip(variances) {
+            *deviation = variance.sqrt();
+        }
+        // Noise enters as offsets do.
+        let (offset_count, noise) = (kinds.offset_count, &mut self.noise);
+        noise[..count * offset_count].fill(0.0);
+        for (&(number, start), noise) in self
+            .places
+            .iter()
+            .zip(noise.chunks_exact_mut(offset_count.max(1)))
+        {
+            let kind = &kinds.all[number];
+            for (&column, value) in kind.columns[..kind.offsets]
+                .iter()
+                .zip(&self.values[start..])
+            {
+                noise[column] = value * self.deviations[column];
+            }
+        }
+        for (i, (number, _)) in self.places.iter().enumerate() {
+            for (j, (other, _)) in self.places[..=i].iter().enumerate() {
+                let is_joined = number == other || !kinds.all[*number].within[*other].is_empty();
+                self.covariance[i * count + j] = if is_joined {
+                    dot(
+                        &noise[i * offset_count..][..offset_count],
+                        &noise[j * offset_count..][..offset_count],
+                    )
+                } else {
+                    0.0
+                };
+            }
+        }
+        factorise(&mut self.covariance, count);
+        // L^-1 from the left.
+        for (i, &(number, start)) in self.places.iter().enumerate() {
+            let (above, own) = self.values.split_at_mut(start);
+            let kind = &kinds.all[number];
+            let own = &mut own[..kind.columns.len() + 1];
+            for (j, &(other, from)) in self.places[..i].iter().enumerate() {
+                let weight = self.covariance[i * count + j];
+                if weight == 0.0 {
+                    continue;
+                }
+                let row = &above[from..][..kinds.all[other].columns.len() + 1];
+                if number == other {
+                    own.iter_mut().zip(row).for_each(|(x, y)| *x -= weight * y);
+                } else {
+                    let within = &kind.within[other];
+                    within
+                        .iter()
+                        .zip(row)
+                        .for_each(|(&place, y)| own[place] -= weight * y);
+                    own[kind.columns.len()] -= weight * row[row.len() - 1];
+                }
+            }
+            let scale = 1.0 / self.covariance[i * count + i];
+            own.iter_mut().for_each(|x| *x *= scale);
+        }
+        count
+    }
+}
+
+/// The rows of several observations.
+#[derive(Clone, Debug)]
+pub(crate) struct Rows {
+    kinds: Vec<OfKind>,
+    observations: u64,
+    /// Duration of gathering [s].
+    pub(crate) span: f64,
+    /// For a block, whether something moved; `moving` is the number of observations of such blocks.
+    pub(crate) has_moved: bool,
+    moving: u64,
+}
+
+/// The rows of one sub-tree.
+#[derive(Clone, Debug)]
+pub(crate) struct OfKind {
+    width: usize,
+    /// Capacity in rows.
+    room: usize,
+    values: Vec<f64>,
+    /// Per row, the observation's slot in the time grid.
+    slots: Vec<i64>,
+}
+
+impl OfKind {
+    /// All rows, each with its right side at its end.
+    pub(crate) fn values(&self) -> &[f64] {
+        &self.values
+    }
+
+    pub(crate) fn slots(&self) -> &[i64] {
+        &self.slots
+    }
+
+    /// Each row, its right side, and its slot.
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (&[f64], f64, i64)> {
+        let rows = self.values.chunks_exact(self.width).zip(&self.slots);
+        rows.filter_map(|(row, slot)| row.split_last().map(|(right, row)| (row, *right, *slot)))
+    }
+
+    fn push(&mut self, slot: i64, row: &[f64]) {
+        if self.slots.len() < self.room {
+            self.values.extend_from_slice(row);
+            self.slots.push(slot);
+        }
+    }
+}
+
+impl Rows {
+    /// With room for this number of observations.
+    pub(crate) fn new(kinds: &Kinds, observations: usize) -> Self {
+        let of_kind = |kind: &Kind| {
+            let (width, room) = (kind.columns.len() + 1, 6 * observations);
+            OfKind {
+                width,
+                room,
+                values: Vec::with_capacity(width * room),
+                slots: Vec::with_capacity(room),
+            }
+        };
+        Self {
+            kinds: kinds.all.iter().map(of_kind).collect(),
+            observations: 0,
+            span: 0.0,
+            has_moved: false,
+            moving: 0,
+        }
+    }
+
+    /// An empty copy with the same capacity.
+    pub(crate) fn clone_room(&self) -> Self {
+        let mut other = self.clone();
+        for kind in &mut other.kinds {
+            kind.values
+                .reserve_exact(kind.width * kind.room - kind.values.len());
+            kind.slots.reserve_exact(kind.room - kind.slots.len());
+        }
+        other.clear();
+        other
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.kinds.iter().map(|kind| kind.slots.len()).sum()
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.kinds.iter().all(|kind| kind.slots.is_empty())
+    }
+
+    pub(crate) fn observations(&self) -> u64 {
+        self.observations
+    }
+
+    pub(crate) fn clear(&mut self) {
+        for kind in &mut self.kinds {
+            kind.values.clear();
+            kind.slots.clear();
+        }
+        (self.observations, self.span, self.has_moved, self.moving) = (0, 0.0, false, 0);
+    }
+
+    /// Adds the rows of an observation, as far as there is room.
+    pub(crate) fn push(&mut self, slot: i64, observation: &ObservationRows) {
+        self.observations += u64::from(!observation.places.is_empty());
+        for &(kind, start) in &observation.places {
+            let kind = &mut self.kinds[kind];
+            kind.push(slot, &observation.values[start..][..kind.width]);
+        }
+    }
+
+    /// Whether something moved most of the time.
+    pub(crate) fn is_moving(&self) -> bool {
+        self.has_moved || 2 * self.moving > self.observations
+    }
+
+    pub(crate) fn take_from(&mut self, other: &Self) {
+        self.observations += other.observations;
+        self.moving += if other.is_moving() {
+            other.observations
+        } else {
+            0
+        };
+        for (to, from) in self.kinds.iter_mut().zip(&other.kinds) {
+            for (row, slot) in from.values.chunks_exact(from.width).zip(&from.slots) {
+                to.push(*slot, row);
+            }
+        }
+    }
+
+    /// Kind by kind.
+    pub(crate) fn iter(&self) -> impl Iterator<Item = &OfKind> {
+        self.kinds.iter()
+    }
+}

@@ -1,0 +1,198 @@
+//! Input and output of on-line identification: observations, solutions, and counts.
+
+use crate::linear::information::InformationError;
+use crate::prior::PriorError;
+use nalgebra::DMatrix;
+use proprio_dynamics::spatial::{RigidInertia, Wrench};
+use proprio_dynamics::{ContactSet, DofSet, DynamicsError, Kinematics};
+use proprio_topics::{Nanos, Reason};
+
+/// Number of parameters per link.
+pub(crate) const WIDTH: usize = 10;
+
+/// Length of a block of rows that the gate judges.
+pub(crate) const BLOCK: Nanos = Nanos::from_millis(100);
+
+/// Why on-line identification is not possible.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum OnlineError {
+    /// No sub-tree with an F/T sensor can be free of contacts.
+    #[error(
+        "nothing can be identified on-line: no sub-tree with F/T sensors can be free of contacts; \
+         set presence = \"possible\" for contacts that come and go"
+    )]
+    Nothing,
+    /// Sizes do not match.
+    #[error(transparent)]
+    Dynamics(#[from] DynamicsError),
+    /// CAD is not a valid prior.
+    #[error(transparent)]
+    Prior(#[from] PriorError),
+    /// An earlier state does not fit.
+    #[error(transparent)]
+    Information(#[from] InformationError),
+}
+
+/// The observed quantities at one time.
+#[derive(Clone, Copy, Debug)]
+pub struct Observation<'a> {
+    /// Time; later than that of the last observation.
+    pub t: Nanos,
+    /// Poses and motions of all links.
+    pub kinematics: &'a Kinematics,
+    /// Raw F/T readings, with offsets, in their measurement frames; finite even if a sensor is
+    /// faulty.
+    pub readings: &'a [Wrench],
+    /// The present contacts.
+    pub active: &'a ContactSet,
+    /// Fault of the base motion.
+    pub base: Reason,
+    /// Fault of each joint's motion.
+    pub joints: &'a [Reason],
+    /// The joints that have moved since the last observation, beyond their noise.
+    pub moved: &'a DofSet,
+    /// Whether the base has moved.
+    pub is_base_moved: bool,
+    /// Fault of each sensor's reading.
+    pub sensors: &'a [Reason],
+}
+
+/// Why identification of a component pauses.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Paused {
+    /// It does not pause.
+    #[default]
+    No,
+    /// A declared contact leaves none of its equations.
+    Contact,
+    /// Noise and the uncertainty of the solution do not explain its readings: an undeclared
+    /// contact, an outlier, or a change.
+    Suspected,
+    /// A channel that it needs is faulty.
+    Fault(Reason),
+}
+
+impl std::fmt::Display for Paused {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::No => write!(f, "identification is running"),
+            Self::Contact => write!(f, "identification pauses: a contact is declared"),
+            Self::Suspected => write!(
+                f,
+                "identification pauses: the readings do not fit the solution; an undeclared \
+                 contact, or a change"
+            ),
+            Self::Fault(reason) => {
+                write!(f, "identification pauses: a channel is faulty ({reason:?})")
+            }
+        }
+    }
+}
+
+/// A change that was found, and its consequence.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Change {
+    /// The sensors' offsets have jumped, and are re-initialised.
+    Offset,
+    /// The load of the outermost links has changed, and their parameters are re-initialised.
+    Load,
+}
+
+impl std::fmt::Display for Change {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Offset => "an F/T offset has jumped: offsets are re-initialised",
+            Self::Load => {
+                "the load has changed: the parameters of the outermost links are re-initialised"
+            }
+        })
+    }
+}
+
+/// Counts of a component's observations.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Absorbed observations.
+    pub learnt: u64,
+    /// Absorbed observations of blocks without motion: they determine a weight once, and offsets.
+    pub still: u64,
+    /// Excluded under a declared contact.
+    pub contact: u64,
+    /// Rejected by the gate for at most one block: outliers, and the begin of every disturbance.
+    pub outlier: u64,
+    /// Rejected by the gate for longer: undeclared contacts, and changes until they are found.
+    pub suspected: u64,
+    /// Excluded because a channel was silent.
+    pub stale: u64,
+    /// Excluded because a sensor was saturated.
+    pub saturated: u64,
+    /// Excluded because a device reported a fault.
+    pub device_fault: u64,
+    /// Excluded because a channel was not seen yet or had too few samples, or the base motion was
+    /// unknown.
+    pub unseen: u64,
+    /// Changes found: all,
+    pub changes: u64,
+    /// of offsets,
+    pub offset_changes: u64,
+    /// and of loads.
+    pub load_changes: u64,
+    /// Solutions that came after their stamp.
+    pub late: u64,
+    /// Solutions that failed.
+    pub failed: u64,
+}
+
+/// The solution of a component.
+#[derive(Clone, Debug, Default)]
+pub struct ComponentSolution {
+    /// Its links.
+    pub links: Vec<usize>,
+    /// Their inertias, physically consistent.
+    pub bodies: Vec<RigidInertia>,
+    /// Its sensors.
+    pub sensors: Vec<usize>,
+    /// Their offsets, raw minus true reading, in their measurement frames.
+    pub offsets: Vec<Wrench>,
+    /// A root `U` of the covariance `P = U^T U` over [ten per link | torque, force of each sensor's
+    /// offset].
+    pub root: DMatrix<f64>,
+    /// Drift rate of each offset: standard deviation after a second [Nm/s^½, N/s^½], [torque;
+    /// force].
+    pub drift: Vec<[f64; 6]>,
+    /// Variance of one reading about its prediction [Nm^2, N^2], [torque; force]: sensor noise,
+    /// vibration, late stamps.
+    pub noise: Vec<[f64; 6]>,
+    /// The stamp of the newest data used.
+    pub data: Nanos,
+    /// The prior's weight; NaN before the first solution.
+    pub tau: f64,
+    /// Number of parameters that the data determine, rather than the prior.
+    pub effective: f64,
+    /// Duration of motion of its links in the absorbed data [s].
+    pub motion: f64,
+    /// Number of absorbed rows, in motion and at rest.
+    pub rows: u64,
+    /// Whether this solution uses the data up to [`Solution::data`]. Otherwise the job failed, and
+    /// the earlier solution is kept.
+    pub is_accepted: bool,
+    /// The most probable unknowns, `[s | d]`, and a root of their covariance over `[d | s]`. The
+    /// gate judges new readings by them.
+    pub(crate) estimate: Vec<f64>,
+    pub(crate) spread: DMatrix<f64>,
+}
+
+/// The result of a job.
+#[derive(Clone, Debug, Default)]
+pub struct Solution {
+    /// The stamp of the newest data of the job.
+    pub data: Nanos,
+    /// The solution of each component.
+    pub components: Vec<ComponentSolution>,
+}
+
+/// Period of the solutions, and the delay of their use after their data.
+pub(crate) const SOLVE: Nanos = Nanos::from_millis(1000);

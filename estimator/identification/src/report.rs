@@ -1,0 +1,10 @@
+//! The result of an identification: figures, findings, series for plots.
+
+pub(crate) mod assemble;
+mod calibration;
+mod comparison;
+mod log;
+pub(crate) mod outcome;
+pub(crate) mod prediction;
+mod spectra;
+mod uncertainty;

@@ -1,0 +1,279 @@
+//! Assembles the [`Outcome`]: the errors of every log with CAD, with CAD and fitted offsets, and
+//! with the identified parameters; the parameters with their uncertainty; findings.
+
+use crate::finding::{Finding, FindingCode, Severity};
+use crate::fit::{Identified, per_column};
+use crate::measurement::model::MeasurementModel;
+use crate::prior::feasibility;
+use crate::report::calibration::{calibrations, channels};
+use crate::report::log::log_outcome;
+use crate::report::outcome::both;
+use crate::report::outcome::{
+    Consistency, CovarianceRoot, LogOutcome, ModelComparison, Outcome, Predicted, TimeOffset,
+    Verdict, WeakDirection,
+};
+use crate::report::prediction::{self, Candidate};
+use crate::report::uncertainty::{
+    base_parameters, cad_root, covariance, expression, links, rotors, rotors_not_separable,
+    scaled_information, shrunk, subspace, unseen,
+};
+use crate::robot::Robot;
+use crate::training::TrainingLog;
+use nalgebra::DMatrix;
+use proprio_topics::Nanos;
+
+/// The outcome without identified parameters: CAD's, and the reason.
+pub(crate) fn nothing(robot: &Robot, logs: &[TrainingLog], reason: String) -> Outcome {
+    let nan = ModelComparison {
+        cad: f64::NAN,
+        cad_fitted: f64::NAN,
+        identified: f64::NAN,
+    };
+    let logs = logs.iter().map(|log| LogOutcome {
+        file: log.file.clone(),
+        role: log.role,
+        span: log.span,
+        used: 0,
+        excluded: log.excluded.clone(),
+        onset: None,
+        predicted: Predicted {
+            relative_error: both([f64::NAN; 2]),
+            relative_error_with_drift: both([f64::NAN; 2]),
+            ..Predicted::default()
+        },
+        fitted_error: nan,
+        joints: Vec::new(),
+        sensors: Vec::new(),
+        two_route: Vec::new(),
+        offsets: Vec::new(),
+        friction: Vec::new(),
+        findings: log.all_findings(),
+        curves: Vec::new(),
+        spectra: Vec::new(),
+    });
+    Outcome {
+        robot: robot.name.clone(),
+        links: robot
+            .model
+            .inertias()
+            .iter()
+            .enumerate()
+            .map(|(link, cad)| unseen(robot, link, cad))
+            .collect(),
+        covariance: CovarianceRoot {
+            columns: Vec::new(),
+            calibrations: Vec::new(),
+            root: DMatrix::zeros(0, 0),
+        },
+        rotors: Vec::new(),
+        calibrations: Vec::new(),
+        tau: f64::NAN,
+        least_retained_fraction: 0.0,
+        unknowns: 0,
+        rank: 0,
+        structural_rank: 0,
+        effective: 0.0,
+        condition: f64::NAN,
+        singular_values: Vec::new(),
+        weakest: Vec::new(),
+        not_separable: Vec::new(),
+        base_parameters: Vec::new(),
+        channels: Vec::new(),
+        time_offsets: Vec::new(),
+        consistency: Consistency {
+            feasible: None,
+            deviations: 0.0,
+            links: Vec::new(),
+            text: "nothing was identified: the parameters are CAD's".into(),
+        },
+        logs: logs.collect(),
+        findings: vec![Finding {
+            severity: Severity::Refusal,
+            code: FindingCode::NotIdentified,
+            subject: String::new(),
+            text: reason.clone(),
+        }],
+        verdict: Verdict::Nothing(reason),
+    }
+}
+
+/// Results of the detectors that run after the fit.
+pub(crate) struct Diagnosis {
+    /// Wrong encoder signs and encoder offsets.
+    pub encoder_offsets: Vec<Finding>,
+    /// Time offset of every stream.
+    pub time_offsets: Vec<TimeOffset>,
+    /// Findings about significant delays.
+    pub delays: Vec<Finding>,
+}
+
+/// The whole outcome.
+pub(crate) fn outcome(
+    robot: &Robot,
+    measurement: &MeasurementModel<'_>,
+    logs: &[TrainingLog],
+    training: &[&TrainingLog],
+    identified: &Identified,
+    diagnosis: Diagnosis,
+) -> Outcome {
+    let unknowns = &identified.unknowns;
+    let p = unknowns.inertial();
+    let narrow = identified.fit.covariance_root();
+    let (scaled, spread) = scaled_information(identified);
+    let root = if identified.retained.iter().all(|kept| *kept >= 1.0) {
+        narrow.clone()
+    } else {
+        let kept = per_column(unknowns, &identified.retained);
+        let (r, _) = identified.information.to_triangle();
+        shrunk(&narrow, &cad_root(unknowns, &r, &spread), &kept)
+    };
+    let svd = scaled.svd(false, true);
+    let mut order: Vec<usize> = (0..svd.singular_values.len()).collect();
+    order.sort_by(|&a, &b| svd.singular_values[b].total_cmp(&svd.singular_values[a]));
+    let singular: Vec<f64> = order.iter().map(|&i| svd.singular_values[i]).collect();
+    let greatest = singular.first().copied().unwrap_or(0.0);
+    let rank = singular
+        .iter()
+        .filter(|s| **s > 1e-8 * greatest && greatest > 0.0)
+        .count();
+    let subspace = subspace(robot, training, identified);
+    let directions = svd.v_t.unwrap_or_else(|| DMatrix::zeros(0, p));
+    let weakest = order[..rank].iter().rev().take(5).map(|&i| {
+        let direction = directions.row(i).transpose();
+        let value = svd.singular_values[i];
+        let (expression, links) = expression(robot, unknowns, &spread, &direction);
+        WeakDirection {
+            expression,
+            links,
+            relative: value / greatest,
+            prior_share: 1.0 / (1.0 + value * value),
+        }
+    });
+    let (base_parameters, mut not_separable, structural_rank) =
+        base_parameters(robot, identified, &root, subspace.as_ref());
+    let sums = rotors_not_separable(robot, identified, &spread);
+    let structural_rank = structural_rank.saturating_sub(sums.len());
+    not_separable.extend(sums);
+    let mut findings: Vec<Finding> = identified
+        .prior
+        .floors()
+        .iter()
+        .filter(|floor| unknowns.links.contains(&floor.link))
+        .map(|floor| Finding {
+            severity: Severity::Note,
+            code: FindingCode::InertiaRegularised,
+            subject: robot.model.link_name(floor.link).to_owned(),
+            text: floor.describe(robot.model.link_name(floor.link)),
+        })
+        .collect();
+    let Diagnosis {
+        encoder_offsets,
+        time_offsets,
+        delays,
+    } = diagnosis;
+    findings.extend(encoder_offsets);
+    findings.extend(delays);
+    let consistency = consistency(robot, identified);
+    if consistency.feasible != Some(true) {
+        findings.push(Finding {
+            severity: Severity::Warning,
+            code: if consistency.feasible.is_none() {
+                FindingCode::FeasibilityUndecided
+            } else {
+                FindingCode::NotPhysical
+            },
+            subject: consistency.links.join(", "),
+            text: consistency.text.clone(),
+        });
+    }
+    findings.extend(identified.findings.iter().cloned());
+    let (calibrations, calibration_findings) = calibrations(robot, measurement, identified, &root);
+    findings.extend(calibration_findings);
+    let mut measurement = measurement.clone();
+    let sets = [identified.cad.clone(), identified.d.clone()];
+    let instants = training.iter().flat_map(|log| &log.instants);
+    let friction = prediction::friction(&measurement, instants, &sets);
+    let candidates = [0, 1].map(|set| Candidate {
+        course: vec![(Nanos::ZERO, sets[set].clone())],
+        friction: friction[set].clone(),
+    });
+    let logs = logs
+        .iter()
+        .map(|log| log_outcome(&mut measurement, log, identified, &sets, &candidates, &root))
+        .collect();
+    Outcome {
+        robot: robot.name.clone(),
+        verdict: verdict(identified),
+        links: links(robot, identified, &narrow, &root, &spread),
+        covariance: covariance(identified, &root),
+        tau: identified.fit.tau,
+        least_retained_fraction: identified.retained[..unknowns.links.len()]
+            .iter()
+            .copied()
+            .fold(1.0, f64::min),
+        rotors: rotors(robot, identified, &root),
+        calibrations,
+        unknowns: p,
+        rank,
+        structural_rank,
+        effective: identified.fit.effective,
+        condition: if rank > 0 {
+            greatest / singular[rank - 1]
+        } else {
+            f64::NAN
+        },
+        singular_values: singular,
+        weakest: weakest.collect(),
+        not_separable,
+        base_parameters,
+        channels: channels(robot, identified, training),
+        time_offsets,
+        consistency,
+        logs,
+        findings,
+    }
+}
+
+/// Physical consistency of the parameters that the data determine.
+fn consistency(robot: &Robot, identified: &Identified) -> Consistency {
+    let (r, z) = identified.information.to_triangle();
+    match feasibility::nearest(
+        &identified.prior,
+        &identified.unknowns.links,
+        &r,
+        &z,
+        &identified.unknowns.precision,
+    ) {
+        Ok(nearest) => Consistency {
+            feasible: match &nearest.verdict {
+                feasibility::Verdict::Feasible => Some(true),
+                feasibility::Verdict::Infeasible(_) => Some(false),
+                feasibility::Verdict::Undecided => None,
+            },
+            deviations: nearest.deviations(),
+            links: match &nearest.verdict {
+                feasibility::Verdict::Infeasible(violations) => violations
+                    .iter()
+                    .map(|v| robot.model.link_name(v.link).to_owned())
+                    .collect(),
+                _ => Vec::new(),
+            },
+            text: nearest.describe(|link| robot.model.link_name(link)),
+        },
+        Err(e) => Consistency {
+            feasible: None,
+            deviations: f64::NAN,
+            links: Vec::new(),
+            text: e.to_string(),
+        },
+    }
+}
+
+/// The verdict after cross-validation.
+fn verdict(identified: &Identified) -> Verdict {
+    if identified.retained.iter().any(|kept| *kept > 0.0) {
+        Verdict::Identified
+    } else {
+        Verdict::NoBetterThanCad
+    }
+}

@@ -1,0 +1,568 @@
+//! The figures of one log: residuals, prediction errors, coverage, offsets, friction, findings.
+
+use crate::arithmetic::{dot, rms};
+use crate::dataset::observation::{Annotated, UnitSet};
+use crate::finding::{Finding, FindingCode, Severity};
+use crate::fit::Identified;
+use crate::measurement::channels::{channel_of, sensor_name};
+use crate::measurement::model::MeasurementModel;
+use crate::measurement::reduction::{Residuals, Segment, reduce, residuals};
+use crate::measurement::rows::Rows;
+use crate::measurement::unknowns::{FRICTION, Unknowns, friction_row};
+use crate::report::comparison::{
+    Compared, STILL, TorqueSeries, cases, configured_nuisance, covered, three,
+};
+use crate::report::outcome::{
+    FrictionOutcome, JointOutcome, LogOutcome, OffsetOutcome, Predicted, SensorOutcome,
+    TwoRouteOutcome, both,
+};
+use crate::report::prediction::{Candidate, PredictionError};
+use crate::report::spectra::{EDGE, Places, RAW_RATE, curves, mean, spectra};
+use crate::robot::{AXES, Robot};
+use crate::training::{MIN_FOLD, TrainingLog};
+use nalgebra::{DMatrix, DVector};
+use proprio_dynamics::Structure;
+use proprio_topics::Nanos;
+
+/// Residuals of a joint's torque with the friction of the training logs for one set of parameters,
+/// instead of the friction fitted to the log.
+pub(crate) fn with_friction_of_training(
+    unknowns: &Unknowns,
+    instants: &[Annotated],
+    residuals: &Residuals,
+    (set, friction): (usize, &[[f64; FRICTION]]),
+    place: usize,
+) -> Vec<f64> {
+    let wrenches = 6 * unknowns.sensors.len();
+    let mut errors = residuals.noise[set][wrenches + place].clone();
+    for (range, block) in residuals.ranges.iter().zip(&residuals.nuisance) {
+        for i in range.clone() {
+            for (k, share) in friction_row(instants[i].velocity[unknowns.joints[place]])
+                .into_iter()
+                .enumerate()
+            {
+                let fitted = block.x[(wrenches + FRICTION * place + k, set)];
+                errors[i] += share * (fitted - friction[place][k]);
+            }
+        }
+    }
+    errors
+}
+
+pub(crate) fn log_outcome(
+    measurement: &mut MeasurementModel<'_>,
+    log: &TrainingLog,
+    identified: &Identified,
+    sets: &[DVector<f64>; 2],
+    candidates: &[Candidate; 2],
+    root: &DMatrix<f64>,
+) -> LogOutcome {
+    let robot = measurement.robot();
+    let unknowns = &identified.unknowns;
+    let usable = !log.instants.is_empty() && !log.refused;
+    let instants = if usable { log.instants.as_slice() } else { &[] };
+    let residuals = residuals(
+        measurement,
+        Segment {
+            instants,
+            offset_jumps: &log.offset_jumps,
+        },
+        &identified.noise,
+        sets,
+    );
+    let times: Vec<f64> = instants
+        .iter()
+        .map(|i| (i.t - log.span.0).seconds())
+        .collect();
+    let places = Places::new(&times);
+    let filter = places.as_ref().filter(|_| log.torque_rate > RAW_RATE);
+    let inner = |i: &usize| {
+        let (first, last) = (
+            times.first().copied().unwrap_or(0.0),
+            times.last().copied().unwrap_or(0.0),
+        );
+        times[*i] >= first + EDGE && times[*i] <= last - EDGE
+    };
+    let wrenches = 6 * unknowns.sensors.len();
+    let compared = Compared::new(measurement, instants, &residuals, identified, sets);
+    let undisturbed = undisturbed(measurement, log, identified, sets);
+    let torques = residuals.noise[1].iter().skip(wrenches);
+    let errors: Vec<&[f64]> = compared.errors[2]
+        .iter()
+        .chain(torques)
+        .map(Vec::as_slice)
+        .collect();
+    let coverage = covered(measurement, instants, &errors, identified, root);
+
+    // Torques: an input of the identification, or a reference for F/T sensors.
+    let mut joints = Vec::new();
+    let mut torques_predicted = Vec::new();
+    let mut torque_share = Vec::new();
+    let mut torque_series: Vec<TorqueSeries> = Vec::new();
+    if unknowns.joints.is_empty() {
+        let dofs = robot.model.dof_count();
+        let mut errors = [vec![Vec::new(); dofs], vec![Vec::new(); dofs]];
+        if instants
+            .iter()
+            .any(|i| i.torque.iter().any(|x| x.is_finite()))
+        {
+            for (set, errors) in sets.iter().zip(&mut errors) {
+                for instant in instants {
+                    let row = measurement
+                        .torque_errors(instant, set.as_slice())
+                        .unwrap_or_else(|_| vec![f64::NAN; dofs]);
+                    errors.iter_mut().zip(row).for_each(|(e, x)| e.push(x));
+                }
+            }
+            for (dof, cad) in errors[0].iter().enumerate() {
+                if cad.iter().any(|x| x.is_finite()) {
+                    let measured = instants.iter().map(|i| i.torque[dof]).collect();
+                    let own = errors[1][dof].clone();
+                    let series = [cad.clone(), cad.clone(), own.clone(), cad.clone(), own];
+                    torque_series.push((dof, series, measured));
+                }
+            }
+        }
+    } else {
+        for (place, &dof) in unknowns.joints.iter().enumerate() {
+            let channel = wrenches + place;
+            let measured: Vec<f64> = instants.iter().map(|i| i.torque[dof]).collect();
+            let raw = residuals.measured[channel]
+                .iter()
+                .zip(&residuals.predicted[channel])
+                .map(|(m, p)| m - p)
+                .collect();
+            let [cad, own] = [0, 1].map(|set| {
+                with_friction_of_training(
+                    unknowns,
+                    instants,
+                    &residuals,
+                    (set, &candidates[set].friction),
+                    place,
+                )
+            });
+            let fitted = [0, 1].map(|set| residuals.noise[set][channel].clone());
+            let [cad_fitted, own_fitted] = fitted;
+            torque_series.push((dof, [raw, cad_fitted, own_fitted, cad, own], measured));
+        }
+    }
+    for (dof, errors, measured) in &torque_series {
+        let smooth = |x: &[f64]| match &filter {
+            Some(places) => places.low_passed(x),
+            None => x.to_vec(),
+        };
+        let keep = |x: &[f64]| -> Vec<f64> { (0..x.len()).filter(inner).map(|i| x[i]).collect() };
+        let errors = errors.each_ref().map(|e| keep(&smooth(e)));
+        let [cad, fitted, own, ..] = &errors;
+        let measured = keep(&smooth(measured));
+        let place = unknowns.joints.binary_search(dof).ok();
+        let of_training = both([3, 4].map(|set| rms(errors[set].iter().copied())));
+        torques_predicted.push((robot.model.dof_name(*dof).to_owned(), of_training));
+        joints.push(JointOutcome {
+            name: robot.model.dof_name(*dof).to_owned(),
+            rms_nm: three([cad, fitted, own].map(|x| rms(x.iter().copied()))),
+            measured_rms_nm: rms(measured.iter().copied()),
+            coverage: place.map_or(f64::NAN, |place| coverage[wrenches + place]),
+        });
+        torque_share.push((errors.to_vec(), measured));
+    }
+
+    let mut sensors = Vec::new();
+    let mut findings = Vec::new();
+    let mut wrench_share = Vec::new();
+    for (place, &sensor) in unknowns.sensors.iter().enumerate() {
+        let name = sensor_name(robot, sensor);
+        let mut values = [[f64::NAN; 6]; 3];
+        findings.extend(unexplained(
+            robot,
+            sensor,
+            &name,
+            undisturbed.as_ref().unwrap_or(&compared),
+            place,
+        ));
+        for axis in 0..6 {
+            let channel = channel_of(place, axis);
+            let errors = compared.errors.each_ref().map(|set| &set[channel]);
+            for (value, errors) in values.iter_mut().zip(errors) {
+                value[axis] = rms(errors.iter().copied());
+            }
+            let scale = if axis < 3 {
+                Structure::LENGTH_SCALE
+            } else {
+                1.0
+            };
+            let load = &compared.load[channel];
+            let (centre, raw_mean) = (mean(load), mean(errors[0]));
+            let errors: Vec<Vec<f64>> = (errors.iter().zip([raw_mean, 0.0, 0.0]))
+                .map(|(errors, mean)| errors.iter().map(|x| (x - mean) * scale).collect())
+                .collect();
+            wrench_share.push((
+                errors,
+                load.iter()
+                    .map(|x| (x - centre) * scale)
+                    .collect::<Vec<_>>(),
+            ));
+        }
+        sensors.push(SensorOutcome {
+            name,
+            rms: three(values),
+            coverage: std::array::from_fn(|axis| coverage[channel_of(place, axis)]),
+        });
+    }
+    let is_of_torque = !torque_share.is_empty();
+    let share = if is_of_torque {
+        &torque_share
+    } else {
+        &wrench_share
+    };
+    let relative = |which: usize| {
+        let (mut above, mut below) = (0.0, 0.0);
+        for (errors, measured) in share {
+            for (e, m) in errors[which].iter().zip(measured) {
+                if e.is_finite() && m.is_finite() {
+                    above += e * e;
+                    below += m * m;
+                }
+            }
+        }
+        (above / below).sqrt()
+    };
+    let prediction_error = PredictionError::of_record(
+        robot,
+        &identified.inputs,
+        identified.calibrated,
+        instants.iter().map(Annotated::observation),
+    );
+    // No error is expected: rows of the same instants were computed before.
+    let mut predicted = prediction_error.map_or_else(
+        |_| Predicted::default(),
+        |prediction_error| prediction_error.predicted(unknowns, candidates),
+    );
+    predicted.joints = torques_predicted;
+    if is_of_torque {
+        predicted.relative_error = both([3, 4].map(relative));
+    }
+    let deviations = nuisance_deviations(measurement, log, instants, identified, root);
+    LogOutcome {
+        file: log.file.clone(),
+        role: log.role,
+        span: log.span,
+        used: instants.len() as u64,
+        excluded: log.excluded.clone(),
+        onset: onset(instants),
+        predicted,
+        fitted_error: three([0, 1, 2].map(relative)),
+        joints,
+        sensors,
+        two_route: two_route(measurement, instants, &residuals, sets),
+        offsets: offsets(robot, unknowns, log, identified, &residuals, &deviations),
+        friction: friction(robot, unknowns, &residuals, &deviations),
+        findings: log.all_findings().into_iter().chain(findings).collect(),
+        curves: curves(
+            measurement,
+            instants,
+            &times,
+            &compared,
+            identified,
+            root,
+            &torque_series,
+        ),
+        spectra: spectra(robot, unknowns, places.as_ref(), &residuals),
+    }
+}
+
+/// A validation log compared as a training log: without undeclared disturbances and their effect on
+/// the offsets. None if no disturbance was found, because the comparison is then the same.
+pub(crate) fn undisturbed(
+    measurement: &MeasurementModel<'_>,
+    log: &TrainingLog,
+    identified: &Identified,
+    sets: &[DVector<f64>; 2],
+) -> Option<Compared> {
+    if log.disturbed.iter().all(UnitSet::is_empty) {
+        return None;
+    }
+    let mut instants = log.instants.clone();
+    for (instant, units) in instants.iter_mut().zip(&log.disturbed) {
+        instant.disturbed = *units;
+    }
+    let segment = Segment {
+        instants: &instants,
+        offset_jumps: &log.offset_jumps,
+    };
+    let residuals = residuals(measurement, segment, &identified.noise, sets);
+    Some(Compared::new(
+        measurement,
+        &instants,
+        &residuals,
+        identified,
+        sets,
+    ))
+}
+
+/// A warning if the residual of a sensor's readings with the identified parameters is much larger
+/// than its noise. Its fraction of the readings depends on the motion of the log: it is reported,
+/// and refuses nothing.
+///
+/// For a log with undeclared disturbances, `compared` excludes these. Axes with fewer than
+/// [`MIN_FOLD`] instants are not tested.
+pub(crate) fn unexplained(
+    robot: &Robot,
+    sensor: usize,
+    name: &str,
+    compared: &Compared,
+    place: usize,
+) -> Option<Finding> {
+    /// Residuals above this multiple of the stated noise are reported ...
+    const TIMES: f64 = 10.0;
+    /// ... if they exceed this fraction of the axis's changes.
+    const FRACTION: f64 = 0.02;
+    /// A correlation of an axis with its prediction below this is not due to noise.
+    const OPPOSITE: f64 = -0.5;
+    let noise = robot.structure.sensors()[sensor].noise();
+    let noise = [noise.force, noise.torque].concat();
+    // Only instants with the rows of all sub-trees of the sensor: if one of them is disturbed, the
+    // errors of the others would be attributed to this sensor alone.
+    let all_rows = compared.rows[place].iter().copied().max().unwrap_or(0);
+    let (mut residual, mut all) = (0.0, 0.0);
+    let (mut axes, mut opposite) = (Vec::new(), Vec::new());
+    for (axis, word) in AXES.into_iter().enumerate() {
+        let channel = channel_of(place, axis);
+        let pairs = compared.load[channel]
+            .iter()
+            .zip(&compared.errors[2][channel]);
+        let is_compared = |((l, e), rows): &((&f64, &f64), &usize)| {
+            l.is_finite() && e.is_finite() && **rows == all_rows
+        };
+        let pairs = pairs.zip(&compared.rows[place]).filter(is_compared);
+        let (load, error): (Vec<f64>, Vec<f64>) = pairs.map(|(pair, _)| pair).unzip();
+        if load.len() < MIN_FOLD {
+            continue;
+        }
+        let centre = mean(&load);
+        let load: Vec<f64> = load.iter().map(|x| x - centre).collect();
+        let predicted: Vec<f64> = load.iter().zip(&error).map(|(l, e)| l - e).collect();
+        let scale = if axis < 3 {
+            Structure::LENGTH_SCALE
+        } else {
+            1.0
+        };
+        let [ll, ee, pp, lp] = [
+            (&load, &load),
+            (&error, &error),
+            (&predicted, &predicted),
+            (&load, &predicted),
+        ]
+        .map(|(a, b)| dot(a, b));
+        (residual, all) = (residual + scale * scale * ee, all + scale * scale * ll);
+        let times = (ee / load.len() as f64).sqrt() / noise[axis];
+        if times > TIMES && ee > FRACTION * FRACTION * ll {
+            axes.push(format!("{word} {times:.0}"));
+            if lp < OPPOSITE * (ll * pp).sqrt() {
+                opposite.push(word);
+            }
+        }
+    }
+    if axes.is_empty() {
+        return None;
+    }
+    let share = (residual / all).sqrt();
+    let hint = if opposite.is_empty() {
+        String::new()
+    } else {
+        format!(
+            " Opposite to the prediction: {} (wrong sign or axis).",
+            opposite.join(", ")
+        )
+    };
+    Some(Finding {
+        severity: Severity::Warning,
+        code: FindingCode::Unexplained,
+        subject: format!("wrench/{name}"),
+        text: format!(
+            "wrench/{name}: the identified parameters leave {:.0} % of its changes unexplained \
+             (times the stated noise: {}).{hint} Check encoder offsets, signs and the order of \
+             joints, dead encoders, the sensor's axes and calibration, time offsets, cables, \
+             undeclared contacts, noise_n and noise_nm, and whether the log is of this robot",
+            100.0 * share,
+            axes.join(", ")
+        ),
+    })
+}
+
+/// When a joint first moves by more than [`STILL`] from its initial position; none if none does, or
+/// within the first half second.
+pub(crate) fn onset(instants: &[Annotated]) -> Option<Nanos> {
+    let first = instants.first()?;
+    let moved = instants.iter().find(|i| {
+        i.position
+            .iter()
+            .zip(&first.position)
+            .any(|(a, b)| (a - b).abs() > STILL)
+    })?;
+    ((moved.t - first.t).seconds() > 0.5).then_some(moved.t)
+}
+
+/// Joint torques computed from the two sides of a joint.
+pub(crate) fn two_route(
+    measurement: &mut MeasurementModel<'_>,
+    instants: &[Annotated],
+    residuals: &Residuals,
+    sets: &[DVector<f64>; 2],
+) -> Vec<TwoRouteOutcome> {
+    let robot = measurement.robot();
+    let unknowns = measurement.unknowns().clone();
+    let dofs = robot.model.dof_count();
+    let configured = configured_nuisance(robot, &unknowns);
+    let mut series = vec![[const { Vec::new() }; 3]; dofs];
+    let mut rows = Rows::new(&unknowns);
+    for (range, block) in residuals.ranges.iter().zip(&residuals.nuisance) {
+        let cases = cases(sets, &configured, block);
+        for instant in &instants[range.clone()] {
+            if unknowns.sensors.len() < 2 || measurement.make(instant, &mut rows).is_err() {
+                continue;
+            }
+            for (dof, along) in measurement.two_routes(&rows) {
+                for (series, (d, nuisance)) in series[dof].iter_mut().zip(cases) {
+                    let residuals = |row: usize| {
+                        rows.r(row) - dot(rows.a(row), d.as_slice()) - dot(rows.g(row), nuisance)
+                    };
+                    series.push(
+                        along
+                            .iter()
+                            .enumerate()
+                            .map(|(row, weight)| weight * residuals(row))
+                            .sum(),
+                    );
+                }
+            }
+        }
+    }
+    (0..dofs)
+        .filter(|&dof| !series[dof][0].is_empty())
+        .map(|dof| TwoRouteOutcome {
+            joint: robot.model.dof_name(dof).to_owned(),
+            rms_nm: three([0, 1, 2].map(|set| rms(series[dof][set].iter().copied()))),
+            rms_mean_removed_nm: three([0, 1, 2].map(|set| {
+                let centre = mean(&series[dof][set]);
+                rms(series[dof][set].iter().map(|x| x - centre))
+            })),
+        })
+        .collect()
+}
+
+/// Standard deviations of the nuisance parameters at the end of the log: their uncertainty for
+/// known parameters, and the contribution of the parameters' covariance.
+pub(crate) fn nuisance_deviations(
+    measurement: &mut MeasurementModel<'_>,
+    log: &TrainingLog,
+    instants: &[Annotated],
+    identified: &Identified,
+    root: &DMatrix<f64>,
+) -> Vec<f64> {
+    // From the last instants only: an offset drifts, and a filter that starts there without prior
+    // knowledge overestimates the uncertainty.
+    let segment = Segment {
+        instants: &instants[instants
+            .len()
+            .saturating_sub(crate::training::SEGMENT_INSTANTS)..],
+        offset_jumps: &log.offset_jumps,
+    };
+    let reduced = reduce(measurement, segment, &identified.noise);
+    let moved = &reduced.slope * root;
+    (0..reduced.covariance.nrows())
+        .map(|i| (reduced.covariance[(i, i)].max(0.0) + moved.row(i).norm_squared()).sqrt())
+        .collect()
+}
+
+/// Offsets of the sensors that occur in rows of the log.
+pub(crate) fn offsets(
+    robot: &Robot,
+    unknowns: &Unknowns,
+    log: &TrainingLog,
+    identified: &Identified,
+    residuals: &Residuals,
+    deviations: &[f64],
+) -> Vec<OffsetOutcome> {
+    let (Some(first), Some(last)) = (residuals.nuisance.first(), residuals.nuisance.last()) else {
+        return Vec::new();
+    };
+    let of = |place: usize, value: &dyn Fn(usize) -> f64| {
+        std::array::from_fn(|axis| value(channel_of(place, axis)))
+    };
+    unknowns
+        .sensors
+        .iter()
+        .enumerate()
+        .filter(|(place, _)| (0..6).any(|axis| residuals.has_channel(6 * place + axis)))
+        .map(|(place, &sensor)| OffsetOutcome {
+            sensor: sensor_name(robot, sensor),
+            start: of(place, &|channel| first.x[(channel, 1)]),
+            end: of(place, &|channel| last.x[(channel, 1)]),
+            deviation: of(place, &|channel| deviations[channel]),
+            rate: of(place, &|channel| identified.noise.drift[channel].sqrt()),
+            offset_jumps: log
+                .offset_jumps
+                .iter()
+                .filter(|b| b.sensor == sensor)
+                .map(|b| b.t)
+                .collect(),
+        })
+        .collect()
+}
+
+/// Friction of the joints whose torque was measured in the log.
+pub(crate) fn friction(
+    robot: &Robot,
+    unknowns: &Unknowns,
+    residuals: &Residuals,
+    deviations: &[f64],
+) -> Vec<FrictionOutcome> {
+    let Some(last) = residuals.nuisance.last() else {
+        return Vec::new();
+    };
+    let first = 6 * unknowns.sensors.len();
+    let value = |place: usize, k: usize| last.x[(first + FRICTION * place + k, 1)];
+    unknowns
+        .joints
+        .iter()
+        .enumerate()
+        .filter(|(place, _)| residuals.has_channel(first + place))
+        .map(|(place, &dof)| FrictionOutcome {
+            joint: robot.model.dof_name(dof).to_owned(),
+            coulomb_nm: value(place, 0),
+            viscous: value(place, 1),
+            offset_nm: value(place, 2),
+            deviation: [0, 1, 2].map(|k| deviations[first + FRICTION * place + k]),
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::measurement::reduction::tests::between_two_sensors;
+
+    /// The finding for residuals of a tenth of each axis's changes, at `instants` instants.
+    fn a_tenth_left(instants: usize) -> Option<Finding> {
+        let robot = between_two_sensors();
+        let mut load: Vec<f64> = (0..400)
+            .map(|i| 100.0 * (0.3 * f64::from(i)).sin())
+            .collect();
+        load[instants..].fill(f64::NAN);
+        let error = load.iter().map(|load| 0.1 * load).collect();
+        let compared = Compared {
+            rows: vec![vec![6; load.len()]],
+            load: vec![load; 6],
+            errors: [Vec::new(), Vec::new(), vec![error; 6]],
+        };
+        unexplained(&robot, 0, "ft", &compared, 0)
+    }
+
+    #[test]
+    fn few_compared_instants_give_no_finding() {
+        assert!(a_tenth_left(MIN_FOLD).is_some());
+        assert!(a_tenth_left(MIN_FOLD - 1).is_none());
+        assert!(a_tenth_left(0).is_none());
+    }
+}

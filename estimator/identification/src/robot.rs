@@ -1,0 +1,316 @@
+//! The robot: its model, sensors and contacts, and the settings known before any measurement. It
+//! does not change; identified parameters are stored elsewhere.
+
+use proprio_dynamics::calibration::{self, Calibration, UNKNOWN_OFFSET};
+use proprio_dynamics::model::{Frame, Model};
+use proprio_dynamics::regressor::identifiable::{BaseRegime, JointMotion, Regime};
+use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
+use proprio_dynamics::{
+    ContactKind, ContactSet, ContactSpec, FrameMotion, SensorCut, Structure, StructureError,
+};
+use proprio_topics::{Kind, MAX_SUBTREES, Nanos};
+use serde::Deserialize;
+
+/// Names of the axes of a wrench, in the order of samples.
+pub const AXES: [&str; 6] = ["fx", "fy", "fz", "tx", "ty", "tz"];
+
+/// The role of a channel of the pipeline.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ChannelRole {
+    /// Degree of freedom number.
+    Joint(usize),
+    /// F/T sensor number.
+    Sensor(usize),
+    /// The IMU of the base.
+    Base,
+}
+
+/// A channel that the pipeline reads.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Channel {
+    /// The kind of measurement.
+    pub kind: Kind,
+    /// Its name.
+    pub name: String,
+    /// Its role.
+    pub role: ChannelRole,
+}
+
+/// The base of the kinematics.
+#[derive(Debug, Clone, PartialEq)]
+pub enum BaseMotion {
+    /// The base link stands still, with this motion.
+    Standing(FrameMotion),
+    /// The first of these links whose contact is present is the base link, and stands still.
+    Stance(Vec<Stance>),
+    /// An IMU at this pose in the base link measures the motion.
+    Imu(Pose),
+}
+
+/// A link that stands still while its contact is present.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Stance {
+    /// The link.
+    pub link: usize,
+    /// Its motion then.
+    pub motion: FrameMotion,
+    /// The number of its contact.
+    pub contact: usize,
+}
+
+/// A published contact.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NamedContact {
+    /// Its name.
+    pub name: String,
+    /// The frame that its wrench is expressed in.
+    pub frame: String,
+    /// Whether it is present unless declared absent.
+    pub always: bool,
+}
+
+/// A measurement that parameters are identified from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum IdentificationInput {
+    /// The force/torque sensors.
+    Wrench,
+    /// Measured joint torques.
+    Torque,
+}
+
+/// The side of the gear on which joint torques are measured.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum TorqueSide {
+    /// Between gear and link, by a joint torque sensor. The rotor's inertia is not included.
+    #[default]
+    Link,
+    /// At the motor: current times torque constant and gear ratio. The rotor's inertia is included
+    /// and identified, one number per joint (each joint is assumed to have its own motor). The
+    /// value is the torque of the joint \[Nm; N for a prismatic joint\], as on the link side. If
+    /// torques are no input of identification, they are compared unchanged.
+    Motor,
+}
+
+/// The constant properties of a robot.
+#[derive(Debug, Clone)]
+pub struct Robot {
+    /// Its name.
+    pub name: String,
+    /// The model, with the inertial parameters of its URDF (CAD).
+    pub model: Model,
+    /// Sub-trees, sensors, contacts.
+    pub structure: Structure,
+    /// The link where kinematics start; with [`BaseMotion::Stance`] the initial one.
+    pub base_link: usize,
+    /// Its motion.
+    pub base: BaseMotion,
+    /// Per degree of freedom, its locked position; NaN if it is measured.
+    pub locked: Vec<f64>,
+    /// The published contacts. The structure may have one more at the end: the support of a fixed
+    /// base.
+    pub contacts: Vec<NamedContact>,
+    /// The contacts that are present without any declaration.
+    pub always: ContactSet,
+    /// The published contact that carries a fixed base, if any: it can not be declared absent.
+    pub support: Option<usize>,
+    /// The channels that are read.
+    pub channels: Vec<Channel>,
+    /// The number of the channel whose stamps trigger an estimate.
+    pub trigger: usize,
+    /// The time that a channel may be silent.
+    pub max_silence: Nanos,
+    /// Peak noise of a joint position \[rad or m\].
+    pub position_noise: f64,
+    /// Per F/T sensor, the configured offset of its corrected reading, and its standard deviation
+    /// [torque; force].
+    pub offsets: Vec<(Wrench, [f64; 6])>,
+    /// Per F/T sensor, the configured correction of its readings.
+    pub calibrations: Vec<Calibration>,
+    /// The parameters of the sensors' calibrations that are identified from logs.
+    pub calibrated: calibration::Kind,
+    /// Relative standard deviation of a gain.
+    pub gain_std: f64,
+    /// Relative standard deviation of the URDF's inertial parameters.
+    pub urdf_relative_std: f64,
+    /// The side on which the joint torques used for identification are measured.
+    pub torque_side: TorqueSide,
+}
+
+/// Why a robot can not be constructed.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum RobotError {
+    /// The model has no such link.
+    #[error("the model has no link {0:?}")]
+    NoLink(String),
+    /// Sensors and contacts do not fit the model.
+    #[error(transparent)]
+    Structure(#[from] StructureError),
+}
+
+impl Robot {
+    /// A robot that stands on its link `base`, with all joints measured: the default settings,
+    /// without a configuration file.
+    ///
+    /// `gravity` is the physical one, in the axes of `base` \[m/s^2\]. Sensors and contacts have
+    /// names. Contacts are present unless declared absent. The support of the base is a separate
+    /// contact.
+    ///
+    /// # Errors
+    /// [`RobotError`].
+    pub fn standing(
+        name: &str,
+        model: Model,
+        base: &str,
+        gravity: &Vec3,
+        sensors: &[(&str, SensorCut)],
+        contacts: &[(&str, ContactSpec)],
+    ) -> Result<Self, RobotError> {
+        let carried = model
+            .frame(base)
+            .ok_or_else(|| RobotError::NoLink(base.to_owned()))?;
+        let mut specs: Vec<ContactSpec> = contacts.iter().map(|(_, spec)| *spec).collect();
+        specs.push(ContactSpec {
+            frame: Frame {
+                link: carried.link,
+                pose: Pose::identity(),
+            },
+            kind: ContactKind::Wrench,
+            position: Vec3::zeros(),
+        });
+        let cuts: Vec<SensorCut> = sensors.iter().map(|(_, cut)| *cut).collect();
+        let channel = |kind, name: &str, role| Channel {
+            kind,
+            name: name.to_owned(),
+            role,
+        };
+        let of_sensors = sensors.iter().enumerate();
+        let of_sensors = of_sensors
+            .map(|(number, (name, _))| channel(Kind::Wrench, name, ChannelRole::Sensor(number)));
+        let dofs = 0..model.dof_count();
+        let of_joints =
+            dofs.map(|dof| channel(Kind::Joint, model.dof_name(dof), ChannelRole::Joint(dof)));
+        let named = |(name, spec): &(&str, ContactSpec)| NamedContact {
+            name: (*name).to_owned(),
+            frame: model.link_name(spec.frame.link).to_owned(),
+            always: true,
+        };
+        let rotation = carried.pose.rotation;
+        Ok(Self {
+            name: name.to_owned(),
+            structure: Structure::new(&model, &cuts, &specs, Structure::LENGTH_SCALE)?,
+            base_link: carried.link,
+            base: BaseMotion::Standing(FrameMotion::standing(&(rotation * gravity))),
+            locked: vec![f64::NAN; model.dof_count()],
+            contacts: contacts.iter().map(named).collect(),
+            always: ContactSet::first(specs.len()),
+            support: None,
+            channels: of_sensors.chain(of_joints).collect(),
+            trigger: 0,
+            max_silence: Nanos::from_millis(50),
+            position_noise: 4.8e-4,
+            offsets: vec![(Wrench::zero(), UNKNOWN_OFFSET); cuts.len()],
+            calibrations: vec![Calibration::default(); cuts.len()],
+            calibrated: calibration::Kind::default(),
+            gain_std: 0.05,
+            urdf_relative_std: 0.2,
+            torque_side: TorqueSide::Link,
+            model,
+        })
+    }
+
+    /// Number of the F/T sensor with this channel.
+    #[must_use]
+    pub fn sensor(&self, channel: &str) -> Option<usize> {
+        self.channels.iter().find_map(|c| match c.role {
+            ChannelRole::Sensor(number) if c.name == channel => Some(number),
+            _ => None,
+        })
+    }
+
+    /// The number of a channel.
+    #[must_use]
+    pub fn channel(&self, kind: Kind, name: &str) -> Option<usize> {
+        self.channels
+            .iter()
+            .position(|c| c.kind == kind && c.name == name)
+    }
+
+    /// The number of a published contact.
+    #[must_use]
+    pub fn contact(&self, name: &str) -> Option<usize> {
+        self.contacts.iter().position(|c| c.name == name)
+    }
+
+    /// The names of the joints, in the order of the estimates.
+    pub fn joint_names(&self) -> impl Iterator<Item = &str> {
+        (0..self.model.dof_count()).map(|dof| self.model.dof_name(dof))
+    }
+
+    /// The names of the contacts, in the order of the estimates.
+    pub fn contact_names(&self) -> impl Iterator<Item = &str> {
+        self.contacts.iter().map(|c| c.name.as_str())
+    }
+
+    /// The names of the F/T sensors' channels, in the order of the structure's sensors.
+    pub fn sensor_names(&self) -> impl Iterator<Item = &str> {
+        let sensors = 0..self.structure.sensors().len();
+        sensors.map(|sensor| {
+            let channel = self
+                .channels
+                .iter()
+                .find(|channel| channel.role == ChannelRole::Sensor(sensor));
+            channel.map_or("", |channel| channel.name.as_str())
+        })
+    }
+
+    /// The names of the sub-trees, those of their top links, in the order of the estimates.
+    pub fn subtree_names(&self) -> impl Iterator<Item = &str> {
+        let subtrees = self.structure.subtrees().iter();
+        subtrees
+            .take(MAX_SUBTREES)
+            .map(|subtree| self.model.link_name(subtree.top))
+    }
+
+    /// The possible motions while the estimator runs, which determine the parameters that its
+    /// sensors can identify at all ([`Identifiable`]). A robot with several feet is assumed to
+    /// stand on the first.
+    #[must_use]
+    pub fn regime(&self) -> Regime {
+        let fixed = |motion: &FrameMotion| BaseRegime::Restricted {
+            gravity: -motion.proper_acceleration,
+            joints: Vec::new(),
+        };
+        let motion = match &self.base {
+            BaseMotion::Standing(motion) => fixed(motion),
+            BaseMotion::Stance(stances) => stances
+                .first()
+                .map_or(BaseRegime::Free, |stance| fixed(&stance.motion)),
+            BaseMotion::Imu(_) => BaseRegime::Free,
+        };
+        let joint = |&locked: &f64| {
+            if locked.is_nan() {
+                JointMotion::Moving
+            } else {
+                JointMotion::Locked(locked)
+            }
+        };
+        Regime {
+            base: self.base_link,
+            motion,
+            joints: self.locked.iter().map(joint).collect(),
+            contacts: ContactSet::EMPTY,
+            tolerance: Regime::TOLERANCE,
+        }
+    }
+
+    /// The name of a contact, as text for a person.
+    #[must_use]
+    pub fn contact_label(&self, contact: usize) -> &str {
+        self.contacts
+            .get(contact)
+            .map_or("the support of the base", |c| c.name.as_str())
+    }
+}

@@ -1,0 +1,449 @@
+//! The logs of an identification: the observations that can be used, why others are excluded, and
+//! the segments in which they are processed.
+
+use crate::dataset::defects::{Defect, OffsetJump};
+use crate::dataset::observation::{Annotated, Observation, UnitSet};
+use crate::dataset::{Dataset, Role};
+use crate::finding::{Finding, FindingCode, Severity};
+use crate::measurement::model::MeasurementModel;
+use crate::measurement::reduction::Segment;
+use crate::measurement::rows::Rows;
+use crate::parallel;
+use crate::robot::{ChannelRole, Robot};
+use proprio_dynamics::spatial::Wrench;
+use proprio_topics::{Nanos, Reason};
+use std::collections::BTreeMap;
+
+/// Observations that are not used, for one reason.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Excluded {
+    /// The reason, in a few words: `contact declared: hand (the links that it touches)`, `contact
+    /// suspected: the links at l_arm_ft_sensor`, `offset jump: the links at l_arm_ft_sensor`,
+    /// `another load: l_hand`, `outlier of r_leg_ft_sensor`, `stale of knee`, or that they are too
+    /// close to an end or a gap for accelerations.
+    pub reason: String,
+    /// Number of observations.
+    pub instants: u64,
+    /// Stamp of the first.
+    pub first: Nanos,
+    /// Stamp of the last.
+    pub last: Nanos,
+}
+
+/// Fewest instants of a cross-validation fold.
+pub(crate) const MIN_FOLD: usize = 50;
+
+/// Most observations that noise, prior scale and cross-validation use, and in how many stretches of
+/// long logs. Shorter stretches would not show how slow the noise is, so of many logs only some are
+/// used.
+pub(crate) const SAMPLE_INSTANTS: usize = 10_000;
+
+const SAMPLE_STRETCHES: usize = 10;
+
+/// Longer logs are divided into segments, each with unknown initial offsets, so that all cores have
+/// work.
+pub(crate) const SEGMENT_INSTANTS: usize = 10_000;
+
+/// A log whose observations are ready to be used.
+pub(crate) struct TrainingLog {
+    pub file: String,
+    pub role: Role,
+    pub span: (Nanos, Nanos),
+    /// Sample rate of the fastest joint torque \[Hz\]; 0 if there is none.
+    pub torque_rate: f64,
+    pub instants: Vec<Annotated>,
+    pub offset_jumps: Vec<OffsetJump>,
+    pub excluded: Vec<Excluded>,
+    pub findings: Vec<Finding>,
+    pub refused: bool,
+    /// Of a validation log: the units on which an undeclared disturbance acts, per instant; empty
+    /// if none was looked for. [`Annotated::disturbed`] stays empty there, because the figures of
+    /// such a log include all of its instants.
+    pub disturbed: Vec<UnitSet>,
+}
+
+impl TrainingLog {
+    /// Excludes a joint's torque, for `reason`, and reports it with `finding`.
+    pub(crate) fn exclude_torque(&mut self, dof: usize, reason: String, finding: Finding) {
+        let is_there = |own: &&Annotated| own.torque.get(dof).is_some_and(|x| x.is_finite());
+        let times = || self.instants.iter().filter(is_there).map(|own| own.t);
+        if let (Some(first), Some(last)) = (times().next(), times().next_back()) {
+            let instants = times().count() as u64;
+            self.excluded.push(Excluded {
+                reason,
+                instants,
+                first,
+                last,
+            });
+        }
+        let all = std::mem::take(&mut self.instants).into_iter();
+        self.instants = all.map(|own| own.map(|o| o.without_torque(dof))).collect();
+        self.findings.push(finding);
+    }
+
+    /// Adds findings about the whole log. A refusal among them refuses the log.
+    pub(crate) fn add_findings(&mut self, findings: Vec<Finding>) {
+        self.refused |= findings
+            .iter()
+            .any(|finding| finding.severity == Severity::Refusal);
+        self.findings.extend(findings);
+    }
+
+    /// All findings of the log, offset jumps included.
+    pub(crate) fn all_findings(&self) -> Vec<Finding> {
+        let jumps = self.offset_jumps.iter().map(|b| finding(&b.jump));
+        self.findings.iter().cloned().chain(jumps).collect()
+    }
+}
+
+/// The training logs that are not refused.
+pub(crate) fn training_logs(logs: &[TrainingLog]) -> Vec<&TrainingLog> {
+    let is_used = |log: &&TrainingLog| log.role == Role::Train && !log.refused;
+    logs.iter().filter(is_used).collect()
+}
+
+pub(crate) fn training_logs_mut(
+    logs: &mut [TrainingLog],
+) -> impl Iterator<Item = &mut TrainingLog> {
+    let is_used = |log: &&mut TrainingLog| log.role == Role::Train && !log.refused;
+    logs.iter_mut().filter(is_used)
+}
+
+/// A finding that refuses a log.
+pub(crate) fn refusal(code: FindingCode, text: String) -> Finding {
+    Finding {
+        severity: Severity::Refusal,
+        code,
+        subject: String::new(),
+        text,
+    }
+}
+
+/// Refuses logs that repeat another one. Training twice on the same data would understate their
+/// noise, and training data can not validate the result.
+pub(crate) fn refuse_repeated(logs: &mut [TrainingLog]) {
+    for number in 1..logs.len() {
+        let (before, rest) = logs.split_at_mut(number);
+        let Some(log) = rest.first_mut().filter(|log| !log.refused) else {
+            continue;
+        };
+        let is_same = |other: &&mut TrainingLog| {
+            // To the bit, because what was not measured is NaN.
+            let same = |a: &[f64], b: &[f64]| {
+                a.iter()
+                    .map(|x| x.to_bits())
+                    .eq(b.iter().map(|x| x.to_bits()))
+            };
+            let reads = |a: &[Wrench], b: &[Wrench]| {
+                a.len() == b.len()
+                    && a.iter()
+                        .zip(b)
+                        .all(|(a, b)| same(&a.torque_first(), &b.torque_first()))
+            };
+            let mut pairs = other.instants.iter().zip(&log.instants);
+            let alike = |(a, b): (&Annotated, &Annotated)| {
+                a.t - other.span.0 == b.t - log.span.0
+                    && same(&a.position, &b.position)
+                    && same(&a.torque, &b.torque)
+                    && reads(&a.readings, &b.readings)
+            };
+            !other.refused && other.instants.len() == log.instants.len() && pairs.all(alike)
+        };
+        let Some(mut other) = before.iter_mut().find(is_same) else {
+            continue;
+        };
+        let mut log = log;
+        // The one for validation is refused.
+        if log.role == Role::Train && other.role == Role::Validate {
+            std::mem::swap(&mut log, &mut other);
+        }
+        let instead = match log.role {
+            Role::Train => "it is used once",
+            Role::Validate => {
+                "it was excluded, because training data can not validate the parameters; record \
+                 another motion"
+            }
+        };
+        let text = format!("it is the same recording as {}: {instead}", other.file);
+        log.findings.push(refusal(FindingCode::DuplicateLog, text));
+        log.refused = true;
+    }
+}
+
+/// Why nothing can be identified: the reasons for which the training logs were refused.
+pub(crate) fn no_log(logs: &[TrainingLog]) -> String {
+    /// Most reasons that are named.
+    const NAMED: usize = 3;
+    let training = logs.iter().filter(|log| log.role == Role::Train);
+    let reasons: Vec<String> = training
+        .flat_map(|log| {
+            let refusals = log
+                .findings
+                .iter()
+                .filter(|f| f.severity == Severity::Refusal);
+            refusals.map(|f| format!("{}: {}", log.file, f.text))
+        })
+        .collect();
+    let more = if reasons.len() > NAMED { "; ..." } else { "" };
+    let named: Vec<&str> = reasons.iter().take(NAMED).map(String::as_str).collect();
+    format!("no log can be identified from: {}{more}", named.join("; "))
+}
+
+/// The observations of a log on which parameters are judged: those with known motion.
+#[must_use]
+pub fn judged(robot: &Robot, dataset: Dataset) -> Vec<Observation> {
+    let log = prepare(robot, dataset);
+    log.instants
+        .iter()
+        .map(|own| own.observation().clone())
+        .collect()
+}
+
+/// A log with the observations at which the motion is known; the reasons why others are excluded.
+pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
+    let apart = stamps_apart(robot, &dataset);
+    let Dataset {
+        name: file,
+        role,
+        instants: all,
+        offset_jumps: breaks,
+        defects,
+        torque_rate,
+        ..
+    } = dataset;
+    let mut findings: Vec<Finding> = defects.iter().map(finding).collect();
+    let refused = defects.iter().any(|d| d.severity() == Severity::Refusal);
+    let span = match (all.first(), all.last()) {
+        (Some(first), Some(last)) => (first.t, last.t),
+        _ => (Nanos::ZERO, Nanos::ZERO),
+    };
+    let mut reasons: BTreeMap<String, Excluded> = BTreeMap::new();
+    let mut leave_out = |reason: String, t: Nanos| {
+        let entry = reasons.entry(reason.clone()).or_insert(Excluded {
+            reason,
+            instants: 0,
+            first: t,
+            last: t,
+        });
+        entry.instants += 1;
+        entry.last = t;
+    };
+    let mut instants = Vec::new();
+    for instant in all {
+        let t = instant.t;
+        if !instant.has_motion(&robot.channels) {
+            let cause = robot.channels.iter().zip(&instant.faults);
+            let cause = cause
+                .filter(|(c, _)| !matches!(c.role, ChannelRole::Sensor(_)))
+                .find(|(_, f)| **f != Reason::None);
+            leave_out(
+                match cause {
+                    Some((_, Reason::Starting)) => {
+                        "too close to the beginning, the end or a gap for accelerations".into()
+                    }
+                    Some((channel, fault)) => format!("{} of {}", fault.word(), channel.name),
+                    None => instant.base_fault.word().into(),
+                },
+                t,
+            );
+            continue;
+        }
+        let mut excluded = Vec::new();
+        for (channel, fault) in robot.channels.iter().zip(&instant.faults) {
+            if let ChannelRole::Sensor(sensor) = channel.role {
+                let outlier = instant.outliers.contains(sensor);
+                if *fault != Reason::None || outlier {
+                    let why = if outlier { "outlier" } else { fault.word() };
+                    leave_out(format!("{why} of {}", channel.name), t);
+                    excluded.push(sensor);
+                }
+            }
+        }
+        for contact in instant.active.difference(&robot.always).iter() {
+            let name = robot.contacts.get(contact).map_or("", |c| c.name.as_str());
+            leave_out(
+                format!("contact declared: {name} (the links that it touches)"),
+                t,
+            );
+        }
+        let read = excluded
+            .into_iter()
+            .fold(instant, Observation::without_reading);
+        instants.push(Annotated::from(read));
+    }
+    if instants.len() < MIN_FOLD && !refused {
+        findings.push(refusal(
+            FindingCode::TooShort,
+            too_few(instants.len(), apart, &reasons, &findings),
+        ));
+    }
+    TrainingLog {
+        file,
+        role,
+        span,
+        torque_rate,
+        refused: refused || instants.len() < MIN_FOLD,
+        instants,
+        offset_jumps: breaks,
+        excluded: reasons.into_values().collect(),
+        findings,
+        disturbed: Vec::new(),
+    }
+}
+
+/// A text if the samples of a log are too far apart for any sample to be valid until the next.
+pub(crate) fn stamps_apart(robot: &Robot, dataset: &Dataset) -> Option<String> {
+    let silence = robot.max_silence;
+    dataset.apart.map(|spacing| {
+        format!(
+            "its samples are {spacing} s apart, and a channel counts as silent after {silence} s \
+             (input.max_silence_ms): record faster, increase that limit, or, if t is in \
+             milliseconds or nanoseconds, convert it to seconds"
+        )
+    })
+}
+
+/// Why so few observations can be used.
+fn too_few(
+    count: usize,
+    apart: Option<String>,
+    excluded: &BTreeMap<String, Excluded>,
+    findings: &[Finding],
+) -> String {
+    let why = if let Some(apart) = apart {
+        apart
+    } else if let Some(dead) = findings
+        .iter()
+        .find(|f| [FindingCode::Frozen, FindingCode::NeverSeen].contains(&f.code))
+    {
+        dead.text.clone()
+    } else {
+        let most = excluded.values().max_by_key(|l| l.instants);
+        most.map_or("record more motion".to_owned(), |l| {
+            format!("{} excluded: {}", l.instants, l.reason)
+        })
+    };
+    format!("only {count} instants can be used, so nothing is identified from this log: {why}")
+}
+
+pub(crate) fn finding(defect: &Defect) -> Finding {
+    let (code, subject) = match defect {
+        Defect::Unreadable { .. } => (FindingCode::Unreadable, String::new()),
+        Defect::SkippedRows { .. } => (FindingCode::SkippedRows, String::new()),
+        Defect::NeverSeen { channel } => (FindingCode::NeverSeen, channel.clone()),
+        Defect::RepeatedRows { .. } => (FindingCode::RepeatedRows, String::new()),
+        Defect::Repeated { channel, .. } => (FindingCode::Repeated, channel.clone()),
+        Defect::Stamps { channel, .. } => (FindingCode::Timestamps, channel.clone()),
+        Defect::Gaps { channel, .. } => (FindingCode::Gap, channel.clone()),
+        Defect::Frozen { channel, .. } => (FindingCode::Frozen, channel.clone()),
+        Defect::Still { channel } => (FindingCode::JointStill, channel.clone()),
+        Defect::Saturated { channel, .. } => (FindingCode::Saturated, channel.clone()),
+        Defect::WrongUnits { channels, .. } => (FindingCode::WrongUnits, channels.join(", ")),
+        Defect::Derivative { joint, .. } => (FindingCode::Derivative, joint.clone()),
+        Defect::NoMotion { .. } => (FindingCode::NoMotion, String::new()),
+        Defect::TooShort { .. } => (FindingCode::TooShort, String::new()),
+        Defect::Jump { channel, .. } => (FindingCode::OffsetJump, channel.clone()),
+        Defect::Outliers { channel, .. } => (FindingCode::Outliers, channel.clone()),
+        Defect::WrongSign { sensor } => (FindingCode::WrongSign, sensor.clone()),
+        Defect::WrongFrame { sensor, .. } => (FindingCode::WrongFrame, sensor.clone()),
+    };
+    Finding {
+        severity: defect.severity(),
+        code,
+        subject,
+        text: defect.to_string(),
+    }
+}
+
+/// Results of a pass over each segment, on all cores, in the order of the segments.
+pub(crate) fn map_segments<'a, T: Send>(
+    measurement: &MeasurementModel<'_>,
+    segments: &[Segment<'a>],
+    pass: impl Fn(&mut MeasurementModel<'_>, usize, Segment<'a>) -> T + Sync,
+) -> Vec<T> {
+    parallel::map_with(
+        segments.len(),
+        || measurement.clone(),
+        |measurement, number| pass(measurement, number, segments[number]),
+    )
+}
+
+/// All instants of all logs, in segments of at most `most`.
+pub(crate) fn segments_of<'a>(training: &[&'a TrainingLog], most: usize) -> Vec<Segment<'a>> {
+    let mut segments = Vec::new();
+    for log in training {
+        let count = log.instants.len().div_ceil(most).max(1);
+        for number in 0..count {
+            let at = |k: usize| log.instants.len() * k / count;
+            segments.push(Segment {
+                instants: &log.instants[at(number)..at(number + 1)],
+                offset_jumps: &log.offset_jumps,
+            });
+        }
+    }
+    segments
+}
+
+/// All instants of short logs; of long logs, stretches spread over them, and more where these lack
+/// a channel. Noise and the prior's scale need no more.
+pub(crate) fn sample<'a>(
+    measurement: &MeasurementModel<'_>,
+    training: &[&'a TrainingLog],
+) -> Vec<Segment<'a>> {
+    let total: usize = training.iter().map(|log| log.instants.len()).sum();
+    if total <= SAMPLE_INSTANTS {
+        return segments_of(training, usize::MAX);
+    }
+    let segments = segments_of(training, total / SAMPLE_STRETCHES);
+    let least = SAMPLE_INSTANTS / SAMPLE_STRETCHES;
+    let in_stretches: usize = segments
+        .iter()
+        .map(|segment| segment.instants.len().min(least))
+        .sum();
+    let every = ((in_stretches + SAMPLE_INSTANTS / 2) / SAMPLE_INSTANTS).max(1);
+    let length = SAMPLE_INSTANTS / segments.len().div_ceil(every);
+    let stretch = |segment: &Segment<'a>, start: usize| Segment {
+        instants: &segment.instants[start..segment.instants.len().min(start + length)],
+        ..*segment
+    };
+    let taken = segments.iter().step_by(every);
+    let mut sampled: Vec<Segment<'a>> = taken.map(|segment| stretch(segment, 0)).collect();
+    // How often each channel occurs, up to `MIN_FOLD`: without any sample of it, its noise would be
+    // estimated as zero.
+    let (mut measurement, mut rows) = (measurement.clone(), Rows::new(measurement.unknowns()));
+    let mut heard = vec![0; measurement.unknowns().channels()];
+    let mut listen = |instant: &Annotated, heard: &mut [usize]| -> bool {
+        let made = measurement.make(instant, &mut rows).is_ok();
+        let mut lacked = false;
+        for (channel, heard) in heard.iter_mut().enumerate() {
+            if made && rows.has(channel) {
+                lacked |= *heard < MIN_FOLD;
+                *heard += 1;
+            }
+        }
+        lacked
+    };
+    for segment in &sampled {
+        for instant in segment.instants {
+            if heard.iter().all(|heard| *heard >= MIN_FOLD) {
+                return sampled;
+            }
+            listen(instant, &mut heard);
+        }
+    }
+    for (number, segment) in segments.iter().enumerate() {
+        let mut i = if number % every == 0 { length } else { 0 };
+        while i < segment.instants.len() && heard.iter().any(|heard| *heard < MIN_FOLD) {
+            if listen(&segment.instants[i], &mut heard) {
+                let additional = stretch(segment, i);
+                for instant in &additional.instants[1..] {
+                    listen(instant, &mut heard);
+                }
+                i += additional.instants.len() - 1;
+                sampled.push(additional);
+            }
+            i += 1;
+        }
+    }
+    sampled
+}

@@ -1,0 +1,330 @@
+//! A setup as text, which `proprio estimator --check` prints, and as a [`Description`]: the names
+//! behind the numbers of the estimates.
+
+use crate::setup::Setup;
+use proprio_dynamics::ContactKind;
+use proprio_dynamics::calibration::Gain;
+use proprio_dynamics::regressor::identifiable::{Identifiable, Measured, Offsets, Scope};
+use proprio_identification::robot::BaseMotion;
+use proprio_topics::{Description, Entry, Kind, Name, Publisher, Role};
+use std::fmt;
+
+impl Setup {
+    /// Text for a person: the joints between the base and an F/T sensor. Empty if there are none.
+    ///
+    /// The torque of such a joint is the sensor's reading plus the load of the links in between,
+    /// which depends on their inertial parameters: those of the URDF, unless they were identified.
+    /// The standard deviation of the torque contains their uncertainty.
+    #[must_use]
+    pub fn upstream_note(&self) -> String {
+        let mut parts = Vec::new();
+        for sensor in self.robot.structure.sensors() {
+            let (mut joints, mut are_identified) = (Vec::new(), true);
+            let mut joint = sensor.joint();
+            // Up to the root, or to the next sensor: then both ends of the segment are measured.
+            let bounded = loop {
+                let parent = self.robot.model.joints().get(joint).map_or(0, |j| j.parent);
+                if parent == 0 {
+                    break false;
+                }
+                are_identified &= self.state.is_identified(parent);
+                joint = parent - 1;
+                if self
+                    .robot
+                    .structure
+                    .sensors()
+                    .iter()
+                    .any(|s| s.joint() == joint)
+                {
+                    break true;
+                }
+                if self
+                    .robot
+                    .model
+                    .joints()
+                    .get(joint)
+                    .is_some_and(|j| j.dof.is_some())
+                {
+                    joints.push(self.robot.model.joint_name(joint));
+                }
+            };
+            if !joints.is_empty() && !bounded {
+                joints.reverse();
+                let whose = if are_identified {
+                    "the identified parameters of the links in between"
+                } else {
+                    "the URDF's parameters of the links in between"
+                };
+                parts.push(format!(
+                    "{} is mounted beyond {}: the torques of these joints also depend on {whose}.",
+                    self.robot.model.joint_name(sensor.joint()),
+                    joints.join(", ")
+                ));
+            }
+        }
+        parts.join(" ")
+    }
+
+    /// Writes which parameters are in use, and their uncertainty.
+    fn write_parameters(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let known = if self.robot.urdf_relative_std > 0.0 {
+            format!(
+                "taken as known to {} %",
+                (1e6 * self.robot.urdf_relative_std).round() / 1e4
+            )
+        } else {
+            "taken as exact".to_owned()
+        };
+        let Some(parameters) = self.state.identified() else {
+            return writeln!(
+                f,
+                "inertial parameters: the URDF's, {known} (identification.urdf_relative_std)"
+            );
+        };
+        let provenance = parameters.provenance();
+        let logs: Vec<_> = provenance
+            .logs
+            .iter()
+            .map(|log| log.file.as_str())
+            .collect();
+        let from = if logs.is_empty() {
+            String::new()
+        } else {
+            format!(" from {}", logs.join(", "))
+        };
+        let tau = provenance.tau.map_or(String::new(), |tau| {
+            format!(" (prior's weight tau = {tau})")
+        });
+        let links = self.robot.model.link_count();
+        writeln!(
+            f,
+            "inertial parameters: identified by {}{from}{tau}: {} of {links} links",
+            provenance.program,
+            parameters.identified().count()
+        )?;
+        let others = (0..links).filter(|&link| !self.state.is_identified(link));
+        let others: Vec<_> = others
+            .map(|link| self.robot.model.link_name(link))
+            .collect();
+        if !others.is_empty() {
+            writeln!(f, "  the URDF's, {known}: {}", others.join(", "))?;
+        }
+        for (place, offset) in parameters.offsets().iter().enumerate() {
+            let deviation = parameters.offset_deviation(place).unwrap_or_default();
+            let numbers = offset
+                .reading
+                .force_first()
+                .into_iter()
+                .zip(deviation.force_first());
+            let numbers: Vec<_> = numbers
+                .map(|(value, std)| format!("{value:.3} +- {std:.3}"))
+                .collect();
+            writeln!(
+                f,
+                "  offset of {} [N, Nm]: {}",
+                offset.sensor,
+                numbers.join(", ")
+            )?;
+            if let Some(found) = &offset.calibrated {
+                let of = |values: [f64; 6]| values.map(|value| format!("{value:.4}")).join(", ");
+                if found.kind.gain != Gain::None {
+                    let diagonal: [f64; 6] =
+                        std::array::from_fn(|i| found.calibration.gain_force_first()[7 * i]);
+                    writeln!(f, "  gain of {}, diagonal: {}", offset.sensor, of(diagonal))?;
+                }
+                if let (true, Some(reference)) =
+                    (found.kind.temperature, found.calibration.reference())
+                {
+                    let per_kelvin = of(found.calibration.per_kelvin().force_first());
+                    writeln!(
+                        f,
+                        "  per kelvin beyond {reference} C, {} [N/K, Nm/K]: {per_kelvin}",
+                        offset.sensor
+                    )?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Text for a person: how many inertial parameters of a sub-tree are identifiable from its F/T
+    /// sensors. None without a sensor.
+    fn identifiability_note(&self, number: usize) -> Option<String> {
+        let subtree = self.robot.structure.subtrees().get(number)?;
+        if subtree.sensors.is_empty() {
+            return None;
+        }
+        // The unknown wrench of an always present contact absorbs the effect of all parameters.
+        let hides = |contact: &usize| {
+            let spec = self.robot.structure.contacts().get(*contact);
+            self.robot.always.contains(*contact)
+                && spec.is_some_and(|spec| spec.kind == ContactKind::Wrench)
+        };
+        if let Some(contact) = subtree.contacts.iter().find(hides) {
+            let name = self.robot.contact_label(contact);
+            return Some(format!(
+                "none of its inertial parameters can be identified while {name} is present"
+            ));
+        }
+        let seen = |offsets| {
+            let scope = Scope::SubTree(&self.robot.structure, number);
+            Identifiable::new(
+                &self.robot.model,
+                scope,
+                &self.robot.regime(),
+                Measured::Wrench,
+                offsets,
+            )
+            .ok()
+        };
+        let (known, unknown) = (seen(Offsets::Known)?, seen(Offsets::Unknown)?);
+        let lost = match unknown.confused() {
+            0 => String::new(),
+            n => format!("; {n} of these are not separable from the sensors' offsets"),
+        };
+        Some(format!(
+            "{} independent combinations of its {} inertial parameters can be identified from its \
+             F/T{lost}",
+            known.rank(),
+            known.columns().len()
+        ))
+    }
+
+    /// The names behind the numbers of the estimates.
+    #[must_use]
+    pub fn description(&self) -> Box<Description> {
+        let name = |text: &str| Name::new(text).unwrap_or(Name::EMPTY);
+        let channels = self.robot.channels.iter().map(|c| Entry {
+            name: name(&c.name),
+            kind: c.kind,
+            max_silence: self.robot.max_silence,
+            ..Entry::NONE
+        });
+        let joints = self.robot.joint_names().map(|j| Entry {
+            name: name(j),
+            role: Role::Joint,
+            ..Entry::NONE
+        });
+        let contacts = self.robot.contacts.iter().map(|c| Entry {
+            name: name(&c.name),
+            frame: name(&c.frame),
+            role: Role::Contact,
+            kind: Kind::Wrench,
+            ..Entry::NONE
+        });
+        let subtrees = self.robot.subtree_names().map(|top| Entry {
+            name: name(top),
+            frame: name(top),
+            role: Role::SubTree,
+            kind: Kind::Wrench,
+            ..Entry::NONE
+        });
+        let numbered = channels
+            .zip(0..)
+            .chain(joints.zip(0..))
+            .chain(contacts.zip(0..));
+        let numbered = numbered.chain(subtrees.zip(0..));
+        Box::new(Description::new(
+            Publisher::Estimator,
+            numbered.map(|(entry, index)| Entry { index, ..entry }),
+        ))
+    }
+}
+
+impl fmt::Display for Setup {
+    /// The text that `proprio estimator --check` prints.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "robot {}: {} links, {} moving joints, {} sub-trees",
+            self.robot.name,
+            self.robot.model.link_count(),
+            self.robot.model.dof_count(),
+            self.robot.structure.subtrees().len()
+        )?;
+        let base = self.robot.model.link_name(self.robot.base_link);
+        match &self.robot.base {
+            BaseMotion::Imu(_) => writeln!(f, "base {base}: an IMU measures its motion")?,
+            BaseMotion::Standing(_) => writeln!(f, "base {base}: at rest")?,
+            BaseMotion::Stance(stances) => {
+                writeln!(
+                    f,
+                    "base: the first of these links whose contact is present, at rest"
+                )?;
+                for stance in stances {
+                    let contact = self
+                        .robot
+                        .contacts
+                        .get(stance.contact)
+                        .map_or("", |c| c.name.as_str());
+                    writeln!(
+                        f,
+                        "  {} with contact {contact}",
+                        self.robot.model.link_name(stance.link)
+                    )?;
+                }
+            }
+        }
+        for (number, channel) in self.robot.channels.iter().enumerate() {
+            let trigger = if number == self.robot.trigger {
+                " (trigger: each of its stamps gives an estimate)"
+            } else {
+                ""
+            };
+            writeln!(
+                f,
+                "  reads {} {}{trigger}",
+                channel.kind.word(),
+                channel.name
+            )?;
+        }
+        for (dof, position) in self.robot.locked.iter().enumerate() {
+            if !position.is_nan() {
+                writeln!(
+                    f,
+                    "  locked {} at {position}",
+                    self.robot.model.dof_name(dof)
+                )?;
+            }
+        }
+        for (number, subtree) in self.robot.structure.subtrees().iter().enumerate() {
+            let sensors: Vec<_> = subtree
+                .sensors
+                .iter()
+                .filter_map(|s| self.robot.structure.sensors().get(s))
+                .map(|s| self.robot.model.joint_name(s.joint()))
+                .collect();
+            let contacts: Vec<_> = subtree
+                .contacts
+                .iter()
+                .map(|c| self.robot.contact_label(c))
+                .collect();
+            let unknowns: usize = subtree
+                .contacts
+                .iter()
+                .filter_map(|c| self.robot.structure.contacts().get(c))
+                .map(|c| c.kind.unknowns())
+                .sum();
+            writeln!(
+                f,
+                "sub-tree {number} from {}: F/T [{}], contacts [{}]: {unknowns} unknowns in 6 \
+                 equations",
+                self.robot.model.link_name(subtree.top),
+                sensors.join(", "),
+                contacts.join(", ")
+            )?;
+            if let Some(note) = self.identifiability_note(number) {
+                writeln!(f, "  {note}")?;
+            }
+        }
+        self.write_parameters(f)?;
+        let note = self.upstream_note();
+        if !note.is_empty() {
+            writeln!(f, "{note}")?;
+        }
+        for warning in self.warnings() {
+            writeln!(f, "note: {warning}")?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,388 @@
+//! Conversion of an identification result ([`Outcome`]) to the parameters that the estimator reads
+//! ([`Parameters`]).
+
+use crate::parameters::{
+    Calibrated, Friction, Offset, Parameters, ParametersError, Provenance, Rotor, Span,
+};
+use nalgebra::DMatrix;
+use proprio_dynamics::regressor::identifiable::Column;
+use proprio_dynamics::spatial::Wrench;
+use proprio_identification::Robot;
+use proprio_identification::robot::ChannelRole;
+use proprio_identification::{LogOutcome, Outcome, Role};
+
+/// The identified parameters of `robot`: inertial parameters of the links in the covariance,
+/// offsets, calibrations, friction, rotor inertias. Offsets and friction are those at the end of
+/// the last training log that contains the sensor, or the joint's torque. `program` is the name and
+/// version of the identifying program.
+///
+/// # Errors
+/// The outcome belongs to another robot, has a physically inconsistent body, or has numbers that
+/// are not finite.
+pub fn parameters(
+    outcome: &Outcome,
+    robot: &Robot,
+    program: &str,
+) -> Result<Parameters, ParametersError> {
+    let trained = || outcome.logs.iter().filter(|log| log.role == Role::Train);
+    let provenance = Provenance {
+        program: program.to_owned(),
+        tau: outcome.tau.is_finite().then_some(outcome.tau),
+        logs: trained()
+            .map(|log| Span {
+                file: log.file.clone(),
+                start: log.span.0,
+                end: log.span.1,
+            })
+            .collect(),
+    };
+    let mut parameters = Parameters::new(robot, provenance);
+
+    let columns = &outcome.covariance.columns;
+    let place = |unknown: Column| columns.iter().position(|column| *column == unknown);
+    let (mut inertias, mut offsets, mut places, mut calibrations) =
+        (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    for link in &outcome.links {
+        let of_link = (0..10).filter_map(|parameter| {
+            place(Column::Inertial {
+                link: link.link,
+                parameter,
+            })
+        });
+        let of_link: Vec<usize> = of_link.collect();
+        if of_link.len() == 10 {
+            inertias.push((link.link, link.identified));
+            places.extend(of_link);
+        }
+    }
+    for channel in &robot.channels {
+        let ChannelRole::Sensor(sensor) = channel.role else {
+            continue;
+        };
+        let of_sensor = (0..6).filter_map(|component| place(Column::Offset { sensor, component }));
+        let of_sensor: Vec<usize> = of_sensor.collect();
+        let last = trained()
+            .rev()
+            .find_map(|log| Some((log, log.offsets.iter().find(|o| o.sensor == channel.name)?)));
+        let (Some((log, offset)), 6) = (last, of_sensor.len()) else {
+            continue;
+        };
+        let calibration = outcome
+            .calibrations
+            .iter()
+            .find(|own| own.sensor == channel.name);
+        let of_calibration = (0..outcome.covariance.calibrations.len()).filter(|&place| {
+            outcome
+                .covariance
+                .calibrations
+                .get(place)
+                .is_some_and(|(own, _)| *own == sensor)
+        });
+        calibrations.extend(of_calibration.map(|place| columns.len() + place));
+        offsets.push(Offset {
+            sensor: channel.name.clone(),
+            reading: wrench(&offset.end),
+            drift: wrench(&offset.rate),
+            known: log.span.1,
+            noise: wrench(&["fx", "fy", "fz", "tx", "ty", "tz"].map(|axis| {
+                let name = format!("wrench/{}/{axis}", channel.name);
+                let found = outcome.channels.iter().find(|own| own.name == name);
+                found.map_or(0.0, |own| own.deviation)
+            })),
+            calibrated: calibration.map(|own| Calibrated {
+                calibration: own.identified,
+                kind: own.kind,
+            }),
+        });
+        places.extend(of_sensor);
+    }
+    places.extend(calibrations);
+    // The outcome has U U^T, where rows of U are unknowns; here root^T root, where columns are.
+    let upper = &outcome.covariance.root;
+    let root = DMatrix::from_fn(upper.ncols(), places.len(), |i, j| {
+        places
+            .get(j)
+            .and_then(|row| upper.get((*row, i)))
+            .copied()
+            .unwrap_or(f64::NAN)
+    });
+    parameters.set_identified(&inertias, &offsets, &root)?;
+
+    // For each joint, the friction of the last log that has it.
+    let mut friction: Vec<Friction> = Vec::new();
+    for mut found in trained().rev().flat_map(frictions) {
+        if !friction.iter().any(|f| f.joint == found.joint) {
+            let own = outcome
+                .rotors
+                .iter()
+                .find(|rotor| rotor.joint == found.joint);
+            found.rotor = own.map(|rotor| Rotor {
+                inertia: rotor.inertia,
+                deviation: rotor.deviation,
+            });
+            friction.push(found);
+        }
+    }
+    parameters.set_friction(&friction)?;
+    Ok(parameters)
+}
+
+/// A wrench from `[fx fy fz tx ty tz]`.
+fn wrench([fx, fy, fz, tx, ty, tz]: &[f64; 6]) -> Wrench {
+    Wrench::from_parts([*fx, *fy, *fz], [*tx, *ty, *tz])
+}
+
+fn frictions(log: &LogOutcome) -> Vec<Friction> {
+    log.friction
+        .iter()
+        .map(|f| Friction {
+            joint: f.joint.clone(),
+            coulomb: f.coulomb_nm,
+            viscous: f.viscous,
+            offset: f.offset_nm,
+            rotor: None,
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use crate::setup::Setup;
+    use proprio_dynamics::spatial::RigidInertia;
+    use proprio_identification::{
+        Consistency, CovarianceRoot, FrictionOutcome, LinkOutcome, ModelComparison, OffsetOutcome,
+        Predicted, RotorOutcome, Verdict,
+    };
+    use proprio_topics::Nanos;
+    use std::collections::BTreeMap;
+    use std::path::Path;
+
+    fn robot() -> Robot {
+        let file =
+            Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/icub_left_arm/estimator.toml");
+        Setup::new(&Config::load(&file).unwrap()).unwrap().robot
+    }
+
+    /// Two links and the sensor of the arm, with any covariance.
+    fn outcome(robot: &Robot) -> Outcome {
+        let links = robot
+            .model
+            .inertias()
+            .iter()
+            .enumerate()
+            .map(|(link, cad)| LinkOutcome {
+                link,
+                name: robot.model.link_name(link).to_owned(),
+                cad: *cad,
+                floored: None,
+                identified: RigidInertia::from_parameters(&cad.parameters().map(|p| 1.1 * p)),
+                deviation: [0.0; 10],
+                retained_fraction: 1.0,
+                significance: 0.0,
+                seen: link == 3 || link == 5,
+            });
+        // Offsets before links, and the later link before the earlier one: only the columns
+        // determine the places.
+        let mut columns: Vec<Column> = (0..6)
+            .map(|component| Column::Offset {
+                sensor: 0,
+                component,
+            })
+            .collect();
+        for link in [5, 3] {
+            columns.extend((0..10).map(|parameter| Column::Inertial { link, parameter }));
+        }
+        let root = DMatrix::from_fn(26, 26, |i, j| {
+            if i <= j {
+                ((i * 31 + j * 17) as f64).sin() * 1e-3
+            } else {
+                0.0
+            }
+        });
+        let log = |file: &str, role, end| LogOutcome {
+            file: file.into(),
+            role,
+            span: (Nanos(1), Nanos(1_000_000_001)),
+            used: 1,
+            excluded: vec![],
+            onset: None,
+            predicted: Predicted::default(),
+            fitted_error: ModelComparison::default(),
+            joints: vec![],
+            sensors: vec![],
+            two_route: vec![],
+            offsets: vec![OffsetOutcome {
+                sensor: "l_arm_ft_sensor".into(),
+                start: [0.0; 6],
+                end,
+                deviation: [0.0; 6],
+                rate: [0.1, 0.2, 0.3, 0.01, 0.02, 0.03],
+                offset_jumps: vec![],
+            }],
+            friction: vec![],
+            findings: vec![],
+            curves: vec![],
+            spectra: vec![],
+        };
+        let consistency = Consistency {
+            feasible: Some(true),
+            deviations: 0.0,
+            links: vec![],
+            text: String::new(),
+        };
+        Outcome {
+            robot: robot.name.clone(),
+            verdict: Verdict::Identified,
+            links: links.collect(),
+            covariance: CovarianceRoot {
+                columns,
+                calibrations: vec![],
+                root,
+            },
+            rotors: vec![],
+            calibrations: vec![],
+            tau: 0.5,
+            least_retained_fraction: 1.0,
+            unknowns: 20,
+            rank: 9,
+            structural_rank: 9,
+            effective: 9.0,
+            condition: 1.0,
+            singular_values: vec![],
+            weakest: vec![],
+            not_separable: vec![],
+            base_parameters: vec![],
+            channels: vec![],
+            time_offsets: vec![],
+            consistency,
+            logs: vec![
+                log("train.csv", Role::Train, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),
+                log("validate.csv", Role::Validate, [9.0; 6]),
+            ],
+            findings: vec![],
+        }
+    }
+
+    #[test]
+    fn identified_parameters_are_exported_with_their_covariance() {
+        let robot = robot();
+        let outcome = outcome(&robot);
+        let given = parameters(&outcome, &robot, "a program 1").unwrap();
+        assert_eq!(given.identified().collect::<Vec<_>>(), [3, 5]);
+        assert_eq!(given.inertia(5), Some(outcome.links[5].identified));
+        let covariance = &outcome.covariance.root * outcome.covariance.root.transpose();
+        let close = |a: f64, b: f64| (a - b).abs() <= 1e-8 * b.abs();
+        for (link, first) in [(5, 6), (3, 16)] {
+            let deviation = given.deviation(link).expect("an identified link's");
+            for (i, d) in deviation.iter().enumerate() {
+                assert!(
+                    close(*d, covariance[(first + i, first + i)].sqrt()),
+                    "link {link}, {i}: {d}"
+                );
+            }
+        }
+        // Also the covariances between the two links and with the offset.
+        let root = given.root();
+        let got = root.transpose() * &root;
+        let place = |i: usize| {
+            if i < 10 {
+                16 + i
+            } else if i < 20 {
+                i - 4
+            } else {
+                i - 20
+            }
+        };
+        for i in 0..26 {
+            for j in 0..26 {
+                let scale =
+                    (covariance[(place(i), place(i))] * covariance[(place(j), place(j))]).sqrt();
+                assert!(
+                    (got[(i, j)] - covariance[(place(i), place(j))]).abs() < 1e-7 * scale,
+                    "{i}, {j}"
+                );
+            }
+        }
+        // The offset of the training log; the outcome has force first.
+        let [offset] = given.offsets() else {
+            panic!("one sensor")
+        };
+        assert_eq!(
+            offset.reading,
+            Wrench::from_parts([1.0, 2.0, 3.0], [4.0, 5.0, 6.0])
+        );
+        assert_eq!(
+            offset.drift,
+            Wrench::from_parts([0.1, 0.2, 0.3], [0.01, 0.02, 0.03])
+        );
+        assert_eq!(
+            (offset.sensor.as_str(), offset.known),
+            ("l_arm_ft_sensor", Nanos(1_000_000_001))
+        );
+        assert_eq!(given.provenance().logs.len(), 1);
+        // The text of the file reads back as the same parameters.
+        given.check_robot(&robot).unwrap();
+        assert_eq!(Parameters::parse(&given.to_string()).unwrap(), given);
+    }
+
+    /// A sensor was dead in the last log, and a joint's torque was not measured there: their values
+    /// come from the log before.
+    #[test]
+    fn each_offset_and_friction_is_from_the_last_log_that_has_it() {
+        let robot = robot();
+        let mut outcome = outcome(&robot);
+        let mut later = outcome.logs[0].clone();
+        later.offsets.clear();
+        later.span = (Nanos(5_000_000_000), Nanos(6_000_000_000));
+        let friction = |joint: &str, coulomb_nm| FrictionOutcome {
+            joint: joint.into(),
+            coulomb_nm,
+            ..FrictionOutcome::default()
+        };
+        outcome.logs[0].friction = vec![friction("l_elbow", 0.1), friction("l_wrist_yaw", 0.2)];
+        later.friction = vec![friction("l_elbow", 0.3)];
+        outcome.rotors = vec![RotorOutcome {
+            joint: "l_elbow".into(),
+            inertia: 0.25,
+            deviation: 0.01,
+        }];
+        outcome.logs.push(later);
+        let given = parameters(&outcome, &robot, "a program 1").unwrap();
+        let [offset] = given.offsets() else {
+            panic!("one sensor")
+        };
+        assert_eq!(
+            offset.reading,
+            Wrench::from_parts([1.0, 2.0, 3.0], [4.0, 5.0, 6.0])
+        );
+        assert_eq!(offset.known, Nanos(1_000_000_001));
+        let rotors: Vec<Option<Rotor>> = given.friction().iter().map(|f| f.rotor).collect();
+        let rotor = Rotor {
+            inertia: 0.25,
+            deviation: 0.01,
+        };
+        assert!(
+            rotors.contains(&Some(rotor)) && rotors.contains(&None),
+            "each joint its own: {rotors:?}"
+        );
+        let coulomb: BTreeMap<&str, f64> = given
+            .friction()
+            .iter()
+            .map(|f| (f.joint.as_str(), f.coulomb))
+            .collect();
+        assert_eq!(
+            coulomb,
+            BTreeMap::from([("l_elbow", 0.3), ("l_wrist_yaw", 0.2)])
+        );
+    }
+
+    #[test]
+    fn numbers_that_are_not_finite_are_refused() {
+        let robot = robot();
+        let mut outcome = outcome(&robot);
+        outcome.covariance.root[(2, 2)] = f64::NAN;
+        assert!(parameters(&outcome, &robot, "").is_err());
+    }
+}

@@ -1,0 +1,519 @@
+//! The text of parameters.toml: writing and reading.
+//!
+//! # The file
+//! `schema` is 1. `robot` is the `robot` of estimator.toml.
+//!
+//! `[provenance]`: `program` with its version, and `tau`, the weight of the prior if there was one.
+//! Each `[[provenance.log]]` has the `file` of a log, and `start_ns` and `end_ns`, the first and
+//! last instant used, in that log's clock.
+//!
+//! `[[link]]`, one for every body of the model, in its order:
+//!
+//! | key | meaning |
+//! |---|---|
+//! | `name` | the link |
+//! | `joint`, `parent` | the joint to its parent, and the parent |
+//! | `placement` | its frame in the parent: translation \[m\], then rotation row by row |
+//! | `axis` | the axis of the joint |
+//! | `cad` | its ten parameters in the URDF |
+//! | `identified` | its ten identified parameters, if it was identified |
+//! | `std` | their standard deviations |
+//!
+//! `[[sensor]]`, one for each F/T sensor with an identified offset:
+//!
+//! | key | meaning |
+//! |---|---|
+//! | `name` | its channel |
+//! | `offset_n`, `offset_nm` | its reading without load, at instant `known_ns` |
+//! | `std_n`, `std_nm` | standard deviations of the offset |
+//! | `drift_n`, `drift_nm` | drift of the offset: standard deviation after one second, in s^-½ |
+//! | `noise_n`, `noise_nm` | standard deviation of the residual of a reading |
+//!
+//! and if its calibration was identified, too ([`proprio_dynamics::calibration`]), which then
+//! replaces the one of estimator.toml:
+//!
+//! | key | meaning |
+//! |---|---|
+//! | `gain` | 36 numbers row by row, rows and columns `fx fy fz tx ty tz` |
+//! | `gain_std` | standard deviations of `E`: 36 numbers, or the 6 of a diagonal |
+//! | `temperature_n_per_k`, `temperature_nm_per_k` | temperature drift |
+//! | `temperature_std_n_per_k`, `temperature_std_nm_per_k` | their standard deviations |
+//! | `reference_celsius` | the board temperature at which the offset is valid |
+//!
+//! `E` is the relative error of the gain: the true wrench is (1 + E) times the corrected reading.
+//! Only uncertain quantities have a standard deviation.
+//!
+//! `[[joint]]`, one for each joint whose torque was measured: `name`, `coulomb_nm`, `viscous_nms`,
+//! `offset_nm` (N and Ns for a prismatic joint). If the torque was measured at the motor, also
+//! `rotor_inertia_kgm2`, the inertia of the rotor times the square of the gear ratio (kg for a
+//! prismatic joint), and `rotor_inertia_std_kgm2`.
+//!
+//! `[correlation]`: `root`, see below.
+//!
+//! The ten parameters are `[m, h_x, h_y, h_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz]`
+//! \[kg, kg m, kg m^2\] about the origin and in the axes of the link
+//! ([`proprio_dynamics::spatial`]). Numbers are written with the shortest text that reads back the
+//! same, so a file that is read and written again does not change.
+//!
+//! # The covariance
+//! Columns: ten per identified link, then six per sensor [torque; force], then the unknowns of each
+//! sensor's calibration ([`proprio_dynamics::calibration::Kind::unknowns`]), all in the order of
+//! the file. `P = U^T U` with `U` upper triangular, and `U = root diag(std)`. The columns of `root`
+//! have unit length. They are written one by one, from the top down to the diagonal, in units of
+//! 1e-9, so the rounding error of a number is half a billionth of its parameter's standard
+//! deviation. The error of a torque's standard deviation is at most that times the sum of the
+//! contributions of all parameters if they were independent. Even a combination that is known a
+//! million times better than its parameters keeps three digits. The file of an iCub (39 links, six
+//! sensors: 426 columns, 91 000 numbers) has less than 1 MB.
+
+use super::{
+    Calibrated, Friction, Link, Offset, Parameters, ParametersError, Provenance, Rotor, Span, UNIT,
+    nanoseconds,
+};
+use crate::config::exactly;
+use crate::files;
+use proprio_dynamics::calibration::{Calibration, Gain, Kind, force_first, gain_from_force_first};
+use proprio_dynamics::spatial::Wrench;
+use proprio_topics::Nanos;
+use serde::Deserialize;
+use std::fmt::{self, Write as _};
+use std::io;
+use std::path::Path;
+
+impl Parameters {
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// [`ParametersError`].
+    pub fn load(file: &Path) -> Result<Self, ParametersError> {
+        let text = std::fs::read_to_string(file).map_err(|error| match error.kind() {
+            io::ErrorKind::InvalidData => ParametersError::Damaged("it is not text".into()),
+            _ => ParametersError::Read(error),
+        })?;
+        Self::parse(&text)
+    }
+
+    /// Reads the text of a file.
+    ///
+    /// # Errors
+    /// [`ParametersError`].
+    pub fn parse(text: &str) -> Result<Self, ParametersError> {
+        let damaged = |error: toml::de::Error| {
+            let line = error
+                .span()
+                .map(|span| 1 + text.get(..span.start).unwrap_or(text).matches('\n').count());
+            ParametersError::Damaged(match line {
+                Some(line) => format!(
+                    "line {line}: {}",
+                    error.message().trim().replace('\n', ", ")
+                ),
+                None => error.message().trim().replace('\n', ", "),
+            })
+        };
+        // Read the version first: another version may have other keys.
+        let Version { schema } = toml::from_str(text).map_err(damaged)?;
+        if schema != 1 {
+            return Err(ParametersError::Schema(schema));
+        }
+        let file: File = toml::from_str(text).map_err(damaged)?;
+        file.parameters()
+    }
+
+    /// Writes a file atomically: a crash leaves the old file or the new one.
+    ///
+    /// # Errors
+    /// The error of the system; the old file is unchanged then.
+    pub fn save(&self, file: &Path) -> Result<(), ParametersError> {
+        files::replace(file, &self.to_string(), 0o644).map_err(ParametersError::Write)
+    }
+}
+
+impl fmt::Display for Parameters {
+    /// The text of the file.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let text = |s: &str| toml::Value::String(s.to_owned()).to_string();
+        let moment = |w: &Wrench| -> [f64; 3] { w.torque.into() };
+        let force = |w: &Wrench| -> [f64; 3] { w.force.into() };
+        writeln!(
+            f,
+            "# The identified parameters of a robot. `proprio estimate --parameters`, and the\n\
+             # estimator with the key `parameters`, use the inertial parameters and F/T offsets\n\
+             # of this file instead of those of the URDF and estimator.toml. The ten parameters\n\
+             # of a link are [m, h_x, h_y, h_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz] in kg, kg m,\n\
+             # kg m^2, about its origin. `cad`: the URDF's values. `std`: standard deviations.\n\
+             # A program writes this file: to change parameters, identify again."
+        )?;
+        writeln!(
+            f,
+            "schema = 1\nrobot = {}\n\n[provenance]",
+            text(&self.robot)
+        )?;
+        writeln!(f, "program = {}", text(&self.provenance.program))?;
+        if let Some(tau) = self.provenance.tau {
+            writeln!(f, "tau = {tau:?}")?;
+        }
+        for Span { file, start, end } in &self.provenance.logs {
+            writeln!(
+                f,
+                "\n[[provenance.log]]\nfile = {}\nstart_ns = {}\nend_ns = {}",
+                text(file),
+                start.0,
+                end.0
+            )?;
+        }
+        for (number, link) in self.links.iter().enumerate() {
+            writeln!(f, "\n[[link]]\nname = {}", text(&link.name))?;
+            if let (Some(joint), Some(parent)) = (&link.joint, &link.parent) {
+                writeln!(f, "joint = {}\nparent = {}", text(joint), text(parent))?;
+            }
+            writeln!(f, "placement = {:?}", link.placement)?;
+            if let Some(axis) = link.axis {
+                writeln!(f, "axis = {axis:?}")?;
+            }
+            writeln!(f, "cad = {:?}", link.cad)?;
+            if let (Some(identified), Some(deviation)) = (link.identified, self.deviation(number)) {
+                writeln!(f, "identified = {identified:?}\nstd = {deviation:?}")?;
+            }
+        }
+        for (place, sensor) in self.sensors.iter().enumerate() {
+            let deviation = self.offset_deviation(place).unwrap_or_default();
+            writeln!(
+                f,
+                "\n[[sensor]]\nname = {}\noffset_n = {:?}\noffset_nm = {:?}\nstd_n = {:?}\nstd_nm \
+                 = {:?}\ndrift_n = {:?}\ndrift_nm = {:?}\nknown_ns = {}\nnoise_n = {:?}\nnoise_nm \
+                 = {:?}",
+                text(&sensor.sensor),
+                force(&sensor.reading),
+                moment(&sensor.reading),
+                force(&deviation),
+                moment(&deviation),
+                force(&sensor.drift),
+                moment(&sensor.drift),
+                sensor.known.0,
+                force(&sensor.noise),
+                moment(&sensor.noise)
+            )?;
+            let Some(Calibrated { calibration, kind }) = &sensor.calibrated else {
+                continue;
+            };
+            writeln!(f, "gain = {:?}", calibration.gain_force_first())?;
+            let gains = kind.count() - 6 * usize::from(kind.temperature);
+            let (gains, kelvins) = self
+                .calibration_deviation(place)
+                .split_at_checked(gains)
+                .unwrap_or_default();
+            if kind.gain != Gain::None {
+                writeln!(f, "gain_std = {:?}", force_first(gains))?;
+            }
+            if let Some(reference) = calibration.reference() {
+                let per_kelvin = calibration.per_kelvin();
+                writeln!(
+                    f,
+                    "temperature_n_per_k = {:?}\ntemperature_nm_per_k = {:?}\nreference_celsius = \
+                     {reference:?}",
+                    force(per_kelvin),
+                    moment(per_kelvin)
+                )?;
+            }
+            if let [tx, ty, tz, fx, fy, fz] = kelvins {
+                writeln!(
+                    f,
+                    "temperature_std_n_per_k = {:?}\ntemperature_std_nm_per_k = {:?}",
+                    [fx, fy, fz],
+                    [tx, ty, tz]
+                )?;
+            }
+        }
+        for joint in &self.joints {
+            writeln!(
+                f,
+                "\n[[joint]]\nname = {}\ncoulomb_nm = {:?}\nviscous_nms = {:?}\noffset_nm = {:?}",
+                text(&joint.joint),
+                joint.coulomb,
+                joint.viscous,
+                joint.offset
+            )?;
+            if let Some(Rotor { inertia, deviation }) = joint.rotor {
+                writeln!(
+                    f,
+                    "rotor_inertia_kgm2 = {inertia:?}\nrotor_inertia_std_kgm2 = {deviation:?}"
+                )?;
+            }
+        }
+        f.write_str("\n[correlation]\nroot = [\n")?;
+        let mut numbers = self.correlation.as_slice();
+        for column in 0..self.deviations.len() {
+            let (own, rest) = numbers
+                .split_at_checked(column + 1)
+                .unwrap_or((numbers, &[]));
+            numbers = rest;
+            for (place, number) in own.iter().enumerate() {
+                f.write_char(if place == 0 { '[' } else { ',' })?;
+                write!(f, "{number}")?;
+            }
+            f.write_str("],\n")?;
+        }
+        f.write_str("]\n")
+    }
+}
+
+#[derive(Deserialize)]
+struct Version {
+    schema: i64,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    #[serde(rename = "schema")]
+    _schema: i64,
+    robot: String,
+    provenance: Provenance,
+    #[serde(default)]
+    link: Vec<FileLink>,
+    #[serde(default)]
+    sensor: Vec<FileSensor>,
+    #[serde(default)]
+    joint: Vec<FileJoint>,
+    // The last section of the file: if it is missing, the file is truncated.
+    correlation: Correlation,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FileLink {
+    name: String,
+    joint: Option<String>,
+    parent: Option<String>,
+    placement: Numbers<12>,
+    axis: Option<Numbers<3>>,
+    cad: Numbers<10>,
+    identified: Option<Numbers<10>>,
+    std: Option<Numbers<10>>,
+}
+
+#[derive(Clone, Copy, Deserialize)]
+#[serde(transparent)]
+struct Numbers<const N: usize>(#[serde(deserialize_with = "exactly")] [f64; N]);
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FileSensor {
+    name: String,
+    offset_n: Numbers<3>,
+    offset_nm: Numbers<3>,
+    std_n: Numbers<3>,
+    std_nm: Numbers<3>,
+    drift_n: Numbers<3>,
+    drift_nm: Numbers<3>,
+    #[serde(with = "nanoseconds", rename = "known_ns")]
+    known: Nanos,
+    noise_n: Option<Numbers<3>>,
+    noise_nm: Option<Numbers<3>>,
+    gain: Option<Vec<f64>>,
+    gain_std: Option<Vec<f64>>,
+    temperature_n_per_k: Option<Numbers<3>>,
+    temperature_nm_per_k: Option<Numbers<3>>,
+    temperature_std_n_per_k: Option<Numbers<3>>,
+    temperature_std_nm_per_k: Option<Numbers<3>>,
+    reference_celsius: Option<f64>,
+}
+
+impl FileSensor {
+    /// Its calibration, if it was identified, and the standard deviations of the uncertain
+    /// quantities, in the order of their columns.
+    fn calibrated(&self) -> Result<(Option<Calibrated>, Vec<f64>), ParametersError> {
+        let damaged = |what: &str| {
+            Err(ParametersError::Damaged(format!(
+                "sensor {}: {what}",
+                self.name
+            )))
+        };
+        let drifts = self.temperature_n_per_k.is_some();
+        let stds = self.temperature_std_n_per_k.is_some();
+        if drifts != self.temperature_nm_per_k.is_some()
+            || drifts != self.reference_celsius.is_some()
+            || stds != self.temperature_std_nm_per_k.is_some()
+            || stds && !drifts
+        {
+            return damaged(
+                "the temperature keys are incomplete: temperature_n_per_k, temperature_nm_per_k \
+                 and reference_celsius are needed together, and so are the two standard deviations",
+            );
+        }
+        let Some(gain) = &self.gain else {
+            return match drifts || self.gain_std.is_some() {
+                true => damaged("gain is missing"),
+                false => Ok((None, Vec::new())),
+            };
+        };
+        let Some(gain) = gain_from_force_first(gain) else {
+            return damaged("gain must have 36 numbers, or the 6 of a diagonal");
+        };
+        let gain_std = self.gain_std.as_deref().unwrap_or_default();
+        let kind = match gain_std.len() {
+            0 => Gain::None,
+            6 => Gain::Diagonal,
+            36 => Gain::Full,
+            _ => return damaged("gain_std must have 36 numbers, or the 6 of a diagonal"),
+        };
+        let numbers =
+            |given: &Option<Numbers<3>>| given.as_ref().map_or([0.0; 3], |numbers| numbers.0);
+        let mut deviations = force_first(gain_std);
+        if stds {
+            deviations.extend(numbers(&self.temperature_std_nm_per_k));
+            deviations.extend(numbers(&self.temperature_std_n_per_k));
+        }
+        let per_kelvin = Wrench::from_parts(
+            numbers(&self.temperature_n_per_k),
+            numbers(&self.temperature_nm_per_k),
+        );
+        let calibrated = Calibrated {
+            calibration: Calibration::new(gain, per_kelvin, self.reference_celsius),
+            kind: Kind {
+                gain: kind,
+                temperature: stds,
+            },
+        };
+        Ok((Some(calibrated), deviations))
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FileJoint {
+    name: String,
+    coulomb_nm: f64,
+    viscous_nms: f64,
+    offset_nm: f64,
+    rotor_inertia_kgm2: Option<f64>,
+    rotor_inertia_std_kgm2: Option<f64>,
+}
+
+impl FileJoint {
+    fn friction(self) -> Result<Friction, ParametersError> {
+        let rotor = match (self.rotor_inertia_kgm2, self.rotor_inertia_std_kgm2) {
+            (Some(inertia), Some(deviation)) => Some(Rotor { inertia, deviation }),
+            (None, None) => None,
+            _ => {
+                return Err(ParametersError::Damaged(format!(
+                    "joint {}: only one of rotor_inertia_kgm2 and rotor_inertia_std_kgm2 is given",
+                    self.name
+                )));
+            }
+        };
+        Ok(Friction {
+            joint: self.name,
+            coulomb: self.coulomb_nm,
+            viscous: self.viscous_nms,
+            offset: self.offset_nm,
+            rotor,
+        })
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Correlation {
+    root: Vec<Vec<i32>>,
+}
+
+impl File {
+    fn parameters(self) -> Result<Parameters, ParametersError> {
+        let mut deviations = Vec::new();
+        for link in &self.link {
+            match (&link.identified, &link.std) {
+                (Some(_), Some(std)) => deviations.extend(std.0),
+                (None, None) => {}
+                _ => {
+                    return Err(ParametersError::Damaged(format!(
+                        "link {}: only one of identified and std is given",
+                        link.name
+                    )));
+                }
+            }
+        }
+        for sensor in &self.sensor {
+            deviations.extend(sensor.std_nm.0.iter().chain(&sensor.std_n.0));
+        }
+        let mut calibrations = Vec::new();
+        for sensor in &self.sensor {
+            let (calibrated, own) = sensor.calibrated()?;
+            calibrations.push(calibrated);
+            deviations.extend(own);
+        }
+        let root = &self.correlation.root;
+        let whole = root.len() == deviations.len()
+            && root
+                .iter()
+                .zip(1..)
+                .all(|(column, length)| column.len() == length);
+        if !whole {
+            return Err(ParametersError::Damaged(format!(
+                "correlation.root must have {} columns, one for each identified parameter, each \
+                 one number longer than the one before",
+                deviations.len()
+            )));
+        }
+        for (number, (column, deviation)) in root.iter().zip(&deviations).enumerate() {
+            let length = column
+                .iter()
+                .map(|&n| (f64::from(n) / UNIT).powi(2))
+                .sum::<f64>()
+                .sqrt();
+            let expected = if *deviation > 0.0 { 1.0 } else { 0.0 };
+            if (length - expected).abs() > 1e-6 {
+                return Err(ParametersError::Damaged(format!(
+                    "correlation.root: column {number} has length {length}, not {expected}"
+                )));
+            }
+        }
+        let parameters = Parameters {
+            robot: self.robot,
+            provenance: self.provenance,
+            links: self
+                .link
+                .into_iter()
+                .map(|link| Link {
+                    name: link.name,
+                    joint: link.joint,
+                    parent: link.parent,
+                    placement: link.placement.0,
+                    axis: link.axis.map(|axis| axis.0),
+                    cad: link.cad.0,
+                    identified: link.identified.map(|numbers| numbers.0),
+                })
+                .collect(),
+            sensors: self
+                .sensor
+                .into_iter()
+                .zip(calibrations)
+                .map(|(sensor, calibrated)| Offset {
+                    calibrated,
+                    sensor: sensor.name,
+                    reading: Wrench::from_parts(sensor.offset_n.0, sensor.offset_nm.0),
+                    drift: Wrench::from_parts(sensor.drift_n.0, sensor.drift_nm.0),
+                    known: sensor.known,
+                    noise: {
+                        let of =
+                            |noise: Option<Numbers<3>>| noise.map_or([0.0; 3], |noise| noise.0);
+                        Wrench::from_parts(of(sensor.noise_n), of(sensor.noise_nm))
+                    },
+                })
+                .collect(),
+            joints: self
+                .joint
+                .into_iter()
+                .map(FileJoint::friction)
+                .collect::<Result<_, _>>()?,
+            correlation: self.correlation.root.concat(),
+            deviations,
+        };
+        match parameters.check() {
+            Err(error @ (ParametersError::Value(_) | ParametersError::Inconsistent { .. })) => {
+                Err(ParametersError::Damaged(error.to_string()))
+            }
+            other => other.map(|()| parameters),
+        }
+    }
+}

@@ -1,0 +1,105 @@
+//! The buffers of the pipeline: the last samples of each channel, and the last declarations of each
+//! contact.
+
+use crate::differentiate::Window;
+use crate::history::{ChannelValue, History};
+use proprio_topics::{Nanos, Reason};
+
+/// How many declarations of a contact are kept: those that may come while an instant waits.
+pub(super) const DECLARATIONS: usize = 16;
+
+/// The last samples of one channel, and a window for the values that are differentiated.
+pub(super) enum ChannelBuffer {
+    /// Position, velocity, acceleration; the last two are NaN if not measured.
+    Joint(History<3>, Box<Window<1>>),
+    /// Force and torque; then temperature of the board.
+    Sensor(History<6>, History<1>),
+    /// Proper acceleration, angular velocity, angular acceleration (NaN if not measured).
+    Imu(History<9>, Box<Window<3>>),
+}
+
+impl ChannelBuffer {
+    pub(super) fn newest(&self) -> Option<Nanos> {
+        match self {
+            Self::Joint(h, _) => h.newest(),
+            Self::Sensor(h, _) => h.newest(),
+            Self::Imu(h, _) => h.newest(),
+        }
+    }
+}
+
+/// When a contact was declared present or absent.
+#[derive(Clone, Default)]
+pub(super) struct Declarations {
+    /// The last changes, oldest first: from which stamp on, and whether present.
+    changes: arrayvec::ArrayVec<(Nanos, bool), DECLARATIONS>,
+    /// The state before these changes.
+    before: Option<bool>,
+}
+
+impl Declarations {
+    /// Records that the contact is present (`active`) or absent from `t` on.
+    pub(super) fn record(&mut self, t: Nanos, active: bool) {
+        let index = |changes: &[(Nanos, bool)]| {
+            changes
+                .iter()
+                .rposition(|(other, _)| *other <= t)
+                .map_or(0, |i| i + 1)
+        };
+        let previous = index(&self.changes)
+            .checked_sub(1)
+            .and_then(|i| self.changes.get(i))
+            .map_or(self.before, |(_, a)| Some(*a));
+        // A declaration that repeats the state at `t` changes nothing.
+        if previous == Some(active) {
+            return;
+        }
+        if self.changes.is_full() {
+            self.before = Some(self.changes.remove(0).1);
+        }
+        self.changes.insert(index(&self.changes), (t, active));
+    }
+
+    /// Whether the contact was declared present at `t`; none before the first declaration.
+    pub(super) fn at(&self, t: Nanos) -> Option<bool> {
+        self.changes
+            .iter()
+            .rev()
+            .find(|(from, _)| *from <= t)
+            .map_or(self.before, |(_, active)| Some(*active))
+    }
+}
+
+pub(super) trait OrReason {
+    /// This reason, or `other` if there is none.
+    fn or(self, other: Self) -> Self;
+}
+
+impl OrReason for Reason {
+    fn or(self, other: Self) -> Self {
+        if self == Self::None { other } else { self }
+    }
+}
+
+/// The temperature of a sensor's board at `t` \[degrees Celsius\], and its age. It is the last one
+/// stamped before `t - max_wait / 2`, however old; NaN if there is none. Estimates do not wait for
+/// temperatures: a sample of that stamp has arrived by the time `t` is released.
+pub(super) fn temperature_at(
+    temperatures: &History<1>,
+    t: Nanos,
+    max_wait: Nanos,
+) -> (f64, Option<Nanos>) {
+    let before = t.saturating_sub(Nanos(max_wait.0 / 2 + 1));
+    let held = temperatures.at(before, before);
+    held.map_or((f64::NAN, None), |held| (held.value[0], Some(held.age)))
+}
+
+/// [`Reason::Stale`] if the last sample is older than `max_silence`.
+pub(super) fn stale<const D: usize>(held: &ChannelValue<D>, max_silence: Nanos) -> Reason {
+    // Also between two samples: the gap between them is too long.
+    if held.age > max_silence {
+        Reason::Stale
+    } else {
+        Reason::None
+    }
+}

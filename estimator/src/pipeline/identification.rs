@@ -1,0 +1,680 @@
+//! On-line identification inside the pipeline: evaluates every channel at an instant in the past,
+//! passes the observation to [`Online`], and puts the solutions in use.
+//!
+//! Torques need the newest instant. Parameters can be identified later, but need accurate
+//! accelerations. So an identification instant lies [`DELAY`] before the estimate that triggers it,
+//! with samples on both sides, and positions are differentiated by polynomials centred on it
+//! ([`Centred`]). F/T readings are averaged over one period about the instant.
+//!
+//! Time is divided into slots of one `period`; at most one estimate in each slot triggers an
+//! identification instant. So these instants depend on the stamps alone, as estimates do.
+
+mod centred;
+
+use crate::pipeline::identification::centred::{Centred, DELAY, SignalStatistics};
+use proprio_topics::{InertiaEstimate, LinkInertia, Name, Nanos, Quality, Reason, SensorOffset};
+
+use super::buffers::{ChannelBuffer, OrReason, temperature_at};
+use crate::history::History;
+use crate::inertial::{PosteriorBlock, set_noise};
+use crate::propagation::{Covariance, Propagation};
+use crate::setup::Setup;
+use proprio_dynamics::spatial::{RigidInertia, Vec3, Wrench};
+use proprio_dynamics::{ContactSet, DofSet, FrameMotion, JointState, Kinematics};
+use proprio_identification::online::state::{Measuring, StateError};
+use proprio_identification::online::{
+    Job as SolverJob, Observation, Online, OnlineError, Solution,
+};
+use proprio_identification::prior::PriorError;
+use proprio_identification::robot::{BaseMotion, ChannelRole};
+
+/// On-line identification in a pipeline.
+pub(super) struct OnlineIdentification {
+    pub(super) online: Online,
+    kinematics: Kinematics,
+    period: Nanos,
+    /// The slot of the last instant.
+    slot: i64,
+    /// The motion that observations use, and the one measured at the present instant.
+    held: Motion,
+    current: Motion,
+    /// Statistics of each joint's samples, then of nine numbers of the IMU.
+    statistics: Vec<SignalStatistics>,
+    /// The same for each joint's position and velocity, where measured values are used.
+    measured_statistics: Vec<SignalStatistics>,
+    /// Per F/T sensor, the mean corrected reading, offset included.
+    readings: Vec<Wrench>,
+    /// Per degree of freedom, why its motion is not valid.
+    joints: Vec<Reason>,
+    /// Joints that move at the present instant.
+    moved: DofSet,
+    /// Per F/T sensor, why its reading is not valid.
+    sensors: Vec<Reason>,
+    differentiator: Box<Centred>,
+    /// The workspace of a job; none while a job runs.
+    workspace: Option<Box<Workspace>>,
+    /// The parameters in use, and whether they have been published.
+    inertia: Box<InertiaEstimate>,
+    is_published: bool,
+}
+
+/// The setup that a job uses, and its results for the pipeline.
+struct Workspace {
+    setup: Setup,
+    propagation: Propagation,
+    inertia: Box<InertiaEstimate>,
+}
+
+/// A job of on-line identification: solves for the parameters and prepares the propagation of their
+/// covariance. [`Job::run`] it in any thread, then [`super::Pipeline::give_back`].
+pub struct Job {
+    solver_job: Box<SolverJob>,
+    workspace: Box<Workspace>,
+}
+
+impl Job {
+    /// Solves. Takes a millisecond or two for each limb that is a component of its own, a tenth of
+    /// a second if a large robot is one component; allocates. The result depends on the samples
+    /// alone.
+    pub fn run(&mut self) {
+        self.solver_job.run();
+        let Workspace {
+            setup,
+            propagation,
+            inertia,
+        } = &mut *self.workspace;
+        let covariance = covariance(setup, self.solver_job.solution());
+        // The covariance is of the same structure, so there is no error.
+        if let Ok(new) = Propagation::new(&setup.robot.structure, &covariance) {
+            *propagation = new;
+        }
+        write_inertia(setup, self.solver_job.solution(), inertia);
+    }
+
+    /// For each component, why it was not solved, if it was not: then its earlier parameters stay
+    /// in use.
+    pub fn failures(&self) -> impl Iterator<Item = Option<&PriorError>> {
+        self.solver_job.failures()
+    }
+
+    /// The state of identification when the job began, as text for [`super::Pipeline::resume`].
+    #[must_use]
+    pub fn state(&self) -> String {
+        let setup = &self.workspace.setup;
+        self.solver_job
+            .state(&setup.robot.name, &measurement_setup(setup))
+    }
+}
+
+/// Structure and calibrations of the sensors: a saved state is valid for these alone.
+fn measurement_setup(setup: &Setup) -> Measuring {
+    Measuring::new(&setup.robot.structure, &setup.state.calibrations)
+}
+
+/// The covariance of all parameters and offsets: the solution's posterior, and the prior of
+/// everything else.
+fn covariance(setup: &Setup, solution: &Solution) -> Covariance {
+    let blocks = solution.components.iter().map(|component| PosteriorBlock {
+        links: &component.links,
+        sensors: &component.sensors,
+        root: (component.root.nrows() > 0).then_some(&component.root),
+        offsets: &component.offsets,
+        drift: &component.drift,
+        known: component.data,
+    });
+    setup.state.covariance_with(&setup.robot, blocks)
+}
+
+/// Writes a solution as the message that is published.
+fn write_inertia(setup: &Setup, solution: &Solution, out: &mut InertiaEstimate) {
+    let name = |text: &str| Name::new(text).unwrap_or(Name::EMPTY);
+    out.header.acquired = solution.data;
+    let (mut links, mut offsets) = (0, 0);
+    for (component, group) in solution.components.iter().zip(0..) {
+        let parameters = 10 * component.links.len();
+        // P = U^T U over [ten per link | torque, force of each offset].
+        let root = &component.root;
+        let deviation = |column: usize| match root.nrows() {
+            0 => f64::NAN,
+            _ => root.column(column).norm(),
+        };
+        let accepted = u32::from(component.is_accepted);
+        for (place, (&link, body)) in component.links.iter().zip(&component.bodies).enumerate() {
+            let Some(to) = out.links.get_mut(links) else {
+                break;
+            };
+            links += 1;
+            *to = LinkInertia {
+                name: name(setup.robot.model.link_name(link)),
+                parameters: body.parameters(),
+                standard_deviation: std::array::from_fn(|i| deviation(10 * place + i)),
+                motion: component.motion,
+                rows: component.rows,
+                group,
+                accepted,
+            };
+        }
+        for (place, (&sensor, offset)) in
+            component.sensors.iter().zip(&component.offsets).enumerate()
+        {
+            let Some(to) = out.offsets.get_mut(offsets) else {
+                break;
+            };
+            offsets += 1;
+            let channel = setup
+                .robot
+                .channels
+                .iter()
+                .find(|c| c.role == ChannelRole::Sensor(sensor));
+            let six = |i: usize| deviation(parameters + 6 * place + i);
+            *to = SensorOffset {
+                name: channel.map_or(Name::EMPTY, |channel| name(&channel.name)),
+                force: offset.force.into(),
+                torque: offset.torque.into(),
+                standard_deviation: [3, 4, 5, 0, 1, 2].map(six),
+                group,
+                accepted,
+            };
+        }
+    }
+    (out.link_count, out.offset_count) = (to_u32(links), to_u32(offsets));
+}
+
+fn to_u32(number: usize) -> u32 {
+    u32::try_from(number).unwrap_or(0)
+}
+
+impl OnlineIdentification {
+    pub(super) fn new(setup: &Setup) -> Result<Self, OnlineError> {
+        let period = setup.identification_period;
+        let mut online = Online::new(
+            &setup.robot.model,
+            &setup.robot.structure,
+            setup.robot.model.inertias(),
+            &setup.state.offsets,
+            &setup.robot.always,
+            setup.robot.base_link,
+            period,
+            setup.robot.urdf_relative_std,
+        )?;
+        if let Some(parameters) = setup.state.identified() {
+            let links: Vec<(usize, RigidInertia)> = parameters
+                .identified()
+                .filter_map(|link| Some((link, parameters.inertia(link)?)))
+                .collect();
+            let root = parameters.root();
+            let of_links = root.columns(0, 10 * links.len()).into_owned();
+            online.begin_with(setup.robot.model.inertias(), &links, &of_links)?;
+        }
+        let dofs = setup.robot.model.dof_count();
+        let held = Motion {
+            position: setup
+                .robot
+                .locked
+                .iter()
+                .map(|q| if q.is_nan() { 0.0 } else { *q })
+                .collect(),
+            velocity: vec![0.0; dofs],
+            acceleration: vec![0.0; dofs],
+            imu: FrameMotion::standing(&Vec3::zeros()),
+            errors: vec![0.0; 3 * dofs + 9],
+        };
+        let propagation = Propagation::new(
+            &setup.robot.structure,
+            &covariance(setup, online.solution()),
+        )?;
+        Ok(Self {
+            kinematics: Kinematics::new(&setup.robot.model, setup.robot.base_link)?,
+            period,
+            slot: i64::MIN,
+            current: held.clone(),
+            statistics: vec![SignalStatistics::default(); dofs + 9],
+            measured_statistics: vec![SignalStatistics::default(); 2 * dofs],
+            held,
+            readings: vec![Wrench::zero(); setup.robot.structure.sensors().len()],
+            joints: vec![Reason::None; dofs],
+            moved: DofSet::default(),
+            sensors: vec![Reason::None; setup.robot.structure.sensors().len()],
+            differentiator: Box::default(),
+            workspace: Some(Box::new(Workspace {
+                setup: setup.clone(),
+                propagation,
+                inertia: Box::default(),
+            })),
+            inertia: Box::default(),
+            is_published: true,
+            online,
+        })
+    }
+
+    /// Puts the covariance before the first solution in use.
+    pub(super) fn install_initial_covariance(&mut self, propagation: &mut Propagation) {
+        if let Some(workspace) = &mut self.workspace {
+            std::mem::swap(propagation, &mut workspace.propagation);
+        }
+    }
+
+    /// The identification instant that an estimate at `t` triggers, if it does.
+    pub(super) fn next_instant(&mut self, t: Nanos) -> Option<Nanos> {
+        // The slot is that of the identification instant, not of the estimate.
+        let t = t - DELAY;
+        let slot = t.0.div_euclid(self.period.0);
+        (slot != std::mem::replace(&mut self.slot, slot)).then_some(t)
+    }
+
+    /// Observes instant `t`. The last argument is the base: its link, its motion if no IMU measures
+    /// it, and why that motion is not valid.
+    pub(super) fn observe(
+        &mut self,
+        t: Nanos,
+        setup: &Setup,
+        buffers: &[ChannelBuffer],
+        active: &ContactSet,
+        (base_link, mut base, mut base_fault): (usize, FrameMotion, Reason),
+    ) {
+        let (from, to) = (t - DELAY, t + DELAY);
+        let mut is_base_moved = false;
+        self.moved = DofSet::default();
+        self.current.copy_from(&self.held);
+        for (buffer, channel) in buffers.iter().zip(&setup.robot.channels) {
+            match (buffer, channel.role) {
+                (ChannelBuffer::Joint(history, window), ChannelRole::Joint(dof)) => {
+                    let places = (
+                        self.current.position.get_mut(dof),
+                        self.current.velocity.get_mut(dof),
+                        self.current.acceleration.get_mut(dof),
+                        self.joints.get_mut(dof),
+                    );
+                    let (Some(q), Some(dq), Some(ddq), Some(fault)) = places else {
+                        continue;
+                    };
+                    // Measured velocities and accelerations are used. Derivatives that are not
+                    // measured come from the highest one that is.
+                    let gathered = self.differentiator.gather(
+                        history,
+                        from,
+                        to,
+                        setup.robot.max_silence,
+                        Quality::UNTRUSTED_ENCODER,
+                    );
+                    *fault = gathered.err().unwrap_or(Reason::None);
+                    let highest = (0..3)
+                        .rev()
+                        .find(|&order| self.differentiator.is_complete(order))
+                        .unwrap_or(0);
+                    let Some(statistics) = self.statistics.get_mut(dof) else {
+                        continue;
+                    };
+                    // For positions the noise during motion is known, too.
+                    let [sigma] = if highest == 0 {
+                        window.noise(to)
+                    } else {
+                        [f64::NAN]
+                    };
+                    let fit = self.differentiator.fit(highest, t, statistics, (sigma, 2));
+                    let mut measured_statistics = self.measured_statistics.iter_mut().skip(2 * dof);
+                    let mut exact = |order: usize| {
+                        let deviation = measured_statistics.next().map_or(0.0, |statistics| {
+                            self.differentiator.deviation(order, t, statistics)
+                        });
+                        (self.differentiator.value(order, t), deviation)
+                    };
+                    let values = match highest {
+                        0 => fit,
+                        1 => [exact(0), fit[0], fit[1]],
+                        _ => [exact(0), exact(1), fit[0]],
+                    };
+                    let errors = self
+                        .current
+                        .errors
+                        .chunks_exact_mut(3)
+                        .nth(dof)
+                        .unwrap_or_default();
+                    for ((place, (value, error)), old) in
+                        [&mut *q, dq, ddq].into_iter().zip(values).zip(errors)
+                    {
+                        if has_moved((*place, *old), (value, error)) {
+                            self.moved.insert(dof);
+                        }
+                        (*place, *old) = (value, error);
+                    }
+                    if !(q.is_finite() && dq.is_finite() && ddq.is_finite()) {
+                        [*q, *dq, *ddq] = [0.0; 3];
+                        *fault = (*fault).or(Reason::NotFinite);
+                    }
+                }
+                (ChannelBuffer::Sensor(history, temperatures), ChannelRole::Sensor(number)) => {
+                    let (Some(reading), Some(fault)) =
+                        (self.readings.get_mut(number), self.sensors.get_mut(number))
+                    else {
+                        continue;
+                    };
+                    let (mean, reason) =
+                        mean_reading(history, t, self.period, setup.robot.max_silence);
+                    let (celsius, _) = temperature_at(temperatures, t, setup.max_wait);
+                    let calibration = setup.state.calibrations.get(number);
+                    *reading =
+                        calibration.map_or(mean, |calibration| calibration.apply(&mean, celsius));
+                    *fault = reason;
+                }
+                (ChannelBuffer::Imu(history, window), ChannelRole::Base) => {
+                    let gathered = self.differentiator.gather(
+                        history,
+                        from,
+                        to,
+                        setup.robot.max_silence,
+                        Quality::DEVICE_FAULT,
+                    );
+                    base_fault = gathered.err().unwrap_or(Reason::None);
+                    let measured = &mut self.current.imu;
+                    let first = self.statistics.len().saturating_sub(9);
+                    let sigma = window.noise(to);
+                    for (axis, sigma) in sigma.into_iter().enumerate() {
+                        // Separate statistics: angular acceleration may be absent at times.
+                        let mut none = [SignalStatistics::default(); 3];
+                        let own = self
+                            .statistics
+                            .get_mut(first + 3 * axis..first + 3 * axis + 3);
+                        let [of_rate, of_angular, of_linear]: &mut [SignalStatistics; 3] =
+                            own.and_then(|own| own.try_into().ok()).unwrap_or(&mut none);
+                        let gyro = self.differentiator.fit(3 + axis, t, of_rate, (sigma, 1));
+                        let alpha = if self.differentiator.is_complete(6 + axis) {
+                            self.differentiator
+                                .fit(6 + axis, t, of_angular, (f64::NAN, 0))[0]
+                        } else {
+                            gyro[1]
+                        };
+                        let acceleration =
+                            self.differentiator.fit(axis, t, of_linear, (f64::NAN, 0))[0];
+                        let errors = self.current.errors.iter_mut().rev().skip(3 * axis);
+                        for ((place, (value, error)), old) in [
+                            (&mut measured.proper_acceleration[axis], acceleration),
+                            (&mut measured.angular_velocity[axis], gyro[0]),
+                            (&mut measured.angular_acceleration[axis], alpha),
+                        ]
+                        .into_iter()
+                        .zip(errors)
+                        {
+                            is_base_moved |= has_moved((*place, *old), (value, error));
+                            (*place, *old) = (value, error);
+                        }
+                    }
+                    let numbers = [
+                        &measured.proper_acceleration,
+                        &measured.angular_velocity,
+                        &measured.angular_acceleration,
+                    ];
+                    if numbers.iter().any(|v| v.iter().any(|x| !x.is_finite())) {
+                        base_fault = base_fault.or(Reason::NotFinite);
+                        *measured = FrameMotion::standing(&Vec3::zeros());
+                    }
+                }
+                _ => {}
+            }
+        }
+        if is_base_moved || !self.moved.is_empty() {
+            self.held.copy_from(&self.current);
+        }
+        if let BaseMotion::Imu(pose) = &setup.robot.base {
+            base = FrameMotion::of_link_from_imu(&self.held.imu, pose);
+        }
+        if base_link != self.kinematics.base()
+            && self
+                .kinematics
+                .set_base(&setup.robot.model, base_link)
+                .is_err()
+        {
+            return;
+        }
+        let state = JointState {
+            position: &self.held.position,
+            velocity: &self.held.velocity,
+            acceleration: &self.held.acceleration,
+        };
+        if self
+            .kinematics
+            .update(&setup.robot.model, state, &base)
+            .is_err()
+        {
+            return;
+        }
+        // No error: sizes are those of the setup, and all values are finite.
+        let _ = self.online.observe(&Observation {
+            t,
+            kinematics: &self.kinematics,
+            readings: &self.readings,
+            active,
+            base: base_fault,
+            joints: &self.joints,
+            moved: &self.moved,
+            is_base_moved,
+            sensors: &self.sensors,
+        });
+    }
+
+    /// Puts a solution in use if its stamp has been reached; whether it did.
+    pub(super) fn apply(&mut self, setup: &mut Setup, propagation: &mut Propagation) -> bool {
+        // A solution to apply implies that its job, and so the workspace, was given back.
+        if !self.online.apply() {
+            return false;
+        }
+        self.put_in_use(setup, propagation);
+        true
+    }
+
+    /// Resumes from the state of an earlier run.
+    pub(super) fn resume(
+        &mut self,
+        text: &str,
+        setup: &mut Setup,
+        propagation: &mut Propagation,
+    ) -> Result<(), StateError> {
+        self.online
+            .resume(&setup.robot.name, &measurement_setup(setup), text)?;
+        if let Some(workspace) = &mut self.workspace
+            && let Ok(new) = Propagation::new(
+                &setup.robot.structure,
+                &covariance(setup, self.online.solution()),
+            )
+        {
+            workspace.propagation = new;
+            write_inertia(setup, self.online.solution(), &mut workspace.inertia);
+        }
+        self.put_in_use(setup, propagation);
+        Ok(())
+    }
+
+    /// Copies the last solution to the setup and the propagation of the pipeline.
+    fn put_in_use(&mut self, setup: &mut Setup, propagation: &mut Propagation) {
+        for component in &self.online.solution().components {
+            for (&link, body) in component.links.iter().zip(&component.bodies) {
+                // No error: a link of the model, and finite.
+                let _ = setup.state.model.set_inertia(link, *body);
+            }
+            for (&sensor, offset) in component.sensors.iter().zip(&component.offsets) {
+                if let Some(place) = setup.state.offsets.get_mut(sensor) {
+                    *place = *offset;
+                }
+            }
+            for (&sensor, found) in component.sensors.iter().zip(&component.noise) {
+                set_noise(
+                    &mut setup.state.excess,
+                    &setup.robot.structure,
+                    sensor,
+                    *found,
+                );
+            }
+        }
+        if let Some(workspace) = &mut self.workspace {
+            std::mem::swap(propagation, &mut workspace.propagation);
+            std::mem::swap(&mut self.inertia, &mut workspace.inertia);
+            self.is_published = false;
+        }
+    }
+
+    /// The parameters in use, if they have not been published yet.
+    pub(super) fn inertia(&mut self) -> Option<&InertiaEstimate> {
+        (!std::mem::replace(&mut self.is_published, true)).then_some(&*self.inertia)
+    }
+
+    pub(super) fn take_job(&mut self) -> Option<Job> {
+        self.workspace.as_ref()?;
+        let solver_job = self.online.take_job()?;
+        Some(Job {
+            solver_job,
+            workspace: self.workspace.take()?,
+        })
+    }
+
+    pub(super) fn give_back(&mut self, job: Job) {
+        self.online.give_back(job.solver_job);
+        self.workspace = Some(job.workspace);
+    }
+}
+
+/// Standard errors by which a value must differ from the held one to count as motion.
+const SIGNIFICANT_CHANGE: f64 = 6.0;
+
+fn has_moved((held, error): (f64, f64), (value, new_error): (f64, f64)) -> bool {
+    let apart = (value - held).abs();
+    apart.is_nan() || apart > SIGNIFICANT_CHANGE * error.hypot(new_error)
+}
+
+/// The motion used in observations. It is held until one of its values differs from the held one by
+/// more than its noise.
+///
+/// So a robot at rest has one state, and its regressor rows differ in their right-hand sides alone.
+/// Noise in the regressor would be motion without a force (errors in variables): some hundred such
+/// rows would show that the robot has no mass.
+#[derive(Clone)]
+struct Motion {
+    position: Vec<f64>,
+    velocity: Vec<f64>,
+    acceleration: Vec<f64>,
+    imu: FrameMotion,
+    /// Standard errors: three per joint, then nine of the IMU, its first axis last.
+    errors: Vec<f64>,
+}
+
+impl Motion {
+    fn copy_from(&mut self, other: &Self) {
+        self.position.copy_from_slice(&other.position);
+        self.velocity.copy_from_slice(&other.velocity);
+        self.acceleration.copy_from_slice(&other.acceleration);
+        self.imu = other.imu;
+        self.errors.copy_from_slice(&other.errors);
+    }
+}
+
+/// The mean of a sensor's readings within one period about `t`; interpolated if there are none.
+fn mean_reading(
+    history: &History<6>,
+    t: Nanos,
+    period: Nanos,
+    max_silence: Nanos,
+) -> (Wrench, Reason) {
+    let half = Nanos(period.0 / 2);
+    let (mut sum, mut count, mut quality) = ([0.0; 6], 0.0, Quality::GOOD);
+    for (_, value, q) in history.within(t - half, t + half) {
+        sum.iter_mut().zip(value).for_each(|(sum, x)| *sum += x);
+        count += 1.0;
+        quality |= q;
+    }
+    let mut stale = Reason::None;
+    if count == 0.0 {
+        let Some(held) = history.at(t, t + DELAY) else {
+            return (Wrench::zero(), Reason::NeverSeen);
+        };
+        (sum, count, quality) = (held.value, 1.0, held.quality);
+        if !held.interpolated || held.age > max_silence {
+            stale = Reason::Stale;
+        }
+    }
+    let [fx, fy, fz, tx, ty, tz] = sum.map(|x| x / count);
+    let reason = Reason::of_quality(quality, Quality::DEVICE_FAULT).or(stale);
+    (Wrench::from_parts([fx, fy, fz], [tx, ty, tz]), reason)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_polynomial_of_degree_four_is_exact_at_irregular_stamps() {
+        let mut history = History::<3>::default();
+        let signal = |t: f64| 0.3 - 0.5 * t + 2.0 * t * t - 3.0 * t.powi(3) + 4.0 * t.powi(4);
+        let centre = Nanos::from_seconds(0.7);
+        for k in 0..70 {
+            let t = Nanos::from_seconds(0.4 + 0.01 * f64::from(k) + 0.0003 * f64::from(k * k % 7));
+            history.push(
+                t,
+                [signal((t - centre).seconds()), f64::NAN, f64::NAN],
+                Quality::GOOD,
+            );
+        }
+        let mut centred = Centred::default();
+        let mut statistics = SignalStatistics::default();
+        let silence = Nanos::from_millis(50);
+        centred
+            .gather(
+                &history,
+                centre - DELAY,
+                centre + DELAY,
+                silence,
+                Quality::UNTRUSTED_ENCODER,
+            )
+            .unwrap();
+        assert!(centred.is_complete(0) && !centred.is_complete(1));
+        let found = centred.fit(0, centre, &mut statistics, (f64::NAN, 2));
+        for (found, expected) in found.iter().zip([0.3, -0.5, 4.0]) {
+            assert!(
+                (found.0 - expected).abs() < 1e-9,
+                "{found:?}, not {expected}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_sine_is_followed_rest_has_little_noise_and_a_gap_is_reported() {
+        let silence = Nanos::from_millis(100);
+        let (w, centre) = (2.0 * std::f64::consts::PI, Nanos::from_seconds(1.25));
+        let mut random = 1u32;
+        let mut noise = || {
+            random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (f64::from(random) / f64::from(u32::MAX) - 0.5) * 2e-4
+        };
+        let mut centred = Centred::default();
+        let mut statistics = SignalStatistics::default();
+        for (size, bound) in [(1.0, 0.5), (0.0, 0.02)] {
+            let mut history = History::<3>::default();
+            for k in 0..250 {
+                let t = Nanos::from_millis(10 * k);
+                let value = size * (w * t.seconds()).sin() + noise();
+                history.push(t, [value, f64::NAN, f64::NAN], Quality::GOOD);
+            }
+            centred
+                .gather(
+                    &history,
+                    centre - DELAY,
+                    centre + DELAY,
+                    silence,
+                    Quality::UNTRUSTED_ENCODER,
+                )
+                .unwrap();
+            let [_, _, (acceleration, _)] = centred.fit(0, centre, &mut statistics, (f64::NAN, 2));
+            let error = (acceleration + size * w * w).abs();
+            // The peak is 39.5 rad/s^2; a quadratic over the whole window would be off by 7.
+            assert!(error < bound, "{error}");
+            // At the end of the samples there is no centred window.
+            let end = Nanos::from_millis(2490);
+            let refused = centred.gather(
+                &history,
+                end - DELAY,
+                end + DELAY,
+                silence,
+                Quality::UNTRUSTED_ENCODER,
+            );
+            assert_eq!(refused, Err(Reason::Stale));
+        }
+    }
+}

@@ -1,0 +1,433 @@
+//! Derivatives in the middle of a window of samples, for identification, which may wait for later
+//! samples.
+
+use crate::history::{History, KEPT};
+use proprio_topics::{Nanos, Quality, Reason};
+
+/// How far an identification instant lies before its estimate, and the half width of the window of
+/// samples that it is differentiated from.
+pub(super) const DELAY: Nanos = Nanos::from_millis(250);
+
+/// Largest number of points that a polynomial is fitted to: more samples are averaged in groups of
+/// neighbours.
+pub(crate) const POINTS: usize = 80;
+
+/// The window at rest: its half width as a share of [`DELAY`], and the polynomial's degree.
+pub(crate) const REST_WINDOW: (f64, usize) = (1.0, 2);
+
+/// The windows in motion, narrowest first.
+pub(crate) const WINDOWS: [(f64, usize); 3] = [(0.32, 4), (0.6, 4), (1.0, 4)];
+
+/// Least-squares polynomials about an instant, on the stamps of the samples, in polynomials
+/// orthogonal over these stamps (Forsythe 1957): value and two derivatives.
+///
+/// At rest a parabola over the whole window is used, because its derivatives have little noise: it
+/// is taken where its residual variance does not exceed that of a quartic over a narrower window.
+///
+/// In motion a quartic is used. Over a window of `+-h` its relative error for a sine of angular
+/// frequency `w` grows with the fourth power of `w h`. This is a bias `b`, proportional to the
+/// derivative `s` itself, and gives the parameters a relative error `b / s`. Noise of variance `n`
+/// in the derivative is motion without a force (errors in variables) and gives them a relative
+/// error `n / s^2`. So the wider window is taken where `b s` plus its own noise variance is less
+/// than the noise variance of the narrower one. `b` is the difference between the two windows
+/// beyond their noise, as the root mean square of the last second ([`SignalStatistics`]). Where the
+/// noise of the samples is not known, the narrowest window is taken.
+pub(super) struct Centred {
+    pub(crate) count: usize,
+    pub(crate) width: usize,
+    pub(crate) stamps: [Nanos; KEPT],
+    pub(crate) values: [[f64; KEPT]; 9],
+    pub(crate) points: usize,
+    pub(crate) times: [f64; POINTS],
+    pub(crate) signal: [f64; POINTS],
+    pub(crate) current: [f64; POINTS],
+    pub(crate) previous: [f64; POINTS],
+}
+
+impl Default for Centred {
+    fn default() -> Self {
+        Self {
+            count: 0,
+            width: 0,
+            stamps: [Nanos::ZERO; KEPT],
+            values: [[0.0; KEPT]; 9],
+            points: 0,
+            times: [0.0; POINTS],
+            signal: [0.0; POINTS],
+            current: [0.0; POINTS],
+            previous: [0.0; POINTS],
+        }
+    }
+}
+
+/// Fewest samples for a derivative.
+pub(crate) const MIN_SAMPLES: usize = 5;
+
+/// Fewest samples beyond the number of a polynomial's coefficients, for its residual variance to
+/// show the noise.
+pub(crate) const MIN_FREEDOM: usize = 10;
+
+/// Weight of one instant at rest in the exponential mean of the samples' noise.
+pub(crate) const REST_WEIGHT: f64 = 0.05;
+
+/// Weight of one instant in the exponential means that the window is chosen by.
+pub(crate) const MOVING_WEIGHT: f64 = 0.01;
+
+/// Running statistics of one signal.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct SignalStatistics {
+    /// Variance of its samples at rest; NaN before any instant at rest.
+    pub(crate) rest_variance: f64,
+    /// Mean square of the derivative, over the last second.
+    pub(crate) derivative_square: f64,
+    /// Mean square of the difference between neighbouring windows, less the noise of that
+    /// difference, over the last second.
+    pub(crate) bias_square: [f64; WINDOWS.len() - 1],
+}
+
+impl Default for SignalStatistics {
+    fn default() -> Self {
+        Self {
+            rest_variance: f64::NAN,
+            derivative_square: f64::NAN,
+            bias_square: [f64::NAN; WINDOWS.len() - 1],
+        }
+    }
+}
+
+impl SignalStatistics {
+    /// Of the quartics of growing windows, the one whose derivative of this order gives the
+    /// smallest parameter error; `sigma` is the standard deviation of the samples.
+    pub(crate) fn choose(
+        &mut self,
+        fits: [Option<Fit>; WINDOWS.len()],
+        (sigma, order): (f64, usize),
+    ) -> Option<Fit> {
+        let update_mean = |mean: &mut f64, value: f64| {
+            *mean = if mean.is_nan() {
+                value
+            } else {
+                *mean + MOVING_WEIGHT * (value - *mean)
+            }
+        };
+        let mut chosen: Option<Fit> = None;
+        let mut noise = f64::NAN;
+        for (number, fit) in fits.into_iter().enumerate() {
+            let Some(fit) = fit else { continue };
+            let (Some(value), Some(error)) = (fit.at.get(order), fit.errors.get(order)) else {
+                continue;
+            };
+            let own = (sigma * error).powi(2);
+            let Some(narrower) = chosen else {
+                update_mean(&mut self.derivative_square, value * value);
+                (chosen, noise) = (Some(fit), own);
+                continue;
+            };
+            let Some(bias_square) = number
+                .checked_sub(1)
+                .and_then(|place| self.bias_square.get_mut(place))
+            else {
+                continue;
+            };
+            // The windows share samples: the noise of the difference is the difference of the
+            // variances.
+            update_mean(
+                bias_square,
+                (value - narrower.at.get(order).unwrap_or(value)).powi(2) - (noise - own).max(0.0),
+            );
+            let is_better =
+                bias_square.max(0.0).sqrt() * self.derivative_square.sqrt() + own < noise;
+            if !is_better {
+                break;
+            }
+            (chosen, noise) = (Some(fit), own);
+        }
+        chosen
+    }
+}
+
+impl Centred {
+    /// Copies the samples of a channel between two instants.
+    ///
+    /// # Errors
+    /// Why they can not be differentiated.
+    pub(crate) fn gather<const D: usize>(
+        &mut self,
+        history: &History<D>,
+        from: Nanos,
+        to: Nanos,
+        max_silence: Nanos,
+        untrusted: Quality,
+    ) -> Result<(), Reason> {
+        (self.count, self.width) = (0, D);
+        let mut quality = Quality::GOOD;
+        let mut newest = to;
+        let mut gap = Nanos::ZERO;
+        for (t, value, q) in history.within(from, to) {
+            gap = gap.max(newest - t);
+            newest = t;
+            quality |= q;
+            if let Some(place) = self.stamps.get_mut(self.count) {
+                *place = t;
+            }
+            for (column, x) in self.values.iter_mut().zip(value) {
+                if let Some(place) = column.get_mut(self.count) {
+                    *place = *x;
+                }
+            }
+            self.count += 1;
+        }
+        gap = gap.max(newest - from);
+        match Reason::of_quality(quality, untrusted) {
+            Reason::None if history.newest().is_none() => Err(Reason::NeverSeen),
+            Reason::None if self.count < MIN_SAMPLES => Err(Reason::Starting),
+            // Samples must reach both ends, without a gap between.
+            Reason::None if gap > max_silence || gap.0 > (to - from).0 / 3 => Err(Reason::Stale),
+            Reason::None => Ok(()),
+            reason => Err(reason),
+        }
+    }
+
+    /// Whether every sample has this signal.
+    pub(crate) fn is_complete(&self, number: usize) -> bool {
+        let column = self.values.get(number).filter(|_| number < self.width);
+        let column = column.and_then(|column| column.get(..self.count));
+        column.is_some_and(|column| !column.is_empty() && column.iter().all(|x| x.is_finite()))
+    }
+
+    /// A signal at an instant, interpolated linearly.
+    pub(crate) fn value(&self, number: usize, t: Nanos) -> f64 {
+        let (Some(column), stamps) = (self.values.get(number), &self.stamps) else {
+            return f64::NAN;
+        };
+        // Newest first.
+        let pairs = stamps.iter().zip(column).take(self.count);
+        let mut later: Option<(Nanos, f64)> = None;
+        for (&stamp, &value) in pairs {
+            if stamp <= t {
+                return later.map_or(value, |(after, next)| {
+                    value + (t - stamp).seconds() / (after - stamp).seconds() * (next - value)
+                });
+            }
+            later = Some((stamp, value));
+        }
+        f64::NAN
+    }
+
+    /// A signal at `t`: value, first and second derivative, each with its standard error.
+    ///
+    /// `statistics` are those of the signal. `by` selects the window: the standard deviation of the
+    /// samples, NaN if it is not known, and the order of the derivative that matters. The standard
+    /// errors use the noise at rest, because in motion a polynomial's residual is not noise alone.
+    /// They are zero before the first instant at rest.
+    pub(crate) fn fit(
+        &mut self,
+        number: usize,
+        t: Nanos,
+        statistics: &mut SignalStatistics,
+        by: (f64, usize),
+    ) -> [(f64, f64); 3] {
+        const NONE: (f64, f64) = (f64::NAN, 0.0);
+        if self.count < MIN_SAMPLES || number >= self.values.len() {
+            return [NONE; 3];
+        }
+        let sigma = by.0 / (self.average(number, t) as f64).sqrt();
+        let rest = self.polynomial(REST_WINDOW.0, REST_WINDOW.1);
+        let [short, middle, wide] = WINDOWS.map(|(reach, degree)| self.polynomial(reach, degree));
+        // A fit with few degrees of freedom can seem exact by chance.
+        let middle = middle.filter(|fit| fit.points > WINDOWS[1].1 + MIN_FREEDOM);
+        let short = short.filter(|fit| fit.points > WINDOWS[0].1 + 3);
+        let is_quiet = match (&rest, &middle) {
+            // Up to two standard deviations of the middle window's variance more.
+            (Some(rest), Some(middle)) => {
+                rest.variance <= middle.variance * (1.0 + 2.0 * (2.0 / middle.freedom).sqrt())
+            }
+            _ => false,
+        };
+        let moving = statistics.choose(
+            [short, middle, wide.filter(|_| short.is_some())],
+            (sigma, by.1),
+        );
+        let chosen = if is_quiet { rest } else { moving.or(rest) };
+        if let (true, Some(rest)) = (is_quiet, &rest) {
+            let weight = if statistics.rest_variance.is_nan() {
+                1.0
+            } else {
+                REST_WEIGHT
+            };
+            statistics.rest_variance = if statistics.rest_variance.is_nan() {
+                0.0
+            } else {
+                statistics.rest_variance
+            };
+            statistics.rest_variance += weight * (rest.variance - statistics.rest_variance);
+        }
+        let deviation = if statistics.rest_variance.is_nan() {
+            0.0
+        } else {
+            statistics.rest_variance.sqrt()
+        };
+        chosen.map_or([NONE; 3], |fit| {
+            std::array::from_fn(|i| (fit.at[i], fit.errors[i] * deviation))
+        })
+    }
+
+    /// Standard deviation of a signal's samples as found at rest, updated with those about `t`;
+    /// `statistics` as for [`Centred::fit`].
+    pub(crate) fn deviation(
+        &mut self,
+        number: usize,
+        t: Nanos,
+        statistics: &mut SignalStatistics,
+    ) -> f64 {
+        self.fit(number, t, statistics, (f64::NAN, 0));
+        // The polynomial was fitted to means of this many samples.
+        let share = self.count.div_ceil(POINTS).max(1);
+        if statistics.rest_variance.is_nan() {
+            0.0
+        } else {
+            (statistics.rest_variance * share as f64).sqrt()
+        }
+    }
+
+    /// Averages the samples to at most [`POINTS`] points, with times relative to `t` in units of
+    /// [`DELAY`]. Returns the number of samples in each point's mean.
+    #[allow(
+        clippy::indexing_slicing,
+        reason = "count is at most the arrays' length, and there are at most POINTS groups"
+    )]
+    pub(crate) fn average(&mut self, number: usize, t: Nanos) -> usize {
+        let n = self.count.min(KEPT);
+        let share = n.div_ceil(POINTS).max(1);
+        self.points = 0;
+        let groups = self.stamps[..n]
+            .chunks(share)
+            .zip(self.values[number][..n].chunks(share));
+        for (stamps, values) in groups {
+            let of = 1.0 / stamps.len() as f64;
+            let time: f64 = stamps.iter().map(|stamp| (*stamp - t).seconds()).sum();
+            self.times[self.points] = time * of / DELAY.seconds();
+            self.signal[self.points] = values.iter().sum::<f64>() * of;
+            self.points += 1;
+        }
+        share
+    }
+
+    /// The least-squares polynomial of this degree on the points within `reach` of the instant.
+    #[allow(clippy::indexing_slicing, reason = "as many points as were averaged")]
+    pub(crate) fn polynomial(&mut self, reach: f64, degree: usize) -> Option<Fit> {
+        // Newest first.
+        let first = self.times[..self.points].iter().position(|u| *u <= reach)?;
+        let last = self.times[..self.points]
+            .iter()
+            .rposition(|u| *u >= -reach)?;
+        if last < first + degree {
+            return None;
+        }
+        let (times, values) = (&self.times[first..=last], &self.signal[first..=last]);
+        let n = times.len();
+        let (current, previous) = (&mut self.current[..n], &mut self.previous[..n]);
+        current.fill(1.0);
+        previous.fill(0.0);
+        // The orthogonal polynomials of this degree and of the one below, each with its first two
+        // derivatives, at the instant.
+        let (mut at, mut below) = ([1.0, 0.0, 0.0], [0.0; 3]);
+        let (mut result, mut squares, mut norm_below) = ([0.0; 3], [0.0; 3], 1.0);
+        let level = values[0];
+        let mut left: f64 = values.iter().map(|x| (x - level) * (x - level)).sum();
+        for k in 0..=degree {
+            let (mut norm, mut moment, mut product) = (0.0, 0.0, 0.0);
+            for ((p, u), x) in current.iter().zip(times).zip(values) {
+                norm += p * p;
+                moment += u * p * p;
+                product += (x - level) * p;
+            }
+            if norm < 1e-14 * n as f64 {
+                return None;
+            }
+            left -= product * product / norm;
+            for ((sum, derivative_square), value) in result.iter_mut().zip(&mut squares).zip(at) {
+                *sum += product / norm * value;
+                *derivative_square += value * value / norm;
+            }
+            let (a, b) = (moment / norm, if k == 0 { 0.0 } else { norm / norm_below });
+            for ((p, old), u) in current.iter_mut().zip(previous.iter_mut()).zip(times) {
+                let next = (u - a) * *p - b * *old;
+                *old = std::mem::replace(p, next);
+            }
+            let next = [
+                -a * at[0] - b * below[0],
+                at[0] - a * at[1] - b * below[1],
+                2.0 * at[1] - a * at[2] - b * below[2],
+            ];
+            below = std::mem::replace(&mut at, next);
+            norm_below = norm;
+        }
+        let scale = DELAY.seconds();
+        let freedom = (n - degree - 1) as f64;
+        Some(Fit {
+            at: [
+                result[0] + level,
+                result[1] / scale,
+                result[2] / (scale * scale),
+            ],
+            errors: [
+                squares[0].sqrt(),
+                squares[1].sqrt() / scale,
+                squares[2].sqrt() / (scale * scale),
+            ],
+            // At least the rounding error, even if the fit is exact.
+            variance: left.max(1e-20 * n as f64) / freedom.max(1.0),
+            freedom: freedom.max(1.0),
+            points: n,
+        })
+    }
+}
+
+/// A polynomial and its derivatives at the instant, and its residual variance.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Fit {
+    pub(crate) at: [f64; 3],
+    /// Standard errors for points of unit variance.
+    pub(crate) errors: [f64; 3],
+    pub(crate) variance: f64,
+    pub(crate) freedom: f64,
+    pub(crate) points: usize,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// One untrusted sample anywhere in the window is enough: a fit uses all of them.
+    #[test]
+    fn the_quality_of_every_sample_in_the_window_counts() {
+        let untrusted = Quality::SATURATED | Quality::DEVICE_FAULT;
+        let count = 20;
+        let stamp = |k: usize| Nanos::from_millis(10 * i64::try_from(k).unwrap());
+        let gathered = |qualities: &dyn Fn(usize) -> Quality| {
+            let mut history = History::<1>::default();
+            for k in 0..count {
+                history.push(stamp(k), [k as f64], qualities(k));
+            }
+            let silence = Nanos::from_millis(30);
+            Centred::default().gather(&history, stamp(2), stamp(17), silence, untrusted)
+        };
+        assert_eq!(gathered(&|_| Quality::GOOD), Ok(()));
+        for bad in 0..count {
+            let quality = |k: usize| {
+                if k == bad {
+                    Quality::SATURATED
+                } else {
+                    Quality::GOOD
+                }
+            };
+            let expected = if (2..=17).contains(&bad) {
+                Err(Reason::Saturated)
+            } else {
+                Ok(())
+            };
+            assert_eq!(gathered(&quality), expected, "sample {bad}");
+        }
+    }
+}

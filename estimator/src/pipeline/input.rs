@@ -1,0 +1,129 @@
+//! The pipeline's input: samples and declarations of contacts.
+
+use super::Pipeline;
+use super::buffers::ChannelBuffer;
+use proprio_topics::{Nanos, Quality, Reading, Reason};
+
+impl Pipeline {
+    /// Takes a sample of channel number `channel`, acquired at `t`. A temperature of an F/T
+    /// sensor's board is also taken, if the sensor's calibration depends on it and the board
+    /// reports no fault. Other readings of a kind that the channel does not use are ignored. Call
+    /// [`Pipeline::poll`] until it gives nothing before the next sample.
+    pub fn push(&mut self, channel: usize, t: Nanos, reading: &Reading, quality: Quality) {
+        let Some(buffer) = self.buffers.get_mut(channel) else {
+            return;
+        };
+        let newest = buffer.newest().unwrap_or(Nanos::MIN);
+        let all_finite = |values: &[f64]| values.iter().all(|v| v.is_finite());
+        let finite_or_absent = |values: &[f64]| values.iter().all(|v| !v.is_infinite());
+        // Decide first whether the sample may be taken; then push it to window and history.
+        let (mut late, mut backward) = (false, false);
+        let mut admit = |is_valid: bool| {
+            late = is_valid && t <= self.released;
+            backward = is_valid && !late && t <= newest;
+            is_valid && !late && !backward
+        };
+        let is_valid = match (buffer, reading) {
+            (ChannelBuffer::Joint(history, window), Reading::Joint(j)) => {
+                let is_valid =
+                    j.position.is_finite() && finite_or_absent(&[j.velocity, j.acceleration]);
+                if j.position.is_nan() {
+                    // For example a row with a torque alone: nothing to differentiate.
+                    return;
+                }
+                if admit(is_valid) {
+                    // A position that the encoder itself marks as untrusted is kept, but not
+                    // differentiated.
+                    if Reason::of_quality(quality, Quality::UNTRUSTED_ENCODER) == Reason::None {
+                        let _ = window.push(t, [j.position]);
+                    } else {
+                        window.interrupt();
+                    }
+                    history.push(t, [j.position, j.velocity, j.acceleration], quality);
+                }
+                is_valid
+            }
+            (ChannelBuffer::Sensor(_, temperatures), Reading::Temperature(temperature)) => {
+                if !self.setup.depends_on_temperature(channel)
+                    || quality.intersects(Quality::DEVICE_FAULT)
+                {
+                    return;
+                }
+                let late = t < self
+                    .released
+                    .saturating_sub(Nanos(self.setup.max_wait.0 / 2));
+                match temperature.celsius.is_finite() {
+                    false => self.counts.not_finite += 1,
+                    true if temperatures.newest().is_some_and(|newest| t <= newest) => {
+                        self.counts.backward += 1;
+                    }
+                    true => {
+                        temperatures.push(t, [temperature.celsius], quality);
+                        self.counts.taken += 1;
+                        // Taken, but too late for a released instant: a replay would use it there.
+                        self.counts.late += u64::from(late);
+                    }
+                }
+                return;
+            }
+            (ChannelBuffer::Sensor(history, _), Reading::Wrench(w)) => {
+                let ([fx, fy, fz], [tx, ty, tz]) = (w.force, w.torque);
+                let value = [fx, fy, fz, tx, ty, tz];
+                let is_valid = all_finite(&value);
+                if admit(is_valid) {
+                    history.push(t, value, quality);
+                }
+                is_valid
+            }
+            (ChannelBuffer::Imu(history, window), Reading::Imu(i)) => {
+                let is_valid = all_finite(&i.proper_acceleration)
+                    && all_finite(&i.angular_velocity)
+                    && finite_or_absent(&i.angular_acceleration);
+                if admit(is_valid) {
+                    if Reason::of_quality(quality, Quality::DEVICE_FAULT) == Reason::None {
+                        let _ = window.push(t, i.angular_velocity);
+                    } else {
+                        window.interrupt();
+                    }
+                    let ([ax, ay, az], [gx, gy, gz], [bx, by, bz]) = (
+                        i.proper_acceleration,
+                        i.angular_velocity,
+                        i.angular_acceleration,
+                    );
+                    history.push(t, [ax, ay, az, gx, gy, gz, bx, by, bz], quality);
+                }
+                is_valid
+            }
+            _ => return,
+        };
+        self.counts.not_finite += u64::from(!is_valid);
+        self.counts.late += u64::from(late);
+        self.counts.backward += u64::from(backward);
+        if !is_valid || late || backward {
+            return;
+        }
+        self.counts.taken += 1;
+        // Taken, but too late for a released instant: a replay would use it there.
+        let until = self
+            .released
+            .saturating_add(Nanos(self.setup.max_wait.0 / 2));
+        self.counts.late += u64::from(newest > Nanos::MIN && newest < self.released && t <= until);
+        self.newest = self.newest.max(t);
+        if channel == self.setup.robot.trigger {
+            if self.waiting.len() < Self::MAX_WAITING {
+                self.waiting.push_back(t);
+            } else {
+                self.counts.late += 1;
+            }
+        }
+    }
+
+    /// Declares contact number `contact` present (`active`) or absent from `t` on.
+    pub fn declare(&mut self, contact: usize, t: Nanos, active: bool) {
+        if let Some(declarations) = self.declarations.get_mut(contact) {
+            // Too late for instants that are already released; it counts from the next one on.
+            self.counts.late += u64::from(t <= self.released);
+            declarations.record(t, active);
+        }
+    }
+}

@@ -1,0 +1,309 @@
+//! Residual test: whether the F/T readings of a sub-tree agree with the net wrenches of its links,
+//! and which undeclared contact would explain a significant residual.
+//!
+//! ```text
+//! b     imbalance: sum of net wrenches, less the wrenches of the sensors and known wrenches
+//! A x   wrench of the contacts that are present, x unknown
+//! S = C / n + P + M    covariance of b: C F/T noise (mean of n readings), P parameters and
+//!                      offsets, M motion
+//! q = min over x of (b - A x)^T S^-1 (b - A x)    chi-square, 6 - rank A degrees of freedom
+//! ```
+//!
+//! Two imbalances are tested: that of the instant and, where no contact is known, an exponential
+//! mean with [`TIME_CONSTANT`], which shows disturbances below the noise of one reading. `q` is
+//! converted to the normal deviate of equal probability. Above [`SIGNIFICANT`], an unknown external
+//! wrench acts on the sub-tree. Of the contacts that are possible there, the one that leaves the
+//! smallest deviate is taken as present, provided that this deviate is at most [`PLAUSIBLE`]. A
+//! detected contact is a force within [`CONTACT_RADIUS`] of the contact's `position_m`: without
+//! that bound, any six numbers could be a wrench at any contact. It stays present until `q` is
+//! plausible without it. If no contact explains the residual, all torques of the sub-tree are
+//! withheld, because the place where the wrench acts is unknown.
+
+use nalgebra::{Matrix6, Vector6};
+use proprio_dynamics::spatial::{Vec3, Wrench};
+use proprio_dynamics::{
+    ContactKind, ContactSet, Kinematics, LeastSquares, Solver, Structure, noise_factor, unknowns,
+};
+use proprio_identification::statistics::deviate;
+use proprio_topics::Nanos;
+
+/// The deviate above which a residual is significant: by chance, 3 of 10 million instants.
+const SIGNIFICANT: f64 = 5.0;
+/// The deviate up to which a residual is plausible: 99 % of instants without an unknown wrench.
+const PLAUSIBLE: f64 = 2.326;
+/// Time constant of the mean imbalance.
+const TIME_CONSTANT: Nanos = Nanos::from_millis(50);
+/// Distance from a contact's position to the force of a detected contact, one standard deviation
+/// \[m\]: 99 % within 17 cm, the size of a hand or a foot.
+const CONTACT_RADIUS: f64 = 0.05;
+/// Rounding error of the variances computed in single precision, relative.
+const ROUNDING_SHARE: f64 = 1e-6;
+
+/// The residual of a sub-tree at the last instant.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct SubtreeResidual {
+    /// The wrench that known contacts do not explain, at the origin and in the axes of the
+    /// sub-tree's top link.
+    pub(super) wrench: Wrench,
+    /// Its normal deviate; NaN where it cannot be tested.
+    pub(super) significance: f64,
+    /// The detected contact.
+    pub(super) contact: Option<usize>,
+    /// Whether the residual is significant and no contact explains it.
+    pub(super) is_unexplained: bool,
+}
+
+impl SubtreeResidual {
+    const NOTHING: Self = Self {
+        wrench: Wrench {
+            torque: Vec3::new(0.0, 0.0, 0.0),
+            force: Vec3::new(0.0, 0.0, 0.0),
+        },
+        significance: f64::NAN,
+        contact: None,
+        is_unexplained: false,
+    };
+}
+
+/// Tests the residuals of all sub-trees.
+pub(super) struct ResidualMonitor {
+    subtrees: Vec<SubtreeState>,
+    least: LeastSquares,
+}
+
+struct SubtreeState {
+    residual: SubtreeResidual,
+    mean: Option<Mean>,
+}
+
+/// Exponential mean of the imbalance `b`.
+#[derive(Clone, Copy)]
+struct Mean {
+    value: Vector6<f64>,
+    /// Its variance relative to that of one reading, `1 / n`.
+    variance_ratio: f64,
+    t: Nanos,
+}
+
+/// The solver's result at one instant.
+pub(super) struct Solved<'a> {
+    pub(super) t: Nanos,
+    pub(super) structure: &'a Structure,
+    pub(super) kinematics: &'a Kinematics,
+    pub(super) solver: &'a Solver,
+    /// The contacts that are known to be present.
+    pub(super) declared: &'a ContactSet,
+}
+
+impl ResidualMonitor {
+    pub(super) fn new(structure: &Structure) -> Self {
+        let nothing = || SubtreeState {
+            residual: SubtreeResidual::NOTHING,
+            mean: None,
+        };
+        Self {
+            subtrees: structure.subtrees().iter().map(|_| nothing()).collect(),
+            least: LeastSquares::with_capacity(6 * structure.contacts().len()),
+        }
+    }
+
+    /// The residual of each sub-tree.
+    pub(super) fn subtrees(&self) -> impl Iterator<Item = &SubtreeResidual> {
+        self.subtrees.iter().map(|subtree| &subtree.residual)
+    }
+
+    /// The detected contacts.
+    pub(super) fn detected(&self) -> ContactSet {
+        let mut detected = ContactSet::EMPTY;
+        self.subtrees()
+            .filter_map(|residual| residual.contact)
+            .for_each(|contact| detected.insert(contact));
+        detected
+    }
+
+    /// Tests the residuals at an instant. `covariance` is that of a sub-tree's imbalance without
+    /// F/T noise, `P + M`; none where the sub-tree has a fault. Does not allocate.
+    pub(super) fn update(
+        &mut self,
+        solved: &Solved<'_>,
+        covariance: impl Fn(usize) -> Option<Matrix6<f64>>,
+    ) {
+        let Self { subtrees, least } = self;
+        for (number, subtree) in subtrees.iter_mut().enumerate() {
+            let before = subtree.residual.contact;
+            subtree.residual = SubtreeResidual::NOTHING;
+            let facts = &solved.structure.subtrees()[number];
+            let is_free =
+                |contact: usize| solved.structure.contacts()[contact].kind != ContactKind::Wrench;
+            let declared = facts.contacts.intersection(solved.declared);
+            let model_covariance = if facts.sensors.is_empty() || !declared.iter().all(is_free) {
+                None
+            } else {
+                covariance(number)
+            };
+            let Some(model_covariance) = model_covariance else {
+                subtree.mean = None;
+                continue;
+            };
+            let b = Vector6::from(
+                solved
+                    .solver
+                    .imbalance(solved.structure, number)
+                    .torque_first(),
+            );
+            // The wrench of a known contact varies with its place, so no mean is formed.
+            let previous_mean = subtree.mean.filter(|_| declared.is_empty());
+            let test = SubtreeTest {
+                solved,
+                number,
+                declared,
+                b,
+                mean: Mean::next(previous_mean, solved.t, b),
+                noise: solved
+                    .solver
+                    .noise(solved.structure, number, &Vec3::zeros()),
+                model: model_covariance
+                    + Matrix6::from_diagonal(&(ROUNDING_SHARE * model_covariance.diagonal())),
+            };
+            subtree.mean = Some(test.mean);
+            subtree.residual = test.run(least, before);
+        }
+    }
+
+    /// Restarts the means: parameters or offsets have changed, so earlier imbalances do not count.
+    pub(super) fn restart_means(&mut self) {
+        self.subtrees
+            .iter_mut()
+            .for_each(|subtree| subtree.mean = None);
+    }
+
+    /// Clears all residuals, after an instant that could not be solved.
+    pub(super) fn reset(&mut self) {
+        for subtree in &mut self.subtrees {
+            (subtree.residual, subtree.mean) = (SubtreeResidual::NOTHING, None);
+        }
+    }
+}
+
+impl Mean {
+    fn next(before: Option<Self>, t: Nanos, b: Vector6<f64>) -> Self {
+        let Some(before) = before.filter(|mean| t - mean.t < TIME_CONSTANT) else {
+            return Self {
+                value: b,
+                variance_ratio: 1.0,
+                t,
+            };
+        };
+        let keep = (-(t - before.t).seconds() / TIME_CONSTANT.seconds()).exp();
+        Self {
+            value: before.value * keep + b * (1.0 - keep),
+            variance_ratio: keep * keep * before.variance_ratio + (1.0 - keep) * (1.0 - keep),
+            t,
+        }
+    }
+}
+
+/// The test of one sub-tree at one instant.
+struct SubtreeTest<'a> {
+    solved: &'a Solved<'a>,
+    number: usize,
+    declared: ContactSet,
+    b: Vector6<f64>,
+    mean: Mean,
+    noise: Matrix6<f64>,
+    /// Covariance of the imbalance without F/T noise, `P + M`.
+    model: Matrix6<f64>,
+}
+
+impl SubtreeTest<'_> {
+    fn run(&self, least: &mut LeastSquares, before: Option<usize>) -> SubtreeResidual {
+        let (significance, residual) = self.test(least, None);
+        let top = self.solved.structure.subtrees()[self.number].top;
+        let residual = Wrench {
+            torque: residual.fixed_rows::<3>(0).into_owned(),
+            force: residual.fixed_rows::<3>(3).into_owned(),
+        };
+        let mut result = SubtreeResidual {
+            wrench: self.solved.kinematics.pose(top).wrench_back(&residual),
+            significance,
+            ..SubtreeResidual::NOTHING
+        };
+        // A contact that was present stays until the residual is plausible without it.
+        let limit = if before.is_some() {
+            PLAUSIBLE
+        } else {
+            SIGNIFICANT
+        };
+        if significance <= limit || significance.is_nan() {
+            return result;
+        }
+        let possible = self.solved.structure.subtrees()[self.number]
+            .contacts
+            .difference(&self.declared);
+        let mut best = PLAUSIBLE;
+        for contact in possible.iter() {
+            let (left, _) = self.test(least, Some(contact));
+            // Of two contacts that fit about equally well, prefer the previous one.
+            let left = if before == Some(contact) {
+                left - 1.0
+            } else {
+                left
+            };
+            if left <= best {
+                (best, result.contact) = (left, Some(contact));
+            }
+        }
+        result.is_unexplained = result.contact.is_none() && significance > SIGNIFICANT;
+        result
+    }
+
+    /// The larger deviate of the two imbalances (mean and instant) if `detected_contact` were
+    /// present, too; and the residual of the instant.
+    fn test(
+        &self,
+        least: &mut LeastSquares,
+        detected_contact: Option<usize>,
+    ) -> (f64, Vector6<f64>) {
+        let (structure, origin) = (self.solved.structure, Vec3::zeros());
+        let columns = |contact: usize| {
+            let spec = &structure.contacts()[contact];
+            unknowns(
+                spec,
+                self.solved.kinematics,
+                &origin,
+                structure.length_scale(),
+            )
+        };
+        let has_unknown_moment = detected_contact
+            .is_some_and(|contact| structure.contacts()[contact].kind == ContactKind::Wrench);
+        let mut largest = (f64::NEG_INFINITY, self.b);
+        // The mean of one reading is that reading: test it once.
+        let mean = Some((self.mean.value, self.mean.variance_ratio))
+            .filter(|(_, variance_ratio)| *variance_ratio < 1.0);
+        for (b, variance_ratio) in mean.into_iter().chain([(self.b, 1.0)]) {
+            let mut covariance = self.noise * variance_ratio + self.model;
+            if has_unknown_moment {
+                let moment = (CONTACT_RADIUS * b.fixed_rows::<3>(3).norm()).powi(2);
+                (0..3).for_each(|axis| covariance[(axis, axis)] += moment);
+            }
+            least.clear();
+            let declared = self.declared.iter().flat_map(columns);
+            let detected = detected_contact
+                .into_iter()
+                .flat_map(|contact| columns(contact).into_iter().take(3));
+            declared
+                .chain(detected)
+                .for_each(|(column, weight)| least.push(column, weight));
+            least.factorise(&noise_factor(covariance));
+            let weight = least.unexplained();
+            let freedom = 6 - least.rank();
+            if freedom == 0 {
+                return (f64::NAN, Vector6::zeros());
+            }
+            // `b - A x` is what the weight gives back through the covariance.
+            let level = deviate((weight * b).dot(&b), freedom);
+            largest = (largest.0.max(level), covariance * weight * b);
+        }
+        largest
+    }
+}

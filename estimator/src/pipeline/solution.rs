@@ -1,0 +1,221 @@
+//! The estimate at one instant: solve, test the residuals, write the results with their validity.
+
+use super::Pipeline;
+use super::motion::OperatingPoint;
+use super::residuals;
+use crate::pipeline::validity::ValidityCheck;
+use proprio_dynamics::spatial::Pose;
+use proprio_dynamics::{Certainty, ContactSet, FrameMotion, JointState};
+use proprio_topics::{ContactWrench, JointTorque, NO_CAUSE, NO_CONTACT, Nanos, Reason, Residual};
+
+impl Pipeline {
+    /// Solves with the contacts in `active` present, and computes all standard deviations. False if
+    /// the solver failed.
+    pub(super) fn solve(
+        &mut self,
+        t: Nanos,
+        base: &FrameMotion,
+        imu: Option<&(FrameMotion, Pose)>,
+        active: &ContactSet,
+    ) -> bool {
+        let (model, structure) = (&self.setup.state.model, &self.setup.robot.structure);
+        let state = JointState {
+            position: &self.position,
+            velocity: &self.velocity,
+            acceleration: &self.acceleration,
+        };
+        self.dependences.update(structure, &self.kinematics, active);
+        self.kinematics
+            .update(model, state, base)
+            .and_then(|()| {
+                self.solver.solve(
+                    model,
+                    structure,
+                    &self.kinematics,
+                    &self.readings,
+                    active,
+                    &[],
+                )
+            })
+            .and_then(|()| self.solver.update_deviations(structure))
+            .and_then(|()| {
+                self.propagation
+                    .update(structure, &self.solver, &self.kinematics, t)
+            })
+            .and_then(|()| {
+                self.motion.update(&OperatingPoint {
+                    t,
+                    model,
+                    structure,
+                    state,
+                    base,
+                    imu: imu.map(|(measured, pose)| (measured, pose)),
+                    readings: &self.readings,
+                    active,
+                    solver: &self.solver,
+                    base_link: self.kinematics.base(),
+                })
+            })
+            .is_ok()
+    }
+
+    /// Tests the residual of each sub-tree, when the contacts in `declared` are known to be
+    /// present.
+    pub(super) fn test_residuals(&mut self, t: Nanos, declared: &ContactSet, is_solved: bool) {
+        if !is_solved {
+            return self.residuals.reset();
+        }
+        let validity = ValidityCheck {
+            channels: &self.setup.robot.channels,
+            faults: &self.faults,
+            base_fault: self.base_fault,
+        };
+        let solved = residuals::Solved {
+            t,
+            structure: &self.setup.robot.structure,
+            kinematics: &self.kinematics,
+            solver: &self.solver,
+            declared,
+        };
+        let covariance = |number: usize| {
+            let dependence = self.dependences.subtrees.get(number)?;
+            let (reason, _) = validity.reason_and_cause(dependence);
+            let parameters = self.propagation.imbalances().get(number)?;
+            (reason == Reason::None).then(|| parameters + self.motion.imbalance(number))
+        };
+        self.residuals.update(&solved, covariance);
+    }
+
+    /// Writes the estimate: values, standard deviations, validity and reasons.
+    pub(super) fn write_estimate(&mut self, t: Nanos, is_solved: bool) {
+        self.estimate.t = t;
+        self.estimate.torques.header.acquired = t;
+        self.estimate.contacts.header.acquired = t;
+        let validity = ValidityCheck {
+            channels: &self.setup.robot.channels,
+            faults: &self.faults,
+            base_fault: self.base_fault,
+        };
+        let results = self
+            .solver
+            .torque()
+            .iter()
+            .zip(self.solver.torque_deviation())
+            .zip(self.propagation.torque())
+            .zip(self.solver.torque_certainty())
+            .zip(self.motion.torques());
+        let structure = &self.setup.robot.structure;
+        let is_unexplained = |link: usize| {
+            let residual = structure
+                .subtree_of(link)
+                .and_then(|number| self.residuals.subtrees().nth(number));
+            residual.is_some_and(|residual| residual.is_unexplained)
+        };
+        let unexplained = |dof: usize| structure.link_of(dof).is_some_and(is_unexplained);
+        let detected = self.residuals.detected();
+        let places = self
+            .estimate
+            .torques
+            .joints
+            .iter_mut()
+            .zip(&self.dependences.torques);
+        for (dof, ((place, dependence), ((((torque, noise), model), certainty), motion))) in
+            places.zip(results).enumerate()
+        {
+            let (mut reason, mut cause) = validity.reason_and_cause(dependence);
+            let deviation = noise.hypot(*model).hypot(*motion);
+            if reason == Reason::None && *certainty == Certainty::Assumed {
+                reason = Reason::Undetermined;
+            }
+            if reason == Reason::None && unexplained(dof) {
+                reason = Reason::Unexplained;
+            }
+            if reason == Reason::None
+                && self
+                    .setup
+                    .max_deviation
+                    .get(dof)
+                    .is_some_and(|most| deviation > *most)
+            {
+                reason = Reason::Uncertain;
+            }
+            if !is_solved || !torque.is_finite() || !deviation.is_finite() {
+                (reason, cause) = (Reason::NotFinite, NO_CAUSE);
+            }
+            // Without any sample of a channel that it depends on there is no value.
+            let known = is_solved && reason != Reason::NeverSeen;
+            *place = JointTorque {
+                torque: if known { *torque } else { f64::NAN },
+                standard_deviation: if known { deviation } else { f64::NAN },
+                valid: u32::from(reason == Reason::None),
+                reason,
+                cause,
+                reserved: 0,
+            };
+        }
+        let places = self
+            .estimate
+            .contacts
+            .contacts
+            .iter_mut()
+            .zip(&self.dependences.contacts);
+        let results = self
+            .solver
+            .contacts()
+            .iter()
+            .zip(self.propagation.contacts());
+        let results = results.zip(self.motion.contacts());
+        let contacts = places.zip(results).take(self.setup.robot.contacts.len());
+        for (number, ((place, dependence), ((result, model), motion))) in contacts.enumerate() {
+            let (mut reason, mut cause) = validity.reason_and_cause(dependence);
+            let link = structure.contacts().get(number).map(|spec| spec.frame.link);
+            if reason == Reason::None && link.is_some_and(is_unexplained) {
+                reason = Reason::Unexplained;
+            }
+            match result.certainty {
+                Certainty::Absent => (reason, cause) = (Reason::Absent, NO_CAUSE),
+                Certainty::Assumed if reason == Reason::None => reason = Reason::Undetermined,
+                _ => {}
+            }
+            if !is_solved || !result.wrench.is_finite() {
+                (reason, cause) = (Reason::NotFinite, NO_CAUSE);
+            }
+            let known = is_solved && reason != Reason::NeverSeen;
+            let [fx, fy, fz, tx, ty, tz] = if known {
+                result.wrench.force_first()
+            } else {
+                [f64::NAN; 6]
+            };
+            *place = ContactWrench {
+                force: [fx, fy, fz],
+                torque: [tx, ty, tz],
+                standard_deviation: std::array::from_fn(|i| {
+                    if known {
+                        let motion = motion.get(i).copied().unwrap_or(0.0);
+                        result.deviation[i].hypot(model[i]).hypot(motion)
+                    } else {
+                        f64::NAN
+                    }
+                }),
+                valid: u32::from(reason == Reason::None),
+                reason,
+                cause,
+                detected: u32::from(detected.contains(number)),
+            };
+        }
+        let places = self.estimate.contacts.residuals.iter_mut();
+        for (place, residual) in places.zip(self.residuals.subtrees()) {
+            let [fx, fy, fz, tx, ty, tz] = residual.wrench.force_first();
+            *place = Residual {
+                force: [fx, fy, fz],
+                torque: [tx, ty, tz],
+                significance: residual.significance,
+                contact: residual
+                    .contact
+                    .and_then(|contact| u32::try_from(contact).ok())
+                    .unwrap_or(NO_CONTACT),
+                unexplained: u32::from(residual.is_unexplained),
+            };
+        }
+    }
+}

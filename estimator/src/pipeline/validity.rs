@@ -1,0 +1,76 @@
+//! Validity of the outputs: the channels that each one depends on, and the faults of these.
+
+use proprio_dynamics::{ContactSet, Dependence, Kinematics, Structure};
+use proprio_identification::robot::{Channel, ChannelRole};
+use proprio_topics::{NO_CAUSE, Reason};
+
+/// The channels that each torque, contact wrench and sub-tree balance depends on. They change only
+/// with the set of contacts present.
+pub(crate) struct Dependences {
+    pub(crate) active: Option<ContactSet>,
+    pub(crate) torques: Vec<Dependence>,
+    pub(crate) contacts: Vec<Dependence>,
+    pub(crate) subtrees: Vec<Dependence>,
+}
+
+impl Dependences {
+    /// Updates them if `active` differs from the last set of contacts.
+    pub(crate) fn update(
+        &mut self,
+        structure: &Structure,
+        kinematics: &Kinematics,
+        active: &ContactSet,
+    ) {
+        if self.active.replace(*active) == Some(*active) {
+            return;
+        }
+        for (dof, place) in self.torques.iter_mut().enumerate() {
+            *place = structure
+                .torque_dependence(dof, kinematics, active)
+                .unwrap_or_default();
+        }
+        for (contact, place) in self.contacts.iter_mut().enumerate() {
+            *place = structure
+                .contact_dependence(contact, kinematics, active)
+                .unwrap_or_default();
+        }
+        for (number, place) in self.subtrees.iter_mut().enumerate() {
+            *place = structure.subtree_dependence(number, kinematics, active);
+        }
+    }
+}
+
+/// Finds why an output is not valid: the first faulty channel that it depends on.
+pub(crate) struct ValidityCheck<'a> {
+    pub(crate) channels: &'a [Channel],
+    pub(crate) faults: &'a [Reason],
+    pub(crate) base_fault: Reason,
+}
+
+impl ValidityCheck<'_> {
+    /// The reason, [`Reason::None`] if there is none, and the number of the faulty channel.
+    pub(crate) fn reason_and_cause(&self, dependence: &Dependence) -> (Reason, u32) {
+        let needed = |role: ChannelRole| match role {
+            ChannelRole::Joint(dof) => dependence.dofs.contains(dof),
+            ChannelRole::Sensor(number) => dependence.sensors.contains(number),
+            ChannelRole::Base => dependence.base,
+        };
+        // A channel without any sample comes first: then the output has no value at all.
+        let mut found = (Reason::None, NO_CAUSE);
+        for ((channel, fault), number) in self.channels.iter().zip(self.faults).zip(0..) {
+            if *fault == Reason::None || !needed(channel.role) {
+                continue;
+            }
+            if *fault == Reason::NeverSeen {
+                return (*fault, number);
+            }
+            if found.0 == Reason::None {
+                found = (*fault, number);
+            }
+        }
+        if found.0 == Reason::None && dependence.base {
+            found.0 = self.base_fault;
+        }
+        found
+    }
+}

@@ -1,0 +1,432 @@
+//! Reads a log into its channels, on all cores: the text is cut between lines into segments, each
+//! segment is parsed on its own, and the results are joined in order.
+//!
+//! The cuts do not depend on the number of cores. The rest of a log is read row by row where the
+//! end of a line may not be the end of a row (a quoted cell can contain one), and where rows have
+//! no stamps and are counted instead.
+
+use proprio_identification::dataset::DatasetError;
+use proprio_identification::dataset::recording::SkippedRows;
+use proprio_identification::robot::Channel;
+use proprio_identification::{Dataset, Recording, Robot, Role, parallel};
+use proprio_topics::csv::{self, Item, Reader, Report, Row, Series, Value, What};
+use proprio_topics::{Kind, Nanos};
+use std::io::Read;
+use std::ops::Range;
+
+/// Why a log can not be read at all.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ReadingError {
+    /// The log can not be read.
+    #[error(transparent)]
+    Log(#[from] csv::Error),
+    /// Without these channels there are no kinematics.
+    #[error("the log has no column for {}", .0.join(", "))]
+    MissingChannels(Vec<String>),
+    /// A channel has columns, but no sample.
+    #[error("{0} in its columns of the log")]
+    Dataset(#[from] DatasetError),
+}
+
+impl ReadingError {
+    /// Whether it is a log without content.
+    fn is_empty(&self) -> bool {
+        matches!(
+            self,
+            Self::Dataset(_) | Self::Log(csv::Error::Empty | csv::Error::NoRow { .. })
+        )
+    }
+}
+
+/// Reads a sample log (columns: [`proprio_topics::csv`]) and aligns its channels.
+///
+/// Rows that cannot be read are skipped. Samples whose stamps go backward are excluded, as few as
+/// possible. [`Dataset::defects`] lists both.
+///
+/// # Errors
+/// [`ReadingError`]: it is no log, or lacks a joint that is not locked, or the IMU of the base. A
+/// missing F/T sensor is a defect.
+pub fn dataset(
+    robot: &Robot,
+    name: &str,
+    role: Role,
+    log: impl Read,
+) -> Result<Dataset, ReadingError> {
+    let recording = recording(robot, log)?;
+    Ok(Dataset::new(robot, name, role, recording)?)
+}
+
+/// The same, but a log with columns and without samples gives a [`Dataset`] that is marked as
+/// unreadable instead of an error.
+///
+/// # Errors
+/// [`ReadingError`]: it is no log of this robot.
+pub fn dataset_or_unreadable(
+    robot: &Robot,
+    name: &str,
+    role: Role,
+    log: impl Read,
+) -> Result<Dataset, ReadingError> {
+    match dataset(robot, name, role, log) {
+        Err(problem) if problem.is_empty() => {
+            Ok(Dataset::unreadable(name, role, problem.to_string()))
+        }
+        result => result,
+    }
+}
+
+/// Reads a sample log, channel by channel.
+///
+/// # Errors
+/// [`ReadingError`]: it is no log, or lacks columns of a channel.
+pub fn recording(robot: &Robot, log: impl Read) -> Result<Recording, ReadingError> {
+    read_in_segments(robot, log, BLOCK, SEGMENT)
+}
+
+/// Size of the text that is read at a time [bytes].
+const BLOCK: usize = 4 << 20;
+/// Approximate size of the text that one thread parses at a time [bytes].
+const SEGMENT: usize = 256 << 10;
+
+#[derive(Clone, Copy)]
+enum Target {
+    Channel(usize),
+    Contact(usize),
+}
+
+/// The samples of consecutive rows.
+#[derive(Clone)]
+struct PartialRecording {
+    recording: Recording,
+    is_stamped: bool,
+    report: Report,
+}
+
+/// [`recording`] with given sizes of blocks and segments.
+fn read_in_segments(
+    robot: &Robot,
+    mut log: impl Read,
+    block: usize,
+    segment: usize,
+) -> Result<Recording, ReadingError> {
+    let mut text = Vec::new();
+    let mut ended = fill(&mut text, &mut log, block)?;
+    let Some((header, mut before)) = header(&text) else {
+        let mut rows = Reader::new(text.chain(log))?;
+        let (mut part, targets) = PartialRecording::new(robot, &rows)?;
+        part.take(&mut rows, &targets)?;
+        return Ok(part.finish());
+    };
+    let header: Vec<u8> = text.drain(..header).collect();
+    let table = Reader::new(header.as_slice())?;
+    let (mut all, targets) = PartialRecording::new(robot, &table)?;
+    let empty = all.clone();
+    all.report = table.report().clone();
+    loop {
+        let end = if ended {
+            text.len()
+        } else {
+            whole_lines(&text)
+        };
+        let segments = segments(&text[..end], segment);
+        let parts = parallel::map(
+            segments.len(),
+            |number| -> Result<Option<(PartialRecording, u64)>, csv::Error> {
+                let segment = &text[segments[number].clone()];
+                // None where the log cannot be cut.
+                if segment.contains(&b'"') {
+                    return Ok(None);
+                }
+                let mut part = empty.clone();
+                part.take(&mut table.further(segment), &targets)?;
+                Ok(part.is_stamped.then(|| (part, lines(segment))))
+            },
+        );
+        let parts: Option<Vec<(PartialRecording, u64)>> =
+            parts.into_iter().collect::<Result<_, _>>()?;
+        let Some(parts) = parts.filter(|_| end > 0 || ended) else {
+            let mut rest = empty;
+            rest.take(&mut table.further(text.chain(log)), &targets)?;
+            all.append(rest, before);
+            break;
+        };
+        for (part, lines) in parts {
+            all.append(part, before);
+            before += lines;
+        }
+        if ended {
+            break;
+        }
+        text.drain(..end);
+        ended = fill(&mut text, &mut log, block)?;
+    }
+    all.report.usable()?;
+    Ok(all.finish())
+}
+
+/// Reads until there is a block of text. True if the log ended.
+fn fill(text: &mut Vec<u8>, log: &mut impl Read, block: usize) -> Result<bool, csv::Error> {
+    let missing = block.saturating_sub(text.len()) as u64;
+    let read = log.by_ref().take(missing).read_to_end(text)?;
+    Ok((read as u64) < missing)
+}
+
+/// The end of the header, and its number of lines; none if the text cannot be cut there.
+fn header(text: &[u8]) -> Option<(usize, u64)> {
+    let mut end = 0;
+    for (lines, own) in (1..).zip(text.split_inclusive(|byte| *byte == b'\n')) {
+        end += own.len();
+        if !own.iter().all(|byte| b"\r\n".contains(byte)) {
+            // Other line ends, or names in quotes, are left to the parser.
+            let is_line = own
+                .strip_suffix(b"\n")
+                .map(|own| own.strip_suffix(b"\r").unwrap_or(own));
+            let is_whole = is_line.is_some_and(|own| !own.contains(&b'\r') && !own.contains(&b'"'));
+            return is_whole.then_some((end, lines));
+        }
+    }
+    None
+}
+
+fn lines(text: &[u8]) -> u64 {
+    text.iter().filter(|byte| **byte == b'\n').count() as u64
+}
+
+fn whole_lines(text: &[u8]) -> usize {
+    text.iter()
+        .rposition(|byte| *byte == b'\n')
+        .map_or(0, |last| last + 1)
+}
+
+/// Segments of whole lines, of at least `size`.
+fn segments(text: &[u8], size: usize) -> Vec<Range<usize>> {
+    let mut segments = Vec::new();
+    let mut start = 0;
+    while start < text.len() {
+        let least = text.len().min(start + size);
+        let rest = text[least..].iter().position(|byte| *byte == b'\n');
+        let end = rest.map_or(text.len(), |rest| least + rest + 1);
+        segments.push(start..end);
+        start = end;
+    }
+    segments
+}
+
+impl PartialRecording {
+    /// A recording without rows; and per series of the log its channel or contact, if it has one.
+    fn new(
+        robot: &Robot,
+        table: &Reader<impl Read>,
+    ) -> Result<(Self, Vec<Option<Target>>), ReadingError> {
+        check_columns(robot, table.series())?;
+        let mut targets = Vec::new();
+        for series in table.series() {
+            let target = match series.what {
+                What::Channel(kind) => robot.channel(kind, &series.name).map(Target::Channel),
+                What::Contact => robot.contact(&series.name).map(Target::Contact),
+            };
+            targets.push(target);
+        }
+        let part = Self {
+            recording: Recording::new(robot),
+            is_stamped: true,
+            report: Report::default(),
+        };
+        Ok((part, targets))
+    }
+
+    fn take<R: Read>(
+        &mut self,
+        rows: &mut Reader<R>,
+        targets: &[Option<Target>],
+    ) -> Result<(), csv::Error> {
+        let (mut row, mut pseudo) = (Row::default(), Nanos::ZERO);
+        while rows.next_row(&mut row)? {
+            let t = row.t.unwrap_or_else(|| {
+                self.is_stamped = false;
+                pseudo += self.recording.unstamped_spacing();
+                pseudo
+            });
+            for Item { series, value } in &row.items {
+                match (targets.get(*series).copied().flatten(), value) {
+                    (Some(Target::Channel(channel)), Value::Reading(reading, quality)) => {
+                        self.recording.push(channel, t, reading, *quality);
+                    }
+                    (Some(Target::Contact(contact)), Value::Active(active)) => {
+                        self.recording.declare(contact, t, *active);
+                    }
+                    _ => {}
+                }
+            }
+        }
+        self.report = rows.report().clone();
+        Ok(())
+    }
+
+    /// Adds the rows that follow, which begin after this number of lines.
+    fn append(&mut self, next: Self, lines: u64) {
+        self.recording.append(next.recording);
+        self.is_stamped &= next.is_stamped;
+        self.report.add(next.report, lines);
+    }
+
+    fn finish(mut self) -> Recording {
+        if !self.is_stamped {
+            self.recording.set_unstamped();
+        }
+        let skipped = self.report.bad.first().map(|first| SkippedRows {
+            rows: self.report.bad_rows,
+            line: first.line,
+            reason: first.reason.clone(),
+        });
+        self.recording.set_rows(self.report.rows, skipped);
+        self.recording
+    }
+}
+
+fn check_columns(robot: &Robot, series: &[Series]) -> Result<(), ReadingError> {
+    let there = |channel: &&Channel| {
+        let same = |s: &Series| s.what == What::Channel(channel.kind) && s.name == channel.name;
+        series.iter().any(same)
+    };
+    let needed = robot.channels.iter().filter(|c| c.kind != Kind::Wrench);
+    let missing = needed.filter(|c| !there(c)).map(|c| {
+        let hint = if c.kind == Kind::Joint {
+            " (measure it, or lock it in [locked])"
+        } else {
+            ""
+        };
+        format!("{}/{}{hint}", c.kind.word(), c.name)
+    });
+    let missing: Vec<String> = missing.collect();
+    if missing.is_empty() {
+        Ok(())
+    } else {
+        Err(ReadingError::MissingChannels(missing))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use crate::setup::Setup;
+    use std::path::Path;
+
+    /// The recording of a log that is not cut.
+    fn read_whole(robot: &Robot, log: &str) -> Result<Recording, ReadingError> {
+        let mut rows = Reader::new(log.as_bytes())?;
+        let (mut part, targets) = PartialRecording::new(robot, &rows)?;
+        part.take(&mut rows, &targets)?;
+        Ok(part.finish())
+    }
+
+    #[test]
+    fn a_log_read_in_segments_gives_the_same_recording() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/oracle/sessions");
+        let config = Config::load(&folder.join("estimator.toml")).expect("a configuration");
+        let robot = Setup::new(&config).expect("a setup").robot;
+        let log = std::fs::read_to_string(folder.join("train.csv")).expect("a session");
+        let mut rows: Vec<String> = log.lines().take(300).map(str::to_owned).collect();
+        // Rows that repeat the one before, some with its stamp, and stamps that go backward.
+        for row in (7..290).step_by(11) {
+            let numbers = |row: &str| {
+                row.split_once(',')
+                    .map_or(String::new(), |(_, rest)| rest.to_owned())
+            };
+            let stamp = |row: &str| row.split(',').next().unwrap_or_default().to_owned();
+            rows[row] = rows[row - 1].clone();
+            rows[row + 1] = format!("{},{}", stamp(&rows[row + 1]), numbers(&rows[row]));
+            let earlier = stamp(&rows[row + 3]).parse::<f64>().expect("a stamp") - 0.025;
+            rows[row + 3] = format!("{earlier:.9},{}", numbers(&rows[row + 3]));
+        }
+        let text = rows.join("\n") + "\n";
+        let change = |what: &dyn Fn(usize, &str) -> String| -> String {
+            text.lines()
+                .enumerate()
+                .map(|(number, line)| what(number, line) + "\n")
+                .collect()
+        };
+        let without_stamp = |line: &str| {
+            line.find(',')
+                .map_or(String::new(), |comma| line[comma..].to_owned())
+        };
+        let cases = [
+            ("as it is", text.clone()),
+            ("no end of line at its end", text.trim_end().to_owned()),
+            (
+                "carriage returns, blank lines",
+                format!("\n\r\n{}", text.replace('\n', "\r\n\n")),
+            ),
+            ("old ends of lines", text.replace('\n', "\r")),
+            (
+                "old ends of lines but the last",
+                text.trim_end().replace('\n', "\r") + "\n",
+            ),
+            (
+                "contacts, bad rows and quality",
+                change(&|number, line| match number {
+                    0 => format!(
+                        "{line},contact/hand/active,l_arm_ft_sensor/quality,l_elbow/quality,\
+                         what/is/this"
+                    ),
+                    _ if number % 17 == 3 => "no row".into(),
+                    _ if number % 9 == 4 => {
+                        format!("{line},{},0,{},", number % 2, 2 * (number % 3))
+                    }
+                    _ => format!("{line},,,,1"),
+                }),
+            ),
+            (
+                "a quoted cell of two lines",
+                change(&|number, line| match number {
+                    0 => format!("{line},note"),
+                    200 => format!("{line},\"one\n1,2,3\""),
+                    _ => format!("{line},"),
+                }),
+            ),
+            ("quoted names", text.replacen('t', "\"t\"", 1)),
+            (
+                "no stamps",
+                change(&|number, line| {
+                    if number == 0 {
+                        line.into()
+                    } else {
+                        without_stamp(line)
+                    }
+                }),
+            ),
+            (
+                "stamps that end",
+                change(&|number, line| {
+                    if number < 250 {
+                        line.into()
+                    } else {
+                        without_stamp(line)
+                    }
+                }),
+            ),
+            ("no rows", text.lines().take(1).collect()),
+            (
+                "no good row",
+                change(&|number, line| if number == 0 { line.into() } else { "x".into() }),
+            ),
+            ("nothing", String::new()),
+        ];
+        for (what, log) in cases {
+            let told = |read: Result<Recording, ReadingError>| match read {
+                Ok(recording) => format!("{recording:?}"),
+                Err(error) => error.to_string(),
+            };
+            let expected = told(read_whole(&robot, &log));
+            for (block, segment) in [(700, 300), (5000, 1), (5000, 900), (BLOCK, SEGMENT)] {
+                let own = told(read_in_segments(&robot, log.as_bytes(), block, segment));
+                assert!(
+                    own == expected,
+                    "{what}, {block}, {segment}: {own:.300} instead of {expected:.300}"
+                );
+            }
+        }
+    }
+}

@@ -1,0 +1,1180 @@
+//! Tests of `Dataset`: synthetic logs of a small arm with known truth, with one defect at a time;
+//! and recorded logs where they are available.
+
+#![allow(
+    clippy::needless_range_loop,
+    clippy::semicolon_if_nothing_returned,
+    reason = "a joint's number counts in several tables; changes of a log are one expression each"
+)]
+
+use proprio_dynamics::model::Model;
+use proprio_dynamics::spatial::{RigidInertia, Wrench};
+use proprio_dynamics::{InverseDynamics, JointState, Kinematics};
+use proprio_estimator::config::Config;
+use proprio_estimator::differentiate::{Settings as WindowSettings, Window};
+use proprio_estimator::reading;
+use proprio_estimator::setup::Setup;
+use proprio_identification::dataset::defects::Defect;
+use proprio_identification::dataset::observation::Observation;
+use proprio_identification::dataset::smooth::{Scratch, Smoother};
+use proprio_identification::robot::BaseMotion;
+use proprio_identification::{Dataset, Robot, Role, Severity};
+use proprio_topics::{Nanos, Quality, Reason};
+use std::path::{Path, PathBuf};
+
+const URDF: &str = r#"<robot name="arm">
+  <link name="base">
+    <inertial><mass value="5"/><inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/>
+    </inertial>
+  </link>
+  <link name="upper">
+    <inertial><origin xyz="0.02 0.01 -0.1"/><mass value="2"/>
+    <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.01"/></inertial>
+  </link>
+  <link name="lower">
+    <inertial><origin xyz="0.01 0.03 -0.12"/><mass value="1.5"/>
+    <inertia ixx="0.015" ixy="0" ixz="0" iyy="0.015" iyz="0" izz="0.004"/></inertial>
+  </link>
+  <link name="hand">
+    <inertial><origin xyz="0.05 0 -0.05"/><mass value="0.8"/>
+    <inertia ixx="0.003" ixy="0" ixz="0" iyy="0.003" iyz="0" izz="0.002"/></inertial>
+  </link>
+  <joint name="shoulder" type="revolute">
+    <origin xyz="0 0 0.3"/><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="50" velocity="5"/>
+  </joint>
+  <joint name="ft" type="fixed">
+    <origin xyz="0 0 -0.2"/><parent link="upper"/><child link="lower"/>
+  </joint>
+  <joint name="elbow" type="revolute">
+    <origin xyz="0 0 -0.25"/><parent link="lower"/><child link="hand"/><axis xyz="1 0 0"/>
+    <limit lower="-2" upper="2" effort="50" velocity="5"/>
+  </joint>
+</robot>"#;
+
+fn robot(more: &str) -> Robot {
+    let text = format!(
+        "schema = 1\nrobot = \"arm\"\nmodel = \"arm.urdf\"\n[base]\nkind = \"fixed\"\nlink = \
+         \"base\"\n[[force_torque]]\nsensor = \"ft\"\njoint = \"ft\"\n{more}"
+    );
+    let config = Config::parse(&text).expect("a configuration");
+    Setup::with_model(&config, Model::from_urdf(URDF, &["ft"]).expect("a model"))
+        .expect("a setup")
+        .robot
+}
+
+/// SplitMix64.
+struct Random(u64);
+
+impl Random {
+    fn unit(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
+    /// Standard normal (Box and Muller).
+    fn normal(&mut self) -> f64 {
+        (-2.0 * self.unit().max(1e-300).ln()).sqrt() * (std::f64::consts::TAU * self.unit()).cos()
+    }
+}
+
+/// Position, velocity, acceleration of a joint at a time \[rad, s\]: sums of sines. The shoulder
+/// begins slowly after one second at rest.
+fn motion(joint: usize, t: f64) -> [f64; 3] {
+    let sines: [(f64, f64, f64); 3] = if joint == 0 {
+        [(0.6, 0.21, 0.3), (0.3, 0.47, 1.1), (0.12, 0.83, 2.0)]
+    } else {
+        [(0.5, 0.31, 1.9), (0.35, 0.53, 0.2), (0.1, 0.91, 0.9)]
+    };
+    let mut sum = [0.0; 3];
+    for (amplitude, hertz, phase) in sines {
+        let omega = std::f64::consts::TAU * hertz;
+        let angle = omega * t + phase;
+        sum[0] += amplitude * angle.sin();
+        sum[1] += amplitude * omega * angle.cos();
+        sum[2] -= amplitude * omega * omega * angle.sin();
+    }
+    sum
+}
+
+/// The reading of the F/T sensor, and the joint torques, at a time \[s\].
+fn truth(robot: &Robot, t: f64) -> (Wrench, Vec<f64>) {
+    truth_of(robot, [motion(0, t), motion(1, t)])
+}
+
+/// The same in any state.
+fn truth_of(robot: &Robot, states: [[f64; 3]; 2]) -> (Wrench, Vec<f64>) {
+    let pick = |k: usize| states.map(|s| s[k]);
+    let BaseMotion::Standing(base) = robot.base else {
+        panic!("a fixed base")
+    };
+    let mut kinematics = Kinematics::new(&robot.model, robot.base_link).unwrap();
+    let (position, velocity, acceleration) = (pick(0), pick(1), pick(2));
+    let state = JointState {
+        position: &position,
+        velocity: &velocity,
+        acceleration: &acceleration,
+    };
+    kinematics.update(&robot.model, state, &base).unwrap();
+    let mut dynamics = InverseDynamics::new(&robot.model);
+    dynamics.update(&robot.model, &kinematics, &[]).unwrap();
+    let cut = robot.structure.sensors()[0];
+    (
+        cut.reading(&dynamics.transmitted(&kinematics, cut.joint())),
+        dynamics.torque().to_vec(),
+    )
+}
+
+/// A log as a table of numbers: stamps in nanoseconds, NaN where a cell is empty.
+#[derive(Clone)]
+struct Table {
+    header: Vec<String>,
+    rows: Vec<(i64, Vec<f64>)>,
+}
+
+impl Table {
+    fn text(&self) -> String {
+        let mut text = format!("t,{}\n", self.header.join(","));
+        for (t, row) in &self.rows {
+            text += &Nanos(*t).to_string();
+            for v in row {
+                text += &if v.is_nan() {
+                    ",".to_owned()
+                } else {
+                    format!(",{v}")
+                };
+            }
+            text.push('\n');
+        }
+        text
+    }
+
+    fn dataset(&self, robot: &Robot) -> Dataset {
+        read(robot, self.text().as_bytes())
+    }
+
+    /// All its defects, including the offset jumps.
+    fn defects(&self, robot: &Robot) -> Vec<Defect> {
+        let dataset = self.dataset(robot);
+        all_defects(&dataset).into_iter().cloned().collect()
+    }
+}
+
+fn read(robot: &Robot, log: impl std::io::Read) -> Dataset {
+    reading::dataset(robot, "log", Role::Train, log).expect("a log")
+}
+
+const COLUMNS: [&str; 8] = [
+    "joint/shoulder/position",
+    "joint/elbow/position",
+    "wrench/ft/fx",
+    "wrench/ft/fy",
+    "wrench/ft/fz",
+    "wrench/ft/tx",
+    "wrench/ft/ty",
+    "wrench/ft/tz",
+];
+const QUANTUM: f64 = 9.6e-4;
+const OFFSET: [f64; 6] = [12.0, -35.0, 80.0, 1.1, -0.4, 0.7];
+
+/// Encoders with a coarse quantum and an F/T sensor with noise and offset, at `rate` \[Hz\], stamps
+/// that jitter by up to `jitter` of a period; F/T stamps are `late` \[s\]. Encoders and F/T have
+/// rows of their own, as buses are read.
+fn log(robot: &Robot, seconds: f64, rate: f64, jitter: f64, late: f64, seed: u64) -> Table {
+    log_of(robot, motion, seconds, rate, jitter, late, seed)
+}
+
+/// The same with any motion.
+fn log_of(
+    robot: &Robot,
+    motion: impl Fn(usize, f64) -> [f64; 3],
+    seconds: f64,
+    rate: f64,
+    jitter: f64,
+    late: f64,
+    seed: u64,
+) -> Table {
+    let mut random = Random(seed);
+    let (mut rows, count) = (Vec::new(), (seconds * rate) as usize);
+    for i in 0..count {
+        let mut stamp = |phase: f64| (i as f64 + phase + jitter * (random.unit() - 0.5)) / rate;
+        let (encoder, wrench) = (stamp(0.2), stamp(0.6));
+        let mut row = vec![f64::NAN; 8];
+        for joint in 0..2 {
+            row[joint] = (motion(joint, encoder)[0] / QUANTUM).round() * QUANTUM;
+        }
+        rows.push(((encoder * 1e9) as i64, row));
+        let (reading, _) = truth_of(robot, [motion(0, wrench), motion(1, wrench)]);
+        let noise = [0.08, 0.09, 0.18, 0.002, 0.003, 0.0015];
+        let mut row = vec![f64::NAN; 8];
+        for (k, value) in reading.force_first().into_iter().enumerate() {
+            row[2 + k] = value + OFFSET[k] + noise[k] * random.normal();
+        }
+        rows.push((((wrench + late) * 1e9) as i64, row));
+    }
+    rows.sort_by_key(|(t, _)| *t);
+    Table {
+        header: COLUMNS.map(str::to_owned).to_vec(),
+        rows,
+    }
+}
+
+/// In a log with large gaps and separate rows for torques, the rate is that of the torques while
+/// they are present.
+#[test]
+fn torques_rate_is_that_while_they_are_there() {
+    let robot = robot("");
+    let table = |period: i64| Table {
+        header: [COLUMNS[0], COLUMNS[1], "joint/shoulder/torque"]
+            .map(str::to_owned)
+            .to_vec(),
+        rows: (0..20_000_i64)
+            .filter(|i| i % 5000 < 1750)
+            .flat_map(|i| {
+                let q = motion(0, 1e-9 * (i * period) as f64)[0];
+                let encoders = (i * period, vec![q, 0.5 * q, f64::NAN]);
+                [
+                    encoders,
+                    (i * period + 300_000, vec![f64::NAN, f64::NAN, 3.0 * q]),
+                ]
+            })
+            .collect(),
+    };
+    for (period, expected) in [(1_000_000, 1000.0), (4_000_000, 250.0)] {
+        let found = table(period).dataset(&robot).torque_rate();
+        assert!((found / expected - 1.0).abs() < 1e-3, "{found}");
+    }
+    let none = log(&robot, 2.0, 1000.0, 0.0, 0.0, 1)
+        .dataset(&robot)
+        .torque_rate();
+    assert_eq!(none, 0.0);
+}
+
+fn rms(errors: impl Iterator<Item = f64>) -> f64 {
+    let (sum, count) = errors.fold((0.0, 0.0), |(s, n), e| (s + e * e, n + 1.0));
+    (sum / count).sqrt()
+}
+
+/// Errors of velocity and acceleration, of the smoother and of the causal window, on one quantised
+/// signal.
+fn against_causal(
+    stamps: &[f64],
+    quantum: f64,
+    signal: impl Fn(f64) -> [f64; 3],
+) -> ([f64; 2], [f64; 2]) {
+    let nanos: Vec<Nanos> = stamps.iter().map(|t| Nanos::from_seconds(*t)).collect();
+    let values: Vec<f64> = stamps
+        .iter()
+        .map(|t| (signal(*t)[0] / quantum).round() * quantum)
+        .collect();
+    let smoother = Smoother::new(&nanos, &values, Nanos::from_millis(50));
+    let mut scratch = Scratch::default();
+    let mut window = Window::<1>::new(WindowSettings::new(0.5 * quantum)).unwrap();
+    let (mut ours, mut causal) = ([Vec::new(), Vec::new()], [Vec::new(), Vec::new()]);
+    for (t, value) in nanos.iter().zip(&values) {
+        window.push(*t, [*value]).unwrap();
+        let truth = signal(t.seconds());
+        if let (Ok(estimate), true) = (window.at(*t), t.seconds() > 1.3) {
+            causal[0].push(estimate.first[0] - truth[1]);
+            causal[1].push(estimate.second[0] - truth[2]);
+        }
+        if let Some(estimate) = smoother.at(*t, 1..=2, 0.3, &mut scratch) {
+            ours[0].push(estimate[1] - truth[1]);
+            ours[1].push(estimate[2] - truth[2]);
+        }
+    }
+    assert!(ours[0].len() > stamps.len() / 2 && causal[0].len() > stamps.len() / 2);
+    (
+        ours.map(|e| rms(e.into_iter())),
+        causal.map(|e| rms(e.into_iter())),
+    )
+}
+
+#[test]
+fn derivatives_are_far_better_than_with_the_past_alone() {
+    let sine = |t: f64| {
+        let omega = std::f64::consts::PI;
+        [
+            20.0 * (omega * t).sin(),
+            20.0 * omega * (omega * t).cos(),
+            -20.0 * omega * omega * (omega * t).sin(),
+        ]
+    };
+    let degrees = |t: f64| motion(0, t).map(f64::to_degrees);
+    let regular = |rate: f64, seconds: f64| -> Vec<f64> {
+        (0..(rate * seconds) as usize)
+            .map(|i| i as f64 / rate)
+            .collect()
+    };
+    let mut random = Random(4);
+    let mut t = 0.0;
+    let jittering: Vec<f64> = (0..1500)
+        .map(|_| {
+            t += 0.005 + 0.012 * random.unit();
+            t
+        })
+        .collect();
+    // Errors of velocity and acceleration [deg/s, deg/s^2] that must not be exceeded.
+    for (name, (ours, causal), most) in [
+        (
+            "sine",
+            against_causal(&regular(100.0, 12.0), 0.055, sine),
+            [0.06, 1.2],
+        ),
+        (
+            "arm",
+            against_causal(&regular(100.0, 12.0), 0.055, degrees),
+            [0.06, 1.5],
+        ),
+        (
+            "arm, jitter",
+            against_causal(&jittering, 0.088, degrees),
+            [0.12, 2.5],
+        ),
+        (
+            "arm, 1 kHz",
+            against_causal(&regular(1000.0, 6.0), 5.5e-5, degrees),
+            [1e-3, 0.02],
+        ),
+    ] {
+        println!(
+            "{name}: velocity {:.3e}, causal {:.3e} deg/s; acceleration {:.3e}, causal {:.3e} \
+             deg/s^2",
+            ours[0], causal[0], ours[1], causal[1]
+        );
+        for m in 0..2 {
+            assert!(ours[m] < most[m], "{name}: {} exceeds {}", ours[m], most[m]);
+            assert!(
+                ours[m] < 0.4 * causal[m],
+                "{name}: {} is not much better than {}",
+                ours[m],
+                causal[m]
+            );
+        }
+    }
+}
+
+#[test]
+fn a_quintic_is_reproduced_on_any_stamps() {
+    let mut random = Random(2);
+    let mut t = 0.0;
+    let stamps: Vec<Nanos> = (0..300)
+        .map(|_| {
+            t += 0.004 + 0.01 * random.unit();
+            Nanos::from_seconds(t)
+        })
+        .collect();
+    let of = |t: f64| {
+        let u = t - 1.0;
+        [
+            0.3 + 0.7 * u - 0.4 * u.powi(2) + 0.2 * u.powi(3) - 0.1 * u.powi(4) + 0.05 * u.powi(5),
+            0.7 - 0.8 * u + 0.6 * u.powi(2) - 0.4 * u.powi(3) + 0.25 * u.powi(4),
+            -0.8 + 1.2 * u - 1.2 * u.powi(2) + u.powi(3),
+        ]
+    };
+    let values: Vec<f64> = stamps.iter().map(|t| of(t.seconds())[0]).collect();
+    let smoother = Smoother::new(&stamps, &values, Nanos::from_millis(50));
+    assert!(smoother.sigma() < 1e-9);
+    let scratch = &mut Scratch::default();
+    for i in 0..20 {
+        let t = Nanos::from_seconds(0.5 + 0.07 * f64::from(i));
+        let estimates = smoother.at(t, 0..=2, 0.3, scratch).unwrap();
+        for (m, tolerance) in [(0, 1e-9), (1, 1e-7), (2, 1e-5)] {
+            let (estimate, exact) = (estimates[m], of(t.seconds())[m]);
+            // Alone as well as with the others.
+            assert_eq!(smoother.at(t, m..=m, 0.3, scratch).unwrap()[m], estimate);
+            assert!(
+                (estimate - exact).abs() < tolerance,
+                "derivative {m} at {t}: {estimate} instead of {exact}"
+            );
+        }
+    }
+    assert_eq!(
+        smoother.at(Nanos::from_seconds(0.02), 2..=2, 0.3, scratch),
+        None
+    );
+}
+
+#[test]
+fn a_clean_log_has_no_defects_and_its_instants_are_true() {
+    let robot = robot("");
+    for (rate, jitter) in [(100.0, 0.5), (500.0, 0.3)] {
+        let instants = log(&robot, 20.0, rate, jitter, 0.0, 7).dataset(&robot);
+        assert_eq!(instants.defects(), []);
+        assert_eq!(instants.breaks(), []);
+        let usable: Vec<&Observation> = instants
+            .observations()
+            .iter()
+            .filter(|i| i.faults.iter().all(|f| *f == Reason::None))
+            .collect();
+        assert!(
+            usable.len() > 1920,
+            "{} of {}",
+            usable.len(),
+            instants.observations().len()
+        );
+        let of = |f: &dyn Fn(&Observation) -> f64| rms(usable.iter().map(|i| f(i)));
+        for joint in 0..2 {
+            let truth = |i: &Observation| motion(joint, i.t.seconds());
+            let position = of(&|i| i.position[joint] - truth(i)[0]);
+            let velocity = of(&|i| i.velocity[joint] - truth(i)[1]);
+            let acceleration = of(&|i| i.acceleration[joint] - truth(i)[2]);
+            println!(
+                "{rate} Hz, joint {joint}: {position:.2e} rad, {velocity:.2e} rad/s, \
+                 {acceleration:.2e} rad/s^2"
+            );
+            assert!(
+                position < 0.5 * QUANTUM / 12_f64.sqrt() && velocity < 2e-3 && acceleration < 0.03
+            );
+        }
+        // An average of five samples has less than half the noise of one; an interpolation never
+        // has more.
+        for (k, (noise, offset)) in [0.08, 0.09, 0.18, 0.002, 0.003, 0.0015]
+            .into_iter()
+            .zip(OFFSET)
+            .enumerate()
+        {
+            let error = of(&|i| {
+                i.readings[0].force_first()[k]
+                    - offset
+                    - truth(&robot, i.t.seconds()).0.force_first()[k]
+            });
+            assert!(
+                error < noise * if rate > 100.0 { 0.55 } else { 1.05 },
+                "{rate} Hz, axis {k}: {error}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_log_that_holds_everything_is_used_row_by_row() {
+    let robot = robot("");
+    let mut header = COLUMNS.map(str::to_owned).to_vec();
+    for joint in ["shoulder", "elbow"] {
+        header.extend(["velocity", "acceleration", "torque"].map(|q| format!("joint/{joint}/{q}")));
+    }
+    let rows: Vec<(i64, Vec<f64>)> = (0..400)
+        .map(|i| {
+            let t = f64::from(i) * 0.01;
+            let (reading, torque) = truth(&robot, t);
+            let mut row = vec![motion(0, t)[0], motion(1, t)[0]];
+            row.extend(reading.force_first());
+            for joint in 0..2 {
+                row.extend([motion(joint, t)[1], motion(joint, t)[2], torque[joint]]);
+            }
+            (i64::from(i) * 10_000_000, row)
+        })
+        .collect();
+    let table = Table { header, rows };
+    let check = |instants: &Dataset| {
+        assert_eq!(all_defects(instants), [] as [&Defect; 0]);
+        assert_eq!(instants.observations().len(), table.rows.len());
+        for (instant, (_, row)) in instants.observations().iter().zip(&table.rows) {
+            assert!(instant.faults.iter().all(|f| *f == Reason::None));
+            let mut held = instant.position.clone();
+            held.extend(instant.readings[0].force_first());
+            for joint in 0..2 {
+                held.extend([
+                    instant.velocity[joint],
+                    instant.acceleration[joint],
+                    instant.torque[joint],
+                ]);
+            }
+            assert_eq!(&held, row);
+        }
+    };
+    check(&table.dataset(&robot));
+    // Rows that the recorder repeated, with the same stamp or a new one.
+    let mut again = table.clone();
+    for at in [350, 200, 120, 119, 70] {
+        let (t, row) = again.rows[at].clone();
+        again
+            .rows
+            .insert(at + 1, (t + if at > 150 { 0 } else { 3_000_000 }, row));
+    }
+    let recording = again.dataset(&robot);
+    assert_eq!(
+        recording.defects(),
+        [Defect::RepeatedRows {
+            rows: 5,
+            first: Nanos(703_000_000)
+        }]
+    );
+    assert_eq!(recording.observations().len(), table.rows.len());
+    // The same without stamps.
+    let text: String = table
+        .text()
+        .lines()
+        .enumerate()
+        .map(|(i, l)| {
+            if i == 0 {
+                format!("{l}\n")
+            } else {
+                format!(",{}\n", l.split_once(',').unwrap().1)
+            }
+        })
+        .collect();
+    let recording = read(&robot, text.as_bytes());
+    check(&recording);
+}
+
+#[test]
+fn given_velocities_are_kept_and_differentiated() {
+    let robot = robot("");
+    let mut table = log(&robot, 10.0, 100.0, 0.0, 0.0, 1);
+    table
+        .header
+        .extend(["joint/shoulder/velocity", "joint/elbow/velocity"].map(str::to_owned));
+    for (t, row) in &mut table.rows {
+        let given = (0..2).map(|j| {
+            if row[0].is_nan() {
+                f64::NAN
+            } else {
+                motion(j, Nanos(*t).seconds())[1]
+            }
+        });
+        row.extend(given.collect::<Vec<_>>());
+    }
+    let instants = table.dataset(&robot);
+    assert_eq!(all_defects(&instants), [] as [&Defect; 0]);
+    let usable = instants
+        .observations()
+        .iter()
+        .filter(|i| i.has_motion(&robot.channels));
+    let errors: Vec<[f64; 2]> = usable
+        .map(|i| {
+            [
+                i.velocity[1] - motion(1, i.t.seconds())[1],
+                i.acceleration[1] - motion(1, i.t.seconds())[2],
+            ]
+        })
+        .collect();
+    assert!(errors.len() > 900);
+    let [velocity, acceleration] = [0, 1].map(|k| rms(errors.iter().map(|e| e[k])));
+    println!("{velocity:.2e} {acceleration:.2e}");
+    // The error of a linear interpolation between samples 10 ms apart is up to dt^2 / 8 times the
+    // second derivative, 1e-3 here.
+    assert!(velocity < 1e-6 && acceleration < 1e-5);
+}
+
+/// The defects, including the offset jumps.
+fn all_defects(instants: &Dataset) -> Vec<&Defect> {
+    instants
+        .defects()
+        .iter()
+        .chain(instants.breaks().iter().map(|b| &b.jump))
+        .collect()
+}
+
+/// The kind of a defect, without its numbers.
+fn kind(defect: &Defect) -> &'static str {
+    match defect {
+        Defect::SkippedRows { .. } => "skipped rows",
+        Defect::NeverSeen { .. } => "never seen",
+        Defect::RepeatedRows { .. } => "repeated rows",
+        Defect::Repeated { .. } => "repeated",
+        Defect::Stamps { .. } => "stamps",
+        Defect::Gaps { .. } => "gaps",
+        Defect::Frozen { .. } => "frozen",
+        Defect::Still { .. } => "still",
+        Defect::Saturated { .. } => "saturated",
+        Defect::WrongUnits { .. } => "units",
+        Defect::Derivative { .. } => "derivative",
+        Defect::NoMotion { .. } => "no motion",
+        Defect::TooShort { .. } => "too short",
+        Defect::Jump { .. } => "jump",
+        Defect::Outliers { .. } => "outliers",
+        _ => "other",
+    }
+}
+
+#[test]
+fn each_defect_put_into_a_clean_log_is_found_and_nothing_else() {
+    let robot = robot("");
+    let clean = log(&robot, 20.0, 100.0, 0.3, 0.0, 11);
+    let with = |change: &dyn Fn(&mut Table)| {
+        let mut table = clean.clone();
+        change(&mut table);
+        table
+    };
+    let is_wrench = |row: &[f64]| !row[2].is_nan();
+    let second = 1_000_000_000;
+    let between =
+        move |t: i64, low: i64, high: i64| t >= low * second / 10 && t < high * second / 10;
+    let each = |table: &mut Table, f: &mut dyn FnMut(i64, &mut [f64])| {
+        table.rows.iter_mut().for_each(|(t, row)| f(*t, row))
+    };
+    // (what, the change, the kinds found, a part of the sentence)
+    type Change<'a> = Box<dyn Fn(&mut Table) + 'a>;
+    let cases: Vec<(&str, Change<'_>, &[&str], &str)> = vec![
+        (
+            "a gap of all",
+            Box::new(|t| t.rows.retain(|(t, _)| !between(*t, 80, 83))),
+            &["gaps"],
+            "every channel has no samples for 0.3",
+        ),
+        (
+            "a gap of the sensor",
+            Box::new(|t| {
+                t.rows
+                    .retain(|(t, r)| !(is_wrench(r) && between(*t, 80, 84)))
+            }),
+            &["gaps"],
+            "wrench/ft has no samples for 0.4",
+        ),
+        (
+            "a sensor that ends",
+            Box::new(|t| t.rows.retain(|(t, r)| !(is_wrench(r) && *t > 12 * second))),
+            &["gaps"],
+            "wrench/ft has no samples for 7.99",
+        ),
+        (
+            "infinite",
+            Box::new(|t| t.rows[500].1[0] = f64::INFINITY),
+            &["skipped rows"],
+            "1 rows can not be read and were skipped; the first: line 502",
+        ),
+        (
+            "rows written twice",
+            Box::new(|t| {
+                (0..5).for_each(|i| {
+                    let row = t.rows[600 + 40 * i].clone();
+                    t.rows.insert(600 + 40 * i, row);
+                })
+            }),
+            &["repeated", "repeated"],
+            "repeats its last reading in",
+        ),
+        (
+            "a slow sensor",
+            Box::new(|t| {
+                let (mut last, mut odd) = (vec![], false);
+                each(t, &mut |_, r| {
+                    if is_wrench(r) {
+                        odd = !odd;
+                        if odd {
+                            last = r.to_vec()
+                        } else {
+                            r.copy_from_slice(&last)
+                        }
+                    }
+                });
+            }),
+            &["repeated"],
+            "wrench/ft repeats its last reading in 1000 of 2000",
+        ),
+        (
+            "a frozen sensor",
+            Box::new(|t| {
+                let mut last: Option<Vec<f64>> = None;
+                each(t, &mut |t, r| {
+                    if is_wrench(r) && between(t, 100, 120) {
+                        let held = last.get_or_insert_with(|| r.to_vec());
+                        r.copy_from_slice(held)
+                    }
+                });
+            }),
+            &["frozen"],
+            "wrench/ft does not change from",
+        ),
+        (
+            "a dead sensor",
+            Box::new(|t| {
+                each(t, &mut |_, r| {
+                    if is_wrench(r) {
+                        r[2..].copy_from_slice(&OFFSET)
+                    }
+                })
+            }),
+            &["frozen"],
+            "wrench/ft does not change from",
+        ),
+        (
+            "a dead encoder",
+            Box::new(|t| {
+                let mut last: Option<f64> = None;
+                each(t, &mut |t, r| {
+                    if !r[0].is_nan() && between(t, 100, 120) {
+                        r[0] = *last.get_or_insert(r[0])
+                    }
+                });
+            }),
+            &["frozen"],
+            "joint/shoulder does not change from",
+        ),
+        (
+            "a joint that stands still",
+            Box::new(|t| {
+                each(t, &mut |_, r| {
+                    if !r[0].is_nan() {
+                        r[1] = 0.25
+                    }
+                })
+            }),
+            &["still"],
+            "joint/elbow never changes",
+        ),
+        (
+            "stamps that go backward",
+            Box::new(|t| (0..6).for_each(|i| t.rows[1000 + i].0 -= second)),
+            &["stamps", "stamps"],
+            "joint/shoulder, joint/elbow: 0 stamps occur twice and 3 go backward",
+        ),
+        (
+            "one stamp far ahead",
+            Box::new(|t| t.rows[1000].0 += 1000 * second),
+            &["stamps"],
+            "1 go backward",
+        ),
+        (
+            "a saturated axis",
+            Box::new(|t| {
+                each(t, &mut |_, r| {
+                    if is_wrench(r) {
+                        r[2] = r[2].min(25.0)
+                    }
+                })
+            }),
+            &["saturated"],
+            "fx is saturated at 25",
+        ),
+        (
+            "counts",
+            Box::new(|t| each(t, &mut |_, r| r[2..].iter_mut().for_each(|v| *v *= 1000.0))),
+            &["units"],
+            "counts or thousandths",
+        ),
+        (
+            "degrees",
+            Box::new(|t| {
+                each(t, &mut |_, r| {
+                    r[..2].iter_mut().for_each(|v| *v = v.to_degrees())
+                })
+            }),
+            &["units"],
+            "convert all joints to radians",
+        ),
+        (
+            "no motion",
+            Box::new(|t| {
+                each(t, &mut |_, r| {
+                    if !r[0].is_nan() {
+                        (r[0], r[1]) = (0.1, 0.2)
+                    }
+                })
+            }),
+            &["no motion", "still", "still"],
+            "no joint moves",
+        ),
+        (
+            "too short",
+            Box::new(|t| t.rows.truncate(300)),
+            &["too short"],
+            "the log of 1.",
+        ),
+        (
+            "a jump",
+            Box::new(|t| {
+                each(t, &mut |t, r| {
+                    if t > 9 * second {
+                        r[2] += 3.0
+                    }
+                })
+            }),
+            &["jump"],
+            "wrench/ft: fx jumps by 3.",
+        ),
+        (
+            "a slide",
+            Box::new(|t| {
+                each(t, &mut |t, r| {
+                    r[3] += 40.0 * ((t - 9 * second) as f64 / (0.3 * second as f64)).clamp(0.0, 1.0)
+                })
+            }),
+            &["jump"],
+            "wrench/ft: fy jumps by ",
+        ),
+        (
+            "blows",
+            Box::new(|t| {
+                each(t, &mut |t, r| {
+                    if between(t, 90, 91) && t % second < 30_000_000 {
+                        r[4] += 9.0
+                    }
+                })
+            }),
+            &["outliers"],
+            "samples of fz are outliers",
+        ),
+        (
+            "ticks of the encoder",
+            Box::new(|t| {
+                for i in [400, 900, 1300] {
+                    let row = (i..).find(|i| !t.rows[*i].1[0].is_nan()).unwrap();
+                    t.rows[row].1[1] += 0.15;
+                }
+            }),
+            &["outliers"],
+            "joint/elbow: 3 samples of position",
+        ),
+        (
+            "an unrecorded sensor",
+            Box::new(|t| each(t, &mut |_, r| r[2..].fill(f64::NAN))),
+            &["never seen"],
+            "wrench/ft is in the configuration but",
+        ),
+    ];
+    let mut failures = Vec::new();
+    for (name, change, kinds, sentence) in cases {
+        let defects = with(&*change).defects(&robot);
+        let sentences: Vec<String> = defects.iter().map(ToString::to_string).collect();
+        let mut found: Vec<&str> = defects.iter().map(kind).collect();
+        found.sort_unstable();
+        if found != kinds || !sentences.iter().any(|s| s.contains(sentence)) {
+            failures.push(format!("{name}: {sentences:#?}"));
+        }
+    }
+    assert!(failures.is_empty(), "{}", failures.join("\n"));
+}
+
+/// An extreme that is reached slowly, in coarse steps, is as flat as a saturated one. The same
+/// holds for a joint that stops there, and for a torque that is measured more slowly than recorded.
+#[test]
+fn what_turns_round_or_rests_at_its_extreme_is_not_saturated_and_what_is_cut_off_is() {
+    /// The findings on fx and on the elbow's torque, in half a minute of two joints that swing
+    /// together, with stops if their range is below one. Both are the given functions of the joint
+    /// positions, in steps of 1/200 and 1/2000 of their range.
+    fn told(
+        hertz: f64,
+        furthest: f64,
+        torque: impl Fn(usize, f64) -> f64,
+        force: impl Fn(f64) -> f64,
+    ) -> Vec<String> {
+        let mut random = Random(3);
+        let rows = (0..3000_usize).map(|i| {
+            let x = (std::f64::consts::TAU * hertz * 0.01 * i as f64)
+                .sin()
+                .clamp(-furthest, furthest);
+            let mut row = vec![1.8 * x, 1.4 * x, 0.1 * (100.0 * force(x)).round()];
+            row.extend((0..5).map(|k| OFFSET[k] + 10.0 * x + 0.1 * random.normal()));
+            row.push(0.004 * (1000.0 * torque(i, x)).round());
+            (10_000_000 * i as i64, row)
+        });
+        let table = Table {
+            header: COLUMNS
+                .into_iter()
+                .chain(["joint/elbow/torque"])
+                .map(str::to_owned)
+                .collect(),
+            rows: rows.collect(),
+        };
+        let recording = table.dataset(&robot(""));
+        let flat = |d: &&Defect| matches!(d, Defect::Saturated { .. } | Defect::Frozen { .. });
+        recording
+            .defects()
+            .iter()
+            .filter(flat)
+            .map(ToString::to_string)
+            .collect()
+    }
+    let none: [String; 0] = [];
+    for hertz in [0.1, 0.2, 1.0] {
+        assert_eq!(
+            told(hertz, 1.0, |_, x| x, |x| x),
+            none,
+            "turns round at {hertz} Hz"
+        );
+    }
+    assert_eq!(told(0.05, 0.6, |_, x| x, |x| x), none, "rests");
+    // The gravity load of a link, largest while the joint passes that position.
+    assert_eq!(
+        told(0.02, 1.0, |_, x| (1.8 * x).cos(), |x| x),
+        none,
+        "passes"
+    );
+    // Every eighth sample is a new one.
+    let held = |i: usize, _: f64| (std::f64::consts::TAU * 0.6 * 0.08 * (i / 8) as f64).cos();
+    assert_eq!(told(0.2, 1.0, held, |x| x), none, "is slow");
+    for limit in [0.95, 0.9, 0.85] {
+        let found = told(1.0, 1.0, |_, x| x.max(-limit), |x| x.min(limit));
+        for (name, value) in [
+            ("joint/elbow: torque", -0.004 * (1000.0 * limit)),
+            ("wrench/ft: fx", 0.1 * (100.0 * limit)),
+        ] {
+            let expected = format!("{name} is saturated at {value}");
+            assert!(
+                found.iter().any(|told| told.starts_with(&expected)),
+                "{expected}: {found:?}"
+            );
+        }
+        assert_eq!(found.len(), 2, "{found:?}");
+    }
+}
+
+#[test]
+fn gating_follows_contacts_quality_and_edges() {
+    let robot = robot("[[contact]]\nlink = \"hand\"\npresence = \"possible\"");
+    let mut table = log(&robot, 10.0, 100.0, 0.0, 0.0, 3);
+    table
+        .header
+        .extend(["contact/hand/active", "ft/quality"].map(str::to_owned));
+    for (t, row) in &mut table.rows {
+        let touched = *t >= 4_000_000_000 && *t < 6_000_000_000;
+        let saturated = *t >= 7_000_000_000 && *t < 7_100_000_000 && !row[2].is_nan();
+        // A touch pulls with 20 N.
+        row[4] += if touched { 20.0 } else { 0.0 };
+        row.extend([
+            f64::from(touched),
+            if row[2].is_nan() {
+                f64::NAN
+            } else {
+                f64::from(Quality::SATURATED.0 * u32::from(saturated))
+            },
+        ]);
+    }
+    let instants = table.dataset(&robot);
+    let defects = all_defects(&instants);
+    let kinds: Vec<&str> = defects.iter().map(|defect| kind(defect)).collect();
+    assert_eq!(kinds, ["saturated"], "{defects:#?}");
+    let sensor = robot.channels.iter().position(|c| c.name == "ft").unwrap();
+    let joint = robot
+        .channels
+        .iter()
+        .position(|c| c.name == "elbow")
+        .unwrap();
+    for instant in instants.observations() {
+        let t = instant.t.seconds();
+        assert_eq!(instant.active.contains(0), (4.0..6.0).contains(&t), "{t}");
+        assert_eq!(
+            instant.faults[sensor] == Reason::Saturated,
+            (6.99..7.11).contains(&t) && instant.readings[0].force.x.is_nan(),
+            "{t}"
+        );
+        if (7.0..7.1).contains(&t) {
+            assert_eq!(instant.faults[sensor], Reason::Saturated);
+        }
+        // At the ends a whole window is excluded, 0.3 s at most.
+        match instant.faults[joint] {
+            Reason::None => assert!((0.05..9.95).contains(&t), "{t}"),
+            fault => assert!(
+                fault == Reason::Starting && !(0.32..9.68).contains(&t)
+                    || !(0.01..=9.98).contains(&t),
+                "{t}: {fault}"
+            ),
+        }
+    }
+}
+
+#[test]
+fn an_imu_tells_how_the_base_moves() {
+    let text = "schema = 1\nrobot = \"arm\"\nmodel = \"arm.urdf\"\n[base]\nkind = \"imu\"\nsensor \
+                = \"chest\"\nlink = \"base\"\nxyz_m = [0.1, 0.0, 0.2]\n[[force_torque]]\nsensor = \
+                \"ft\"\njoint = \"ft\"";
+    let model = Model::from_urdf(URDF, &["ft"]).unwrap();
+    let robot = Setup::with_model(&Config::parse(text).unwrap(), model)
+        .unwrap()
+        .robot;
+    let fixed = self::robot("");
+    let mut table = log(&fixed, 10.0, 100.0, 0.2, 0.0, 5);
+    table
+        .header
+        .extend(["ax", "ay", "az", "gx", "gy", "gz"].map(|c| format!("imu/chest/{c}")));
+    let mut random = Random(9);
+    for (t, row) in &mut table.rows {
+        let t = Nanos(*t).seconds();
+        let there = row[2].is_nan();
+        let rate = [motion(0, t)[1], 0.1, motion(1, t)[1]];
+        let values = [0.3, -0.2, 9.7]
+            .into_iter()
+            .chain(rate.map(|r| r + 1e-3 * random.normal()));
+        row.extend(values.map(|v| {
+            if there {
+                v + 1e-4 * random.normal()
+            } else {
+                f64::NAN
+            }
+        }));
+    }
+    let instants = table.dataset(&robot);
+    let usable: Vec<&Observation> = instants
+        .observations()
+        .iter()
+        .filter(|i| i.has_motion(&robot.channels))
+        .collect();
+    assert!(usable.len() > 900);
+    let alpha = rms(usable
+        .iter()
+        .map(|i| i.base.angular_acceleration.x - motion(0, i.t.seconds())[2]));
+    let omega = rms(usable
+        .iter()
+        .map(|i| i.base.angular_velocity.z - motion(1, i.t.seconds())[1]));
+    println!("angular acceleration {alpha:.2e} rad/s^2, angular velocity {omega:.2e} rad/s");
+    assert!(alpha < 0.02 && omega < 5e-4);
+    for (_, row) in &mut table.rows {
+        row[8..11].iter_mut().for_each(|a| *a /= 9.80665);
+    }
+    let defects = table.dataset(&robot).defects().to_vec();
+    assert_eq!(
+        defects.iter().map(kind).collect::<Vec<_>>(),
+        ["units"],
+        "{defects:#?}"
+    );
+    assert!(
+        defects[0].to_string().contains("is not near 9.8"),
+        "{}",
+        defects[0]
+    );
+}
+
+/// A recorded log, or none if it is not available.
+fn data(file: &str) -> Option<PathBuf> {
+    let Some(folder) = std::env::var_os("PROPRIO_DATA") else {
+        println!("skipped: PROPRIO_DATA (recorded logs) is not set");
+        return None;
+    };
+    let path = Path::new(&folder).join(file);
+    if path.exists() {
+        return Some(path);
+    }
+    println!("skipped: there is no {}", path.display());
+    None
+}
+
+#[test]
+fn the_leg_of_a_real_icub_has_its_true_defects_and_no_others() {
+    let (Some(log), Some(models)) = (
+        data("icub_leg_24_44s.csv"),
+        std::env::var_os("PROPRIO_ICUB_MODELS"),
+    ) else {
+        println!("skipped: PROPRIO_DATA or PROPRIO_ICUB_MODELS is not set");
+        return;
+    };
+    let mut config = Config::load(
+        &Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/real_leg/estimator.toml"),
+    )
+    .unwrap();
+    config.model = Path::new(&models).join("iCubGenova02.urdf");
+    // The right foot is in the air.
+    config.contact.clear();
+    let robot = Setup::new(&config).unwrap().robot;
+    let instants = read(&robot, std::fs::File::open(log).unwrap());
+    instants
+        .defects()
+        .iter()
+        .for_each(|d| println!("{:?}: {d}", d.severity()));
+    println!(
+        "{} instants, breaks {:?}",
+        instants.observations().len(),
+        instants.breaks()
+    );
+    assert_eq!(instants.observations().len(), 1981);
+    let warnings: Vec<&Defect> = all_defects(&instants)
+        .into_iter()
+        .filter(|d| d.severity() > Severity::Note)
+        .collect();
+    // The left leg's board repeats one reading for nine seconds, and others now and then. All other
+    // streams have no defect.
+    let (left, right): (Vec<&Defect>, Vec<&Defect>) = warnings
+        .into_iter()
+        .partition(|d| d.to_string().contains("l_leg_ft_sensor"));
+    assert!(
+        left.iter()
+            .any(|d| matches!(d, Defect::Frozen { from, to, .. } if (*to - *from).seconds() > 9.0))
+    );
+    // The right hip stops abruptly: an outlier in the leg's sensor, and before it a force that no
+    // motion explains.
+    let leg = "wrench/r_leg_ft_sensor";
+    let blow = |d: &&Defect| {
+        matches!(d, Defect::Outliers { channel, t, .. }
+            if channel == leg && (25.5..25.7).contains(&t.seconds()))
+    };
+    let slide = |d: &&Defect| {
+        matches!(d, Defect::Jump { channel, axis: "fx", t, size }
+            if channel == leg
+                && (25.0..25.5).contains(&t.seconds())
+                && (4.0..8.0).contains(size))
+    };
+    assert!(right.iter().any(blow) && right.iter().any(slide) && right.len() == 2);
+    assert_eq!(instants.breaks().len(), 1);
+}
+
+#[test]
+fn the_logs_of_a_real_kuka_are_clean() {
+    for file in ["kuka_lwr4_1.csv", "kuka_lwr4_2.csv"] {
+        let (Some(log), Some(model)) = (data(file), data("kuka_lwr4.urdf")) else {
+            return;
+        };
+        let text = "schema = 1\nrobot = \"kuka\"\nmodel = \"kuka_lwr4.urdf\"\n[base]\nkind = \
+                    \"fixed\"\nlink = \"lwr_base_link\"\n[identification]\ninputs = [\"torque\"]";
+        let mut config = Config::parse(text).unwrap();
+        config.model = model;
+        let robot = Setup::new(&config).unwrap().robot;
+        let instants = read(&robot, std::fs::File::open(log).unwrap());
+        instants
+            .defects()
+            .iter()
+            .for_each(|d| println!("{:?}: {d}", d.severity()));
+        assert_eq!(all_defects(&instants), [] as [&Defect; 0]);
+        let usable = instants
+            .observations()
+            .iter()
+            .filter(|i| i.has_motion(&robot.channels) && i.torque.iter().all(|t| t.is_finite()))
+            .count();
+        println!("{usable} of {} instants", instants.observations().len());
+        assert!(
+            usable > 2440
+                && (0..7).all(|dof| instants
+                    .observations()
+                    .iter()
+                    .any(|i| i.torque[dof].is_finite()))
+        );
+    }
+}
+
+#[test]
+fn a_wrong_model_and_a_late_start_are_no_defects() {
+    let robot = robot("");
+    // Every mass is a third too large, every centre of mass is displaced.
+    let mut wrong = robot.clone();
+    for (link, inertia) in robot.model.inertias().iter().enumerate() {
+        let mut parameters = inertia.parameters().map(|p| 1.33 * p);
+        parameters[1] += 0.02 * parameters[0];
+        parameters[2] -= 0.03 * parameters[0];
+        let changed = RigidInertia::from_parameters(&parameters);
+        wrong.model.set_inertia(link, changed).unwrap();
+    }
+    // At rest for six seconds; then the motion starts, within one second.
+    let begin = |joint: usize, t: f64| {
+        let s = ((t - 6.0) / 1.0).clamp(0.0, 1.0);
+        let rate = s * s * (3.0 - 2.0 * s);
+        let change = if s > 0.0 && s < 1.0 {
+            6.0 * s * (1.0 - s)
+        } else {
+            0.0
+        };
+        let passed = s.powi(3) - 0.5 * s.powi(4) + (t - 7.0).max(0.0);
+        let [q, dq, ddq] = motion(joint, passed);
+        [q, dq * rate, ddq * rate * rate + dq * change]
+    };
+    let mut alarms = Vec::new();
+    for seed in 0..8 {
+        for (rate, jitter) in [(50.0, 0.2), (100.0, 0.5), (200.0, 0.3)] {
+            for table in [
+                log(&robot, 20.0, rate, jitter, 0.0, 100 + seed),
+                log_of(&robot, begin, 20.0, rate, jitter, 0.0, 200 + seed),
+            ] {
+                alarms.extend(
+                    table
+                        .defects(&wrong)
+                        .into_iter()
+                        .map(|d| format!("{seed}, {rate} Hz: {d}")),
+                );
+            }
+        }
+    }
+    assert!(alarms.is_empty(), "{}", alarms.join("\n"));
+}
