@@ -46,7 +46,7 @@ struct Args {
 
 #[derive(Subcommand)]
 enum Verb {
-    /// Run a simulated robot, gateway and estimator as three processes and compare with the truth
+    /// Simulate a robot, run gateway and estimator on it, and compare with the truth
     Demo(demo::Args),
     /// Run the gateway daemon: read CAN buses, publish samples in shared memory
     Gateway(Daemon),

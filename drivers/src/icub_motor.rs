@@ -35,7 +35,8 @@
 //! velocity = true    # false: ignore the board's velocity (coarse if `ratio` is small), encode 0
 //! ```
 
-use crate::icub::{self, Bringup, NoInquiry, class};
+use crate::icub::bringup::{Bringup, NoInquiry};
+use crate::icub::{self, class};
 use crate::{
     Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Spec, SpecError, State,
     Transmit, device,

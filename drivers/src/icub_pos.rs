@@ -34,7 +34,8 @@
 //! sensors = [{ label = 0, inverted = false, rotation_deg = 0, zero_deg = 0.0 }, { label = 1 }]
 //! ```
 
-use crate::icub::{self, Bringup, NoInquiry, class, command};
+use crate::icub::bringup::{Bringup, NoInquiry};
+use crate::icub::{self, class, command};
 use crate::{
     Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Outputs, Spec, SpecError,
     State, Transmit, device,

@@ -21,7 +21,7 @@ pub struct InertialState {
     pub offsets: Vec<Wrench>,
     /// Per F/T sensor, the variance that its readings were found to have beyond the configured
     /// noise [torque; force] \[Nm^2, N^2\].
-    pub excess: Vec<[f64; 6]>,
+    pub excess_variance: Vec<[f64; 6]>,
     /// Per F/T sensor, its calibration.
     pub calibrations: Vec<Calibration>,
     /// The covariance of inertial parameters and offsets.
@@ -55,7 +55,7 @@ impl InertialState {
         let sensors = robot.offsets.len();
         let mut state = Self {
             offsets: Vec::new(),
-            excess: vec![[0.0; 6]; sensors],
+            excess_variance: vec![[0.0; 6]; sensors],
             calibrations: Vec::new(),
             covariance: Covariance::exact(robot.model.link_count(), sensors),
             identified: None,
@@ -85,7 +85,7 @@ impl InertialState {
         self.covariance = Covariance::exact(links, sensors);
         self.offsets = robot.offsets.iter().map(|(offset, _)| *offset).collect();
         self.calibrations.clone_from(&robot.calibrations);
-        self.excess.fill([0.0; 6]);
+        self.excess_variance.fill([0.0; 6]);
         for (link, cad) in robot.model.inertias().iter().enumerate() {
             let identified = self
                 .identified
@@ -103,7 +103,7 @@ impl InertialState {
                     *place = offset.reading;
                 }
                 set_noise(
-                    &mut self.excess,
+                    &mut self.excess_variance,
                     &robot.structure,
                     sensor,
                     offset.noise.torque_first().map(|x| x * x),
@@ -268,12 +268,15 @@ impl InertialState {
 
 /// Sets the excess variance of a sensor from the variance `found` of its readings [torque; force].
 pub(crate) fn set_noise(
-    excess: &mut [[f64; 6]],
+    excess_variance: &mut [[f64; 6]],
     structure: &Structure,
     sensor: usize,
     found: [f64; 6],
 ) {
-    if let (Some(place), Some(cut)) = (excess.get_mut(sensor), structure.sensors().get(sensor)) {
+    if let (Some(place), Some(cut)) = (
+        excess_variance.get_mut(sensor),
+        structure.sensors().get(sensor),
+    ) {
         let stated = Wrench::from_parts(cut.noise().force, cut.noise().torque).torque_first();
         *place = std::array::from_fn(|i| (found[i] - stated[i] * stated[i]).max(0.0));
     }

@@ -2,16 +2,20 @@
 //! contact wrenches out, with their standard deviations and whether they are valid.
 //!
 //! # Stages
-//! 1. Samples: each channel sends stamped readings. [`daemon`] takes them from shared memory,
-//!    [`offline`] from a log.
-//! 2. Pipeline ([`pipeline::Pipeline`]): each stamp `t` of the trigger channel is an instant. The
-//!    pipeline waits for the other channels, then interpolates or differentiates each one at `t`,
-//!    corrects F/T readings for calibration, temperature and offset, and tests their residuals.
-//! 3. Kinematics ([`proprio_dynamics::Kinematics`]): pose, motion and net wrench of every link.
-//! 4. Solver ([`proprio_dynamics::Solver`]): balances each sub-tree between F/T sensors and solves
-//!    for its contact wrenches.
-//! 5. Torques: the solver's joint torques, with standard deviations from noise, parameters
-//!    ([`propagation`]) and motion, are published if they are valid.
+//! 1. [`pipeline::Pipeline::push`] stores a stamped sample of a channel. [`daemon`] takes samples
+//!    from shared memory, [`offline`] from a log.
+//! 2. [`pipeline::Pipeline::poll`] releases a stamp `t` of the trigger channel as soon as the other
+//!    channels have passed it, and evaluates every channel at `t`: interpolated or differentiated,
+//!    F/T readings corrected for calibration, temperature and offset.
+//! 3. [`proprio_dynamics::Kinematics::update`]: pose, motion and net wrench of every link.
+//! 4. [`proprio_dynamics::Solver::solve`] balances each sub-tree between F/T sensors and solves for
+//!    its contact wrenches and joint torques.
+//! 5. [`propagation::Propagation::update`]: standard deviations from the covariance of parameters
+//!    and offsets, beside those from noise and motion.
+//! 6. The residual of each sub-tree is tested. Where that changes the detected contacts, 3 to 5 run
+//!    once more.
+//! 7. Every torque and contact wrench is written with its standard deviation, whether it is valid,
+//!    and the reason if it is not ([`pipeline::Estimate`]).
 //!
 //! With identification on, the pipeline also feeds [`proprio_identification::online`], which
 //! updates inertial parameters and F/T offsets once a second.
@@ -28,7 +32,9 @@
 //!   `--check` shows, [`assessment`] measures the accuracy of a run, `first_look` tests the first
 //!   samples for implausible readings, [`files`] replaces files atomically.
 //!
-//! Notation, frames and signs: [`proprio_dynamics::spatial`].
+//! # Notation
+//! That of [`proprio_dynamics`] and [`proprio_identification`]; `t` is a stamp of the trigger
+//! channel.
 
 pub mod assessment;
 pub mod check;

@@ -60,11 +60,11 @@ use crate::history::History;
 use crate::propagation::Propagation;
 use crate::setup::Setup;
 use buffers::{ChannelBuffer, Declarations, OrReason, stale, temperature_at};
-use channels::{imu_at, joint_at};
+use channels::{imu_at, joint_at, wrench_at};
 use identification::OnlineIdentification;
-use motion::{ENCODER_OFFSET, MotionErrors};
+use motion::{ENCODER_OFFSET_STD, MotionErrors};
 use proprio_dynamics::model::{JointKind, Model};
-use proprio_dynamics::spatial::{Vec3, Wrench};
+use proprio_dynamics::spatial::{Pose, Wrench};
 use proprio_dynamics::{ContactSet, Dependence, FrameMotion, Kinematics, Solver};
 use proprio_identification::online::state::StateError;
 use proprio_identification::online::{Online, OnlineError};
@@ -318,7 +318,7 @@ impl Pipeline {
         };
         if let Some(instant) = identification.next_instant(t) {
             let active = self.active_contacts(instant);
-            let base = self.base_motion(&active);
+            let base = self.setup.robot.base_motion(&active);
             identification.observe(instant, &self.setup, &self.buffers, &active, base);
             if identification.apply(&mut self.setup, &mut self.propagation) {
                 self.residuals.restart_means();
@@ -327,60 +327,16 @@ impl Pipeline {
         self.identification = Some(identification);
     }
 
-    /// The base: the link where kinematics start, its motion if no IMU measures it, and why that
-    /// motion is not valid.
-    fn base_motion(&self, active: &ContactSet) -> (usize, FrameMotion, Reason) {
-        let stances = match &self.setup.robot.base {
-            BaseMotion::Standing(motion) => {
-                return (self.setup.robot.base_link, *motion, Reason::None);
-            }
-            BaseMotion::Imu(_) => {
-                return (
-                    self.setup.robot.base_link,
-                    FrameMotion::standing(&Vec3::zeros()),
-                    Reason::None,
-                );
-            }
-            BaseMotion::Stance(stances) => stances,
-        };
-        let standing = stances
-            .iter()
-            .find(|stance| active.contains(stance.contact));
-        let fault = if standing.is_none() {
-            Reason::NoStance
-        } else {
-            Reason::None
-        };
-        standing.or(stances.first()).map_or_else(
-            || {
-                (
-                    self.setup.robot.base_link,
-                    FrameMotion::standing(&Vec3::zeros()),
-                    Reason::NoStance,
-                )
-            },
-            |stance| (stance.link, stance.motion, fault),
-        )
-    }
-
     /// The contacts known to be present at `t`, by configuration or declaration.
     fn active_contacts(&self, t: Nanos) -> ContactSet {
-        let mut active = self.setup.robot.always;
-        for (contact, declarations) in self.declarations.iter().enumerate() {
-            match declarations.at(t) {
-                Some(true) => active.insert(contact),
-                Some(false) if self.setup.robot.support != Some(contact) => active.remove(contact),
-                Some(false) => {}
-                None => {}
-            }
-        }
-        active
+        let declared = |contact: usize| self.declarations.get(contact)?.at(t);
+        self.setup.robot.active_contacts(declared)
     }
 
     /// Makes the base link the start of the kinematics. Returns its motion, which the IMU replaces
     /// if there is one.
     fn place_base(&mut self, active: &ContactSet) -> FrameMotion {
-        let (link, motion, fault) = self.base_motion(active);
+        let (link, motion, fault) = self.setup.robot.base_motion(active);
         self.base_fault = fault;
         if link != self.kinematics.base()
             && self
@@ -393,12 +349,16 @@ impl Pipeline {
         motion
     }
 
-    /// Evaluates every channel at `t`, solves, tests residuals and writes the estimate.
-    fn compute_estimate(&mut self, t: Nanos) {
+    /// Evaluates every channel at `t`. Returns the motion of the base link, and the IMU's motion
+    /// and pose if there is one.
+    fn evaluate_channels(
+        &mut self,
+        t: Nanos,
+        active: &ContactSet,
+    ) -> (FrameMotion, Option<(FrameMotion, Pose)>) {
         // Half of the wait: a sample that may be used can then arrive late by the other half.
         let until = t + Nanos(self.setup.max_wait.0 / 2);
-        let active = self.active_contacts(t);
-        let mut base = self.place_base(&active);
+        let mut base = self.place_base(active);
         let mut imu = None;
         for ((buffer, channel), fault) in self
             .buffers
@@ -440,41 +400,14 @@ impl Pipeline {
                     match history.at(t, until) {
                         None => Reason::NeverSeen,
                         Some(sample) => {
-                            let [fx, fy, fz, tx, ty, tz] = sample.value;
-                            if let (Some(reading), Some(offset), Some(calibration)) = (
+                            let celsius = temperature_at(temperatures, t, self.setup.max_wait);
+                            let state = &self.setup.state;
+                            if let (Some(reading), Some(missing), Some(corrected)) = (
                                 self.readings.get_mut(number),
-                                self.setup.state.offsets.get(number),
-                                self.setup.state.calibrations.get(number),
+                                self.missing_temperature.get_mut(number),
+                                wrench_at(state, number, &sample, celsius, &mut self.propagation),
                             ) {
-                                let (celsius, age) =
-                                    temperature_at(temperatures, t, self.setup.max_wait);
-                                let temperature_variance =
-                                    calibration.temperature_variance(age.map(Nanos::seconds));
-                                if let Some(missing) = self.missing_temperature.get_mut(number) {
-                                    *missing = temperature_variance != [0.0; 6];
-                                }
-                                let excess_variance = self
-                                    .setup
-                                    .state
-                                    .excess
-                                    .get(number)
-                                    .copied()
-                                    .unwrap_or_default();
-                                let extra_variance = std::array::from_fn(|i| {
-                                    temperature_variance[i] + excess_variance[i]
-                                });
-                                self.propagation.set_extra_variance(number, extra_variance);
-                                let corrected = calibration.apply(
-                                    &Wrench::from_parts([fx, fy, fz], [tx, ty, tz]),
-                                    celsius,
-                                );
-                                // The effect of an uncertain calibration depends on the reading.
-                                self.propagation.set_reading(
-                                    number,
-                                    &corrected,
-                                    calibration.warmth(celsius),
-                                );
-                                *reading = corrected - *offset;
+                                (*reading, *missing) = corrected;
                             }
                             stale(&sample, self.setup.robot.max_silence)
                                 .or(Reason::of_quality(sample.quality, Quality::DEVICE_FAULT))
@@ -505,19 +438,7 @@ impl Pipeline {
                 _ => Reason::NeverSeen,
             };
         }
-        // A contact detected at the last instant is most likely still there.
-        let detected = self.residuals.detected().difference(&active);
-        let mut solved = self.solve(t, &base, imu.as_ref(), &active.union(&detected));
-        self.test_residuals(t, &active, solved);
-        if solved && self.residuals.detected() != detected {
-            solved = self.solve(
-                t,
-                &base,
-                imu.as_ref(),
-                &active.union(&self.residuals.detected()),
-            );
-        }
-        self.write_estimate(t, solved);
+        (base, imu)
     }
 }
 
@@ -529,7 +450,7 @@ fn encoder_offset_std(model: &Model) -> Vec<f64> {
             .iter()
             .find(|joint| joint.dof == Some(dof))
             .map(|joint| &joint.kind);
-        ENCODER_OFFSET[usize::from(matches!(kind, Some(JointKind::Prismatic(_))))]
+        ENCODER_OFFSET_STD[usize::from(matches!(kind, Some(JointKind::Prismatic(_))))]
     };
     (0..model.dof_count()).map(of_dof).collect()
 }

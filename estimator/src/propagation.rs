@@ -59,7 +59,7 @@ use nalgebra::{Matrix6, Vector6};
 use proprio_topics::Nanos;
 use pulp::{Arch, Simd, WithSimd};
 
-use proprio_dynamics::regressor::{WIDTH, link_rows};
+use proprio_dynamics::regressor::{LINK_PARAMETERS, link_rows};
 use proprio_dynamics::spatial::{Motion, Pose, Wrench};
 use proprio_dynamics::{DynamicsError, Kinematics, Solver, Structure, check_size};
 
@@ -152,7 +152,7 @@ impl Propagation {
     /// Sets a sensor's corrected reading, offset included, and the temperature of its board above
     /// the reference \[K\]. The effect of an uncertain calibration depends on both. Initially an
     /// uncertain calibration has no effect.
-    pub fn set_reading(&mut self, sensor: usize, corrected: &Wrench, kelvin: f64) {
+    pub fn set_calibration_point(&mut self, sensor: usize, corrected: &Wrench, kelvin: f64) {
         let corrected = corrected.torque_first();
         for column_block in self
             .subtrees
@@ -160,7 +160,7 @@ impl Propagation {
             .flat_map(|part| &mut part.column_blocks)
         {
             if matches!(column_block.what, Member::Sensor(own, _) if own == sensor) {
-                column_block.calibrate(&corrected, kelvin);
+                column_block.set_calibration_point(&corrected, kelvin);
             }
         }
     }
@@ -211,19 +211,19 @@ impl Propagation {
 
     /// Standard deviations of the torques [Nm or N], by degree of freedom. Zero where all
     /// parameters that matter are exact.
-    pub fn torque(&self) -> &[f64] {
+    pub fn torque_std(&self) -> &[f64] {
         &self.torque
     }
 
     /// Covariance of each sub-tree's imbalance `b` [torque; force], at the origin of base
     /// coordinates [Nm, N]; zero where no sensor measures it.
-    pub fn imbalances(&self) -> &[Matrix6<f64>] {
+    pub fn imbalance_covariances(&self) -> &[Matrix6<f64>] {
         &self.imbalances
     }
 
     /// Standard deviations of the contacts' wrenches, `[fx fy fz tx ty tz]` [N, Nm], in the order
     /// of the structure's.
-    pub fn contacts(&self) -> &[[f64; 6]] {
+    pub fn contact_std(&self) -> &[[f64; 6]] {
         &self.contacts
     }
 }
@@ -383,8 +383,8 @@ impl SubtreeRoot {
             let mut members = Vec::new();
             for end in &ends {
                 if let Some(i) = block.sensors.iter().position(|&s| s == end.sensor) {
-                    let first = WIDTH * block.links.len() + 6 * i;
-                    let mut own = WIDTH * block.links.len() + 6 * block.sensors.len();
+                    let first = LINK_PARAMETERS * block.links.len() + 6 * i;
+                    let mut own = LINK_PARAMETERS * block.links.len() + 6 * block.sensors.len();
                     for (sensor, kind) in &block.calibrations {
                         if *sensor == end.sensor {
                             members.push((Member::Calibration, end.link, own..own + kind.count()));
@@ -400,7 +400,11 @@ impl SubtreeRoot {
             }
             for &link in numbers.iter().rev() {
                 if let Some(i) = block.links.iter().position(|&l| l == link) {
-                    members.push((Member::Link(link), link, WIDTH * i..WIDTH * (i + 1)));
+                    members.push((
+                        Member::Link(link),
+                        link,
+                        LINK_PARAMETERS * i..LINK_PARAMETERS * (i + 1),
+                    ));
                 }
             }
             let wanted: Vec<usize> = members

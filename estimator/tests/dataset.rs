@@ -404,7 +404,7 @@ fn a_clean_log_has_no_defects_and_its_instants_are_true() {
     for (rate, jitter) in [(100.0, 0.5), (500.0, 0.3)] {
         let instants = log(&robot, 20.0, rate, jitter, 0.0, 7).dataset(&robot);
         assert_eq!(instants.defects(), []);
-        assert_eq!(instants.breaks(), []);
+        assert_eq!(instants.offset_jumps(), []);
         let usable: Vec<&Observation> = instants
             .observations()
             .iter()
@@ -566,7 +566,7 @@ fn all_defects(instants: &Dataset) -> Vec<&Defect> {
     instants
         .defects()
         .iter()
-        .chain(instants.breaks().iter().map(|b| &b.jump))
+        .chain(instants.offset_jumps().iter().map(|b| &b.jump))
         .collect()
 }
 
@@ -1069,7 +1069,7 @@ fn the_leg_of_a_real_icub_has_its_true_defects_and_no_others() {
     println!(
         "{} instants, breaks {:?}",
         instants.observations().len(),
-        instants.breaks()
+        instants.offset_jumps()
     );
     assert_eq!(instants.observations().len(), 1981);
     let warnings: Vec<&Defect> = all_defects(&instants)
@@ -1099,7 +1099,7 @@ fn the_leg_of_a_real_icub_has_its_true_defects_and_no_others() {
                 && (4.0..8.0).contains(size))
     };
     assert!(right.iter().any(blow) && right.iter().any(slide) && right.len() == 2);
-    assert_eq!(instants.breaks().len(), 1);
+    assert_eq!(instants.offset_jumps().len(), 1);
 }
 
 #[test]

@@ -2237,7 +2237,7 @@ fn miscalibrated(log: &str, right: &Calibration) -> String {
         let share = number as f64 / rows.len() as f64;
         let celsius = 25.0 + 15.0 * (1.0 - (-3.0 * share).exp());
         let warm = Wrench::from_parts([fx, fy, fz], [tx, ty, tz])
-            + *right.per_kelvin() * right.warmth(celsius);
+            + *right.per_kelvin() * right.temperature_rise(celsius);
         let sent = inverse * Vector6::from(warm.torque_first());
         for (place, axis) in places.into_iter().zip([3, 4, 5, 0, 1, 2]) {
             cells[place] = sent[axis].to_string();

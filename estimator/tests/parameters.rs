@@ -120,7 +120,7 @@ proptest! {
             let (variance, scale) = deviation(rows.torque_subtree(dof).unwrap(), &|own| {
                 rows.torque_row(dof, own).unwrap();
             });
-            let got = propagation.torque()[dof].powi(2);
+            let got = propagation.torque_std()[dof].powi(2);
             // The deviation has single precision.
             prop_assert!(
                 (got - variance).abs() < 1e-5 * variance + 1e-10 * (1.0 + scale),
@@ -129,7 +129,7 @@ proptest! {
         }
         for contact in 0..contacts.len() {
             let components = [3, 4, 5, 0, 1, 2];
-            for (component, got) in components.into_iter().zip(propagation.contacts()[contact]) {
+            for (component, got) in components.into_iter().zip(propagation.contact_std()[contact]) {
                 let (variance, scale) =
                     deviation(rows.contact_subtree(contact).unwrap(), &|own| {
                         rows.contact_row(contact, component, own).unwrap();
@@ -205,19 +205,20 @@ proptest! {
         let mut want = Propagation::new(&structure, &expected).unwrap();
         // Earlier readings have no effect.
         for (sensor, _) in readings.iter().enumerate() {
-            got.set_reading(sensor, &random.wrench(), 3.0);
+            got.set_calibration_point(sensor, &random.wrench(), 3.0);
         }
         for (sensor, reading) in readings.iter().enumerate() {
-            got.set_reading(sensor, reading, kelvin);
+            got.set_calibration_point(sensor, reading, kelvin);
         }
         for propagation in [&mut got, &mut want] {
             propagation.update(&structure, &solver, &kinematics, Nanos::ZERO).unwrap();
         }
-        let most = want.torque().iter().fold(0.0, |most: f64, x| most.max(*x));
-        for (got, want) in got.torque().iter().zip(want.torque()) {
+        let most = want.torque_std().iter().fold(0.0, |most: f64, x| most.max(*x));
+        for (got, want) in got.torque_std().iter().zip(want.torque_std()) {
             prop_assert!((got - want).abs() <= 1e-4 * want + 1e-5 * most, "{} not {}", got, want);
         }
-        for (got, want) in got.contacts().iter().flatten().zip(want.contacts().iter().flatten()) {
+        let (got, want) = (got.contact_std().as_flattened(), want.contact_std().as_flattened());
+        for (got, want) in got.iter().zip(want) {
             prop_assert!((got - want).abs() < 1e-3 * (want + 1e-3), "{} not {}", got, want);
         }
     }
@@ -304,10 +305,10 @@ fn spread(
         .update(structure, &solver, &kinematics, KNOWN)
         .unwrap();
     let stated: Vec<f64> = propagation
-        .torque()
+        .torque_std()
         .iter()
         .copied()
-        .chain(propagation.contacts().iter().flatten().copied())
+        .chain(propagation.contact_std().iter().flatten().copied())
         .collect();
 
     let results = |solver: &Solver| -> Vec<f64> {
@@ -995,11 +996,11 @@ fn an_uncertain_calibration_stays_uncertain_during_on_line_identification() {
         .unwrap();
     let torques = |covariance: &Covariance| {
         let mut propagation = Propagation::new(&setup.robot.structure, covariance).unwrap();
-        propagation.set_reading(0, &(load + offset[0]), 0.0);
+        propagation.set_calibration_point(0, &(load + offset[0]), 0.0);
         propagation
             .update(&setup.robot.structure, &solver, &kinematics, Nanos::ZERO)
             .unwrap();
-        propagation.torque().to_vec()
+        propagation.torque_std().to_vec()
     };
     let group = PosteriorBlock {
         links: &[],
@@ -1510,17 +1511,16 @@ fn everything_but_the_inertials_stays_byte_for_byte() {
   <joint name="fixed1" type="fixed">
     <parent link="frame"/><child link="a"/><origin xyz="0 0 0.3" rpy="0.1 0 0"/>
   </joint>
-  <link name="a">
-    <inertial><mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/>
-    </inertial>
-  </link>
+  <link name="a"><inertial>
+    <mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/>
+  </inertial></link>
   <joint name="fixed2" type="fixed">
     <parent link="a"/><child link="b"/><origin xyz="0.2 0 0"/>
   </joint>
-  <link name="b">
-    <inertial><mass value="0.5"/>
-    <inertia ixx="0.001" ixy="0" ixz="0" iyy="0.002" iyz="0" izz="0.002"/></inertial>
-  </link>
+  <link name="b"><inertial>
+    <mass value="0.5"/>
+    <inertia ixx="0.001" ixy="0" ixz="0" iyy="0.002" iyz="0" izz="0.002"/>
+  </inertial></link>
   <transmission name="t"><type>x</type></transmission>
   <gazebo reference="b"><sensor type="camera" name="c"/></gazebo>
 </robot>

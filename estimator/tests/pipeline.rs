@@ -131,7 +131,7 @@ fn miscalibrated(log: &str, change: &Calibration) -> (String, Vec<f64>) {
         let mut cells: Vec<String> = record.unwrap().iter().map(str::to_owned).collect();
         let [fx, fy, fz, tx, ty, tz] = places.map(|place| cells[place].parse::<f64>().unwrap());
         let warm = Wrench6::from_parts([fx, fy, fz], [tx, ty, tz])
-            + *change.per_kelvin() * change.warmth(last);
+            + *change.per_kelvin() * change.temperature_rise(last);
         let raw = inverse * nalgebra::Vector6::from(warm.torque_first());
         for (place, axis) in places.into_iter().zip([3, 4, 5, 0, 1, 2]) {
             cells[place] = raw[axis].to_string();

@@ -1,13 +1,17 @@
 #!/usr/bin/env python3
-"""Opens reports in a headless Chromium, as on a telephone (360 px) and on a desk (1280 px), by day and by night, and says what is wrong with them.
+"""Opens reports in a headless Chromium and prints what is wrong with them.
 
     tests/browser/check.py [--screenshots DIR] REPORT.html ...
 
-A report must log no error and ask the network for nothing, be no wider than the screen, be smaller than 2 MB; every figure must have a caption and
-something drawn; no text may leave its box, be smaller than 10 px, or lie upon another tick's text. Folded parts are unfolded first.
+The screens are those of a telephone (360 px) and a desktop (1280 px), each in light and dark
+colours. A report must log no error, make no network request, be no wider than the screen and
+smaller than 2 MB. Every figure must have a caption and something drawn. No text may leave its box,
+be smaller than 10 px, or overlap the text of another tick. Folded parts are unfolded first.
 
-Exits 0 if all is well, 1 if not (one line per fault), 4 if the browser fails, 3 without one: one of chromium-headless-shell, chromium, chromium-browser, google-chrome, or what
-CHROMIUM names. Needs nothing else: the browser is spoken to through its debugging pipe (file descriptors 3 and 4, messages end with a zero byte).
+Exit status: 0 if all is well, 1 if not (one line per fault), 3 without a browser, 4 if the browser
+fails. The browser is one of chromium-headless-shell, chromium, chromium-browser, google-chrome, or
+the one that CHROMIUM names. Nothing else is needed: the script controls the browser through its
+debugging pipe (file descriptors 3 and 4, messages end with a zero byte).
 """
 
 import argparse
@@ -28,33 +32,51 @@ SCREENS = [(360, 780), (1280, 900)]
 LARGEST = 2_000_000
 PATIENCE = 60.0
 
-# Runs in the page; returns faults as text.
+# Runs in the page and returns the faults as text.
 LOOK = r"""
 (() => {
   const faults = [];
-  const what = e => `${e.tagName.toLowerCase()}${e.className && e.className.baseVal === undefined ? '.' + e.className : ''} "${e.textContent.trim().slice(0, 40)}"`;
+  const what = e => {
+    const names = e.className && e.className.baseVal === undefined ? '.' + e.className : '';
+    return `${e.tagName.toLowerCase()}${names} "${e.textContent.trim().slice(0, 40)}"`;
+  };
   document.querySelectorAll('details').forEach(d => { d.open = true; });
   const wide = document.documentElement.clientWidth;
-  if (document.documentElement.scrollWidth > wide) faults.push(`the page is ${document.documentElement.scrollWidth} px wide, the screen ${wide} px`);
+  if (document.documentElement.scrollWidth > wide) {
+    const page = document.documentElement.scrollWidth;
+    faults.push(`the page is ${page} px wide, the screen ${wide} px`);
+  }
   if (!document.querySelector('h1')) faults.push('no heading');
   for (const figure of document.querySelectorAll('figure')) {
     const caption = figure.querySelector('figcaption');
     const name = caption ? caption.textContent.trim() : '';
     if (!name) faults.push('a figure without a caption');
     if (figure.querySelector('.none')) continue;
-    const drawn = [...figure.querySelectorAll('svg path.line, svg path.dots')].filter(p => (p.getAttribute('d') || '').length > 3);
+    const drawn = [...figure.querySelectorAll('svg path.line, svg path.dots')]
+      .filter(p => (p.getAttribute('d') || '').length > 3);
     const box = figure.querySelector('svg') && figure.querySelector('svg').getBoundingClientRect();
-    if (!drawn.length || !box || box.width < 100 || box.height < 80) faults.push(`figure ${name}: nothing is drawn`);
+    if (!drawn.length || !box || box.width < 100 || box.height < 80) {
+      faults.push(`figure ${name}: nothing is drawn`);
+    }
     for (const path of drawn) {
       const p = path.getBBox();
-      if (p.width <= 0 && p.height <= 0 && !path.classList.contains('dots')) faults.push(`figure ${name}: an empty path`);
-      if (getComputedStyle(path).stroke === 'none') faults.push(`figure ${name}: a line without a colour`);
+      if (p.width <= 0 && p.height <= 0 && !path.classList.contains('dots')) {
+        faults.push(`figure ${name}: an empty path`);
+      }
+      if (getComputedStyle(path).stroke === 'none') {
+        faults.push(`figure ${name}: a line without a colour`);
+      }
     }
     for (const kind of ['x', 'y', 'm']) {
-      const ticks = [...figure.querySelectorAll(`.plot > span.${kind}`)].map(t => [t, t.getBoundingClientRect()]);
-      if (kind !== 'm' && ticks.length < 2) faults.push(`figure ${name}: fewer than two ticks along ${kind}`);
+      const ticks = [...figure.querySelectorAll(`.plot > span.${kind}`)]
+        .map(t => [t, t.getBoundingClientRect()]);
+      if (kind !== 'm' && ticks.length < 2) {
+        faults.push(`figure ${name}: fewer than two ticks along ${kind}`);
+      }
       ticks.forEach(([t, a], i) => ticks.slice(i + 1).forEach(([u, b]) => {
-        if (a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom) faults.push(`figure ${name}: ${what(t)} lies upon ${what(u)}`);
+        if (a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom) {
+          faults.push(`figure ${name}: ${what(t)} overlaps ${what(u)}`);
+        }
       }));
     }
   }
@@ -67,16 +89,27 @@ LOOK = r"""
     range.selectNodeContents(text);
     const r = range.getBoundingClientRect();
     if (!r.width) continue;
-    if (parseFloat(getComputedStyle(e).fontSize) < (e.closest('sup') ? 7 : 10)) faults.push(`${what(e)} is smaller than 10 px`);
+    if (parseFloat(getComputedStyle(e).fontSize) < (e.closest('sup') ? 7 : 10)) {
+      faults.push(`${what(e)} is smaller than 10 px`);
+    }
     if (e.closest('.scroll')) continue;
-    if (r.left < -0.5 || r.right > wide + 0.5) faults.push(`${what(e)} leaves the screen: ${Math.round(r.left)} to ${Math.round(r.right)} px`);
+    if (r.left < -0.5 || r.right > wide + 0.5) {
+      const span = `${Math.round(r.left)} to ${Math.round(r.right)} px`;
+      faults.push(`${what(e)} leaves the screen: ${span}`);
+    }
     for (let box = e; box && box !== document.body; box = box.parentElement) {
       if (seen.has(box) || box.closest('.plot')) continue;
       seen.add(box);
-      if (box.scrollWidth > box.clientWidth + 1 && getComputedStyle(box).display !== 'inline') faults.push(`${what(box)} is wider than its box`);
+      if (box.scrollWidth > box.clientWidth + 1 && getComputedStyle(box).display !== 'inline') {
+        faults.push(`${what(box)} is wider than its box`);
+      }
     }
   }
-  return { faults, figures: document.querySelectorAll('figure').length, height: document.documentElement.scrollHeight };
+  return {
+    faults,
+    figures: document.querySelectorAll('figure').length,
+    height: document.documentElement.scrollHeight,
+  };
 })()
 """
 
@@ -88,23 +121,37 @@ class Browser:
         self.folder = tempfile.mkdtemp(prefix="report-browser-")
         to_read, self.to = os.pipe()
         self.answers, from_write = os.pipe()
-        # Above 4, so that neither is overwritten before it has been moved there.
+        # Above 4, so that neither is overwritten before it is moved to 3 or 4.
         ends = [fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, 10) for fd in (to_read, from_write)]
         os.close(to_read)
         os.close(from_write)
         null = os.open(os.devnull, os.O_RDWR)
         arguments = [
-            program, "--headless", "--remote-debugging-pipe", f"--user-data-dir={self.folder}", "--no-first-run", "--disable-gpu",
-            "--disable-dev-shm-usage", "--disable-extensions", "--disable-background-networking", "--disable-component-update",
-            "--hide-scrollbars", "--host-resolver-rules=MAP * ~NOTFOUND",
+            program,
+            "--headless",
+            "--remote-debugging-pipe",
+            f"--user-data-dir={self.folder}",
+            "--no-first-run",
+            "--disable-gpu",
+            "--disable-dev-shm-usage",
+            "--disable-extensions",
+            "--disable-background-networking",
+            "--disable-component-update",
+            "--hide-scrollbars",
+            "--host-resolver-rules=MAP * ~NOTFOUND",
         ]
         if os.getuid() == 0:
             arguments.append("--no-sandbox")
         self.pid = os.posix_spawn(
-            program, [*arguments, "about:blank"], os.environ,
+            program,
+            [*arguments, "about:blank"],
+            os.environ,
             file_actions=[
-                (os.POSIX_SPAWN_DUP2, null, 0), (os.POSIX_SPAWN_DUP2, null, 1), (os.POSIX_SPAWN_DUP2, null, 2),
-                (os.POSIX_SPAWN_DUP2, ends[0], 3), (os.POSIX_SPAWN_DUP2, ends[1], 4),
+                (os.POSIX_SPAWN_DUP2, null, 0),
+                (os.POSIX_SPAWN_DUP2, null, 1),
+                (os.POSIX_SPAWN_DUP2, null, 2),
+                (os.POSIX_SPAWN_DUP2, ends[0], 3),
+                (os.POSIX_SPAWN_DUP2, ends[1], 4),
             ],
             setpgroup=0,
         )
@@ -145,7 +192,9 @@ class Browser:
 
     def open_tab(self):
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        self.session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        self.session = self.call("Target.attachToTarget", targetId=target, flatten=True)[
+            "sessionId"
+        ]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
 
@@ -172,18 +221,32 @@ def check(browser, file, screenshots):
     for width, height in SCREENS:
         browser.events.clear()
         browser.call(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=2 if width < 600 else 1, mobile=width < 600
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=2 if width < 600 else 1,
+            mobile=width < 600,
         )
         browser.call("Page.navigate", url=file.resolve().as_uri())
         browser.wait_for("Page.loadEventFired")
-        before = browser.call("Runtime.evaluate", expression="document.documentElement.scrollHeight", returnByValue=True)["result"]["value"]
+        before = browser.call(
+            "Runtime.evaluate",
+            expression="document.documentElement.scrollHeight",
+            returnByValue=True,
+        )["result"]["value"]
         schemes = ("light", "dark")
         if screenshots:
             for scheme in schemes:
-                browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+                browser.call(
+                    "Emulation.setEmulatedMedia",
+                    features=[{"name": "prefers-color-scheme", "value": scheme}],
+                )
                 shoot(browser, screenshots / f"{file.stem}-{width}-{scheme}.png", width, before)
         for scheme in schemes:
-            browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+            browser.call(
+                "Emulation.setEmulatedMedia",
+                features=[{"name": "prefers-color-scheme", "value": scheme}],
+            )
             result = browser.call("Runtime.evaluate", expression=LOOK, returnByValue=True)
             if "exceptionDetails" in result:
                 raise RuntimeError(result["exceptionDetails"])
@@ -191,13 +254,21 @@ def check(browser, file, screenshots):
             for fault in dict.fromkeys(look["faults"]):
                 yield f"{width} px, {scheme}: {fault}"
         if screenshots:
-            browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
+            browser.call(
+                "Emulation.setEmulatedMedia",
+                features=[{"name": "prefers-color-scheme", "value": "light"}],
+            )
             shoot(browser, screenshots / f"{file.stem}-{width}-unfolded.png", width, look["height"])
         for event in browser.events:
             method, parameters = event.get("method"), event.get("params", {})
-            if method == "Runtime.exceptionThrown" or (method == "Runtime.consoleAPICalled" and parameters["type"] in ("error", "warning")):
+            if method == "Runtime.exceptionThrown" or (
+                method == "Runtime.consoleAPICalled" and parameters["type"] in ("error", "warning")
+            ):
                 yield f"{width} px: the console says {json.dumps(parameters)[:300]}"
-            elif method == "Log.entryAdded" and parameters["entry"]["level"] in ("error", "warning"):
+            elif method == "Log.entryAdded" and parameters["entry"]["level"] in (
+                "error",
+                "warning",
+            ):
                 yield f"{width} px: the browser says {parameters['entry']['text']}"
             elif method == "Network.requestWillBeSent":
                 url = parameters["request"]["url"]
@@ -207,7 +278,9 @@ def check(browser, file, screenshots):
 
 def shoot(browser, name, width, height):
     picture = browser.call(
-        "Page.captureScreenshot", format="png", captureBeyondViewport=True,
+        "Page.captureScreenshot",
+        format="png",
+        captureBeyondViewport=True,
         clip={"x": 0, "y": 0, "width": width, "height": min(height, 8000), "scale": 1},
     )
     name.write_bytes(base64.b64decode(picture["data"]))
@@ -215,13 +288,15 @@ def shoot(browser, name, width, height):
 
 def main():
     parser = argparse.ArgumentParser(description="Checks reports in a headless browser.")
-    parser.add_argument("--screenshots", type=pathlib.Path, help="a folder for pictures of each report")
+    parser.add_argument(
+        "--screenshots", type=pathlib.Path, help="a folder for pictures of each report"
+    )
     parser.add_argument("reports", nargs="+", type=pathlib.Path)
     options = parser.parse_args()
     names = [os.environ["CHROMIUM"]] if os.environ.get("CHROMIUM") else PROGRAMS
     program = next((p for p in map(shutil.which, names) if p), None)
     if program is None:
-        print(f"no browser: none of {', '.join(names)} is at hand", file=sys.stderr)
+        print(f"no browser: none of {', '.join(names)} is installed", file=sys.stderr)
         return 3
     if options.screenshots:
         options.screenshots.mkdir(parents=True, exist_ok=True)
@@ -242,5 +317,5 @@ if __name__ == "__main__":
     try:
         sys.exit(main())
     except (OSError, RuntimeError) as error:
-        print(f"the browser could not be asked: {error}", file=sys.stderr)
+        print(f"the browser failed: {error}", file=sys.stderr)
         sys.exit(4)

@@ -1,10 +1,12 @@
-"""Sessions: what a robot's own boards would have recorded while MuJoCo moved it, with the truth beside it. For identification to be judged by.
+"""Sessions: logs of simulated boards with the true torques, for tests of identification.
 
-A session is a log in the project's CSV form: every board samples at its own period and phase, its stamps are a little late, its numbers are noisy and
-in steps. The robot has the inertias of its URDF; the estimator is given another URDF, whose every link is 20 % off. Five sessions of each robot:
-`train` stands still, then swings; `validate` goes from posture to posture; `contact` is pushed at the hand; `payload` picks something up half-way;
-`pushed` is pushed at hand and forearm, from 2 to 50 N, and nobody declares it.
-README.md ("Sessions") says what stands in the files.
+MuJoCo moves the robot. A session is a log in the project's CSV format. Every board samples at its
+own period and phase, its stamps are a little late, and its values have noise and a resolution. The
+robot has the inertias of its URDF; the estimator gets another URDF, with errors of 20 % in every
+link. Each robot has five sessions: `train` stands still, then swings; `validate` goes from posture
+to posture; in `contact` the hand is pushed; in `payload` the hand picks up something half-way; in
+`pushed` hand and forearm are pushed with 2 to 50 N without declaration. README.md ("Sessions")
+describes the files.
 """
 
 import json
@@ -12,20 +14,34 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 
-from libraries import IDynTree, MuJoCo, Pinocchio, Robot, check_agreement, made_with, move_wrench, must, origin_of, rotation_of
+from libraries import (
+    IDynTree,
+    MuJoCo,
+    Pinocchio,
+    Robot,
+    check_agreement,
+    made_with,
+    move_wrench,
+    must,
+    origin_of,
+    rotation_of,
+)
 
 SEED = 20260704
 GRAVITY = np.array([0.0, 0.0, -9.80665])
-TOLERANCE = 1e-9  # of the largest magnitude of a quantity, over the instants that the libraries are compared at
+TOLERANCE = 1e-9  # of the largest magnitude of a quantity, over the compared instants
 
-# What the strain board of an iCub arm adds to a reading, robot still, and its step: [fx fy fz tx ty tz] [N, Nm].
+# Standard deviation and resolution of the readings of an iCub arm's strain board while the robot
+# stands still: [fx fy fz tx ty tz] [N, Nm].
 FT_NOISE = np.array([0.0760, 0.0894, 0.1794, 0.00194, 0.00286, 0.00143])
 FT_STEP = np.array([1804.0] * 3 + [31.0] * 3) / 32768.0
-# Offsets: anywhere in +-OFFSET at the start of a session; then a board that gets warm, and a random walk.
+# Offsets: random within +-OFFSET at the start of a session; then drift of a board that gets warm,
+# and a random walk.
 OFFSET = np.array([8.0] * 3 + [0.4] * 3)
 WARM, WARM_SECONDS = np.array([0.7] * 3 + [0.01] * 3), 150.0
-WALK = np.array([0.02] * 3 + [3e-4] * 3)  # per square root of second
-# IMU: noise and steps of acceleration [m/s^2] and angular velocity [rad/s], as the simulator and the driver have them.
+WALK = np.array([0.02] * 3 + [3e-4] * 3)  # per square root of a second
+# IMU: noise and resolution of acceleration [m/s^2] and angular velocity [rad/s], as in the
+# simulator and the driver.
 IMU_NOISE = np.array([0.03] * 3 + [0.002] * 3)
 IMU_STEP = np.array([0.01] * 3 + [np.pi / 180 / 16] * 3)
 CLOCK_PPM = 30.0
@@ -38,21 +54,31 @@ TRUTH_EVERY = 5  # samples of the first F/T sensor
 
 # ---------------------------------------------------------------- inertias
 
+
 def pseudo_inertia(link):
-    """The 4x4 matrix [[integral x x' dm, m c], [m c', m]] of a <link>, in its axes; none if it has no mass."""
+    """The 4x4 matrix [[integral x x' dm, m c], [m c', m]] of a <link>, in its axes.
+
+    None for a link without mass.
+    """
     inertial = link.find("inertial")
     if inertial is None or float(inertial.find("mass").get("value")) == 0.0:
         return None
     mass = float(inertial.find("mass").get("value"))
     i = {key: float(value) for key, value in inertial.find("inertia").attrib.items()}
-    tensor = np.array([[i["ixx"], i["ixy"], i["ixz"]], [i["ixy"], i["iyy"], i["iyz"]], [i["ixz"], i["iyz"], i["izz"]]])
+    tensor = np.array(
+        [
+            [i["ixx"], i["ixy"], i["ixz"]],
+            [i["ixy"], i["iyy"], i["iyz"]],
+            [i["ixz"], i["iyz"], i["izz"]],
+        ]
+    )
     turn, centre = origin_of(inertial)
     tensor = turn @ tensor @ turn.T
     return assemble(mass, centre, np.trace(tensor) / 2 * np.eye(3) - tensor)
 
 
 def assemble(mass, centre, spread):
-    """From the mass, its centre, and the second moments about the centre."""
+    """The pseudo-inertia from mass, centre of mass, and second moments about the centre."""
     whole = np.zeros((4, 4))
     whole[:3, :3] = spread + mass * np.outer(centre, centre)
     whole[:3, 3] = whole[3, :3] = mass * centre
@@ -61,13 +87,13 @@ def assemble(mass, centre, spread):
 
 
 def take_apart(whole):
-    """Mass, centre, second moments about the centre."""
+    """Mass, centre of mass, and second moments about the centre."""
     mass, centre = whole[3, 3], whole[:3, 3] / whole[3, 3]
     return mass, centre, whole[:3, :3] - mass * np.outer(centre, centre)
 
 
 def set_inertia(link, whole):
-    """Writes a <link>'s <inertial>, in the link's axes."""
+    """Replaces the <inertial> of a <link>, in the link's axes."""
     mass, centre, spread = take_apart(whole)
     tensor = np.trace(spread) * np.eye(3) - spread
     inertial = link.find("inertial")
@@ -75,24 +101,38 @@ def set_inertia(link, whole):
     inertial.find("origin").set("xyz", text(centre))
     inertial.find("origin").set("rpy", "0 0 0")
     inertial.find("mass").set("value", f"{mass:.9g}")
-    for key, (row, column) in {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}.items():
+    for key, (row, column) in {
+        "ixx": (0, 0),
+        "ixy": (0, 1),
+        "ixz": (0, 2),
+        "iyy": (1, 1),
+        "iyz": (1, 2),
+        "izz": (2, 2),
+    }.items():
         inertial.find("inertia").set(key, f"{tensor[row, column]:.9g}")
 
 
 def another_body(whole, random):
-    """A body somewhat like this one, and as physical: its mass, each component of its first moment, each principal second moment about its centre 20 %
-    off, up or down, and its principal axes turned by 0.2 rad."""
+    """A similar physical body, with errors of 20 %, up or down.
+
+    The errors are in the mass, each component of the first moment, and each principal second moment
+    about the centre. The principal axes are rotated by 0.2 rad.
+    """
     off = lambda count: PERTURBATION * random.choice([-1.0, 1.0], count)
     mass, centre, spread = take_apart(whole)
     extents, axes = np.linalg.eigh(spread)
-    must(extents[0] > 0, "a link of the URDF is no body")
+    must(extents[0] > 0, "a link of the URDF is not physical")
     other_mass = mass * (1 + off(1)[0])
     axes = rotation_of(off(3) / np.sqrt(3)) @ axes
-    return assemble(other_mass, mass * centre * (1 + off(3)) / other_mass, (axes * (extents * (1 + off(3)))) @ axes.T)
+    return assemble(
+        other_mass,
+        mass * centre * (1 + off(3)) / other_mass,
+        (axes * (extents * (1 + off(3)))) @ axes.T,
+    )
 
 
 def wrong_urdf(path, random):
-    """The URDF as the estimator gets it, without its shapes."""
+    """A random URDF with errors for the estimator, without shapes."""
     tree = ElementTree.parse(path).getroot()
     for link in tree.findall("link"):
         for shape in link.findall("visual") + link.findall("collision"):
@@ -100,14 +140,18 @@ def wrong_urdf(path, random):
         whole = pseudo_inertia(link)
         if whole is not None:
             wrong = another_body(whole, random)
-            must(np.linalg.eigvalsh(wrong)[0] > 0, f"{link.get('name')}: no body")
+            must(np.linalg.eigvalsh(wrong)[0] > 0, f"{link.get('name')}: not physical")
             set_inertia(link, wrong)
     return ElementTree.tostring(tree, encoding="unicode") + "\n"
 
 
 def wrong_enough(plan, world, path, random, file):
-    """The first such URDF by which, in every joint beyond a sensor, torques are off by more than a tenth of their RMS: errors of neighbouring links may
-    cancel, and there would be nothing to identify. `file` is where it may be kept meanwhile."""
+    """The first `wrong_urdf` with large enough errors of torque.
+
+    In every joint beyond a sensor the RMS error must be more than a tenth of the RMS torque.
+    Otherwise errors of neighbouring links may cancel, and there is nothing to identify. `file` is
+    overwritten with each candidate.
+    """
     robot = world.robot
     joints = [robot.joints.index(joint) for joint in plan["distal"]]
     instants = np.linspace(0, plan["durations"]["train"], 25)
@@ -116,15 +160,17 @@ def wrong_enough(plan, world, path, random, file):
     for _ in range(2000):
         text = wrong_urdf(path, random)
         file.write_text(text)
-        engines = {"bare": (MuJoCo(Robot(file, robot.imu), floating=True), world.engines["bare"][1])}
+        engines = {
+            "bare": (MuJoCo(Robot(file, robot.imu), floating=True), world.engines["bare"][1])
+        }
         wrong = torques(World(plan, robot, engines, world.motion, world.leaning, None, None))
         if (np.sum((wrong - truth) ** 2, axis=0) > 0.1**2 * np.sum(truth**2, axis=0)).all():
             return text
-    raise SystemExit("no URDF is wrong enough")
+    raise SystemExit("no URDF has large enough errors")
 
 
 def loaded(robot, hand, centre):
-    """The robot with a cube of PAYLOAD_MASS in its hand, `centre` in the hand's axes."""
+    """The robot with a cube of PAYLOAD_MASS in its hand, its `centre` in the hand's axes."""
     other = Robot(robot.path, robot.imu)
     tree = ElementTree.fromstring(other.text)
     (link,) = [link for link in tree.findall("link") if link.get("name") == hand]
@@ -136,15 +182,26 @@ def loaded(robot, hand, centre):
 
 # ---------------------------------------------------------------- motions
 
+
 def smooth_step(x):
-    """From 0 to 1 while x goes from 0 to 1, three derivatives continuous at both ends; with its first two derivatives."""
+    """A step from 0 to 1 for x from 0 to 1, and its first two derivatives.
+
+    Three derivatives are continuous at both ends.
+    """
     x = np.clip(x, 0.0, 1.0)
     y = 1.0 - x
-    return x**4 * (35 + x * (-84 + x * (70 - 20 * x))), 140 * (x * y) ** 3, 420 * (x * y) ** 2 * (y - x)
+    return (
+        x**4 * (35 + x * (-84 + x * (70 - 20 * x))),
+        140 * (x * y) ** 3,
+        420 * (x * y) ** 2 * (y - x),
+    )
 
 
 class Swing:
-    """Every joint stands at `rest`, then follows three sines of 0.1 to 0.9 Hz, no faster than `speed`, no further than `reach` from there."""
+    """Every joint stands at `rest` until `still`, then follows three sines of 0.1 to 0.9 Hz.
+
+    It stays within `reach` of `rest` and below `speed`.
+    """
 
     BLEND = 2.0
 
@@ -168,7 +225,10 @@ class Swing:
 
 
 class Postures:
-    """From posture to random posture within `reach` of `rest`, at rest in each; a move takes 1 s or more, so long that no joint is faster than `speed`."""
+    """Moves between random postures within `reach` of `rest`, with a stop in each.
+
+    A move takes at least 1 s, and so long that no joint is faster than `speed`.
+    """
 
     def __init__(self, random, rest, reach, speed, still, duration):
         self.starts, self.places, self.lasts = [still], [np.asarray(rest)], []
@@ -187,7 +247,10 @@ class Postures:
 
 
 class Pushes:
-    """Forces through one point of the hand, in its axes: some of 1 to 3 s, each coming and going within 0.15 s, of 4 to 10 N."""
+    """Forces of 4 to 10 N at one point of the hand, in its axes, for 1 to 3 s each.
+
+    Each rises and falls within 0.15 s.
+    """
 
     EDGE = 0.15
 
@@ -199,18 +262,29 @@ class Pushes:
             if end > last:
                 break
             direction = random.normal(size=3)
-            self.spans.append((start, end, random.uniform(4.0, 10.0) * direction / np.linalg.norm(direction)))
+            self.spans.append(
+                (start, end, random.uniform(4.0, 10.0) * direction / np.linalg.norm(direction))
+            )
             start = end + random.uniform(1.5, 3.5)
 
     def at(self, t):
         force = np.zeros(3)
         for start, end, most in self.spans:
-            force = force + most * smooth_step((t - start) / self.EDGE)[0] * smooth_step((end - t) / self.EDGE)[0]
+            force = (
+                force
+                + most
+                * smooth_step((t - start) / self.EDGE)[0]
+                * smooth_step((end - t) / self.EDGE)[0]
+            )
         return np.concatenate([force, np.cross(self.point, force)])
 
 
 class Pokes:
-    """Pushes that nobody declares, from weak to strong in turn: at one point of each of some links, in the link's axes, for a second each."""
+    """Undeclared pushes of one second, at one point of each of some links in turn.
+
+    After each round of the links the force is the next of `forces`. Forces and points are in the
+    axes of the link.
+    """
 
     EDGE, LAST, PAUSE = 0.05, 1.0, 3.0
 
@@ -220,21 +294,33 @@ class Pokes:
             link, point = list(points.items())[number % len(points)]
             direction = random.normal(size=3)
             force = forces[number // len(points) % len(forces)]
-            self.spans.append((start, start + self.LAST, force * direction / np.linalg.norm(direction), link, np.array(point)))
+            self.spans.append(
+                (
+                    start,
+                    start + self.LAST,
+                    force * direction / np.linalg.norm(direction),
+                    link,
+                    np.array(point),
+                )
+            )
             start, number = start + self.LAST + self.PAUSE, number + 1
 
     def at(self, t):
-        """Links and wrenches at their origins."""
+        """The pushed links, each with the wrench at its origin."""
         found = []
         for start, end, most, link, point in self.spans:
             if start < t < end:
-                force = most * smooth_step((t - start) / self.EDGE)[0] * smooth_step((end - t) / self.EDGE)[0]
+                force = (
+                    most
+                    * smooth_step((t - start) / self.EDGE)[0]
+                    * smooth_step((end - t) / self.EDGE)[0]
+                )
                 found.append((link, np.concatenate([force, np.cross(point, force)])))
         return found
 
 
 class Leaning:
-    """A root that leans to and fro by up to 5 degrees, turning about a point 0.3 m below it, once the session's stillness is over."""
+    """A root that swings up to 5 degrees about a point 0.3 m below it, from the time `still`."""
 
     ARM = np.array([0.0, 0.0, 0.3])
 
@@ -242,34 +328,54 @@ class Leaning:
         self.angles = Swing(random, np.zeros(2), 0.08, 0.3, still)
 
     def at(self, t):
-        """As `MuJoCo.solve` has it: attitude, then velocity, classical acceleration, angular velocity and acceleration in the root's axes."""
+        """The `base` of `MuJoCo.solve`: attitude, then velocity, classical acceleration, angular
+        velocity and angular acceleration in the root's axes.
+        """
         (r, p), (dr, dp), (ddr, ddp) = self.angles.at(t)
-        (sr, cr) = np.sin(r), np.cos(r)
+        sr, cr = np.sin(r), np.cos(r)
         omega = np.array([dr, dp * cr, -dp * sr])
         alpha = np.array([ddr, ddp * cr - dp * dr * sr, -ddp * sr - dp * dr * cr])
         velocity = np.cross(omega, self.ARM)
-        return rotation_of([r, p, 0.0]), velocity, np.cross(alpha, self.ARM) + np.cross(omega, velocity), omega, alpha
+        return (
+            rotation_of([r, p, 0.0]),
+            velocity,
+            np.cross(alpha, self.ARM) + np.cross(omega, velocity),
+            omega,
+            alpha,
+        )
 
 
 # ---------------------------------------------------------------- the robot, moved
 
+
 class World:
-    """What happens at an instant: motion, F/T readings, IMU, torques; all of it MuJoCo's, the payload by a second model."""
+    """The true motion, F/T and IMU readings, and torques at any time.
+
+    All come from MuJoCo, with a second model for the robot with its payload.
+    """
 
     def __init__(self, plan, robot, engines, motion, leaning, pushes, pick_up):
         self.plan, self.robot, self.engines, self.motion = plan, robot, engines, motion
         self.leaning, self.pushes, self.pick_up = leaning, pushes, pick_up
 
     def held(self, t):
-        """The share of the payload that the hand carries, the rest being on the table still."""
-        return 0.0 if self.pick_up is None else float(smooth_step((t - self.pick_up) / PICK_UP_SECONDS)[0])
+        """The share of the payload that the hand carries; the rest is still on the table."""
+        return (
+            0.0
+            if self.pick_up is None
+            else float(smooth_step((t - self.pick_up) / PICK_UP_SECONDS)[0])
+        )
 
     def at(self, t):
         share = self.held(t)
-        parts = [(1 - share, self.engines["bare"])] * (share < 1) + [(share, self.engines.get("loaded"))] * (share > 0)
+        parts = [(1 - share, self.engines["bare"])] * (share < 1) + [
+            (share, self.engines.get("loaded"))
+        ] * (share > 0)
         answers = [(weight, self.solve(t, *engine)) for weight, engine in parts]
         # Readings and torques are linear in the robot's inertias.
-        return {key: sum(weight * answer[key] for weight, answer in answers) for key in answers[0][1]}
+        return {
+            key: sum(weight * answer[key] for weight, answer in answers) for key in answers[0][1]
+        }
 
     def wrenches(self, t):
         if isinstance(self.pushes, Pokes):
@@ -277,32 +383,43 @@ class World:
         return [] if self.pushes is None else [(self.plan["hand"], self.pushes.at(t))]
 
     def base(self, t, pinocchio):
-        """Gravity and the root's motion."""
+        """Gravity and the `base` of `MuJoCo.solve`."""
         if self.leaning is not None:
             return GRAVITY, self.leaning.at(t)
-        # The foot stands: only what is felt at the root matters.
-        felt = pinocchio.root_motion(*self.motion.at(t), self.plan["stands_on"], np.concatenate([-GRAVITY, np.zeros(6)]))
+        # The foot stands. Only the root's proper acceleration matters, so gravity can be zero.
+        felt = pinocchio.root_motion(
+            *self.motion.at(t), self.plan["stands_on"], np.concatenate([-GRAVITY, np.zeros(6)])
+        )
         return np.zeros(3), (np.eye(3), np.zeros(3), felt[:3], felt[3:6], felt[6:])
 
     def solve(self, t, engine, pinocchio):
-        state, (gravity, base), wrenches = self.motion.at(t), self.base(t, pinocchio), self.wrenches(t)
+        state, (gravity, base), wrenches = (
+            self.motion.at(t),
+            self.base(t, pinocchio),
+            self.wrenches(t),
+        )
         answer = engine.solve(*state, gravity, wrenches, base)
         if self.plan["stands_on"] is not None:
-            # What the root would need goes through the foot.
-            root, foot = (engine.data.body(name) for name in (self.robot.root, self.plan["stands_on"]))
+            # The wrench that the root needs acts on the foot.
+            root, foot = (
+                engine.data.body(name) for name in (self.robot.root, self.plan["stands_on"])
+            )
             turn = root.xmat.reshape(3, 3).T @ foot.xmat.reshape(3, 3)
             way = root.xmat.reshape(3, 3).T @ (foot.xpos - root.xpos)
             support = move_wrench(answer["base"], turn.T, -turn.T @ way)
-            answer = engine.solve(*state, gravity, wrenches + [(self.plan["stands_on"], support)], base)
-            must(np.abs(answer["base"]).max() < 1e-8, "something is left for the root")
+            answer = engine.solve(
+                *state, gravity, wrenches + [(self.plan["stands_on"], support)], base
+            )
+            must(np.abs(answer["base"]).max() < 1e-8, "a wrench remains on the root")
             answer["support"] = support
         return answer
 
 
 # ---------------------------------------------------------------- the boards
 
+
 def instants(random, period, duration):
-    """When a board samples, by true time, and what it stamps: up to 0.1 ms late."""
+    """The true times of a board's samples, and their stamps, which are up to 0.1 ms late."""
     period *= 1 + 1e-6 * CLOCK_PPM * random.uniform(-1, 1)
     t = np.arange(random.uniform(0, period), duration, period)
     return t, t + random.uniform(0, 1e-4, len(t))
@@ -318,7 +435,7 @@ def in_steps(values, step):
 
 
 class Log:
-    """Rows with empty cells, one per sample of a board; in the order of stamps."""
+    """A table with one row per sample of a board, in the order of stamps; other cells are empty."""
 
     def __init__(self, columns):
         self.columns, self.rows = {name: i for i, name in enumerate(columns)}, []
@@ -336,7 +453,7 @@ class Log:
 
 
 def record(plan, robot, world, duration, stream):
-    """One session as its boards see it. Returns the log and what is true of the sensors."""
+    """The log of one session, and the true offsets and pushes."""
     joints = robot.joints
     columns = [f"joint/{j}/position" for j in joints] + [f"joint/{j}/torque" for j in joints]
     columns += [f"wrench/{s.name}/{c}" for s in robot.sensors for c in WRENCH]
@@ -354,11 +471,17 @@ def record(plan, robot, world, duration, stream):
             before, offset = t, start + warm * (1 - np.exp(-t / WARM_SECONDS)) + walk
             now = world.at(t)
             reading = now["ft"].reshape(-1, 6)[number] + offset + FT_NOISE * random.normal(size=6)
-            cells = {f"wrench/{sensor.name}/{c}": cell(x, 3 if c[0] == "f" else 4) for c, x in zip(WRENCH, in_steps(reading, FT_STEP))}
+            cells = {
+                f"wrench/{sensor.name}/{c}": cell(x, 3 if c[0] == "f" else 4)
+                for c, x in zip(WRENCH, in_steps(reading, FT_STEP))
+            }
             if number == 0 and index % TRUTH_EVERY == 0:
                 cells |= {f"joint/{j}/torque": cell(x, 5) for j, x in zip(joints, now["torque"])}
                 if pushed:
-                    cells |= {f"contact/{plan['contact']}/{c}": cell(x, 4) for c, x in zip(WRENCH, world.pushes.at(t))}
+                    cells |= {
+                        f"contact/{plan['contact']}/{c}": cell(x, 4)
+                        for c, x in zip(WRENCH, world.pushes.at(t))
+                    }
             log.add(stamp, cells)
         truth["offsets"][sensor.name] = {"start": plain(start), "end": plain(offset)}
 
@@ -366,7 +489,9 @@ def record(plan, robot, world, duration, stream):
         random = stream("encoders", number)
         places = [joints.index(joint) for joint in board]
         for t, stamp in zip(*instants(random, plan["encoder_period"], duration)):
-            noisy = world.motion.at(t)[0][places] + plan["encoder_noise"] * random.normal(size=len(places))
+            noisy = world.motion.at(t)[0][places] + plan["encoder_noise"] * random.normal(
+                size=len(places)
+            )
             read = in_steps(noisy, plan["encoder_step"])
             log.add(stamp, {f"joint/{j}/position": cell(x, 5) for j, x in zip(board, read)})
 
@@ -374,17 +499,36 @@ def record(plan, robot, world, duration, stream):
         random = stream("imu", 0)
         for t, stamp in zip(*instants(random, plan["imu_period"], duration)):
             read = in_steps(world.at(t)["imu"][:6] + IMU_NOISE * random.normal(size=6), IMU_STEP)
-            log.add(stamp, {f"imu/{plan['imu']}/{c}": cell(x, 2 if c[0] == "a" else 4) for c, x in zip(IMU, read)})
+            log.add(
+                stamp,
+                {
+                    f"imu/{plan['imu']}/{c}": cell(x, 2 if c[0] == "a" else 4)
+                    for c, x in zip(IMU, read)
+                },
+            )
 
     if pushed:
-        # Whoever declares it knows it a little earlier and a little longer.
-        declared = [(0.0, 0)] + [at for start, end, _ in world.pushes.spans for at in ((start - 0.05, 1), (end + 0.05, 0))]
+        # The declaration begins a little before the contact and ends a little after it.
+        declared = [(0.0, 0)] + [
+            at
+            for start, end, _ in world.pushes.spans
+            for at in ((start - 0.05, 1), (end + 0.05, 0))
+        ]
         for t, active in declared:
             log.add(t, {f"contact/{plan['contact']}/active": str(active)})
-        truth["pushes"] = [{"from": round(start, 5), "to": round(end, 5), "force": plain(force)} for start, end, force in world.pushes.spans]
+        truth["pushes"] = [
+            {"from": round(start, 5), "to": round(end, 5), "force": plain(force)}
+            for start, end, force in world.pushes.spans
+        ]
     if isinstance(world.pushes, Pokes):
         truth["pushes"] = [
-            {"from": round(start, 5), "to": round(end, 5), "force": plain(force), "link": link, "point": plain(point)}
+            {
+                "from": round(start, 5),
+                "to": round(end, 5),
+                "force": plain(force),
+                "link": link,
+                "point": plain(point),
+            }
             for start, end, force, link, point in world.pushes.spans
         ]
     return log.text(), truth
@@ -396,12 +540,17 @@ def plain(values):
 
 # ---------------------------------------------------------------- sessions
 
+
 def make(plan, urdf, out, seed):
-    """All files of a robot."""
+    """Writes all files of a robot."""
     robot = Robot(urdf, plan["imu_frame"])
     stream = lambda *what: np.random.default_rng([seed, *(number_of(w) for w in what)])
     out.mkdir(parents=True, exist_ok=True)
-    config = plan["config"].replace("POSITION_NOISE", f"{plan['encoder_step'] / 2 + 1.4e-4:.2g}").replace("PALM", str(plan["palm"]))
+    config = (
+        plan["config"]
+        .replace("POSITION_NOISE", f"{plan['encoder_step'] / 2 + 1.4e-4:.2g}")
+        .replace("PALM", str(plan["palm"]))
+    )
     (out / "estimator.toml").write_text(config)
     point = np.array(plan["palm"])
     payload = loaded(robot, plan["hand"], point)
@@ -421,15 +570,29 @@ def make(plan, urdf, out, seed):
         else:
             motion = Postures(of("motion"), rest, reach, plan["speed"], still, duration)
         leaning = Leaning(of("leaning"), still) if plan["stands_on"] is None else None
-        pushes = Pushes(of("pushes"), still + 3.0, duration - 2.0, point) if name == "contact" else None
+        pushes = (
+            Pushes(of("pushes"), still + 3.0, duration - 2.0, point) if name == "contact" else None
+        )
         if name == "pushed":
             points = {plan["hand"]: plan["palm"], plan["forearm"]: plan["forearm_point"]}
             pushes = Pokes(of("pushes"), still + 9.0, duration, points, plan["forces"])
-        world = World(plan, robot, engines, motion, leaning, pushes, duration / 2 if name == "payload" else None)
+        world = World(
+            plan,
+            robot,
+            engines,
+            motion,
+            leaning,
+            pushes,
+            duration / 2 if name == "payload" else None,
+        )
         if name == "train":
-            (out / "cad.urdf").write_text(wrong_enough(plan, world, urdf, stream("cad"), out / "cad.urdf"))
-        compared = compare(plan, robot, idyn, world, name, of("exact").uniform(0, duration, plan["compared"]))
-        # There something touches the hand alone.
+            (out / "cad.urdf").write_text(
+                wrong_enough(plan, world, urdf, stream("cad"), out / "cad.urdf")
+            )
+        compared = compare(
+            plan, robot, idyn, world, name, of("exact").uniform(0, duration, plan["compared"])
+        )
+        # The columns of exact.csv have no place for contacts other than that of the hand.
         exact += compared if name != "pushed" else []
         text, truth = record(plan, robot, world, duration, of)
         (out / f"{name}.csv").write_text(text)
@@ -437,12 +600,22 @@ def make(plan, urdf, out, seed):
         if name == "payload":
             cube = PAYLOAD_MASS * PAYLOAD_SIDE**2 / 6
             facts[name]["payload"] = {
-                "from": duration / 2, "all_from": duration / 2 + PICK_UP_SECONDS, "link": plan["hand"], "mass": PAYLOAD_MASS,
-                "centre": plain(point), "inertia_about_centre": plain([cube] * 3),
+                "from": duration / 2,
+                "all_from": duration / 2 + PICK_UP_SECONDS,
+                "link": plan["hand"],
+                "mass": PAYLOAD_MASS,
+                "centre": plain(point),
+                "inertia_about_centre": plain([cube] * 3),
             }
         print(f"{out.name}/{name}.csv: {len(text) / 1000:.0f} kB, {text.count(chr(10)) - 1} rows")
     write_exact(plan, robot, out, exact)
-    head = {"made_with": made_with(), "seed": seed, "model": plan["model"], "units": "SI; wrenches are [fx, fy, fz, tx, ty, tz]", "sessions": facts}
+    head = {
+        "made_with": made_with(),
+        "seed": seed,
+        "model": plan["model"],
+        "units": "SI; wrenches are [fx, fy, fz, tx, ty, tz]",
+        "sessions": facts,
+    }
     (out / "sessions.json").write_text(json.dumps(head, indent=1) + "\n")
 
 
@@ -451,7 +624,10 @@ def number_of(what):
 
 
 def compare(plan, robot, idyn, world, name, times):
-    """Some instants of a session by MuJoCo, by Pinocchio, and (which reads the URDF from its file) without payload by iDynTree. Returns them."""
+    """Compares the libraries at some instants of a session. Returns MuJoCo's answers there.
+
+    iDynTree takes part without payload only, because it reads the URDF from its file.
+    """
     rows, worst = [], 0.0
     for t in sorted(times):
         share = world.held(t)
@@ -464,28 +640,63 @@ def compare(plan, robot, idyn, world, name, times):
         support = [(plan["stands_on"], now["support"])] if plan["stands_on"] else []
         by_pin = pinocchio.solve(*state, gravity, wrenches + support, base)
         shown = ("torque", "ft", "imu")
-        worst = max(worst, check_agreement(f"{name} at {t:.3f} s: mujoco and pinocchio", TOLERANCE, {k: now[k] for k in shown}, by_pin))
+        worst = max(
+            worst,
+            check_agreement(
+                f"{name} at {t:.3f} s: mujoco and pinocchio",
+                TOLERANCE,
+                {k: now[k] for k in shown},
+                by_pin,
+            ),
+        )
         if not share:
-            by_idyn = idyn.solve(*state, by_pin["imu"], wrenches, robot.imu, plan["stands_on"] or robot.root)
-            worst = max(worst, check_agreement(f"{name} at {t:.3f} s: mujoco and idyntree", TOLERANCE, {k: now[k] for k in ("torque", "ft")}, by_idyn))
+            by_idyn = idyn.solve(
+                *state, by_pin["imu"], wrenches, robot.imu, plan["stands_on"] or robot.root
+            )
+            worst = max(
+                worst,
+                check_agreement(
+                    f"{name} at {t:.3f} s: mujoco and idyntree",
+                    TOLERANCE,
+                    {k: now[k] for k in ("torque", "ft")},
+                    by_idyn,
+                ),
+            )
         rows.append((state, now, share, wrenches[0][1] if wrenches else None))
-    print(f"{name}: mujoco, pinocchio and idyntree agree within {worst:.1e} at {len(rows)} instants")
+    print(
+        f"{name}: mujoco, pinocchio and idyntree agree within {worst:.1e} at {len(rows)} instants"
+    )
     return rows
 
 
 def write_exact(plan, robot, out, rows):
-    """Instants of all sessions, 10 s apart, without noise, offset or steps: a log in which every row holds everything. A payload is something that
-    the hand touches; its wrench is left empty."""
-    columns = ["t"] + [f"joint/{j}/{what}" for j in robot.joints for what in ("position", "velocity", "acceleration", "torque")]
+    """Writes exact.csv: instants of the sessions, 10 s apart, without noise, offset or rounding.
+
+    Every row contains all quantities. A payload counts as a contact of the hand, with an empty
+    wrench.
+    """
+    columns = ["t"] + [
+        f"joint/{j}/{what}"
+        for j in robot.joints
+        for what in ("position", "velocity", "acceleration", "torque")
+    ]
     columns += [f"wrench/{s.name}/{c}" for s in robot.sensors for c in WRENCH]
-    columns += [f"imu/{plan['imu']}/{c}" for c in (*IMU, "alx", "aly", "alz")] if plan["imu"] else []
+    columns += (
+        [f"imu/{plan['imu']}/{c}" for c in (*IMU, "alx", "aly", "alz")] if plan["imu"] else []
+    )
     columns += [f"contact/{plan['contact']}/{c}" for c in ("active", *WRENCH)]
     lines = [",".join(columns)]
     for number, ((q, dq, ddq), now, share, pushed) in enumerate(rows):
-        values = [np.stack([q, dq, ddq, now["torque"]], axis=1).ravel(), now["ft"]] + ([now["imu"]] if plan["imu"] else [])
+        values = [np.stack([q, dq, ddq, now["torque"]], axis=1).ravel(), now["ft"]] + (
+            [now["imu"]] if plan["imu"] else []
+        )
         cells = [str(10 * number)] + [f"{x + 0.0:.13g}" for x in np.concatenate(values)]
         wrench = np.zeros(6) if pushed is None else pushed
-        cells += ["1", *[""] * 6] if share else ["0" if pushed is None else "1", *(f"{x + 0.0:.13g}" for x in wrench)]
+        cells += (
+            ["1", *[""] * 6]
+            if share
+            else ["0" if pushed is None else "1", *(f"{x + 0.0:.13g}" for x in wrench)]
+        )
         must(len(cells) == len(columns), "a row is not as long as the header")
         lines.append(",".join(cells))
     (out / "exact.csv").write_text("\n".join(lines) + "\n")
@@ -494,8 +705,9 @@ def write_exact(plan, robot, out, rows):
 # ---------------------------------------------------------------- robots
 
 ARM_CONFIG = """\
-# The arm of config/icub_left_arm as identification meets it: a URDF whose every link is 20 % off, no offsets known, nobody touching the hand
-# unless said so. Written by tests/oracle/sessions.py.
+# The arm of config/icub_left_arm for tests of identification: a URDF with errors of 20 % in every
+# link, unknown offsets, and a hand that is free unless contact is declared or found. Written by
+# tests/oracle/sessions.py.
 schema = 1
 robot = "icub_left_arm"
 model = "cad.urdf"
@@ -524,7 +736,8 @@ position_m = PALM
 presence = "possible"
 
 [differentiation]
-# Half an encoder's step, its noise of 2e-5 rad, and stamps that are late by up to 0.1 ms: at 1 rad/s this is 1e-4 rad.
+# Half an encoder's step, its noise of 2e-5 rad, and the error of stamps that are up to 0.1 ms late,
+# which is 1e-4 rad at 1 rad/s.
 position_noise_rad = POSITION_NOISE
 
 [input]
@@ -538,36 +751,80 @@ max_wait_ms = 60.0
 ARM = {
     "model": "config/icub_left_arm/model.urdf",
     "config": ARM_CONFIG,
-    "imu": "chest_imu", "imu_frame": "chest_imu_frame", "stands_on": None,
-    "hand": "l_hand", "palm": [-0.0017, 0.0056, 0.0592], "contact": "hand",
-    "forearm": "l_forearm", "forearm_point": [0.0007, 0.0053, 0.0405],
+    "imu": "chest_imu",
+    "imu_frame": "chest_imu_frame",
+    "stands_on": None,
+    "hand": "l_hand",
+    "palm": [-0.0017, 0.0056, 0.0592],
+    "contact": "hand",
+    "forearm": "l_forearm",
+    "forearm_point": [0.0007, 0.0053, 0.0405],
     "encoders": [
-        ["l_shoulder_pitch", "l_shoulder_roll", "l_shoulder_yaw", "l_elbow"], ["l_wrist_prosup", "l_wrist_pitch", "l_wrist_yaw"],
+        ["l_shoulder_pitch", "l_shoulder_roll", "l_shoulder_yaw", "l_elbow"],
+        ["l_wrist_prosup", "l_wrist_pitch", "l_wrist_yaw"],
     ],
     "distal": ["l_elbow", "l_wrist_prosup", "l_wrist_pitch", "l_wrist_yaw"],
-    # The motor's encoder behind a gear has finer steps than these; what a log of five decimals keeps.
-    "encoder_noise": 2e-5, "encoder_step": 1e-5,
-    "reach": 0.8, "speed": 1.2, "compared": 30,
+    # The resolution of a log with five decimals. The encoder of a geared motor has a finer one.
+    "encoder_noise": 2e-5,
+    "encoder_step": 1e-5,
+    "reach": 0.8,
+    "speed": 1.2,
+    "compared": 30,
 }
-# In the repository: small. Everything every 20 ms.
-SMALL = {"ft_period": 0.02, "encoder_period": 0.02, "imu_period": 0.02,
-         "durations": {"train": 28.0, "validate": 18.0, "contact": 24.0, "payload": 24.0, "pushed": 27.0},
-         "forces": (5.0, 20.0)}
-FULL = {"ft_period": 0.01, "encoder_period": 0.01, "imu_period": 0.01,
-        "durations": {"train": 45.0, "validate": 20.0, "contact": 45.0, "payload": 45.0, "pushed": 90.0},
-        "forces": (2.0, 5.0, 10.0, 20.0, 50.0)}
+# The sessions in the repository are small: every board has a period of 20 ms.
+SMALL = {
+    "ft_period": 0.02,
+    "encoder_period": 0.02,
+    "imu_period": 0.02,
+    "durations": {
+        "train": 28.0,
+        "validate": 18.0,
+        "contact": 24.0,
+        "payload": 24.0,
+        "pushed": 27.0,
+    },
+    "forces": (5.0, 20.0),
+}
+FULL = {
+    "ft_period": 0.01,
+    "encoder_period": 0.01,
+    "imu_period": 0.01,
+    "durations": {
+        "train": 45.0,
+        "validate": 20.0,
+        "contact": 45.0,
+        "payload": 45.0,
+        "pushed": 90.0,
+    },
+    "forces": (2.0, 5.0, 10.0, 20.0, 50.0),
+}
 
 
 def limb(side):
-    arm = [f"{side}_shoulder_pitch", f"{side}_shoulder_roll", f"{side}_shoulder_yaw", f"{side}_elbow",
-           f"{side}_wrist_prosup", f"{side}_wrist_pitch", f"{side}_wrist_yaw"]
-    leg = [f"{side}_hip_pitch", f"{side}_hip_roll", f"{side}_hip_yaw", f"{side}_knee", f"{side}_ankle_pitch", f"{side}_ankle_roll"]
+    arm = [
+        f"{side}_shoulder_pitch",
+        f"{side}_shoulder_roll",
+        f"{side}_shoulder_yaw",
+        f"{side}_elbow",
+        f"{side}_wrist_prosup",
+        f"{side}_wrist_pitch",
+        f"{side}_wrist_yaw",
+    ]
+    leg = [
+        f"{side}_hip_pitch",
+        f"{side}_hip_roll",
+        f"{side}_hip_yaw",
+        f"{side}_knee",
+        f"{side}_ankle_pitch",
+        f"{side}_ankle_roll",
+    ]
     return [arm, leg]
 
 
 ICUB_CONFIG_HEAD = """\
-# An iCub on its left foot as identification meets it: a URDF whose every link is 20 % off, no offsets known, nobody touching the hand unless said
-# so. Written by tests/oracle/sessions.py.
+# An iCub on its left foot for tests of identification: a URDF with errors of 20 % in every link,
+# unknown offsets, and a hand that is free unless contact is declared or found. Written by
+# tests/oracle/sessions.py.
 schema = 1
 robot = "icub"
 model = "cad.urdf"
@@ -586,7 +843,8 @@ position_m = PALM
 presence = "possible"
 
 [differentiation]
-# Half an encoder's step, its noise of 2e-5 rad, and stamps that are late by up to 0.1 ms: at 1 rad/s this is 1e-4 rad.
+# Half an encoder's step, its noise of 2e-5 rad, and the error of stamps that are up to 0.1 ms late,
+# which is 1e-4 rad at 1 rad/s.
 position_noise_rad = POSITION_NOISE
 
 [input]
@@ -598,28 +856,44 @@ max_wait_ms = 60.0
 
 ICUB = {
     "model": "iCubGazeboV2_5.urdf of icub-models 3.2.0",
-    "imu": None, "imu_frame": "chest", "stands_on": "l_sole",
-    "hand": "l_hand", "palm": [0.0, 0.0, 0.06], "contact": "hand",
-    "forearm": "l_forearm", "forearm_point": [0.0, 0.005, 0.04],
-    "encoders": [*limb("l"), *limb("r"), ["torso_pitch", "torso_roll", "torso_yaw"], ["neck_pitch", "neck_roll", "neck_yaw"]],
+    "imu": None,
+    "imu_frame": "chest",
+    "stands_on": "l_sole",
+    "hand": "l_hand",
+    "palm": [0.0, 0.0, 0.06],
+    "contact": "hand",
+    "forearm": "l_forearm",
+    "forearm_point": [0.0, 0.005, 0.04],
+    "encoders": [
+        *limb("l"),
+        *limb("r"),
+        ["torso_pitch", "torso_roll", "torso_yaw"],
+        ["neck_pitch", "neck_roll", "neck_yaw"],
+    ],
     "distal": [*limb("l")[0][3:], *limb("r")[0][3:], *limb("r")[1][2:]],
-    "encoder_noise": 2e-5, "encoder_step": 1e-5,
-    "reach": 0.4, "speed": 1.0, "compared": 25,
+    "encoder_noise": 2e-5,
+    "encoder_step": 1e-5,
+    "reach": 0.4,
+    "speed": 1.0,
+    "compared": 25,
 }
 
 
 def write_arm(urdf, out):
-    """The arm's sessions as they are in the repository: small."""
+    """The small sessions of the arm, as in the repository."""
     make({**ARM, **SMALL}, urdf, out, SEED)
 
 
 def write_in_full(urdf, icub, out, seed, encoder_step_deg=None):
-    """Sessions of the arm, or of the iCub, in full length and rate; encoders in other steps, if wanted."""
+    """Sessions of the arm or of the iCub, with full length and rate."""
     plan = {**(ICUB if icub else ARM), **FULL}
     if encoder_step_deg:
         plan["encoder_step"] = np.radians(encoder_step_deg)
     if icub:
         sensors = Robot(urdf, plan["imu_frame"]).sensors
-        tables = "".join(f'\n[[force_torque]]\nsensor = "{sensor.name}"\njoint = "{sensor.joint}"\n' for sensor in sensors)
+        tables = "".join(
+            f'\n[[force_torque]]\nsensor = "{sensor.name}"\njoint = "{sensor.joint}"\n'
+            for sensor in sensors
+        )
         plan["config"] = ICUB_CONFIG_HEAD + tables + ICUB_CONFIG_TAIL
     make(plan, urdf, out, seed)

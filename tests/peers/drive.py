@@ -1,11 +1,14 @@
-"""Asks the programs of this folder in turn, checks that they agree, and prints how long each takes.
+"""Runs the programs of this folder in turn, checks that they agree, and prints their times.
 
-Usage: python drive.py FOLDER [--rounds N] [--row ROW]...        (standard library only; `run` builds the programs into FOLDER and calls this)
+Usage: python drive.py FOLDER [--rounds N] [--row ROW]...
+(needs only the standard library; `run` builds the programs into FOLDER and calls this)
 
-Every program loads the robot, then waits (the conversation: server.rs). First each row's outputs are compared at a few states, by name: whoever differs
-from our portable build by more than 1e-9 of the largest value of its kind ends the run. Then come the rounds: in each, every program computes one batch of
-every row, one after the other on the same core, so that whatever disturbs the machine disturbs all alike. From the rounds' times per call, the least and the
-median are reported, and how many times as long as ours the peer takes.
+Every program loads the robot, then waits for requests (the protocol is in server.rs). First each
+row's outputs are compared at a few states, by name. A difference from our portable build of more
+than 1e-9 of the largest value of its kind ends the run. Then come the rounds. In each, every
+program computes one batch of every row, one after the other on the same core, so that a disturbance
+of the machine affects all of them equally. The results are the least and the median of the rounds'
+times per call, and their ratios to ours.
 """
 
 import argparse
@@ -20,19 +23,22 @@ import statistics
 import subprocess
 import sys
 
-# Name, what is computed. A program that has the row is asked; a new row needs a line here and an entry in the programs that have it.
+# Name, what is computed. A new row needs a line here and an entry in the programs that have it.
 ROWS = {
     "kinematics": "pose, velocity and acceleration of 33 links (ours: their net wrenches too)",
     "rnea": "inverse dynamics (RNEA), base standing, 33 links",
     "rnea_floating": "inverse dynamics (RNEA), base moving, 33 links",
     "regressor_33": "regressor, base moving, 38 x 330",
     "regressor_39": "regressor, base moving, F/T joints kept, 38 x 390",
-    "pass_33": "least squares over a log: regressor_33, its rows into [R z] every 16 samples; per sample",
+    "pass_33": "least squares over a log: regressor_33, its rows into [R z] every 16 samples; "
+    "per sample",
     "cycle": "full cycle: kinematics, 6 F/T readings to 7 contact wrenches and 32 torques",
-    "recursion_44": "recursive least squares, 44 unknowns, 6 rows a sample, solved at each sample; per sample",
+    "recursion_44": "recursive least squares, 44 unknowns, 6 rows a sample, solved at each sample; "
+    "per sample",
     "panels_44": "the same, absorbed and solved every 8 samples; per sample, square-root form",
 }
-# Name in the tables, command in the folder. What the others are compared with comes first and second.
+# Name in the tables, command in the folder. The first two are those that the others are compared
+# with.
 OURS_NATIVE, OURS_PORTABLE = "ours, native", "ours, portable"
 IDYNTREE = "iDynTree, portable: the wheel's libraries"
 PROGRAMS = {
@@ -43,7 +49,8 @@ PROGRAMS = {
     "dynibo, native": ["dynibo/release/peers-dynibo", "folded.urdf", "states.txt"],
     "Eigen, native": ["peers-eigen"],
 }
-# Which build of ours is built as a peer is: the ratio to that one compares libraries, and not compilers' flags.
+# The build of ours with the same kind of flags as a peer: the ratio to it compares libraries, not
+# compiler flags.
 BUILT_LIKE = {
     IDYNTREE: OURS_PORTABLE,
     "Pinocchio, native": OURS_NATIVE,
@@ -53,11 +60,11 @@ BUILT_LIKE = {
 REFERENCE = OURS_PORTABLE
 TOLERANCE = 1e-9
 SHOWN_STATES = (0, 17, 63)
-BATCH_NS = 2e6  # long against the clock and the pipe, short against what disturbs a machine
+BATCH_NS = 2e6  # much more than the clock and the pipe take, much less than most disturbances
 
 
 class Failure(Exception):
-    """What ends the run, in one sentence."""
+    """The reason for which the run ends, in one sentence."""
 
 
 class Program:
@@ -99,7 +106,7 @@ class Program:
         return float(self._ask(f"time {row} {calls}"))
 
     def show(self, row, state):
-        """What comes out, by name."""
+        """The outputs of a row at a state, by name."""
         return {
             name: float(value)
             for name, value in (
@@ -113,11 +120,14 @@ class Program:
 
 
 def largest_difference(values, reference):
-    """Of two outputs, relative to the largest value of the same kind, and where it is. Both must hold the same names."""
+    """The largest difference of two outputs, and its name. Both must have the same names.
+
+    It is relative to the largest value of the same kind.
+    """
     if values.keys() != reference.keys() or not values:
         only = sorted(values.keys() ^ reference.keys())
         raise Failure(f"not the same outputs: {' '.join(only[:8]) or 'none'}")
-    # Compared with a number that is none, anything would pass.
+    # A comparison with NaN would always pass.
     wrong = [
         name
         for output in (values, reference)
@@ -140,7 +150,7 @@ def largest_difference(values, reference):
 
 
 def check(row, programs):
-    """That all programs get the same from a row; the largest relative difference by program."""
+    """Fails unless the outputs of a row agree. Returns the largest difference by program."""
     reference = next((p for p in programs if p.name == REFERENCE), programs[0])
     found = {}
     for program in programs:
@@ -155,7 +165,8 @@ def check(row, programs):
                 raise Failure(f"{row}, {program.name} and {reference.name}: {failure}") from failure
             if worst > TOLERANCE:
                 raise Failure(
-                    f"{row}, state {state}: {program.name} differs from {reference.name} by {worst:.1e} in {where}"
+                    f"{row}, state {state}: {program.name} differs from {reference.name} "
+                    f"by {worst:.1e} in {where}"
                 )
             found[program.name] = max(found.get(program.name, 0.0), worst)
     return found
@@ -171,7 +182,7 @@ def measure(rows, rounds):
     }
     for number in range(rounds):
         for row, programs in rows.items():
-            # Somebody else first in each round, so that nobody always follows the same neighbour.
+            # Another program first in each round, so that the order changes.
             shift = number % len(programs)
             for program in programs[shift:] + programs[:shift]:
                 times[row][program.name].append(program.time(row, calls[row, program.name]))
@@ -179,7 +190,7 @@ def measure(rows, rounds):
 
 
 def machine():
-    """What the numbers were taken on."""
+    """The machine on which the times were measured."""
     try:
         cpus = re.findall(
             r"^model name\s*: (.*)$", pathlib.Path("/proc/cpuinfo").read_text(), re.MULTILINE
@@ -208,7 +219,7 @@ def report(times, differences):
                     "program": name,
                     "min_us": low[name],
                     "median_us": middle[name],
-                    # Times as long as ours.
+                    # Relative to ours.
                     "ratio_min": {
                         ours: low[name] / low[ours] for ours in (OURS_NATIVE, OURS_PORTABLE)
                     },
@@ -223,12 +234,14 @@ def report(times, differences):
 
 
 def markdown(rows, rounds, at):
-    """The result as a text that reads well as it is."""
+    """The result as Markdown tables."""
     lines = [
-        f"{at['cpu']}, core {' '.join(map(str, at['cores']))}, {at['system']}, {at['time']}; load {at['load']:.2f} at the start; {rounds} rounds.",
-        "Microseconds per call. Ratio: the program's time over ours, of the least / of the medians. Difference: largest, relative, of outputs.",
-        "The ratio that counts, marked *, is to the build of ours that is built as the peer is: for iDynTree, whose libraries come built for any processor,",
-        "the portable one.",
+        f"{at['cpu']}, core {' '.join(map(str, at['cores']))}, {at['system']}, {at['time']}; "
+        f"load {at['load']:.2f} at the start; {rounds} rounds.",
+        "Microseconds per call. Ratio: the program's time over ours, of the least / of the "
+        "medians. Difference: the largest relative difference of the outputs.",
+        "The ratio that counts, marked *, is to the build of ours with the same kind of flags: the",
+        "portable one for iDynTree, whose libraries are built for any processor.",
         "",
     ]
     header = ["program", "min", "median", "ratio to native", "ratio to portable", "difference"]
@@ -239,7 +252,8 @@ def markdown(rows, rounds, at):
         table = [header]
         for entry in entries:
             ratios = [
-                f"{entry['ratio_min'][ours]:.2f} / {entry['ratio_median'][ours]:.2f}{' *' if entry['built_like'] == ours else '  '}"
+                f"{entry['ratio_min'][ours]:.2f} / {entry['ratio_median'][ours]:.2f}"
+                f"{' *' if entry['built_like'] == ours else '  '}"
                 for ours in (OURS_NATIVE, OURS_PORTABLE)
             ]
             difference = "-" if entry["difference"] is None else f"{entry['difference']:.0e}"
@@ -271,7 +285,7 @@ def main():
     parser.add_argument("folder", type=pathlib.Path)
     parser.add_argument("--rounds", type=int, default=100)
     parser.add_argument(
-        "--row", action="append", choices=ROWS, help="this row alone; may be repeated"
+        "--row", action="append", choices=ROWS, help="measure only this row; may be repeated"
     )
     arguments = parser.parse_args()
     if arguments.rounds < 1:
@@ -281,7 +295,8 @@ def main():
     at = machine()
     if at["load"] > 0.5:
         print(
-            f"drive.py: the machine is not idle (load {at['load']:.2f}): trust the least times alone, if any",
+            f"drive.py: the machine is not idle (load {at['load']:.2f}): "
+            "only the least times may be reliable",
             file=sys.stderr,
         )
     programs = [Program(name, folder) for name in PROGRAMS]
@@ -293,7 +308,7 @@ def main():
     rows = {row: having for row, having in rows.items() if having}
     for row, having in rows.items():
         if not {OURS_NATIVE, OURS_PORTABLE} <= {program.name for program in having}:
-            raise Failure(f"{row}: not in both builds of ours, which all are compared with")
+            raise Failure(f"{row}: one of the two builds of ours does not have this row")
     differences = {row: check(row, having) for row, having in rows.items()}
     compared = sum(map(len, differences.values()))
     print(

@@ -1,7 +1,9 @@
-// Times recursive least squares written with Eigen. Usage: peers-eigen        (conversation: server.rs)
+// Times recursive least squares written with Eigen. Usage: peers-eigen        (protocol: server.rs)
 //
-// There is no library for this to compare with: what whoever identifies a robot in C++ has at hand is Eigen. Two ways: the paper's authors' own, a
-// Cholesky factor of the information, updated row by row and solved at every sample; and the same square-root form as ours, in panels, by Eigen's Householder.
+// There is no library for this to compare with; in C++ one would use Eigen. There are two methods:
+// that of the paper's authors, a Cholesky factor of the information matrix, updated row by row and
+// solved at every sample; and the square-root form that ours has, in panels, with Eigen's
+// Householder QR.
 
 #include "server.hpp"
 
@@ -15,7 +17,7 @@ using peers::Row;
 
 namespace {
 
-// As in ours/src/main.rs.
+// The same as in ours/src/main.rs.
 constexpr int UNKNOWNS = 44, ROWS = 6, SAMPLES = 8;
 constexpr std::size_t STATES = 64;
 
@@ -39,7 +41,8 @@ private:
 
 struct Sample
 {
-    Eigen::Matrix<double, UNKNOWNS, ROWS> transposed; // a row of the regressor is a column here, contiguous
+    // The regressor transposed, so that each of its rows is contiguous.
+    Eigen::Matrix<double, UNKNOWNS, ROWS> transposed;
     Eigen::Matrix<double, ROWS, 1> measured;
 };
 
@@ -57,7 +60,7 @@ std::vector<Sample> samples()
     return all;
 }
 
-// Both start from the row x = 0 of every unknown.
+// Both methods start with one row x = 0 for every unknown.
 struct RankUpdates
 {
     Eigen::LLT<Eigen::MatrixXd> factor{Eigen::MatrixXd::Identity(UNKNOWNS, UNKNOWNS)};
@@ -78,7 +81,7 @@ struct RankUpdates
 struct Panels
 {
     static constexpr int BELOW = ROWS * SAMPLES;
-    // [R | z] above, rows to come below.
+    // [R | z] at the top, new rows below it.
     Eigen::MatrixXd stacked = Eigen::MatrixXd::Identity(UNKNOWNS + BELOW, UNKNOWNS + 1);
     Eigen::VectorXd x = Eigen::VectorXd::Zero(UNKNOWNS);
     int waiting = 0;
@@ -109,7 +112,7 @@ template <class Recursion> Row row(const std::string& name, const std::vector<Sa
             running->take(all[state]);
             *last = state;
         },
-        // What timing has taken in differs from program to program: the state's panels afresh.
+        // The samples absorbed during timing differ between programs, so start afresh.
         [last, &all](Output& output) {
             Recursion fresh;
             for (std::size_t state = 0; state < (*last / SAMPLES + 1) * SAMPLES; ++state)

@@ -1,7 +1,8 @@
-// Times iDynTree. Usage: peers-idyntree robot.urdf states.txt        (conversation: server.rs)
+// Times iDynTree. Usage: peers-idyntree robot.urdf states.txt        (protocol: server.rs)
 //
-// Everything that a caller could prepare once is prepared for each state beforehand, so that the calls of the library alone are timed. The states change
-// from call to call, because iDynTree keeps the sines of joints that have not moved.
+// Everything that a caller can prepare once is prepared for each state beforehand, so that only the
+// calls of the library are timed. Each call has another state, because iDynTree keeps the sines of
+// joints that have not moved.
 
 #include "server.hpp"
 
@@ -41,13 +42,15 @@ std::vector<std::string> jointNames(const Model& model)
 }
 
 template <class Vector>
-void setJoints(Vector& to, const std::vector<double>& from, const std::vector<std::string>& names, const States& states)
+void setJoints(
+    Vector& to, const std::vector<double>& from, const std::vector<std::string>& names,
+    const States& states)
 {
     for (std::size_t joint = 0; joint < names.size(); ++joint)
         to(joint) = from[peers::place(states.joints, names[joint])];
 }
 
-// The functions that iDynTree's classes are made of, on a model of their own.
+// The low-level functions that iDynTree's classes call, each object with its own model.
 struct LowLevel
 {
     const States& states;
@@ -92,7 +95,7 @@ struct LowLevel
             position.worldBasePos() = Transform::Identity();
             velocity.baseVel().zero();
             acceleration.baseAcc().zero();
-            // Spatial accelerations less gravity; the motion of a base fixed to the world is that of gravity alone.
+            // Spatial accelerations minus gravity. A base fixed to the world has only gravity.
             const peers::Triple spatial = states.baseSpatialAcceleration(state);
             for (int axis = 0; axis < 3; ++axis)
             {
@@ -100,9 +103,11 @@ struct LowLevel
                 {
                     velocity.baseVel().getLinearVec3()(axis) = state.baseVelocity[axis];
                     velocity.baseVel().getAngularVec3()(axis) = state.baseAngularVelocity[axis];
-                    acceleration.baseAcc().getAngularVec3()(axis) = state.baseAngularAcceleration[axis];
+                    acceleration.baseAcc().getAngularVec3()(axis)
+                        = state.baseAngularAcceleration[axis];
                 }
-                acceleration.baseAcc().getLinearVec3()(axis) = (floating ? spatial[axis] : 0.0) - states.gravity[axis];
+                acceleration.baseAcc().getLinearVec3()(axis)
+                    = (floating ? spatial[axis] : 0.0) - states.gravity[axis];
             }
             positions.push_back(position);
             velocities.push_back(velocity);
@@ -113,7 +118,8 @@ struct LowLevel
     void kinematics(std::size_t k)
     {
         must(ForwardPosVelAccKinematics(
-            model, traversal, positions[k], velocities[k], accelerations[k], linkPositions, linkVelocities, linkAccelerations));
+            model, traversal, positions[k], velocities[k], accelerations[k], linkPositions,
+            linkVelocities, linkAccelerations));
     }
 
     void showKinematics(Output& output) const
@@ -125,7 +131,8 @@ struct LowLevel
             const std::string name = model.getLinkName(link);
             const Eigen::Vector3d omega = toEigen(linkVelocities(link).getAngularVec3());
             const Eigen::Vector3d velocity = toEigen(linkVelocities(link).getLinearVec3());
-            const Eigen::Vector3d acceleration = toEigen(linkAccelerations(link).getLinearVec3()) + omega.cross(velocity);
+            const Eigen::Vector3d acceleration
+                = toEigen(linkAccelerations(link).getLinearVec3()) + omega.cross(velocity);
             output.add3("position", name, toEigen(linkPositions(link).getPosition()));
             output.add3("omega", name, omega);
             output.add3("alpha", name, toEigen(linkAccelerations(link).getAngularVec3()));
@@ -133,11 +140,15 @@ struct LowLevel
         }
     }
 
-    // Inverse dynamics needs no poses: velocities and accelerations are enough.
+    // Inverse dynamics needs only velocities and accelerations, no poses.
     void inverseDynamics(std::size_t k)
     {
-        must(ForwardVelAccKinematics(model, traversal, positions[k], velocities[k], accelerations[k], linkVelocities, linkAccelerations));
-        must(RNEADynamicPhase(model, traversal, positions[k].jointPos(), linkVelocities, linkAccelerations, external, internal, torques));
+        must(ForwardVelAccKinematics(
+            model, traversal, positions[k], velocities[k], accelerations[k], linkVelocities,
+            linkAccelerations));
+        must(RNEADynamicPhase(
+            model, traversal, positions[k].jointPos(), linkVelocities, linkAccelerations, external,
+            internal, torques));
     }
 
     void showInverseDynamics(Output& output) const
@@ -154,17 +165,19 @@ struct LowLevel
     void regress(std::size_t k)
     {
         kinematics(k);
-        must(InverseDynamicsInertialParametersRegressor(model, traversal, linkPositions, linkVelocities, linkAccelerations, regressor));
+        must(InverseDynamicsInertialParametersRegressor(
+            model, traversal, linkPositions, linkVelocities, linkAccelerations, regressor));
     }
 
-    // The regressor times parameters that are random numbers: every column counts.
+    // The regressor times random parameters, so that every column counts.
     void showRegressor(Output& output) const
     {
         Eigen::VectorXd parameters(10 * model.getNrOfLinks());
         for (LinkIndex link = 0; link < static_cast<LinkIndex>(model.getNrOfLinks()); ++link)
         {
-            const std::size_t body
-                = link == model.getDefaultBaseLink() ? 0 : peers::place(states.bodies, model.getLinkName(link));
+            const std::size_t body = link == model.getDefaultBaseLink()
+                                         ? 0
+                                         : peers::place(states.bodies, model.getLinkName(link));
             for (int i = 0; i < 10; ++i)
                 parameters(10 * link + i) = states.parameters[body][i];
         }
@@ -176,7 +189,7 @@ struct LowLevel
     }
 };
 
-// F/T readings in; a full contact wrench on each piece between sensors, and all torques, out.
+// From F/T readings: a full contact wrench on each sub-tree between sensors, and all torques.
 struct Estimation
 {
     const States& states;
@@ -228,9 +241,11 @@ struct Estimation
         {
             const FrameIndex frame = estimator.model().getFrameIndex(name);
             must(unknowns->addNewUnknownFullWrenchInFrameOrigin(estimator.model(), frame));
-            pieces.insert(estimator.submodels().getSubModelOfLink(estimator.model().getFrameLink(frame)));
+            pieces.insert(
+                estimator.submodels().getSubModelOfLink(estimator.model().getFrameLink(frame)));
         }
-        if (pieces.size() != states.contacts.size() || pieces.size() != estimator.submodels().getNrOfSubModels())
+        if (pieces.size() != states.contacts.size()
+            || pieces.size() != estimator.submodels().getNrOfSubModels())
             fail("not one contact in every sub-model");
         contacts.resize(estimator.model());
         torques.resize(estimator.model());
@@ -242,8 +257,10 @@ struct Estimation
 
     void run(std::size_t k)
     {
-        must(estimator.updateKinematicsFromFixedBase(positions[k], velocities[k], accelerations[k], base, gravity));
-        must(estimator.estimateExtWrenchesAndJointTorques(*unknowns, readings[k], contacts, torques));
+        must(estimator.updateKinematicsFromFixedBase(
+            positions[k], velocities[k], accelerations[k], base, gravity));
+        must(estimator.estimateExtWrenchesAndJointTorques(
+            *unknowns, readings[k], contacts, torques));
     }
 
     void show(Output& output) const
@@ -252,7 +269,8 @@ struct Estimation
             output.add("torque", joints[joint], torques(joint));
         for (const std::string& name : states.contacts)
         {
-            const LinkIndex link = estimator.model().getFrameLink(estimator.model().getFrameIndex(name));
+            const LinkIndex link
+                = estimator.model().getFrameLink(estimator.model().getFrameIndex(name));
             const Wrench& wrench = contacts.contactWrench(link, 0).contactWrench();
             output.add3("force", name, toEigen(wrench.getLinearVec3()));
             output.add3("moment", name, toEigen(wrench.getAngularVec3()));
@@ -267,7 +285,8 @@ int main(int count, char** arguments)
     if (count != 3)
         fail("usage: peers-idyntree robot.urdf states.txt");
     const States states(arguments[2]);
-    // Each fixed joint folded; and the joints of the F/T sensors kept, as iDynTree does when it has the choice.
+    // The first model merges links at all fixed joints. The second keeps the joints of the F/T
+    // sensors, which is iDynTree's own choice.
     ModelLoader folding, loader;
     must(folding.loadReducedModelFromFile(arguments[1], states.joints));
     must(loader.loadModelFromFile(arguments[1]));
@@ -280,13 +299,17 @@ int main(int count, char** arguments)
     peers::serve(
         states.states.size(),
         {
-            {"kinematics", [&](std::size_t k) { folded.kinematics(k); }, [&](Output& o) { folded.showKinematics(o); }},
-            {"rnea", [&](std::size_t k) { folded.inverseDynamics(k); }, [&](Output& o) { folded.showInverseDynamics(o); }},
-            {"rnea_floating",
-             [&](std::size_t k) { foldedFloating.inverseDynamics(k); },
+            {"kinematics", [&](std::size_t k) { folded.kinematics(k); },
+             [&](Output& o) { folded.showKinematics(o); }},
+            {"rnea", [&](std::size_t k) { folded.inverseDynamics(k); },
+             [&](Output& o) { folded.showInverseDynamics(o); }},
+            {"rnea_floating", [&](std::size_t k) { foldedFloating.inverseDynamics(k); },
              [&](Output& o) { foldedFloating.showInverseDynamics(o); }},
-            {"regressor_33", [&](std::size_t k) { foldedFloating.regress(k); }, [&](Output& o) { foldedFloating.showRegressor(o); }},
-            {"regressor_39", [&](std::size_t k) { keptFloating.regress(k); }, [&](Output& o) { keptFloating.showRegressor(o); }},
-            {"cycle", [&](std::size_t k) { estimation.run(k); }, [&](Output& o) { estimation.show(o); }},
+            {"regressor_33", [&](std::size_t k) { foldedFloating.regress(k); },
+             [&](Output& o) { foldedFloating.showRegressor(o); }},
+            {"regressor_39", [&](std::size_t k) { keptFloating.regress(k); },
+             [&](Output& o) { keptFloating.showRegressor(o); }},
+            {"cycle", [&](std::size_t k) { estimation.run(k); },
+             [&](Output& o) { estimation.show(o); }},
         });
 }

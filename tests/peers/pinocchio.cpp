@@ -1,7 +1,8 @@
-// Times Pinocchio. Usage: peers-pinocchio pinocchio.txt states.txt        (conversation: server.rs)
+// Times Pinocchio. Usage: peers-pinocchio pinocchio.txt states.txt        (protocol: server.rs)
 //
-// Templates alone, compiled for this very processor; nothing of Pinocchio's own is linked. (Its libraries are compiled for any processor, and Eigen lays
-// out memory otherwise there: the two must not meet in one program.) The model therefore comes as text, from prepare.py.
+// This program uses only Pinocchio's templates, compiled for this processor. It must not be linked
+// with Pinocchio's libraries: they are compiled for any processor, for which Eigen has another
+// memory layout. So the model comes as text, from prepare.py.
 
 #include "server.hpp"
 
@@ -28,15 +29,16 @@ Eigen::Vector3d vector(const peers::Triple& values)
     return Eigen::Vector3d(values[0], values[1], values[2]);
 }
 
-// Pinocchio's order of the tensor of inertia is xx xy yy xz yz zz, that of the states xx xy xz yy yz zz.
+// The order of the inertia tensor: xx xy yy xz yz zz in Pinocchio, xx xy xz yy yz zz in the states.
 constexpr std::array<int, 10> ORDER{0, 1, 2, 3, 4, 5, 7, 6, 8, 9};
 
 struct Robot
 {
     const States& states;
     pin::Model model;
-    // Numbers of the joints of the robot, of their child links and of the base, in the model.
+    // The robot's joints and their child links, in the order of the model.
     std::vector<std::string> joints, children;
+    // Index of the base's joint in the model; 0 if the base is fixed.
     pin::JointIndex root = 0;
     std::vector<Eigen::VectorXd> positions, velocities, accelerations;
 
@@ -82,7 +84,8 @@ struct Robot
             if (floating)
             {
                 dq.head<6>() << vector(state.baseVelocity), vector(state.baseAngularVelocity);
-                ddq.head<6>() << vector(states.baseSpatialAcceleration(state)), vector(state.baseAngularAcceleration);
+                ddq.head<6>() << vector(states.baseSpatialAcceleration(state)),
+                    vector(state.baseAngularAcceleration);
             }
             for (std::size_t joint = 0; joint < count; ++joint)
             {
@@ -114,8 +117,10 @@ struct Robot
         {
             const pin::JointIndex joint = root + 1 + number;
             const Eigen::Vector3d omega = data.v[joint].angular();
-            const Eigen::Vector3d gravity = data.oMi[joint].rotation().transpose() * model.gravity.linear();
-            const Eigen::Vector3d acceleration = data.a[joint].linear() + omega.cross(data.v[joint].linear()) - gravity;
+            const Eigen::Vector3d gravity
+                = data.oMi[joint].rotation().transpose() * model.gravity.linear();
+            const Eigen::Vector3d acceleration
+                = data.a[joint].linear() + omega.cross(data.v[joint].linear()) - gravity;
             output.add3("position", children[number], data.oMi[joint].translation());
             output.add3("omega", children[number], omega);
             output.add3("alpha", children[number], data.a[joint].angular());
@@ -123,13 +128,14 @@ struct Robot
         }
     }
 
-    // Random numbers, ten per link, so that every column of a regressor counts.
+    // Random parameters, ten per link, so that every column of a regressor counts.
     Eigen::VectorXd parameters() const
     {
         Eigen::VectorXd parameters(10 * (1 + children.size()));
         for (std::size_t link = 0; link <= children.size(); ++link)
         {
-            const std::size_t body = link == 0 ? 0 : peers::place(states.bodies, children[link - 1]);
+            const std::size_t body
+                = link == 0 ? 0 : peers::place(states.bodies, children[link - 1]);
             for (int i = 0; i < 10; ++i)
                 parameters[10 * link + i] = states.parameters[body][ORDER[i]];
         }
@@ -150,8 +156,10 @@ private:
         return pin::Inertia::FromDynamicParameters(parameters);
     }
 
-    // The type that Pinocchio's own reader chose: about x, y or z where it saw so.
-    pin::JointIndex add(const std::string& kind, const Eigen::Vector3d& axis, pin::JointIndex parent, const pin::SE3& at, const std::string& name)
+    // The joint type that Pinocchio's URDF reader chose.
+    pin::JointIndex
+    add(const std::string& kind, const Eigen::Vector3d& axis, pin::JointIndex parent,
+        const pin::SE3& at, const std::string& name)
     {
         if (kind == "JointModelRX")
             return model.addJoint(parent, pin::JointModelRX(), at, name);
@@ -161,18 +169,19 @@ private:
             return model.addJoint(parent, pin::JointModelRZ(), at, name);
         if (kind == "JointModelRevoluteUnaligned")
             return model.addJoint(parent, pin::JointModelRevoluteUnaligned(axis), at, name);
-        fail("joint " + name + " is a " + kind + ", which this program does not know");
+        fail("joint " + name + " is a " + kind + ", which this program does not support");
     }
 };
 
-// A pass of least squares over a log, as in ours/src/main.rs: the regressor of each sample, some samples' rows at once into [R z], by Eigen's Householder.
+// A pass of least squares over a log, as in ours/src/main.rs: the regressor of each sample, and the
+// rows of some samples at once into [R z], with Eigen's Householder QR.
 struct Pass
 {
     static constexpr std::size_t SAMPLES = 16;
     const Robot& robot;
     pin::Data data{robot.model};
     const Eigen::Index rows = robot.model.nv, columns = 10 * (1 + robot.children.size());
-    // [R | z] above, rows to come below.
+    // [R | z] at the top, new rows below it.
     Eigen::MatrixXd stacked = Eigen::MatrixXd::Zero(columns + rows * SAMPLES, columns + 1);
     double residual = 0.0;
     std::size_t waiting = 0, last = 0;
@@ -185,7 +194,8 @@ struct Pass
     void take(std::size_t k)
     {
         last = k;
-        pin::computeJointTorqueRegressor(robot.model, data, robot.positions[k], robot.velocities[k], robot.accelerations[k]);
+        pin::computeJointTorqueRegressor(
+            robot.model, data, robot.positions[k], robot.velocities[k], robot.accelerations[k]);
         auto to = stacked.middleRows(columns + rows * waiting, rows);
         to.leftCols(columns) = data.jointTorqueRegressor;
         to.col(columns) = robot.velocities[k];
@@ -203,7 +213,8 @@ struct Pass
         for (std::size_t k = 0; k < (last / SAMPLES + 1) * SAMPLES; ++k)
             fresh.take(k);
         const auto root = fresh.stacked.topLeftCorner(columns, columns);
-        const Eigen::VectorXd misfit = root * robot.parameters() - fresh.stacked.col(columns).head(columns);
+        const Eigen::VectorXd misfit
+            = root * robot.parameters() - fresh.stacked.col(columns).head(columns);
         const Eigen::VectorXd gradient = root.transpose() * misfit;
         output.add("square", "sum", misfit.squaredNorm() + fresh.residual);
         for (Eigen::Index link = 0; 10 * link < columns; ++link)
@@ -233,20 +244,31 @@ int main(int count, char** arguments)
         states.states.size(),
         {
             {"kinematics",
-             [&](std::size_t k) { pin::forwardKinematics(fixed.model, fixedData, fixed.positions[k], fixed.velocities[k], fixed.accelerations[k]); },
+             [&](std::size_t k) {
+                 pin::forwardKinematics(
+                     fixed.model, fixedData, fixed.positions[k], fixed.velocities[k],
+                     fixed.accelerations[k]);
+             },
              [&](Output& o) { fixed.showKinematics(fixedData, o); }},
             {"rnea",
-             [&](std::size_t k) { pin::rnea(fixed.model, fixedData, fixed.positions[k], fixed.velocities[k], fixed.accelerations[k]); },
+             [&](std::size_t k) {
+                 pin::rnea(
+                     fixed.model, fixedData, fixed.positions[k], fixed.velocities[k],
+                     fixed.accelerations[k]);
+             },
              [&](Output& o) { fixed.showGeneralized(fixedData.tau, o); }},
             {"rnea_floating",
              [&](std::size_t k) {
-                 pin::rnea(floating.model, floatingData, floating.positions[k], floating.velocities[k], floating.accelerations[k]);
+                 pin::rnea(
+                     floating.model, floatingData, floating.positions[k], floating.velocities[k],
+                     floating.accelerations[k]);
              },
              [&](Output& o) { floating.showGeneralized(floatingData.tau, o); }},
             {"regressor_33",
              [&](std::size_t k) {
                  pin::computeJointTorqueRegressor(
-                     floating.model, floatingData, floating.positions[k], floating.velocities[k], floating.accelerations[k]);
+                     floating.model, floatingData, floating.positions[k], floating.velocities[k],
+                     floating.accelerations[k]);
              },
              [&](Output& o) { floating.showRegressor(floatingData, o); }},
             {"pass_33", [&](std::size_t k) { pass.take(k); }, [&](Output& o) { pass.show(o); }},

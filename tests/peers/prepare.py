@@ -1,23 +1,33 @@
-"""Writes what every program of this folder reads: the robot, and the states at which it is computed.
+"""Writes the files that every program of this folder reads: the robot and its states.
 
 Usage: python prepare.py FOLDER        (packages: requirements.txt; `run` calls this)
 
-    robot.urdf      iCubGazeboV2_5 as icub-models has it: 213 links, most of them massless frames; six F/T sensors in fixed joints
-    folded.urdf     the same dynamics in 33 links, one per moving joint and the root, for a program that folds nothing by itself
-    pinocchio.txt   the 32 joints as Pinocchio has read them, one a line, for a program that is not linked against its URDF reader:
-                    parent's number, joint's name, child's name, type, axis, placement (rotation by rows, translation), ten parameters
-    states.txt      words and numbers between blanks, SI; in this order:
-                        joints N, their names                       sensors N, their names
-                        bodies N, their names: the first is the URDF's root, the others are the links that moving joints and F/T joints move
-                        contacts N, names of links, one for every piece between F/T sensors
-                        gravity, three numbers                      parameters, ten random numbers per body (their order: estimator/dynamics/src/spatial.rs)
-                        states N, then for each state:
-                            positions, velocities, accelerations of the joints
-                            motion of the base: angular velocity, velocity of the origin, angular acceleration, classical acceleration of the origin,
-                                in base axes, which are those of the world
-                            readings of the sensors: force, torque
+robot.urdf
+    iCubGazeboV2_5 of icub-models: 213 links, most of them massless frames; six F/T sensors in fixed
+    joints.
+folded.urdf
+    The same dynamics in 33 links, one per moving joint and the root, for a program that does not
+    merge links at fixed joints.
+pinocchio.txt
+    The 32 joints as Pinocchio reads them, one a line, for a program that is not linked with its
+    URDF reader: parent's number, joint's name, child's name, type, axis, placement (rotation by
+    rows, translation), ten parameters.
+states.txt
+    Words and numbers separated by blanks, in SI units, in this order:
+    - joints N, their names
+    - sensors N, their names
+    - bodies N, their names: the first is the URDF's root, the others are the links that moving
+      joints and F/T joints move
+    - contacts N, names of links, one for every sub-tree between F/T sensors
+    - gravity, three numbers
+    - parameters, ten random numbers per body (order: estimator/dynamics/src/spatial.rs)
+    - states N, then for each state:
+        - positions, velocities, accelerations of the joints
+        - motion of the base: angular velocity, velocity of the origin, angular acceleration,
+          classical acceleration of the origin, in base axes, which are those of the world
+        - readings of the sensors: force, torque
 
-The numbers are random, from a fixed seed: what they are does not matter to an equality or to a time.
+The numbers are random, from a fixed seed: realistic values are not necessary.
 """
 
 import pathlib
@@ -32,7 +42,7 @@ import pinocchio
 ROBOT = "iCubGazeboV2_5"
 SEED = 20150526
 STATES = 64
-GRAVITY = [0.0, 0.0, -9.80665]  # dynibo knows no other
+GRAVITY = [0.0, 0.0, -9.80665]  # dynibo supports no other
 CONTACTS = ["root_link", "l_hand", "r_hand", "l_upper_leg", "r_upper_leg", "l_foot", "r_foot"]
 
 
@@ -116,7 +126,7 @@ def main(folder):
     bodies = [root] + [child[name] for name in [*moving, *cuts]]
 
     model = pinocchio.buildModelFromUrdf(str(urdf))
-    # Pinocchio's fixed base is its joint 0, with the links that do not move.
+    # Joint 0 of Pinocchio is the fixed base, with the links that do not move.
     folded = folded_link(root, model.inertias[0])
     lines = f"{model.njoints - 1}\n{text(model.inertias[0].toDynamicParameters())}\n"
     for number in range(1, model.njoints):
@@ -130,21 +140,23 @@ def main(folder):
             joints[name].get("type") not in ("revolute", "continuous")
             or model.joints[number].nq != 1
         ):
-            sys.exit(
-                f"prepare.py: joint {name} is a {kind}; only joints that turn are handed to Pinocchio"
-            )
+            sys.exit(f"prepare.py: joint {name} is a {kind}; only revolute joints are supported")
         axis = np.array([float(x) for x in joints[name].find("axis").get("xyz").split()])
         axis /= np.linalg.norm(axis)
         parent = model.parents[number]
         lines += (
-            f"{parent} {name} {child[name]} {kind} {text(axis)} {text(placement.rotation.ravel())} {text(placement.translation)} "
+            f"{parent} {name} {child[name]} {kind} {text(axis)} "
+            f"{text(placement.rotation.ravel())} {text(placement.translation)} "
             f"{text(inertia.toDynamicParameters())}\n"
         )
         folded += folded_link(child[name], inertia)
         folded += (
-            f'<joint name="{name}" type="revolute"><parent link="{root if parent == 0 else child[model.names[parent]]}"/>'
-            f'<child link="{child[name]}"/><origin xyz="{text(placement.translation)}" rpy="{text(rpy(placement.rotation))}"/>'
-            f'<axis xyz="{text(axis)}"/><limit lower="-4" upper="4" effort="1000" velocity="100"/></joint>\n'
+            f'<joint name="{name}" type="revolute">'
+            f'<parent link="{root if parent == 0 else child[model.names[parent]]}"/>'
+            f'<child link="{child[name]}"/>'
+            f'<origin xyz="{text(placement.translation)}" rpy="{text(rpy(placement.rotation))}"/>'
+            f'<axis xyz="{text(axis)}"/>'
+            f'<limit lower="-4" upper="4" effort="1000" velocity="100"/></joint>\n'
         )
 
     (folder / "robot.urdf").write_bytes(urdf.read_bytes())

@@ -1,4 +1,5 @@
-// What the C++ programs here share: the states, and the conversation with drive.py. The same as server.rs, where the conversation is written down.
+// The common part of the C++ programs here: the states, and the protocol of drive.py, which
+// server.rs describes.
 #pragma once
 
 #include <array>
@@ -25,7 +26,8 @@ using Triple = std::array<double, 3>;
 struct State
 {
     std::vector<double> position, velocity, acceleration;
-    // Motion of the base in its own axes, which are those of the world; the acceleration is classical, gravity not taken off.
+    // Motion of the base in its own axes, which are those of the world. The acceleration is
+    // classical, without subtraction of gravity.
     Triple baseAngularVelocity, baseVelocity, baseAngularAcceleration, baseAcceleration;
     // Force, torque.
     std::vector<std::array<Triple, 2>> readings;
@@ -68,7 +70,8 @@ struct States
                     fill(in, *values);
                 }
                 for (auto* values :
-                     {&state.baseAngularVelocity, &state.baseVelocity, &state.baseAngularAcceleration, &state.baseAcceleration})
+                     {&state.baseAngularVelocity, &state.baseVelocity,
+                      &state.baseAngularAcceleration, &state.baseAcceleration})
                     fill(in, *values);
                 state.readings.resize(sensors.size());
                 for (auto& reading : state.readings)
@@ -77,15 +80,18 @@ struct States
             }
         } catch (const std::ios::failure&)
         {
-            fail(path + " ends early, or a number is out of place");
+            fail(path + " ends early or has a wrong number");
         }
     }
 
-    // Spatial acceleration of the base's origin, without gravity: the classical one less omega x v.
+    // Spatial acceleration of the base's origin without gravity: the classical one minus omega x v.
     Triple baseSpatialAcceleration(const State& state) const
     {
-        const Triple &w = state.baseAngularVelocity, &v = state.baseVelocity, &a = state.baseAcceleration;
-        return {a[0] - (w[1] * v[2] - w[2] * v[1]), a[1] - (w[2] * v[0] - w[0] * v[2]), a[2] - (w[0] * v[1] - w[1] * v[0])};
+        const Triple &w = state.baseAngularVelocity, &v = state.baseVelocity,
+                     &a = state.baseAcceleration;
+        return {
+            a[0] - (w[1] * v[2] - w[2] * v[1]), a[1] - (w[2] * v[0] - w[0] * v[2]),
+            a[2] - (w[0] * v[1] - w[1] * v[0])};
     }
 
 private:
@@ -115,7 +121,7 @@ private:
     }
 };
 
-// Where a name is in a list.
+// The index of a name in a list.
 inline std::size_t place(const std::vector<std::string>& names, const std::string& name)
 {
     for (std::size_t at = 0; at < names.size(); ++at)
@@ -124,7 +130,7 @@ inline std::size_t place(const std::vector<std::string>& names, const std::strin
     fail(name + " is not in the states");
 }
 
-// What comes out at one state, by name.
+// The outputs at one state, by name.
 class Output
 {
 public:
@@ -135,7 +141,8 @@ public:
         text += kind + "/" + name + "=" + number + " ";
     }
 
-    template <class Vector> void add3(const std::string& kind, const std::string& name, const Vector& values)
+    template <class Vector>
+    void add3(const std::string& kind, const std::string& name, const Vector& values)
     {
         for (int axis = 0; axis < 3; ++axis)
             add(kind, name + "." + "xyz"[axis], values[axis]);
@@ -147,13 +154,13 @@ public:
 struct Row
 {
     std::string name;
-    // The calls that are timed, at the state of this number.
+    // The timed calls, at the state with this number.
     std::function<void(std::size_t)> run;
-    // What the last run came to.
+    // The outputs of the last run.
     std::function<void(Output&)> show;
 };
 
-// Nanoseconds per call. Every state comes once before, untimed: another program has just had the caches.
+// Nanoseconds per call. An untimed round of all states first fills the caches.
 inline double nanoseconds(const Row& row, std::size_t states, std::size_t calls)
 {
     for (std::size_t state = 0; state < states; ++state)
@@ -161,11 +168,12 @@ inline double nanoseconds(const Row& row, std::size_t states, std::size_t calls)
     const auto start = std::chrono::steady_clock::now();
     for (std::size_t call = 0; call < calls; ++call)
         row.run(call % states);
-    const std::chrono::duration<double, std::nano> passed = std::chrono::steady_clock::now() - start;
+    const std::chrono::duration<double, std::nano> passed
+        = std::chrono::steady_clock::now() - start;
     return passed.count() / static_cast<double>(calls);
 }
 
-// Answers until standard input ends.
+// Answers requests until standard input ends.
 inline void serve(std::size_t states, const std::vector<Row>& rows)
 {
     for (std::string line; std::getline(std::cin, line);)

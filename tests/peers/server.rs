@@ -1,20 +1,22 @@
-//! What the Rust programs here share (the C++ ones have server.hpp): the states, and the
-//! conversation with `drive.py`.
+//! The common part of the Rust programs here: the states, and the protocol of `drive.py`. (The C++
+//! programs have server.hpp.)
 //!
-//! A program offers rows by name. On standard input it is asked, one line each, and answers with
-//! one line:
+//! A program has rows with names. Every request on standard input is one line, and so is its answer
+//! on standard output:
 //!
 //! ```text
-//! rows              the names of the rows it has
+//! rows              the names of the program's rows
 //! time ROW CALLS    nanoseconds per call, over CALLS calls that go round the states
-//! show ROW STATE    what comes out at that state: name=value ...; the part of a name before the slash says what is comparable in size
+//! show ROW STATE    the outputs at that state: name=value ...
 //! ```
+//!
+//! The part of an output's name before the slash says which outputs are comparable in size.
 
 use std::io::{BufRead, Write};
 use std::str::FromStr;
 use std::time::Instant;
 
-/// The joints' state, the motion of the base and the sensors' readings at one instant; see
+/// The joints' state, the motion of the base and the sensors' readings at one instant. See
 /// prepare.py.
 pub struct State {
     pub position: Vec<f64>,
@@ -30,11 +32,11 @@ pub struct Motion {
     pub angular_velocity: [f64; 3],
     pub velocity: [f64; 3],
     pub angular_acceleration: [f64; 3],
-    /// Of the origin, classical, gravity not taken off.
+    /// Classical acceleration of the origin, without subtraction of gravity.
     pub acceleration: [f64; 3],
 }
 
-/// states.txt.
+/// The contents of states.txt.
 pub struct States {
     pub joints: Vec<String>,
     pub sensors: Vec<String>,
@@ -46,15 +48,14 @@ pub struct States {
     pub states: Vec<State>,
 }
 
-/// Words of a text, one after the other; a missing or wrong one ends the program, which can do
-/// nothing without it.
+/// The words of a text, one after the other. A missing or wrong word ends the program.
 struct Words<'a>(std::str::SplitAsciiWhitespace<'a>);
 
 impl Words<'_> {
     fn next<T: FromStr>(&mut self) -> T {
         let word = self.0.next().unwrap_or_else(|| fail("states: ends early"));
         word.parse()
-            .unwrap_or_else(|_| fail(&format!("states: '{word}' is out of place")))
+            .unwrap_or_else(|_| fail(&format!("states: '{word}' is wrong here")))
     }
 
     fn key(&mut self, key: &str) {
@@ -116,7 +117,7 @@ impl States {
         }
     }
 
-    /// The states with the joints in the order of `names`, that of the library at hand.
+    /// The states with the joints in the order of `names`.
     pub fn in_order_of(mut self, names: &[&str]) -> Self {
         let places: Vec<usize> = names.iter().map(|name| place(&self.joints, name)).collect();
         if places.len() != self.joints.len() {
@@ -140,7 +141,7 @@ impl States {
     }
 }
 
-/// Where a name is in a list.
+/// The index of a name in a list.
 pub fn place(names: &[String], name: &str) -> usize {
     names
         .iter()
@@ -148,7 +149,7 @@ pub fn place(names: &[String], name: &str) -> usize {
         .unwrap_or_else(|| fail(&format!("{name} is not among {}", names.join(" "))))
 }
 
-/// What comes out at one state, by name.
+/// The outputs at one state, by name.
 #[derive(Default)]
 pub struct Output(String);
 
@@ -164,15 +165,15 @@ impl Output {
     }
 }
 
-/// Something to time, and what it yields.
+/// A row: calls to time, and their outputs.
 pub trait Bench {
-    /// The calls that are timed, at the state of this number.
+    /// The timed calls, at the state with this number.
     fn run(&mut self, state: usize);
-    /// What the last run came to.
+    /// The outputs of the last run.
     fn show(&self, output: &mut Output);
 }
 
-/// Answers until standard input ends.
+/// Answers requests until standard input ends.
 pub fn serve(states: usize, rows: &mut [(&str, Box<dyn Bench>)]) {
     let out = std::io::stdout();
     for line in std::io::stdin().lock().lines() {
@@ -209,12 +210,8 @@ pub fn serve(states: usize, rows: &mut [(&str, Box<dyn Bench>)]) {
     }
 }
 
-/// Nanoseconds per call. Every state comes once before, untimed: another program has just had the
-/// caches.
-#[expect(
-    clippy::disallowed_methods,
-    reason = "to measure time is what this is for"
-)]
+/// Nanoseconds per call. An untimed round of all states first fills the caches.
+#[expect(clippy::disallowed_methods, reason = "this function measures time")]
 fn nanoseconds(bench: &mut dyn Bench, states: usize, calls: usize) -> f64 {
     (0..states).for_each(|state| bench.run(state));
     let start = Instant::now();

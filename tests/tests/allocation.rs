@@ -694,7 +694,7 @@ fn the_dynamics_allocate_nothing_after_construction() {
     let results = [
         inverse.torque(),
         solver.torque(),
-        propagation.torque(),
+        propagation.torque_std(),
         equation.bias_torque(),
         &torque,
         &row,

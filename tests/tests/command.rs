@@ -6,7 +6,7 @@ use proprio_gateway::offline;
 use proprio_simulator::record::record;
 use proprio_simulator::{Robot, Settings, Simulation};
 use proprio_tests::{PATIENCE, Process, Rig, browse, until};
-use proprio_topics::Nanos;
+use proprio_topics::{Nanos, Quality};
 use serde_json::Value as Json;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -1158,6 +1158,98 @@ fn bad_rows_are_named_and_take_nothing_else_with_them() {
             "line {line}: {}",
             dirty.err
         );
+    }
+}
+
+/// A board that reports a hardware fault for half a second, and a lost half of a wrench: the table
+/// of samples has both, and the estimator withholds the torques beyond the joint meanwhile.
+#[test]
+fn faults_and_gaps_of_a_log_are_in_its_table_of_samples() {
+    let place = Place::new();
+    let during = |line: &str, from: f64, to: f64| {
+        let stamp = line[1..].split(')').next().unwrap().parse::<f64>().unwrap();
+        (from..to).contains(&(stamp - T0.seconds()))
+    };
+    let (mut faults, mut gaps) = (0, 0);
+    let mut lines: Vec<String> = Vec::new();
+    for line in session(4.0, &Settings::default()).lines() {
+        // STATUS of the board of the elbow; its first byte is the mode.
+        if let Some((front, data)) = line.split_once(" 143#")
+            && during(line, 2.0, 2.5)
+        {
+            lines.push(format!("{front} 143#A0{}", &data[2..]));
+            faults += 1;
+        } else if line.contains(" 3DB#") && during(line, 3.0, 4.0) && gaps == 0 {
+            gaps += 1;
+        } else {
+            lines.push(line.to_owned());
+        }
+    }
+    assert!(faults > 3 && gaps == 1, "{faults} faults, {gaps} gaps");
+    place.write("faults.log", &(lines.join("\n") + "\n"));
+    place
+        .run(&[
+            "decode",
+            "--config",
+            "gateway.toml",
+            "--log",
+            "faults.log",
+            "--out",
+            "samples.csv",
+        ])
+        .good();
+    let samples = table(&place.read("samples.csv"));
+    let since = |row: usize| samples["t"][row] - T0.seconds();
+    let flagged = |channel: &str, flag: Quality| -> Vec<f64> {
+        let quality = &samples[&format!("{channel}/quality")];
+        let rows = (0..quality.len()).filter(|row| {
+            quality[*row].is_finite() && Quality(quality[*row] as u32).contains(flag)
+        });
+        rows.map(since).collect()
+    };
+    let faulty = flagged("l_elbow", Quality::DEVICE_FAULT);
+    // From the first such status to the next one without: they come every tenth of a second.
+    assert!(
+        faulty.len() > 100 && faulty[0] >= 2.0 && faulty.iter().all(|t| *t < 2.6),
+        "{faulty:?}"
+    );
+    assert!(flagged("l_shoulder_yaw", Quality::DEVICE_FAULT).is_empty());
+    let gap = flagged("l_arm_ft_sensor", Quality::GAP_BEFORE);
+    assert!(
+        gap.len() == 1 && (3.0..3.1).contains(&gap[0]),
+        "one reading after the lost half: {gap:?}"
+    );
+    place
+        .run(&[
+            "estimate",
+            "--config",
+            "estimator.toml",
+            "--log",
+            "samples.csv",
+            "--out",
+            "estimates.csv",
+        ])
+        .good();
+    let text = place.read("estimates.csv");
+    let mut rows = text.lines().map(|line| line.split(',').collect::<Vec<_>>());
+    let header = rows.next().unwrap();
+    let column = |name: &str| header.iter().position(|own| *own == name).unwrap();
+    let (t, reason) = (column("t"), column("reason/l_wrist_prosup"));
+    for row in rows {
+        let at = row[t].parse::<f64>().unwrap() - T0.seconds();
+        if (2.2..2.5).contains(&at) {
+            assert!(
+                row[reason].starts_with("device_fault"),
+                "{at}: {}",
+                row[reason]
+            );
+        } else if (1.5..2.0).contains(&at) || at > 3.2 {
+            assert!(
+                !row[reason].starts_with("device_fault"),
+                "{at}: {}",
+                row[reason]
+            );
+        }
     }
 }
 
@@ -2412,7 +2504,7 @@ fn a_demonstration_ends_well_and_leaves_nothing_behind() {
     // With a wrong URDF and no time for identification the torques are uncertain and withheld.
     assert!(summary["valid_share"].as_f64().unwrap() > 0.2, "{summary}");
     for (joint, error) in summary["torque_rms_error_nm"].as_object().unwrap() {
-        assert!(error.as_f64().unwrap() < 2.0, "{joint}: {summary}");
+        assert!(error.as_f64().unwrap() < 0.4, "{joint}: {summary}");
     }
     let identification = &summary["identification"];
     assert!(
@@ -2539,7 +2631,7 @@ fn a_demonstration_learns_what_its_urdf_has_wrong() {
     // The torques above the sensor depend mainly on its reading, so both are equally good.
     for joint in ["l_shoulder_pitch", "l_shoulder_roll", "l_shoulder_yaw"] {
         assert!(
-            error("after", "identified", joint) < 0.2,
+            error("after", "identified", joint) < 0.16,
             "{joint}: {summary}"
         );
     }

@@ -2,14 +2,19 @@
 //! again. The chain recovers while the simulator and the other process keep running. On the virtual
 //! bus; `vcan.rs` does the same on a kernel's bus.
 //!
+//! What an estimator loses while it is stopped, or can not use, is counted.
+//!
 //! `PROPRIO_KILLS=1000 cargo test -p proprio-tests --test recovery -- --nocapture` uses more
 //! instants. Start-up kills are drawn from the first `PROPRIO_STARTUP_MS` (default 15).
 #![allow(missing_docs)]
 
 use proprio_tests::watch::{Newest, open, valid_since};
 use proprio_tests::{Arm, PATIENCE, Process, Rig, now, until};
-use proprio_topics::ipc::Topic;
-use proprio_topics::{EstimatorHealth, Nanos, Sample, TorqueEstimate};
+use proprio_topics::ipc::{Topic, Writer};
+use proprio_topics::{
+    Description, Entry, EstimatorHealth, Header, JointState, Kind, Name, Nanos, Publisher, Reading,
+    Role, Sample, TorqueEstimate, Wrench,
+};
 use std::time::Duration;
 
 fn setting(name: &str, default: u64) -> u64 {
@@ -139,8 +144,7 @@ fn the_chain_recovers_from_kills_at_any_instant() {
     rig.assert_nothing_left();
 }
 
-/// An estimator that stood still loses the samples that its buffer does not hold, and those that it
-/// finds there are too old for their estimates: its health shows both.
+/// A stopped estimator loses the samples that its buffers do not hold. Its health counts them.
 #[test]
 fn samples_lost_while_the_estimator_is_stopped_are_counted() {
     use nix::sys::signal::{Signal, kill};
@@ -181,4 +185,92 @@ fn samples_lost_while_the_estimator_is_stopped_are_counted() {
     [&mut estimator, &mut gateway, &mut simulator]
         .into_iter()
         .for_each(Process::end);
+}
+
+/// The test plays the gateway: a sample that comes after its estimate, a stamp that is repeated, and
+/// a number that is not finite. Health counts each by its kind.
+#[test]
+fn samples_that_can_not_be_used_are_counted_by_kind() {
+    let rig = Rig::new();
+    let arm = Arm::new().on_virtual(["a", "b"]).write(&rig.path("robot"));
+    let domain = rig.open();
+    let robot = "icub_left_arm";
+    let channels = [("l_arm_ft_sensor", Kind::Wrench), ("l_elbow", Kind::Joint)];
+    let entries = channels.iter().zip(0..).map(|((name, kind), index)| Entry {
+        name: Name::new(name).expect("short"),
+        kind: *kind,
+        role: Role::Channel,
+        index,
+        ..Entry::NONE
+    });
+    let description = Description::new(Publisher::Gateway, entries);
+    let mut names = Writer::create(&domain, robot, domain.epoch()).expect("no gateway");
+    let mut samples = Writer::<Sample>::create(&domain, robot, domain.epoch()).expect("no gateway");
+    let mut estimator = rig.start(&["estimator", "--config", &arm.estimator]);
+    let mut health = Newest::<EstimatorHealth>::open(&domain, robot);
+    let mut torques = open::<TorqueEstimate>(&domain, robot);
+    let start = now();
+    let mut send = |channel: u32, step: i64, reading: Reading| {
+        let sample = Sample {
+            header: Header {
+                acquired: start + Nanos::from_millis(10 * step),
+                ..Header::default()
+            },
+            channel,
+            reserved: 0,
+            reading,
+        };
+        samples.send(&sample, now()).expect("sent");
+    };
+    let wrench = |fx: f64| {
+        Reading::Wrench(Wrench {
+            force: [fx, 0.0, 0.0],
+            torque: [0.0; 3],
+        })
+    };
+    let elbow = Reading::Joint(JointState {
+        position: 0.5,
+        velocity: 0.0,
+        acceleration: 0.0,
+        torque: f64::NAN,
+        current: f64::NAN,
+    });
+    // Until the estimator listens.
+    let mut first = 0;
+    until(PATIENCE, || {
+        names.send(&description, now()).expect("sent");
+        first += 1;
+        send(0, first, wrench(1.0));
+        health.get().is_some_and(|h| h.samples > 0).then_some(())
+    })
+    .expect("the estimator receives samples");
+    let before = health.fresh().samples;
+    for step in first + 1..=first + 100 {
+        send(0, step, wrench(1.0));
+        if step <= first + 50 {
+            send(1, step, elbow);
+        }
+    }
+    let none = health.wait("the samples", |h| h.samples >= before + 150);
+    assert_eq!(
+        (none.late, none.backward, none.not_finite),
+        (0, 0, 0),
+        "{none:?}"
+    );
+    until(PATIENCE, || {
+        let estimate = torques.latest().expect("shared memory can be read")?;
+        (estimate.header.acquired > start + Nanos::from_millis(10 * (first + 70))).then_some(())
+    })
+    .expect("estimates");
+    send(1, first + 60, elbow);
+    send(0, first + 200, wrench(1.0));
+    send(0, first + 200, wrench(1.0));
+    send(0, first + 300, wrench(f64::NAN));
+    let counted = health.wait("the rest", |h| h.samples >= before + 154);
+    assert_eq!(
+        (counted.late, counted.backward, counted.not_finite),
+        (1, 1, 1),
+        "{counted:?}"
+    );
+    estimator.end();
 }

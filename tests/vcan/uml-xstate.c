@@ -1,10 +1,12 @@
-/* Lets Debian's user-mode Linux 6.1 run on hosts whose x86 extended register state is larger than it knows.
+/* Lets Debian's user-mode Linux 6.1 run on hosts with a larger x86 extended register state than it
+ * supports.
  *
- * That kernel saves and restores the state of its processes with ptrace, in a buffer sized at compile time for
- * AVX-512. On a CPU with more (AMX: 11008 bytes) the host takes the short read but refuses the short write
- * ("userspace - ptrace set fp regs failed, errno = 14"): it wants the whole buffer. Preloaded, this completes the
- * write, leaving in their initial state the parts that the short buffer has no room for. Newer kernels (6.13) ask
- * the host for the size and need none of this. Built and used by `with-vcan` alone.
+ * That kernel saves and restores the state of its processes with ptrace, in a buffer of fixed size
+ * for AVX-512. On a CPU with a larger state (AMX: 11008 bytes) the host accepts the short read but
+ * not the short write ("userspace - ptrace set fp regs failed, errno = 14"): it needs the whole
+ * buffer. This preloaded library completes the write. The parts that do not fit in the short buffer
+ * get their initial state. Newer kernels (6.13) ask the host for the size and do not need this.
+ * Only `with-vcan` builds and uses it.
  */
 #define _GNU_SOURCE
 #include <cpuid.h>
@@ -18,10 +20,12 @@
 #include <sys/uio.h>
 #include <unistd.h>
 
-#define XSTATE_BV 512 /* where the XSAVE area says which components it holds (Intel SDM 1, 13.4.2) */
+/* Offset of the bits that say which components the XSAVE area has (Intel SDM 1, 13.4.2). */
+#define XSTATE_BV 512
 
-/* The components that end beyond `length` bytes. Asked of the processor once: in a virtual machine each CPUID is a call
- * to the hypervisor, and sixty of them at every switch of a process make everything inside a hundred times slower.
+/* The components that end beyond `length` bytes. CPUID is only called the first time: in a virtual
+ * machine each CPUID is a call to the hypervisor, and sixty of them at every process switch make
+ * everything inside a hundred times slower.
  */
 static unsigned long beyond(size_t length)
 {
@@ -47,7 +51,7 @@ static long complete_write(pid_t pid, void *type, const struct iovec *given)
     struct iovec iov = {whole, sizeof whole};
     unsigned long components;
 
-    /* A read of the whole state tells how long it is, and fills what the caller does not give. */
+    /* A read of the whole state returns its length, and the part that the caller does not give. */
     if (syscall(SYS_ptrace, PTRACE_GETREGSET, pid, type, &iov) < 0)
         return -1;
     if (given->iov_len < XSTATE_BV + sizeof components || given->iov_len >= iov.iov_len)

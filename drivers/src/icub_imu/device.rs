@@ -5,7 +5,9 @@ use super::frames::{
     ACCELERATION_LSB, FIELD_LSB, Legacy, QUATERNION_LSB, Quantity, RATE_LSB, kind, sensor,
 };
 use super::options::{Options, Plan};
-use crate::icub::{self, Ask, Bringup, Inquiry, Paired, Pairing, class, command};
+use crate::icub::bringup::{Ask, Bringup, Inquiry};
+use crate::icub::pairing::{Paired, Pairing};
+use crate::icub::{self, class, command};
 use crate::{
     Claim, Decoded, Device, Frame, Mode, Refusal, Spec, SpecError, State, Transmit, device,
 };
@@ -53,7 +55,7 @@ impl Configure {
             return;
         }
         let agrees = has == wants;
-        self.settled = agrees || self.attempts >= icub::ATTEMPTS;
+        self.settled = agrees || self.attempts >= icub::bringup::ATTEMPTS;
         if !agrees {
             self.told = false;
             self.ask_at = Nanos::MIN;
@@ -81,7 +83,7 @@ impl Inquiry for Configure {
         }
         let id = icub::to_board(class::POLLING_ANALOG, self.address);
         if !self.told {
-            if self.attempts >= icub::ATTEMPTS {
+            if self.attempts >= icub::bringup::ATTEMPTS {
                 self.settled = true;
                 return Ask::Done;
             }
@@ -90,8 +92,8 @@ impl Inquiry for Configure {
         }
         self.told = false;
         self.attempts += 1;
-        self.ask_at = now + icub::ANSWER_TIMEOUT;
-        self.counts_until = now + icub::ANSWER_COUNTS;
+        self.ask_at = now + icub::bringup::ANSWER_TIMEOUT;
+        self.counts_until = now + icub::bringup::ANSWER_COUNTS;
         Ask::Send(Frame::new(id, &[command::IMU_CONFIG_GET]))
     }
 
@@ -335,7 +337,9 @@ impl ImuDevice {
             return;
         }
         let begun = (self.acquisition.acquired, self.acquisition.stamp);
-        if !self.acquisition.open || !icub::within(begun, (frame.t, frame.stamp), self.together) {
+        if !self.acquisition.open
+            || !icub::pairing::within(begun, (frame.t, frame.stamp), self.together)
+        {
             out.fault(Counter::Unpaired, 1, frame.id);
             self.gap = true;
             return;

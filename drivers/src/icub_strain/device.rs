@@ -3,7 +3,9 @@
 
 use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind};
 use super::options::{Options, Stream};
-use crate::icub::{self, Ask, Bringup, Inquiry, Paired, Pairing, class, command};
+use crate::icub::bringup::{Ask, Bringup, Inquiry};
+use crate::icub::pairing::{Paired, Pairing};
+use crate::icub::{self, class, command};
 use crate::{
     Claim, Decoded, Device, Frame, Mode, Refusal, Spec, SpecError, State, Transmit, device,
 };
@@ -86,8 +88,8 @@ impl FullScales {
         if value == 0 {
             self.refusal = Some(Refusal::ZeroFullScale { channel });
             // Ask again slowly: the board may be repaired meanwhile.
-            self.attempts = icub::ATTEMPTS;
-            self.ask_at = frame.t + icub::SLOW_ATTEMPT;
+            self.attempts = icub::bringup::ATTEMPTS;
+            self.ask_at = frame.t + icub::bringup::SLOW_ATTEMPT;
             return;
         }
         *told = Some(value);
@@ -121,14 +123,14 @@ impl Inquiry for FullScales {
         if self.refusal == Some(Refusal::Changed) || now < self.ask_at {
             return Ask::Wait;
         }
-        if self.attempts < icub::ATTEMPTS {
+        if self.attempts < icub::bringup::ATTEMPTS {
             self.attempts += 1;
-            self.ask_at = now + icub::ANSWER_TIMEOUT;
+            self.ask_at = now + icub::bringup::ANSWER_TIMEOUT;
         } else {
             if self.per_step.is_none() && self.refusal.is_none() {
                 self.refusal = Some(Refusal::NoFullScale);
             }
-            self.ask_at = now + icub::SLOW_ATTEMPT;
+            self.ask_at = now + icub::bringup::SLOW_ATTEMPT;
         }
         if now > self.counts_until {
             self.open = [0; 6];
@@ -136,7 +138,7 @@ impl Inquiry for FullScales {
         if let Some(open) = self.open.get_mut(usize::from(self.axis)) {
             *open = open.saturating_add(1);
         }
-        self.counts_until = now + icub::ANSWER_COUNTS;
+        self.counts_until = now + icub::bringup::ANSWER_COUNTS;
         Ask::Send(Frame::new(
             icub::to_board(class::POLLING_ANALOG, self.address),
             &[command::GET_FULL_SCALES, self.axis],

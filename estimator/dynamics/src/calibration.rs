@@ -91,17 +91,17 @@ impl Calibration {
     /// minute, up to 10 K: the warm-up of a board within hours (an iCub's: 14 K).
     #[must_use]
     pub fn temperature_variance(&self, age: Option<f64>) -> [f64; 6] {
-        const MOST: f64 = 10.0;
+        const MAX_KELVIN: f64 = 10.0;
         if !self.has_temperature {
             return [0.0; 6];
         }
-        let kelvin = age.map_or(MOST, |age| (age / 60.0 - 1.0).clamp(0.0, MOST));
+        let kelvin = age.map_or(MAX_KELVIN, |age| (age / 60.0 - 1.0).clamp(0.0, MAX_KELVIN));
         self.per_kelvin.torque_first().map(|k| (k * kelvin).powi(2))
     }
 
     /// Difference of a temperature from the reference \[K\]; 0 if either is unknown.
     #[must_use]
-    pub fn warmth(&self, celsius: f64) -> f64 {
+    pub fn temperature_rise(&self, celsius: f64) -> f64 {
         let kelvin = self.reference.map(|reference| celsius - reference);
         kelvin.filter(|kelvin| kelvin.is_finite()).unwrap_or(0.0)
     }
@@ -115,7 +115,7 @@ impl Calibration {
             corrected = wrench(&(self.gain * Vector6::from(reading.torque_first())));
         }
         if self.has_temperature {
-            corrected -= self.per_kelvin * self.warmth(celsius);
+            corrected -= self.per_kelvin * self.temperature_rise(celsius);
         }
         corrected
     }
@@ -393,8 +393,8 @@ mod tests {
                     .then(&e, &wrench(&Vector6::from(more)), None)
                     .apply(&raw, 31.0);
                 let change = (changed - corrected).torque_first();
-                let expected =
-                    -1e-3 * unknown.as_offset(&corrected.torque_first(), base.warmth(31.0));
+                let expected = -1e-3
+                    * unknown.as_offset(&corrected.torque_first(), base.temperature_rise(31.0));
                 for (channel, value) in change.into_iter().enumerate() {
                     let expected = if channel == unknown.channel() {
                         expected

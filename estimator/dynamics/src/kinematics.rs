@@ -1,4 +1,19 @@
 //! The kinematic pass from any base, and inverse dynamics with known external wrenches.
+//!
+//! Link states are in one array in the order of the model: parents first, limbs contiguous. The
+//! pass works in link axes, where inertia is constant, and ends with the net wrench of each link in
+//! *base coordinates*. After that nothing is transformed: the wrenches of sub-trees, F/T sensors
+//! and contacts are about one point and in one set of axes, so they are accumulated by addition,
+//! and no sub-tree needs its own root. This is how the reordered recursion (towards the contact
+//! link) is implemented.
+//!
+//! Quantities that depend on no other link are computed before the pass: sines and cosines four at
+//! a time, and the pose of each joint, with short cuts for axes along x, y or z. This keeps the
+//! chain of dependent operations along the tree short.
+//!
+//! Tried and rejected: the recursion in base axes (slower), visiting the tree breadth first (no
+//! gain), two links in one vector register for the net wrenches (no gain: gathering costs what it
+//! saves), link-time optimisation (no gain), one code-generation unit (slower).
 
 use wide::f64x4;
 

@@ -75,7 +75,7 @@ mod subtree;
 mod tree;
 
 pub use estimate::EstimateRows;
-pub use link::{LinkRows, WIDTH, WITH_FORCE, link_regressor, link_rows};
+pub use link::{LINK_PARAMETERS, LinkRows, WITH_FORCE, link_regressor, link_rows};
 pub use motor::{Actuator, Coupling, MotorError, MotorRegressor, MotorTerm, Transmission};
 pub use subtree::{PresentContact, StackedRegressor, SubTreeRegressor, Weighting};
 pub use tree::{Regressor, Serialization, SerializationError};

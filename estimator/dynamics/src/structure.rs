@@ -62,11 +62,11 @@ impl SensorCut {
         let number = model
             .joint(joint)
             .ok_or_else(|| StructureError::NoJoint(name()))?;
-        let facts = model
+        let folded = model
             .joints()
             .get(number)
             .ok_or_else(|| StructureError::NoJoint(name()))?;
-        if facts.kind != JointKind::Fixed {
+        if folded.kind != JointKind::Fixed {
             return Err(StructureError::JointMoves(name()));
         }
         if noise
@@ -92,7 +92,7 @@ impl SensorCut {
                 let x_body_link = parent_link
                     .ok_or_else(|| StructureError::NoJoint(name()))?
                     .pose;
-                facts.placement.inverse() * x_body_link
+                folded.placement.inverse() * x_body_link
             }
             MeasurementFrame::Sensor => *pose,
         };

@@ -1,23 +1,26 @@
 //! Several recorded logs to one set of parameters: the stages of [`identify`].
 //!
-//! 1. Each log becomes observations ([`crate::dataset::recording`]). Joint torques with a wrong
-//!    sign or unit are excluded ([`crate::diagnose::torque_units`]), repeated logs are refused.
-//! 2. Each observation becomes rows ([`crate::measurement::model`]). Logs with F/T readings in
-//!    wrong units ([`crate::diagnose::wrench_units`]) are refused, and so is a wrong measurement
-//!    frame or direction of a sensor, in all logs or in one
-//!    ([`crate::diagnose::sensor_frame`]).
-//! 3. Noise and MAP estimate in turn, until the noise converges
-//!    ([`crate::fit::alternate_noise_and_map`]). After each such fit, undeclared disturbances are
-//!    excluded and offset jumps that the fit does not confirm are dropped
-//!    ([`crate::diagnose::disturbance`]); then the next fit, until neither changes.
-//! 4. Gains of the F/T sensors, if requested or worth it ([`gains`]): 3 again, with these unknown.
-//! 5. Cross-validation: segments of the logs are predicted from the others. The change from CAD is
-//!    shrunk where it does not improve the prediction ([`crate::cross_validation`]).
-//! 6. Structural vibration ([`crate::diagnose::structural_vibration`]), where other sensors observe
-//!    it, is subtracted; then the fit of 3 and the cross-validation of 5 once more.
-//! 7. Disturbances in validation logs, encoder errors and delays are reported
-//!    ([`crate::diagnose::encoder_offsets`], [`crate::diagnose::delay`]).
-//! 8. Figures for every log and the parameters' uncertainty ([`crate::report::assemble`]).
+//! 1. [`prepare_logs`]: observations without motion are dropped. Joint torques with a wrong sign or
+//!    unit are excluded ([`crate::diagnose::torque_units`]), repeated logs are refused.
+//! 2. [`plausible_model`]: the measurement model, which makes rows of observations
+//!    ([`crate::measurement::model`]). Logs with F/T readings in wrong units
+//!    ([`crate::diagnose::wrench_units`]) are refused, and so is a wrong measurement frame or
+//!    direction of a sensor, in all logs or in one ([`crate::diagnose::sensor_frame`]).
+//! 3. [`exclude_disturbed`]: noise and MAP estimate in turn, until the noise converges
+//!    ([`crate::fit::alternate_noise_and_map`]). After each such fit, undeclared contacts
+//!    ([`crate::diagnose::undeclared`]) and loads ([`crate::diagnose::load`]) are excluded and
+//!    offset jumps that the fit does not confirm are dropped; then the next fit, until neither
+//!    changes.
+//! 4. [`choose_gain`]: gains of the F/T sensors, if requested or worth it; then 3 again, with these
+//!    unknown ([`with_gains`]).
+//! 5. [`cross_validated_fit`]: segments of the logs are predicted from the others. The change from
+//!    CAD is shrunk where it does not improve the prediction ([`crate::cross_validation`]).
+//! 6. [`without_vibration`]: structural vibration that other sensors observe
+//!    ([`crate::diagnose::structural_vibration`]) is subtracted; then the fit of 3 and the
+//!    cross-validation of 5 once more.
+//! 7. Disturbances in validation logs, encoder errors ([`encoder_offsets::encoder_errors`]) and
+//!    delays ([`delay::delays`]) are reported, not corrected.
+//! 8. [`assemble::outcome`]: figures for every log and the parameters' uncertainty.
 
 mod gains;
 
@@ -30,8 +33,8 @@ use crate::diagnose::{delay, encoder_offsets, load, sensor_frame, torque_units, 
 use crate::finding::{Finding, FindingCode, Severity};
 use crate::fit::{
     Identified, IdentifyError, LOAD_VARIANCE_RATIO, NoiseAndMap, OffsetDrift, added,
-    alternate_noise_and_map, beside_cad, negative_rotors, per_column, posterior, unsettled,
-    walk_limits, without_negative_rotors,
+    alternate_noise_and_map, negative_rotors, parameters_without_cad, per_column, posterior,
+    unsettled, walk_limits, without_negative_rotors,
 };
 use crate::measurement::channels;
 use crate::measurement::model::MeasurementModel;
@@ -58,7 +61,7 @@ pub struct Options {
 /// Progress of [`identify`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Progress {
-    /// The current step, in a few words: `reading walk.csv`, `round 3`.
+    /// The current step, in a few words: `structural vibration`, `figures`.
     pub step: String,
     /// Fraction done, 0 to 1.
     pub done: f64,
@@ -105,7 +108,7 @@ pub fn identify(
         gain: Gain::None,
         ..robot.calibrated
     };
-    measurement.calibrate(
+    measurement.set_calibration_unknowns(
         temperature_only,
         training_logs(&logs)
             .iter()
@@ -241,7 +244,7 @@ fn plausible_model<'a>(
         return nothing(logs, no_log(logs));
     }
     let all = training.iter().flat_map(|log| log.instants.iter());
-    let mut measurement = MeasurementModel::survey(robot, inputs, all)?;
+    let mut measurement = MeasurementModel::for_observations(robot, inputs, all)?;
     if measurement.unknowns().links.is_empty() {
         let what = match inputs {
             [IdentificationInput::Torque] => {
@@ -322,7 +325,9 @@ fn surveyed_again<'a>(
         return Ok(None);
     }
     let instants = training.iter().flat_map(|log| log.instants.iter());
-    Ok(Some(MeasurementModel::survey(robot, inputs, instants)?))
+    Ok(Some(MeasurementModel::for_observations(
+        robot, inputs, instants,
+    )?))
 }
 
 /// Subtracts structural vibration, if other sensors observe it, from all logs and fits again.
@@ -637,7 +642,7 @@ fn cross_validated_fit(
     retention
         .findings
         .extend(negative_rotors(measurement.robot(), &unknowns, &fit));
-    let cad = beside_cad(&unknowns, &information);
+    let cad = parameters_without_cad(&unknowns, &information);
     let mut d = without_negative_rotors(&prior, &unknowns, &information, &fit)?;
     for (column, share) in per_column(&unknowns, &retention.share)
         .into_iter()
@@ -697,7 +702,8 @@ mod tests {
             let logs: Vec<&TrainingLog> = logs.iter().collect();
             let wrench = [IdentificationInput::Wrench];
             let all = logs.iter().flat_map(|log| &log.instants);
-            let measurement = MeasurementModel::survey(&robot, &wrench, all).expect("rows");
+            let measurement =
+                MeasurementModel::for_observations(&robot, &wrench, all).expect("rows");
             let lengths: Vec<usize> = sample(&measurement, &logs)
                 .iter()
                 .map(|segment| segment.instants.len())
@@ -724,7 +730,8 @@ mod tests {
             (instant.torque, instant.active) = (vec![0.1; 2], ContactSet::default());
         }
         let both = [IdentificationInput::Wrench, IdentificationInput::Torque];
-        let measurement = MeasurementModel::survey(&robot, &both, instants.iter()).expect("rows");
+        let measurement =
+            MeasurementModel::for_observations(&robot, &both, instants.iter()).expect("rows");
         let of_link = |link: &str| {
             let link =
                 (0..robot.model.link_count()).find(|&number| robot.model.link_name(number) == link);

@@ -13,7 +13,9 @@
 //! folds, whichever is larger, because errors in one posture are correlated.
 
 use crate::finding::{Finding, FindingCode, Severity};
-use crate::fit::{IdentifyError, added, beside_cad, posterior, without_negative_rotors};
+use crate::fit::{
+    IdentifyError, added, parameters_without_cad, posterior, without_negative_rotors,
+};
 use crate::linear::information::Information;
 use crate::measurement::channels;
 use crate::measurement::model::{Groups, MeasurementModel};
@@ -183,13 +185,13 @@ pub(crate) fn held_out(
     let mut candidates: Vec<Candidate> = Vec::new();
     // Per fold, CAD and the parameters from the others.
     let mut pairs: Vec<[usize; 2]> = Vec::new();
-    let cad_is_one = unknowns.beside_cad().is_empty() && unknowns.joints.is_empty();
+    let cad_is_one = unknowns.parameters_without_cad().is_empty() && unknowns.joints.is_empty();
     for (fold, reduced) in reduced.chunks(segments.len()).enumerate() {
         let others: Information = added(reduced, unknowns.parameters());
         let own = posterior(prior, unknowns, &others)?.fit(tau)?;
         // As the parameters are reported.
         let own = without_negative_rotors(prior, unknowns, &others, &own)?;
-        let both = [beside_cad(unknowns, &others), own];
+        let both = [parameters_without_cad(unknowns, &others), own];
         let of_others = blocks.iter().filter(|block| block.fold != fold);
         let instants =
             of_others.flat_map(|block| &segments[block.segment].instants[block.range.clone()]);

@@ -148,9 +148,10 @@ impl Dataset {
         &self.instants
     }
 
-    /// Where the offset of an F/T sensor seems to jump, judged by its readings alone.
+    /// Where the offset of an F/T sensor seems to jump, judged by its readings minus the CAD's
+    /// prediction.
     #[must_use]
-    pub fn breaks(&self) -> &[OffsetJump] {
+    pub fn offset_jumps(&self) -> &[OffsetJump] {
         &self.offset_jumps
     }
 

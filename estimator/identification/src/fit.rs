@@ -61,7 +61,7 @@ pub(crate) struct Identified {
     /// Identified parameters less CAD, after shrinking.
     pub d: DVector<f64>,
     /// CAD's parameters in the same columns: zero, except for parameters that CAD does not contain,
-    /// which have the values that best fit the data together with CAD ([`beside_cad`]).
+    /// which have the values that best fit the data together with CAD ([`parameters_without_cad`]).
     pub cad: DVector<f64>,
     /// Retained fraction of the change from CAD, per link of the layout, then per extra parameter.
     pub retained: Vec<f64>,
@@ -107,9 +107,12 @@ pub(crate) fn posterior(
 /// ([`ExtraParameter::lacks_cad`]) have the values that best fit these data and their priors
 /// together with CAD. No rotor's inertia is negative. (These parameters belong to the robot, so
 /// they are not fitted to the log on which CAD is compared.)
-pub(crate) fn beside_cad(unknowns: &Unknowns, information: &Information) -> DVector<f64> {
+pub(crate) fn parameters_without_cad(
+    unknowns: &Unknowns,
+    information: &Information,
+) -> DVector<f64> {
     let mut x = DVector::zeros(unknowns.parameters());
-    let mut columns = unknowns.beside_cad();
+    let mut columns = unknowns.parameters_without_cad();
     let (r, z) = information.to_triangle();
     let (rows, precision) = (r.nrows(), &unknowns.precision);
     while !columns.is_empty() {
@@ -238,7 +241,7 @@ pub(crate) fn alternate_noise_and_map(
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<NoiseAndMap, IdentifyError> {
     let unknowns = measurement.unknowns().clone();
-    let prior = Prior::new(robot.model.inertias())?.expecting(robot.urdf_relative_std);
+    let prior = Prior::new(robot.model.inertias())?.with_relative_std(robot.urdf_relative_std);
     let least = least_variances(robot, &unknowns);
     let limits = walk_limits(robot, &unknowns, drift);
     let sampled = sample(measurement, training);
@@ -248,7 +251,7 @@ pub(crate) fn alternate_noise_and_map(
         });
         estimate_noise(&unknowns, &residuals, 0, &limits, &least)
     };
-    let has_cad = unknowns.beside_cad().is_empty();
+    let has_cad = unknowns.parameters_without_cad().is_empty();
     let noise = from.unwrap_or_else(|| {
         let unknown = NoiseModel::unknown(least.clone());
         (0..3).fold(unknown, |noise, _| {
@@ -258,7 +261,7 @@ pub(crate) fn alternate_noise_and_map(
                 let reduced = map_segments(measurement, &sampled, |measurement, _, segment| {
                     reduce(measurement, segment, &noise)
                 });
-                beside_cad(&unknowns, &added(&reduced, unknowns.parameters()))
+                parameters_without_cad(&unknowns, &added(&reduced, unknowns.parameters()))
             };
             noise_of_residuals(&noise, &cad)
         })
@@ -279,7 +282,7 @@ pub(crate) fn alternate_noise_and_map(
         let next = noise_of_residuals(last, &fit.x);
         let change = next.change(last);
         rounds.push(next);
-        let (noise, change) = match NoiseModel::resolve_limit_cycle(&rounds, CONVERGED) {
+        let (noise, change) = match NoiseModel::end_limit_cycle(&rounds, CONVERGED) {
             Some(noise) => (noise, 0.0),
             None if round == ROUNDS => (rounds.swap_remove(round), change),
             None => continue,

@@ -1,7 +1,7 @@
-//! The test of whether an additional effect explains residuals: one test for everything that may
-//! have happened to a robot or its sensors.
+//! The test of whether an additional effect explains residuals: a load, an offset jump, an encoder
+//! offset, a delay, physically infeasible bodies.
 //!
-//! An effect (a load, an offset jump, an encoder offset, a delay) adds unknowns to the parameters
+//! An effect adds unknowns to the parameters
 //! and the noise. Its gain is the increase of twice the log-likelihood with these unknowns, with
 //! all others fitted again. In the linear case the gain is the square of the estimate in standard
 //! deviations. Without an effect, the gain is a chi-square variable with one degree of freedom per

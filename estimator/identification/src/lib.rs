@@ -3,35 +3,32 @@
 //!
 //! - Off-line, [`identify`]`(&`[`Robot`]`, Vec<`[`Dataset`]`>, ..)` takes recorded logs and returns
 //!   an [`Outcome`]: parameters, covariance, figures for each log, findings.
-//! - On-line, [`online`] does the same while the robot works, once a second.
+//! - On-line, [`online`] estimates the same parameters recursively while the robot works.
+//!
+//! `examples/identification.rs` is a program of 20 lines.
 //!
 //! # Stages
-//! In the order in which the data pass them:
+//! [`Dataset::new`] makes a log into observations: all channels at common instants, with
+//! derivatives, and a list of defects. [`identify`] then calls, in this order (details:
+//! `batch.rs`):
 //!
-//! 1. [`dataset`]: a log becomes observations of all channels at common instants, with derivatives
-//!    and a list of defects.
-//! 2. `diagnose::{torque_units, wrench_units, sensor_frame}`: joint torques and F/T readings with
-//!    wrong units or sign, F/T sensors with a wrong measurement frame or direction.
-//! 3. `measurement::model`: the rows of each observation, `A d + G s = r + N e`.
-//! 4. `measurement::reduction`: the nuisance parameters `s` are eliminated by a Kalman filter.
-//! 5. [`linear::information`]: `[R | z]`, the square-root information of all logs about `d`.
-//! 6. [`prior`]: the maximum a posteriori (MAP) parameters under a prior at CAD; the prior's scale
-//!    `tau` maximises the evidence.
-//! 7. `measurement::noise_estimate`: the noise of each channel, from its residuals. Stages 4 to 7
-//!    repeat until the noise converges (`fit::alternate_noise_and_map`).
-//! 8. `diagnose::undeclared`: undeclared contacts and loads are excluded, offset jumps are
-//!    confirmed or dropped. Stages 4 to 8 repeat until neither changes.
-//! 9. `batch::gains`: gains of the F/T sensors, if requested or worth it. Stages 4 to 8 again.
-//! 10. `cross_validation`: the change from CAD is shrunk where it does not improve the prediction
-//!     of held-out data.
-//! 11. `diagnose::structural_vibration`: vibration that other F/T sensors observe is subtracted.
-//!     Stages 4 to 7 and 10 again.
-//! 12. `diagnose::{encoder_offsets, delay}`: encoder signs, encoder offsets and time offsets. They
-//!     are reported, not corrected.
-//! 13. `report`: the [`Outcome`].
+//! 1. `prepare_logs`: drops observations without motion; joint torques with a wrong sign or unit.
+//! 2. `plausible_model`: rows of each observation, `A d + G s = r + N e`; refuses F/T sensors with
+//!    wrong units, frame or direction.
+//! 3. `exclude_disturbed`: the nuisance parameters `s` are eliminated by a Kalman filter
+//!    (`measurement::reduction`), which leaves the square-root information `[R | z]` about `d`
+//!    ([`linear::information`]). The maximum a posteriori (MAP) parameters under a prior at CAD
+//!    ([`prior`]) and the noise of each channel are estimated in turn. Undeclared contacts and
+//!    loads are excluded.
+//! 4. `choose_gain`, `with_gains`: gains of the F/T sensors, if requested or worth it.
+//! 5. `cross_validated_fit`: the change from CAD is shrunk where it does not improve the prediction
+//!    of held-out data.
+//! 6. `without_vibration`: vibration that other F/T sensors observe is subtracted.
+//! 7. `encoder_errors`, `delays`: encoder signs, encoder offsets and time offsets are reported.
+//! 8. `outcome`: the [`Outcome`].
 //!
-//! One test, `hypothesis`, decides whether the data show more than parameters and noise: a load, an
-//! offset jump, an encoder offset, a delay.
+//! One test, `hypothesis`, decides whether a load, an offset jump, an encoder offset or a delay
+//! explains more of the data than parameters and noise do.
 //!
 //! # Notation
 //! ```text

@@ -45,13 +45,13 @@
 //! any duration.
 //!
 //! # The parameters in use
-//! Initially CAD. Then the parameters that predict later readings better (`contest`), with the
+//! Initially CAD. Then the parameters that predict later readings better (`selection`), with the
 //! offsets that fit them best. The most probable parameters are solved every second, and judge new
 //! rows.
 
 mod channel;
-mod contest;
 mod rows;
+mod selection;
 pub mod state;
 
 mod component;
@@ -64,7 +64,8 @@ pub use solution::{Change, ComponentSolution, Counts, Observation, OnlineError, 
 
 use component::{Component, KEPT, LARGE};
 use job::Part;
-use solution::{BLOCK, SOLVE, WIDTH};
+use proprio_dynamics::regressor::LINK_PARAMETERS;
+use solution::{BLOCK, SOLVE};
 
 use std::sync::Arc;
 
@@ -171,7 +172,7 @@ impl Online {
         {
             drop(std::hint::black_box(Vec::<u8>::with_capacity(KEPT)));
         }
-        let prior = Arc::new(Prior::new(cad)?.expecting(relative));
+        let prior = Arc::new(Prior::new(cad)?.with_relative_std(relative));
         let solution = Solution {
             data: Nanos::MIN,
             components: components.iter().map(|c| c.unknown(cad, offsets)).collect(),
@@ -214,7 +215,7 @@ impl Online {
         links: &[(usize, RigidInertia)],
         root: &DMatrix<f64>,
     ) -> Result<(), OnlineError> {
-        let width = WIDTH * links.len();
+        let width = LINK_PARAMETERS * links.len();
         if root.ncols() != width {
             let (what, got, expected) = ("columns of the covariance's root", root.ncols(), width);
             return Err(InformationError::Size {
@@ -238,10 +239,10 @@ impl Online {
                     continue;
                 };
                 let (found, cad) = (links[at].1.parameters(), cad[*link].parameters());
-                columns.extend((0..WIDTH).map(|i| {
+                columns.extend((0..LINK_PARAMETERS).map(|i| {
                     (
-                        offset_count + WIDTH * place + i,
-                        WIDTH * at + i,
+                        offset_count + LINK_PARAMETERS * place + i,
+                        LINK_PARAMETERS * at + i,
                         found[i] - cad[i],
                     )
                 }));
@@ -286,7 +287,7 @@ impl Online {
             let Some(part) = job.parts.get_mut(number) else {
                 continue;
             };
-            let mut begun = part.contest.in_use().clone();
+            let mut begun = part.selection.in_use().clone();
             let (rows, parameters) = begun.root.shape();
             begun.root = begun.root.resize_vertically(rows + columns.len(), 0.0);
             for (j, (&(column, _, value), deviation)) in columns.iter().zip(&deviations).enumerate()
@@ -301,7 +302,7 @@ impl Online {
             begun.bodies.clone_from(&known.bodies);
             begun.tau = f64::NAN;
             debug_assert_eq!(begun.root.ncols(), parameters);
-            part.contest.replace_all(begun);
+            part.selection.replace_all(begun);
             part.write_solution(known);
             part.last_valid.clone_from(known);
         }

@@ -261,7 +261,7 @@ impl Prior {
     /// to a factor of 1.5. That is `tau = relative / sqrt 2` ([`crate::prior::cad_root`]). Zero:
     /// CAD is exact.
     #[must_use]
-    pub fn expecting(self, relative: f64) -> Self {
+    pub fn with_relative_std(self, relative: f64) -> Self {
         let median = (relative * FRAC_1_SQRT_2).clamp(LEAST_TAU, GREATEST_TAU);
         let spread = QUALITY_FACTOR.ln();
         let expected = Expected { median, spread };

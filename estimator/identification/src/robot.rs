@@ -8,7 +8,7 @@ use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
 use proprio_dynamics::{
     ContactKind, ContactSet, ContactSpec, FrameMotion, SensorCut, Structure, StructureError,
 };
-use proprio_topics::{Kind, MAX_SUBTREES, Nanos};
+use proprio_topics::{Kind, MAX_SUBTREES, Nanos, Reason};
 use serde::Deserialize;
 
 /// Names of the axes of a wrench, in the order of samples.
@@ -151,6 +151,40 @@ pub enum RobotError {
 }
 
 impl Robot {
+    /// The contacts that are present: those that always are, changed by the declarations, of which
+    /// `declared` returns a contact's last one. The support of the base cannot be absent.
+    #[must_use]
+    pub fn active_contacts(&self, declared: impl Fn(usize) -> Option<bool>) -> ContactSet {
+        let mut active = self.always;
+        for contact in 0..self.structure.contacts().len() {
+            match declared(contact) {
+                Some(true) => active.insert(contact),
+                Some(false) if self.support != Some(contact) => active.remove(contact),
+                _ => {}
+            }
+        }
+        active
+    }
+
+    /// The link where kinematics start, its motion, and why that motion is not valid. An IMU, if
+    /// there is one, replaces the motion.
+    #[must_use]
+    pub fn base_motion(&self, active: &ContactSet) -> (usize, FrameMotion, Reason) {
+        let at_rest = FrameMotion::standing(&Vec3::zeros());
+        let stances = match &self.base {
+            BaseMotion::Standing(motion) => return (self.base_link, *motion, Reason::None),
+            BaseMotion::Imu(_) => return (self.base_link, at_rest, Reason::None),
+            BaseMotion::Stance(stances) => stances,
+        };
+        let standing = stances.iter().find(|s| active.contains(s.contact));
+        let fault = standing.map_or(Reason::NoStance, |_| Reason::None);
+        standing
+            .or(stances.first())
+            .map_or((self.base_link, at_rest, fault), |stance| {
+                (stance.link, stance.motion, fault)
+            })
+    }
+
     /// A robot that stands on its link `base`, with all joints measured: the default settings,
     /// without a configuration file.
     ///

@@ -1,5 +1,5 @@
-//! Quantiles of normal and chi-square variables, the latter by the cube root approximation of
-//! Wilson and Hilferty (1931).
+//! Quantiles: of normal variables, of chi-square variables by the cube root approximation of Wilson
+//! and Hilferty (1931), and of numbers.
 //!
 //! The approximation is within 1 % of the quantile from three degrees of freedom on, and a few per
 //! cent too large for one.
@@ -27,6 +27,30 @@ pub fn exceeded(probability: f64) -> f64 {
         *if is_more { &mut low } else { &mut high } = middle;
     }
     0.5 * (low + high)
+}
+
+/// The median; 0 of nothing. Of an even number of values the greater of the middle two.
+pub(crate) fn median(mut values: Vec<f64>) -> f64 {
+    let middle = values.len() / 2;
+    if values.is_empty() {
+        return 0.0;
+    }
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
+/// The value below which this fraction of the numbers is; NaN if there are none.
+pub(crate) fn quantile(mut values: Vec<f64>, fraction: f64) -> f64 {
+    if values.is_empty() {
+        return f64::NAN;
+    }
+    let place = (fraction * (values.len() - 1) as f64).round() as usize;
+    *values.select_nth_unstable_by(place, f64::total_cmp).1
+}
+
+/// Robust standard deviation of values with zero mean: 1.4826 times their median magnitude, which
+/// is the standard deviation of normal values. 0 of nothing.
+pub(crate) fn robust_std(values: impl Iterator<Item = f64>) -> f64 {
+    1.4826 * median(values.map(f64::abs).collect())
 }
 
 fn cube(freedom: usize) -> (f64, f64) {

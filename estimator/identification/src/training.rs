@@ -411,33 +411,33 @@ pub(crate) fn sample<'a>(
     // How often each channel occurs, up to `MIN_FOLD`: without any sample of it, its noise would be
     // estimated as zero.
     let (mut measurement, mut rows) = (measurement.clone(), Rows::new(measurement.unknowns()));
-    let mut heard = vec![0; measurement.unknowns().channels()];
-    let mut listen = |instant: &Annotated, heard: &mut [usize]| -> bool {
+    let mut appears = vec![0; measurement.unknowns().channels()];
+    let mut count_channels = |instant: &Annotated, appears: &mut [usize]| -> bool {
         let made = measurement.make(instant, &mut rows).is_ok();
         let mut lacked = false;
-        for (channel, heard) in heard.iter_mut().enumerate() {
+        for (channel, appears) in appears.iter_mut().enumerate() {
             if made && rows.has(channel) {
-                lacked |= *heard < MIN_FOLD;
-                *heard += 1;
+                lacked |= *appears < MIN_FOLD;
+                *appears += 1;
             }
         }
         lacked
     };
     for segment in &sampled {
         for instant in segment.instants {
-            if heard.iter().all(|heard| *heard >= MIN_FOLD) {
+            if appears.iter().all(|appears| *appears >= MIN_FOLD) {
                 return sampled;
             }
-            listen(instant, &mut heard);
+            count_channels(instant, &mut appears);
         }
     }
     for (number, segment) in segments.iter().enumerate() {
         let mut i = if number % every == 0 { length } else { 0 };
-        while i < segment.instants.len() && heard.iter().any(|heard| *heard < MIN_FOLD) {
-            if listen(&segment.instants[i], &mut heard) {
+        while i < segment.instants.len() && appears.iter().any(|appears| *appears < MIN_FOLD) {
+            if count_channels(&segment.instants[i], &mut appears) {
                 let additional = stretch(segment, i);
                 for instant in &additional.instants[1..] {
-                    listen(instant, &mut heard);
+                    count_channels(instant, &mut appears);
                 }
                 i += additional.instants.len() - 1;
                 sampled.push(additional);

@@ -1,10 +1,13 @@
-//! The value of a joint or IMU channel at an instant: measured, interpolated or differentiated.
+//! The value of a channel at an instant: measured, interpolated or differentiated; of an F/T
+//! sensor, corrected for calibration, temperature and offset.
 
 use super::buffers::stale;
 use crate::differentiate::{Grid, Unavailable, Window};
 use crate::history::ChannelValue;
+use crate::inertial::InertialState;
+use crate::propagation::Propagation;
 use proprio_dynamics::FrameMotion;
-use proprio_dynamics::spatial::Vec3;
+use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_topics::{Nanos, Reason};
 
 /// Position, velocity and acceleration of a joint at `t`, the standard deviation of the
@@ -100,6 +103,30 @@ pub(crate) fn imu_at(
             (motion, [0.0; 3], reason_of(unavailable, held, max_silence))
         }
     }
+}
+
+/// The corrected reading of F/T sensor `number` less its offset, and whether the calibration needs
+/// a temperature that is missing or too old. `temperature` is that of the board \[degrees Celsius\]
+/// and its age. What is uncertain in the correction goes to `propagation`.
+pub(crate) fn wrench_at(
+    state: &InertialState,
+    number: usize,
+    held: &ChannelValue<6>,
+    (celsius, age): (f64, Option<Nanos>),
+    propagation: &mut Propagation,
+) -> Option<(Wrench, bool)> {
+    let calibration = state.calibrations.get(number)?;
+    let offset = state.offsets.get(number)?;
+    let excess = (state.excess_variance.get(number).copied()).unwrap_or_default();
+    let by_temperature = calibration.temperature_variance(age.map(Nanos::seconds));
+    let extra = std::array::from_fn(|i| by_temperature[i] + excess[i]);
+    propagation.set_extra_variance(number, extra);
+    let [fx, fy, fz, tx, ty, tz] = held.value;
+    let corrected = calibration.apply(&Wrench::from_parts([fx, fy, fz], [tx, ty, tz]), celsius);
+    // The effect of an uncertain calibration depends on the reading.
+    let kelvin = calibration.temperature_rise(celsius);
+    propagation.set_calibration_point(number, &corrected, kelvin);
+    Some((corrected - *offset, by_temperature != [0.0; 6]))
 }
 
 /// Why a channel has no derivative at the instant.

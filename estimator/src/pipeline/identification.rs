@@ -21,7 +21,7 @@ use crate::propagation::{Covariance, Propagation};
 use crate::setup::Setup;
 use proprio_dynamics::spatial::{RigidInertia, Vec3, Wrench};
 use proprio_dynamics::{ContactSet, DofSet, FrameMotion, JointState, Kinematics};
-use proprio_identification::online::state::{Measuring, StateError};
+use proprio_identification::online::state::{SensorFingerprint, StateError};
 use proprio_identification::online::{
     Job as SolverJob, Observation, Online, OnlineError, Solution,
 };
@@ -107,8 +107,8 @@ impl Job {
 }
 
 /// Structure and calibrations of the sensors: a saved state is valid for these alone.
-fn measurement_setup(setup: &Setup) -> Measuring {
-    Measuring::new(&setup.robot.structure, &setup.state.calibrations)
+fn measurement_setup(setup: &Setup) -> SensorFingerprint {
+    SensorFingerprint::new(&setup.robot.structure, &setup.state.calibrations)
 }
 
 /// The covariance of all parameters and offsets: the solution's posterior, and the prior of
@@ -498,7 +498,7 @@ impl OnlineIdentification {
             }
             for (&sensor, found) in component.sensors.iter().zip(&component.noise) {
                 set_noise(
-                    &mut setup.state.excess,
+                    &mut setup.state.excess_variance,
                     &setup.robot.structure,
                     sensor,
                     *found,

@@ -9,12 +9,12 @@
 //!
 //! The sigma of differentiated accelerations comes from [`crate::differentiate`]. Errors of
 //! different channels are independent. The error of a position is its noise, which includes the
-//! jitter of stamps, and the encoder offset, [`ENCODER_OFFSET`]. The error of the base's proper
-//! acceleration is [`BASE_ACCELERATION`]: bias and mounting of an IMU, or a fixed base that is not
-//! level. These two are typical calibration accuracies, not properties of one robot.
+//! jitter of stamps, and the encoder offset, [`ENCODER_OFFSET_STD`]. The error of the base's proper
+//! acceleration is [`BASE_ACCELERATION_STD`]: bias and mounting of an IMU, or a fixed base that is
+//! not level. These two are typical calibration accuracies, not properties of one robot.
 //!
-//! A column of S is a finite difference. S depends on the posture alone, so it is computed with the
-//! first estimate of each tenth of a second, and when contacts or base change. The tenths are those
+//! A column of S is a finite difference. S is computed with the first estimate of each tenth of a
+//! second and when contacts or base change, and held in between. The tenths are those
 //! of the stamps, so that a replay which begins elsewhere gives the same. Errors of velocities are
 //! smaller by an order of magnitude and are neglected.
 
@@ -31,11 +31,11 @@ const POSTURE_PERIOD: Nanos = Nanos::from_millis(100);
 
 /// Standard deviation of an encoder's offset: revolute joint \[rad\], a third of a degree;
 /// prismatic joint \[m\].
-pub(super) const ENCODER_OFFSET: [f64; 2] = [0.005, 0.001];
+pub(super) const ENCODER_OFFSET_STD: [f64; 2] = [0.005, 0.001];
 
 /// Standard deviation of the base's proper acceleration, each axis \[m/s^2\]: a hundredth of
 /// gravity, or a tilt of 0.6 degrees.
-const BASE_ACCELERATION: f64 = 0.1;
+const BASE_ACCELERATION_STD: f64 = 0.1;
 
 /// Step of positions for finite differences \[rad, m\].
 const STEP: f64 = 1e-4;
@@ -90,7 +90,7 @@ impl MotionErrors {
             dofs + 6 * (contacts + structure.subtrees().len()),
         );
         let mut sigma = vec![0.0; columns];
-        sigma[2 * dofs..2 * dofs + 3].fill(BASE_ACCELERATION);
+        sigma[2 * dofs..2 * dofs + 3].fill(BASE_ACCELERATION_STD);
         Ok(Self {
             kinematics: Kinematics::new(model, base_link)?,
             solver: Solver::new(structure),
@@ -244,12 +244,12 @@ impl MotionErrors {
     }
 
     /// Standard deviation of each torque [Nm or N].
-    pub(super) fn torques(&self) -> &[f64] {
+    pub(super) fn torque_std(&self) -> &[f64] {
         self.deviation.get(..self.dofs).unwrap_or_default()
     }
 
     /// Standard deviations of each contact's wrench, `[fx fy fz tx ty tz]` [N, Nm].
-    pub(super) fn contacts(&self) -> impl Iterator<Item = &[f64]> {
+    pub(super) fn contact_std(&self) -> impl Iterator<Item = &[f64]> {
         self.deviation
             .get(self.dofs..)
             .unwrap_or_default()
@@ -257,7 +257,7 @@ impl MotionErrors {
     }
 
     /// Covariance of a sub-tree's imbalance [torque; force], at the origin of base coordinates.
-    pub(super) fn imbalance(&self, number: usize) -> Matrix6<f64> {
+    pub(super) fn imbalance_covariance(&self, number: usize) -> Matrix6<f64> {
         let first = self.deviation.len() + 6 * number;
         let mut covariance = Matrix6::zeros();
         for (column, sigma) in self.sensitivity.chunks_exact(self.rows).zip(&self.sigma) {

@@ -129,20 +129,20 @@ impl ResidualMonitor {
         covariance: impl Fn(usize) -> Option<Matrix6<f64>>,
     ) {
         let Self { subtrees, least } = self;
-        for (number, subtree) in subtrees.iter_mut().enumerate() {
-            let before = subtree.residual.contact;
-            subtree.residual = SubtreeResidual::NOTHING;
-            let facts = &solved.structure.subtrees()[number];
+        for (number, state) in subtrees.iter_mut().enumerate() {
+            let before = state.residual.contact;
+            state.residual = SubtreeResidual::NOTHING;
+            let subtree = &solved.structure.subtrees()[number];
             let is_free =
                 |contact: usize| solved.structure.contacts()[contact].kind != ContactKind::Wrench;
-            let declared = facts.contacts.intersection(solved.declared);
-            let model_covariance = if facts.sensors.is_empty() || !declared.iter().all(is_free) {
+            let declared = subtree.contacts.intersection(solved.declared);
+            let model_covariance = if subtree.sensors.is_empty() || !declared.iter().all(is_free) {
                 None
             } else {
                 covariance(number)
             };
             let Some(model_covariance) = model_covariance else {
-                subtree.mean = None;
+                state.mean = None;
                 continue;
             };
             let b = Vector6::from(
@@ -152,7 +152,7 @@ impl ResidualMonitor {
                     .torque_first(),
             );
             // The wrench of a known contact varies with its place, so no mean is formed.
-            let previous_mean = subtree.mean.filter(|_| declared.is_empty());
+            let previous_mean = state.mean.filter(|_| declared.is_empty());
             let test = SubtreeTest {
                 solved,
                 number,
@@ -165,8 +165,8 @@ impl ResidualMonitor {
                 model: model_covariance
                     + Matrix6::from_diagonal(&(ROUNDING_SHARE * model_covariance.diagonal())),
             };
-            subtree.mean = Some(test.mean);
-            subtree.residual = test.run(least, before);
+            state.mean = Some(test.mean);
+            state.residual = test.run(least, before);
         }
     }
 

@@ -1,4 +1,5 @@
-//! The estimate at one instant: solve, test the residuals, write the results with their validity.
+//! The estimate at one instant: evaluate the channels, solve, test the residuals, write the results
+//! with their validity.
 
 use super::Pipeline;
 use super::motion::OperatingPoint;
@@ -9,9 +10,29 @@ use proprio_dynamics::{Certainty, ContactSet, FrameMotion, JointState};
 use proprio_topics::{ContactWrench, JointTorque, NO_CAUSE, NO_CONTACT, Nanos, Reason, Residual};
 
 impl Pipeline {
+    /// Computes the estimate at `t`: evaluates the channels, solves, tests the residuals, solves
+    /// again if other contacts are detected, and writes the results.
+    pub(super) fn compute_estimate(&mut self, t: Nanos) {
+        let active = self.active_contacts(t);
+        let (base, imu) = self.evaluate_channels(t, &active);
+        // A contact detected at the last instant is most likely still there.
+        let detected = self.residuals.detected().difference(&active);
+        let mut solved = self.solve(t, &base, imu.as_ref(), &active.union(&detected));
+        self.test_residuals(t, &active, solved);
+        if solved && self.residuals.detected() != detected {
+            solved = self.solve(
+                t,
+                &base,
+                imu.as_ref(),
+                &active.union(&self.residuals.detected()),
+            );
+        }
+        self.write_estimate(t, solved);
+    }
+
     /// Solves with the contacts in `active` present, and computes all standard deviations. False if
     /// the solver failed.
-    pub(super) fn solve(
+    fn solve(
         &mut self,
         t: Nanos,
         base: &FrameMotion,
@@ -61,7 +82,7 @@ impl Pipeline {
 
     /// Tests the residual of each sub-tree, when the contacts in `declared` are known to be
     /// present.
-    pub(super) fn test_residuals(&mut self, t: Nanos, declared: &ContactSet, is_solved: bool) {
+    fn test_residuals(&mut self, t: Nanos, declared: &ContactSet, is_solved: bool) {
         if !is_solved {
             return self.residuals.reset();
         }
@@ -80,14 +101,14 @@ impl Pipeline {
         let covariance = |number: usize| {
             let dependence = self.dependences.subtrees.get(number)?;
             let (reason, _) = validity.reason_and_cause(dependence);
-            let parameters = self.propagation.imbalances().get(number)?;
-            (reason == Reason::None).then(|| parameters + self.motion.imbalance(number))
+            let parameters = self.propagation.imbalance_covariances().get(number)?;
+            (reason == Reason::None).then(|| parameters + self.motion.imbalance_covariance(number))
         };
         self.residuals.update(&solved, covariance);
     }
 
     /// Writes the estimate: values, standard deviations, validity and reasons.
-    pub(super) fn write_estimate(&mut self, t: Nanos, is_solved: bool) {
+    fn write_estimate(&mut self, t: Nanos, is_solved: bool) {
         self.estimate.t = t;
         self.estimate.torques.header.acquired = t;
         self.estimate.contacts.header.acquired = t;
@@ -101,9 +122,9 @@ impl Pipeline {
             .torque()
             .iter()
             .zip(self.solver.torque_deviation())
-            .zip(self.propagation.torque())
+            .zip(self.propagation.torque_std())
             .zip(self.solver.torque_certainty())
-            .zip(self.motion.torques());
+            .zip(self.motion.torque_std());
         let structure = &self.setup.robot.structure;
         let is_unexplained = |link: usize| {
             let residual = structure
@@ -163,8 +184,8 @@ impl Pipeline {
             .solver
             .contacts()
             .iter()
-            .zip(self.propagation.contacts());
-        let results = results.zip(self.motion.contacts());
+            .zip(self.propagation.contact_std());
+        let results = results.zip(self.motion.contact_std());
         let contacts = places.zip(results).take(self.setup.robot.contacts.len());
         for (number, ((place, dependence), ((result, model), motion))) in contacts.enumerate() {
             let (mut reason, mut cause) = validity.reason_and_cause(dependence);

@@ -2,7 +2,7 @@
 
 use nalgebra::{Cholesky, DMatrix};
 use proprio_dynamics::calibration::Kind;
-use proprio_dynamics::regressor::WIDTH;
+use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::{DynamicsError, check_size};
 use proprio_topics::Nanos;
 
@@ -108,7 +108,7 @@ impl Covariance {
         check_size(
             "columns of a covariance",
             root.ncols(),
-            WIDTH * links.len() + 6 * sensors.len() + of_calibrations,
+            LINK_PARAMETERS * links.len() + 6 * sensors.len() + of_calibrations,
         )?;
         if let Some((sensor, _)) = calibrations
             .iter()
@@ -207,7 +207,10 @@ impl Covariance {
     /// All of `P`, over `[10 per link | 6 per sensor]`, without drift and without calibrations.
     pub fn dense(&self) -> DMatrix<f64> {
         let (links, sensors) = (self.links.len(), self.sensors.len());
-        let mut all = DMatrix::zeros(WIDTH * links + 6 * sensors, WIDTH * links + 6 * sensors);
+        let mut all = DMatrix::zeros(
+            LINK_PARAMETERS * links + 6 * sensors,
+            LINK_PARAMETERS * links + 6 * sensors,
+        );
         for block in &self.blocks {
             let columns: Vec<usize> = block.model_columns(links).collect();
             let covariance = block.root.transpose() * &block.root;
@@ -240,11 +243,13 @@ pub(crate) fn mark(
 impl Block {
     /// Its columns among those of the whole model.
     pub(crate) fn model_columns(&self, links: usize) -> impl Iterator<Item = usize> {
-        let of_links = self.links.iter().flat_map(|&l| WIDTH * l..WIDTH * (l + 1));
-        let of_sensors = self
-            .sensors
+        let of_links = self
+            .links
             .iter()
-            .flat_map(move |&s| WIDTH * links + 6 * s..WIDTH * links + 6 * (s + 1));
+            .flat_map(|&l| LINK_PARAMETERS * l..LINK_PARAMETERS * (l + 1));
+        let of_sensors = self.sensors.iter().flat_map(move |&s| {
+            LINK_PARAMETERS * links + 6 * s..LINK_PARAMETERS * links + 6 * (s + 1)
+        });
         of_links.chain(of_sensors)
     }
 }

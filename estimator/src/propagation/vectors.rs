@@ -1,7 +1,7 @@
 //! Loops over the rows of the root, in the widest vector instructions of the processor.
 
 use proprio_dynamics::calibration::Unknown;
-use proprio_dynamics::regressor::{LinkRows, WIDTH, WITH_FORCE};
+use proprio_dynamics::regressor::{LINK_PARAMETERS, LinkRows, WITH_FORCE};
 use proprio_dynamics::spatial::{Motion, Pose};
 use pulp::Simd;
 use std::ops::Range;
@@ -13,7 +13,7 @@ pub(crate) const LANES: usize = 16;
 pub(crate) type Lanes = [f32; LANES];
 
 /// The root of a link's covariance, upper triangular.
-pub(crate) type Root = [[f64; WIDTH]; WIDTH];
+pub(crate) type Root = [[f64; LINK_PARAMETERS]; LINK_PARAMETERS];
 
 /// A covariance of a wrench [torque; force], symmetric.
 pub(crate) type Covariance6 = [[f64; 6]; 6];
@@ -63,7 +63,7 @@ pub(crate) fn bilinear_form(a: &[f64; 6], covariance: &Covariance6, b: &[f64; 6]
 
 /// Adds `A P A^T` of a link, `P = U^T U`.
 pub(crate) fn add_independent(out: &mut Covariance6, root: &Root, coefficients: &LinkRows) {
-    let columns: [[f64; 6]; WIDTH] =
+    let columns: [[f64; 6]; LINK_PARAMETERS] =
         std::array::from_fn(|c| std::array::from_fn(|axis| coefficients[axis][c]));
     for (first, row) in root.iter().enumerate() {
         let mut wrench = [0.0; 6];
@@ -104,7 +104,7 @@ pub(crate) fn add_link<S: Simd>(
     column_block: &ColumnBlock,
     coefficients: &LinkRows,
 ) {
-    let mut a = [[0.0; 6]; WIDTH];
+    let mut a = [[0.0; 6]; LINK_PARAMETERS];
     for (axis, row) in coefficients.iter().enumerate() {
         for (a, value) in a.iter_mut().zip(row) {
             a[axis] = single(*value);
@@ -126,7 +126,7 @@ pub(crate) fn add_link<S: Simd>(
         .zip(vectors_mut::<S>(f1))
         .zip(vectors_mut::<S>(f2));
     let columns = vectors::<S>(&column_block.columns);
-    let count = columns.len() / WIDTH;
+    let count = columns.len() / LINK_PARAMETERS;
     for (i, (((t0, t1), t2), ((f0, f1), f2))) in torques.zip(forces).enumerate() {
         let (mut torque, mut force) = ([*t0, *t1, *t2], [*f0, *f1, *f2]);
         for (c, a) in a.iter().enumerate() {
@@ -199,7 +199,7 @@ pub(crate) struct ColumnBlock {
 impl ColumnBlock {
     /// Combines the columns of offset and calibration: an unknown of the calibration acts like an
     /// offset, with a factor that depends on the reading.
-    pub(crate) fn calibrate(&mut self, corrected: &[f64; 6], kelvin: f64) {
+    pub(crate) fn set_calibration_point(&mut self, corrected: &[f64; 6], kelvin: f64) {
         let Some(calibration) = &self.calibration else {
             return;
         };

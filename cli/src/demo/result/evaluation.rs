@@ -231,4 +231,17 @@ mod tests {
         };
         assert_eq!(Counts::of(&watched).unwrap(), expected);
     }
+
+    /// The last solution counts: here three of four are within twice what it states.
+    #[test]
+    fn parameters_are_compared_with_the_truth_in_their_last_solution() {
+        assert_eq!(within_2_sigma(&[]), None);
+        let courses = [
+            Course::ending(1.0, 0.1, 1.19),
+            Course::ending(-1.0, 0.1, -1.19),
+            Course::ending(1.0, 0.1, 1.21),
+            Course::ending(0.0, 1.0, 1.5),
+        ];
+        assert_eq!(within_2_sigma(&courses), Some(0.75));
+    }
 }

@@ -42,6 +42,7 @@ impl Course {
         }
     }
 
+    /// Whether the last value is within two standard deviations of the truth.
     pub(super) fn is_within_2_sigma(&self) -> bool {
         self.points
             .last()
@@ -198,4 +199,18 @@ pub(super) fn learnt_section(
             ),
         ],
     )
+}
+
+#[cfg(test)]
+impl Course {
+    /// A number whose last value and standard deviation are these.
+    pub(super) fn ending(value: f64, deviation: f64, truth: f64) -> Self {
+        Self {
+            title: String::new(),
+            unit: "",
+            points: vec![(0.0, truth, 1e-9), (1.0, value, deviation)],
+            cad: f64::NAN,
+            truth,
+        }
+    }
 }

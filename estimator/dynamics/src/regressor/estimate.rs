@@ -8,7 +8,7 @@
 //! `m_l^T X* A_l`. Those of the offset of an F/T sensor above link `l` (or, with the other sign,
 //! below it) are `m_l` expressed in the sensor's measurement frame.
 
-use super::link::{WIDTH, in_link_axes, row_along};
+use super::link::{LINK_PARAMETERS, in_link_axes, row_along};
 use super::subtree::spread;
 use crate::error::{DynamicsError, check_size};
 use crate::kinematics::{ExternalWrench, Kinematics, check_external, check_readings};
@@ -81,13 +81,13 @@ impl<'a> EstimateRows<'a> {
     /// Number of columns of a sub-tree's rows: `10 links + 6 sensors`; `None` if there is no such
     /// sub-tree.
     pub fn column_count(&self, subtree: usize) -> Option<usize> {
-        let facts = self.structure.subtrees().get(subtree)?;
-        Some(WIDTH * self.structure.links_of(subtree).count() + 6 * facts.sensors.len())
+        let tree = self.structure.subtrees().get(subtree)?;
+        Some(LINK_PARAMETERS * self.structure.links_of(subtree).count() + 6 * tree.sensors.len())
     }
 
     /// Number of columns of all sub-trees: `10 N_B + 6 per sensor`.
     pub fn stacked_column_count(&self) -> usize {
-        WIDTH * self.structure.link_count() + 6 * self.structure.sensors().len()
+        LINK_PARAMETERS * self.structure.link_count() + 6 * self.structure.sensors().len()
     }
 
     /// Writes a sub-tree's row over the columns of all sub-trees, zeros included: those of
@@ -234,7 +234,7 @@ impl<'a> EstimateRows<'a> {
         let (links, offsets) =
             row.split_at_mut(columns - 6 * self.structure.subtrees()[subtree].sensors.len());
         for (out, link) in links
-            .chunks_exact_mut(WIDTH)
+            .chunks_exact_mut(LINK_PARAMETERS)
             .zip(self.structure.links_of(subtree))
         {
             // The motion is transformed to the link, so that the ten columns need no transform to

@@ -7,14 +7,14 @@ use crate::kinematics::FrameMotion;
 use crate::spatial::{Motion, Pose};
 
 /// Columns of one link.
-pub const WIDTH: usize = 10;
+pub const LINK_PARAMETERS: usize = 10;
 
 /// The first columns, mass and first moment; only these have a force.
 pub const WITH_FORCE: usize = 4;
 
 /// Six rows, [torque; force]. Each row is ten contiguous numbers, so that loops over them become
 /// vector instructions.
-pub type LinkRows = [[f64; WIDTH]; 6];
+pub type LinkRows = [[f64; LINK_PARAMETERS]; 6];
 
 /// The regressor of a link: its net wrench, the sum of all wrenches on it except gravity, is
 /// `A_l phi_l`.
@@ -71,10 +71,10 @@ pub(super) fn in_link_axes(motion: &FrameMotion) -> LinkRows {
 pub fn link_rows(x_al: &Pose, motion: &FrameMotion) -> LinkRows {
     let link = in_link_axes(motion);
     let (r, t) = (&x_al.rotation, &x_al.translation);
-    let mut rows = [[0.0; WIDTH]; 6];
+    let mut rows = [[0.0; LINK_PARAMETERS]; 6];
     for axis in 0..3 {
         let (x, y, z) = (r[(axis, 0)], r[(axis, 1)], r[(axis, 2)]);
-        for column in 0..WIDTH {
+        for column in 0..LINK_PARAMETERS {
             rows[axis][column] = x * link[0][column] + y * link[1][column] + z * link[2][column];
         }
         for column in 0..WITH_FORCE {
@@ -94,10 +94,10 @@ pub fn link_rows(x_al: &Pose, motion: &FrameMotion) -> LinkRows {
 /// The row `motion^T rows`: the power of the link's wrench along a motion given in the same frame,
 /// per unit of each parameter.
 #[inline(always)]
-pub(super) fn row_along(motion: &Motion, rows: &LinkRows) -> [f64; WIDTH] {
+pub(super) fn row_along(motion: &Motion, rows: &LinkRows) -> [f64; LINK_PARAMETERS] {
     let (n, v) = (&motion.angular, &motion.linear);
-    let mut out = [0.0; WIDTH];
-    for column in 0..WIDTH {
+    let mut out = [0.0; LINK_PARAMETERS];
+    for column in 0..LINK_PARAMETERS {
         out[column] = n.x * rows[0][column] + n.y * rows[1][column] + n.z * rows[2][column];
     }
     for column in 0..WITH_FORCE {

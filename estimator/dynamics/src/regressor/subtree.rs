@@ -9,7 +9,7 @@ use nalgebra::{DMatrixView, Matrix6, Vector6};
 use crate::error::{DynamicsError, check_size};
 use crate::kinematics::{ExternalWrench, Kinematics, check_external, check_readings};
 use crate::least_squares::{LeastSquares, noise_factor, scale_factor};
-use crate::regressor::link::{WIDTH, WITH_FORCE, link_rows};
+use crate::regressor::link::{LINK_PARAMETERS, WITH_FORCE, link_rows};
 use crate::regressor::tree::transposed_view;
 use crate::spatial::{Pose, Wrench};
 use crate::structure::{ContactSet, Structure};
@@ -94,7 +94,7 @@ impl SubTreeRegressor {
                 )
             })
             .collect();
-        let known = WIDTH * links.len() + 6 * sensors.len();
+        let known = LINK_PARAMETERS * links.len() + 6 * sensors.len();
         let room = subtree
             .contacts
             .iter()
@@ -147,7 +147,7 @@ impl SubTreeRegressor {
 
     /// First column of the sensors' offsets, after those of the links.
     pub fn offset_column(&self) -> usize {
-        WIDTH * self.links.len()
+        LINK_PARAMETERS * self.links.len()
     }
 
     /// First column of the contacts, after those of the offsets.
@@ -219,7 +219,7 @@ impl SubTreeRegressor {
         let to_top = kinematics.pose(self.top).inverse();
         let stride = self.stride;
         for (place, &link) in self.links.iter().enumerate() {
-            let column = WIDTH * place;
+            let column = LINK_PARAMETERS * place;
             // The pose of the top link is exactly the identity, without rounding from a transform
             // to the base and back.
             let x_tl = if link == self.top {
@@ -230,11 +230,15 @@ impl SubTreeRegressor {
             let rows = link_rows(&x_tl, kinematics.motion(link));
             for (number, row) in rows.iter().enumerate() {
                 // The other columns of force rows are zero from the start.
-                let width = if number < 3 { WIDTH } else { WITH_FORCE };
+                let width = if number < 3 {
+                    LINK_PARAMETERS
+                } else {
+                    WITH_FORCE
+                };
                 self.values[number * stride + column..][..width].copy_from_slice(&row[..width]);
             }
         }
-        let mut column = WIDTH * self.links.len();
+        let mut column = LINK_PARAMETERS * self.links.len();
         for &(sensor, is_above) in &self.sensors {
             let Signed { child, x_cm, sign } = sensors[sensor];
             // The child of a sensor's joint is the top of the sub-tree below the sensor.
@@ -282,7 +286,7 @@ impl SubTreeRegressor {
         self.measured = [0.0; 6];
         self.covariance = Matrix6::zeros();
         for (place, &(sensor, _)) in self.sensors.iter().enumerate() {
-            let first = WIDTH * self.links.len() + 6 * place;
+            let first = LINK_PARAMETERS * self.links.len() + 6 * place;
             let reading = readings[sensor].torque_first();
             for (channel, (value, variance)) in reading.iter().zip(&variances[sensor]).enumerate() {
                 let column =
@@ -470,7 +474,7 @@ impl StackedRegressor {
     /// First of the stacked columns of contacts, `10 N_B + 6 per sensor`: after those of all links
     /// and offsets.
     pub fn contact_column(&self) -> usize {
-        WIDTH * self.structure.link_count() + 6 * self.sensors.len()
+        LINK_PARAMETERS * self.structure.link_count() + 6 * self.sensors.len()
     }
 
     /// Number of stacked columns:
@@ -659,8 +663,8 @@ pub(super) fn spread(structure: &Structure, subtree: usize, row: &[f64], stacked
     };
     structure
         .links_of(subtree)
-        .for_each(|link| put(WIDTH * link, WIDTH));
-    let offsets = WIDTH * structure.link_count();
+        .for_each(|link| put(LINK_PARAMETERS * link, LINK_PARAMETERS));
+    let offsets = LINK_PARAMETERS * structure.link_count();
     let sensors = structure.subtrees()[subtree].sensors;
     sensors
         .iter()

@@ -3,7 +3,7 @@
 
 use nalgebra::{Const, DMatrixView, DVector, Dyn};
 
-use super::link::{WIDTH, WITH_FORCE, link_rows, row_along};
+use super::link::{LINK_PARAMETERS, WITH_FORCE, link_rows, row_along};
 use crate::error::{DynamicsError, check_size};
 use crate::kinematics::Kinematics;
 use crate::model::Model;
@@ -51,7 +51,7 @@ impl Serialization {
 
     /// The first of a link's ten columns; `None` if there is no such link.
     pub fn link_column(&self, link: usize) -> Option<usize> {
-        self.links.get(link).map(|place| WIDTH * place)
+        self.links.get(link).map(|place| LINK_PARAMETERS * place)
     }
 
     /// Index of a degree of freedom among the joint rows; `None` if there is no such degree of
@@ -63,9 +63,9 @@ impl Serialization {
     /// `phi`: the ten parameters of every link of a model, in this order. A link that is not in the
     /// serialization is omitted.
     pub fn parameters(&self, model: &Model) -> DVector<f64> {
-        let mut phi = DVector::zeros(WIDTH * self.links.len());
+        let mut phi = DVector::zeros(LINK_PARAMETERS * self.links.len());
         for (inertia, &place) in model.inertias().iter().zip(&self.links) {
-            phi.rows_mut(WIDTH * place, WIDTH)
+            phi.rows_mut(LINK_PARAMETERS * place, LINK_PARAMETERS)
                 .copy_from_slice(&inertia.parameters());
         }
         phi
@@ -208,7 +208,7 @@ impl Regressor {
 
     fn room(serialization: Serialization, joints: usize) -> Self {
         let (links, dofs) = (serialization.link_count(), serialization.dof_count());
-        let stride = WIDTH * links;
+        let stride = LINK_PARAMETERS * links;
         Self {
             serialization,
             values: vec![0.0; (6 + dofs) * stride],
@@ -362,9 +362,10 @@ fn fill(
     let (wrench, joints) = values.split_at_mut(6 * stride);
     for (link, &place) in serialization.links.iter().enumerate() {
         let rows = link_rows(kinematics.pose(link), kinematics.motion(link));
-        let column = WIDTH * place;
+        let column = LINK_PARAMETERS * place;
         for axis in 0..3 {
-            if let Some(out) = wrench[axis * stride + column..].first_chunk_mut::<WIDTH>() {
+            if let Some(out) = wrench[axis * stride + column..].first_chunk_mut::<LINK_PARAMETERS>()
+            {
                 *out = rows[axis];
             }
             let force = &mut wrench[(axis + 3) * stride + column..][..WITH_FORCE];
@@ -373,7 +374,7 @@ fn fill(
         let mut hop = hops[link];
         while let Some(Hop { dof, next }) = hop {
             let start = stride * serialization.dofs[dof] + column;
-            if let Some(out) = joints[start..].first_chunk_mut::<WIDTH>() {
+            if let Some(out) = joints[start..].first_chunk_mut::<LINK_PARAMETERS>() {
                 *out = row_along(&axes[dof], &rows);
             }
             hop = hops[next];

@@ -58,7 +58,7 @@ pub(crate) fn choose_gain(
     let mut checked = |gain: Gain| -> Result<Retention, IdentifyError> {
         let training = training_logs(logs);
         let instants = training.iter().flat_map(|log| log.instants.iter());
-        measurement.calibrate(Kind { gain, ..wanted }, instants);
+        measurement.set_calibration_unknowns(Kind { gain, ..wanted }, instants);
         let sampled = sample(measurement, &training);
         let NoiseAndMap {
             prior, noise, fit, ..
@@ -89,7 +89,7 @@ pub(crate) fn choose_gain(
     let training = training_logs(logs);
     let instants = training.iter().flat_map(|log| log.instants.iter());
     let gain = Gain::None;
-    measurement.calibrate(Kind { gain, ..wanted }, instants);
+    measurement.set_calibration_unknowns(Kind { gain, ..wanted }, instants);
     let what = match chosen {
         Gain::Full => "all entries of the F/T sensors' gains are identified",
         Gain::Diagonal => "a gain of each channel of the F/T sensors is identified",
@@ -137,7 +137,7 @@ pub(crate) fn fit_gains(
     let mut progress = |step: String, _| progress(format!("{step}, with gains"), 0.62);
     set_fitted_readings(measurement, logs, &estimate);
     let instants = training_logs(logs);
-    measurement.calibrate(
+    measurement.set_calibration_unknowns(
         calibrated,
         instants.iter().flat_map(|log| log.instants.iter()),
     );

@@ -5,9 +5,10 @@
 use crate::dataset::defects::Defect;
 use crate::dataset::recording::Recording;
 use crate::dataset::repeats::{Repeat, Repeats};
-use crate::dataset::smooth::{median, quantum};
+use crate::dataset::smooth::quantum;
 use crate::dataset::stream::{JointTrack, MOTION, Stream};
 use crate::robot::{ChannelRole, Robot};
+use crate::statistics::robust_std;
 use proprio_topics::Nanos;
 use std::ops::Range;
 
@@ -111,13 +112,11 @@ impl<const D: usize> Stream<D> {
                 (values[i] - middle, neighbours[4] - neighbours[1])
             })
             .collect();
-        let usual = 1.4826
-            * median(
-                off.iter()
-                    .filter(|(_, spread)| spread.is_finite())
-                    .map(|(d, _)| d.abs())
-                    .collect(),
-            );
+        let usual = robust_std(
+            off.iter()
+                .filter(|(_, spread)| spread.is_finite())
+                .map(|(d, _)| *d),
+        );
         let floor = 8.0 * usual + 3.0 * quantum(&values);
         let far = |(d, spread): (f64, f64)| d.abs() > floor + spread && d.abs() > least;
         let count = off.iter().filter(|o| far(**o)).count();

@@ -3,9 +3,10 @@
 use crate::dataset::cleaning::{FREEZE, STEEP, label, merged, steep};
 use crate::dataset::defects::{Defect, LEAST_ROWS, LEAST_SECONDS, Units};
 use crate::dataset::recording::{Recording, SkippedRows};
-use crate::dataset::smooth::{median, quantum};
+use crate::dataset::smooth::quantum;
 use crate::dataset::stream::{MOTION, Stream, range};
 use crate::robot::{AXES, ChannelRole, Robot};
+use crate::statistics::median;
 use proprio_dynamics::spatial::Wrench;
 use proprio_topics::{Nanos, Reason};
 use std::ops::Range;

@@ -1,6 +1,6 @@
 //! Observations: the values of all channels at one time, and annotations by fits.
 
-use crate::robot::{BaseMotion, Channel, ChannelRole, Robot};
+use crate::robot::{Channel, ChannelRole};
 use proprio_dynamics::spatial::Wrench;
 use proprio_dynamics::{BitSet, ContactSet, FrameMotion, SensorSet};
 use proprio_topics::{Nanos, Reason};
@@ -47,23 +47,6 @@ pub struct Observation {
 impl Observation {
     /// The unit of all measured joint torques, among the numbers of sub-trees.
     pub const TORQUES: usize = UnitSet::CAPACITY - 1;
-
-    /// Starts kinematics at the standing link, unless an IMU measures the base motion.
-    pub(crate) fn stand(&mut self, robot: &Robot) {
-        match &robot.base {
-            BaseMotion::Standing(motion) => self.base = *motion,
-            BaseMotion::Imu(_) => {}
-            BaseMotion::Stance(stances) => {
-                let standing = stances.iter().find(|s| self.active.contains(s.contact));
-                if standing.is_none() {
-                    self.base_fault = Reason::NoStance;
-                }
-                if let Some(stance) = standing.or(stances.first()) {
-                    (self.base_link, self.base) = (stance.link, stance.motion);
-                }
-            }
-        }
-    }
 
     /// Whether the motion of every joint and of the base is known.
     #[must_use]

@@ -14,10 +14,10 @@ use crate::dataset::cleaning::label;
 use crate::dataset::defects::{Defect, OffsetJump};
 use crate::dataset::recording::Recording;
 use crate::dataset::resampling::Observations;
-use crate::dataset::smooth::median;
 use crate::finding::Severity;
 use crate::parallel;
 use crate::robot::{AXES, ChannelRole, Robot};
+use crate::statistics::{median, robust_std};
 use proprio_dynamics::{InverseDynamics, JointState, Kinematics, Structure};
 use proprio_topics::{Nanos, Reason};
 use std::ops::Range;
@@ -90,11 +90,7 @@ pub(crate) fn inspect(recording: &Recording, robot: &Robot, observations: &mut O
             let runs: Vec<_> = runs
                 .map(|(r, e)| Residual::new(r.clone(), series(r), e, period))
                 .collect();
-            let usual = median(
-                runs.iter()
-                    .flat_map(|r| r.off.iter().map(|d| d.abs()))
-                    .collect(),
-            ) * 1.4826;
+            let usual = robust_std(runs.iter().flat_map(|r| r.off.iter().copied()));
             let (mut outliers, mut jumps) = (Vec::new(), Vec::new());
             for mut run in runs {
                 let scatter: Vec<f64> = run
@@ -398,7 +394,7 @@ impl<'a> Residual<'a> {
         let (half, step) = (samples(SURROUNDINGS, period), samples(0.25, period));
         let at = |i: usize| {
             let window = &values[i.saturating_sub(half)..(i + half).min(values.len())];
-            1.4826 * median(window.iter().map(|v| v.abs()).collect())
+            robust_std(window.iter().copied())
         };
         let knots: Vec<f64> = (0..values.len()).step_by(step).map(at).collect();
         (0..values.len()).map(|i| knots[i / step]).collect()
@@ -461,7 +457,7 @@ impl<'a> Residual<'a> {
             })
             .collect();
         let inside = &misses[reach..count - reach];
-        let usual = 1.4826 * median(inside.iter().map(|m| m.abs()).collect());
+        let usual = robust_std(inside.iter().copied());
         // The usual result of the test nearby, from lines that share no sample with those at the
         // place itself.
         let surroundings = samples(SURROUNDINGS, period);
@@ -471,7 +467,7 @@ impl<'a> Residual<'a> {
                 .iter();
             let last = count - reach;
             let after = misses[(i + reach).min(last)..(i + reach + surroundings).min(last)].iter();
-            1.4826 * median(before.chain(after).map(|m| m.abs()).collect())
+            robust_std(before.chain(after).copied())
         };
         let excess = |i: usize| {
             let size = misses[i].abs();

@@ -56,8 +56,8 @@ impl Default for Settings {
 pub struct Observations {
     /// In order of time.
     pub instants: Vec<Observation>,
-    /// Where the offset of an F/T sensor seems to jump, judged by its readings alone. From there on
-    /// the offset is re-initialised, unless a fit contradicts.
+    /// Where the offset of an F/T sensor seems to jump, judged by its readings minus the CAD's
+    /// prediction. From there on the offset is re-initialised, unless a fit contradicts.
     pub offset_jumps: Vec<OffsetJump>,
     /// All other defects of the log: those of single channels, and those found at common times.
     pub defects: Vec<Defect>,
@@ -78,21 +78,23 @@ impl Recording {
             .collect();
         let at = |number: usize| {
             let t = times[number];
+            let active = self.active(robot, t);
+            let (base_link, base, base_fault) = robot.base_motion(&active);
             let mut observation = Observation {
                 t,
                 position: at_rest.clone(),
                 velocity: vec![0.0; dofs],
                 acceleration: vec![0.0; dofs],
                 torque: vec![f64::NAN; dofs],
-                base_link: robot.base_link,
-                base: FrameMotion::standing(&Vec3::zeros()),
+                base_link,
+                base,
                 readings: vec![
                     Wrench::from_parts([f64::NAN; 3], [f64::NAN; 3]);
                     self.sensors.len()
                 ],
-                active: self.active(robot, t),
+                active,
                 faults: vec![Reason::None; self.channels.len()],
-                base_fault: Reason::None,
+                base_fault,
                 temperatures: self
                     .temperatures
                     .iter()
@@ -100,7 +102,6 @@ impl Recording {
                     .collect(),
                 outliers: SensorSet::default(),
             };
-            observation.stand(robot);
             for (channel, fault) in self.channels.iter().zip(&mut observation.faults) {
                 *fault = match channel.role {
                     ChannelRole::Joint(dof) => {
@@ -176,20 +177,13 @@ impl Recording {
         times
     }
 
+    /// The contacts that are present at `t`, as declared.
     fn active(&self, robot: &Robot, t: Nanos) -> ContactSet {
-        let mut active = robot.always;
-        for (contact, declared) in self.declared.iter().enumerate() {
-            match declared
-                .partition_point(|(from, _)| *from <= t)
-                .checked_sub(1)
-                .and_then(|i| declared.get(i))
-            {
-                Some((_, true)) => active.insert(contact),
-                Some((_, false)) if robot.support != Some(contact) => active.remove(contact),
-                _ => {}
-            }
-        }
-        active
+        robot.active_contacts(|contact| {
+            let declared = self.declared.get(contact)?;
+            let next = declared.partition_point(|(from, _)| *from <= t);
+            Some(declared.get(next.checked_sub(1)?)?.1)
+        })
     }
 
     /// Per degree of freedom and time. Joints are independent, so they run on all cores.

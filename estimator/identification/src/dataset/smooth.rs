@@ -35,6 +35,7 @@
 //! In the last row the velocity's error is that of averaging five samples to one.
 
 use crate::arithmetic::dot;
+use crate::statistics::median;
 use proprio_topics::Nanos;
 use std::ops::RangeInclusive;
 
@@ -505,15 +506,6 @@ impl Scratch {
             .all(|e| e.is_finite())
             .then_some(fit)
     }
-}
-
-/// The median; 0 of nothing.
-pub(crate) fn median(mut values: Vec<f64>) -> f64 {
-    let middle = values.len() / 2;
-    if values.is_empty() {
-        return 0.0;
-    }
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
 /// The quantum of a signal: its least change, if all changes are multiples of it; else 0.

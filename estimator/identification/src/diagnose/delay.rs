@@ -28,7 +28,7 @@ use crate::training::{TrainingLog, map_segments, sample};
 const DELAY_STD: f64 = 0.05;
 
 /// Smallest delay that matters \[s\].
-const LEAST: f64 = 2e-3;
+const MIN_REPORTED: f64 = 2e-3;
 
 /// A single torque is reported if its delay exceeds that of any other by this factor. (A real arm
 /// with joint torque sensors, whose friction makes them seem late, reaches 3.7.)
@@ -50,7 +50,8 @@ pub(crate) fn delays(
     let (robot, unknowns) = (measurement.robot(), &identified.unknowns);
     let sensors = unknowns.sensors.len();
     let significance = deviations(sensors + unknowns.joints.len() + 1);
-    let is_long = |(seconds, deviation): Delay| seconds.abs() > LEAST.max(significance * deviation);
+    let is_long =
+        |(seconds, deviation): Delay| seconds.abs() > MIN_REPORTED.max(significance * deviation);
     let common_streams = fit(measurement, training, identified, false).unwrap_or_default();
     let names = unknowns
         .sensors

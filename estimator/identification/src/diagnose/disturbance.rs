@@ -20,6 +20,7 @@ use crate::measurement::noise_model::NoiseModel;
 use crate::measurement::reduction::{Segment, blocks, residuals};
 use crate::measurement::rows::Rows;
 use crate::statistics::chi_square;
+use crate::statistics::quantile;
 use crate::training::{SEGMENT_INSTANTS, TrainingLog, map_segments};
 use nalgebra::DVector;
 
@@ -53,7 +54,7 @@ const SHORTEST: usize = 10;
 
 /// Where a larger fraction of the blocks is outlying, no contact is reported: model and log are
 /// then not of the same robot.
-const MOST: f64 = 0.7;
+const MAX_OUTLYING_FRACTION: f64 = 0.7;
 
 /// Half of the window whose median is the level of a channel [blocks]: an offset drifts more
 /// slowly, a contact is shorter.
@@ -111,7 +112,7 @@ fn of_segment(
 ) -> Vec<UnitSet> {
     let unknowns = measurement.unknowns().clone();
     let channels = unknowns.channels();
-    let variances = noise.following();
+    let variances = noise.offset_tracking_variances();
     let residuals = residuals(measurement, segment, noise, std::slice::from_ref(d));
     // The median of each offset over a stretch: the offset itself may have followed a contact, and
     // would hide it.
@@ -192,7 +193,7 @@ fn of_segment(
         let outlier = outlying(&own, &starts, &motion, &least);
         let share =
             outlier.iter().filter(|outlier| **outlier).count() as f64 / outlier.len().max(1) as f64;
-        if share > MOST {
+        if share > MAX_OUTLYING_FRACTION {
             continue;
         }
         for ((range, _), _) in ranges.iter().zip(&outlier).filter(|(_, outlier)| **outlier) {
@@ -330,15 +331,6 @@ fn medians(series: &[f64], starts: &[usize]) -> Vec<f64> {
         }
     }
     out
-}
-
-/// A quantile of some numbers; NaN if there are none.
-fn quantile(mut values: Vec<f64>, share: f64) -> f64 {
-    if values.is_empty() {
-        return f64::NAN;
-    }
-    let place = (share * (values.len() - 1) as f64).round() as usize;
-    *values.select_nth_unstable_by(place, f64::total_cmp).1
 }
 
 #[cfg(test)]

@@ -37,11 +37,11 @@ use proprio_dynamics::model::JointKind;
 const OFFSET_STD: f64 = 0.1;
 
 /// Smallest offset that is reported \[rad\].
-const LEAST: f64 = 0.01;
+const MIN_REPORTED: f64 = 0.01;
 
 /// The same of a joint between the base and the sensors \[rad\]: floors and bases are tilted by
 /// less.
-const LEAST_BEFORE: f64 = 0.02;
+const MIN_REPORTED_BEFORE_SENSORS: f64 = 0.02;
 
 /// Observations that are used in all.
 const ENOUGH: usize = 2000;
@@ -416,7 +416,11 @@ pub(crate) fn encoder_errors(
         let of_joint = |place: &usize| offsets[*place].0.joint == number;
         let places: Vec<usize> = (0..offsets.len()).filter(of_joint).collect();
         let is_within = is_within(dof);
-        let least = if is_within { LEAST } else { LEAST_BEFORE };
+        let least = if is_within {
+            MIN_REPORTED
+        } else {
+            MIN_REPORTED_BEFORE_SENSORS
+        };
         if places.iter().all(|&place| offsets[place].1.abs() <= least) {
             continue;
         }

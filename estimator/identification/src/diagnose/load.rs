@@ -6,10 +6,11 @@ use crate::linear::information::Information;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
 use crate::measurement::reduction::{Segment, reduce};
-use crate::measurement::unknowns::{Unknowns, WIDTH};
+use crate::measurement::unknowns::Unknowns;
 use crate::prior::Prior;
 use crate::training::{TrainingLog, map_segments};
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
+use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_topics::Nanos;
 use std::ops::Range;
 
@@ -57,8 +58,8 @@ impl Load {
 /// Inertial parameters that a load adds to a link, with their covariance.
 #[derive(Clone, Debug)]
 pub(crate) struct AddedBody {
-    pub parameters: SVector<f64, WIDTH>,
-    pub covariance: SMatrix<f64, WIDTH, WIDTH>,
+    pub parameters: SVector<f64, LINK_PARAMETERS>,
+    pub covariance: SMatrix<f64, LINK_PARAMETERS, LINK_PARAMETERS>,
 }
 
 /// Normal equations `[R^T R, R^T z]` of some information. They are used to search for a load, not
@@ -86,7 +87,10 @@ impl Normal {
         for (place, &link) in unknowns.links.iter().enumerate() {
             let mut own = self
                 .matrix
-                .fixed_view_mut::<WIDTH, WIDTH>(WIDTH * place, WIDTH * place);
+                .fixed_view_mut::<LINK_PARAMETERS, LINK_PARAMETERS>(
+                    LINK_PARAMETERS * place,
+                    LINK_PARAMETERS * place,
+                );
             own += prior.metric(link) / (2.0 * tau * tau);
         }
         for (precision, column) in unknowns
@@ -112,13 +116,19 @@ pub(crate) fn body(
 ) -> Option<(AddedBody, f64)> {
     let cross = some
         .matrix
-        .fixed_columns::<WIDTH>(WIDTH * place)
+        .fixed_columns::<LINK_PARAMETERS>(LINK_PARAMETERS * place)
         .into_owned();
-    let own = cross.fixed_rows::<WIDTH>(WIDTH * place).into_owned();
+    let own = cross
+        .fixed_rows::<LINK_PARAMETERS>(LINK_PARAMETERS * place)
+        .into_owned();
     // A weak prior: the body is known to three times the link's own size.
     let weak = prior.metric(unknowns.links[place]) / 18.0;
     let rest = own + weak - cross.transpose() * factor.solve(&cross);
-    let misfit = some.right.fixed_rows::<WIDTH>(WIDTH * place).into_owned() - cross.transpose() * x;
+    let misfit = some
+        .right
+        .fixed_rows::<LINK_PARAMETERS>(LINK_PARAMETERS * place)
+        .into_owned()
+        - cross.transpose() * x;
     let covariance = rest.cholesky()?.inverse();
     let parameters = covariance * misfit;
     let gain = misfit.dot(&parameters);
@@ -199,7 +209,7 @@ pub(crate) fn find(
         .collect();
     // The threshold is that of a single test, because the noise still includes the load. The noise
     // of the fit without it decides.
-    let least = needed(WIDTH, 1);
+    let least = needed(LINK_PARAMETERS, 1);
     let mut best: Option<(f64, f64, usize, usize, usize)> = None;
     for (log, range) in of_log.iter().enumerate() {
         if range.len() < 2 * LEAST_SEGMENTS {

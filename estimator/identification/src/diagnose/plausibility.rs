@@ -54,7 +54,7 @@ pub fn implausible(robot: &Robot, dataset: Dataset) -> Vec<Finding> {
     // tested.
     log.refused = !has_motion || log.instants.len() < MIN_FOLD;
     let wrench = [IdentificationInput::Wrench];
-    let measurement = MeasurementModel::survey(robot, &wrench, log.instants.iter()).ok();
+    let measurement = MeasurementModel::for_observations(robot, &wrench, log.instants.iter()).ok();
     if let Some(mut measurement) =
         measurement.filter(|measurement| !log.refused && !measurement.unknowns().links.is_empty())
     {

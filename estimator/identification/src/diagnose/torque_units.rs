@@ -23,10 +23,10 @@ use proprio_dynamics::DynamicsError;
 use proprio_dynamics::model::JointKind;
 
 /// Most observations that are used.
-const ENOUGH: usize = 2000;
+const MAX_OBSERVATIONS: usize = 2000;
 
 /// Fewest observations for a comparison.
-const LEAST: usize = 50;
+const MIN_OBSERVATIONS: usize = 50;
 
 /// A torque above this multiple of the prediction, or below its inverse, has wrong units.
 const FACTOR: f64 = 30.0;
@@ -63,7 +63,7 @@ impl Pairs {
     /// first two. None with too few observations.
     fn compare(&self, side: TorqueSide) -> Option<Compared> {
         let count = self.measured.len();
-        if count < LEAST {
+        if count < MIN_OBSERVATIONS {
             return None;
         }
         let width = match side {
@@ -167,9 +167,10 @@ pub(crate) fn faulty(robot: &Robot, log: &TrainingLog) -> Result<Vec<FaultyTorqu
     if log.refused || !(0..robot.model.dof_count()).any(|dof| measured(&dof)) {
         return Ok(Vec::new());
     }
-    let step = log.instants.len().div_ceil(ENOUGH).max(1);
+    let step = log.instants.len().div_ceil(MAX_OBSERVATIONS).max(1);
     let some = || log.instants.iter().step_by(step);
-    let mut measurement = MeasurementModel::survey(robot, &[IdentificationInput::Torque], some())?;
+    let mut measurement =
+        MeasurementModel::for_observations(robot, &[IdentificationInput::Torque], some())?;
     let joints = measurement.unknowns().joints.clone();
     let mut pairs: Vec<Pairs> = joints.iter().map(|_| Pairs::default()).collect();
     let mut rows = Rows::new(measurement.unknowns());

@@ -23,13 +23,13 @@ use crate::training::TrainingLog;
 use nalgebra::DVector;
 
 /// Most observations that are used.
-const ENOUGH: usize = 2000;
+const MAX_OBSERVATIONS: usize = 2000;
 
 /// Fewest observations of a stretch of constant offset.
-const LEAST: usize = 50;
+const MIN_OBSERVATIONS: usize = 50;
 
 /// Readings above this multiple of the prediction have wrong units.
-const LARGE: f64 = 30.0;
+const MAX_RATIO: f64 = 30.0;
 
 /// Readings below the prediction by this factor have wrong units.
 const SMALL: f64 = 300.0;
@@ -93,7 +93,7 @@ struct Compared {
 impl Compared {
     /// `most`: the largest reading that the robot can cause.
     fn is_too_large(&self, most: f64) -> bool {
-        self.ratio > LARGE
+        self.ratio > MAX_RATIO
             && self.correlation.abs() > CORRELATED
             && self.ratio * self.predicted > most
     }
@@ -243,7 +243,7 @@ fn pairs(measurement: &mut MeasurementModel<'_>, log: &TrainingLog) -> Vec<[Pair
         .collect();
     let close = |pairs: &mut [Pairs; 6], open: &mut [Vec<(f64, f64)>; 6]| {
         for (pairs, stretch) in pairs.iter_mut().zip(open) {
-            if stretch.len() >= LEAST {
+            if stretch.len() >= MIN_OBSERVATIONS {
                 pairs.add(stretch);
             }
             stretch.clear();
@@ -254,7 +254,7 @@ fn pairs(measurement: &mut MeasurementModel<'_>, log: &TrainingLog) -> Vec<[Pair
     for instant in log
         .instants
         .iter()
-        .step_by(log.instants.len().div_ceil(ENOUGH).max(1))
+        .step_by(log.instants.len().div_ceil(MAX_OBSERVATIONS).max(1))
     {
         let made = measurement.make(instant, &mut rows).is_ok();
         let residual = DVector::from_fn(rows.count, |row, _| rows.r(row));

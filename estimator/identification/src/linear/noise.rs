@@ -1,4 +1,7 @@
 //! The noise of a channel, from its residuals: autocorrelation time and random walk.
+//!
+//! Source of the random walk: the local level model, A. C. Harvey, "Forecasting, structural time
+//! series models and the Kalman filter", 1989, chapter 2.
 
 /// Mean square and integrated autocorrelation time of a residual: `1 + 2 sum rho_k`, in samples, at
 /// least 1, summed until the window is six times the sum (Sokal 1997, "Monte Carlo methods in
@@ -42,6 +45,36 @@ pub(crate) fn autocorrelation_time(segments: &[&[f64]]) -> (f64, f64) {
     (variance, time.max(1.0))
 }
 
+/// The filter of the local level model: a level that walks randomly, observed with noise.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct LocalLevel {
+    pub(crate) level: f64,
+    pub(crate) variance: f64,
+}
+
+impl LocalLevel {
+    /// After a first value with this noise variance, of a level of which nothing was known.
+    pub(crate) fn first((level, variance): (f64, f64)) -> Self {
+        Self { level, variance }
+    }
+
+    /// What a value with this noise variance is expected to differ by after a step with variance
+    /// `walk`: the innovation, and its variance.
+    pub(crate) fn innovation(&self, walk: f64, (value, noise): (f64, f64)) -> (f64, f64) {
+        (value - self.level, self.variance + walk + noise)
+    }
+
+    /// Takes in a value with this noise variance after a step with variance `walk`. `weight` is the
+    /// probability that the value is one of the level: with 0 nothing changes. Returns the gain.
+    pub(crate) fn update(&mut self, walk: f64, (value, noise): (f64, f64), weight: f64) -> f64 {
+        let (innovation, total) = self.innovation(walk, (value, noise));
+        let gain = weight * (self.variance + walk) / total;
+        self.level += gain * innovation;
+        self.variance = (self.variance + weight * walk) * (1.0 - gain);
+        gain
+    }
+}
+
 /// A segment of a series in blocks of equal length: the mean of each, NaN where it has no sample.
 pub(crate) type Blocks = Vec<f64>;
 
@@ -53,26 +86,26 @@ pub(crate) fn random_walk(segments: &[Blocks], bound: f64) -> (f64, f64) {
     let evaluate = |ratio: f64| -> (f64, f64) {
         let (mut logs, mut squares, mut count) = (0.0, 0.0, 0.0);
         for segment in segments {
-            let mut state: Option<(f64, f64)> = None;
+            // Variances are in units of that of the noise.
+            let mut state: Option<LocalLevel> = None;
             for &value in segment {
-                // Predict.
-                if let Some((_, p)) = &mut state {
-                    *p += ratio;
+                if let Some(filter) = &mut state {
+                    filter.variance += ratio;
                 }
                 if !value.is_finite() {
                     continue;
                 }
-                state = Some(match state {
-                    None => (value, 1.0),
-                    Some((level, p)) => {
-                        let f = p + 1.0;
-                        let innovation = value - level;
-                        logs += f.ln();
-                        squares += innovation * innovation / f;
+                match &mut state {
+                    None => state = Some(LocalLevel::first((value, 1.0))),
+                    Some(filter) => {
+                        let (innovation, total) = filter.innovation(0.0, (value, 1.0));
+                        logs += total.ln();
+                        squares += innovation * innovation / total;
                         count += 1.0;
-                        (level + p / f * innovation, p / f)
+                        // With noise of unit variance the gain is the variance.
+                        filter.variance = filter.update(0.0, (value, 1.0), 1.0);
                     }
-                });
+                }
             }
         }
         let variance = if count > 0.0 { squares / count } else { 0.0 };
@@ -115,26 +148,23 @@ pub(crate) fn random_walk(segments: &[Blocks], bound: f64) -> (f64, f64) {
 /// The levels of a series of block means, given the variances of a step and of the noise: a Kalman
 /// filter and a backward smoother.
 pub(crate) fn levels(segment: &[f64], step: f64, noise: f64) -> Vec<f64> {
-    let mut filtered: Vec<(f64, f64)> = Vec::with_capacity(segment.len());
-    let mut state: Option<(f64, f64)> = None;
+    let mut filtered: Vec<LocalLevel> = Vec::with_capacity(segment.len());
+    let mut state: Option<LocalLevel> = None;
     for &value in segment {
-        if let Some((_, p)) = &mut state {
-            *p += step;
+        if let Some(filter) = &mut state {
+            filter.variance += step;
         }
         if value.is_finite() {
-            state = Some(match state {
-                None => (value, noise),
-                Some((level, p)) => {
-                    let gain = p / (p + noise);
-                    (level + gain * (value - level), p * (1.0 - gain))
-                }
-            });
+            match &mut state {
+                None => state = Some(LocalLevel::first((value, noise))),
+                Some(filter) => _ = filter.update(0.0, (value, noise), 1.0),
+            }
         }
-        filtered.push(state.unwrap_or((f64::NAN, f64::NAN)));
+        filtered.push(state.unwrap_or(LocalLevel::first((f64::NAN, f64::NAN))));
     }
-    let mut out: Vec<f64> = filtered.iter().map(|(level, _)| *level).collect();
+    let mut out: Vec<f64> = filtered.iter().map(|filter| filter.level).collect();
     for k in (1..out.len()).rev() {
-        let (level, p) = filtered[k - 1];
+        let LocalLevel { level, variance: p } = filtered[k - 1];
         if level.is_finite() {
             out[k - 1] = level + p / (p + step) * (out[k] - level);
         } else {

@@ -7,7 +7,7 @@ use std::ops::{Deref, DerefMut};
 use pulp::Simd;
 
 /// Number of vectors processed together, so that no instruction waits for a single sum.
-pub(crate) const TOGETHER: usize = 4;
+pub(crate) const VECTORS: usize = 4;
 
 /// A multiple of the vector length of every processor.
 pub(crate) const LANES: usize = 8;
@@ -76,11 +76,11 @@ pub(crate) fn inner<S: Simd>(simd: S, a: &[f64], b: &[f64]) -> f64 {
 #[inline(always)]
 pub(crate) fn inner_of_four<S: Simd>(
     simd: S,
-    four: [&[f64]; TOGETHER],
+    four: [&[f64]; VECTORS],
     c: &[f64],
-) -> [f64; TOGETHER] {
+) -> [f64; VECTORS] {
     let [a, b, d, e] = vectors::<S>(four);
-    let mut sums = [simd.splat_f64s(0.0); TOGETHER];
+    let mut sums = [simd.splat_f64s(0.0); VECTORS];
     for ((((c, a), b), d), e) in S::as_simd_f64s(c).0.iter().zip(a).zip(b).zip(d).zip(e) {
         sums[0] = simd.mul_add_e_f64s(*a, *c, sums[0]);
         sums[1] = simd.mul_add_e_f64s(*b, *c, sums[1]);
@@ -131,10 +131,10 @@ pub(crate) fn add_and_square<S: Simd>(simd: S, c: &mut [f64], factor: f64, v: &[
 pub(crate) fn add_four<S: Simd>(
     simd: S,
     c: &mut [f64],
-    factors: [f64; TOGETHER],
-    four: [&[f64]; TOGETHER],
+    factors: [f64; VECTORS],
+    four: [&[f64]; VECTORS],
 ) {
-    let mut splat = [simd.splat_f64s(0.0); TOGETHER];
+    let mut splat = [simd.splat_f64s(0.0); VECTORS];
     for (splat, factor) in splat.iter_mut().zip(factors) {
         *splat = simd.splat_f64s(factor);
     }
@@ -156,7 +156,7 @@ pub(crate) fn add_four<S: Simd>(
 }
 
 #[inline(always)]
-fn vectors<S: Simd>(four: [&[f64]; TOGETHER]) -> [&[S::f64s]; TOGETHER] {
+fn vectors<S: Simd>(four: [&[f64]; VECTORS]) -> [&[S::f64s]; VECTORS] {
     let [a, b, d, e] = four;
     [
         S::as_simd_f64s(a).0,

@@ -30,10 +30,11 @@
 use crate::arithmetic::dot;
 use crate::dataset::observation::{Annotated, Observation, UnitSet};
 use crate::measurement::rows::Rows;
-use crate::measurement::unknowns::{ExtraParameter, FRICTION, Unknowns, WIDTH, friction_row};
+use crate::measurement::unknowns::{ExtraParameter, FRICTION, Unknowns, friction_row};
 use crate::robot::{IdentificationInput, Robot, TorqueSide};
 use nalgebra::{DVector, Matrix6, Vector6};
 use proprio_dynamics::calibration::{Kind, Unknown};
+use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::regressor::{Regressor, StackedRegressor, Weighting};
 use proprio_dynamics::spatial::{Motion, Vec3, Wrench};
 use proprio_dynamics::{DynamicsError, JointState, Kinematics};
@@ -97,7 +98,7 @@ impl<'a> MeasurementModel<'a> {
     ///
     /// # Errors
     /// The observations are of another robot.
-    pub(crate) fn survey<'b>(
+    pub(crate) fn for_observations<'b>(
         robot: &'a Robot,
         inputs: &[IdentificationInput],
         observations: impl Iterator<Item = &'b Annotated>,
@@ -148,7 +149,7 @@ impl<'a> MeasurementModel<'a> {
         );
         let mut parent: Vec<usize> = (0..nodes + channels).collect();
         let mut rows = Rows::new(&measurement.unknowns);
-        let (mut seen, mut heard) = (vec![false; nodes], vec![false; channels]);
+        let (mut seen, mut appears) = (vec![false; nodes], vec![false; channels]);
         for observation in observations {
             measurement.make(observation, &mut rows)?;
             for row in 0..rows.count {
@@ -158,9 +159,9 @@ impl<'a> MeasurementModel<'a> {
                     let with = root_of(&mut parent, *first.get_or_insert(own));
                     parent[own.max(with)] = own.min(with);
                 };
-                let (of_links, of_further) = rows.a(row).split_at(WIDTH * links);
+                let (of_links, of_further) = rows.a(row).split_at(LINK_PARAMETERS * links);
                 let columns = of_links
-                    .chunks_exact(WIDTH)
+                    .chunks_exact(LINK_PARAMETERS)
                     .chain(of_further.chunks_exact(1));
                 for (node, (seen, columns)) in seen.iter_mut().zip(columns).enumerate() {
                     if columns.iter().any(|x| *x != 0.0) {
@@ -168,16 +169,16 @@ impl<'a> MeasurementModel<'a> {
                         join(node);
                     }
                 }
-                for (channel, (heard, entry)) in heard.iter_mut().zip(rows.n(row)).enumerate() {
+                for (channel, (appears, entry)) in appears.iter_mut().zip(rows.n(row)).enumerate() {
                     if *entry != 0.0 {
-                        *heard = true;
+                        *appears = true;
                         join(nodes + channel);
                     }
                 }
             }
         }
         let numbers = |flags: &[bool]| (0..flags.len()).filter(|&i| flags[i]).collect();
-        let (wrenches, torques) = heard.split_at(6 * sensors);
+        let (wrenches, torques) = appears.split_at(6 * sensors);
         let sensing: Vec<bool> = wrenches.chunks(6).map(|six| six.contains(&true)).collect();
         let (seen, shows) = seen.split_at(links);
         let shown: Vec<usize> = numbers(shows);
@@ -213,13 +214,13 @@ impl<'a> MeasurementModel<'a> {
     /// Makes these parameters of the calibrations of the visible sensors unknown, and no others. A
     /// gain has all its entries. The change per kelvin is included where the temperature varies in
     /// these observations. Its reference temperature is the configured one, else the mean.
-    pub(crate) fn calibrate<'b>(
+    pub(crate) fn set_calibration_unknowns<'b>(
         &mut self,
         wanted: Kind,
         observations: impl Iterator<Item = &'b Annotated>,
     ) {
         /// Least temperature range that determines a change per kelvin [K].
-        const LEAST: f64 = 0.1;
+        const MIN_TEMPERATURE_RANGE: f64 = 0.1;
         let robot = self.robot;
         // Calibration parameters come last.
         let others = self.unknowns.extra.iter();
@@ -245,13 +246,13 @@ impl<'a> MeasurementModel<'a> {
             let mean = own.iter().sum::<f64>() / own.len() as f64;
             self.references[sensor] = robot.calibrations[sensor].reference().unwrap_or(mean);
             let kind = Kind {
-                temperature: wanted.temperature && high - low > LEAST,
+                temperature: wanted.temperature && high - low > MIN_TEMPERATURE_RANGE,
                 ..wanted
             };
             for unknown in kind.unknowns() {
                 let extra = ExtraParameter::Calibration(sensor, unknown);
                 self.calibrations[sensor].push((
-                    WIDTH * self.unknowns.links.len() + self.unknowns.extra.len(),
+                    LINK_PARAMETERS * self.unknowns.links.len() + self.unknowns.extra.len(),
                     unknown,
                 ));
                 self.unknowns.extra.push(extra);
@@ -314,7 +315,11 @@ impl<'a> MeasurementModel<'a> {
     /// CAD's parameters in the columns of the rows; zero for extra parameters.
     pub(crate) fn cad_of_unknowns(&self) -> Vec<f64> {
         let links = self.unknowns.links.iter();
-        let of_links = links.flat_map(|link| self.cad[WIDTH * link..][..WIDTH].iter().copied());
+        let of_links = links.flat_map(|link| {
+            self.cad[LINK_PARAMETERS * link..][..LINK_PARAMETERS]
+                .iter()
+                .copied()
+        });
         of_links
             .chain(self.unknowns.extra.iter().map(|_| 0.0))
             .collect()
@@ -340,7 +345,10 @@ impl<'a> MeasurementModel<'a> {
                 return f64::NAN;
             };
             let own = self.unknowns.links.iter().enumerate().map(|(place, link)| {
-                dot(&row[WIDTH * link..][..WIDTH], &d[WIDTH * place..][..WIDTH])
+                dot(
+                    &row[LINK_PARAMETERS * link..][..LINK_PARAMETERS],
+                    &d[LINK_PARAMETERS * place..][..LINK_PARAMETERS],
+                )
             });
             observation.torque[dof] - dot(row, &self.cad) - own.sum::<f64>()
         };
@@ -452,10 +460,13 @@ impl<'a> MeasurementModel<'a> {
         let mut b = vibration_of(observation, number);
         for (row, sum) in b.iter_mut().enumerate() {
             let (links, offsets) = subtree.row(row).split_at(subtree.offset_column());
-            for (values, link) in links.chunks_exact(WIDTH).zip(subtree.links()) {
-                *sum += dot(values, &self.cad[WIDTH * link..][..WIDTH]);
+            for (values, link) in links.chunks_exact(LINK_PARAMETERS).zip(subtree.links()) {
+                *sum += dot(
+                    values,
+                    &self.cad[LINK_PARAMETERS * link..][..LINK_PARAMETERS],
+                );
                 if let Ok(place) = self.unknowns.links.binary_search(link) {
-                    *sum += dot(values, &d[WIDTH * place..][..WIDTH]);
+                    *sum += dot(values, &d[LINK_PARAMETERS * place..][..LINK_PARAMETERS]);
                 }
             }
             for (values, sensor) in offsets.chunks_exact(6).zip(subtree.sensors()) {
@@ -553,11 +564,11 @@ impl<'a> MeasurementModel<'a> {
                 let (a, r, g, n) = rows.push(unit);
                 *r = subtree.projected_measured()[number]
                     - dot(subtree.projection(number), &vibration);
-                for (values, link) in links.chunks_exact(WIDTH).zip(subtree.links()) {
-                    let cad = &self.cad[WIDTH * link..][..WIDTH];
+                for (values, link) in links.chunks_exact(LINK_PARAMETERS).zip(subtree.links()) {
+                    let cad = &self.cad[LINK_PARAMETERS * link..][..LINK_PARAMETERS];
                     *r -= values.iter().zip(cad).map(|(x, y)| x * y).sum::<f64>();
                     if let Ok(place) = self.unknowns.links.binary_search(link) {
-                        a[WIDTH * place..][..WIDTH].copy_from_slice(values);
+                        a[LINK_PARAMETERS * place..][..LINK_PARAMETERS].copy_from_slice(values);
                     }
                 }
                 for (values, sensor) in offsets.chunks_exact(6).zip(subtree.sensors()) {
@@ -595,8 +606,11 @@ impl<'a> MeasurementModel<'a> {
             }
             let (a, r, g, n) = rows.push(Observation::TORQUES);
             *r = torque - row.iter().zip(&self.cad).map(|(x, y)| x * y).sum::<f64>();
-            for (to, link) in a.chunks_exact_mut(WIDTH).zip(&self.unknowns.links) {
-                to.copy_from_slice(&row[WIDTH * link..][..WIDTH]);
+            for (to, link) in a
+                .chunks_exact_mut(LINK_PARAMETERS)
+                .zip(&self.unknowns.links)
+            {
+                to.copy_from_slice(&row[LINK_PARAMETERS * link..][..LINK_PARAMETERS]);
             }
             if let Some(column) = self.unknowns.column(ExtraParameter::RotorInertia(dof)) {
                 a[column] = observation.acceleration[dof];

@@ -149,7 +149,7 @@ pub(crate) fn estimate_noise(
 /// noise at all. Combinations of rows that show only these channels would then count as exact. So
 /// each channel has at least half the mean noise of these channels, relative to the stated noise.
 pub(crate) fn alike(unknowns: &Unknowns, segments: &[Residuals], model: &NoiseModel) -> Vec<f64> {
-    const LEAST: f64 = 0.5;
+    const MIN_SHARE: f64 = 0.5;
     let wrenches = 6 * unknowns.sensors.len();
     let relative =
         |c: usize| (model.square[c] * model.time[c]).max(model.block[c]) / model.least[c];
@@ -168,7 +168,7 @@ pub(crate) fn alike(unknowns: &Unknowns, segments: &[Residuals], model: &NoiseMo
             (sum + relative(c), count + 1.0)
         });
         if count > 1.0 {
-            *least *= (LEAST.powi(2) * sum / count).max(1.0);
+            *least *= (MIN_SHARE.powi(2) * sum / count).max(1.0);
         }
     }
     least

@@ -55,7 +55,7 @@ impl NoiseModel {
     }
 
     /// Variances for tracking the offsets.
-    pub(crate) fn following(&self) -> Vec<f64> {
+    pub(crate) fn offset_tracking_variances(&self) -> Vec<f64> {
         self.block
             .iter()
             .zip(&self.least)
@@ -89,7 +89,7 @@ impl NoiseModel {
     /// newest (no variance changed by more than `within`, see [`NoiseModel::change`]), the result
     /// has for each channel the greatest noise in between, so that no uncertainty is stated too
     /// small. None if there is no cycle.
-    pub(crate) fn resolve_limit_cycle(rounds: &[Self], within: f64) -> Option<Self> {
+    pub(crate) fn end_limit_cycle(rounds: &[Self], within: f64) -> Option<Self> {
         let (newest, before) = rounds.split_last()?;
         let back = before
             .iter()

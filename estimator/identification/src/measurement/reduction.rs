@@ -27,7 +27,7 @@ const FRICTION_VARIANCE: f64 = 1e4;
 const PANEL: usize = 96;
 
 /// Blocks that one thread processes at a time.
-const TOGETHER: usize = 16;
+const BLOCKS_PER_TASK: usize = 16;
 
 /// Number of such batches whose rows are kept in memory.
 const AT_ONCE: usize = 32;
@@ -274,15 +274,15 @@ pub(crate) fn filter_nuisance(
 ) -> (Vec<BlockRange>, Vec<Block>) {
     let unknowns = measurement.unknowns().clone();
     let k = sets.len();
-    let variances = noise.following();
+    let variances = noise.offset_tracking_variances();
     let mut nuisance = NuisanceFilter::new(&nuisance_prior(&unknowns), k);
     let make = || (measurement.clone(), Rows::new(&unknowns));
     let (mut states, mut last) = (Vec::new(), None);
     let blocks = blocks(&unknowns, segment);
-    for some in blocks.chunks(AT_ONCE * TOGETHER) {
+    for some in blocks.chunks(AT_ONCE * BLOCKS_PER_TASK) {
         // Per row: the residual of every set, and the coefficients of the nuisance parameters.
         let width = k + unknowns.nuisance();
-        let shares: Vec<_> = some.chunks(TOGETHER).collect();
+        let shares: Vec<_> = some.chunks(BLOCKS_PER_TASK).collect();
         let lines = parallel::map_with(
             shares.len(),
             make,
@@ -340,7 +340,7 @@ pub(crate) fn residuals(
 ) -> Residuals {
     let unknowns = measurement.unknowns().clone();
     let (k, channels, count) = (sets.len(), unknowns.channels(), segment.instants.len());
-    let variances = noise.following();
+    let variances = noise.offset_tracking_variances();
     let make = || (measurement.clone(), Rows::new(&unknowns));
     let (blocks, mut states) = filter_nuisance(measurement, segment, noise, sets);
     let ranges: Vec<Range<usize>> = blocks.into_iter().map(|(range, _)| range).collect();
@@ -353,11 +353,11 @@ pub(crate) fn residuals(
             .for_each(|(value, change)| *value += change);
     }
     let cad = measurement.cad_of_unknowns();
-    let number = |at: usize| at * TOGETHER..ranges.len().min((at + 1) * TOGETHER);
+    let number = |at: usize| at * BLOCKS_PER_TASK..ranges.len().min((at + 1) * BLOCKS_PER_TASK);
     // For some blocks, per observation and channel: the residual of each set, the prediction of the
     // first set, the measurement; then sums of shares, and counts of observations.
     let parts = parallel::map_with(
-        ranges.len().div_ceil(TOGETHER),
+        ranges.len().div_ceil(BLOCKS_PER_TASK),
         make,
         |(measurement, rows), at| {
             let (mut white, mut e) = (Vec::new(), vec![0.0; channels]);
@@ -467,7 +467,7 @@ pub(crate) mod tests {
                 .cloned()
                 .chain(rounds.iter().copied().map(noise))
                 .collect();
-            NoiseModel::resolve_limit_cycle(&rounds, 0.03)
+            NoiseModel::end_limit_cycle(&rounds, 0.03)
         };
         assert_eq!(of(&[[1.0, 2.0], [1.2, 2.0], [1.5, 2.0]]), None);
         assert_eq!(
@@ -483,7 +483,7 @@ pub(crate) mod tests {
         ])
         .unwrap();
         assert_eq!(found, noise([1.3, 2.201]));
-        assert_eq!(NoiseModel::resolve_limit_cycle(&far[..1], 0.03), None);
+        assert_eq!(NoiseModel::end_limit_cycle(&far[..1], 0.03), None);
     }
 
     /// A leg with links between two F/T sensors and a foot beyond that stands on the ground. The
@@ -583,9 +583,12 @@ pub(crate) mod tests {
                 })
             })
             .collect();
-        let mut measurement =
-            MeasurementModel::survey(robot, &[IdentificationInput::Wrench], instants.iter())
-                .expect("rows");
+        let mut measurement = MeasurementModel::for_observations(
+            robot,
+            &[IdentificationInput::Wrench],
+            instants.iter(),
+        )
+        .expect("rows");
         let mut rows = Rows::new(measurement.unknowns());
         let mut offset = [0.0; 12];
         for observation in &mut instants {
@@ -614,9 +617,12 @@ pub(crate) mod tests {
     }
 
     fn noise_found(robot: &Robot, instants: &[Annotated], rounds: usize) -> NoiseModel {
-        let measurement =
-            MeasurementModel::survey(robot, &[IdentificationInput::Wrench], instants.iter())
-                .expect("rows");
+        let measurement = MeasurementModel::for_observations(
+            robot,
+            &[IdentificationInput::Wrench],
+            instants.iter(),
+        )
+        .expect("rows");
         let unknowns = measurement.unknowns().clone();
         assert_eq!((unknowns.sensors.len(), unknowns.channels()), (2, 12));
         let least: Vec<f64> = (0..12)
@@ -651,7 +657,7 @@ pub(crate) mod tests {
         }
         let inputs = [IdentificationInput::Wrench, IdentificationInput::Torque];
         let mut measurement =
-            MeasurementModel::survey(&robot, &inputs, instants.iter()).expect("rows");
+            MeasurementModel::for_observations(&robot, &inputs, instants.iter()).expect("rows");
         let zero = vec![0.0; measurement.unknowns().parameters()];
         let of_link = |name: &str| {
             let link =

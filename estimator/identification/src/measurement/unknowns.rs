@@ -3,13 +3,11 @@
 use crate::robot::Robot;
 use proprio_dynamics::Structure;
 use proprio_dynamics::calibration::Unknown;
+use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::spatial::Vec3;
 
 /// Speed over which the sign of Coulomb friction is smoothed [rad/s or m/s].
 pub(crate) const COULOMB_SPEED: f64 = 0.02;
-
-/// Number of parameters of a link.
-pub(crate) const WIDTH: usize = 10;
 
 /// Number of friction columns of a joint.
 pub(crate) const FRICTION: usize = 3;
@@ -84,7 +82,7 @@ pub(crate) struct Unknowns {
 impl Unknowns {
     /// Number of unknown inertial parameters: the first columns of `A`.
     pub(crate) fn inertial(&self) -> usize {
-        WIDTH * self.links.len()
+        LINK_PARAMETERS * self.links.len()
     }
 
     /// Number of the robot's unknowns: the columns of `A`.
@@ -99,7 +97,7 @@ impl Unknowns {
     }
 
     /// Columns of the unknowns for which CAD has no value.
-    pub(crate) fn beside_cad(&self) -> Vec<usize> {
+    pub(crate) fn parameters_without_cad(&self) -> Vec<usize> {
         let each = self.extra.iter().zip(self.inertial()..);
         each.filter(|(extra, _)| extra.lacks_cad())
             .map(|(_, column)| column)

@@ -11,15 +11,14 @@
 //! `b_k` is the variance of the mean by the uncertainty of the bodies. The bodies are those solved
 //! *before* the second, independent of its readings, so that overfitting does not hide noise.
 //!
-//! For each pair `(V, q)` of a grid a Kalman filter with one state gives the likelihood of the
-//! innovations `y_k - o_k|k-1`. An undeclared disturbance is no noise: each innovation has a
-//! mixture distribution, of which a share [`DISTURBED`] is uniform within [`RANGE`]. The estimates
-//! of `V` and `q^2` are means over the grid, weighted by likelihood and prior. Initially `V` is
-//! hundreds of times the stated variance: readings get their full weight only after their noise was
-//! observed.
-//!
-//! Source: the local level model, A. C. Harvey, "Forecasting, structural time series models and the
-//! Kalman filter", 1989, chapter 2.
+//! For each pair `(V, q)` of a grid a filter of the local level model ([`LocalLevel`]) gives the
+//! likelihood of the innovations `y_k - o_k|k-1`. An undeclared disturbance is no noise: each
+//! innovation has a mixture distribution, of which a share [`DISTURBED`] is uniform within
+//! [`RANGE`]. The estimates of `V` and `q^2` are means over the grid, weighted by likelihood and
+//! prior. Initially `V` is hundreds of times the stated variance: readings get their full weight
+//! only after their noise was observed.
+
+use crate::linear::noise::LocalLevel;
 
 /// Grid of the noise: `V` over the stated variance, in half decades, `10^0 ... 10^5`. Readings
 /// beyond are no noise: the greatest value found on a real leg is 10^4.
@@ -51,11 +50,10 @@ const CORRELATED: (f64, f64) = (0.0, 10.0);
 const LARGE: f64 = 3.0;
 const GREATEST: f64 = 0.9;
 
-/// One filter: offset, its variance, log-likelihood.
+/// One filter of the offset, and its log-likelihood.
 #[derive(Clone, Copy, Debug, Default)]
 struct Filter {
-    offset: f64,
-    variance: f64,
+    offset: LocalLevel,
     likelihood: f64,
 }
 
@@ -117,7 +115,7 @@ impl Channel {
         self.filters
             .as_flattened_mut()
             .iter_mut()
-            .for_each(|filter| filter.offset += by);
+            .for_each(|filter| filter.offset.level += by);
     }
 
     /// Restarts the filters with the next second.
@@ -142,7 +140,7 @@ impl Channel {
             for (filter, rate) in row.iter_mut().zip(RATES) {
                 let innovation = match since {
                     None => {
-                        (filter.offset, filter.variance) = (second.mean, noise);
+                        filter.offset = LocalLevel::first((second.mean, noise));
                         (f64::NAN, 1.0)
                     }
                     Some(dt) => {
@@ -215,18 +213,14 @@ impl Filter {
         dt: f64,
         disturbed: f64,
     ) -> (f64, f64) {
-        let grown = self.variance + walked;
-        let total = grown + noise;
-        let innovation = mean - self.offset;
+        let (innovation, total) = self.offset.innovation(walked, (mean, noise));
         let square = innovation * innovation / total;
         let regular =
             (1.0 - DISTURBED) * (-0.5 * square).exp() / (std::f64::consts::TAU * total).sqrt();
         let share = regular / (regular + disturbed);
         // A disturbance gives no information about the offset, which does not drift meanwhile, and
         // does not age earlier innovations.
-        let gain = share * grown / total;
-        self.offset += gain * innovation;
-        self.variance = (self.variance + share * walked) * (1.0 - gain);
+        self.offset.update(walked, (mean, noise), share);
         self.likelihood *= (-share * dt / MEMORY).exp();
         self.likelihood += (regular + disturbed).ln();
         (innovation / total.sqrt(), share)

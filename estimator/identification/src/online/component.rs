@@ -2,15 +2,14 @@
 
 use crate::arithmetic::{add_multiple, dot, factorise, forward};
 use crate::linear::information::{Information, Panel};
-use crate::linear::simd::{self, TOGETHER};
+use crate::linear::simd::{self, VECTORS};
 use crate::online::channel::Channel;
 use crate::online::rows::{Kinds, ObservationRows, Rows, spread};
-use crate::online::solution::{
-    BLOCK, Change, ComponentSolution, Counts, Observation, Paused, WIDTH,
-};
+use crate::online::solution::{BLOCK, Change, ComponentSolution, Counts, Observation, Paused};
 use crate::statistics::chi_square;
 use nalgebra::DMatrix;
 use proprio_dynamics::model::Model;
+use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::regressor::StackedRegressor;
 use proprio_dynamics::spatial::{RigidInertia, Vec3, Wrench};
 use proprio_dynamics::{ContactSet, DofSet};
@@ -145,7 +144,7 @@ impl Component {
             list.dedup();
         }
         let offset_count = 6 * sensors.len();
-        let unknowns = offset_count + WIDTH * links.len();
+        let unknowns = offset_count + LINK_PARAMETERS * links.len();
         let place = |list: &[usize], of: usize| list.binary_search(&of).unwrap_or(0);
         if unknowns >= LARGE {
             // Whitened rows also have the unknowns of earlier rows, so the trunk's come last.
@@ -162,8 +161,8 @@ impl Component {
             .map(|&k| {
                 let subtree = &stacked.subtrees()[k];
                 let of_links = subtree.links().iter().flat_map(|&link| {
-                    let first = offset_count + WIDTH * place(&links, link);
-                    first..first + WIDTH
+                    let first = offset_count + LINK_PARAMETERS * place(&links, link);
+                    first..first + LINK_PARAMETERS
                 });
                 let of_sensors = subtree.sensors().flat_map(|sensor| {
                     let first = 6 * place(&sensors, sensor);
@@ -198,7 +197,9 @@ impl Component {
         let parents: Vec<usize> = model.joints().iter().map(|joint| joint.parent).collect();
         let outermost = (links.iter().enumerate())
             .filter(|(_, link)| !parents.contains(link))
-            .flat_map(|(place, _)| offset_count + WIDTH * place..offset_count + WIDTH * (place + 1))
+            .flat_map(|(place, _)| {
+                offset_count + LINK_PARAMETERS * place..offset_count + LINK_PARAMETERS * (place + 1)
+            })
             .collect();
         let mut reference: Vec<f64> = sensors
             .iter()
@@ -292,7 +293,10 @@ impl Component {
             bodies: self.links.iter().map(|&link| cad[link]).collect(),
             sensors: self.sensors.clone(),
             offsets: self.sensors.iter().map(|&sensor| offsets[sensor]).collect(),
-            root: DMatrix::zeros(0, WIDTH * self.links.len() + 6 * self.sensors.len()),
+            root: DMatrix::zeros(
+                0,
+                LINK_PARAMETERS * self.links.len() + 6 * self.sensors.len(),
+            ),
             drift: self
                 .drift_rates
                 .chunks_exact(6)
@@ -582,10 +586,10 @@ impl WithSimd for Project<'_> {
         let (rows, parameters) = (self.root.nrows(), self.root.ncols() - self.offset_count);
         let root = self.root.as_slice();
         self.to.fill(0.0);
-        let (columns, rest) = self.columns.as_chunks::<TOGETHER>();
-        let (values, values_left) = self.row.as_chunks::<TOGETHER>();
+        let (columns, rest) = self.columns.as_chunks::<VECTORS>();
+        let (values, values_left) = self.row.as_chunks::<VECTORS>();
         for (columns, values) in columns.iter().zip(values) {
-            let mut four: [&[f64]; TOGETHER] = [&[]; TOGETHER];
+            let mut four: [&[f64]; VECTORS] = [&[]; VECTORS];
             for (own, &column) in four.iter_mut().zip(columns) {
                 *own = &root[rows * reordered(column, self.offset_count, parameters)..][..rows];
             }

@@ -4,13 +4,14 @@
 use crate::linear::information::{Information, Panel};
 use crate::online::channel::{Channel, SecondMean};
 use crate::online::component::{Component, channels};
-use crate::online::contest::{self, Contest};
 use crate::online::parameters::Parameters;
 use crate::online::rows::{self, Kinds, Rows, spread};
-use crate::online::solution::{Change, ComponentSolution, SOLVE, Solution, WIDTH};
+use crate::online::selection::{self, ModelSelection};
+use crate::online::solution::{Change, ComponentSolution, SOLVE, Solution};
 use crate::prior::{Posterior, Prior, PriorError};
 use nalgebra::{DMatrix, DMatrixView, DVector};
 use proprio_dynamics::calibration::UNKNOWN_OFFSET;
+use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::spatial::Wrench;
 use proprio_topics::Nanos;
 use std::sync::Arc;
@@ -20,7 +21,7 @@ pub(crate) const PERSISTENT: f64 = 3.0;
 
 /// Cosine of the least tilt of a sensor for that test, 20 degrees. Without tilt an offset, a weight
 /// and a push are not separable.
-pub(crate) const TILTED: f64 = 0.94;
+pub(crate) const TILTED_COSINE: f64 = 0.94;
 
 /// Mean square of the innovations after a change, in units of inflated noise, up to which the
 /// change explains them.
@@ -28,9 +29,9 @@ pub(crate) const EXPLAINED: f64 = 1.0;
 
 /// Squared Newton decrements of the fits for the prior's weight, and for the solution: a hundredth
 /// and a ten-thousandth of a standard deviation.
-pub(crate) const NEAR: f64 = 1e-4;
+pub(crate) const PRIOR_WEIGHT_TOLERANCE: f64 = 1e-4;
 
-pub(crate) const NEAREST: f64 = 1e-8;
+pub(crate) const SOLUTION_TOLERANCE: f64 = 1e-8;
 
 /// Logarithmic step of the prior's weight that needs no second fit in the same job.
 pub(crate) const SETTLED: f64 = 1e-3;
@@ -79,7 +80,7 @@ pub(crate) struct Part {
     pub(crate) estimate: Vec<f64>,
     pub(crate) spread: DMatrix<f64>,
     pub(crate) newest: Parameters,
-    pub(crate) contest: Contest<Parameters>,
+    pub(crate) selection: ModelSelection<Parameters>,
     /// Whether the parameters in use must be replaced.
     pub(crate) is_replaced: bool,
     /// The information in the rejected rows, and the time over which they were collected \[s\].
@@ -153,7 +154,7 @@ impl Part {
             estimate: Vec::new(),
             spread: DMatrix::zeros(0, 0),
             newest: Parameters::default(),
-            contest: Contest::new(
+            selection: ModelSelection::new(
                 component.variances.len(),
                 Parameters::of_cad(&last_valid.bodies, relative),
             ),
@@ -178,10 +179,10 @@ impl Part {
             Some(_) => solution.clone_from(&self.last_valid),
             None => {
                 if is_replaced {
-                    self.contest.replace_all(self.newest.clone());
+                    self.selection.replace_all(self.newest.clone());
                 }
                 let newest = &self.newest;
-                self.contest.enter(|| newest.clone());
+                self.selection.enter(|| newest.clone());
                 self.write_solution(solution);
                 solution.data = data;
             }
@@ -195,7 +196,8 @@ impl Part {
 
     /// Solves for the most probable bodies and offsets.
     pub(crate) fn solve(&mut self, prior: &Prior) -> Result<(), PriorError> {
-        let (offset_count, parameters) = (6 * self.sensors.len(), WIDTH * self.links.len());
+        let (offset_count, parameters) =
+            (6 * self.sensors.len(), LINK_PARAMETERS * self.links.len());
         let unknowns = offset_count + parameters;
         let posterior = self.posterior(prior, &self.information)?;
         // One iteration of the evidence per second: it converges while data come in. The last
@@ -204,10 +206,10 @@ impl Part {
             Some((offsets, bodies)) => bodies.iter().chain(offsets).copied().collect(),
             None => vec![0.0; unknowns],
         };
-        let mut fit = posterior.fit_from(&last, self.tau, NEAR)?;
+        let mut fit = posterior.fit_from(&last, self.tau, PRIOR_WEIGHT_TOLERANCE)?;
         let tau = fit.next_tau();
-        if (tau / self.tau).ln().abs() > SETTLED || fit.decrement > NEAREST {
-            fit = posterior.fit_from(fit.x.as_slice(), tau, NEAREST)?;
+        if (tau / self.tau).ln().abs() > SETTLED || fit.decrement > SOLUTION_TOLERANCE {
+            fit = posterior.fit_from(fit.x.as_slice(), tau, SOLUTION_TOLERANCE)?;
         }
         self.tau = tau;
         // [d | s] -> [s | d]
@@ -234,19 +236,19 @@ impl Part {
             return;
         };
         let residuals: Vec<Blocks> = self
-            .contest
+            .selection
             .all()
             .map(|own| self.blocks(&span, &own.change))
             .collect();
         for (number, (t, _)) in residuals.first().into_iter().flatten().enumerate() {
-            self.contest
+            self.selection
                 .take(*t, residuals.iter().map(|own| own[number].1.as_slice()));
         }
         // The parameters in use stay if the mixture fails, which needs numbers that are not finite.
         let between = |old: &Parameters, new: &Parameters, share| {
             Parameters::between(old, new, share).unwrap_or_else(|_| old.clone())
         };
-        self.contest.decide(between);
+        self.selection.decide(between);
     }
 
     /// The mean residual of each channel in each block of this second's rows, for these parameters:
@@ -261,7 +263,7 @@ impl Part {
             .copied()
             .collect();
         let (series, _) = self.series(&[&self.learnt], span, &unknowns);
-        let per_block = (contest::BLOCK / self.period).round().max(1.0) as usize;
+        let per_block = (selection::BLOCK / self.period).round().max(1.0) as usize;
         let mean = |channel: usize, from: usize| {
             let own = series[channel * span.count..][..span.count].iter();
             let (sum, count) = (own.skip(from).take(per_block).filter(|x| x.is_finite()))
@@ -289,7 +291,7 @@ impl Part {
             bodies,
             tau,
             effective,
-        } = self.contest.in_use();
+        } = self.selection.in_use();
         let (offset_count, parameters) = (self.variances.len(), change.len());
         let (r, z) = self.information.to_triangle();
         // R_ss s = z - R_sd d, and the prior of the offsets.
@@ -503,7 +505,7 @@ impl Part {
         let _ = self.rejected_information.absorb(&mut panel);
         self.rejected_time += SOLVE.seconds();
         let tilted: Vec<usize> = (self.cosines.iter().enumerate())
-            .filter(|(_, cosine)| **cosine < TILTED)
+            .filter(|(_, cosine)| **cosine < TILTED_COSINE)
             .flat_map(|(place, _)| 6 * place..6 * place + 6)
             .collect();
         if self.rejected_time < PERSISTENT || tilted.is_empty() {
@@ -554,7 +556,8 @@ impl Part {
         prior: &Prior,
         information: &Information,
     ) -> Result<Posterior, PriorError> {
-        let (offset_count, parameters) = (6 * self.sensors.len(), WIDTH * self.links.len());
+        let (offset_count, parameters) =
+            (6 * self.sensors.len(), LINK_PARAMETERS * self.links.len());
         let (root, right) = information.to_triangle();
         // [s | d] -> [d | s]
         let order: Vec<usize> = (offset_count..offset_count + parameters)

@@ -1,9 +1,9 @@
 //! Sets of parameters for use on-line, and mixtures of two sets.
 
 use crate::linear::information::{Information, InformationError, Panel};
-use crate::online::solution::WIDTH;
 use crate::prior::cad_root;
 use nalgebra::DMatrix;
+use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::spatial::RigidInertia;
 
 /// A set of parameters: in use, or a candidate.
@@ -21,11 +21,11 @@ pub(crate) struct Parameters {
 impl Parameters {
     /// CAD's parameters, with this relative standard deviation.
     pub(crate) fn of_cad(bodies: &[RigidInertia], relative: f64) -> Self {
-        let count = WIDTH * bodies.len();
+        let count = LINK_PARAMETERS * bodies.len();
         let mut root = DMatrix::zeros(count, count);
         for (place, body) in bodies.iter().enumerate() {
-            let at = WIDTH * place;
-            root.view_mut((at, at), (WIDTH, WIDTH))
+            let at = LINK_PARAMETERS * place;
+            root.view_mut((at, at), (LINK_PARAMETERS, LINK_PARAMETERS))
                 .copy_from(&cad_root(body, relative));
         }
         Self {

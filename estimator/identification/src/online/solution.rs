@@ -7,9 +7,6 @@ use proprio_dynamics::spatial::{RigidInertia, Wrench};
 use proprio_dynamics::{ContactSet, DofSet, DynamicsError, Kinematics};
 use proprio_topics::{Nanos, Reason};
 
-/// Number of parameters per link.
-pub(crate) const WIDTH: usize = 10;
-
 /// Length of a block of rows that the gate judges.
 pub(crate) const BLOCK: Nanos = Nanos::from_millis(100);
 

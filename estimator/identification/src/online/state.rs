@@ -17,12 +17,12 @@
 //! prior twice. It depends on the calibration of the sensors: with a gain 7 % higher everything
 //! would have been 7 % heavier.
 
+use proprio_dynamics::regressor::LINK_PARAMETERS;
 use std::fmt::Write as _;
 
 use crate::linear::information::{Information, Panel};
 use crate::online::Online;
 use crate::online::job::{Job, Part};
-use crate::online::solution::WIDTH;
 use proprio_dynamics::Structure;
 use proprio_dynamics::calibration::Calibration;
 
@@ -55,9 +55,9 @@ pub enum StateError {
 
 /// Identifies how the sensors measure, which a state depends on besides the model.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Measuring(String);
+pub struct SensorFingerprint(String);
 
-impl Measuring {
+impl SensorFingerprint {
     /// From the structure's sensors, with these calibrations in the same order: mounting,
     /// measurement frame, sign, gain and temperature coefficients.
     pub fn new(structure: &Structure, calibrations: &[Calibration]) -> Self {
@@ -142,14 +142,14 @@ fn numbers(line: Option<&str>, word: &str, count: usize) -> Result<Vec<f64>, Sta
 impl Job {
     /// The state at the job's snapshot as text, for [`Online::resume`].
     #[must_use]
-    pub fn state(&self, robot: &str, sensors: &Measuring) -> String {
+    pub fn state(&self, robot: &str, sensors: &SensorFingerprint) -> String {
         let (model, sensors) = (model(&self.parts), &sensors.0);
         let mut text =
             format!("{TITLE} {SCHEMA}\nrobot {robot}\nmodel {model}\nsensors {sensors}\n");
         for part in &self.parts {
             let parameters = part.information.trailing(6 * part.sensors.len());
             let _ = write!(text, "component {}", parameters.unknowns());
-            let is_learnt = part.contest.in_use().effective > 0.0;
+            let is_learnt = part.selection.in_use().effective > 0.0;
             put(
                 &mut text,
                 "",
@@ -175,7 +175,7 @@ impl Online {
     pub fn resume(
         &mut self,
         robot: &str,
-        sensors: &Measuring,
+        sensors: &SensorFingerprint,
         text: &str,
     ) -> Result<(), StateError> {
         let Some(job) = &mut self.job else {
@@ -217,7 +217,8 @@ impl Online {
         }
         let mut read = Vec::new();
         for part in &job.parts {
-            let (offset_count, parameters) = (6 * part.sensors.len(), WIDTH * part.links.len());
+            let (offset_count, parameters) =
+                (6 * part.sensors.len(), LINK_PARAMETERS * part.links.len());
             let [tau, is_learnt] =
                 numbers(lines.next(), &format!("component {parameters}"), 2)?[..]
             else {

@@ -27,7 +27,7 @@ pub(crate) type TorqueSeries = (usize, [Vec<f64>; 5], Vec<f64>);
 pub(crate) const UNREAD: f64 = 0.9 * OFFSET_VARIANCE;
 
 /// Blocks of instants that one thread takes at a time.
-pub(crate) const TOGETHER: usize = 64;
+pub(crate) const BLOCKS_PER_TASK: usize = 64;
 
 pub(crate) fn three<T: Copy>(values: [T; 3]) -> ModelComparison<T> {
     ModelComparison {
@@ -80,14 +80,15 @@ impl Compared {
         let configured = configured_nuisance(measurement.robot(), &unknowns);
         let empty = || vec![vec![f64::NAN; instants.len()]; 6 * unknowns.sensors.len()];
         let (mut load, mut errors) = (empty(), [empty(), empty(), empty()]);
-        let variances = identified.noise.following();
+        let variances = identified.noise.offset_tracking_variances();
         let channels = 6 * unknowns.sensors.len();
         let mut held = vec![vec![0; instants.len()]; unknowns.sensors.len()];
         let parts = parallel::map_with(
-            residuals.ranges.len().div_ceil(TOGETHER),
+            residuals.ranges.len().div_ceil(BLOCKS_PER_TASK),
             || (measurement.clone(), Rows::new(&unknowns)),
             |(measurement, rows), part| {
-                let blocks = part * TOGETHER..residuals.ranges.len().min((part + 1) * TOGETHER);
+                let blocks = part * BLOCKS_PER_TASK
+                    ..residuals.ranges.len().min((part + 1) * BLOCKS_PER_TASK);
                 let mut out = Vec::new();
                 for (range, block) in residuals.ranges[blocks.clone()]
                     .iter()
@@ -200,7 +201,11 @@ pub(crate) fn predicted_deviations(
     let wrenches = 6 * unknowns.sensors.len();
     let sensors = (0..unknowns.sensors.len()).map(|place| 6 * place..6 * place + 6);
     for channels in sensors.chain((wrenches..unknowns.channels()).map(|c| c..c + 1)) {
-        let Some(map) = attribute_to(&rows, &identified.noise.following(), channels.clone()) else {
+        let Some(map) = attribute_to(
+            &rows,
+            &identified.noise.offset_tracking_variances(),
+            channels.clone(),
+        ) else {
             continue;
         };
         let (parameters, noise) = (&map * &a, &map * &noise);

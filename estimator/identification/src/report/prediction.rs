@@ -36,10 +36,10 @@ use proprio_topics::Nanos;
 
 /// Most observations of a log that are used: they give its RMS to 1 %, and the same ones are used
 /// for CAD and for other parameters.
-const MOST: usize = 20_000;
+const MAX_OBSERVATIONS: usize = 20_000;
 
 /// Observations that one thread processes at a time.
-const TOGETHER: usize = 256;
+const BATCH: usize = 256;
 
 /// Parameters to be judged, with their friction.
 #[derive(Clone, Debug)]
@@ -209,11 +209,11 @@ impl<'a> PredictionError<'a> {
         calibrated: Kind,
         instants: impl ExactSizeIterator<Item = &'b Observation>,
     ) -> Result<Self, DynamicsError> {
-        let stride = instants.len().div_ceil(MOST).max(1);
+        let stride = instants.len().div_ceil(MAX_OBSERVATIONS).max(1);
         let recorded = |observation: &Observation| Annotated::from(observation.clone());
         let instants: Vec<Annotated> = instants.step_by(stride).map(recorded).collect();
-        let mut measurement = MeasurementModel::survey(robot, inputs, instants.iter())?;
-        measurement.calibrate(calibrated, instants.iter());
+        let mut measurement = MeasurementModel::for_observations(robot, inputs, instants.iter())?;
+        measurement.set_calibration_unknowns(calibrated, instants.iter());
         Ok(Self {
             measurement,
             instants,
@@ -416,12 +416,12 @@ impl<'a> PredictionError<'a> {
         };
         let half = 0.5 * (last.t - first.t).seconds().max(f64::MIN_POSITIVE);
         parallel::map_with(
-            self.instants.len().div_ceil(TOGETHER),
+            self.instants.len().div_ceil(BATCH),
             || (self.measurement.clone(), Rows::new(self.unknowns())),
             |(measurement, rows), part| {
                 let mut own = make();
-                let end = self.instants.len().min(TOGETHER * (part + 1));
-                for instant in &self.instants[TOGETHER * part..end] {
+                let end = self.instants.len().min(BATCH * (part + 1));
+                for instant in &self.instants[BATCH * part..end] {
                     if measurement.make(instant, rows).is_err() {
                         rows.clear();
                     }
@@ -623,12 +623,12 @@ pub(crate) fn friction<'b>(
     let zero = || vec![(Matrix3::zeros(), vec![Vector3::zeros(); sets.len()]); joints];
     let instants: Vec<&Annotated> = instants.collect();
     let parts = parallel::map_with(
-        instants.len().div_ceil(TOGETHER),
+        instants.len().div_ceil(BATCH),
         || (measurement.clone(), Rows::new(unknowns)),
         |(measurement, rows), part| {
             let mut sums = zero();
-            let end = instants.len().min(TOGETHER * (part + 1));
-            for instant in &instants[TOGETHER * part..end] {
+            let end = instants.len().min(BATCH * (part + 1));
+            for instant in &instants[BATCH * part..end] {
                 if measurement.make(instant, rows).is_err() {
                     continue;
                 }

@@ -2,12 +2,13 @@
 
 use crate::fit::{Identified, link_inertias};
 use crate::measurement::reduction::ReducedLog;
-use crate::measurement::unknowns::{ExtraParameter, Unknowns, WIDTH};
+use crate::measurement::unknowns::{ExtraParameter, Unknowns};
 use crate::report::comparison::{STILL, UNREAD};
 use crate::report::outcome::{BaseParameterOutcome, CovarianceRoot, LinkOutcome, RotorOutcome};
 use crate::robot::{IdentificationInput, Robot};
 use crate::training::TrainingLog;
 use nalgebra::{DMatrix, DVector};
+use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::regressor::identifiable::{
     BaseParameter, Column, Identifiable, JointMotion, Measured, Offsets, Scope, Term,
 };
@@ -39,14 +40,18 @@ pub(crate) fn rotors_not_separable(
     spread: &[DMatrix<f64>],
 ) -> Vec<String> {
     let unknowns = &identified.unknowns;
-    let mut fitted = unknowns.beside_cad();
+    let mut fitted = unknowns.parameters_without_cad();
     if fitted.is_empty() {
         return Vec::new();
     }
     let (mut r, _) = identified.information.to_triangle();
     for (place, spread) in spread.iter().enumerate() {
-        let columns = r.columns(WIDTH * place, WIDTH).into_owned() * spread;
-        r.columns_mut(WIDTH * place, WIDTH).copy_from(&columns);
+        let columns = r
+            .columns(LINK_PARAMETERS * place, LINK_PARAMETERS)
+            .into_owned()
+            * spread;
+        r.columns_mut(LINK_PARAMETERS * place, LINK_PARAMETERS)
+            .copy_from(&columns);
     }
     // Rotors without rows are not tested.
     fitted.retain(|column| r.column(*column).norm() > 0.0);
@@ -70,7 +75,7 @@ pub(crate) fn rotors_not_separable(
 /// columns within rounding: to 1e-5 of their length.
 pub(crate) fn combinations(matrix: &DMatrix<f64>, columns: &[usize]) -> Vec<usize> {
     /// Largest distance from the combination, relative to the length.
-    const NEAR: f64 = 1e-5;
+    const MAX_DISTANCE: f64 = 1e-5;
     const ROUNDING: f64 = 1e-12;
     // Component of each column orthogonal to the rest of the matrix ...
     let mut remainder = matrix.select_columns(columns);
@@ -96,7 +101,7 @@ pub(crate) fn combinations(matrix: &DMatrix<f64>, columns: &[usize]) -> Vec<usiz
         squares.sum::<f64>().sqrt().recip()
     };
     let each = columns.iter().enumerate();
-    each.filter(|(place, _)| far(*place) < NEAR)
+    each.filter(|(place, _)| far(*place) < MAX_DISTANCE)
         .map(|(_, column)| *column)
         .collect()
 }
@@ -140,9 +145,14 @@ pub(crate) fn scaled_information(identified: &Identified) -> (DMatrix<f64>, Vec<
             .and_then(|c| c.l().try_inverse())
             .map(|l| l.transpose());
         let spread = inverse.unwrap_or_default() * (2.0_f64.sqrt() * identified.fit.tau);
-        let spread = DMatrix::from_fn(WIDTH, WIDTH, |i, j| spread[(i, j)]);
-        let columns = r.columns(WIDTH * place, WIDTH).into_owned() * &spread;
-        scaled.columns_mut(WIDTH * place, WIDTH).copy_from(&columns);
+        let spread = DMatrix::from_fn(LINK_PARAMETERS, LINK_PARAMETERS, |i, j| spread[(i, j)]);
+        let columns = r
+            .columns(LINK_PARAMETERS * place, LINK_PARAMETERS)
+            .into_owned()
+            * &spread;
+        scaled
+            .columns_mut(LINK_PARAMETERS * place, LINK_PARAMETERS)
+            .copy_from(&columns);
         spreads.push(spread);
     }
     (scaled, spreads)
@@ -195,15 +205,18 @@ pub(crate) fn cad_root(
     spread: &[DMatrix<f64>],
 ) -> DMatrix<f64> {
     let count = unknowns.parameters();
-    let fitted = unknowns.beside_cad();
+    let fitted = unknowns.parameters_without_cad();
     let given: Vec<usize> = (0..count)
         .filter(|column| !fitted.contains(column))
         .collect();
     let precision = &unknowns.precision;
     let mut root = DMatrix::zeros(count, count);
     for (place, spread) in spread.iter().enumerate() {
-        root.view_mut((WIDTH * place, WIDTH * place), (WIDTH, WIDTH))
-            .copy_from(spread);
+        root.view_mut(
+            (LINK_PARAMETERS * place, LINK_PARAMETERS * place),
+            (LINK_PARAMETERS, LINK_PARAMETERS),
+        )
+        .copy_from(spread);
     }
     for (precision, column) in precision.iter().zip(unknowns.inertial()..) {
         root[(column, column)] = 1.0 / precision.sqrt();
@@ -270,9 +283,14 @@ pub(crate) fn links(
         let inverse = spread
             .clone()
             .try_inverse()
-            .unwrap_or_else(|| DMatrix::zeros(WIDTH, WIDTH));
-        let rows = inverse * root.rows(WIDTH * place, WIDTH).into_owned();
-        weighted.rows_mut(WIDTH * place, WIDTH).copy_from(&rows);
+            .unwrap_or_else(|| DMatrix::zeros(LINK_PARAMETERS, LINK_PARAMETERS));
+        let rows = inverse
+            * root
+                .rows(LINK_PARAMETERS * place, LINK_PARAMETERS)
+                .into_owned();
+        weighted
+            .rows_mut(LINK_PARAMETERS * place, LINK_PARAMETERS)
+            .copy_from(&rows);
     }
     for (precision, row) in unknowns
         .precision
@@ -308,19 +326,24 @@ pub(crate) fn links(
                     ..unseen(robot, link, cad)
                 };
             };
-            let own = root.rows(WIDTH * place, WIDTH).into_owned();
+            let own = root
+                .rows(LINK_PARAMETERS * place, LINK_PARAMETERS)
+                .into_owned();
             let mut deviation = [0.0; 10];
             for (k, value) in deviation.iter_mut().enumerate() {
-                *value = wide.row(WIDTH * place + k).norm();
+                *value = wide.row(LINK_PARAMETERS * place + k).norm();
             }
             let inverse = spread[place]
                 .clone()
                 .try_inverse()
-                .unwrap_or_else(|| DMatrix::zeros(WIDTH, WIDTH));
+                .unwrap_or_else(|| DMatrix::zeros(LINK_PARAMETERS, LINK_PARAMETERS));
             let significance = significance(
                 &(&inverse * own),
-                &(&inverse * shrinking.rows(WIDTH * place, WIDTH).into_owned()),
-                &(&inverse * identified.d.rows(WIDTH * place, WIDTH)),
+                &(&inverse
+                    * shrinking
+                        .rows(LINK_PARAMETERS * place, LINK_PARAMETERS)
+                        .into_owned()),
+                &(&inverse * identified.d.rows(LINK_PARAMETERS * place, LINK_PARAMETERS)),
             );
             LinkOutcome {
                 link,
@@ -387,7 +410,7 @@ pub(crate) fn covariance(identified: &Identified, root: &DMatrix<f64>) -> Covari
     );
     let mut columns = Vec::new();
     for &link in &unknowns.links {
-        columns.extend((0..WIDTH).map(|parameter| Column::Inertial { link, parameter }));
+        columns.extend((0..LINK_PARAMETERS).map(|parameter| Column::Inertial { link, parameter }));
     }
     for &sensor in &unknowns.sensors {
         columns.extend((0..6).map(|component| Column::Offset { sensor, component }));
@@ -472,10 +495,14 @@ pub(crate) fn expression(
         let Some(inverse) = spread.clone().try_inverse() else {
             continue;
         };
-        let factors = inverse.tr_mul(&direction.rows(WIDTH * place, WIDTH).into_owned());
+        let factors = inverse.tr_mul(
+            &direction
+                .rows(LINK_PARAMETERS * place, LINK_PARAMETERS)
+                .into_owned(),
+        );
         for (k, factor) in factors.iter().enumerate() {
             parts.push((
-                WIDTH * place + k,
+                LINK_PARAMETERS * place + k,
                 *factor,
                 (factor * spread.row(k).norm()).abs(),
             ));
@@ -487,8 +514,10 @@ pub(crate) fn expression(
         column,
         name: format!(
             "{}.{}",
-            robot.model.link_name(unknowns.links[column / WIDTH]),
-            PARAMETERS[column % WIDTH]
+            robot
+                .model
+                .link_name(unknowns.links[column / LINK_PARAMETERS]),
+            PARAMETERS[column % LINK_PARAMETERS]
         ),
     };
     let leading: Vec<_> = parts
@@ -498,7 +527,7 @@ pub(crate) fn expression(
         .collect();
     let mut links: Vec<usize> = leading
         .iter()
-        .map(|part| unknowns.links[part.0 / WIDTH])
+        .map(|part| unknowns.links[part.0 / LINK_PARAMETERS])
         .collect();
     links.dedup();
     let mut terms = leading.into_iter().map(term);
@@ -594,7 +623,7 @@ pub(crate) fn base_parameters(
         for term in all() {
             if let Column::Inertial { link, parameter } = subspace.columns()[term.column] {
                 match unknowns.links.binary_search(&link) {
-                    Ok(place) => row[WIDTH * place + parameter] += term.coefficient,
+                    Ok(place) => row[LINK_PARAMETERS * place + parameter] += term.coefficient,
                     Err(_) => seen = false,
                 }
             }

@@ -433,4 +433,54 @@ mod tests {
         };
         assert_eq!(quality, Quality::SATURATED | Quality::FROZEN);
     }
+
+    /// A flag lost on the way would make a faulty sample a good one.
+    #[test]
+    fn every_flag_of_every_kind_is_read_back() {
+        let readings = [
+            (
+                Kind::Joint,
+                Reading::Joint(JointState {
+                    position: 1.0,
+                    ..JointState::ABSENT
+                }),
+            ),
+            (
+                Kind::Wrench,
+                Reading::Wrench(Wrench {
+                    force: [1.0; 3],
+                    torque: [2.0; 3],
+                }),
+            ),
+            (
+                Kind::Imu,
+                Reading::Imu(Imu {
+                    proper_acceleration: [1.0; 3],
+                    ..Imu::ABSENT
+                }),
+            ),
+        ];
+        for (kind, reading) in readings {
+            let series = [Series {
+                what: What::Channel(kind),
+                name: "one".into(),
+            }];
+            let mut writer = Writer::new(Vec::new(), &series, Columns::All).unwrap();
+            let flags: Vec<Quality> = (0..32).map(|bit| Quality(1 << bit)).collect();
+            for (t, flag) in (0..).zip(&flags) {
+                let value = Value::Reading(reading, *flag);
+                writer.push(Some(Nanos(t)), 0, &value).unwrap();
+            }
+            let text = writer.finish().unwrap();
+            let mut reader = Reader::new(text.as_slice()).unwrap();
+            let (mut got, mut row) = (Vec::new(), Row::default());
+            while reader.next_row(&mut row).unwrap() {
+                let Value::Reading(_, quality) = row.items[0].value else {
+                    panic!("a reading")
+                };
+                got.push(quality);
+            }
+            assert_eq!(got, flags, "{kind:?}");
+        }
+    }
 }

@@ -1,4 +1,4 @@
-//! Times dynibo. Usage: peers-dynibo folded.urdf states.txt        (conversation: ../../server.rs)
+//! Times dynibo. Usage: peers-dynibo folded.urdf states.txt        (protocol: ../../server.rs)
 
 #[path = "../../server.rs"]
 #[allow(dead_code, reason = "each program uses its own part")]

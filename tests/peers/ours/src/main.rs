@@ -1,4 +1,4 @@
-//! Times this project's estimator. Usage: peers-ours robot.urdf states.txt (conversation:
+//! Times this project's estimator. Usage: peers-ours robot.urdf states.txt (protocol:
 //! ../../server.rs)
 
 #[path = "../../server.rs"]

@@ -1,6 +1,6 @@
 //! A buffer of whitened rows, and the reflections that absorb them.
 
-use crate::linear::simd::{self, Aligned, LANES, TOGETHER};
+use crate::linear::simd::{self, Aligned, LANES, VECTORS};
 use pulp::{Simd, WithSimd};
 
 /// Why rows were refused, or why there is no solution.
@@ -178,7 +178,7 @@ pub(crate) struct Reflection {
     pub(crate) per_beta: f64,
     pub(crate) per_delta: f64,
     /// `v . v_i` with the previous reflections that are applied together with it.
-    pub(crate) products: [f64; TOGETHER],
+    pub(crate) products: [f64; VECTORS],
 }
 
 /// Reflects the rows of a panel into the triangle `[R | z]`. The residual remains in the panel's
@@ -207,7 +207,7 @@ impl WithSimd for Reflect<'_> {
             filled,
         } = self;
         let width = unknowns + 1;
-        let (mut pending, mut count) = ([Reflection::default(); TOGETHER], 0);
+        let (mut pending, mut count) = ([Reflection::default(); VECTORS], 0);
         for k in 0..width {
             let (before, own) = panel.split_at_mut(k * stride);
             let own = &mut own[..rows];
@@ -234,7 +234,7 @@ impl WithSimd for Reflect<'_> {
             }
             let delta = sigma / (alpha + (alpha * alpha + sigma).sqrt());
             *diagonal = alpha + delta;
-            let mut products = [0.0; TOGETHER];
+            let mut products = [0.0; VECTORS];
             for (product, other) in products.iter_mut().zip(&pending[..count]) {
                 *product = simd::inner(simd, own, &before[other.column * stride..][..rows]);
             }
@@ -246,7 +246,7 @@ impl WithSimd for Reflect<'_> {
                 products,
             };
             count += 1;
-            if count == TOGETHER {
+            if count == VECTORS {
                 let (before, after) = panel.split_at_mut((k + 1) * stride);
                 let four = pending.map(|reflection| &before[reflection.column * stride..][..rows]);
                 let columns = after
@@ -276,13 +276,13 @@ impl WithSimd for Reflect<'_> {
 #[inline(always)]
 pub(crate) fn apply<S: Simd>(
     simd: S,
-    (reflections, four): (&[Reflection; TOGETHER], [&[f64]; TOGETHER]),
-    (triangle, places): (&mut [f64], [usize; TOGETHER]),
+    (reflections, four): (&[Reflection; VECTORS], [&[f64]; VECTORS]),
+    (triangle, places): (&mut [f64], [usize; VECTORS]),
     (columns, stride): (&mut [f64], usize),
     filled: &mut [bool],
 ) {
     let (count, rows) = (filled.len(), four[0].len());
-    let mut above = [[0.0; COLUMNS]; TOGETHER];
+    let mut above = [[0.0; COLUMNS]; VECTORS];
     for (above, place) in above.iter_mut().zip(places) {
         above[..count].copy_from_slice(&triangle[place..][..count]);
     }
@@ -297,7 +297,7 @@ pub(crate) fn apply<S: Simd>(
         return;
     }
     // Columns that are not filled are zero and remain zero.
-    let mut factors = [[0.0; COLUMNS]; TOGETHER];
+    let mut factors = [[0.0; COLUMNS]; VECTORS];
     for (place, column) in columns.chunks(stride).enumerate() {
         for (products, product) in
             factors

@@ -26,12 +26,12 @@ use crate::linear::noise::autocorrelation_time;
 /// Length of a block \[s\].
 pub(crate) const BLOCK: f64 = 0.1;
 /// Least motion before a decision, and the greatest that counts \[s\].
-const LEAST: f64 = 4.0;
-const MOST: f64 = 60.0;
+const MIN_MOTION: f64 = 4.0;
+const MAX_MOTION: f64 = 60.0;
 /// Least motion between the entries of two candidates \[s\], and the number of candidates at a
 /// time.
-const APART: f64 = 1.0;
-const TOGETHER: usize = 5;
+const CANDIDATE_INTERVAL: f64 = 1.0;
+const MAX_CANDIDATES: usize = 5;
 /// In standard errors: a candidate that is no better exceeds it in one of thirty thousand tests.
 /// There are at most five tests in a second, mostly of data tested before.
 const LEVEL: f64 = 4.0;
@@ -41,43 +41,43 @@ const BOUND: f64 = 3.0;
 /// Period after which a motion repeats \[s\].
 const CYCLE: f64 = 4.0;
 /// Iterations of robust fits.
-const ROUNDS: usize = 5;
+const ROBUST_ITERATIONS: usize = 5;
 
 /// The parameters in use and their candidates, of type `P`.
 #[derive(Clone, Debug)]
-pub(crate) struct Contest<P> {
+pub(crate) struct ModelSelection<P> {
     channels: usize,
     /// Time of each block \[s\].
     times: Vec<f64>,
     /// The first is in use; then candidates, the oldest first.
-    entrants: Vec<Entrant<P>>,
+    candidates: Vec<Candidate<P>>,
 }
 
 /// Parameters, the first block after their entry, and the residual of each channel in the blocks
 /// since; NaN where the channel was not seen.
 #[derive(Clone, Debug)]
-struct Entrant<P> {
+struct Candidate<P> {
     parameters: P,
     first: usize,
     residuals: Vec<f64>,
 }
 
-impl<P> Contest<P> {
+impl<P> ModelSelection<P> {
     /// With this number of channels, and no candidate.
     pub(crate) fn new(channels: usize, in_use: P) -> Self {
-        let mut contest = Self {
+        let mut selection = Self {
             channels,
             times: Vec::new(),
-            entrants: Vec::new(),
+            candidates: Vec::new(),
         };
-        contest.replace_all(in_use);
-        contest
+        selection.replace_all(in_use);
+        selection
     }
 
     /// Puts parameters in use without a trial, and removes all candidates.
     pub(crate) fn replace_all(&mut self, parameters: P) {
         self.times.clear();
-        self.entrants = vec![Entrant {
+        self.candidates = vec![Candidate {
             parameters,
             first: 0,
             residuals: Vec::new(),
@@ -86,34 +86,37 @@ impl<P> Contest<P> {
 
     /// The parameters in use.
     pub(crate) fn in_use(&self) -> &P {
-        &self.entrants[0].parameters
+        &self.candidates[0].parameters
     }
 
     /// All parameters, those in use first.
     pub(crate) fn all(&self) -> impl Iterator<Item = &P> {
-        self.entrants.iter().map(|entrant| &entrant.parameters)
+        self.candidates
+            .iter()
+            .map(|candidate| &candidate.parameters)
     }
 
     /// Adds a candidate, if the last one entered long enough ago.
     pub(crate) fn enter(&mut self, parameters: impl FnOnce() -> P) {
-        let age = |entrant: &Entrant<P>| BLOCK * (self.times.len() - entrant.first) as f64;
-        if self.entrants[1..]
+        let age = |candidate: &Candidate<P>| BLOCK * (self.times.len() - candidate.first) as f64;
+        if self.candidates[1..]
             .last()
-            .is_some_and(|last| age(last) < APART)
+            .is_some_and(|last| age(last) < CANDIDATE_INTERVAL)
         {
             return;
         }
-        if self.entrants.len() > TOGETHER {
+        if self.candidates.len() > MAX_CANDIDATES {
             // Removes the candidate whose neighbours in age are nearest to each other.
-            let ages: Vec<f64> = self.entrants.iter().map(age).collect();
-            let apart = |i: usize| ages[i - 1] / ages.get(i + 1).copied().unwrap_or(APART);
+            let ages: Vec<f64> = self.candidates.iter().map(age).collect();
+            let apart =
+                |i: usize| ages[i - 1] / ages.get(i + 1).copied().unwrap_or(CANDIDATE_INTERVAL);
             let nearest = (2..ages.len()).min_by(|&a, &b| apart(a).total_cmp(&apart(b)));
             nearest
                 .into_iter()
-                .for_each(|place| drop(self.entrants.remove(place)));
+                .for_each(|place| drop(self.candidates.remove(place)));
         }
         let first = self.times.len();
-        self.entrants.push(Entrant {
+        self.candidates.push(Candidate {
             parameters: parameters(),
             first,
             residuals: Vec::new(),
@@ -121,23 +124,23 @@ impl<P> Contest<P> {
     }
 
     /// Takes in a block: the residual of each channel for all parameters, in the order of
-    /// [`Contest::all`].
+    /// [`ModelSelection::all`].
     pub(crate) fn take<'a>(&mut self, t: f64, residuals: impl Iterator<Item = &'a [f64]>) {
         self.times.push(t);
-        for (entrant, own) in self.entrants.iter_mut().zip(residuals) {
-            entrant.residuals.extend_from_slice(own);
+        for (candidate, own) in self.candidates.iter_mut().zip(residuals) {
+            candidate.residuals.extend_from_slice(own);
         }
     }
 
     /// Puts the youngest winning candidate in use, by its fraction, and removes older ones.
     /// `between` mixes two sets of parameters.
     pub(crate) fn decide(&mut self, between: impl FnOnce(&P, &P, f64) -> P) {
-        let better = (1..self.entrants.len())
+        let better = (1..self.candidates.len())
             .rev()
             .find_map(|place| Some((place, self.share(place)?)));
         if let Some((place, share)) = better {
-            let old = self.entrants.drain(..place).next();
-            if let (Some(old), Some(new)) = (old, self.entrants.first_mut()) {
+            let old = self.candidates.drain(..place).next();
+            if let (Some(old), Some(new)) = (old, self.candidates.first_mut()) {
                 new.parameters = between(&old.parameters, &new.parameters, share);
                 let before = &old.residuals[(new.first - old.first) * self.channels..];
                 for (own, before) in new.residuals.iter_mut().zip(before) {
@@ -145,27 +148,32 @@ impl<P> Contest<P> {
                 }
             }
         }
-        let is_old = |entrant: &Entrant<P>, end: usize| BLOCK * (end - entrant.first) as f64 > MOST;
+        let is_old = |candidate: &Candidate<P>, end: usize| {
+            BLOCK * (end - candidate.first) as f64 > MAX_MOTION
+        };
         let (end, mut place) = (self.times.len(), 0);
-        self.entrants.retain(|entrant| {
+        self.candidates.retain(|candidate| {
             place += 1;
-            place == 1 || !is_old(entrant, end)
+            place == 1 || !is_old(candidate, end)
         });
         // Blocks before the oldest candidate are dropped.
-        let oldest = self.entrants.get(1).map_or(end, |entrant| entrant.first);
+        let oldest = self
+            .candidates
+            .get(1)
+            .map_or(end, |candidate| candidate.first);
         self.times.drain(..oldest);
-        for entrant in &mut self.entrants {
-            let gone = oldest.saturating_sub(entrant.first);
-            entrant.residuals.drain(..gone * self.channels);
-            entrant.first = entrant.first.saturating_sub(oldest);
+        for candidate in &mut self.candidates {
+            let gone = oldest.saturating_sub(candidate.first);
+            candidate.residuals.drain(..gone * self.channels);
+            candidate.first = candidate.first.saturating_sub(oldest);
         }
     }
 
     /// The fraction of a candidate to adopt; None if it is not better than the parameters in use.
     fn share(&self, place: usize) -> Option<f64> {
-        let candidate = &self.entrants[place];
+        let candidate = &self.candidates[place];
         let times = &self.times[candidate.first..];
-        if BLOCK * (times.len() as f64) < LEAST {
+        if BLOCK * (times.len() as f64) < MIN_MOTION {
             return None;
         }
         let mut gain = vec![f64::NAN; times.len()];
@@ -173,13 +181,9 @@ impl<P> Contest<P> {
         // candidate, in units of the candidate's residual.
         let mut pairs = Vec::new();
         for channel in 0..self.channels {
-            let [one, other] = [&self.entrants[0], candidate].map(|entrant| {
-                let skipped = (candidate.first - entrant.first) * self.channels + channel;
-                let own = entrant
-                    .residuals
-                    .iter()
-                    .skip(skipped)
-                    .step_by(self.channels);
+            let [one, other] = [&self.candidates[0], candidate].map(|either| {
+                let skipped = (candidate.first - either.first) * self.channels + channel;
+                let own = either.residuals.iter().skip(skipped).step_by(self.channels);
                 detrended(times, own.copied().collect())
             });
             let scale = scale(one.iter().chain(&other));
@@ -205,14 +209,14 @@ impl<P> Contest<P> {
         let mean = seen().sum::<f64>() / count;
         gain.iter_mut().for_each(|x| *x -= mean);
         let (square, time) = autocorrelation_time(&[&gain]);
-        if BLOCK * count < LEAST || mean <= LEVEL * (square * time / count).sqrt() {
+        if BLOCK * count < MIN_MOTION || mean <= LEVEL * (square * time / count).sqrt() {
             return None;
         }
         // Least squares with Huber's rule, from the whole change.
         let all: f64 = pairs.iter().map(|(_, _, change)| change * change).sum();
         let mut share = 1.0;
         let mut residuals = Vec::new();
-        for _ in 0..ROUNDS {
+        for _ in 0..ROBUST_ITERATIONS {
             residuals = vec![0.0; times.len()];
             for (block, one, change) in &pairs {
                 residuals[*block] += change * (one - share * change).clamp(-BOUND, BOUND);
@@ -245,7 +249,7 @@ fn detrended(times: &[f64], values: Vec<f64>) -> Vec<f64> {
     const BEYOND: f64 = 5.0;
     let mut residuals = values;
     let mut weights = vec![1.0; residuals.len()];
-    for _ in 0..ROUNDS {
+    for _ in 0..ROBUST_ITERATIONS {
         let seen = || {
             times
                 .iter()
@@ -287,12 +291,12 @@ mod tests {
 
     /// Two channels, blocks for some seconds: noise of unit variance. The residual of parameters
     /// `p` also has `p` times a motion, an offset and a drift.
-    fn play(contest: &mut Contest<f64>, seconds: f64, seed: u64) {
+    fn play(selection: &mut ModelSelection<f64>, seconds: f64, seed: u64) {
         let count = (seconds / BLOCK) as usize;
         let noise: Vec<f64> = normals(seed, 2 * count).iter().map(|x| 0.2 * x).collect();
         for block in 0..count {
-            let t = contest.times.last().copied().unwrap_or(0.0) + BLOCK;
-            let residuals: Vec<[f64; 2]> = (contest.all())
+            let t = selection.times.last().copied().unwrap_or(0.0) + BLOCK;
+            let residuals: Vec<[f64; 2]> = (selection.all())
                 .map(|wrong| {
                     let of = |channel: usize| {
                         let motion = (1.7 * t + channel as f64).sin();
@@ -301,21 +305,21 @@ mod tests {
                     [of(0), of(1)]
                 })
                 .collect();
-            contest.take(t, residuals.iter().map(<[f64; 2]>::as_slice));
-            contest.decide(|a, b, share| a + share * (b - a));
+            selection.take(t, residuals.iter().map(<[f64; 2]>::as_slice));
+            selection.decide(|a, b, share| a + share * (b - a));
         }
     }
 
     #[test]
     fn the_better_is_adopted_and_never_the_worse() {
         for seed in 0..20 {
-            let mut contest = Contest::new(2, 2.0);
-            contest.enter(|| 3.0);
-            play(&mut contest, 20.0, seed);
-            assert_eq!(*contest.in_use(), 2.0);
-            contest.enter(|| 0.3);
-            play(&mut contest, 20.0, seed + 100);
-            let found = *contest.in_use();
+            let mut selection = ModelSelection::new(2, 2.0);
+            selection.enter(|| 3.0);
+            play(&mut selection, 20.0, seed);
+            assert_eq!(*selection.in_use(), 2.0);
+            selection.enter(|| 0.3);
+            play(&mut selection, 20.0, seed + 100);
+            let found = *selection.in_use();
             assert!((0.2..0.8).contains(&found), "seed {seed}: {found}");
         }
     }
@@ -323,11 +327,11 @@ mod tests {
     #[test]
     fn an_equal_candidate_is_hardly_ever_adopted() {
         let wins = (0..40).filter(|&seed| {
-            let mut contest = Contest::new(2, 1.0);
+            let mut selection = ModelSelection::new(2, 1.0);
             // An equal error of opposite sign.
-            contest.enter(|| -1.0);
-            play(&mut contest, 50.0, seed);
-            *contest.in_use() < 0.0
+            selection.enter(|| -1.0);
+            play(&mut selection, 50.0, seed);
+            *selection.in_use() < 0.0
         });
         assert!(wins.count() <= 2);
     }
@@ -335,8 +339,8 @@ mod tests {
     /// A disturbance that acts on both alike does not prevent the decision.
     #[test]
     fn disturbances_do_not_prevent_the_decision() {
-        let mut contest = Contest::new(1, 2.0);
-        contest.enter(|| 0.0);
+        let mut selection = ModelSelection::new(1, 2.0);
+        selection.enter(|| 0.0);
         for (block, noise) in normals(4, 200).iter().enumerate() {
             let t = BLOCK * block as f64;
             let push = if (60..100).contains(&block) {
@@ -344,44 +348,44 @@ mod tests {
             } else {
                 0.0
             };
-            let residuals: Vec<[f64; 1]> = (contest.all())
+            let residuals: Vec<[f64; 1]> = (selection.all())
                 .map(|wrong| [wrong * (1.7 * t).sin() + 0.2 * noise + push + 4.0])
                 .collect();
-            contest.take(t, residuals.iter().map(<[f64; 1]>::as_slice));
+            selection.take(t, residuals.iter().map(<[f64; 1]>::as_slice));
         }
-        contest.decide(|a, b, share| a + share * (b - a));
-        assert!(contest.in_use().abs() < 0.4, "{}", contest.in_use());
+        selection.decide(|a, b, share| a + share * (b - a));
+        assert!(selection.in_use().abs() < 0.4, "{}", selection.in_use());
     }
 
     /// A candidate that changes twice too much is adopted by half.
     #[test]
     fn a_change_is_adopted_as_far_as_it_explains_something() {
-        let mut contest = Contest::new(2, 2.0);
-        contest.enter(|| -1.5);
-        play(&mut contest, 30.0, 11);
+        let mut selection = ModelSelection::new(2, 2.0);
+        selection.enter(|| -1.5);
+        play(&mut selection, 30.0, 11);
         assert!(
-            (0.0..0.6).contains(contest.in_use()),
+            (0.0..0.6).contains(selection.in_use()),
             "{}",
-            contest.in_use()
+            selection.in_use()
         );
     }
 
     #[test]
     fn a_decision_needs_motion_and_the_younger_candidate_wins() {
-        let mut contest = Contest::new(2, 9.0);
-        contest.enter(|| 5.0);
-        play(&mut contest, LEAST - 0.2, 1);
-        assert_eq!(*contest.in_use(), 9.0);
+        let mut selection = ModelSelection::new(2, 9.0);
+        selection.enter(|| 5.0);
+        play(&mut selection, MIN_MOTION - 0.2, 1);
+        assert_eq!(*selection.in_use(), 9.0);
         // Too soon after the other.
-        let mut other = Contest::new(2, 9.0);
+        let mut other = ModelSelection::new(2, 9.0);
         other.enter(|| 5.0);
         other.enter(|| 1.0);
         assert_eq!(other.all().count(), 2);
-        let mut both = Contest::new(2, 9.0);
+        let mut both = ModelSelection::new(2, 9.0);
         both.enter(|| 8.0);
         play(&mut both, 1.5, 2);
         both.enter(|| 0.0);
-        play(&mut both, LEAST + 1.0, 3);
+        play(&mut both, MIN_MOTION + 1.0, 3);
         assert!(
             *both.in_use() < 1.0 && both.all().count() == 1,
             "{}",
@@ -391,19 +395,19 @@ mod tests {
 
     #[test]
     fn old_candidates_are_removed_and_their_number_is_limited() {
-        let mut contest = Contest::new(2, 1.0);
+        let mut selection = ModelSelection::new(2, 1.0);
         for number in 0..200 {
-            contest.enter(|| 1.0 + 1e-9 * f64::from(number));
-            play(&mut contest, 1.0, number as u64);
-            assert!(contest.all().count() <= TOGETHER + 1);
-            assert!(contest.times.len() as f64 * BLOCK <= MOST + 2.0);
+            selection.enter(|| 1.0 + 1e-9 * f64::from(number));
+            play(&mut selection, 1.0, number as u64);
+            assert!(selection.all().count() <= MAX_CANDIDATES + 1);
+            assert!(selection.times.len() as f64 * BLOCK <= MAX_MOTION + 2.0);
         }
         // Blocks that judge no candidate are dropped.
-        let most = contest
-            .entrants
+        let most = selection
+            .candidates
             .iter()
-            .map(|entrant| entrant.residuals.len())
+            .map(|candidate| candidate.residuals.len())
             .max();
-        assert!(most <= Some(2 * contest.times.len()));
+        assert!(most <= Some(2 * selection.times.len()));
     }
 }
