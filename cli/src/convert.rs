@@ -134,7 +134,7 @@ impl Write for Marked {
 }
 
 /// A conversion's error with the file concerned.
-fn blame(error: offline::OfflineError, input: &Path, output: &Path) -> anyhow::Error {
+fn with_file(error: offline::OfflineError, input: &Path, output: &Path) -> anyhow::Error {
     match error {
         offline::OfflineError::Io(e)
             if e.get_ref()
@@ -190,7 +190,7 @@ impl Output {
     }
 }
 
-fn tell_table(log: &Path, report: &Report) {
+fn report_table(log: &Path, report: &Report) {
     for bad in &report.bad {
         eprintln!(
             "{}: line {}: skipped: {}",
@@ -222,7 +222,7 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
         Columns::Main
     };
     let report = offline::decode(&plan, log, out.writer(), columns)
-        .map_err(|e| blame(e, &args.log, &args.out))?;
+        .map_err(|e| with_file(e, &args.log, &args.out))?;
     // A result without rows does not replace an existing file.
     if report.samples > 0 {
         out.finish()
@@ -274,7 +274,7 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
             "error_frames": report.error_frames, "dropped": report.dropped,
             "out_of_order": report.out_of_order, "devices": devices,
         });
-        tell_json(&args.out, &summary);
+        print_json(&args.out, &summary);
     } else {
         eprintln!(
             "{} frames, {} samples; {} frames of unknown devices, {} of other interfaces, {} lines \
@@ -307,12 +307,12 @@ pub(crate) fn encode(args: &Encode) -> anyhow::Result<()> {
     let samples = input(&args.samples)?;
     let mut out = Output::new(&args.out)?;
     let report = offline::encode(&plan, samples, out.writer())
-        .map_err(|e| blame(e, &args.samples, &args.out))?;
+        .map_err(|e| with_file(e, &args.samples, &args.out))?;
     if report.samples > 0 {
         out.finish()
             .with_context(|| args.out.display().to_string())?;
     }
-    tell_table(&args.samples, &report.table);
+    report_table(&args.samples, &report.table);
     if !report.unknown_channels.is_empty() {
         eprintln!(
             "{}: not in {}: {}",
@@ -334,7 +334,7 @@ pub(crate) fn encode(args: &Encode) -> anyhow::Result<()> {
             "rows": report.table.rows, "bad_rows": report.table.bad_rows,
             "unknown_channels": report.unknown_channels,
         });
-        tell_json(&args.out, &summary);
+        print_json(&args.out, &summary);
     } else {
         eprintln!("{} samples, {} frames", report.samples, report.frames);
     }
@@ -349,22 +349,15 @@ pub(crate) fn encode(args: &Encode) -> anyhow::Result<()> {
 ///
 /// # Errors
 /// A [`ConfigError`]: the configuration does not match the log.
-pub(crate) fn blame_columns(
+pub(crate) fn check_columns(
     header: &[u8],
     log: &Path,
     config: &Path,
     setup: &Setup,
 ) -> anyhow::Result<()> {
     let reader = csv::Reader::new(header).with_context(|| log.display().to_string())?;
-    match estimates::missing_channels(setup, reader.series()) {
-        missing if missing.is_empty() => Ok(()),
-        missing => Err(unfit(
-            config,
-            log,
-            &estimates::OfflineError::MissingChannels(missing),
-        )
-        .into()),
-    }
+    reading::check_columns(&setup.robot, reader.series(), |_| true)
+        .map_err(|missing| unfit(config, log, &missing).into())
 }
 
 /// The error that the configuration does not match the log.
@@ -383,14 +376,11 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
             config.parameters = Some(parameters.clone());
         }
     })?;
-    tell_implausible(args, &setup);
+    warn_of_implausible(args, &setup);
     let mut assessor = args.assess.then(|| assessor(args, &setup)).transpose()?;
     let log = input(&args.log)?;
     let mut out = Output::new(&args.out)?;
-    let report = match &mut assessor {
-        Some(assessor) => estimates::assess(setup, log, out.writer(), assessor),
-        None => estimates::estimate(setup, log, out.writer()),
-    };
+    let report = estimates::estimate(setup, log, out.writer(), assessor.as_mut());
     let report = match report {
         Ok(report) => report,
         Err(error @ estimates::OfflineError::MissingChannels(_)) => {
@@ -405,7 +395,7 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
         out.finish()
             .with_context(|| args.out.display().to_string())?;
     }
-    tell_table(&args.log, &report.log);
+    report_table(&args.log, &report.log);
     if !report.unused_channels.is_empty() {
         eprintln!(
             "{}: not in {}: {}",
@@ -424,24 +414,32 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
             report.first_dropped.unwrap_or_default()
         );
     }
+    let withheld: u64 = report.withheld.values().sum();
     let assessment = assessor.map(Assessor::finish);
     if args.json {
         let mut summary = json!({
-            "estimates": report.estimates, "torques_withheld": report.withheld,
+            "estimates": report.estimates, "torques_withheld": withheld,
+            "withheld_by_reason": report.withheld,
             "rows": report.log.rows, "bad_rows": report.log.bad_rows, "late": late,
             "backward": backward, "not_finite": not_finite,
         });
         if let Some(assessment) = &assessment {
             summary["assessment"] = assessment_json(assessment);
         }
-        tell_json(&args.out, &summary);
+        print_json(&args.out, &summary);
     } else {
+        let reasons: Vec<String> = (report.withheld.iter())
+            .map(|(reason, count)| format!("{count} {}", reason.replace('_', " ")))
+            .collect();
         eprintln!(
-            "{} estimates from {} rows; {} torques withheld",
-            report.estimates, report.log.rows, report.withheld
+            "{} estimates from {} rows; {withheld} torques withheld{}{}",
+            report.estimates,
+            report.log.rows,
+            if reasons.is_empty() { "" } else { ": " },
+            reasons.join(", ")
         );
         if let Some(assessment) = &assessment {
-            tell_assessment(assessment);
+            print_assessment(assessment);
         }
     }
     if report.estimates == 0 {
@@ -464,7 +462,7 @@ fn is_file(log: &Path) -> bool {
 
 /// Warns of implausible channels in the log before the estimation. Errors of reading are reported
 /// by the estimation itself; a log that can be read only once is not checked.
-fn tell_implausible(args: &Estimate, setup: &Setup) {
+fn warn_of_implausible(args: &Estimate, setup: &Setup) {
     let log = is_file(&args.log)
         .then(|| File::open(&args.log).ok())
         .flatten();
@@ -509,7 +507,7 @@ fn assessment_json(assessment: &Assessment) -> serde_json::Value {
     })
 }
 
-fn tell_assessment(assessment: &Assessment) {
+fn print_assessment(assessment: &Assessment) {
     let Assessment {
         predicted,
         changes,
@@ -541,7 +539,8 @@ fn tell_assessment(assessment: &Assessment) {
     }
     for (top, c) in residuals {
         eprintln!(
-            "residual at {top}: {:.1} % of {} within two standard deviations",
+            "residual of the sub-tree at {top}: {:.1} % of {} instants within two standard \
+             deviations",
             100.0 * c.covered,
             c.count
         );
@@ -558,10 +557,10 @@ fn tell_assessment(assessment: &Assessment) {
 }
 
 /// JSON goes to standard output, unless the table itself does.
-fn tell_json(out: &Path, summary: &serde_json::Value) {
+fn print_json(out: &Path, summary: &serde_json::Value) {
     if out == Path::new("-") {
         eprintln!("{summary}");
     } else {
-        say!("{summary}");
+        print_line!("{summary}");
     }
 }

@@ -18,7 +18,7 @@ use anyhow::{Context, bail};
 use experiment::Experiment;
 use processes::Processes;
 use proprio_estimator::config::ConfigError;
-use proprio_simulator::{Fault, Robot, Settings, Simulator};
+use proprio_simulator::{Fault, FaultError, Robot, Settings, Simulator};
 use proprio_topics::Nanos;
 use proprio_topics::ipc::{Domain, DomainConfig};
 use std::fs::{self};
@@ -37,6 +37,15 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         .iter()
         .map(|f| f.parse::<Fault>())
         .collect::<Result<Vec<_>, _>>()?;
+    if let Some((text, _)) =
+        (args.fault.iter().zip(&faults)).find(|(_, fault)| fault.begin() >= args.seconds)
+    {
+        return Err(FaultError::AfterEnd {
+            text: text.clone(),
+            seconds: args.seconds,
+        }
+        .into());
+    }
     Simulator::new(
         &original,
         &Settings {
@@ -72,12 +81,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let robot = Robot::load(&folder)?;
     let experiment = Experiment::prepare(args, &robot, &out)?;
 
-    say!(
+    print_line!(
         "robot {}: simulator, gateway and estimator as three processes, {} s",
         robot.config.robot,
         args.seconds
     );
-    say!("{}", experiment.story(args));
+    print_line!("{}", experiment.story(args));
     let mut processes = Processes {
         private: private.path().to_owned(),
         domain: domain.clone(),

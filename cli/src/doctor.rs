@@ -58,12 +58,12 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
                 })
             })
             .collect();
-        say!("{}", serde_json::Value::from(rows));
+        print_line!("{}", serde_json::Value::from(rows));
     } else {
         for f in &findings {
-            say!("{:<8} {:<16} {}", word(f.verdict), f.what, f.says);
+            print_line!("{:<8} {:<16} {}", word(f.verdict), f.what, f.says);
             if !f.hint.is_empty() {
-                say!("{:<26}-> {}", "", f.hint);
+                print_line!("{:<26}-> {}", "", f.hint);
             }
         }
     }

@@ -71,7 +71,7 @@ fn fits(config: &Path, setup: &Setup, gateway: &Path) -> anyhow::Result<()> {
         [] => String::new(),
         names => format!("; it does not read {}", names.join(", ")),
     };
-    say!(
+    print_line!(
         "{} publishes all channels that the estimator reads{more}",
         gateway.display()
     );

@@ -10,7 +10,7 @@ mod example;
 mod page;
 pub(crate) mod summary;
 
-use crate::convert::blame_columns;
+use crate::convert::check_columns;
 use advice::{Advice, findings, sentence};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -58,7 +58,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     })?;
     // Read now: it may be a result of an earlier run, which is removed below.
     let urdf = fs::read_to_string(&config.model)
-        .with_context(|| format!("{}: can not be read", config.model.display()))?;
+        .with_context(|| format!("{}: cannot be read", config.model.display()))?;
     let files: Vec<(&PathBuf, Role)> = args
         .log
         .iter()
@@ -72,13 +72,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     // All inputs are open. Remove the results of an earlier run, which could be mistaken for
     // results of this one.
     fs::create_dir_all(&args.out)
-        .with_context(|| format!("{}: can not be created", args.out.display()))?;
+        .with_context(|| format!("{}: cannot be created", args.out.display()))?;
     for name in FILES {
         let file = args.out.join(name);
         match fs::remove_file(&file) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
                 return Err(error)
-                    .with_context(|| format!("{}: can not be replaced", file.display()));
+                    .with_context(|| format!("{}: cannot be replaced", file.display()));
             }
             _ => {}
         }
@@ -150,9 +150,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         );
     }
     if args.json {
-        say!("{json}");
+        print_line!("{json}");
     } else {
-        tell(&outcome, &advice, &args.out);
+        print_outcome(&outcome, &advice, &args.out);
     }
     if let Verdict::Nothing(reason) = &outcome.verdict {
         bail!(
@@ -167,19 +167,19 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 fn open(file: &Path, config: &Path, setup: &Setup) -> anyhow::Result<impl Read + Send + use<>> {
     let mut table = BufReader::with_capacity(
         1 << 18,
-        File::open(file).with_context(|| format!("{}: can not be read", file.display()))?,
+        File::open(file).with_context(|| format!("{}: cannot be read", file.display()))?,
     );
     let mut header = Vec::new();
     // Skip blank lines before the header.
     while header.trim_ascii().is_empty() {
         let read = table
             .read_until(b'\n', &mut header)
-            .with_context(|| format!("{}: can not be read", file.display()))?;
+            .with_context(|| format!("{}: cannot be read", file.display()))?;
         if read == 0 {
             break;
         }
     }
-    blame_columns(&header, file, config, setup)?;
+    check_columns(&header, file, config, setup)?;
     Ok(Cursor::new(header).chain(table))
 }
 
@@ -226,30 +226,30 @@ fn progress_bar() -> ProgressBar {
 fn write(folder: &Path, name: &str, text: &str) -> anyhow::Result<()> {
     let file = folder.join(name);
     proprio_estimator::files::replace(&file, text, 0o644)
-        .with_context(|| format!("{}: can not be written", file.display()))
+        .with_context(|| format!("{}: cannot be written", file.display()))
 }
 
 /// The result in a few lines.
-fn tell(outcome: &Outcome, advice: &Advice, out: &Path) {
-    say!(
+fn print_outcome(outcome: &Outcome, advice: &Advice, out: &Path) {
+    print_line!(
         "{}: {}",
         outcome.robot,
         advice.grade.headline().to_lowercase()
     );
     for line in &advice.why {
-        say!("  {line}");
+        print_line!("  {line}");
     }
     if !advice.next.is_empty() {
-        say!("next:");
+        print_line!("next:");
     }
     for line in &advice.next {
-        say!("- {line}");
+        print_line!("- {line}");
     }
     let written: Vec<&str> = FILES
         .into_iter()
         .filter(|name| out.join(name).exists())
         .collect();
-    say!("{}: {}", out.display(), written.join(", "));
+    print_line!("{}: {}", out.display(), written.join(", "));
 }
 
 #[cfg(test)]

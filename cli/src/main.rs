@@ -1,7 +1,7 @@
 //! The `proprio` command with all subcommands. `proprio --help` lists them.
 
 /// `println!` that ignores a closed standard output, so that piping into `head` is not an error.
-macro_rules! say {
+macro_rules! print_line {
     ($($text:tt)*) => {{
         use std::io::Write as _;
         let _ = writeln!(std::io::stdout(), $($text)*);
@@ -9,7 +9,7 @@ macro_rules! say {
 }
 
 /// The same without a line break.
-macro_rules! say_part {
+macro_rules! print_part {
     ($($text:tt)*) => {{
         use std::io::Write as _;
         let _ = write!(std::io::stdout(), $($text)*);

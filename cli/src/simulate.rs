@@ -79,17 +79,21 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     }
     let mut skin = args
         .skin
-        .then(|| Teller::open(domain, &robot.config.robot))
+        .then(|| Skin::open(domain, &robot.config.robot))
         .transpose()?;
-    let mut tell = |contact: &str, at, active| {
+    let mut declare = |contact: &str, at, active| {
         if let Some(skin) = &mut skin {
-            skin.tell(contact, at, active);
+            skin.declare(contact, at, active);
         }
     };
-    let summary =
-        proprio_simulator::run_with_skin(&robot, &options, args.skin.then_some(&mut tell), &stop)?;
+    let summary = proprio_simulator::run_with_skin(
+        &robot,
+        &options,
+        args.skin.then_some(&mut declare),
+        &stop,
+    )?;
     if args.json {
-        say!("{}", serde_json::to_string(&summary)?);
+        print_line!("{}", serde_json::to_string(&summary)?);
     } else {
         eprintln!("{} frames sent in {:.1} s", summary.sent, summary.seconds);
     }
@@ -97,15 +101,15 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
 }
 
 /// Publishes the touches of the robot as contact declarations.
-struct Teller(Writer<ContactDeclaration>);
+struct Skin(Writer<ContactDeclaration>);
 
-impl Teller {
+impl Skin {
     fn open(domain: &DomainConfig, robot: &str) -> anyhow::Result<Self> {
         let domain = Domain::open(domain)?;
         Ok(Self(Writer::create(&domain, robot, domain.epoch())?))
     }
 
-    fn tell(&mut self, contact: &str, at: Nanos, active: bool) {
+    fn declare(&mut self, contact: &str, at: Nanos, active: bool) {
         let header = Header {
             acquired: at,
             ..Header::default()

@@ -89,7 +89,7 @@ impl Assessor {
     /// Reads the log. Call it before the estimates are computed.
     ///
     /// # Errors
-    /// The log can not be read.
+    /// The log cannot be read.
     pub fn new(setup: &Setup, log: impl Read) -> Result<Self, ReadingError> {
         let robot = setup.robot.clone();
         Ok(Self {

@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 /// Keys that had another name in an earlier version.
 const RENAMED: [(&str, &str); 1] = [("model_std", "urdf_relative_std")];
 
-/// A configuration that can not be used: exit 2.
+/// A configuration that cannot be used: exit 2.
 #[derive(Debug, thiserror::Error)]
 #[error("{}: {problem}", .file.display())]
 pub struct ConfigError {
@@ -429,7 +429,7 @@ impl Config {
             problem,
         };
         let text =
-            std::fs::read_to_string(file).map_err(|e| error(format!("can not be read: {e}")))?;
+            std::fs::read_to_string(file).map_err(|e| error(format!("cannot be read: {e}")))?;
         let mut config = Self::parse(&text).map_err(error)?;
         let folder = file.parent().unwrap_or(Path::new("."));
         config.model = folder.join(&config.model);
@@ -574,7 +574,7 @@ impl Config {
                     .find(|v| !(*v >= 0.0 && v.is_finite()))
                 {
                     return Err(format!(
-                        "{} has the value {value}; a standard deviation can not be negative",
+                        "{} has the value {value}; a standard deviation cannot be negative",
                         at(key)
                     ));
                 }

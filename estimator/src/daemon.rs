@@ -49,7 +49,7 @@ const INBOX: usize = <Sample as Topic>::QUALITY.buffer * <Sample as Topic>::QUAL
 /// As for [`run`].
 pub fn check(config: &Path) -> anyhow::Result<Setup> {
     let (_, setup) = load(config, |_| {})?;
-    let checked = Check::of(&setup).context("the configuration can not be checked")?;
+    let checked = Check::of(&setup).context("the configuration cannot be checked")?;
     // The reader of a pipe may close it early.
     let _ = write!(std::io::stdout(), "{setup}{checked}");
     let file = config.to_owned();
@@ -289,7 +289,10 @@ impl DataPlane {
         }
         self.publish_health(monotonic());
         if self.identification.is_some() {
-            tracing::info!("identification instants: {}", self.health.identification);
+            tracing::info!(
+                "observations of identification: {}",
+                self.health.identification
+            );
         }
     }
 
@@ -508,7 +511,7 @@ impl StateFile {
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return,
             Err(error) => {
                 return tracing::error!(
-                    "{file}: can not be read: {error}; identification starts without it"
+                    "{file}: cannot be read: {error}; identification starts without it"
                 );
             }
             Ok(bytes) => String::from_utf8_lossy(&bytes).into_owned(),
@@ -522,7 +525,7 @@ impl StateFile {
                 ),
                 Err(other) => {
                     tracing::error!(
-                        "{file}: {error}; it can not be renamed ({other}) and will be overwritten"
+                        "{file}: {error}; it cannot be renamed ({other}) and will be overwritten"
                     );
                 }
             },
@@ -532,7 +535,7 @@ impl StateFile {
     fn write(&self, text: &str) {
         if let Err(error) = files::replace(&self.file, text, 0o600) {
             tracing::error!(
-                "{}: the state of identification can not be written: {error}; check the folder and \
+                "{}: the state of identification cannot be written: {error}; check the folder and \
                  its permissions",
                 self.file.display()
             );
@@ -566,7 +569,7 @@ impl IdentificationThread {
                     match failure {
                         Some(error) if !*fails => tracing::error!(
                             component,
-                            "identification can not solve for the parameters: {error}; the earlier \
+                            "identification cannot solve for the parameters: {error}; the earlier \
                              parameters stay in use"
                         ),
                         None if *fails => tracing::info!(

@@ -93,7 +93,7 @@ impl Setup {
             format!(" from {}", logs.join(", "))
         };
         let tau = provenance.tau.map_or(String::new(), |tau| {
-            format!(" (prior's weight tau = {tau})")
+            format!(" (scale of the prior: tau = {tau})")
         });
         let links = self.robot.model.link_count();
         writeln!(

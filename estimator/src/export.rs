@@ -8,7 +8,7 @@ use nalgebra::DMatrix;
 use proprio_dynamics::regressor::identifiable::Column;
 use proprio_dynamics::spatial::Wrench;
 use proprio_identification::Robot;
-use proprio_identification::robot::ChannelRole;
+use proprio_identification::robot::{AXES, ChannelRole};
 use proprio_identification::{LogOutcome, Outcome, Role};
 
 /// The identified parameters of `robot`: inertial parameters of the links in the covariance,
@@ -84,7 +84,7 @@ pub fn parameters(
             reading: wrench(&offset.end),
             drift: wrench(&offset.rate),
             known: log.span.1,
-            noise: wrench(&["fx", "fy", "fz", "tx", "ty", "tz"].map(|axis| {
+            noise: wrench(&AXES.map(|axis| {
                 let name = format!("wrench/{}/{axis}", channel.name);
                 let found = outcome.channels.iter().find(|own| own.name == name);
                 found.map_or(0.0, |own| own.deviation)
@@ -152,8 +152,8 @@ mod tests {
     use crate::setup::Setup;
     use proprio_dynamics::spatial::RigidInertia;
     use proprio_identification::{
-        Consistency, CovarianceRoot, FrictionOutcome, LinkOutcome, ModelComparison, OffsetOutcome,
-        Predicted, RotorOutcome, Verdict,
+        ChannelNoise, Consistency, CovarianceRoot, FrictionOutcome, LinkOutcome, ModelComparison,
+        OffsetOutcome, Predicted, RotorOutcome, Verdict,
     };
     use proprio_topics::Nanos;
     use std::collections::BTreeMap;
@@ -221,7 +221,13 @@ mod tests {
                 rate: [0.1, 0.2, 0.3, 0.01, 0.02, 0.03],
                 offset_jumps: vec![],
             }],
-            friction: vec![],
+            friction: vec![FrictionOutcome {
+                joint: "l_elbow".into(),
+                coulomb_nm: 0.4,
+                viscous: 0.08,
+                offset_nm: -0.02,
+                deviation: [0.01; 3],
+            }],
             findings: vec![],
             curves: vec![],
             spectra: vec![],
@@ -254,7 +260,17 @@ mod tests {
             weakest: vec![],
             not_separable: vec![],
             base_parameters: vec![],
-            channels: vec![],
+            channels: ["fz", "fx", "fy", "tx", "ty", "tz"]
+                .iter()
+                .zip([0.3, 0.1, 0.2, 0.01, 0.02, 0.03])
+                .map(|(axis, deviation)| ChannelNoise {
+                    name: format!("wrench/l_arm_ft_sensor/{axis}"),
+                    unit: "",
+                    deviation,
+                    autocorrelation_seconds: 0.0,
+                    drift: 0.0,
+                })
+                .collect(),
             time_offsets: vec![],
             consistency,
             logs: vec![
@@ -321,7 +337,21 @@ mod tests {
             (offset.sensor.as_str(), offset.known),
             ("l_arm_ft_sensor", Nanos(1_000_000_001))
         );
-        assert_eq!(given.provenance().logs.len(), 1);
+        assert_eq!(
+            offset.noise,
+            Wrench::from_parts([0.1, 0.2, 0.3], [0.01, 0.02, 0.03])
+        );
+        let friction = Friction {
+            joint: "l_elbow".into(),
+            coulomb: 0.4,
+            viscous: 0.08,
+            offset: -0.02,
+            rotor: None,
+        };
+        assert_eq!(given.friction(), [friction]);
+        let provenance = given.provenance();
+        assert_eq!((provenance.logs.len(), provenance.tau), (1, Some(0.5)));
+        assert_eq!(provenance.logs[0].file, "train.csv");
         // The text of the file reads back as the same parameters.
         given.check_robot(&robot).unwrap();
         assert_eq!(Parameters::parse(&given.to_string()).unwrap(), given);

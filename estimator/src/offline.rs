@@ -23,25 +23,26 @@
 
 use crate::assessment::Assessor;
 use crate::pipeline::{Estimate, Pipeline};
+use crate::reading::{MissingChannels, Target, check_columns, targets};
 use crate::setup::Setup;
-use proprio_identification::robot::Channel;
-use proprio_topics::csv::{Item, Reader, Report, Row, Series, Value, What};
-use proprio_topics::{ContactWrench, JointTorque, Kind, NO_CAUSE, Nanos, Reason, Residual};
+use proprio_topics::csv::{Item, Reader, Report, Row, Value};
+use proprio_topics::{ContactWrench, JointTorque, NO_CAUSE, Nanos, Reason, Residual};
+use std::collections::BTreeMap;
 use std::io::{self, Read, Write};
 
 /// Why a log cannot be estimated.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum OfflineError {
-    /// The log can not be read.
+    /// The log cannot be read.
     #[error(transparent)]
     Log(#[from] proprio_topics::csv::Error),
-    /// The estimates can not be written.
-    #[error("the estimates can not be written")]
+    /// The estimates cannot be written.
+    #[error("the estimates cannot be written")]
     Write(#[from] io::Error),
     /// The log lacks channels that the configuration names.
-    #[error("the log has no column for {}", .0.join(", "))]
-    MissingChannels(Vec<String>),
+    #[error(transparent)]
+    MissingChannels(#[from] MissingChannels),
 }
 
 /// Counts and remarks of the estimates of a log.
@@ -49,8 +50,8 @@ pub enum OfflineError {
 pub struct EstimateReport {
     /// Estimates written.
     pub estimates: u64,
-    /// Withheld torques in them.
-    pub withheld: u64,
+    /// Withheld torques in them, by reason ([`Reason::word`]).
+    pub withheld: BTreeMap<&'static str, u64>,
     /// The rows that the reader skipped.
     pub log: Report,
     /// Samples dropped: late, stamped no later than the last one, not finite.
@@ -70,32 +71,11 @@ fn run_due_job(pipeline: &mut Pipeline) {
     }
 }
 
-/// Estimates for every trigger stamp of a log.
+/// Estimates for every trigger stamp of a log. They also go to `assessor`, which has read this log.
 ///
 /// # Errors
 /// [`OfflineError`]; a joint that the log lacks and the configuration does not lock is one.
 pub fn estimate(
-    setup: Setup,
-    log: impl Read,
-    out: impl Write,
-) -> Result<EstimateReport, OfflineError> {
-    estimate_with(setup, log, out, None)
-}
-
-/// The same, and also passes the estimates to `assessor`, which has read this log.
-///
-/// # Errors
-/// As for [`estimate`].
-pub fn assess(
-    setup: Setup,
-    log: impl Read,
-    out: impl Write,
-    assessor: &mut Assessor,
-) -> Result<EstimateReport, OfflineError> {
-    estimate_with(setup, log, out, Some(assessor))
-}
-
-fn estimate_with(
     setup: Setup,
     log: impl Read,
     out: impl Write,
@@ -104,28 +84,14 @@ fn estimate_with(
     let mut reader = Reader::new(log)?;
     let mut report = EstimateReport::default();
     let mut pipeline = Pipeline::new(setup);
-    let missing = missing_channels(pipeline.setup(), reader.series());
-    if !missing.is_empty() {
-        return Err(OfflineError::MissingChannels(missing));
+    let robot = &pipeline.setup().robot;
+    check_columns(robot, reader.series(), |_| true)?;
+    let targets = targets(robot, reader.series());
+    for (series, target) in reader.series().iter().zip(&targets) {
+        if target.is_none() {
+            report.unused_channels.push(series.name.clone());
+        }
     }
-    let targets: Vec<Target> = reader
-        .series()
-        .iter()
-        .map(|s| {
-            let target = match s.what {
-                What::Channel(kind) => pipeline
-                    .setup()
-                    .robot
-                    .channel(kind, &s.name)
-                    .map(Target::Channel),
-                What::Contact => pipeline.setup().robot.contact(&s.name).map(Target::Contact),
-            };
-            if target.is_none() {
-                report.unused_channels.push(s.name.clone());
-            }
-            target.unwrap_or(Target::None)
-        })
-        .collect();
     let mut table = Table::new(out, pipeline.setup())?;
     // Rows of a log without stamps are spaced so far that none affects the next.
     let spacing =
@@ -151,12 +117,12 @@ fn estimate_with(
             pseudo
         });
         for Item { series, value } in &row.items {
-            match (targets.get(*series), value) {
+            match (targets.get(*series).copied().flatten(), value) {
                 (Some(Target::Channel(channel)), Value::Reading(reading, quality)) => {
-                    pipeline.push(*channel, t, reading, *quality);
+                    pipeline.push(channel, t, reading, *quality);
                 }
                 (Some(Target::Contact(contact)), Value::Active(active)) => {
-                    pipeline.declare(*contact, t, *active);
+                    pipeline.declare(contact, t, *active);
                 }
                 _ => {}
             }
@@ -177,37 +143,6 @@ fn estimate_with(
     Ok(report)
 }
 
-/// The channels that `setup` reads and a log with these columns does not have, each with a hint
-/// what to do.
-pub fn missing_channels(setup: &Setup, series: &[Series]) -> Vec<String> {
-    let there = |channel: &Channel| {
-        series
-            .iter()
-            .any(|s| s.what == What::Channel(channel.kind) && s.name == channel.name)
-    };
-    setup
-        .robot
-        .channels
-        .iter()
-        .filter(|channel| !there(channel))
-        .map(|channel| {
-            let hint = if channel.kind == Kind::Joint {
-                " (measure it, or lock it in [locked])"
-            } else {
-                ""
-            };
-            format!("{}/{}{hint}", channel.kind.word(), channel.name)
-        })
-        .collect()
-}
-
-#[derive(Clone, Copy)]
-enum Target {
-    None,
-    Channel(usize),
-    Contact(usize),
-}
-
 /// Writes estimates row by row.
 pub struct Table<W> {
     out: W,
@@ -217,14 +152,14 @@ pub struct Table<W> {
     subtrees: usize,
     text: Vec<u8>,
     rows: u64,
-    withheld: u64,
+    withheld: BTreeMap<&'static str, u64>,
 }
 
 impl<W: Write> Table<W> {
     /// Writes the header.
     ///
     /// # Errors
-    /// If `out` can not be written.
+    /// If `out` cannot be written.
     pub fn new(mut out: W, setup: &Setup) -> io::Result<Self> {
         let joints: Vec<&str> = setup.robot.joint_names().collect();
         let contacts: Vec<&str> = setup.robot.contact_names().collect();
@@ -268,14 +203,14 @@ impl<W: Write> Table<W> {
             subtrees: subtrees.len(),
             text: Vec::new(),
             rows: 0,
-            withheld: 0,
+            withheld: BTreeMap::new(),
         })
     }
 
     /// Writes one estimate, with its instant if the log is `stamped`.
     ///
     /// # Errors
-    /// If the output can not be written.
+    /// If the output cannot be written.
     pub fn write(&mut self, estimate: &Estimate, stamped: bool) -> io::Result<()> {
         let joints = || {
             (0..self.joints).map(|i| {
@@ -321,7 +256,9 @@ impl<W: Write> Table<W> {
         }
         for joint in joints() {
             flag(&mut self.text, joint.valid);
-            self.withheld += u64::from(joint.valid != 1);
+            if joint.valid != 1 {
+                *self.withheld.entry(joint.reason.word()).or_default() += 1;
+            }
         }
         for joint in joints() {
             reason(&mut self.text, &self.channels, joint.reason, joint.cause);

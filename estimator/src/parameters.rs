@@ -51,7 +51,7 @@ pub struct Parameters {
 pub struct Provenance {
     /// The program and its version.
     pub program: String,
-    /// The weight of the prior, if there was one.
+    /// The scale of the prior, if there was one.
     pub tau: Option<f64>,
     /// The logs.
     #[serde(default, rename = "log")]
@@ -151,15 +151,15 @@ pub struct Rotor {
     pub deviation: f64,
 }
 
-/// Why parameters can not be read, written or used.
+/// Why parameters cannot be read, written or used.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ParametersError {
-    /// The file can not be read.
-    #[error("can not be read: {0}")]
+    /// The file cannot be read.
+    #[error("cannot be read: {0}")]
     Read(io::Error),
-    /// The file can not be written; what was there before is as it was.
-    #[error("can not be written: {0}")]
+    /// The file cannot be written; what was there before is as it was.
+    #[error("cannot be written: {0}")]
     Write(io::Error),
     /// It is no parameters file, or it is truncated, or a value in it is wrong.
     #[error("is damaged, or is not a parameters.toml: {0}; use a backup, or identify again")]

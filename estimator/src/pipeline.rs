@@ -18,11 +18,12 @@
 //! # Alignment
 //! Each stamp `t` of the trigger channel gives exactly one estimate, in order. It is released once
 //! every channel has a sample stamped `t` or later, or once the newest stamp of any channel is
-//! later than `t + max_wait`. The estimate uses the samples stamped `t` or earlier and, of each
-//! channel, the first later one if its stamp is at most `t + max_wait / 2`. A sample that arrives
-//! after its instant was released is dropped and counted. So the estimates depend on the stamps
-//! alone: not on the time of day, and not on the order of arrival, provided that no sample arrives
-//! more than `max_wait / 2` behind a later one. A replay gives the live estimates bit for bit.
+//! later than `t + max_wait`, or once 256 instants wait (a trigger above 1 kHz). The estimate uses
+//! the samples stamped `t` or earlier and, of each channel, the first later one if its stamp is at
+//! most `t + max_wait / 2`. A sample that arrives after its instant was released is dropped and
+//! counted. So the estimates depend on the stamps alone: not on the time of day, and not on the
+//! order of arrival, provided that no sample arrives more than `max_wait / 2` behind a later one. A
+//! replay gives the live estimates bit for bit.
 //!
 //! A sample stamped exactly `t` is used as it is, with its velocity and acceleration if it has
 //! them. Otherwise the adaptive window differentiates ([`crate::differentiate`]). Wrenches and

@@ -23,7 +23,7 @@
 //!
 //! If a sensor's calibration is uncertain, too ([`proprio_dynamics::calibration`]), its columns act
 //! like additional columns of the offset that depend on the reading `r` and the board temperature
-//! `T`: `U_s` becomes `U_s - U_E r + U_k (T - T0)` at each instant ([`Propagation::set_reading`]).
+//! `T`: `U_s` becomes `U_s - U_E r + U_k (T - T0)` at each instant ([`Propagation::set_calibration_point`]).
 //!
 //! Loops over rows use the widest vector instructions of the processor, in a portable build too.
 //!
@@ -288,7 +288,7 @@ impl WithSimd for Update<'_> {
                 let Some(dof) = structure.dof_of(link.link) else {
                     continue;
                 };
-                let (axis, response) = solver.torque_motions(dof);
+                let (axis, response) = solver.torque_rows(dof);
                 let below = structure.below(link.link);
                 let drift = from_drift(&|other| {
                     if below.contains(&other) {
@@ -300,7 +300,7 @@ impl WithSimd for Update<'_> {
                 torque[dof] = (part.variance(simd, place, axis, response) + drift).sqrt();
             }
             for contact in subtree.contacts.iter() {
-                let motions = solver.contact_motions(contact);
+                let motions = solver.contact_rows(contact);
                 for (deviation, motion) in contacts[contact].iter_mut().zip(motions) {
                     *deviation =
                         (part.variance_of_all(simd, motion) + from_drift(&|_| *motion)).sqrt();

@@ -5,6 +5,7 @@
 //! end of a line may not be the end of a row (a quoted cell can contain one), and where rows have
 //! no stamps and are counted instead.
 
+use crate::setup::nearest;
 use proprio_identification::dataset::DatasetError;
 use proprio_identification::dataset::recording::SkippedRows;
 use proprio_identification::robot::Channel;
@@ -14,19 +15,32 @@ use proprio_topics::{Kind, Nanos};
 use std::io::Read;
 use std::ops::Range;
 
-/// Why a log can not be read at all.
+/// Why a log cannot be read at all.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ReadingError {
-    /// The log can not be read.
+    /// The log cannot be read.
     #[error(transparent)]
     Log(#[from] csv::Error),
     /// Without these channels there are no kinematics.
-    #[error("the log has no column for {}", .0.join(", "))]
-    MissingChannels(Vec<String>),
+    #[error(transparent)]
+    MissingChannels(#[from] MissingChannels),
     /// A channel has columns, but no sample.
     #[error("{0} in its columns of the log")]
     Dataset(#[from] DatasetError),
+}
+
+/// A log lacks channels that the configuration names.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "the log has no column for {}{hint}; use a log of {robot:?} with these channels, or name \
+     joints that are not measured in [locked] of the configuration", .missing.join(", ")
+)]
+pub struct MissingChannels {
+    robot: String,
+    missing: Vec<String>,
+    /// A similar column, if there is one.
+    hint: String,
 }
 
 impl ReadingError {
@@ -46,7 +60,7 @@ impl ReadingError {
 ///
 /// # Errors
 /// [`ReadingError`]: it is no log, or lacks a joint that is not locked, or the IMU of the base. A
-/// missing F/T sensor is a defect.
+/// missing F/T sensor is a defect here; `proprio identify` refuses the log before.
 pub fn dataset(
     robot: &Robot,
     name: &str,
@@ -89,10 +103,20 @@ const BLOCK: usize = 4 << 20;
 /// Approximate size of the text that one thread parses at a time [bytes].
 const SEGMENT: usize = 256 << 10;
 
+/// The channel or contact that a column belongs to.
 #[derive(Clone, Copy)]
-enum Target {
+pub(crate) enum Target {
     Channel(usize),
     Contact(usize),
+}
+
+/// Per series of a log its channel or contact; none if the robot has no such.
+pub(crate) fn targets(robot: &Robot, series: &[Series]) -> Vec<Option<Target>> {
+    let target = |series: &Series| match series.what {
+        What::Channel(kind) => robot.channel(kind, &series.name).map(Target::Channel),
+        What::Contact => robot.contact(&series.name).map(Target::Contact),
+    };
+    series.iter().map(target).collect()
 }
 
 /// The samples of consecutive rows.
@@ -219,15 +243,9 @@ impl PartialRecording {
         robot: &Robot,
         table: &Reader<impl Read>,
     ) -> Result<(Self, Vec<Option<Target>>), ReadingError> {
-        check_columns(robot, table.series())?;
-        let mut targets = Vec::new();
-        for series in table.series() {
-            let target = match series.what {
-                What::Channel(kind) => robot.channel(kind, &series.name).map(Target::Channel),
-                What::Contact => robot.contact(&series.name).map(Target::Contact),
-            };
-            targets.push(target);
-        }
+        // A log may lack an F/T sensor, but no joint and no IMU.
+        check_columns(robot, table.series(), |c| c.kind != Kind::Wrench)?;
+        let targets = targets(robot, table.series());
         let part = Self {
             recording: Recording::new(robot),
             is_stamped: true,
@@ -285,26 +303,49 @@ impl PartialRecording {
     }
 }
 
-fn check_columns(robot: &Robot, series: &[Series]) -> Result<(), ReadingError> {
-    let there = |channel: &&Channel| {
-        let same = |s: &Series| s.what == What::Channel(channel.kind) && s.name == channel.name;
-        series.iter().any(same)
-    };
-    let needed = robot.channels.iter().filter(|c| c.kind != Kind::Wrench);
-    let missing = needed.filter(|c| !there(c)).map(|c| {
-        let hint = if c.kind == Kind::Joint {
-            " (measure it, or lock it in [locked])"
-        } else {
-            ""
-        };
-        format!("{}/{}{hint}", c.kind.word(), c.name)
-    });
-    let missing: Vec<String> = missing.collect();
+/// Checks that a log with these columns has every channel of the robot of which `needed` is true.
+///
+/// # Errors
+/// The channels that it lacks.
+pub fn check_columns(
+    robot: &Robot,
+    series: &[Series],
+    needed: impl Fn(&Channel) -> bool,
+) -> Result<(), MissingChannels> {
+    let column = |kind: Kind, name: &str| format!("{}/{name}", kind.word());
+    let columns: Vec<String> = series
+        .iter()
+        .filter_map(|series| match series.what {
+            What::Channel(kind) => Some(column(kind, &series.name)),
+            What::Contact => None,
+        })
+        .collect();
+    let missing: Vec<String> = robot
+        .channels
+        .iter()
+        .filter(|channel| needed(channel))
+        .map(|channel| column(channel.kind, &channel.name))
+        .filter(|channel| !columns.contains(channel))
+        .collect();
     if missing.is_empty() {
-        Ok(())
-    } else {
-        Err(ReadingError::MissingChannels(missing))
+        return Ok(());
     }
+    // A misspelt column is one that the robot does not have.
+    let of_robot = |name: &&str| {
+        let mut channels = robot.channels.iter();
+        channels.any(|channel| column(channel.kind, &channel.name) == **name)
+    };
+    let others = columns.iter().map(String::as_str).filter(|c| !of_robot(c));
+    let near = nearest(&missing[0], others);
+    Err(MissingChannels {
+        robot: robot.name.clone(),
+        missing,
+        hint: if near.contains("did you mean") {
+            near
+        } else {
+            String::new()
+        },
+    })
 }
 
 #[cfg(test)]

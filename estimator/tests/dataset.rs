@@ -636,7 +636,7 @@ fn each_defect_put_into_a_clean_log_is_found_and_nothing_else() {
             "infinite",
             Box::new(|t| t.rows[500].1[0] = f64::INFINITY),
             &["skipped rows"],
-            "1 rows can not be read and were skipped; the first: line 502",
+            "1 rows cannot be read and were skipped; the first: line 502",
         ),
         (
             "rows written twice",
@@ -808,7 +808,7 @@ fn each_defect_put_into_a_clean_log_is_found_and_nothing_else() {
                 })
             }),
             &["outliers"],
-            "samples of fz are outliers",
+            "outliers of fz",
         ),
         (
             "ticks of the encoder",
@@ -819,7 +819,7 @@ fn each_defect_put_into_a_clean_log_is_found_and_nothing_else() {
                 }
             }),
             &["outliers"],
-            "joint/elbow: 3 samples of position",
+            "joint/elbow: 3 outliers of position",
         ),
         (
             "an unrecorded sensor",

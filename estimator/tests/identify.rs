@@ -82,7 +82,7 @@ fn describe(o: &Outcome) {
     for c in &o.channels {
         println!(
             "  {}: {:.4} {} iat {:.1} drift {:.5}",
-            c.name, c.deviation, c.unit, c.autocorrelation, c.drift
+            c.name, c.deviation, c.unit, c.autocorrelation_seconds, c.drift
         );
     }
     for link in o.links.iter().filter(|l| l.seen) {
@@ -2276,7 +2276,7 @@ fn before_the_sensor(
     let mut setup = setup.clone();
     setup.apply(parameters).expect("its own parameters");
     let mut out = Vec::new();
-    offline::estimate(setup.clone(), log.as_bytes(), &mut out).expect("estimates");
+    offline::estimate(setup.clone(), log.as_bytes(), &mut out, None).expect("estimates");
     let table = |bytes: &[u8]| -> HashMap<String, Vec<f64>> {
         let mut reader = csv::Reader::from_reader(bytes);
         let names: Vec<String> = reader
@@ -2370,7 +2370,8 @@ fn judged_alike(setup: &Setup, parameters: &Parameters, log: &str, predicted: &P
     let mut setup = setup.clone();
     setup.apply(parameters).expect("its own parameters");
     let mut assessor = Assessor::new(&setup, log.as_bytes()).expect("a log");
-    offline::assess(setup, log.as_bytes(), std::io::sink(), &mut assessor).expect("estimates");
+    offline::estimate(setup, log.as_bytes(), std::io::sink(), Some(&mut assessor))
+        .expect("estimates");
     let assessment = assessor.finish();
     assert_eq!(assessment.changes, 0);
     let of = |p: &Predicted| {

@@ -572,7 +572,7 @@ fn estimates(setup: Setup) -> Table {
     let log =
         std::fs::read_to_string(root().join("tests/oracle/icub_left_arm_mujoco.csv")).unwrap();
     let mut out = Vec::new();
-    offline::estimate(setup, log.as_bytes(), &mut out).unwrap();
+    offline::estimate(setup, log.as_bytes(), &mut out, None).unwrap();
     let mut reader = csv::Reader::from_reader(out.as_slice());
     let names: Vec<String> = reader
         .headers()
@@ -618,8 +618,8 @@ fn identified_parameters_replace_those_of_the_urdf() {
     );
     let text = setup.to_string();
     for expected in [
-        "identified by proprio 0.0.0 \"test\" from a log.csv (prior's weight tau = 0.58): 5 of 9 \
-         links",
+        "identified by proprio 0.0.0 \"test\" from a log.csv (scale of the prior: tau = 0.58): 5 of \
+         9 links",
         "the URDF's, taken as known to 20 %: chest",
         "offset of l_arm_ft_sensor",
     ] {
@@ -1359,7 +1359,7 @@ fn a_setup_names_the_file_that_it_could_not_use() {
     config.parameters = Some("nowhere/p.toml".into());
     let problem = Setup::new(&config).unwrap_err();
     assert!(
-        problem.starts_with("parameters: nowhere/p.toml can not be read: "),
+        problem.starts_with("parameters: nowhere/p.toml cannot be read: "),
         "{problem}"
     );
 }

@@ -73,7 +73,7 @@ fn estimates_from_a_file_equal_those_of_other_libraries() {
         });
         let joints: Vec<String> = setup.robot.joint_names().map(str::to_owned).collect();
         let (log, mut out) = (golden(name), Vec::new());
-        let report = offline::estimate(setup, log.as_bytes(), &mut out).unwrap();
+        let report = offline::estimate(setup, log.as_bytes(), &mut out, None).unwrap();
         let (want, got) = (table(&log), table(std::str::from_utf8(&out).unwrap()));
         assert_eq!(report.estimates, 201);
         assert_eq!(want["t"].len(), got["t"].len());
@@ -182,7 +182,7 @@ fn corrected_readings_give_the_same_estimates_as_exact_ones() {
     assert!(temperatures.last().unwrap() - temperatures[0] > 9.0);
     let run = |setup: Setup, text: &str| {
         let mut out = Vec::new();
-        offline::estimate(setup, text.as_bytes(), &mut out).unwrap();
+        offline::estimate(setup, text.as_bytes(), &mut out, None).unwrap();
         table(std::str::from_utf8(&out).unwrap())
     };
     let right = run(setup(|_| {}), &log);
@@ -466,7 +466,7 @@ fn a_log_without_stamps_keeps_its_order_and_its_estimates() {
         .collect();
     let run = |text: &str| {
         let mut out = Vec::new();
-        offline::estimate(setup(|_| {}), text.as_bytes(), &mut out).unwrap();
+        offline::estimate(setup(|_| {}), text.as_bytes(), &mut out, None).unwrap();
         table(std::str::from_utf8(&out).unwrap())
     };
     let (with, without) = (run(&log), run(&blank));
@@ -933,10 +933,24 @@ fn a_repeated_declaration_changes_nothing() {
             );
         }
     }
-    // More changes than are kept: the last one of those dropped is still valid.
+    // More changes than are kept: before the first that is kept, the last one of those dropped is
+    // valid.
+    let start = events.last().unwrap().1 + Nanos::from_millis(10);
     for i in 0..40 {
-        pipeline.declare(hand, Nanos::from_millis(400 + i), i % 2 == 0);
+        pipeline.declare(hand, start + Nanos::from_millis(100 + i), i % 2 == 1);
     }
+    let (mut present, mut all) = (0, 0);
+    for (channel, t, reading, quality) in &events {
+        pipeline.push(*channel, start + *t, reading, *quality);
+        while let Some(estimate) = pipeline.poll() {
+            if (start..start + Nanos::from_millis(100)).contains(&estimate.t) {
+                let contact = &estimate.contacts.contacts()[hand];
+                all += 1;
+                present += usize::from(contact.reason != Reason::Absent && contact.detected == 0);
+            }
+        }
+    }
+    assert!(all > 50 && present == all, "{present} of {all}");
 }
 
 #[test]
@@ -1018,12 +1032,12 @@ fn each_mistake_between_configuration_and_model_has_one_clear_message() {
         assert!(problem.contains(expected), "{expected}: {problem}");
     }
     // A joint that is neither measured nor locked.
-    let log = golden("icub_left_arm_mujoco.csv").replace("joint/l_elbow/", "joint/other/");
-    let error = offline::estimate(setup(|_| {}), log.as_bytes(), Vec::new())
+    let log = golden("icub_left_arm_mujoco.csv").replace("joint/l_elbow/", "joint/l_elbo/");
+    let error = offline::estimate(setup(|_| {}), log.as_bytes(), Vec::new(), None)
         .unwrap_err()
         .to_string();
     assert!(
-        error.contains("joint/l_elbow (measure it, or lock it in [locked])"),
+        error.contains("joint/l_elbow; did you mean \"joint/l_elbo\"?; use a log of"),
         "{error}"
     );
 }
@@ -1309,7 +1323,7 @@ fn estimates_with_added(
         text += &(row.join(",") + "\n");
     }
     let mut out = Vec::new();
-    offline::estimate(setup(change), text.as_bytes(), &mut out).unwrap();
+    offline::estimate(setup(change), text.as_bytes(), &mut out, None).unwrap();
     table(std::str::from_utf8(&out).unwrap())
 }
 

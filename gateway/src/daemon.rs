@@ -126,7 +126,7 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
     let watchdog = sd_notify::watchdog_enabled();
 
     let mut health = Box::new(GatewayHealth::new(started));
-    let mut diary = Diary::default();
+    let mut health_log = HealthLog::default();
     let mut ticks = tokio::time::interval(HEALTH_PERIOD);
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
     let why = loop {
@@ -137,7 +137,7 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
         }
         let now = clock.now();
         fill_health(&mut health, &threads);
-        diary.tell(&health);
+        health_log.log_changes(&health);
         // A reader that cannot be reached now is no reason to stop; the next health follows in 0.1
         // s.
         let _ = health_writer.send(&health, now);
@@ -322,20 +322,20 @@ fn fill_health(health: &mut GatewayHealth, threads: &[BusThread]) {
 
 /// Turns health into log lines: one at the first of a series of problems, one at its end.
 #[derive(Default)]
-struct Diary {
+struct HealthLog {
     last: Option<Box<GatewayHealth>>,
     /// Per device and counter, the number of ticks since the last increase, at most
-    /// [`Diary::REST`].
+    /// [`HealthLog::REST`].
     quiet: Vec<[u32; Counter::ALL.len()]>,
     /// Per bus, the remaining ticks in which a dropped frame belongs to the same problem.
     dropping: Vec<u32>,
 }
 
-impl Diary {
+impl HealthLog {
     /// After this many ticks without an increase, the next one is a new problem.
     const REST: u32 = 50;
 
-    fn tell(&mut self, health: &GatewayHealth) {
+    fn log_changes(&mut self, health: &GatewayHealth) {
         let last = self.last.replace(Box::new(*health));
         self.quiet
             .resize(health.devices().len(), [Self::REST; Counter::ALL.len()]);

@@ -316,7 +316,12 @@ impl Builder<'_> {
                 raw.driver,
                 DRIVERS.join(", ")
             ),
-            OptionsError::Keys(e) => format!("{name:?} ({}): {}", raw.driver, one_line(&e)),
+            OptionsError::Keys(e) => format!(
+                "{name:?} ({}): {}; keys of every device: {}",
+                raw.driver,
+                one_line(&e),
+                RawDevice::KEYS.join(", ")
+            ),
         })?;
         if !(raw.max_silence_ms > 0.0 && raw.max_silence_ms <= 3.6e6) {
             return Err(format!(
@@ -590,11 +595,11 @@ impl fmt::Display for Plan {
                     if channel.kind == Kind::Joint {
                         write!(
                             f,
-                            " = {} * channel {} {:+} rad",
+                            " = {} * output {} of the device {:+} rad",
                             route.map.gain, route.output, route.map.offset
                         )?;
                     }
-                    writeln!(f, ", silent at most {} s", channel.max_silence)?;
+                    writeln!(f, ", stale after {} s", channel.max_silence)?;
                 }
             }
         }

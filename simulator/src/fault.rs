@@ -104,6 +104,14 @@ impl Window {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum FaultError {
+    /// The fault begins after the end of the run.
+    #[error("fault {text:?} begins after the end of the run ({seconds} s)")]
+    AfterEnd {
+        /// The fault as given.
+        text: String,
+        /// Duration of the run \[s\].
+        seconds: f64,
+    },
     /// The kind of fault is not known.
     #[error(
         "fault {text:?}: {kind:?} is not known; known are lost, silent, reboot, saturate, spike, \
@@ -154,6 +162,19 @@ const EXAMPLES: &str =
     "\"lost:0.01\", \"silent:l_arm_ft_sensor@3..4\", \"spike:l_arm_ft_sensor@6\"";
 
 impl Fault {
+    /// When it begins \[s\].
+    #[must_use]
+    pub fn begin(&self) -> f64 {
+        match self {
+            Self::Lost { window, .. }
+            | Self::Silent { window, .. }
+            | Self::Saturate { window, .. }
+            | Self::LateHalf { window, .. }
+            | Self::Push { window, .. } => window.from,
+            Self::Reboot { at, .. } | Self::Spike { at, .. } => *at,
+        }
+    }
+
     /// The board concerned.
     #[must_use]
     pub fn device(&self) -> Option<&str> {

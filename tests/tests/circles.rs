@@ -4,7 +4,8 @@
 //! A file depends on another if it uses a name that is defined there. Names are followed through
 //! imports, aliases, globs and re-exports to their definitions. A re-export (`pub use`) and the
 //! declaration of a module (`mod`) do not count as uses, so that a crate's root may list its parts.
-//! Unit tests are excluded. Names in macro arguments and methods are not detected.
+//! Unit tests are excluded. Names in macro arguments and methods are not detected: the methods of
+//! one type may be divided over its file and that file's children, as those of the pipeline are.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

@@ -361,6 +361,9 @@ fn typing_mistakes_end_with_2_and_say_what_was_meant() {
             .fails(2, &["no board or channel \"nose\"", "l_arm_ft_sensor"]);
     }
     place
+        .run(&["demo", "--seconds", "3", "--fault", "push:l_hand=20@4..5"])
+        .fails(2, &["push:l_hand=20@4..5", "after the end", "3 s"]);
+    place
         .run(&["demo", "--robot", "nobody"])
         .fails(2, &["there is no robot \"nobody\""]);
     assert!(
@@ -793,7 +796,7 @@ fn a_joint_that_is_neither_measured_nor_locked_is_told() {
     ];
     place.run(&args).fails_in(
         "estimator.toml",
-        &["cut.csv", "joint/l_wrist_yaw", "lock it in [locked]"],
+        &["cut.csv", "joint/l_wrist_yaw", "in [locked]"],
     );
     assert!(!place.exists("o.csv"));
     // The remedy in the message works.
@@ -1219,7 +1222,7 @@ fn faults_and_gaps_of_a_log_are_in_its_table_of_samples() {
         gap.len() == 1 && (3.0..3.1).contains(&gap[0]),
         "one reading after the lost half: {gap:?}"
     );
-    place
+    let told = place
         .run(&[
             "estimate",
             "--config",
@@ -1228,8 +1231,14 @@ fn faults_and_gaps_of_a_log_are_in_its_table_of_samples() {
             "samples.csv",
             "--out",
             "estimates.csv",
+            "--json",
         ])
-        .good();
+        .good()
+        .json();
+    let withheld = told["withheld_by_reason"].as_object().unwrap();
+    let sum: u64 = withheld.values().map(|count| count.as_u64().unwrap()).sum();
+    assert!(withheld["device_fault"].as_u64().unwrap() > 1000, "{told}");
+    assert_eq!(told["torques_withheld"], sum, "{told}");
     let text = place.read("estimates.csv");
     let mut rows = text.lines().map(|line| line.split(',').collect::<Vec<_>>());
     let header = rows.next().unwrap();
@@ -1507,7 +1516,7 @@ fn what_is_no_log_at_all_is_told_and_leaves_no_file() {
     let with_parameters = [&["estimate", "--config", "estimator.toml"], &parameters[..]].concat();
     place.run(&with_parameters).fails(
         2,
-        &["estimator.toml: parameters: p.toml can not be read: No such file"],
+        &["estimator.toml: parameters: p.toml cannot be read: No such file"],
     );
     place.write("p.toml", "schema = 1\nrobot = \"icub_left_arm\"\n");
     place

@@ -14,7 +14,7 @@ use proprio_dynamics::spatial::Wrench;
 use proprio_estimator::assessment::{Assessment, Assessor, Coverage};
 use proprio_estimator::config::{Config, ForceTorque, Presence};
 use proprio_estimator::export::parameters;
-use proprio_estimator::offline::{assess, estimate};
+use proprio_estimator::offline::estimate;
 use proprio_estimator::parameters::{Offset, Parameters, Provenance};
 use proprio_estimator::pipeline::{Estimate, Job, Pipeline};
 use proprio_estimator::setup::Setup;
@@ -266,7 +266,7 @@ impl Table {
 
 fn estimates(setup: Setup, log: &str) -> Table {
     let mut out = Vec::new();
-    estimate(setup, log.as_bytes(), &mut out).unwrap();
+    estimate(setup, log.as_bytes(), &mut out, None).unwrap();
     Table::new(&String::from_utf8(out).unwrap())
 }
 
@@ -650,7 +650,7 @@ fn a_run_that_learns_is_assessed_as_it_went() {
     let log = sessions.log("train");
     let assessed = |setup: Setup, log: &str| {
         let mut assessor = Assessor::new(&setup, log.as_bytes()).unwrap();
-        assess(setup, log.as_bytes(), std::io::sink(), &mut assessor).unwrap();
+        estimate(setup, log.as_bytes(), std::io::sink(), Some(&mut assessor)).unwrap();
         assessor.finish()
     };
     let learnt = assessed(learning(&sessions), &log);

@@ -183,7 +183,9 @@ fn what_was_learnt_survives_the_process() {
     estimator.end();
     let kept = fs::read_to_string(&state).expect("kept at the end");
     assert!(
-        estimator.log().contains("identification instants: learnt"),
+        estimator
+            .log()
+            .contains("observations of identification: learnt"),
         "{}",
         estimator.log()
     );

@@ -63,7 +63,7 @@ impl Leg {
     /// Estimates of a table: per instant, per joint, the torque.
     fn estimates(&self, table: &str) -> Estimates {
         let mut out = Vec::new();
-        estimate(self.setup(), table.as_bytes(), &mut out).expect("estimates");
+        estimate(self.setup(), table.as_bytes(), &mut out, None).expect("estimates");
         let text = String::from_utf8(out).expect("text");
         let mut lines = text.lines();
         let header: Vec<&str> = lines.next().expect("a header").split(',').collect();
@@ -436,7 +436,7 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
     recorder.write_samples(&channels, &received);
     let received = std::fs::read_to_string(received).expect("the samples");
     let mut out = Vec::new();
-    estimate(leg.setup(), received.as_bytes(), &mut out).expect("estimates");
+    estimate(leg.setup(), received.as_bytes(), &mut out, None).expect("estimates");
     let offline = rows(&String::from_utf8(out).expect("text"));
     let live = recorder.estimate_rows(&setup);
     let stamp = |t: &str| Nanos::parse_seconds(t);
@@ -510,7 +510,7 @@ type Pair = ((f64, f64), (f64, f64));
 fn swinging(setup: Setup, table: &str) -> Vec<[Option<(f64, f64)>; 4]> {
     let joints = ["r_hip_pitch", "r_hip_yaw", "r_knee", "r_ankle_pitch"];
     let mut out = Vec::new();
-    estimate(setup, table.as_bytes(), &mut out).expect("estimates");
+    estimate(setup, table.as_bytes(), &mut out, None).expect("estimates");
     let text = String::from_utf8(out).expect("text");
     let mut lines = text.lines().map(|line| line.split(',').collect::<Vec<_>>());
     let header = lines.next().expect("a header");

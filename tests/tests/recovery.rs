@@ -2,7 +2,7 @@
 //! again. The chain recovers while the simulator and the other process keep running. On the virtual
 //! bus; `vcan.rs` does the same on a kernel's bus.
 //!
-//! What an estimator loses while it is stopped, or can not use, is counted.
+//! What an estimator loses while it is stopped, or cannot use, is counted.
 //!
 //! `PROPRIO_KILLS=1000 cargo test -p proprio-tests --test recovery -- --nocapture` uses more
 //! instants. Start-up kills are drawn from the first `PROPRIO_STARTUP_MS` (default 15).

@@ -104,13 +104,14 @@ impl Processes {
                 .filter(|l| l.contains("ERROR") || l.starts_with("error"))
                 .collect();
             for line in lines.iter().rev().take(3).rev() {
+                let line = line.strip_prefix("error: ").unwrap_or(line);
                 text.push_str(&format!("\n  {name}: {line}"));
             }
         }
         if text.is_empty() {
             error
         } else {
-            error.context(format!("errors in the processes' logs:{text}\n"))
+            anyhow!("{error:#}; from the logs of the processes:{text}")
         }
     }
 }

@@ -312,7 +312,7 @@ impl Screen {
         let moves = elapsed >= self.still;
         if !self.terminal {
             if moves && !std::mem::replace(&mut self.has_told, true) {
-                say!("{elapsed:5.1} s  the robot begins to move");
+                print_line!("{elapsed:5.1} s  the robot begins to move");
             }
             let cells: Vec<_> = self
                 .joints
@@ -328,7 +328,7 @@ impl Screen {
                     })
                 })
                 .collect();
-            say!("{elapsed:5.1} s  {}", cells.join("  "));
+            print_line!("{elapsed:5.1} s  {}", cells.join("  "));
             return;
         }
         let mut text = String::new();
@@ -346,9 +346,9 @@ impl Screen {
         }
         self.bar.suspend(|| {
             if self.lines > 0 {
-                say_part!("\x1b[{}A", self.lines);
+                print_part!("\x1b[{}A", self.lines);
             }
-            say_part!("{text}");
+            print_part!("{text}");
             let _ = std::io::stdout().flush();
         });
         self.lines = self.joints.len();

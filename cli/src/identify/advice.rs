@@ -3,7 +3,7 @@
 use proprio_identification::{
     Both, Finding, FindingCode, LogOutcome, Outcome, Role, Severity, Verdict,
 };
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Whether the identified parameters should be used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -66,7 +66,7 @@ impl Advice {
             this.look_at_findings(outcome);
             return this;
         }
-        this.say_errors(outcome);
+        this.assess_errors(outcome);
         if outcome.verdict == Verdict::NoBetterThanCad {
             this.worsen(Grade::Care);
             let why = if findings(outcome).any(|(_, f)| f.code == FindingCode::NotCrossValidated) {
@@ -115,7 +115,7 @@ impl Advice {
             );
         }
         this.look_at_findings(outcome);
-        this.say_excitation(outcome);
+        this.assess_excitation(outcome);
         if this.grade != Grade::Reject {
             if !outcome.logs.iter().any(|log| log.role == Role::Validate) {
                 this.next.push(
@@ -125,8 +125,9 @@ impl Advice {
                 );
             }
             this.next.push(
-                "To use the result, add parameters = \"parameters.toml\" to estimator.toml; other \
-                 programs load identified.urdf."
+                "To use the result, copy parameters.toml beside estimator.toml and write parameters \
+                 = \"parameters.toml\" above the first [table] there; other programs load \
+                 identified.urdf."
                     .into(),
             );
         }
@@ -140,7 +141,7 @@ impl Advice {
     }
 
     /// Prediction errors: on the validation logs, if there are any.
-    fn say_errors(&mut self, outcome: &Outcome) {
+    fn assess_errors(&mut self, outcome: &Outcome) {
         let validated = outcome.logs.iter().any(|log| log.role == Role::Validate);
         let role = if validated {
             Role::Validate
@@ -173,7 +174,7 @@ impl Advice {
                 predicted(log),
                 percent(identified),
                 percent(cad),
-                if log.predicted.sensors.is_empty() {
+                if !log.joints.is_empty() {
                     "nothing was fitted to it"
                 } else {
                     "for both, only a constant offset of each F/T channel was fitted to it"
@@ -182,16 +183,33 @@ impl Advice {
             if identified > cad * (1.0 + NOTICEABLE) {
                 if validated {
                     self.worsen(Grade::Reject);
-                    self.why.push(
-                        "That is worse than the CAD: the parameters are not valid outside the \
-                         training motion."
-                            .into(),
-                    );
-                    self.next.push(format!(
-                        "Identify from richer motion: add {} to the training logs, or record \
-                         longer and faster motion.",
-                        log.file
-                    ));
+                    if log
+                        .findings
+                        .iter()
+                        .any(|f| f.code == FindingCode::Disturbance)
+                    {
+                        self.why.push(format!(
+                            "That is worse than the CAD, but {} contains undeclared contacts or \
+                             loads.",
+                            log.file
+                        ));
+                        self.next.push(format!(
+                            "Declare the contacts and loads of {}, or validate on a log without \
+                             them.",
+                            log.file
+                        ));
+                    } else {
+                        self.why.push(
+                            "That is worse than the CAD: the parameters are not valid outside the \
+                             training motion."
+                                .into(),
+                        );
+                        self.next.push(format!(
+                            "Identify from richer motion: add {} to the training logs, or record \
+                             longer and faster motion.",
+                            log.file
+                        ));
+                    }
                 } else {
                     self.worsen(Grade::Care);
                     self.why.push("That is worse than the CAD.".into());
@@ -232,12 +250,27 @@ impl Advice {
                     | FindingCode::EncoderOffset
                     | FindingCode::WrongUnits
                     | FindingCode::Scale
-                    | FindingCode::Unexplained
             )
         }) {
             if finding.severity >= Severity::Warning && said.insert(finding.text.as_str()) {
                 self.next.push(sentence(&finding.text));
             }
+        }
+        // The same checks for every log: once per channel.
+        let mut unexplained = BTreeMap::<&str, Vec<&str>>::new();
+        for (log, finding) in findings(outcome) {
+            if finding.code == FindingCode::Unexplained && finding.severity >= Severity::Warning {
+                let logs = unexplained.entry(&finding.subject).or_default();
+                logs.extend(log.map(|log| log.file.as_str()));
+            }
+        }
+        for (channel, logs) in unexplained {
+            self.next.push(format!(
+                "Check {channel}: much of its changes is unexplained{}{}; \"Findings\" names \
+                 possible causes.",
+                if logs.is_empty() { "" } else { " in " },
+                logs.join(", ")
+            ));
         }
         let total = refusals + warnings;
         let what = if total == 1 {
@@ -245,13 +278,16 @@ impl Advice {
         } else {
             &format!("{total} findings")
         };
-        self.next.push(format!(
-            "Read the {what} under \"Findings\" before you use the result."
-        ));
+        self.next
+            .push(if matches!(outcome.verdict, Verdict::Nothing(_)) {
+                "Correct what \"Findings\" names, then identify again.".into()
+            } else {
+                format!("Read the {what} under \"Findings\" before you use the result.")
+            });
     }
 
     /// What the motion did not excite.
-    fn say_excitation(&mut self, outcome: &Outcome) {
+    fn assess_excitation(&mut self, outcome: &Outcome) {
         if outcome.effective.is_finite() && outcome.rank > 0 {
             self.why.push(format!(
                 "Of {} identifiable combinations of inertial parameters the logs determine about \
@@ -297,12 +333,12 @@ pub(crate) fn findings(outcome: &Outcome) -> impl Iterator<Item = (Option<&LogOu
     outcome.findings.iter().map(|f| (None, f)).chain(of_logs)
 }
 
-/// What is compared with predictions in a log.
+/// What the relative prediction error of a log compares.
 fn predicted(log: &LogOutcome) -> &'static str {
-    match (log.joints.is_empty(), log.sensors.is_empty()) {
-        (false, true) => "joint torques",
-        (true, false) => "F/T readings",
-        _ => "joint torques and F/T readings",
+    if log.joints.is_empty() {
+        "F/T readings"
+    } else {
+        "joint torques"
     }
 }
 
@@ -396,7 +432,27 @@ mod tests {
             "{:?}",
             advice.next
         );
-        // Equal to the CAD is not accepted without a remark.
+        // Worse where something touched the robot says nothing about the parameters.
+        let training = |advice: &Advice| {
+            (advice.next.iter()).any(|n| n.contains("add walk_2.csv to the training logs"))
+        };
+        assert!(training(&advice));
+        outcome.logs[1].findings.push(Finding {
+            severity: Severity::Note,
+            code: FindingCode::Disturbance,
+            subject: String::new(),
+            text: "an undeclared contact".into(),
+        });
+        let advice = Advice::of(&outcome);
+        assert!(!training(&advice));
+        assert!(
+            advice.next[0].starts_with("Declare the contacts and loads of walk_2.csv"),
+            "{advice:?}"
+        );
+        outcome.logs[1].findings.clear();
+        // Equal to the CAD is not accepted without a remark, nor is a hundredth better or worse.
+        outcome.logs[1].predicted.relative_error.identified = 0.0645;
+        assert_eq!(Advice::of(&outcome).grade, Grade::Care);
         outcome.logs[1].predicted.relative_error.identified = 0.064;
         assert_eq!(Advice::of(&outcome).grade, Grade::Care);
     }
@@ -446,18 +502,23 @@ mod tests {
     #[test]
     fn an_unexplained_residual_lowers_the_grade() {
         let mut outcome = good();
-        outcome.logs[0].findings.push(Finding {
-            severity: Severity::Warning,
-            code: FindingCode::Unexplained,
-            subject: "wrench/r_leg_ft_sensor".into(),
-            text: "wrench/r_leg_ft_sensor: 20 % is left".into(),
-        });
+        for log in &mut outcome.logs {
+            log.findings.push(Finding {
+                severity: Severity::Warning,
+                code: FindingCode::Unexplained,
+                subject: "wrench/r_leg_ft_sensor".into(),
+                text: "wrench/r_leg_ft_sensor: 20 % is unexplained".into(),
+            });
+        }
         let advice = Advice::of(&outcome);
         assert_eq!(advice.grade, Grade::Care);
-        assert!(
-            advice.next.iter().any(|n| n.contains("20 % is left")),
-            "{advice:?}"
+        // Once, with both logs.
+        assert_eq!(
+            advice.next[0],
+            "Check wrench/r_leg_ft_sensor: much of its changes is unexplained in walk_1.csv, \
+             walk_2.csv; \"Findings\" names possible causes."
         );
+        assert!(advice.next[1].contains("2 findings"), "{advice:?}");
     }
 
     #[test]

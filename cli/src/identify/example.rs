@@ -164,6 +164,7 @@ fn log(file: &str, role: Role) -> LogOutcome {
             .collect(),
         spectra: vec![Spectrum {
             name: "joint/r_knee/torque".into(),
+            unit: "Nm",
             frequency: (0..200).map(|i| f64::from(i) * 0.25).collect(),
             cad_fitted: (0..200)
                 .map(|i| 0.1 / (1.0 + f64::from(i).powi(2)))
@@ -263,7 +264,6 @@ pub(crate) fn outcome() -> Outcome {
                 name: format!("wrench/r_leg_ft_sensor/{c}"),
                 unit: if c.starts_with('f') { "N" } else { "Nm" },
                 deviation: 0.2,
-                autocorrelation: 12.0,
                 autocorrelation_seconds: 0.12,
                 drift: 0.01,
             })
@@ -308,7 +308,7 @@ fn calibration() -> CalibrationOutcome {
     );
     CalibrationOutcome {
         sensor: "r_leg_ft_sensor".into(),
-        workbench: Calibration::default(),
+        configured: Calibration::default(),
         identified: Calibration::new(
             gain_from_force_first(&gain).unwrap(),
             per_kelvin,

@@ -50,6 +50,9 @@ fn verdict(advice: &Advice) -> String {
 }
 
 fn key_facts(outcome: &Outcome) -> String {
+    if matches!(outcome.verdict, Verdict::Nothing(_)) {
+        return String::new();
+    }
     let mut facts = Vec::new();
     for log in &outcome.logs {
         let error = &log.predicted.relative_error;
@@ -147,7 +150,8 @@ fn how_to_read() -> String {
             "CAD, offsets fitted: the same parameters, with offsets (which may drift) and friction \
              fitted to the log. Identified parameters must do better than this.",
             "Identified: parameters fitted to the training logs, with offsets and friction fitted \
-             to each log in the same way as for the CAD.",
+             to each log in the same way as for the CAD. (This holds for plots and residuals; the \
+             first table under \"The logs\" fits constant offsets only.)",
             "σ: standard deviation of the prediction, from the uncertainty of the parameters and \
              the noise of the measurement. About 95 % of the measurements should lie within ± 2σ.",
             "tau: the relative error of the CAD that fits the logs best; the prior's standard \

@@ -23,7 +23,7 @@
 //! | `effective_parameters` | combinations determined by the logs rather than the prior |
 //! | `condition`, `singular_values` | of the logs' information, scaled by the prior |
 //! | `weakest` | worst first: {`expression`, `relative`, `prior_share`}: below |
-//! | `not_separable` | combinations that the motion of the logs can not separate, in words |
+//! | `not_separable` | combinations that the motion of the logs cannot separate, in words |
 //! | `time_offsets` | {`channel`, `seconds` (> 0: late), `std`, `significant`}: not corrected |
 //! | `feasibility` | {`feasible`, `standard_deviations`, `links`, `text`}: below |
 //! | `findings` | {`log` or `null`, `severity`, `code`, `subject`, `text`}: below |

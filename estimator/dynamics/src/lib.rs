@@ -22,7 +22,9 @@
 //!
 //! Without F/T sensors, [`InverseDynamics::update`] takes the place of 2 and 4 (recursive
 //! Newton-Euler with known external wrenches), and [`EquationOfMotion::update`] has its matrices.
-//! [`calibration`] is the calibration of an F/T sensor.
+//! [`calibration`] is the calibration of an F/T sensor. [`EquationOfMotion`],
+//! [`regressor::MotorRegressor`] and [`regressor::EstimateRows`] are for other programs: nothing in
+//! this workspace but tests and benchmarks calls them.
 //!
 //! # Notation
 //! ```text

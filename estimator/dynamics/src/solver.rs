@@ -32,8 +32,12 @@
 //! to the contact.
 
 mod estimates;
+mod unknowns;
 
 pub use estimates::{Balance, Certainty, ContactEstimate, Disagreement, SideTorque, Sides};
+pub use unknowns::unknowns;
+
+use unknowns::contact_pose;
 
 use nalgebra::{Matrix6, Vector6};
 
@@ -43,7 +47,7 @@ use crate::kinematics::{check_external, check_readings};
 use crate::least_squares::{LeastSquares, noise_factor, scale_factor};
 use crate::model::Model;
 use crate::spatial::{Mat3, Motion, Pose, Vec3, Wrench, stack};
-use crate::structure::{ContactKind, ContactSet, ContactSpec, Route, SensorSet, Structure};
+use crate::structure::{ContactKind, ContactSet, Route, SensorSet, Structure};
 
 /// A value counts as determined if at most this fraction of it comes from the least-norm choice.
 const UNDETERMINED: f64 = 1e-9;
@@ -63,9 +67,12 @@ pub struct Solver {
     /// Per link: `F_j`, the net wrench of it and of the links below it in its sub-tree, minus the
     /// known wrenches.
     wrenches: Vec<Wrench>,
+    /// Per joint, `s_j`.
     axes: Vec<Motion>,
-    responses: Vec<Motion>,
-    gains: Vec<[Motion; 6]>,
+    /// Per joint, `h_j`.
+    torque_rows: Vec<Motion>,
+    /// Per contact, its rows of `K`, as the contact's wrench is reported.
+    contact_rows: Vec<[Motion; 6]>,
     sensor_poses: Vec<Pose>,
     // Scratch.
     least: LeastSquares,
@@ -95,8 +102,8 @@ impl Solver {
             active: None,
             wrenches: vec![Wrench::zero(); structure.link_count()],
             axes: vec![still; dofs],
-            responses: vec![still; dofs],
-            gains: vec![[still; 6]; contacts],
+            torque_rows: vec![still; dofs],
+            contact_rows: vec![[still; 6]; contacts],
             sensor_poses: vec![Pose::identity(); structure.sensors().len()],
             least: LeastSquares::with_capacity(6 * contacts),
             columns: Vec::with_capacity(6 * contacts),
@@ -215,7 +222,7 @@ impl Solver {
         let present = subtree.contacts.intersection(active);
         for contact in subtree.contacts.difference(active).iter() {
             self.contacts[contact] = ContactEstimate::ABSENT;
-            self.gains[contact] = [Motion::zero(); 6];
+            self.contact_rows[contact] = [Motion::zero(); 6];
         }
         let b = self.wrenches[subtree.top];
         let single = match (present.iter().next(), present.len()) {
@@ -238,8 +245,9 @@ impl Solver {
             };
             for axis in 0..3 {
                 let direction = x_bf.rotation.column(axis).into_owned();
-                self.gains[contact][axis] = Motion::translation(&direction);
-                self.gains[contact][axis + 3] = Motion::rotation(&direction, &x_bf.translation);
+                self.contact_rows[contact][axis] = Motion::translation(&direction);
+                self.contact_rows[contact][axis + 3] =
+                    Motion::rotation(&direction, &x_bf.translation);
             }
             self.balances[number] = Balance {
                 residual: Wrench::zero(),
@@ -321,7 +329,7 @@ impl Solver {
             };
             self.torque_certainty[dof] = certainty;
             self.axes[dof] = axis;
-            self.responses[dof] = response;
+            self.torque_rows[dof] = response;
         }
     }
 
@@ -432,7 +440,7 @@ impl Solver {
                     Certainty::Assumed
                 },
             };
-            self.gains[contact] = rows.map(|row| about_origin(&row, point));
+            self.contact_rows[contact] = rows.map(|row| about_origin(&row, point));
         }
 
         let weight = self.least.unexplained();
@@ -464,8 +472,8 @@ impl Solver {
         let Self {
             sensor_poses,
             axes,
-            responses,
-            gains,
+            torque_rows,
+            contact_rows,
             torque_deviation,
             contacts,
             ..
@@ -478,7 +486,7 @@ impl Solver {
                 continue;
             };
             let place = &structure.places[link];
-            let (s, h) = (axes[dof], responses[dof]);
+            let (s, h) = (axes[dof], torque_rows[dof]);
             let mut sum = 0.0;
             for sensor in structure.subtrees()[place.subtree].sensors.iter() {
                 let motion = if place.sensors_below.contains(sensor) {
@@ -492,7 +500,7 @@ impl Solver {
         }
         for subtree in structure.subtrees() {
             for contact in subtree.contacts.iter() {
-                let rows = &gains[contact];
+                let rows = &contact_rows[contact];
                 contacts[contact].deviation = rows.map(|row| {
                     subtree
                         .sensors
@@ -551,14 +559,14 @@ impl Solver {
 
     /// `s_j` and `h_j` of the last solution, in base coordinates: `tau_j = s_j . F_j - h_j . b`
     /// (see the top of this file).
-    pub fn torque_motions(&self, dof: usize) -> (&Motion, &Motion) {
-        (&self.axes[dof], &self.responses[dof])
+    pub fn torque_rows(&self, dof: usize) -> (&Motion, &Motion) {
+        (&self.axes[dof], &self.torque_rows[dof])
     }
 
     /// Rows `k` of the last solution in base coordinates, `x_i = k_i . b`, force first, as the
     /// contact's wrench is reported.
-    pub fn contact_motions(&self, contact: usize) -> &[Motion; 6] {
-        &self.gains[contact]
+    pub fn contact_rows(&self, contact: usize) -> &[Motion; 6] {
+        &self.contact_rows[contact]
     }
 
     /// Imbalance `b` of a sub-tree, in base coordinates: the net wrenches of its links minus its
@@ -633,35 +641,6 @@ impl Solver {
 fn variance(structure: &Structure, sensor: usize, x_bm: &Pose, motion: &Motion) -> f64 {
     let in_sensor = x_bm.twist_back(motion);
     in_sensor.dot(&structure.sensors()[sensor].covariance_times(&in_sensor))
-}
-
-fn contact_pose(spec: &ContactSpec, kinematics: &Kinematics) -> Pose {
-    *kinematics.pose(spec.frame.link) * spec.frame.pose
-}
-
-/// The columns [torque; force] about `point` of the unknowns of a contact, and their weights in the
-/// least norm: forces and torques at its position, along the axes of its frame.
-pub fn unknowns(
-    spec: &ContactSpec,
-    kinematics: &Kinematics,
-    point: &Vec3,
-    length: f64,
-) -> arrayvec::ArrayVec<(Vector6<f64>, f64), 6> {
-    let x_bf = contact_pose(spec, kinematics);
-    let arm = x_bf.point(&spec.position) - point;
-    let force = |direction: Vec3| (stack(&arm.cross(&direction), &direction), 1.0);
-    let torque = |direction: Vec3| (stack(&direction, &Vec3::zeros()), length);
-    let axis = |i: usize| x_bf.rotation.column(i).into_owned();
-    match spec.kind {
-        ContactKind::Wrench => (0..3)
-            .map(|i| force(axis(i)))
-            .chain((0..3).map(|i| torque(axis(i))))
-            .collect(),
-        ContactKind::Force => (0..3).map(|i| force(axis(i))).collect(),
-        ContactKind::ForceAlong(direction) => {
-            std::iter::once(force(x_bf.rotation * direction)).collect()
-        }
-    }
 }
 
 /// A row of motion coordinates about `point`, as a motion about the origin.

@@ -72,21 +72,7 @@ impl Dataset {
         robot: &Robot,
         name: &str,
         role: Role,
-        recording: Recording,
-    ) -> Result<Self, DatasetError> {
-        Self::with_settings(robot, name, role, recording, &Settings::default())
-    }
-
-    /// As [`Dataset::new`], with other settings such as the rate of observations.
-    ///
-    /// # Errors
-    /// As [`Dataset::new`].
-    pub fn with_settings(
-        robot: &Robot,
-        name: &str,
-        role: Role,
         mut recording: Recording,
-        settings: &Settings,
     ) -> Result<Self, DatasetError> {
         recording
             .declared
@@ -115,7 +101,7 @@ impl Dataset {
         }
         inspection::inspect(&mut recording, robot);
         let spacing = recording.spacing();
-        let mut found = recording.instants(robot, settings);
+        let mut found = recording.instants(robot, &Settings::default());
         readings::inspect(&recording, robot, &mut found);
         Ok(Self {
             name: name.to_owned(),
@@ -128,7 +114,7 @@ impl Dataset {
         })
     }
 
-    /// A log that can not be used at all, with the reason. It is still part of the outcome.
+    /// A log that cannot be used at all, with the reason. It is still part of the outcome.
     #[must_use]
     pub fn unreadable(name: &str, role: Role, reason: String) -> Self {
         Self {

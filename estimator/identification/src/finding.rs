@@ -81,9 +81,9 @@ pub enum FindingCode {
     WorseThanCad,
     /// The inertia of a rotor comes out negative.
     NegativeRotorInertia,
-    /// Rotor inertias were requested but can not be identified.
+    /// Rotor inertias were requested but cannot be identified.
     RotorsNotAvailable,
-    /// A calibration was requested but can not be identified.
+    /// A calibration was requested but cannot be identified.
     CalibrationNotAvailable,
     /// A change with temperature was requested, but none was recorded.
     NoTemperature,
@@ -91,7 +91,7 @@ pub enum FindingCode {
     CalibrationNotObservable,
     /// Gains of F/T sensors are identified, too.
     GainChosen,
-    /// A common gain error can not be separated from mass.
+    /// A common gain error cannot be separated from mass.
     GainMassNotSeparable,
     /// The inertia of the URDF is that of no body, or nearly none.
     InertiaRegularised,

@@ -28,7 +28,7 @@ pub enum IdentifyError {
     /// The recorded motion does not fit the robot's model.
     #[error("the logs do not fit the robot's model: {0}")]
     Dynamics(#[from] DynamicsError),
-    /// The MAP parameters can not be computed.
+    /// The MAP parameters cannot be computed.
     #[error("no parameters can be fitted to the logs: {0}")]
     Fit(#[from] PriorError),
 }

@@ -327,19 +327,6 @@ impl Online {
         ))
     }
 
-    /// Noise inflation of a component: the ratio of the variance of each channel [torque; force of
-    /// each sensor] to the configured one. Empty if the component does not exist.
-    pub fn inflation(&self, component: usize) -> Vec<f64> {
-        let of = self.components.get(component);
-        of.map_or(Vec::new(), |of| {
-            of.variances
-                .iter()
-                .zip(&of.least)
-                .map(|(v, least)| v / least)
-                .collect()
-        })
-    }
-
     /// The solution in use.
     pub fn solution(&self) -> &Solution {
         &self.solution
@@ -675,7 +662,7 @@ mod tests {
         let (model, sensors) = robot();
         let mut job = online(&model, &structure(&model, &sensors)).job.unwrap();
         let last_valid = job.solution.components[0].clone();
-        for (tau, text) in [(f64::NAN, Some("the weight tau is NaN")), (1.0, None)] {
+        for (tau, text) in [(f64::NAN, Some("the scale tau is NaN")), (1.0, None)] {
             job.parts[0].tau = tau;
             job.run();
             let reported: Vec<Option<String>> =

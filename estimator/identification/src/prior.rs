@@ -57,7 +57,7 @@
 //! Two assumptions on `tau` precede the data. It is at most 1, since CAD is worth at least one
 //! sample per parameter. And `ln tau ~ N(ln tau_0, s^2)`, worth `1 / (2 s^2)` parameters, where
 //! `tau_0` is the usual distance of a CAD model from its robot and `s = ln 1.5` the uncertainty of
-//! that ([`Prior::expecting`]). So data without information leave `tau` there, where D / gamma
+//! that ([`Prior::with_relative_std`]). So data without information leave `tau` there, where D / gamma
 //! would be 0 / 0. For a CAD of unknown quality `tau_0` is 1, the weakest assumption, and `s` is 1.
 //!
 //! # Speed
@@ -133,7 +133,7 @@ pub enum PriorError {
     #[error("link {0} is among the unknowns twice")]
     Twice(usize),
     /// A number is not finite, or a precision or weight not positive.
-    #[error("{what} is {value}, which can not be used for a fit")]
+    #[error("{what} is {value}, which cannot be used for a fit")]
     Number {
         /// The quantity.
         what: &'static str,

@@ -113,7 +113,7 @@ pub struct Robot {
     pub contacts: Vec<NamedContact>,
     /// The contacts that are present without any declaration.
     pub always: ContactSet,
-    /// The published contact that carries a fixed base, if any: it can not be declared absent.
+    /// The published contact that carries a fixed base, if any: it cannot be declared absent.
     pub support: Option<usize>,
     /// The channels that are read.
     pub channels: Vec<Channel>,
@@ -138,7 +138,7 @@ pub struct Robot {
     pub torque_side: TorqueSide,
 }
 
-/// Why a robot can not be constructed.
+/// Why a robot cannot be constructed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum RobotError {

@@ -120,7 +120,7 @@ pub(crate) fn refusal(code: FindingCode, text: String) -> Finding {
 }
 
 /// Refuses logs that repeat another one. Training twice on the same data would understate their
-/// noise, and training data can not validate the result.
+/// noise, and training data cannot validate the result.
 pub(crate) fn refuse_repeated(logs: &mut [TrainingLog]) {
     for number in 1..logs.len() {
         let (before, rest) = logs.split_at_mut(number);
@@ -160,7 +160,7 @@ pub(crate) fn refuse_repeated(logs: &mut [TrainingLog]) {
         let instead = match log.role {
             Role::Train => "it is used once",
             Role::Validate => {
-                "it was excluded, because training data can not validate the parameters; record \
+                "it was excluded, because training data cannot validate the parameters; record \
                  another motion"
             }
         };
@@ -323,7 +323,7 @@ fn too_few(
             format!("{} excluded: {}", l.instants, l.reason)
         })
     };
-    format!("only {count} instants can be used, so nothing is identified from this log: {why}")
+    format!("usable instants: {count}, so nothing is identified from this log: {why}")
 }
 
 pub(crate) fn finding(defect: &Defect) -> Finding {

@@ -328,7 +328,7 @@ proptest! {
             let size = 10_f64.powi(exponent) * 10_f64.powf(random.real(1.0));
             data.row_mut(row).iter_mut().for_each(|value| *value *= size);
         }
-        // Mostly not the parameters of a body, so that data can not be fitted exactly.
+        // Mostly not the parameters of a body, so that data cannot be fitted exactly.
         let mut wanted = DVector::from_fn(data.ncols(), |_, _| random.real(0.02));
         if exponent > 2 {
             // A target that no body attains at this weight would give a body closer to the boundary
@@ -718,7 +718,7 @@ fn infeasible_links_are_reported() {
     }
 
     // A chain of revolute joints, base parameters only. Mass can move to a neighbour, the hand's
-    // moment of inertia about its joint's axis can not.
+    // moment of inertia about its joint's axis cannot.
     let link = |name: &str| {
         format!(
             "<link name=\"{name}\"><inertial><origin xyz=\"0.02 0 0.1\"/><mass value=\"1\"/>\

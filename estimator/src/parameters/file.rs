@@ -3,7 +3,7 @@
 //! # The file
 //! `schema` is 1. `robot` is the `robot` of estimator.toml.
 //!
-//! `[provenance]`: `program` with its version, and `tau`, the weight of the prior if there was one.
+//! `[provenance]`: `program` with its version, and `tau`, the scale of the prior if there was one.
 //! Each `[[provenance.log]]` has the `file` of a log, and `start_ns` and `end_ns`, the first and
 //! last instant used, in that log's clock.
 //!

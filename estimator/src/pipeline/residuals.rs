@@ -13,11 +13,12 @@
 //! mean with [`TIME_CONSTANT`], which shows disturbances below the noise of one reading. `q` is
 //! converted to the normal deviate of equal probability. Above [`SIGNIFICANT`], an unknown external
 //! wrench acts on the sub-tree. Of the contacts that are possible there, the one that leaves the
-//! smallest deviate is taken as present, provided that this deviate is at most [`PLAUSIBLE`]. A
-//! detected contact is a force within [`CONTACT_RADIUS`] of the contact's `position_m`: without
-//! that bound, any six numbers could be a wrench at any contact. It stays present until `q` is
-//! plausible without it. If no contact explains the residual, all torques of the sub-tree are
-//! withheld, because the place where the wrench acts is unknown.
+//! smallest deviate is taken as present, provided that this deviate is at most [`PLAUSIBLE`]; the
+//! one detected before is given an advantage of [`PREVIOUS`]. A detected contact is a force within
+//! [`CONTACT_RADIUS`] of the contact's `position_m`: without that bound, any six numbers could be a
+//! wrench at any contact. It stays present until `q` is plausible without it. If no contact
+//! explains the residual, all torques of the sub-tree are withheld, because the place where the
+//! wrench acts is unknown.
 
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::spatial::{Vec3, Wrench};
@@ -31,6 +32,9 @@ use proprio_topics::Nanos;
 const SIGNIFICANT: f64 = 5.0;
 /// The deviate up to which a residual is plausible: 99 % of instants without an unknown wrench.
 const PLAUSIBLE: f64 = 2.326;
+/// Advantage of the contact that was detected before, a deviate: of two that fit about equally well
+/// it is preferred.
+const PREVIOUS: f64 = 1.0;
 /// Time constant of the mean imbalance.
 const TIME_CONSTANT: Nanos = Nanos::from_millis(50);
 /// Distance from a contact's position to the force of a detected contact, one standard deviation
@@ -243,9 +247,8 @@ impl SubtreeTest<'_> {
         let mut best = PLAUSIBLE;
         for contact in possible.iter() {
             let (left, _) = self.test(least, Some(contact));
-            // Of two contacts that fit about equally well, prefer the previous one.
             let left = if before == Some(contact) {
-                left - 1.0
+                left - PREVIOUS
             } else {
                 left
             };

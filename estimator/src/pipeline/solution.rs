@@ -198,7 +198,12 @@ impl Pipeline {
                 Certainty::Assumed if reason == Reason::None => reason = Reason::Undetermined,
                 _ => {}
             }
-            if !is_solved || !result.wrench.is_finite() {
+            let deviation: [f64; 6] = std::array::from_fn(|i| {
+                let motion = motion.get(i).copied().unwrap_or(0.0);
+                result.deviation[i].hypot(model[i]).hypot(motion)
+            });
+            let is_finite = result.wrench.is_finite() && deviation.iter().all(|x| x.is_finite());
+            if !is_solved || !is_finite {
                 (reason, cause) = (Reason::NotFinite, NO_CAUSE);
             }
             let known = is_solved && reason != Reason::NeverSeen;
@@ -210,14 +215,7 @@ impl Pipeline {
             *place = ContactWrench {
                 force: [fx, fy, fz],
                 torque: [tx, ty, tz],
-                standard_deviation: std::array::from_fn(|i| {
-                    if known {
-                        let motion = motion.get(i).copied().unwrap_or(0.0);
-                        result.deviation[i].hypot(model[i]).hypot(motion)
-                    } else {
-                        f64::NAN
-                    }
-                }),
+                standard_deviation: if known { deviation } else { [f64::NAN; 6] },
                 valid: u32::from(reason == Reason::None),
                 reason,
                 cause,

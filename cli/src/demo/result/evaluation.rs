@@ -128,8 +128,7 @@ impl<'a> Evaluation<'a> {
 
     /// The q-quantile of the latency \[us\].
     pub(super) fn latency(&self, q: f64) -> f64 {
-        let at = ((self.latency.len() as f64 - 1.0) * q).round().max(0.0) as usize;
-        self.latency.get(at).copied().unwrap_or(f64::NAN)
+        quantile(&self.latency, q)
     }
 
     /// The content of `summary.json`.
@@ -173,6 +172,12 @@ impl<'a> Evaluation<'a> {
             "simulator": watched.simulator,
         })
     }
+}
+
+/// The q-quantile of sorted numbers; NaN of nothing.
+fn quantile(sorted: &[f64], q: f64) -> f64 {
+    let at = ((sorted.len() as f64 - 1.0) * q).round().max(0.0) as usize;
+    sorted.get(at).copied().unwrap_or(f64::NAN)
 }
 
 /// The fraction of parameters whose last value is within two standard deviations of the truth.
@@ -243,5 +248,13 @@ mod tests {
             Course::ending(0.0, 1.0, 1.5),
         ];
         assert_eq!(within_2_sigma(&courses), Some(0.75));
+    }
+
+    #[test]
+    fn quantiles_are_those_of_sorted_numbers() {
+        let numbers: Vec<f64> = (0..=1000).map(f64::from).collect();
+        let found = [0.0, 0.5, 0.99, 0.999, 1.0].map(|q| quantile(&numbers, q));
+        assert_eq!(found, [0.0, 500.0, 990.0, 999.0, 1000.0]);
+        assert!(quantile(&[], 0.5).is_nan());
     }
 }

@@ -6,6 +6,7 @@ use crate::demo::experiment::{Experiment, Link};
 use crate::demo::watching::Watched;
 use crate::report::plot::{Axis, Ink, Plot, Series};
 use crate::report::{self, Cell, Table as ReportTable};
+use proprio_identification::robot::AXES;
 
 /// Names and units of a link's ten parameters.
 const PARAMETERS: [(&str, &str); 10] = [
@@ -123,11 +124,7 @@ pub(super) fn courses(
         let Some((_, truth)) = experiment.offsets.iter().find(|(n, _)| n == name) else {
             continue;
         };
-        for (i, (part, truth)) in ["fx", "fy", "fz", "tx", "ty", "tz"]
-            .into_iter()
-            .zip(truth)
-            .enumerate()
-        {
+        for (i, (part, truth)) in AXES.into_iter().zip(truth).enumerate() {
             let points = watched.learnt.iter().filter_map(|learnt| {
                 let offset = learnt.offsets.get(place)?;
                 let value = offset.force.iter().chain(&offset.torque).nth(i)?;

@@ -7,6 +7,11 @@ use crate::report::plot::{Ink, Plot};
 use crate::report::{self, Cell, Table};
 use proprio_topics::Nanos;
 
+/// Why the CAD may be better at joints whose torques rest on offsets.
+const TRUE_OFFSETS: &str = "The torques of the wrong URDF use the offsets of the F/T sensors that \
+                            the robot's configuration states. Identification does not: it has to \
+                            find them.";
+
 fn percent(share: f64) -> String {
     format!("{:.1} %", 100.0 * share)
 }
@@ -121,6 +126,7 @@ pub(super) fn page(evaluation: &Evaluation<'_>) -> String {
                 "Joint torques",
                 &[
                     rows.html(),
+                    report::paragraph(TRUE_OFFSETS),
                     report::paragraph(&setup.upstream_note()),
                     report::paragraph(
                         "Grey: torques are withheld, because an input is missing or their standard \
@@ -144,21 +150,22 @@ pub(super) fn print(evaluation: &Evaluation<'_>) {
         ..
     } = evaluation;
     for (name, value) in facts(evaluation) {
-        say!("{name:<17} {value}");
+        print_line!("{name:<17} {value}");
     }
-    say!(
+    print_line!(
         "RMS error of the torques against the simulator's truth, {since} [Nm]: identified, and \
          with the wrong URDF:"
     );
     let errors = judged.identified.iter().zip(&judged.cad);
     for (joint, (identified, cad)) in watched.joints.iter().zip(errors) {
-        say!("  {joint:<20} {identified:.4}  {cad:.4}");
+        print_line!("  {joint:<20} {identified:.4}  {cad:.4}");
     }
+    print_line!("{TRUE_OFFSETS}");
     let upstream = evaluation.experiment.setup.upstream_note();
     if !upstream.is_empty() {
-        say!("{upstream}");
+        print_line!("{upstream}");
     }
-    say!(
+    print_line!(
         "{}: report.html, estimates.csv, summary.json, cad.urdf, estimator.toml and the \
          processes' logs",
         evaluation.args.out.display()

@@ -26,16 +26,17 @@ pub(super) fn logs(outcome: &Outcome) -> Option<String> {
         return None;
     }
     let mut relative = Table::new(
-        "Relative prediction error, |predicted − measured| / |measured|. Friction and gains are \
-         those of the training logs; one constant offset of each F/T channel is fitted to the log \
-         (with drift: a linear drift, too)",
+        "Relative prediction error, |predicted − measured| / |measured|: of joint torques where \
+         any were measured, else of F/T readings. Friction and gains are those of the training \
+         logs; one constant offset of each F/T channel is fitted to the log. Last two columns: F/T \
+         readings, with a linear drift fitted, too",
         &[
             "log",
             "role",
             "identified",
             "CAD",
-            "identified, with drift",
-            "CAD, with drift",
+            "F/T, identified, with drift",
+            "F/T, CAD, with drift",
         ],
     );
     let mut fitted = Table::new(
@@ -421,7 +422,7 @@ fn spectrum(spectrum: &Spectrum, most: usize) -> Plot {
     Plot {
         title: spectrum.name.clone(),
         x: Axis::log("frequency [Hz]"),
-        y: Axis::log("[unit²/Hz]"),
+        y: Axis::log(&format!("[{}²/Hz]", spectrum.unit)),
         series: vec![
             Series::line(
                 "CAD, offsets fitted",
@@ -432,5 +433,48 @@ fn spectrum(spectrum: &Spectrum, most: usize) -> Plot {
         ],
         most,
         ..Plot::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::identify::example;
+
+    /// The error is predicted minus measured, with its band about zero.
+    #[test]
+    fn errors_are_predicted_minus_measured() {
+        let outcome = example::outcome();
+        let log = &outcome.logs[0];
+        let curve = Curve {
+            t: vec![0.0, 1.0],
+            measured: vec![3.0, 4.0],
+            cad_fitted: vec![5.0, 4.5],
+            identified: vec![2.5, 4.0],
+            sigma: vec![0.5, 0.25],
+            ..log.curves[0].clone()
+        };
+        let [values, errors] = pair(&curve, log, 100);
+        let svg = |plot: Plot| format!("{:?}", plot.series);
+        let expected = [
+            Series::band(
+                "± 2σ",
+                Ink::Identified,
+                vec![(0.0, -1.0, 1.0), (1.0, -0.5, 0.5)],
+            ),
+            Series::line(
+                "CAD, offsets fitted",
+                Ink::Fitted,
+                vec![(0.0, 2.0), (1.0, 0.5)],
+            ),
+            Series::line("identified", Ink::Identified, vec![(0.0, -0.5), (1.0, 0.0)]),
+        ];
+        assert_eq!(svg(errors), format!("{expected:?}"));
+        let band = Series::band(
+            "± 2σ",
+            Ink::Identified,
+            vec![(0.0, 1.5, 3.5), (1.0, 3.5, 4.5)],
+        );
+        assert!(svg(values).contains(&format!("{band:?}")));
     }
 }

@@ -191,7 +191,7 @@ impl<'a> EstimateRows<'a> {
 
     /// `[other below j] s_j - h_j`.
     fn torque_motion(&self, dof: usize, link: usize, other: usize) -> Motion {
-        let (axis, response) = self.solver.torque_motions(dof);
+        let (axis, response) = self.solver.torque_rows(dof);
         let axis = if self.structure.below(link).contains(&other) {
             *axis
         } else {
@@ -211,7 +211,7 @@ impl<'a> EstimateRows<'a> {
             count: self.structure.contacts().len(),
         })?;
         // The solver's order is force first.
-        let motions = self.solver.contact_motions(contact);
+        let motions = self.solver.contact_rows(contact);
         let motion = [3, 4, 5, 0, 1, 2]
             .get(component)
             .map(|&i: &usize| motions[i])

@@ -35,7 +35,7 @@ pub struct OffsetJump {
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum Defect {
-    /// The log can not be used.
+    /// The log cannot be used.
     Unreadable {
         /// The reason.
         reason: String,
@@ -189,6 +189,18 @@ pub enum Defect {
     },
 }
 
+/// The SI unit of a quantity of a channel.
+fn unit(axis: &str) -> &'static str {
+    match axis {
+        "fx" | "fy" | "fz" => "N",
+        "tx" | "ty" | "tz" | "torque" => "Nm",
+        "ax" | "ay" | "az" => "m/s^2",
+        "gx" | "gy" | "gz" => "rad/s",
+        "position" => "rad (or m)",
+        _ => "",
+    }
+}
+
 impl Defect {
     /// Its severity.
     #[must_use]
@@ -210,7 +222,7 @@ impl fmt::Display for Defect {
             Self::Unreadable { reason } => f.write_str(reason),
             Self::SkippedRows { rows, line, reason } => write!(
                 f,
-                "{rows} rows can not be read and were skipped; the first: line {line}: {reason}"
+                "{rows} rows cannot be read and were skipped; the first: line {line}: {reason}"
             ),
             Self::NeverSeen { channel } => write!(
                 f,
@@ -295,18 +307,18 @@ impl fmt::Display for Defect {
                 match units {
                     Units::Degrees => write!(
                         f,
-                        "{names}: positions up to {magnitude:.4} are far beyond the URDF's \
+                        "{names}: positions up to {magnitude:.4} rad are far beyond the URDF's \
                          limits, but within them as degrees: convert all joints to radians"
                     ),
                     Units::Counts => write!(
                         f,
-                        "{names}: a typical magnitude of {magnitude:.4} is more than 100 times \
+                        "{names}: a typical magnitude of {magnitude:.4} N is more than 100 times \
                          the robot's weight: the unit is counts or thousandths; convert it to N \
                          and Nm"
                     ),
                     Units::NotMetresPerSecondSquared => write!(
                         f,
-                        "{names}: a typical proper acceleration of {magnitude:.4} is not near \
+                        "{names}: a typical proper acceleration of {magnitude:.4} m/s^2 is not near \
                          9.8: convert it to m/s^2"
                     ),
                 }
@@ -343,9 +355,10 @@ impl fmt::Display for Defect {
                 size,
             } => write!(
                 f,
-                "{channel}: {axis} jumps by {size:.4} at {t} s and stays there, unexplained by \
+                "{channel}: {axis} jumps by {size:.4} {} at {t} s and stays there, unexplained by \
                  motion (a cable, internal stress, an undeclared contact): its offset is \
-                 re-initialised there"
+                 re-initialised there",
+                unit(axis)
             ),
             Self::Outliers {
                 channel,
@@ -355,8 +368,13 @@ impl fmt::Display for Defect {
                 t,
             } => write!(
                 f,
-                "{channel}: {samples} samples of {axis} are outliers, the largest by {largest:.4} \
-                 at {t} s: they are excluded"
+                "{channel}: {} of {axis}, the largest by {largest:.4} {} at {t} s: excluded",
+                if *samples == 1 {
+                    "1 outlier".to_owned()
+                } else {
+                    format!("{samples} outliers")
+                },
+                unit(axis)
             ),
             Self::WrongSign { sensor } => write!(
                 f,

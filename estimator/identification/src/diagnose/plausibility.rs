@@ -50,7 +50,7 @@ pub fn implausible(robot: &Robot, dataset: Dataset) -> Vec<Finding> {
             }),
     );
     log.findings.clear();
-    // Without motion, with motion in wrong units, or with too few instants, F/T readings can not be
+    // Without motion, with motion in wrong units, or with too few instants, F/T readings cannot be
     // tested.
     log.refused = !has_motion || log.instants.len() < MIN_FOLD;
     let wrench = [IdentificationInput::Wrench];

@@ -82,7 +82,8 @@ impl std::fmt::Display for Paused {
                  contact, or a change"
             ),
             Self::Fault(reason) => {
-                write!(f, "identification pauses: a channel is faulty ({reason:?})")
+                let reason = reason.word().replace('_', " ");
+                write!(f, "identification pauses: a channel is faulty ({reason})")
             }
         }
     }

@@ -31,7 +31,7 @@ const SCHEMA: &str = "3";
 /// Text for a difference of the sensors.
 const SENSORS: &str = "mounting or calibration of its force/torque sensors";
 
-/// Why a state can not be resumed.
+/// Why a state cannot be resumed.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum StateError {
@@ -117,7 +117,7 @@ fn model(parts: &[Part]) -> String {
 fn put(text: &mut String, word: &str, numbers: impl Iterator<Item = f64>) {
     text.push_str(word);
     for number in numbers {
-        // Writing to a string can not fail.
+        // Writing to a string cannot fail.
         let _ = write!(text, " {:016x}", number.to_bits());
     }
     text.push('\n');
@@ -132,7 +132,7 @@ fn numbers(line: Option<&str>, word: &str, count: usize) -> Result<Vec<f64>, Sta
         .split_whitespace()
         .map(|digits| u64::from_str_radix(digits, 16).ok().map(f64::from_bits))
         .collect();
-    let numbers = numbers.ok_or(StateError::Damaged("a number can not be read"))?;
+    let numbers = numbers.ok_or(StateError::Damaged("a number cannot be read"))?;
     if numbers.len() != count || numbers.iter().any(|x| !x.is_finite()) {
         return Err(DAMAGED);
     }

@@ -172,7 +172,7 @@ impl Posterior {
     pub fn fit(&self, tau: f64) -> Result<Fit, PriorError> {
         if !(tau.is_finite() && tau > 0.0) {
             return Err(PriorError::Number {
-                what: "the weight tau",
+                what: "the scale tau",
                 value: tau,
             });
         }
@@ -441,7 +441,7 @@ impl Posterior {
         let links = self.centres.len();
         let mut x = DVector::zeros(u.len());
         let mut bodies = Vec::with_capacity(links);
-        let mut divergences = Vec::with_capacity(links);
+        let mut divergence_sum = 0.0;
         let mut inverses = Vec::with_capacity(links);
         for (link, centre) in self.centres.iter().enumerate() {
             let l = &chart.stretch[link];
@@ -458,7 +458,7 @@ impl Posterior {
             if least < LEAST_EIGENVALUE {
                 relative += Matrix4::identity() * (2.0 * LEAST_EIGENVALUE - least);
             }
-            divergences.push(divergence(&relative));
+            divergence_sum += divergence(&relative);
             let difference = body_of(&(centre.root * relative * centre.root.transpose()));
             let body = centre.reference + difference;
             x.fixed_rows_mut::<10>(10 * link)
@@ -495,8 +495,7 @@ impl Posterior {
             x,
             bodies,
             tau,
-            divergence: divergences.iter().sum(),
-            divergences,
+            divergence: divergence_sum,
             effective,
             residual_square,
             iterations: descent.iterations,
@@ -528,8 +527,6 @@ pub struct Fit {
     pub tau: f64,
     /// The divergence from CAD, summed over all links.
     pub divergence: f64,
-    /// The same for each link.
-    pub divergences: Vec<f64>,
     /// `gamma`: the number of the links' parameters that the data determine, rather than the prior.
     pub effective: f64,
     /// `|R x - z|^2`.

@@ -157,7 +157,7 @@ pub(crate) fn calibrations(
         }
         outcomes.push(CalibrationOutcome {
             sensor: name,
-            workbench: robot.calibrations[sensor],
+            configured: robot.calibrations[sensor],
             identified: robot.calibrations[sensor].then(&e, &more, reference),
             kind,
             error: own
@@ -190,7 +190,6 @@ pub(crate) fn channels(
                 name,
                 unit,
                 deviation: noise.square[channel].sqrt(),
-                autocorrelation: noise.time[channel],
                 autocorrelation_seconds: noise.time[channel] * period,
                 drift: noise.drift[channel].sqrt(),
             }

@@ -179,9 +179,7 @@ pub struct ChannelNoise {
     pub unit: &'static str,
     /// Standard deviation of the residual at the rate of the rows [`unit`].
     pub deviation: f64,
-    /// Its integrated autocorrelation time, in samples of the rows (1: white).
-    pub autocorrelation: f64,
-    /// The same \[s\].
+    /// Its integrated autocorrelation time \[s\].
     pub autocorrelation_seconds: f64,
     /// Rate of the offset's random walk [`unit` per square root of second]; 0 for a constant.
     pub drift: f64,
@@ -208,7 +206,7 @@ pub struct CalibrationOutcome {
     pub sensor: String,
     /// The configured calibration, which [`ModelComparison::cad`] and
     /// [`ModelComparison::cad_fitted`] use.
-    pub workbench: Calibration,
+    pub configured: Calibration,
     /// The whole identified calibration. Offsets and [`ModelComparison::identified`] refer to
     /// readings corrected by it.
     pub identified: Calibration,
@@ -336,6 +334,8 @@ pub struct Curve {
 pub struct Spectrum {
     /// As in [`ChannelNoise::name`].
     pub name: String,
+    /// The unit of the channel.
+    pub unit: &'static str,
     /// Frequencies \[Hz\].
     pub frequency: Vec<f64>,
     /// Density with CAD fitted [`unit`^2/Hz].
@@ -424,7 +424,7 @@ pub struct Outcome {
     pub singular_values: Vec<f64>,
     /// The least excited of the identifiable directions, worst first.
     pub weakest: Vec<WeakDirection>,
-    /// Combinations whose terms the logs' motion can not separate, in words.
+    /// Combinations whose terms the logs' motion cannot separate, in words.
     pub not_separable: Vec<String>,
     /// Base parameters of the seen links.
     pub base_parameters: Vec<BaseParameterOutcome>,

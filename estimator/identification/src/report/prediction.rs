@@ -164,7 +164,7 @@ fn beside(cad: &Robot, unknowns: &Unknowns, in_force: &InForce) -> DVector<f64> 
         .calibrations
         .iter()
         .zip(&cad.calibrations)
-        .map(|(own, workbench)| own.after(workbench))
+        .map(|(own, configured)| own.after(configured))
         .collect();
     for (extra, value) in unknowns
         .extra

@@ -124,8 +124,10 @@ pub(crate) fn spectra(
     let (rate, welch) = (places.rate, Welch::new());
     let density = |values: &[f64]| welch.density(&places.spread(values), rate);
     (0..unknowns.channels())
-        .map(|channel| Spectrum {
-            name: channel_name(robot, unknowns, channel).0,
+        .map(|channel| (channel, channel_name(robot, unknowns, channel)))
+        .map(|(channel, (name, unit))| Spectrum {
+            name,
+            unit,
             frequency: (1..=SPECTRUM / 2)
                 .map(|k| k as f64 * rate / SPECTRUM as f64)
                 .collect(),

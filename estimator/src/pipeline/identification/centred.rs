@@ -78,10 +78,10 @@ pub(crate) const MOVING_WEIGHT: f64 = 0.01;
 pub(crate) struct SignalStatistics {
     /// Variance of its samples at rest; NaN before any instant at rest.
     pub(crate) rest_variance: f64,
-    /// Mean square of the derivative, over the last second.
+    /// Mean square of the derivative: an exponential mean ([`MOVING_WEIGHT`]).
     pub(crate) derivative_square: f64,
     /// Mean square of the difference between neighbouring windows, less the noise of that
-    /// difference, over the last second.
+    /// difference: an exponential mean.
     pub(crate) bias_square: [f64; WINDOWS.len() - 1],
 }
 
@@ -150,7 +150,7 @@ impl Centred {
     /// Copies the samples of a channel between two instants.
     ///
     /// # Errors
-    /// Why they can not be differentiated.
+    /// Why they cannot be differentiated.
     pub(crate) fn gather<const D: usize>(
         &mut self,
         history: &History<D>,
