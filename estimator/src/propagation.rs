@@ -23,7 +23,8 @@
 //!
 //! If a sensor's calibration is uncertain, too ([`proprio_dynamics::calibration`]), its columns act
 //! like additional columns of the offset that depend on the reading `r` and the board temperature
-//! `T`: `U_s` becomes `U_s - U_E r + U_k (T - T0)` at each instant ([`Propagation::set_calibration_point`]).
+//! `T`: `U_s` becomes `U_s - U_E r + U_k (T - T0)` at each instant
+//! ([`Propagation::set_calibration_point`]).
 //!
 //! Loops over rows use the widest vector instructions of the processor, in a portable build too.
 //!

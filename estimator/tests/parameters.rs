@@ -618,8 +618,8 @@ fn identified_parameters_replace_those_of_the_urdf() {
     );
     let text = setup.to_string();
     for expected in [
-        "identified by proprio 0.0.0 \"test\" from a log.csv (scale of the prior: tau = 0.58): 5 of \
-         9 links",
+        "identified by proprio 0.0.0 \"test\" from a log.csv (scale of the prior: tau = 0.58): 5 \
+         of 9 links",
         "the URDF's, taken as known to 20 %: chest",
         "offset of l_arm_ft_sensor",
     ] {

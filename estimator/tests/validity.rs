@@ -440,8 +440,8 @@ fn no_more_than_256_instants_wait() {
     assert_eq!(released, 300 - 255);
 }
 
-/// A torque may be as uncertain as a quarter of the drive's effort, if that is more than the gravity
-/// load of the links, and if the URDF's limit is credible.
+/// A torque may be as uncertain as a quarter of the drive's effort, if that is more than the
+/// gravity load of the links, and if the URDF's limit is credible.
 #[test]
 fn the_default_bound_of_a_torque_is_a_quarter_of_its_effort() {
     let setup = setup(|config| config.output.max_torque_std_nm = None);

@@ -810,6 +810,34 @@ fn no_file_is_large() {
     assert_eq!(too_large(&sources).len(), 1);
 }
 
+/// Lines of text and code over 100 columns. The outputs of candump are as it prints them.
+fn too_wide(sources: &[Source]) -> Vec<String> {
+    let texts = [".rs", ".md", ".toml", ".py", ".css", ".cpp", ".hpp", "/run"];
+    let ours = |s: &&Source| {
+        texts.iter().any(|end| s.path.ends_with(end)) && s.path != "gateway/tests/candump.rs"
+    };
+    let lines = (sources.iter().filter(ours))
+        .flat_map(|s| s.text.lines().zip(1..).map(move |(line, at)| (s, line, at)));
+    lines
+        .filter(|(_, line, _)| line.chars().count() > 100)
+        .map(|(source, _, at)| format!("{}:{at}", source.path))
+        .collect()
+}
+
+#[test]
+fn no_line_is_wider_than_100_columns() {
+    let mut sources = sources();
+    assert_eq!(too_wide(&sources), [""; 0]);
+    let line = format!("// {}\n", "é".repeat(97));
+    sources.push(Source::new(
+        "cli/src/wide.rs",
+        &format!("{line}{}", &line[1..]),
+    ));
+    assert_eq!(too_wide(&sources), [""; 0]);
+    sources.push(Source::new("cli/src/wider.rs", &format!("{line}/{line}")));
+    assert_eq!(too_wide(&sources), ["cli/src/wider.rs:2"]);
+}
+
 /// Words that mark unfinished work.
 fn unfinished(sources: &[Source]) -> Vec<String> {
     let words = [

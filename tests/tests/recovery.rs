@@ -187,8 +187,8 @@ fn samples_lost_while_the_estimator_is_stopped_are_counted() {
         .for_each(Process::end);
 }
 
-/// The test plays the gateway: a sample that comes after its estimate, a stamp that is repeated, and
-/// a number that is not finite. Health counts each by its kind.
+/// The test plays the gateway: a sample that comes after its estimate, a stamp that is repeated,
+/// and a number that is not finite. Health counts each by its kind.
 #[test]
 fn samples_that_can_not_be_used_are_counted_by_kind() {
     let rig = Rig::new();

@@ -778,8 +778,9 @@ fn interleaved_boards_keep_their_own_halves() {
     let config = rig.path("gateway.toml");
     let board = |address: u32, scale: u32| {
         format!(
-            "[[bus.device]]\ndriver = \"icub_strain\"\nname = \"ft{address}\"\naddress = {address}\n\
-             listen_only = true\nmax_silence_ms = 5000\npair_timeout_ms = 500.0\n\
+            "[[bus.device]]\ndriver = \"icub_strain\"\nname = \"ft{address}\"\n\
+             address = {address}\nlisten_only = true\n\
+             max_silence_ms = 5000\npair_timeout_ms = 500.0\n\
              full_scale_n = [{scale}, {scale}, {scale}]\n\
              full_scale_nm = [{scale}, {scale}, {scale}]\n"
         )

@@ -125,9 +125,9 @@ impl Advice {
                 );
             }
             this.next.push(
-                "To use the result, copy parameters.toml beside estimator.toml and write parameters \
-                 = \"parameters.toml\" above the first [table] there; other programs load \
-                 identified.urdf."
+                "To use the result, copy parameters.toml beside estimator.toml and write \
+                 parameters = \"parameters.toml\" above the first [table] there; other programs \
+                 load identified.urdf."
                     .into(),
             );
         }

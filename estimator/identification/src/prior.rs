@@ -57,8 +57,9 @@
 //! Two assumptions on `tau` precede the data. It is at most 1, since CAD is worth at least one
 //! sample per parameter. And `ln tau ~ N(ln tau_0, s^2)`, worth `1 / (2 s^2)` parameters, where
 //! `tau_0` is the usual distance of a CAD model from its robot and `s = ln 1.5` the uncertainty of
-//! that ([`Prior::with_relative_std`]). So data without information leave `tau` there, where D / gamma
-//! would be 0 / 0. For a CAD of unknown quality `tau_0` is 1, the weakest assumption, and `s` is 1.
+//! that ([`Prior::with_relative_std`]). So data without information leave `tau` there, where D /
+//! gamma would be 0 / 0. For a CAD of unknown quality `tau_0` is 1, the weakest assumption, and `s`
+//! is 1.
 //!
 //! # Speed
 //! One round needs one QR, `O(n^3)`, and about five Newton steps with a matrix product and a

@@ -318,8 +318,8 @@ impl fmt::Display for Defect {
                     ),
                     Units::NotMetresPerSecondSquared => write!(
                         f,
-                        "{names}: a typical proper acceleration of {magnitude:.4} m/s^2 is not near \
-                         9.8: convert it to m/s^2"
+                        "{names}: a typical proper acceleration of {magnitude:.4} m/s^2 is not \
+                         near 9.8: convert it to m/s^2"
                     ),
                 }
             }
