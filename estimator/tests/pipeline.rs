@@ -4,7 +4,7 @@
 
 use proprio_dynamics::calibration::Calibration;
 use proprio_dynamics::spatial::Wrench as Wrench6;
-use proprio_estimator::config::{Config, Direction, Presence, SensorFrame};
+use proprio_estimator::config::{Config, ContactKind, Direction, Presence, SensorFrame};
 use proprio_estimator::offline;
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
@@ -1455,6 +1455,34 @@ fn an_unexplained_residual_withholds_the_torques_of_its_sub_tree() {
             .iter()
             .sum();
         assert!((force.sqrt() - far[1]).abs() < 1e-6);
+    }
+}
+
+/// The hand is touched at a point by declaration. A torque that no force at that point explains
+/// makes the wrench of that contact invalid, too.
+#[test]
+fn an_unexplained_residual_withholds_the_wrench_of_a_known_contact() {
+    let touched = |config: &mut Config| {
+        config.identification.urdf_relative_std = 0.0;
+        let hand = config.contact.iter_mut().find(|c| c.name() == "hand");
+        let hand = hand.unwrap();
+        (hand.kind, hand.presence) = (ContactKind::Force, Presence::Always);
+    };
+    let found = estimates_with_added(touched, "icub_left_arm_mujoco.csv", |number| {
+        let torque = if (50..100).contains(&number) {
+            8.0
+        } else {
+            0.0
+        };
+        [0.0, 0.0, 0.0, 0.0, torque, torque]
+    });
+    for (number, reason) in found["contact/hand/reason"].iter().enumerate() {
+        let expected = if (50..100).contains(&number) {
+            "unexplained"
+        } else {
+            ""
+        };
+        assert_eq!(reason, expected, "{number}");
     }
 }
 
