@@ -192,12 +192,7 @@ impl Pipeline {
             propagation,
             motion: Box::new(motion.expect("the base is a link of the model")),
             residuals: ResidualMonitor::new(&setup.robot.structure),
-            position: setup
-                .robot
-                .locked
-                .iter()
-                .map(|q| if q.is_nan() { 0.0 } else { *q })
-                .collect(),
+            position: setup.robot.position_without_samples(),
             velocity: vec![0.0; dofs],
             acceleration: vec![0.0; dofs],
             encoder_offset_std: encoder_offset_std(&setup.state.model),
@@ -339,11 +334,10 @@ impl Pipeline {
     fn place_base(&mut self, active: &ContactSet) -> FrameMotion {
         let (link, motion, fault) = self.setup.robot.base_motion(active);
         self.base_fault = fault;
-        if link != self.kinematics.base()
-            && self
-                .kinematics
-                .set_base(&self.setup.state.model, link)
-                .is_err()
+        if self
+            .kinematics
+            .set_base(&self.setup.state.model, link)
+            .is_err()
         {
             self.base_fault = Reason::NotFinite;
         }

@@ -5,7 +5,7 @@
 //! end of a line may not be the end of a row (a quoted cell can contain one), and where rows have
 //! no stamps and are counted instead.
 
-use crate::setup::nearest;
+use crate::setup::similar_name;
 use proprio_identification::dataset::DatasetError;
 use proprio_identification::dataset::recording::SkippedRows;
 use proprio_identification::robot::Channel;
@@ -336,15 +336,11 @@ pub fn check_columns(
         channels.any(|channel| column(channel.kind, &channel.name) == **name)
     };
     let others = columns.iter().map(String::as_str).filter(|c| !of_robot(c));
-    let near = nearest(&missing[0], others);
+    let hint = similar_name(&missing[0], others).unwrap_or_default();
     Err(MissingChannels {
         robot: robot.name.clone(),
         missing,
-        hint: if near.contains("did you mean") {
-            near
-        } else {
-            String::new()
-        },
+        hint,
     })
 }
 

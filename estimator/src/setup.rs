@@ -580,21 +580,32 @@ fn no_joint(model: &Model, name: &str) -> String {
 
 /// A suggestion for a misspelt name: the most similar one, or some of the names that exist.
 pub fn nearest<'a>(name: &str, names: impl Iterator<Item = &'a str>) -> String {
+    let names = by_distance(name, names);
+    similar(name, &names).unwrap_or_else(|| {
+        let some: Vec<_> = names.iter().take(8).map(|(_, n)| *n).collect();
+        format!(
+            "; the names are {}{}",
+            some.join(", "),
+            if names.len() > 8 { ", ..." } else { "" }
+        )
+    })
+}
+
+/// The most similar name as a suggestion; none if none is similar.
+pub(crate) fn similar_name<'a>(name: &str, names: impl Iterator<Item = &'a str>) -> Option<String> {
+    similar(name, &by_distance(name, names))
+}
+
+/// Names with their distance from `name`, the nearest first.
+fn by_distance<'a>(name: &str, names: impl Iterator<Item = &'a str>) -> Vec<(usize, &'a str)> {
     let mut names: Vec<_> = names
         .map(|n| (strsim::damerau_levenshtein(name, n), n))
         .collect();
     names.sort_unstable();
-    match names.first() {
-        Some((distance, near)) if *distance <= name.len() / 2 => {
-            format!("; did you mean {near:?}?")
-        }
-        _ => {
-            let some: Vec<_> = names.iter().take(8).map(|(_, n)| *n).collect();
-            format!(
-                "; the names are {}{}",
-                some.join(", "),
-                if names.len() > 8 { ", ..." } else { "" }
-            )
-        }
-    }
+    names
+}
+
+fn similar(name: &str, by_distance: &[(usize, &str)]) -> Option<String> {
+    let (distance, near) = by_distance.first()?;
+    (*distance <= name.len() / 2).then(|| format!("; did you mean {near:?}?"))
 }

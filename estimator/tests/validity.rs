@@ -27,8 +27,8 @@ fn setup(change: impl FnOnce(&mut Config)) -> Setup {
     Setup::new(&config).unwrap()
 }
 
-/// What channel `number` reads while nothing moves, with so much added to the F/T sensor.
-fn reading(setup: &Setup, number: usize, noise: [f64; 6]) -> Reading {
+/// What channel `number` reads while nothing moves.
+fn reading(setup: &Setup, number: usize) -> Reading {
     match setup.robot.channels[number].kind {
         Kind::Joint => Reading::Joint(JointState {
             position: 0.3,
@@ -37,8 +37,8 @@ fn reading(setup: &Setup, number: usize, noise: [f64; 6]) -> Reading {
             ..JointState::ABSENT
         }),
         Kind::Wrench => Reading::Wrench(Wrench {
-            force: [5.0 + noise[0], -4.0 + noise[1], 12.0 + noise[2]],
-            torque: [0.2 + noise[3], -0.3 + noise[4], 0.1 + noise[5]],
+            force: [5.0, -4.0, 12.0],
+            torque: [0.2, -0.3, 0.1],
         }),
         Kind::Imu => Reading::Imu(Imu {
             proper_acceleration: [0.0, 0.0, 9.80665],
@@ -49,20 +49,21 @@ fn reading(setup: &Setup, number: usize, noise: [f64; 6]) -> Reading {
     }
 }
 
-/// The estimates of so many instants; `quality` of each channel at each instant.
+/// The estimates of so many instants; `change` has the instant, the channel and what the channel
+/// reads, and returns the quality.
 fn estimates(
     setup: &Setup,
     count: usize,
-    noise: impl Fn(usize) -> [f64; 6],
-    quality: impl Fn(usize, usize) -> Quality,
+    change: impl Fn(usize, usize, &mut Reading) -> Quality,
 ) -> Vec<Estimate> {
     let mut pipeline = Pipeline::new(setup.clone());
     let mut estimates = Vec::new();
     for instant in 0..count {
         let t = Nanos(PERIOD * i64::try_from(instant).unwrap());
         for channel in 0..setup.robot.channels.len() {
-            let reading = reading(setup, channel, noise(instant));
-            pipeline.push(channel, t, &reading, quality(channel, instant));
+            let mut reading = reading(setup, channel);
+            let quality = change(instant, channel, &mut reading);
+            pipeline.push(channel, t, &reading, quality);
             while let Some(estimate) = pipeline.poll() {
                 estimates.push(estimate.clone());
             }
@@ -73,6 +74,32 @@ fn estimates(
         estimates.push(estimate.clone());
     }
     estimates
+}
+
+/// Values and standard deviations of all torques, and of the valid wrench at the hand.
+fn stated(setup: &Setup, estimate: &Estimate) -> (Vec<f64>, Vec<f64>) {
+    let joints = estimate.torques.joints().iter();
+    let hand = &estimate.contacts.contacts()[setup.robot.contact("hand").unwrap()];
+    assert_eq!(hand.valid, 1, "{:?}", hand.reason);
+    let (mut values, mut deviations): (Vec<f64>, Vec<f64>) = joints
+        .map(|joint| (joint.torque, joint.standard_deviation))
+        .unzip();
+    values.extend(hand.force.iter().chain(&hand.torque));
+    deviations.extend(hand.standard_deviation);
+    (values, deviations)
+}
+
+/// What is stated of the last of so many estimates, the readings of each channel changed.
+fn stated_last(
+    setup: &Setup,
+    count: usize,
+    change: impl Fn(usize, &mut Reading),
+) -> (Vec<f64>, Vec<f64>) {
+    let found = estimates(setup, count, |_, channel, reading| {
+        change(channel, reading);
+        Quality::GOOD
+    });
+    stated(setup, found.last().unwrap())
 }
 
 /// Normal deviates: sums of twelve uniform numbers of a linear congruence.
@@ -99,38 +126,37 @@ fn torques_and_contact_wrenches_scatter_as_stated() {
     let (force, torque) = NOISE;
     let sigma = [force, torque].concat();
     let deviates = normals(count);
-    let stated = setup(|_| {});
+    let nominal = setup(|_| {});
     let doubled = setup(|config| {
         for ft in &mut config.force_torque {
             (ft.noise_n, ft.noise_nm) = (force.map(|x| 2.0 * x), torque.map(|x| 2.0 * x));
         }
     });
-    let noise = |i: usize| std::array::from_fn(|k| sigma[k] * deviates[i][k]);
-    let good = |_: usize, _: usize| Quality::GOOD;
-    let found = estimates(&stated, count, noise, good);
-    let more = estimates(&doubled, 50, noise, good);
-    assert_eq!(found.len(), count);
-    let hand = stated.robot.contact("hand").unwrap();
-    let numbers = |estimate: &Estimate| -> (Vec<f64>, Vec<f64>) {
-        let contact = &estimate.contacts.contacts()[hand];
-        assert_eq!(contact.valid, 1, "{:?}", contact.reason);
-        let joints = estimate.torques.joints().iter();
-        let (mut values, mut deviations): (Vec<f64>, Vec<f64>) = joints
-            .map(|joint| (joint.torque, joint.standard_deviation))
-            .unzip();
-        values.extend(contact.force.iter().chain(&contact.torque));
-        deviations.extend(contact.standard_deviation);
-        (values, deviations)
+    let noise = |instant: usize, _: usize, reading: &mut Reading| {
+        if let Reading::Wrench(wrench) = reading {
+            let values = wrench.force.iter_mut().chain(&mut wrench.torque);
+            for ((value, sigma), deviate) in values.zip(&sigma).zip(&deviates[instant]) {
+                *value += sigma * deviate;
+            }
+        }
+        Quality::GOOD
     };
-    let all: Vec<(Vec<f64>, Vec<f64>)> = found.iter().skip(20).map(numbers).collect();
-    let (_, once) = numbers(&found[40]);
-    let (_, twice) = numbers(&more[40]);
+    let found = estimates(&nominal, count, noise);
+    let more = estimates(&doubled, 50, noise);
+    assert_eq!(found.len(), count);
+    let all: Vec<_> = found
+        .iter()
+        .skip(20)
+        .map(|e| stated(&nominal, e).0)
+        .collect();
+    let (_, once) = stated(&nominal, &found[40]);
+    let (_, twice) = stated(&doubled, &more[40]);
     let mut compared = 0;
     for k in 0..once.len() {
-        let mean = all.iter().map(|(values, _)| values[k]).sum::<f64>() / all.len() as f64;
+        let mean = all.iter().map(|values| values[k]).sum::<f64>() / all.len() as f64;
         let square = all
             .iter()
-            .map(|(values, _)| (values[k] - mean).powi(2))
+            .map(|values| (values[k] - mean).powi(2))
             .sum::<f64>();
         let scatter = (square / all.len() as f64).sqrt();
         let expected = ((twice[k].powi(2) - once[k].powi(2)) / 3.0).sqrt();
@@ -156,14 +182,14 @@ fn a_frozen_sensor_gives_no_valid_torque() {
         .robot
         .channel(Kind::Wrench, "l_arm_ft_sensor")
         .unwrap();
-    let frozen = |channel: usize, instant: usize| {
+    let frozen = |instant: usize, channel: usize, _: &mut Reading| {
         if channel == sensor && instant >= 30 {
             Quality::FROZEN
         } else {
             Quality::GOOD
         }
     };
-    let found = estimates(&setup, 60, |_| [0.0; 6], frozen);
+    let found = estimates(&setup, 60, frozen);
     let valid = |i: usize| {
         found[i]
             .torques
@@ -192,8 +218,10 @@ fn what_two_unknown_contacts_leave_open_is_undetermined() {
         second.presence = Presence::Always;
         config.contact.push(second);
     });
-    let good = |_: usize, _: usize| Quality::GOOD;
-    let of = |setup: &Setup| estimates(setup, 40, |_| [0.0; 6], good).pop().unwrap();
+    let of = |setup: &Setup| {
+        let found = estimates(setup, 40, |_, _, _| Quality::GOOD);
+        found.last().unwrap().clone()
+    };
     let (one, two) = (of(&one), of(&two));
     assert!(one.torques.joints().iter().all(|joint| joint.valid == 1));
     let open = |reason: Reason, valid: u32| reason == Reason::Undetermined && valid == 0;
@@ -225,12 +253,7 @@ fn an_estimate_waits_as_long_as_configured() {
             if channel == silent && k >= 100 {
                 continue;
             }
-            pipeline.push(
-                channel,
-                t,
-                &reading(&setup, channel, [0.0; 6]),
-                Quality::GOOD,
-            );
+            pipeline.push(channel, t, &reading(&setup, channel), Quality::GOOD);
             while let Some(estimate) = pipeline.poll() {
                 if estimate.t > Nanos(100 * step) {
                     delays.push((t - estimate.t).0);
@@ -247,36 +270,6 @@ fn an_estimate_waits_as_long_as_configured() {
     );
 }
 
-/// Values and standard deviations of all torques, and of the wrench at the hand.
-fn stated(setup: &Setup, estimate: &Estimate) -> (Vec<f64>, Vec<f64>) {
-    let joints = estimate.torques.joints().iter();
-    let hand = &estimate.contacts.contacts()[setup.robot.contact("hand").unwrap()];
-    let (mut values, mut deviations): (Vec<f64>, Vec<f64>) = joints
-        .map(|joint| (joint.torque, joint.standard_deviation))
-        .unzip();
-    values.extend(hand.force.iter().chain(&hand.torque));
-    deviations.extend(hand.standard_deviation);
-    (values, deviations)
-}
-
-/// The last of so many estimates, the readings of each channel changed.
-fn changed(setup: &Setup, count: usize, change: impl Fn(usize, &mut Reading)) -> Estimate {
-    let mut pipeline = Pipeline::new(setup.clone());
-    let mut last = None;
-    for instant in 0..count {
-        let t = Nanos(PERIOD * i64::try_from(instant).unwrap());
-        for channel in 0..setup.robot.channels.len() {
-            let mut reading = reading(setup, channel, [0.0; 6]);
-            change(channel, &mut reading);
-            pipeline.push(channel, t, &reading, Quality::GOOD);
-        }
-        while let Some(estimate) = pipeline.poll() {
-            last = Some(estimate.clone());
-        }
-    }
-    last.unwrap()
-}
-
 /// With known bodies and a sensor without noise, what is uncertain is each encoder's offset (0.005
 /// rad) and the base's proper acceleration (0.1 m/s^2 along each axis). So the variance is the sum
 /// of the squares of what such errors change, one by one.
@@ -287,7 +280,7 @@ fn errors_of_positions_and_of_gravity_are_propagated() {
             (ft.noise_n, ft.noise_nm) = ([1e-6; 3], [1e-6; 3]);
         }
     });
-    let (usual, deviations) = stated(&setup, &changed(&setup, 3, |_, _| ()));
+    let (usual, deviations) = stated_last(&setup, 3, |_, _| ());
     let mut variances = vec![0.0; usual.len()];
     let mut add = |values: Vec<f64>, step: f64, sigma: f64| {
         for ((sum, value), usual) in variances.iter_mut().zip(values).zip(&usual) {
@@ -297,7 +290,7 @@ fn errors_of_positions_and_of_gravity_are_propagated() {
     for number in 0..setup.robot.channels.len() {
         for axis in 0..3 {
             let step = 1e-4;
-            let estimate = changed(&setup, 3, |channel, reading| match reading {
+            let (values, _) = stated_last(&setup, 3, |channel, reading| match reading {
                 Reading::Joint(joint) if channel == number && axis == 0 => joint.position += step,
                 Reading::Imu(imu) if channel == number => imu.proper_acceleration[axis] += step,
                 _ => {}
@@ -307,7 +300,7 @@ fn errors_of_positions_and_of_gravity_are_propagated() {
                 Kind::Imu => 0.1,
                 _ => continue,
             };
-            add(stated(&setup, &estimate).0, step, sigma);
+            add(values, step, sigma);
         }
     }
     for (number, (variance, stated)) in variances.iter().zip(&deviations).enumerate() {
@@ -329,7 +322,7 @@ fn errors_of_positions_and_of_gravity_are_propagated() {
 fn the_uncertainty_of_bodies_is_part_of_every_deviation() {
     let deviations = |relative: f64| {
         let setup = setup(|config| config.identification.urdf_relative_std = relative);
-        stated(&setup, &changed(&setup, 3, |_, _| ())).1
+        stated_last(&setup, 3, |_, _| ()).1
     };
     let (none, once, twice) = (deviations(0.0), deviations(0.1), deviations(0.2));
     let mut compared = 0;
@@ -349,18 +342,17 @@ fn the_uncertainty_of_bodies_is_part_of_every_deviation() {
 fn a_differentiated_angular_acceleration_is_uncertain() {
     let setup = setup(|_| {});
     let [exact, noisy] = [false, true].map(|is_differentiated| {
-        let estimate = changed(&setup, 60, |_, reading| match reading {
-            Reading::Imu(imu) if is_differentiated => imu.angular_acceleration = [f64::NAN; 3],
-            _ => {}
+        let found = estimates(&setup, 60, |_, _, reading| {
+            if let Reading::Imu(imu) = reading
+                && is_differentiated
+            {
+                imu.angular_acceleration = [f64::NAN; 3];
+            }
+            Quality::GOOD
         });
-        assert!(
-            estimate
-                .torques
-                .joints()
-                .iter()
-                .all(|joint| joint.valid == 1)
-        );
-        stated(&setup, &estimate).1
+        let last = found.last().unwrap();
+        assert!(last.torques.joints().iter().all(|joint| joint.valid == 1));
+        stated(&setup, last).1
     });
     let larger = exact.iter().zip(&noisy).filter(|(a, b)| b > a).count();
     assert!(larger > exact.len() / 2, "{larger} of {}", exact.len());
@@ -384,12 +376,7 @@ fn what_comes_too_late_is_counted() {
     for instant in 0..60 {
         let t = Nanos(PERIOD * instant);
         for channel in (0..setup.robot.channels.len()).filter(|c| *c != silent || instant < 20) {
-            pipeline.push(
-                channel,
-                t,
-                &reading(&setup, channel, [0.0; 6]),
-                Quality::GOOD,
-            );
+            pipeline.push(channel, t, &reading(&setup, channel), Quality::GOOD);
         }
         while let Some(estimate) = pipeline.poll() {
             released = estimate.t;
@@ -403,12 +390,7 @@ fn what_comes_too_late_is_counted() {
     // Taken, because it is later than the released instant, but that instant would have used it.
     let taken = pipeline.counts().taken;
     let soon = released + Nanos(wait.0 / 4);
-    pipeline.push(
-        silent,
-        soon,
-        &reading(&setup, silent, [0.0; 6]),
-        Quality::GOOD,
-    );
+    pipeline.push(silent, soon, &reading(&setup, silent), Quality::GOOD);
     let counts = pipeline.counts();
     assert_eq!((counts.taken - taken, counts.late), (1, 2));
 }
@@ -426,12 +408,7 @@ fn no_more_than_256_instants_wait() {
     for instant in 0..300 {
         let t = Nanos(500_000 * instant);
         for channel in (0..setup.robot.channels.len()).filter(|channel| *channel != silent) {
-            pipeline.push(
-                channel,
-                t,
-                &reading(&setup, channel, [0.0; 6]),
-                Quality::GOOD,
-            );
+            pipeline.push(channel, t, &reading(&setup, channel), Quality::GOOD);
         }
         while pipeline.poll().is_some() {
             released += 1;

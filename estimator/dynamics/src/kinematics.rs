@@ -153,18 +153,26 @@ impl Kinematics {
             ],
             net: vec![Wrench::zero(); count],
         };
-        kinematics.set_base(model, base)?;
+        kinematics.root_at(model, base)?;
         Ok(kinematics)
     }
 
-    /// Changes the base, and expresses the computed poses and wrenches in its coordinates. Does not
-    /// allocate.
+    /// Changes the base, and expresses the computed poses and wrenches in its coordinates. Where the
+    /// base is this link already, nothing is changed. Does not allocate.
     ///
     /// # Errors
     /// There is no such link, or the size of the model differs from that at construction. Nothing
     /// is changed in that case.
     pub fn set_base(&mut self, model: &Model, base: usize) -> Result<(), DynamicsError> {
         self.check_model(model)?;
+        if base == self.base {
+            return Ok(());
+        }
+        self.root_at(model, base)
+    }
+
+    /// Orders the pass to begin at `base`.
+    fn root_at(&mut self, model: &Model, base: usize) -> Result<(), DynamicsError> {
         let Some(x_ba) = self.links.get(base).map(|link| link.pose.inverse()) else {
             return Err(DynamicsError::NoLink(base));
         };

@@ -26,7 +26,6 @@ use defects::{Defect, OffsetJump};
 use observation::Observation;
 use proprio_topics::Nanos;
 use recording::Recording;
-use resampling::Settings;
 
 /// The use of a log.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -101,7 +100,7 @@ impl Dataset {
         }
         inspection::inspect(&mut recording, robot);
         let spacing = recording.spacing();
-        let mut found = recording.instants(robot, &Settings::default());
+        let mut found = recording.instants(robot);
         readings::inspect(&recording, robot, &mut found);
         Ok(Self {
             name: name.to_owned(),

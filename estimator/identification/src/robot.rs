@@ -151,6 +151,13 @@ pub enum RobotError {
 }
 
 impl Robot {
+    /// Per degree of freedom, its position before any sample of it: where it is locked, else 0.
+    #[must_use]
+    pub fn position_without_samples(&self) -> Vec<f64> {
+        let position = |q: &f64| if q.is_nan() { 0.0 } else { *q };
+        self.locked.iter().map(position).collect()
+    }
+
     /// The contacts that are present: those that always are, changed by the declarations, of which
     /// `declared` returns a contact's last one. The support of the base cannot be absent.
     #[must_use]

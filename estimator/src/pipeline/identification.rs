@@ -208,12 +208,7 @@ impl OnlineIdentification {
         }
         let dofs = setup.robot.model.dof_count();
         let held = Motion {
-            position: setup
-                .robot
-                .locked
-                .iter()
-                .map(|q| if q.is_nan() { 0.0 } else { *q })
-                .collect(),
+            position: setup.robot.position_without_samples(),
             velocity: vec![0.0; dofs],
             acceleration: vec![0.0; dofs],
             imu: FrameMotion::standing(&Vec3::zeros()),
@@ -418,11 +413,10 @@ impl OnlineIdentification {
         if let BaseMotion::Imu(pose) = &setup.robot.base {
             base = FrameMotion::of_link_from_imu(&self.held.imu, pose);
         }
-        if base_link != self.kinematics.base()
-            && self
-                .kinematics
-                .set_base(&setup.robot.model, base_link)
-                .is_err()
+        if self
+            .kinematics
+            .set_base(&setup.robot.model, base_link)
+            .is_err()
         {
             return;
         }

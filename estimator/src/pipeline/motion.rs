@@ -141,9 +141,7 @@ impl MotionErrors {
         ));
         if self.valid_for != key {
             self.is_known.fill(false);
-            if self.kinematics.base() != point.base_link {
-                self.kinematics.set_base(point.model, point.base_link)?;
-            }
+            self.kinematics.set_base(point.model, point.base_link)?;
             self.valid_for = key;
         }
         for column in 0..self.is_known.len() {

@@ -250,7 +250,9 @@ pub(super) fn parse_line(line: &[u8]) -> Result<ParsedLine, LineError> {
         3 | 8 => parse_id(id),
         _ => Err(LineError::Identifier { digits }),
     };
-    match after {
+    // A stamp that is not absolute counts from the start in a log, and from the line before on a
+    // screen.
+    let (frame, direction, relative) = match after {
         [b'#', data @ ..] if columns.is_none() => {
             let (mut frame, used) = parse_log_frame(identifier()?, data)?;
             let direction = match data.get(used..).unwrap_or(&[]).trim_ascii_start() {
@@ -260,49 +262,31 @@ pub(super) fn parse_line(line: &[u8]) -> Result<ParsedLine, LineError> {
                 _ => return Err(LineError::Trailing),
             };
             frame.whole |= direction.is_some();
-            let stamp = stamp.map(|s| {
-                (
-                    s.t,
-                    if s.absolute {
-                        StampForm::Absolute
-                    } else {
-                        StampForm::Origin
-                    },
-                )
-            });
-            Ok(ParsedLine::Record(Parsed {
-                stamp,
-                interface,
-                direction,
-                frame: frame.frame,
-                whole: frame.whole,
-            }))
+            (frame, direction, StampForm::Origin)
         }
         [b' ', ..] | [b'[', ..] => {
             let (direction, flags) = columns.map_or((None, (false, false)), |(d, f)| (Some(d), f));
             let frame = parse_screen_frame(identifier()?, after.trim_ascii_start(), flags)?;
-            let stamp = stamp.map(|s| {
-                (
-                    s.t,
-                    if s.absolute {
-                        StampForm::Absolute
-                    } else {
-                        StampForm::Relative
-                    },
-                )
-            });
-            Ok(ParsedLine::Record(Parsed {
-                stamp,
-                interface,
-                direction,
-                frame: frame.frame,
-                whole: frame.whole,
-            }))
+            (frame, direction, StampForm::Relative)
         }
-        _ if digits == 0 && rest.is_empty() => Err(LineError::NoFrame),
-        _ if digits != 3 && digits != 8 => Err(LineError::Identifier { digits }),
-        _ => Err(LineError::Separator),
-    }
+        _ if digits == 0 && rest.is_empty() => return Err(LineError::NoFrame),
+        _ if digits != 3 && digits != 8 => return Err(LineError::Identifier { digits }),
+        _ => return Err(LineError::Separator),
+    };
+    let form = |absolute: bool| {
+        if absolute {
+            StampForm::Absolute
+        } else {
+            relative
+        }
+    };
+    Ok(ParsedLine::Record(Parsed {
+        stamp: stamp.map(|s| (s.t, form(s.absolute))),
+        interface,
+        direction,
+        frame: frame.frame,
+        whole: frame.whole,
+    }))
 }
 
 /// The columns of `candump -x`: the direction, and whether bit rate switch and error state are set.

@@ -180,10 +180,9 @@ fn predict(robot: &Robot, observations: &Observations) -> Vec<Vec<[f64; 6]>> {
                 velocity: &observation.velocity,
                 acceleration: &observation.acceleration,
             };
-            let based = observation.base_link == kinematics.base()
-                || kinematics
-                    .set_base(&robot.model, observation.base_link)
-                    .is_ok();
+            let based = kinematics
+                .set_base(&robot.model, observation.base_link)
+                .is_ok();
             let done = observation.has_motion(&robot.channels)
                 && based
                 && kinematics

@@ -32,24 +32,12 @@ use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{ContactSet, FrameMotion, SensorSet};
 use proprio_topics::{Nanos, Reason};
 
-/// Settings of the resampling.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Settings {
-    /// Greatest number of observations per second \[Hz\]. A slower log keeps its own stamps.
-    pub rate: f64,
-    /// Length of signal required on either side of a time for its derivatives, unless the window is
-    /// narrower \[ns\].
-    pub edge: Nanos,
-}
+/// Greatest number of observations per second \[Hz\]. A slower log keeps its own stamps.
+const RATE: f64 = 100.0;
 
-impl Default for Settings {
-    fn default() -> Self {
-        Self {
-            rate: 100.0,
-            edge: Nanos::from_millis(300),
-        }
-    }
-}
+/// Length of signal required on either side of a time for its derivatives, unless the window is
+/// narrower \[ns\].
+const EDGE: Nanos = Nanos::from_millis(300);
 
 /// The observations of a log, and its defects.
 #[derive(Debug, Clone)]
@@ -65,17 +53,13 @@ pub struct Observations {
 
 impl Recording {
     /// The observations of the log.
-    pub(crate) fn instants(&self, robot: &Robot, settings: &Settings) -> Observations {
-        let period = Nanos::from_seconds(1.0 / settings.rate);
+    pub(crate) fn instants(&self, robot: &Robot) -> Observations {
+        let period = Nanos::from_seconds(1.0 / RATE);
         let times = self.times(robot, period);
-        let joints = self.joint_columns(&times, period, settings);
-        let imu = self.imu_column(robot, &times, period, settings);
+        let joints = self.joint_columns(&times, period);
+        let imu = self.imu_column(robot, &times, period);
         let dofs = robot.model.dof_count();
-        let at_rest: Vec<f64> = robot
-            .locked
-            .iter()
-            .map(|q| if q.is_nan() { 0.0 } else { *q })
-            .collect();
+        let at_rest = robot.position_without_samples();
         let at = |number: usize| {
             let t = times[number];
             let active = self.active(robot, t);
@@ -187,14 +171,9 @@ impl Recording {
     }
 
     /// Per degree of freedom and time. Joints are independent, so they run on all cores.
-    fn joint_columns(
-        &self,
-        times: &[Nanos],
-        period: Nanos,
-        settings: &Settings,
-    ) -> Vec<Vec<JointAt>> {
+    fn joint_columns(&self, times: &[Nanos], period: Nanos) -> Vec<Vec<JointAt>> {
         parallel::map(self.joints.len(), |dof| {
-            self.joints[dof].at_all(times, period, settings.edge.seconds())
+            self.joints[dof].at_all(times, period, EDGE.seconds())
         })
     }
 
@@ -203,7 +182,6 @@ impl Recording {
         robot: &Robot,
         times: &[Nanos],
         period: Nanos,
-        settings: &Settings,
     ) -> Vec<(FrameMotion, Reason)> {
         let BaseMotion::Imu(pose) = &robot.base else {
             return Vec::new();
@@ -229,7 +207,7 @@ impl Recording {
                 angular_velocity.mean(t, period)?;
                 let (mut omega, mut alpha) = ([0.0; 3], [0.0; 3]);
                 for (axis, smoother) in smoothers.iter().enumerate() {
-                    let both = smoother.at(t, 0..=1, settings.edge.seconds(), &mut scratch);
+                    let both = smoother.at(t, 0..=1, EDGE.seconds(), &mut scratch);
                     [omega[axis], alpha[axis], _] = both.ok_or(Reason::Starting)?;
                 }
                 (omega, alpha)

@@ -370,10 +370,8 @@ impl<'a> MeasurementModel<'a> {
         rows: &mut Rows,
     ) -> Result<(), DynamicsError> {
         rows.clear();
-        if observation.base_link != self.kinematics.base() {
-            self.kinematics
-                .set_base(&self.robot.model, observation.base_link)?;
-        }
+        self.kinematics
+            .set_base(&self.robot.model, observation.base_link)?;
         let state = JointState {
             position: &observation.position,
             velocity: &observation.velocity,
