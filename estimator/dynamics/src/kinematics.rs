@@ -157,7 +157,7 @@ impl Kinematics {
         Ok(kinematics)
     }
 
-    /// Changes the base, and expresses the computed poses and wrenches in its coordinates. Where the
+    /// Changes the base, and expresses the computed poses and wrenches in its coordinates. If the
     /// base is this link already, nothing is changed. Does not allocate.
     ///
     /// # Errors
