@@ -4,7 +4,7 @@
 use crate::{Frame, Id};
 use alloc::boxed::Box;
 use arrayvec::ArrayVec;
-use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, StampKind};
+use proprio_topics::{Counter, DeviceState, Kind, Nanos, Quality, Reading, Refusal, StampKind};
 
 /// A set of identifiers whose frames a device receives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -67,12 +67,31 @@ pub struct Output {
     pub acquired: Nanos,
     /// The source of that stamp.
     pub stamp: StampKind,
+    /// The device's own time of the reading \[ns\], in its own clock; [`Nanos::MIN`] if it reports
+    /// none.
+    pub device_time: Nanos,
     /// The device's own sequence number if it has one (then `quality` has DEVICE_COUNTER).
     pub device_counter: u32,
     /// Its quality flags.
     pub quality: Quality,
     /// The measured quantities.
     pub reading: Reading,
+}
+
+impl Output {
+    /// A reading that `frame` holds, of a device without time and sequence number.
+    #[must_use]
+    pub const fn new(output: u8, frame: &Frame, quality: Quality, reading: Reading) -> Self {
+        Self {
+            output,
+            acquired: frame.t,
+            stamp: frame.stamp,
+            device_time: Nanos::MIN,
+            device_counter: 0,
+            quality,
+            reading,
+        }
+    }
 }
 
 /// A fault in the frames of a device. It is counted and never stops the gateway.
@@ -134,113 +153,57 @@ pub struct Transmit {
 
 /// The state of a device's bring-up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[repr(u32)]
 pub enum State {
     /// The host keeps silent, as boards require after power-on.
-    Waiting = 0,
+    Waiting,
     /// The host asks for the board's configuration.
-    Asking = 1,
+    Asking,
     /// The board was started; no reading received yet.
-    Starting = 2,
+    Starting,
     /// Readings arrive.
-    Streaming = 3,
+    Streaming,
     /// No reading for longer than the maximum silence; the board is started again.
-    Silent = 4,
-    /// Not usable: see the refusal.
-    Refused(Refusal) = 5,
+    Silent,
+    /// Not usable.
+    Refused(Refusal),
     /// The board was stopped.
-    Stopped = 6,
+    Stopped,
 }
 
 impl State {
-    /// Its number in `DeviceHealth::state`.
+    /// The state as readers of `DeviceHealth` see it.
     #[must_use]
-    pub const fn code(self) -> u32 {
+    pub const fn published(self) -> DeviceState {
         match self {
-            Self::Waiting => 0,
-            Self::Asking => 1,
-            Self::Starting => 2,
-            Self::Streaming => 3,
-            Self::Silent => 4,
-            Self::Refused(_) => 5,
-            Self::Stopped => 6,
+            Self::Waiting => DeviceState::Waiting,
+            Self::Asking => DeviceState::Asking,
+            Self::Starting => DeviceState::Starting,
+            Self::Streaming => DeviceState::Streaming,
+            Self::Silent => DeviceState::Silent,
+            Self::Refused(_) => DeviceState::Refused,
+            Self::Stopped => DeviceState::Stopped,
         }
     }
 
-    /// The name of state number `code` of `DeviceHealth`.
+    /// Why the device is not usable, if it is not.
     #[must_use]
-    pub const fn word(code: u32) -> &'static str {
-        match code {
-            0 => "waiting",
-            1 => "asking",
-            2 => "starting",
-            3 => "streaming",
-            4 => "silent",
-            5 => "refused",
-            6 => "stopped",
-            _ => "unknown",
-        }
-    }
-}
-
-/// Why a device is not usable.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Refusal {
-    /// It did not report its full scales in time, and the configuration has none.
-    NoFullScale,
-    /// It reports a full scale of zero for this channel.
-    ZeroFullScale {
-        /// The channel, 0 to 5.
-        channel: u8,
-    },
-    /// It reports a different configuration than before: its readings since then cannot be trusted.
-    Changed,
-}
-
-impl Refusal {
-    /// Its number in `DeviceHealth::refusal`.
-    #[must_use]
-    pub const fn code(self) -> u32 {
+    pub const fn refusal(self) -> Option<Refusal> {
         match self {
-            Self::NoFullScale => 1,
-            Self::ZeroFullScale { channel } => 0x100 | channel as u32,
-            Self::Changed => 2,
-        }
-    }
-
-    /// The refusal with number `code`.
-    #[must_use]
-    #[allow(clippy::cast_possible_truncation)]
-    pub const fn from_code(code: u32) -> Option<Self> {
-        match code {
-            1 => Some(Self::NoFullScale),
-            2 => Some(Self::Changed),
-            0x100..=0x1FF => Some(Self::ZeroFullScale {
-                channel: (code & 0xFF) as u8,
-            }),
+            Self::Refused(refusal) => Some(refusal),
             _ => None,
         }
     }
 }
 
-impl core::fmt::Display for Refusal {
-    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        match self {
-            Self::NoFullScale => f.write_str(
-                "it did not report its full scales; check its power, cable and address, or set \
-                 full_scale_n and full_scale_nm",
-            ),
-            Self::ZeroFullScale { channel } => write!(
-                f,
-                "it reports a full scale of zero for channel {channel}; its memory needs repair, \
-                 or set full_scale_n and full_scale_nm"
-            ),
-            Self::Changed => f.write_str(
-                "it reports a different configuration than before; check the board, then restart \
-                 the gateway",
-            ),
-        }
-    }
+/// Why a frame was not sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum NotSent {
+    /// Its deadline passed before the interface took it.
+    Deadline,
+    /// The link was lost, or is not up.
+    LinkLost,
+    /// The link cannot carry it or does not send at all, or the system refused it.
+    Refused,
 }
 
 /// Whether the host commands a device or only listens.
@@ -345,6 +308,12 @@ pub trait Device: Send {
     /// Events that only the passing of time shows (a silence, a start) are added to `out`, also in
     /// [`Mode::Listen`].
     fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit>;
+
+    /// What became of `frame`, which [`Device::poll_transmit`] gave: when the interface took it
+    /// \[ns\], or why it did not.
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        let _ = (frame, outcome);
+    }
 
     /// When to call [`Device::poll_transmit`] again even if no frame comes \[ns\].
     fn next_wake(&self) -> Option<Nanos>;

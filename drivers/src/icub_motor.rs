@@ -38,8 +38,8 @@
 use crate::icub::bringup::{Bringup, NoInquiry};
 use crate::icub::{self, class};
 use crate::{
-    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Spec, SpecError, State,
-    Transmit, device,
+    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Output, Spec, SpecError,
+    State, Transmit,
 };
 use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
@@ -217,7 +217,7 @@ impl Motor {
             current: f64::from(icub::i16_le(data, 0)) * AMPERE_PER_LSB,
             ..JointState::ABSENT
         });
-        out.push(output(frame, quality, reading), frame.id);
+        out.push(Output::new(0, frame, quality, reading), frame.id);
     }
 
     fn status(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
@@ -227,25 +227,12 @@ impl Motor {
             mode: u32::from(mode),
             encoder: u32::from(encoder),
             faults: icub::u32_le(data, 4),
-            reserved: 0,
         };
         self.status = quality_of(&actuator);
         out.push(
-            output(frame, self.status, Reading::Actuator(actuator)),
+            Output::new(0, frame, self.status, Reading::Actuator(actuator)),
             frame.id,
         );
-    }
-}
-
-/// The reading of a single frame.
-fn output(frame: &Frame, quality: Quality, reading: Reading) -> device::Output {
-    device::Output {
-        output: 0,
-        acquired: frame.t,
-        stamp: frame.stamp,
-        device_counter: 0,
-        quality,
-        reading,
     }
 }
 
@@ -390,7 +377,6 @@ impl Board for MotorBoard {
                         mode: 6,
                         encoder: 0,
                         faults: 0,
-                        reserved: 0,
                     };
                     if quality.contains(Quality::DEVICE_FAULT) {
                         actuator.faults = fault::ENCODER;
@@ -420,9 +406,7 @@ impl Board for MotorBoard {
                 Ok(())
             }
             Reading::Actuator(actuator) => self.send_status(actuator, out),
-            Reading::Wrench(_) | Reading::Imu(_) | Reading::Gauges(_) | Reading::Temperature(_) => {
-                Err(EncodeError::Kind)
-            }
+            _ => Err(EncodeError::Kind),
         }
     }
 }

@@ -37,8 +37,8 @@
 use crate::icub::bringup::{Bringup, NoInquiry};
 use crate::icub::{self, class, command};
 use crate::{
-    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Outputs, Spec, SpecError,
-    State, Transmit, device,
+    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Output, Outputs, Spec,
+    SpecError, State, Transmit,
 };
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
@@ -311,14 +311,7 @@ impl Device for Pos {
                 position,
                 ..JointState::ABSENT
             });
-            let output = device::Output {
-                output,
-                acquired: frame.t,
-                stamp: frame.stamp,
-                device_counter: 0,
-                quality,
-                reading,
-            };
+            let output = Output::new(output, frame, quality, reading);
             out.push(output, frame.id);
         }
     }

@@ -56,9 +56,9 @@
 //! ```
 //!
 //! [`Quality::saturation`]: proprio_topics::Quality::saturation
-//! [`Refusal::NoFullScale`]: crate::Refusal::NoFullScale
-//! [`Refusal::ZeroFullScale`]: crate::Refusal::ZeroFullScale
-//! [`Refusal::Changed`]: crate::Refusal::Changed
+//! [`Refusal::NoFullScale`]: proprio_topics::Refusal::NoFullScale
+//! [`Refusal::ZeroFullScale`]: proprio_topics::Refusal::ZeroFullScale
+//! [`Refusal::Changed`]: proprio_topics::Refusal::Changed
 
 mod board;
 mod device;

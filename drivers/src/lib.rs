@@ -30,7 +30,7 @@ pub mod icub_strain;
 mod registry;
 
 pub use device::{
-    Board, Claim, Decoded, Device, EncodeError, Fault, Frames, Mode, Output, Outputs, Refusal,
+    Board, Claim, Decoded, Device, EncodeError, Fault, Frames, Mode, NotSent, Output, Outputs,
     Spec, SpecError, State, Transmit,
 };
 pub use frame::{Format, Frame, Id};

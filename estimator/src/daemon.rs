@@ -327,9 +327,11 @@ impl DataPlane {
             // other programs.
             let Some(channel) = channel else { continue };
             let (t, quality) = (sample.header.acquired, sample.header.quality);
-            self.first_look
-                .see(now, channel, t, &sample.reading, quality);
-            self.pipeline.push(channel, t, &sample.reading, quality);
+            let Some(reading) = sample.reading() else {
+                continue;
+            };
+            self.first_look.see(now, channel, t, &reading, quality);
+            self.pipeline.push(channel, t, &reading, quality);
             while let Some(estimate) = self.pipeline.poll() {
                 let now = monotonic();
                 let sent = self.torques.send(&estimate.torques, now).is_ok()
@@ -370,10 +372,9 @@ impl DataPlane {
                 let entry = u32::try_from(number)
                     .ok()
                     .and_then(|n| description.find(Role::Channel, n));
+                let robot = &self.pipeline.setup().robot;
                 self.map
-                    .push(entry.and_then(|e| {
-                        self.pipeline.setup().robot.channel(e.kind, e.name.as_str())
-                    }));
+                    .push(entry.and_then(|e| robot.channel(e.kind.get()?, e.name.as_str())));
             }
             self.map_epoch = description.header.epoch;
             let missing = (0..self.pipeline.setup().robot.channels.len())

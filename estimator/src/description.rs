@@ -196,27 +196,27 @@ impl Setup {
         let name = |text: &str| Name::new(text).unwrap_or(Name::EMPTY);
         let channels = self.robot.channels.iter().map(|c| Entry {
             name: name(&c.name),
-            kind: c.kind,
+            kind: c.kind.in_memory(),
             max_silence: self.robot.max_silence,
             ..Entry::NONE
         });
         let joints = self.robot.joint_names().map(|j| Entry {
             name: name(j),
-            role: Role::Joint,
+            role: Role::Joint.in_memory(),
             ..Entry::NONE
         });
         let contacts = self.robot.contacts.iter().map(|c| Entry {
             name: name(&c.name),
             frame: name(&c.frame),
-            role: Role::Contact,
-            kind: Kind::Wrench,
+            role: Role::Contact.in_memory(),
+            kind: Kind::Wrench.in_memory(),
             ..Entry::NONE
         });
         let subtrees = self.robot.subtree_names().map(|top| Entry {
             name: name(top),
             frame: name(top),
-            role: Role::SubTree,
-            kind: Kind::Wrench,
+            role: Role::SubTree.in_memory(),
+            kind: Kind::Wrench.in_memory(),
             ..Entry::NONE
         });
         let numbered = channels

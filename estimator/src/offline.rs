@@ -249,7 +249,7 @@ impl<W: Write> Table<W> {
             reason(
                 &mut self.text,
                 &self.channels,
-                contact.reason,
+                contact.reason.get().unwrap_or_default(),
                 contact.cause,
             );
             flag(&mut self.text, contact.detected);
@@ -257,11 +257,13 @@ impl<W: Write> Table<W> {
         for joint in joints() {
             flag(&mut self.text, joint.valid);
             if joint.valid != 1 {
-                *self.withheld.entry(joint.reason.word()).or_default() += 1;
+                let reason = joint.reason.get().unwrap_or_default();
+                *self.withheld.entry(reason.word()).or_default() += 1;
             }
         }
         for joint in joints() {
-            reason(&mut self.text, &self.channels, joint.reason, joint.cause);
+            let why = joint.reason.get().unwrap_or_default();
+            reason(&mut self.text, &self.channels, why, joint.cause);
         }
         for i in 0..self.subtrees {
             let residual = estimate

@@ -522,7 +522,7 @@ fn recording_with(setup: &Setup, seconds: f64, phase: impl Fn(usize) -> f64) -> 
         let period = match channel.kind {
             Kind::Wrench => 1e-3,
             Kind::Joint => 4e-3,
-            Kind::Imu => 1e-2,
+            _ => 1e-2,
         };
         let mut t = phase(number);
         while t < seconds {
@@ -560,7 +560,7 @@ fn bits(estimates: &[Estimate]) -> Vec<(Nanos, Vec<Bits>)> {
             j.torque.to_bits(),
             j.standard_deviation.to_bits(),
             j.valid,
-            j.reason,
+            j.reason.get().unwrap(),
             j.cause,
         )
     };
@@ -975,10 +975,13 @@ fn a_possible_contact_is_absent_unless_declared() {
             if estimate.t < Nanos::from_millis(200) {
                 assert_eq!(
                     (contact.valid, contact.reason, contact.force),
-                    (0, Reason::Absent, [0.0; 3])
+                    (0, Reason::Absent.in_memory(), [0.0; 3])
                 );
             } else {
-                assert_eq!((contact.valid, contact.reason), (1, Reason::None));
+                assert_eq!(
+                    (contact.valid, contact.reason),
+                    (1, Reason::None.in_memory())
+                );
                 assert!(contact.force.iter().any(|f| *f != 0.0));
             }
         }
@@ -1134,7 +1137,7 @@ fn the_base_is_the_link_that_stands() {
             if step < 70 {
                 assert_eq!(
                     (joint.valid, joint.reason),
-                    (1, Reason::None),
+                    (1, Reason::None.in_memory()),
                     "at {step} ms"
                 );
                 assert!(
@@ -1146,7 +1149,7 @@ fn the_base_is_the_link_that_stands() {
                 // The motion of the base is unknown, and so is the ground reaction.
                 assert_eq!(
                     (joint.valid, joint.reason),
-                    (0, Reason::NoStance),
+                    (0, Reason::NoStance.in_memory()),
                     "at {step} ms"
                 );
             }
@@ -1285,7 +1288,7 @@ fn a_torque_that_is_too_uncertain_is_withheld() {
         };
         assert_eq!(
             (joint.reason, joint.torque.to_bits()),
-            (expected, other.torque.to_bits())
+            (expected.in_memory(), other.torque.to_bits())
         );
     }
 }

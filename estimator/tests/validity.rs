@@ -5,7 +5,7 @@
 use proprio_estimator::config::{Config, Presence};
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
-use proprio_topics::{Imu, JointState, Kind, Nanos, Quality, Reading, Reason, Wrench};
+use proprio_topics::{Code, Imu, JointState, Kind, Nanos, Quality, Reading, Reason, Wrench};
 use std::path::{Path, PathBuf};
 
 const PERIOD: i64 = 10_000_000;
@@ -46,6 +46,7 @@ fn reading(setup: &Setup, number: usize) -> Reading {
             angular_acceleration: [0.0; 3],
             ..Imu::ABSENT
         }),
+        other => panic!("{other}"),
     }
 }
 
@@ -224,7 +225,7 @@ fn what_two_unknown_contacts_leave_open_is_undetermined() {
     };
     let (one, two) = (of(&one), of(&two));
     assert!(one.torques.joints().iter().all(|joint| joint.valid == 1));
-    let open = |reason: Reason, valid: u32| reason == Reason::Undetermined && valid == 0;
+    let open = |reason: Code<Reason>, valid: u32| reason == Reason::Undetermined && valid == 0;
     let contacts = two.contacts.contacts().iter();
     assert_eq!(contacts.filter(|c| open(c.reason, c.valid)).count(), 2);
     let joints = setup(|_| {}).robot;

@@ -124,6 +124,14 @@ impl RealtimeToMonotonic {
     }
 }
 
+/// CLOCK_REALTIME minus CLOCK_MONOTONIC now \[ns\].
+#[must_use]
+pub fn realtime_offset() -> Nanos {
+    let mut times = RealtimeToMonotonic::default();
+    times.refresh();
+    Nanos(times.offset)
+}
+
 /// Converts an adapter's receive stamps, in the adapter's own clock, to CLOCK_MONOTONIC.
 ///
 /// Each frame has two stamps, the adapter's `h` and the kernel's `s`, with `s = h + offset + d`,

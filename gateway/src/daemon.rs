@@ -6,7 +6,7 @@
 //! changes of it, and feeds the watchdog as long as every bus thread runs.
 
 use crate::bus::{Bus, Turn};
-use crate::clock::{Clock, Monotonic};
+use crate::clock::{Clock, Monotonic, realtime_offset};
 use crate::config::{Pace, Source};
 use crate::decoder::Decoder;
 use crate::link::replay::Replay;
@@ -17,10 +17,12 @@ use crate::plan::{BusPlan, ConfigError, Plan};
 use crate::publish::Shared;
 use crate::status::BusStatus;
 use anyhow::{Context, anyhow, bail};
-use proprio_drivers::{Claim, Mode, Refusal, State};
+use proprio_drivers::{Claim, Mode};
 use proprio_topics::ipc::{Domain, DomainConfig, DomainError, Writer};
 use proprio_topics::realtime;
-use proprio_topics::{Counter, Description, GatewayHealth, LinkState, Nanos, Sample};
+use proprio_topics::{
+    Counter, Description, DeviceState, GatewayHealth, LinkState, Nanos, Refusal, Sample,
+};
 use sd_notify::NotifyState;
 use std::io::Write as _;
 use std::path::Path;
@@ -305,6 +307,7 @@ pub fn open_link(
 }
 
 fn fill_health(health: &mut GatewayHealth, threads: &[BusThread]) {
+    health.realtime_offset = realtime_offset();
     (health.bus_count, health.device_count) = (0, 0);
     for (slot, thread) in health.buses.iter_mut().zip(threads) {
         *slot = thread.status.bus();
@@ -341,10 +344,10 @@ impl HealthLog {
             .resize(health.devices().len(), [Self::REST; Counter::ALL.len()]);
         for (i, bus) in health.buses().iter().enumerate() {
             let before = last.as_ref().and_then(|l| l.buses().get(i));
-            let was = before.map_or(LinkState::Up, |b| b.link);
+            let was = before.map_or(LinkState::Up.in_memory(), |b| b.link);
             if bus.link != was {
                 let name = bus.name.as_str();
-                match bus.link {
+                match bus.link.get().unwrap_or_default() {
                     LinkState::Up => tracing::info!(bus = name, "the link is up again"),
                     LinkState::Ended => {
                         tracing::info!(bus = name, frames = bus.frames, "the log has ended");
@@ -381,7 +384,10 @@ impl HealthLog {
             if before.is_none_or(|b| (b.state, b.refusal) != (device.state, device.refusal)) {
                 match Refusal::from_code(device.refusal) {
                     Some(refusal) => tracing::error!(device = name, "refused: {refusal}"),
-                    None => tracing::info!(device = name, "{}", State::word(device.state)),
+                    None => {
+                        let state = device.state.get().map_or("unknown", DeviceState::word);
+                        tracing::info!(device = name, "{state}");
+                    }
                 }
             }
             let Some(quiet) = self.quiet.get_mut(i) else {

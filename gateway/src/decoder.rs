@@ -97,10 +97,7 @@ impl Decoder {
                 let Some(route) = running.routes.iter().find(|r| r.output == output.output) else {
                     continue;
                 };
-                let main = match output.reading {
-                    Reading::Joint(_) | Reading::Wrench(_) | Reading::Imu(_) => true,
-                    Reading::Gauges(_) | Reading::Temperature(_) | Reading::Actuator(_) => false,
-                };
+                let main = output.reading.kind() == route.kind;
                 if main && let Some(last) = self.last.get_mut(route.channel as usize) {
                     if output.acquired < *last {
                         self.status.count(number, Counter::Backward, 1);
@@ -114,19 +111,15 @@ impl Decoder {
                 };
                 let header = Header {
                     acquired: output.acquired,
+                    device_time: output.device_time,
                     device_counter: output.device_counter,
                     quality: output.quality,
-                    stamp: output.stamp,
+                    stamp: output.stamp.in_memory(),
                     bus: self.bus,
                     ..Header::default()
                 };
                 self.status.count(number, Counter::Readings, 1);
-                publish(&mut Sample {
-                    header,
-                    channel: route.channel,
-                    reserved: 0,
-                    reading,
-                });
+                publish(&mut Sample::new(header, route.channel, &reading));
             }
             self.status.set_state(number, running.device.state());
         }

@@ -7,7 +7,7 @@ use crate::decoder::Decoder;
 use crate::link::replay::Matching;
 use crate::plan::{BusPlan, Plan};
 use crate::status::BusStatus;
-use proprio_drivers::{Board, Format, Frame, Frames, Mode, Spec, State};
+use proprio_drivers::{Board, Format, Frame, Frames, Mode, Spec};
 use proprio_topics::csv::{self, Columns, Item, Series, Value, What};
 use proprio_topics::{Counter, Nanos, Reading, Sample, StampKind};
 use std::collections::VecDeque;
@@ -239,11 +239,7 @@ pub fn decode(
                     .map(|c| (c, count(c)))
                     .filter(|(_, n)| *n > 0)
                     .collect(),
-                refusal: if let State::Refused(refusal) = state {
-                    Some(refusal.to_string())
-                } else {
-                    None
-                },
+                refusal: state.refusal().map(|refusal| refusal.to_string()),
             });
         }
     }
@@ -252,11 +248,11 @@ pub fn decode(
 
 fn write_sample<W: Write>(writer: &mut csv::Writer<W>, sample: &Sample) -> io::Result<()> {
     let t = (sample.header.stamp != StampKind::None).then_some(sample.header.acquired);
-    writer.push(
-        t,
-        sample.channel as usize,
-        &Value::Reading(sample.reading, sample.header.quality),
-    )
+    let Some(reading) = sample.reading() else {
+        return Ok(());
+    };
+    let value = Value::Reading(reading, sample.header.quality);
+    writer.push(t, sample.channel as usize, &value)
 }
 
 /// The result of encoding a table.

@@ -65,6 +65,8 @@ pub struct Route {
     pub output: u8,
     /// The number of the channel.
     pub channel: u32,
+    /// The kind of the channel.
+    pub kind: Kind,
     /// The conversion from device angle to joint angle; the identity for sensors.
     pub map: JointMap,
 }
@@ -86,13 +88,14 @@ impl JointMap {
     };
 
     /// The joint's state from the device's: gain and offset apply to position, the gain to its
-    /// derivatives. Torque and current pass unchanged.
+    /// derivatives, and its inverse to the torque (of an ideal gear). The current passes unchanged.
     #[must_use]
     pub fn joint(&self, device: JointState) -> JointState {
         JointState {
             position: device.position * self.gain + self.offset,
             velocity: device.velocity * self.gain,
             acceleration: device.acceleration * self.gain,
+            torque: device.torque / self.gain,
             ..device
         }
     }
@@ -104,6 +107,7 @@ impl JointMap {
             position: (joint.position - self.offset) / self.gain,
             velocity: joint.velocity / self.gain,
             acceleration: joint.acceleration / self.gain,
+            torque: joint.torque * self.gain,
             ..joint
         }
     }
@@ -198,9 +202,9 @@ impl Plan {
         let entries = self.channels.iter().zip(0..).map(|(channel, index)| Entry {
             name: Name::new(&channel.name).unwrap_or(Name::EMPTY),
             max_silence: channel.max_silence,
-            role: Role::Channel,
+            role: Role::Channel.in_memory(),
             index,
-            kind: channel.kind,
+            kind: channel.kind.in_memory(),
             bus: u32::try_from(channel.bus).unwrap_or(u32::MAX),
             ..Entry::NONE
         });
@@ -351,13 +355,13 @@ impl Builder<'_> {
                     raw.driver
                 ));
             }
-            (Kind::Wrench | Kind::Imu, false) => {
+            (_, false) if kind != Kind::Joint => {
                 return Err(format!(
                     "{name:?}: {} is a sensor; remove its [[bus.device.joint]]",
                     raw.driver
                 ));
             }
-            (Kind::Wrench | Kind::Imu, true) => {
+            (_, true) => {
                 let channel = self.channel(ChannelPlan {
                     name: name.clone(),
                     kind,
@@ -368,10 +372,11 @@ impl Builder<'_> {
                 routes.push(Route {
                     output: 0,
                     channel,
+                    kind,
                     map: JointMap::IDENTITY,
                 });
             }
-            (Kind::Joint, false) => {
+            (_, false) => {
                 for joint in raw.joint {
                     let at = format!("{name:?}, joint {:?}", joint.name);
                     check_name(&at, &joint.name)?;
@@ -416,6 +421,7 @@ impl Builder<'_> {
                     routes.push(Route {
                         output: joint.channel,
                         channel,
+                        kind,
                         map,
                     });
                 }
@@ -610,6 +616,31 @@ impl fmt::Display for Plan {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A gear of 100 that turns the other way: a hundredth of the angle, 100 times the torque.
+    #[test]
+    fn a_gear_transmits_angles_and_torques() {
+        let map = JointMap {
+            gain: -1.0 / 100.0,
+            offset: 0.5,
+        };
+        let motor = JointState {
+            position: 200.0,
+            velocity: 30.0,
+            acceleration: 4.0,
+            torque: 0.25,
+            current: 1.5,
+        };
+        let joint = map.joint(motor);
+        assert_eq!((joint.position, joint.velocity), (-1.5, -0.3));
+        assert_eq!((joint.acceleration, joint.torque), (-0.04, -25.0));
+        assert_eq!(joint.current, motor.current);
+        let power = |state: JointState| state.torque * state.velocity;
+        assert_eq!(power(joint), power(motor));
+        let back = map.device(joint);
+        assert!((back.position - motor.position).abs() < 1e-9);
+        assert_eq!((back.velocity, back.torque), (30.0, 0.25));
+    }
 
     const ARM: &str = r#"
         schema = 1

@@ -4,7 +4,7 @@
 use crate::link::LinkCounters;
 use crate::plan::BusPlan;
 use proprio_drivers::State;
-use proprio_topics::{BusHealth, Counter, DeviceHealth, LinkState, Name, Nanos};
+use proprio_topics::{BusHealth, Code, Counter, DeviceHealth, LinkState, Name, Nanos, Refusal};
 use std::sync::atomic::Ordering::Relaxed;
 use std::sync::atomic::{AtomicI64, AtomicU32, AtomicU64};
 
@@ -81,12 +81,8 @@ impl BusStatus {
     /// Sets the state of a device.
     pub fn set_state(&self, device: u16, state: State) {
         if let Some(status) = self.devices.get(usize::from(device)) {
-            let refusal = if let State::Refused(refusal) = state {
-                refusal.code()
-            } else {
-                0
-            };
-            status.state.store(state.code(), Relaxed);
+            let refusal = state.refusal().map_or(0, Refusal::code);
+            status.state.store(state.published() as u32, Relaxed);
             status.refusal.store(refusal, Relaxed);
         }
     }
@@ -116,14 +112,6 @@ impl BusStatus {
     pub fn bus(&self) -> BusHealth {
         let [dropped, error_frames, sent, send_failures, link_losses] =
             [0, 1, 2, 3, 4].map(|i| self.link.get(i).map_or(0, |c: &AtomicU64| c.load(Relaxed)));
-        let states = [
-            LinkState::Up,
-            LinkState::Down,
-            LinkState::Gone,
-            LinkState::BusOff,
-            LinkState::Ended,
-        ];
-        let state = self.link_state.load(Relaxed);
         BusHealth {
             name: self.name,
             frames: self.frames.load(Relaxed),
@@ -138,11 +126,8 @@ impl BusStatus {
             connections: self.connections.load(Relaxed),
             last_frame: Nanos(self.last_frame.load(Relaxed)),
             last_turn: Nanos(self.last_turn.load(Relaxed)),
-            link: states
-                .into_iter()
-                .find(|s| *s as u32 == state)
-                .unwrap_or_default(),
-            reserved: 0,
+            link: Code::of_number(self.link_state.load(Relaxed)),
+            ..BusHealth::EMPTY
         }
     }
 
@@ -157,7 +142,7 @@ impl BusStatus {
             DeviceHealth {
                 name: d.name,
                 counters,
-                state: d.state.load(Relaxed),
+                state: Code::of_number(d.state.load(Relaxed)),
                 refusal: d.refusal.load(Relaxed),
                 bus: self.number,
                 reserved: 0,

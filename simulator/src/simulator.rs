@@ -423,6 +423,8 @@ impl Node {
                          link of the URDF has its name",
                     )
                 })?),
+                // What is not simulated is silent.
+                Kind::Gauges | Kind::Temperature | Kind::Actuator | Kind::Skin => continue,
             };
             outputs.push((route.output, route.map, source));
         }
@@ -569,7 +571,6 @@ impl Node {
                 mode: CURRENT_CONTROL,
                 encoder: 0,
                 faults: 0,
-                reserved: 0,
             };
             refused += u64::from(
                 self.board

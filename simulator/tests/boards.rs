@@ -211,7 +211,7 @@ fn what_is_decoded_is_the_truth_within_half_a_step_and_noise() {
             let name = session.channels[sample.channel as usize].as_str();
             let joint = simulation.joint(name);
             let truth = simulation.at(time_of(sample));
-            match sample.reading {
+            match sample.reading().unwrap() {
                 Reading::Joint(state) => {
                     let joint = truth.joints[joint.unwrap()];
                     near(state.position, joint.position, POSITION_LSB, JOINT_NOISE);
@@ -286,7 +286,7 @@ fn noise_has_the_size_that_is_stated() {
     let mut simulation = Simulation::new(&robot, &settings(&[])).unwrap();
     let (mut sum, mut n) = ([0.0; 6], 0.0);
     for sample in session.of("l_arm_ft_sensor") {
-        let Reading::Wrench(wrench) = sample.reading else {
+        let Reading::Wrench(wrench) = sample.reading().unwrap() else {
             continue;
         };
         let truth = simulation.at(time_of(sample)).wrenches[0];
@@ -425,7 +425,10 @@ fn a_saturated_sensor_says_so_and_freezes() {
             .contains(Quality::SATURATED | Quality::FROZEN);
         assert_eq!(saturated, (2.0..2.5).contains(&t), "{t}");
         if saturated {
-            assert_eq!(*frozen.get_or_insert(sample.reading), sample.reading);
+            assert_eq!(
+                *frozen.get_or_insert(sample.reading().unwrap()),
+                sample.reading().unwrap()
+            );
         }
     }
     assert!(frozen.is_some());
@@ -442,7 +445,9 @@ fn a_spike_is_one_reading() {
         .of("l_arm_ft_sensor")
         .zip(plain.of("l_arm_ft_sensor"))
     {
-        let (Reading::Wrench(a), Reading::Wrench(b)) = (sample.reading, plain.reading) else {
+        let (Reading::Wrench(a), Reading::Wrench(b)) =
+            (sample.reading().unwrap(), plain.reading().unwrap())
+        else {
             panic!()
         };
         if a != b {
@@ -504,7 +509,7 @@ fn a_late_half_comes_behind_the_next_first_half_and_is_never_paired_wrongly() {
     };
     let mut told_apart = 0;
     for sample in many.of("l_arm_ft_sensor") {
-        let Reading::Wrench(wrench) = sample.reading else {
+        let Reading::Wrench(wrench) = sample.reading().unwrap() else {
             continue;
         };
         assert!(off_by(wrench.torque, time_of(sample)) <= 0.5 * TORQUE_LSB + 1e-9);

@@ -206,7 +206,7 @@ impl Recorder {
             channels
                 .entry(sample.channel)
                 .or_default()
-                .push(exact(&sample.reading, sample.header.quality));
+                .push(exact(&sample.reading().unwrap(), sample.header.quality));
         }
         channels
     }
@@ -227,10 +227,14 @@ impl Recorder {
         let out = File::create(file).expect("a file in a temporary folder");
         let mut writer =
             csv::Writer::new(out, &series, Columns::Main).expect("a table can be written");
-        let mut samples: Vec<&Sample> = self.taken.iter().filter(|s| is_main(&s.reading)).collect();
+        let mut samples: Vec<&Sample> = self
+            .taken
+            .iter()
+            .filter(|s| is_main(&s.reading().unwrap()))
+            .collect();
         samples.sort_by_key(|s| s.header.acquired);
         for sample in samples {
-            let value = Value::Reading(sample.reading, sample.header.quality);
+            let value = Value::Reading(sample.reading().unwrap(), sample.header.quality);
             let pushed = writer.push(
                 Some(sample.header.acquired),
                 sample.channel as usize,

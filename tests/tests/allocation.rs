@@ -403,7 +403,12 @@ fn identification_in_the_pipeline_allocates_nothing_but_in_its_jobs() {
             if number % 5000 == 0 {
                 pipeline.declare(hand, t, number % 10_000 == 0);
             }
-            pipeline.push(channel, t, &sample.reading, sample.header.quality);
+            pipeline.push(
+                channel,
+                t,
+                &sample.reading().unwrap(),
+                sample.header.quality,
+            );
             while pipeline.poll().is_some() {
                 told += u32::from(pipeline.inertia().is_some());
                 job = pipeline.take_job().or(job.take());
@@ -463,7 +468,7 @@ fn the_pipeline_allocates_nothing_once_it_runs() {
                     pipeline.push(
                         channel,
                         t - Nanos::from_millis(20),
-                        &sample.reading,
+                        &sample.reading().unwrap(),
                         sample.header.quality,
                     );
                 }
@@ -475,7 +480,12 @@ fn the_pipeline_allocates_nothing_once_it_runs() {
                     pipeline.push(channel, t, &nothing, sample.header.quality);
                 }
             }
-            pipeline.push(channel, t, &sample.reading, sample.header.quality);
+            pipeline.push(
+                channel,
+                t,
+                &sample.reading().unwrap(),
+                sample.header.quality,
+            );
             while let Some(estimate) = pipeline.poll() {
                 estimates += 1;
                 withheld += u64::from(estimate.torques.joints().iter().any(|j| j.valid != 1));

@@ -75,7 +75,7 @@ const ALWAYS_IN_TOPICS: [&str; 2] = ["iceoryx2-bb-elementary-traits", "iceoryx2-
 
 /// All libraries that drivers and topics (without features) may depend on, directly or not: all are
 /// no_std.
-const BARE: [&str; 17] = [
+const BARE: [&str; 19] = [
     "arrayvec",
     "iceoryx2-bb-concurrency",
     "iceoryx2-bb-derive-macros",
@@ -93,6 +93,8 @@ const BARE: [&str; 17] = [
     "syn",
     "thiserror",
     "thiserror-impl",
+    "zerocopy",
+    "zerocopy-derive",
 ];
 
 /// The files that may contain `unsafe`, with the reason.

@@ -198,8 +198,8 @@ fn samples_that_can_not_be_used_are_counted_by_kind() {
     let channels = [("l_arm_ft_sensor", Kind::Wrench), ("l_elbow", Kind::Joint)];
     let entries = channels.iter().zip(0..).map(|((name, kind), index)| Entry {
         name: Name::new(name).expect("short"),
-        kind: *kind,
-        role: Role::Channel,
+        kind: kind.in_memory(),
+        role: Role::Channel.in_memory(),
         index,
         ..Entry::NONE
     });
@@ -211,15 +211,11 @@ fn samples_that_can_not_be_used_are_counted_by_kind() {
     let mut torques = open::<TorqueEstimate>(&domain, robot);
     let start = now();
     let mut send = |channel: u32, step: i64, reading: Reading| {
-        let sample = Sample {
-            header: Header {
-                acquired: start + Nanos::from_millis(10 * step),
-                ..Header::default()
-            },
-            channel,
-            reserved: 0,
-            reading,
+        let header = Header {
+            acquired: start + Nanos::from_millis(10 * step),
+            ..Header::default()
         };
+        let sample = Sample::new(header, channel, &reading);
         samples.send(&sample, now()).expect("sent");
     };
     let wrench = |fx: f64| {

@@ -842,7 +842,7 @@ fn interleaved_boards_keep_their_own_halves() {
             .collect();
         assert_eq!(samples.len(), readings as usize, "board {number}");
         for (k, sample) in samples.iter().enumerate() {
-            let Reading::Wrench(wrench) = sample.reading else {
+            let Reading::Wrench(wrench) = sample.reading().unwrap() else {
                 panic!("{sample:?}")
             };
             let force = (first + k as f64) * unit;

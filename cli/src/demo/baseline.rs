@@ -52,7 +52,7 @@ impl Baseline {
                         self.pipeline
                             .setup()
                             .robot
-                            .channel(entry.kind, entry.name.as_str())
+                            .channel(entry.kind.get()?, entry.name.as_str())
                     })
                     .collect();
                 self.epoch = description.header.epoch;
@@ -82,13 +82,11 @@ impl Baseline {
                 .get(sample.channel as usize)
                 .copied()
                 .flatten();
-            if let Some(channel) = channel.filter(|_| sample.header.epoch == self.epoch) {
-                self.pipeline.push(
-                    channel,
-                    sample.header.acquired,
-                    &sample.reading,
-                    sample.header.quality,
-                );
+            if let Some(channel) = channel.filter(|_| sample.header.epoch == self.epoch)
+                && let Some(reading) = sample.reading()
+            {
+                let (t, quality) = (sample.header.acquired, sample.header.quality);
+                self.pipeline.push(channel, t, &reading, quality);
                 self.keep();
             }
         }

@@ -323,7 +323,7 @@ impl Screen {
                         if t.valid == 1 {
                             format!("{j} {:.2}", t.torque)
                         } else {
-                            format!("{j} withheld ({})", t.reason.word())
+                            format!("{j} withheld ({})", t.reason.get().unwrap_or_default())
                         }
                     })
                 })
@@ -337,7 +337,7 @@ impl Screen {
             let state = if torque.valid == 1 {
                 "valid"
             } else {
-                torque.reason.word()
+                torque.reason.get().unwrap_or_default().word()
             };
             text.push_str(&format!(
                 "\x1b[2K{joint:<20} {:>9.3} Nm  +- {:>6.3}  {state}\n",

@@ -17,9 +17,9 @@
 //! cannot keep other senders silent. A reading ends the wait at once, because a board that streams
 //! has left its bootloader.
 
-use crate::{Decoded, Frame, Id, Mode, Refusal, Spec, State, Transmit};
+use crate::{Decoded, Frame, Id, Mode, Spec, State, Transmit};
 use arrayvec::ArrayVec;
-use proprio_topics::{Counter, Nanos};
+use proprio_topics::{Counter, Nanos, Refusal};
 
 /// The questions that a board must answer before it can be started.
 pub(crate) trait Inquiry {

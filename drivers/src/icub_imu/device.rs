@@ -8,11 +8,9 @@ use super::options::{Options, Plan};
 use crate::icub::bringup::{Ask, Bringup, Inquiry};
 use crate::icub::pairing::{Paired, Pairing};
 use crate::icub::{self, class, command};
-use crate::{
-    Claim, Decoded, Device, Frame, Mode, Refusal, Spec, SpecError, State, Transmit, device,
-};
+use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, State, Transmit};
 use arrayvec::ArrayVec;
-use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, StampKind};
+use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, Refusal, StampKind};
 
 /// A frame up to this many sequence numbers back is late; further back, the counter has restarted
 /// or there is a long gap.
@@ -292,18 +290,13 @@ impl ImuDevice {
             quality |= Quality::GAP_BEFORE;
         }
         self.seen = true;
-        let reading = Reading::Imu(imu);
-        out.push(
-            device::Output {
-                output: 0,
-                acquired,
-                stamp,
-                device_counter,
-                quality,
-                reading,
-            },
-            frame.id,
-        );
+        let output = Output {
+            acquired,
+            stamp,
+            device_counter,
+            ..Output::new(0, frame, quality, Reading::Imu(imu))
+        };
+        out.push(output, frame.id);
     }
 
     fn triple(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {

@@ -182,9 +182,7 @@ impl Board for StrainBoard {
                 let id = icub::stream(class::PERIODIC_ANALOG, self.address, kind::THERMOMETER);
                 let _ = out.try_push(Frame::new(id, &[1, low, high, 0, 0]));
             }
-            Reading::Joint(_) | Reading::Imu(_) | Reading::Actuator(_) => {
-                return Err(EncodeError::Kind);
-            }
+            _ => return Err(EncodeError::Kind),
         }
         Ok(())
     }

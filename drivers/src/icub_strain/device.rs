@@ -6,12 +6,10 @@ use super::options::{Options, Stream};
 use crate::icub::bringup::{Ask, Bringup, Inquiry};
 use crate::icub::pairing::{Paired, Pairing};
 use crate::icub::{self, class, command};
-use crate::{
-    Claim, Decoded, Device, Frame, Mode, Refusal, Spec, SpecError, State, Transmit, device,
-};
+use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, State, Transmit};
 use arrayvec::ArrayVec;
 use proprio_topics::{
-    Counter, Gauges, Kind, Nanos, Quality, Reading, StampKind, Temperature, Wrench,
+    Counter, Gauges, Kind, Nanos, Quality, Reading, Refusal, StampKind, Temperature, Wrench,
 };
 
 /// The full scales: configured, requested axis by axis, or from replies to another program.
@@ -327,13 +325,10 @@ impl Strain {
         } else {
             Quality::GOOD
         };
-        let output = device::Output {
-            output: 0,
+        let output = Output {
             acquired: whole.acquired,
             stamp: whole.stamp,
-            device_counter: 0,
-            quality: quality | gap,
-            reading,
+            ..Output::new(0, frame, quality | gap, reading)
         };
         out.push(output, frame.id);
     }
@@ -451,14 +446,8 @@ fn temperature(data: &[u8], frame: &Frame, out: &mut Decoded) {
     match *data {
         [mask, _, _, _, _] if mask & 1 == 1 => {
             let celsius = f64::from(icub::i16_le(data, 1)) * CELSIUS_PER_LSB;
-            let output = device::Output {
-                output: 0,
-                acquired: frame.t,
-                stamp: frame.stamp,
-                device_counter: 0,
-                quality: Quality::GOOD,
-                reading: Reading::Temperature(Temperature { celsius }),
-            };
+            let reading = Reading::Temperature(Temperature { celsius });
+            let output = Output::new(0, frame, Quality::GOOD, reading);
             out.push(output, frame.id);
         }
         [_, _, _, _, _] => out.fault(Counter::Value, 1, frame.id),

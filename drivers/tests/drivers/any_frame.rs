@@ -139,7 +139,7 @@ fn is_finite(reading: &Reading) -> bool {
         Reading::Joint(joint) => joint.position.is_finite(),
         Reading::Temperature(temperature) => temperature.celsius.is_finite(),
         Reading::Actuator(actuator) => actuator.duty.is_finite(),
-        Reading::Gauges(_) => true,
+        Reading::Gauges(_) | Reading::Skin(_) => true,
     }
 }
 

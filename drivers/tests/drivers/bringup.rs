@@ -2,8 +2,8 @@
 //! stop.
 
 use crate::rig::{Rig, decode, frame, listener, options, spec};
-use proprio_drivers::{Mode, Options, Refusal, SpecError, State};
-use proprio_topics::{Counter, Imu, JointState, Nanos, Quality, Reading, Wrench};
+use proprio_drivers::{Mode, Options, SpecError, State};
+use proprio_topics::{Counter, Imu, JointState, Nanos, Quality, Reading, Refusal, Wrench};
 
 const SCALES: &str = "full_scale_n = [1804, 1804, 1804]\nfull_scale_nm = [31, 31, 31]\n";
 

@@ -403,8 +403,7 @@ fn the_faults_of_a_motor_board_are_those_of_the_document() {
             duty: 1.0,
             mode: 6,
             encoder,
-            faults,
-            reserved: 0
+            faults
         }
     );
     assert_eq!(

@@ -158,7 +158,7 @@ proptest! {
 
     #[test]
     fn actuators(duty in -1.0_f64..=1.0, mode in 0_u32..256, encoder in 0_u32..256, faults: u32) {
-        let actuator = Actuator { duty, mode, encoder, faults, reserved: 0 };
+        let actuator = Actuator { duty, mode, encoder, faults };
         let reading = Reading::Actuator(actuator);
         let (back, _) = through("icub_motor", "", &[0], 0, reading, Quality::GOOD);
         let Reading::Actuator(back) = back else { panic!("{back:?}") };

@@ -169,7 +169,7 @@ impl Pipeline {
                 torque: if known { *torque } else { f64::NAN },
                 standard_deviation: if known { deviation } else { f64::NAN },
                 valid: u32::from(reason == Reason::None),
-                reason,
+                reason: reason.in_memory(),
                 cause,
                 reserved: 0,
             };
@@ -217,7 +217,7 @@ impl Pipeline {
                 torque: [tx, ty, tz],
                 standard_deviation: if known { deviation } else { [f64::NAN; 6] },
                 valid: u32::from(reason == Reason::None),
-                reason,
+                reason: reason.in_memory(),
                 cause,
                 detected: u32::from(detected.contains(number)),
             };

@@ -1,14 +1,16 @@
 //! The meaning of the numbers in the payloads: name, kind, bus and maximum silence of each channel,
 //! joint and contact.
 
-use crate::{Header, Kind, Nanos};
+use crate::code::coded;
+use crate::{Code, Header, Kind, Nanos};
 use core::fmt;
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+use zerocopy::FromBytes;
 
 /// A name of at most 63 bytes of UTF-8, ended by a zero byte.
 #[repr(C)]
-#[derive(Clone, Copy, PartialEq, Eq, Hash, ZeroCopySend)]
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ZeroCopySend, FromBytes)]
 pub struct Name {
     bytes: [u8; 64],
 }
@@ -68,6 +70,11 @@ pub enum Publisher {
     Estimator = 1,
 }
 
+coded!(Publisher {
+    Gateway = "gateway",
+    Estimator = "estimator",
+});
+
 /// What an entry's number is an index of.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
@@ -82,9 +89,16 @@ pub enum Role {
     SubTree = 3,
 }
 
+coded!(Role {
+    Channel = "channel",
+    Joint = "joint",
+    Contact = "contact",
+    SubTree = "sub_tree",
+});
+
 /// One named number.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend, FromBytes)]
 pub struct Entry {
     /// Its name.
     pub name: Name,
@@ -95,11 +109,11 @@ pub struct Entry {
     /// meaning.
     pub max_silence: Nanos,
     /// What `index` is an index of.
-    pub role: Role,
+    pub role: Code<Role>,
     /// The index.
     pub index: u32,
     /// The kind of a channel; `Kind::Joint` for a joint, `Kind::Wrench` for a contact or sub-tree.
-    pub kind: Kind,
+    pub kind: Code<Kind>,
     /// The bus that a channel is on.
     pub bus: u32,
 }
@@ -107,13 +121,13 @@ pub struct Entry {
 /// The names of all numbers of one publisher: the payload of `<robot>/description`. A reader that
 /// opens late receives the last one.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, ZeroCopySend)]
-#[type_name("proprio/Description/2")]
+#[derive(Debug, Clone, Copy, ZeroCopySend, FromBytes)]
+#[type_name("proprio/Description/3")]
 pub struct Description {
     /// Time stamps and sequence number; `epoch` is that of the publisher's other payloads.
     pub header: Header,
     /// The sender.
-    pub publisher: Publisher,
+    pub publisher: Code<Publisher>,
     /// Number of valid entries in `entries`.
     pub count: u32,
     /// The entries.
@@ -126,9 +140,9 @@ impl Entry {
         name: Name::EMPTY,
         frame: Name::EMPTY,
         max_silence: Nanos::ZERO,
-        role: Role::Channel,
+        role: Role::Channel.in_memory(),
         index: 0,
-        kind: Kind::Joint,
+        kind: Kind::Joint.in_memory(),
         bus: 0,
     };
 }
@@ -140,7 +154,7 @@ impl Description {
     pub fn new(publisher: Publisher, entries: impl IntoIterator<Item = Entry>) -> Self {
         let mut description = Self {
             header: Header::default(),
-            publisher,
+            publisher: publisher.in_memory(),
             count: 0,
             entries: [Entry::NONE; Self::CAPACITY],
         };
@@ -182,7 +196,7 @@ impl Description {
 }
 
 const _: () = assert!(
-    size_of::<Entry>() == 152 && size_of::<Description>() == 56 + 152 * Description::CAPACITY
+    size_of::<Entry>() == 152 && size_of::<Description>() == 64 + 152 * Description::CAPACITY
 );
 
 #[cfg(test)]

@@ -1,10 +1,11 @@
 //! The estimator's output (joint torques, contact wrenches) and the declarations of contacts it
 //! receives.
 
-use crate::{Header, MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name, Quality};
-use core::fmt;
+use crate::code::coded;
+use crate::{Code, Header, MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name, Quality};
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+use zerocopy::FromBytes;
 
 /// Why an estimate is withheld. Its value is published but must not be used.
 #[repr(C)]
@@ -39,6 +40,21 @@ pub enum Reason {
     Unexplained = 11,
 }
 
+coded!(Reason {
+    None = "",
+    NeverSeen = "never_seen",
+    Stale = "stale",
+    Saturated = "saturated",
+    DeviceFault = "device_fault",
+    Undetermined = "undetermined",
+    Uncertain = "uncertain",
+    NotFinite = "not_finite",
+    Absent = "absent",
+    Starting = "starting",
+    NoStance = "no_stance",
+    Unexplained = "unexplained",
+});
+
 impl Reason {
     /// The reason that `quality` gives, or [`Reason::None`]; `faults` are the flags that count as a
     /// device fault.
@@ -52,31 +68,6 @@ impl Reason {
             Self::None
         }
     }
-
-    /// Its name in tables and logs.
-    #[must_use]
-    pub const fn word(self) -> &'static str {
-        match self {
-            Self::None => "",
-            Self::NeverSeen => "never_seen",
-            Self::Stale => "stale",
-            Self::Saturated => "saturated",
-            Self::DeviceFault => "device_fault",
-            Self::Undetermined => "undetermined",
-            Self::Uncertain => "uncertain",
-            Self::NotFinite => "not_finite",
-            Self::Absent => "absent",
-            Self::Starting => "starting",
-            Self::NoStance => "no_stance",
-            Self::Unexplained => "unexplained",
-        }
-    }
-}
-
-impl fmt::Display for Reason {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(self.word())
-    }
 }
 
 /// `JointTorque::cause` and `ContactWrench::cause` if no single channel is the cause.
@@ -84,7 +75,7 @@ pub const NO_CAUSE: u32 = u32::MAX;
 
 /// The estimated torque of one joint.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
 pub struct JointTorque {
     /// Torque \[Nm\] (force \[N\] for a prismatic joint) exerted by the parent link on the child
     /// link along the URDF axis. It is the link-side torque: without rotor inertia and friction.
@@ -94,7 +85,7 @@ pub struct JointTorque {
     /// 1 if it may be used, 0 if it is withheld.
     pub valid: u32,
     /// Why it is withheld.
-    pub reason: Reason,
+    pub reason: Code<Reason>,
     /// The channel that causes it: its number among the estimator's channels in
     /// `<robot>/description`, or [`NO_CAUSE`].
     pub cause: u32,
@@ -108,7 +99,7 @@ impl JointTorque {
         torque: f64::NAN,
         standard_deviation: f64::NAN,
         valid: 0,
-        reason: Reason::NeverSeen,
+        reason: Reason::NeverSeen.in_memory(),
         cause: NO_CAUSE,
         reserved: 0,
     };
@@ -116,8 +107,8 @@ impl JointTorque {
 
 /// The torques of all joints at one instant: the payload of `<robot>/estimate/torque`.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
-#[type_name("proprio/TorqueEstimate/2")]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
+#[type_name("proprio/TorqueEstimate/3")]
 pub struct TorqueEstimate {
     /// `acquired` is the instant that the torques refer to.
     pub header: Header,
@@ -141,7 +132,7 @@ impl TorqueEstimate {
 
 /// The estimated external wrench at one contact, exerted by the environment on the link.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
 pub struct ContactWrench {
     /// Force \[N\], in the axes of the frame that the configuration's `link` names.
     pub force: [f64; 3],
@@ -152,7 +143,7 @@ pub struct ContactWrench {
     /// 1 if it may be used, 0 if it is withheld.
     pub valid: u32,
     /// Why it is withheld.
-    pub reason: Reason,
+    pub reason: Code<Reason>,
     /// The channel that causes it, or [`NO_CAUSE`].
     pub cause: u32,
     /// 1 if the contact is not declared but F/T readings show that it is present, else 0.
@@ -166,7 +157,7 @@ impl ContactWrench {
         torque: [f64::NAN; 3],
         standard_deviation: [f64::NAN; 6],
         valid: 0,
-        reason: Reason::NeverSeen,
+        reason: Reason::NeverSeen.in_memory(),
         cause: NO_CAUSE,
         detected: 0,
     };
@@ -175,7 +166,7 @@ impl ContactWrench {
 /// The residual of a sub-tree (a part of the robot between F/T sensors): the wrench that the model,
 /// the F/T sensors and the contacts known to be present do not explain.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
 pub struct Residual {
     /// Unexplained force \[N\] on the sub-tree, in the axes of its top link.
     pub force: [f64; 3],
@@ -210,7 +201,7 @@ impl Residual {
 /// The wrenches of all contacts at one instant and the residuals of all sub-trees: the payload of
 /// `<robot>/estimate/contact`.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
 #[type_name("proprio/ContactEstimate/3")]
 pub struct ContactEstimate {
     /// `acquired` is the instant that the wrenches refer to.
@@ -246,8 +237,8 @@ impl ContactEstimate {
 /// A declaration that a contact is present or absent, sent to the estimator: the payload of
 /// `<robot>/contact/declared`.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
-#[type_name("proprio/ContactDeclaration/1")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend, FromBytes)]
+#[type_name("proprio/ContactDeclaration/2")]
 pub struct ContactDeclaration {
     /// `acquired` is the instant from which the declaration holds.
     pub header: Header,
@@ -261,6 +252,6 @@ pub struct ContactDeclaration {
 
 const _: () = assert!(size_of::<JointTorque>() == 32 && size_of::<ContactWrench>() == 112);
 const _: () =
-    assert!(size_of::<TorqueEstimate>() == 56 + 32 * MAX_JOINTS && size_of::<Residual>() == 64);
-const _: () = assert!(size_of::<ContactEstimate>() == 56 + 112 * MAX_CONTACTS + 64 * MAX_SUBTREES);
-const _: () = assert!(size_of::<ContactDeclaration>() == 120);
+    assert!(size_of::<TorqueEstimate>() == 64 + 32 * MAX_JOINTS && size_of::<Residual>() == 64);
+const _: () = assert!(size_of::<ContactEstimate>() == 64 + 112 * MAX_CONTACTS + 64 * MAX_SUBTREES);
+const _: () = assert!(size_of::<ContactDeclaration>() == 128);

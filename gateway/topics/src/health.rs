@@ -3,9 +3,11 @@
 
 use core::fmt;
 
-use crate::{Header, MAX_BUSES, MAX_CHANNELS, Name, Nanos};
+use crate::code::coded;
+use crate::{Code, Header, MAX_BUSES, MAX_CHANNELS, Name, Nanos};
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+use zerocopy::FromBytes;
 
 /// The counters of one device.
 #[repr(C)]
@@ -37,46 +39,29 @@ pub enum Counter {
     Starts = 11,
     /// Readings dropped because their stamp was not later than the last one's.
     Backward = 12,
+    /// Readings with a fault of the drive that does not concern the reading.
+    DriveFault = 13,
+    /// Frames to the device that could not be sent.
+    Unsent = 14,
 }
 
-impl Counter {
-    /// All of them, in order.
-    pub const ALL: [Self; 13] = [
-        Self::Frames,
-        Self::Readings,
-        Self::Length,
-        Self::Value,
-        Self::Unpaired,
-        Self::Lost,
-        Self::Unexpected,
-        Self::Changed,
-        Self::Saturated,
-        Self::DeviceFault,
-        Self::Silences,
-        Self::Starts,
-        Self::Backward,
-    ];
-
-    /// Its name in tables and logs.
-    #[must_use]
-    pub const fn word(self) -> &'static str {
-        match self {
-            Self::Frames => "frames",
-            Self::Readings => "readings",
-            Self::Length => "bad_length",
-            Self::Value => "bad_value",
-            Self::Unpaired => "unpaired",
-            Self::Lost => "lost",
-            Self::Unexpected => "unexpected",
-            Self::Changed => "changed",
-            Self::Saturated => "saturated",
-            Self::DeviceFault => "device_fault",
-            Self::Silences => "silences",
-            Self::Starts => "starts",
-            Self::Backward => "backward_stamp",
-        }
-    }
-}
+coded!(Counter {
+    Frames = "frames",
+    Readings = "readings",
+    Length = "bad_length",
+    Value = "bad_value",
+    Unpaired = "unpaired",
+    Lost = "lost",
+    Unexpected = "unexpected",
+    Changed = "changed",
+    Saturated = "saturated",
+    DeviceFault = "device_fault",
+    Silences = "silences",
+    Starts = "starts",
+    Backward = "backward_stamp",
+    DriveFault = "drive_fault",
+    Unsent = "unsent",
+});
 
 /// The state of a link to a bus.
 #[repr(C)]
@@ -93,25 +78,135 @@ pub enum LinkState {
     BusOff = 3,
     /// The replayed log has ended.
     Ended = 4,
+    /// The interface is up, but has no carrier: its controller or its peer is not running.
+    NoCarrier = 5,
 }
 
-impl LinkState {
-    /// Its name in tables and logs.
-    #[must_use]
-    pub const fn word(self) -> &'static str {
-        match self {
-            Self::Up => "up",
-            Self::Down => "down",
-            Self::Gone => "gone",
-            Self::BusOff => "bus_off",
-            Self::Ended => "ended",
-        }
-    }
+coded!(LinkState {
+    Up = "up",
+    Down = "down",
+    Gone = "gone",
+    BusOff = "bus_off",
+    Ended = "ended",
+    NoCarrier = "no_carrier",
+});
+
+/// The error state of a CAN controller (ISO 11898-1), as the kernel reports it.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, ZeroCopySend)]
+pub enum Controller {
+    /// Not known: a virtual interface, or not asked yet.
+    #[default]
+    Unknown = 0,
+    /// Error active: the normal state.
+    Active = 1,
+    /// An error counter has reached the warning limit (96).
+    Warning = 2,
+    /// Error passive: an error counter has reached 128.
+    Passive = 3,
+    /// Bus-off: the transmit error counter has passed 255.
+    BusOff = 4,
+    /// Stopped by its host.
+    Stopped = 5,
+    /// Asleep.
+    Sleeping = 6,
+}
+
+coded!(Controller {
+    Unknown = "unknown",
+    Active = "active",
+    Warning = "warning",
+    Passive = "passive",
+    BusOff = "bus_off",
+    Stopped = "stopped",
+    Sleeping = "sleeping",
+});
+
+/// What an error frame of a CAN interface reports; one frame may report several.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, ZeroCopySend)]
+pub enum BusError {
+    /// A frame could not be sent in time.
+    TxTimeout = 0,
+    /// Arbitration was lost.
+    ArbitrationLost = 1,
+    /// The controller's receive buffer overflowed: frames were lost.
+    RxOverflow = 2,
+    /// The controller's transmit buffer overflowed.
+    TxOverflow = 3,
+    /// An error counter reached the warning limit.
+    Warning = 4,
+    /// The controller became error passive.
+    Passive = 5,
+    /// The controller became error active again.
+    Active = 6,
+    /// A violation of the protocol: bit, form, stuff or other error.
+    Protocol = 7,
+    /// The transceiver reports a fault, such as a broken wire or a short circuit.
+    Transceiver = 8,
+    /// Nobody acknowledged a frame.
+    NoAck = 9,
+    /// The controller became bus-off.
+    BusOff = 10,
+    /// A bus error.
+    Bus = 11,
+    /// The controller was restarted.
+    Restarted = 12,
+}
+
+coded!(BusError {
+    TxTimeout = "tx_timeout",
+    ArbitrationLost = "arbitration_lost",
+    RxOverflow = "rx_overflow",
+    TxOverflow = "tx_overflow",
+    Warning = "warning",
+    Passive = "passive",
+    Active = "active",
+    Protocol = "protocol",
+    Transceiver = "transceiver",
+    NoAck = "no_ack",
+    BusOff = "bus_off",
+    Bus = "bus_error",
+    Restarted = "restarted",
+});
+
+/// What the kernel knows of an interface and its CAN controller; zero where it does not tell.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ZeroCopySend, FromBytes)]
+pub struct InterfaceHealth {
+    /// Frames received by the interface, for all programs.
+    pub rx_frames: u64,
+    /// Frames sent by the interface.
+    pub tx_frames: u64,
+    /// Receive errors.
+    pub rx_errors: u64,
+    /// Transmit errors.
+    pub tx_errors: u64,
+    /// Received frames that the interface dropped.
+    pub rx_dropped: u64,
+    /// Frames to be sent that the interface dropped.
+    pub tx_dropped: u64,
+    /// The controller's error state.
+    pub controller: Code<Controller>,
+    /// The controller's transmit error counter.
+    pub tx_error_counter: u32,
+    /// The controller's receive error counter.
+    pub rx_error_counter: u32,
+    /// Nominal bit-rate \[bit/s\].
+    pub bit_rate: u32,
+    /// Bit-rate of the data phase of CAN FD \[bit/s\].
+    pub data_bit_rate: u32,
+    /// Time from bus-off to the automatic restart \[ms\]; 0: none.
+    pub restart_ms: u32,
+    /// 1 if the interface carries CAN FD frames.
+    pub fd: u32,
+    /// 1 if the controller only listens.
+    pub listen_only: u32,
 }
 
 /// Counters and state of one bus.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
 pub struct BusHealth {
     /// Its name in the configuration.
     pub name: Name,
@@ -119,14 +214,19 @@ pub struct BusHealth {
     pub frames: u64,
     /// Of these, frames with an identifier of no configured device.
     pub unclaimed: u64,
-    /// Frames that the kernel dropped because the gateway read them too late.
+    /// Frames lost because the gateway read them too late, or the controller's buffer overflowed.
     pub dropped: u64,
     /// Error frames received.
     pub error_frames: u64,
+    /// What they reported; index by `BusError as usize`.
+    pub errors: [u64; BusError::ALL.len()],
     /// Frames sent.
     pub sent: u64,
-    /// Frames that could not be sent before their deadline.
+    /// Frames not sent: their deadline passed, the link was lost, or the interface refused them.
     pub send_failures: u64,
+    /// Attempts to send that found the interface's queue full; each was repeated until the frame's
+    /// deadline.
+    pub queue_full: u64,
     /// Number of link losses (down, gone, bus-off).
     pub link_losses: u64,
     /// Samples published.
@@ -139,8 +239,10 @@ pub struct BusHealth {
     pub last_frame: Nanos,
     /// Time of the last turn of the bus thread's loop \[ns\].
     pub last_turn: Nanos,
+    /// The interface and its controller.
+    pub interface: InterfaceHealth,
     /// The link's state.
-    pub link: LinkState,
+    pub link: Code<LinkState>,
     /// Unused, zero.
     pub reserved: u32,
 }
@@ -153,31 +255,139 @@ impl BusHealth {
         unclaimed: 0,
         dropped: 0,
         error_frames: 0,
+        errors: [0; BusError::ALL.len()],
         sent: 0,
         send_failures: 0,
+        queue_full: 0,
         link_losses: 0,
         published: 0,
         publish_failures: 0,
         connections: 0,
         last_frame: Nanos::MIN,
         last_turn: Nanos::MIN,
-        link: LinkState::Up,
+        interface: InterfaceHealth {
+            rx_frames: 0,
+            tx_frames: 0,
+            rx_errors: 0,
+            tx_errors: 0,
+            rx_dropped: 0,
+            tx_dropped: 0,
+            controller: Controller::Unknown.in_memory(),
+            tx_error_counter: 0,
+            rx_error_counter: 0,
+            bit_rate: 0,
+            data_bit_rate: 0,
+            restart_ms: 0,
+            fd: 0,
+            listen_only: 0,
+        },
+        link: LinkState::Up.in_memory(),
         reserved: 0,
     };
 }
 
+/// The state of a device's bring-up.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, ZeroCopySend)]
+pub enum DeviceState {
+    /// The gateway keeps silent, as boards require after power-on.
+    #[default]
+    Waiting = 0,
+    /// The gateway asks for the board's configuration.
+    Asking = 1,
+    /// The board was started; no reading received yet.
+    Starting = 2,
+    /// Readings arrive.
+    Streaming = 3,
+    /// No reading for longer than the maximum silence; the board is started again.
+    Silent = 4,
+    /// Not usable: see the refusal.
+    Refused = 5,
+    /// The board was stopped.
+    Stopped = 6,
+}
+
+coded!(DeviceState {
+    Waiting = "waiting",
+    Asking = "asking",
+    Starting = "starting",
+    Streaming = "streaming",
+    Silent = "silent",
+    Refused = "refused",
+    Stopped = "stopped",
+});
+
+/// Why a device is not usable.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Refusal {
+    /// It did not report its full scales in time, and the configuration has none.
+    NoFullScale,
+    /// It reports a full scale of zero for this channel.
+    ZeroFullScale {
+        /// The channel, 0 to 5.
+        channel: u8,
+    },
+    /// It reports a different configuration than before: its readings since then cannot be trusted.
+    Changed,
+}
+
+impl Refusal {
+    /// Its number in [`DeviceHealth::refusal`].
+    #[must_use]
+    pub const fn code(self) -> u32 {
+        match self {
+            Self::NoFullScale => 1,
+            Self::ZeroFullScale { channel } => 0x100 | channel as u32,
+            Self::Changed => 2,
+        }
+    }
+
+    /// The refusal with number `code`.
+    #[must_use]
+    #[allow(clippy::cast_possible_truncation)]
+    pub const fn from_code(code: u32) -> Option<Self> {
+        match code {
+            1 => Some(Self::NoFullScale),
+            2 => Some(Self::Changed),
+            0x100..=0x1FF => Some(Self::ZeroFullScale {
+                channel: (code & 0xFF) as u8,
+            }),
+            _ => None,
+        }
+    }
+}
+
+impl fmt::Display for Refusal {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NoFullScale => f.write_str(
+                "it did not report its full scales; check its power, cable and address, or set \
+                 full_scale_n and full_scale_nm",
+            ),
+            Self::ZeroFullScale { channel } => write!(
+                f,
+                "it reports a full scale of zero for channel {channel}; its memory needs repair, \
+                 or set full_scale_n and full_scale_nm"
+            ),
+            Self::Changed => f.write_str(
+                "it reports a different configuration than before; check the board, then restart \
+                 the gateway",
+            ),
+        }
+    }
+}
+
 /// Counters and state of one device.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
 pub struct DeviceHealth {
     /// Its name in the configuration.
     pub name: Name,
     /// The counters; index by `Counter as usize`.
     pub counters: [u64; Counter::ALL.len()],
-    /// Its state (`proprio_drivers::State`): 0 waiting, 1 asking, 2 starting, 3 streaming, 4
-    /// silent, 5 refused, 6 stopped.
-    pub state: u32,
-    /// Why it was refused (`proprio_drivers::Refusal`); 0 if it was not.
+    /// Its state.
+    pub state: Code<DeviceState>,
+    /// Why it was refused ([`Refusal::from_code`]); 0 if it was not.
     pub refusal: u32,
     /// The number of its bus.
     pub bus: u32,
@@ -187,13 +397,16 @@ pub struct DeviceHealth {
 
 /// State and counters of the gateway, published ten times a second.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
-#[type_name("proprio/GatewayHealth/1")]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
+#[type_name("proprio/GatewayHealth/2")]
 pub struct GatewayHealth {
     /// When.
     pub header: Header,
     /// When the gateway started \[ns\].
     pub started: Nanos,
+    /// CLOCK_REALTIME minus CLOCK_MONOTONIC at `header.published` \[ns\]: what to add to a stamp
+    /// to have the time of day (UTC).
+    pub realtime_offset: Nanos,
     /// Number of valid entries in `buses`.
     pub bus_count: u32,
     /// Number of valid entries in `devices`.
@@ -209,7 +422,7 @@ impl DeviceHealth {
     pub const EMPTY: Self = Self {
         name: Name::EMPTY,
         counters: [0; Counter::ALL.len()],
-        state: 0,
+        state: DeviceState::Waiting.in_memory(),
         refusal: 0,
         bus: 0,
         reserved: 0,
@@ -223,6 +436,7 @@ impl GatewayHealth {
         Self {
             header: Header::default(),
             started,
+            realtime_offset: Nanos::ZERO,
             bus_count: 0,
             device_count: 0,
             buses: [BusHealth::EMPTY; MAX_BUSES],
@@ -253,7 +467,7 @@ impl GatewayHealth {
 /// Instants are counted per group of links and sensors. Groups are identified independently: one
 /// may pause while another learns. There are at most `identification.rate_hz` instants a second.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ZeroCopySend, FromBytes)]
 pub struct IdentificationHealth {
     /// Number of groups; 0 if nothing is identified.
     pub groups: u32,
@@ -328,8 +542,8 @@ impl fmt::Display for IdentificationHealth {
 
 /// State and counters of the estimator, published ten times a second.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ZeroCopySend)]
-#[type_name("proprio/EstimatorHealth/2")]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ZeroCopySend, FromBytes)]
+#[type_name("proprio/EstimatorHealth/3")]
 pub struct EstimatorHealth {
     /// When.
     pub header: Header,
@@ -363,10 +577,11 @@ pub struct EstimatorHealth {
     pub identification: IdentificationHealth,
 }
 
-const _: () =
-    assert!(size_of::<BusHealth>() == 64 + 13 * 8 && size_of::<DeviceHealth>() == 64 + 13 * 8 + 16);
-const _: () = assert!(size_of::<GatewayHealth>() == 64 + 168 * MAX_BUSES + 184 * MAX_CHANNELS);
-const _: () = assert!(
-    size_of::<IdentificationHealth>() == 15 * 8
-        && size_of::<EstimatorHealth>() == 48 + 13 * 8 + 15 * 8
-);
+const _: () = {
+    assert!(size_of::<InterfaceHealth>() == 6 * 8 + 8 * 4);
+    assert!(size_of::<BusHealth>() == 64 + 26 * 8 + size_of::<InterfaceHealth>() + 8);
+    assert!(size_of::<DeviceHealth>() == 64 + 15 * 8 + 16);
+    assert!(size_of::<GatewayHealth>() == 80 + 360 * MAX_BUSES + 200 * MAX_CHANNELS);
+    assert!(size_of::<IdentificationHealth>() == 15 * 8);
+    assert!(size_of::<EstimatorHealth>() == 56 + 13 * 8 + 15 * 8);
+};

@@ -6,10 +6,11 @@
 use crate::{Header, MAX_LINKS, MAX_SENSORS, Name};
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+use zerocopy::FromBytes;
 
 /// An identified link.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
 pub struct LinkInertia {
     /// The link, as the model names it.
     pub name: Name,
@@ -50,7 +51,7 @@ impl LinkInertia {
 
 /// The offset of one F/T sensor: its reading without load.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
 pub struct SensorOffset {
     /// The sensor's channel.
     pub name: Name,
@@ -81,8 +82,8 @@ impl SensorOffset {
 
 /// The identified parameters in use from now on: the payload of `<robot>/estimate/inertia`.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
-#[type_name("proprio/InertiaEstimate/1")]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
+#[type_name("proprio/InertiaEstimate/2")]
 pub struct InertiaEstimate {
     /// `acquired` is the instant of the newest data used, about a second before the parameters are
     /// in use. [`Nanos::MIN`](crate::Nanos::MIN): the parameters of an earlier run, resumed.
@@ -144,8 +145,8 @@ const _: () = {
             && offset_of!(SensorOffset, group) == 160
     );
     assert!(
-        offset_of!(InertiaEstimate, link_count) == 48 && offset_of!(InertiaEstimate, links) == 56
+        offset_of!(InertiaEstimate, link_count) == 56 && offset_of!(InertiaEstimate, links) == 64
     );
-    assert!(offset_of!(InertiaEstimate, offsets) == 56 + 248 * MAX_LINKS);
-    assert!(size_of::<InertiaEstimate>() == 56 + 248 * MAX_LINKS + 168 * MAX_SENSORS);
+    assert!(offset_of!(InertiaEstimate, offsets) == 64 + 248 * MAX_LINKS);
+    assert!(size_of::<InertiaEstimate>() == 64 + 248 * MAX_LINKS + 168 * MAX_SENSORS);
 };

@@ -11,14 +11,16 @@
 //!   and the amount of data they come from.
 //! - [`description`]: what the channel, joint and contact numbers mean.
 //! - [`health`]: state and counters of gateway and estimator.
+//! - [`code`]: enumerations as they stand in shared memory: numbers that a reader checks.
 //! - [`time`]: instants and durations as integer nanoseconds.
 //! - `csv` (feature `csv`): the same samples as a text table.
 //! - `ipc` (feature `ipc`): the ports: a domain in shared memory, writers and readers. `realtime`:
 //!   scheduling of the threads that use them.
 //!
-//! Every type that crosses a process boundary is `repr(C)`. Its size is asserted here at compile
-//! time. The version of its layout is part of its type name, because the transport compares only
-//! names, sizes and alignments.
+//! Every type that crosses a process boundary is `repr(C)` and holds only integers and floating
+//! point numbers, for which every pattern of bits is legal (`zerocopy::FromBytes` proves it). Its
+//! size is asserted here at compile time. The version of its layout is part of its type name,
+//! because the transport compares only names, sizes and alignments.
 //!
 //! # Conventions
 //! Angles in rad, forces in N, torques in Nm, right-handed frames. *Absent is not zero*: a quantity
@@ -29,6 +31,7 @@
 #[cfg(any(feature = "std", test))]
 extern crate std;
 
+pub mod code;
 #[cfg(feature = "csv")]
 pub mod csv;
 pub mod description;
@@ -43,17 +46,20 @@ pub mod realtime;
 pub mod sample;
 pub mod time;
 
+pub use code::{Code, Coded};
 pub use description::{Description, Entry, Name, Publisher, Role};
 pub use estimate::{
     ContactDeclaration, ContactEstimate, ContactWrench, JointTorque, NO_CAUSE, NO_CONTACT, Reason,
     Residual, TorqueEstimate,
 };
 pub use health::{
-    BusHealth, Counter, DeviceHealth, EstimatorHealth, GatewayHealth, IdentificationHealth,
-    LinkState,
+    BusError, BusHealth, Controller, Counter, DeviceHealth, DeviceState, EstimatorHealth,
+    GatewayHealth, IdentificationHealth, InterfaceHealth, LinkState, Refusal,
 };
 pub use inertia::{InertiaEstimate, LinkInertia, SensorOffset};
-pub use reading::{Actuator, Gauges, Imu, JointState, Kind, Reading, Temperature, Wrench};
+pub use reading::{
+    Actuator, Gauges, Imu, JointState, Kind, Reading, Skin, Temperature, VALUES, Wrench,
+};
 pub use sample::{Header, Quality, Sample, Saturation, StampKind};
 pub use time::Nanos;
 

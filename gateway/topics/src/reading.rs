@@ -1,11 +1,12 @@
-//! A device's measurement in SI units, one variant per kind of quantity.
+//! A device's measurement in SI units, one variant per kind of quantity, and its form in shared
+//! memory: the kind's number and up to [`VALUES`] numbers.
 
+use crate::code::coded;
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
 /// A joint's (or a motor shaft's) state, positive along the axis that the configuration states.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct JointState {
     /// Position \[rad, or m for a prismatic joint\]. NaN if this device does not report it.
     pub position: f64,
@@ -37,8 +38,7 @@ impl JointState {
 /// The gateway passes on the device's values in SI units. The body that the wrench acts on and the
 /// pose of the sensor frame are in the estimator's configuration (`[[force_torque]]`: `frame`,
 /// `direction`).
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Wrench {
     /// Force \[N\], sensor axes.
     pub force: [f64; 3],
@@ -47,8 +47,7 @@ pub struct Wrench {
 }
 
 /// An inertial measurement unit's reading, in the IMU's axes.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Imu {
     /// Proper acceleration of the IMU's origin \[m/s^2\]: classical acceleration minus gravity. At
     /// rest it points up.
@@ -76,24 +75,21 @@ impl Imu {
 }
 
 /// Raw strain gauge counts of a force/torque sensor, before its calibration matrix.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Gauges {
     /// Analog-to-digital counts of channels 0 to 5, as the device sends them.
     pub counts: [i32; 6],
 }
 
 /// A device's temperature.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Temperature {
     /// Temperature \[degrees Celsius\].
     pub celsius: f64,
 }
 
 /// A motor board's state.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Actuator {
     /// Duty cycle of the power stage, -1 to 1. NaN if not reported.
     pub duty: f64,
@@ -103,13 +99,19 @@ pub struct Actuator {
     pub encoder: u32,
     /// Fault bits, the device's own (see the driver); 0 is no fault.
     pub faults: u32,
-    /// Unused, zero.
-    pub reserved: u32,
+}
+
+/// A patch of tactile skin: one triangle of twelve taxels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Skin {
+    /// The triangle's number on its device.
+    pub triangle: u32,
+    /// Pressure on each taxel, as the device scales it (see the driver). NaN if not reported.
+    pub taxels: [f64; 12],
 }
 
 /// One reading of one channel.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Reading {
     /// A joint's state.
     Joint(JointState),
@@ -123,34 +125,247 @@ pub enum Reading {
     Temperature(Temperature),
     /// A motor board's state.
     Actuator(Actuator),
+    /// A patch of skin.
+    Skin(Skin),
 }
 
-/// The kind of a channel, after its main reading.
+/// The kind of a reading. The kind of a channel is that of its main reading; a channel may also
+/// carry readings of other kinds, such as the temperature of a force/torque sensor.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, ZeroCopySend)]
 pub enum Kind {
-    /// A joint: [`Reading::Joint`], and [`Reading::Actuator`] or [`Reading::Temperature`] of its
-    /// motor.
+    /// [`Reading::Joint`].
     Joint = 0,
-    /// A force/torque sensor: [`Reading::Wrench`], and [`Reading::Gauges`],
-    /// [`Reading::Temperature`].
+    /// [`Reading::Wrench`].
     Wrench = 1,
-    /// An inertial measurement unit: [`Reading::Imu`].
+    /// [`Reading::Imu`].
     Imu = 2,
+    /// [`Reading::Gauges`].
+    Gauges = 3,
+    /// [`Reading::Temperature`].
+    Temperature = 4,
+    /// [`Reading::Actuator`].
+    Actuator = 5,
+    /// [`Reading::Skin`].
+    Skin = 6,
 }
 
+// The words are also the first parts of CSV columns.
+coded!(Kind {
+    Joint = "joint",
+    Wrench = "wrench",
+    Imu = "imu",
+    Gauges = "gauges",
+    Temperature = "temperature",
+    Actuator = "actuator",
+    Skin = "skin",
+});
+
+/// The largest number of values of a reading.
+pub const VALUES: usize = 16;
+
 impl Kind {
-    /// Its name in configuration files and CSV columns.
+    /// The names of a reading's values, in their order: those of CSV columns.
     #[must_use]
-    pub const fn word(self) -> &'static str {
+    pub const fn fields(self) -> &'static [&'static str] {
         match self {
-            Self::Joint => "joint",
-            Self::Wrench => "wrench",
-            Self::Imu => "imu",
+            Self::Joint => &["position", "velocity", "acceleration", "torque", "current"],
+            Self::Wrench => &["fx", "fy", "fz", "tx", "ty", "tz"],
+            Self::Imu => &[
+                "ax", "ay", "az", "gx", "gy", "gz", "alx", "aly", "alz", "mx", "my", "mz", "qw",
+                "qx", "qy", "qz",
+            ],
+            Self::Gauges => &["g0", "g1", "g2", "g3", "g4", "g5"],
+            Self::Temperature => &["temperature"],
+            Self::Actuator => &["duty", "mode", "encoder", "faults"],
+            Self::Skin => &[
+                "triangle", "p0", "p1", "p2", "p3", "p4", "p5", "p6", "p7", "p8", "p9", "p10",
+                "p11",
+            ],
         }
     }
 }
 
-const _: () =
-    assert!(size_of::<Imu>() == 128 && size_of::<Wrench>() == 48 && size_of::<JointState>() == 40);
-const _: () = assert!(size_of::<Reading>() == 136 && align_of::<Reading>() == 8);
+impl Reading {
+    /// Its kind.
+    #[must_use]
+    pub const fn kind(&self) -> Kind {
+        match self {
+            Self::Joint(_) => Kind::Joint,
+            Self::Wrench(_) => Kind::Wrench,
+            Self::Imu(_) => Kind::Imu,
+            Self::Gauges(_) => Kind::Gauges,
+            Self::Temperature(_) => Kind::Temperature,
+            Self::Actuator(_) => Kind::Actuator,
+            Self::Skin(_) => Kind::Skin,
+        }
+    }
+
+    /// Its values in the order of [`Kind::fields`]; zero beyond them.
+    #[must_use]
+    pub fn values(&self) -> [f64; VALUES] {
+        match self {
+            Self::Joint(j) => {
+                padded([[j.position, j.velocity, j.acceleration, j.torque, j.current]])
+            }
+            Self::Wrench(w) => padded([w.force, w.torque]),
+            Self::Imu(i) => {
+                let [w, x, y, z] = i.orientation;
+                padded([
+                    i.proper_acceleration,
+                    i.angular_velocity,
+                    i.angular_acceleration,
+                    i.magnetic_field,
+                    [w, x, y],
+                    [z, 0.0, 0.0],
+                ])
+            }
+            Self::Gauges(g) => padded([g.counts.map(f64::from)]),
+            Self::Temperature(t) => padded([[t.celsius]]),
+            Self::Actuator(a) => {
+                let [mode, encoder, faults] = [a.mode, a.encoder, a.faults].map(f64::from);
+                padded([[a.duty, mode, encoder, faults]])
+            }
+            Self::Skin(s) => {
+                let mut values = [0.0; VALUES];
+                let all = core::iter::once(f64::from(s.triangle)).chain(s.taxels);
+                values.iter_mut().zip(all).for_each(|(to, from)| *to = from);
+                values
+            }
+        }
+    }
+
+    /// The inverse of [`Reading::values`]; `None` if a value that counts something is no integer
+    /// of its range.
+    #[must_use]
+    pub fn from_values(kind: Kind, values: &[f64; VALUES]) -> Option<Self> {
+        let [
+            v0,
+            v1,
+            v2,
+            v3,
+            v4,
+            v5,
+            v6,
+            v7,
+            v8,
+            v9,
+            v10,
+            v11,
+            v12,
+            v13,
+            v14,
+            v15,
+        ] = *values;
+        Some(match kind {
+            Kind::Joint => Self::Joint(JointState {
+                position: v0,
+                velocity: v1,
+                acceleration: v2,
+                torque: v3,
+                current: v4,
+            }),
+            Kind::Wrench => Self::Wrench(Wrench {
+                force: [v0, v1, v2],
+                torque: [v3, v4, v5],
+            }),
+            Kind::Imu => Self::Imu(Imu {
+                proper_acceleration: [v0, v1, v2],
+                angular_velocity: [v3, v4, v5],
+                angular_acceleration: [v6, v7, v8],
+                magnetic_field: [v9, v10, v11],
+                orientation: [v12, v13, v14, v15],
+            }),
+            Kind::Gauges => {
+                let mut counts = [0; 6];
+                for (count, value) in counts.iter_mut().zip(values) {
+                    *count = i32::try_from(integer(*value)?).ok()?;
+                }
+                Self::Gauges(Gauges { counts })
+            }
+            Kind::Temperature => Self::Temperature(Temperature { celsius: v0 }),
+            Kind::Actuator => {
+                let [mode, encoder, faults] = [unsigned(v1)?, unsigned(v2)?, unsigned(v3)?];
+                Self::Actuator(Actuator {
+                    duty: v0,
+                    mode,
+                    encoder,
+                    faults,
+                })
+            }
+            Kind::Skin => Self::Skin(Skin {
+                triangle: unsigned(v0)?,
+                taxels: [v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12],
+            }),
+        })
+    }
+}
+
+fn padded<const N: usize, const M: usize>(parts: [[f64; N]; M]) -> [f64; VALUES] {
+    let mut values = [0.0; VALUES];
+    let all = parts.as_flattened();
+    values
+        .iter_mut()
+        .zip(all)
+        .for_each(|(to, from)| *to = *from);
+    values
+}
+
+/// `value` as an integer, if it is one of at most 32 bits.
+#[allow(clippy::cast_possible_truncation)] // within the range
+fn integer(value: f64) -> Option<i64> {
+    let nearest = value as i64;
+    (value.abs() < 4_294_967_296.0 && nearest as f64 == value).then_some(nearest)
+}
+
+fn unsigned(value: f64) -> Option<u32> {
+    u32::try_from(integer(value)?).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn each_value_of_a_reading_has_a_name() {
+        for kind in Kind::ALL {
+            let mut values = [f64::NAN; VALUES];
+            for (value, number) in values.iter_mut().zip(0_u8..) {
+                *value = f64::from(number);
+            }
+            let back = Reading::from_values(kind, &values).unwrap().values();
+            let count = kind.fields().len();
+            assert_eq!(back[..count], values[..count], "{kind}");
+            assert!(back[count..].iter().all(|v| *v == 0.0), "{kind}");
+        }
+    }
+
+    #[test]
+    fn counts_are_integers_of_their_range() {
+        let of = |kind, v| Reading::from_values(kind, &[v; VALUES]);
+        for bad in [f64::NAN, f64::INFINITY, 0.5, 5e9, -5e9] {
+            assert_eq!(of(Kind::Gauges, bad), None);
+            assert_eq!(of(Kind::Actuator, bad), None);
+            assert_eq!(of(Kind::Skin, bad), None);
+        }
+        assert_eq!(of(Kind::Actuator, -1.0), None);
+        assert_eq!(of(Kind::Gauges, 3e9), None);
+        assert!(of(Kind::Gauges, -2_147_483_648.0).is_some());
+        assert!(of(Kind::Actuator, 4_294_967_295.0).is_some());
+    }
+
+    proptest! {
+        #[test]
+        fn any_values_are_legal_input(code in 0..9_u32, values: [f64; VALUES]) {
+            if let Some(kind) = crate::Code::<Kind>::of_number(code).get()
+                && let Some(reading) = Reading::from_values(kind, &values)
+            {
+                let count = kind.fields().len();
+                for (back, value) in reading.values().iter().zip(&values).take(count) {
+                    prop_assert!(back == value || back.to_bits() == value.to_bits());
+                }
+            }
+        }
+    }
+}

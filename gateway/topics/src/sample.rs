@@ -1,10 +1,13 @@
 //! A reading with its channel number, time stamp, quality and sequence number.
 
-use crate::{Nanos, Reading};
+use crate::code::coded;
+use crate::reading::VALUES;
+use crate::{Code, Kind, Nanos, Reading};
 use core::fmt;
 use core::ops::{BitOr, BitOrAssign};
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+use zerocopy::FromBytes;
 
 /// Source of an acquisition stamp, from worst to best.
 #[repr(C)]
@@ -23,6 +26,14 @@ pub enum StampKind {
     Hardware = 4,
 }
 
+coded!(StampKind {
+    None = "none",
+    User = "user",
+    Log = "log",
+    Software = "software",
+    Hardware = "hardware",
+});
+
 /// Saturation of one axis of a six-axis sensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Saturation {
@@ -36,7 +47,7 @@ pub enum Saturation {
 
 /// Quality flags of a sample; the empty set means that no problem is known.
 #[repr(C)]
-#[derive(Clone, Copy, Default, PartialEq, Eq, Hash, ZeroCopySend)]
+#[derive(Clone, Copy, Default, PartialEq, Eq, Hash, ZeroCopySend, FromBytes)]
 pub struct Quality(pub u32);
 
 impl Quality {
@@ -49,23 +60,27 @@ impl Quality {
     /// The device repeats its last value instead of measuring (iCub strain boards do so while
     /// saturated).
     pub const FROZEN: Self = Self(1 << 2);
-    /// The device reports a fault.
+    /// The device reports a fault that makes this reading doubtful.
     pub const DEVICE_FAULT: Self = Self(1 << 3);
     /// The device reports that it is not calibrated.
     pub const NOT_CALIBRATED: Self = Self(1 << 4);
     /// `Header::device_counter` is valid: it is the device's own sequence number.
     pub const DEVICE_COUNTER: Self = Self(1 << 5);
+    /// The joint's drive reports a fault (emergency stop, over-current, ...) that does not concern
+    /// its encoder: the position is good.
+    pub const DRIVE_FAULT: Self = Self(1 << 6);
 
     /// The flags that make an encoder's position unusable.
     pub const UNTRUSTED_ENCODER: Self = Self(Self::DEVICE_FAULT.0 | Self::NOT_CALIBRATED.0);
 
-    const NAMED: [(Self, &'static str); 6] = [
+    const NAMED: [(Self, &'static str); 7] = [
         (Self::GAP_BEFORE, "gap_before"),
         (Self::SATURATED, "saturated"),
         (Self::FROZEN, "frozen"),
         (Self::DEVICE_FAULT, "device_fault"),
         (Self::NOT_CALIBRATED, "not_calibrated"),
         (Self::DEVICE_COUNTER, "device_counter"),
+        (Self::DRIVE_FAULT, "drive_fault"),
     ];
     const SATURATION_SHIFT: u32 = 16;
 
@@ -146,7 +161,7 @@ impl fmt::Display for Quality {
 
 /// Time stamps and sequence number; the same in every published payload.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend, FromBytes)]
 pub struct Header {
     /// Changes at each start of the publisher; `sequence` then starts again at 0.
     pub epoch: u64,
@@ -158,33 +173,78 @@ pub struct Header {
     pub acquired: Nanos,
     /// Time just before sending \[ns\].
     pub published: Nanos,
+    /// The device's own time of this reading \[ns\], in the device's clock; [`Nanos::MIN`] if it
+    /// reports none.
+    pub device_time: Nanos,
     /// The device's own sequence number if it has one (then `quality` has DEVICE_COUNTER), else 0.
     pub device_counter: u32,
     /// Quality flags of this sample.
     pub quality: Quality,
     /// The source of `acquired`.
-    pub stamp: StampKind,
+    pub stamp: Code<StampKind>,
     /// Number of the bus in the gateway's configuration, from 0.
     pub bus: u32,
 }
 
+impl Default for Header {
+    /// Zero, without a device's time.
+    fn default() -> Self {
+        Self {
+            epoch: 0,
+            sequence: 0,
+            acquired: Nanos::ZERO,
+            published: Nanos::ZERO,
+            device_time: Nanos::MIN,
+            device_counter: 0,
+            quality: Quality::GOOD,
+            stamp: StampKind::None.in_memory(),
+            bus: 0,
+        }
+    }
+}
+
 /// One reading of one channel: the payload of `<robot>/samples`.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
-#[type_name("proprio/Sample/1")]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
+#[type_name("proprio/Sample/2")]
 pub struct Sample {
     /// Time stamps, sequence number, quality.
     pub header: Header,
     /// The channel's number; `<robot>/description` holds its name and kind.
     pub channel: u32,
-    /// Unused, zero.
-    pub reserved: u32,
-    /// The measured quantities.
-    pub reading: Reading,
+    /// The kind of the reading.
+    pub kind: Code<Kind>,
+    /// The reading's values in SI units, in the order of [`Kind::fields`]: NaN if not reported,
+    /// zero beyond them.
+    pub values: [f64; VALUES],
 }
 
-const _: () = assert!(size_of::<Header>() == 48 && core::mem::offset_of!(Header, bus) == 44);
-const _: () = assert!(size_of::<Sample>() == 192 && core::mem::offset_of!(Sample, reading) == 56);
+impl Sample {
+    /// `reading` of channel `channel`.
+    #[must_use]
+    pub fn new(header: Header, channel: u32, reading: &Reading) -> Self {
+        Self {
+            header,
+            channel,
+            kind: reading.kind().in_memory(),
+            values: reading.values(),
+        }
+    }
+
+    /// The reading. A sample out of a [`Reader`](crate::ipc::Reader) has one; in other memory the
+    /// kind may be unknown, or a value out of its range.
+    #[must_use]
+    pub fn reading(&self) -> Option<Reading> {
+        Reading::from_values(self.kind.get()?, &self.values)
+    }
+}
+
+// Readers in other languages depend on these byte offsets.
+const _: () = {
+    use core::mem::offset_of;
+    assert!(size_of::<Header>() == 56 && offset_of!(Header, bus) == 52);
+    assert!(size_of::<Sample>() == 192 && offset_of!(Sample, values) == 64);
+};
 
 #[cfg(test)]
 mod tests {

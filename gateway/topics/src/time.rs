@@ -4,6 +4,7 @@ use core::fmt;
 use core::ops::{Add, AddAssign, Sub};
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+use zerocopy::FromBytes;
 
 /// An instant of CLOCK_MONOTONIC, or the difference of two instants \[ns\].
 ///
@@ -11,7 +12,9 @@ use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 /// appears only in differences ([`Nanos::seconds`]): after weeks of uptime a double holds an
 /// instant since boot only to about a microsecond.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, ZeroCopySend)]
+#[derive(
+    Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, ZeroCopySend, FromBytes,
+)]
 pub struct Nanos(pub i64);
 
 impl Nanos {

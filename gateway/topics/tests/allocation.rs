@@ -54,12 +54,7 @@ fn only_iceoryx2s_loan_allocates() {
 
     let mut writer = Writer::<Sample>::create(&domain, "icub", 1).unwrap();
     let mut reader = Reader::<Sample>::open(&domain, "icub").unwrap();
-    let sample = Sample {
-        header: Header::default(),
-        channel: 0,
-        reserved: 0,
-        reading: Reading::Joint(JointState::ABSENT),
-    };
+    let sample = Sample::new(Header::default(), 0, &Reading::Joint(JointState::ABSENT));
     writer.send(&sample, Nanos(0)).unwrap();
     reader.latest().unwrap().unwrap();
 
@@ -84,7 +79,7 @@ fn only_iceoryx2s_loan_allocates() {
     let joint = JointTorque {
         torque: 1.0,
         valid: 1,
-        reason: Reason::None,
+        reason: Reason::None.in_memory(),
         ..JointTorque::ABSENT
     };
     let mut estimate = TorqueEstimate {

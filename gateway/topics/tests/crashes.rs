@@ -17,12 +17,7 @@ const ROLE: &str = "PROPRIO_TEST_ROLE";
 const HANGS: Nanos = Nanos::from_millis(20_000);
 
 fn sample() -> Sample {
-    Sample {
-        header: Header::default(),
-        channel: 1,
-        reserved: 0,
-        reading: Reading::Joint(JointState::ABSENT),
-    }
+    Sample::new(Header::default(), 1, &Reading::Joint(JointState::ABSENT))
 }
 
 /// Not a test: the code of a child process. The test executable runs itself with [`ROLE`] set.

@@ -9,12 +9,13 @@ use proprio_topics::ipc::{
     Topic, TorqueReader, Writer, monotonic,
 };
 use proprio_topics::{
-    ContactDeclaration, Description, Entry, EstimatorHealth, GatewayHealth, Header,
+    Code, ContactDeclaration, Description, Entry, EstimatorHealth, GatewayHealth, Header,
     InertiaEstimate, JointState, JointTorque, Kind, LinkInertia, MAX_JOINTS, Name, Nanos,
     Publisher, Reading, Reason, Role, Sample, TorqueEstimate,
 };
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
+use zerocopy::FromBytes;
 
 fn place() -> (tempfile::TempDir, DomainConfig) {
     let base = tempfile::tempdir().unwrap();
@@ -30,12 +31,7 @@ fn sample(channel: u32) -> Sample {
         torque: 3.0,
         current: 4.0,
     };
-    Sample {
-        header: Header::default(),
-        channel,
-        reserved: 0,
-        reading: Reading::Joint(joint),
-    }
+    Sample::new(Header::default(), channel, &Reading::Joint(joint))
 }
 
 fn description(publisher: Publisher, entries: &[(&str, Role, u32)]) -> Description {
@@ -43,21 +39,21 @@ fn description(publisher: Publisher, entries: &[(&str, Role, u32)]) -> Descripti
         name: Name::EMPTY,
         frame: Name::EMPTY,
         max_silence: Nanos::ZERO,
-        role: Role::Channel,
+        role: Role::Channel.in_memory(),
         index: 0,
-        kind: Kind::Joint,
+        kind: Kind::Joint.in_memory(),
         bus: 0,
     };
     let mut d = Description {
         header: Header::default(),
-        publisher,
+        publisher: publisher.in_memory(),
         count: entries.len() as u32,
         entries: [none; Description::CAPACITY],
     };
     for (entry, &(name, role, index)) in d.entries.iter_mut().zip(entries) {
         *entry = Entry {
             name: Name::new(name).unwrap(),
-            role,
+            role: role.in_memory(),
             index,
             ..none
         };
@@ -103,7 +99,7 @@ fn what_is_sent_arrives_in_order_and_nothing_remains() {
                 (channel, u64::from(channel))
             );
             assert_eq!((got.header.epoch, got.header.published), (7, Nanos(5)));
-            assert_eq!(got.reading, sample(channel).reading);
+            assert_eq!(got.values, sample(channel).values);
         }
         assert_eq!(reader.try_take().unwrap(), None);
         assert_eq!(
@@ -252,7 +248,7 @@ fn a_late_reader_gets_the_last_description_of_each_publisher() {
     assert_eq!(gateway.update_connections().unwrap(), 0);
     let mut names = Vec::new();
     while let Some(d) = reader.try_take().unwrap() {
-        names.push((d.publisher as u32, d.entries()[0].name.to_string()));
+        names.push((d.publisher.number(), d.entries()[0].name.to_string()));
     }
     names.sort();
     assert_eq!(names, [(0, "imu".to_owned()), (1, "l_elbow".to_owned())]);
@@ -379,11 +375,11 @@ fn who_comes_late_finds_the_last_inertia_at_once() {
 
 /// A later version of the sample, on the same service.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, ZeroCopySend)]
-#[type_name("proprio/Sample/2")]
+#[derive(Debug, Clone, Copy, ZeroCopySend, FromBytes)]
+#[type_name("proprio/Sample/3")]
 struct NextSample {
     header: Header,
-    more: [u64; 18],
+    more: [u64; 17],
 }
 
 impl Topic for NextSample {
@@ -394,6 +390,9 @@ impl Topic for NextSample {
     }
     fn header_mut(&mut self) -> &mut Header {
         &mut self.header
+    }
+    fn is_valid(&self) -> bool {
+        true
     }
 }
 
@@ -416,8 +415,8 @@ fn another_version_is_told_apart_although_its_size_is_the_same() {
         assert_eq!(
             (offered.as_str(), needed.as_str()),
             (
-                "proprio/Sample/2 (192 bytes)",
-                "proprio/Sample/1 (192 bytes)"
+                "proprio/Sample/3 (192 bytes)",
+                "proprio/Sample/2 (192 bytes)"
             )
         );
     }
@@ -527,13 +526,13 @@ fn torques_come_with_a_reason_when_they_do_not_come() {
         torque: 1.5,
         standard_deviation: 0.1,
         valid: 1,
-        reason: Reason::None,
+        reason: Reason::None.in_memory(),
         ..JointTorque::ABSENT
     };
     let bad = JointTorque {
         torque: 2.5,
         valid: 0,
-        reason: Reason::Stale,
+        reason: Reason::Stale.in_memory(),
         cause: 3,
         ..JointTorque::ABSENT
     };
@@ -652,4 +651,164 @@ fn ports_of_many_threads_share_one_domain() {
     });
     drop(domain);
     assert!(is_empty(base.path()));
+}
+
+/// What another process may write where samples are expected: bytes of the right size.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, ZeroCopySend, FromBytes)]
+#[type_name("proprio/Sample/2")]
+struct Garbage {
+    header: Header,
+    words: [u64; 17],
+}
+
+impl Topic for Garbage {
+    const SUFFIX: &'static str = Sample::SUFFIX;
+    const QUALITY: QualityOfService = Sample::QUALITY;
+    fn header(&self) -> &Header {
+        &self.header
+    }
+    fn header_mut(&mut self) -> &mut Header {
+        &mut self.header
+    }
+    fn is_valid(&self) -> bool {
+        true
+    }
+}
+
+#[test]
+fn garbage_is_counted_and_skipped() {
+    assert_eq!(size_of::<Garbage>(), size_of::<Sample>());
+    let (_base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    let mut honest = Writer::<Sample>::create(&domain, "icub", 1).unwrap();
+    let mut other = Writer::<Garbage>::create(&domain, "icub", 2).unwrap();
+    let mut reader = Reader::<Sample>::open(&domain, "icub").unwrap();
+    let mut state = 1_u64;
+    let mut random = || {
+        state = state
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1442695040888963407);
+        state >> 3 ^ state << 29
+    };
+    let mut bytes = [0; size_of::<Garbage>()];
+    let count = 500;
+    for _ in 0..count {
+        bytes
+            .chunks_mut(8)
+            .for_each(|word| word.copy_from_slice(&random().to_ne_bytes()));
+        let garbage = Garbage::read_from_bytes(&bytes).unwrap();
+        other.forward(&garbage).unwrap();
+        honest.send(&sample(7), Nanos(1)).unwrap();
+    }
+    let mut taken = 0;
+    while let Some(sample) = reader.try_take().unwrap() {
+        assert_eq!((sample.channel, sample.header.epoch), (7, 1));
+        assert!(sample.reading().is_some());
+        taken += 1;
+    }
+    assert_eq!((taken, reader.invalid(), reader.lost()), (count, count, 0));
+    assert!(
+        other.forward(&garbage_of(&sample(8))).is_ok(),
+        "the service still works"
+    );
+    assert_eq!(reader.try_take().unwrap().map(|s| s.channel), Some(8));
+}
+
+/// The same bytes as a sample's.
+fn garbage_of(sample: &Sample) -> Garbage {
+    let kind = u64::from(sample.kind.number()) << 32;
+    let mut words = [kind | u64::from(sample.channel); 17];
+    let values = sample.values.map(f64::to_bits);
+    words[1..].copy_from_slice(&values);
+    Garbage {
+        header: sample.header,
+        words,
+    }
+}
+
+/// Each payload with one number that has no meaning.
+#[test]
+fn every_payload_is_checked() {
+    let mut good = sample(1);
+    assert!(good.is_valid());
+    good.kind = Code::of_number(7);
+    assert!(!good.is_valid());
+    let mut stamp = sample(1);
+    stamp.header.stamp = Code::of_number(5);
+    assert!(!stamp.is_valid());
+    let mut gauges = sample(1);
+    gauges.kind = Kind::Gauges.in_memory();
+    gauges.values[3] = 0.5;
+    assert!(!gauges.is_valid());
+
+    let names = description(Publisher::Gateway, &[("a", Role::Channel, 0)]);
+    assert!(names.is_valid());
+    let changes: [fn(&mut Description); 4] = [
+        |d| d.publisher = Code::of_number(2),
+        |d| d.count = u32::MAX,
+        |d| d.entries[0].role = Code::of_number(4),
+        |d| d.entries[0].kind = Code::of_number(99),
+    ];
+    for change in changes {
+        let mut names = names;
+        change(&mut names);
+        assert!(!names.is_valid());
+    }
+
+    let mut torques = TorqueEstimate {
+        header: Header::default(),
+        count: 1,
+        reserved: 0,
+        joints: [JointTorque::ABSENT; MAX_JOINTS],
+    };
+    torques.joints[1].reason = Code::of_number(12);
+    assert!(torques.is_valid(), "what is not counted is not looked at");
+    torques.count = 2;
+    assert!(!torques.is_valid());
+    torques.count = MAX_JOINTS as u32 + 1;
+    assert!(!torques.is_valid());
+
+    let mut health = Box::new(GatewayHealth::new(Nanos::ZERO));
+    (health.bus_count, health.device_count) = (1, 1);
+    assert!(health.is_valid());
+    let changes: [fn(&mut GatewayHealth); 5] = [
+        |h| h.buses[0].link = Code::of_number(6),
+        |h| h.buses[0].interface.controller = Code::of_number(7),
+        |h| h.devices[0].state = Code::of_number(7),
+        |h| h.bus_count = 17,
+        |h| h.device_count = 129,
+    ];
+    for change in changes {
+        let mut health = health.clone();
+        change(&mut health);
+        assert!(!health.is_valid());
+    }
+}
+
+/// A bridge keeps what the first publisher wrote; a writer of its own does not.
+#[test]
+fn a_forwarded_payload_is_that_of_its_first_publisher() {
+    let (_base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    let mut writer = Writer::<Sample>::create(&domain, "icub", 1).unwrap();
+    let mut reader = Reader::<Sample>::open(&domain, "icub").unwrap();
+    let mut there = sample(3);
+    there.header = Header {
+        epoch: 77,
+        sequence: 1234,
+        acquired: Nanos(5),
+        published: Nanos(6),
+        device_time: Nanos(7),
+        ..Header::default()
+    };
+    assert_eq!(writer.forward(&there).unwrap().sequence, 1234);
+    assert_eq!(reader.try_take().unwrap(), Some(there));
+    assert_eq!(writer.send(&there, Nanos(9)).unwrap().sequence, 0);
+    let sent = reader.try_take().unwrap().unwrap().header;
+    assert_eq!(
+        (sent.epoch, sent.sequence, sent.published),
+        (1, 0, Nanos(9))
+    );
+    assert_eq!((sent.acquired, sent.device_time), (Nanos(5), Nanos(7)));
 }

@@ -1,37 +1,57 @@
 //! The columns of a table: their names, and the conversion between a value and its cells.
 
-use crate::{Actuator, Gauges, Imu, JointState, Kind, Quality, Reading, Temperature, Wrench};
+use crate::{Kind, Quality, Reading, VALUES};
+use core::ops::Range;
+use std::format;
 use std::string::String;
 
 /// The quantity in one column of a channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Field {
-    Joint(u8),
-    Wrench(u8),
-    Imu(u8),
-    Gauge(u8),
-    Temperature,
-    Actuator(u8),
+    /// A value of a reading of this kind: its place in [`Kind::fields`].
+    Value(Kind, u8),
     Quality,
     Active,
 }
 
-const JOINT: [&str; 5] = ["position", "velocity", "acceleration", "torque", "current"];
-const WRENCH: [&str; 6] = ["fx", "fy", "fz", "tx", "ty", "tz"];
-const IMU: [&str; 16] = [
-    "ax", "ay", "az", "gx", "gy", "gz", "alx", "aly", "alz", "mx", "my", "mz", "qw", "qx", "qy",
-    "qz",
-];
-const GAUGES: [&str; 6] = ["g0", "g1", "g2", "g3", "g4", "g5"];
-const ACTUATOR: [&str; 4] = ["duty", "mode", "encoder", "faults"];
-/// The vectors of an IMU's reading; each is present or absent as a whole.
-const IMU_GROUPS: [core::ops::Range<usize>; 5] = [0..3, 3..6, 6..9, 9..12, 12..16];
+/// The readings that a channel of kind `kind` can have, its main one first.
+pub(super) const fn readings(kind: Kind) -> &'static [Kind] {
+    match kind {
+        Kind::Joint => &[Kind::Joint, Kind::Actuator],
+        Kind::Wrench => &[Kind::Wrench, Kind::Gauges, Kind::Temperature],
+        Kind::Imu => &[Kind::Imu],
+        Kind::Gauges => &[Kind::Gauges],
+        Kind::Temperature => &[Kind::Temperature],
+        Kind::Actuator => &[Kind::Actuator],
+        Kind::Skin => &[Kind::Skin],
+    }
+}
 
-fn position(names: &[&str], name: &str) -> Option<u8> {
-    names
-        .iter()
-        .position(|n| *n == name)
-        .and_then(|i| u8::try_from(i).ok())
+/// The first so many values of a channel's main reading are the table's usual columns; all others
+/// are optional.
+pub(super) const fn usual(kind: Kind) -> usize {
+    match kind {
+        Kind::Joint => 2,
+        Kind::Imu => 6,
+        other => other.fields().len(),
+    }
+}
+
+/// The values of a reading that are present or absent together, with their names.
+const fn groups(kind: Kind) -> &'static [(Range<usize>, &'static str)] {
+    match kind {
+        Kind::Joint | Kind::Temperature | Kind::Skin => &[],
+        Kind::Wrench => &[(0..6, "fx fy fz tx ty tz")],
+        Kind::Imu => &[
+            (0..3, "ax ay az"),
+            (3..6, "gx gy gz"),
+            (6..9, "alx aly alz"),
+            (9..12, "mx my mz"),
+            (12..16, "qw qx qy qz"),
+        ],
+        Kind::Gauges => &[(0..6, "g0 to g5")],
+        Kind::Actuator => &[(0..4, "duty, mode, encoder, faults")],
+    }
 }
 
 /// The kind of a series.
@@ -64,51 +84,25 @@ pub enum Value {
 /// The values of one series in the row that is being read or written.
 #[derive(Clone)]
 pub(super) struct Cells {
-    joint: [f64; 5],
-    wrench: [f64; 6],
-    imu: [f64; 16],
-    gauges: [f64; 6],
-    actuator: [f64; 4],
-    temperature: f64,
+    /// By the number of the reading's kind.
+    values: [[f64; VALUES]; Kind::ALL.len()],
     quality: f64,
     active: f64,
 }
 
 impl Cells {
     pub(super) const EMPTY: Self = Self {
-        joint: [f64::NAN; 5],
-        wrench: [f64::NAN; 6],
-        imu: [f64::NAN; 16],
-        gauges: [f64::NAN; 6],
-        actuator: [f64::NAN; 4],
-        temperature: f64::NAN,
+        values: [[f64::NAN; VALUES]; Kind::ALL.len()],
         quality: f64::NAN,
         active: f64::NAN,
     };
 
     pub(super) fn slot(&mut self, field: Field) -> Option<&mut f64> {
         match field {
-            Field::Joint(i) => self.joint.get_mut(usize::from(i)),
-            Field::Wrench(i) => self.wrench.get_mut(usize::from(i)),
-            Field::Imu(i) => self.imu.get_mut(usize::from(i)),
-            Field::Gauge(i) => self.gauges.get_mut(usize::from(i)),
-            Field::Actuator(i) => self.actuator.get_mut(usize::from(i)),
-            Field::Temperature => Some(&mut self.temperature),
+            Field::Value(kind, i) => self.values.get_mut(kind as usize)?.get_mut(usize::from(i)),
             Field::Quality => Some(&mut self.quality),
             Field::Active => Some(&mut self.active),
         }
-    }
-}
-
-/// `Some(true)` if all of `values` are present, `Some(false)` if none is, otherwise `None`.
-fn all_or_none(values: &[f64]) -> Option<bool> {
-    let there = values.iter().filter(|v| !v.is_nan()).count();
-    if there == values.len() {
-        Some(true)
-    } else if there == 0 {
-        Some(false)
-    } else {
-        None
     }
 }
 
@@ -124,11 +118,10 @@ pub(super) fn parse_column(column: &str) -> Option<(Option<What>, &str, Field)> 
     let (front, field) = column.rsplit_once('/')?;
     if let Some((head, name)) = front.split_once('/') {
         let what = match head {
-            "joint" => Some(What::Channel(Kind::Joint)),
-            "wrench" => Some(What::Channel(Kind::Wrench)),
-            "imu" => Some(What::Channel(Kind::Imu)),
             "contact" => Some(What::Contact),
-            _ => None,
+            _ => (Kind::ALL.into_iter())
+                .find(|kind| kind.word() == head)
+                .map(What::Channel),
         };
         if let Some(what) = what
             && !name.is_empty()
@@ -143,137 +136,56 @@ pub(super) fn parse_field(what: What, field: &str) -> Option<Field> {
     if field == "quality" && what != What::Contact {
         return Some(Field::Quality);
     }
-    match what {
-        What::Channel(Kind::Joint) => position(&JOINT, field)
-            .map(Field::Joint)
-            .or_else(|| position(&ACTUATOR, field).map(Field::Actuator)),
-        What::Channel(Kind::Wrench) => position(&WRENCH, field)
-            .map(Field::Wrench)
-            .or_else(|| position(&GAUGES, field).map(Field::Gauge))
-            .or_else(|| (field == "temperature").then_some(Field::Temperature)),
-        What::Channel(Kind::Imu) => position(&IMU, field).map(Field::Imu),
-        What::Contact => (field == "active").then_some(Field::Active),
-    }
+    let What::Channel(kind) = what else {
+        return (field == "active").then_some(Field::Active);
+    };
+    readings(kind).iter().find_map(|&kind| {
+        let at = kind.fields().iter().position(|name| *name == field)?;
+        Some(Field::Value(kind, u8::try_from(at).ok()?))
+    })
 }
 
-/// Passes the readings in `cells` to `push`; `Err` names an incomplete vector.
+/// Passes the readings in `cells` to `push`; `Err` says what is wrong with them.
 pub(super) fn items_of(
     series: &Series,
     cells: &Cells,
     mut push: impl FnMut(Value),
-) -> Result<(), &'static str> {
+) -> Result<(), String> {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     let quality = if cells.quality.is_nan() {
         Quality::GOOD
     } else {
         Quality(cells.quality as u32)
     };
-    match series.what {
-        What::Contact => {
-            if !cells.active.is_nan() {
-                push(Value::Active(cells.active != 0.0));
+    let What::Channel(kind) = series.what else {
+        if !cells.active.is_nan() {
+            push(Value::Active(cells.active != 0.0));
+        }
+        return Ok(());
+    };
+    for &kind in readings(kind) {
+        let Some(values) = cells.values.get(kind as usize) else {
+            continue;
+        };
+        for (group, names) in groups(kind) {
+            let group = values.get(group.clone()).unwrap_or_default();
+            let missing = group.iter().filter(|value| value.is_nan()).count();
+            if missing > 0 && missing < group.len() {
+                return Err(format!("holds some of {names}, but not all"));
             }
         }
-        What::Channel(Kind::Joint) => {
-            let [position, velocity, acceleration, torque, current] = cells.joint;
-            if cells.joint.iter().any(|v| !v.is_nan()) {
-                let state = JointState {
-                    position,
-                    velocity,
-                    acceleration,
-                    torque,
-                    current,
-                };
-                push(Value::Reading(Reading::Joint(state), quality));
-            }
-            if all_or_none(&cells.actuator).ok_or("duty, mode, encoder, faults")? {
-                let [duty, mode, encoder, faults] = cells.actuator;
-                #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-                let state = Actuator {
-                    duty,
-                    mode: mode as u32,
-                    encoder: encoder as u32,
-                    faults: faults as u32,
-                    reserved: 0,
-                };
-                push(Value::Reading(Reading::Actuator(state), quality));
-            }
-        }
-        What::Channel(Kind::Wrench) => {
-            let [fx, fy, fz, tx, ty, tz] = cells.wrench;
-            if all_or_none(&cells.wrench).ok_or("fx fy fz tx ty tz")? {
-                let wrench = Wrench {
-                    force: [fx, fy, fz],
-                    torque: [tx, ty, tz],
-                };
-                push(Value::Reading(Reading::Wrench(wrench), quality));
-            }
-            if all_or_none(&cells.gauges).ok_or("g0 to g5")? {
-                #[allow(clippy::cast_possible_truncation)]
-                let counts = cells.gauges.map(|g| g as i32);
-                push(Value::Reading(Reading::Gauges(Gauges { counts }), quality));
-            }
-            if !cells.temperature.is_nan() {
-                push(Value::Reading(
-                    Reading::Temperature(Temperature {
-                        celsius: cells.temperature,
-                    }),
-                    quality,
-                ));
-            }
-        }
-        What::Channel(Kind::Imu) => {
-            for (group, part) in IMU_GROUPS.into_iter().zip([
-                "ax ay az",
-                "gx gy gz",
-                "alx aly alz",
-                "mx my mz",
-                "qw qx qy qz",
-            ]) {
-                all_or_none(cells.imu.get(group).unwrap_or_default()).ok_or(part)?;
-            }
-            if cells.imu.iter().any(|v| !v.is_nan()) {
-                let [
-                    ax,
-                    ay,
-                    az,
-                    gx,
-                    gy,
-                    gz,
-                    alx,
-                    aly,
-                    alz,
-                    mx,
-                    my,
-                    mz,
-                    qw,
-                    qx,
-                    qy,
-                    qz,
-                ] = cells.imu;
-                let imu = Imu {
-                    proper_acceleration: [ax, ay, az],
-                    angular_velocity: [gx, gy, gz],
-                    angular_acceleration: [alx, aly, alz],
-                    magnetic_field: [mx, my, mz],
-                    orientation: [qw, qx, qy, qz],
-                };
-                push(Value::Reading(Reading::Imu(imu), quality));
-            }
+        if values.iter().any(|value| !value.is_nan()) {
+            let reading = Reading::from_values(kind, values)
+                .ok_or_else(|| format!("has values of {kind} that must be integers and are not"))?;
+            push(Value::Reading(reading, quality));
         }
     }
     Ok(())
 }
 
 pub(super) fn field_word(field: Field) -> &'static str {
-    let of = |names: &[&'static str], i: u8| names.get(usize::from(i)).copied().unwrap_or_default();
     match field {
-        Field::Joint(i) => of(&JOINT, i),
-        Field::Wrench(i) => of(&WRENCH, i),
-        Field::Imu(i) => of(&IMU, i),
-        Field::Gauge(i) => of(&GAUGES, i),
-        Field::Actuator(i) => of(&ACTUATOR, i),
-        Field::Temperature => "temperature",
+        Field::Value(kind, i) => (kind.fields().get(usize::from(i)).copied()).unwrap_or_default(),
         Field::Quality => "quality",
         Field::Active => "active",
     }
@@ -285,37 +197,8 @@ pub(super) fn spread(value: &Value, cells: &mut Cells) {
         Value::Active(active) => cells.active = f64::from(u8::from(*active)),
         Value::Reading(reading, quality) => {
             cells.quality = f64::from(quality.0);
-            match reading {
-                Reading::Joint(j) => {
-                    cells.joint = [j.position, j.velocity, j.acceleration, j.torque, j.current];
-                }
-                Reading::Wrench(w) => {
-                    let ([fx, fy, fz], [tx, ty, tz]) = (w.force, w.torque);
-                    cells.wrench = [fx, fy, fz, tx, ty, tz];
-                }
-                Reading::Imu(i) => {
-                    let parts = i
-                        .proper_acceleration
-                        .iter()
-                        .chain(&i.angular_velocity)
-                        .chain(&i.angular_acceleration);
-                    let parts = parts.chain(&i.magnetic_field).chain(&i.orientation);
-                    cells
-                        .imu
-                        .iter_mut()
-                        .zip(parts)
-                        .for_each(|(cell, v)| *cell = *v);
-                }
-                Reading::Gauges(g) => cells.gauges = g.counts.map(f64::from),
-                Reading::Temperature(t) => cells.temperature = t.celsius,
-                Reading::Actuator(a) => {
-                    cells.actuator = [
-                        a.duty,
-                        f64::from(a.mode),
-                        f64::from(a.encoder),
-                        f64::from(a.faults),
-                    ];
-                }
+            if let Some(values) = cells.values.get_mut(reading.kind() as usize) {
+                *values = reading.values();
             }
         }
     }
@@ -324,8 +207,8 @@ pub(super) fn spread(value: &Value, cells: &mut Cells) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Nanos;
     use crate::csv::{Columns, Reader, Row, Writer};
+    use crate::{Imu, JointState, Nanos, Temperature, Wrench};
     use std::vec;
     use std::vec::Vec;
 
@@ -411,12 +294,7 @@ mod tests {
         let bits = |v: &Value| {
             let mut cells = Cells::EMPTY;
             spread(v, &mut cells);
-            let all = cells
-                .joint
-                .iter()
-                .chain(&cells.wrench)
-                .chain(&cells.imu)
-                .chain([&cells.temperature, &cells.active]);
+            let all = (cells.values.iter().flatten()).chain([&cells.active]);
             all.map(|x| if x.is_nan() { 0 } else { x.to_bits() })
                 .collect::<Vec<_>>()
         };

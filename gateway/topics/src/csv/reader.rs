@@ -365,13 +365,7 @@ impl<R: io::Read> Reader<R> {
                     value,
                 });
             })
-            .map_err(|part| {
-                format!(
-                    "{}/{} holds some of {part}, but not all",
-                    word(series.what),
-                    series.name
-                )
-            })?;
+            .map_err(|problem| format!("{}/{} {problem}", word(series.what), series.name))?;
         }
         Ok(())
     }

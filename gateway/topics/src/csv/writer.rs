@@ -1,10 +1,13 @@
 //! Writes a table row by row. Values of one instant share a row.
 
-use super::columns::{Cells, Field, Series, Value, What, field_word, spread, word};
+use super::columns::{
+    Cells, Field, Series, Value, What, field_word, readings, spread, usual, word,
+};
 use crate::{Kind, Nanos};
 use std::format;
 use std::io;
 use std::string::String;
+use std::vec;
 use std::vec::Vec;
 
 /// Which columns a [`Writer`] writes per channel, besides its quality.
@@ -175,25 +178,16 @@ fn write_integer(text: &mut Vec<u8>, value: i32) {
 }
 
 fn fields_of(what: What, columns: Columns) -> Vec<Field> {
-    let all = columns == Columns::All;
-    let mut fields = Vec::new();
-    match what {
-        What::Channel(Kind::Joint) if all => {
-            fields.extend((0..5).map(Field::Joint).chain((0..4).map(Field::Actuator)));
-        }
-        What::Channel(Kind::Joint) => fields.extend((0..2).map(Field::Joint)),
-        What::Channel(Kind::Wrench) => {
-            fields.extend((0..6).map(Field::Wrench));
-            if all {
-                fields.extend((0..6).map(Field::Gauge));
-                fields.push(Field::Temperature);
-            }
-        }
-        What::Channel(Kind::Imu) => fields.extend((0..if all { 16 } else { 6 }).map(Field::Imu)),
-        What::Contact => fields.push(Field::Active),
-    }
-    if what != What::Contact {
-        fields.push(Field::Quality);
-    }
+    let What::Channel(kind) = what else {
+        return vec![Field::Active];
+    };
+    let values = |kind: Kind, count| (0_u8..).take(count).map(move |i| Field::Value(kind, i));
+    let mut fields: Vec<Field> = match columns {
+        Columns::Main => values(kind, usual(kind)).collect(),
+        Columns::All => (readings(kind).iter())
+            .flat_map(|&kind| values(kind, kind.fields().len()))
+            .collect(),
+    };
+    fields.push(Field::Quality);
     fields
 }

@@ -61,6 +61,7 @@ pub struct Reader<T: Topic> {
     ports: Option<Ports<T>>,
     domain: Domain,
     tally: Tally,
+    invalid: u64,
     last: Option<Header>,
 }
 
@@ -106,15 +107,15 @@ impl<T: Topic> Reader<T> {
         patience: Patience,
     ) -> Result<Self, PortError> {
         let name = service_name(robot, T::SUFFIX)?;
-        let (subscriber, service, elders) = domain.locked(patience, |node| {
+        let (subscriber, service, predecessors) = domain.locked(patience, |node| {
             let service = node
                 .service_builder(&name)
                 .publish_subscribe::<T>()
                 .open()
                 .map_err(|e| explain::<T>(domain, &name, e))?;
-            let mut elders = Vec::new();
+            let mut predecessors = Vec::new();
             service.dynamic_config().list_publishers(|p| {
-                elders.push(p.publisher_id.value());
+                predecessors.push(p.publisher_id.value());
                 CallbackProgression::Continue
             });
             let subscriber = service.subscriber_builder().create().map_err(|e| match e {
@@ -127,18 +128,20 @@ impl<T: Topic> Reader<T> {
                     problem: e.to_string(),
                 },
             })?;
-            Ok((subscriber, service, elders))
+            Ok((subscriber, service, predecessors))
         })?;
         Ok(Self {
             ports: Some((subscriber, service)),
             domain: domain.clone(),
-            tally: Tally::new(elders),
+            tally: Tally::new(predecessors),
+            invalid: 0,
             last: None,
         })
     }
 
     /// The next waiting payload, in each writer's order; `None` if none is waiting. Never blocks,
-    /// never allocates.
+    /// never allocates. A payload whose numbers have no meaning ([`Topic::is_valid`]) is skipped
+    /// and counted.
     ///
     /// # Errors
     /// [`TakeError`]; the reader stays usable.
@@ -146,19 +149,27 @@ impl<T: Topic> Reader<T> {
         let Some((subscriber, _)) = &self.ports else {
             return Err(TakeError::Internal);
         };
-        let sample = subscriber.receive().map_err(|e| match e {
-            ReceiveError::ConnectionFailure(_) => TakeError::Connection,
-            ReceiveError::ExceedsMaxBorrows => TakeError::Internal,
-        })?;
-        let Some(sample) = sample else {
-            return Ok(None);
-        };
-        let value = *sample.payload();
-        let writer = sample.header().publisher_id().value();
-        drop(sample);
-        self.tally.count(writer, value.header());
-        self.last = Some(*value.header());
-        Ok(Some(value))
+        // No endless loop, even if a writer sends nonsense as fast as this reads.
+        for _ in 0..T::QUALITY.buffer.saturating_mul(T::QUALITY.publishers) {
+            let sample = subscriber.receive().map_err(|e| match e {
+                ReceiveError::ConnectionFailure(_) => TakeError::Connection,
+                ReceiveError::ExceedsMaxBorrows => TakeError::Internal,
+            })?;
+            let Some(sample) = sample else {
+                return Ok(None);
+            };
+            let value = *sample.payload();
+            let writer = sample.header().publisher_id().value();
+            drop(sample);
+            if !value.is_valid() {
+                self.invalid += 1;
+                continue;
+            }
+            self.tally.count(writer, value.header());
+            self.last = Some(*value.header());
+            return Ok(Some(value));
+        }
+        Ok(None)
     }
 
     /// Takes all waiting payloads and returns the newest; `None` if none is waiting.
@@ -167,13 +178,15 @@ impl<T: Topic> Reader<T> {
     /// fast as this reads.
     ///
     /// # Errors
-    /// As [`Reader::try_take`].
+    /// As [`Reader::try_take`], if there was no payload before the error.
     pub fn latest(&mut self) -> Result<Option<T>, TakeError> {
         let mut newest = None;
         for _ in 0..T::QUALITY.buffer.saturating_mul(T::QUALITY.publishers) {
-            match self.try_take()? {
-                None => break,
-                some => newest = some,
+            match self.try_take() {
+                Ok(None) => break,
+                Ok(some) => newest = some,
+                Err(error) if newest.is_none() => return Err(error),
+                Err(_) => break,
             }
         }
         Ok(newest)
@@ -196,6 +209,12 @@ impl<T: Topic> Reader<T> {
     #[must_use]
     pub fn taken(&self) -> u64 {
         self.tally.taken
+    }
+
+    /// Number of payloads that were skipped because their numbers have no meaning.
+    #[must_use]
+    pub fn invalid(&self) -> u64 {
+        self.invalid
     }
 
     /// Number of different epochs seen: 1, plus 1 for each restart of a publisher.
@@ -227,7 +246,7 @@ impl<T: Topic> Drop for Reader<T> {
 struct Tally {
     /// Writers older than the reader: the first payload seen may have any sequence number. All
     /// others begin at 0.
-    elders: Vec<u128>,
+    predecessors: Vec<u128>,
     writers: [Option<Seen>; Self::WRITERS],
     known_epochs: [u64; Self::WRITERS],
     taken: u64,
@@ -246,9 +265,9 @@ impl Tally {
     /// Twice the largest number of writers of any topic.
     const WRITERS: usize = 2 * crate::MAX_BUSES;
 
-    fn new(elders: Vec<u128>) -> Self {
+    fn new(predecessors: Vec<u128>) -> Self {
         Self {
-            elders,
+            predecessors,
             writers: [None; Self::WRITERS],
             known_epochs: [0; Self::WRITERS],
             taken: 0,
@@ -281,7 +300,7 @@ impl Tally {
             seen.last_taken = self.taken;
             return;
         }
-        if !self.elders.contains(&writer) {
+        if !self.predecessors.contains(&writer) {
             self.lost = self.lost.saturating_add(header.sequence);
         }
         // A free place, else the place of the writer that has been silent for longest: it is dead.

@@ -6,6 +6,7 @@ use crate::{
 };
 use core::fmt::Debug;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+use zerocopy::FromBytes;
 
 /// The quality of service of one service; the first process to create the service fixes it.
 ///
@@ -26,9 +27,10 @@ pub struct QualityOfService {
 
 /// A payload type with its own service `<robot>/<SUFFIX>`.
 ///
-/// The version of its layout is in its type name (`proprio/Sample/1`): a reader of another version
-/// gets `PortError::Incompatible`, never a misread payload. To add a service, implement this trait.
-pub trait Topic: ZeroCopySend + Copy + Debug + 'static {
+/// The version of its layout is in its type name (`proprio/Sample/2`): a reader of another version
+/// gets `PortError::Incompatible`, never a misread payload. Any bytes are a legal payload
+/// (`FromBytes`), though not a valid one. To add a service, implement this trait.
+pub trait Topic: ZeroCopySend + FromBytes + Copy + Debug + 'static {
     /// The service's name after the robot's.
     const SUFFIX: &'static str;
     /// Its quality of service.
@@ -38,10 +40,13 @@ pub trait Topic: ZeroCopySend + Copy + Debug + 'static {
     fn header(&self) -> &Header;
     /// The header, which the writer fills in.
     fn header_mut(&mut self) -> &mut Header;
+    /// Whether its numbers have a meaning: codes that exist, counts within their arrays. A reader
+    /// skips and counts a payload without.
+    fn is_valid(&self) -> bool;
 }
 
 macro_rules! topic {
-    ($payload:ty, $suffix:literal, $quality:expr) => {
+    ($payload:ty, $suffix:literal, $is_valid:expr, $quality:expr) => {
         impl Topic for $payload {
             const SUFFIX: &'static str = $suffix;
             const QUALITY: QualityOfService = $quality;
@@ -51,8 +56,17 @@ macro_rules! topic {
             fn header_mut(&mut self) -> &mut Header {
                 &mut self.header
             }
+            fn is_valid(&self) -> bool {
+                let is_valid: fn(&Self) -> bool = $is_valid;
+                self.header.stamp.get().is_some() && is_valid(self)
+            }
         }
     };
+}
+
+/// Whether `count` entries fit `entries`.
+fn within<E>(count: u32, entries: &[E]) -> bool {
+    count as usize <= entries.len()
 }
 
 const NODES: usize = 64;
@@ -61,6 +75,7 @@ const NODES: usize = 64;
 topic!(
     Sample,
     "samples",
+    |sample| sample.reading().is_some(),
     QualityOfService {
         publishers: crate::MAX_BUSES,
         subscribers: 40,
@@ -73,6 +88,11 @@ topic!(
 topic!(
     Description,
     "description",
+    |d| {
+        d.publisher.get().is_some()
+            && within(d.count, &d.entries)
+            && (d.entries().iter()).all(|e| e.role.get().is_some() && e.kind.get().is_some())
+    },
     QualityOfService {
         publishers: 4,
         subscribers: 40,
@@ -86,6 +106,9 @@ topic!(
 topic!(
     TorqueEstimate,
     "estimate/torque",
+    |e| {
+        within(e.count, &e.joints) && e.joints().iter().all(|joint| joint.reason.get().is_some())
+    },
     QualityOfService {
         publishers: 1,
         subscribers: 24,
@@ -97,6 +120,13 @@ topic!(
 topic!(
     ContactEstimate,
     "estimate/contact",
+    |e| {
+        within(e.count, &e.contacts)
+            && within(e.residual_count, &e.residuals)
+            && e.contacts()
+                .iter()
+                .all(|contact| contact.reason.get().is_some())
+    },
     QualityOfService {
         publishers: 1,
         subscribers: 24,
@@ -110,6 +140,7 @@ topic!(
 topic!(
     InertiaEstimate,
     "estimate/inertia",
+    |e| within(e.link_count, &e.links) && within(e.offset_count, &e.offsets),
     QualityOfService {
         publishers: 1,
         subscribers: 16,
@@ -121,6 +152,7 @@ topic!(
 topic!(
     ContactDeclaration,
     "contact/declared",
+    |_| true,
     QualityOfService {
         publishers: 8,
         subscribers: 8,
@@ -134,6 +166,15 @@ topic!(
 topic!(
     GatewayHealth,
     "health/gateway",
+    |h| {
+        within(h.bus_count, &h.buses)
+            && within(h.device_count, &h.devices)
+            && (h.buses().iter())
+                .all(|b| b.link.get().is_some() && b.interface.controller.get().is_some())
+            && h.devices()
+                .iter()
+                .all(|device| device.state.get().is_some())
+    },
     QualityOfService {
         publishers: 1,
         subscribers: 16,
@@ -145,6 +186,7 @@ topic!(
 topic!(
     EstimatorHealth,
     "health/estimator",
+    |_| true,
     QualityOfService {
         publishers: 1,
         subscribers: 16,

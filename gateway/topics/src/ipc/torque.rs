@@ -186,7 +186,7 @@ impl TorqueReader {
             .and_then(|d| d.find(Role::Channel, joint.cause))
             .map_or(Name::EMPTY, |e| e.name);
         Err(NoTorque::Withheld {
-            reason: joint.reason,
+            reason: joint.reason.get().unwrap_or_default(),
             channel,
             torque: joint.torque,
         })

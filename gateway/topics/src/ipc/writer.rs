@@ -3,7 +3,7 @@
 use super::domain::service_name;
 use super::lock::Patience;
 use super::{Domain, PortError, SendError, Topic};
-use crate::Nanos;
+use crate::{Header, Nanos};
 use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::port::{LoanError, SendError as IoxSendError};
@@ -126,26 +126,23 @@ impl<T: Topic> Writer<T> {
     /// # Errors
     /// [`SendError`]; the sequence number is used up, so that readers count the loss.
     pub fn send(&mut self, value: &T, published: Nanos) -> Result<Sent, SendError> {
-        let connected = self.newcomers();
         let sequence = self.sequence;
         self.sequence += 1;
-        let Some((publisher, _)) = &self.ports else {
-            return Err(SendError::Internal);
-        };
-        let mut sample = publisher
-            .loan_uninit()
-            .map_err(|e| send_error(e.into()))?
-            .write_payload(*value);
-        let header = sample.payload_mut().header_mut();
-        header.epoch = self.epoch;
-        header.sequence = sequence;
-        header.published = published;
-        let readers = sample.send().map_err(send_error)?;
-        Ok(Sent {
-            sequence,
-            readers,
-            connected,
+        let epoch = self.epoch;
+        self.put(value, |header| {
+            header.epoch = epoch;
+            header.sequence = sequence;
+            header.published = published;
         })
+    }
+
+    /// Sends a copy of `value` as it is, with the epoch, sequence number and stamps of its first
+    /// publisher: for a bridge that carries the payloads of another machine.
+    ///
+    /// # Errors
+    /// As [`Writer::send`].
+    pub fn forward(&mut self, value: &T) -> Result<Sent, SendError> {
+        self.put(value, |_| {})
     }
 
     /// Connects new readers and gives them the history. Call it regularly while there is nothing to
@@ -175,6 +172,26 @@ impl<T: Topic> Writer<T> {
     pub fn readers(&self) -> usize {
         self.ports.as_ref().map_or(0, |(_, service)| {
             service.dynamic_config().number_of_subscribers()
+        })
+    }
+
+    fn put(&mut self, value: &T, fill: impl FnOnce(&mut Header)) -> Result<Sent, SendError> {
+        let connected = self.newcomers();
+        let Some((publisher, _)) = &self.ports else {
+            return Err(SendError::Internal);
+        };
+        let mut sample = publisher
+            .loan_uninit()
+            .map_err(|e| send_error(e.into()))?
+            .write_payload(*value);
+        let header = sample.payload_mut().header_mut();
+        fill(header);
+        let sequence = header.sequence;
+        let readers = sample.send().map_err(send_error)?;
+        Ok(Sent {
+            sequence,
+            readers,
+            connected,
         })
     }
 
