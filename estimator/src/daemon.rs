@@ -2,8 +2,8 @@
 //! supervises it.
 //!
 //! The data-plane thread waits for samples in shared memory. It takes no lock and allocates nothing
-//! once its ports are open. It retries services that are not there yet, so gateway and estimator can start in any
-//! order, and either can be killed and started again.
+//! once its ports are open. It retries services that are not there yet, so gateway and estimator
+//! can start in any order, and either can be killed and started again.
 
 use crate::check::Check;
 use crate::config::{Config, ConfigError};

@@ -5,7 +5,7 @@
 //!
 //! PROPRIO_RUNTIME_DIR and PROPRIO_DOMAIN select the domain.
 use proprio_topics::Nanos;
-use proprio_topics::ipc::{Domain, DomainConfig, Freshness, TorqueReader, monotonic};
+use proprio_topics::ipc::{DomainConfig, RobotReader, TorqueHandle, monotonic};
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -25,39 +25,37 @@ fn run() -> Result<(), Box<dyn std::error::Error>> {
         .nth(2)
         .map_or(Ok(u32::MAX), |text| text.parse())?;
 
-    let domain = Domain::open(&DomainConfig::from_env())?;
-    let mut torques = TorqueReader::new(&domain, &robot, Nanos::from_millis(50));
-    let (mut cycles, mut fresh) = (0, 0);
+    // An estimate that is older than 50 ms is stale. The reader may start before the robot does.
+    let max_age = Nanos::from_millis(50);
+    let mut reader = RobotReader::new(&DomainConfig::from_env(), &robot, max_age)?;
+    let mut joints: Vec<(String, TorqueHandle)> = Vec::new();
     for _ in 0..seconds {
         for _ in 0..1000 {
-            // In every cycle: take new payloads without waiting, then use a torque only if it is
-            // valid.
-            cycles += 1;
-            if torques.update(monotonic()).is_fresh() {
-                fresh += 1;
-            }
+            // Each cycle: take what has arrived, without waiting.
+            reader.update(monotonic());
             std::thread::sleep(Duration::from_millis(1));
         }
-        match torques.freshness() {
-            Freshness::NeverSeen => println!("no estimate yet"),
-            Freshness::Stale { age } => {
-                println!("stale: the last estimate is {:.3} s old", age.seconds());
-            }
-            Freshness::Fresh { age } => println!(
-                "{fresh} of {cycles} cycles fresh, age {:.2} ms",
-                age.seconds() * 1e3
-            ),
+        // Once a second, for a person: not part of a cycle.
+        if joints.is_empty() {
+            let names: Vec<String> = reader.torque_names().map(ToOwned::to_owned).collect();
+            joints = names
+                .into_iter()
+                .map(|name| (name.clone(), reader.torque_handle(&name)))
+                .collect();
         }
-        if let Some(problem) = torques.problem() {
-            println!("  {problem}");
+        let missing = reader.who_is_missing();
+        if !missing.is_nobody() {
+            println!("{missing}");
         }
-        for joint in torques.joints() {
-            match torques.torque(joint) {
+        for (name, joint) in &joints {
+            match reader.torque(*joint) {
                 Ok(t) => println!(
-                    "  {joint:<20} {:>10.4} Nm  +- {:.4}",
-                    t.torque, t.standard_deviation
+                    "  {name:<20} {:>10.4} Nm  +- {:.4}, {:.2} ms old",
+                    t.torque,
+                    t.standard_deviation,
+                    t.age.seconds() * 1e3
                 ),
-                Err(why) => println!("  {joint:<20} {why}"),
+                Err(why) => println!("  {name:<20} {why}"),
             }
         }
     }

@@ -3,9 +3,10 @@
 // A global allocator needs unsafe code.
 #![allow(missing_docs, unsafe_code, clippy::unwrap_used)]
 
-use proprio_topics::ipc::{Domain, DomainConfig, Reader, TorqueReader, Writer, monotonic};
+use proprio_topics::ipc::{Domain, DomainConfig, Reader, RobotReader, Writer, monotonic};
 use proprio_topics::{
-    Header, JointState, JointTorque, MAX_JOINTS, Nanos, Reading, Reason, Sample, TorqueEstimate,
+    Description, Entry, Header, JointState, JointTorque, MAX_JOINTS, Name, Nanos, Publisher,
+    Reading, Reason, Role, Sample, TorqueEstimate,
 };
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -74,8 +75,17 @@ fn only_iceoryx2s_loan_allocates() {
     assert!(reader.taken() > 2000);
 
     let mut estimates = Writer::<TorqueEstimate>::create(&domain, "icub", 1).unwrap();
-    let _names = Writer::<proprio_topics::Description>::create(&domain, "icub", 1).unwrap();
-    let mut torques = TorqueReader::new(&domain, "icub", Nanos::from_millis(50));
+    let mut names = Writer::<Description>::create(&domain, "icub", 1).unwrap();
+    let entry = Entry {
+        name: Name::new("elbow").unwrap(),
+        role: Role::Joint.in_memory(),
+        ..Entry::NONE
+    };
+    names
+        .send(&Description::new(Publisher::Estimator, [entry]), Nanos(0))
+        .unwrap();
+    let mut robot = RobotReader::new(domain.config(), "icub", Nanos::from_millis(50)).unwrap();
+    let elbow = robot.torque_handle("elbow");
     let joint = JointTorque {
         torque: 1.0,
         valid: 1,
@@ -88,17 +98,21 @@ fn only_iceoryx2s_loan_allocates() {
         reserved: 0,
         joints: [joint; MAX_JOINTS],
     };
-    torques.update(monotonic());
-    assert!(torques.problem().is_none());
-    estimates.send(&estimate, Nanos(0)).unwrap(); // connects
-    torques.update(monotonic());
+    // Until the reader's thread has opened the ports.
+    while robot.torque(elbow).is_err() {
+        names.update_connections().unwrap();
+        estimate.header.acquired = monotonic();
+        estimates.send(&estimate, Nanos(0)).unwrap();
+        robot.update(monotonic());
+        std::thread::sleep(std::time::Duration::from_millis(1));
+    }
     let counted = counted(|| {
         for _ in 0..1000 {
             let now = monotonic();
             estimate.header.acquired = now;
             estimates.send(&estimate, now).unwrap();
-            assert!(torques.update(now).is_fresh());
-            assert_eq!(torques.torque_at(0).unwrap().torque, 1.0);
+            robot.update(now);
+            assert_eq!(robot.torque(elbow).unwrap().torque, 1.0);
         }
     });
     assert_eq!(counted, (1000, 48_000), "iceoryx2's loan only");

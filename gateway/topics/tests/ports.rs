@@ -5,13 +5,12 @@
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 use proprio_topics::ipc::{
-    Domain, DomainConfig, DomainError, Freshness, NoTorque, PortError, QualityOfService, Reader,
-    Topic, TorqueReader, Writer, monotonic,
+    Domain, DomainConfig, DomainError, PortError, QualityOfService, Reader, Topic, Writer,
 };
 use proprio_topics::{
     Code, ContactDeclaration, Description, Entry, EstimatorHealth, GatewayHealth, Header,
     InertiaEstimate, JointState, JointTorque, Kind, LinkInertia, MAX_JOINTS, Name, Nanos,
-    Publisher, Reading, Reason, Role, Sample, TorqueEstimate,
+    Publisher, Reading, Role, Sample, TorqueEstimate,
 };
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
@@ -59,20 +58,6 @@ fn description(publisher: Publisher, entries: &[(&str, Role, u32)]) -> Descripti
         };
     }
     d
-}
-
-fn estimate(acquired: Nanos, joints: &[JointTorque]) -> TorqueEstimate {
-    let mut e = TorqueEstimate {
-        header: Header {
-            acquired,
-            ..Header::default()
-        },
-        count: joints.len() as u32,
-        reserved: 0,
-        joints: [JointTorque::ABSENT; MAX_JOINTS],
-    };
-    e.joints[..joints.len()].copy_from_slice(joints);
-    e
 }
 
 fn is_empty(dir: &Path) -> bool {
@@ -497,133 +482,6 @@ fn a_base_that_is_a_file_is_said_to_be() {
             && error.to_string().contains("PROPRIO_RUNTIME_DIR"),
         "{error}"
     );
-}
-
-#[test]
-fn torques_come_with_a_reason_when_they_do_not_come() {
-    let (_base, config) = place();
-    let domain = Domain::open(&config).unwrap();
-    let max_age = Nanos::from_millis(50);
-    let mut torques = TorqueReader::new(&domain, "icub", max_age);
-    let mut now = monotonic();
-    let step = Nanos::from_millis(100);
-    assert_eq!(torques.update(now), Freshness::NeverSeen);
-    assert!(matches!(torques.problem(), Some(PortError::NotYet { .. })));
-    assert_eq!(torques.torque("l_elbow"), Err(NoTorque::NeverSeen));
-
-    // The estimator appears.
-    let start = |epoch| {
-        (
-            Writer::<TorqueEstimate>::create(&domain, "icub", epoch).unwrap(),
-            Writer::<Description>::create(&domain, "icub", epoch).unwrap(),
-        )
-    };
-    let (mut estimates, mut descriptions) = start(1);
-    now += step;
-    torques.update(now);
-    assert!(torques.problem().is_none());
-    let good = JointTorque {
-        torque: 1.5,
-        standard_deviation: 0.1,
-        valid: 1,
-        reason: Reason::None.in_memory(),
-        ..JointTorque::ABSENT
-    };
-    let bad = JointTorque {
-        torque: 2.5,
-        valid: 0,
-        reason: Reason::Stale.in_memory(),
-        cause: 3,
-        ..JointTorque::ABSENT
-    };
-    estimates.send(&estimate(now, &[good, bad]), now).unwrap();
-    torques.update(now);
-    assert_eq!(torques.torque("l_elbow"), Err(NoTorque::NotDescribed));
-    assert_eq!(torques.torque_at(0).unwrap().torque, 1.5);
-    let entries = [
-        ("l_elbow", Role::Joint, 0),
-        ("l_wrist", Role::Joint, 1),
-        ("l_arm_ft", Role::Channel, 3),
-    ];
-    let gateways = description(
-        Publisher::Gateway,
-        &[("l_elbow", Role::Channel, 9), ("wrong", Role::Joint, 0)],
-    );
-    let mut other = Writer::<Description>::create(&domain, "icub", 1).unwrap();
-    descriptions
-        .send(&description(Publisher::Estimator, &entries), now)
-        .unwrap();
-    other.send(&gateways, now).unwrap();
-    torques.update(now + Nanos(1_000));
-    let torque = torques.torque("l_elbow").unwrap();
-    assert_eq!(
-        (torque.torque, torque.standard_deviation, torque.age),
-        (1.5, 0.1, Nanos(1_000))
-    );
-    let withheld = torques.torque("l_wrist").unwrap_err();
-    assert_eq!(withheld.to_string(), "withheld: stale (l_arm_ft)");
-    assert!(matches!(withheld, NoTorque::Withheld { torque: 2.5, .. }));
-    assert_eq!(torques.torque("r_elbow"), Err(NoTorque::UnknownJoint));
-    assert_eq!(torques.joints().collect::<Vec<_>>(), ["l_elbow", "l_wrist"]);
-
-    // It becomes silent.
-    assert_eq!(
-        torques.update(now + max_age),
-        Freshness::Fresh { age: max_age }
-    );
-    let late = now + max_age + Nanos(1);
-    assert_eq!(
-        torques.update(late),
-        Freshness::Stale {
-            age: max_age + Nanos(1)
-        }
-    );
-    assert!(matches!(
-        torques.torque("l_elbow"),
-        Err(NoTorque::Stale { .. })
-    ));
-
-    // It restarts and numbers its joints in reverse order: joints must not be mixed up in the
-    // meantime.
-    drop((estimates, descriptions));
-    let (mut estimates, mut descriptions) = start(2);
-    now = late + step;
-    estimates.send(&estimate(now, &[bad, good]), now).unwrap();
-    torques.update(now);
-    assert_eq!(torques.torque("l_elbow"), Err(NoTorque::NotDescribed));
-    let entries = [("l_wrist", Role::Joint, 0), ("l_elbow", Role::Joint, 1)];
-    descriptions
-        .send(&description(Publisher::Estimator, &entries), now)
-        .unwrap();
-    torques.update(now);
-    assert_eq!(torques.torque("l_elbow").unwrap().torque, 1.5);
-}
-
-#[test]
-fn a_control_loop_does_not_wait_for_who_holds_the_lock() {
-    let (base, config) = place();
-    let domain = Domain::open(&config).unwrap();
-    let _estimates = Writer::<TorqueEstimate>::create(&domain, "icub", 1).unwrap();
-    let _descriptions = Writer::<Description>::create(&domain, "icub", 1).unwrap();
-    let mut torques = TorqueReader::new(&domain, "icub", Nanos::from_millis(50));
-    // This test holds the lock: a reader that waited for it would time out much later.
-    let lock = std::fs::File::open(base.path().join("test.lock")).unwrap();
-    lock.lock().unwrap();
-    torques.update(Nanos(0));
-    match torques.problem() {
-        Some(PortError::Domain(DomainError::Busy { holder, .. })) => {
-            assert_eq!(*holder, std::process::id());
-        }
-        other => panic!("{other:?}"),
-    }
-    drop(lock);
-    torques.update(Nanos::from_millis(99));
-    assert!(
-        torques.problem().is_some(),
-        "the next attempt is after 100 ms"
-    );
-    torques.update(Nanos::from_millis(100));
-    assert!(torques.problem().is_none());
 }
 
 #[test]

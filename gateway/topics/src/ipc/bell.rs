@@ -4,6 +4,9 @@
 //! iceoryx2 has events of its own. They are ports, with files and connections that must survive the
 //! death of a process at any instant, and each notification is a system call. A futex needs nothing
 //! but memory: it survives every death, and ringing costs a system call only if somebody waits.
+//!
+//! A second word counts the changes of the service's writers. A reader that must not make file
+//! operations compares it before it reads, because iceoryx2 connects to new writers while reading.
 
 use super::PortError;
 use crate::Nanos;
@@ -16,11 +19,14 @@ use rustix::thread::futex::{self, Flags, Timespec};
 use std::fs::{DirBuilder, OpenOptions};
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// The word's lowest bit: somebody waits. The other bits count the rings.
 const WAITED_FOR: u32 = 1;
 const RING: u32 = 2;
+
+/// The rings, and the changes of the writers.
+type Words = [AtomicU32; 2];
 
 /// The bell of one service, in every process that writes or reads it.
 #[derive(Debug)]
@@ -42,6 +48,15 @@ impl Bell {
         })
     }
 
+    /// Whether somebody has opened the bell of `service`.
+    pub(super) fn exists(root: &Path, service: &str) -> bool {
+        Self::file(&root.join("bells"), service).exists()
+    }
+
+    fn file(folder: &Path, service: &str) -> PathBuf {
+        folder.join(service.replace('/', "."))
+    }
+
     fn map(folder: &Path, service: &str) -> io::Result<Self> {
         match DirBuilder::new().mode(0o700).create(folder) {
             Err(cause) if cause.kind() != io::ErrorKind::AlreadyExists => return Err(cause),
@@ -53,21 +68,49 @@ impl Bell {
             .create(true)
             .truncate(false)
             .mode(0o600)
-            .open(folder.join(service.replace('/', ".")))?;
+            .open(Self::file(folder, service))?;
         // Whoever was killed between these two lines has left an empty file, which is as good as a
         // new one.
-        file.set_len(size_of::<AtomicU32>() as u64)?;
-        let memory = MmapOptions::new()
-            .len(size_of::<AtomicU32>())
-            .map_raw(&file)?;
+        file.set_len(size_of::<Words>() as u64)?;
+        let memory = MmapOptions::new().len(size_of::<Words>()).map_raw(&file)?;
         Ok(Self { memory })
     }
 
     #[allow(unsafe_code)]
+    fn words(&self) -> &Words {
+        // SAFETY: the mapping is readable, writable and as long as the words; it begins at a page,
+        // so it is aligned; it lives as long as `self`. All processes access it atomically only,
+        // and any bytes are legal.
+        unsafe { &*self.memory.as_ptr().cast() }
+    }
+
     fn word(&self) -> &AtomicU32 {
-        // SAFETY: the mapping is readable, writable and as long as the word; it begins at a page,
-        // so it is aligned; it lives as long as `self`. All processes access it atomically only.
-        unsafe { AtomicU32::from_ptr(self.memory.as_mut_ptr().cast()) }
+        let [rings, _] = self.words();
+        rings
+    }
+
+    /// The number of changes of the service's writers.
+    pub(super) fn changes(&self) -> u32 {
+        let [_, changes] = self.words();
+        changes.load(Acquire)
+    }
+
+    /// Counts a change of the service's writers. Call it before the change.
+    pub(super) fn change(&self) {
+        let [_, changes] = self.words();
+        changes.fetch_add(1, AcqRel);
+    }
+
+    /// Counts a change of the writers of every service under the domain's directory `root`.
+    pub(super) fn change_all(root: &Path) {
+        let folder = root.join("bells");
+        for entry in std::fs::read_dir(&folder).into_iter().flatten().flatten() {
+            if let Some(name) = entry.file_name().to_str()
+                && let Ok(bell) = Self::map(&folder, name)
+            {
+                bell.change();
+            }
+        }
     }
 
     /// Wakes everybody who waits.

@@ -1,17 +1,18 @@
 //! A shared-memory domain: a directory and a name. Processes communicate only within one domain.
 
 use super::bell::Bell;
-use super::lock::{Lock, Patience};
+use super::lock::Lock;
 use super::sweep::{self, Place, SHM, Swept};
 use super::{DomainError, PortError};
 use iceoryx2::prelude::{
     Config, FileName, LogLevel, Node, NodeBuilder, Path as IoxPath, SemanticString, ServiceName,
     SignalHandlingMode, ipc, set_log_level_from_env_or,
 };
+use iceoryx2::service::Service;
 use nix::unistd::{AccessFlags, access, geteuid};
 use std::borrow::ToOwned;
 use std::format;
-use std::fs::{self, DirBuilder};
+use std::fs::{self, DirBuilder, File, Metadata};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::string::{String, ToString};
@@ -140,20 +141,31 @@ fn owned_by_us(path: &Path) -> Result<(), DomainError> {
 
 /// An open domain. Clones share it. This process leaves the domain when its last clone and its last
 /// port are dropped; the last process that leaves removes the domain's files.
-#[derive(Debug, Clone)]
-pub struct Domain {
-    inner: Arc<Inner>,
+///
+/// `S` is the kind of iceoryx2's ports: those of the default belong to one thread and take no lock.
+#[derive(Debug)]
+pub struct Domain<S: Service = ipc::Service> {
+    inner: Arc<Inner<S>>,
+}
+
+impl<S: Service> Clone for Domain<S> {
+    fn clone(&self) -> Self {
+        let inner = Arc::clone(&self.inner);
+        Self { inner }
+    }
 }
 
 #[derive(Debug)]
-struct Inner {
+struct Inner<S: Service> {
     config: DomainConfig,
     place: Place,
     iceoryx: Config,
     epoch: u64,
     id: u128,
+    /// Its directory, open so that no other directory can have its inode.
+    folder: File,
     // `None` only during `drop`.
-    node: Mutex<Option<Node<ipc::Service>>>,
+    node: Mutex<Option<Node<S>>>,
 }
 
 impl Domain {
@@ -166,12 +178,53 @@ impl Domain {
     /// [`DomainError`]: a bad name or directory, no shared memory, no permission, another owner, or
     /// another process that holds the lock.
     pub fn open(config: &DomainConfig) -> Result<Self, DomainError> {
+        Self::create(config)
+    }
+
+    /// Opens the domain for reading: it must exist, and nothing is created if it does not.
+    ///
+    /// # Errors
+    /// [`DomainError::NotYet`] if no process has opened the domain; others as [`Domain::open`].
+    pub fn open_existing(config: &DomainConfig) -> Result<Self, DomainError> {
+        Self::existing(config)
+    }
+
+    /// Removes a domain's files if no live process uses it; returns whether it did.
+    ///
+    /// The last process that leaves a domain does this. Use it after killing processes, as in a
+    /// test or a demonstration.
+    ///
+    /// # Errors
+    /// As [`Domain::open`].
+    pub fn remove_if_unused(config: &DomainConfig) -> Result<bool, DomainError> {
+        let place = config.place()?;
+        let lock = Lock::take(&place.lock)?;
+        let swept = sweep::sweep(&place, &iceoryx(&place)?)?;
+        if swept.alive == 0 {
+            lock.remove();
+        }
+        Ok(swept.alive == 0)
+    }
+}
+
+impl<S: Service> Domain<S> {
+    /// As [`Domain::open_existing`].
+    pub(super) fn existing(config: &DomainConfig) -> Result<Self, DomainError> {
+        let root = config.base.join(&config.name);
+        if !root.exists() {
+            return Err(DomainError::NotYet { root });
+        }
+        Self::create(config)
+    }
+
+    /// As [`Domain::open`].
+    fn create(config: &DomainConfig) -> Result<Self, DomainError> {
         static QUIET: Once = Once::new();
         QUIET.call_once(|| set_log_level_from_env_or(LogLevel::Fatal));
 
         let place = config.place()?;
         let iceoryx = iceoryx(&place)?;
-        let _lock = Lock::take(&place.lock, Patience::Normal)?;
+        let _lock = Lock::take(&place.lock)?;
         sweep::sweep(&place, &iceoryx)?;
         let failed = |problem: String| DomainError::Transport {
             root: place.root.clone(),
@@ -181,10 +234,15 @@ impl Domain {
         let node = NodeBuilder::new()
             .config(&iceoryx)
             .signal_handling_mode(SignalHandlingMode::Disabled)
-            .create::<ipc::Service>()
+            .create::<S>()
             .map_err(|e| failed(e.to_string()))?;
         let id = node.id().value();
         sweep::register(&place, id);
+        let folder = File::open(&place.root).map_err(|cause| DomainError::Io {
+            doing: "cannot open directory",
+            path: place.root.clone(),
+            cause,
+        })?;
         let mut epoch = Fnv::new();
         epoch.add(&id.to_le_bytes());
         let inner = Inner {
@@ -193,6 +251,7 @@ impl Domain {
             iceoryx,
             epoch: epoch.0.max(1),
             id,
+            folder,
             node: Mutex::new(Some(node)),
         };
         Ok(Self {
@@ -218,34 +277,16 @@ impl Domain {
     /// # Errors
     /// As [`Domain::open`].
     pub fn sweep(&self) -> Result<Swept, DomainError> {
-        let _lock = Lock::take(&self.inner.place.lock, Patience::Normal)?;
+        let _lock = Lock::take(&self.inner.place.lock)?;
         sweep::sweep(&self.inner.place, &self.inner.iceoryx)
-    }
-
-    /// Removes a domain's files if no live process uses it; returns whether it did.
-    ///
-    /// The last process that leaves a domain does this. Use it after killing processes, as in a
-    /// test or a demonstration.
-    ///
-    /// # Errors
-    /// As [`Domain::open`].
-    pub fn remove_if_unused(config: &DomainConfig) -> Result<bool, DomainError> {
-        let place = config.place()?;
-        let lock = Lock::take(&place.lock, Patience::Normal)?;
-        let swept = sweep::sweep(&place, &iceoryx(&place)?)?;
-        if swept.alive == 0 {
-            lock.remove();
-        }
-        Ok(swept.alive == 0)
     }
 
     /// Runs `create` under the domain's lock, after a sweep.
     pub(super) fn locked<R>(
         &self,
-        patience: Patience,
-        create: impl FnOnce(&Node<ipc::Service>) -> Result<R, PortError>,
+        create: impl FnOnce(&Node<S>) -> Result<R, PortError>,
     ) -> Result<R, PortError> {
-        let _lock = Lock::take(&self.inner.place.lock, patience)?;
+        let _lock = Lock::take(&self.inner.place.lock)?;
         sweep::sweep(&self.inner.place, &self.inner.iceoryx)?;
         match &*self
             .inner
@@ -261,13 +302,23 @@ impl Domain {
     /// Drops a port under the domain's lock, so that no process sees it half removed.
     pub(super) fn drop_locked<P>(&self, port: P) {
         // If a stopped process holds the lock, drop without it: a program must be able to end.
-        let _lock = Lock::take(&self.inner.place.lock, Patience::Normal);
-        drop(port);
+        let _lock = Lock::take(&self.inner.place.lock);
+        self.inner.drop_unless_replaced(port);
     }
 
     /// The bell of `service`.
     pub(super) fn bell(&self, service: &ServiceName) -> Result<Bell, PortError> {
         Bell::open(&self.inner.place.root, service.as_str())
+    }
+
+    /// Whether `service` has a bell: a writer has created it.
+    pub(super) fn has_bell(&self, service: &ServiceName) -> bool {
+        Bell::exists(&self.inner.place.root, service.as_str())
+    }
+
+    /// Whether the domain's directory is still the one that was opened.
+    pub(super) fn is_there(&self) -> bool {
+        self.inner.is_there()
     }
 
     pub(super) fn iceoryx(&self) -> &Config {
@@ -288,15 +339,34 @@ impl Domain {
     }
 }
 
-impl Drop for Inner {
+impl<S: Service> Inner<S> {
+    fn is_there(&self) -> bool {
+        let inode = |meta: Metadata| (meta.dev(), meta.ino());
+        let now = fs::metadata(&self.place.root).map(inode);
+        let opened = self.folder.metadata().map(inode);
+        now.is_ok_and(|now| opened.is_ok_and(|opened| now == opened))
+    }
+
+    /// Drops a node or port. If the domain's directory was deleted, there is nothing to remove, and
+    /// iceoryx2 would remove the files of the same names in the directory that has replaced it.
+    fn drop_unless_replaced<P>(&self, resource: P) {
+        if self.is_there() {
+            drop(resource);
+        } else {
+            std::mem::forget(resource);
+        }
+    }
+}
+
+impl<S: Service> Drop for Inner<S> {
     fn drop(&mut self) {
-        let lock = Lock::take(&self.place.lock, Patience::Normal);
-        drop(
-            self.node
-                .lock()
-                .unwrap_or_else(PoisonError::into_inner)
-                .take(),
-        );
+        let lock = Lock::take(&self.place.lock);
+        let node = self
+            .node
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .take();
+        self.drop_unless_replaced(node);
         sweep::deregister(&self.place, self.id);
         if let Ok(lock) = lock
             && sweep::sweep(&self.place, &self.iceoryx).is_ok_and(|s| s.alive == 0)

@@ -27,6 +27,15 @@ pub enum DomainError {
         /// The directory.
         base: PathBuf,
     },
+    /// No process has opened the domain.
+    #[error(
+        "shared-memory domain: there is no {}: no gateway or estimator runs in this domain",
+        root.display()
+    )]
+    NotYet {
+        /// Its directory.
+        root: PathBuf,
+    },
     /// There is no /dev/shm, or it is not writable.
     #[error(
         "no shared memory: /dev/shm {problem}; in a container, give it one that all processes \

@@ -9,15 +9,8 @@ use std::path::{Path, PathBuf};
 use std::string::ToString;
 use std::time::Duration;
 
-/// How long to wait for the lock.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Patience {
-    /// Not at all.
-    None,
-    /// About five seconds: a hundred times the duration of a creation on a busy machine.
-    Normal,
-}
-
+/// How long to wait for the lock, about five seconds: a hundred times the duration of a creation
+/// on a busy machine.
 const STEP: Duration = Duration::from_millis(1);
 const STEPS: u32 = 5000;
 
@@ -31,7 +24,7 @@ pub(super) struct Lock {
 
 impl Lock {
     /// Takes the lock at `path`; creates the file if it does not exist.
-    pub(super) fn take(path: &Path, patience: Patience) -> Result<Self, DomainError> {
+    pub(super) fn take(path: &Path) -> Result<Self, DomainError> {
         let io = |doing| {
             move |cause| DomainError::Io {
                 doing,
@@ -39,7 +32,7 @@ impl Lock {
                 cause,
             }
         };
-        let mut steps = if patience == Patience::None { 0 } else { STEPS };
+        let mut steps = STEPS;
         loop {
             let mut file = OpenOptions::new()
                 .read(true)

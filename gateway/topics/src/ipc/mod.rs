@@ -6,7 +6,8 @@
 //! - [`Writer`]: sends a payload; never waits for a reader.
 //! - [`Reader`]: takes payloads in order, or the newest; counts losses; opens a service but never
 //!   creates one.
-//! - [`TorqueReader`]: for control loops: the torque of a joint, or the reason why there is none.
+//! - [`RobotReader`]: for control loops: torques, contacts and measurements by name, or the reason
+//!   why one is not available.
 //! - [`Freshness`]: the age of the last payload read.
 //! - [`monotonic`]: the clock of all stamps, for the outermost loop of a consumer.
 //!
@@ -21,24 +22,30 @@
 //! # Threads
 //! A [`Domain`] can be cloned and sent to other threads. Ports cannot: each thread creates its own.
 //! This keeps `send` and `try_take` free of locks; iceoryx2's sendable ports take a mutex in every
-//! call.
+//! call. Only [`RobotReader`] uses those: one thread opens a port, another reads it, and no two use
+//! it at a time, so that the mutex is always free.
 
 mod bell;
 mod clock;
 mod domain;
 mod error;
 mod lock;
+mod presence;
 mod reader;
+mod robot;
 mod sweep;
 mod topic;
-mod torque;
 mod writer;
 
 pub use clock::monotonic;
 pub use domain::{Domain, DomainConfig};
 pub use error::{DomainError, PortError, SendError, TakeError};
+pub use presence::{Presence, RobotPresence};
 pub use reader::{Freshness, Reader};
+pub use robot::{
+    ChannelHandle, Contact, ContactHandle, Measured, Missing, RobotReader, Torque, TorqueHandle,
+    Unavailable,
+};
 pub use sweep::Swept;
 pub use topic::{QualityOfService, Topic};
-pub use torque::{NoTorque, Torque, TorqueReader};
 pub use writer::{Sent, Writer};

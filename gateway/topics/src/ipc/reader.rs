@@ -2,13 +2,13 @@
 
 use super::bell::{Bell, Rings};
 use super::domain::service_name;
-use super::lock::Patience;
 use super::writer::explain;
 use super::{Domain, PortError, TakeError, Topic};
 use crate::{Header, Nanos};
 use iceoryx2::port::ReceiveError;
 use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
 use iceoryx2::prelude::{CallbackProgression, PortFactory as _, ipc};
+use iceoryx2::service::Service;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use std::string::ToString;
 use std::vec::Vec;
@@ -48,22 +48,21 @@ impl Freshness {
     }
 }
 
-type Ports<T> = (
-    Subscriber<ipc::Service, T, ()>,
-    PortFactory<ipc::Service, T, ()>,
-);
+type Ports<T, S> = (Subscriber<S, T, ()>, PortFactory<S, T, ()>);
 
 /// The receiving end of a topic. Belongs to one thread: open it where it is used.
 ///
 /// It stays open when its writers die, and receives from their successors.
 #[derive(Debug)]
-pub struct Reader<T: Topic> {
+pub struct Reader<T: Topic, S: Service = ipc::Service> {
     // `Some` until drop; dropped under the domain's lock.
-    ports: Option<Ports<T>>,
-    domain: Domain,
+    ports: Option<Ports<T, S>>,
+    domain: Domain<S>,
     bell: Bell,
     /// The rings heard when nothing was waiting.
     heard: Rings,
+    /// The changes of the writers before it was opened.
+    changes: u32,
     tally: Tally,
     invalid: u64,
     last: Option<Header>,
@@ -77,7 +76,7 @@ impl<T: Topic> Reader<T> {
     /// [`PortError::NotYet`] if it does not exist; [`PortError::Incompatible`] if it has another
     /// version; [`PortError::Full`]; [`PortError::Denied`]; others as [`Domain::open`].
     pub fn open(domain: &Domain, robot: &str) -> Result<Self, PortError> {
-        Self::open_with(domain, robot, Patience::Normal)
+        Self::open_in(domain, robot)
     }
 
     /// Opens the service as soon as it exists. After each attempt that does not find it, calls
@@ -104,19 +103,26 @@ impl<T: Topic> Reader<T> {
             }
         }
     }
+}
 
-    pub(super) fn open_with(
-        domain: &Domain,
-        robot: &str,
-        patience: Patience,
-    ) -> Result<Self, PortError> {
+impl<T: Topic, S: Service> Reader<T, S> {
+    /// As [`Reader::open`], with any kind of ports.
+    pub(super) fn open_in(domain: &Domain<S>, robot: &str) -> Result<Self, PortError> {
         let name = service_name(robot, T::SUFFIX)?;
-        let (subscriber, service, predecessors, bell) = domain.locked(patience, |node| {
+        // A cheap question first: a program that waits for the service asks often.
+        if !domain.has_bell(&name) {
+            return Err(PortError::NotYet {
+                service: name.to_string(),
+            });
+        }
+        let (subscriber, service, predecessors, (bell, changes)) = domain.locked(|node| {
+            let bell = domain.bell(&name)?;
+            let changes = bell.changes();
             let service = node
                 .service_builder(&name)
                 .publish_subscribe::<T>()
                 .open()
-                .map_err(|e| explain::<T>(domain, &name, e))?;
+                .map_err(|e| explain::<T, _>(domain, &name, e))?;
             let mut predecessors = Vec::new();
             service.dynamic_config().list_publishers(|p| {
                 predecessors.push(p.publisher_id.value());
@@ -132,13 +138,14 @@ impl<T: Topic> Reader<T> {
                     problem: e.to_string(),
                 },
             })?;
-            Ok((subscriber, service, predecessors, domain.bell(&name)?))
+            Ok((subscriber, service, predecessors, (bell, changes)))
         })?;
         Ok(Self {
             ports: Some((subscriber, service)),
             domain: domain.clone(),
             bell,
             heard: Rings::default(),
+            changes,
             tally: Tally::new(predecessors),
             invalid: 0,
             last: None,
@@ -238,6 +245,30 @@ impl<T: Topic> Reader<T> {
         self.tally.epochs
     }
 
+    /// Whether its writers are those that it is connected to. If not, [`Reader::try_take`] will
+    /// connect to them, with file operations.
+    pub(super) fn is_connected(&self) -> bool {
+        self.bell.changes() == self.changes
+    }
+
+    /// The process of a live writer; 0 if there is none, or it is not known.
+    pub(super) fn writer_process(&self) -> i32 {
+        let mut process = 0;
+        if let Some((_, service)) = &self.ports {
+            service.dynamic_config().list_publishers(|p| {
+                process = process.max(self.domain.process_of(p.node_id.value()));
+                CallbackProgression::Continue
+            });
+        }
+        process
+    }
+
+    /// Whether the bell has rung since nothing was waiting: a payload may be waiting. One load from
+    /// memory.
+    pub(super) fn has_rung(&self) -> bool {
+        self.bell.rings() != self.heard
+    }
+
     /// Number of writers now. A dead writer still counts until some process opens a domain or a
     /// port.
     #[must_use]
@@ -248,7 +279,7 @@ impl<T: Topic> Reader<T> {
     }
 }
 
-impl<T: Topic> Drop for Reader<T> {
+impl<T: Topic, S: Service> Drop for Reader<T, S> {
     fn drop(&mut self) {
         let ports = self.ports.take();
         self.domain.drop_locked(ports);

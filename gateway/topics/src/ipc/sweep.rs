@@ -7,6 +7,7 @@
 //! lets iceoryx2 clean the dead nodes, then removes everything without a live owner.
 
 use super::DomainError;
+use super::bell::Bell;
 use iceoryx2::node::NodeView;
 use iceoryx2::prelude::{CallbackProgression, Config, Node, NodeState, ipc};
 use iceoryx2::service::Service;
@@ -116,6 +117,7 @@ pub(super) fn sweep(place: &Place, config: &Config) -> Result<Swept, DomainError
     }
 
     if !dead.is_empty() {
+        Bell::change_all(&place.root);
         clean_dead(place, config, &dead, &mut swept);
     }
     remove_ownerless(place, config, &mut swept)?;

@@ -2,7 +2,6 @@
 
 use super::bell::Bell;
 use super::domain::service_name;
-use super::lock::Patience;
 use super::{Domain, PortError, SendError, Topic};
 use crate::{Header, Nanos};
 use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
@@ -63,7 +62,7 @@ impl<T: Topic> Writer<T> {
     pub fn create(domain: &Domain, robot: &str, epoch: u64) -> Result<Self, PortError> {
         let name = service_name(robot, T::SUFFIX)?;
         let quality = T::QUALITY;
-        let (publisher, service, bell) = domain.locked(Patience::Normal, |node| {
+        let (publisher, service, bell) = domain.locked(|node| {
             let service = node
                 .service_builder(&name)
                 .publish_subscribe::<T>()
@@ -77,13 +76,15 @@ impl<T: Topic> Writer<T> {
                 .open_or_create()
                 .map_err(|e| match e {
                     OpenOrCreateError::PublishSubscribeOpenError(e) => {
-                        explain::<T>(domain, &name, e)
+                        explain::<T, _>(domain, &name, e)
                     }
                     e => PortError::Transport {
                         service: name.to_string(),
                         problem: e.to_string(),
                     },
                 })?;
+            let bell = domain.bell(&name)?;
+            bell.change();
             let publisher = service
                 .publisher_builder()
                 .max_loaned_samples(1)
@@ -107,7 +108,7 @@ impl<T: Topic> Writer<T> {
                         problem: e.to_string(),
                     },
                 })?;
-            Ok((publisher, service, domain.bell(&name)?))
+            Ok((publisher, service, bell))
         })?;
         let readers = service.dynamic_config().number_of_subscribers();
         Ok(Self {
@@ -162,6 +163,8 @@ impl<T: Topic> Writer<T> {
         publisher
             .update_connections()
             .map_err(|_| SendError::Connection)?;
+        // A new reader has the history now.
+        self.bell.ring();
         Ok(connected)
     }
 
@@ -211,6 +214,7 @@ impl<T: Topic> Writer<T> {
 
 impl<T: Topic> Drop for Writer<T> {
     fn drop(&mut self) {
+        self.bell.change();
         let ports = self.ports.take();
         self.domain.drop_locked(ports);
     }
@@ -227,7 +231,11 @@ fn send_error(e: IoxSendError) -> SendError {
 }
 
 /// Converts the reason why a service cannot be opened into a message. Called under the lock.
-pub(super) fn explain<T: Topic>(domain: &Domain, name: &ServiceName, e: OpenError) -> PortError {
+pub(super) fn explain<T: Topic, S: Service>(
+    domain: &Domain<S>,
+    name: &ServiceName,
+    e: OpenError,
+) -> PortError {
     let service = name.to_string();
     match e {
         OpenError::DoesNotExist | OpenError::IsMarkedForDestruction => {
