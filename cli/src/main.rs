@@ -23,6 +23,7 @@ mod estimator;
 mod identify;
 mod report;
 mod simulate;
+mod system;
 
 use clap::{Parser, Subcommand};
 use proprio_topics::ipc::DomainConfig;
@@ -62,6 +63,12 @@ enum Verb {
     Estimate(convert::Estimate),
     /// Identify inertial parameters from recorded tables of samples and write a report
     Identify(identify::Args),
+    /// Show the robots of a running system: processes, buses, devices, channels, estimates
+    Status(system::Status),
+    /// Print the samples of a channel as they come
+    Echo(system::Echo),
+    /// Record samples and declared contacts into the table that `identify` reads
+    Record(system::Record),
     /// Check this machine: CAN, permissions, shared memory, buffers, real-time limits
     Doctor(doctor::Args),
 }
@@ -92,6 +99,9 @@ fn main() -> ExitCode {
         Verb::Encode(args) => convert::encode(&args),
         Verb::Estimate(args) => convert::estimate(&args),
         Verb::Identify(args) => identify::run(&args),
+        Verb::Status(args) => system::status(&args, &domain),
+        Verb::Echo(args) => system::echo(&args, &domain),
+        Verb::Record(args) => system::record(&args, &domain),
         Verb::Doctor(args) => doctor::run(&args, &domain),
     };
     match result {

@@ -82,40 +82,65 @@ pub struct DeviceReport {
     pub refusal: Option<String>,
 }
 
-/// Delays samples until no earlier one can come, so that the table is sorted by time.
-struct InOrder {
-    waiting: VecDeque<Sample>,
+/// Delays items until no earlier one can come, so that a table is sorted by time.
+#[derive(Debug)]
+pub struct InOrder<T> {
+    waiting: VecDeque<(Nanos, T)>,
     newest: Nanos,
-    written: Nanos,
+    passed_on: Nanos,
     out_of_order: u64,
 }
 
-impl InOrder {
-    fn push(
-        &mut self,
-        sample: Sample,
-        mut write: impl FnMut(&Sample) -> io::Result<()>,
-    ) -> io::Result<()> {
-        let t = sample.header.acquired;
-        if sample.header.stamp == StampKind::None {
-            return write(&sample);
+impl<T> Default for InOrder<T> {
+    fn default() -> Self {
+        Self {
+            waiting: VecDeque::new(),
+            newest: Nanos::MIN,
+            passed_on: Nanos::MIN,
+            out_of_order: 0,
         }
-        self.out_of_order += u64::from(t < self.written);
+    }
+}
+
+impl<T> InOrder<T> {
+    /// Adds an item of instant `t`; calls `write` for those that are due, in order.
+    ///
+    /// # Errors
+    /// The first of `write`.
+    pub fn push(
+        &mut self,
+        t: Nanos,
+        item: T,
+        mut write: impl FnMut(Nanos, &T) -> io::Result<()>,
+    ) -> io::Result<()> {
+        self.out_of_order += u64::from(t < self.passed_on);
         self.newest = self.newest.max(t);
-        let at = self
-            .waiting
-            .iter()
-            .rposition(|s| s.header.acquired <= t)
-            .map_or(0, |i| i + 1);
-        self.waiting.insert(at, sample);
-        while let Some(first) = self.waiting.front()
-            && self.newest - first.header.acquired > REORDER
+        let place = self.waiting.iter().rposition(|(other, _)| *other <= t);
+        self.waiting.insert(place.map_or(0, |i| i + 1), (t, item));
+        while let Some((first, item)) = self.waiting.front()
+            && self.newest - *first > REORDER
         {
-            self.written = self.written.max(first.header.acquired);
-            write(first)?;
+            self.passed_on = self.passed_on.max(*first);
+            write(*first, item)?;
             self.waiting.pop_front();
         }
         Ok(())
+    }
+
+    /// Writes what still waits, in order.
+    ///
+    /// # Errors
+    /// The first of `write`.
+    pub fn finish(&mut self, mut write: impl FnMut(Nanos, &T) -> io::Result<()>) -> io::Result<()> {
+        self.waiting
+            .drain(..)
+            .try_for_each(|(t, item)| write(t, &item))
+    }
+
+    /// Number of items that came too late to be sorted.
+    #[must_use]
+    pub const fn out_of_order(&self) -> u64 {
+        self.out_of_order
     }
 }
 
@@ -153,12 +178,7 @@ pub fn decode(
         buses.push((plan.matching(number as usize), decoder, status));
     }
     let mut report = DecodeReport::default();
-    let mut order = InOrder {
-        waiting: VecDeque::new(),
-        newest: Nanos::MIN,
-        written: Nanos::MIN,
-        out_of_order: 0,
-    };
+    let mut order = InOrder::default();
     let mut failure = None;
     let mut reader = candump::Reader::new(log);
     let mut last_bus = 0;
@@ -195,7 +215,13 @@ pub fn decode(
             decoder.poll_transmit(record.frame.t, |_| {});
         }
         decoder.on_frame(&record.frame, |sample| {
-            let written = order.push(*sample, |s| write_sample(&mut writer, s));
+            let (t, mut write) = (sample.header.acquired, |s: &Sample| {
+                write_sample(&mut writer, s)
+            });
+            let written = match sample.header.stamp == StampKind::None {
+                true => write(sample),
+                false => order.push(t, *sample, |_, s| write(s)),
+            };
             if let Err(error) = written {
                 failure.get_or_insert(error);
             }
@@ -205,11 +231,9 @@ pub fn decode(
             return Err(error.into());
         }
     }
-    for sample in std::mem::take(&mut order.waiting) {
-        write_sample(&mut writer, &sample)?;
-    }
+    order.finish(|_, sample| write_sample(&mut writer, sample))?;
     writer.finish()?;
-    report.out_of_order = order.out_of_order;
+    report.out_of_order = order.out_of_order();
     (report.bad_lines, report.dropped) = (reader.report().bad, reader.report().dropped);
     report.bad = reader
         .report()

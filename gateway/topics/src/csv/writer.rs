@@ -146,6 +146,14 @@ impl<W: io::Write> Writer<W> {
         self.output.write_all(&self.text)
     }
 
+    /// Flushes the output: the rows that are complete outlive a crash of this program.
+    ///
+    /// # Errors
+    /// If it cannot be written.
+    pub fn flush(&mut self) -> io::Result<()> {
+        self.output.flush()
+    }
+
     /// Writes the last row and returns the output.
     ///
     /// # Errors
