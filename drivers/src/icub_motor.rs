@@ -35,7 +35,7 @@
 //! velocity = true    # false: ignore the board's velocity (coarse if `ratio` is small), encode 0
 //! ```
 
-use crate::icub::bringup::{Bringup, NoInquiry};
+use crate::bringup::{Bringup, NoInquiry};
 use crate::icub::{self, class};
 use crate::{
     Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Output, Spec, SpecError,
@@ -193,7 +193,7 @@ impl Motor {
         Ok(Self {
             address,
             claims: icub::claims(class::PERIODIC_MOTOR, address, &kinds),
-            bringup: Bringup::new(spec, Mode::Listen, Nanos::ZERO, watched),
+            bringup: Bringup::new(spec, Mode::Listen, icub::PATIENCE, watched),
             velocity: options.velocity,
             status: Quality::GOOD,
             seen: false,

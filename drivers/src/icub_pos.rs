@@ -34,7 +34,7 @@
 //! sensors = [{ label = 0, inverted = false, rotation_deg = 0, zero_deg = 0.0 }, { label = 1 }]
 //! ```
 
-use crate::icub::bringup::{Bringup, NoInquiry};
+use crate::bringup::{Bringup, NoInquiry};
 use crate::icub::{self, class, command};
 use crate::{
     Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Output, Outputs, Spec,
@@ -232,14 +232,14 @@ impl Pos {
         let address = icub::address(spec)?;
         joints(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
-        let silence = icub::power_on_silence(options.power_on_silence_ms)?;
+        let patience = icub::patience(options.power_on_silence_ms)?;
         let mode = if options.listen {
             Mode::Listen
         } else {
             spec.mode
         };
         let watched = icub::stream(class::PERIODIC_ANALOG, address, POS);
-        let mut bringup = Bringup::new(spec, mode, silence, watched);
+        let mut bringup = Bringup::new(spec, mode, patience, watched);
         let id = icub::to_board(class::POLLING_ANALOG, address);
         if let Some(configuration) = options.configuration()? {
             bringup.start_with(id, &configuration);

@@ -18,7 +18,7 @@
 //!   axis k of [`Quality::saturation`], although through the calibration matrix each gauge affects
 //!   every axis.
 //! - The frames have no sequence number: force and torque are paired by order and time
-//!   ([`crate::icub`], "Pairing" in its source).
+//!   (`Pairing` in `pairing.rs`).
 //! - A thermometer frame has type E in the document and the shared header, but F in the strain2
 //!   firmware's enumeration: both are accepted.
 //!

@@ -20,6 +20,7 @@ extern crate alloc;
 #[cfg(test)]
 extern crate std;
 
+mod bringup;
 pub mod device;
 pub mod frame;
 pub mod icub;
@@ -27,6 +28,7 @@ pub mod icub_imu;
 pub mod icub_motor;
 pub mod icub_pos;
 pub mod icub_strain;
+mod pairing;
 mod registry;
 
 pub use device::{

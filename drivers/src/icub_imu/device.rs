@@ -5,9 +5,9 @@ use super::frames::{
     ACCELERATION_LSB, FIELD_LSB, Legacy, QUATERNION_LSB, Quantity, RATE_LSB, kind, sensor,
 };
 use super::options::{Options, Plan};
-use crate::icub::bringup::{Ask, Bringup, Inquiry};
-use crate::icub::pairing::{Paired, Pairing};
+use crate::bringup::{Ask, Bringup, Inquiry};
 use crate::icub::{self, class, command};
+use crate::pairing::{self, Paired, Pairing};
 use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, State, Transmit};
 use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, Refusal, StampKind};
@@ -53,7 +53,7 @@ impl Configure {
             return;
         }
         let agrees = has == wants;
-        self.settled = agrees || self.attempts >= icub::bringup::ATTEMPTS;
+        self.settled = agrees || self.attempts >= icub::PATIENCE.attempts;
         if !agrees {
             self.told = false;
             self.ask_at = Nanos::MIN;
@@ -81,7 +81,7 @@ impl Inquiry for Configure {
         }
         let id = icub::to_board(class::POLLING_ANALOG, self.address);
         if !self.told {
-            if self.attempts >= icub::bringup::ATTEMPTS {
+            if self.attempts >= icub::PATIENCE.attempts {
                 self.settled = true;
                 return Ask::Done;
             }
@@ -90,8 +90,8 @@ impl Inquiry for Configure {
         }
         self.told = false;
         self.attempts += 1;
-        self.ask_at = now + icub::bringup::ANSWER_TIMEOUT;
-        self.counts_until = now + icub::bringup::ANSWER_COUNTS;
+        self.ask_at = now + icub::PATIENCE.answer_timeout;
+        self.counts_until = now + icub::PATIENCE.answer_counts;
         Ask::Send(Frame::new(id, &[command::IMU_CONFIG_GET]))
     }
 
@@ -153,7 +153,7 @@ impl ImuDevice {
     /// range.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let plan = Plan::new(spec, options)?;
-        let silence = icub::power_on_silence(options.power_on_silence_ms)?;
+        let patience = icub::patience(options.power_on_silence_ms)?;
         let mode = if options.listen {
             Mode::Listen
         } else {
@@ -170,7 +170,7 @@ impl ImuDevice {
             plan.address,
             *kinds.first().unwrap_or(&kind::TRIPLE),
         );
-        let mut bringup = Bringup::new(spec, mode, silence, watched);
+        let mut bringup = Bringup::new(spec, mode, patience, watched);
         let id = icub::to_board(class::POLLING_ANALOG, plan.address);
         let mut claims: ArrayVec<Claim, 4> =
             icub::claims(class::PERIODIC_INERTIAL, plan.address, kinds);
@@ -330,8 +330,7 @@ impl ImuDevice {
             return;
         }
         let begun = (self.acquisition.acquired, self.acquisition.stamp);
-        if !self.acquisition.open
-            || !icub::pairing::within(begun, (frame.t, frame.stamp), self.together)
+        if !self.acquisition.open || !pairing::within(begun, (frame.t, frame.stamp), self.together)
         {
             out.fault(Counter::Unpaired, 1, frame.id);
             self.gap = true;

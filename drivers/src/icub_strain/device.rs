@@ -3,9 +3,9 @@
 
 use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind};
 use super::options::{Options, Stream};
-use crate::icub::bringup::{Ask, Bringup, Inquiry};
-use crate::icub::pairing::{Paired, Pairing};
+use crate::bringup::{Ask, Bringup, Inquiry};
 use crate::icub::{self, class, command};
+use crate::pairing::{Paired, Pairing};
 use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, State, Transmit};
 use arrayvec::ArrayVec;
 use proprio_topics::{
@@ -86,8 +86,8 @@ impl FullScales {
         if value == 0 {
             self.refusal = Some(Refusal::ZeroFullScale { channel });
             // Ask again slowly: the board may be repaired meanwhile.
-            self.attempts = icub::bringup::ATTEMPTS;
-            self.ask_at = frame.t + icub::bringup::SLOW_ATTEMPT;
+            self.attempts = icub::PATIENCE.attempts;
+            self.ask_at = frame.t + icub::PATIENCE.slow_attempt;
             return;
         }
         *told = Some(value);
@@ -121,14 +121,14 @@ impl Inquiry for FullScales {
         if self.refusal == Some(Refusal::Changed) || now < self.ask_at {
             return Ask::Wait;
         }
-        if self.attempts < icub::bringup::ATTEMPTS {
+        if self.attempts < icub::PATIENCE.attempts {
             self.attempts += 1;
-            self.ask_at = now + icub::bringup::ANSWER_TIMEOUT;
+            self.ask_at = now + icub::PATIENCE.answer_timeout;
         } else {
             if self.per_step.is_none() && self.refusal.is_none() {
                 self.refusal = Some(Refusal::NoFullScale);
             }
-            self.ask_at = now + icub::bringup::SLOW_ATTEMPT;
+            self.ask_at = now + icub::PATIENCE.slow_attempt;
         }
         if now > self.counts_until {
             self.open = [0; 6];
@@ -136,7 +136,7 @@ impl Inquiry for FullScales {
         if let Some(open) = self.open.get_mut(usize::from(self.axis)) {
             *open = open.saturating_add(1);
         }
-        self.counts_until = now + icub::bringup::ANSWER_COUNTS;
+        self.counts_until = now + icub::PATIENCE.answer_counts;
         Ask::Send(Frame::new(
             icub::to_board(class::POLLING_ANALOG, self.address),
             &[command::GET_FULL_SCALES, self.axis],
@@ -246,7 +246,7 @@ impl Strain {
         icub::no_joints(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
         let configured = options.full_scale(false)?;
-        let silence = icub::power_on_silence(options.power_on_silence_ms)?;
+        let patience = icub::patience(options.power_on_silence_ms)?;
         let timeout = match options.pair_timeout_ms {
             None => Nanos::from_micros(i64::from(period) * 500),
             Some(ms) if ms.is_finite() && ms > 0.0 && ms <= 1000.0 => {
@@ -273,7 +273,7 @@ impl Strain {
             Stream::Uncalibrated => icub::stream(class::PERIODIC_ANALOG, address, kind::RAW_FORCE),
             Stream::Calibrated | Stream::Both => force,
         };
-        let mut bringup = Bringup::new(spec, mode, silence, watched);
+        let mut bringup = Bringup::new(spec, mode, patience, watched);
         bringup.start_with(command_id, &[command::SET_CANDATARATE, period]);
         if let Some(seconds) = options.temperature_period_s {
             let seconds = icub::period_ms("temperature_period_s", seconds)?;

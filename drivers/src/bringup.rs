@@ -1,7 +1,5 @@
-//! Asks, starts, watches, restarts and stops one board.
-//!
-//! `Bringup` is the part of a [`crate::Device`] that asks, starts, watches, restarts and stops a
-//! board:
+//! Asks, starts, watches, restarts and stops one board: the part of a [`crate::Device`] that any
+//! family with a bring-up shares.
 //!
 //! ```text
 //! Waiting --power_on_silence--> Asking --answers--> Starting --first reading--> Streaming
@@ -11,11 +9,10 @@
 //! ```
 //! (1) No reading: again, doubling the wait. (2) No reading for `max_silence`: counted once.
 //!
-//! After power-up these boards wait 5 s in their bootloader, and *any* frame on the bus makes them
-//! stay there. If boards are powered together with the host, set `power_on_silence_ms = 6000`: this
-//! host then stays silent that long at start and before each attempt to wake a silent board. It
-//! cannot keep other senders silent. A reading ends the wait at once, because a board that streams
-//! has left its bootloader.
+//! A family gives a [`Bringup`] its [`Patience`], its start and stop commands, and an [`Inquiry`]:
+//! the questions that a board must answer before it is started ([`NoInquiry`] if there are none).
+//! Its device tells the bring-up of every reading ([`Bringup::reading`]) and passes on the calls of
+//! [`crate::Device`].
 
 use crate::{Decoded, Frame, Id, Mode, Spec, State, Transmit};
 use arrayvec::ArrayVec;
@@ -61,24 +58,28 @@ impl Inquiry for NoInquiry {
     }
 }
 
-/// Time to wait for an answer before the question is repeated. A board answers within a few ms;
-/// icub-main repeats after 20 ms.
-pub(crate) const ANSWER_TIMEOUT: Nanos = Nanos::from_millis(20);
-/// Number of attempts at that pace, as in icub-main; then the board counts as not answering.
-pub(crate) const ATTEMPTS: u8 = 15;
-/// Interval between attempts after that: a board that is powered later starts within this time, at
-/// the cost of one or two frames a second.
-pub(crate) const SLOW_ATTEMPT: Nanos = Nanos::from_millis(500);
-/// How long after a question its answer is accepted: slow boards answer the first attempt after the
-/// second was sent.
-pub(crate) const ANSWER_COUNTS: Nanos = Nanos::from_millis(1000);
-/// Time from start to first reading, in addition to the maximum silence: an IMU changes its fusion
-/// mode meanwhile. Doubled with each attempt up to [`START_PATIENCE_MOST`].
-const START_PATIENCE: Nanos = Nanos::from_millis(250);
-/// The longest time between two attempts to start.
-const START_PATIENCE_MOST: Nanos = Nanos::from_millis(500);
-/// A command that could not be sent for this long is dropped; the next attempt sends it again.
-const SEND_WITHIN: Nanos = Nanos::from_millis(100);
+/// How long the host waits for boards of a family.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Patience {
+    /// Silence kept after power-on and before each attempt to wake a silent board; 0: none.
+    pub(crate) power_on_silence: Nanos,
+    /// Time to wait for an answer before the question is repeated.
+    pub(crate) answer_timeout: Nanos,
+    /// Number of attempts at that pace; then the board counts as not answering.
+    pub(crate) attempts: u8,
+    /// Interval between attempts after that.
+    pub(crate) slow_attempt: Nanos,
+    /// How long after a question its answer is accepted: a slow board answers the first attempt
+    /// after the second was sent.
+    pub(crate) answer_counts: Nanos,
+    /// Time from start to first reading, in addition to the maximum silence; doubled with each
+    /// attempt up to `start_most`.
+    pub(crate) start: Nanos,
+    /// The longest time between two attempts to start.
+    pub(crate) start_most: Nanos,
+    /// A command that could not be sent for this long is dropped; the next attempt sends it again.
+    pub(crate) send_within: Nanos,
+}
 
 /// The phase of the bring-up.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -104,13 +105,14 @@ enum Phase {
 pub(crate) struct Bringup {
     mode: Mode,
     max_silence: Nanos,
-    power_on_silence: Nanos,
+    patience: Patience,
     start: ArrayVec<Frame, 8>,
     stop: ArrayVec<Frame, 4>,
     /// The stream that is watched, for the faults.
     watched: Id,
     phase: Phase,
-    patience: Nanos,
+    /// Time to the first reading, in addition to the maximum silence, of the next attempt.
+    start_patience: Nanos,
     /// Time of the last reading; `None` while the board is silent.
     last: Option<Nanos>,
     silent: bool,
@@ -119,16 +121,16 @@ pub(crate) struct Bringup {
 }
 
 impl Bringup {
-    pub(crate) fn new(spec: &Spec, mode: Mode, power_on_silence: Nanos, watched: Id) -> Self {
+    pub(crate) fn new(spec: &Spec, mode: Mode, patience: Patience, watched: Id) -> Self {
         Self {
             mode,
             max_silence: spec.max_silence,
-            power_on_silence,
+            patience,
             start: ArrayVec::new(),
             stop: ArrayVec::new(),
             watched,
             phase: Phase::Fresh,
-            patience: START_PATIENCE,
+            start_patience: patience.start,
             last: None,
             silent: false,
             begun: false,
@@ -188,7 +190,7 @@ impl Bringup {
             self.silent = true;
             out.fault(Counter::Silences, 1, self.watched);
             if matches!(self.phase, Phase::Watching { .. }) {
-                self.patience = START_PATIENCE;
+                self.start_patience = self.patience.start;
                 self.phase = Phase::Fresh;
             }
         }
@@ -199,8 +201,8 @@ impl Bringup {
                     self.phase = Phase::Watching { until: Nanos::MAX }
                 }
                 Phase::Fresh => {
-                    let until = if self.power_on_silence > Nanos::ZERO {
-                        now + self.power_on_silence
+                    let until = if self.patience.power_on_silence > Nanos::ZERO {
+                        now + self.patience.power_on_silence
                     } else {
                         Nanos::MIN
                     };
@@ -217,7 +219,7 @@ impl Bringup {
                     Ask::Send(frame) => {
                         return Some(Transmit {
                             frame,
-                            deadline: now + ANSWER_TIMEOUT,
+                            deadline: now + self.patience.answer_timeout,
                         });
                     }
                     Ask::Wait => return None,
@@ -228,13 +230,16 @@ impl Bringup {
                         self.phase = Phase::Starting { next: next + 1 };
                         return Some(Transmit {
                             frame,
-                            deadline: now + SEND_WITHIN,
+                            deadline: now + self.patience.send_within,
                         });
                     }
                     self.phase = Phase::Watching {
-                        until: now + self.max_silence + self.patience,
+                        until: now + self.max_silence + self.start_patience,
                     };
-                    self.patience = START_PATIENCE_MOST.min(self.patience + self.patience);
+                    self.start_patience = self
+                        .patience
+                        .start_most
+                        .min(self.start_patience + self.start_patience);
                     return None;
                 }
                 Phase::Watching { until } if self.last.is_some() || now < until => return None,
@@ -245,7 +250,7 @@ impl Bringup {
                         self.phase = Phase::Stopping { next: next + 1 };
                         return Some(Transmit {
                             frame,
-                            deadline: now + SEND_WITHIN,
+                            deadline: now + self.patience.send_within,
                         });
                     }
                     self.phase = Phase::Stopped;
@@ -297,7 +302,7 @@ impl Bringup {
         let waiting = matches!(self.phase, Phase::Fresh | Phase::Waiting { .. });
         let quiet = self.mode == Mode::Listen
             || !self.begun
-            || (waiting && self.power_on_silence > Nanos::ZERO);
+            || (waiting && self.patience.power_on_silence > Nanos::ZERO);
         if self.active() {
             self.phase = if quiet {
                 Phase::Stopped
@@ -311,7 +316,7 @@ impl Bringup {
     pub(crate) fn restart(&mut self) {
         if self.active() {
             self.phase = Phase::Fresh;
-            self.patience = START_PATIENCE;
+            self.start_patience = self.patience.start;
             self.last = None;
             self.silent = false;
         }
