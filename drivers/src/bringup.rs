@@ -11,10 +11,14 @@
 //!
 //! A family gives a [`Bringup`] its [`Patience`], its start and stop commands, and an [`Inquiry`]:
 //! the questions that a board must answer before it is started ([`NoInquiry`] if there are none).
+//! One frame is under way at a time. A question or a start command that was not sent is tried again
+//! after `Patience::answer_timeout`, and such a question is no attempt: a device does not count as
+//! silent because the host's own bus could not send. A stop command is sent once.
+//!
 //! Its device tells the bring-up of every reading ([`Bringup::reading`]) and passes on the calls of
 //! [`crate::Device`].
 
-use crate::{Decoded, Frame, Id, Mode, Spec, State, Transmit};
+use crate::{Decoded, Frame, Id, Mode, NotSent, Spec, State, Transmit};
 use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Nanos, Refusal};
 
@@ -22,8 +26,11 @@ use proprio_topics::{Counter, Nanos, Refusal};
 pub(crate) trait Inquiry {
     /// Starts again: the board may have been reset or replaced.
     fn begin(&mut self);
-    /// The next step at `now`.
+    /// The next step at `now`. A question counts as sent at `now` until [`Inquiry::sent`] says
+    /// otherwise, because its answer may come before that call.
     fn poll(&mut self, now: Nanos) -> Ask;
+    /// The last question was sent at this time, or not at all.
+    fn sent(&mut self, outcome: Result<Nanos, NotSent>);
     /// Time of the next poll.
     fn wake(&self) -> Option<Nanos>;
     /// Why the board cannot be used.
@@ -50,6 +57,7 @@ impl Inquiry for NoInquiry {
     fn poll(&mut self, _now: Nanos) -> Ask {
         Ask::Done
     }
+    fn sent(&mut self, _outcome: Result<Nanos, NotSent>) {}
     fn wake(&self) -> Option<Nanos> {
         None
     }
@@ -77,8 +85,95 @@ pub(crate) struct Patience {
     pub(crate) start: Nanos,
     /// The longest time between two attempts to start.
     pub(crate) start_most: Nanos,
-    /// A command that could not be sent for this long is dropped; the next attempt sends it again.
+    /// A command that could not be sent for this long is given up and tried again.
     pub(crate) send_within: Nanos,
+}
+
+/// The pace of one question: it is repeated after `Patience::answer_timeout`, and after
+/// `Patience::attempts` times every `Patience::slow_attempt`.
+#[derive(Debug)]
+pub(crate) struct Attempts {
+    patience: Patience,
+    /// How often it was sent, at most `Patience::attempts`.
+    count: u8,
+    /// Earliest time of the next attempt.
+    next: Nanos,
+    /// Time from the last attempt to the next.
+    pause: Nanos,
+    /// Answers may still arrive until then.
+    counts_until: Nanos,
+    /// `count` and `counts_until` before the last attempt.
+    before: (u8, Nanos),
+}
+
+impl Attempts {
+    pub(crate) const fn new(patience: Patience) -> Self {
+        Self {
+            patience,
+            count: 0,
+            next: Nanos::MIN,
+            pause: Nanos::ZERO,
+            counts_until: Nanos::MIN,
+            before: (0, Nanos::MIN),
+        }
+    }
+
+    /// A new question, to be asked at once. Answers to the last one may still arrive.
+    pub(crate) const fn begin(&mut self) {
+        self.count = 0;
+        self.next = Nanos::MIN;
+    }
+
+    /// The question is asked at `now`.
+    pub(crate) fn ask(&mut self, now: Nanos) {
+        self.before = (self.count, self.counts_until);
+        self.pause = if self.exhausted() {
+            self.patience.slow_attempt
+        } else {
+            self.count += 1;
+            self.patience.answer_timeout
+        };
+        self.asked(now);
+    }
+
+    fn asked(&mut self, t: Nanos) {
+        self.next = t + self.pause;
+        self.counts_until = t + self.patience.answer_counts;
+    }
+
+    /// The time of the last attempt; one that was not sent does not count.
+    pub(crate) fn sent(&mut self, outcome: Result<Nanos, NotSent>) {
+        match outcome {
+            Ok(t) => self.asked(t),
+            Err(_) => (self.count, self.counts_until) = self.before,
+        }
+    }
+
+    /// The answer at `t` cannot be used: asks slowly from now on.
+    pub(crate) fn slow_down(&mut self, t: Nanos) {
+        self.count = self.patience.attempts;
+        self.next = t + self.patience.slow_attempt;
+    }
+
+    /// The answer cannot be used: asks again at once.
+    pub(crate) const fn again(&mut self) {
+        self.next = Nanos::MIN;
+    }
+
+    /// Whether the board counts as not answering.
+    pub(crate) const fn exhausted(&self) -> bool {
+        self.count >= self.patience.attempts
+    }
+
+    /// Earliest time of the next attempt.
+    pub(crate) const fn next(&self) -> Nanos {
+        self.next
+    }
+
+    /// Whether an answer at `t` may belong to an attempt.
+    pub(crate) fn counts(&self, t: Nanos) -> bool {
+        t <= self.counts_until
+    }
 }
 
 /// The phase of the bring-up.
@@ -100,6 +195,14 @@ enum Phase {
     Stopped,
 }
 
+/// A frame whose outcome is not known yet.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct UnderWay {
+    frame: Frame,
+    /// If it is not sent, nothing is tried again before this.
+    again: Nanos,
+}
+
 /// Asks, starts, watches, restarts and stops one board (state machine in the module documentation).
 #[derive(Debug)]
 pub(crate) struct Bringup {
@@ -111,6 +214,9 @@ pub(crate) struct Bringup {
     /// The stream that is watched, for the faults.
     watched: Id,
     phase: Phase,
+    under_way: Option<UnderWay>,
+    /// After a frame that was not sent: nothing is asked or started before this.
+    hold: Nanos,
     /// Time to the first reading, in addition to the maximum silence, of the next attempt.
     start_patience: Nanos,
     /// Time of the last reading; `None` while the board is silent.
@@ -130,6 +236,8 @@ impl Bringup {
             stop: ArrayVec::new(),
             watched,
             phase: Phase::Fresh,
+            under_way: None,
+            hold: Nanos::MIN,
             start_patience: patience.start,
             last: None,
             silent: false,
@@ -194,6 +302,24 @@ impl Bringup {
                 self.phase = Phase::Fresh;
             }
         }
+        if self.under_way.is_some() {
+            return None;
+        }
+        let transmit = self.step(now, inquiry, out)?;
+        self.under_way = Some(UnderWay {
+            frame: transmit.frame,
+            again: now + self.patience.answer_timeout,
+        });
+        Some(transmit)
+    }
+
+    /// The next frame to send at `now`, if none is under way.
+    fn step(
+        &mut self,
+        now: Nanos,
+        inquiry: &mut impl Inquiry,
+        out: &mut Decoded,
+    ) -> Option<Transmit> {
         // Each turn returns or advances to a later phase, so the loop ends.
         loop {
             match self.phase {
@@ -215,6 +341,7 @@ impl Bringup {
                     inquiry.begin();
                     self.phase = Phase::Asking;
                 }
+                Phase::Asking | Phase::Starting { .. } if now < self.hold => return None,
                 Phase::Asking => match inquiry.poll(now) {
                     Ask::Send(frame) => {
                         return Some(Transmit {
@@ -227,7 +354,6 @@ impl Bringup {
                 },
                 Phase::Starting { next } => {
                     if let Some(&frame) = self.start.get(next) {
-                        self.phase = Phase::Starting { next: next + 1 };
                         return Some(Transmit {
                             frame,
                             deadline: now + self.patience.send_within,
@@ -247,7 +373,6 @@ impl Bringup {
                 Phase::Watching { .. } => self.phase = Phase::Fresh,
                 Phase::Stopping { next } => {
                     if let Some(&frame) = self.stop.get(next) {
-                        self.phase = Phase::Stopping { next: next + 1 };
                         return Some(Transmit {
                             frame,
                             deadline: now + self.patience.send_within,
@@ -260,12 +385,37 @@ impl Bringup {
         }
     }
 
+    /// Takes the outcome of a frame that [`Bringup::poll`] gave.
+    pub(crate) fn on_sent(
+        &mut self,
+        frame: &Frame,
+        outcome: Result<Nanos, NotSent>,
+        inquiry: &mut impl Inquiry,
+    ) {
+        // After a restart a late outcome may concern an earlier frame.
+        let Some(under_way) = self.under_way.take_if(|last| last.frame == *frame) else {
+            return;
+        };
+        if outcome.is_err() {
+            self.hold = under_way.again;
+        }
+        match &mut self.phase {
+            Phase::Asking => inquiry.sent(outcome),
+            Phase::Starting { next } => *next += usize::from(outcome.is_ok()),
+            Phase::Stopping { next } if self.stop.get(*next) == Some(frame) => *next += 1,
+            _ => {}
+        }
+    }
+
     pub(crate) fn next_wake(&self, inquiry: &impl Inquiry) -> Option<Nanos> {
         let silence = self.last.map(|last| last + self.max_silence + Nanos(1));
         let phase = match self.phase {
-            Phase::Fresh | Phase::Starting { .. } | Phase::Stopping { .. } => Some(Nanos::MIN),
+            // Its outcome is the next event.
+            _ if self.under_way.is_some() => None,
+            Phase::Fresh | Phase::Stopping { .. } => Some(Nanos::MIN),
+            Phase::Starting { .. } => Some(self.hold),
             Phase::Waiting { until } => Some(until),
-            Phase::Asking => inquiry.wake(),
+            Phase::Asking => inquiry.wake().map(|wake| wake.max(self.hold)),
             Phase::Watching { until } => {
                 (self.last.is_none() && until < Nanos::MAX).then_some(until)
             }
@@ -316,6 +466,8 @@ impl Bringup {
     pub(crate) fn restart(&mut self) {
         if self.active() {
             self.phase = Phase::Fresh;
+            self.under_way = None;
+            self.hold = Nanos::MIN;
             self.start_patience = self.patience.start;
             self.last = None;
             self.silent = false;

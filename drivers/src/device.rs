@@ -303,17 +303,16 @@ pub trait Device: Send {
     /// input.
     fn on_frame(&mut self, frame: &Frame, out: &mut Decoded);
 
-    /// The next frame to send at `now`; call until `None`. Never anything in [`Mode::Listen`].
+    /// The next frame to send at `now`. While the outcome of the last one is open
+    /// ([`Device::on_sent`]), and in [`Mode::Listen`], there is none.
     ///
     /// Events that only the passing of time shows (a silence, a start) are added to `out`, also in
     /// [`Mode::Listen`].
     fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit>;
 
     /// What became of `frame`, which [`Device::poll_transmit`] gave: when the interface took it
-    /// \[ns\], or why it did not.
-    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
-        let _ = (frame, outcome);
-    }
+    /// \[ns\], or why it did not. Must be called once for each such frame.
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>);
 
     /// When to call [`Device::poll_transmit`] again even if no frame comes \[ns\].
     fn next_wake(&self) -> Option<Nanos>;

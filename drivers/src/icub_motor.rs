@@ -38,8 +38,8 @@
 use crate::bringup::{Bringup, NoInquiry};
 use crate::icub::{self, class};
 use crate::{
-    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Output, Spec, SpecError,
-    State, Transmit,
+    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, NotSent, Output, Spec,
+    SpecError, State, Transmit,
 };
 use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
@@ -272,6 +272,10 @@ impl Device for Motor {
 
     fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
         self.bringup.poll(now, &mut NoInquiry, out)
+    }
+
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        self.bringup.on_sent(frame, outcome, &mut NoInquiry);
     }
 
     fn next_wake(&self) -> Option<Nanos> {

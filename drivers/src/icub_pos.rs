@@ -37,8 +37,8 @@
 use crate::bringup::{Bringup, NoInquiry};
 use crate::icub::{self, class, command};
 use crate::{
-    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Output, Outputs, Spec,
-    SpecError, State, Transmit,
+    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, NotSent, Output, Outputs,
+    Spec, SpecError, State, Transmit,
 };
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
@@ -318,6 +318,10 @@ impl Device for Pos {
 
     fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
         self.bringup.poll(now, &mut NoInquiry, out)
+    }
+
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        self.bringup.on_sent(frame, outcome, &mut NoInquiry);
     }
 
     fn next_wake(&self) -> Option<Nanos> {

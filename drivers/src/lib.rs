@@ -21,6 +21,7 @@ extern crate alloc;
 extern crate std;
 
 mod bringup;
+mod configure;
 pub mod device;
 pub mod frame;
 pub mod icub;

@@ -3,7 +3,9 @@
 
 use crate::plan::{BusPlan, Route};
 use crate::status::BusStatus;
-use proprio_drivers::{Claim, Decoded, Device, Frame, Id, Mode, SpecError, State, Transmit};
+use proprio_drivers::{
+    Claim, Decoded, Device, Frame, Id, Mode, NotSent, SpecError, State, Transmit,
+};
 use proprio_topics::{Counter, Header, MAX_CHANNELS, Nanos, Reading, Sample};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
@@ -128,20 +130,17 @@ impl Decoder {
         }
     }
 
-    /// Calls `send` for every frame that a device wants to send at `now`.
-    pub fn poll_transmit(&mut self, now: Nanos, mut send: impl FnMut(&Transmit)) {
+    /// Calls `send` for every frame that a device wants to send at `now`, with the device's number
+    /// in the plan. [`Decoder::on_sent`] must follow for each; until then that device sends nothing
+    /// else.
+    pub fn poll_transmit(&mut self, now: Nanos, mut send: impl FnMut(u16, &Transmit)) {
         for (running, number) in self.devices.iter_mut().zip(0_u16..) {
             if running.device.next_wake().is_none_or(|wake| wake > now) {
                 continue;
             }
             self.decoded.clear();
-            // A device sends a few frames at once; the limit keeps a faulty one from blocking the
-            // loop.
-            for _ in 0..64 {
-                let Some(transmit) = running.device.poll_transmit(now, &mut self.decoded) else {
-                    break;
-                };
-                send(&transmit);
+            if let Some(transmit) = running.device.poll_transmit(now, &mut self.decoded) {
+                send(number, &transmit);
             }
             for fault in &self.decoded.faults {
                 self.status
@@ -149,6 +148,19 @@ impl Decoder {
             }
             self.status.set_state(number, running.device.state());
         }
+    }
+
+    /// What became of `frame` of device number `device`: when the interface took it \[ns\], or why
+    /// it did not.
+    pub fn on_sent(&mut self, device: u16, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        let Some(running) = self.devices.get_mut(usize::from(device)) else {
+            return;
+        };
+        running.device.on_sent(frame, outcome);
+        if outcome.is_err() {
+            self.status.count(device, Counter::Unsent, 1);
+        }
+        self.status.set_state(device, running.device.state());
     }
 
     /// The earliest instant at which a device must be polled.

@@ -680,7 +680,10 @@ fn power_on_with(
         for _ in 0..64 {
             decoded.clear();
             match host.poll_transmit(now, &mut decoded) {
-                Some(transmit) => board.on_frame(&transmit.frame, &mut answers),
+                Some(transmit) => {
+                    host.on_sent(&transmit.frame, Ok(now));
+                    board.on_frame(&transmit.frame, &mut answers);
+                }
                 None if board.period().is_some() => break,
                 None => now = host.next_wake().unwrap_or(now).max(now),
             }

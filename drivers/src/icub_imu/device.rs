@@ -5,104 +5,19 @@ use super::frames::{
     ACCELERATION_LSB, FIELD_LSB, Legacy, QUATERNION_LSB, Quantity, RATE_LSB, kind, sensor,
 };
 use super::options::{Options, Plan};
-use crate::bringup::{Ask, Bringup, Inquiry};
+use crate::bringup::Bringup;
+use crate::configure::{Configure, Setting};
 use crate::icub::{self, class, command};
 use crate::pairing::{self, Paired, Pairing};
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, State, Transmit};
+use crate::{
+    Claim, Decoded, Device, Frame, Mode, NotSent, Output, Spec, SpecError, State, Transmit,
+};
 use arrayvec::ArrayVec;
-use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, Refusal, StampKind};
+use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, StampKind};
 
 /// A frame up to this many sequence numbers back is late; further back, the counter has restarted
 /// or there is a long gap.
 const LATE: u8 = 4;
-
-/// Sends a board its configuration and verifies it.
-#[derive(Debug)]
-struct Configure {
-    address: u8,
-    wanted: [u8; 8],
-    /// Legacy boards have no such configuration.
-    needed: bool,
-    /// The board has confirmed it, or does not answer.
-    settled: bool,
-    /// The configuration has been sent; the question follows.
-    told: bool,
-    attempts: u8,
-    ask_at: Nanos,
-    /// Answers may still arrive until then.
-    counts_until: Nanos,
-}
-
-impl Configure {
-    fn answer(&mut self, data: &[u8], mode: Mode, frame: &Frame, out: &mut Decoded) {
-        if mode == Mode::Listen {
-            return;
-        }
-        let &[_, ref has @ .., _, _, _] = data else {
-            return out.fault(Counter::Length, 1, frame.id);
-        };
-        let [_, wants @ .., _, _, _] = &self.wanted;
-        if has.len() != wants.len() {
-            return out.fault(Counter::Length, 1, frame.id);
-        }
-        if frame.t > self.counts_until {
-            return out.fault(Counter::Unexpected, 1, frame.id);
-        }
-        if self.settled {
-            // A late answer to an earlier question.
-            return;
-        }
-        let agrees = has == wants;
-        self.settled = agrees || self.attempts >= icub::PATIENCE.attempts;
-        if !agrees {
-            self.told = false;
-            self.ask_at = Nanos::MIN;
-            if self.settled {
-                out.fault(Counter::Changed, 1, frame.id);
-            }
-        }
-    }
-}
-
-impl Inquiry for Configure {
-    fn begin(&mut self) {
-        self.settled = !self.needed;
-        self.told = false;
-        self.attempts = 0;
-        self.ask_at = Nanos::MIN;
-    }
-
-    fn poll(&mut self, now: Nanos) -> Ask {
-        if self.settled {
-            return Ask::Done;
-        }
-        if now < self.ask_at {
-            return Ask::Wait;
-        }
-        let id = icub::to_board(class::POLLING_ANALOG, self.address);
-        if !self.told {
-            if self.attempts >= icub::PATIENCE.attempts {
-                self.settled = true;
-                return Ask::Done;
-            }
-            self.told = true;
-            return Ask::Send(Frame::new(id, &self.wanted));
-        }
-        self.told = false;
-        self.attempts += 1;
-        self.ask_at = now + icub::PATIENCE.answer_timeout;
-        self.counts_until = now + icub::PATIENCE.answer_counts;
-        Ask::Send(Frame::new(id, &[command::IMU_CONFIG_GET]))
-    }
-
-    fn wake(&self) -> Option<Nanos> {
-        Some(self.ask_at)
-    }
-
-    fn refusal(&self) -> Option<Refusal> {
-        None
-    }
-}
 
 /// The current, incomplete acquisition.
 #[derive(Debug, Clone, Copy)]
@@ -188,20 +103,19 @@ impl ImuDevice {
                 plan.address,
             )));
         }
+        let setting = Setting {
+            set: Frame::new(id, &plan.configuration),
+            get: Frame::new(id, &[command::IMU_CONFIG_GET]),
+            // Mask, mode and orientation; the rest is unused.
+            from: 1,
+            until: 5,
+        };
         let together = Nanos::from_micros(i64::from(plan.period_ms) * 500);
         Ok(Self {
             claims,
             bringup,
-            configure: Configure {
-                address: plan.address,
-                wanted: plan.configuration,
-                needed: !is_legacy,
-                settled: false,
-                told: false,
-                attempts: 0,
-                ask_at: Nanos::MIN,
-                counts_until: Nanos::MIN,
-            },
+            // Legacy boards have no such configuration.
+            configure: Configure::new((!is_legacy).then_some(setting), icub::PATIENCE),
             acquisition: Acquisition::NONE,
             sequence: None,
             not_calibrated: false,
@@ -473,6 +387,10 @@ impl Device for ImuDevice {
             self.reset();
         }
         transmit
+    }
+
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        self.bringup.on_sent(frame, outcome, &mut self.configure);
     }
 
     fn next_wake(&self) -> Option<Nanos> {

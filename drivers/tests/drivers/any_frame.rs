@@ -2,7 +2,7 @@
 //! number in a wrench.
 
 use crate::rig::{options, spec};
-use proprio_drivers::{Board, Decoded, Device, Format, Frame, Frames, Id, Mode};
+use proprio_drivers::{Board, Decoded, Device, Format, Frame, Frames, Id, Mode, NotSent};
 use proprio_topics::{Nanos, Quality, Reading, StampKind};
 use proptest::prelude::*;
 
@@ -49,7 +49,9 @@ enum Event {
     Pass {
         ns: i64,
     },
-    Poll,
+    Poll {
+        sent: bool,
+    },
     Restart,
     Stop,
 }
@@ -84,7 +86,7 @@ fn event() -> impl Strategy<Value = Event> {
             0_i64..1_000_000, 0_i64..100_000_000, -5_000_000_i64..2_000_000_000, -YEARS..YEARS
         ]
             .prop_map(|ns| Event::Pass { ns }),
-        10 => Just(Event::Poll),
+        10 => any::<bool>().prop_map(|sent| Event::Poll { sent }),
         1 => Just(Event::Restart),
         1 => Just(Event::Stop),
     ]
@@ -161,13 +163,19 @@ fn drive(device: &mut dyn Device, board: &mut dyn Board, events: &[Event], liste
                 }
             }
             Event::Pass { ns } => now = Nanos((now.0 + ns).clamp(-YEARS, YEARS)),
-            Event::Poll => {
+            Event::Poll { sent } => {
                 for turn in 0.. {
                     assert!(turn < 32, "it never stops sending");
                     let Some(transmit) = device.poll_transmit(now, &mut out) else {
                         break;
                     };
                     assert!(!listens, "a listener sends {transmit:?}");
+                    let outcome = if *sent {
+                        Ok(now)
+                    } else {
+                        Err(NotSent::Refused)
+                    };
+                    device.on_sent(&transmit.frame, outcome);
                     let mut answers = Frames::new();
                     board.on_frame(&transmit.frame, &mut answers);
                 }

@@ -2,7 +2,7 @@
 //! stop.
 
 use crate::rig::{Rig, decode, frame, listener, options, spec};
-use proprio_drivers::{Mode, Options, SpecError, State};
+use proprio_drivers::{Decoded, Mode, NotSent, Options, SpecError, State};
 use proprio_topics::{Counter, Imu, JointState, Nanos, Quality, Reading, Refusal, Wrench};
 
 const SCALES: &str = "full_scale_n = [1804, 1804, 1804]\nfull_scale_nm = [31, 31, 31]\n";
@@ -143,6 +143,130 @@ fn a_board_that_is_off_is_refused_and_comes_up_when_it_gets_power() {
     rig.host_loses = Box::new(|_, _| false);
     rig.run(600);
     assert_eq!(rig.device.state(), State::Streaming);
+}
+
+/// The host's bus can not send for 2 s: 6 times as long as 15 attempts take.
+#[test]
+fn a_question_that_was_never_sent_is_no_attempt() {
+    let mut rig = strain();
+    rig.interface = Box::new(|_| Some(NotSent::Refused));
+    rig.run(2000);
+    assert_eq!(rig.states, [State::Asking]);
+    // Tried again every 20 ms, not in an endless loop.
+    let times: Vec<_> = rig.unsent.iter().map(|(t, _)| *t).collect();
+    assert!(
+        times
+            .windows(2)
+            .all(|pair| pair[1] - pair[0] == Nanos::from_millis(20))
+    );
+    rig.interface = Box::new(|_| None);
+    rig.run(100);
+    assert_eq!(rig.device.state(), State::Streaming);
+    assert_eq!(rig.sent.len(), 8, "{:?}", rig.sent);
+    assert_eq!(rig.count(Counter::Unexpected), 0);
+    // What was never asked has no answer.
+    let mut rig = strain();
+    rig.interface = Box::new(|_| Some(NotSent::Deadline));
+    rig.run(100);
+    let now = rig.now.seconds() * 1e3;
+    let (_, faults) = decode(&mut *rig.device, &[frame("210#1800070C", now)]);
+    assert_eq!(faults[0].counter, Counter::Unexpected);
+}
+
+#[test]
+fn a_start_command_that_was_not_sent_is_repeated() {
+    for (driver, keys, command, fails) in [
+        ("icub_strain", SCALES, "201#080A", NotSent::Refused),
+        ("icub_strain", SCALES, "201#0700", NotSent::Deadline),
+        ("icub_imu", "", "201#350A", NotSent::LinkLost),
+        ("icub_imu", "", "201#3405000100000000", NotSent::Refused),
+        ("icub_imu", "", "201#33", NotSent::Refused),
+    ] {
+        let reading = if driver == "icub_imu" {
+            imu()
+        } else {
+            wrench()
+        };
+        let mut rig = Rig::new(driver, keys, &[], reading);
+        let mut count = 0;
+        rig.interface = Box::new(move |frame| {
+            count += u32::from(frame.to_string() == command);
+            (frame.to_string() == command && count <= 3).then_some(fails)
+        });
+        rig.run(120);
+        let unsent: Vec<&str> = rig.unsent.iter().map(|(_, text)| text.as_str()).collect();
+        assert_eq!(unsent, [command; 3]);
+        // As if it had been sent at once: every command once, in the same order.
+        let sent = std::mem::take(&mut rig.sent);
+        let mut usual = Rig::new(driver, keys, &[], reading);
+        usual.run(50);
+        assert_eq!(sent, usual.sent, "{command}");
+        assert_eq!(
+            (rig.device.state(), rig.count(Counter::Starts)),
+            (State::Streaming, 1)
+        );
+    }
+}
+
+/// The outcome is late: until it is known nothing else is sent. After a restart the device does not
+/// wait for it.
+#[test]
+fn one_frame_is_under_way_at_a_time() {
+    let device = || {
+        options("icub_strain", SCALES)
+            .device(&spec(1, Mode::Supervise, &[]))
+            .unwrap()
+    };
+    let mut out = Decoded::new();
+    let (mut one, now) = (device(), Nanos::from_millis(1000));
+    let first = one.poll_transmit(now, &mut out).unwrap();
+    assert_eq!(first.frame.to_string(), "201#080A");
+    let later = now + Nanos::from_millis(500);
+    assert_eq!(one.poll_transmit(later, &mut out), None);
+    assert_eq!(one.next_wake(), None);
+    // Another frame's outcome is not this one's.
+    one.on_sent(&frame("201#0700", 0.0), Ok(later));
+    assert_eq!(one.poll_transmit(later, &mut out), None);
+    one.on_sent(&first.frame, Ok(later));
+    assert!(one.next_wake().unwrap() <= later);
+    let second = one.poll_transmit(later, &mut out).unwrap();
+    assert_eq!(second.frame.to_string(), "201#0700");
+    one.restart(later);
+    assert_eq!(
+        one.poll_transmit(later, &mut out).unwrap().frame,
+        first.frame
+    );
+    // A stop waits for the outcome, and is not repeated.
+    one.stop(later);
+    assert_eq!(one.poll_transmit(later, &mut out), None);
+    one.on_sent(&first.frame, Err(NotSent::Deadline));
+    let stop = one.poll_transmit(later, &mut out).unwrap().frame;
+    assert_eq!(
+        (stop.to_string().as_str(), one.state()),
+        ("201#0701", State::Starting)
+    );
+    one.on_sent(&stop, Err(NotSent::LinkLost));
+    assert_eq!(one.poll_transmit(later, &mut out), None);
+    assert_eq!(one.state(), State::Stopped);
+}
+
+/// The time-out of an answer begins when the question is sent.
+#[test]
+fn a_question_that_waited_for_the_bus_is_not_repeated_early() {
+    let mut device = options("icub_strain", "")
+        .device(&spec(1, Mode::Supervise, &[]))
+        .unwrap();
+    let (mut out, now) = (Decoded::new(), Nanos::from_millis(1000));
+    let question = device.poll_transmit(now, &mut out).unwrap().frame;
+    let sent = now + Nanos::from_millis(19);
+    device.on_sent(&question, Ok(sent));
+    let next = device.next_wake().unwrap();
+    assert_eq!(next - sent, Nanos::from_millis(20));
+    assert_eq!(device.poll_transmit(next - Nanos(1), &mut out), None);
+    assert_eq!(
+        device.poll_transmit(next, &mut out).unwrap().frame,
+        question
+    );
 }
 
 #[test]
