@@ -350,7 +350,8 @@ pub enum EncodeError {
 }
 
 /// The device's own side of its protocol: answers commands and encodes readings, as the hardware
-/// does.
+/// does. After power-on it waits for its start command; one whose [`Spec`] says [`Mode::Listen`] has
+/// been started by another program.
 pub trait Board: Send {
     /// Takes a frame from the bus and adds the answers to `out`. Frames for other boards are
     /// ignored.

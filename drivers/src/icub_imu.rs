@@ -67,7 +67,6 @@
 //! legacy = "none"           # "mtb" or "bno055": legacy frames of that scale instead
 //! legacy_mask = 6           # which legacy sensors; default accelerometer and gyroscope
 //! power_on_silence_ms = 0   # see `crate::icub`
-//! listen = false            # true: another program commands this board; never transmit
 //! ```
 
 mod board;

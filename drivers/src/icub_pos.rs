@@ -29,7 +29,6 @@
 //! period_ms = 10            # 1 to 255
 //! quantity = "angle"        # "angle" (rad) or "length" (m): the quantity that the board sends
 //! power_on_silence_ms = 0   # see `crate::icub`
-//! listen = false            # true: another program commands this board; never transmit
 //! # Configuration of a psc's one or two sensors; without it the board keeps its own.
 //! sensors = [{ label = 0, inverted = false, rotation_deg = 0, zero_deg = 0.0 }, { label = 1 }]
 //! ```
@@ -142,8 +141,6 @@ pub struct Options {
     pub quantity: Quantity,
     /// Silence kept after power-on \[ms\]; default 0.
     pub power_on_silence_ms: u32,
-    /// Another program commands this board; default false.
-    pub listen: bool,
     /// Configuration of its sensors, at most two; default: keep the board's own.
     pub sensors: Option<Vec<Sensor>>,
 }
@@ -154,7 +151,6 @@ impl Default for Options {
             period_ms: 10,
             quantity: Quantity::Angle,
             power_on_silence_ms: 0,
-            listen: false,
             sensors: None,
         }
     }
@@ -233,13 +229,8 @@ impl Pos {
         joints(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
         let patience = icub::patience(options.power_on_silence_ms)?;
-        let mode = if options.listen {
-            Mode::Listen
-        } else {
-            spec.mode
-        };
         let watched = icub::stream(class::PERIODIC_ANALOG, address, POS);
-        let mut bringup = Bringup::new(spec, mode, patience, watched);
+        let mut bringup = Bringup::new(spec, spec.mode, patience, watched);
         let id = icub::to_board(class::POLLING_ANALOG, address);
         if let Some(configuration) = options.configuration()? {
             bringup.start_with(id, &configuration);
@@ -353,7 +344,7 @@ pub struct PosBoard {
 }
 
 impl PosBoard {
-    /// A board after power-on. With `listen` another program has already started it.
+    /// A board after power-on; in [`Mode::Listen`] another program has already started it.
     ///
     /// # Errors
     /// As [`Pos::new`].
@@ -365,7 +356,7 @@ impl PosBoard {
         Ok(Self {
             address: icub::address(spec)?,
             period,
-            streaming: options.listen,
+            streaming: spec.mode == Mode::Listen,
             quantity: options.quantity,
         })
     }

@@ -52,7 +52,6 @@
 //! temperature_period_s = 1           # none if absent
 //! pair_timeout_ms = 5.0              # longest time from force to torque; default half a period
 //! power_on_silence_ms = 0            # see `crate::icub`
-//! listen = false                     # true: another program commands this board; never transmit
 //! ```
 //!
 //! [`Quality::saturation`]: proprio_topics::Quality::saturation

@@ -312,7 +312,8 @@ pub fn encode(
         let mut of_bus = Vec::new();
         for device in &bus.devices {
             let spec = Spec {
-                mode: Mode::Listen,
+                // Nobody has started it: it encodes what the table holds, not a stream.
+                mode: Mode::Supervise,
                 ..device.spec.clone()
             };
             let board = device.options.board(&spec);

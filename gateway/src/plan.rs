@@ -39,6 +39,8 @@ pub struct BusPlan {
     pub source: Source,
     /// Scheduling of its thread.
     pub realtime: Option<Realtime>,
+    /// Nothing is ever sent to it: all its devices only listen.
+    pub listen_only: bool,
     /// Its devices.
     pub devices: Vec<DevicePlan>,
 }
@@ -289,6 +291,7 @@ impl Builder<'_> {
             name: raw.name,
             source,
             realtime: raw.realtime,
+            listen_only: raw.listen_only,
             devices: Vec::new(),
         });
         for table in raw.device {
@@ -321,10 +324,11 @@ impl Builder<'_> {
                 DRIVERS.join(", ")
             ),
             OptionsError::Keys(e) => format!(
-                "{name:?} ({}): {}; keys of every device: {}",
+                "{name:?} ({}): {}; keys of every device: {}{}",
                 raw.driver,
                 one_line(&e),
-                RawDevice::KEYS.join(", ")
+                RawDevice::KEYS.join(", "),
+                did_you_mean(&e)
             ),
         })?;
         if !(raw.max_silence_ms > 0.0 && raw.max_silence_ms <= 3.6e6) {
@@ -336,11 +340,15 @@ impl Builder<'_> {
         let max_silence = Nanos::from_seconds(raw.max_silence_ms * 1e-3);
         let kind = options.kind();
         let bus = self.plan.buses.len() - 1;
-        let device = self.plan.buses.last().map_or(0, |b| b.devices.len());
+        let (device, quiet_bus) = self
+            .plan
+            .buses
+            .last()
+            .map_or((0, false), |b| (b.devices.len(), b.listen_only));
         let mut spec = Spec {
             address: raw.address,
             max_silence,
-            mode: if raw.listen_only {
+            mode: if raw.listen_only || quiet_bus {
                 Mode::Listen
             } else {
                 Mode::Supervise
@@ -502,6 +510,26 @@ fn one_line(error: &toml::de::Error) -> String {
         .join(" ")
 }
 
+/// A suggestion for an unknown key of a device, out of the driver's and the common keys.
+fn did_you_mean(error: &toml::de::Error) -> String {
+    // The message names the key first, then the driver's keys, each between backquotes.
+    let mut words = error.message().split('`').skip(1).step_by(2);
+    let Some(unknown) = words
+        .next()
+        .filter(|_| error.message().starts_with("unknown field"))
+    else {
+        return String::new();
+    };
+    // Winkler's similarity, because most mistakes are at the end of a key; above 0.85 two keys
+    // share most letters, or one is the beginning of the other.
+    words
+        .chain(RawDevice::KEYS)
+        .map(|key| (strsim::jaro_winkler(unknown, key), key))
+        .filter(|(similarity, _)| *similarity > 0.85)
+        .max_by(|(a, _), (b, _)| a.total_cmp(b))
+        .map_or_else(String::new, |(_, key)| format!("; did you mean {key:?}?"))
+}
+
 fn check_name(place: &str, name: &str) -> Result<(), String> {
     if name.is_empty() || name.len() > Name::CAPACITY || name.contains(['/', ',', '"', '\n', '\0'])
     {
@@ -563,6 +591,9 @@ impl fmt::Display for Plan {
                 realtime
                     .priority
                     .map_or(Ok(()), |p| write!(f, ", SCHED_FIFO {p}"))?;
+            }
+            if bus.listen_only {
+                write!(f, ", listens only")?;
             }
             writeln!(f)?;
             for device in &bus.devices {
@@ -749,6 +780,41 @@ mod tests {
             let problem = problem(from, to);
             assert!(problem.contains(expected), "{from} -> {to}: {problem}");
         }
+    }
+
+    #[test]
+    fn an_unknown_key_leads_to_the_one_that_was_meant() {
+        for (key, meant) in [
+            ("max_silence = 30.0", "max_silence_ms"),
+            ("listen = true", "listen_only"),
+            ("adress = 3", "address"),
+            ("perod_ms = 3", "period_ms"),
+            ("pair_time_out_ms = 3", "pair_timeout_ms"),
+        ] {
+            let problem = problem("max_silence_ms = 30", key);
+            assert!(
+                problem.ends_with(&format!("did you mean {meant:?}?")),
+                "{key}: {problem}"
+            );
+            assert!(problem.contains("keys of every device: driver, name"));
+        }
+        let problem = problem("max_silence_ms = 30", "velocity = true");
+        assert!(!problem.contains("did you mean"), "{problem}");
+    }
+
+    #[test]
+    fn a_bus_that_is_only_listened_to_has_no_device_that_sends() {
+        let modes = |text: &str| {
+            let plan = Plan::parse(text, Path::new(".")).unwrap();
+            let modes: Vec<Mode> = plan.buses[0].devices.iter().map(|d| d.spec.mode).collect();
+            (plan.buses[0].listen_only, modes)
+        };
+        let supervised = vec![Mode::Supervise; 2];
+        assert_eq!(modes(ARM), (false, supervised));
+        let quiet = ARM.replacen("name = \"arm\"", "name = \"arm\"\nlisten_only = true", 1);
+        assert_eq!(modes(&quiet), (true, vec![Mode::Listen; 2]));
+        let one = ARM.replacen("address = 13", "address = 13\nlisten_only = true", 1);
+        assert_eq!(modes(&one), (false, vec![Mode::Listen, Mode::Supervise]));
     }
 
     #[test]

@@ -17,7 +17,7 @@ use crate::noise::Random;
 use crate::robot::{Robot, RobotError};
 use crate::settings::Settings;
 use crate::truth::Simulation;
-use proprio_drivers::{Board, Decoded, Frame, Frames, Mode, Options, Spec};
+use proprio_drivers::{Board, Frame, Frames, Options, Spec};
 use proprio_gateway::plan::{DevicePlan, JointMap};
 use proprio_topics::{
     Actuator, Imu, JointState, Kind, Nanos, Quality, Reading, Saturation, StampKind, Wrench,
@@ -472,7 +472,7 @@ impl Node {
         let before = self.reboots.len();
         self.reboots.retain(|at| *at > since_t0);
         if self.reboots.len() < before
-            && let Ok(board) = power_on_with(&self.options, &self.spec)
+            && let Ok(board) = self.options.board(&self.spec)
         {
             self.board = board;
             self.slots = None;
@@ -657,41 +657,10 @@ fn scaled(duration: Nanos, factor: f64) -> Nanos {
     Nanos::from_seconds(duration.0 as f64 * factor * 1e-9)
 }
 
+/// A board after power-on.
 fn power_on(robot: &Robot, device: &DevicePlan) -> Result<Box<dyn Board>, RobotError> {
-    power_on_with(&device.options, &device.spec)
+    device
+        .options
+        .board(&device.spec)
         .map_err(|e| robot.mismatch(format!("gateway.toml, {:?}: {e}", device.name)))
-}
-
-/// A board after power-on. One that the gateway may only listen to is started at once, with the
-/// commands of the program that would command it.
-fn power_on_with(
-    options: &Options,
-    spec: &Spec,
-) -> Result<Box<dyn Board>, proprio_drivers::SpecError> {
-    let mut board = options.board(spec)?;
-    if spec.mode == Mode::Listen && board.period().is_none() {
-        let mut host = options.device(&Spec {
-            mode: Mode::Supervise,
-            ..spec.clone()
-        })?;
-        let (mut decoded, mut answers) = (Decoded::new(), Frames::new());
-        let mut now = Nanos::ZERO;
-        // A host asks at most a dozen questions and then starts the board.
-        for _ in 0..64 {
-            decoded.clear();
-            match host.poll_transmit(now, &mut decoded) {
-                Some(transmit) => {
-                    host.on_sent(&transmit.frame, Ok(now));
-                    board.on_frame(&transmit.frame, &mut answers);
-                }
-                None if board.period().is_some() => break,
-                None => now = host.next_wake().unwrap_or(now).max(now),
-            }
-            for answer in answers.drain(..) {
-                decoded.clear();
-                host.on_frame(&answer.at(now, StampKind::User), &mut decoded);
-            }
-        }
-    }
-    Ok(board)
 }

@@ -9,9 +9,7 @@ use crate::bringup::Bringup;
 use crate::configure::{Configure, Setting};
 use crate::icub::{self, class, command};
 use crate::pairing::{self, Paired, Pairing};
-use crate::{
-    Claim, Decoded, Device, Frame, Mode, NotSent, Output, Spec, SpecError, State, Transmit,
-};
+use crate::{Claim, Decoded, Device, Frame, NotSent, Output, Spec, SpecError, State, Transmit};
 use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, StampKind};
 
@@ -69,11 +67,6 @@ impl ImuDevice {
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let plan = Plan::new(spec, options)?;
         let patience = icub::patience(options.power_on_silence_ms)?;
-        let mode = if options.listen {
-            Mode::Listen
-        } else {
-            spec.mode
-        };
         let is_legacy = plan.legacy != Legacy::None;
         let kinds: &[u8] = if is_legacy {
             &[kind::LEGACY_ACCELEROMETER, kind::LEGACY_GYROSCOPE]
@@ -85,7 +78,7 @@ impl ImuDevice {
             plan.address,
             *kinds.first().unwrap_or(&kind::TRIPLE),
         );
-        let mut bringup = Bringup::new(spec, mode, patience, watched);
+        let mut bringup = Bringup::new(spec, spec.mode, patience, watched);
         let id = icub::to_board(class::POLLING_ANALOG, plan.address);
         let mut claims: ArrayVec<Claim, 4> =
             icub::claims(class::PERIODIC_INERTIAL, plan.address, kinds);

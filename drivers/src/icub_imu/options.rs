@@ -25,8 +25,6 @@ pub struct Options {
     pub legacy_mask: Option<u8>,
     /// Silence kept after power-on \[ms\]; default 0.
     pub power_on_silence_ms: u32,
-    /// Another program commands this board; default false.
-    pub listen: bool,
 }
 
 impl Default for Options {
@@ -39,7 +37,6 @@ impl Default for Options {
             legacy: Legacy::None,
             legacy_mask: None,
             power_on_silence_ms: 0,
-            listen: false,
         }
     }
 }

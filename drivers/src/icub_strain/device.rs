@@ -264,11 +264,6 @@ impl Strain {
                 });
             }
         };
-        let mode = if options.listen {
-            Mode::Listen
-        } else {
-            spec.mode
-        };
         let (force, command_id) = (
             icub::stream(class::PERIODIC_ANALOG, address, kind::FORCE),
             icub::to_board(class::POLLING_ANALOG, address),
@@ -277,7 +272,7 @@ impl Strain {
             Stream::Uncalibrated => icub::stream(class::PERIODIC_ANALOG, address, kind::RAW_FORCE),
             Stream::Calibrated | Stream::Both => force,
         };
-        let mut bringup = Bringup::new(spec, mode, patience, watched);
+        let mut bringup = Bringup::new(spec, spec.mode, patience, watched);
         bringup.start_with(command_id, &[command::SET_CANDATARATE, period]);
         if let Some(seconds) = options.temperature_period_s {
             let seconds = icub::period_ms("temperature_period_s", seconds)?;

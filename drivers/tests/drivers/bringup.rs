@@ -279,13 +279,7 @@ fn silence_is_kept_after_power_on() {
     assert_eq!(rig.device.state(), State::Streaming);
     // A board that streams already has left its bootloader, so the host need not wait.
     let keys = format!("{SCALES}power_on_silence_ms = 6000");
-    let mut rig = Rig::with_board(
-        "icub_strain",
-        &keys,
-        &format!("{SCALES}listen = true"),
-        &[],
-        wrench(),
-    );
+    let mut rig = Rig::started("icub_strain", &keys, Mode::Supervise, wrench());
     rig.run(30);
     assert_eq!(rig.device.state(), State::Streaming);
     assert_eq!(rig.sent.len(), 2);
@@ -447,12 +441,7 @@ fn a_listener_learns_the_scale_from_the_log() {
 
 #[test]
 fn a_listener_watches_for_silence() {
-    let mut rig = Rig::new(
-        "icub_strain",
-        &format!("{SCALES}listen = true"),
-        &[],
-        wrench(),
-    );
+    let mut rig = Rig::started("icub_strain", SCALES, Mode::Listen, wrench());
     rig.run(100);
     assert_eq!(rig.device.state(), State::Streaming);
     let woken = rig.device.next_wake().unwrap();

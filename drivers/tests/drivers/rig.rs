@@ -92,6 +92,9 @@ pub(crate) fn encode(
 /// Whether this frame, the n-th of one side, is lost.
 type Loss = Box<dyn FnMut(usize, &Frame) -> bool>;
 
+/// Why the host's interface does not send this frame, if it does not.
+type Outage = Box<dyn FnMut(&Frame) -> Option<NotSent>>;
+
 /// One device and one board on a bus, with turns of 1 ms.
 pub(crate) struct Rig {
     pub(crate) device: Box<dyn Device>,
@@ -99,8 +102,8 @@ pub(crate) struct Rig {
     /// The board's measurement.
     pub(crate) reading: (u8, Reading),
     pub(crate) now: Nanos,
-    /// Why the host's interface does not send this frame.
-    pub(crate) interface: Box<dyn FnMut(&Frame) -> Option<NotSent>>,
+    /// The host's interface.
+    pub(crate) interface: Outage,
     /// What it did not send, and when.
     pub(crate) unsent: Vec<(Nanos, String)>,
     /// Frames of the host that are lost.
@@ -121,6 +124,19 @@ impl Rig {
     /// A device and a board with the same keys.
     pub(crate) fn new(driver: &str, keys: &str, outputs: &[u8], reading: (u8, Reading)) -> Self {
         Self::with_board(driver, keys, keys, outputs, reading)
+    }
+
+    /// A board that another program has started, and a device in `mode`.
+    pub(crate) fn started(driver: &str, keys: &str, mode: Mode, reading: (u8, Reading)) -> Self {
+        let mut rig = Self::new(driver, keys, &[], reading);
+        let options = options(driver, keys);
+        rig.device = options
+            .device(&spec(1, mode, &[]))
+            .expect("a legal configuration");
+        rig.board = options
+            .board(&spec(1, Mode::Listen, &[]))
+            .expect("a legal configuration");
+        rig
     }
 
     /// A device and a board with different keys.
