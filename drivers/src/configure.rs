@@ -2,7 +2,7 @@
 //! do not acknowledge a configuration.
 
 use crate::bringup::{Ask, Attempts, Inquiry, Patience};
-use crate::{Decoded, Frame, Mode, NotSent};
+use crate::{Decoded, Frame, Mode, NotSent, Spec};
 use core::ops::Range;
 use proprio_topics::{Counter, Nanos, Refusal};
 
@@ -38,8 +38,10 @@ pub(crate) struct Configure {
 }
 
 impl Configure {
-    /// Sends `setting`; `None`: the board keeps its own, and there is nothing to confirm.
-    pub(crate) const fn new(setting: Option<Setting>, patience: Patience) -> Self {
+    /// Sends `setting`. If it is `None`, the board keeps its own, and in [`Mode::Listen`] another
+    /// program sets it: there is nothing to confirm.
+    pub(crate) fn new(spec: &Spec, setting: Option<Setting>, patience: Patience) -> Self {
+        let setting = setting.filter(|_| spec.mode == Mode::Supervise);
         Self {
             settled: setting.is_none(),
             confirmed: setting.is_none(),
@@ -55,13 +57,10 @@ impl Configure {
     }
 
     /// Takes the board's answer in `frame`.
-    pub(crate) fn answer(&mut self, data: &[u8], mode: Mode, frame: &Frame, out: &mut Decoded) {
+    pub(crate) fn answer(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
         let Some(setting) = &self.setting else {
             return;
         };
-        if mode == Mode::Listen {
-            return;
-        }
         if data.len() != setting.set.len() {
             return out.fault(Counter::Length, 1, frame.id);
         }

@@ -71,6 +71,8 @@ pub mod command {
     pub const THERMOMETER_TRANSMIT: u8 = 0x3A;
     /// Class 2: `[4F, mask, period in ms]`: legacy accelerometer and gyroscope.
     pub const ACC_GYRO_SETUP: u8 = 0x4F;
+    /// Class 2: `[51, type]`, answered by 8 bytes like those of [`POS_CONFIG_SET`].
+    pub const POS_CONFIG_GET: u8 = 0x51;
     /// Class 2: `[52, id << 4 | type, sensor 0 (3 bytes), sensor 1 (3 bytes)]`.
     pub const POS_CONFIG_SET: u8 = 0x52;
     /// Class 2: `[53, period in ms]`, 0 stops.

@@ -108,7 +108,7 @@ impl ImuDevice {
             claims,
             bringup,
             // Legacy boards have no such configuration.
-            configure: Configure::new((!is_legacy).then_some(setting), icub::PATIENCE),
+            configure: Configure::new(spec, (!is_legacy).then_some(setting), icub::PATIENCE),
             acquisition: Acquisition::NONE,
             sequence: None,
             not_calibrated: false,
@@ -364,7 +364,7 @@ impl Device for ImuDevice {
         {
             match data.first() {
                 Some(&command::IMU_CONFIG_GET) => {
-                    self.configure.answer(data, self.bringup.mode(), frame, out);
+                    self.configure.answer(data, frame, out);
                 }
                 // Answers to other questions are for other devices.
                 Some(_) => {}

@@ -7,7 +7,7 @@ use proprio_topics::{Nanos, Quality, Reading, StampKind};
 use proptest::prelude::*;
 
 /// Every family in all its configurations.
-const SETUPS: [(&str, &str, &[u8]); 9] = [
+const SETUPS: [(&str, &str, &[u8]); 10] = [
     ("icub_strain", "", &[]),
     (
         "icub_strain",
@@ -30,6 +30,7 @@ const SETUPS: [(&str, &str, &[u8]); 9] = [
     ("icub_imu", r#"legacy = "bno055""#, &[]),
     ("icub_motor", "", &[0]),
     ("icub_pos", "", &[0, 1, 2, 15]),
+    ("icub_pos", "sensors = [{ label = 2 }]", &[2, 3]),
 ];
 
 /// About 18 years: clocks may jump, but not to the limits of `i64` nanoseconds.
@@ -74,6 +75,7 @@ fn event() -> impl Strategy<Value = Event> {
         Just(0x07),
         Just(0x34),
         Just(0x35),
+        Just(0x51),
         Just(0x53)
     ]);
     let any_id = proptest::option::weighted(0.1, any::<u32>());

@@ -586,7 +586,8 @@ fn a_pos_board_is_configured_and_started() {
     let mut rig = Rig::new("icub_pos", keys, &[2], joint);
     rig.run(50);
     // F2: enabled, inverted, -90 deg, label 2; zero 0x0100. 83: enabled, label 3.
-    assert_eq!(rig.sent, ["201#5200F20001830000", "201#5305"]);
+    assert_eq!(rig.sent, ["201#5200F20001830000", "201#5100", "201#5305"]);
+    assert!(rig.readings.iter().all(|r| r.quality == Quality::GOOD));
     assert_eq!(
         (rig.device.state(), rig.readings.len()),
         (State::Streaming, 10)
@@ -597,6 +598,86 @@ fn a_pos_board_is_configured_and_started() {
         (rig.sent.last().unwrap().as_str(), rig.board.period()),
         ("201#5300", None)
     );
+}
+
+const POS: &str = "sensors = [{ label = 2, zero_deg = 25.6 }]";
+
+fn pos() -> (u8, Reading) {
+    let state = JointState {
+        position: 0.5,
+        ..JointState::ABSENT
+    };
+    (2, Reading::Joint(state))
+}
+
+/// The board misses the configuration several times; it streams meanwhile, with its old one.
+#[test]
+fn an_angle_is_good_only_when_the_board_has_confirmed_its_configuration() {
+    let mut rig = Rig::new("icub_pos", POS, &[2], pos());
+    rig.board = options("icub_pos", POS)
+        .board(&spec(1, Mode::Listen, &[2]))
+        .unwrap();
+    let mut sets = 0;
+    rig.host_loses = Box::new(move |_, frame| {
+        sets += u32::from(frame.data().first() == Some(&0x52));
+        // Neither the first configurations nor any question arrive: 3 x 20 ms without an answer.
+        sets <= 3
+    });
+    rig.run(200);
+    let good: Vec<bool> = rig
+        .readings
+        .iter()
+        .map(|reading| reading.quality == Quality::GOOD)
+        .collect();
+    let first = good.iter().position(|good| *good).unwrap();
+    assert!((5..8).contains(&first), "{good:?}");
+    for reading in &rig.readings[..first] {
+        assert_eq!(reading.quality, Quality::NOT_CALIBRATED);
+    }
+    assert!(good[first..].iter().all(|good| *good));
+    assert_eq!(rig.count(Counter::Changed), 0);
+    assert_eq!(rig.sent.last().unwrap(), "201#530A");
+    // A board that was reset has lost its configuration: it counts again only when confirmed.
+    rig.board = options("icub_pos", POS)
+        .board(&spec(1, Mode::Listen, &[2]))
+        .unwrap();
+    rig.device.restart(rig.now);
+    let before = rig.readings.len();
+    rig.board_loses = Box::new(|_, frame| frame.data().first() == Some(&0x51));
+    rig.run(600);
+    let after = &rig.readings[before..];
+    assert!(after.len() > 10 && rig.device.state() == State::Streaming);
+    assert!(
+        after
+            .iter()
+            .all(|reading| reading.quality.contains(Quality::NOT_CALIBRATED))
+    );
+    assert_eq!(rig.count(Counter::Changed), 0);
+}
+
+#[test]
+fn a_pos_board_that_never_agrees_is_counted_and_its_angles_stay_doubtful() {
+    let mut rig = Rig::new("icub_pos", POS, &[2], pos());
+    rig.host_loses = Box::new(|_, frame| frame.data().first() == Some(&0x52));
+    rig.run(500);
+    assert_eq!(
+        (rig.device.state(), rig.count(Counter::Changed)),
+        (State::Streaming, 1)
+    );
+    assert!(rig.readings.len() > 10);
+    assert!(
+        rig.readings
+            .iter()
+            .all(|reading| reading.quality == Quality::NOT_CALIBRATED)
+    );
+    // Without `sensors`, and where another program commands the board, there is nothing to confirm.
+    let mut rig = Rig::new("icub_pos", "", &[2], pos());
+    rig.run(100);
+    assert_eq!(rig.sent, ["201#530A"]);
+    assert_eq!(rig.readings[0].quality, Quality::GOOD);
+    let mut device = listener("icub_pos", POS, &[2]);
+    let (readings, _) = decode(&mut *device, &[frame("311#0021840300000000", 0.0)]);
+    assert_eq!(readings[0].quality, Quality::GOOD);
 }
 
 #[test]

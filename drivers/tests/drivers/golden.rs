@@ -189,6 +189,9 @@ fn boards_say_who_they_are() {
         "meant for another"
     );
     let mut motor = board("icub_motor", "", &[0]);
+    let mut pos = board("icub_pos", "", &[2]);
+    assert!(answers(&mut *pos, "201#5200F20001830000").is_empty());
+    assert_eq!(answers(&mut *pos, "201#5100"), ["210#5100F20001830000"]);
     assert_eq!(answers(&mut *motor, "001#5B0100"), ["010#5B08020008020000"]);
 }
 
