@@ -388,7 +388,7 @@ fn a_motor_board() {
 fn the_faults_of_a_motor_board_are_those_of_the_document() {
     // The document's worked value: bits 0, 7, 14 and 31.
     let mut device = listener("icub_motor", "", &[0]);
-    let (readings, _) = decode(
+    let (readings, faults) = decode(
         &mut *device,
         &[
             frame("113#0610007D81400080", 0.0),
@@ -398,7 +398,13 @@ fn the_faults_of_a_motor_board_are_those_of_the_document() {
     let Reading::Actuator(actuator) = readings[0].reading else {
         panic!("{readings:?}")
     };
-    let faults = fault::CAN_INVALID_PROTOCOL | fault::EXTERNAL | 1 << 14 | 1 << 31;
+    let counts = [Counter::DeviceFault, Counter::DriveFault].map(|c| count(&faults, c));
+    assert_eq!(
+        counts,
+        [0, 1],
+        "the emergency button does not move the joint"
+    );
+    let faults = fault::CAN_INVALID_PROTOCOL | fault::EXTERNAL | fault::SETPOINT_EXPIRED | 1 << 31;
     let encoder = encoder::NOT_CALIBRATED;
     assert_eq!(
         actuator,
@@ -411,14 +417,19 @@ fn the_faults_of_a_motor_board_are_those_of_the_document() {
     );
     assert_eq!(
         readings[1].quality,
-        Quality::DEVICE_FAULT | Quality::NOT_CALIBRATED
+        Quality::DRIVE_FAULT | Quality::NOT_CALIBRATED
     );
-    // Bus faults do not make a position doubtful; other faults do; finally all is well.
+    // Bus faults are neutral, an encoder's make a position doubtful, a drive's do not; finally all
+    // is well.
     for (status, quality) in [
         ("113#0600000000BC00F8", Quality::GOOD),
-        ("113#0600000010000000", Quality::DEVICE_FAULT),
+        ("113#0600000010000000", Quality::DRIVE_FAULT),
         ("113#0602000000000000", Quality::DEVICE_FAULT),
-        ("113#A000000000000000", Quality::DEVICE_FAULT),
+        ("113#A000000000000000", Quality::DRIVE_FAULT),
+        (
+            "113#A001000000000000",
+            Quality::DRIVE_FAULT | Quality::DEVICE_FAULT,
+        ),
         ("113#B000000000000000", Quality::NOT_CALIBRATED),
         ("113#0600000000000000", Quality::GOOD),
     ] {
@@ -427,6 +438,23 @@ fn the_faults_of_a_motor_board_are_those_of_the_document() {
             &[frame(status, 1.0), frame("110#0000000000000000", 1.1)],
         );
         assert_eq!(readings[1].quality, quality, "{status}");
+    }
+    // Bit by bit, after the names in the document.
+    for bit in 0..32_u32 {
+        let [a, b, c, d] = (1_u32 << bit).to_le_bytes();
+        let status = frame(&format!("113#06000000{a:02X}{b:02X}{c:02X}{d:02X}"), 2.0);
+        let (readings, faults) =
+            decode(&mut *device, &[status, frame("110#0000000000000000", 2.1)]);
+        let (quality, counts) = match bit {
+            1..=3 | 17..=19 => (Quality::DEVICE_FAULT, [1, 0]),
+            10..=13 | 15 | 27..=31 => (Quality::GOOD, [0, 0]),
+            _ => (Quality::DRIVE_FAULT, [0, 1]),
+        };
+        assert_eq!(readings[1].quality, quality, "bit {bit}");
+        assert_eq!(
+            [Counter::DeviceFault, Counter::DriveFault].map(|c| count(&faults, c)),
+            counts
+        );
     }
 }
 
