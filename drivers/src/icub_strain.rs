@@ -50,7 +50,8 @@
 //! period_ms = 10                     # 1 to 255; strain2 needs 2 or more for full accuracy
 //! stream = "calibrated"              # "calibrated", "uncalibrated" or "both"
 //! temperature_period_s = 1           # none if absent
-//! pair_timeout_ms = 5.0              # longest time from force to torque; default half a period
+//! pair_timeout_ms = 5.3              # longest time from force to torque; default: half a period
+//!                                    # plus 0.3 ms; below 2 ms of period 1.3 ms if the bus jitters
 //! power_on_silence_ms = 0            # see `crate::icub`
 //! ```
 //!

@@ -1,4 +1,38 @@
-//! Combines the two halves of a reading that a board sends in two frames.
+//! Combines the two halves of a reading that a board sends in two frames, in a protocol without
+//! sequence numbers. Never combines halves of different readings.
+//!
+//! # Order
+//! A board sends the two halves back to back, always in the same order. So a second half belongs to
+//! the first half directly before it, unless a half was lost. If a first half follows a first half,
+//! the missing second half is lost *or late*, and the next second half may be the late one or the
+//! right one: its contents do not show which. Therefore it is dropped together with its first half:
+//! one more reading is lost, but none is wrong. After that, in *doubt*, a second half must follow
+//! its first as quickly as usual on this bus, until one does or a surplus second half shows that
+//! one was late.
+//!
+//! # Time
+//! The order does not show that a second half *and* the next first half were lost; the time does.
+//! With a period P, a second half L after the first, and a delay of each frame of 0 to J on its way
+//! (the arbitration, an adapter that transfers frames in batches):
+//!
+//! | time from the first half to | least | most |
+//! |---|---|---|
+//! | its own second half | 0 (the order is kept) | L + J |
+//! | the next reading's second half | P + L - J | P + L + J |
+//!
+//! As long as J is below P/2, the limit L + P/2 separates the two. L is at most [`ADJACENT`]. Where
+//! P/2 is less than 1 ms, the jitter of a USB adapter ([`ADAPTER`]), no limit can: a good pair of a
+//! jittering bus looks like a wrong one of a steady bus. There the limit depends on the bus: it is
+//! L + 1 ms, so that jitter costs no reading; and L + P/2 while the bus is *calm*, that is, most
+//! second halves come within L. On a bus with a jitter of 1 ms and independent delays about a third
+//! come later, and `calm` reaches [`CALM`] less than once in a year at 1 kHz; with a jitter below
+//! 0.5 ms, which loses nothing by the shorter limit, it may.
+//!
+//! Two cases cannot be distinguished from a good pair. (1) A second half that arrives between a
+//! first half and its own second half and is late by more than two periods, or had lost its first
+//! half, or is not the only late one in a row. (2) With a period below 2 ms, on a bus that is not
+//! calm (or not yet, in the first 64 readings): a second half and the next first half are lost, and
+//! the next second half comes within L + 1 ms.
 
 use crate::Frame;
 use proprio_topics::{Nanos, StampKind};
@@ -23,24 +57,50 @@ pub(crate) enum Paired<T> {
     Alone,
 }
 
-/// Combines the two halves of a reading in a protocol without sequence numbers. Never combines
-/// halves of different readings.
-///
-/// A board sends the two halves back to back, always in the same order. So a second half belongs to
-/// the first half before it, if that arrived no longer than `timeout` ago. If a first half follows
-/// a first half, the missing second half is lost *or late*, and the next second half may be the
-/// late one or the right one: its contents do not show which. Therefore it is dropped together with
-/// its first half: one more reading is lost, but none is wrong. After that a second half must
-/// follow its first as quickly as usual on this bus, until one does or a surplus second half shows
-/// that one was late.
-///
-/// One case cannot be distinguished from a good pair: a second half that arrives between a first
-/// half and its own second half and is late by more than two periods, or had lost its first half,
-/// or is not the only late one in a row.
+/// The longest time from the start of a first half to the end of its second half if nothing delays
+/// them: one frame of another board between them, each at most 135 bits at 1 Mbit/s.
+const ADJACENT: Nanos = Nanos::from_micros(300);
+/// The jitter of a USB adapter: it transfers frames once per USB frame.
+const ADAPTER: Nanos = Nanos::from_millis(1);
+/// So many more second halves must be in time than late before a bus counts as calm.
+const CALM: u8 = 64;
+/// The most that `calm` counts: then five late ones in a row end the calm.
+const CALM_MOST: u8 = 96;
+/// A late second half counts as much as so many in time.
+const CALM_LATE: u8 = 8;
+
+/// The longest time from the first half of a reading to the second.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Limit {
+    /// On a calm bus.
+    calm: Nanos,
+    /// Otherwise.
+    jittering: Nanos,
+}
+
+impl Limit {
+    /// As derived above, for readings with this period.
+    pub(crate) fn of_period(period: Nanos) -> Self {
+        let half = Nanos(period.0 / 2);
+        Self {
+            calm: ADJACENT + half,
+            jittering: ADJACENT + half.max(ADAPTER),
+        }
+    }
+
+    /// Always `time`.
+    pub(crate) const fn fixed(time: Nanos) -> Self {
+        Self {
+            calm: time,
+            jittering: time,
+        }
+    }
+}
+
+/// Combines the two halves of a reading (rules in the module documentation).
 #[derive(Debug)]
 pub(crate) struct Pairing<T> {
-    /// The longest time from the first half to the second.
-    timeout: Nanos,
+    limit: Limit,
     /// Whether the first half always comes first. If not, either half waits for the other.
     ordered: bool,
     pending: Option<(bool, Nanos, StampKind, T)>,
@@ -50,20 +110,23 @@ pub(crate) struct Pairing<T> {
     doubt: bool,
     /// Usual delay of second halves: a running mean.
     usual: Option<Nanos>,
+    /// Rises with second halves in time, falls with late ones.
+    calm: u8,
 }
 
 /// Margin beyond twice the usual delay: the duration of a frame on the bus.
 const USUAL_SLACK: Nanos = Nanos::from_micros(125);
 
 impl<T: Copy> Pairing<T> {
-    pub(crate) const fn new(timeout: Nanos, ordered: bool) -> Self {
+    pub(crate) const fn new(limit: Limit, ordered: bool) -> Self {
         Self {
-            timeout,
+            limit,
             ordered,
             pending: None,
             owed: false,
             doubt: false,
             usual: None,
+            calm: 0,
         }
     }
 
@@ -93,11 +156,23 @@ impl<T: Copy> Pairing<T> {
             self.pending = Some(waiting);
             return Paired::Waiting;
         }
-        let in_time = within((t, stamp), (frame.t, frame.stamp), self.timeout);
+        let limit = if self.calm >= CALM {
+            self.limit.calm
+        } else {
+            self.limit.jittering
+        };
+        let in_time = within((t, stamp), (frame.t, frame.stamp), limit);
         let usual = match self.usual {
             Some(usual) => usual + usual + USUAL_SLACK,
-            None => Nanos(self.timeout.0 / 2),
+            None => Nanos(limit.0 / 2),
         };
+        if !self.owed {
+            self.calm = if within((t, stamp), (frame.t, frame.stamp), ADJACENT) {
+                CALM_MOST.min(self.calm + 1)
+            } else {
+                self.calm.saturating_sub(CALM_LATE)
+            };
+        }
         if in_time
             && !self.owed
             && (!self.doubt || within((t, stamp), (frame.t, frame.stamp), usual))

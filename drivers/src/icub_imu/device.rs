@@ -8,7 +8,7 @@ use super::options::{Options, Plan};
 use crate::bringup::Bringup;
 use crate::configure::{Configure, Setting};
 use crate::icub::{self, class, command};
-use crate::pairing::{self, Paired, Pairing};
+use crate::pairing::{self, Limit, Paired, Pairing};
 use crate::{Claim, Decoded, Device, Frame, NotSent, Output, Spec, SpecError, State, Transmit};
 use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, StampKind};
@@ -103,7 +103,7 @@ impl ImuDevice {
             from: 1,
             until: 5,
         };
-        let together = Nanos::from_micros(i64::from(plan.period_ms) * 500);
+        let period = Nanos::from_millis(i64::from(plan.period_ms));
         Ok(Self {
             claims,
             bringup,
@@ -113,8 +113,8 @@ impl ImuDevice {
             sequence: None,
             not_calibrated: false,
             // A BNO055 board sends the accelerometer first; the order of an mtb is not documented.
-            legacy: Pairing::new(together, plan.legacy == Legacy::Bno055),
-            together,
+            legacy: Pairing::new(Limit::of_period(period), plan.legacy == Legacy::Bno055),
+            together: Nanos(period.0 / 2),
             gap: false,
             seen: false,
             plan,

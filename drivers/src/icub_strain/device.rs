@@ -5,7 +5,7 @@ use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind};
 use super::options::{Options, Stream};
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry};
 use crate::icub::{self, class, command};
-use crate::pairing::{Paired, Pairing};
+use crate::pairing::{Limit, Paired, Pairing};
 use crate::{
     Claim, Decoded, Device, Frame, Mode, NotSent, Output, Spec, SpecError, State, Transmit,
 };
@@ -174,9 +174,9 @@ struct Pair {
 }
 
 impl Pair {
-    const fn new(timeout: Nanos) -> Self {
+    const fn new(limit: Limit) -> Self {
         Self {
-            pairing: Pairing::new(timeout, true),
+            pairing: Pairing::new(limit, true),
             gap: false,
         }
     }
@@ -251,10 +251,10 @@ impl Strain {
         let period = icub::period_ms("period_ms", options.period_ms)?;
         let configured = options.full_scale(false)?;
         let patience = icub::patience(options.power_on_silence_ms)?;
-        let timeout = match options.pair_timeout_ms {
-            None => Nanos::from_micros(i64::from(period) * 500),
+        let limit = match options.pair_timeout_ms {
+            None => Limit::of_period(Nanos::from_millis(i64::from(period))),
             Some(ms) if ms.is_finite() && ms > 0.0 && ms <= 1000.0 => {
-                Nanos::from_seconds(ms * 1e-3)
+                Limit::fixed(Nanos::from_seconds(ms * 1e-3))
             }
             Some(value) => {
                 return Err(SpecError::Key {
@@ -300,8 +300,8 @@ impl Strain {
             claims,
             bringup,
             scales: FullScales::new(address, configured, options.stream),
-            calibrated: Pair::new(timeout),
-            raw: Pair::new(timeout),
+            calibrated: Pair::new(limit),
+            raw: Pair::new(limit),
             seen: false,
         })
     }

@@ -253,6 +253,27 @@ fn an_imu_acquisition() {
     );
 }
 
+/// The quaternion has no SEQ. If its acquisition's own is lost, the next one must not take its place.
+#[test]
+fn a_quaternion_belongs_to_an_acquisition_for_half_a_period() {
+    let keys = r#"quantities = ["acceleration", "orientation"]"#;
+    // The period is 10 ms.
+    for (ms, pairs) in [(0.2, true), (4.9, true), (5.1, false), (9.0, false)] {
+        let mut device = listener("icub_imu", keys, &[]);
+        let frames = [
+            frame("513#070000009CFFD503", 0.0),
+            frame("514#0040000000000000", ms),
+        ];
+        let (readings, faults) = decode(&mut *device, &frames);
+        assert_eq!(readings.len(), usize::from(pairs), "{ms} ms");
+        assert_eq!(
+            count(&faults, Counter::Unpaired),
+            u32::from(!pairs),
+            "{ms} ms"
+        );
+    }
+}
+
 #[test]
 fn an_uncalibrated_sensor_in_use_is_told() {
     let keys = r#"quantities = ["angular_velocity", "status"]"#;
