@@ -183,18 +183,6 @@ pub(crate) fn period_ms(key: &'static str, ms: u32) -> Result<u8, SpecError> {
     }
 }
 
-/// Checks that a sensor has no joints.
-///
-/// # Errors
-/// [`SpecError::Joints`].
-pub(crate) fn no_joints(spec: &Spec) -> Result<(), SpecError> {
-    if spec.outputs.0.is_empty() {
-        Ok(())
-    } else {
-        Err(SpecError::Joints("this device measures no joint"))
-    }
-}
-
 /// Little-endian 16 bits at `at`; 0 beyond the end (callers have checked the length).
 pub(crate) fn u16_le(data: &[u8], at: usize) -> u16 {
     match data.get(at..at + 2) {

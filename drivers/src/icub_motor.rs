@@ -63,9 +63,11 @@
 use crate::bringup::{Bringup, NoInquiry};
 use crate::icub::{self, class};
 use crate::{
-    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, NotSent, Output, Spec,
-    SpecError, State, Transmit,
+    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, NotSent, Output,
+    OutputInfo, Spec, SpecError, State, Transmit,
 };
+use alloc::boxed::Box;
+use alloc::vec::Vec;
 use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
 use proprio_topics::{Actuator, Counter, JointState, Kind, Nanos, Quality, Reading};
@@ -164,20 +166,19 @@ impl Default for Options {
     }
 }
 
-/// Checks that channel 0, the only one, is a joint.
-fn one_joint(spec: &Spec) -> Result<(), SpecError> {
-    if spec.outputs.0.is_empty() {
-        return Err(SpecError::Joints(
-            "a motor board needs a joint: [[bus.device.joint]] with channel = 0",
-        ));
+impl Driver for Options {
+    const NAME: &'static str = "icub_motor";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Joint)].to_vec()
     }
-    match spec.outputs.0.iter().find(|&&channel| channel != 0) {
-        Some(&channel) => Err(SpecError::Channel {
-            channel,
-            least: 0,
-            most: 0,
-        }),
-        None => Ok(()),
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        Ok(Box::new(Motor::new(spec, self)?))
+    }
+
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(MotorBoard::new(spec, self)?))
     }
 }
 
@@ -214,11 +215,9 @@ impl Motor {
     /// A device in its initial state.
     ///
     /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, no joint, a joint's channel that is not 0, a
-    /// period out of range.
+    /// [`SpecError`]: an address outside 1 to 14, a period out of range.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
-        one_joint(spec)?;
         icub::period_ms("period_ms", options.period_ms)?;
         let kinds = [
             kind::TWO_FOC,
@@ -277,10 +276,6 @@ impl Motor {
 }
 
 impl Device for Motor {
-    fn kind(&self) -> Kind {
-        Kind::Joint
-    }
-
     fn claims(&self) -> &[Claim] {
         &self.claims
     }
@@ -353,7 +348,6 @@ impl MotorBoard {
     /// # Errors
     /// As [`Motor::new`].
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        one_joint(spec)?;
         let period =
             Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));
         Ok(Self {

@@ -46,9 +46,10 @@ use crate::bringup::Bringup;
 use crate::configure::{Configure, Setting};
 use crate::icub::{self, class, command};
 use crate::{
-    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, NotSent, Output, Outputs,
-    Spec, SpecError, State, Transmit,
+    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, NotSent, Output,
+    OutputInfo, Outputs, Spec, SpecError, State, Transmit,
 };
+use alloc::boxed::Box;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
@@ -197,20 +198,21 @@ impl Options {
     }
 }
 
-/// Checks that there are joints and that all channels are labels.
-fn joints(spec: &Spec) -> Result<(), SpecError> {
-    if spec.outputs.0.is_empty() {
-        return Err(SpecError::Joints(
-            "a POS board needs a joint: [[bus.device.joint]] with channel = its label",
-        ));
+impl Driver for Options {
+    const NAME: &'static str = "icub_pos";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        (0..=LABEL_MOST)
+            .map(|label| OutputInfo::new(label, Kind::Joint))
+            .collect()
     }
-    match spec.outputs.0.iter().find(|&&channel| channel > LABEL_MOST) {
-        Some(&channel) => Err(SpecError::Channel {
-            channel,
-            least: 0,
-            most: LABEL_MOST,
-        }),
-        None => Ok(()),
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        Ok(Box::new(Pos::new(spec, self)?))
+    }
+
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(PosBoard::new(spec, self)?))
     }
 }
 
@@ -233,11 +235,9 @@ impl Pos {
     /// A device in its initial state.
     ///
     /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, no joint or one whose channel is not 0 to 15, a
-    /// key out of range.
+    /// [`SpecError`]: an address outside 1 to 14, a key out of range.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
-        joints(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
         let patience = icub::patience(options.power_on_silence_ms)?;
         let watched = icub::stream(class::PERIODIC_ANALOG, address, POS);
@@ -272,10 +272,6 @@ impl Pos {
 }
 
 impl Device for Pos {
-    fn kind(&self) -> Kind {
-        Kind::Joint
-    }
-
     fn claims(&self) -> &[Claim] {
         &self.claims
     }
@@ -384,7 +380,6 @@ impl PosBoard {
     /// # Errors
     /// As [`Pos::new`].
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        joints(spec)?;
         options.configuration()?;
         let period =
             Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));

@@ -68,3 +68,24 @@ mod options;
 pub use board::StrainBoard;
 pub use device::Strain;
 pub use options::{Options, Stream};
+
+use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
+use alloc::boxed::Box;
+use alloc::vec::Vec;
+use proprio_topics::Kind;
+
+impl Driver for Options {
+    const NAME: &'static str = "icub_strain";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Wrench)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        Ok(Box::new(Strain::new(spec, self)?))
+    }
+
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(StrainBoard::new(spec, self)?))
+    }
+}

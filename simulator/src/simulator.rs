@@ -204,16 +204,16 @@ impl Simulator {
                 node.reboots.push(Nanos::from_seconds(*at));
             }
             Fault::Saturate { window, .. } => {
-                possible(node.kind == Kind::Wrench, "an F/T sensor")?;
+                possible(node.measures(Kind::Wrench), "an F/T sensor")?;
                 node.saturations.push(*window);
             }
             Fault::Spike { at, .. } => {
-                possible(node.kind == Kind::Wrench, "an F/T sensor")?;
+                possible(node.measures(Kind::Wrench), "an F/T sensor")?;
                 node.spikes.push(*at);
             }
             Fault::LateHalf { window, once, .. } => {
                 possible(
-                    node.kind != Kind::Joint,
+                    node.measures(Kind::Wrench) || node.measures(Kind::Imu),
                     "a board that sends a reading in several frames",
                 )?;
                 node.late.push((*window, *once));
@@ -352,7 +352,7 @@ enum Source {
 
 /// One board with its measured quantities and its faults.
 struct Node {
-    kind: Kind,
+    kinds: Vec<Kind>,
     options: Options,
     spec: Spec,
     board: Box<dyn Board>,
@@ -379,7 +379,7 @@ struct Node {
 impl std::fmt::Debug for Node {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Node")
-            .field("kind", &self.kind)
+            .field("kinds", &self.kinds)
             .field("spec", &self.spec)
             .finish_non_exhaustive()
     }
@@ -430,7 +430,7 @@ impl Node {
         }
         let mut random = Random::new(settings.seed, "board", stream);
         let mut node = Self {
-            kind: device.options.kind(),
+            kinds: device.routes.iter().map(|route| route.kind).collect(),
             board: power_on(robot, device)?,
             options: device.options.clone(),
             spec: device.spec.clone(),
@@ -450,6 +450,10 @@ impl Node {
         };
         node.follow(t0);
         Ok(node)
+    }
+
+    fn measures(&self, kind: Kind) -> bool {
+        self.kinds.contains(&kind)
     }
 
     fn is_silent(&self, t: f64) -> bool {

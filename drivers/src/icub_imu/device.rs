@@ -11,7 +11,7 @@ use crate::icub::{self, class, command};
 use crate::pairing::{self, Limit, Paired, Pairing};
 use crate::{Claim, Decoded, Device, Frame, NotSent, Output, Spec, SpecError, State, Transmit};
 use arrayvec::ArrayVec;
-use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, StampKind};
+use proprio_topics::{Counter, Imu, Nanos, Quality, Reading, StampKind};
 
 /// A frame up to this many sequence numbers back is late; further back, the counter has restarted
 /// or there is a long gap.
@@ -62,7 +62,7 @@ impl ImuDevice {
     /// A device in its initial state.
     ///
     /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, joints, incompatible quantities, a key out of
+    /// [`SpecError`]: an address outside 1 to 14, incompatible quantities, a key out of
     /// range.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let plan = Plan::new(spec, options)?;
@@ -327,10 +327,6 @@ fn vector(data: &[u8], at: usize) -> [i16; 3] {
 }
 
 impl Device for ImuDevice {
-    fn kind(&self) -> Kind {
-        Kind::Imu
-    }
-
     fn claims(&self) -> &[Claim] {
         &self.claims
     }

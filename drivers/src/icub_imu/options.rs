@@ -60,7 +60,6 @@ pub(super) struct Plan {
 impl Plan {
     pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
-        icub::no_joints(spec)?;
         let period_ms = icub::period_ms("period_ms", options.period_ms)?;
         let want = options
             .quantities

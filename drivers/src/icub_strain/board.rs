@@ -37,7 +37,6 @@ impl StrainBoard {
     /// corrupt memory.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
-        icub::no_joints(spec)?;
         let configured = options.full_scale(true)?;
         let period =
             Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));

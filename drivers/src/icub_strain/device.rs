@@ -11,7 +11,7 @@ use crate::{
 };
 use arrayvec::ArrayVec;
 use proprio_topics::{
-    Counter, Gauges, Kind, Nanos, Quality, Reading, Refusal, StampKind, Temperature, Wrench,
+    Counter, Gauges, Nanos, Quality, Reading, Refusal, StampKind, Temperature, Wrench,
 };
 
 /// The full scales: configured, requested axis by axis, or from replies to another program.
@@ -243,11 +243,10 @@ impl Strain {
     /// A device in its initial state.
     ///
     /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, joints, a period or time out of range, a full
+    /// [`SpecError`]: an address outside 1 to 14, a period or time out of range, a full
     /// scale that is not positive or incomplete.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
-        icub::no_joints(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
         let configured = options.full_scale(false)?;
         let patience = icub::patience(options.power_on_silence_ms)?;
@@ -377,10 +376,6 @@ impl Strain {
 }
 
 impl Device for Strain {
-    fn kind(&self) -> Kind {
-        Kind::Wrench
-    }
-
     fn claims(&self) -> &[Claim] {
         &self.claims
     }

@@ -739,7 +739,7 @@ fn configurations_that_can_not_work_are_named() {
         "b is missing: it is needed together with a"
     );
     // Unknown keys are errors.
-    for driver in proprio_drivers::DRIVERS {
+    for &driver in proprio_drivers::DRIVERS {
         let table: toml::Table = "full_scale = 3".parse().unwrap();
         assert!(Options::deserialize(driver, table).is_err(), "{driver}");
     }
