@@ -670,6 +670,12 @@ fn a_pos_board_that_never_agrees_is_counted_and_its_angles_stay_doubtful() {
             .iter()
             .all(|reading| reading.quality == Quality::NOT_CALIBRATED)
     );
+    // Before anything was sent.
+    let mut device = options("icub_pos", POS)
+        .device(&spec(1, Mode::Supervise, &[2]))
+        .unwrap();
+    let (readings, _) = decode(&mut *device, &[frame("311#0021840300000000", 0.0)]);
+    assert_eq!(readings[0].quality, Quality::NOT_CALIBRATED);
     // Without `sensors`, and where another program commands the board, there is nothing to confirm.
     let mut rig = Rig::new("icub_pos", "", &[2], pos());
     rig.run(100);
