@@ -7,22 +7,14 @@ use core::ops::Range;
 use proprio_topics::{Counter, Nanos, Refusal};
 
 /// A board's configuration in its protocol.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug)]
 pub(crate) struct Setting {
     /// The command that sets it.
     pub(crate) set: Frame,
     /// The question for it. The answer has the form of `set`.
     pub(crate) get: Frame,
-    /// The first byte of `set` and of its answer that must agree.
-    pub(crate) from: usize,
-    /// The byte after the last one that must agree.
-    pub(crate) until: usize,
-}
-
-impl Setting {
-    const fn compared(&self) -> Range<usize> {
-        self.from..self.until
-    }
+    /// The bytes of `set` and of the answer that must agree.
+    pub(crate) compared: Range<usize>,
 }
 
 /// An [`Inquiry`] that sets, asks and compares. It ends when the board confirms its configuration,
@@ -67,7 +59,8 @@ impl Configure {
         if !self.attempts.counts(frame.t) {
             return out.fault(Counter::Unexpected, 1, frame.id);
         }
-        let agrees = data.get(setting.compared()) == setting.set.data().get(setting.compared());
+        let compared = &setting.compared;
+        let agrees = data.get(compared.clone()) == setting.set.data().get(compared.clone());
         if self.settled {
             // A late answer to an earlier question.
             self.confirmed |= agrees;

@@ -373,12 +373,12 @@ pub enum EncodeError {
 }
 
 /// The device's own side of its protocol: answers commands and encodes readings, as the hardware
-/// does. After power-on it waits for its start command; one whose [`Spec`] says [`Mode::Listen`] has
-/// been started by another program.
+/// does. After power-on it waits for its start command; one whose [`Spec`] says [`Mode::Listen`]
+/// has been started by another program.
 ///
-/// Boards differ in when they send. One that *streams* has a [`Board::period`], and its readings are
-/// encoded then. One that is *polled* has none: it answers a request in [`Board::on_frame`] with the
-/// reading that [`Board::present`] gave it last.
+/// Boards differ in when they send. One that *streams* has a [`Board::period`], and its readings
+/// are encoded then. One that is *polled* has none: it answers a request in [`Board::on_frame`]
+/// with the reading that [`Board::present`] gave it last.
 pub trait Board: Send {
     /// Takes a frame from the bus and adds the answers to `out`. Frames for other boards are
     /// ignored.

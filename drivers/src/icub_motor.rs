@@ -41,12 +41,12 @@
 //! | encoder not calibrated | `encoder` 4 | NOT_CALIBRATED |
 //! | mode 0xB0, not configured | `mode` | NOT_CALIBRATED |
 //!
-//! Debatable: under-voltage is that of the motor's supply, and the encoder has its own. The ADC
-//! measures currents: with bit 23 the *current* is doubtful, the position is not. Bits 24 and 25 say
-//! where the joint is, which is only known because the position is good. The mode 0xA0 follows from
-//! a fault that has its own bit: if that is an encoder's, the bit condemns the position. A fault
-//! that is not known stops the drive and does not condemn what the encoder's own bits call good.
-//! Hall sensors count as encoders: they measure the same shaft, and which of two is wrong is open.
+//! Debatable: under-voltage is that of the motor's supply; an encoder that suffers from it has bits
+//! of its own. The ADC measures currents: with bit 23 the *current* is doubtful, the position is
+//! not. Bits 24 and 25 say where the joint is, which is only known because the position is good.
+//! The mode 0xA0 follows from a fault that has its own bit: if that is an encoder's, the bit
+//! condemns the position. Hall sensors count as encoders: they measure the same shaft, and which of
+//! two is wrong is open.
 //!
 //! Another program commands these boards once a millisecond (`10F`, four target currents, which
 //! triggers the answers above). This driver never transmits; it only detects silence.

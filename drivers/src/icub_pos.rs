@@ -29,9 +29,10 @@
 //! good at once.
 //!
 //! Sources: `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12,
-//! `embot_prot_can_analog_periodic.cpp` (icub-firmware b4299211). Certain, except the bytes of `51`: the firmware's messages hold a type
-//! in the question, a type and both sensors in the answer; that they lie where `52` has them is
-//! highly probable. An mtb4fap answers without its sensors: do not use `sensors` for it.
+//! `embot_prot_can_analog_periodic.cpp` (icub-firmware b4299211). Certain, except the bytes of `51`:
+//! the firmware's messages hold a type in the question, a type and both sensors in the answer; that
+//! these lie where `52` has them is highly probable. An mtb4fap answers without its sensors: do not
+//! use `sensors` for it.
 //!
 //! # Keys
 //! ```toml
@@ -249,8 +250,7 @@ impl Pos {
                 &[command::POS_CONFIG_GET, options.quantity.code_and_lsb().0],
             ),
             set: Frame::new(id, &set),
-            from: 1,
-            until: 8,
+            compared: 1..8,
         });
         bringup.start_with(id, &[command::POS_TRANSMIT, period]);
         bringup.stop_with(id, &[command::POS_TRANSMIT, 0]);

@@ -100,8 +100,7 @@ impl ImuDevice {
             set: Frame::new(id, &plan.configuration),
             get: Frame::new(id, &[command::IMU_CONFIG_GET]),
             // Mask, mode and orientation; the rest is unused.
-            from: 1,
-            until: 5,
+            compared: 1..5,
         };
         let period = Nanos::from_millis(i64::from(plan.period_ms));
         Ok(Self {

@@ -253,7 +253,7 @@ fn an_imu_acquisition() {
     );
 }
 
-/// The quaternion has no SEQ. If its acquisition's own is lost, the next one must not take its place.
+/// The quaternion has no SEQ: if one is lost, that of the next acquisition must not take its place.
 #[test]
 fn a_quaternion_belongs_to_an_acquisition_for_half_a_period() {
     let keys = r#"quantities = ["acceleration", "orientation"]"#;

@@ -135,8 +135,8 @@ fn a_torque_too_long_after_its_force_is_not_paired_either() {
     assert_eq!((numbers, unpaired), (vec![1], 2));
 }
 
-/// The late torque of reading 1 comes after force 3, whose own torque is lost: more than two periods
-/// late, but not as quickly after a force as usual.
+/// The late torque of reading 1 comes after force 3, whose own torque is lost: more than two
+/// periods late, but not as quickly after a force as usual.
 #[test]
 fn in_doubt_a_torque_must_follow_its_force_as_quickly_as_usual() {
     let (numbers, gaps, unpaired) = numbers(&sequence(&[
