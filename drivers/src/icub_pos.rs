@@ -29,10 +29,10 @@
 //! good at once.
 //!
 //! Sources: `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12,
-//! `embot_prot_can_analog_periodic.cpp` (icub-firmware b4299211). Certain, except the bytes of `51`:
-//! the firmware's messages hold a type in the question, a type and both sensors in the answer; that
-//! these lie where `52` has them is highly probable. An mtb4fap answers without its sensors: do not
-//! use `sensors` for it.
+//! `embot_prot_can_analog_periodic.cpp` (icub-firmware b4299211). Certain, except the bytes of
+//! `51`: the firmware's messages hold a type in the question, a type and both sensors in the answer;
+//! it is highly probable that these lie where `52` has them. An mtb4fap answers without its sensors:
+//! do not use `sensors` for it.
 //!
 //! # Keys
 //! ```toml
