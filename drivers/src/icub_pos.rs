@@ -30,9 +30,9 @@
 //!
 //! Sources: `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12,
 //! `embot_prot_can_analog_periodic.cpp` (icub-firmware b4299211). Certain, except the bytes of
-//! `51`: the firmware's messages hold a type in the question, a type and both sensors in the answer;
-//! it is highly probable that these lie where `52` has them. An mtb4fap answers without its sensors:
-//! do not use `sensors` for it.
+//! `51`: the firmware's messages hold a type in the question, a type and both sensors in the
+//! answer; it is highly probable that these lie where `52` has them. An mtb4fap answers without its
+//! sensors: do not use `sensors` for it.
 //!
 //! # Keys
 //! ```toml

@@ -1,5 +1,6 @@
 //! Combines the two halves of a reading that a board sends in two frames, in a protocol without
-//! sequence numbers. Never combines halves of different readings.
+//! sequence numbers. Halves of different readings are not combined, but for the cases named at the
+//! end.
 //!
 //! # Order
 //! A board sends the two halves back to back, always in the same order. So a second half belongs to
@@ -23,16 +24,17 @@
 //! As long as J is below P/2, the limit L + P/2 separates the two. L is at most [`ADJACENT`]. Where
 //! P/2 is less than 1 ms, the jitter of a USB adapter ([`ADAPTER`]), no limit can: a good pair of a
 //! jittering bus looks like a wrong one of a steady bus. There the limit depends on the bus: it is
-//! L + 1 ms, so that jitter costs no reading; and L + P/2 while the bus is *calm*, that is, most
-//! second halves come within L. On a bus with a jitter of 1 ms and independent delays about a third
-//! come later, and `calm` reaches [`CALM`] less than once in a year at 1 kHz; with a jitter below
-//! 0.5 ms, which loses nothing by the shorter limit, it may.
+//! L + 1 ms, so that jitter costs no reading; and L + P/2 while the bus is *calm*, that is, nearly
+//! all second halves come within L + P/4. At 1 kHz with a jitter of 1 ms and independent delays a
+//! sixth come later, and the bus counts as calm less than once in a year; with one of up to 0.6 ms,
+//! which loses nothing by the shorter limit, it does.
 //!
 //! Two cases cannot be distinguished from a good pair. (1) A second half that arrives between a
 //! first half and its own second half and is late by more than two periods, or had lost its first
 //! half, or is not the only late one in a row. (2) With a period below 2 ms, on a bus that is not
-//! calm (or not yet, in the first 64 readings): a second half and the next first half are lost, and
-//! the next second half comes within L + 1 ms.
+//! calm (or not yet, in the first 192 readings): a second half and the next first half are lost,
+//! and the next second half comes within L + 1 ms. At 1 kHz with a jitter of 1 ms and one frame in
+//! 1000 lost, that is about one reading in a million.
 
 use crate::Frame;
 use proprio_topics::{Nanos, StampKind};
@@ -62,16 +64,18 @@ pub(crate) enum Paired<T> {
 const ADJACENT: Nanos = Nanos::from_micros(300);
 /// The jitter of a USB adapter: it transfers frames once per USB frame.
 const ADAPTER: Nanos = Nanos::from_millis(1);
-/// So many more second halves must be in time than late before a bus counts as calm.
-const CALM: u8 = 64;
-/// The most that `calm` counts: then five late ones in a row end the calm.
-const CALM_MOST: u8 = 96;
-/// A late second half counts as much as so many in time.
-const CALM_LATE: u8 = 8;
+/// From so many on a bus is calm: the count of second halves that came soon, up to 255, minus
+/// [`CALM_LATE`] for each other one. So four late ones in a row end the calm.
+const CALM: u8 = 192;
+/// More than the ratio of soon to late second halves at a jitter of 0.7 ms or more and 1 kHz, so
+/// that there the count falls.
+const CALM_LATE: u8 = 16;
 
 /// The longest time from the first half of a reading to the second.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Limit {
+    /// A second half within this time came soon.
+    soon: Nanos,
     /// On a calm bus.
     calm: Nanos,
     /// Otherwise.
@@ -83,6 +87,7 @@ impl Limit {
     pub(crate) fn of_period(period: Nanos) -> Self {
         let half = Nanos(period.0 / 2);
         Self {
+            soon: ADJACENT + Nanos(period.0 / 4),
             calm: ADJACENT + half,
             jittering: ADJACENT + half.max(ADAPTER),
         }
@@ -91,6 +96,7 @@ impl Limit {
     /// Always `time`.
     pub(crate) const fn fixed(time: Nanos) -> Self {
         Self {
+            soon: time,
             calm: time,
             jittering: time,
         }
@@ -110,7 +116,7 @@ pub(crate) struct Pairing<T> {
     doubt: bool,
     /// Usual delay of second halves: a running mean.
     usual: Option<Nanos>,
-    /// Rises with second halves in time, falls with late ones.
+    /// Rises with second halves that come soon, falls with others ([`CALM`]).
     calm: u8,
 }
 
@@ -167,8 +173,8 @@ impl<T: Copy> Pairing<T> {
             None => Nanos(limit.0 / 2),
         };
         if !self.owed {
-            self.calm = if within((t, stamp), (frame.t, frame.stamp), ADJACENT) {
-                CALM_MOST.min(self.calm + 1)
+            self.calm = if within((t, stamp), (frame.t, frame.stamp), self.limit.soon) {
+                self.calm.saturating_add(1)
             } else {
                 self.calm.saturating_sub(CALM_LATE)
             };
