@@ -2,6 +2,7 @@
 //! [`Board`] on the device.
 
 use crate::{Frame, Id};
+use alloc::borrow::Cow;
 use alloc::boxed::Box;
 use arrayvec::ArrayVec;
 use proprio_topics::{Counter, DeviceState, Kind, Nanos, Quality, Reading, Refusal, StampKind};
@@ -90,6 +91,31 @@ impl Output {
             device_counter: 0,
             quality,
             reading,
+        }
+    }
+}
+
+/// An output of a device, as its driver states it before the device is built.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct OutputInfo {
+    /// Its number: [`Output::output`].
+    pub number: u8,
+    /// The kind of its main reading. An output of kind [`Kind::Joint`] is used only if a
+    /// `[[bus.device.joint]]` with that channel names it.
+    pub kind: Kind,
+    /// For another output, the end of its channel's name, `<device>_<suffix>`; empty: the name is
+    /// the device's own.
+    pub suffix: Cow<'static, str>,
+}
+
+impl OutputInfo {
+    /// Output `number`, without a suffix.
+    #[must_use]
+    pub const fn new(number: u8, kind: Kind) -> Self {
+        Self {
+            number,
+            kind,
+            suffix: Cow::Borrowed(""),
         }
     }
 }
@@ -229,7 +255,7 @@ pub struct Spec {
     pub max_silence: Nanos,
     /// Whether to command the device or only listen.
     pub mode: Mode,
-    /// The device channels that are joints; empty for sensors.
+    /// The outputs that are joints ([`OutputInfo::number`]); empty for sensors.
     pub outputs: Outputs,
 }
 
@@ -292,9 +318,6 @@ pub enum SpecError {
 ///
 /// It never reads a clock: frames carry their stamps, and the caller passes the time.
 pub trait Device: Send {
-    /// The kind of its main reading.
-    fn kind(&self) -> Kind;
-
     /// The identifiers it receives. The gateway rejects a plan with overlapping exclusive claims
     /// and sets the kernel's filters from the claims.
     fn claims(&self) -> &[Claim];
@@ -303,17 +326,16 @@ pub trait Device: Send {
     /// input.
     fn on_frame(&mut self, frame: &Frame, out: &mut Decoded);
 
-    /// The next frame to send at `now`; call until `None`. Never anything in [`Mode::Listen`].
+    /// The next frame to send at `now`. While the outcome of the last one is open
+    /// ([`Device::on_sent`]), and in [`Mode::Listen`], there is none.
     ///
     /// Events that only the passing of time shows (a silence, a start) are added to `out`, also in
     /// [`Mode::Listen`].
     fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit>;
 
     /// What became of `frame`, which [`Device::poll_transmit`] gave: when the interface took it
-    /// \[ns\], or why it did not.
-    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
-        let _ = (frame, outcome);
-    }
+    /// \[ns\], or why it did not. Must be called once for each such frame.
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>);
 
     /// When to call [`Device::poll_transmit`] again even if no frame comes \[ns\].
     fn next_wake(&self) -> Option<Nanos>;
@@ -351,7 +373,12 @@ pub enum EncodeError {
 }
 
 /// The device's own side of its protocol: answers commands and encodes readings, as the hardware
-/// does.
+/// does. After power-on it waits for its start command; one whose [`Spec`] says [`Mode::Listen`]
+/// has been started by another program.
+///
+/// Boards differ in when they send. One that *streams* has a [`Board::period`], and its readings
+/// are encoded then. One that is *polled* has none: it answers a request in [`Board::on_frame`]
+/// with the reading that [`Board::present`] gave it last.
 pub trait Board: Send {
     /// Takes a frame from the bus and adds the answers to `out`. Frames for other boards are
     /// ignored.
@@ -359,6 +386,12 @@ pub trait Board: Send {
 
     /// The current streaming period of its main reading \[ns\]; `None` while it does not stream.
     fn period(&self) -> Option<Nanos>;
+
+    /// The reading of output `output` at this instant, with which a polled board answers a request.
+    /// A board that streams does not need it.
+    fn present(&mut self, output: u8, reading: &Reading, quality: Quality) {
+        let _ = (output, reading, quality);
+    }
 
     /// Encodes a reading of output `output`, quantised and limited as the board does, and adds its
     /// frames to `out`.

@@ -12,18 +12,22 @@
 //! asks board 10, `2A0` answers. In a streaming class there is no command byte. Most commands that
 //! set or start something are not acknowledged.
 //!
+//! After power-up these boards wait 5 s in their bootloader, and *any* frame on the bus makes them
+//! stay there. If boards are powered together with the host, set `power_on_silence_ms = 6000`: this
+//! host then stays silent that long at start and before each attempt to wake a silent board. It
+//! cannot keep other senders silent. A reading ends the wait at once, because a board that streams
+//! has left its bootloader.
+//!
 //! Sources: robotology/icub-firmware `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12 (25 Nov
 //! 2024) and the firmware under `emBODY/eBcode/arch-arm/embot` at b4299211;
 //! robotology/icub-firmware-shared `can/canProtocolLib` at 62f2818a; the hosts in
 //! robotology/icub-main at 24c1a003. Certain (document and independent code agree), unless stated
 //! otherwise.
 
+use crate::bringup::Patience;
 use crate::{Claim, Decoded, Format, Frame, Frames, Id, Spec, SpecError};
 use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Nanos};
-
-pub(crate) mod bringup;
-pub(crate) mod pairing;
 
 /// The classes of messages: bits 10:8 of the identifier.
 pub mod class {
@@ -67,6 +71,8 @@ pub mod command {
     pub const THERMOMETER_TRANSMIT: u8 = 0x3A;
     /// Class 2: `[4F, mask, period in ms]`: legacy accelerometer and gyroscope.
     pub const ACC_GYRO_SETUP: u8 = 0x4F;
+    /// Class 2: `[51, type]`, answered by 8 bytes like those of [`POS_CONFIG_SET`].
+    pub const POS_CONFIG_GET: u8 = 0x51;
     /// Class 2: `[52, id << 4 | type, sensor 0 (3 bytes), sensor 1 (3 bytes)]`.
     pub const POS_CONFIG_SET: u8 = 0x52;
     /// Class 2: `[53, period in ms]`, 0 stops.
@@ -128,11 +134,27 @@ pub fn address(spec: &Spec) -> Result<u8, SpecError> {
     }
 }
 
-/// The silence after power-on, from the key `power_on_silence_ms`.
+/// How long the host waits for these boards, apart from the silence after power-on.
+pub(crate) const PATIENCE: Patience = Patience {
+    power_on_silence: Nanos::ZERO,
+    // A board answers within a few ms; icub-main repeats after 20 ms.
+    answer_timeout: Nanos::from_millis(20),
+    // As in icub-main.
+    attempts: 15,
+    // A board that is powered later starts within this time, at the cost of two frames a second.
+    slow_attempt: Nanos::from_millis(500),
+    answer_counts: Nanos::from_millis(1000),
+    // An IMU changes its fusion mode before its first reading.
+    start: Nanos::from_millis(250),
+    start_most: Nanos::from_millis(500),
+    send_within: Nanos::from_millis(100),
+};
+
+/// [`PATIENCE`] with the silence after power-on of the key `power_on_silence_ms`.
 ///
 /// # Errors
 /// [`SpecError::Key`] above a minute.
-pub(crate) fn power_on_silence(ms: u32) -> Result<Nanos, SpecError> {
+pub(crate) fn patience(ms: u32) -> Result<Patience, SpecError> {
     if ms > 60_000 {
         return Err(SpecError::Key {
             key: "power_on_silence_ms",
@@ -140,7 +162,10 @@ pub(crate) fn power_on_silence(ms: u32) -> Result<Nanos, SpecError> {
             expected: "at most 60000",
         });
     }
-    Ok(Nanos::from_millis(i64::from(ms)))
+    Ok(Patience {
+        power_on_silence: Nanos::from_millis(i64::from(ms)),
+        ..PATIENCE
+    })
 }
 
 /// A period in ms that fits in a byte.
@@ -155,18 +180,6 @@ pub(crate) fn period_ms(key: &'static str, ms: u32) -> Result<u8, SpecError> {
             value: f64::from(ms),
             expected: "an integer from 1 to 255",
         }),
-    }
-}
-
-/// Checks that a sensor has no joints.
-///
-/// # Errors
-/// [`SpecError::Joints`].
-pub(crate) fn no_joints(spec: &Spec) -> Result<(), SpecError> {
-    if spec.outputs.0.is_empty() {
-        Ok(())
-    } else {
-        Err(SpecError::Joints("this device measures no joint"))
     }
 }
 

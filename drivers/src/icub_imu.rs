@@ -67,7 +67,6 @@
 //! legacy = "none"           # "mtb" or "bno055": legacy frames of that scale instead
 //! legacy_mask = 6           # which legacy sensors; default accelerometer and gyroscope
 //! power_on_silence_ms = 0   # see `crate::icub`
-//! listen = false            # true: another program commands this board; never transmit
 //! ```
 
 mod board;
@@ -79,3 +78,24 @@ pub use board::ImuBoard;
 pub use device::ImuDevice;
 pub use frames::{Fusion, Legacy, Quantity};
 pub use options::Options;
+
+use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
+use alloc::boxed::Box;
+use alloc::vec::Vec;
+use proprio_topics::Kind;
+
+impl Driver for Options {
+    const NAME: &'static str = "icub_imu";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Imu)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        Ok(Box::new(ImuDevice::new(spec, self)?))
+    }
+
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(ImuBoard::new(spec, self)?))
+    }
+}

@@ -17,11 +17,36 @@
 //! - `mode`: 0 idle, 1 position, 6 current, 9 forced idle, 0x0A voltage, 0x50 open loop, 0xA0
 //!   hardware fault, 0xB0 not configured.
 //! - `encoder`, bits: 0 dirty, 1 stuck, 2 index broken, 3 phase broken, 4 not calibrated.
-//! - `faults`: bit numbers in [`fault`].
 //!
-//! STATUS yields an actuator reading and sets the quality of the joint readings after it:
-//! DEVICE_FAULT for mode 0xA0, for encoder bits 0 to 3 and for every fault bit except those that
-//! concern only the bus ([`fault::BUS`]); NOT_CALIBRATED for encoder bit 4 and for mode 0xB0.
+//! STATUS yields an actuator reading and sets the quality of the joint readings after it. A fault
+//! belongs to what it spoils:
+//!
+//! | fault | bits | effect on a joint reading |
+//! |---|---|---|
+//! | encoder: dirty, stuck, index or phase broken | `encoder` 0 to 3 | DEVICE_FAULT |
+//! | Hall sensors: impossible order, impossible state | `faults` 1, 3 | DEVICE_FAULT |
+//! | absolute encoder: checksum, calculation | 2, 17 | DEVICE_FAULT |
+//! | SPI timing (the bus to the encoder) | 18 | DEVICE_FAULT |
+//! | position encoder | 19 | DEVICE_FAULT |
+//! | over-current, over-voltage, under-voltage | 4, 5, 6 | DRIVE_FAULT |
+//! | external (emergency stop), over-heating | 7, 9 | DRIVE_FAULT |
+//! | set point expired | 14 | DRIVE_FAULT |
+//! | PWM fatal, I2t, ADC calibration | 16, 22, 23 | DRIVE_FAULT |
+//! | EMU ROM, its checksum | 20, 21 | DRIVE_FAULT |
+//! | position limits | 24, 25 | DRIVE_FAULT |
+//! | silicon revision; unused | 26; 8 | DRIVE_FAULT |
+//! | illegal command | 0 | DRIVE_FAULT |
+//! | bus states, overrun, length, remote | 10 to 13, 15, 27 to 31 | none |
+//! | mode 0xA0, hardware fault | `mode` | DRIVE_FAULT |
+//! | encoder not calibrated | `encoder` 4 | NOT_CALIBRATED |
+//! | mode 0xB0, not configured | `mode` | NOT_CALIBRATED |
+//!
+//! Debatable: under-voltage is that of the motor's supply; an encoder that suffers from it has bits
+//! of its own. The ADC measures currents: with bit 23 the *current* is doubtful, the position is
+//! not. Bits 24 and 25 say where the joint is, which is only known because the position is good.
+//! The mode 0xA0 follows from a fault that has its own bit: if that is an encoder's, the bit
+//! condemns the position. Hall sensors count as encoders: they measure the same shaft, and which of
+//! two is wrong is open.
 //!
 //! Another program commands these boards once a millisecond (`10F`, four target currents, which
 //! triggers the answers above). This driver never transmits; it only detects silence.
@@ -35,12 +60,14 @@
 //! velocity = true    # false: ignore the board's velocity (coarse if `ratio` is small), encode 0
 //! ```
 
-use crate::icub::bringup::{Bringup, NoInquiry};
+use crate::bringup::{Bringup, NoInquiry};
 use crate::icub::{self, class};
 use crate::{
-    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Output, Spec, SpecError,
-    State, Transmit,
+    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, NotSent, Output,
+    OutputInfo, Spec, SpecError, State, Transmit,
 };
+use alloc::boxed::Box;
+use alloc::vec::Vec;
 use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
 use proprio_topics::{Actuator, Counter, JointState, Kind, Nanos, Quality, Reading};
@@ -74,15 +101,25 @@ pub mod fault {
     pub const EXTERNAL: u32 = 1 << 7;
     /// Temperature above its limit.
     pub const OVER_HEATING: u32 = 1 << 9;
+    /// No command in time.
+    pub const SETPOINT_EXPIRED: u32 = 1 << 14;
+    /// Calculation of the absolute encoder.
+    pub const ENCODER_CALCULATION: u32 = 1 << 17;
+    /// Timing of the SPI bus to the encoder.
+    pub const SPI_TIMING: u32 = 1 << 18;
     /// Position encoder fault.
     pub const ENCODER: u32 = 1 << 19;
     /// Mean current above its limit.
     pub const I2T: u32 = 1 << 22;
-    /// Bits that concern the bus and its commands, not the motor or its encoder: 10 to 13 (warning
-    /// and passive states), 15 (buffer overrun), 27 to 31 (illegal length, past states, remote
-    /// requests). They do not make a position doubtful, and past states stay set until the board is
-    /// reset.
+    /// Bits that make a position doubtful.
+    pub const POSITION: u32 =
+        HALL_SEQUENCE | ENCODER_CHECKSUM | HALL_VALUE | ENCODER_CALCULATION | SPI_TIMING | ENCODER;
+    /// Bits that concern only the bus: 10 to 13 (warning and passive states), 15 (buffer overrun),
+    /// 27 to 31 (illegal length, past states, remote requests). Past states stay set until the
+    /// board is reset.
     pub const BUS: u32 = 0b1111 << 10 | 1 << 15 | 0b11111 << 27;
+    /// All others: the drive has a fault, and the position is good.
+    pub const DRIVE: u32 = !(POSITION | BUS);
 }
 
 /// Bits of `Actuator::encoder`.
@@ -129,29 +166,30 @@ impl Default for Options {
     }
 }
 
-/// Checks that channel 0, the only one, is a joint.
-fn one_joint(spec: &Spec) -> Result<(), SpecError> {
-    if spec.outputs.0.is_empty() {
-        return Err(SpecError::Joints(
-            "a motor board needs a joint: [[bus.device.joint]] with channel = 0",
-        ));
+impl Driver for Options {
+    const NAME: &'static str = "icub_motor";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Joint)].to_vec()
     }
-    match spec.outputs.0.iter().find(|&&channel| channel != 0) {
-        Some(&channel) => Err(SpecError::Channel {
-            channel,
-            least: 0,
-            most: 0,
-        }),
-        None => Ok(()),
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        Ok(Box::new(Motor::new(spec, self)?))
+    }
+
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(MotorBoard::new(spec, self)?))
     }
 }
 
 /// The quality flags of the readings after a status frame.
 fn quality_of(actuator: &Actuator) -> Quality {
     let mut quality = Quality::GOOD;
-    let broken = actuator.encoder & encoder::BROKEN != 0;
-    if broken || actuator.faults & !fault::BUS != 0 || actuator.mode == mode::HARDWARE_FAULT {
+    if actuator.encoder & encoder::BROKEN != 0 || actuator.faults & fault::POSITION != 0 {
         quality |= Quality::DEVICE_FAULT;
+    }
+    if actuator.faults & fault::DRIVE != 0 || actuator.mode == mode::HARDWARE_FAULT {
+        quality |= Quality::DRIVE_FAULT;
     }
     if actuator.encoder & encoder::NOT_CALIBRATED != 0 || actuator.mode == mode::NOT_CONFIGURED {
         quality |= Quality::NOT_CALIBRATED;
@@ -177,11 +215,9 @@ impl Motor {
     /// A device in its initial state.
     ///
     /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, no joint, a joint's channel that is not 0, a
-    /// period out of range.
+    /// [`SpecError`]: an address outside 1 to 14, a period out of range.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
-        one_joint(spec)?;
         icub::period_ms("period_ms", options.period_ms)?;
         let kinds = [
             kind::TWO_FOC,
@@ -193,7 +229,7 @@ impl Motor {
         Ok(Self {
             address,
             claims: icub::claims(class::PERIODIC_MOTOR, address, &kinds),
-            bringup: Bringup::new(spec, Mode::Listen, Nanos::ZERO, watched),
+            bringup: Bringup::new(spec, Mode::Listen, icub::PATIENCE, watched),
             velocity: options.velocity,
             status: Quality::GOOD,
             seen: false,
@@ -205,6 +241,9 @@ impl Motor {
         let mut quality = self.status;
         if quality.contains(Quality::DEVICE_FAULT) {
             out.fault(Counter::DeviceFault, 1, frame.id);
+        }
+        if quality.contains(Quality::DRIVE_FAULT) {
+            out.fault(Counter::DriveFault, 1, frame.id);
         }
         if core::mem::take(&mut self.gap) | self.bringup.reading(frame.t) {
             quality |= Quality::GAP_BEFORE;
@@ -237,10 +276,6 @@ impl Motor {
 }
 
 impl Device for Motor {
-    fn kind(&self) -> Kind {
-        Kind::Joint
-    }
-
     fn claims(&self) -> &[Claim] {
         &self.claims
     }
@@ -272,6 +307,10 @@ impl Device for Motor {
 
     fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
         self.bringup.poll(now, &mut NoInquiry, out)
+    }
+
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        self.bringup.on_sent(frame, outcome, &mut NoInquiry);
     }
 
     fn next_wake(&self) -> Option<Nanos> {
@@ -309,7 +348,6 @@ impl MotorBoard {
     /// # Errors
     /// As [`Motor::new`].
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        one_joint(spec)?;
         let period =
             Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));
         Ok(Self {
@@ -370,7 +408,7 @@ impl Board for MotorBoard {
                 if !joint.position.is_finite() || !velocity.is_finite() {
                     return Err(EncodeError::NotFinite);
                 }
-                let told = Quality::DEVICE_FAULT | Quality::NOT_CALIBRATED;
+                let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT | Quality::NOT_CALIBRATED;
                 if self.status.0 & told.0 != quality.0 & told.0 {
                     let mut actuator = Actuator {
                         duty: 0.0,
@@ -379,7 +417,10 @@ impl Board for MotorBoard {
                         faults: 0,
                     };
                     if quality.contains(Quality::DEVICE_FAULT) {
-                        actuator.faults = fault::ENCODER;
+                        actuator.faults |= fault::ENCODER;
+                    }
+                    if quality.contains(Quality::DRIVE_FAULT) {
+                        actuator.faults |= fault::EXTERNAL;
                     }
                     if quality.contains(Quality::NOT_CALIBRATED) {
                         actuator.encoder = encoder::NOT_CALIBRATED;

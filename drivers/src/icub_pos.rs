@@ -10,36 +10,47 @@
 //!   joint.
 //! - A psc sends both its sensors in one frame, n = 2.
 //!
-//! Commands on `20a`, neither acknowledged:
+//! Commands on `20a`:
 //!
-//! | bytes | meaning |
-//! |---|---|
-//! | `52 id<<4\|type S0 S1` | configuration of sensors S0, S1 |
-//! | `53 ms` | period, 0 stops |
+//! | bytes | meaning | answer on `2a0` |
+//! |---|---|---|
+//! | `52 id<<4\|type S0 S1` | configuration of sensors S0, S1 | none |
+//! | `51 type` | get the configuration | `51 type S0 S1` |
+//! | `53 ms` | period, 0 stops | none |
 //!
 //! S: enabled, inverted, rotation (2 bits: 0, 180, 90, -90 deg), label (4 bits), zero (i16, 0.1
 //! deg). The board then sends ((v + rotation) mod 360 deg) - ((zero + rotation) mod 360 deg),
 //! negated if inverted.
 //!
+//! A lost configuration would leave a board with another zero, and its angles would be plausible
+//! and wrong. Therefore the driver reads the configuration back and repeats it until both agree.
+//! Until then readings are NOT_CALIBRATED, and they remain so if the board does not answer or never
+//! agrees (counted as changed). Without the key `sensors` nothing is configured, and angles are
+//! good at once.
+//!
 //! Sources: `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12,
-//! `embot_prot_can_analog_periodic.cpp` (icub-firmware b4299211). Certain.
+//! `embot_prot_can_analog_periodic.cpp` (icub-firmware b4299211). Certain, except the bytes of
+//! `51`: the firmware's messages hold a type in the question, a type and both sensors in the
+//! answer; it is highly probable that these lie where `52` has them. An mtb4fap answers without its
+//! sensors: do not use `sensors` for it.
 //!
 //! # Keys
 //! ```toml
 //! period_ms = 10            # 1 to 255
 //! quantity = "angle"        # "angle" (rad) or "length" (m): the quantity that the board sends
 //! power_on_silence_ms = 0   # see `crate::icub`
-//! listen = false            # true: another program commands this board; never transmit
 //! # Configuration of a psc's one or two sensors; without it the board keeps its own.
 //! sensors = [{ label = 0, inverted = false, rotation_deg = 0, zero_deg = 0.0 }, { label = 1 }]
 //! ```
 
-use crate::icub::bringup::{Bringup, NoInquiry};
+use crate::bringup::Bringup;
+use crate::configure::{Configure, Setting};
 use crate::icub::{self, class, command};
 use crate::{
-    Board, Claim, Decoded, Device, EncodeError, Frame, Frames, Mode, Output, Outputs, Spec,
-    SpecError, State, Transmit,
+    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, NotSent, Output,
+    OutputInfo, Outputs, Spec, SpecError, State, Transmit,
 };
+use alloc::boxed::Box;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
@@ -142,8 +153,6 @@ pub struct Options {
     pub quantity: Quantity,
     /// Silence kept after power-on \[ms\]; default 0.
     pub power_on_silence_ms: u32,
-    /// Another program commands this board; default false.
-    pub listen: bool,
     /// Configuration of its sensors, at most two; default: keep the board's own.
     pub sensors: Option<Vec<Sensor>>,
 }
@@ -154,7 +163,6 @@ impl Default for Options {
             period_ms: 10,
             quantity: Quantity::Angle,
             power_on_silence_ms: 0,
-            listen: false,
             sensors: None,
         }
     }
@@ -191,20 +199,21 @@ impl Options {
     }
 }
 
-/// Checks that there are joints and that all channels are labels.
-fn joints(spec: &Spec) -> Result<(), SpecError> {
-    if spec.outputs.0.is_empty() {
-        return Err(SpecError::Joints(
-            "a POS board needs a joint: [[bus.device.joint]] with channel = its label",
-        ));
+impl Driver for Options {
+    const NAME: &'static str = "icub_pos";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        (0..=LABEL_MOST)
+            .map(|label| OutputInfo::new(label, Kind::Joint))
+            .collect()
     }
-    match spec.outputs.0.iter().find(|&&channel| channel > LABEL_MOST) {
-        Some(&channel) => Err(SpecError::Channel {
-            channel,
-            least: 0,
-            most: LABEL_MOST,
-        }),
-        None => Ok(()),
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        Ok(Box::new(Pos::new(spec, self)?))
+    }
+
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(PosBoard::new(spec, self)?))
     }
 }
 
@@ -212,8 +221,9 @@ fn joints(spec: &Spec) -> Result<(), SpecError> {
 #[derive(Debug)]
 pub struct Pos {
     address: u8,
-    claims: ArrayVec<Claim, 1>,
+    claims: ArrayVec<Claim, 2>,
     bringup: Bringup,
+    configure: Configure,
     quantity: Quantity,
     outputs: Outputs,
     /// Labels whose next reading follows a gap, one bit each.
@@ -226,31 +236,33 @@ impl Pos {
     /// A device in its initial state.
     ///
     /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, no joint or one whose channel is not 0 to 15, a
-    /// key out of range.
+    /// [`SpecError`]: an address outside 1 to 14, a key out of range.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
-        joints(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
-        let silence = icub::power_on_silence(options.power_on_silence_ms)?;
-        let mode = if options.listen {
-            Mode::Listen
-        } else {
-            spec.mode
-        };
+        let patience = icub::patience(options.power_on_silence_ms)?;
         let watched = icub::stream(class::PERIODIC_ANALOG, address, POS);
-        let mut bringup = Bringup::new(spec, mode, silence, watched);
+        let mut bringup = Bringup::new(spec, spec.mode, patience, watched);
         let id = icub::to_board(class::POLLING_ANALOG, address);
-        if let Some(configuration) = options.configuration()? {
-            bringup.start_with(id, &configuration);
-        }
+        let setting = options.configuration()?.map(|set| Setting {
+            get: Frame::new(
+                id,
+                &[command::POS_CONFIG_GET, options.quantity.code_and_lsb().0],
+            ),
+            set: Frame::new(id, &set),
+            compared: 1..8,
+        });
         bringup.start_with(id, &[command::POS_TRANSMIT, period]);
         bringup.stop_with(id, &[command::POS_TRANSMIT, 0]);
-        let claims = icub::claims(class::PERIODIC_ANALOG, address, &[POS]);
+        let mut claims: ArrayVec<Claim, 2> = icub::claims(class::PERIODIC_ANALOG, address, &[POS]);
+        if setting.is_some() {
+            claims.push(Claim::shared(icub::to_host(class::POLLING_ANALOG, address)));
+        }
         Ok(Self {
             address,
             claims,
             bringup,
+            configure: Configure::new(spec, setting, icub::PATIENCE),
             quantity: options.quantity,
             outputs: spec.outputs.clone(),
             gap: 0,
@@ -260,18 +272,24 @@ impl Pos {
 }
 
 impl Device for Pos {
-    fn kind(&self) -> Kind {
-        Kind::Joint
-    }
-
     fn claims(&self) -> &[Claim] {
         &self.claims
     }
 
     fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
-        if !self.bringup.active()
-            || icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address) != Some(POS)
-        {
+        if !self.bringup.active() {
+            return;
+        }
+        if frame.id == icub::to_host(class::POLLING_ANALOG, self.address) {
+            // Answers to other questions are for other devices.
+            if let Some(data) = icub::payload(frame, out)
+                && data.first() == Some(&command::POS_CONFIG_GET)
+            {
+                self.configure.answer(data, frame, out);
+            }
+            return;
+        }
+        if icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address) != Some(POS) {
             return;
         }
         let Some(data) = icub::payload(frame, out) else {
@@ -299,11 +317,13 @@ impl Device for Pos {
                 continue;
             }
             let bit = 1 << output;
-            let quality = if self.gap & bit == 0 {
-                Quality::GOOD
-            } else {
-                Quality::GAP_BEFORE
-            };
+            let mut quality = Quality::GOOD;
+            if self.gap & bit != 0 {
+                quality |= Quality::GAP_BEFORE;
+            }
+            if !self.configure.confirmed() {
+                quality |= Quality::NOT_CALIBRATED;
+            }
             self.gap &= !bit;
             self.seen |= bit;
             let position = f64::from(icub::i16_le(value, 0)) * lsb;
@@ -317,15 +337,19 @@ impl Device for Pos {
     }
 
     fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
-        self.bringup.poll(now, &mut NoInquiry, out)
+        self.bringup.poll(now, &mut self.configure, out)
+    }
+
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        self.bringup.on_sent(frame, outcome, &mut self.configure);
     }
 
     fn next_wake(&self) -> Option<Nanos> {
-        self.bringup.next_wake(&NoInquiry)
+        self.bringup.next_wake(&self.configure)
     }
 
     fn state(&self) -> State {
-        self.bringup.state(&NoInquiry)
+        self.bringup.state(&self.configure)
     }
 
     fn stop(&mut self, _now: Nanos) {
@@ -346,23 +370,25 @@ pub struct PosBoard {
     period: Nanos,
     streaming: bool,
     quantity: Quantity,
+    /// The configuration received, in the form of POS_CONFIG_SET.
+    configuration: [u8; 8],
 }
 
 impl PosBoard {
-    /// A board after power-on. With `listen` another program has already started it.
+    /// A board after power-on; in [`Mode::Listen`] another program has already started it.
     ///
     /// # Errors
     /// As [`Pos::new`].
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        joints(spec)?;
         options.configuration()?;
         let period =
             Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));
         Ok(Self {
             address: icub::address(spec)?,
             period,
-            streaming: options.listen,
+            streaming: spec.mode == Mode::Listen,
             quantity: options.quantity,
+            configuration: [0; 8],
         })
     }
 }
@@ -376,13 +402,26 @@ impl Board for PosBoard {
             icub::board::PSC,
             out,
         );
-        if let Some(&[command::POS_TRANSMIT, ms]) =
-            icub::command_for(frame, class::POLLING_ANALOG, self.address)
-        {
-            self.streaming = ms > 0;
-            if ms > 0 {
-                self.period = Nanos::from_millis(i64::from(ms));
+        match icub::command_for(frame, class::POLLING_ANALOG, self.address) {
+            Some(&[command::POS_CONFIG_SET, a, b, c, d, e, f, g]) => {
+                // As in the firmware, a new configuration stops the stream.
+                self.streaming = false;
+                self.configuration = [command::POS_CONFIG_SET, a, b, c, d, e, f, g];
             }
+            Some(&[command::POS_CONFIG_GET, kind]) => {
+                let [_, _, sensors @ ..] = self.configuration;
+                let [b, c, d, e, f, g] = sensors;
+                let id = icub::to_host(class::POLLING_ANALOG, self.address);
+                let answer = [command::POS_CONFIG_GET, kind, b, c, d, e, f, g];
+                let _ = out.try_push(Frame::new(id, &answer));
+            }
+            Some(&[command::POS_TRANSMIT, ms]) => {
+                self.streaming = ms > 0;
+                if ms > 0 {
+                    self.period = Nanos::from_millis(i64::from(ms));
+                }
+            }
+            _ => {}
         }
     }
 

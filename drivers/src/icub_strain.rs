@@ -18,7 +18,7 @@
 //!   axis k of [`Quality::saturation`], although through the calibration matrix each gauge affects
 //!   every axis.
 //! - The frames have no sequence number: force and torque are paired by order and time
-//!   ([`crate::icub`], "Pairing" in its source).
+//!   (`Pairing` in `pairing.rs`).
 //! - A thermometer frame has type E in the document and the shared header, but F in the strain2
 //!   firmware's enumeration: both are accepted.
 //!
@@ -50,9 +50,9 @@
 //! period_ms = 10                     # 1 to 255; strain2 needs 2 or more for full accuracy
 //! stream = "calibrated"              # "calibrated", "uncalibrated" or "both"
 //! temperature_period_s = 1           # none if absent
-//! pair_timeout_ms = 5.0              # longest time from force to torque; default half a period
+//! pair_timeout_ms = 5.3              # longest time from force to torque; default: half a period
+//!                                    # plus 0.3 ms; below 2 ms of period 1.3 ms if the bus jitters
 //! power_on_silence_ms = 0            # see `crate::icub`
-//! listen = false                     # true: another program commands this board; never transmit
 //! ```
 //!
 //! [`Quality::saturation`]: proprio_topics::Quality::saturation
@@ -68,3 +68,24 @@ mod options;
 pub use board::StrainBoard;
 pub use device::Strain;
 pub use options::{Options, Stream};
+
+use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
+use alloc::boxed::Box;
+use alloc::vec::Vec;
+use proprio_topics::Kind;
+
+impl Driver for Options {
+    const NAME: &'static str = "icub_strain";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Wrench)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        Ok(Box::new(Strain::new(spec, self)?))
+    }
+
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(StrainBoard::new(spec, self)?))
+    }
+}

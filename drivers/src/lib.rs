@@ -12,14 +12,17 @@
 //! identifiers into readings and starts its board. A [`Board`] is the board's own side: it answers
 //! commands and encodes readings. The simulator, `proprio encode` and the round-trip tests use it.
 //!
-//! To add a family, write a module with an `Options` type (its keys in gateway.toml, documented at
-//! the top of the module), a `Device` and a `Board`. Add it to [`Options`] in `registry.rs`; the
-//! compiler lists the other places to extend.
+//! To add a family, write a module with a `Device`, a `Board`, and an `Options` type (its keys in
+//! gateway.toml, documented at the top of the module) that implements [`Driver`], and add its line
+//! to the list in `registry.rs`. `bringup.rs`, `configure.rs` and `pairing.rs` hold what families
+//! share: starting a board, confirming its configuration, combining two frames.
 #![no_std]
 extern crate alloc;
 #[cfg(test)]
 extern crate std;
 
+mod bringup;
+mod configure;
 pub mod device;
 pub mod frame;
 pub mod icub;
@@ -27,11 +30,12 @@ pub mod icub_imu;
 pub mod icub_motor;
 pub mod icub_pos;
 pub mod icub_strain;
+mod pairing;
 mod registry;
 
 pub use device::{
-    Board, Claim, Decoded, Device, EncodeError, Fault, Frames, Mode, NotSent, Output, Outputs,
-    Spec, SpecError, State, Transmit,
+    Board, Claim, Decoded, Device, EncodeError, Fault, Frames, Mode, NotSent, Output, OutputInfo,
+    Outputs, Spec, SpecError, State, Transmit,
 };
 pub use frame::{Format, Frame, Id};
-pub use registry::{DRIVERS, Options, OptionsError};
+pub use registry::{DRIVERS, Driver, Options, OptionsError};

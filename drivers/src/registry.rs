@@ -1,25 +1,33 @@
-//! The names of the drivers: the one place that lists all families.
+//! The drivers: one list from which their names, their keys and their devices follow.
 
-use crate::{Board, Device, Spec, SpecError, icub_imu, icub_motor, icub_pos, icub_strain};
+use crate::{
+    Board, Device, OutputInfo, Spec, SpecError, icub_imu, icub_motor, icub_pos, icub_strain,
+};
 use alloc::boxed::Box;
+use alloc::vec::Vec;
 use proprio_topics::Kind;
 use serde::Deserialize;
 
-/// The names of all drivers, as gateway.toml writes them.
-pub const DRIVERS: [&str; 4] = ["icub_strain", "icub_imu", "icub_motor", "icub_pos"];
+/// A driver: implemented by its `Options`, which hold the keys of one device.
+pub trait Driver {
+    /// Its name in gateway.toml: that of its file.
+    const NAME: &'static str;
 
-/// A driver with its keys.
-#[derive(Debug, Clone, PartialEq)]
-#[non_exhaustive]
-pub enum Options {
-    /// iCub F/T boards.
-    IcubStrain(icub_strain::Options),
-    /// iCub IMUs.
-    IcubImu(icub_imu::Options),
-    /// iCub 2FOC motor boards.
-    IcubMotor(icub_motor::Options),
-    /// iCub POS encoders.
-    IcubPos(icub_pos::Options),
+    /// The outputs of a device with these keys, in the order of its channels. None: it takes part
+    /// in the bus and measures nothing.
+    fn outputs(&self) -> Vec<OutputInfo>;
+
+    /// The host's side of one device. The joints of `spec` are outputs of this driver.
+    ///
+    /// # Errors
+    /// [`SpecError`]: an address or value that is invalid for the family.
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError>;
+
+    /// The device's own side.
+    ///
+    /// # Errors
+    /// As [`Driver::device`].
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError>;
 }
 
 /// Why a driver's keys cannot be read.
@@ -31,59 +39,114 @@ pub enum OptionsError<E> {
     Keys(E),
 }
 
-impl Options {
-    /// Reads the keys of driver `driver`.
-    ///
-    /// # Errors
-    /// [`OptionsError`]: no such driver, or an unknown key or wrong value (the deserializer's
-    /// message).
-    pub fn deserialize<'de, D: serde::Deserializer<'de>>(
-        driver: &str,
-        keys: D,
-    ) -> Result<Self, OptionsError<D::Error>> {
-        match driver {
-            "icub_strain" => icub_strain::Options::deserialize(keys).map(Self::IcubStrain),
-            "icub_imu" => icub_imu::Options::deserialize(keys).map(Self::IcubImu),
-            "icub_motor" => icub_motor::Options::deserialize(keys).map(Self::IcubMotor),
-            "icub_pos" => icub_pos::Options::deserialize(keys).map(Self::IcubPos),
-            _ => return Err(OptionsError::UnknownDriver),
+macro_rules! drivers {
+    ($($(#[$doc:meta])* $variant:ident: $module:ident,)+) => {
+        /// The names of all drivers, as gateway.toml writes them.
+        pub const DRIVERS: &[&str] = &[$(<$module::Options as Driver>::NAME),+];
+
+        /// A driver with its keys.
+        #[derive(Debug, Clone, PartialEq)]
+        #[non_exhaustive]
+        pub enum Options {
+            $($(#[$doc])* $variant($module::Options),)+
         }
-        .map_err(OptionsError::Keys)
-    }
 
-    /// The kind of the main reading of this driver's devices.
-    #[must_use]
-    pub const fn kind(&self) -> Kind {
-        match self {
-            Self::IcubStrain(_) => Kind::Wrench,
-            Self::IcubImu(_) => Kind::Imu,
-            Self::IcubMotor(_) | Self::IcubPos(_) => Kind::Joint,
+        impl Options {
+            /// Reads the keys of driver `driver`.
+            ///
+            /// # Errors
+            /// [`OptionsError`]: no such driver, or an unknown key or wrong value (the
+            /// deserializer's message).
+            pub fn deserialize<'de, D: serde::Deserializer<'de>>(
+                driver: &str,
+                keys: D,
+            ) -> Result<Self, OptionsError<D::Error>> {
+                $(if driver == <$module::Options as Driver>::NAME {
+                    return $module::Options::deserialize(keys)
+                        .map(Self::$variant)
+                        .map_err(OptionsError::Keys);
+                })+
+                Err(OptionsError::UnknownDriver)
+            }
+
+            /// The outputs of its devices.
+            #[must_use]
+            pub fn outputs(&self) -> Vec<OutputInfo> {
+                match self {
+                    $(Self::$variant(options) => options.outputs(),)+
+                }
+            }
+
+            /// The host's side of one device.
+            ///
+            /// # Errors
+            /// [`SpecError`]: an address, joint or value that is invalid for the family.
+            pub fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+                check_joints(spec, &self.outputs())?;
+                match self {
+                    $(Self::$variant(options) => options.device(spec),)+
+                }
+            }
+
+            /// The device's own side.
+            ///
+            /// # Errors
+            /// As [`Options::device`].
+            pub fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+                check_joints(spec, &self.outputs())?;
+                match self {
+                    $(Self::$variant(options) => options.board(spec),)+
+                }
+            }
         }
-    }
+    };
+}
 
-    /// The host's side of one device.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address, channel or value that is invalid for the family.
-    pub fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Ok(match self {
-            Self::IcubStrain(o) => Box::new(icub_strain::Strain::new(spec, o)?),
-            Self::IcubImu(o) => Box::new(icub_imu::ImuDevice::new(spec, o)?),
-            Self::IcubMotor(o) => Box::new(icub_motor::Motor::new(spec, o)?),
-            Self::IcubPos(o) => Box::new(icub_pos::Pos::new(spec, o)?),
-        })
-    }
+drivers! {
+    /// iCub F/T boards.
+    IcubStrain: icub_strain,
+    /// iCub IMUs.
+    IcubImu: icub_imu,
+    /// iCub 2FOC motor boards.
+    IcubMotor: icub_motor,
+    /// iCub POS encoders.
+    IcubPos: icub_pos,
+}
 
-    /// The device's own side.
-    ///
-    /// # Errors
-    /// As [`Options::device`].
-    pub fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        Ok(match self {
-            Self::IcubStrain(o) => Box::new(icub_strain::StrainBoard::new(spec, o)?),
-            Self::IcubImu(o) => Box::new(icub_imu::ImuBoard::new(spec, o)?),
-            Self::IcubMotor(o) => Box::new(icub_motor::MotorBoard::new(spec, o)?),
-            Self::IcubPos(o) => Box::new(icub_pos::PosBoard::new(spec, o)?),
-        })
+/// Checks that the joints of `spec` are outputs of the driver, and that one that measures joints
+/// has at least one.
+fn check_joints(spec: &Spec, outputs: &[OutputInfo]) -> Result<(), SpecError> {
+    let joints = || {
+        outputs
+            .iter()
+            .filter(|output| output.kind == Kind::Joint)
+            .map(|output| output.number)
+    };
+    let (Some(least), Some(most)) = (joints().min(), joints().max()) else {
+        return if spec.outputs.0.is_empty() {
+            Ok(())
+        } else {
+            Err(SpecError::Joints(
+                "this device measures no joint; remove its [[bus.device.joint]]",
+            ))
+        };
+    };
+    if spec.outputs.0.is_empty() {
+        return Err(SpecError::Joints(
+            "this device needs a joint: name it in [[bus.device.joint]]",
+        ));
+    }
+    match spec
+        .outputs
+        .0
+        .iter()
+        .find(|&&channel| joints().all(|joint| joint != channel))
+    {
+        Some(&channel) => Err(SpecError::Channel {
+            channel,
+            least,
+            most,
+        }),
+        None => Ok(()),
     }
 }

@@ -7,6 +7,7 @@ use crate::decoder::Decoder;
 use crate::link::{Link, Received};
 use crate::publish::Sink;
 use crate::status::BusStatus;
+use proprio_drivers::{Frame, NotSent};
 use proprio_topics::{LinkState, Nanos};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
@@ -24,6 +25,8 @@ pub struct Bus<S> {
     decoder: Decoder,
     sink: S,
     status: Arc<BusStatus>,
+    /// The outcomes of the frames of one turn, at most one of each device.
+    outcomes: Vec<(u16, Frame, Result<Nanos, NotSent>)>,
     link_was_up: bool,
     /// The stamp of the last frame, as long as more frames may be waiting.
     heard: Option<Nanos>,
@@ -42,11 +45,13 @@ impl<S: Sink> Bus<S> {
     /// Combines link, devices and sink.
     pub fn new(link: Box<dyn Link>, decoder: Decoder, sink: S, status: Arc<BusStatus>) -> Self {
         let link_was_up = link.state() == LinkState::Up;
+        let outcomes = decoder.states().count();
         Self {
             link,
             decoder,
             sink,
             status,
+            outcomes: Vec::with_capacity(outcomes),
             link_was_up,
             heard: None,
         }
@@ -68,10 +73,15 @@ impl<S: Sink> Bus<S> {
             // the clock only when no frame is waiting.
             let then = self.heard.map_or(now, |t| t.min(now));
             let behind = now - then;
-            // The link counts failures. The device reacts when its reply does not arrive.
-            self.decoder.poll_transmit(then, |t| {
-                let _ = link.send(&t.frame, t.deadline + behind);
+            let outcomes = &mut self.outcomes;
+            self.decoder.poll_transmit(then, |device, t| {
+                let sent = link.send(&t.frame, t.deadline + behind);
+                let outcome = sent.map(|()| clock.now()).map_err(|_| NotSent::Refused);
+                outcomes.push((device, t.frame, outcome));
             });
+            for (device, frame, outcome) in self.outcomes.drain(..) {
+                self.decoder.on_sent(device, &frame, outcome);
+            }
             deadline = self
                 .decoder
                 .next_wake()

@@ -3,7 +3,9 @@
 
 use crate::plan::{BusPlan, Route};
 use crate::status::BusStatus;
-use proprio_drivers::{Claim, Decoded, Device, Frame, Id, Mode, SpecError, State, Transmit};
+use proprio_drivers::{
+    Claim, Decoded, Device, Frame, Id, Mode, NotSent, SpecError, State, Transmit,
+};
 use proprio_topics::{Counter, Header, MAX_CHANNELS, Nanos, Reading, Sample};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
@@ -48,6 +50,10 @@ impl Decoder {
                 })
             })
             .collect::<Result<Vec<_>, SpecError>>()?;
+        Ok(Self::of(bus, devices, status))
+    }
+
+    fn of(bus: u32, devices: Vec<Running>, status: Arc<BusStatus>) -> Self {
         let dispatch = Dispatch::new(devices.iter().map(|d| d.device.claims()));
         let last = [Nanos::MIN; MAX_CHANNELS];
         let this = Self {
@@ -59,7 +65,7 @@ impl Decoder {
             status,
         };
         this.store_states();
-        Ok(this)
+        this
     }
 
     /// The identifiers that the devices claim: the link's filters.
@@ -128,20 +134,17 @@ impl Decoder {
         }
     }
 
-    /// Calls `send` for every frame that a device wants to send at `now`.
-    pub fn poll_transmit(&mut self, now: Nanos, mut send: impl FnMut(&Transmit)) {
+    /// Calls `send` for every frame that a device wants to send at `now`, with the device's number
+    /// in the plan. [`Decoder::on_sent`] must follow for each; until then that device sends nothing
+    /// else.
+    pub fn poll_transmit(&mut self, now: Nanos, mut send: impl FnMut(u16, &Transmit)) {
         for (running, number) in self.devices.iter_mut().zip(0_u16..) {
             if running.device.next_wake().is_none_or(|wake| wake > now) {
                 continue;
             }
             self.decoded.clear();
-            // A device sends a few frames at once; the limit keeps a faulty one from blocking the
-            // loop.
-            for _ in 0..64 {
-                let Some(transmit) = running.device.poll_transmit(now, &mut self.decoded) else {
-                    break;
-                };
-                send(&transmit);
+            if let Some(transmit) = running.device.poll_transmit(now, &mut self.decoded) {
+                send(number, &transmit);
             }
             for fault in &self.decoded.faults {
                 self.status
@@ -149,6 +152,19 @@ impl Decoder {
             }
             self.status.set_state(number, running.device.state());
         }
+    }
+
+    /// What became of `frame` of device number `device`: when the interface took it \[ns\], or why
+    /// it did not.
+    pub fn on_sent(&mut self, device: u16, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        let Some(running) = self.devices.get_mut(usize::from(device)) else {
+            return;
+        };
+        running.device.on_sent(frame, outcome);
+        if outcome.is_err() {
+            self.status.count(device, Counter::Unsent, 1);
+        }
+        self.status.set_state(device, running.device.state());
     }
 
     /// The earliest instant at which a device must be polled.
@@ -202,27 +218,48 @@ struct Dispatch {
     /// Per standard identifier, at most [`SHARERS`] device numbers.
     standard: Vec<arrayvec::ArrayVec<u16, SHARERS>>,
     extended: Vec<(Claim, u16)>,
+    /// The first identifier that more devices claim than it is passed to; a plan has none.
+    crowded: Option<Id>,
 }
 
 /// Maximum number of devices that receive one identifier: those of one board.
-const SHARERS: usize = 4;
+pub(crate) const SHARERS: usize = 4;
+
+/// An identifier that more than [`SHARERS`] devices with these claims would receive.
+pub(crate) fn crowded<'a>(claims: impl Iterator<Item = &'a [Claim]>) -> Option<Id> {
+    Dispatch::new(claims).crowded
+}
 
 impl Dispatch {
     fn new<'a>(claims: impl Iterator<Item = &'a [Claim]>) -> Self {
         let mut this = Self {
             standard: vec![arrayvec::ArrayVec::new(); 2048],
             extended: Vec::new(),
+            crowded: None,
         };
         for (claims, device) in claims.zip(0_u16..) {
             for claim in claims {
                 match claim.id {
-                    Id::Extended(_) => this.extended.push((*claim, device)),
+                    Id::Extended(_) => {
+                        this.extended.push((*claim, device));
+                        let mut sharers: Vec<u16> = this
+                            .extended
+                            .iter()
+                            .filter(|(other, _)| other.overlaps(claim))
+                            .map(|(_, device)| *device)
+                            .collect();
+                        sharers.dedup();
+                        if sharers.len() > SHARERS {
+                            this.crowded.get_or_insert(claim.id);
+                        }
+                    }
                     Id::Standard(_) => {
                         for (devices, id) in this.standard.iter_mut().zip(0_u16..) {
-                            if claim.matches(Id::Standard(id)) && !devices.contains(&device) {
-                                // A fifth listener of one board is not served; no supported board
-                                // has more than four.
-                                let _ = devices.try_push(device);
+                            if claim.matches(Id::Standard(id))
+                                && !devices.contains(&device)
+                                && devices.try_push(device).is_err()
+                            {
+                                this.crowded.get_or_insert(Id::Standard(id));
                             }
                         }
                     }
@@ -249,5 +286,146 @@ impl Dispatch {
                 found
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::Plan;
+    use std::path::Path;
+
+    /// A participant of the bus without an output: it sends one frame every 10 ms, and counts the
+    /// answers.
+    struct Master {
+        claims: [Claim; 1],
+        next: Nanos,
+        under_way: bool,
+        answers: u32,
+        stopped: bool,
+    }
+
+    impl Device for Master {
+        fn claims(&self) -> &[Claim] {
+            &self.claims
+        }
+
+        fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
+            self.answers += 1;
+            out.fault(Counter::Unexpected, self.answers - 1, frame.id);
+        }
+
+        fn poll_transmit(&mut self, now: Nanos, _out: &mut Decoded) -> Option<Transmit> {
+            if self.under_way || self.stopped || now < self.next {
+                return None;
+            }
+            self.under_way = true;
+            Some(Transmit {
+                frame: Frame::new(Id::standard(0x80), &[]),
+                deadline: now + Nanos::from_millis(10),
+            })
+        }
+
+        fn on_sent(&mut self, _frame: &Frame, outcome: Result<Nanos, NotSent>) {
+            self.under_way = false;
+            if let Ok(t) = outcome {
+                self.next = t + Nanos::from_millis(10);
+            }
+        }
+
+        fn next_wake(&self) -> Option<Nanos> {
+            (!self.under_way && !self.stopped).then_some(self.next)
+        }
+
+        fn state(&self) -> State {
+            if self.stopped {
+                State::Stopped
+            } else {
+                State::Streaming
+            }
+        }
+
+        fn stop(&mut self, _now: Nanos) {
+            self.stopped = true;
+        }
+
+        fn restart(&mut self, now: Nanos) {
+            self.next = now;
+        }
+    }
+
+    #[test]
+    fn a_device_without_an_output_takes_part_in_the_bus() {
+        let plan = Plan::parse(
+            "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\n\
+             source = { kind = \"virtual\", name = \"b\" }\n[[bus.device]]\nname = \"master\"\n\
+             driver = \"icub_imu\"\naddress = 1",
+            Path::new("."),
+        )
+        .unwrap();
+        let status = Arc::new(BusStatus::new(0, &plan.buses[0]));
+        let answer = Id::standard(0x701);
+        let running = Running {
+            device: Box::new(Master {
+                claims: [Claim::exclusive(answer)],
+                next: Nanos::ZERO,
+                under_way: false,
+                answers: 0,
+                stopped: false,
+            }),
+            routes: Vec::new(),
+        };
+        let mut decoder = Decoder::of(0, vec![running], Arc::clone(&status));
+        assert_eq!(decoder.claims(), [Claim::exclusive(answer)]);
+        let count = |counter: Counter| status.devices().next().unwrap().counters[counter as usize];
+        let sent = |decoder: &mut Decoder, now| {
+            let mut sent = Vec::new();
+            decoder.poll_transmit(now, |device, t| sent.push((device, t.frame)));
+            sent
+        };
+        let sync = Frame::new(Id::standard(0x80), &[]);
+        assert_eq!(sent(&mut decoder, Nanos::ZERO), [(0, sync)]);
+        assert_eq!(sent(&mut decoder, Nanos::ZERO), [], "it is under way");
+        assert_eq!(decoder.next_wake(), None);
+        decoder.on_sent(0, &sync, Err(NotSent::Refused));
+        assert_eq!(count(Counter::Unsent), 1);
+        assert_eq!(sent(&mut decoder, Nanos::ZERO), [(0, sync)]);
+        decoder.on_sent(0, &sync, Ok(Nanos(5)));
+        assert_eq!(count(Counter::Unsent), 1);
+        assert_eq!(decoder.next_wake(), Some(Nanos(5) + Nanos::from_millis(10)));
+        for _ in 0..2 {
+            let heartbeat = Frame::new(answer, &[5]);
+            decoder.on_frame(&heartbeat, |sample| panic!("{sample:?}"));
+        }
+        assert_eq!((count(Counter::Frames), count(Counter::Readings)), (2, 0));
+        assert_eq!(count(Counter::Unexpected), 1);
+        decoder.stop(Nanos::ZERO);
+        assert!(decoder.stopped());
+        // Its plan can be shown, and its health has a name.
+        let mut plan = plan;
+        plan.channels.clear();
+        plan.buses[0].devices[0].routes.clear();
+        assert!(plan.to_string().contains("master"), "{plan}");
+        assert_eq!(status.devices().next().unwrap().name.as_str(), "master");
+    }
+
+    #[test]
+    fn an_identifier_has_at_most_four_listeners() {
+        for id in [Id::standard(0x2A0), Id::extended(0x18FF_0001)] {
+            let shared = [Claim::shared(id)];
+            let other = [Claim::shared(Id::standard(0x2B0))];
+            let claims = |n: usize| {
+                std::iter::repeat_n(&shared[..], n).chain(std::iter::repeat_n(&other[..], 4))
+            };
+            assert_eq!(crowded(claims(4)), None);
+            assert_eq!(crowded(claims(5)), Some(id));
+            assert_eq!(Dispatch::new(claims(4)).find(id).len(), 4);
+        }
+        // Two claims of one device are one listener.
+        let twice = [
+            Claim::shared(Id::extended(7)),
+            Claim::shared(Id::extended(7)),
+        ];
+        assert_eq!(crowded(std::iter::repeat_n(&twice[..], 4)), None);
     }
 }

@@ -212,7 +212,7 @@ pub fn decode(
         };
         // As live: the devices see the time pass, so that silences are seen.
         if record.frame.stamp != StampKind::None {
-            decoder.poll_transmit(record.frame.t, |_| {});
+            decoder.poll_transmit(record.frame.t, |_, _| {});
         }
         decoder.on_frame(&record.frame, |sample| {
             let (t, mut write) = (sample.header.acquired, |s: &Sample| {
@@ -340,7 +340,8 @@ pub fn encode(
         let mut of_bus = Vec::new();
         for device in &bus.devices {
             let spec = Spec {
-                mode: Mode::Listen,
+                // Nobody has started it: it encodes what the table holds, not a stream.
+                mode: Mode::Supervise,
                 ..device.spec.clone()
             };
             let board = device.options.board(&spec);

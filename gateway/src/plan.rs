@@ -1,11 +1,13 @@
 //! The checked and resolved form of gateway.toml, which the rest of the gateway uses.
 
-use crate::config::{Pace, Raw, RawBus, RawDevice, Realtime, Source};
+use crate::config::{Pace, Raw, RawBus, RawDevice, RawJoint, Realtime, Source};
+use crate::decoder::{SHARERS, crowded};
 use crate::link::replay::Matching;
-use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, Spec};
+use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, OutputInfo, Outputs, Spec};
 use proprio_topics::{
     Description, Entry, JointState, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, Role,
 };
+use std::f64::consts::TAU;
 use std::fmt::{self, Write as _};
 use std::path::{Path, PathBuf};
 
@@ -39,6 +41,8 @@ pub struct BusPlan {
     pub source: Source,
     /// Scheduling of its thread.
     pub realtime: Option<Realtime>,
+    /// Nothing is ever sent to it: all its devices only listen.
+    pub listen_only: bool,
     /// Its devices.
     pub devices: Vec<DevicePlan>,
 }
@@ -54,7 +58,7 @@ pub struct DevicePlan {
     pub options: Options,
     /// Address, silence, outputs.
     pub spec: Spec,
-    /// The channel of each output.
+    /// The channel of each output; empty for a device that measures nothing.
     pub routes: Vec<Route>,
 }
 
@@ -289,6 +293,7 @@ impl Builder<'_> {
             name: raw.name,
             source,
             realtime: raw.realtime,
+            listen_only: raw.listen_only,
             devices: Vec::new(),
         });
         for table in raw.device {
@@ -321,10 +326,11 @@ impl Builder<'_> {
                 DRIVERS.join(", ")
             ),
             OptionsError::Keys(e) => format!(
-                "{name:?} ({}): {}; keys of every device: {}",
+                "{name:?} ({}): {}; keys of every device: {}{}",
                 raw.driver,
                 one_line(&e),
-                RawDevice::KEYS.join(", ")
+                RawDevice::KEYS.join(", "),
+                did_you_mean(&e)
             ),
         })?;
         if !(raw.max_silence_ms > 0.0 && raw.max_silence_ms <= 3.6e6) {
@@ -334,98 +340,53 @@ impl Builder<'_> {
             ));
         }
         let max_silence = Nanos::from_seconds(raw.max_silence_ms * 1e-3);
-        let kind = options.kind();
         let bus = self.plan.buses.len() - 1;
-        let device = self.plan.buses.last().map_or(0, |b| b.devices.len());
+        let (device, quiet_bus) = self
+            .plan
+            .buses
+            .last()
+            .map_or((0, false), |b| (b.devices.len(), b.listen_only));
         let mut spec = Spec {
             address: raw.address,
             max_silence,
-            mode: if raw.listen_only {
+            mode: if raw.listen_only || quiet_bus {
                 Mode::Listen
             } else {
                 Mode::Supervise
             },
-            outputs: proprio_drivers::Outputs::default(),
+            outputs: Outputs::default(),
         };
-        let mut routes = Vec::new();
-        match (kind, raw.joint.is_empty()) {
-            (Kind::Joint, true) => {
+        let channel = |name: String, kind| ChannelPlan {
+            name,
+            kind,
+            bus,
+            device,
+            max_silence,
+        };
+        let mut routes = self.sensors(name, &options.outputs(), &channel)?;
+        for joint in raw.joint {
+            let at = format!("{name:?}, joint {:?}", joint.name);
+            check_name(&at, &joint.name)?;
+            let map = joint_map(&at, &joint)?;
+            if spec.outputs.0.contains(&joint.channel) {
                 return Err(format!(
-                    "{name:?}: {} measures joints; name them in [[bus.device.joint]]",
-                    raw.driver
+                    "{at}: channel = {} is already another joint",
+                    joint.channel
                 ));
             }
-            (_, false) if kind != Kind::Joint => {
+            if spec.outputs.0.try_push(joint.channel).is_err() {
                 return Err(format!(
-                    "{name:?}: {} is a sensor; remove its [[bus.device.joint]]",
-                    raw.driver
+                    "{at}: a device has at most {} joints",
+                    spec.outputs.0.capacity()
                 ));
             }
-            (_, true) => {
-                let channel = self.channel(ChannelPlan {
-                    name: name.clone(),
-                    kind,
-                    bus,
-                    device,
-                    max_silence,
-                })?;
-                routes.push(Route {
-                    output: 0,
-                    channel,
-                    kind,
-                    map: JointMap::IDENTITY,
-                });
-            }
-            (_, false) => {
-                for joint in raw.joint {
-                    let at = format!("{name:?}, joint {:?}", joint.name);
-                    check_name(&at, &joint.name)?;
-                    if !joint.ratio.is_finite() || joint.ratio == 0.0 {
-                        return Err(format!(
-                            "{at}: ratio = {} must be a number other than 0",
-                            joint.ratio
-                        ));
-                    }
-                    if joint.sign.abs() != 1 {
-                        return Err(format!("{at}: sign = {} must be 1 or -1", joint.sign));
-                    }
-                    if !joint.offset_rad.is_finite() {
-                        return Err(format!(
-                            "{at}: offset_rad = {} must be a finite number",
-                            joint.offset_rad
-                        ));
-                    }
-                    if spec.outputs.0.contains(&joint.channel) {
-                        return Err(format!(
-                            "{at}: channel = {} is already another joint",
-                            joint.channel
-                        ));
-                    }
-                    if spec.outputs.0.try_push(joint.channel).is_err() {
-                        return Err(format!(
-                            "{at}: a device has at most {} joints",
-                            spec.outputs.0.capacity()
-                        ));
-                    }
-                    let map = JointMap {
-                        gain: f64::from(joint.sign) / joint.ratio,
-                        offset: joint.offset_rad,
-                    };
-                    let channel = self.channel(ChannelPlan {
-                        name: joint.name,
-                        kind,
-                        bus,
-                        device,
-                        max_silence,
-                    })?;
-                    routes.push(Route {
-                        output: joint.channel,
-                        channel,
-                        kind,
-                        map,
-                    });
-                }
-            }
+            let channel = self.channel(channel(joint.name, Kind::Joint))?;
+            routes.push(Route {
+                output: joint.channel,
+                channel,
+                kind: Kind::Joint,
+                map,
+            });
         }
         // Built here once so that --check reports a wrong address or value; the bus thread builds
         // its own.
@@ -439,6 +400,16 @@ impl Builder<'_> {
             spec,
             routes,
         };
+        if self
+            .plan
+            .buses
+            .iter()
+            .map(|b| b.devices.len())
+            .sum::<usize>()
+            >= MAX_CHANNELS
+        {
+            return Err(format!("there are more than {MAX_CHANNELS} devices"));
+        }
         if let Some(bus) = self.plan.buses.last_mut() {
             if bus.devices.iter().any(|d| d.name == plan.name) {
                 return Err(format!("two devices are named {:?}", plan.name));
@@ -446,6 +417,31 @@ impl Builder<'_> {
             bus.devices.push(plan);
         }
         Ok(())
+    }
+
+    /// A channel for each output of device `name` that is no joint.
+    fn sensors(
+        &mut self,
+        name: &str,
+        outputs: &[OutputInfo],
+        channel: &impl Fn(String, Kind) -> ChannelPlan,
+    ) -> Result<Vec<Route>, String> {
+        let mut routes = Vec::new();
+        for output in outputs.iter().filter(|output| output.kind != Kind::Joint) {
+            let name = if output.suffix.is_empty() {
+                name.to_owned()
+            } else {
+                format!("{name}_{}", output.suffix)
+            };
+            check_name("the name of its channel", &name)?;
+            routes.push(Route {
+                output: output.number,
+                channel: self.channel(channel(name, output.kind))?,
+                kind: output.kind,
+                map: JointMap::IDENTITY,
+            });
+        }
+        Ok(routes)
     }
 
     fn channel(&mut self, channel: ChannelPlan) -> Result<u32, String> {
@@ -487,8 +483,51 @@ impl Builder<'_> {
             }
             claimed.push((&plan.name, device));
         }
+        if let Some(id) = crowded(claimed.iter().map(|(_, device)| device.claims())) {
+            let names: Vec<&str> = claimed
+                .iter()
+                .filter(|(_, device)| device.claims().iter().any(|claim| claim.matches(id)))
+                .map(|(name, _)| *name)
+                .collect();
+            return Err(format!(
+                "{place}: devices {} all listen to identifier {id}; at most {SHARERS} can",
+                names.join(", ")
+            ));
+        }
         Ok(())
     }
+}
+
+/// The conversion of a joint's table, checked; `at` is its place.
+fn joint_map(at: &str, joint: &RawJoint) -> Result<JointMap, String> {
+    if !joint.ratio.is_finite() || joint.ratio == 0.0 {
+        return Err(format!(
+            "{at}: ratio = {} must be a number other than 0",
+            joint.ratio
+        ));
+    }
+    if joint.sign.abs() != 1 {
+        return Err(format!("{at}: sign = {} must be 1 or -1", joint.sign));
+    }
+    if !joint.offset_rad.is_finite() {
+        return Err(format!(
+            "{at}: offset_rad = {} must be a finite number",
+            joint.offset_rad
+        ));
+    }
+    // More than a full turn is no other angle: such a number is in degrees.
+    if joint.offset_rad.abs() > TAU {
+        return Err(format!(
+            "{at}: offset_rad = {} looks like degrees; in rad it is {:.6} (at most a full \
+             turn, {TAU:.6}, is possible)",
+            joint.offset_rad,
+            joint.offset_rad.to_radians()
+        ));
+    }
+    Ok(JointMap {
+        gain: f64::from(joint.sign) / joint.ratio,
+        offset: joint.offset_rad,
+    })
 }
 
 /// A TOML error in one line, with the key that it is about.
@@ -500,6 +539,26 @@ fn one_line(error: &toml::de::Error) -> String {
         .filter(|l| !l.is_empty())
         .collect::<Vec<_>>()
         .join(" ")
+}
+
+/// A suggestion for an unknown key of a device, out of the driver's and the common keys.
+fn did_you_mean(error: &toml::de::Error) -> String {
+    // The message names the key first, then the driver's keys, each between backquotes.
+    let mut words = error.message().split('`').skip(1).step_by(2);
+    let Some(unknown) = words
+        .next()
+        .filter(|_| error.message().starts_with("unknown field"))
+    else {
+        return String::new();
+    };
+    // Winkler's similarity, because most mistakes are at the end of a key; above 0.85 two keys
+    // share most letters, or one is the beginning of the other.
+    words
+        .chain(RawDevice::KEYS)
+        .map(|key| (strsim::jaro_winkler(unknown, key), key))
+        .filter(|(similarity, _)| *similarity > 0.85)
+        .max_by(|(a, _), (b, _)| a.total_cmp(b))
+        .map_or_else(String::new, |(_, key)| format!("; did you mean {key:?}?"))
 }
 
 fn check_name(place: &str, name: &str) -> Result<(), String> {
@@ -563,6 +622,9 @@ impl fmt::Display for Plan {
                 realtime
                     .priority
                     .map_or(Ok(()), |p| write!(f, ", SCHED_FIFO {p}"))?;
+            }
+            if bus.listen_only {
+                write!(f, ", listens only")?;
             }
             writeln!(f)?;
             for device in &bus.devices {
@@ -729,6 +791,26 @@ mod tests {
                 "address = 15 is outside 1 to 14",
             ),
             ("address = 13", "", "missing field `address`"),
+            (
+                "offset_rad = 0.5",
+                "offset_rad = 90.0",
+                "offset_rad = 90 looks like degrees; in rad it is 1.570796",
+            ),
+            (
+                "offset_rad = 0.5",
+                "offset_rad = -6.3",
+                "offset_rad = -6.3 looks like degrees",
+            ),
+            (
+                "offset_rad = 0.5",
+                "channel = 1",
+                "joint channel 1 does not exist",
+            ),
+            (
+                "full_scale_nm = [31.0, 31.0, 31.0]",
+                "full_scale_nm = [31.0, 31.0, 31.0]\n[[bus.device.joint]]\nname = \"wrist\"",
+                "this device measures no joint; remove its [[bus.device.joint]]",
+            ),
             ("sign = -1", "sign = 2", "sign = 2 must be 1 or -1"),
             (
                 "ratio = 100.0",
@@ -749,6 +831,80 @@ mod tests {
             let problem = problem(from, to);
             assert!(problem.contains(expected), "{from} -> {to}: {problem}");
         }
+    }
+
+    #[test]
+    fn each_sensor_of_a_device_has_a_channel() {
+        let mut builder = Builder {
+            text: "",
+            folder: Path::new("."),
+            plan: Plan::parse(ARM, Path::new(".")).unwrap(),
+        };
+        let channel = |name, kind| ChannelPlan {
+            name,
+            kind,
+            bus: 0,
+            device: 2,
+            max_silence: Nanos::ZERO,
+        };
+        let outputs = [
+            OutputInfo::new(0, Kind::Wrench),
+            OutputInfo::new(1, Kind::Joint),
+            OutputInfo {
+                suffix: "skin".into(),
+                ..OutputInfo::new(7, Kind::Skin)
+            },
+        ];
+        let routes = builder.sensors("hand", &outputs, &channel).unwrap();
+        let of = |route: &Route| (route.output, route.channel, route.kind);
+        assert_eq!(
+            routes.iter().map(of).collect::<Vec<_>>(),
+            [(0, 2, Kind::Wrench), (7, 3, Kind::Skin)]
+        );
+        let names: Vec<&str> = builder.plan.channels[2..]
+            .iter()
+            .map(|c| c.name.as_str())
+            .collect();
+        assert_eq!(names, ["hand", "hand_skin"]);
+        assert_eq!(builder.sensors("none", &[], &channel), Ok(vec![]));
+        let long = "x".repeat(Name::CAPACITY - 2);
+        let problem = builder.sensors(&long, &outputs, &channel).unwrap_err();
+        assert!(problem.starts_with("the name of its channel"), "{problem}");
+    }
+
+    #[test]
+    fn an_unknown_key_leads_to_the_one_that_was_meant() {
+        for (key, meant) in [
+            ("max_silence = 30.0", "max_silence_ms"),
+            ("listen = true", "listen_only"),
+            ("adress = 3", "address"),
+            ("perod_ms = 3", "period_ms"),
+            ("pair_time_out_ms = 3", "pair_timeout_ms"),
+        ] {
+            let problem = problem("max_silence_ms = 30", key);
+            assert!(
+                problem.ends_with(&format!("did you mean {meant:?}?")),
+                "{key}: {problem}"
+            );
+            assert!(problem.contains("keys of every device: driver, name"));
+        }
+        let problem = problem("max_silence_ms = 30", "velocity = true");
+        assert!(!problem.contains("did you mean"), "{problem}");
+    }
+
+    #[test]
+    fn a_bus_that_is_only_listened_to_has_no_device_that_sends() {
+        let modes = |text: &str| {
+            let plan = Plan::parse(text, Path::new(".")).unwrap();
+            let modes: Vec<Mode> = plan.buses[0].devices.iter().map(|d| d.spec.mode).collect();
+            (plan.buses[0].listen_only, modes)
+        };
+        let supervised = vec![Mode::Supervise; 2];
+        assert_eq!(modes(ARM), (false, supervised));
+        let quiet = ARM.replacen("name = \"arm\"", "name = \"arm\"\nlisten_only = true", 1);
+        assert_eq!(modes(&quiet), (true, vec![Mode::Listen; 2]));
+        let one = ARM.replacen("address = 13", "address = 13\nlisten_only = true", 1);
+        assert_eq!(modes(&one), (false, vec![Mode::Listen, Mode::Supervise]));
     }
 
     #[test]

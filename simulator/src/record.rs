@@ -99,8 +99,9 @@ pub fn record(
         for (bus, host) in hosts.iter_mut().enumerate() {
             let mut commands = Vec::new();
             host.decoder
-                .poll_transmit(now, |transmit| commands.push(transmit.frame));
-            for command in commands {
+                .poll_transmit(now, |device, t| commands.push((device, t.frame)));
+            for (device, command) in commands {
+                host.decoder.on_sent(device, &command, Ok(now));
                 let command = host.transfer(command, now);
                 host.commands += 1;
                 simulator.on_frame(bus, &command, now);

@@ -410,7 +410,7 @@ mod tests {
     struct SlowLink {
         clock: Slow,
         gateway: Decoder,
-        commands: VecDeque<Frame>,
+        commands: VecDeque<(u16, Frame)>,
         sent: Arc<AtomicU64>,
         stop: Arc<AtomicBool>,
     }
@@ -420,9 +420,12 @@ mod tests {
             let now = self.clock.now();
             let commands = &mut self.commands;
             self.gateway
-                .poll_transmit(now, |command| commands.push_back(command.frame));
+                .poll_transmit(now, |device, t| commands.push_back((device, t.frame)));
             match self.commands.pop_front() {
-                Some(command) => Received::Frame(command),
+                Some((device, command)) => {
+                    self.gateway.on_sent(device, &command, Ok(now));
+                    Received::Frame(command)
+                }
                 None => {
                     self.clock.0.fetch_max(deadline.0, Relaxed);
                     Received::TimedOut

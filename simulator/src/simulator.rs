@@ -17,7 +17,7 @@ use crate::noise::Random;
 use crate::robot::{Robot, RobotError};
 use crate::settings::Settings;
 use crate::truth::Simulation;
-use proprio_drivers::{Board, Decoded, Frame, Frames, Mode, Options, Spec};
+use proprio_drivers::{Board, Frame, Frames, Options, Spec};
 use proprio_gateway::plan::{DevicePlan, JointMap};
 use proprio_topics::{
     Actuator, Imu, JointState, Kind, Nanos, Quality, Reading, Saturation, StampKind, Wrench,
@@ -204,16 +204,16 @@ impl Simulator {
                 node.reboots.push(Nanos::from_seconds(*at));
             }
             Fault::Saturate { window, .. } => {
-                possible(node.kind == Kind::Wrench, "an F/T sensor")?;
+                possible(node.measures(Kind::Wrench), "an F/T sensor")?;
                 node.saturations.push(*window);
             }
             Fault::Spike { at, .. } => {
-                possible(node.kind == Kind::Wrench, "an F/T sensor")?;
+                possible(node.measures(Kind::Wrench), "an F/T sensor")?;
                 node.spikes.push(*at);
             }
             Fault::LateHalf { window, once, .. } => {
                 possible(
-                    node.kind != Kind::Joint,
+                    node.measures(Kind::Wrench) || node.measures(Kind::Imu),
                     "a board that sends a reading in several frames",
                 )?;
                 node.late.push((*window, *once));
@@ -257,6 +257,10 @@ impl BusSimulator {
         for node in &mut self.nodes {
             if node.is_silent(t) {
                 continue;
+            }
+            if node.board.period().is_none() {
+                // It may be a request for a reading.
+                node.present(&mut self.simulation, t);
             }
             node.board.on_frame(frame, &mut answers);
             node.follow(now);
@@ -352,13 +356,15 @@ enum Source {
 
 /// One board with its measured quantities and its faults.
 struct Node {
-    kind: Kind,
+    kinds: Vec<Kind>,
     options: Options,
     spec: Spec,
     board: Box<dyn Board>,
     outputs: Vec<(u8, JointMap, Source)>,
     noise: bool,
     random: Random,
+    /// The noise of presented readings, so that requests do not change what it streams later.
+    presented: Random,
     /// Its phase within the period, 0 to 1.
     phase: f64,
     /// The relative error of its clock.
@@ -379,7 +385,7 @@ struct Node {
 impl std::fmt::Debug for Node {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Node")
-            .field("kind", &self.kind)
+            .field("kinds", &self.kinds)
             .field("spec", &self.spec)
             .finish_non_exhaustive()
     }
@@ -430,7 +436,7 @@ impl Node {
         }
         let mut random = Random::new(settings.seed, "board", stream);
         let mut node = Self {
-            kind: device.options.kind(),
+            kinds: device.routes.iter().map(|route| route.kind).collect(),
             board: power_on(robot, device)?,
             options: device.options.clone(),
             spec: device.spec.clone(),
@@ -439,6 +445,7 @@ impl Node {
             phase: random.uniform(0.0, 1.0),
             drift: random.uniform(-DRIFT, DRIFT),
             random,
+            presented: Random::new(settings.seed, "presented", stream),
             slots: None,
             status: matches!(device.options, Options::IcubMotor(_)).then_some(t0),
             silences: Vec::new(),
@@ -450,6 +457,10 @@ impl Node {
         };
         node.follow(t0);
         Ok(node)
+    }
+
+    fn measures(&self, kind: Kind) -> bool {
+        self.kinds.contains(&kind)
     }
 
     fn is_silent(&self, t: f64) -> bool {
@@ -472,12 +483,29 @@ impl Node {
         let before = self.reboots.len();
         self.reboots.retain(|at| *at > since_t0);
         if self.reboots.len() < before
-            && let Ok(board) = power_on_with(&self.options, &self.spec)
+            && let Ok(board) = self.options.board(&self.spec)
         {
             self.board = board;
             self.slots = None;
             self.held.clear();
             self.follow(now);
+        }
+    }
+
+    fn quality(&self, t: f64) -> Quality {
+        if self.saturations.iter().any(|w| w.contains(t)) {
+            Quality::GOOD.with_saturation(2, Saturation::High)
+        } else {
+            Quality::GOOD
+        }
+    }
+
+    /// Gives a board that does not stream its readings at `t`.
+    fn present(&mut self, simulation: &mut Simulation, t: f64) {
+        let quality = self.quality(t);
+        let noise = self.noise.then_some(&mut self.presented);
+        for (output, reading) in measure(&self.outputs, simulation, t, false, noise) {
+            self.board.present(output, &reading, quality);
         }
     }
 
@@ -490,75 +518,15 @@ impl Node {
         frames: &mut Frames,
     ) -> u64 {
         let mut refused = 0;
-        let mut quality = Quality::GOOD;
-        if self.saturations.iter().any(|w| w.contains(t)) {
-            quality = quality.with_saturation(2, Saturation::High);
-        }
+        let quality = self.quality(t);
         let spikes = self.spikes.len();
         self.spikes.retain(|at| *at > t);
         let spike = self.spikes.len() < spikes;
-        for (output, map, source) in &self.outputs {
-            let reading = match *source {
-                Source::Joint(joint) => {
-                    let Some(point) = simulation.motion(joint, t) else {
-                        continue;
-                    };
-                    let noise = if self.noise {
-                        JOINT_NOISE * self.random.normal()
-                    } else {
-                        0.0
-                    };
-                    let state = JointState {
-                        position: point.position + noise,
-                        velocity: point.velocity,
-                        acceleration: point.acceleration,
-                        ..JointState::ABSENT
-                    };
-                    Reading::Joint(map.device(state))
-                }
-                Source::Wrench(number, noise_n, noise_nm) => {
-                    let Some(&[fx, fy, fz, tx, ty, tz]) = simulation.at(t).wrenches.get(number)
-                    else {
-                        continue;
-                    };
-                    let mut wrench = Wrench {
-                        force: [fx, fy, fz],
-                        torque: [tx, ty, tz],
-                    };
-                    if self.noise {
-                        self.random.disturb(&mut wrench.force, noise_n);
-                        self.random.disturb(&mut wrench.torque, noise_nm);
-                    }
-                    if spike {
-                        wrench.force = wrench.force.map(|f| f + SPIKE.0);
-                        wrench.torque = wrench.torque.map(|n| n + SPIKE.1);
-                    }
-                    Reading::Wrench(wrench)
-                }
-                Source::Imu(number) => {
-                    let Some(truth) = simulation.at(t).imus.get(number) else {
-                        continue;
-                    };
-                    let mut imu = Imu {
-                        proper_acceleration: truth.proper_acceleration,
-                        angular_velocity: truth.angular_velocity,
-                        // Not simulated: constants, for boards configured to send them.
-                        magnetic_field: [2e-5, 0.0, -4e-5],
-                        orientation: [1.0, 0.0, 0.0, 0.0],
-                        ..Imu::ABSENT
-                    };
-                    if self.noise {
-                        self.random
-                            .disturb(&mut imu.proper_acceleration, [ACCELERATION_NOISE; 3]);
-                        self.random
-                            .disturb(&mut imu.angular_velocity, [ANGULAR_VELOCITY_NOISE; 3]);
-                    }
-                    Reading::Imu(imu)
-                }
-            };
+        let noise = self.noise.then_some(&mut self.random);
+        for (output, reading) in measure(&self.outputs, simulation, t, spike, noise) {
             refused += u64::from(
                 self.board
-                    .encode(*output, &reading, quality, frames)
+                    .encode(output, &reading, quality, frames)
                     .is_err(),
             );
         }
@@ -603,6 +571,74 @@ impl Node {
         }
         *frames = together;
     }
+}
+
+/// The readings of a board's outputs at `t`, with noise if there is a source of it.
+fn measure(
+    outputs: &[(u8, JointMap, Source)],
+    simulation: &mut Simulation,
+    t: f64,
+    spike: bool,
+    mut random: Option<&mut Random>,
+) -> Vec<(u8, Reading)> {
+    let mut readings = Vec::with_capacity(outputs.len());
+    for (output, map, source) in outputs {
+        let reading = match *source {
+            Source::Joint(joint) => {
+                let Some(point) = simulation.motion(joint, t) else {
+                    continue;
+                };
+                let noise = random
+                    .as_mut()
+                    .map_or(0.0, |random| JOINT_NOISE * random.normal());
+                let state = JointState {
+                    position: point.position + noise,
+                    velocity: point.velocity,
+                    acceleration: point.acceleration,
+                    ..JointState::ABSENT
+                };
+                Reading::Joint(map.device(state))
+            }
+            Source::Wrench(number, noise_n, noise_nm) => {
+                let Some(&[fx, fy, fz, tx, ty, tz]) = simulation.at(t).wrenches.get(number) else {
+                    continue;
+                };
+                let mut wrench = Wrench {
+                    force: [fx, fy, fz],
+                    torque: [tx, ty, tz],
+                };
+                if let Some(random) = &mut random {
+                    random.disturb(&mut wrench.force, noise_n);
+                    random.disturb(&mut wrench.torque, noise_nm);
+                }
+                if spike {
+                    wrench.force = wrench.force.map(|f| f + SPIKE.0);
+                    wrench.torque = wrench.torque.map(|n| n + SPIKE.1);
+                }
+                Reading::Wrench(wrench)
+            }
+            Source::Imu(number) => {
+                let Some(truth) = simulation.at(t).imus.get(number) else {
+                    continue;
+                };
+                let mut imu = Imu {
+                    proper_acceleration: truth.proper_acceleration,
+                    angular_velocity: truth.angular_velocity,
+                    // Not simulated: constants, for boards configured to send them.
+                    magnetic_field: [2e-5, 0.0, -4e-5],
+                    orientation: [1.0, 0.0, 0.0, 0.0],
+                    ..Imu::ABSENT
+                };
+                if let Some(random) = &mut random {
+                    random.disturb(&mut imu.proper_acceleration, [ACCELERATION_NOISE; 3]);
+                    random.disturb(&mut imu.angular_velocity, [ANGULAR_VELOCITY_NOISE; 3]);
+                }
+                Reading::Imu(imu)
+            }
+        };
+        readings.push((*output, reading));
+    }
+    readings
 }
 
 /// The sending times of a board.
@@ -657,38 +693,78 @@ fn scaled(duration: Nanos, factor: f64) -> Nanos {
     Nanos::from_seconds(duration.0 as f64 * factor * 1e-9)
 }
 
+/// A board after power-on.
 fn power_on(robot: &Robot, device: &DevicePlan) -> Result<Box<dyn Board>, RobotError> {
-    power_on_with(&device.options, &device.spec)
+    device
+        .options
+        .board(&device.spec)
         .map_err(|e| robot.mismatch(format!("gateway.toml, {:?}: {e}", device.name)))
 }
 
-/// A board after power-on. One that the gateway may only listen to is started at once, with the
-/// commands of the program that would command it.
-fn power_on_with(
-    options: &Options,
-    spec: &Spec,
-) -> Result<Box<dyn Board>, proprio_drivers::SpecError> {
-    let mut board = options.board(spec)?;
-    if spec.mode == Mode::Listen && board.period().is_none() {
-        let mut host = options.device(&Spec {
-            mode: Mode::Supervise,
-            ..spec.clone()
-        })?;
-        let (mut decoded, mut answers) = (Decoded::new(), Frames::new());
-        let mut now = Nanos::ZERO;
-        // A host asks at most a dozen questions and then starts the board.
-        for _ in 0..64 {
-            decoded.clear();
-            match host.poll_transmit(now, &mut decoded) {
-                Some(transmit) => board.on_frame(&transmit.frame, &mut answers),
-                None if board.period().is_some() => break,
-                None => now = host.next_wake().unwrap_or(now).max(now),
-            }
-            for answer in answers.drain(..) {
-                decoded.clear();
-                host.on_frame(&answer.at(now, StampKind::User), &mut decoded);
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proprio_drivers::{EncodeError, Id};
+
+    /// A board that answers a request with the force along z \[N\].
+    struct Polled(Option<f64>);
+
+    impl Board for Polled {
+        fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
+            if frame.id == Id::standard(1)
+                && let Some(force) = self.0
+            {
+                out.push(Frame::new(Id::standard(2), &force.to_le_bytes()));
             }
         }
+
+        fn period(&self) -> Option<Nanos> {
+            None
+        }
+
+        fn present(&mut self, output: u8, reading: &Reading, _quality: Quality) {
+            if let (0, Reading::Wrench(wrench)) = (output, reading) {
+                self.0 = Some(wrench.force[2]);
+            }
+        }
+
+        fn encode(
+            &mut self,
+            _: u8,
+            _: &Reading,
+            _: Quality,
+            _: &mut Frames,
+        ) -> Result<(), EncodeError> {
+            Err(EncodeError::Kind)
+        }
     }
-    Ok(board)
+
+    #[test]
+    fn a_polled_board_answers_with_the_reading_of_the_request() {
+        let robot = Robot::open("icub_left_arm").unwrap();
+        let settings = Settings {
+            noise: false,
+            ..Settings::default()
+        };
+        let t0 = Nanos::from_millis(5);
+        let mut simulator = Simulator::new(&robot, &settings, t0).unwrap();
+        let bus = &mut simulator.buses[0];
+        let node = bus
+            .nodes
+            .iter_mut()
+            .find(|node| node.measures(Kind::Wrench))
+            .unwrap();
+        node.board = Box::new(Polled(None));
+        let mut truth = Simulation::new(&robot, &settings).unwrap();
+        for ms in [300, 900] {
+            let now = t0 + Nanos::from_millis(ms);
+            bus.on_frame(&Frame::new(Id::standard(1), &[]), now);
+            let answer = std::iter::from_fn(|| bus.poll(now))
+                .find(|frame| frame.id == Id::standard(2))
+                .unwrap();
+            let force = f64::from_le_bytes(answer.data().try_into().unwrap());
+            let seconds = Nanos::from_millis(ms).seconds();
+            assert_eq!(force, truth.at(seconds).wrenches[0][2]);
+        }
+    }
 }

@@ -98,8 +98,9 @@ fn session_from(robot: &Robot, settings: &Settings, seconds: f64, start: Nanos) 
         if now >= start {
             for (bus, (decoder, _)) in hosts.iter_mut().enumerate() {
                 let mut commands = Vec::new();
-                decoder.poll_transmit(now, |t| commands.push(t.frame));
-                for command in commands {
+                decoder.poll_transmit(now, |device, t| commands.push((device, t.frame)));
+                for (device, command) in commands {
+                    decoder.on_sent(device, &command, Ok(now));
                     simulator.on_frame(bus, &command, now);
                 }
             }

@@ -167,7 +167,14 @@ fn listen(
     let mut link = VirtualBus::open(domain, name, &[]).unwrap();
     let clock = Monotonic;
     while !stop.load(Relaxed) {
-        decoder.poll_transmit(clock.now(), |t| link.send(&t.frame, t.deadline).unwrap());
+        let mut sent = Vec::new();
+        decoder.poll_transmit(clock.now(), |device, t| {
+            link.send(&t.frame, t.deadline).unwrap();
+            sent.push((device, t.frame));
+        });
+        for (device, frame) in sent {
+            decoder.on_sent(device, &frame, Ok(clock.now()));
+        }
         let deadline = clock.now() + Nanos::from_millis(10);
         if let Received::Frame(frame) =
             link.recv(decoder.next_wake().map_or(deadline, |w| w.min(deadline)))

@@ -8,7 +8,7 @@
 // A global allocator needs unsafe code.
 #![allow(unsafe_code)]
 
-use proprio_drivers::{Claim, Frame, Id, Mode};
+use proprio_drivers::{Claim, Frame, Id, Mode, NotSent};
 use proprio_dynamics::model::{self, Model};
 use proprio_dynamics::regressor::{
     Actuator, Coupling, EstimateRows, MotorRegressor, Regressor, StackedRegressor, Transmission,
@@ -347,6 +347,7 @@ fn decoding_allocates_nothing() {
         .map(|bus| BadFrames::new(&robot, bus))
         .collect();
     let (mut samples, mut at) = (0_u64, Nanos::ZERO);
+    let mut commands = Vec::with_capacity(64);
     // Measured from the first frame on: no warm-up is needed.
     let allocated = counted(|| {
         for (bus, frame) in &frames {
@@ -355,7 +356,16 @@ fn decoding_allocates_nothing() {
             for bad in [bad[*bus].next(), bad[*bus].next()] {
                 decoders[*bus].on_frame(&bad.at(at, frame.stamp), |_| {});
             }
-            decoders[*bus].poll_transmit(at, |_| {});
+            decoders[*bus].poll_transmit(at, |device, t| commands.push((device, t.frame)));
+            for (device, command) in commands.drain(..) {
+                let refused = samples % 2 == 0;
+                let outcome = if refused {
+                    Err(NotSent::Refused)
+                } else {
+                    Ok(at)
+                };
+                decoders[*bus].on_sent(device, &command, outcome);
+            }
             std::hint::black_box(decoders[*bus].next_wake());
         }
         decoders[0].restart(at);

@@ -1164,7 +1164,7 @@ fn bad_rows_are_named_and_take_nothing_else_with_them() {
     }
 }
 
-/// A board that reports a hardware fault for half a second, and a lost half of a wrench: the table
+/// A board that reports an encoder fault for half a second, and a lost half of a wrench: the table
 /// of samples has both, and the estimator withholds the torques beyond the joint meanwhile.
 #[test]
 fn faults_and_gaps_of_a_log_are_in_its_table_of_samples() {
@@ -1176,11 +1176,11 @@ fn faults_and_gaps_of_a_log_are_in_its_table_of_samples() {
     let (mut faults, mut gaps) = (0, 0);
     let mut lines: Vec<String> = Vec::new();
     for line in session(4.0, &Settings::default()).lines() {
-        // STATUS of the board of the elbow; its first byte is the mode.
+        // STATUS of the board of the elbow; its second byte is the state of the encoder: stuck.
         if let Some((front, data)) = line.split_once(" 143#")
             && during(line, 2.0, 2.5)
         {
-            lines.push(format!("{front} 143#A0{}", &data[2..]));
+            lines.push(format!("{front} 143#{}02{}", &data[..2], &data[4..]));
             faults += 1;
         } else if line.contains(" 3DB#") && during(line, 3.0, 4.0) && gaps == 0 {
             gaps += 1;

@@ -6,7 +6,7 @@ use super::frames::{
 };
 use super::options::{Options, Plan};
 use crate::icub::{self, class, command};
-use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
+use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
 use proprio_topics::{Nanos, Quality, Reading};
 
 /// Duration of a simulated board's acquisition \[us\]; real boards take 2 to 6 ms.
@@ -27,7 +27,7 @@ pub struct ImuBoard {
 }
 
 impl ImuBoard {
-    /// A board after power-on. With `listen` another program has already started it.
+    /// A board after power-on; in [`Mode::Listen`] another program has already started it.
     ///
     /// # Errors
     /// As [`ImuDevice::new`](super::ImuDevice::new).
@@ -35,7 +35,7 @@ impl ImuBoard {
         let plan = Plan::new(spec, options)?;
         Ok(Self {
             period: Nanos::from_millis(i64::from(plan.period_ms)),
-            streaming: options.listen,
+            streaming: spec.mode == Mode::Listen,
             configuration: None,
             legacy_mask: None,
             sequence: 0,

@@ -5,104 +5,17 @@ use super::frames::{
     ACCELERATION_LSB, FIELD_LSB, Legacy, QUATERNION_LSB, Quantity, RATE_LSB, kind, sensor,
 };
 use super::options::{Options, Plan};
-use crate::icub::bringup::{Ask, Bringup, Inquiry};
-use crate::icub::pairing::{Paired, Pairing};
+use crate::bringup::Bringup;
+use crate::configure::{Configure, Setting};
 use crate::icub::{self, class, command};
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, State, Transmit};
+use crate::pairing::{self, Limit, Paired, Pairing};
+use crate::{Claim, Decoded, Device, Frame, NotSent, Output, Spec, SpecError, State, Transmit};
 use arrayvec::ArrayVec;
-use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, Refusal, StampKind};
+use proprio_topics::{Counter, Imu, Nanos, Quality, Reading, StampKind};
 
 /// A frame up to this many sequence numbers back is late; further back, the counter has restarted
 /// or there is a long gap.
 const LATE: u8 = 4;
-
-/// Sends a board its configuration and verifies it.
-#[derive(Debug)]
-struct Configure {
-    address: u8,
-    wanted: [u8; 8],
-    /// Legacy boards have no such configuration.
-    needed: bool,
-    /// The board has confirmed it, or does not answer.
-    settled: bool,
-    /// The configuration has been sent; the question follows.
-    told: bool,
-    attempts: u8,
-    ask_at: Nanos,
-    /// Answers may still arrive until then.
-    counts_until: Nanos,
-}
-
-impl Configure {
-    fn answer(&mut self, data: &[u8], mode: Mode, frame: &Frame, out: &mut Decoded) {
-        if mode == Mode::Listen {
-            return;
-        }
-        let &[_, ref has @ .., _, _, _] = data else {
-            return out.fault(Counter::Length, 1, frame.id);
-        };
-        let [_, wants @ .., _, _, _] = &self.wanted;
-        if has.len() != wants.len() {
-            return out.fault(Counter::Length, 1, frame.id);
-        }
-        if frame.t > self.counts_until {
-            return out.fault(Counter::Unexpected, 1, frame.id);
-        }
-        if self.settled {
-            // A late answer to an earlier question.
-            return;
-        }
-        let agrees = has == wants;
-        self.settled = agrees || self.attempts >= icub::bringup::ATTEMPTS;
-        if !agrees {
-            self.told = false;
-            self.ask_at = Nanos::MIN;
-            if self.settled {
-                out.fault(Counter::Changed, 1, frame.id);
-            }
-        }
-    }
-}
-
-impl Inquiry for Configure {
-    fn begin(&mut self) {
-        self.settled = !self.needed;
-        self.told = false;
-        self.attempts = 0;
-        self.ask_at = Nanos::MIN;
-    }
-
-    fn poll(&mut self, now: Nanos) -> Ask {
-        if self.settled {
-            return Ask::Done;
-        }
-        if now < self.ask_at {
-            return Ask::Wait;
-        }
-        let id = icub::to_board(class::POLLING_ANALOG, self.address);
-        if !self.told {
-            if self.attempts >= icub::bringup::ATTEMPTS {
-                self.settled = true;
-                return Ask::Done;
-            }
-            self.told = true;
-            return Ask::Send(Frame::new(id, &self.wanted));
-        }
-        self.told = false;
-        self.attempts += 1;
-        self.ask_at = now + icub::bringup::ANSWER_TIMEOUT;
-        self.counts_until = now + icub::bringup::ANSWER_COUNTS;
-        Ask::Send(Frame::new(id, &[command::IMU_CONFIG_GET]))
-    }
-
-    fn wake(&self) -> Option<Nanos> {
-        Some(self.ask_at)
-    }
-
-    fn refusal(&self) -> Option<Refusal> {
-        None
-    }
-}
 
 /// The current, incomplete acquisition.
 #[derive(Debug, Clone, Copy)]
@@ -149,16 +62,11 @@ impl ImuDevice {
     /// A device in its initial state.
     ///
     /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, joints, incompatible quantities, a key out of
+    /// [`SpecError`]: an address outside 1 to 14, incompatible quantities, a key out of
     /// range.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let plan = Plan::new(spec, options)?;
-        let silence = icub::power_on_silence(options.power_on_silence_ms)?;
-        let mode = if options.listen {
-            Mode::Listen
-        } else {
-            spec.mode
-        };
+        let patience = icub::patience(options.power_on_silence_ms)?;
         let is_legacy = plan.legacy != Legacy::None;
         let kinds: &[u8] = if is_legacy {
             &[kind::LEGACY_ACCELEROMETER, kind::LEGACY_GYROSCOPE]
@@ -170,7 +78,7 @@ impl ImuDevice {
             plan.address,
             *kinds.first().unwrap_or(&kind::TRIPLE),
         );
-        let mut bringup = Bringup::new(spec, mode, silence, watched);
+        let mut bringup = Bringup::new(spec, spec.mode, patience, watched);
         let id = icub::to_board(class::POLLING_ANALOG, plan.address);
         let mut claims: ArrayVec<Claim, 4> =
             icub::claims(class::PERIODIC_INERTIAL, plan.address, kinds);
@@ -188,26 +96,24 @@ impl ImuDevice {
                 plan.address,
             )));
         }
-        let together = Nanos::from_micros(i64::from(plan.period_ms) * 500);
+        let setting = Setting {
+            set: Frame::new(id, &plan.configuration),
+            get: Frame::new(id, &[command::IMU_CONFIG_GET]),
+            // Mask, mode and orientation; the rest is unused.
+            compared: 1..5,
+        };
+        let period = Nanos::from_millis(i64::from(plan.period_ms));
         Ok(Self {
             claims,
             bringup,
-            configure: Configure {
-                address: plan.address,
-                wanted: plan.configuration,
-                needed: !is_legacy,
-                settled: false,
-                told: false,
-                attempts: 0,
-                ask_at: Nanos::MIN,
-                counts_until: Nanos::MIN,
-            },
+            // Legacy boards have no such configuration.
+            configure: Configure::new(spec, (!is_legacy).then_some(setting), icub::PATIENCE),
             acquisition: Acquisition::NONE,
             sequence: None,
             not_calibrated: false,
             // A BNO055 board sends the accelerometer first; the order of an mtb is not documented.
-            legacy: Pairing::new(together, plan.legacy == Legacy::Bno055),
-            together,
+            legacy: Pairing::new(Limit::of_period(period), plan.legacy == Legacy::Bno055),
+            together: Nanos(period.0 / 2),
             gap: false,
             seen: false,
             plan,
@@ -330,8 +236,7 @@ impl ImuDevice {
             return;
         }
         let begun = (self.acquisition.acquired, self.acquisition.stamp);
-        if !self.acquisition.open
-            || !icub::pairing::within(begun, (frame.t, frame.stamp), self.together)
+        if !self.acquisition.open || !pairing::within(begun, (frame.t, frame.stamp), self.together)
         {
             out.fault(Counter::Unpaired, 1, frame.id);
             self.gap = true;
@@ -421,10 +326,6 @@ fn vector(data: &[u8], at: usize) -> [i16; 3] {
 }
 
 impl Device for ImuDevice {
-    fn kind(&self) -> Kind {
-        Kind::Imu
-    }
-
     fn claims(&self) -> &[Claim] {
         &self.claims
     }
@@ -458,7 +359,7 @@ impl Device for ImuDevice {
         {
             match data.first() {
                 Some(&command::IMU_CONFIG_GET) => {
-                    self.configure.answer(data, self.bringup.mode(), frame, out);
+                    self.configure.answer(data, frame, out);
                 }
                 // Answers to other questions are for other devices.
                 Some(_) => {}
@@ -474,6 +375,10 @@ impl Device for ImuDevice {
             self.reset();
         }
         transmit
+    }
+
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        self.bringup.on_sent(frame, outcome, &mut self.configure);
     }
 
     fn next_wake(&self) -> Option<Nanos> {

@@ -25,8 +25,6 @@ pub struct Options {
     pub legacy_mask: Option<u8>,
     /// Silence kept after power-on \[ms\]; default 0.
     pub power_on_silence_ms: u32,
-    /// Another program commands this board; default false.
-    pub listen: bool,
 }
 
 impl Default for Options {
@@ -39,7 +37,6 @@ impl Default for Options {
             legacy: Legacy::None,
             legacy_mask: None,
             power_on_silence_ms: 0,
-            listen: false,
         }
     }
 }
@@ -63,7 +60,6 @@ pub(super) struct Plan {
 impl Plan {
     pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
-        icub::no_joints(spec)?;
         let period_ms = icub::period_ms("period_ms", options.period_ms)?;
         let want = options
             .quantities

@@ -4,7 +4,7 @@
 use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind, saturation_bytes};
 use super::options::{Options, Stream};
 use crate::icub::{self, class, command};
-use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
+use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
 use proprio_topics::{Nanos, Quality, Reading, Saturation, Temperature};
 
 /// Default full scales: the iCub's usual sensor \[N, Nm\]. A simulated board reports them on
@@ -19,7 +19,8 @@ const USUAL_FULL_SCALE: [f64; 6] = [1804.0, 1804.0, 1804.0, 31.0, 31.0, 31.0];
 pub struct StrainBoard {
     address: u8,
     full_scale: [f64; 6],
-    /// Whether the host knows the scale: from the same configuration, or from the board's answer.
+    /// Whether the host knows the scale: from the same configuration, or from the board's answer
+    /// (to the program that has started it, too).
     scale_known: bool,
     period: Nanos,
     /// The stream selected by the host; `None` while it is silent.
@@ -29,23 +30,22 @@ pub struct StrainBoard {
 }
 
 impl StrainBoard {
-    /// A board after power-on. With `listen` another program has already started it.
+    /// A board after power-on; in [`Mode::Listen`] another program has already started it.
     ///
     /// # Errors
     /// As [`Strain::new`](super::Strain::new), but a full scale of zero is legal: a board with a
     /// corrupt memory.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
-        icub::no_joints(spec)?;
         let configured = options.full_scale(true)?;
         let period =
             Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));
         Ok(Self {
             address,
             full_scale: configured.unwrap_or(USUAL_FULL_SCALE),
-            scale_known: configured.is_some(),
+            scale_known: configured.is_some() || spec.mode == Mode::Listen,
             period,
-            stream: options.listen.then_some(options.stream),
+            stream: (spec.mode == Mode::Listen).then_some(options.stream),
             last_good: None,
         })
     }

@@ -3,13 +3,15 @@
 
 use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind};
 use super::options::{Options, Stream};
-use crate::icub::bringup::{Ask, Bringup, Inquiry};
-use crate::icub::pairing::{Paired, Pairing};
+use crate::bringup::{Ask, Attempts, Bringup, Inquiry};
 use crate::icub::{self, class, command};
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, State, Transmit};
+use crate::pairing::{Limit, Paired, Pairing};
+use crate::{
+    Claim, Decoded, Device, Frame, Mode, NotSent, Output, Spec, SpecError, State, Transmit,
+};
 use arrayvec::ArrayVec;
 use proprio_topics::{
-    Counter, Gauges, Kind, Nanos, Quality, Reading, Refusal, StampKind, Temperature, Wrench,
+    Counter, Gauges, Nanos, Quality, Reading, Refusal, StampKind, Temperature, Wrench,
 };
 
 /// The full scales: configured, requested axis by axis, or from replies to another program.
@@ -24,12 +26,11 @@ struct FullScales {
     address: u8,
     /// The axis of the current question; 6: all answered.
     axis: u8,
-    attempts: u8,
-    /// Earliest time of the next question.
-    ask_at: Nanos,
-    /// Questions per axis whose answers may still arrive, until `counts_until`.
+    attempts: Attempts,
+    /// The axis of the last question.
+    asked: u8,
+    /// Questions per axis whose answers may still arrive.
     open: [u8; 6],
-    counts_until: Nanos,
 }
 
 impl FullScales {
@@ -41,10 +42,9 @@ impl FullScales {
             refusal: None,
             address,
             axis: 0,
-            attempts: 0,
-            ask_at: Nanos::MIN,
+            attempts: Attempts::new(icub::PATIENCE),
+            asked: 0,
             open: [0; 6],
-            counts_until: Nanos::MIN,
         }
     }
 
@@ -70,7 +70,7 @@ impl FullScales {
             out.fault(Counter::Changed, 1, frame.id);
         }
         if mode == Mode::Supervise {
-            if *open == 0 || frame.t > self.counts_until {
+            if *open == 0 || !self.attempts.counts(frame.t) {
                 return out.fault(Counter::Unexpected, 1, frame.id);
             }
             *open -= 1;
@@ -86,15 +86,13 @@ impl FullScales {
         if value == 0 {
             self.refusal = Some(Refusal::ZeroFullScale { channel });
             // Ask again slowly: the board may be repaired meanwhile.
-            self.attempts = icub::bringup::ATTEMPTS;
-            self.ask_at = frame.t + icub::bringup::SLOW_ATTEMPT;
+            self.attempts.slow_down(frame.t);
             return;
         }
         *told = Some(value);
         if channel == self.axis {
             self.axis += 1;
-            self.attempts = 0;
-            self.ask_at = Nanos::MIN;
+            self.attempts.begin();
         }
         match self.refusal {
             Some(Refusal::ZeroFullScale { channel: refused }) if refused != channel => {}
@@ -110,41 +108,47 @@ impl FullScales {
 impl Inquiry for FullScales {
     fn begin(&mut self) {
         self.axis = 0;
-        self.attempts = 0;
-        self.ask_at = Nanos::MIN;
+        self.attempts.begin();
     }
 
     fn poll(&mut self, now: Nanos) -> Ask {
         if self.settled || self.axis > 5 {
             return Ask::Done;
         }
-        if self.refusal == Some(Refusal::Changed) || now < self.ask_at {
+        if self.refusal == Some(Refusal::Changed) || now < self.attempts.next() {
             return Ask::Wait;
         }
-        if self.attempts < icub::bringup::ATTEMPTS {
-            self.attempts += 1;
-            self.ask_at = now + icub::bringup::ANSWER_TIMEOUT;
-        } else {
-            if self.per_step.is_none() && self.refusal.is_none() {
-                self.refusal = Some(Refusal::NoFullScale);
-            }
-            self.ask_at = now + icub::bringup::SLOW_ATTEMPT;
+        if self.attempts.exhausted() && self.per_step.is_none() && self.refusal.is_none() {
+            self.refusal = Some(Refusal::NoFullScale);
         }
-        if now > self.counts_until {
+        if !self.attempts.counts(now) {
             self.open = [0; 6];
         }
+        self.attempts.ask(now);
         if let Some(open) = self.open.get_mut(usize::from(self.axis)) {
             *open = open.saturating_add(1);
         }
-        self.counts_until = now + icub::bringup::ANSWER_COUNTS;
+        self.asked = self.axis;
         Ask::Send(Frame::new(
             icub::to_board(class::POLLING_ANALOG, self.address),
             &[command::GET_FULL_SCALES, self.axis],
         ))
     }
 
+    fn sent(&mut self, outcome: Result<Nanos, NotSent>) {
+        // If the answer is here already, the next question is another one.
+        if self.asked == self.axis {
+            self.attempts.sent(outcome);
+        }
+        if outcome.is_err()
+            && let Some(open) = self.open.get_mut(usize::from(self.asked))
+        {
+            *open = open.saturating_sub(1);
+        }
+    }
+
     fn wake(&self) -> Option<Nanos> {
-        (self.refusal != Some(Refusal::Changed)).then_some(self.ask_at)
+        (self.refusal != Some(Refusal::Changed)).then_some(self.attempts.next())
     }
 
     fn refusal(&self) -> Option<Refusal> {
@@ -170,9 +174,9 @@ struct Pair {
 }
 
 impl Pair {
-    const fn new(timeout: Nanos) -> Self {
+    const fn new(limit: Limit) -> Self {
         Self {
-            pairing: Pairing::new(timeout, true),
+            pairing: Pairing::new(limit, true),
             gap: false,
         }
     }
@@ -239,18 +243,17 @@ impl Strain {
     /// A device in its initial state.
     ///
     /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, joints, a period or time out of range, a full
+    /// [`SpecError`]: an address outside 1 to 14, a period or time out of range, a full
     /// scale that is not positive or incomplete.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
-        icub::no_joints(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
         let configured = options.full_scale(false)?;
-        let silence = icub::power_on_silence(options.power_on_silence_ms)?;
-        let timeout = match options.pair_timeout_ms {
-            None => Nanos::from_micros(i64::from(period) * 500),
+        let patience = icub::patience(options.power_on_silence_ms)?;
+        let limit = match options.pair_timeout_ms {
+            None => Limit::of_period(Nanos::from_millis(i64::from(period))),
             Some(ms) if ms.is_finite() && ms > 0.0 && ms <= 1000.0 => {
-                Nanos::from_seconds(ms * 1e-3)
+                Limit::fixed(Nanos::from_seconds(ms * 1e-3))
             }
             Some(value) => {
                 return Err(SpecError::Key {
@@ -260,11 +263,6 @@ impl Strain {
                 });
             }
         };
-        let mode = if options.listen {
-            Mode::Listen
-        } else {
-            spec.mode
-        };
         let (force, command_id) = (
             icub::stream(class::PERIODIC_ANALOG, address, kind::FORCE),
             icub::to_board(class::POLLING_ANALOG, address),
@@ -273,7 +271,7 @@ impl Strain {
             Stream::Uncalibrated => icub::stream(class::PERIODIC_ANALOG, address, kind::RAW_FORCE),
             Stream::Calibrated | Stream::Both => force,
         };
-        let mut bringup = Bringup::new(spec, mode, silence, watched);
+        let mut bringup = Bringup::new(spec, spec.mode, patience, watched);
         bringup.start_with(command_id, &[command::SET_CANDATARATE, period]);
         if let Some(seconds) = options.temperature_period_s {
             let seconds = icub::period_ms("temperature_period_s", seconds)?;
@@ -301,8 +299,8 @@ impl Strain {
             claims,
             bringup,
             scales: FullScales::new(address, configured, options.stream),
-            calibrated: Pair::new(timeout),
-            raw: Pair::new(timeout),
+            calibrated: Pair::new(limit),
+            raw: Pair::new(limit),
             seen: false,
         })
     }
@@ -378,10 +376,6 @@ impl Strain {
 }
 
 impl Device for Strain {
-    fn kind(&self) -> Kind {
-        Kind::Wrench
-    }
-
     fn claims(&self) -> &[Claim] {
         &self.claims
     }
@@ -418,6 +412,10 @@ impl Device for Strain {
 
     fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
         self.bringup.poll(now, &mut self.scales, out)
+    }
+
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        self.bringup.on_sent(frame, outcome, &mut self.scales);
     }
 
     fn next_wake(&self) -> Option<Nanos> {

@@ -63,12 +63,10 @@ pub struct Options {
     pub stream: Stream,
     /// Period of the temperature \[s\], 1 to 255; default none.
     pub temperature_period_s: Option<u32>,
-    /// Longest time from a force frame to its torque frame \[ms\]; default half a period.
+    /// Longest time from a force frame to its torque frame \[ms\]; default by the period.
     pub pair_timeout_ms: Option<f64>,
     /// Silence kept after power-on \[ms\]; default 0.
     pub power_on_silence_ms: u32,
-    /// Another program commands this board; default false.
-    pub listen: bool,
 }
 
 impl Default for Options {
@@ -81,7 +79,6 @@ impl Default for Options {
             temperature_period_s: None,
             pair_timeout_ms: None,
             power_on_silence_ms: 0,
-            listen: false,
         }
     }
 }

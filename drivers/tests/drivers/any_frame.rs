@@ -2,12 +2,12 @@
 //! number in a wrench.
 
 use crate::rig::{options, spec};
-use proprio_drivers::{Board, Decoded, Device, Format, Frame, Frames, Id, Mode};
+use proprio_drivers::{Board, Decoded, Device, Format, Frame, Frames, Id, Mode, NotSent};
 use proprio_topics::{Nanos, Quality, Reading, StampKind};
 use proptest::prelude::*;
 
 /// Every family in all its configurations.
-const SETUPS: [(&str, &str, &[u8]); 9] = [
+const SETUPS: [(&str, &str, &[u8]); 10] = [
     ("icub_strain", "", &[]),
     (
         "icub_strain",
@@ -30,6 +30,7 @@ const SETUPS: [(&str, &str, &[u8]); 9] = [
     ("icub_imu", r#"legacy = "bno055""#, &[]),
     ("icub_motor", "", &[0]),
     ("icub_pos", "", &[0, 1, 2, 15]),
+    ("icub_pos", "sensors = [{ label = 2 }]", &[2, 3]),
 ];
 
 /// About 18 years: clocks may jump, but not to the limits of `i64` nanoseconds.
@@ -49,7 +50,9 @@ enum Event {
     Pass {
         ns: i64,
     },
-    Poll,
+    Poll {
+        sent: bool,
+    },
     Restart,
     Stop,
 }
@@ -72,6 +75,7 @@ fn event() -> impl Strategy<Value = Event> {
         Just(0x07),
         Just(0x34),
         Just(0x35),
+        Just(0x51),
         Just(0x53)
     ]);
     let any_id = proptest::option::weighted(0.1, any::<u32>());
@@ -84,7 +88,7 @@ fn event() -> impl Strategy<Value = Event> {
             0_i64..1_000_000, 0_i64..100_000_000, -5_000_000_i64..2_000_000_000, -YEARS..YEARS
         ]
             .prop_map(|ns| Event::Pass { ns }),
-        10 => Just(Event::Poll),
+        10 => any::<bool>().prop_map(|sent| Event::Poll { sent }),
         1 => Just(Event::Restart),
         1 => Just(Event::Stop),
     ]
@@ -161,13 +165,19 @@ fn drive(device: &mut dyn Device, board: &mut dyn Board, events: &[Event], liste
                 }
             }
             Event::Pass { ns } => now = Nanos((now.0 + ns).clamp(-YEARS, YEARS)),
-            Event::Poll => {
+            Event::Poll { sent } => {
                 for turn in 0.. {
                     assert!(turn < 32, "it never stops sending");
                     let Some(transmit) = device.poll_transmit(now, &mut out) else {
                         break;
                     };
                     assert!(!listens, "a listener sends {transmit:?}");
+                    let outcome = if *sent {
+                        Ok(now)
+                    } else {
+                        Err(NotSent::Refused)
+                    };
+                    device.on_sent(&transmit.frame, outcome);
                     let mut answers = Frames::new();
                     board.on_frame(&transmit.frame, &mut answers);
                 }

@@ -2,7 +2,7 @@
 //! stop.
 
 use crate::rig::{Rig, decode, frame, listener, options, spec};
-use proprio_drivers::{Mode, Options, SpecError, State};
+use proprio_drivers::{Decoded, Mode, NotSent, Options, SpecError, State};
 use proprio_topics::{Counter, Imu, JointState, Nanos, Quality, Reading, Refusal, Wrench};
 
 const SCALES: &str = "full_scale_n = [1804, 1804, 1804]\nfull_scale_nm = [31, 31, 31]\n";
@@ -145,6 +145,130 @@ fn a_board_that_is_off_is_refused_and_comes_up_when_it_gets_power() {
     assert_eq!(rig.device.state(), State::Streaming);
 }
 
+/// The host's bus can not send for 2 s: 6 times as long as 15 attempts take.
+#[test]
+fn a_question_that_was_never_sent_is_no_attempt() {
+    let mut rig = strain();
+    rig.interface = Box::new(|_| Some(NotSent::Refused));
+    rig.run(2000);
+    assert_eq!(rig.states, [State::Asking]);
+    // Tried again every 20 ms, not in an endless loop.
+    let times: Vec<_> = rig.unsent.iter().map(|(t, _)| *t).collect();
+    assert!(
+        times
+            .windows(2)
+            .all(|pair| pair[1] - pair[0] == Nanos::from_millis(20))
+    );
+    rig.interface = Box::new(|_| None);
+    rig.run(100);
+    assert_eq!(rig.device.state(), State::Streaming);
+    assert_eq!(rig.sent.len(), 8, "{:?}", rig.sent);
+    assert_eq!(rig.count(Counter::Unexpected), 0);
+    // What was never asked has no answer.
+    let mut rig = strain();
+    rig.interface = Box::new(|_| Some(NotSent::Deadline));
+    rig.run(100);
+    let now = rig.now.seconds() * 1e3;
+    let (_, faults) = decode(&mut *rig.device, &[frame("210#1800070C", now)]);
+    assert_eq!(faults[0].counter, Counter::Unexpected);
+}
+
+#[test]
+fn a_start_command_that_was_not_sent_is_repeated() {
+    for (driver, keys, command, fails) in [
+        ("icub_strain", SCALES, "201#080A", NotSent::Refused),
+        ("icub_strain", SCALES, "201#0700", NotSent::Deadline),
+        ("icub_imu", "", "201#350A", NotSent::LinkLost),
+        ("icub_imu", "", "201#3405000100000000", NotSent::Refused),
+        ("icub_imu", "", "201#33", NotSent::Refused),
+    ] {
+        let reading = if driver == "icub_imu" {
+            imu()
+        } else {
+            wrench()
+        };
+        let mut rig = Rig::new(driver, keys, &[], reading);
+        let mut count = 0;
+        rig.interface = Box::new(move |frame| {
+            count += u32::from(frame.to_string() == command);
+            (frame.to_string() == command && count <= 3).then_some(fails)
+        });
+        rig.run(120);
+        let unsent: Vec<&str> = rig.unsent.iter().map(|(_, text)| text.as_str()).collect();
+        assert_eq!(unsent, [command; 3]);
+        // As if it had been sent at once: every command once, in the same order.
+        let sent = std::mem::take(&mut rig.sent);
+        let mut usual = Rig::new(driver, keys, &[], reading);
+        usual.run(50);
+        assert_eq!(sent, usual.sent, "{command}");
+        assert_eq!(
+            (rig.device.state(), rig.count(Counter::Starts)),
+            (State::Streaming, 1)
+        );
+    }
+}
+
+/// The outcome is late: until it is known nothing else is sent. After a restart the device does not
+/// wait for it.
+#[test]
+fn one_frame_is_under_way_at_a_time() {
+    let device = || {
+        options("icub_strain", SCALES)
+            .device(&spec(1, Mode::Supervise, &[]))
+            .unwrap()
+    };
+    let mut out = Decoded::new();
+    let (mut one, now) = (device(), Nanos::from_millis(1000));
+    let first = one.poll_transmit(now, &mut out).unwrap();
+    assert_eq!(first.frame.to_string(), "201#080A");
+    let later = now + Nanos::from_millis(500);
+    assert_eq!(one.poll_transmit(later, &mut out), None);
+    assert_eq!(one.next_wake(), None);
+    // Another frame's outcome is not this one's.
+    one.on_sent(&frame("201#0700", 0.0), Ok(later));
+    assert_eq!(one.poll_transmit(later, &mut out), None);
+    one.on_sent(&first.frame, Ok(later));
+    assert!(one.next_wake().unwrap() <= later);
+    let second = one.poll_transmit(later, &mut out).unwrap();
+    assert_eq!(second.frame.to_string(), "201#0700");
+    one.restart(later);
+    assert_eq!(
+        one.poll_transmit(later, &mut out).unwrap().frame,
+        first.frame
+    );
+    // A stop waits for the outcome, and is not repeated.
+    one.stop(later);
+    assert_eq!(one.poll_transmit(later, &mut out), None);
+    one.on_sent(&first.frame, Err(NotSent::Deadline));
+    let stop = one.poll_transmit(later, &mut out).unwrap().frame;
+    assert_eq!(
+        (stop.to_string().as_str(), one.state()),
+        ("201#0701", State::Starting)
+    );
+    one.on_sent(&stop, Err(NotSent::LinkLost));
+    assert_eq!(one.poll_transmit(later, &mut out), None);
+    assert_eq!(one.state(), State::Stopped);
+}
+
+/// The time-out of an answer begins when the question is sent.
+#[test]
+fn a_question_that_waited_for_the_bus_is_not_repeated_early() {
+    let mut device = options("icub_strain", "")
+        .device(&spec(1, Mode::Supervise, &[]))
+        .unwrap();
+    let (mut out, now) = (Decoded::new(), Nanos::from_millis(1000));
+    let question = device.poll_transmit(now, &mut out).unwrap().frame;
+    let sent = now + Nanos::from_millis(19);
+    device.on_sent(&question, Ok(sent));
+    let next = device.next_wake().unwrap();
+    assert_eq!(next - sent, Nanos::from_millis(20));
+    assert_eq!(device.poll_transmit(next - Nanos(1), &mut out), None);
+    assert_eq!(
+        device.poll_transmit(next, &mut out).unwrap().frame,
+        question
+    );
+}
+
 #[test]
 fn silence_is_kept_after_power_on() {
     let mut rig = Rig::new("icub_strain", "power_on_silence_ms = 6000", &[], wrench());
@@ -155,13 +279,7 @@ fn silence_is_kept_after_power_on() {
     assert_eq!(rig.device.state(), State::Streaming);
     // A board that streams already has left its bootloader, so the host need not wait.
     let keys = format!("{SCALES}power_on_silence_ms = 6000");
-    let mut rig = Rig::with_board(
-        "icub_strain",
-        &keys,
-        &format!("{SCALES}listen = true"),
-        &[],
-        wrench(),
-    );
+    let mut rig = Rig::started("icub_strain", &keys, Mode::Supervise, wrench());
     rig.run(30);
     assert_eq!(rig.device.state(), State::Streaming);
     assert_eq!(rig.sent.len(), 2);
@@ -323,12 +441,7 @@ fn a_listener_learns_the_scale_from_the_log() {
 
 #[test]
 fn a_listener_watches_for_silence() {
-    let mut rig = Rig::new(
-        "icub_strain",
-        &format!("{SCALES}listen = true"),
-        &[],
-        wrench(),
-    );
+    let mut rig = Rig::started("icub_strain", SCALES, Mode::Listen, wrench());
     rig.run(100);
     assert_eq!(rig.device.state(), State::Streaming);
     let woken = rig.device.next_wake().unwrap();
@@ -473,7 +586,8 @@ fn a_pos_board_is_configured_and_started() {
     let mut rig = Rig::new("icub_pos", keys, &[2], joint);
     rig.run(50);
     // F2: enabled, inverted, -90 deg, label 2; zero 0x0100. 83: enabled, label 3.
-    assert_eq!(rig.sent, ["201#5200F20001830000", "201#5305"]);
+    assert_eq!(rig.sent, ["201#5200F20001830000", "201#5100", "201#5305"]);
+    assert!(rig.readings.iter().all(|r| r.quality == Quality::GOOD));
     assert_eq!(
         (rig.device.state(), rig.readings.len()),
         (State::Streaming, 10)
@@ -484,6 +598,92 @@ fn a_pos_board_is_configured_and_started() {
         (rig.sent.last().unwrap().as_str(), rig.board.period()),
         ("201#5300", None)
     );
+}
+
+const POS: &str = "sensors = [{ label = 2, zero_deg = 25.6 }]";
+
+fn pos() -> (u8, Reading) {
+    let state = JointState {
+        position: 0.5,
+        ..JointState::ABSENT
+    };
+    (2, Reading::Joint(state))
+}
+
+/// The board misses the configuration several times; it streams meanwhile, with its old one.
+#[test]
+fn an_angle_is_good_only_when_the_board_has_confirmed_its_configuration() {
+    let mut rig = Rig::new("icub_pos", POS, &[2], pos());
+    rig.board = options("icub_pos", POS)
+        .board(&spec(1, Mode::Listen, &[2]))
+        .unwrap();
+    let mut sets = 0;
+    rig.host_loses = Box::new(move |_, frame| {
+        sets += u32::from(frame.data().first() == Some(&0x52));
+        // Neither the first configurations nor any question arrive: 3 x 20 ms without an answer.
+        sets <= 3
+    });
+    rig.run(200);
+    let good: Vec<bool> = rig
+        .readings
+        .iter()
+        .map(|reading| reading.quality == Quality::GOOD)
+        .collect();
+    let first = good.iter().position(|good| *good).unwrap();
+    assert!((5..8).contains(&first), "{good:?}");
+    for reading in &rig.readings[..first] {
+        assert_eq!(reading.quality, Quality::NOT_CALIBRATED);
+    }
+    assert!(good[first..].iter().all(|good| *good));
+    assert_eq!(rig.count(Counter::Changed), 0);
+    assert_eq!(rig.sent.last().unwrap(), "201#530A");
+    // A board that was reset has lost its configuration: it counts again only when confirmed.
+    rig.board = options("icub_pos", POS)
+        .board(&spec(1, Mode::Listen, &[2]))
+        .unwrap();
+    rig.device.restart(rig.now);
+    let before = rig.readings.len();
+    rig.board_loses = Box::new(|_, frame| frame.data().first() == Some(&0x51));
+    rig.run(600);
+    let after = &rig.readings[before..];
+    assert!(after.len() > 10 && rig.device.state() == State::Streaming);
+    assert!(
+        after
+            .iter()
+            .all(|reading| reading.quality.contains(Quality::NOT_CALIBRATED))
+    );
+    assert_eq!(rig.count(Counter::Changed), 0);
+}
+
+#[test]
+fn a_pos_board_that_never_agrees_is_counted_and_its_angles_stay_doubtful() {
+    let mut rig = Rig::new("icub_pos", POS, &[2], pos());
+    rig.host_loses = Box::new(|_, frame| frame.data().first() == Some(&0x52));
+    rig.run(500);
+    assert_eq!(
+        (rig.device.state(), rig.count(Counter::Changed)),
+        (State::Streaming, 1)
+    );
+    assert!(rig.readings.len() > 10);
+    assert!(
+        rig.readings
+            .iter()
+            .all(|reading| reading.quality == Quality::NOT_CALIBRATED)
+    );
+    // Before anything was sent.
+    let mut device = options("icub_pos", POS)
+        .device(&spec(1, Mode::Supervise, &[2]))
+        .unwrap();
+    let (readings, _) = decode(&mut *device, &[frame("311#0021840300000000", 0.0)]);
+    assert_eq!(readings[0].quality, Quality::NOT_CALIBRATED);
+    // Without `sensors`, and where another program commands the board, there is nothing to confirm.
+    let mut rig = Rig::new("icub_pos", "", &[2], pos());
+    rig.run(100);
+    assert_eq!(rig.sent, ["201#530A"]);
+    assert_eq!(rig.readings[0].quality, Quality::GOOD);
+    let mut device = listener("icub_pos", POS, &[2]);
+    let (readings, _) = decode(&mut *device, &[frame("311#0021840300000000", 0.0)]);
+    assert_eq!(readings[0].quality, Quality::GOOD);
 }
 
 #[test]
@@ -545,7 +745,7 @@ fn configurations_that_can_not_work_are_named() {
         "b is missing: it is needed together with a"
     );
     // Unknown keys are errors.
-    for driver in proprio_drivers::DRIVERS {
+    for &driver in proprio_drivers::DRIVERS {
         let table: toml::Table = "full_scale = 3".parse().unwrap();
         assert!(Options::deserialize(driver, table).is_err(), "{driver}");
     }

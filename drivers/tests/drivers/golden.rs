@@ -189,6 +189,9 @@ fn boards_say_who_they_are() {
         "meant for another"
     );
     let mut motor = board("icub_motor", "", &[0]);
+    let mut pos = board("icub_pos", "", &[2]);
+    assert!(answers(&mut *pos, "201#5200F20001830000").is_empty());
+    assert_eq!(answers(&mut *pos, "201#5100"), ["210#5100F20001830000"]);
     assert_eq!(answers(&mut *motor, "001#5B0100"), ["010#5B08020008020000"]);
 }
 
@@ -248,6 +251,27 @@ fn an_imu_acquisition() {
             .all(|value| value.is_nan()),
         "absent is not zero"
     );
+}
+
+/// The quaternion has no SEQ: if one is lost, that of the next acquisition must not take its place.
+#[test]
+fn a_quaternion_belongs_to_an_acquisition_for_half_a_period() {
+    let keys = r#"quantities = ["acceleration", "orientation"]"#;
+    // The period is 10 ms.
+    for (ms, pairs) in [(0.2, true), (4.9, true), (5.1, false), (9.0, false)] {
+        let mut device = listener("icub_imu", keys, &[]);
+        let frames = [
+            frame("513#070000009CFFD503", 0.0),
+            frame("514#0040000000000000", ms),
+        ];
+        let (readings, faults) = decode(&mut *device, &frames);
+        assert_eq!(readings.len(), usize::from(pairs), "{ms} ms");
+        assert_eq!(
+            count(&faults, Counter::Unpaired),
+            u32::from(!pairs),
+            "{ms} ms"
+        );
+    }
 }
 
 #[test]
@@ -385,7 +409,7 @@ fn a_motor_board() {
 fn the_faults_of_a_motor_board_are_those_of_the_document() {
     // The document's worked value: bits 0, 7, 14 and 31.
     let mut device = listener("icub_motor", "", &[0]);
-    let (readings, _) = decode(
+    let (readings, faults) = decode(
         &mut *device,
         &[
             frame("113#0610007D81400080", 0.0),
@@ -395,7 +419,13 @@ fn the_faults_of_a_motor_board_are_those_of_the_document() {
     let Reading::Actuator(actuator) = readings[0].reading else {
         panic!("{readings:?}")
     };
-    let faults = fault::CAN_INVALID_PROTOCOL | fault::EXTERNAL | 1 << 14 | 1 << 31;
+    let counts = [Counter::DeviceFault, Counter::DriveFault].map(|c| count(&faults, c));
+    assert_eq!(
+        counts,
+        [0, 1],
+        "the emergency button does not move the joint"
+    );
+    let faults = fault::CAN_INVALID_PROTOCOL | fault::EXTERNAL | fault::SETPOINT_EXPIRED | 1 << 31;
     let encoder = encoder::NOT_CALIBRATED;
     assert_eq!(
         actuator,
@@ -408,14 +438,19 @@ fn the_faults_of_a_motor_board_are_those_of_the_document() {
     );
     assert_eq!(
         readings[1].quality,
-        Quality::DEVICE_FAULT | Quality::NOT_CALIBRATED
+        Quality::DRIVE_FAULT | Quality::NOT_CALIBRATED
     );
-    // Bus faults do not make a position doubtful; other faults do; finally all is well.
+    // Bus faults are neutral, an encoder's make a position doubtful, a drive's do not; finally all
+    // is well.
     for (status, quality) in [
         ("113#0600000000BC00F8", Quality::GOOD),
-        ("113#0600000010000000", Quality::DEVICE_FAULT),
+        ("113#0600000010000000", Quality::DRIVE_FAULT),
         ("113#0602000000000000", Quality::DEVICE_FAULT),
-        ("113#A000000000000000", Quality::DEVICE_FAULT),
+        ("113#A000000000000000", Quality::DRIVE_FAULT),
+        (
+            "113#A001000000000000",
+            Quality::DRIVE_FAULT | Quality::DEVICE_FAULT,
+        ),
         ("113#B000000000000000", Quality::NOT_CALIBRATED),
         ("113#0600000000000000", Quality::GOOD),
     ] {
@@ -424,6 +459,23 @@ fn the_faults_of_a_motor_board_are_those_of_the_document() {
             &[frame(status, 1.0), frame("110#0000000000000000", 1.1)],
         );
         assert_eq!(readings[1].quality, quality, "{status}");
+    }
+    // Bit by bit, after the names in the document.
+    for bit in 0..32_u32 {
+        let [a, b, c, d] = (1_u32 << bit).to_le_bytes();
+        let status = frame(&format!("113#06000000{a:02X}{b:02X}{c:02X}{d:02X}"), 2.0);
+        let (readings, faults) =
+            decode(&mut *device, &[status, frame("110#0000000000000000", 2.1)]);
+        let (quality, counts) = match bit {
+            1..=3 | 17..=19 => (Quality::DEVICE_FAULT, [1, 0]),
+            10..=13 | 15 | 27..=31 => (Quality::GOOD, [0, 0]),
+            _ => (Quality::DRIVE_FAULT, [0, 1]),
+        };
+        assert_eq!(readings[1].quality, quality, "bit {bit}");
+        assert_eq!(
+            [Counter::DeviceFault, Counter::DriveFault].map(|c| count(&faults, c)),
+            counts
+        );
     }
 }
 

@@ -2,7 +2,8 @@
 //! frames.
 
 use proprio_drivers::{
-    Board, Decoded, Device, Fault, Frame, Frames, Id, Mode, Options, Output, Outputs, Spec, State,
+    Board, Decoded, Device, Fault, Frame, Frames, Id, Mode, NotSent, Options, Output, Outputs,
+    Spec, State,
 };
 use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind};
 
@@ -91,6 +92,9 @@ pub(crate) fn encode(
 /// Whether this frame, the n-th of one side, is lost.
 type Loss = Box<dyn FnMut(usize, &Frame) -> bool>;
 
+/// Why the host's interface does not send this frame, if it does not.
+type Outage = Box<dyn FnMut(&Frame) -> Option<NotSent>>;
+
 /// One device and one board on a bus, with turns of 1 ms.
 pub(crate) struct Rig {
     pub(crate) device: Box<dyn Device>,
@@ -98,11 +102,15 @@ pub(crate) struct Rig {
     /// The board's measurement.
     pub(crate) reading: (u8, Reading),
     pub(crate) now: Nanos,
+    /// The host's interface.
+    pub(crate) interface: Outage,
+    /// What it did not send, and when.
+    pub(crate) unsent: Vec<(Nanos, String)>,
     /// Frames of the host that are lost.
     pub(crate) host_loses: Loss,
     /// Frames of the board that are lost.
     pub(crate) board_loses: Loss,
-    /// All frames that the host sent, lost or not.
+    /// All frames that the host's interface sent, lost or not.
     pub(crate) sent: Vec<String>,
     pub(crate) received: usize,
     pub(crate) readings: Vec<Output>,
@@ -116,6 +124,19 @@ impl Rig {
     /// A device and a board with the same keys.
     pub(crate) fn new(driver: &str, keys: &str, outputs: &[u8], reading: (u8, Reading)) -> Self {
         Self::with_board(driver, keys, keys, outputs, reading)
+    }
+
+    /// A board that another program has started, and a device in `mode`.
+    pub(crate) fn started(driver: &str, keys: &str, mode: Mode, reading: (u8, Reading)) -> Self {
+        let mut rig = Self::new(driver, keys, &[], reading);
+        let options = options(driver, keys);
+        rig.device = options
+            .device(&spec(1, mode, &[]))
+            .expect("a legal configuration");
+        rig.board = options
+            .board(&spec(1, Mode::Listen, &[]))
+            .expect("a legal configuration");
+        rig
     }
 
     /// A device and a board with different keys.
@@ -136,6 +157,8 @@ impl Rig {
                 .expect("a legal configuration"),
             reading,
             now: Nanos::from_millis(1000),
+            interface: Box::new(|_| None),
+            unsent: Vec::new(),
             host_loses: Box::new(|_, _| false),
             board_loses: Box::new(|_, _| false),
             sent: Vec::new(),
@@ -174,6 +197,14 @@ impl Rig {
             let mut out = Decoded::new();
             while let Some(transmit) = self.device.poll_transmit(self.now, &mut out) {
                 assert!(transmit.deadline > self.now, "a frame after its deadline");
+                let under_way = self.device.poll_transmit(self.now, &mut out);
+                assert_eq!(under_way, None, "the last frame is still under way");
+                let outcome = (self.interface)(&transmit.frame).map_or(Ok(self.now), Err);
+                self.device.on_sent(&transmit.frame, outcome);
+                if outcome.is_err() {
+                    self.unsent.push((self.now, transmit.frame.to_string()));
+                    continue;
+                }
                 self.sent.push(transmit.frame.to_string());
                 assert!(self.sent.len() < 10_000, "it never stops sending");
                 if (self.host_loses)(self.sent.len(), &transmit.frame) {

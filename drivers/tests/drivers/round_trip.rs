@@ -137,12 +137,13 @@ proptest! {
     #[test]
     fn motors(
         position in -2e5_f64..2e5, velocity in -3000.0_f64..3000.0,
-        current in -32.7_f64..32.7, bits in 0_u8..4,
+        current in -32.7_f64..32.7, bits in 0_u8..8,
     ) {
         let joint = JointState { position, velocity, current, ..JointState::ABSENT };
         let mut quality = Quality::GOOD;
         if bits & 1 != 0 { quality |= Quality::DEVICE_FAULT; }
         if bits & 2 != 0 { quality |= Quality::NOT_CALIBRATED; }
+        if bits & 4 != 0 { quality |= Quality::DRIVE_FAULT; }
         let reading = Reading::Joint(joint);
         let (back, back_quality) = through("icub_motor", "", &[0], 0, reading, quality);
         let Reading::Joint(back) = back else { panic!("{back:?}") };

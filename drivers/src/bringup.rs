@@ -1,7 +1,5 @@
-//! Asks, starts, watches, restarts and stops one board.
-//!
-//! `Bringup` is the part of a [`crate::Device`] that asks, starts, watches, restarts and stops a
-//! board:
+//! Asks, starts, watches, restarts and stops one board: the part of a [`crate::Device`] that any
+//! family with a bring-up shares.
 //!
 //! ```text
 //! Waiting --power_on_silence--> Asking --answers--> Starting --first reading--> Streaming
@@ -11,13 +9,16 @@
 //! ```
 //! (1) No reading: again, doubling the wait. (2) No reading for `max_silence`: counted once.
 //!
-//! After power-up these boards wait 5 s in their bootloader, and *any* frame on the bus makes them
-//! stay there. If boards are powered together with the host, set `power_on_silence_ms = 6000`: this
-//! host then stays silent that long at start and before each attempt to wake a silent board. It
-//! cannot keep other senders silent. A reading ends the wait at once, because a board that streams
-//! has left its bootloader.
+//! A family gives a [`Bringup`] its [`Patience`], its start and stop commands, and an [`Inquiry`]:
+//! the questions that a board must answer before it is started ([`NoInquiry`] if there are none).
+//! One frame is under way at a time. A question or a start command that was not sent is tried again
+//! after `Patience::answer_timeout`, and such a question is no attempt: a device does not count as
+//! silent because the host's own bus could not send. A stop command is sent once.
+//!
+//! Its device tells the bring-up of every reading ([`Bringup::reading`]) and passes on the calls of
+//! [`crate::Device`].
 
-use crate::{Decoded, Frame, Id, Mode, Spec, State, Transmit};
+use crate::{Decoded, Frame, Id, Mode, NotSent, Spec, State, Transmit};
 use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Nanos, Refusal};
 
@@ -25,8 +26,11 @@ use proprio_topics::{Counter, Nanos, Refusal};
 pub(crate) trait Inquiry {
     /// Starts again: the board may have been reset or replaced.
     fn begin(&mut self);
-    /// The next step at `now`.
+    /// The next step at `now`. A question counts as sent at `now` until [`Inquiry::sent`] says
+    /// otherwise, because its answer may come before that call.
     fn poll(&mut self, now: Nanos) -> Ask;
+    /// The last question was sent at this time, or not at all.
+    fn sent(&mut self, outcome: Result<Nanos, NotSent>);
     /// Time of the next poll.
     fn wake(&self) -> Option<Nanos>;
     /// Why the board cannot be used.
@@ -53,6 +57,7 @@ impl Inquiry for NoInquiry {
     fn poll(&mut self, _now: Nanos) -> Ask {
         Ask::Done
     }
+    fn sent(&mut self, _outcome: Result<Nanos, NotSent>) {}
     fn wake(&self) -> Option<Nanos> {
         None
     }
@@ -61,24 +66,115 @@ impl Inquiry for NoInquiry {
     }
 }
 
-/// Time to wait for an answer before the question is repeated. A board answers within a few ms;
-/// icub-main repeats after 20 ms.
-pub(crate) const ANSWER_TIMEOUT: Nanos = Nanos::from_millis(20);
-/// Number of attempts at that pace, as in icub-main; then the board counts as not answering.
-pub(crate) const ATTEMPTS: u8 = 15;
-/// Interval between attempts after that: a board that is powered later starts within this time, at
-/// the cost of one or two frames a second.
-pub(crate) const SLOW_ATTEMPT: Nanos = Nanos::from_millis(500);
-/// How long after a question its answer is accepted: slow boards answer the first attempt after the
-/// second was sent.
-pub(crate) const ANSWER_COUNTS: Nanos = Nanos::from_millis(1000);
-/// Time from start to first reading, in addition to the maximum silence: an IMU changes its fusion
-/// mode meanwhile. Doubled with each attempt up to [`START_PATIENCE_MOST`].
-const START_PATIENCE: Nanos = Nanos::from_millis(250);
-/// The longest time between two attempts to start.
-const START_PATIENCE_MOST: Nanos = Nanos::from_millis(500);
-/// A command that could not be sent for this long is dropped; the next attempt sends it again.
-const SEND_WITHIN: Nanos = Nanos::from_millis(100);
+/// How long the host waits for boards of a family.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Patience {
+    /// Silence kept after power-on and before each attempt to wake a silent board; 0: none.
+    pub(crate) power_on_silence: Nanos,
+    /// Time to wait for an answer before the question is repeated.
+    pub(crate) answer_timeout: Nanos,
+    /// Number of attempts at that pace; then the board counts as not answering.
+    pub(crate) attempts: u8,
+    /// Interval between attempts after that.
+    pub(crate) slow_attempt: Nanos,
+    /// How long after a question its answer is accepted: a slow board answers the first attempt
+    /// after the second was sent.
+    pub(crate) answer_counts: Nanos,
+    /// Time from start to first reading, in addition to the maximum silence; doubled with each
+    /// attempt up to `start_most`.
+    pub(crate) start: Nanos,
+    /// The longest time between two attempts to start.
+    pub(crate) start_most: Nanos,
+    /// A command that could not be sent for this long is given up and tried again.
+    pub(crate) send_within: Nanos,
+}
+
+/// The pace of one question: it is repeated after `Patience::answer_timeout`, and after
+/// `Patience::attempts` times every `Patience::slow_attempt`.
+#[derive(Debug)]
+pub(crate) struct Attempts {
+    patience: Patience,
+    /// How often it was sent, at most `Patience::attempts`.
+    count: u8,
+    /// Earliest time of the next attempt.
+    next: Nanos,
+    /// Time from the last attempt to the next.
+    pause: Nanos,
+    /// Answers may still arrive until then.
+    counts_until: Nanos,
+    /// `count` and `counts_until` before the last attempt.
+    before: (u8, Nanos),
+}
+
+impl Attempts {
+    pub(crate) const fn new(patience: Patience) -> Self {
+        Self {
+            patience,
+            count: 0,
+            next: Nanos::MIN,
+            pause: Nanos::ZERO,
+            counts_until: Nanos::MIN,
+            before: (0, Nanos::MIN),
+        }
+    }
+
+    /// A new question, to be asked at once. Answers to the last one may still arrive.
+    pub(crate) const fn begin(&mut self) {
+        self.count = 0;
+        self.next = Nanos::MIN;
+    }
+
+    /// The question is asked at `now`.
+    pub(crate) fn ask(&mut self, now: Nanos) {
+        self.before = (self.count, self.counts_until);
+        self.pause = if self.exhausted() {
+            self.patience.slow_attempt
+        } else {
+            self.count += 1;
+            self.patience.answer_timeout
+        };
+        self.asked(now);
+    }
+
+    fn asked(&mut self, t: Nanos) {
+        self.next = t + self.pause;
+        self.counts_until = t + self.patience.answer_counts;
+    }
+
+    /// The time of the last attempt; one that was not sent does not count.
+    pub(crate) fn sent(&mut self, outcome: Result<Nanos, NotSent>) {
+        match outcome {
+            Ok(t) => self.asked(t),
+            Err(_) => (self.count, self.counts_until) = self.before,
+        }
+    }
+
+    /// The answer at `t` cannot be used: asks slowly from now on.
+    pub(crate) fn slow_down(&mut self, t: Nanos) {
+        self.count = self.patience.attempts;
+        self.next = t + self.patience.slow_attempt;
+    }
+
+    /// The answer cannot be used: asks again at once.
+    pub(crate) const fn again(&mut self) {
+        self.next = Nanos::MIN;
+    }
+
+    /// Whether the board counts as not answering.
+    pub(crate) const fn exhausted(&self) -> bool {
+        self.count >= self.patience.attempts
+    }
+
+    /// Earliest time of the next attempt.
+    pub(crate) const fn next(&self) -> Nanos {
+        self.next
+    }
+
+    /// Whether an answer at `t` may belong to an attempt.
+    pub(crate) fn counts(&self, t: Nanos) -> bool {
+        t <= self.counts_until
+    }
+}
 
 /// The phase of the bring-up.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -99,18 +195,30 @@ enum Phase {
     Stopped,
 }
 
+/// A frame whose outcome is not known yet.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct UnderWay {
+    frame: Frame,
+    /// If it is not sent, nothing is tried again before this.
+    again: Nanos,
+}
+
 /// Asks, starts, watches, restarts and stops one board (state machine in the module documentation).
 #[derive(Debug)]
 pub(crate) struct Bringup {
     mode: Mode,
     max_silence: Nanos,
-    power_on_silence: Nanos,
+    patience: Patience,
     start: ArrayVec<Frame, 8>,
     stop: ArrayVec<Frame, 4>,
     /// The stream that is watched, for the faults.
     watched: Id,
     phase: Phase,
-    patience: Nanos,
+    under_way: Option<UnderWay>,
+    /// After a frame that was not sent: nothing is asked or started before this.
+    hold: Nanos,
+    /// Time to the first reading, in addition to the maximum silence, of the next attempt.
+    start_patience: Nanos,
     /// Time of the last reading; `None` while the board is silent.
     last: Option<Nanos>,
     silent: bool,
@@ -119,16 +227,18 @@ pub(crate) struct Bringup {
 }
 
 impl Bringup {
-    pub(crate) fn new(spec: &Spec, mode: Mode, power_on_silence: Nanos, watched: Id) -> Self {
+    pub(crate) fn new(spec: &Spec, mode: Mode, patience: Patience, watched: Id) -> Self {
         Self {
             mode,
             max_silence: spec.max_silence,
-            power_on_silence,
+            patience,
             start: ArrayVec::new(),
             stop: ArrayVec::new(),
             watched,
             phase: Phase::Fresh,
-            patience: START_PATIENCE,
+            under_way: None,
+            hold: Nanos::MIN,
+            start_patience: patience.start,
             last: None,
             silent: false,
             begun: false,
@@ -188,10 +298,28 @@ impl Bringup {
             self.silent = true;
             out.fault(Counter::Silences, 1, self.watched);
             if matches!(self.phase, Phase::Watching { .. }) {
-                self.patience = START_PATIENCE;
+                self.start_patience = self.patience.start;
                 self.phase = Phase::Fresh;
             }
         }
+        if self.under_way.is_some() {
+            return None;
+        }
+        let transmit = self.step(now, inquiry, out)?;
+        self.under_way = Some(UnderWay {
+            frame: transmit.frame,
+            again: now + self.patience.answer_timeout,
+        });
+        Some(transmit)
+    }
+
+    /// The next frame to send at `now`, if none is under way.
+    fn step(
+        &mut self,
+        now: Nanos,
+        inquiry: &mut impl Inquiry,
+        out: &mut Decoded,
+    ) -> Option<Transmit> {
         // Each turn returns or advances to a later phase, so the loop ends.
         loop {
             match self.phase {
@@ -199,8 +327,8 @@ impl Bringup {
                     self.phase = Phase::Watching { until: Nanos::MAX }
                 }
                 Phase::Fresh => {
-                    let until = if self.power_on_silence > Nanos::ZERO {
-                        now + self.power_on_silence
+                    let until = if self.patience.power_on_silence > Nanos::ZERO {
+                        now + self.patience.power_on_silence
                     } else {
                         Nanos::MIN
                     };
@@ -213,11 +341,12 @@ impl Bringup {
                     inquiry.begin();
                     self.phase = Phase::Asking;
                 }
+                Phase::Asking | Phase::Starting { .. } if now < self.hold => return None,
                 Phase::Asking => match inquiry.poll(now) {
                     Ask::Send(frame) => {
                         return Some(Transmit {
                             frame,
-                            deadline: now + ANSWER_TIMEOUT,
+                            deadline: now + self.patience.answer_timeout,
                         });
                     }
                     Ask::Wait => return None,
@@ -225,16 +354,18 @@ impl Bringup {
                 },
                 Phase::Starting { next } => {
                     if let Some(&frame) = self.start.get(next) {
-                        self.phase = Phase::Starting { next: next + 1 };
                         return Some(Transmit {
                             frame,
-                            deadline: now + SEND_WITHIN,
+                            deadline: now + self.patience.send_within,
                         });
                     }
                     self.phase = Phase::Watching {
-                        until: now + self.max_silence + self.patience,
+                        until: now + self.max_silence + self.start_patience,
                     };
-                    self.patience = START_PATIENCE_MOST.min(self.patience + self.patience);
+                    self.start_patience = self
+                        .patience
+                        .start_most
+                        .min(self.start_patience + self.start_patience);
                     return None;
                 }
                 Phase::Watching { until } if self.last.is_some() || now < until => return None,
@@ -242,10 +373,9 @@ impl Bringup {
                 Phase::Watching { .. } => self.phase = Phase::Fresh,
                 Phase::Stopping { next } => {
                     if let Some(&frame) = self.stop.get(next) {
-                        self.phase = Phase::Stopping { next: next + 1 };
                         return Some(Transmit {
                             frame,
-                            deadline: now + SEND_WITHIN,
+                            deadline: now + self.patience.send_within,
                         });
                     }
                     self.phase = Phase::Stopped;
@@ -255,12 +385,37 @@ impl Bringup {
         }
     }
 
+    /// Takes the outcome of a frame that [`Bringup::poll`] gave.
+    pub(crate) fn on_sent(
+        &mut self,
+        frame: &Frame,
+        outcome: Result<Nanos, NotSent>,
+        inquiry: &mut impl Inquiry,
+    ) {
+        // After a restart a late outcome may concern an earlier frame.
+        let Some(under_way) = self.under_way.take_if(|last| last.frame == *frame) else {
+            return;
+        };
+        if outcome.is_err() {
+            self.hold = under_way.again;
+        }
+        match &mut self.phase {
+            Phase::Asking => inquiry.sent(outcome),
+            Phase::Starting { next } => *next += usize::from(outcome.is_ok()),
+            Phase::Stopping { next } if self.stop.get(*next) == Some(frame) => *next += 1,
+            _ => {}
+        }
+    }
+
     pub(crate) fn next_wake(&self, inquiry: &impl Inquiry) -> Option<Nanos> {
         let silence = self.last.map(|last| last + self.max_silence + Nanos(1));
         let phase = match self.phase {
-            Phase::Fresh | Phase::Starting { .. } | Phase::Stopping { .. } => Some(Nanos::MIN),
+            // Its outcome is the next event.
+            _ if self.under_way.is_some() => None,
+            Phase::Fresh | Phase::Stopping { .. } => Some(Nanos::MIN),
+            Phase::Starting { .. } => Some(self.hold),
             Phase::Waiting { until } => Some(until),
-            Phase::Asking => inquiry.wake(),
+            Phase::Asking => inquiry.wake().map(|wake| wake.max(self.hold)),
             Phase::Watching { until } => {
                 (self.last.is_none() && until < Nanos::MAX).then_some(until)
             }
@@ -297,7 +452,7 @@ impl Bringup {
         let waiting = matches!(self.phase, Phase::Fresh | Phase::Waiting { .. });
         let quiet = self.mode == Mode::Listen
             || !self.begun
-            || (waiting && self.power_on_silence > Nanos::ZERO);
+            || (waiting && self.patience.power_on_silence > Nanos::ZERO);
         if self.active() {
             self.phase = if quiet {
                 Phase::Stopped
@@ -311,7 +466,9 @@ impl Bringup {
     pub(crate) fn restart(&mut self) {
         if self.active() {
             self.phase = Phase::Fresh;
-            self.patience = START_PATIENCE;
+            self.under_way = None;
+            self.hold = Nanos::MIN;
+            self.start_patience = self.patience.start;
             self.last = None;
             self.silent = false;
         }
