@@ -93,7 +93,7 @@ fn open(config: &DomainConfig) -> anyhow::Result<Domain> {
 
 /// The robots to show: the named one, or all.
 fn robots(domain: &Domain, name: Option<&str>) -> anyhow::Result<Vec<RobotPresence>> {
-    let all = domain.robots(monotonic());
+    let all = domain.robots();
     let Some(name) = name else { return Ok(all) };
     match all.iter().find(|robot| robot.name == name) {
         Some(robot) => Ok(vec![robot.clone()]),
@@ -552,7 +552,7 @@ pub(crate) fn record(args: &Record, config: &DomainConfig) -> anyhow::Result<()>
     };
     let file = File::create(&args.out).with_context(|| args.out.display().to_string())?;
     let mut table = Writer::new(BufWriter::new(file), &series, columns)?;
-    let mut order = InOrder::<(usize, Value)>::default();
+    let (mut order, mut inbox) = (InOrder::<(usize, Value)>::default(), Vec::new());
     let began = monotonic();
     let end = args
         .seconds
@@ -574,7 +574,12 @@ pub(crate) fn record(args: &Record, config: &DomainConfig) -> anyhow::Result<()>
                 table.push(Some(t), *at, value)
             })?;
         }
+        // Shared memory delivers all samples of one bus before those of the next.
         while let Some(sample) = samples.try_take()? {
+            inbox.push(sample);
+        }
+        inbox.sort_by_key(|sample| sample.header.acquired);
+        for sample in inbox.drain(..) {
             if sample.header.epoch != numbers.epoch {
                 // The gateway was restarted: the same channels may have other numbers.
                 while let Some(description) = descriptions.try_take()? {

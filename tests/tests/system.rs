@@ -15,7 +15,7 @@ fn a_running_system_says_what_it_does() {
         .on_virtual(["a", "b"])
         .write(&rig.path("robot"));
     let out = |arguments: &[&str]| {
-        let output = rig.run(arguments);
+        let output = rig.command(arguments).output().expect("it runs");
         let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
         (
             output.status.code(),

@@ -1,6 +1,7 @@
 //! Who is there: the domains of a machine, the robots of a domain, and whether a robot's gateway
 //! and estimator live.
 
+use super::clock::monotonic;
 use super::{Domain, DomainConfig, Reader, Topic};
 use crate::{EstimatorHealth, GatewayHealth, Nanos};
 use core::fmt;
@@ -9,6 +10,7 @@ use iceoryx2::service::Service;
 use std::collections::BTreeSet;
 use std::fs;
 use std::string::{String, ToString};
+use std::time::Duration;
 use std::vec::Vec;
 
 /// Whether a gateway or an estimator is there.
@@ -46,7 +48,7 @@ const SILENCE: Nanos = Nanos::from_millis(1000);
 #[derive(Debug)]
 pub(super) struct Watch<T: Topic, S: Service> {
     reader: Option<Reader<T, S>>,
-    /// When the last health arrived, by the clock of [`Watch::look`].
+    /// When the last health was published, and at first when this was opened.
     last: Nanos,
 }
 
@@ -62,8 +64,7 @@ impl<T: Topic, S: Service> Watch<T, S> {
     pub(super) fn look(&mut self, domain: &Domain<S>, robot: &str, now: Nanos) -> Presence {
         if self.reader.is_none() {
             self.reader = Reader::open_in(domain, robot).ok();
-            // Its history holds the last message, which may be old.
-            self.last = Nanos::MIN;
+            self.last = now;
         }
         let Some(reader) = &mut self.reader else {
             return Presence::NotStarted;
@@ -71,11 +72,9 @@ impl<T: Topic, S: Service> Watch<T, S> {
         if let Ok(Some(health)) = reader.latest() {
             self.last = health.header().published;
         }
-        if now.saturating_sub(self.last) <= SILENCE {
-            return Presence::Running;
-        }
         match reader.writer_process() {
             0 => Presence::Ended,
+            _ if now.saturating_sub(self.last) <= SILENCE => Presence::Running,
             process => Presence::Stuck { process },
         }
     }
@@ -93,17 +92,29 @@ pub struct RobotPresence {
 }
 
 impl Domain {
-    /// The robots of this domain at `now` (CLOCK_MONOTONIC), by name.
+    /// The robots of this domain, by name. Watches them for more than a second, to tell a process
+    /// that is stuck from one that runs.
     #[must_use]
-    pub fn robots(&self, now: Nanos) -> Vec<RobotPresence> {
-        self.robot_names()
+    pub fn robots(&self) -> Vec<RobotPresence> {
+        let mut watches: Vec<(String, Watch<GatewayHealth, _>, Watch<EstimatorHealth, _>)> = self
+            .robot_names()
             .into_iter()
-            .map(|name| RobotPresence {
-                gateway: Watch::<GatewayHealth, _>::new().look(self, &name, now),
-                estimator: Watch::<EstimatorHealth, _>::new().look(self, &name, now),
-                name,
-            })
-            .collect()
+            .map(|name| (name, Watch::new(), Watch::new()))
+            .collect();
+        let mut look = || -> Vec<RobotPresence> {
+            let robots = watches.iter_mut().map(|(name, gateway, estimator)| {
+                let now = monotonic();
+                RobotPresence {
+                    gateway: gateway.look(self, name, now),
+                    estimator: estimator.look(self, name, now),
+                    name: name.clone(),
+                }
+            });
+            robots.collect()
+        };
+        look();
+        std::thread::sleep(Duration::from_millis(1200));
+        look()
     }
 }
 
