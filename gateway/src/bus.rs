@@ -4,6 +4,7 @@
 
 use crate::clock::Clock;
 use crate::decoder::Decoder;
+use crate::link::error_frame::ErrorFrame;
 use crate::link::{Link, Received};
 use crate::publish::Sink;
 use crate::status::BusStatus;
@@ -99,6 +100,11 @@ impl<S: Sink> Bus<S> {
                             status.publish_failures.fetch_add(1, Relaxed);
                         }
                     });
+            }
+            Received::Error(frame) => {
+                if let Some(error) = ErrorFrame::of(&frame) {
+                    self.status.record_error(error);
+                }
             }
             Received::TimedOut => self.sink.idle(),
             Received::StateChanged => {}

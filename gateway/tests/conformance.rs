@@ -7,11 +7,12 @@
 use proprio_drivers::{Claim, Format, Frame, Id};
 use proprio_gateway::candump::write_log_line;
 use proprio_gateway::clock::{Clock, Monotonic, sleep_until};
+use proprio_gateway::link::error_frame::ErrorFrame;
 use proprio_gateway::link::replay::{Matching, Pace, Replay};
 use proprio_gateway::link::socketcan::SocketCan;
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, OpenError, Received, SendError};
-use proprio_topics::{LinkState, Nanos, StampKind};
+use proprio_topics::{BusError, LinkState, Nanos, StampKind};
 use std::path::PathBuf;
 use std::process::Command;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -590,18 +591,21 @@ fn a_log_at_once_keeps_its_stamps_and_its_lack_of_them() {
           (1.5) can0 20000004#00\n(2.5) can0 123#33\n",
     );
     let mut link = Replay::open(&path, Pace::Fast, None, &[]).unwrap();
-    let stamps: Vec<_> = exactly(&mut link, 3)
-        .iter()
-        .map(|f| (f.t.0, f.stamp))
-        .collect();
+    let mut next = || match link.recv(now() + PATIENCE) {
+        Received::Frame(frame) => (false, frame.t.0, frame.stamp),
+        Received::Error(frame) => (true, frame.t.0, frame.stamp),
+        other => panic!("{other:?}"),
+    };
     assert_eq!(
-        stamps,
+        [next(), next(), next(), next()],
         [
-            (1_479_121_923_123_456_000, StampKind::Log),
-            (0, StampKind::None),
-            (2_500_000_000, StampKind::Log)
+            (false, 1_479_121_923_123_456_000, StampKind::Log),
+            (false, 0, StampKind::None),
+            (true, 1_500_000_000, StampKind::Log),
+            (false, 2_500_000_000, StampKind::Log)
         ]
     );
+    silent(&mut link);
     assert_eq!(
         (
             link.report().bad,
@@ -893,16 +897,24 @@ fn a_lost_interface_is_told_and_found_again() {
     );
 }
 
+/// The next error frame, within the time-out; anything else fails.
+fn error_frame(link: &mut dyn Link) -> ErrorFrame {
+    match link.recv(now() + PATIENCE) {
+        Received::Error(frame) => ErrorFrame::of(&frame).unwrap(),
+        other => panic!("{other:?} instead of an error frame"),
+    }
+}
+
 #[test]
-fn error_frames_set_the_state() {
+fn error_frames_are_handed_on_and_set_the_state() {
     if !vcan() {
         return;
     }
     let own = OwnInterface::new();
     let mut link = SocketCan::open(&own.name, &[Claim::exclusive(Id::standard(7))]).unwrap();
     // A driver sends these frames; on a virtual interface any program may.
-    let error = |classes: &str| {
-        let frame = format!("{classes}#0000000000000000");
+    let error = |classes: &str, data: &str| {
+        let frame = format!("{classes}#{data}");
         assert!(
             Command::new("cansend")
                 .args([&own.name, &frame])
@@ -911,30 +923,39 @@ fn error_frames_set_the_state() {
                 .success()
         );
     };
-    error("20000004");
-    silent(&mut link);
+    let none = "0000000000000000";
+    // Error passive in both directions, with the error counters.
+    error("20000204", "0030000000008087");
+    let passive = error_frame(&mut link);
+    assert_eq!(
+        (passive.classes, passive.data),
+        (0x204, [0, 0x30, 0, 0, 0, 0, 0x80, 0x87])
+    );
     assert_eq!(
         (link.state(), link.counters().error_frames),
         (LinkState::Up, 1)
     );
-    error("20000040");
-    assert_eq!(link.recv(now() + PATIENCE), Received::StateChanged);
+    error("20000040", none);
+    assert!(error_frame(&mut link).reports(BusError::BusOff));
     assert_eq!(link.state(), LinkState::BusOff);
     assert_eq!(
         link.send(&Frame::new(Id::standard(7), &[]), now() + PATIENCE),
         Err(SendError::NotUp)
     );
-    error("20000100");
-    assert_eq!(link.recv(now() + PATIENCE), Received::StateChanged);
+    error("20000100", none);
+    assert!(error_frame(&mut link).reports(BusError::Restarted));
     assert_eq!(link.state(), LinkState::Up);
     // A controller that has restarted automatically and counts errors again is up too.
-    error("20000040");
-    changes_to(&mut link, LinkState::BusOff);
-    error("20000004");
-    changes_to(&mut link, LinkState::Up);
+    error("20000040", none);
+    error_frame(&mut link);
+    assert_eq!(link.state(), LinkState::BusOff);
+    error("20000004", none);
+    error_frame(&mut link);
+    assert_eq!(link.state(), LinkState::Up);
     // Received frames show it as well, and none of them is lost.
-    error("20000040");
-    changes_to(&mut link, LinkState::BusOff);
+    error("20000040", none);
+    error_frame(&mut link);
+    assert_eq!(link.state(), LinkState::BusOff);
     let wanted = Frame::new(Id::standard(7), &[1]);
     own.peer_sends(&wanted);
     assert_eq!(

@@ -301,7 +301,7 @@ fn turn_until(
             .min(bus.next_wake().unwrap_or(Nanos::MAX));
         match link.recv(deadline) {
             Received::Frame(frame) => bus.on_frame(&frame, clock.now()),
-            Received::TimedOut | Received::StateChanged => {}
+            Received::Error(_) | Received::TimedOut | Received::StateChanged => {}
             Received::Ended => break,
         }
     }

@@ -10,6 +10,7 @@
 use proprio_drivers::{Claim, Format, Frame};
 use proprio_topics::{LinkState, Nanos};
 
+pub mod error_frame;
 pub mod replay;
 mod socket;
 pub mod socketcan;
@@ -20,6 +21,9 @@ pub mod virtual_bus;
 pub enum Received {
     /// A frame, stamped with its time of arrival.
     Frame(Frame),
+    /// An error frame of the interface ([`Format::Error`]), stamped likewise. It may have changed
+    /// the link's state.
+    Error(Frame),
     /// The deadline has passed without a frame.
     TimedOut,
     /// There will be no more frames (the end of a log).
@@ -35,7 +39,7 @@ pub struct LinkCounters {
     pub received: u64,
     /// Frames that the kernel dropped because the receive buffer was full.
     pub dropped: u64,
-    /// Error frames received (they set the state and are not returned).
+    /// Error frames returned.
     pub error_frames: u64,
     /// Frames sent.
     pub sent: u64,

@@ -172,11 +172,7 @@ impl Replay {
             self.unmatched += 1;
             return None;
         }
-        if frame.format == Format::Error {
-            self.counters.error_frames += 1;
-            return None;
-        }
-        passes(&self.claims, &frame).then_some(frame)
+        (frame.format == Format::Error || passes(&self.claims, &frame)).then_some(frame)
     }
 
     /// The next frame to return, due or not.
@@ -262,6 +258,10 @@ impl Link for Replay {
                 frame.at(due, StampKind::Log)
             }
         };
+        if frame.format == Format::Error {
+            self.counters.error_frames += 1;
+            return Received::Error(handed_out);
+        }
         self.counters.received += 1;
         Received::Frame(handed_out)
     }

@@ -15,6 +15,7 @@
 //! Recovery happens inside [`Link::recv`], which checks every 50 ms. While the state is not up
 //! nothing is sent, so that no stale command waits in a queue until the bus is back.
 
+use super::error_frame::ErrorFrame;
 use super::socket::{
     RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, interface_flags, newly_dropped, wait,
 };
@@ -24,7 +25,7 @@ use nix::errno::Errno;
 use nix::poll::PollFlags;
 use nix::sys::socket::{MsgFlags, send, setsockopt, sockopt};
 use proprio_drivers::{Claim, Format, Frame, Id};
-use proprio_topics::{LinkState, Nanos, StampKind};
+use proprio_topics::{BusError, LinkState, Nanos, StampKind};
 use socketcan::{CanAddr, CanFdSocket, Socket, SocketOptions};
 use std::io;
 use std::os::fd::{AsFd, AsRawFd};
@@ -159,24 +160,8 @@ impl SocketCan {
         while let Some(message) = self.receiver.batch.next() {
             self.counters.dropped += newly_dropped(&mut self.receiver.drops, message.control.drops);
             let frame = match decode(message.bytes) {
-                Some(Decoded::Frame(frame)) if passes(&self.claims, &frame) => frame,
-                Some(Decoded::Error(classes)) => {
-                    self.counters.error_frames += 1;
-                    let state = match self.state {
-                        _ if classes & libc::CAN_ERR_BUSOFF != 0 => LinkState::BusOff,
-                        // The controller has restarted, or counts errors again, as adapters that
-                        // restart automatically report.
-                        LinkState::BusOff
-                            if classes & (libc::CAN_ERR_RESTARTED | libc::CAN_ERR_CRTL) != 0 =>
-                        {
-                            LinkState::Up
-                        }
-                        state => state,
-                    };
-                    if self.set_state(state) {
-                        return Some(Received::StateChanged);
-                    }
-                    continue;
+                Some(frame) if frame.format == Format::Error || passes(&self.claims, &frame) => {
+                    frame
                 }
                 _ => continue,
             };
@@ -193,6 +178,19 @@ impl SocketCan {
                 (None, None) => (times.now(), StampKind::User),
             };
             let frame = frame.at(times.limit(stamp), kind);
+            if let Some(error) = ErrorFrame::of(&frame) {
+                self.counters.error_frames += 1;
+                if error.reports(BusError::BusOff) {
+                    self.set_state(LinkState::BusOff);
+                } else if self.state == LinkState::BusOff
+                    && error.classes & (libc::CAN_ERR_RESTARTED | libc::CAN_ERR_CRTL) != 0
+                {
+                    // The controller has restarted, or counts errors again, as adapters that
+                    // restart automatically report.
+                    self.set_state(LinkState::Up);
+                }
+                return Some(Received::Error(frame));
+            }
             // A controller that receives is on the bus. This does not hold if the interface was
             // lost: the frame may have been waiting since before the loss, which the system reports
             // only once.
@@ -308,21 +306,18 @@ fn open_error(interface: &str, cause: io::Error) -> OpenError {
     }
 }
 
-enum Decoded {
-    Frame(Frame),
-    /// Error classes. Only two of them are used here, and socketcan's full decoding allocates from
-    /// the third cause on.
-    Error(u32),
-}
-
 /// Reads a `struct can_frame` or `struct canfd_frame`.
-fn decode(bytes: &[u8]) -> Option<Decoded> {
+fn decode(bytes: &[u8]) -> Option<Frame> {
     let raw = u32::from_ne_bytes(*bytes.first_chunk()?);
     let (len, flags) = (*bytes.get(4)?, *bytes.get(5)?);
     let len = usize::from(len);
     let payload = bytes.get(DATA..)?.get(..len);
     if raw & libc::CAN_ERR_FLAG != 0 {
-        return Some(Decoded::Error(raw & libc::CAN_ERR_MASK));
+        return Frame::with_format(
+            Id::extended(raw & libc::CAN_ERR_MASK),
+            Format::Error,
+            payload?,
+        );
     }
     let id = if raw & libc::CAN_EFF_FLAG != 0 {
         Id::extended(raw & libc::CAN_EFF_MASK)
@@ -330,20 +325,19 @@ fn decode(bytes: &[u8]) -> Option<Decoded> {
         #[allow(clippy::cast_possible_truncation)] // 11 bits
         Id::standard((raw & libc::CAN_SFF_MASK) as u16)
     };
-    let frame = match bytes.len() {
+    match bytes.len() {
         #[allow(clippy::cast_possible_truncation)] // of a byte
-        CLASSIC if raw & libc::CAN_RTR_FLAG != 0 => Frame::remote(id, len as u8),
-        CLASSIC => Frame::with_format(id, Format::Classic, payload?)?,
+        CLASSIC if raw & libc::CAN_RTR_FLAG != 0 => Some(Frame::remote(id, len as u8)),
+        CLASSIC => Frame::with_format(id, Format::Classic, payload?),
         FD => {
             let format = Format::Fd {
                 bit_rate_switch: flags & BIT_RATE_SWITCH != 0,
                 error_state: flags & ERROR_STATE != 0,
             };
-            Frame::with_format(id, format, payload?)?
+            Frame::with_format(id, format, payload?)
         }
-        _ => return None,
-    };
-    Some(Decoded::Frame(frame))
+        _ => None,
+    }
 }
 
 /// Writes a frame as `struct can_frame` or `struct canfd_frame` and returns its size; `None` for an
@@ -535,8 +529,8 @@ mod tests {
             let mut bytes = [0; FD];
             let size = encode(&frame, &mut bytes).unwrap();
             match decode(&bytes[..size]) {
-                Some(Decoded::Frame(back)) => prop_assert_eq!(back, frame),
-                _ => prop_assert!(false),
+                Some(back) => prop_assert_eq!(back, frame),
+                None => prop_assert!(false),
             }
         }
 
