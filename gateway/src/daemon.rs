@@ -10,6 +10,7 @@ use crate::clock::{Clock, Monotonic};
 use crate::config::{Pace, Source};
 use crate::decoder::Decoder;
 use crate::health::{HealthLog, fill_health};
+use crate::link::interface::{Netlink, Observer};
 use crate::link::replay::Replay;
 use crate::link::socketcan::SocketCan;
 use crate::link::virtual_bus::VirtualBus;
@@ -117,6 +118,23 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
         join(&mut threads, &stop);
         return Err(error);
     }
+    let interfaces = plan.buses.iter().map(|bus| match &bus.source {
+        Source::SocketCan { interface } => Some(interface.clone()),
+        Source::Virtual { .. } | Source::Replay { .. } => None,
+    });
+    let observer = Observer::start(
+        interfaces.collect(),
+        Netlink::default(),
+        HEALTH_PERIOD,
+        Arc::clone(&stop),
+    );
+    let observer = match observer {
+        Ok(observer) => observer,
+        Err(error) => {
+            join(&mut threads, &stop);
+            return Err(anyhow!(error).context("cannot start a thread"));
+        }
+    };
     tracing::info!(
         robot = plan.robot,
         buses = plan.buses.len(),
@@ -138,7 +156,7 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
         }
         let now = clock.now();
         let statuses = statuses(&threads);
-        fill_health(&mut health, &statuses);
+        fill_health(&mut health, &statuses, &observer.newest());
         health_log.log_changes(&health, &statuses);
         // A reader that cannot be reached now is no reason to stop; the next health follows in 0.1
         // s.
@@ -163,7 +181,7 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
     tracing::info!(why, "stopping");
     let _ = sd_notify::notify(&[NotifyState::Stopping]);
     let panicked = join(&mut threads, &stop);
-    fill_health(&mut health, &statuses(&threads));
+    fill_health(&mut health, &statuses(&threads), &observer.newest());
     let _ = health_writer.send(&health, clock.now());
     match panicked {
         None => Ok(()),

@@ -4,14 +4,26 @@
 use crate::clock::realtime_offset;
 use crate::link::error_frame::ErrorFrame;
 use crate::status::BusStatus;
-use proprio_topics::{BusError, Counter, DeviceState, GatewayHealth, LinkState, Refusal};
+use proprio_topics::{
+    BusError, BusHealth, Controller, Counter, DeviceHealth, DeviceState, GatewayHealth,
+    InterfaceHealth, LinkState, Refusal,
+};
 
-/// Fills the health message from the counters of the buses.
-pub(crate) fn fill_health(health: &mut GatewayHealth, buses: &[&BusStatus]) {
+/// Fills the health message from the counters of the buses and what is known of their interfaces.
+pub(crate) fn fill_health(
+    health: &mut GatewayHealth,
+    buses: &[&BusStatus],
+    interfaces: &[InterfaceHealth],
+) {
     health.realtime_offset = realtime_offset();
     (health.bus_count, health.device_count) = (0, 0);
-    for (slot, status) in health.buses.iter_mut().zip(buses) {
+    for (i, (slot, status)) in health.buses.iter_mut().zip(buses).enumerate() {
         *slot = status.bus();
+        slot.interface = interfaces.get(i).copied().unwrap_or_default();
+        // A gateway that is started on a bus-off controller receives no error frame that says so.
+        if slot.link == LinkState::NoCarrier && slot.interface.controller == Controller::BusOff {
+            slot.link = LinkState::BusOff.in_memory();
+        }
         health.bus_count += 1;
     }
     for (slot, device) in health
@@ -98,6 +110,16 @@ impl HealthLog {
                     LinkState::Ended => {
                         tracing::info!(bus = name, frames = bus.frames, "the log has ended");
                     }
+                    LinkState::BusOff
+                        if bus.interface.controller != Controller::Unknown
+                            && bus.interface.restart_ms == 0 =>
+                    {
+                        tracing::error!(
+                            bus = name,
+                            "the link is bus_off, until a person restarts the controller (`ip link \
+                             set INTERFACE type can restart`): it has no restart-ms"
+                        );
+                    }
                     state => tracing::error!(
                         bus = name,
                         "the link is {}; waiting for it to come back",
@@ -105,10 +127,11 @@ impl HealthLog {
                     ),
                 }
             }
+            log_controller(bus, before);
             // One frame may report several causes: it is told once.
             let mut told: Vec<ErrorFrame> = Vec::new();
             for (cause, run) in BusError::ALL.into_iter().zip(&mut runs.errors) {
-                let of = |b: &proprio_topics::BusHealth| b.errors.get(cause as usize).copied();
+                let of = |b: &BusHealth| b.errors.get(cause as usize).copied();
                 let count = of(bus).unwrap_or(0);
                 if run.begins(increase(count, before.and_then(of)) > 0)
                     && let Some(frame) = statuses.get(i).and_then(|s| s.newest_error(cause))
@@ -151,8 +174,7 @@ impl HealthLog {
             for (counter, run) in Counter::ALL.into_iter().zip(runs).filter(|(c, _)| {
                 !matches!(c, Counter::Frames | Counter::Readings | Counter::Starts)
             }) {
-                let of =
-                    |d: &proprio_topics::DeviceHealth| d.counters.get(counter as usize).copied();
+                let of = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
                 let count = of(device).unwrap_or(0);
                 let new = increase(count, before.and_then(of));
                 if run.begins(new > 0) {
@@ -165,6 +187,37 @@ impl HealthLog {
                 }
             }
         }
+    }
+}
+
+/// Logs a change of the controller's error state.
+fn log_controller(bus: &BusHealth, before: Option<&BusHealth>) {
+    let was = before.map_or(Controller::Unknown.in_memory(), |b| b.interface.controller);
+    let now = bus.interface.controller;
+    if now == was || now == Controller::Unknown {
+        return;
+    }
+    let name = bus.name.as_str();
+    let (tx, rx) = (
+        bus.interface.tx_error_counter,
+        bus.interface.rx_error_counter,
+    );
+    match now.get().unwrap_or_default() {
+        // Not what is normal at the start.
+        Controller::Active if was == Controller::Unknown => {}
+        Controller::Active => tracing::info!(bus = name, "the controller is error active again"),
+        state => tracing::warn!(
+            bus = name,
+            "the controller is {}; error counters: tx={tx}, rx={rx}",
+            match state {
+                Controller::Warning => "at the warning limit",
+                Controller::Passive => "error passive",
+                Controller::BusOff => "bus-off",
+                Controller::Stopped => "stopped",
+                Controller::Sleeping => "asleep",
+                Controller::Active | Controller::Unknown => "in an unknown state",
+            }
+        ),
     }
 }
 
@@ -219,6 +272,99 @@ mod tests {
         health.bus_count = 1;
         health.buses[0] = bus;
         health
+    }
+
+    /// A controller in `state`, with its counters.
+    fn controller(state: Controller, restart_ms: u32) -> InterfaceHealth {
+        InterfaceHealth {
+            controller: state.in_memory(),
+            tx_error_counter: 96,
+            rx_error_counter: 5,
+            restart_ms,
+            ..InterfaceHealth::default()
+        }
+    }
+
+    #[test]
+    fn a_bus_without_carrier_whose_controller_is_bus_off_is_bus_off() {
+        let status = status();
+        let link = |state, interface| {
+            status.set_link(state, &crate::link::LinkCounters::default());
+            let mut health = Box::new(GatewayHealth::new(Nanos::ZERO));
+            fill_health(&mut health, &[&status], &[interface]);
+            assert_eq!(health.buses()[0].interface, interface);
+            assert!(health.realtime_offset > Nanos::ZERO);
+            health.buses()[0].link.get()
+        };
+        let (off, active) = (
+            controller(Controller::BusOff, 0),
+            controller(Controller::Active, 0),
+        );
+        assert_eq!(link(LinkState::NoCarrier, off), Some(LinkState::BusOff));
+        assert_eq!(
+            link(LinkState::NoCarrier, active),
+            Some(LinkState::NoCarrier)
+        );
+        assert_eq!(link(LinkState::Up, off), Some(LinkState::Up));
+        assert_eq!(link(LinkState::Down, off), Some(LinkState::Down));
+    }
+
+    #[test]
+    fn every_change_of_a_controller_and_its_link_is_one_line() {
+        let status = status();
+        let mut log = HealthLog::default();
+        let mut tick = |link, interface| {
+            status.set_link(link, &crate::link::LinkCounters::default());
+            let mut health = Box::new(GatewayHealth::new(Nanos::ZERO));
+            fill_health(&mut health, &[&status], &[interface]);
+            logged(|| log.log_changes(&health, &[&status]))
+        };
+        use Controller::{Active, BusOff, Passive, Unknown, Warning};
+        use LinkState::{NoCarrier, Up};
+        for (link, state, restart_ms, told) in [
+            (Up, Unknown, 0, &[][..]),
+            (Up, Active, 0, &[]),
+            (
+                Up,
+                Warning,
+                0,
+                &["the controller is at the warning limit; error counters: tx=96, rx=5"],
+            ),
+            (Up, Warning, 0, &[]),
+            (Up, Passive, 0, &["the controller is error passive"]),
+            (
+                NoCarrier,
+                BusOff,
+                0,
+                &[
+                    "the link is bus_off, until a person restarts",
+                    "the controller is bus-off",
+                ],
+            ),
+            (NoCarrier, BusOff, 0, &[]),
+            (
+                Up,
+                Active,
+                0,
+                &[
+                    "the link is up again",
+                    "the controller is error active again",
+                ],
+            ),
+            (
+                NoCarrier,
+                BusOff,
+                100,
+                &["the link is bus_off; waiting", "the controller is bus-off"],
+            ),
+            (NoCarrier, Unknown, 0, &["the link is no_carrier; waiting"]),
+        ] {
+            let lines = tick(link, controller(state, restart_ms));
+            assert_eq!(lines.len(), told.len(), "{state:?}: {lines:?}");
+            for (line, told) in lines.iter().zip(told) {
+                assert!(line.contains(told), "{line}, not {told}");
+            }
+        }
     }
 
     #[test]

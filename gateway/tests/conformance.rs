@@ -8,11 +8,12 @@ use proprio_drivers::{Claim, Format, Frame, Id};
 use proprio_gateway::candump::write_log_line;
 use proprio_gateway::clock::{Clock, Monotonic, sleep_until};
 use proprio_gateway::link::error_frame::ErrorFrame;
+use proprio_gateway::link::interface::{Interfaces as _, Netlink};
 use proprio_gateway::link::replay::{Matching, Pace, Replay};
 use proprio_gateway::link::socketcan::SocketCan;
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, OpenError, Received, SendError};
-use proprio_topics::{BusError, LinkState, Nanos, StampKind};
+use proprio_topics::{BusError, Controller, LinkState, Nanos, StampKind};
 use std::path::PathBuf;
 use std::process::Command;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -968,6 +969,90 @@ fn error_frames_are_handed_on_and_set_the_state() {
         (counters.error_frames, counters.losses, counters.received),
         (6, 3, 1)
     );
+}
+
+/// The kernel's flags end it, if neither an error frame nor a received one does.
+#[test]
+fn bus_off_ends_while_there_is_a_carrier() {
+    if !vcan() {
+        return;
+    }
+    let own = OwnInterface::new();
+    let mut link = SocketCan::open(&own.name, &[]).unwrap();
+    assert!(
+        Command::new("cansend")
+            .args([&own.name, "20000040#0000000000000000"])
+            .status()
+            .unwrap()
+            .success()
+    );
+    assert!(error_frame(&mut link).reports(BusError::BusOff));
+    let since = now();
+    changes_to(&mut link, LinkState::Up);
+    // The flags of a real controller lag behind by up to a second.
+    assert!(now() - since > Nanos::from_millis(1000));
+    // Down is not bus-off, and up again is up.
+    own.ip("link set dev NAME down");
+    changes_to(&mut link, LinkState::Down);
+    own.ip("link set dev NAME up");
+    changes_to(&mut link, LinkState::Up);
+}
+
+/// A pair of interfaces, each of which has a carrier only while the other is up.
+#[test]
+fn an_interface_without_a_carrier_is_not_up() {
+    if !vcan() {
+        return;
+    }
+    let own = OwnInterface {
+        name: format!("px{}", std::process::id()),
+    };
+    let peer = OwnInterface {
+        name: format!("py{}", std::process::id()),
+    };
+    let add = format!(
+        "link add dev {} type vxcan peer name {}",
+        own.name, peer.name
+    );
+    let made = Command::new("/usr/sbin/ip").args(add.split(' ')).status();
+    if !made.is_ok_and(|status| status.success()) {
+        println!("skipped: this kernel has no vxcan");
+        return;
+    }
+    own.ip("link set dev NAME up");
+    let mut link = SocketCan::open(&own.name, &[]).unwrap();
+    assert_eq!(link.state(), LinkState::NoCarrier);
+    let frame = Frame::new(Id::standard(7), &[1]);
+    assert_eq!(link.send(&frame, now() + PATIENCE), Err(SendError::NotUp));
+    peer.ip("link set dev NAME up");
+    changes_to(&mut link, LinkState::Up);
+    assert_eq!(link.send(&frame, now() + PATIENCE), Ok(()));
+    peer.ip("link set dev NAME down");
+    changes_to(&mut link, LinkState::NoCarrier);
+    peer.ip("link set dev NAME up");
+    changes_to(&mut link, LinkState::Up);
+    assert_eq!(link.counters().losses, 1);
+}
+
+/// Totals and modes of a virtual interface, which has no controller.
+#[test]
+fn the_kernel_tells_what_it_knows_of_an_interface() {
+    if !vcan() {
+        return;
+    }
+    let own = OwnInterface::new();
+    let mut netlink = Netlink::default();
+    let before = netlink.ask(&own.name).unwrap();
+    own.peer_sends(&Frame::new(Id::standard(7), &[1]));
+    let after = netlink.ask(&own.name).unwrap();
+    assert_eq!(after.tx_frames, before.tx_frames + 1);
+    assert_eq!(
+        (after.fd, after.controller.get()),
+        (1, Some(Controller::Unknown))
+    );
+    own.ip("link set dev NAME down");
+    own.ip("link set dev NAME mtu 16");
+    assert_eq!(netlink.ask(&own.name).unwrap().fd, 0);
 }
 
 #[test]

@@ -11,6 +11,7 @@ use proprio_drivers::{Claim, Format, Frame};
 use proprio_topics::{LinkState, Nanos};
 
 pub mod error_frame;
+pub mod interface;
 pub mod replay;
 mod socket;
 pub mod socketcan;

@@ -9,11 +9,15 @@
 //! | `ip link set can0 down` | [`LinkState::Down`] | when the interface is up again |
 //! | adapter unplugged, interface deleted | [`LinkState::Gone`] | new socket when it is back |
 //! | too many errors: bus-off | [`LinkState::BusOff`] | controller restart (`restart-ms`) |
+//! | up without a carrier | [`LinkState::NoCarrier`] | when it has a carrier |
 //!
-//! `ip link set can0 type can restart` restarts a controller by hand.
+//! `ip link set can0 type can restart` restarts a controller by hand. A controller without a
+//! carrier is mostly bus-off since before the link was opened; only netlink tells
+//! ([`super::interface`]).
 //!
-//! Recovery happens inside [`Link::recv`], which checks every 50 ms. While the state is not up
-//! nothing is sent, so that no stale command waits in a queue until the bus is back.
+//! [`Link::recv`] asks for the interface's flags every 50 ms, in every state; error frames and
+//! failures of the socket tell changes at once. While the state is not up nothing is sent, so that
+//! no stale command waits in a queue until the bus is back.
 
 use super::error_frame::ErrorFrame;
 use super::socket::{
@@ -30,8 +34,11 @@ use socketcan::{CanAddr, CanFdSocket, Socket, SocketOptions};
 use std::io;
 use std::os::fd::{AsFd, AsRawFd};
 
-/// Interval between checks for a lost interface.
-const RETRY: Nanos = Nanos::from_millis(50);
+/// Interval between queries of the interface's flags.
+const CHECK: Nanos = Nanos::from_millis(50);
+/// For this long after an error frame told of bus-off, flags with a carrier do not end it: the
+/// kernel's link watch updates them at most once a second. Half a second is for a busy machine.
+const LINK_WATCH: Nanos = Nanos::from_millis(1500);
 /// Interval between attempts when the transmit queue is full; the socket cannot be polled for that.
 const QUEUE_RETRY: Nanos = Nanos::from_micros(200);
 /// Maximum number of kernel filters (`CAN_RAW_FILTER_MAX`).
@@ -60,8 +67,10 @@ pub struct SocketCan {
     changed: bool,
     /// A frame that showed that the link is up again; returned after the state change.
     pending: Option<Frame>,
-    /// Time of the next check for the lost interface.
-    retry: Nanos,
+    /// Time of the next query of the flags.
+    check: Nanos,
+    /// Until then bus-off is believed rather than a carrier.
+    bus_off_until: Nanos,
     counters: LinkCounters,
 }
 
@@ -92,7 +101,7 @@ impl SocketCan {
         let mut receiver = Receiver::new();
         let socket = open_socket(interface, &filters, &mut receiver)
             .map_err(|e| open_error(interface, e))?;
-        let state = current_state(&socket, interface);
+        let state = state_of(interface_flags(socket.as_fd(), interface), false);
         Ok(Self {
             interface: interface.to_owned(),
             socket,
@@ -107,7 +116,8 @@ impl SocketCan {
             state,
             changed: false,
             pending: None,
-            retry: Nanos::ZERO,
+            check: Nanos::ZERO,
+            bus_off_until: Nanos::ZERO,
             counters: LinkCounters::default(),
         })
     }
@@ -121,12 +131,13 @@ impl SocketCan {
             self.counters.losses += 1;
         }
         self.state = state;
+        // Flags that lag behind what has told the change do not undo it at once.
+        self.check = Monotonic.now().saturating_add(CHECK);
         true
     }
 
     /// Sets the state after a failure of the socket; returns whether it has changed.
     fn lose(&mut self, error: Errno) -> bool {
-        self.retry = Monotonic.now().saturating_add(RETRY);
         // After any other error the socket is checked again.
         self.set_state(if matches!(error, Errno::ENODEV | Errno::ENXIO) {
             LinkState::Gone
@@ -135,14 +146,13 @@ impl SocketCan {
         })
     }
 
-    /// Checks, if it is time to, whether the lost interface is back; returns whether the state has
-    /// changed.
-    fn recover(&mut self) -> bool {
+    /// Asks, if it is time to, for the interface's flags; returns whether the state has changed.
+    fn checks(&mut self) -> bool {
         let now = Monotonic.now();
-        if now < self.retry {
+        if now < self.check {
             return false;
         }
-        self.retry = now.saturating_add(RETRY);
+        self.check = now.saturating_add(CHECK);
         // An interface that was deleted and created again needs a new socket.
         if self.state == LinkState::Gone {
             match open_socket(&self.interface, &self.filters, &mut self.receiver) {
@@ -151,8 +161,10 @@ impl SocketCan {
             }
             self.adapter = HardwareToMonotonic::default();
         }
-        let state = current_state(&self.socket, &self.interface);
-        self.set_state(state)
+        let flags = interface_flags(self.socket.as_fd(), &self.interface);
+        let carrier = matches!(flags, Ok(flags) if flags & libc::IFF_RUNNING != 0);
+        let bus_off = self.state == LinkState::BusOff && (!carrier || now < self.bus_off_until);
+        self.set_state(state_of(flags, bus_off))
     }
 
     /// Takes the next frame from the batch. `None`: the batch is empty.
@@ -181,6 +193,7 @@ impl SocketCan {
             if let Some(error) = ErrorFrame::of(&frame) {
                 self.counters.error_frames += 1;
                 if error.reports(BusError::BusOff) {
+                    self.bus_off_until = Monotonic.now().saturating_add(LINK_WATCH);
                     self.set_state(LinkState::BusOff);
                 } else if self.state == LinkState::BusOff
                     && error.classes & (libc::CAN_ERR_RESTARTED | libc::CAN_ERR_CRTL) != 0
@@ -262,12 +275,15 @@ fn open_socket(
     Ok(socket)
 }
 
-/// The state of an interface as the system sees it.
-fn current_state(socket: &CanFdSocket, interface: &str) -> LinkState {
-    match interface_flags(socket.as_fd(), interface) {
-        Ok(flags) if flags & libc::IFF_UP != 0 => LinkState::Up,
-        Ok(_) => LinkState::Down,
+/// The state of an interface with these flags, of which an error frame may have told that it is
+/// bus-off.
+const fn state_of(flags: Result<libc::c_int, Errno>, bus_off: bool) -> LinkState {
+    match flags {
         Err(_) => LinkState::Gone,
+        Ok(flags) if flags & libc::IFF_UP == 0 => LinkState::Down,
+        Ok(_) if bus_off => LinkState::BusOff,
+        Ok(flags) if flags & libc::IFF_RUNNING == 0 => LinkState::NoCarrier,
+        Ok(_) => LinkState::Up,
     }
 }
 
@@ -383,7 +399,7 @@ impl Link for SocketCan {
             if let Some(received) = self.next() {
                 return received;
             }
-            if matches!(self.state, LinkState::Down | LinkState::Gone) && self.recover() {
+            if self.checks() {
                 return Received::StateChanged;
             }
             // An endless series of error frames must not hold the caller beyond its deadline.
@@ -391,15 +407,12 @@ impl Link for SocketCan {
                 return Received::TimedOut;
             }
             asked = true;
-            let until = match self.state {
-                LinkState::Gone => {
-                    // The old socket will not report anything more.
-                    sleep_until(deadline.min(self.retry));
-                    continue;
-                }
-                LinkState::Down => deadline.min(self.retry),
-                _ => deadline,
-            };
+            let until = deadline.min(self.check);
+            if self.state == LinkState::Gone {
+                // The old socket will not report anything more.
+                sleep_until(until);
+                continue;
+            }
             if let Err(error) = self.receiver.fill(self.socket.as_fd(), until)
                 && self.lose(error)
             {
@@ -493,6 +506,23 @@ mod tests {
         );
         assert_eq!(bytes[..4], 0x98FF_0001_u32.to_ne_bytes());
         assert_eq!(bytes[4..16], [3, 0, 0, 0, 1, 2, 3, 0, 0, 0, 0, 0]);
+    }
+
+    /// What the flags of an interface mean, without and with an error frame that told of bus-off.
+    #[test]
+    fn the_state_follows_the_flags() {
+        use LinkState::{BusOff, Down, Gone, NoCarrier, Up};
+        let (up, carrier, other) = (libc::IFF_UP, libc::IFF_RUNNING, libc::IFF_NOARP);
+        for (flags, state, after_bus_off) in [
+            (Err(Errno::ENODEV), Gone, Gone),
+            (Ok(0), Down, Down),
+            (Ok(carrier | other), Down, Down),
+            (Ok(up | other), NoCarrier, BusOff),
+            (Ok(up | carrier | other), Up, BusOff),
+        ] {
+            assert_eq!(state_of(flags, false), state, "{flags:?}");
+            assert_eq!(state_of(flags, true), after_bus_off, "{flags:?}");
+        }
     }
 
     fn frame() -> impl Strategy<Value = Frame> {
