@@ -1,8 +1,8 @@
 //! The estimator daemon: one data-plane thread turns samples into estimates, and a control plane
 //! supervises it.
 //!
-//! The data-plane thread polls shared memory. It takes no lock and allocates nothing once its ports
-//! are open. It retries services that are not there yet, so gateway and estimator can start in any
+//! The data-plane thread waits for samples in shared memory. It takes no lock and allocates nothing
+//! once its ports are open. It retries services that are not there yet, so gateway and estimator can start in any
 //! order, and either can be killed and started again.
 
 use crate::check::Check;
@@ -29,8 +29,6 @@ use std::sync::{Arc, mpsc};
 use std::time::Duration;
 use tokio::signal::unix::{SignalKind, signal};
 
-/// How long the data plane sleeps when no sample is waiting.
-const IDLE_SLEEP: Duration = Duration::from_micros(100);
 /// How often the data plane tries to open services that are not open yet.
 const CONNECT_PERIOD: Nanos = Nanos::from_millis(50);
 /// How often the health message is published.
@@ -284,7 +282,7 @@ impl DataPlane {
                 self.publish_health(now);
             }
             if idle {
-                std::thread::sleep(IDLE_SLEEP);
+                self.wait();
             }
         }
         self.publish_health(monotonic());
@@ -293,6 +291,24 @@ impl DataPlane {
                 "observations of identification: {}",
                 self.health.identification
             );
+        }
+    }
+
+    /// Waits until the gateway publishes a sample, or something else is to be done.
+    fn wait(&self) {
+        let is_connected = self.samples.is_some() && self.descriptions.is_some();
+        let until = match is_connected {
+            true => self.next_health,
+            false => self.next_health.min(self.next_connect),
+        };
+        match &self.samples {
+            Some(samples) => {
+                samples.wait(until);
+            }
+            None => {
+                let left = until.saturating_sub(monotonic()).0;
+                std::thread::sleep(Duration::from_nanos(u64::try_from(left).unwrap_or(0)));
+            }
         }
     }
 

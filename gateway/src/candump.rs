@@ -48,5 +48,5 @@ mod stamp;
 mod writer;
 
 pub use line::{Direction, Line, LineError, Record, parse_frame};
-pub use reader::{Reader, Report, Stamps};
+pub use reader::{REORDER, Reader, Report, Stamps};
 pub use writer::{Writer, write_log_line};

@@ -17,7 +17,7 @@ use std::sync::atomic::Ordering::Relaxed;
 
 /// Maximum delay of a sample that is still sorted into its place in the table. Samples can be late
 /// because a wrench has the stamp of its first frame but is complete only with its second.
-const REORDER: Nanos = Nanos::from_millis(100);
+const REORDER: Nanos = candump::REORDER;
 
 /// Why a log or table cannot be converted at all.
 #[derive(Debug, thiserror::Error)]
@@ -190,6 +190,10 @@ pub fn decode(
         let Some((_, decoder, _)) = buses.get_mut(last_bus) else {
             continue;
         };
+        // As live: the devices see the time pass, so that silences are seen.
+        if record.frame.stamp != StampKind::None {
+            decoder.poll_transmit(record.frame.t, |_| {});
+        }
         decoder.on_frame(&record.frame, |sample| {
             let written = order.push(*sample, |s| write_sample(&mut writer, s));
             if let Err(error) = written {

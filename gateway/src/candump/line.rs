@@ -55,6 +55,12 @@ pub enum LineError {
          HH:MM:SS.FRACTION)"
     )]
     Stamp,
+    /// The stamp is far later than that of the next frame.
+    #[error("the time stamp is {ahead} s later than that of the next frame")]
+    Ahead {
+        /// By how much \[ns\].
+        ahead: Nanos,
+    },
     /// There is no interface, or it is not text.
     #[error("there is no interface name")]
     Interface,
@@ -152,6 +158,7 @@ fn hex_byte(high: u8, low: u8) -> Option<u8> {
 }
 
 /// A record with its interface as a range of the line instead of a borrow.
+#[derive(Debug)]
 pub(super) struct Parsed {
     pub(super) stamp: Option<(Nanos, StampForm)>,
     interface: Range<usize>,

@@ -9,6 +9,9 @@ use std::io::{self, BufRead, Read};
 
 /// Maximum number of bad lines in a [`Report`].
 const NAMED: usize = 8;
+/// The order of the frames in a log is that of their stamps, except within this time \[ns\]: the
+/// recorder reads one interface after the other.
+pub const REORDER: Nanos = Nanos::from_millis(100);
 
 /// The meaning of a log's relative stamps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -41,15 +44,31 @@ pub struct Report {
     pub first_bad: ArrayVec<(u64, LineError), NAMED>,
 }
 
+impl Report {
+    fn reject(&mut self, line: u64, error: LineError) {
+        self.bad += 1;
+        // The ninth and later ones are only counted.
+        let _ = self.first_bad.try_push((line, error));
+    }
+}
+
 /// Reads the records of a log one after the other; allocates nothing after construction.
 ///
 /// A line that cannot be read is skipped and reported. A last line without a line end, as a stopped
 /// recorder leaves it, counts only if no continuation could make it another frame: half a payload
 /// is not returned as a short one.
+///
+/// A stamp that is later than the next frame's by more than [`REORDER`], while the next is not
+/// earlier than the one before, is wrong: its frame is skipped and reported. (Everything after it
+/// would otherwise seem late.)
 #[derive(Debug)]
 pub struct Reader<R> {
     inner: R,
     line: Vec<u8>,
+    /// The frame after the current one, if it has been read already: its text, the number of its
+    /// line, and the frame.
+    next_line: Vec<u8>,
+    next: Option<(u64, Parsed)>,
     stamps: Stamps,
     sum: Nanos,
     last: Option<Nanos>,
@@ -65,10 +84,12 @@ impl<R: BufRead> Reader<R> {
 
     /// Reads from `inner`; relative stamps have the meaning `stamps`.
     pub fn with_stamps(inner: R, stamps: Stamps) -> Self {
-        let line = Vec::with_capacity(MAX_LINE + 2);
+        let line = || Vec::with_capacity(MAX_LINE + 2);
         Self {
             inner,
-            line,
+            next_line: line(),
+            line: line(),
+            next: None,
             stamps,
             sum: Nanos::ZERO,
             last: None,
@@ -92,18 +113,12 @@ impl<R: BufRead> Reader<R> {
     /// A read error of `inner`. A bad line is not an error: see [`Reader::report`].
     pub fn next_record(&mut self) -> io::Result<Option<Record<'_>>> {
         let parsed = loop {
-            match self.next_parsed()? {
-                None => return Ok(None),
-                Some(Ok(ParsedLine::Record(parsed))) => break parsed,
-                Some(Ok(ParsedLine::Dropped(count))) => {
-                    self.report.dropped = self.report.dropped.saturating_add(count);
-                }
-                Some(Ok(ParsedLine::Note)) => {}
-                Some(Err(error)) => {
-                    self.report.bad += 1;
-                    // The ninth and later ones are only counted.
-                    let _ = self.report.first_bad.try_push((self.report.lines, error));
-                }
+            let Some((number, parsed)) = self.next_frame()? else {
+                return Ok(None);
+            };
+            match self.ahead(&parsed)? {
+                None => break parsed,
+                Some(ahead) => self.report.reject(number, LineError::Ahead { ahead }),
             }
         };
         let stamp = match parsed.stamp {
@@ -130,6 +145,52 @@ impl<R: BufRead> Reader<R> {
         }
         self.report.records += 1;
         Ok(parsed.record(&self.line, stamp))
+    }
+
+    /// The next frame and the number of its line; its text is in `line`. Lines without a frame are
+    /// skipped.
+    fn next_frame(&mut self) -> io::Result<Option<(u64, Parsed)>> {
+        if let Some(next) = self.next.take() {
+            std::mem::swap(&mut self.line, &mut self.next_line);
+            return Ok(Some(next));
+        }
+        loop {
+            match self.next_parsed()? {
+                None => return Ok(None),
+                Some(Ok(ParsedLine::Record(parsed))) => {
+                    return Ok(Some((self.report.lines, parsed)));
+                }
+                Some(Ok(ParsedLine::Dropped(count))) => {
+                    self.report.dropped = self.report.dropped.saturating_add(count);
+                }
+                Some(Ok(ParsedLine::Note)) => {}
+                Some(Err(error)) => self.report.reject(self.report.lines, error),
+            }
+        }
+    }
+
+    /// By how much the stamp of `parsed` is too late to be right \[ns\], if it is. Only a stamp
+    /// that jumps is compared with the next one, which is then read.
+    fn ahead(&mut self, parsed: &Parsed) -> io::Result<Option<Nanos>> {
+        let counts_from_origin = |form: StampForm| match form {
+            StampForm::Absolute | StampForm::Origin => true,
+            StampForm::Relative => self.stamps == Stamps::SinceOrigin,
+        };
+        let Some((t, form)) = parsed.stamp else {
+            return Ok(None);
+        };
+        let last = self.last.unwrap_or(Nanos::MIN);
+        if !counts_from_origin(form) || t.saturating_sub(last) <= REORDER {
+            return Ok(None);
+        }
+        std::mem::swap(&mut self.line, &mut self.next_line);
+        self.next = self.next_frame()?;
+        std::mem::swap(&mut self.line, &mut self.next_line);
+        let Some((next, _)) = self.next.as_ref().and_then(|(_, next)| next.stamp) else {
+            return Ok(None);
+        };
+        let ahead = t.saturating_sub(next);
+        Ok((ahead > REORDER && next >= last.saturating_sub(REORDER)).then_some(ahead))
     }
 
     /// Reads and parses the next line; `None` at the end.

@@ -1,5 +1,6 @@
 //! A shared-memory domain: a directory and a name. Processes communicate only within one domain.
 
+use super::bell::Bell;
 use super::lock::{Lock, Patience};
 use super::sweep::{self, Place, SHM, Swept};
 use super::{DomainError, PortError};
@@ -262,6 +263,11 @@ impl Domain {
         // If a stopped process holds the lock, drop without it: a program must be able to end.
         let _lock = Lock::take(&self.inner.place.lock, Patience::Normal);
         drop(port);
+    }
+
+    /// The bell of `service`.
+    pub(super) fn bell(&self, service: &ServiceName) -> Result<Bell, PortError> {
+        Bell::open(&self.inner.place.root, service.as_str())
     }
 
     pub(super) fn iceoryx(&self) -> &Config {

@@ -23,6 +23,7 @@
 //! This keeps `send` and `try_take` free of locks; iceoryx2's sendable ports take a mutex in every
 //! call.
 
+mod bell;
 mod clock;
 mod domain;
 mod error;

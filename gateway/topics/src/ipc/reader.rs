@@ -1,5 +1,6 @@
 //! Takes the payloads of one topic, counts losses and reports the age of the last payload.
 
+use super::bell::{Bell, Rings};
 use super::domain::service_name;
 use super::lock::Patience;
 use super::writer::explain;
@@ -60,6 +61,9 @@ pub struct Reader<T: Topic> {
     // `Some` until drop; dropped under the domain's lock.
     ports: Option<Ports<T>>,
     domain: Domain,
+    bell: Bell,
+    /// The rings heard when nothing was waiting.
+    heard: Rings,
     tally: Tally,
     invalid: u64,
     last: Option<Header>,
@@ -107,7 +111,7 @@ impl<T: Topic> Reader<T> {
         patience: Patience,
     ) -> Result<Self, PortError> {
         let name = service_name(robot, T::SUFFIX)?;
-        let (subscriber, service, predecessors) = domain.locked(patience, |node| {
+        let (subscriber, service, predecessors, bell) = domain.locked(patience, |node| {
             let service = node
                 .service_builder(&name)
                 .publish_subscribe::<T>()
@@ -128,11 +132,13 @@ impl<T: Topic> Reader<T> {
                     problem: e.to_string(),
                 },
             })?;
-            Ok((subscriber, service, predecessors))
+            Ok((subscriber, service, predecessors, domain.bell(&name)?))
         })?;
         Ok(Self {
             ports: Some((subscriber, service)),
             domain: domain.clone(),
+            bell,
+            heard: Rings::default(),
             tally: Tally::new(predecessors),
             invalid: 0,
             last: None,
@@ -149,6 +155,7 @@ impl<T: Topic> Reader<T> {
         let Some((subscriber, _)) = &self.ports else {
             return Err(TakeError::Internal);
         };
+        let rings = self.bell.rings();
         // No endless loop, even if a writer sends nonsense as fast as this reads.
         for _ in 0..T::QUALITY.buffer.saturating_mul(T::QUALITY.publishers) {
             let sample = subscriber.receive().map_err(|e| match e {
@@ -156,6 +163,7 @@ impl<T: Topic> Reader<T> {
                 ReceiveError::ExceedsMaxBorrows => TakeError::Internal,
             })?;
             let Some(sample) = sample else {
+                self.heard = rings;
                 return Ok(None);
             };
             let value = *sample.payload();
@@ -170,6 +178,13 @@ impl<T: Topic> Reader<T> {
             return Ok(Some(value));
         }
         Ok(None)
+    }
+
+    /// Waits until a payload may be waiting, at most until CLOCK_MONOTONIC shows `deadline` \[ns\];
+    /// returns whether one may be. Returns at once if there may be some that
+    /// [`Reader::try_take`] has not seen. One system call.
+    pub fn wait(&self, deadline: Nanos) -> bool {
+        self.bell.wait(self.heard, deadline)
     }
 
     /// Takes all waiting payloads and returns the newest; `None` if none is waiting.

@@ -1,5 +1,6 @@
 //! Sends the payloads of one topic. Never waits for a reader.
 
+use super::bell::Bell;
 use super::domain::service_name;
 use super::lock::Patience;
 use super::{Domain, PortError, SendError, Topic};
@@ -42,6 +43,7 @@ pub struct Writer<T: Topic> {
     // `Some` until drop; dropped under the domain's lock.
     ports: Option<Ports<T>>,
     domain: Domain,
+    bell: Bell,
     epoch: u64,
     sequence: u64,
     readers: usize,
@@ -61,7 +63,7 @@ impl<T: Topic> Writer<T> {
     pub fn create(domain: &Domain, robot: &str, epoch: u64) -> Result<Self, PortError> {
         let name = service_name(robot, T::SUFFIX)?;
         let quality = T::QUALITY;
-        let (publisher, service) = domain.locked(Patience::Normal, |node| {
+        let (publisher, service, bell) = domain.locked(Patience::Normal, |node| {
             let service = node
                 .service_builder(&name)
                 .publish_subscribe::<T>()
@@ -105,12 +107,13 @@ impl<T: Topic> Writer<T> {
                         problem: e.to_string(),
                     },
                 })?;
-            Ok((publisher, service))
+            Ok((publisher, service, domain.bell(&name)?))
         })?;
         let readers = service.dynamic_config().number_of_subscribers();
         Ok(Self {
             ports: Some((publisher, service)),
             domain: domain.clone(),
+            bell,
             epoch,
             sequence: 0,
             readers,
@@ -121,7 +124,8 @@ impl<T: Topic> Writer<T> {
     /// header.
     ///
     /// A reader that is too slow loses its oldest payloads. Allocates once, 48 bytes in iceoryx2.
-    /// Makes no system call unless a reader has opened or closed.
+    /// Makes no system call unless a reader has opened or closed, or waits
+    /// ([`Reader::wait`](super::Reader::wait)).
     ///
     /// # Errors
     /// [`SendError`]; the sequence number is used up, so that readers count the loss.
@@ -188,6 +192,7 @@ impl<T: Topic> Writer<T> {
         fill(header);
         let sequence = header.sequence;
         let readers = sample.send().map_err(send_error)?;
+        self.bell.ring();
         Ok(Sent {
             sequence,
             readers,
