@@ -7,7 +7,7 @@ use proprio_drivers::{Frame, Id};
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::link::interface::{Interfaces as _, Netlink};
 use proprio_gateway::link::virtual_bus::VirtualBus;
-use proprio_gateway::link::{Link, Received};
+use proprio_gateway::link::{Link, Received, send_by};
 use proprio_topics::ipc::{Domain, DomainConfig};
 use proprio_topics::{Controller, InterfaceHealth, Nanos};
 use serde_json::json;
@@ -267,7 +267,8 @@ fn virtual_bus(domain: &DomainConfig) -> Finding {
         let open = || VirtualBus::open(&domain.name, &name, &[]).map_err(|e| e.to_string());
         let (mut one, mut other) = (open()?, open()?);
         let sent = clock.now();
-        one.send(
+        send_by(
+            &mut one,
             &Frame::new(Id::standard(0x123), &[1, 2, 3]),
             sent + Nanos::from_millis(100),
         )

@@ -28,6 +28,9 @@ pub struct RawBus {
     pub source: Source,
     /// Scheduling of its thread.
     pub realtime: Option<Realtime>,
+    /// Never send anything on it: another program commands its devices.
+    #[serde(default)]
+    pub listen_only: bool,
     /// `[[bus.device]]`: common keys and the driver's own keys in one table.
     #[serde(default)]
     pub device: Vec<Spanned<toml::Table>>,

@@ -14,7 +14,7 @@ use crate::link::interface::{Netlink, Observer};
 use crate::link::replay::Replay;
 use crate::link::socketcan::SocketCan;
 use crate::link::virtual_bus::VirtualBus;
-use crate::link::{Link, OpenError};
+use crate::link::{Link, ListenOnly, OpenError};
 use crate::plan::{BusPlan, ConfigError, Plan};
 use crate::publish::Shared;
 use crate::status::BusStatus;
@@ -242,9 +242,10 @@ impl BusThread {
         let status = Arc::new(BusStatus::new(number, bus));
         // A log is not interactive: its boards answered the program that commanded them during the
         // recording.
-        let mode = matches!(bus.source, Source::Replay { .. }).then_some(Mode::Listen);
+        let listens = bus.listen_only || matches!(bus.source, Source::Replay { .. });
+        let mode = listens.then_some(Mode::Listen);
         let decoder = Decoder::new(number, bus, mode, Arc::clone(&status))?;
-        let link: Box<dyn Link> = if let Source::Replay { log, pace } = &bus.source {
+        let mut link: Box<dyn Link> = if let Source::Replay { log, pace } = &bus.source {
             let mut replay = Replay::open(
                 log,
                 *pace,
@@ -256,6 +257,9 @@ impl BusThread {
         } else {
             open_link(bus, &domain.config().name, &decoder.claims())?
         };
+        if bus.listen_only {
+            link = Box::new(ListenOnly(link));
+        }
         let ended = Arc::new(AtomicBool::new(false));
         let (ready, is_ready) = mpsc::channel();
         let (domain, robot, realtime) = (domain.clone(), plan.robot.clone(), bus.realtime);

@@ -3,7 +3,9 @@
 
 use crate::plan::{BusPlan, Route};
 use crate::status::BusStatus;
-use proprio_drivers::{Claim, Decoded, Device, Frame, Id, Mode, SpecError, State, Transmit};
+use proprio_drivers::{
+    Claim, Decoded, Device, Frame, Id, Mode, NotSent, SpecError, State, Transmit,
+};
 use proprio_topics::{Counter, Header, MAX_CHANNELS, Nanos, Reading, Sample};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
@@ -128,8 +130,8 @@ impl Decoder {
         }
     }
 
-    /// Calls `send` for every frame that a device wants to send at `now`.
-    pub fn poll_transmit(&mut self, now: Nanos, mut send: impl FnMut(&Transmit)) {
+    /// Calls `send` for every frame that a device wants to send at `now`, with the device's number.
+    pub fn poll_transmit(&mut self, now: Nanos, mut send: impl FnMut(u16, &Transmit)) {
         for (running, number) in self.devices.iter_mut().zip(0_u16..) {
             if running.device.next_wake().is_none_or(|wake| wake > now) {
                 continue;
@@ -141,13 +143,25 @@ impl Decoder {
                 let Some(transmit) = running.device.poll_transmit(now, &mut self.decoded) else {
                     break;
                 };
-                send(&transmit);
+                send(number, &transmit);
             }
             for fault in &self.decoded.faults {
                 self.status
                     .count(number, fault.counter, u64::from(fault.count));
             }
             self.status.set_state(number, running.device.state());
+        }
+    }
+
+    /// Tells device number `device` what became of a frame of it: when it was sent \[ns\], or why
+    /// it was not.
+    pub fn on_sent(&mut self, device: u16, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        if outcome.is_err() {
+            self.status.count(device, Counter::Unsent, 1);
+        }
+        if let Some(running) = self.devices.get_mut(usize::from(device)) {
+            running.device.on_sent(frame, outcome);
+            self.status.set_state(device, running.device.state());
         }
     }
 

@@ -192,7 +192,7 @@ pub fn decode(
         };
         // As live: the devices see the time pass, so that silences are seen.
         if record.frame.stamp != StampKind::None {
-            decoder.poll_transmit(record.frame.t, |_| {});
+            decoder.poll_transmit(record.frame.t, |_, _| {});
         }
         decoder.on_frame(&record.frame, |sample| {
             let written = order.push(*sample, |s| write_sample(&mut writer, s));

@@ -39,6 +39,8 @@ pub struct BusPlan {
     pub source: Source,
     /// Scheduling of its thread.
     pub realtime: Option<Realtime>,
+    /// Nothing is ever sent on it.
+    pub listen_only: bool,
     /// Its devices.
     pub devices: Vec<DevicePlan>,
 }
@@ -289,6 +291,7 @@ impl Builder<'_> {
             name: raw.name,
             source,
             realtime: raw.realtime,
+            listen_only: raw.listen_only,
             devices: Vec::new(),
         });
         for table in raw.device {

@@ -20,6 +20,10 @@ pub struct BusStatus {
     pub frames: AtomicU64,
     /// Frames that no device claims.
     pub unclaimed: AtomicU64,
+    /// Frames that were not sent.
+    pub send_failures: AtomicU64,
+    /// Attempts to send that found the link's queue full.
+    pub queue_full: AtomicU64,
     /// Samples published.
     pub published: AtomicU64,
     /// Samples not published.
@@ -30,7 +34,7 @@ pub struct BusStatus {
     pub last_frame: AtomicI64,
     /// Time of the last turn of the loop.
     pub last_turn: AtomicI64,
-    link: [AtomicU64; 5],
+    link: [AtomicU64; 4],
     link_state: AtomicU32,
     errors: [ErrorStatus; BusError::ALL.len()],
     devices: Vec<DeviceStatus>,
@@ -97,12 +101,14 @@ impl BusStatus {
             number,
             frames: AtomicU64::new(0),
             unclaimed: AtomicU64::new(0),
+            send_failures: AtomicU64::new(0),
+            queue_full: AtomicU64::new(0),
             published: AtomicU64::new(0),
             publish_failures: AtomicU64::new(0),
             connections: AtomicU64::new(0),
             last_frame: AtomicI64::new(Nanos::MIN.0),
             last_turn: AtomicI64::new(Nanos::MIN.0),
-            link: [const { AtomicU64::new(0) }; 5],
+            link: [const { AtomicU64::new(0) }; 4],
             link_state: AtomicU32::new(LinkState::Up as u32),
             errors: Default::default(),
             devices: devices.collect(),
@@ -135,15 +141,10 @@ impl BusStatus {
             dropped,
             error_frames,
             sent,
-            send_failures,
             losses,
             received: _,
         } = *counters;
-        for (cell, value) in
-            self.link
-                .iter()
-                .zip([dropped, error_frames, sent, send_failures, losses])
-        {
+        for (cell, value) in self.link.iter().zip([dropped, error_frames, sent, losses]) {
             cell.store(value, Relaxed);
         }
         self.link_state.store(state as u32, Relaxed);
@@ -175,8 +176,8 @@ impl BusStatus {
             .get(BusError::RxOverflow as usize)
             .copied()
             .unwrap_or(0);
-        let [dropped, error_frames, sent, send_failures, link_losses] =
-            [0, 1, 2, 3, 4].map(|i| self.link.get(i).map_or(0, |c: &AtomicU64| c.load(Relaxed)));
+        let [dropped, error_frames, sent, link_losses] =
+            [0, 1, 2, 3].map(|i| self.link.get(i).map_or(0, |c: &AtomicU64| c.load(Relaxed)));
         BusHealth {
             name: self.name,
             frames: self.frames.load(Relaxed),
@@ -186,7 +187,8 @@ impl BusStatus {
             error_frames,
             errors,
             sent,
-            send_failures,
+            send_failures: self.send_failures.load(Relaxed),
+            queue_full: self.queue_full.load(Relaxed),
             link_losses,
             published: self.published.load(Relaxed),
             publish_failures: self.publish_failures.load(Relaxed),

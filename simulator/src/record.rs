@@ -99,7 +99,7 @@ pub fn record(
         for (bus, host) in hosts.iter_mut().enumerate() {
             let mut commands = Vec::new();
             host.decoder
-                .poll_transmit(now, |transmit| commands.push(transmit.frame));
+                .poll_transmit(now, |_, transmit| commands.push(transmit.frame));
             for command in commands {
                 let command = host.transfer(command, now);
                 host.commands += 1;

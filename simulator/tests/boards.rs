@@ -98,7 +98,7 @@ fn session_from(robot: &Robot, settings: &Settings, seconds: f64, start: Nanos) 
         if now >= start {
             for (bus, (decoder, _)) in hosts.iter_mut().enumerate() {
                 let mut commands = Vec::new();
-                decoder.poll_transmit(now, |t| commands.push(t.frame));
+                decoder.poll_transmit(now, |_, t| commands.push(t.frame));
                 for command in commands {
                     simulator.on_frame(bus, &command, now);
                 }

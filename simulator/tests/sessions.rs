@@ -167,7 +167,7 @@ fn listen(
     let mut link = VirtualBus::open(domain, name, &[]).unwrap();
     let clock = Monotonic;
     while !stop.load(Relaxed) {
-        decoder.poll_transmit(clock.now(), |t| link.send(&t.frame, t.deadline).unwrap());
+        decoder.poll_transmit(clock.now(), |_, t| link.send(&t.frame).unwrap());
         let deadline = clock.now() + Nanos::from_millis(10);
         if let Received::Frame(frame) =
             link.recv(decoder.next_wake().map_or(deadline, |w| w.min(deadline)))

@@ -12,7 +12,7 @@ use proprio_estimator::setup::Setup;
 use proprio_gateway::candump;
 use proprio_gateway::clock::{Clock as _, Monotonic, sleep_until};
 use proprio_gateway::decoder::Decoder;
-use proprio_gateway::link::Link as _;
+use proprio_gateway::link::send_by;
 use proprio_gateway::link::socketcan::SocketCan;
 use proprio_gateway::plan::Plan;
 use proprio_gateway::status::BusStatus;
@@ -877,8 +877,7 @@ fn play(frames: &[(Nanos, usize, Frame)], mut meanwhile: impl FnMut()) {
     let start = Monotonic.now() + Nanos::from_millis(50) - *begin;
     for (t, interface, frame) in frames {
         sleep_until(start + *t);
-        links[*interface]
-            .send(frame, Monotonic.now() + PATIENCE)
+        send_by(&mut links[*interface], frame, Monotonic.now() + PATIENCE)
             .expect("a frame can be sent");
         meanwhile();
     }

@@ -7,6 +7,7 @@
 //! | [`replay`] | a recorded log | the log's, shifted to the present or as recorded |
 //! | [`virtual_bus`] | IPv4 multicast on the loopback interface, without kernel CAN | kernel |
 
+use crate::clock::{Clock, Monotonic, sleep_until};
 use proprio_drivers::{Claim, Format, Frame};
 use proprio_topics::{LinkState, Nanos};
 
@@ -44,8 +45,6 @@ pub struct LinkCounters {
     pub error_frames: u64,
     /// Frames sent.
     pub sent: u64,
-    /// Frames not sent before their deadline, or refused by the interface.
-    pub send_failures: u64,
     /// Number of link losses.
     pub losses: u64,
 }
@@ -54,12 +53,15 @@ pub struct LinkCounters {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum SendError {
-    /// The deadline passed first: the queue was full, or the call came too late.
-    #[error("the deadline passed before the frame could be sent")]
-    Deadline,
+    /// The system's queue is full; a later attempt may succeed.
+    #[error("the queue is full")]
+    Full,
     /// The link is down, gone or bus-off.
     #[error("the link is not up")]
     NotUp,
+    /// This link was opened to listen only.
+    #[error("this link only listens")]
+    ListenOnly,
     /// This link cannot carry such a frame (CAN FD on a classic interface), or does not send at
     /// all.
     #[error("this link cannot send such a frame")]
@@ -78,11 +80,11 @@ pub trait Link: Send {
     /// if the deadline is in the past. Frames that this link sent are not received.
     fn recv(&mut self, deadline: Nanos) -> Received;
 
-    /// Sends a frame before `deadline`.
+    /// Hands a frame to the system to be sent: one attempt, which never waits.
     ///
     /// # Errors
     /// [`SendError`]; the frame was not sent and will not be.
-    fn send(&mut self, frame: &Frame, deadline: Nanos) -> Result<(), SendError>;
+    fn send(&mut self, frame: &Frame) -> Result<(), SendError>;
 
     /// The link's state.
     fn state(&self) -> LinkState;
@@ -93,6 +95,48 @@ pub trait Link: Send {
     /// A note for the log when the link has ended, such as lines of a log that could not be read.
     fn note(&self) -> Option<String> {
         None
+    }
+}
+
+/// A link that never sends: for a bus whose devices another program commands.
+pub struct ListenOnly(pub Box<dyn Link>);
+
+impl Link for ListenOnly {
+    fn recv(&mut self, deadline: Nanos) -> Received {
+        self.0.recv(deadline)
+    }
+
+    /// Refuses every frame.
+    fn send(&mut self, _frame: &Frame) -> Result<(), SendError> {
+        Err(SendError::ListenOnly)
+    }
+
+    fn state(&self) -> LinkState {
+        self.0.state()
+    }
+
+    fn counters(&self) -> LinkCounters {
+        self.0.counters()
+    }
+
+    fn note(&self) -> Option<String> {
+        self.0.note()
+    }
+}
+
+/// Sends a frame, also if the queue is full at first: tries again every 0.2 ms until `deadline`.
+/// For programs that may wait, such as a simulated board; the gateway's data plane may not.
+///
+/// # Errors
+/// [`SendError`]; [`SendError::Full`] if the queue was full until the deadline.
+pub fn send_by(link: &mut dyn Link, frame: &Frame, deadline: Nanos) -> Result<(), SendError> {
+    loop {
+        let sent = link.send(frame);
+        let next = Monotonic.now() + Nanos::from_micros(200);
+        if sent != Err(SendError::Full) || next > deadline {
+            return sent;
+        }
+        sleep_until(next);
     }
 }
 

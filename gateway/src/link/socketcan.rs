@@ -17,16 +17,18 @@
 //!
 //! [`Link::recv`] asks for the interface's flags every 50 ms, in every state; error frames and
 //! failures of the socket tell changes at once. While the state is not up nothing is sent, so that
-//! no stale command waits in a queue until the bus is back.
+//! no stale command waits in a queue until the bus is back. What the kernel's queue holds when the
+//! interface goes down, the kernel drops. It can not be recalled while the interface is up: a
+//! controller that nobody acknowledges, or that is bus-off and restarted, sends what its queue and
+//! its own buffers hold (`ip link set can0 txqueuelen 10` keeps that short).
 
 use super::error_frame::ErrorFrame;
 use super::socket::{
-    RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, interface_flags, newly_dropped, wait,
+    RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, interface_flags, newly_dropped,
 };
 use super::{Link, LinkCounters, OpenError, Received, SendError, passes};
 use crate::clock::{Clock, HardwareToMonotonic, Monotonic, sleep_until};
 use nix::errno::Errno;
-use nix::poll::PollFlags;
 use nix::sys::socket::{MsgFlags, send, setsockopt, sockopt};
 use proprio_drivers::{Claim, Format, Frame, Id};
 use proprio_topics::{BusError, LinkState, Nanos, StampKind};
@@ -39,8 +41,6 @@ const CHECK: Nanos = Nanos::from_millis(50);
 /// For this long after an error frame told of bus-off, flags with a carrier do not end it: the
 /// kernel's link watch updates them at most once a second. Half a second is for a busy machine.
 const LINK_WATCH: Nanos = Nanos::from_millis(1500);
-/// Interval between attempts when the transmit queue is full; the socket cannot be polled for that.
-const QUEUE_RETRY: Nanos = Nanos::from_micros(200);
 /// Maximum number of kernel filters (`CAN_RAW_FILTER_MAX`).
 const MOST_FILTERS: usize = 512;
 /// Sizes of `struct can_frame` and `struct canfd_frame`.
@@ -421,46 +421,28 @@ impl Link for SocketCan {
         }
     }
 
-    /// As [`Link::send`]. Retries until the deadline while the interface's transmit queue is full.
-    fn send(&mut self, frame: &Frame, deadline: Nanos) -> Result<(), SendError> {
+    fn send(&mut self, frame: &Frame) -> Result<(), SendError> {
         let mut bytes = [0; FD];
-        let sent = match encode(frame, &mut bytes).and_then(|size| bytes.get(..size)) {
-            None => Err(SendError::Unsupported),
-            Some(_) if self.state != LinkState::Up => Err(SendError::NotUp),
-            Some(bytes) => loop {
-                let now = Monotonic.now();
-                if now > deadline {
-                    break Err(SendError::Deadline);
-                }
-                match send(self.socket.as_raw_fd(), bytes, MsgFlags::MSG_DONTWAIT) {
-                    Ok(_) => break Ok(()),
-                    Err(Errno::EINTR) => {}
-                    Err(Errno::EAGAIN) => {
-                        if let Err(error) = wait(
-                            self.socket.as_fd(),
-                            PollFlags::POLLOUT,
-                            deadline.saturating_sub(now),
-                        ) {
-                            break Err(SendError::System(error as i32));
-                        }
-                    }
-                    Err(Errno::ENOBUFS) => {
-                        sleep_until(deadline.min(now.saturating_add(QUEUE_RETRY)));
-                    }
-                    Err(error @ (Errno::ENETDOWN | Errno::ENODEV | Errno::ENXIO)) => {
-                        self.changed |= self.lose(error);
-                        break Err(SendError::NotUp);
-                    }
-                    Err(Errno::EINVAL | Errno::EMSGSIZE) => break Err(SendError::Unsupported),
-                    Err(error) => break Err(SendError::System(error as i32)),
-                }
-            },
-        };
-        match sent {
-            Ok(()) => self.counters.sent += 1,
-            Err(_) => self.counters.send_failures += 1,
+        let bytes = encode(frame, &mut bytes)
+            .and_then(|size| bytes.get(..size))
+            .ok_or(SendError::Unsupported)?;
+        if self.state != LinkState::Up {
+            return Err(SendError::NotUp);
         }
-        sent
+        match send(self.socket.as_raw_fd(), bytes, MsgFlags::MSG_DONTWAIT) {
+            Ok(_) => {
+                self.counters.sent += 1;
+                Ok(())
+            }
+            // The socket's own queue, the interface's queue, a signal.
+            Err(Errno::EAGAIN | Errno::ENOBUFS | Errno::EINTR) => Err(SendError::Full),
+            Err(error @ (Errno::ENETDOWN | Errno::ENODEV | Errno::ENXIO)) => {
+                self.changed |= self.lose(error);
+                Err(SendError::NotUp)
+            }
+            Err(Errno::EINVAL | Errno::EMSGSIZE) => Err(SendError::Unsupported),
+            Err(error) => Err(SendError::System(error as i32)),
+        }
     }
 
     fn state(&self) -> LinkState {
