@@ -289,3 +289,18 @@ fn error_frames_are_counted_and_let_time_pass() {
     rig.turns(4);
     assert!(rig.sent().len() > started);
 }
+
+#[test]
+fn a_bus_is_opened_to_listen_only_if_the_configuration_says_so() {
+    let plan = |key: &str| {
+        let text = format!(
+            "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\n{key}\n\
+             source = {{ kind = \"virtual\", name = \"b\" }}\n"
+        );
+        Plan::parse(&text, Path::new(".")).map(|plan| plan.buses[0].listen_only)
+    };
+    assert_eq!(plan(""), Ok(false));
+    assert_eq!(plan("listen_only = false"), Ok(false));
+    assert_eq!(plan("listen_only = true"), Ok(true));
+    assert!(plan("listen_only = 1").is_err());
+}

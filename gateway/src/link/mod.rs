@@ -6,6 +6,9 @@
 //! | [`socketcan`] | a CAN interface of the kernel | kernel, or the adapter's |
 //! | [`replay`] | a recorded log | the log's, shifted to the present or as recorded |
 //! | [`virtual_bus`] | IPv4 multicast on the loopback interface, without kernel CAN | kernel |
+//!
+//! [`ListenOnly`] takes from any of them the way to send. [`error_frame`] reads what a controller
+//! reports, and [`interface`] what the kernel knows of it.
 
 use crate::clock::{Clock, Monotonic, sleep_until};
 use proprio_drivers::{Claim, Format, Frame};
