@@ -3,8 +3,8 @@
 //! no lock, and waits only for frames, at most [`MAX_TURN`] at a time.
 //!
 //! **Time.** Before a frame is processed, the devices are advanced to its stamp; when no frame is
-//! waiting, to the clock. After a stall, frames that wait are thus no silence, and a silence between
-//! two of them is one, as in a recorded log.
+//! waiting, to the clock. After a stall, frames that wait are thus no silence, and a silence
+//! between two of them is one, as in a recorded log.
 //!
 //! **Sending never delays receiving.** What a device wants to send goes into a queue of [`QUEUE`]
 //! frames, and each turn sends what the link takes. If the link's own queue is full, the next

@@ -683,7 +683,7 @@ fn nothing_is_sent_on_a_bus_to_listen_to() {
         for frame in ["31A#008000800080", "31B#008000800080"] {
             can::run(&format!("cansend vcan0 {frame}"));
         }
-        health.wait("a sample", |h| bus(h.buses(), "bus").published == 1);
+        health.wait("both frames", |h| bus(h.buses(), "bus").frames == 2);
         // The board is started again after 0.35 s of silence.
         std::thread::sleep(Duration::from_millis(1000));
         let sent = bus(health.fresh().buses(), "bus").sent;

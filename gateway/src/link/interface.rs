@@ -71,8 +71,8 @@ fn open() -> Result<OwnedFd, Errno> {
 
 /// The request `RTM_GETLINK` for the interface called `name`.
 fn query(name: &str) -> Vec<u8> {
-    // struct nlmsghdr { len, type: u16, flags: u16, sequence number, port }, the length last; struct
-    // ifinfomsg, all zero; the attribute with the name, which ends with a zero.
+    // struct nlmsghdr { len, type: u16, flags: u16, sequence number, port }, the length last;
+    // struct ifinfomsg, all zero; the attribute with the name, which ends with a zero.
     let mut message = vec![0; 2 * HEADER];
     let mut put = |at: usize, number: u16| {
         if let Some(field) = message.get_mut(at..at + 2) {
