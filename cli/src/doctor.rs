@@ -5,11 +5,13 @@ use nix::sys::resource::{Resource, getrlimit};
 use nix::sys::socket::{AddressFamily, SockFlag, SockType};
 use proprio_drivers::{Frame, Id};
 use proprio_gateway::clock::{Clock, Monotonic};
+use proprio_gateway::link::interface::{Interfaces as _, Netlink};
 use proprio_gateway::link::virtual_bus::VirtualBus;
-use proprio_gateway::link::{Link, Received};
-use proprio_topics::Nanos;
+use proprio_gateway::link::{Link, Received, send_by};
 use proprio_topics::ipc::{Domain, DomainConfig};
+use proprio_topics::{Controller, InterfaceHealth, Nanos};
 use serde_json::json;
+use std::fmt::Write as _;
 use std::fs;
 
 /// `proprio doctor`.
@@ -40,15 +42,15 @@ struct Finding {
 
 /// Runs all checks; fails if one finds that Proprio cannot run.
 pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
-    let findings = [
-        can(),
-        interfaces(),
+    let mut findings = vec![can()];
+    findings.extend(interfaces());
+    findings.extend([
         virtual_bus(domain),
         shared_memory(domain),
         buffers(),
         realtime(),
         locked_memory(),
-    ];
+    ]);
     if args.json {
         let rows: Vec<_> = findings
             .iter()
@@ -134,9 +136,10 @@ fn can() -> Finding {
     }
 }
 
-fn interfaces() -> Finding {
+fn interfaces() -> Vec<Finding> {
     const ARPHRD_CAN: &str = "280";
-    let mut names = Vec::new();
+    let mut netlink = Netlink::default();
+    let mut findings = Vec::new();
     for entry in fs::read_dir("/sys/class/net")
         .into_iter()
         .flatten()
@@ -149,21 +152,112 @@ fn interfaces() -> Finding {
                 .to_owned()
         };
         if read("type") == ARPHRD_CAN {
-            names.push(format!(
-                "{} ({}, queue {})",
-                entry.file_name().to_string_lossy(),
+            let name = entry.file_name().to_string_lossy().into_owned();
+            let system = format!(
+                "{name}: {}, queue {}",
                 read("operstate"),
                 read("tx_queue_len")
-            ));
+            );
+            findings.push(match netlink.ask(&name) {
+                Ok(health) => interface(&name, &system, &health),
+                Err(error) => finding(
+                    INTERFACE,
+                    Verdict::Lacking,
+                    format!("{system}; its controller is not known ({error})"),
+                    "allow AF_NETLINK sockets",
+                ),
+            });
         }
     }
-    if names.is_empty() {
+    if findings.is_empty() {
         let hint = "`ip link add dev vcan0 type vcan && ip link set vcan0 up` creates a virtual \
                     one; `ip link set can0 up type can bitrate 1000000 restart-ms 100` brings a \
                     real one up";
-        return finding("CAN interfaces", Verdict::Lacking, "no CAN interface", hint);
+        findings.push(finding(
+            INTERFACE,
+            Verdict::Lacking,
+            "no CAN interface",
+            hint,
+        ));
     }
-    finding("CAN interfaces", Verdict::Ok, names.join(", "), "")
+    findings
+}
+
+const INTERFACE: &str = "CAN interfaces";
+
+/// The finding about interface `name`, of which the system says `system`.
+fn interface(name: &str, system: &str, health: &InterfaceHealth) -> Finding {
+    let mut says = system.to_owned();
+    let _ = write!(
+        says,
+        ", {}",
+        if health.fd == 1 {
+            "CAN FD"
+        } else {
+            "classic CAN"
+        }
+    );
+    let controller = health.controller.get().unwrap_or_default();
+    if controller != Controller::Unknown {
+        let _ = write!(says, ", {} bit/s", health.bit_rate);
+        if health.data_bit_rate != 0 {
+            let _ = write!(says, " ({} bit/s in the data phase)", health.data_bit_rate);
+        }
+        let _ = write!(
+            says,
+            ", controller {}, error counters tx={} rx={}, restart-ms {}{}",
+            controller.word(),
+            health.tx_error_counter,
+            health.rx_error_counter,
+            health.restart_ms,
+            if health.listen_only == 1 {
+                ", listen-only"
+            } else {
+                ""
+            }
+        );
+    }
+    let _ = write!(
+        says,
+        "; received {} ({} errors, {} dropped), sent {} ({} errors, {} dropped)",
+        health.rx_frames,
+        health.rx_errors,
+        health.rx_dropped,
+        health.tx_frames,
+        health.tx_errors,
+        health.tx_dropped
+    );
+    let (verdict, hint) = match controller {
+        Controller::BusOff => (
+            Verdict::Lacking,
+            format!(
+                "bus-off: check the cable, the termination and the bit-rate, then `ip link set \
+                 {name} type can restart`"
+            ),
+        ),
+        Controller::Warning | Controller::Passive => (
+            Verdict::Lacking,
+            "many errors: check the cable, the termination and the bit-rate".to_owned(),
+        ),
+        Controller::Unknown => (Verdict::Ok, String::new()),
+        // A stopped one is that of an interface that is down.
+        Controller::Active | Controller::Stopped | Controller::Sleeping
+            if health.restart_ms == 0 =>
+        {
+            (
+                Verdict::Lacking,
+                format!(
+                    "restart-ms 0: after too many errors (bus-off) it stays off until a person \
+                     restarts it; `ip link set {name} down && ip link set {name} up type can \
+                     restart-ms 100`"
+                ),
+            )
+        }
+        Controller::Active | Controller::Stopped | Controller::Sleeping => {
+            (Verdict::Ok, String::new())
+        }
+    };
+    finding(INTERFACE, verdict, says, &hint)
 }
 
 fn virtual_bus(domain: &DomainConfig) -> Finding {
@@ -173,7 +267,8 @@ fn virtual_bus(domain: &DomainConfig) -> Finding {
         let open = || VirtualBus::open(&domain.name, &name, &[]).map_err(|e| e.to_string());
         let (mut one, mut other) = (open()?, open()?);
         let sent = clock.now();
-        one.send(
+        send_by(
+            &mut one,
             &Frame::new(Id::standard(0x123), &[1, 2, 3]),
             sent + Nanos::from_millis(100),
         )
@@ -304,4 +399,55 @@ fn locked_memory() -> Finding {
         "LimitMEMLOCK=infinity in the systemd unit, or `ulimit -l unlimited`; needed only for \
          realtime = { priority = ... }",
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_controller_is_described_and_its_problem_named() {
+        let health = |controller: Controller, restart_ms| InterfaceHealth {
+            controller: controller.in_memory(),
+            bit_rate: 500_000,
+            tx_error_counter: 136,
+            rx_frames: 77,
+            restart_ms,
+            ..InterfaceHealth::default()
+        };
+        for (controller, restart_ms, verdict, hint) in [
+            (Controller::Active, 100, Verdict::Ok, ""),
+            (Controller::Active, 0, Verdict::Lacking, "restart-ms 100"),
+            (Controller::Stopped, 0, Verdict::Lacking, "restart-ms 100"),
+            (Controller::Passive, 100, Verdict::Lacking, "many errors"),
+            (
+                Controller::BusOff,
+                100,
+                Verdict::Lacking,
+                "can5 type can restart",
+            ),
+            // A virtual interface has no controller.
+            (Controller::Unknown, 0, Verdict::Ok, ""),
+        ] {
+            let finding = interface(
+                "can5",
+                "can5: up, queue 10",
+                &health(controller, restart_ms),
+            );
+            assert!(finding.verdict == verdict, "{controller:?}");
+            assert!(finding.hint.contains(hint), "{}", finding.hint);
+            assert_eq!(finding.hint.is_empty(), verdict == Verdict::Ok);
+            for fact in ["can5: up", "classic CAN", "received 77"] {
+                assert!(finding.says.contains(fact), "{}", finding.says);
+            }
+            for fact in ["500000 bit/s", controller.word(), "tx=136"] {
+                assert_eq!(
+                    finding.says.contains(fact),
+                    controller != Controller::Unknown,
+                    "{}",
+                    finding.says
+                );
+            }
+        }
+    }
 }

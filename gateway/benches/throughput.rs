@@ -12,7 +12,7 @@ use proprio_gateway::candump;
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::decoder::Decoder;
 use proprio_gateway::link::virtual_bus::VirtualBus;
-use proprio_gateway::link::{Link, LinkCounters, Received, SendError};
+use proprio_gateway::link::{Link, LinkCounters, Received, SendError, send_by};
 use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
 use proprio_gateway::publish::Shared;
@@ -124,7 +124,9 @@ fn frames() -> Vec<Frame> {
 
 fn fill(bus: &mut VirtualBus, frames: &[Frame]) {
     let deadline = Monotonic.now() + Nanos::from_millis(1000);
-    frames.iter().for_each(|f| bus.send(f, deadline).unwrap());
+    frames
+        .iter()
+        .for_each(|f| send_by(bus, f, deadline).unwrap());
 }
 
 /// Only reads the datagrams that have arrived.
@@ -177,8 +179,8 @@ impl Link for Waiting {
     fn recv(&mut self, _: Nanos) -> Received {
         self.0.recv(Nanos::ZERO)
     }
-    fn send(&mut self, frame: &Frame, deadline: Nanos) -> Result<(), SendError> {
-        self.0.send(frame, deadline)
+    fn send(&mut self, frame: &Frame) -> Result<(), SendError> {
+        self.0.send(frame)
     }
     fn state(&self) -> LinkState {
         self.0.state()

@@ -1,14 +1,28 @@
 //! The data plane of one bus: the loop that moves frames from the link through the devices to the
 //! sink and sends the devices' frames. One thread owns it. After start it allocates nothing, takes
 //! no lock, and waits only for frames, at most [`MAX_TURN`] at a time.
+//!
+//! **Time.** Before a frame is processed, the devices are advanced to its stamp; when no frame is
+//! waiting, to the clock. After a stall, frames that wait are thus no silence, and a silence
+//! between two of them is one, as in a recorded log.
+//!
+//! **Sending never delays receiving.** What a device wants to send goes into a queue of [`QUEUE`]
+//! frames, and each turn sends what the link takes. If the link's own queue is full, the next
+//! attempt is made after [`RETRY`]; poll does not tell when a CAN interface has room. A frame that
+//! is not sent by its deadline is dropped, and so is everything that waits when the link is lost: a
+//! stale command moves robots. Every device learns what became of its frames. (What the kernel's
+//! queue holds when an interface goes down, the kernel drops; a frame that the controller has begun
+//! to send can not be recalled.)
 
 use crate::clock::Clock;
 use crate::decoder::Decoder;
-use crate::link::{Link, Received};
+use crate::link::error_frame::ErrorFrame;
+use crate::link::{Link, Received, SendError};
 use crate::publish::Sink;
 use crate::status::BusStatus;
-use proprio_drivers::{Frame, NotSent};
+use proprio_drivers::{Frame, NotSent, Transmit};
 use proprio_topics::{LinkState, Nanos};
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 
@@ -19,17 +33,22 @@ pub const MAX_TURN: Nanos = Nanos::from_millis(50);
 /// Time for the devices to stop before the link is closed in any case.
 pub const STOP_TIME: Nanos = Nanos::from_millis(200);
 
+/// Maximum number of frames that wait to be sent: a start-up command for each of 16 boards, several
+/// times over.
+pub const QUEUE: usize = 64;
+
+/// Time to the next attempt after the link's queue was full: meanwhile a bus of 1 Mbit/s sends
+/// about eight of its frames.
+pub const RETRY: Nanos = Nanos::from_millis(1);
+
 /// A running bus.
 pub struct Bus<S> {
     link: Box<dyn Link>,
     decoder: Decoder,
     sink: S,
     status: Arc<BusStatus>,
-    /// The outcomes of the frames of one turn, at most one of each device.
-    outcomes: Vec<(u16, Frame, Result<Nanos, NotSent>)>,
     link_was_up: bool,
-    /// The stamp of the last frame, as long as more frames may be waiting.
-    heard: Option<Nanos>,
+    queue: Queue,
 }
 
 /// Whether more frames can come.
@@ -41,61 +60,57 @@ pub enum Turn {
     Ended,
 }
 
+/// The frames that wait to be sent, in the order in which the devices gave them.
+struct Queue {
+    waiting: VecDeque<Waiting>,
+    /// Frames that found the queue full, until their devices have been told.
+    refused: Vec<Waiting>,
+    /// Time of the next attempt after the link's queue was full.
+    retry: Nanos,
+}
+
+struct Waiting {
+    device: u16,
+    frame: Frame,
+    /// \[ns\] of the clock.
+    deadline: Nanos,
+}
+
 impl<S: Sink> Bus<S> {
     /// Combines link, devices and sink.
     pub fn new(link: Box<dyn Link>, decoder: Decoder, sink: S, status: Arc<BusStatus>) -> Self {
         let link_was_up = link.state() == LinkState::Up;
-        let outcomes = decoder.states().count();
         Self {
             link,
             decoder,
             sink,
             status,
-            outcomes: Vec::with_capacity(outcomes),
             link_was_up,
-            heard: None,
+            queue: Queue {
+                waiting: VecDeque::with_capacity(QUEUE),
+                refused: Vec::with_capacity(QUEUE),
+                retry: Nanos::MIN,
+            },
         }
     }
 
-    /// One turn: send the frames that are due, wait for a frame, process it.
+    /// One turn: send what waits, wait for a frame, process it.
     pub fn turn(&mut self, clock: &impl Clock) -> Turn {
         let now = clock.now();
         self.status.last_turn.store(now.0, Relaxed);
+        self.follow_link(now);
         let mut deadline = now + MAX_TURN;
-        if self.link.state() == LinkState::Up {
-            if !self.link_was_up {
-                self.link_was_up = true;
-                self.decoder.restart(now);
+        if self.link_was_up {
+            self.send(now, clock);
+            let wake = self.decoder.next_wake().unwrap_or(Nanos::MAX);
+            deadline = deadline.min(wake);
+            if !self.queue.waiting.is_empty() {
+                deadline = deadline.min(self.queue.retry);
             }
-            let link = &mut self.link;
-            // After a stall old frames are waiting, and a device is not silent while its frames
-            // have not been read. Therefore the devices' time follows the stamps of the frames, and
-            // the clock only when no frame is waiting.
-            let then = self.heard.map_or(now, |t| t.min(now));
-            let behind = now - then;
-            let outcomes = &mut self.outcomes;
-            self.decoder.poll_transmit(then, |device, t| {
-                let sent = link.send(&t.frame, t.deadline + behind);
-                let outcome = sent.map(|()| clock.now()).map_err(|_| NotSent::Refused);
-                outcomes.push((device, t.frame, outcome));
-            });
-            for (device, frame, outcome) in self.outcomes.drain(..) {
-                self.decoder.on_sent(device, &frame, outcome);
-            }
-            deadline = self
-                .decoder
-                .next_wake()
-                .map_or(deadline, |wake| wake.min(deadline));
-        } else if self.link_was_up {
-            // No device streams over a lost link, and the health must show that.
-            self.link_was_up = false;
-            self.decoder.restart(now);
         }
-        let received = self.link.recv(deadline);
-        self.heard = None;
-        match received {
+        match self.link.recv(deadline) {
             Received::Frame(frame) => {
-                self.heard = Some(frame.t);
+                self.advance(frame.t, clock);
                 let (sink, status) = (&mut self.sink, &self.status);
                 self.decoder
                     .on_frame(&frame, |sample| match sink.publish(sample, clock.now()) {
@@ -110,7 +125,18 @@ impl<S: Sink> Bus<S> {
                         }
                     });
             }
-            Received::TimedOut => self.sink.idle(),
+            Received::Error(frame) => {
+                self.advance(frame.t, clock);
+                if let Some(error) = ErrorFrame::of(&frame) {
+                    self.status.record_error(error);
+                }
+            }
+            Received::TimedOut => {
+                // Until then nothing had arrived. The clock itself may be later, if this thread
+                // was not scheduled meanwhile, and then frames may be waiting again.
+                self.advance(clock.now().min(deadline).max(now), clock);
+                self.sink.idle();
+            }
             Received::StateChanged => {}
             Received::Ended => {
                 self.status
@@ -123,12 +149,104 @@ impl<S: Sink> Bus<S> {
         Turn::Continue
     }
 
+    /// Starts the devices again when the link is lost (no device streams over it, and the health
+    /// must show that) and when it is back.
+    fn follow_link(&mut self, now: Nanos) {
+        let up = self.link.state() == LinkState::Up;
+        if up == self.link_was_up {
+            return;
+        }
+        self.link_was_up = up;
+        self.give_up();
+        self.decoder.restart(now);
+    }
+
+    /// Lets the time of the devices pass until `then` and queues what they want to send.
+    fn advance(&mut self, then: Nanos, clock: &impl Clock) {
+        // Over a lost link nothing is sent or expected.
+        if !self.link_was_up || self.link.state() != LinkState::Up {
+            return;
+        }
+        let (queue, status) = (&mut self.queue, &self.status);
+        self.decoder
+            .poll_transmit(then, |device, Transmit { frame, deadline }| {
+                // A device that lives in the past has as much time as it would have had then.
+                let behind = (clock.now() - then).max(Nanos::ZERO);
+                let waiting = Waiting {
+                    device,
+                    frame: *frame,
+                    deadline: *deadline + behind,
+                };
+                if queue.waiting.len() < QUEUE {
+                    queue.waiting.push_back(waiting);
+                } else {
+                    status.send_failures.fetch_add(1, Relaxed);
+                    // More than a full queue at once only a faulty device wants to send.
+                    if queue.refused.len() < QUEUE {
+                        queue.refused.push(waiting);
+                    }
+                }
+            });
+        for Waiting { device, frame, .. } in queue.refused.drain(..) {
+            self.decoder.on_sent(device, &frame, Err(NotSent::Deadline));
+        }
+    }
+
+    /// Sends what waits, as far as the link takes it, without waiting.
+    fn send(&mut self, now: Nanos, clock: &impl Clock) {
+        if self.queue.waiting.is_empty() {
+            return;
+        }
+        let (decoder, status) = (&mut self.decoder, &self.status);
+        self.queue.waiting.retain(|waiting| {
+            let in_time = now <= waiting.deadline;
+            if !in_time {
+                status.send_failures.fetch_add(1, Relaxed);
+                decoder.on_sent(waiting.device, &waiting.frame, Err(NotSent::Deadline));
+            }
+            in_time
+        });
+        if now < self.queue.retry {
+            return;
+        }
+        while let Some(waiting) = self.queue.waiting.front() {
+            let outcome = match self.link.send(&waiting.frame) {
+                Ok(()) => Ok(clock.now()),
+                Err(SendError::Full) => {
+                    self.status.queue_full.fetch_add(1, Relaxed);
+                    self.queue.retry = now + RETRY;
+                    return;
+                }
+                Err(SendError::NotUp) => return self.give_up(),
+                Err(SendError::ListenOnly | SendError::Unsupported | SendError::System(_)) => {
+                    self.status.send_failures.fetch_add(1, Relaxed);
+                    Err(NotSent::Refused)
+                }
+            };
+            let (device, frame) = (waiting.device, waiting.frame);
+            self.queue.waiting.pop_front();
+            self.decoder.on_sent(device, &frame, outcome);
+        }
+    }
+
+    /// Drops everything that waits.
+    fn give_up(&mut self) {
+        while let Some(Waiting { device, frame, .. }) = self.queue.waiting.pop_front() {
+            self.status.send_failures.fetch_add(1, Relaxed);
+            self.decoder.on_sent(device, &frame, Err(NotSent::LinkLost));
+        }
+        self.queue.retry = Nanos::MIN;
+    }
+
     /// Stops the devices, within [`STOP_TIME`].
     pub fn stop(&mut self, clock: &impl Clock) {
         let now = clock.now();
         self.decoder.stop(now);
         let end = now + STOP_TIME;
-        while !self.decoder.stopped() && clock.now() < end && self.link.state() == LinkState::Up {
+        while !(self.decoder.stopped() && self.queue.waiting.is_empty())
+            && clock.now() < end
+            && self.link.state() == LinkState::Up
+        {
             if self.turn(clock) == Turn::Ended {
                 break;
             }

@@ -6,13 +6,15 @@
 //! changes of it, and feeds the watchdog as long as every bus thread runs.
 
 use crate::bus::{Bus, Turn};
-use crate::clock::{Clock, Monotonic, realtime_offset};
+use crate::clock::{Clock, Monotonic};
 use crate::config::{Pace, Source};
 use crate::decoder::Decoder;
+use crate::health::{HealthLog, fill_health};
+use crate::link::interface::{Netlink, Observer};
 use crate::link::replay::Replay;
 use crate::link::socketcan::SocketCan;
 use crate::link::virtual_bus::VirtualBus;
-use crate::link::{Link, OpenError};
+use crate::link::{Link, ListenOnly, OpenError};
 use crate::plan::{BusPlan, ConfigError, Plan};
 use crate::publish::Shared;
 use crate::status::BusStatus;
@@ -20,9 +22,7 @@ use anyhow::{Context, anyhow, bail};
 use proprio_drivers::{Claim, Mode};
 use proprio_topics::ipc::{Domain, DomainConfig, DomainError, Writer};
 use proprio_topics::realtime;
-use proprio_topics::{
-    Counter, Description, DeviceState, GatewayHealth, LinkState, Nanos, Refusal, Sample,
-};
+use proprio_topics::{Description, GatewayHealth, Nanos, Sample};
 use sd_notify::NotifyState;
 use std::io::Write as _;
 use std::path::Path;
@@ -118,6 +118,23 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
         join(&mut threads, &stop);
         return Err(error);
     }
+    let interfaces = plan.buses.iter().map(|bus| match &bus.source {
+        Source::SocketCan { interface } => Some(interface.clone()),
+        Source::Virtual { .. } | Source::Replay { .. } => None,
+    });
+    let observer = Observer::start(
+        interfaces.collect(),
+        Netlink::default(),
+        HEALTH_PERIOD,
+        Arc::clone(&stop),
+    );
+    let observer = match observer {
+        Ok(observer) => observer,
+        Err(error) => {
+            join(&mut threads, &stop);
+            return Err(anyhow!(error).context("cannot start a thread"));
+        }
+    };
     tracing::info!(
         robot = plan.robot,
         buses = plan.buses.len(),
@@ -138,8 +155,9 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
             _ = ticks.tick() => {}
         }
         let now = clock.now();
-        fill_health(&mut health, &threads);
-        health_log.log_changes(&health);
+        let statuses = statuses(&threads);
+        fill_health(&mut health, &statuses, &observer.newest());
+        health_log.log_changes(&health, &statuses);
         // A reader that cannot be reached now is no reason to stop; the next health follows in 0.1
         // s.
         let _ = health_writer.send(&health, now);
@@ -163,12 +181,16 @@ async fn serve(plan: &Plan, domain_config: &DomainConfig) -> anyhow::Result<()> 
     tracing::info!(why, "stopping");
     let _ = sd_notify::notify(&[NotifyState::Stopping]);
     let panicked = join(&mut threads, &stop);
-    fill_health(&mut health, &threads);
+    fill_health(&mut health, &statuses(&threads), &observer.newest());
     let _ = health_writer.send(&health, clock.now());
     match panicked {
         None => Ok(()),
         Some(bus) => bail!("the thread of bus {bus:?} panicked: this is a bug in the program"),
     }
+}
+
+fn statuses(threads: &[BusThread]) -> Vec<&BusStatus> {
+    threads.iter().map(|t| &*t.status).collect()
 }
 
 /// Stops all bus threads and waits for them; returns the name of the first that panicked.
@@ -220,9 +242,10 @@ impl BusThread {
         let status = Arc::new(BusStatus::new(number, bus));
         // A log is not interactive: its boards answered the program that commanded them during the
         // recording.
-        let mode = matches!(bus.source, Source::Replay { .. }).then_some(Mode::Listen);
+        let listens = bus.listen_only || matches!(bus.source, Source::Replay { .. });
+        let mode = listens.then_some(Mode::Listen);
         let decoder = Decoder::new(number, bus, mode, Arc::clone(&status))?;
-        let link: Box<dyn Link> = if let Source::Replay { log, pace } = &bus.source {
+        let mut link: Box<dyn Link> = if let Source::Replay { log, pace } = &bus.source {
             let mut replay = Replay::open(
                 log,
                 *pace,
@@ -234,6 +257,9 @@ impl BusThread {
         } else {
             open_link(bus, &domain.config().name, &decoder.claims())?
         };
+        if bus.listen_only {
+            link = Box::new(ListenOnly(link));
+        }
         let ended = Arc::new(AtomicBool::new(false));
         let (ready, is_ready) = mpsc::channel();
         let (domain, robot, realtime) = (domain.clone(), plan.robot.clone(), bus.realtime);
@@ -304,125 +330,6 @@ pub fn open_link(
         Source::Virtual { name } => Box::new(VirtualBus::open(domain, name, claims)?),
         Source::Replay { log, pace } => Box::new(Replay::open(log, *pace, None, claims)?),
     })
-}
-
-fn fill_health(health: &mut GatewayHealth, threads: &[BusThread]) {
-    health.realtime_offset = realtime_offset();
-    (health.bus_count, health.device_count) = (0, 0);
-    for (slot, thread) in health.buses.iter_mut().zip(threads) {
-        *slot = thread.status.bus();
-        health.bus_count += 1;
-    }
-    for (slot, device) in health
-        .devices
-        .iter_mut()
-        .zip(threads.iter().flat_map(|t| t.status.devices()))
-    {
-        *slot = device;
-        health.device_count += 1;
-    }
-}
-
-/// Turns health into log lines: one at the first of a series of problems, one at its end.
-#[derive(Default)]
-struct HealthLog {
-    last: Option<Box<GatewayHealth>>,
-    /// Per device and counter, the number of ticks since the last increase, at most
-    /// [`HealthLog::REST`].
-    quiet: Vec<[u32; Counter::ALL.len()]>,
-    /// Per bus, the remaining ticks in which a dropped frame belongs to the same problem.
-    dropping: Vec<u32>,
-}
-
-impl HealthLog {
-    /// After this many ticks without an increase, the next one is a new problem.
-    const REST: u32 = 50;
-
-    fn log_changes(&mut self, health: &GatewayHealth) {
-        let last = self.last.replace(Box::new(*health));
-        self.quiet
-            .resize(health.devices().len(), [Self::REST; Counter::ALL.len()]);
-        for (i, bus) in health.buses().iter().enumerate() {
-            let before = last.as_ref().and_then(|l| l.buses().get(i));
-            let was = before.map_or(LinkState::Up.in_memory(), |b| b.link);
-            if bus.link != was {
-                let name = bus.name.as_str();
-                match bus.link.get().unwrap_or_default() {
-                    LinkState::Up => tracing::info!(bus = name, "the link is up again"),
-                    LinkState::Ended => {
-                        tracing::info!(bus = name, frames = bus.frames, "the log has ended");
-                    }
-                    state => tracing::error!(
-                        bus = name,
-                        "the link is {}; waiting for it to come back",
-                        state.word()
-                    ),
-                }
-            }
-            let dropped = bus.dropped - before.map_or(0, |b| b.dropped.min(bus.dropped));
-            self.dropping.resize(health.buses().len(), 0);
-            let first = self.dropping.get_mut(i).is_none_or(|rest| {
-                let first = *rest == 0;
-                *rest = if dropped > 0 {
-                    Self::REST
-                } else {
-                    rest.saturating_sub(1)
-                };
-                first
-            });
-            if dropped > 0 && first {
-                tracing::warn!(
-                    bus = bus.name.as_str(),
-                    dropped,
-                    "the kernel dropped frames: the receive buffer was full"
-                );
-            }
-        }
-        for (i, device) in health.devices().iter().enumerate() {
-            let before = last.as_ref().and_then(|l| l.devices().get(i));
-            let name = device.name.as_str();
-            if before.is_none_or(|b| (b.state, b.refusal) != (device.state, device.refusal)) {
-                match Refusal::from_code(device.refusal) {
-                    Some(refusal) => tracing::error!(device = name, "refused: {refusal}"),
-                    None => {
-                        let state = device.state.get().map_or("unknown", DeviceState::word);
-                        tracing::info!(device = name, "{state}");
-                    }
-                }
-            }
-            let Some(quiet) = self.quiet.get_mut(i) else {
-                continue;
-            };
-            for counter in Counter::ALL
-                .into_iter()
-                .filter(|c| !matches!(c, Counter::Frames | Counter::Readings | Counter::Starts))
-            {
-                let at = counter as usize;
-                let count = device.counters.get(at).copied().unwrap_or(0);
-                let new = count
-                    - before
-                        .and_then(|b| b.counters.get(at).copied())
-                        .unwrap_or(0)
-                        .min(count);
-                let Some(rest) = quiet.get_mut(at) else {
-                    continue;
-                };
-                if new == 0 {
-                    *rest = (*rest + 1).min(Self::REST);
-                } else {
-                    if *rest >= Self::REST {
-                        tracing::warn!(
-                            device = name,
-                            total = count,
-                            "{}: {new} (further ones are only counted, in health)",
-                            counter.word()
-                        );
-                    }
-                    *rest = 0;
-                }
-            }
-        }
-    }
 }
 
 /// Sends log lines to standard error; RUST_LOG selects the level, `info` by default.

@@ -15,7 +15,7 @@
 //!   frames through it.
 //! - [`publish`]: the destinations of samples; [`status`]: the counters of a bus thread.
 //! - [`offline`]: converts a log to a table of samples and back, without a daemon.
-//! - [`daemon`]: the control plane: threads, signals, health, watchdog.
+//! - [`daemon`]: the control plane: threads, signals, health, log lines, watchdog.
 //! - [`clock`]: the only place that reads a clock.
 
 pub mod bus;
@@ -24,6 +24,7 @@ pub mod clock;
 pub mod config;
 pub mod daemon;
 pub mod decoder;
+mod health;
 pub mod link;
 pub mod offline;
 pub mod plan;

@@ -2,11 +2,14 @@
 //! atomics.
 
 use crate::link::LinkCounters;
+use crate::link::error_frame::ErrorFrame;
 use crate::plan::BusPlan;
 use proprio_drivers::State;
-use proprio_topics::{BusHealth, Code, Counter, DeviceHealth, LinkState, Name, Nanos, Refusal};
+use proprio_topics::{
+    BusError, BusHealth, Code, Counter, DeviceHealth, LinkState, Name, Nanos, Refusal,
+};
 use std::sync::atomic::Ordering::Relaxed;
-use std::sync::atomic::{AtomicI64, AtomicU32, AtomicU64};
+use std::sync::atomic::{AtomicI64, AtomicU32, AtomicU64, Ordering, fence};
 
 /// The counters of one bus.
 #[derive(Debug)]
@@ -17,6 +20,10 @@ pub struct BusStatus {
     pub frames: AtomicU64,
     /// Frames that no device claims.
     pub unclaimed: AtomicU64,
+    /// Frames that were not sent.
+    pub send_failures: AtomicU64,
+    /// Attempts to send that found the link's queue full.
+    pub queue_full: AtomicU64,
     /// Samples published.
     pub published: AtomicU64,
     /// Samples not published.
@@ -27,9 +34,47 @@ pub struct BusStatus {
     pub last_frame: AtomicI64,
     /// Time of the last turn of the loop.
     pub last_turn: AtomicI64,
-    link: [AtomicU64; 5],
+    link: [AtomicU64; 4],
     link_state: AtomicU32,
+    errors: [ErrorStatus; BusError::ALL.len()],
     devices: Vec<DeviceStatus>,
+}
+
+/// The number of error frames with one cause, and the newest of them.
+#[derive(Debug, Default)]
+struct ErrorStatus {
+    /// Twice the number; odd while the newest frame is being written.
+    version: AtomicU64,
+    classes: AtomicU32,
+    data: AtomicU64,
+}
+
+impl ErrorStatus {
+    /// Counts and keeps `frame`. For one writer.
+    fn record(&self, frame: ErrorFrame) {
+        let version = self.version.load(Relaxed);
+        self.version.store(version + 1, Relaxed);
+        fence(Ordering::Release);
+        self.classes.store(frame.classes, Relaxed);
+        self.data.store(u64::from_ne_bytes(frame.data), Relaxed);
+        self.version.store(version + 2, Ordering::Release);
+    }
+
+    fn count(&self) -> u64 {
+        self.version.load(Relaxed) / 2
+    }
+
+    /// The newest frame; `None` before the first, and if the next one is being written.
+    fn newest(&self) -> Option<ErrorFrame> {
+        let version = self.version.load(Ordering::Acquire);
+        let frame = ErrorFrame {
+            classes: self.classes.load(Relaxed),
+            data: self.data.load(Relaxed).to_ne_bytes(),
+        };
+        fence(Ordering::Acquire);
+        (version >= 2 && version.is_multiple_of(2) && self.version.load(Relaxed) == version)
+            .then_some(frame)
+    }
 }
 
 #[derive(Debug)]
@@ -56,13 +101,16 @@ impl BusStatus {
             number,
             frames: AtomicU64::new(0),
             unclaimed: AtomicU64::new(0),
+            send_failures: AtomicU64::new(0),
+            queue_full: AtomicU64::new(0),
             published: AtomicU64::new(0),
             publish_failures: AtomicU64::new(0),
             connections: AtomicU64::new(0),
             last_frame: AtomicI64::new(Nanos::MIN.0),
             last_turn: AtomicI64::new(Nanos::MIN.0),
-            link: [const { AtomicU64::new(0) }; 5],
+            link: [const { AtomicU64::new(0) }; 4],
             link_state: AtomicU32::new(LinkState::Up as u32),
+            errors: Default::default(),
             devices: devices.collect(),
         }
     }
@@ -93,33 +141,54 @@ impl BusStatus {
             dropped,
             error_frames,
             sent,
-            send_failures,
             losses,
             received: _,
         } = *counters;
-        for (cell, value) in
-            self.link
-                .iter()
-                .zip([dropped, error_frames, sent, send_failures, losses])
-        {
+        for (cell, value) in self.link.iter().zip([dropped, error_frames, sent, losses]) {
             cell.store(value, Relaxed);
         }
         self.link_state.store(state as u32, Relaxed);
     }
 
-    /// The bus's part of the health message.
+    /// Counts an error frame under each of its causes.
+    pub fn record_error(&self, frame: ErrorFrame) {
+        for cause in frame.causes() {
+            if let Some(status) = self.errors.get(cause as usize) {
+                status.record(frame);
+            }
+        }
+    }
+
+    /// The newest error frame with `cause`; `None` before the first, and for an instant while the
+    /// bus thread writes the next.
+    #[must_use]
+    pub fn newest_error(&self, cause: BusError) -> Option<ErrorFrame> {
+        self.errors
+            .get(cause as usize)
+            .and_then(ErrorStatus::newest)
+    }
+
+    /// The bus's part of the health message, without what the kernel tells of the interface.
     #[must_use]
     pub fn bus(&self) -> BusHealth {
-        let [dropped, error_frames, sent, send_failures, link_losses] =
-            [0, 1, 2, 3, 4].map(|i| self.link.get(i).map_or(0, |c: &AtomicU64| c.load(Relaxed)));
+        let errors = self.errors.each_ref().map(ErrorStatus::count);
+        let overflows = errors
+            .get(BusError::RxOverflow as usize)
+            .copied()
+            .unwrap_or(0);
+        let [dropped, error_frames, sent, link_losses] =
+            [0, 1, 2, 3].map(|i| self.link.get(i).map_or(0, |c: &AtomicU64| c.load(Relaxed)));
         BusHealth {
             name: self.name,
             frames: self.frames.load(Relaxed),
             unclaimed: self.unclaimed.load(Relaxed),
-            dropped,
+            // The controller tells of an overflow, not of the number of frames: at least one.
+            dropped: dropped + overflows,
             error_frames,
+            errors,
             sent,
-            send_failures,
+            send_failures: self.send_failures.load(Relaxed),
+            queue_full: self.queue_full.load(Relaxed),
             link_losses,
             published: self.published.load(Relaxed),
             publish_failures: self.publish_failures.load(Relaxed),
@@ -148,5 +217,75 @@ impl BusStatus {
                 reserved: 0,
             }
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::Plan;
+    use std::path::Path;
+    use std::sync::atomic::AtomicBool;
+
+    fn status() -> BusStatus {
+        let text = "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\n\
+                    source = { kind = \"virtual\", name = \"b\" }\n";
+        let plan = Plan::parse(text, Path::new(".")).unwrap();
+        BusStatus::new(0, &plan.buses[0])
+    }
+
+    const fn controller(bits: u8, mark: u8) -> ErrorFrame {
+        ErrorFrame {
+            classes: libc::CAN_ERR_CRTL,
+            data: [0, bits, 0, 0, 0, 0, mark, mark],
+        }
+    }
+
+    #[test]
+    fn every_cause_is_counted_and_its_newest_frame_kept() {
+        let status = status();
+        assert_eq!(status.newest_error(BusError::Warning), None);
+        status.record_error(controller(0x0C, 1));
+        // A warning and an overflow.
+        status.record_error(controller(0x05, 2));
+        status.record_error(controller(0x30, 3));
+        let health = status.bus();
+        let count = |cause: BusError| health.errors[cause as usize];
+        assert_eq!(
+            [BusError::Warning, BusError::Passive, BusError::RxOverflow].map(count),
+            [2, 1, 1]
+        );
+        assert_eq!(health.errors.iter().sum::<u64>(), 4);
+        assert_eq!(health.dropped, 1, "an overflow has lost a frame");
+        let newest = |cause| status.newest_error(cause).map(|f| f.data[7]);
+        assert_eq!(
+            [BusError::Warning, BusError::Passive, BusError::Bus].map(newest),
+            [Some(2), Some(3), None]
+        );
+    }
+
+    /// Classes and data of one frame are never mixed with those of another.
+    #[test]
+    fn the_newest_frame_is_read_whole() {
+        let (status, stop) = (status(), AtomicBool::new(false));
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                for i in (0..=0xFF_u8).cycle().take(200_000) {
+                    status.record_error(ErrorFrame {
+                        classes: libc::CAN_ERR_ACK | u32::from(i) << 16,
+                        data: [i; 8],
+                    });
+                }
+                stop.store(true, Relaxed);
+            });
+            while !stop.load(Relaxed) {
+                if let Some(frame) = status.newest_error(BusError::NoAck) {
+                    let [first, ..] = frame.data;
+                    assert_eq!(frame.data, [first; 8]);
+                    assert_eq!(frame.classes >> 16, u32::from(first));
+                }
+            }
+        });
+        assert_eq!(status.bus().errors[BusError::NoAck as usize], 200_000);
     }
 }

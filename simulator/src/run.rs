@@ -10,7 +10,7 @@ use anyhow::Context as _;
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::config::Source;
 use proprio_gateway::daemon::open_link;
-use proprio_gateway::link::{Link, Received};
+use proprio_gateway::link::{Link, LinkCounters, Received, send_by};
 use proprio_topics::Nanos;
 use serde::Serialize;
 use std::fs::File;
@@ -240,17 +240,19 @@ pub fn run_with_skin(
         .iter()
         .zip(&buses)
         .zip(summaries)
-        .map(|((plan, source), (counts, link))| BusSummary {
-            name: plan.name.clone(),
-            source: source_text(source),
-            sent: link.sent,
-            send_failures: link.send_failures,
-            received: link.received,
-            lost_on_request: counts.lost_on_request,
-            skipped: counts.skipped,
-            refused: counts.refused,
-            latest: counts.latest.seconds(),
-        })
+        .map(
+            |((plan, source), (counts, link, send_failures))| BusSummary {
+                name: plan.name.clone(),
+                source: source_text(source),
+                sent: link.sent,
+                send_failures,
+                received: link.received,
+                lost_on_request: counts.lost_on_request,
+                skipped: counts.skipped,
+                refused: counts.refused,
+                latest: counts.latest.seconds(),
+            },
+        )
         .collect();
     Ok(Summary {
         robot: robot.plan.robot.clone(),
@@ -276,14 +278,15 @@ pub fn is_configuration(error: &anyhow::Error) -> bool {
 }
 
 /// The loop of one bus: send the frames that are due, then wait for a frame or for the next due
-/// time.
+/// time. Returns the counters of boards and link and the number of frames not sent.
 fn turn_until(
     mut bus: BusSimulator,
     mut link: Box<dyn Link>,
     clock: &impl Clock,
     end: Nanos,
     stop: &AtomicBool,
-) -> (BusCounts, proprio_gateway::link::LinkCounters) {
+) -> (BusCounts, LinkCounters, u64) {
+    let mut send_failures = 0;
     loop {
         let now = clock.now();
         if now >= end || stop.load(Relaxed) {
@@ -293,19 +296,19 @@ fn turn_until(
             let Some(frame) = bus.poll(clock.now()) else {
                 break;
             };
-            // The link counts frames that it could not send.
-            let _ = link.send(&frame, clock.now() + SEND_WITHIN);
+            let sent = send_by(&mut *link, &frame, clock.now() + SEND_WITHIN);
+            send_failures += u64::from(sent.is_err());
         }
         let deadline = (clock.now() + MOST_WAIT)
             .min(end)
             .min(bus.next_wake().unwrap_or(Nanos::MAX));
         match link.recv(deadline) {
             Received::Frame(frame) => bus.on_frame(&frame, clock.now()),
-            Received::TimedOut | Received::StateChanged => {}
+            Received::Error(_) | Received::TimedOut | Received::StateChanged => {}
             Received::Ended => break,
         }
     }
-    (bus.counts(), link.counters())
+    (bus.counts(), link.counters(), send_failures)
 }
 
 /// The loop of the skin, until no more touch follows.
@@ -388,7 +391,7 @@ mod tests {
     use super::*;
     use proprio_drivers::Frame;
     use proprio_gateway::decoder::Decoder;
-    use proprio_gateway::link::{LinkCounters, SendError};
+    use proprio_gateway::link::SendError;
     use proprio_gateway::status::BusStatus;
     use proprio_topics::{Counter, LinkState};
     use std::collections::VecDeque;
@@ -433,7 +436,7 @@ mod tests {
             }
         }
 
-        fn send(&mut self, frame: &Frame, _: Nanos) -> Result<(), SendError> {
+        fn send(&mut self, frame: &Frame) -> Result<(), SendError> {
             let now = Nanos(self.clock.0.fetch_add(10_000_000, Relaxed));
             self.gateway
                 .on_frame(&frame.at(now, proprio_topics::StampKind::Software), |_| {});

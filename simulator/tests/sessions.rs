@@ -169,7 +169,7 @@ fn listen(
     while !stop.load(Relaxed) {
         let mut sent = Vec::new();
         decoder.poll_transmit(clock.now(), |device, t| {
-            link.send(&t.frame, t.deadline).unwrap();
+            link.send(&t.frame).unwrap();
             sent.push((device, t.frame));
         });
         for (device, frame) in sent {

@@ -28,7 +28,7 @@ use proprio_gateway::candump;
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::decoder::Decoder;
 use proprio_gateway::link::virtual_bus::VirtualBus;
-use proprio_gateway::link::{Link, Received};
+use proprio_gateway::link::{Link, Received, send_by};
 use proprio_gateway::publish::{Memory, Shared, Sink};
 use proprio_gateway::status::BusStatus;
 use proprio_simulator::record::record;
@@ -179,11 +179,11 @@ fn far_end(
         let now = clock.now();
         while let Some((bus, frame)) = simulator.poll(now) {
             if bus == number {
-                let _ = link.send(&frame, now + patience);
+                let _ = send_by(&mut link, &frame, now + patience);
             }
         }
         for _ in 0..if nonsense.load(Relaxed) { 3 } else { 0 } {
-            let _ = link.send(&bad.next(), now + patience);
+            let _ = send_by(&mut link, &bad.next(), now + patience);
         }
         if let Received::Frame(frame) = link.recv(now + Nanos::from_millis(1)) {
             simulator.on_frame(number, &frame, clock.now());

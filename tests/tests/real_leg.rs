@@ -9,7 +9,7 @@ use proprio_estimator::offline::estimate;
 use proprio_estimator::reading;
 use proprio_estimator::setup::Setup;
 use proprio_gateway::candump;
-use proprio_gateway::link::Link;
+use proprio_gateway::link::send_by;
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::offline::{decode, encode};
 use proprio_gateway::plan::Plan;
@@ -278,9 +278,8 @@ fn played_onto_virtual_buses_the_live_estimates_are_those_of_the_samples_receive
                     .iter()
                     .position(|name| name == record.interface)
                     .expect("one of the buses");
-                buses[bus]
-                    .send(&record.frame, now() + Nanos::from_millis(1000))
-                    .expect("a frame can be sent");
+                let patience = now() + Nanos::from_millis(1000);
+                send_by(&mut buses[bus], &record.frame, patience).expect("a frame can be sent");
             }
         });
         Box::new(move || player.is_finished())

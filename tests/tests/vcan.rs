@@ -12,7 +12,7 @@ use proprio_estimator::setup::Setup;
 use proprio_gateway::candump;
 use proprio_gateway::clock::{Clock as _, Monotonic, sleep_until};
 use proprio_gateway::decoder::Decoder;
-use proprio_gateway::link::Link as _;
+use proprio_gateway::link::send_by;
 use proprio_gateway::link::socketcan::SocketCan;
 use proprio_gateway::plan::Plan;
 use proprio_gateway::status::BusStatus;
@@ -23,7 +23,7 @@ use proprio_tests::watch::{
 };
 use proprio_tests::{Arm, PATIENCE, Process, Rig, Written, now, uml, until};
 use proprio_topics::{
-    Counter, EstimatorHealth, GatewayHealth, LinkState, Nanos, Reading, TorqueEstimate,
+    BusError, Counter, EstimatorHealth, GatewayHealth, LinkState, Nanos, Reading, TorqueEstimate,
 };
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -593,6 +593,108 @@ fn interfaces_go_and_come_back() {
     chain.end();
 }
 
+/// A controller's error frames, which on a virtual interface any program may send: each cause is
+/// counted, the first of a run is told in words, and bus-off is a state of the link.
+#[test]
+fn error_frames_reach_health_and_log() {
+    if !vcan() {
+        return;
+    }
+    let rig = Rig::new();
+    let arm = Arm::slow()
+        .on_interfaces(INTERFACES)
+        .write(&rig.path("robot"));
+    let mut gateway = gateway(&rig, &arm);
+    let domain = rig.open();
+    let mut health = Newest::<GatewayHealth>::open(&domain, ROBOT);
+    health.wait("both links up", |h| {
+        h.buses().iter().filter(|b| b.link == LinkState::Up).count() == 2
+    });
+    let errors = |h: &GatewayHealth, cause: BusError| h.buses()[0].errors[cause as usize];
+    // Error passive in both directions with the error counters, ten times; then an overflow, and a
+    // stuff error in the data length code.
+    for _ in 0..10 {
+        can::run("cansend vcan0 20000204#0030000000008087");
+    }
+    can::run("cansend vcan0 20000004#0001000000000000");
+    can::run("cansend vcan0 20000008#0000040B00000000");
+    let told = health.wait("the errors", |h| errors(h, BusError::Protocol) == 1);
+    let bus = &told.buses()[0];
+    assert_eq!(
+        [BusError::Passive, BusError::RxOverflow, BusError::Bus].map(|c| errors(&told, c)),
+        [10, 1, 0]
+    );
+    assert_eq!((bus.error_frames, bus.dropped), (12, 1));
+    assert_eq!(told.buses()[1].error_frames, 0, "the other bus has none");
+    // What the kernel knows of a virtual interface.
+    let told = health.wait("the interface's totals", |h| {
+        h.buses()[0].interface.rx_frames >= 12
+    });
+    assert_eq!(told.buses()[0].interface.fd, 1);
+
+    can::run("cansend vcan0 20000040#0000000000000000");
+    health.wait("bus-off", |h| h.buses()[0].link == LinkState::BusOff);
+    can::run("cansend vcan0 20000100#0000000000000000");
+    let back = health.wait("up again", |h| h.buses()[0].link == LinkState::Up);
+    assert_eq!(back.buses()[0].link_losses, 1);
+    assert_eq!(back.buses()[1].link_losses, 0);
+    drop((health, domain));
+    gateway.end();
+    let log = gateway.log();
+    for (words, count) in [
+        ("rx passive, tx passive; error counters: tx=128, rx=135", 1),
+        ("receive buffer overflow", 1),
+        ("protocol violation at data length code", 1),
+        ("the link is bus_off", 1),
+        ("the link is up again", 1),
+    ] {
+        assert_eq!(log.matches(words).count(), count, "{words:?} in\n{log}");
+    }
+    rig.assert_nothing_left();
+}
+
+/// Nothing leaves a gateway on a bus that it may only listen to, although its board is one that it
+/// would start.
+#[test]
+fn nothing_is_sent_on_a_bus_to_listen_to() {
+    if !vcan() {
+        return;
+    }
+    let rig = Rig::new();
+    let config = rig.path("gateway.toml");
+    let plan = |listen_only: bool| {
+        format!(
+            "schema = 1\nrobot = \"listener\"\n[[bus]]\nname = \"bus\"\n\
+             source = {{ kind = \"socketcan\", interface = \"vcan0\" }}\n\
+             listen_only = {listen_only}\n[[bus.device]]\ndriver = \"icub_strain\"\n\
+             name = \"ft\"\naddress = 1\nfull_scale_n = [1804.0, 1804.0, 1804.0]\n\
+             full_scale_nm = [31.0, 31.0, 31.0]\n"
+        )
+    };
+    for listen_only in [true, false] {
+        fs::write(&config, plan(listen_only)).expect("a configuration");
+        let dump = Candump::start(&rig, "vcan0", "", "7FF#");
+        let mut gateway = rig.start(&["gateway", "--config", text(&config)]);
+        let domain = rig.open();
+        let mut health = Newest::<GatewayHealth>::open(&domain, "listener");
+        health.wait("the link up", |h| {
+            bus(h.buses(), "bus").link == LinkState::Up
+        });
+        for frame in ["31A#008000800080", "31B#008000800080"] {
+            can::run(&format!("cansend vcan0 {frame}"));
+        }
+        health.wait("both frames", |h| bus(h.buses(), "bus").frames == 2);
+        // The board is started again after 0.35 s of silence.
+        std::thread::sleep(Duration::from_millis(1000));
+        let sent = bus(health.fresh().buses(), "bus").sent;
+        drop((health, domain));
+        gateway.end();
+        assert_eq!(sent == 0, listen_only, "{sent} sent");
+        assert_eq!(dump.count() == 2, listen_only, "{}", dump.log());
+    }
+    rig.assert_nothing_left();
+}
+
 /// The gateway's claims on bus number `number`, that is, its filters.
 fn claims(plan: &Plan, number: usize) -> Vec<Claim> {
     let bus = &plan.buses[number];
@@ -671,12 +773,13 @@ fn floods_are_counted() {
     fs::write(&claimed, log).expect("a log");
     can::run(&format!("canplayer -t -g 0 -I {}", claimed.display()));
     let flooded = health.fresh();
-    let continued = health.wait("readings of all after the flood", |h| {
+    let continued = health.within(recovery(), |h| {
         readings(h)
             .iter()
             .zip(readings(&flooded))
             .all(|(now, then)| *now > then + 5)
     });
+    let continued = continued.expect("readings of all soon after the flood");
     // Each claimed identifier had 5 frames of each of the lengths 0 to 8, of which at most three
     // are legal.
     for device in continued.devices() {
@@ -877,8 +980,7 @@ fn play(frames: &[(Nanos, usize, Frame)], mut meanwhile: impl FnMut()) {
     let start = Monotonic.now() + Nanos::from_millis(50) - *begin;
     for (t, interface, frame) in frames {
         sleep_until(start + *t);
-        links[*interface]
-            .send(frame, Monotonic.now() + PATIENCE)
+        send_by(&mut links[*interface], frame, Monotonic.now() + PATIENCE)
             .expect("a frame can be sent");
         meanwhile();
     }

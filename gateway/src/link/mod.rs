@@ -6,10 +6,16 @@
 //! | [`socketcan`] | a CAN interface of the kernel | kernel, or the adapter's |
 //! | [`replay`] | a recorded log | the log's, shifted to the present or as recorded |
 //! | [`virtual_bus`] | IPv4 multicast on the loopback interface, without kernel CAN | kernel |
+//!
+//! [`ListenOnly`] takes from any of them the way to send. [`error_frame`] reads what a controller
+//! reports, and [`interface`] what the kernel knows of it.
 
+use crate::clock::{Clock, Monotonic, sleep_until};
 use proprio_drivers::{Claim, Format, Frame};
 use proprio_topics::{LinkState, Nanos};
 
+pub mod error_frame;
+pub mod interface;
 pub mod replay;
 mod socket;
 pub mod socketcan;
@@ -20,6 +26,9 @@ pub mod virtual_bus;
 pub enum Received {
     /// A frame, stamped with its time of arrival.
     Frame(Frame),
+    /// An error frame of the interface ([`Format::Error`]), stamped likewise. It may have changed
+    /// the link's state.
+    Error(Frame),
     /// The deadline has passed without a frame.
     TimedOut,
     /// There will be no more frames (the end of a log).
@@ -35,12 +44,10 @@ pub struct LinkCounters {
     pub received: u64,
     /// Frames that the kernel dropped because the receive buffer was full.
     pub dropped: u64,
-    /// Error frames received (they set the state and are not returned).
+    /// Error frames returned.
     pub error_frames: u64,
     /// Frames sent.
     pub sent: u64,
-    /// Frames not sent before their deadline, or refused by the interface.
-    pub send_failures: u64,
     /// Number of link losses.
     pub losses: u64,
 }
@@ -49,12 +56,15 @@ pub struct LinkCounters {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum SendError {
-    /// The deadline passed first: the queue was full, or the call came too late.
-    #[error("the deadline passed before the frame could be sent")]
-    Deadline,
+    /// The system's queue is full; a later attempt may succeed.
+    #[error("the queue is full")]
+    Full,
     /// The link is down, gone or bus-off.
     #[error("the link is not up")]
     NotUp,
+    /// This link was opened to listen only.
+    #[error("this link only listens")]
+    ListenOnly,
     /// This link cannot carry such a frame (CAN FD on a classic interface), or does not send at
     /// all.
     #[error("this link cannot send such a frame")]
@@ -73,11 +83,11 @@ pub trait Link: Send {
     /// if the deadline is in the past. Frames that this link sent are not received.
     fn recv(&mut self, deadline: Nanos) -> Received;
 
-    /// Sends a frame before `deadline`.
+    /// Hands a frame to the system to be sent: one attempt, which never waits.
     ///
     /// # Errors
     /// [`SendError`]; the frame was not sent and will not be.
-    fn send(&mut self, frame: &Frame, deadline: Nanos) -> Result<(), SendError>;
+    fn send(&mut self, frame: &Frame) -> Result<(), SendError>;
 
     /// The link's state.
     fn state(&self) -> LinkState;
@@ -88,6 +98,48 @@ pub trait Link: Send {
     /// A note for the log when the link has ended, such as lines of a log that could not be read.
     fn note(&self) -> Option<String> {
         None
+    }
+}
+
+/// A link that never sends: for a bus whose devices another program commands.
+pub struct ListenOnly(pub Box<dyn Link>);
+
+impl Link for ListenOnly {
+    fn recv(&mut self, deadline: Nanos) -> Received {
+        self.0.recv(deadline)
+    }
+
+    /// Refuses every frame.
+    fn send(&mut self, _frame: &Frame) -> Result<(), SendError> {
+        Err(SendError::ListenOnly)
+    }
+
+    fn state(&self) -> LinkState {
+        self.0.state()
+    }
+
+    fn counters(&self) -> LinkCounters {
+        self.0.counters()
+    }
+
+    fn note(&self) -> Option<String> {
+        self.0.note()
+    }
+}
+
+/// Sends a frame, also if the queue is full at first: tries again every 0.2 ms until `deadline`.
+/// For programs that may wait, such as a simulated board; the gateway's data plane may not.
+///
+/// # Errors
+/// [`SendError`]; [`SendError::Full`] if the queue was full until the deadline.
+pub fn send_by(link: &mut dyn Link, frame: &Frame, deadline: Nanos) -> Result<(), SendError> {
+    loop {
+        let sent = link.send(frame);
+        let next = Monotonic.now() + Nanos::from_micros(200);
+        if sent != Err(SendError::Full) || next > deadline {
+            return sent;
+        }
+        sleep_until(next);
     }
 }
 

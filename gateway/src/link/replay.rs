@@ -172,11 +172,7 @@ impl Replay {
             self.unmatched += 1;
             return None;
         }
-        if frame.format == Format::Error {
-            self.counters.error_frames += 1;
-            return None;
-        }
-        passes(&self.claims, &frame).then_some(frame)
+        (frame.format == Format::Error || passes(&self.claims, &frame)).then_some(frame)
     }
 
     /// The next frame to return, due or not.
@@ -262,13 +258,16 @@ impl Link for Replay {
                 frame.at(due, StampKind::Log)
             }
         };
+        if frame.format == Format::Error {
+            self.counters.error_frames += 1;
+            return Received::Error(handed_out);
+        }
         self.counters.received += 1;
         Received::Frame(handed_out)
     }
 
     /// Never sends: a log does not answer.
-    fn send(&mut self, _frame: &Frame, _deadline: Nanos) -> Result<(), SendError> {
-        self.counters.send_failures += 1;
+    fn send(&mut self, _frame: &Frame) -> Result<(), SendError> {
         Err(SendError::Unsupported)
     }
 

@@ -242,7 +242,7 @@ impl<const SIZE: usize> Receiver<SIZE> {
             if self.empty {
                 let now = Monotonic.now();
                 if now < deadline {
-                    wait(socket, PollFlags::POLLIN, deadline.saturating_sub(now))?;
+                    wait(socket, deadline.saturating_sub(now))?;
                 }
             }
             match self.batch.receive(socket) {
@@ -273,14 +273,18 @@ pub(super) const fn newly_dropped(total: &mut u32, now: Option<u32>) -> u64 {
     new as u64
 }
 
-/// Waits at most `timeout` \[ns\] until the socket can be read (or written) or has an error.
+/// Waits at most `timeout` \[ns\] until the socket can be read or has an error.
 ///
 /// # Errors
 /// The system's; a signal counts as the end of the wait.
-pub(super) fn wait(socket: BorrowedFd<'_>, events: PollFlags, timeout: Nanos) -> Result<(), Errno> {
+fn wait(socket: BorrowedFd<'_>, timeout: Nanos) -> Result<(), Errno> {
     let timeout = timeout.0.max(0);
     let timeout = TimeSpec::new(timeout / 1_000_000_000, timeout % 1_000_000_000);
-    match ppoll(&mut [PollFd::new(socket, events)], Some(timeout), None) {
+    match ppoll(
+        &mut [PollFd::new(socket, PollFlags::POLLIN)],
+        Some(timeout),
+        None,
+    ) {
         Ok(_) | Err(Errno::EINTR) => Ok(()),
         Err(error) => Err(error),
     }

@@ -9,30 +9,38 @@
 //! | `ip link set can0 down` | [`LinkState::Down`] | when the interface is up again |
 //! | adapter unplugged, interface deleted | [`LinkState::Gone`] | new socket when it is back |
 //! | too many errors: bus-off | [`LinkState::BusOff`] | controller restart (`restart-ms`) |
+//! | up without a carrier | [`LinkState::NoCarrier`] | when it has a carrier |
 //!
-//! `ip link set can0 type can restart` restarts a controller by hand.
+//! `ip link set can0 type can restart` restarts a controller by hand. A controller without a
+//! carrier is mostly bus-off since before the link was opened; only netlink tells
+//! ([`super::interface`]).
 //!
-//! Recovery happens inside [`Link::recv`], which checks every 50 ms. While the state is not up
-//! nothing is sent, so that no stale command waits in a queue until the bus is back.
+//! [`Link::recv`] asks for the interface's flags every 50 ms, in every state; error frames and
+//! failures of the socket tell changes at once. While the state is not up nothing is sent, so that
+//! no stale command waits in a queue until the bus is back. What the kernel's queue holds when the
+//! interface goes down, the kernel drops. It can not be recalled while the interface is up: a
+//! controller that nobody acknowledges, or that is bus-off and restarted, sends what its queue and
+//! its own buffers hold (`ip link set can0 txqueuelen 10` keeps that short).
 
+use super::error_frame::ErrorFrame;
 use super::socket::{
-    RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, interface_flags, newly_dropped, wait,
+    RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, interface_flags, newly_dropped,
 };
 use super::{Link, LinkCounters, OpenError, Received, SendError, passes};
 use crate::clock::{Clock, HardwareToMonotonic, Monotonic, sleep_until};
 use nix::errno::Errno;
-use nix::poll::PollFlags;
 use nix::sys::socket::{MsgFlags, send, setsockopt, sockopt};
 use proprio_drivers::{Claim, Format, Frame, Id};
-use proprio_topics::{LinkState, Nanos, StampKind};
+use proprio_topics::{BusError, LinkState, Nanos, StampKind};
 use socketcan::{CanAddr, CanFdSocket, Socket, SocketOptions};
 use std::io;
 use std::os::fd::{AsFd, AsRawFd};
 
-/// Interval between checks for a lost interface.
-const RETRY: Nanos = Nanos::from_millis(50);
-/// Interval between attempts when the transmit queue is full; the socket cannot be polled for that.
-const QUEUE_RETRY: Nanos = Nanos::from_micros(200);
+/// Interval between queries of the interface's flags.
+const CHECK: Nanos = Nanos::from_millis(50);
+/// For this long after an error frame told of bus-off, flags with a carrier do not end it: the
+/// kernel's link watch updates them at most once a second. Half a second is for a busy machine.
+const LINK_WATCH: Nanos = Nanos::from_millis(1500);
 /// Maximum number of kernel filters (`CAN_RAW_FILTER_MAX`).
 const MOST_FILTERS: usize = 512;
 /// Sizes of `struct can_frame` and `struct canfd_frame`.
@@ -59,8 +67,10 @@ pub struct SocketCan {
     changed: bool,
     /// A frame that showed that the link is up again; returned after the state change.
     pending: Option<Frame>,
-    /// Time of the next check for the lost interface.
-    retry: Nanos,
+    /// Time of the next query of the flags.
+    check: Nanos,
+    /// Until then bus-off is believed rather than a carrier.
+    bus_off_until: Nanos,
     counters: LinkCounters,
 }
 
@@ -91,7 +101,7 @@ impl SocketCan {
         let mut receiver = Receiver::new();
         let socket = open_socket(interface, &filters, &mut receiver)
             .map_err(|e| open_error(interface, e))?;
-        let state = current_state(&socket, interface);
+        let state = state_of(interface_flags(socket.as_fd(), interface), false);
         Ok(Self {
             interface: interface.to_owned(),
             socket,
@@ -106,7 +116,8 @@ impl SocketCan {
             state,
             changed: false,
             pending: None,
-            retry: Nanos::ZERO,
+            check: Nanos::ZERO,
+            bus_off_until: Nanos::ZERO,
             counters: LinkCounters::default(),
         })
     }
@@ -120,12 +131,13 @@ impl SocketCan {
             self.counters.losses += 1;
         }
         self.state = state;
+        // Flags that lag behind what has told the change do not undo it at once.
+        self.check = Monotonic.now().saturating_add(CHECK);
         true
     }
 
     /// Sets the state after a failure of the socket; returns whether it has changed.
     fn lose(&mut self, error: Errno) -> bool {
-        self.retry = Monotonic.now().saturating_add(RETRY);
         // After any other error the socket is checked again.
         self.set_state(if matches!(error, Errno::ENODEV | Errno::ENXIO) {
             LinkState::Gone
@@ -134,14 +146,13 @@ impl SocketCan {
         })
     }
 
-    /// Checks, if it is time to, whether the lost interface is back; returns whether the state has
-    /// changed.
-    fn recover(&mut self) -> bool {
+    /// Asks, if it is time to, for the interface's flags; returns whether the state has changed.
+    fn checks(&mut self) -> bool {
         let now = Monotonic.now();
-        if now < self.retry {
+        if now < self.check {
             return false;
         }
-        self.retry = now.saturating_add(RETRY);
+        self.check = now.saturating_add(CHECK);
         // An interface that was deleted and created again needs a new socket.
         if self.state == LinkState::Gone {
             match open_socket(&self.interface, &self.filters, &mut self.receiver) {
@@ -150,8 +161,10 @@ impl SocketCan {
             }
             self.adapter = HardwareToMonotonic::default();
         }
-        let state = current_state(&self.socket, &self.interface);
-        self.set_state(state)
+        let flags = interface_flags(self.socket.as_fd(), &self.interface);
+        let carrier = matches!(flags, Ok(flags) if flags & libc::IFF_RUNNING != 0);
+        let bus_off = self.state == LinkState::BusOff && (!carrier || now < self.bus_off_until);
+        self.set_state(state_of(flags, bus_off))
     }
 
     /// Takes the next frame from the batch. `None`: the batch is empty.
@@ -159,24 +172,8 @@ impl SocketCan {
         while let Some(message) = self.receiver.batch.next() {
             self.counters.dropped += newly_dropped(&mut self.receiver.drops, message.control.drops);
             let frame = match decode(message.bytes) {
-                Some(Decoded::Frame(frame)) if passes(&self.claims, &frame) => frame,
-                Some(Decoded::Error(classes)) => {
-                    self.counters.error_frames += 1;
-                    let state = match self.state {
-                        _ if classes & libc::CAN_ERR_BUSOFF != 0 => LinkState::BusOff,
-                        // The controller has restarted, or counts errors again, as adapters that
-                        // restart automatically report.
-                        LinkState::BusOff
-                            if classes & (libc::CAN_ERR_RESTARTED | libc::CAN_ERR_CRTL) != 0 =>
-                        {
-                            LinkState::Up
-                        }
-                        state => state,
-                    };
-                    if self.set_state(state) {
-                        return Some(Received::StateChanged);
-                    }
-                    continue;
+                Some(frame) if frame.format == Format::Error || passes(&self.claims, &frame) => {
+                    frame
                 }
                 _ => continue,
             };
@@ -193,6 +190,20 @@ impl SocketCan {
                 (None, None) => (times.now(), StampKind::User),
             };
             let frame = frame.at(times.limit(stamp), kind);
+            if let Some(error) = ErrorFrame::of(&frame) {
+                self.counters.error_frames += 1;
+                if error.reports(BusError::BusOff) {
+                    self.bus_off_until = Monotonic.now().saturating_add(LINK_WATCH);
+                    self.set_state(LinkState::BusOff);
+                } else if self.state == LinkState::BusOff
+                    && error.classes & (libc::CAN_ERR_RESTARTED | libc::CAN_ERR_CRTL) != 0
+                {
+                    // The controller has restarted, or counts errors again, as adapters that
+                    // restart automatically report.
+                    self.set_state(LinkState::Up);
+                }
+                return Some(Received::Error(frame));
+            }
             // A controller that receives is on the bus. This does not hold if the interface was
             // lost: the frame may have been waiting since before the loss, which the system reports
             // only once.
@@ -264,12 +275,15 @@ fn open_socket(
     Ok(socket)
 }
 
-/// The state of an interface as the system sees it.
-fn current_state(socket: &CanFdSocket, interface: &str) -> LinkState {
-    match interface_flags(socket.as_fd(), interface) {
-        Ok(flags) if flags & libc::IFF_UP != 0 => LinkState::Up,
-        Ok(_) => LinkState::Down,
+/// The state of an interface with these flags, of which an error frame may have told that it is
+/// bus-off.
+const fn state_of(flags: Result<libc::c_int, Errno>, bus_off: bool) -> LinkState {
+    match flags {
         Err(_) => LinkState::Gone,
+        Ok(flags) if flags & libc::IFF_UP == 0 => LinkState::Down,
+        Ok(_) if bus_off => LinkState::BusOff,
+        Ok(flags) if flags & libc::IFF_RUNNING == 0 => LinkState::NoCarrier,
+        Ok(_) => LinkState::Up,
     }
 }
 
@@ -308,21 +322,18 @@ fn open_error(interface: &str, cause: io::Error) -> OpenError {
     }
 }
 
-enum Decoded {
-    Frame(Frame),
-    /// Error classes. Only two of them are used here, and socketcan's full decoding allocates from
-    /// the third cause on.
-    Error(u32),
-}
-
 /// Reads a `struct can_frame` or `struct canfd_frame`.
-fn decode(bytes: &[u8]) -> Option<Decoded> {
+fn decode(bytes: &[u8]) -> Option<Frame> {
     let raw = u32::from_ne_bytes(*bytes.first_chunk()?);
     let (len, flags) = (*bytes.get(4)?, *bytes.get(5)?);
     let len = usize::from(len);
     let payload = bytes.get(DATA..)?.get(..len);
     if raw & libc::CAN_ERR_FLAG != 0 {
-        return Some(Decoded::Error(raw & libc::CAN_ERR_MASK));
+        return Frame::with_format(
+            Id::extended(raw & libc::CAN_ERR_MASK),
+            Format::Error,
+            payload?,
+        );
     }
     let id = if raw & libc::CAN_EFF_FLAG != 0 {
         Id::extended(raw & libc::CAN_EFF_MASK)
@@ -330,20 +341,19 @@ fn decode(bytes: &[u8]) -> Option<Decoded> {
         #[allow(clippy::cast_possible_truncation)] // 11 bits
         Id::standard((raw & libc::CAN_SFF_MASK) as u16)
     };
-    let frame = match bytes.len() {
+    match bytes.len() {
         #[allow(clippy::cast_possible_truncation)] // of a byte
-        CLASSIC if raw & libc::CAN_RTR_FLAG != 0 => Frame::remote(id, len as u8),
-        CLASSIC => Frame::with_format(id, Format::Classic, payload?)?,
+        CLASSIC if raw & libc::CAN_RTR_FLAG != 0 => Some(Frame::remote(id, len as u8)),
+        CLASSIC => Frame::with_format(id, Format::Classic, payload?),
         FD => {
             let format = Format::Fd {
                 bit_rate_switch: flags & BIT_RATE_SWITCH != 0,
                 error_state: flags & ERROR_STATE != 0,
             };
-            Frame::with_format(id, format, payload?)?
+            Frame::with_format(id, format, payload?)
         }
-        _ => return None,
-    };
-    Some(Decoded::Frame(frame))
+        _ => None,
+    }
 }
 
 /// Writes a frame as `struct can_frame` or `struct canfd_frame` and returns its size; `None` for an
@@ -389,7 +399,7 @@ impl Link for SocketCan {
             if let Some(received) = self.next() {
                 return received;
             }
-            if matches!(self.state, LinkState::Down | LinkState::Gone) && self.recover() {
+            if self.checks() {
                 return Received::StateChanged;
             }
             // An endless series of error frames must not hold the caller beyond its deadline.
@@ -397,15 +407,12 @@ impl Link for SocketCan {
                 return Received::TimedOut;
             }
             asked = true;
-            let until = match self.state {
-                LinkState::Gone => {
-                    // The old socket will not report anything more.
-                    sleep_until(deadline.min(self.retry));
-                    continue;
-                }
-                LinkState::Down => deadline.min(self.retry),
-                _ => deadline,
-            };
+            let until = deadline.min(self.check);
+            if self.state == LinkState::Gone {
+                // The old socket will not report anything more.
+                sleep_until(until);
+                continue;
+            }
             if let Err(error) = self.receiver.fill(self.socket.as_fd(), until)
                 && self.lose(error)
             {
@@ -414,46 +421,28 @@ impl Link for SocketCan {
         }
     }
 
-    /// As [`Link::send`]. Retries until the deadline while the interface's transmit queue is full.
-    fn send(&mut self, frame: &Frame, deadline: Nanos) -> Result<(), SendError> {
+    fn send(&mut self, frame: &Frame) -> Result<(), SendError> {
         let mut bytes = [0; FD];
-        let sent = match encode(frame, &mut bytes).and_then(|size| bytes.get(..size)) {
-            None => Err(SendError::Unsupported),
-            Some(_) if self.state != LinkState::Up => Err(SendError::NotUp),
-            Some(bytes) => loop {
-                let now = Monotonic.now();
-                if now > deadline {
-                    break Err(SendError::Deadline);
-                }
-                match send(self.socket.as_raw_fd(), bytes, MsgFlags::MSG_DONTWAIT) {
-                    Ok(_) => break Ok(()),
-                    Err(Errno::EINTR) => {}
-                    Err(Errno::EAGAIN) => {
-                        if let Err(error) = wait(
-                            self.socket.as_fd(),
-                            PollFlags::POLLOUT,
-                            deadline.saturating_sub(now),
-                        ) {
-                            break Err(SendError::System(error as i32));
-                        }
-                    }
-                    Err(Errno::ENOBUFS) => {
-                        sleep_until(deadline.min(now.saturating_add(QUEUE_RETRY)));
-                    }
-                    Err(error @ (Errno::ENETDOWN | Errno::ENODEV | Errno::ENXIO)) => {
-                        self.changed |= self.lose(error);
-                        break Err(SendError::NotUp);
-                    }
-                    Err(Errno::EINVAL | Errno::EMSGSIZE) => break Err(SendError::Unsupported),
-                    Err(error) => break Err(SendError::System(error as i32)),
-                }
-            },
-        };
-        match sent {
-            Ok(()) => self.counters.sent += 1,
-            Err(_) => self.counters.send_failures += 1,
+        let bytes = encode(frame, &mut bytes)
+            .and_then(|size| bytes.get(..size))
+            .ok_or(SendError::Unsupported)?;
+        if self.state != LinkState::Up {
+            return Err(SendError::NotUp);
         }
-        sent
+        match send(self.socket.as_raw_fd(), bytes, MsgFlags::MSG_DONTWAIT) {
+            Ok(_) => {
+                self.counters.sent += 1;
+                Ok(())
+            }
+            // The socket's own queue, the interface's queue, a signal.
+            Err(Errno::EAGAIN | Errno::ENOBUFS | Errno::EINTR) => Err(SendError::Full),
+            Err(error @ (Errno::ENETDOWN | Errno::ENODEV | Errno::ENXIO)) => {
+                self.changed |= self.lose(error);
+                Err(SendError::NotUp)
+            }
+            Err(Errno::EINVAL | Errno::EMSGSIZE) => Err(SendError::Unsupported),
+            Err(error) => Err(SendError::System(error as i32)),
+        }
     }
 
     fn state(&self) -> LinkState {
@@ -501,6 +490,23 @@ mod tests {
         assert_eq!(bytes[4..16], [3, 0, 0, 0, 1, 2, 3, 0, 0, 0, 0, 0]);
     }
 
+    /// What the flags of an interface mean, without and with an error frame that told of bus-off.
+    #[test]
+    fn the_state_follows_the_flags() {
+        use LinkState::{BusOff, Down, Gone, NoCarrier, Up};
+        let (up, carrier, other) = (libc::IFF_UP, libc::IFF_RUNNING, libc::IFF_NOARP);
+        for (flags, state, after_bus_off) in [
+            (Err(Errno::ENODEV), Gone, Gone),
+            (Ok(0), Down, Down),
+            (Ok(carrier | other), Down, Down),
+            (Ok(up | other), NoCarrier, BusOff),
+            (Ok(up | carrier | other), Up, BusOff),
+        ] {
+            assert_eq!(state_of(flags, false), state, "{flags:?}");
+            assert_eq!(state_of(flags, true), after_bus_off, "{flags:?}");
+        }
+    }
+
     fn frame() -> impl Strategy<Value = Frame> {
         let id = prop_oneof![
             (0..=0x7FF_u16).prop_map(Id::Standard),
@@ -535,8 +541,8 @@ mod tests {
             let mut bytes = [0; FD];
             let size = encode(&frame, &mut bytes).unwrap();
             match decode(&bytes[..size]) {
-                Some(Decoded::Frame(back)) => prop_assert_eq!(back, frame),
-                _ => prop_assert!(false),
+                Some(back) => prop_assert_eq!(back, frame),
+                None => prop_assert!(false),
             }
         }
 

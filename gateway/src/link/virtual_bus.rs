@@ -30,10 +30,9 @@
 //! discarded here, but a drop count may include some. There is no arbitration and no bit rate:
 //! frames arrive in the order in which the kernel received them, as fast as they are sent.
 
-use super::socket::{RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, newly_dropped, wait};
+use super::socket::{RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, newly_dropped};
 use super::{Link, LinkCounters, OpenError, Received, SendError, passes};
 use crate::clock::{Clock, Monotonic, sleep_until};
-use nix::poll::PollFlags;
 use nix::sys::socket::{setsockopt, sockopt};
 use proprio_drivers::{Claim, Format, Frame, Id};
 use proprio_topics::{LinkState, Nanos, StampKind};
@@ -327,43 +326,20 @@ impl Link for VirtualBus {
         }
     }
 
-    fn send(&mut self, frame: &Frame, deadline: Nanos) -> Result<(), SendError> {
+    fn send(&mut self, frame: &Frame) -> Result<(), SendError> {
         let mut datagram = self.template;
-        let sent = match encode(frame, &mut datagram, self.key_len)
+        let datagram = encode(frame, &mut datagram, self.key_len)
             .and_then(|len| datagram.get(..len))
-        {
-            None => Err(SendError::Unsupported),
-            Some(datagram) => loop {
-                let now = Monotonic.now();
-                if now > deadline {
-                    break Err(SendError::Deadline);
-                }
-                match self.socket.send_to(datagram, self.group) {
-                    Ok(_) => break Ok(()),
-                    Err(error) => match error.raw_os_error() {
-                        Some(libc::EINTR) => {}
-                        Some(libc::EAGAIN) => {
-                            let timeout = deadline.saturating_sub(now);
-                            if let Err(error) =
-                                wait(self.socket.as_fd(), PollFlags::POLLOUT, timeout)
-                            {
-                                break Err(SendError::System(error as i32));
-                            }
-                        }
-                        Some(libc::ENOBUFS) => {
-                            sleep_until(deadline.min(now + Nanos::from_micros(200)));
-                        }
-                        Some(libc::ENETDOWN | libc::ENETUNREACH) => break Err(SendError::NotUp),
-                        number => break Err(SendError::System(number.unwrap_or_default())),
-                    },
-                }
-            },
-        };
-        match sent {
-            Ok(()) => self.counters.sent += 1,
-            Err(_) => self.counters.send_failures += 1,
-        }
-        sent
+            .ok_or(SendError::Unsupported)?;
+        self.socket
+            .send_to(datagram, self.group)
+            .map_err(|error| match error.raw_os_error() {
+                Some(libc::EAGAIN | libc::ENOBUFS | libc::EINTR) => SendError::Full,
+                Some(libc::ENETDOWN | libc::ENETUNREACH) => SendError::NotUp,
+                number => SendError::System(number.unwrap_or_default()),
+            })?;
+        self.counters.sent += 1;
+        Ok(())
     }
 
     fn state(&self) -> LinkState {

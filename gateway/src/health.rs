@@ -1,0 +1,409 @@
+//! The health message, and what of it becomes a line of the log: changes of state and the first of
+//! a run of problems, never every frame.
+
+use crate::clock::realtime_offset;
+use crate::link::error_frame::ErrorFrame;
+use crate::status::BusStatus;
+use proprio_topics::{
+    BusError, BusHealth, Controller, Counter, DeviceHealth, DeviceState, GatewayHealth,
+    InterfaceHealth, LinkState, Refusal,
+};
+
+/// Fills the health message from the counters of the buses and what is known of their interfaces.
+pub(crate) fn fill_health(
+    health: &mut GatewayHealth,
+    buses: &[&BusStatus],
+    interfaces: &[InterfaceHealth],
+) {
+    health.realtime_offset = realtime_offset();
+    (health.bus_count, health.device_count) = (0, 0);
+    for (i, (slot, status)) in health.buses.iter_mut().zip(buses).enumerate() {
+        *slot = status.bus();
+        slot.interface = interfaces.get(i).copied().unwrap_or_default();
+        // A gateway that is started on a bus-off controller receives no error frame that says so.
+        if slot.link == LinkState::NoCarrier && slot.interface.controller == Controller::BusOff {
+            slot.link = LinkState::BusOff.in_memory();
+        }
+        health.bus_count += 1;
+    }
+    for (slot, device) in health
+        .devices
+        .iter_mut()
+        .zip(buses.iter().flat_map(|b| b.devices()))
+    {
+        *slot = device;
+        health.device_count += 1;
+    }
+}
+
+/// The ticks since something last happened, which tell the first of a run from its others.
+#[derive(Clone, Copy)]
+struct Run(u32);
+
+impl Run {
+    /// After this many ticks without it, the next one begins a new run: 5 s.
+    const REST: u32 = 50;
+    /// No run yet.
+    const NONE: Self = Self(Self::REST);
+
+    /// To be called at every tick with whether it happened; returns whether a run begins.
+    fn begins(&mut self, happened: bool) -> bool {
+        let begins = happened && self.0 >= Self::REST;
+        self.0 = if happened {
+            0
+        } else {
+            (self.0 + 1).min(Self::REST)
+        };
+        begins
+    }
+}
+
+/// Turns health into log lines.
+#[derive(Default)]
+pub(crate) struct HealthLog {
+    last: Option<Box<GatewayHealth>>,
+    devices: Vec<[Run; Counter::ALL.len()]>,
+    buses: Vec<BusRuns>,
+}
+
+/// The runs of problems of one bus.
+#[derive(Clone, Copy)]
+struct BusRuns {
+    dropped: Run,
+    errors: [Run; BusError::ALL.len()],
+}
+
+/// The increase of a counter that starts again at zero with its program.
+const fn increase(now: u64, before: Option<u64>) -> u64 {
+    match before {
+        Some(before) if before <= now => now - before,
+        _ => now,
+    }
+}
+
+impl HealthLog {
+    /// Logs what has changed since the last call; `statuses` are those of the health's buses.
+    pub(crate) fn log_changes(&mut self, health: &GatewayHealth, statuses: &[&BusStatus]) {
+        let last = self.last.replace(Box::new(*health));
+        self.log_buses(health, last.as_deref(), statuses);
+        self.log_devices(health, last.as_deref());
+    }
+
+    fn log_buses(
+        &mut self,
+        health: &GatewayHealth,
+        last: Option<&GatewayHealth>,
+        statuses: &[&BusStatus],
+    ) {
+        let none = BusRuns {
+            dropped: Run::NONE,
+            errors: [Run::NONE; BusError::ALL.len()],
+        };
+        self.buses.resize(health.buses().len(), none);
+        for (i, (bus, runs)) in health.buses().iter().zip(&mut self.buses).enumerate() {
+            let before = last.and_then(|l| l.buses().get(i));
+            let name = bus.name.as_str();
+            let was = before.map_or(LinkState::Up.in_memory(), |b| b.link);
+            if bus.link != was {
+                match bus.link.get().unwrap_or_default() {
+                    LinkState::Up => tracing::info!(bus = name, "the link is up again"),
+                    LinkState::Ended => {
+                        tracing::info!(bus = name, frames = bus.frames, "the log has ended");
+                    }
+                    LinkState::BusOff
+                        if bus.interface.controller != Controller::Unknown
+                            && bus.interface.restart_ms == 0 =>
+                    {
+                        tracing::error!(
+                            bus = name,
+                            "the link is bus_off, until a person restarts the controller (`ip link \
+                             set INTERFACE type can restart`): it has no restart-ms"
+                        );
+                    }
+                    state => tracing::error!(
+                        bus = name,
+                        "the link is {}; waiting for it to come back",
+                        state.word()
+                    ),
+                }
+            }
+            log_controller(bus, before);
+            // One frame may report several causes: it is told once.
+            let mut told: Vec<ErrorFrame> = Vec::new();
+            for (cause, run) in BusError::ALL.into_iter().zip(&mut runs.errors) {
+                let of = |b: &BusHealth| b.errors.get(cause as usize).copied();
+                let count = of(bus).unwrap_or(0);
+                if run.begins(increase(count, before.and_then(of)) > 0)
+                    && let Some(frame) = statuses.get(i).and_then(|s| s.newest_error(cause))
+                    && !told.contains(&frame)
+                {
+                    told.push(frame);
+                    tracing::warn!(
+                        bus = name,
+                        "error frame: {frame} (further ones are only counted, in health)"
+                    );
+                }
+            }
+            let dropped = increase(bus.dropped, before.map(|b| b.dropped));
+            if runs.dropped.begins(dropped > 0) {
+                tracing::warn!(
+                    bus = name,
+                    dropped,
+                    "frames were lost: the receive buffer of the kernel or of the controller was \
+                     full"
+                );
+            }
+        }
+    }
+
+    fn log_devices(&mut self, health: &GatewayHealth, last: Option<&GatewayHealth>) {
+        self.devices
+            .resize(health.devices().len(), [Run::NONE; Counter::ALL.len()]);
+        for (i, (device, runs)) in health.devices().iter().zip(&mut self.devices).enumerate() {
+            let before = last.and_then(|l| l.devices().get(i));
+            let name = device.name.as_str();
+            if before.is_none_or(|b| (b.state, b.refusal) != (device.state, device.refusal)) {
+                match Refusal::from_code(device.refusal) {
+                    Some(refusal) => tracing::error!(device = name, "refused: {refusal}"),
+                    None => {
+                        let state = device.state.get().map_or("unknown", DeviceState::word);
+                        tracing::info!(device = name, "{state}");
+                    }
+                }
+            }
+            for (counter, run) in Counter::ALL.into_iter().zip(runs).filter(|(c, _)| {
+                !matches!(c, Counter::Frames | Counter::Readings | Counter::Starts)
+            }) {
+                let of = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
+                let count = of(device).unwrap_or(0);
+                let new = increase(count, before.and_then(of));
+                if run.begins(new > 0) {
+                    tracing::warn!(
+                        device = name,
+                        total = count,
+                        "{}: {new} (further ones are only counted, in health)",
+                        counter.word()
+                    );
+                }
+            }
+        }
+    }
+}
+
+/// Logs a change of the controller's error state.
+fn log_controller(bus: &BusHealth, before: Option<&BusHealth>) {
+    let was = before.map_or(Controller::Unknown.in_memory(), |b| b.interface.controller);
+    let now = bus.interface.controller;
+    if now == was || now == Controller::Unknown {
+        return;
+    }
+    let name = bus.name.as_str();
+    let (tx, rx) = (
+        bus.interface.tx_error_counter,
+        bus.interface.rx_error_counter,
+    );
+    match now.get().unwrap_or_default() {
+        // Not what is normal at the start.
+        Controller::Active if was == Controller::Unknown => {}
+        Controller::Active => tracing::info!(bus = name, "the controller is error active again"),
+        state => tracing::warn!(
+            bus = name,
+            "the controller is {}; error counters: tx={tx}, rx={rx}",
+            match state {
+                Controller::Warning => "at the warning limit",
+                Controller::Passive => "error passive",
+                Controller::BusOff => "bus-off",
+                Controller::Stopped => "stopped",
+                Controller::Sleeping => "asleep",
+                Controller::Active | Controller::Unknown => "in an unknown state",
+            }
+        ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::Plan;
+    use proprio_topics::{BusHealth, Nanos};
+    use std::io;
+    use std::path::Path;
+    use std::sync::{Arc, Mutex};
+
+    /// Collects log lines.
+    #[derive(Clone, Default)]
+    struct Lines(Arc<Mutex<Vec<u8>>>);
+
+    impl io::Write for Lines {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            self.0.lock().unwrap().extend(bytes);
+            Ok(bytes.len())
+        }
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    /// The lines that `run` logs.
+    fn logged(run: impl FnOnce()) -> Vec<String> {
+        let lines = Lines::default();
+        let writer = lines.clone();
+        let subscriber = tracing_subscriber::fmt()
+            .with_writer(move || writer.clone())
+            .with_ansi(false)
+            .without_time()
+            .with_target(false)
+            .finish();
+        tracing::subscriber::with_default(subscriber, run);
+        let bytes = lines.0.lock().unwrap().clone();
+        let text = String::from_utf8(bytes).unwrap();
+        text.lines().map(|l| l.trim().to_owned()).collect()
+    }
+
+    fn status() -> BusStatus {
+        let text = "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\n\
+                    source = { kind = \"virtual\", name = \"b\" }\n";
+        let plan = Plan::parse(text, Path::new(".")).unwrap();
+        BusStatus::new(0, &plan.buses[0])
+    }
+
+    fn health(bus: BusHealth) -> GatewayHealth {
+        let mut health = GatewayHealth::new(Nanos::ZERO);
+        health.bus_count = 1;
+        health.buses[0] = bus;
+        health
+    }
+
+    /// A controller in `state`, with its counters.
+    fn controller(state: Controller, restart_ms: u32) -> InterfaceHealth {
+        InterfaceHealth {
+            controller: state.in_memory(),
+            tx_error_counter: 96,
+            rx_error_counter: 5,
+            restart_ms,
+            ..InterfaceHealth::default()
+        }
+    }
+
+    #[test]
+    fn a_bus_without_carrier_whose_controller_is_bus_off_is_bus_off() {
+        let status = status();
+        let link = |state, interface| {
+            status.set_link(state, &crate::link::LinkCounters::default());
+            let mut health = Box::new(GatewayHealth::new(Nanos::ZERO));
+            fill_health(&mut health, &[&status], &[interface]);
+            assert_eq!(health.buses()[0].interface, interface);
+            assert!(health.realtime_offset > Nanos::ZERO);
+            health.buses()[0].link.get()
+        };
+        let (off, active) = (
+            controller(Controller::BusOff, 0),
+            controller(Controller::Active, 0),
+        );
+        assert_eq!(link(LinkState::NoCarrier, off), Some(LinkState::BusOff));
+        assert_eq!(
+            link(LinkState::NoCarrier, active),
+            Some(LinkState::NoCarrier)
+        );
+        assert_eq!(link(LinkState::Up, off), Some(LinkState::Up));
+        assert_eq!(link(LinkState::Down, off), Some(LinkState::Down));
+    }
+
+    #[test]
+    fn every_change_of_a_controller_and_its_link_is_one_line() {
+        let status = status();
+        let mut log = HealthLog::default();
+        let mut tick = |link, interface| {
+            status.set_link(link, &crate::link::LinkCounters::default());
+            let mut health = Box::new(GatewayHealth::new(Nanos::ZERO));
+            fill_health(&mut health, &[&status], &[interface]);
+            logged(|| log.log_changes(&health, &[&status]))
+        };
+        use Controller::{Active, BusOff, Passive, Unknown, Warning};
+        use LinkState::{NoCarrier, Up};
+        for (link, state, restart_ms, told) in [
+            (Up, Unknown, 0, &[][..]),
+            (Up, Active, 0, &[]),
+            (
+                Up,
+                Warning,
+                0,
+                &["the controller is at the warning limit; error counters: tx=96, rx=5"],
+            ),
+            (Up, Warning, 0, &[]),
+            (Up, Passive, 0, &["the controller is error passive"]),
+            (
+                NoCarrier,
+                BusOff,
+                0,
+                &[
+                    "the link is bus_off, until a person restarts",
+                    "the controller is bus-off",
+                ],
+            ),
+            (NoCarrier, BusOff, 0, &[]),
+            (
+                Up,
+                Active,
+                0,
+                &[
+                    "the link is up again",
+                    "the controller is error active again",
+                ],
+            ),
+            (
+                NoCarrier,
+                BusOff,
+                100,
+                &["the link is bus_off; waiting", "the controller is bus-off"],
+            ),
+            (NoCarrier, Unknown, 0, &["the link is no_carrier; waiting"]),
+        ] {
+            let lines = tick(link, controller(state, restart_ms));
+            assert_eq!(lines.len(), told.len(), "{state:?}: {lines:?}");
+            for (line, told) in lines.iter().zip(told) {
+                assert!(line.contains(told), "{line}, not {told}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_first_error_frame_of_a_run_is_told_in_words() {
+        let status = status();
+        let mut log = HealthLog::default();
+        let mut tick = |error: Option<ErrorFrame>| {
+            if let Some(error) = error {
+                status.record_error(error);
+            }
+            logged(|| log.log_changes(&health(status.bus()), &[&status]))
+        };
+        // A form error at the end of the frame, which is a bus error too, with its counters.
+        let error = ErrorFrame {
+            classes: 0x288,
+            data: [0, 0, 2, 0x1A, 0, 0, 17, 4],
+        };
+        assert_eq!(tick(None), [""; 0]);
+        let first = tick(Some(error));
+        assert_eq!(first.len(), 1, "{first:?}");
+        for word in ["protocol violation", "bus error", "tx=17", "rx=4"] {
+            assert!(first[0].contains(word), "{first:?}");
+        }
+        for _ in 0..100 {
+            assert_eq!(tick(Some(error)), [""; 0], "the same run");
+        }
+        for _ in 0..Run::REST {
+            assert_eq!(tick(None), [""; 0]);
+        }
+        assert_eq!(tick(Some(error)).len(), 1, "a new run");
+        let overflow = tick(Some(ErrorFrame {
+            classes: 4,
+            data: [0, 1, 0, 0, 0, 0, 0, 0],
+        }));
+        assert_eq!(overflow.len(), 2, "{overflow:?}");
+        assert!(
+            overflow[0].contains("receive buffer overflow"),
+            "{overflow:?}"
+        );
+        assert!(overflow[1].contains("frames were lost"), "{overflow:?}");
+    }
+}

@@ -1,0 +1,306 @@
+//! The loop of a bus over a scripted link: what is sent, when, in which order, and what is dropped,
+//! while frames keep being received.
+
+use proprio_drivers::{Frame, Id};
+use proprio_gateway::bus::{Bus, RETRY};
+use proprio_gateway::clock::Manual;
+use proprio_gateway::decoder::Decoder;
+use proprio_gateway::link::{Link, LinkCounters, ListenOnly, Received, SendError};
+use proprio_gateway::plan::Plan;
+use proprio_gateway::publish::Memory;
+use proprio_gateway::status::BusStatus;
+use proprio_topics::{BusError, Counter, LinkState, Nanos, StampKind};
+use std::collections::VecDeque;
+use std::fmt::Write as _;
+use std::path::Path;
+use std::sync::atomic::Ordering::Relaxed;
+use std::sync::{Arc, Mutex, MutexGuard};
+
+/// What a scripted link does and has been asked to do.
+#[derive(Default)]
+struct Script {
+    state: LinkState,
+    /// What `recv` returns; then a time-out.
+    receives: VecDeque<Received>,
+    /// How attempts to send end; then all succeed.
+    answers: VecDeque<Result<(), SendError>>,
+    sent: Vec<Frame>,
+    attempts: usize,
+    /// The last deadline of `recv`.
+    deadline: Nanos,
+}
+
+struct Scripted(Arc<Mutex<Script>>);
+
+impl Link for Scripted {
+    fn recv(&mut self, deadline: Nanos) -> Received {
+        let mut script = self.0.lock().unwrap();
+        script.deadline = deadline;
+        script.receives.pop_front().unwrap_or(Received::TimedOut)
+    }
+    fn send(&mut self, frame: &Frame) -> Result<(), SendError> {
+        let mut script = self.0.lock().unwrap();
+        script.attempts += 1;
+        let answer = script.answers.pop_front().unwrap_or(Ok(()));
+        if answer.is_ok() {
+            script.sent.push(*frame);
+        }
+        answer
+    }
+    fn state(&self) -> LinkState {
+        self.0.lock().unwrap().state
+    }
+    fn counters(&self) -> LinkCounters {
+        LinkCounters::default()
+    }
+}
+
+/// A bus with F/T boards that are to be started, at a clock that is set by hand.
+struct Rig {
+    script: Arc<Mutex<Script>>,
+    status: Arc<BusStatus>,
+    bus: Bus<Memory>,
+    clock: Manual,
+    now: Nanos,
+}
+
+impl Rig {
+    fn new(boards: u32) -> Self {
+        Self::over(boards, |link| Box::new(link))
+    }
+
+    fn over(boards: u32, link: impl Fn(Scripted) -> Box<dyn Link>) -> Self {
+        let mut text = "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\n\
+                        source = { kind = \"virtual\", name = \"b\" }\n"
+            .to_owned();
+        for address in 1..=boards {
+            write!(
+                text,
+                "[[bus.device]]\ndriver = \"icub_strain\"\nname = \"ft{address}\"\n\
+                 address = {address}\nfull_scale_n = [1804.0, 1804.0, 1804.0]\n\
+                 full_scale_nm = [31.0, 31.0, 31.0]\n"
+            )
+            .unwrap();
+        }
+        let plan = Plan::parse(&text, Path::new(".")).unwrap();
+        let status = Arc::new(BusStatus::new(0, &plan.buses[0]));
+        let decoder = Decoder::new(0, &plan.buses[0], None, Arc::clone(&status)).unwrap();
+        let script = Arc::new(Mutex::new(Script::default()));
+        let link = link(Scripted(Arc::clone(&script)));
+        let bus = Bus::new(link, decoder, Memory::default(), Arc::clone(&status));
+        let now = Nanos::from_millis(1000);
+        Self {
+            script,
+            status,
+            bus,
+            clock: Manual::new(now),
+            now,
+        }
+    }
+
+    fn script(&self) -> MutexGuard<'_, Script> {
+        self.script.lock().unwrap()
+    }
+
+    fn attempts(&self) -> usize {
+        self.script().attempts
+    }
+
+    fn sent(&self) -> Vec<Frame> {
+        self.script().sent.clone()
+    }
+
+    /// Lets the clock pass by `time`.
+    fn pass(&mut self, time: Nanos) {
+        self.now += time;
+        self.clock.set(self.now);
+    }
+
+    fn turns(&mut self, count: usize) {
+        for _ in 0..count {
+            self.bus.turn(&self.clock);
+        }
+    }
+
+    /// Frames that are not sent: as the bus counts them, and as the devices do.
+    fn unsent(&self) -> (u64, u64) {
+        let devices = self.status.devices();
+        let unsent = devices.map(|d| d.counters[Counter::Unsent as usize]).sum();
+        (self.status.bus().send_failures, unsent)
+    }
+}
+
+/// The start commands of `boards` boards, in order.
+fn start_commands(boards: u32) -> Vec<Frame> {
+    let mut rig = Rig::new(boards);
+    rig.turns(3);
+    let sent = rig.sent();
+    assert!(sent.len() >= boards as usize);
+    assert_eq!(rig.unsent(), (0, 0));
+    sent
+}
+
+/// Attempts that find the link's queue full.
+fn full(count: usize) -> VecDeque<Result<(), SendError>> {
+    vec![Err(SendError::Full); count].into()
+}
+
+#[test]
+fn a_full_queue_is_tried_again_in_order_while_frames_are_received() {
+    let wanted = start_commands(3);
+    let mut rig = Rig::new(3);
+    rig.script().answers = full(2);
+    rig.turns(2);
+    assert_eq!((rig.attempts(), rig.sent().len()), (1, 0));
+    // Frames are received meanwhile, without another attempt.
+    let now = rig.now;
+    let other = Frame::new(Id::standard(0x7F0), &[1]).at(now, StampKind::Software);
+    rig.script().receives = vec![Received::Frame(other); 20].into();
+    rig.turns(20);
+    assert_eq!(rig.status.frames.load(Relaxed), 20);
+    assert_eq!(rig.attempts(), 1);
+    assert_eq!(rig.script().deadline, now + RETRY, "the wait is shortened");
+    rig.pass(RETRY);
+    rig.turns(1);
+    assert_eq!((rig.attempts(), rig.sent().len()), (2, 0));
+    // Full again after the second frame.
+    rig.script().answers = [Ok(()), Ok(()), Err(SendError::Full)].into();
+    rig.pass(RETRY);
+    rig.turns(1);
+    assert_eq!(rig.sent().len(), 2);
+    rig.pass(RETRY);
+    rig.turns(1);
+    assert_eq!(rig.sent(), wanted);
+    assert_eq!((rig.status.bus().queue_full, rig.unsent()), (3, (0, 0)));
+    rig.turns(1);
+    assert!(rig.script().deadline > rig.now + RETRY, "nothing waits");
+}
+
+#[test]
+fn what_is_not_sent_by_its_deadline_is_dropped() {
+    let wanted = start_commands(2).len() as u64;
+    let mut rig = Rig::new(2);
+    rig.script().answers = full(1000);
+    rig.turns(2);
+    // The commands may be sent within 100 ms.
+    rig.pass(Nanos::from_millis(100));
+    rig.turns(1);
+    assert_eq!(rig.unsent(), (0, 0));
+    rig.pass(Nanos(1));
+    rig.turns(1);
+    assert_eq!(rig.unsent(), (wanted, wanted));
+    rig.script().answers.clear();
+    rig.pass(RETRY);
+    rig.turns(3);
+    assert!(rig.sent().is_empty());
+}
+
+#[test]
+fn what_waits_is_dropped_when_the_link_is_lost() {
+    let wanted = start_commands(2);
+    let failures = wanted.len() as u64;
+    // Told by the state, and by an attempt to send.
+    for by_state in [true, false] {
+        let mut rig = Rig::new(2);
+        rig.script().answers = full(1);
+        rig.turns(2);
+        if !by_state {
+            rig.script().answers = [Err(SendError::NotUp)].into();
+            rig.pass(RETRY);
+            rig.turns(1);
+            assert_eq!(rig.unsent(), (failures, failures), "at once");
+        }
+        for state in [LinkState::Down, LinkState::Gone, LinkState::BusOff] {
+            rig.script().state = state;
+            rig.script().receives = [Received::StateChanged].into();
+            let attempts = rig.attempts();
+            for _ in 0..20 {
+                rig.turns(1);
+                rig.pass(Nanos::from_millis(5));
+            }
+            assert_eq!(rig.unsent(), (failures, failures), "{state:?}");
+            assert_eq!(rig.attempts(), attempts, "nothing while {state:?}");
+        }
+        // The boards are started again, once.
+        rig.script().state = LinkState::Up;
+        rig.turns(5);
+        assert_eq!(rig.sent(), wanted);
+    }
+}
+
+#[test]
+fn what_the_link_refuses_is_told_to_its_device_alone() {
+    let wanted = start_commands(2);
+    let mut rig = Rig::new(2);
+    rig.script().answers = [Err(SendError::Unsupported)].into();
+    rig.turns(3);
+    assert_eq!(rig.sent(), wanted[1..]);
+    let unsent: Vec<u64> = rig
+        .status
+        .devices()
+        .map(|d| d.counters[Counter::Unsent as usize])
+        .collect();
+    assert_eq!((rig.status.bus().send_failures, unsent), (1, vec![1, 0]));
+
+    let mut rig = Rig::over(2, |link| Box::new(ListenOnly(Box::new(link))));
+    rig.turns(3);
+    let count = wanted.len() as u64;
+    assert_eq!((rig.attempts(), rig.unsent()), (0, (count, count)));
+}
+
+#[test]
+fn stop_commands_are_sent_before_the_end() {
+    let mut rig = Rig::new(2);
+    rig.turns(3);
+    rig.script().sent.clear();
+    rig.bus.stop(&rig.clock);
+    assert_eq!(rig.sent().len(), 2, "one per board");
+    assert_eq!(rig.unsent(), (0, 0));
+}
+
+#[test]
+fn error_frames_are_counted_and_let_time_pass() {
+    let mut rig = Rig::new(1);
+    rig.turns(3);
+    let error = |data| {
+        let frame = Frame::with_format(Id::extended(4), proprio_drivers::Format::Error, data);
+        frame.unwrap().at(rig.now, StampKind::Software)
+    };
+    let frames = [
+        error(&[0, 0x04, 0, 0, 0, 0, 96, 0]),
+        error(&[0, 0x31, 0, 0, 0, 0, 7, 135]),
+    ];
+    rig.script().receives = frames.map(Received::Error).into();
+    rig.turns(3);
+    let bus = rig.status.bus();
+    assert_eq!(
+        [BusError::Warning, BusError::Passive, BusError::RxOverflow]
+            .map(|cause| bus.errors[cause as usize]),
+        [1, 1, 1]
+    );
+    assert_eq!((bus.dropped, bus.frames), (1, 0));
+    let newest = rig.status.newest_error(BusError::Passive).unwrap();
+    assert_eq!(newest.data, [0, 0x31, 0, 0, 0, 0, 7, 135]);
+    // A stream of nothing but error frames does not stop the bring-up: the board is started again.
+    let started = rig.sent().len();
+    rig.pass(Nanos::from_millis(600));
+    let late = frames[0].at(rig.now, StampKind::Software);
+    rig.script().receives = vec![Received::Error(late); 10].into();
+    rig.turns(4);
+    assert!(rig.sent().len() > started);
+}
+
+#[test]
+fn a_bus_is_opened_to_listen_only_if_the_configuration_says_so() {
+    let plan = |key: &str| {
+        let text = format!(
+            "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\n{key}\n\
+             source = {{ kind = \"virtual\", name = \"b\" }}\n"
+        );
+        Plan::parse(&text, Path::new(".")).map(|plan| plan.buses[0].listen_only)
+    };
+    assert_eq!(plan(""), Ok(false));
+    assert_eq!(plan("listen_only = false"), Ok(false));
+    assert_eq!(plan("listen_only = true"), Ok(true));
+    assert!(plan("listen_only = 1").is_err());
+}
