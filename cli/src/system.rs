@@ -23,6 +23,10 @@ const WINDOW: Nanos = Nanos::from_millis(1000);
 /// A description or health message is sent again to a new reader within this time.
 const HISTORY: Nanos = Nanos::from_millis(500);
 
+/// How late a sample is still sorted into its place in a recording: a gateway that starts publishes
+/// the frames that arrived meanwhile.
+const REORDER: Nanos = Nanos::from_millis(2000);
+
 /// `proprio status`.
 #[derive(clap::Args)]
 pub(crate) struct Status {
@@ -552,7 +556,7 @@ pub(crate) fn record(args: &Record, config: &DomainConfig) -> anyhow::Result<()>
     };
     let file = File::create(&args.out).with_context(|| args.out.display().to_string())?;
     let mut table = Writer::new(BufWriter::new(file), &series, columns)?;
-    let (mut order, mut inbox) = (InOrder::<(usize, Value)>::default(), Vec::new());
+    let (mut order, mut inbox) = (InOrder::<(usize, Value)>::new(REORDER), Vec::new());
     let began = monotonic();
     let end = args
         .seconds
@@ -601,7 +605,7 @@ pub(crate) fn record(args: &Record, config: &DomainConfig) -> anyhow::Result<()>
         }
         let now = monotonic();
         if now >= next_flush {
-            // At most this much is lost if this program or the machine is killed.
+            // If this program is killed, the rows of the last moments are lost, not the table.
             next_flush = now + Nanos::from_millis(500);
             table.flush()?;
         }

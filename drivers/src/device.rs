@@ -1,9 +1,10 @@
 //! The two sides of a device's protocol as sans-I/O state machines: [`Device`] on the host,
-//! [`Board`] on the device.
+//! [`Board`] on the device; and [`Driver`], which makes both from a device's keys.
 
 use crate::{Frame, Id};
 use alloc::borrow::Cow;
 use alloc::boxed::Box;
+use alloc::vec::Vec;
 use arrayvec::ArrayVec;
 use proprio_topics::{Counter, DeviceState, Kind, Nanos, Quality, Reading, Refusal, StampKind};
 
@@ -410,5 +411,24 @@ pub trait Board: Send {
     ) -> Result<(), EncodeError>;
 }
 
-/// A device built by [`crate::Options::device`].
-pub type BoxedDevice = Box<dyn Device>;
+/// A driver: implemented by its `Options`, which hold the keys of one device.
+pub trait Driver {
+    /// Its name in gateway.toml: that of its file.
+    const NAME: &'static str;
+
+    /// The outputs of a device with these keys, in the order of its channels. None: it takes part
+    /// in the bus and measures nothing.
+    fn outputs(&self) -> Vec<OutputInfo>;
+
+    /// The host's side of one device. The joints of `spec` are outputs of this driver.
+    ///
+    /// # Errors
+    /// [`SpecError`]: an address or value that is invalid for the family.
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError>;
+
+    /// The device's own side.
+    ///
+    /// # Errors
+    /// As [`Driver::device`].
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError>;
+}

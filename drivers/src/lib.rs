@@ -34,8 +34,8 @@ mod pairing;
 mod registry;
 
 pub use device::{
-    Board, Claim, Decoded, Device, EncodeError, Fault, Frames, Mode, NotSent, Output, OutputInfo,
-    Outputs, Spec, SpecError, State, Transmit,
+    Board, Claim, Decoded, Device, Driver, EncodeError, Fault, Frames, Mode, NotSent, Output,
+    OutputInfo, Outputs, Spec, SpecError, State, Transmit,
 };
 pub use frame::{Format, Frame, Id};
-pub use registry::{DRIVERS, Driver, Options, OptionsError};
+pub use registry::{DRIVERS, Options, OptionsError};

@@ -1,34 +1,12 @@
 //! The drivers: one list from which their names, their keys and their devices follow.
 
 use crate::{
-    Board, Device, OutputInfo, Spec, SpecError, icub_imu, icub_motor, icub_pos, icub_strain,
+    Board, Device, Driver, OutputInfo, Spec, SpecError, icub_imu, icub_motor, icub_pos, icub_strain,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::Kind;
 use serde::Deserialize;
-
-/// A driver: implemented by its `Options`, which hold the keys of one device.
-pub trait Driver {
-    /// Its name in gateway.toml: that of its file.
-    const NAME: &'static str;
-
-    /// The outputs of a device with these keys, in the order of its channels. None: it takes part
-    /// in the bus and measures nothing.
-    fn outputs(&self) -> Vec<OutputInfo>;
-
-    /// The host's side of one device. The joints of `spec` are outputs of this driver.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address or value that is invalid for the family.
-    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError>;
-
-    /// The device's own side.
-    ///
-    /// # Errors
-    /// As [`Driver::device`].
-    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError>;
-}
 
 /// Why a driver's keys cannot be read.
 #[derive(Debug, Clone, PartialEq)]

@@ -5,6 +5,7 @@ use nix::errno::Errno;
 use nix::sys::time::TimeSpec;
 use nix::time::{ClockId, ClockNanosleepFlags, clock_gettime, clock_nanosleep};
 use proprio_topics::Nanos;
+use proprio_topics::ipc::monotonic;
 
 /// A source of time.
 pub trait Clock {
@@ -18,7 +19,7 @@ pub struct Monotonic;
 
 impl Clock for Monotonic {
     fn now(&self) -> Nanos {
-        read(ClockId::CLOCK_MONOTONIC)
+        monotonic()
     }
 }
 

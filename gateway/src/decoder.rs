@@ -1,11 +1,10 @@
 //! All devices of one bus: turns received frames into samples and collects the frames to send. It
 //! has no link, clock or sink, so it serves the live gateway and the offline tools alike.
 
+use crate::dispatch::Dispatch;
 use crate::plan::{BusPlan, Route};
 use crate::status::BusStatus;
-use proprio_drivers::{
-    Claim, Decoded, Device, Frame, Id, Mode, NotSent, SpecError, State, Transmit,
-};
+use proprio_drivers::{Claim, Decoded, Device, Frame, Mode, NotSent, SpecError, State, Transmit};
 use proprio_topics::{Counter, Header, MAX_CHANNELS, Nanos, Reading, Sample};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
@@ -212,87 +211,11 @@ impl Decoder {
     }
 }
 
-/// The devices that receive each identifier: a table for the 2048 standard identifiers, a list for
-/// the extended ones.
-struct Dispatch {
-    /// Per standard identifier, at most [`SHARERS`] device numbers.
-    standard: Vec<arrayvec::ArrayVec<u16, SHARERS>>,
-    extended: Vec<(Claim, u16)>,
-    /// The first identifier that more devices claim than it is passed to; a plan has none.
-    crowded: Option<Id>,
-}
-
-/// Maximum number of devices that receive one identifier: those of one board.
-pub(crate) const SHARERS: usize = 4;
-
-/// An identifier that more than [`SHARERS`] devices with these claims would receive.
-pub(crate) fn crowded<'a>(claims: impl Iterator<Item = &'a [Claim]>) -> Option<Id> {
-    Dispatch::new(claims).crowded
-}
-
-impl Dispatch {
-    fn new<'a>(claims: impl Iterator<Item = &'a [Claim]>) -> Self {
-        let mut this = Self {
-            standard: vec![arrayvec::ArrayVec::new(); 2048],
-            extended: Vec::new(),
-            crowded: None,
-        };
-        for (claims, device) in claims.zip(0_u16..) {
-            for claim in claims {
-                match claim.id {
-                    Id::Extended(_) => {
-                        this.extended.push((*claim, device));
-                        let mut sharers: Vec<u16> = this
-                            .extended
-                            .iter()
-                            .filter(|(other, _)| other.overlaps(claim))
-                            .map(|(_, device)| *device)
-                            .collect();
-                        sharers.dedup();
-                        if sharers.len() > SHARERS {
-                            this.crowded.get_or_insert(claim.id);
-                        }
-                    }
-                    Id::Standard(_) => {
-                        for (devices, id) in this.standard.iter_mut().zip(0_u16..) {
-                            if claim.matches(Id::Standard(id))
-                                && !devices.contains(&device)
-                                && devices.try_push(device).is_err()
-                            {
-                                this.crowded.get_or_insert(Id::Standard(id));
-                            }
-                        }
-                    }
-                }
-            }
-        }
-        this
-    }
-
-    fn find(&self, id: Id) -> arrayvec::ArrayVec<u16, SHARERS> {
-        match id {
-            Id::Standard(id) => self
-                .standard
-                .get(usize::from(id))
-                .cloned()
-                .unwrap_or_default(),
-            Id::Extended(_) => {
-                let mut found = arrayvec::ArrayVec::new();
-                for (claim, device) in &self.extended {
-                    if claim.matches(id) && !found.contains(device) {
-                        let _ = found.try_push(*device);
-                    }
-                }
-                found
-            }
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::plan::Plan;
+    use proprio_drivers::Id;
     use std::path::Path;
 
     /// A participant of the bus without an output: it sends one frame every 10 ms, and counts the
@@ -407,25 +330,5 @@ mod tests {
         plan.buses[0].devices[0].routes.clear();
         assert!(plan.to_string().contains("master"), "{plan}");
         assert_eq!(status.devices().next().unwrap().name.as_str(), "master");
-    }
-
-    #[test]
-    fn an_identifier_has_at_most_four_listeners() {
-        for id in [Id::standard(0x2A0), Id::extended(0x18FF_0001)] {
-            let shared = [Claim::shared(id)];
-            let other = [Claim::shared(Id::standard(0x2B0))];
-            let claims = |n: usize| {
-                std::iter::repeat_n(&shared[..], n).chain(std::iter::repeat_n(&other[..], 4))
-            };
-            assert_eq!(crowded(claims(4)), None);
-            assert_eq!(crowded(claims(5)), Some(id));
-            assert_eq!(Dispatch::new(claims(4)).find(id).len(), 4);
-        }
-        // Two claims of one device are one listener.
-        let twice = [
-            Claim::shared(Id::extended(7)),
-            Claim::shared(Id::extended(7)),
-        ];
-        assert_eq!(crowded(std::iter::repeat_n(&twice[..], 4)), None);
     }
 }

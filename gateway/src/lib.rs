@@ -24,6 +24,7 @@ pub mod clock;
 pub mod config;
 pub mod daemon;
 pub mod decoder;
+mod dispatch;
 mod health;
 pub mod link;
 pub mod offline;

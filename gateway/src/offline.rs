@@ -86,23 +86,25 @@ pub struct DeviceReport {
 #[derive(Debug)]
 pub struct InOrder<T> {
     waiting: VecDeque<(Nanos, T)>,
+    window: Nanos,
     newest: Nanos,
     passed_on: Nanos,
     out_of_order: u64,
 }
 
-impl<T> Default for InOrder<T> {
-    fn default() -> Self {
+impl<T> InOrder<T> {
+    /// Delays items until others are later by `window` \[ns\].
+    #[must_use]
+    pub const fn new(window: Nanos) -> Self {
         Self {
             waiting: VecDeque::new(),
+            window,
             newest: Nanos::MIN,
             passed_on: Nanos::MIN,
             out_of_order: 0,
         }
     }
-}
 
-impl<T> InOrder<T> {
     /// Adds an item of instant `t`; calls `write` for those that are due, in order.
     ///
     /// # Errors
@@ -118,7 +120,7 @@ impl<T> InOrder<T> {
         let place = self.waiting.iter().rposition(|(other, _)| *other <= t);
         self.waiting.insert(place.map_or(0, |i| i + 1), (t, item));
         while let Some((first, item)) = self.waiting.front()
-            && self.newest - *first > REORDER
+            && self.newest - *first > self.window
         {
             self.passed_on = self.passed_on.max(*first);
             write(*first, item)?;
@@ -178,7 +180,7 @@ pub fn decode(
         buses.push((plan.matching(number as usize), decoder, status));
     }
     let mut report = DecodeReport::default();
-    let mut order = InOrder::default();
+    let mut order = InOrder::new(REORDER);
     let mut failure = None;
     let mut reader = candump::Reader::new(log);
     let mut last_bus = 0;

@@ -1,7 +1,7 @@
 //! The checked and resolved form of gateway.toml, which the rest of the gateway uses.
 
 use crate::config::{Pace, Raw, RawBus, RawDevice, RawJoint, Realtime, Source};
-use crate::decoder::{SHARERS, crowded};
+use crate::dispatch::{SHARERS, crowded};
 use crate::link::replay::Matching;
 use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, OutputInfo, Outputs, Spec};
 use proprio_topics::{

@@ -130,12 +130,16 @@ impl Rig {
     }
 }
 
-/// The start commands of `boards` boards, in order.
+/// Turns in which every board gets all its start commands: each is given when the one before is
+/// sent.
+const START: usize = 8;
+
+/// The start commands of `boards` boards, in order: of each board one frame waits at a time.
 fn start_commands(boards: u32) -> Vec<Frame> {
     let mut rig = Rig::new(boards);
-    rig.turns(3);
+    rig.turns(START);
     let sent = rig.sent();
-    assert!(sent.len() >= boards as usize);
+    assert_eq!(sent.len(), 2 * boards as usize);
     assert_eq!(rig.unsent(), (0, 0));
     sent
 }
@@ -169,7 +173,7 @@ fn a_full_queue_is_tried_again_in_order_while_frames_are_received() {
     rig.turns(1);
     assert_eq!(rig.sent().len(), 2);
     rig.pass(RETRY);
-    rig.turns(1);
+    rig.turns(START);
     assert_eq!(rig.sent(), wanted);
     assert_eq!((rig.status.bus().queue_full, rig.unsent()), (3, (0, 0)));
     rig.turns(1);
@@ -178,7 +182,7 @@ fn a_full_queue_is_tried_again_in_order_while_frames_are_received() {
 
 #[test]
 fn what_is_not_sent_by_its_deadline_is_dropped() {
-    let wanted = start_commands(2).len() as u64;
+    let wanted = start_commands(2);
     let mut rig = Rig::new(2);
     rig.script().answers = full(1000);
     rig.turns(2);
@@ -188,17 +192,21 @@ fn what_is_not_sent_by_its_deadline_is_dropped() {
     assert_eq!(rig.unsent(), (0, 0));
     rig.pass(Nanos(1));
     rig.turns(1);
-    assert_eq!(rig.unsent(), (wanted, wanted));
+    assert_eq!(rig.unsent(), (2, 2), "one of each board");
+    assert!(rig.sent().is_empty());
+    // The boards are started later, with the same commands.
     rig.script().answers.clear();
     rig.pass(RETRY);
-    rig.turns(3);
-    assert!(rig.sent().is_empty());
+    rig.turns(START);
+    assert_eq!(rig.sent(), wanted);
+    assert_eq!(rig.unsent(), (2, 2));
 }
 
 #[test]
 fn what_waits_is_dropped_when_the_link_is_lost() {
     let wanted = start_commands(2);
-    let failures = wanted.len() as u64;
+    // One of each board.
+    let failures = 2;
     // Told by the state, and by an attempt to send.
     for by_state in [true, false] {
         let mut rig = Rig::new(2);
@@ -223,7 +231,7 @@ fn what_waits_is_dropped_when_the_link_is_lost() {
         }
         // The boards are started again, once.
         rig.script().state = LinkState::Up;
-        rig.turns(5);
+        rig.turns(START);
         assert_eq!(rig.sent(), wanted);
     }
 }
@@ -233,25 +241,37 @@ fn what_the_link_refuses_is_told_to_its_device_alone() {
     let wanted = start_commands(2);
     let mut rig = Rig::new(2);
     rig.script().answers = [Err(SendError::Unsupported)].into();
-    rig.turns(3);
-    assert_eq!(rig.sent(), wanted[1..]);
+    rig.turns(START);
+    let of_board = |address: u16| -> Vec<Frame> {
+        let id = Id::standard(0x200 | address);
+        wanted
+            .iter()
+            .filter(|frame| frame.id == id)
+            .copied()
+            .collect()
+    };
+    assert_eq!(rig.sent(), of_board(2));
     let unsent: Vec<u64> = rig
         .status
         .devices()
         .map(|d| d.counters[Counter::Unsent as usize])
         .collect();
     assert_eq!((rig.status.bus().send_failures, unsent), (1, vec![1, 0]));
+    // It repeats the command that was refused.
+    rig.script().sent.clear();
+    rig.pass(Nanos::from_millis(20));
+    rig.turns(START);
+    assert_eq!(rig.sent(), of_board(1));
 
     let mut rig = Rig::over(2, |link| Box::new(ListenOnly(Box::new(link))));
-    rig.turns(3);
-    let count = wanted.len() as u64;
-    assert_eq!((rig.attempts(), rig.unsent()), (0, (count, count)));
+    rig.turns(START);
+    assert_eq!((rig.attempts(), rig.unsent()), (0, (2, 2)));
 }
 
 #[test]
 fn stop_commands_are_sent_before_the_end() {
     let mut rig = Rig::new(2);
-    rig.turns(3);
+    rig.turns(START);
     rig.script().sent.clear();
     rig.bus.stop(&rig.clock);
     assert_eq!(rig.sent().len(), 2, "one per board");
@@ -261,7 +281,7 @@ fn stop_commands_are_sent_before_the_end() {
 #[test]
 fn error_frames_are_counted_and_let_time_pass() {
     let mut rig = Rig::new(1);
-    rig.turns(3);
+    rig.turns(START);
     let error = |data| {
         let frame = Frame::with_format(Id::extended(4), proprio_drivers::Format::Error, data);
         frame.unwrap().at(rig.now, StampKind::Software)

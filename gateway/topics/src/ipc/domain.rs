@@ -115,14 +115,15 @@ impl DomainConfig {
             .map_err(|e| DomainError::NoSharedMemory { problem: e.into() })?;
         // Directories of the same path in different mount namespaces are different domains, even if
         // they share /dev/shm.
-        let mut hash = Fnv::new();
-        hash.add(root.as_os_str().as_encoded_bytes());
-        hash.add(&base.dev().to_le_bytes());
-        hash.add(&base.ino().to_le_bytes());
+        let hash = fnv1a(&[
+            root.as_os_str().as_encoded_bytes(),
+            &base.dev().to_le_bytes(),
+            &base.ino().to_le_bytes(),
+        ]);
         Ok(Place {
             root,
             lock,
-            prefix: format!("proprio_{:016x}_", hash.0),
+            prefix: format!("proprio_{hash:016x}_"),
         })
     }
 }
@@ -243,13 +244,11 @@ impl<S: Service> Domain<S> {
             path: place.root.clone(),
             cause,
         })?;
-        let mut epoch = Fnv::new();
-        epoch.add(&id.to_le_bytes());
         let inner = Inner {
             config: config.clone(),
             place,
             iceoryx,
-            epoch: epoch.0.max(1),
+            epoch: fnv1a(&[&id.to_le_bytes()]).max(1),
             id,
             folder,
             node: Mutex::new(Some(node)),
@@ -413,17 +412,15 @@ fn iceoryx(place: &Place) -> Result<Config, DomainError> {
     Ok(config)
 }
 
-/// FNV-1a, 64 bits: a hash that is the same in every build.
-struct Fnv(u64);
-
-impl Fnv {
-    fn new() -> Self {
-        Self(0xcbf2_9ce4_8422_2325)
-    }
-
-    fn add(&mut self, bytes: &[u8]) {
-        for &byte in bytes {
-            self.0 = (self.0 ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
-        }
-    }
+/// The 64-bit FNV-1a hash of `parts` in a row (<http://www.isthe.com/chongo/tech/comp/fnv/>), the
+/// same in every build.
+#[must_use]
+pub fn fnv1a(parts: &[&[u8]]) -> u64 {
+    parts
+        .iter()
+        .copied()
+        .flatten()
+        .fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+            (hash ^ u64::from(*byte)).wrapping_mul(0x0000_0100_0000_01b3)
+        })
 }

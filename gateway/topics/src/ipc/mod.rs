@@ -38,7 +38,7 @@ mod topic;
 mod writer;
 
 pub use clock::monotonic;
-pub use domain::{Domain, DomainConfig};
+pub use domain::{Domain, DomainConfig, fnv1a};
 pub use error::{DomainError, PortError, SendError, TakeError};
 pub use presence::{Presence, RobotPresence};
 pub use reader::{Freshness, Reader};
