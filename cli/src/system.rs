@@ -185,7 +185,9 @@ struct Glance {
     estimates: f64,
     description: Option<Description>,
     channels: Vec<Seen>,
+    /// The end of the window in which they were counted, and its duration.
     now: Nanos,
+    window: Nanos,
 }
 
 impl Glance {
@@ -194,8 +196,9 @@ impl Glance {
         let description = described(domain, &robot, Publisher::Gateway)?;
         let mut channels = vec![Seen::default(); MAX_CHANNELS];
         let before = newest::<EstimatorHealth>(domain, &robot)?;
-        let until = monotonic() + WINDOW;
         let mut samples = Reader::<Sample>::open(domain, &robot).ok();
+        let began = monotonic();
+        let until = began + WINDOW;
         while monotonic() < until {
             match &mut samples {
                 Some(samples) => {
@@ -211,6 +214,8 @@ impl Glance {
                 None => std::thread::sleep(std::time::Duration::from_millis(50)),
             }
         }
+        let now = monotonic();
+        let window = now - began;
         let estimator = newest::<EstimatorHealth>(domain, &robot)?;
         let estimates = match (&before, &estimator) {
             (Some(a), Some(b)) if b.header.published > a.header.published => {
@@ -226,7 +231,8 @@ impl Glance {
             estimates,
             description,
             channels,
-            now: monotonic(),
+            now,
+            window,
         })
     }
 
@@ -235,7 +241,7 @@ impl Glance {
         let entries = self.description.as_ref().map(Description::entries);
         entries.unwrap_or_default().iter().filter_map(|entry| {
             let seen = self.channels.get(entry.index as usize)?;
-            let rate = seen.count as f64 / WINDOW.seconds();
+            let rate = seen.count as f64 / self.window.seconds();
             let age = seen
                 .last
                 .map(|last| self.now.saturating_sub(last).seconds());
@@ -266,7 +272,7 @@ impl Glance {
                         "send_failures": bus.send_failures, "queue_full": bus.queue_full,
                         "link_losses": bus.link_losses, "published": bus.published,
                         "publish_failures": bus.publish_failures,
-                        "controller": interface.controller.get().map(|c| c.word()),
+                        "controller": interface.controller.get().map(proprio_topics::Controller::word),
                         "tx_error_counter": interface.tx_error_counter,
                         "rx_error_counter": interface.rx_error_counter,
                         "bit_rate": interface.bit_rate, "data_bit_rate": interface.data_bit_rate,
@@ -573,7 +579,8 @@ pub(crate) fn record(args: &Record, config: &DomainConfig) -> anyhow::Result<()>
                 continue;
             };
             let value = Value::Active(declared.active != 0);
-            let t = declared.header.acquired;
+            // What was declared long before arrives with the next declaration.
+            let t = declared.header.acquired.max(order.passed_on());
             order.push(t, (at, value), |t, (at, value)| {
                 table.push(Some(t), *at, value)
             })?;

@@ -139,6 +139,12 @@ impl<T> InOrder<T> {
             .try_for_each(|(t, item)| write(t, &item))
     }
 
+    /// The instant of the last item written: an earlier one would be out of order.
+    #[must_use]
+    pub const fn passed_on(&self) -> Nanos {
+        self.passed_on
+    }
+
     /// Number of items that came too late to be sorted.
     #[must_use]
     pub const fn out_of_order(&self) -> u64 {
