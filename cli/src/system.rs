@@ -7,8 +7,8 @@ use proprio_topics::ipc::{
     Domain, DomainConfig, PortError, Reader, RobotPresence, Topic, monotonic,
 };
 use proprio_topics::{
-    ContactDeclaration, Counter, Description, DeviceState, EstimatorHealth, GatewayHealth, Kind,
-    LinkState, MAX_CHANNELS, Nanos, Publisher, Quality, Role, Sample,
+    ContactDeclaration, Controller, Counter, Description, DeviceState, EstimatorHealth,
+    GatewayHealth, Kind, LinkState, MAX_CHANNELS, Nanos, Publisher, Quality, Role, Sample,
 };
 use serde_json::{Value as Json, json};
 use std::fs::File;
@@ -272,7 +272,7 @@ impl Glance {
                         "send_failures": bus.send_failures, "queue_full": bus.queue_full,
                         "link_losses": bus.link_losses, "published": bus.published,
                         "publish_failures": bus.publish_failures,
-                        "controller": interface.controller.get().map(proprio_topics::Controller::word),
+                        "controller": interface.controller.get().map(Controller::word),
                         "tx_error_counter": interface.tx_error_counter,
                         "rx_error_counter": interface.rx_error_counter,
                         "bit_rate": interface.bit_rate, "data_bit_rate": interface.data_bit_rate,

@@ -138,5 +138,6 @@ fn a_running_system_says_what_it_does() {
     [&mut estimator, &mut gateway, &mut simulator]
         .into_iter()
         .for_each(proprio_tests::Process::end);
+    drop((torques, domain));
     rig.assert_nothing_left();
 }
