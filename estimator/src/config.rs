@@ -392,29 +392,50 @@ impl Default for Input {
 }
 
 /// `[output]`: when and what is published.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Output {
     /// The trigger channel: each of its stamps gives one estimate. Default: the first force/torque
     /// sensor, else the first joint.
     pub trigger: Option<String>,
-    /// How long an estimate waits for the samples of other channels, counted in stamps \[ms\]; at
-    /// most 32 periods of the fastest channel. A dead channel costs this wait. The order of arrival
-    /// does not matter, provided that no sample arrives more than half of this behind a later one.
-    pub max_wait_ms: f64,
+    /// Whether an estimate waits for the samples of other channels. Default: `aligned` if
+    /// `max_wait_ms` is given, else `immediate`.
+    pub timing: Option<Timing>,
+    /// How long an `aligned` estimate waits for them, counted in stamps \[ms\]; at most 32 periods
+    /// of the fastest channel; default 1. A dead channel costs this wait. The order of arrival does
+    /// not matter, provided that no sample arrives more than half of this behind a later one.
+    pub max_wait_ms: Option<f64>,
     /// A joint torque whose standard deviation exceeds this is withheld \[Nm\]; default: the
     /// largest gravity load of the links beyond the joint, or a quarter of its effort limit if that
     /// is more ([`crate::setup::Setup::max_deviation`]).
     pub max_torque_std_nm: Option<f64>,
 }
 
-impl Default for Output {
-    fn default() -> Self {
-        Self {
-            trigger: None,
-            max_wait_ms: 1.0,
-            max_torque_std_nm: None,
-        }
+/// When an estimate is made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Timing {
+    /// Once every channel has a sample of the trigger's stamp or later, or after `max_wait_ms`.
+    Aligned,
+    /// As soon as the trigger's sample arrives. The other channels are extrapolated to it, and the
+    /// standard deviations include what that costs.
+    Immediate,
+}
+
+impl Output {
+    /// [`Output::timing`] with its default.
+    #[must_use]
+    pub fn timing(&self) -> Timing {
+        self.timing.unwrap_or(match self.max_wait_ms {
+            Some(_) => Timing::Aligned,
+            None => Timing::Immediate,
+        })
+    }
+
+    /// [`Output::max_wait_ms`] with its default \[ms\].
+    #[must_use]
+    pub fn max_wait_ms(&self) -> f64 {
+        self.max_wait_ms.unwrap_or(1.0)
     }
 }
 
@@ -516,10 +537,10 @@ impl Config {
         positive("identification.gain_std", self.identification.gain_std, 1.0)?;
         // Buffers for a waiting instant: 32 samples of a channel beside those of its window, and
         // 256 instants.
-        if !(self.output.max_wait_ms >= 0.0 && self.output.max_wait_ms <= 250.0) {
+        let max_wait_ms = self.output.max_wait_ms();
+        if !(0.0..=250.0).contains(&max_wait_ms) {
             return Err(format!(
-                "output.max_wait_ms = {} must be 0 to 250",
-                self.output.max_wait_ms
+                "output.max_wait_ms = {max_wait_ms} must be 0 to 250"
             ));
         }
         let finite = |key: &str, values: &[f64]| match values.iter().find(|v| !v.is_finite()) {

@@ -331,50 +331,63 @@ impl DataPlane {
             let Some(sample) = self.inbox.get(at).copied() else {
                 break;
             };
-            if sample.header.epoch != self.map_epoch {
-                self.take_descriptions();
-            }
-            let channel = self.map.get(sample.channel as usize).copied().flatten();
-            if sample.header.epoch != self.map_epoch {
-                self.health.unknown_channel += 1;
-                continue;
-            }
-            // A channel that the configuration does not name is ignored: the gateway may serve
-            // other programs.
-            let Some(channel) = channel else { continue };
-            let (t, quality) = (sample.header.acquired, sample.header.quality);
-            let Some(reading) = sample.reading() else {
-                continue;
-            };
-            self.first_look.see(now, channel, t, &reading, quality);
-            self.pipeline.push(channel, t, &reading, quality);
-            while let Some(estimate) = self.pipeline.poll() {
-                let now = monotonic();
-                let sent = self.torques.send(&estimate.torques, now).is_ok()
-                    & self.contacts.send(&estimate.contacts, now).is_ok();
-                self.health.estimates += 1;
-                self.health.publish_failures += u64::from(!sent);
-                self.health.withheld +=
-                    u64::from(estimate.torques.joints().iter().any(|j| j.valid != 1));
-                self.health.last_estimate = estimate.t;
-                if let Some(inertias) = &mut self.inertias
-                    && let Some(inertia) = self.pipeline.inertia()
-                {
-                    self.health.publish_failures += u64::from(inertias.send(inertia, now).is_err());
-                }
-                if let Some(jobs) = self
-                    .identification
-                    .as_ref()
-                    .and_then(|identification| identification.jobs.as_ref())
-                    && let Some(job) = self.pipeline.take_job()
-                {
-                    // There is one job, so the queue has room. If the thread has ended, the error
-                    // is reported elsewhere.
-                    let _ = jobs.try_send(job);
-                }
+            self.take_sample(now, &sample);
+            // Samples of one stamp arrived together: an immediate estimate uses them all.
+            let next = self.inbox.get(at + 1).map(|next| next.header.acquired);
+            if next != Some(sample.header.acquired) {
+                self.publish_estimates();
             }
         }
         !self.inbox.is_empty()
+    }
+
+    /// Passes a sample to the pipeline, if its channel is one of the configuration's.
+    fn take_sample(&mut self, now: Nanos, sample: &Sample) {
+        if sample.header.epoch != self.map_epoch {
+            self.take_descriptions();
+        }
+        if sample.header.epoch != self.map_epoch {
+            self.health.unknown_channel += 1;
+            return;
+        }
+        // A channel that the configuration does not name is ignored: the gateway may serve other
+        // programs.
+        let channel = self.map.get(sample.channel as usize).copied().flatten();
+        let (Some(channel), Some(reading)) = (channel, sample.reading()) else {
+            return;
+        };
+        let (t, quality) = (sample.header.acquired, sample.header.quality);
+        self.first_look.see(now, channel, t, &reading, quality);
+        self.pipeline.push(channel, t, &reading, quality);
+    }
+
+    /// Publishes the estimates that are due.
+    fn publish_estimates(&mut self) {
+        while let Some(estimate) = self.pipeline.poll() {
+            let now = monotonic();
+            let sent = self.torques.send(&estimate.torques, now).is_ok()
+                & self.contacts.send(&estimate.contacts, now).is_ok();
+            self.health.estimates += 1;
+            self.health.publish_failures += u64::from(!sent);
+            self.health.withheld +=
+                u64::from(estimate.torques.joints().iter().any(|j| j.valid != 1));
+            self.health.last_estimate = estimate.t;
+            if let Some(inertias) = &mut self.inertias
+                && let Some(inertia) = self.pipeline.inertia()
+            {
+                self.health.publish_failures += u64::from(inertias.send(inertia, now).is_err());
+            }
+            if let Some(jobs) = self
+                .identification
+                .as_ref()
+                .and_then(|identification| identification.jobs.as_ref())
+                && let Some(job) = self.pipeline.take_job()
+            {
+                // There is one job, so the queue has room. If the thread has ended, the error is
+                // reported elsewhere.
+                let _ = jobs.try_send(job);
+            }
+        }
     }
 
     /// Maps the channel numbers of the gateway's description to the pipeline's channels.

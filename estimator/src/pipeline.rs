@@ -16,7 +16,8 @@
 //!    `estimate`).
 //!
 //! # Alignment
-//! Each stamp `t` of the trigger channel gives exactly one estimate, in order. It is released once
+//! Each stamp `t` of the trigger channel gives exactly one estimate, in order. What follows is
+//! `timing = "aligned"`; see below for `"immediate"`. An estimate is released once
 //! every channel has a sample stamped `t` or later, or once the newest stamp of any channel is
 //! later than `t + max_wait`, or once 256 instants wait (a trigger above 1 kHz). The estimate uses
 //! the samples stamped `t` or earlier and, of each channel, the first later one if its stamp is at
@@ -32,6 +33,16 @@
 //! `t - max_wait / 2`, however old: temperature changes slowly. Before the first temperature, the
 //! board is taken to be at its reference temperature. While there is none, or it is older than a
 //! minute, the variance of the offset is increased ([`Calibration::temperature_variance`]).
+//!
+//! # Immediate estimates
+//! With `timing = "immediate"` nothing waits: the trigger's sample releases its estimate. Every
+//! other channel is evaluated from the samples that have arrived. Where none is stamped `t` or
+//! later, the adaptive window extrapolates: positions and angular velocities with the windows that
+//! differentiate them, wrenches and proper accelerations with one of their own (`prediction`). The
+//! standard deviations include that of the extrapolated value: its noise, and its change with a
+//! polynomial of one degree more. (As elsewhere, errors of velocities are neglected.) No sample is
+//! late then, and the estimates depend on the order of arrival: a replay in that order gives them
+//! bit for bit.
 //!
 //! # Identification
 //! With identification on ([`proprio_identification::online`]), the inertial parameters, offsets
@@ -49,6 +60,7 @@ mod estimate;
 mod identification;
 mod input;
 mod motion;
+mod prediction;
 mod residuals;
 mod solution;
 mod validity;
@@ -56,17 +68,19 @@ mod validity;
 pub use estimate::{Counts, Estimate};
 pub use identification::Job;
 
+use crate::config::Timing;
 use crate::differentiate::{Grid, Window};
-use crate::history::History;
+use crate::history::{ChannelValue, History};
 use crate::propagation::Propagation;
 use crate::setup::Setup;
 use buffers::{ChannelBuffer, Declarations, OrReason, stale, temperature_at};
 use channels::{imu_at, joint_at, wrench_at};
 use identification::OnlineIdentification;
 use motion::{ENCODER_OFFSET_STD, MotionErrors};
+use prediction::Predictor;
 use proprio_dynamics::model::{JointKind, Model};
-use proprio_dynamics::spatial::{Pose, Wrench};
-use proprio_dynamics::{ContactSet, Dependence, FrameMotion, Kinematics, Solver};
+use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
+use proprio_dynamics::{ContactSet, Dependence, FrameMotion, Kinematics, Noise, Solver};
 use proprio_identification::online::state::StateError;
 use proprio_identification::online::{Online, OnlineError};
 use proprio_identification::robot::{BaseMotion, ChannelRole};
@@ -140,10 +154,17 @@ impl Pipeline {
                 History::default(),
                 Box::new(Window::new(setup.joint_settings).expect("settings were checked")),
             ),
-            ChannelRole::Sensor(_) => ChannelBuffer::Sensor(History::default(), History::default()),
+            ChannelRole::Sensor(number) => ChannelBuffer::Sensor(
+                History::default(),
+                History::default(),
+                sensor_predictor(&setup, number),
+            ),
             ChannelRole::Base => ChannelBuffer::Imu(
                 History::default(),
                 Box::new(Window::new(setup.gyro_settings).expect("settings were checked")),
+                (setup.timing == Timing::Immediate)
+                    .then(|| Predictor::new([ACCELEROMETER_NOISE; 3], setup.gyro_settings))
+                    .flatten(),
             ),
         });
         let kinematics = Kinematics::new(&setup.state.model, setup.robot.base_link)
@@ -297,7 +318,13 @@ impl Pipeline {
                 .all(|buffer| buffer.newest().is_some_and(|newest| newest >= t))
         };
         let waited = self.newest > t + self.setup.max_wait;
-        if !(self.finished || waited || self.waiting.len() == Self::MAX_WAITING || passed()) {
+        let is_immediate = self.setup.timing == Timing::Immediate;
+        if !(is_immediate
+            || self.finished
+            || waited
+            || self.waiting.len() == Self::MAX_WAITING
+            || passed())
+        {
             return None;
         }
         self.waiting.pop_front();
@@ -352,7 +379,11 @@ impl Pipeline {
         active: &ContactSet,
     ) -> (FrameMotion, Option<(FrameMotion, Pose)>) {
         // Half of the wait: a sample that may be used can then arrive late by the other half.
-        let until = t + Nanos(self.setup.max_wait.0 / 2);
+        let until = match self.setup.timing {
+            Timing::Aligned => t + Nanos(self.setup.max_wait.0 / 2),
+            // What has arrived, and never more is known.
+            Timing::Immediate => Nanos::MAX,
+        };
         let mut base = self.place_base(active);
         let mut imu = None;
         for ((buffer, channel), fault) in self
@@ -366,7 +397,7 @@ impl Pipeline {
                     match history.at(t, until) {
                         None => Reason::NeverSeen,
                         Some(sample) => {
-                            let (state, deviation, reason) = joint_at(
+                            let (state, [acceleration_std, position_std], reason) = joint_at(
                                 t,
                                 until,
                                 &sample,
@@ -376,8 +407,11 @@ impl Pipeline {
                             let [noise] = window.noise(t);
                             let offset_std =
                                 self.encoder_offset_std.get(dof).copied().unwrap_or(0.0);
-                            self.motion
-                                .set_joint(dof, deviation, offset_std.hypot(noise));
+                            self.motion.set_joint(
+                                dof,
+                                acceleration_std,
+                                offset_std.hypot(noise).hypot(position_std),
+                            );
                             let places = (
                                 self.position.get_mut(dof),
                                 self.velocity.get_mut(dof),
@@ -391,35 +425,44 @@ impl Pipeline {
                         }
                     }
                 }
-                (ChannelBuffer::Sensor(history, temperatures), ChannelRole::Sensor(number)) => {
-                    match history.at(t, until) {
-                        None => Reason::NeverSeen,
-                        Some(sample) => {
-                            let celsius = temperature_at(temperatures, t, self.setup.max_wait);
-                            let state = &self.setup.state;
-                            if let (Some(reading), Some(missing), Some(corrected)) = (
-                                self.readings.get_mut(number),
-                                self.missing_temperature.get_mut(number),
-                                wrench_at(state, number, &sample, celsius, &mut self.propagation),
-                            ) {
-                                (*reading, *missing) = corrected;
-                            }
-                            stale(&sample, self.setup.robot.max_silence)
-                                .or(Reason::of_quality(sample.quality, Quality::DEVICE_FAULT))
+                (
+                    ChannelBuffer::Sensor(history, temperatures, predictor),
+                    ChannelRole::Sensor(number),
+                ) => match history.at(t, until) {
+                    None => Reason::NeverSeen,
+                    Some(sample) => {
+                        let celsius = temperature_at(temperatures, t, self.setup.max_wait);
+                        let state = &self.setup.state;
+                        let raw = predicted(t, &sample, predictor, &mut self.grid)
+                            .unwrap_or((sample.value, [0.0; 6]));
+                        if let (Some(reading), Some(missing), Some(corrected)) = (
+                            self.readings.get_mut(number),
+                            self.missing_temperature.get_mut(number),
+                            wrench_at(state, number, raw, celsius, &mut self.propagation),
+                        ) {
+                            (*reading, *missing) = corrected;
                         }
+                        stale(&sample, self.setup.robot.max_silence)
+                            .or(Reason::of_quality(sample.quality, Quality::DEVICE_FAULT))
                     }
-                }
-                (ChannelBuffer::Imu(history, window), ChannelRole::Base) => {
+                },
+                (ChannelBuffer::Imu(history, window, predictor), ChannelRole::Base) => {
                     match history.at(t, until) {
                         None => Reason::NeverSeen,
                         Some(sample) => {
-                            let (measured, deviation, reason) = imu_at(
+                            let (mut measured, deviation, reason) = imu_at(
                                 t,
                                 until,
                                 &sample,
                                 (window, &mut self.grid),
                                 self.setup.robot.max_silence,
                             );
+                            let predicted = predicted(t, &sample, predictor, &mut self.grid);
+                            if let Some((value, _)) = predicted {
+                                measured.proper_acceleration = Vec3::from(value);
+                            }
+                            let std = predicted.map_or([0.0; 3], |(_, std)| std);
+                            self.motion.set_proper(&std);
                             if let BaseMotion::Imu(pose) = &self.setup.robot.base {
                                 base = FrameMotion::of_link_from_imu(&measured, pose);
                                 imu = Some((measured, *pose));
@@ -434,6 +477,37 @@ impl Pipeline {
             };
         }
         (base, imu)
+    }
+}
+
+/// Peak noise of an accelerometer \[m/s^2\]: three times the noise of a BNO055 at a bandwidth of
+/// 62 Hz; the samples may show more.
+const ACCELEROMETER_NOISE: f64 = 0.035;
+
+/// The predictor of F/T sensor `number`, if estimates do not wait.
+fn sensor_predictor(setup: &Setup, number: usize) -> Option<Predictor<6>> {
+    if setup.timing == Timing::Aligned {
+        return None;
+    }
+    let Noise { force, torque } = setup.robot.structure.sensors().get(number)?.noise();
+    let ([fx, fy, fz], [tx, ty, tz]) = (force, torque);
+    // A uniformly distributed error of this peak has this standard deviation.
+    let peak = [fx, fy, fz, tx, ty, tz].map(|std| std * f64::sqrt(3.0));
+    Predictor::new(peak, setup.joint_settings)
+}
+
+/// The values of a channel whose last sample is earlier than `t`, extrapolated to `t`, and their
+/// standard deviations. None if a sample was measured at `t` or later, or there is no predictor.
+fn predicted<const N: usize, const D: usize>(
+    t: Nanos,
+    sample: &ChannelValue<N>,
+    predictor: &Option<Predictor<D>>,
+    grid: &mut Grid,
+) -> Option<([f64; D], [f64; D])> {
+    let predictor = predictor.as_ref()?;
+    match sample.exact || sample.interpolated {
+        true => None,
+        false => predictor.at(t, grid),
     }
 }
 

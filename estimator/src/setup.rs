@@ -3,7 +3,7 @@
 
 use crate::config::{
     Base, Config, ContactKind as KindWord, Differentiation, Direction, Foot, ForceTorque, Presence,
-    STANDARD_GRAVITY, SensorFrame,
+    STANDARD_GRAVITY, SensorFrame, Timing,
 };
 use crate::differentiate::Settings;
 use crate::inertial::InertialState;
@@ -33,6 +33,8 @@ pub struct Setup {
     pub state: InertialState,
     /// How long an estimate waits for channels without a sample, by stamps.
     pub max_wait: Nanos,
+    /// Whether an estimate waits for them at all.
+    pub timing: Timing,
     /// Per degree of freedom: a torque whose standard deviation exceeds this is withheld \[Nm or
     /// N\]. The default is the larger of two values: the largest gravity load of the links beyond
     /// the joint, with the limb stretched out (the error of an estimate from the URDF alone), and
@@ -272,7 +274,8 @@ impl Setup {
         let mut setup = Self {
             state: InertialState::configured(&robot),
             robot,
-            max_wait: Nanos::from_seconds(config.output.max_wait_ms * 1e-3),
+            max_wait: Nanos::from_seconds(config.output.max_wait_ms() * 1e-3),
+            timing: config.output.timing(),
             max_deviation,
             joint_settings: settings(position_noise_rad),
             gyro_settings: settings(angular_velocity_noise_radps),

@@ -1,10 +1,10 @@
 //! The pipeline on a robot for which three other libraries agree, and its rules: estimates depend
-//! on stamps alone, a missing channel affects only the estimates that depend on it, and bad samples
+//! on stamps alone unless they are immediate, a missing channel affects only the estimates that depend on it, and bad samples
 //! are counted and affect nothing else.
 
 use proprio_dynamics::calibration::Calibration;
 use proprio_dynamics::spatial::Wrench as Wrench6;
-use proprio_estimator::config::{Config, ContactKind, Direction, Presence, SensorFrame};
+use proprio_estimator::config::{Config, ContactKind, Direction, Presence, SensorFrame, Timing};
 use proprio_estimator::offline;
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
@@ -27,6 +27,7 @@ fn setup(change: impl FnOnce(&mut Config)) -> Setup {
     for ft in &mut config.force_torque {
         (ft.offset_n, ft.offset_nm) = (Some([0.0; 3]), Some([0.0; 3]));
     }
+    config.output.timing = Some(Timing::Aligned);
     change(&mut config);
     Setup::new(&config).unwrap()
 }
@@ -229,7 +230,7 @@ fn temperatures_count_by_their_stamps() {
     let run = |delay: Nanos| {
         let mut pipeline = Pipeline::new(setup(|config| {
             calibrate(config, &change);
-            config.output.max_wait_ms = 40.0;
+            config.output.max_wait_ms = Some(40.0);
         }));
         let mut reader = Reader::new(log.as_bytes()).unwrap();
         let series: Vec<_> = reader.series().to_vec();
@@ -912,7 +913,7 @@ fn a_repeated_declaration_changes_nothing() {
         for contact in config.contact.iter_mut().filter(|c| c.name() == "hand") {
             contact.presence = Presence::Possible;
         }
-        config.output.max_wait_ms = 20.0;
+        config.output.max_wait_ms = Some(20.0);
     });
     let hand = setup.robot.contact("hand").unwrap();
     let events = recording(&setup, 0.3);
@@ -1497,7 +1498,7 @@ fn the_mean_shows_a_force_below_the_noise_of_one_reading() {
         possible_hand_contact(config);
         config.force_torque[0].noise_n = [1.0; 3];
         config.force_torque[0].noise_nm = [0.1; 3];
-        config.output.max_wait_ms = 20.0;
+        config.output.max_wait_ms = Some(20.0);
     };
     let setup = setup(noisy);
     let events = recording(&setup, 0.9);
@@ -1575,4 +1576,159 @@ fn an_offset_that_is_not_configured_is_unknown() {
             .unwrap()
     };
     assert!(std("l_shoulder_roll") > 100.0 && std("l_elbow") < 0.1);
+}
+
+/// Estimates of `events` with `timing = "immediate"`: each is made when its trigger sample arrives.
+fn run_immediate(change: impl FnOnce(&mut Config), events: &[Event]) -> (Vec<Estimate>, Pipeline) {
+    let setup = setup(|config| {
+        config.output.timing = Some(Timing::Immediate);
+        config.output.max_torque_std_nm = Some(1000.0);
+        change(config);
+    });
+    let trigger = setup.robot.trigger;
+    let mut pipeline = Pipeline::new(setup);
+    let mut estimates = vec![];
+    for (channel, t, reading, quality) in events {
+        pipeline.push(*channel, *t, reading, *quality);
+        let estimate = pipeline.poll().cloned();
+        assert_eq!(
+            estimate.as_ref().map(|e| e.t),
+            (*channel == trigger).then_some(*t)
+        );
+        estimates.extend(estimate);
+        assert!(pipeline.poll().is_none());
+    }
+    (estimates, pipeline)
+}
+
+/// Per torque, the RMS difference of two series of estimates after the first 0.1 s, and the share
+/// within two deviations of the first.
+fn difference(a: &[Estimate], b: &[Estimate]) -> (f64, f64) {
+    let (mut square, mut within, mut count) = (0.0, 0.0, 0.0);
+    for (a, b) in a
+        .iter()
+        .zip(b)
+        .filter(|(a, _)| a.t > Nanos::from_millis(100))
+    {
+        assert_eq!(a.t, b.t);
+        for (a, b) in a.torques.joints().iter().zip(b.torques.joints()) {
+            let error = a.torque - b.torque;
+            square += error * error;
+            within += f64::from(u8::from(error.abs() <= 2.0 * a.standard_deviation));
+            count += 1.0;
+        }
+    }
+    (f64::sqrt(square / count), within / count)
+}
+
+/// Noise of unit variance, uniformly distributed.
+fn noise_of(seed: u64) -> impl FnMut() -> f64 {
+    let mut state = seed;
+    move || {
+        state = state
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
+        ((state >> 11) as f64 / (1_u64 << 53) as f64 - 0.5) * f64::sqrt(12.0)
+    }
+}
+
+/// What a wrench or an IMU that sends every 10 ms only costs an immediate estimate that the encoders
+/// trigger: the RMS difference \[Nm\] to one that has a sample every millisecond, and the share
+/// within two deviations; and the same if the last value is held instead. The signal moves by many
+/// times its noise in 10 ms.
+#[test]
+fn what_an_immediate_estimate_extrapolates_is_better_than_the_last_value() {
+    let trigger = |config: &mut Config| config.output.trigger = Some("l_elbow".into());
+    let waiting = || {
+        setup(|config| {
+            trigger(config);
+            config.output.max_wait_ms = Some(0.0);
+            config.output.max_torque_std_nm = Some(1000.0);
+        })
+    };
+    let base = waiting();
+    let mut noise = noise_of(1);
+    for kind in [Kind::Wrench, Kind::Imu] {
+        let mut all = vec![];
+        for (channel, t, reading, quality) in recording(&base, 1.0) {
+            let phase = |t: Nanos| (2.0 * std::f64::consts::TAU * t.seconds()).sin();
+            match reading {
+                Reading::Wrench(mut w) => {
+                    w.force = w.force.map(|f| f + 20.0 * phase(t) + 0.1 * noise());
+                    all.push((channel, t, Reading::Wrench(w), quality));
+                }
+                Reading::Imu(imu) => {
+                    // Ten samples in a period of the recording.
+                    for t in (0..10).map(|i| t + Nanos::from_millis(i)) {
+                        let acceleration = imu.proper_acceleration;
+                        let proper_acceleration =
+                            acceleration.map(|a| a + 5.0 * phase(t) + 0.01 * noise());
+                        let reading = Reading::Imu(proprio_topics::Imu {
+                            proper_acceleration,
+                            ..imu
+                        });
+                        all.push((channel, t, reading, quality));
+                    }
+                }
+                _ => all.push((channel, t, reading, quality)),
+            }
+        }
+        all.sort_by_key(|e| (e.1, e.0));
+        let mut number = 0;
+        let sparse: Vec<Event> = all
+            .iter()
+            .filter(|e| {
+                let is_kind = e.2.kind() == kind;
+                number += usize::from(is_kind);
+                !is_kind || number % 10 == 1
+            })
+            .copied()
+            .collect();
+        assert!(sparse.len() < all.len());
+        let (dense, _) = run_immediate(trigger, &all);
+        let (immediate, _) = run_immediate(trigger, &sparse);
+        let (rms, within) = difference(&immediate, &dense);
+        let (rms_held, _) = difference(&run(waiting(), &sparse).0, &run(waiting(), &all).0);
+        println!("{kind:?}: {rms:.5} Nm ({within:.3} within), held {rms_held:.5} Nm");
+        assert!(rms < 0.3 * rms_held, "{kind:?} {rms} {rms_held}");
+        assert!(within > 0.95, "{kind:?} {within}");
+        if kind == Kind::Imu {
+            // Its extrapolation is far more certain than its mounting.
+            continue;
+        }
+        // Extrapolation costs certainty.
+        let deviation = |estimates: &[Estimate]| {
+            let of = |e: &Estimate| e.torques.joints()[0].standard_deviation;
+            estimates.iter().skip(100).map(of).sum::<f64>()
+        };
+        let (more, less) = (deviation(&immediate), deviation(&dense));
+        assert!(more > 1.0001 * less, "{kind:?} {more} {less}");
+    }
+}
+
+#[test]
+fn immediate_estimates_depend_on_the_order_of_arrival_alone() {
+    let events = recording(&setup(|_| {}), 0.5);
+    // Every channel but the trigger is late by up to three milliseconds.
+    let trigger = setup(|_| {}).robot.trigger;
+    let delay = |channel: usize| match channel == trigger {
+        true => 0,
+        false => 1_000_000 * (1 + channel as i64 % 3),
+    };
+    let mut arrivals: Vec<(i64, Event)> = events.iter().map(|e| (e.1.0 + delay(e.0), *e)).collect();
+    arrivals.sort_by_key(|(at, e)| (*at, e.1));
+    let arrived: Vec<Event> = arrivals.into_iter().map(|(_, e)| e).collect();
+    let (first, pipeline) = run_immediate(|_| {}, &arrived);
+    let counts = pipeline.counts();
+    assert_eq!((counts.taken, counts.late), (events.len() as u64, 0));
+    let (again, _) = run_immediate(|_| {}, &arrived);
+    assert_eq!(bits(&first), bits(&again));
+    let (in_order, _) = run_immediate(|_| {}, &events);
+    assert_ne!(bits(&first), bits(&in_order));
+    assert!(
+        first
+            .iter()
+            .skip(100)
+            .all(|e| e.torques.joints().iter().all(|j| j.valid == 1))
+    );
 }

@@ -2,7 +2,7 @@
 //! still on an IMU, every channel sampled at the same instants, so that the reason of each number
 //! is plain.
 
-use proprio_estimator::config::{Config, Presence};
+use proprio_estimator::config::{Config, Presence, Timing};
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
 use proprio_topics::{Code, Imu, JointState, Kind, Nanos, Quality, Reading, Reason, Wrench};
@@ -23,6 +23,7 @@ fn setup(change: impl FnOnce(&mut Config)) -> Setup {
     for ft in &mut config.force_torque {
         (ft.noise_n, ft.noise_nm) = NOISE;
     }
+    config.output.timing = Some(Timing::Aligned);
     change(&mut config);
     Setup::new(&config).unwrap()
 }
@@ -242,7 +243,7 @@ fn what_two_unknown_contacts_leave_open_is_undetermined() {
 fn an_estimate_waits_as_long_as_configured() {
     let wait = 40_000_000;
     let setup = setup(|config| {
-        config.output.max_wait_ms = 40.0;
+        config.output.max_wait_ms = Some(40.0);
         config.input.max_silence_ms = 1000.0;
     });
     let silent = setup.robot.channel(Kind::Joint, "l_elbow").unwrap();
@@ -365,7 +366,7 @@ fn a_differentiated_angular_acceleration_is_uncertain() {
 fn what_comes_too_late_is_counted() {
     let wait = Nanos::from_millis(20);
     let setup = setup(|config| {
-        config.output.max_wait_ms = 20.0;
+        config.output.max_wait_ms = Some(20.0);
         config.input.max_silence_ms = 1000.0;
     });
     let (hand, silent) = (
@@ -400,7 +401,7 @@ fn what_comes_too_late_is_counted() {
 #[test]
 fn no_more_than_256_instants_wait() {
     let setup = setup(|config| {
-        config.output.max_wait_ms = 250.0;
+        config.output.max_wait_ms = Some(250.0);
         config.input.max_silence_ms = 1000.0;
     });
     let silent = setup.robot.channel(Kind::Joint, "l_elbow").unwrap();

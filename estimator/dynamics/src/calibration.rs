@@ -120,6 +120,21 @@ impl Calibration {
         corrected
     }
 
+    /// Variances of the corrected channels, from those of a reading whose channels have the
+    /// standard deviations `reading` and independent errors.
+    #[must_use]
+    pub fn variance_of(&self, reading: &Wrench) -> [f64; 6] {
+        let std = Vector6::from(reading.torque_first());
+        let gain = &self.gain;
+        std::array::from_fn(|i| {
+            gain.row(i)
+                .iter()
+                .zip(&std)
+                .map(|(c, s)| (c * s).powi(2))
+                .sum()
+        })
+    }
+
     /// This correction followed by another one that was identified on its output:
     /// `(1 + e) (C r - k (T - T0)) - more (T - T0)`. If this one has no reference temperature,
     /// `reference` is used.

@@ -1,6 +1,7 @@
 //! The buffers of the pipeline: the last samples of each channel, and the last declarations of each
 //! contact.
 
+use super::prediction::Predictor;
 use crate::differentiate::Window;
 use crate::history::{ChannelValue, History};
 use proprio_topics::{Nanos, Reason};
@@ -12,18 +13,20 @@ pub(super) const DECLARATIONS: usize = 16;
 pub(super) enum ChannelBuffer {
     /// Position, velocity, acceleration; the last two are NaN if not measured.
     Joint(History<3>, Box<Window<1>>),
-    /// Force and torque; then temperature of the board.
-    Sensor(History<6>, History<1>),
+    /// Force and torque; then temperature of the board. The predictor is there if estimates do not
+    /// wait.
+    Sensor(History<6>, History<1>, Option<Predictor<6>>),
     /// Proper acceleration, angular velocity, angular acceleration (NaN if not measured).
-    Imu(History<9>, Box<Window<3>>),
+    /// The predictor of the acceleration is there if estimates do not wait.
+    Imu(History<9>, Box<Window<3>>, Option<Predictor<3>>),
 }
 
 impl ChannelBuffer {
     pub(super) fn newest(&self) -> Option<Nanos> {
         match self {
             Self::Joint(h, _) => h.newest(),
-            Self::Sensor(h, _) => h.newest(),
-            Self::Imu(h, _) => h.newest(),
+            Self::Sensor(h, ..) => h.newest(),
+            Self::Imu(h, ..) => h.newest(),
         }
     }
 }

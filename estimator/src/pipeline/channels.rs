@@ -10,18 +10,18 @@ use proprio_dynamics::FrameMotion;
 use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_topics::{Nanos, Reason};
 
-/// Position, velocity and acceleration of a joint at `t`, the standard deviation of the
-/// acceleration, and why they are not valid.
+/// Position, velocity and acceleration of a joint at `t`, the standard deviations of the
+/// acceleration and of an extrapolated position, and why they are not valid.
 pub(crate) fn joint_at(
     t: Nanos,
     until: Nanos,
     held: &ChannelValue<3>,
     (window, grid): (&Window<1>, &mut Grid),
     max_silence: Nanos,
-) -> ([f64; 3], f64, Reason) {
+) -> ([f64; 3], [f64; 2], Reason) {
     let [position, velocity, acceleration] = held.value;
     if held.exact && velocity.is_finite() && acceleration.is_finite() {
-        return ([position, velocity, acceleration], 0.0, Reason::None);
+        return ([position, velocity, acceleration], [0.0; 2], Reason::None);
     }
     // A channel stamped exactly t needs no later sample.
     let until = if held.exact { t } else { until };
@@ -40,19 +40,23 @@ pub(crate) fn joint_at(
             } else {
                 0.0
             };
+            let extrapolated = match estimate.ahead < Nanos::ZERO {
+                true => finite_or_zero(estimate.value_std[0]),
+                false => 0.0,
+            };
             (
                 [
                     given(position, value),
                     given(velocity, first),
                     given(acceleration, second),
                 ],
-                deviation,
+                [deviation, extrapolated],
                 stale(held, max_silence),
             )
         }
         Err(unavailable) => (
             [position, 0.0, 0.0],
-            0.0,
+            [0.0; 2],
             reason_of(unavailable, held, max_silence),
         ),
     }
@@ -106,12 +110,13 @@ pub(crate) fn imu_at(
 }
 
 /// The corrected reading of F/T sensor `number` less its offset, and whether the calibration needs
-/// a temperature that is missing or too old. `temperature` is that of the board \[degrees Celsius\]
-/// and its age. What is uncertain in the correction goes to `propagation`.
+/// a temperature that is missing or too old. `raw` is the reading and its standard deviation, if it
+/// was extrapolated; `temperature` is that of the board \[degrees Celsius\] and its age. What is
+/// uncertain in reading and correction goes to `propagation`.
 pub(crate) fn wrench_at(
     state: &InertialState,
     number: usize,
-    held: &ChannelValue<6>,
+    (raw, raw_std): ([f64; 6], [f64; 6]),
     (celsius, age): (f64, Option<Nanos>),
     propagation: &mut Propagation,
 ) -> Option<(Wrench, bool)> {
@@ -119,9 +124,11 @@ pub(crate) fn wrench_at(
     let offset = state.offsets.get(number)?;
     let excess = (state.excess_variance.get(number).copied()).unwrap_or_default();
     let by_temperature = calibration.temperature_variance(age.map(Nanos::seconds));
-    let extra = std::array::from_fn(|i| by_temperature[i] + excess[i]);
+    let [fx, fy, fz, tx, ty, tz] = raw_std;
+    let extrapolation = calibration.variance_of(&Wrench::from_parts([fx, fy, fz], [tx, ty, tz]));
+    let extra = std::array::from_fn(|i| by_temperature[i] + excess[i] + extrapolation[i]);
     propagation.set_extra_variance(number, extra);
-    let [fx, fy, fz, tx, ty, tz] = held.value;
+    let [fx, fy, fz, tx, ty, tz] = raw;
     let corrected = calibration.apply(&Wrench::from_parts([fx, fy, fz], [tx, ty, tz]), celsius);
     // The effect of an uncertain calibration depends on the reading.
     let kelvin = calibration.temperature_rise(celsius);

@@ -338,7 +338,7 @@ impl OnlineIdentification {
                         *fault = (*fault).or(Reason::NotFinite);
                     }
                 }
-                (ChannelBuffer::Sensor(history, temperatures), ChannelRole::Sensor(number)) => {
+                (ChannelBuffer::Sensor(history, temperatures, _), ChannelRole::Sensor(number)) => {
                     let (Some(reading), Some(fault)) =
                         (self.readings.get_mut(number), self.sensors.get_mut(number))
                     else {
@@ -352,7 +352,7 @@ impl OnlineIdentification {
                         calibration.map_or(mean, |calibration| calibration.apply(&mean, celsius));
                     *fault = reason;
                 }
-                (ChannelBuffer::Imu(history, window), ChannelRole::Base) => {
+                (ChannelBuffer::Imu(history, window, _), ChannelRole::Base) => {
                     let gathered = self.differentiator.gather(
                         history,
                         from,

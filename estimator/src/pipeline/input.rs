@@ -2,6 +2,7 @@
 
 use super::Pipeline;
 use super::buffers::ChannelBuffer;
+use crate::config::Timing;
 use proprio_topics::{Nanos, Quality, Reading, Reason};
 
 impl Pipeline {
@@ -13,13 +14,15 @@ impl Pipeline {
         let Some(buffer) = self.buffers.get_mut(channel) else {
             return;
         };
+        // Estimates that do not wait go by the order of arrival: no sample is late.
+        let waits = self.setup.timing == Timing::Aligned;
         let newest = buffer.newest().unwrap_or(Nanos::MIN);
         let all_finite = |values: &[f64]| values.iter().all(|v| v.is_finite());
         let finite_or_absent = |values: &[f64]| values.iter().all(|v| !v.is_infinite());
         // Decide first whether the sample may be taken; then push it to window and history.
         let (mut late, mut backward) = (false, false);
         let mut admit = |is_valid: bool| {
-            late = is_valid && t <= self.released;
+            late = waits && is_valid && t <= self.released;
             backward = is_valid && !late && t <= newest;
             is_valid && !late && !backward
         };
@@ -43,15 +46,16 @@ impl Pipeline {
                 }
                 is_valid
             }
-            (ChannelBuffer::Sensor(_, temperatures), Reading::Temperature(temperature)) => {
+            (ChannelBuffer::Sensor(_, temperatures, _), Reading::Temperature(temperature)) => {
                 if !self.setup.depends_on_temperature(channel)
                     || quality.intersects(Quality::DEVICE_FAULT)
                 {
                     return;
                 }
-                let late = t < self
-                    .released
-                    .saturating_sub(Nanos(self.setup.max_wait.0 / 2));
+                let late = waits
+                    && t < self
+                        .released
+                        .saturating_sub(Nanos(self.setup.max_wait.0 / 2));
                 match temperature.celsius.is_finite() {
                     false => self.counts.not_finite += 1,
                     true if temperatures.newest().is_some_and(|newest| t <= newest) => {
@@ -66,21 +70,29 @@ impl Pipeline {
                 }
                 return;
             }
-            (ChannelBuffer::Sensor(history, _), Reading::Wrench(w)) => {
+            (ChannelBuffer::Sensor(history, _, predictor), Reading::Wrench(w)) => {
                 let ([fx, fy, fz], [tx, ty, tz]) = (w.force, w.torque);
                 let value = [fx, fy, fz, tx, ty, tz];
                 let is_valid = all_finite(&value);
                 if admit(is_valid) {
+                    if let Some(predictor) = predictor {
+                        let fault = Reason::of_quality(quality, Quality::DEVICE_FAULT);
+                        predictor.push(t, &value, fault == Reason::None);
+                    }
                     history.push(t, value, quality);
                 }
                 is_valid
             }
-            (ChannelBuffer::Imu(history, window), Reading::Imu(i)) => {
+            (ChannelBuffer::Imu(history, window, predictor), Reading::Imu(i)) => {
                 let is_valid = all_finite(&i.proper_acceleration)
                     && all_finite(&i.angular_velocity)
                     && finite_or_absent(&i.angular_acceleration);
                 if admit(is_valid) {
-                    if Reason::of_quality(quality, Quality::DEVICE_FAULT) == Reason::None {
+                    let fault = Reason::of_quality(quality, Quality::DEVICE_FAULT);
+                    if let Some(predictor) = predictor {
+                        predictor.push(t, &i.proper_acceleration, fault == Reason::None);
+                    }
+                    if fault == Reason::None {
                         let _ = window.push(t, i.angular_velocity);
                     } else {
                         window.interrupt();
@@ -107,7 +119,8 @@ impl Pipeline {
         let until = self
             .released
             .saturating_add(Nanos(self.setup.max_wait.0 / 2));
-        self.counts.late += u64::from(newest > Nanos::MIN && newest < self.released && t <= until);
+        self.counts.late +=
+            u64::from(waits && newest > Nanos::MIN && newest < self.released && t <= until);
         self.newest = self.newest.max(t);
         if channel == self.setup.robot.trigger {
             if self.waiting.len() < Self::MAX_WAITING {
@@ -122,7 +135,8 @@ impl Pipeline {
     pub fn declare(&mut self, contact: usize, t: Nanos, active: bool) {
         if let Some(declarations) = self.declarations.get_mut(contact) {
             // Too late for instants that are already released; it counts from the next one on.
-            self.counts.late += u64::from(t <= self.released);
+            let waits = self.setup.timing == Timing::Aligned;
+            self.counts.late += u64::from(waits && t <= self.released);
             declarations.record(t, active);
         }
     }

@@ -120,6 +120,14 @@ impl MotionErrors {
         [accelerations, rest.get_mut(..self.dofs).unwrap_or_default()]
     }
 
+    /// Sets what extrapolation adds to the standard deviations of the base's proper acceleration.
+    pub(super) fn set_proper(&mut self, extrapolation: &[f64; 3]) {
+        let places = self.sigma.iter_mut().skip(2 * self.dofs);
+        places
+            .zip(extrapolation)
+            .for_each(|(to, from)| *to = BASE_ACCELERATION_STD.hypot(*from));
+    }
+
     /// Sets the standard deviations of the IMU's angular acceleration.
     pub(super) fn set_angular(&mut self, deviation: &[f64; 3]) {
         let places = self.sigma.iter_mut().rev();

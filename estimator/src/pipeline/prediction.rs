@@ -1,0 +1,49 @@
+//! Wrenches and proper accelerations at an instant after their last sample, for estimates that do
+//! not wait for it (`timing = "immediate"`).
+
+use crate::differentiate::{Grid, Settings, Window};
+use proprio_topics::Nanos;
+
+/// Extrapolates the `D` numbers of a channel: the adaptive window of [`crate::differentiate`], in
+/// units of each number's own noise.
+pub(super) struct Predictor<const D: usize> {
+    window: Box<Window<D>>,
+    /// Peak noise of each number.
+    noise: [f64; D],
+}
+
+impl<const D: usize> Predictor<D> {
+    /// A predictor without samples. `noise` is the peak noise of each number, as in
+    /// [`Settings::noise`], which is ignored; the samples may show more. None if it is not
+    /// positive.
+    pub(super) fn new(noise: [f64; D], settings: Settings) -> Option<Self> {
+        let window = Window::new(Settings {
+            noise: 1.0,
+            ..settings
+        });
+        let is_valid = noise.iter().all(|x| x.is_finite() && *x > 0.0);
+        let window = window.ok().filter(|_| is_valid)?;
+        Some(Self {
+            window: Box::new(window),
+            noise,
+        })
+    }
+
+    /// Takes a sample; one that must not be fitted together with others separates them.
+    pub(super) fn push(&mut self, t: Nanos, value: &[f64; D], is_good: bool) {
+        if is_good {
+            let scaled = std::array::from_fn(|i| value[i] / self.noise[i]);
+            let _ = self.window.push(t, scaled);
+        } else {
+            self.window.interrupt();
+        }
+    }
+
+    /// The value at `t`, after the last sample, and its standard deviation. None if too few samples
+    /// are at hand, or the last one is too old.
+    pub(super) fn at(&self, t: Nanos, grid: &mut Grid) -> Option<([f64; D], [f64; D])> {
+        let estimate = self.window.at_sharing(t, t, grid).ok()?;
+        let scaled = |x: [f64; D]| std::array::from_fn(|i| x[i] * self.noise[i]);
+        Some((scaled(estimate.value), scaled(estimate.value_std)))
+    }
+}
