@@ -1,6 +1,6 @@
 //! The pipeline on a robot for which three other libraries agree, and its rules: estimates depend
-//! on stamps alone unless they are immediate, a missing channel affects only the estimates that depend on it, and bad samples
-//! are counted and affect nothing else.
+//! on stamps alone (immediate ones on the order of arrival), a missing channel affects only the
+//! estimates that depend on it, and bad samples are counted and affect nothing else.
 
 use proprio_dynamics::calibration::Calibration;
 use proprio_dynamics::spatial::Wrench as Wrench6;
