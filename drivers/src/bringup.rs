@@ -264,6 +264,11 @@ impl Bringup {
         self.mode
     }
 
+    /// Changes the maximum silence from now on.
+    pub(crate) const fn set_max_silence(&mut self, max_silence: Nanos) {
+        self.max_silence = max_silence;
+    }
+
     /// Whether it has been silent for too long.
     pub(crate) const fn is_silent(&self) -> bool {
         self.silent

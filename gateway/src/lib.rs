@@ -12,7 +12,7 @@
 //! - [`link`]: one trait and three links to a bus; [`candump`]: the log format of replay, decode
 //!   and encode.
 //! - [`decoder`]: all devices of one bus, without input or output; [`bus`]: the loop that moves
-//!   frames through it.
+//!   frames through it; [`inbox`]: what the control plane asks of it while it runs.
 //! - [`publish`]: the destinations of samples; [`status`]: the counters of a bus thread.
 //! - [`offline`]: converts a log to a table of samples and back, without a daemon.
 //! - [`daemon`]: the control plane: threads, signals, health, log lines, watchdog.
@@ -26,6 +26,7 @@ pub mod daemon;
 pub mod decoder;
 mod dispatch;
 mod health;
+pub mod inbox;
 pub mod link;
 pub mod offline;
 pub mod plan;

@@ -437,6 +437,10 @@ impl Device for Strain {
             pair.gap |= self.seen;
         }
     }
+
+    fn set_max_silence(&mut self, max_silence: Nanos) {
+        self.bringup.set_max_silence(max_silence);
+    }
 }
 
 /// The reading of a thermometer frame.
