@@ -1,7 +1,7 @@
 //! The loop of a bus over a scripted link: what is sent, when, in which order, and what is dropped,
 //! while frames keep being received.
 
-use proprio_drivers::{Command, Frame, Id};
+use proprio_drivers::{Command, CommandRefused, Frame, Id};
 use proprio_gateway::bus::{Bus, RETRY};
 use proprio_gateway::clock::Manual;
 use proprio_gateway::decoder::{Decoder, build};
@@ -395,7 +395,10 @@ fn requests_are_answered_over_a_lost_link_too() {
     replies.sort_by_key(|(device, _)| *device);
     assert!(matches!(
         replies[..],
-        [(0, Reply::Replaced(_)), (1, Reply::Refused(_))]
+        [
+            (0, Reply::Replaced(_)),
+            (1, Reply::Refused(CommandRefused::NotStreaming))
+        ]
     ));
     // Back again, the new device starts its board.
     rig.script().state = LinkState::Up;
