@@ -47,11 +47,11 @@
 //!
 //! # Tare
 //! [`Command::Tare`](crate::Command::Tare) makes the present load the zero of the calibrated
-//! stream: the board adds minus that load from then on, until its next tare or power-on. (It forgets
-//! the tare with its power, and does not tell.) The host sends the command once, then reads back
-//! all six axes, which confirms it and gives what is added. The board does not say which reading is
-//! the first with the new zero, so every reading from the command to the confirmation, and the first
-//! after it, has [`Quality::GAP_BEFORE`].
+//! stream: the board adds minus that load from then on, until its next tare or power-on. (It
+//! forgets the tare with its power, and does not tell.) The host sends the command once, then reads
+//! back all six axes, which confirms it and gives what is added. The board does not say which
+//! reading is the first with the new zero, so every reading from the command to the confirmation,
+//! and the first after it, has [`Quality::GAP_BEFORE`].
 //!
 //! A tare changes the sensor's offset: offsets that were identified before it no longer hold. It
 //! takes what the sensor carries at that instant, gravity and contacts too.

@@ -1,0 +1,245 @@
+//! Carries out the orders of the control socket: passes them to the devices by the inboxes of their
+//! buses, and answers when the devices have replied.
+
+use crate::control::{Asked, Order, refusal};
+use crate::inbox::{Reply, Request};
+use crate::plan::{Plan, did_you_mean};
+use crate::thread::BusThread;
+use proprio_drivers::{COMMAND_TIME, Command, CommandOutcome, Mode};
+use proprio_topics::{
+    Counter, DeviceHealth, DeviceState, GatewayHealth, LinkState, Nanos, Refusal,
+};
+use serde_json::{Value as Json, json};
+use std::path::{Path, PathBuf};
+use tokio::sync::oneshot;
+
+/// How long the devices may take to reply: a command, and a few turns of a bus without frames.
+const REPLY_TIME: Nanos = Nanos(COMMAND_TIME.0 * 3 / 2);
+
+/// What is being carried out, and on what.
+pub(crate) struct Operator {
+    config: PathBuf,
+    plan: Plan,
+    waiting: Vec<Waiting>,
+}
+
+/// An order whose devices have not all replied.
+struct Waiting {
+    /// The number of the bus, and of the device on it.
+    open: Vec<(usize, u16)>,
+    /// Given up after this.
+    limit: Nanos,
+    answer: oneshot::Sender<Json>,
+}
+
+impl Operator {
+    /// For a gateway that runs `plan`, which it has read from `config`.
+    pub(crate) fn new(config: &Path, plan: Plan) -> Self {
+        Self {
+            config: config.to_owned(),
+            plan,
+            waiting: Vec::new(),
+        }
+    }
+
+    /// What the gateway runs.
+    pub(crate) fn plan(&self) -> &Plan {
+        &self.plan
+    }
+
+    /// Whether a device has not replied.
+    pub(crate) fn waits(&self) -> bool {
+        !self.waiting.is_empty()
+    }
+
+    /// Begins to carry out what was asked, at `now`; `health` is that of now.
+    pub(crate) fn begin(
+        &mut self,
+        asked: Asked,
+        threads: &mut [BusThread],
+        health: &GatewayHealth,
+        now: Nanos,
+    ) {
+        let Asked { order, answer } = asked;
+        let begun = match &order {
+            Order::Status => {
+                // An operator who has gone needs no answer; nor below.
+                let _ = answer.send(self.status(health, now));
+                return;
+            }
+            Order::Devices => {
+                let _ = answer.send(self.devices(threads, health));
+                return;
+            }
+            Order::Tare { device } => self.tare(device, threads),
+        };
+        match begun {
+            Ok(open) => self.waiting.push(Waiting {
+                open,
+                limit: now + REPLY_TIME,
+                answer,
+            }),
+            Err(error) => {
+                tracing::warn!("refused: {error}");
+                let _ = answer.send(refusal(&error));
+            }
+        }
+    }
+
+    /// Takes the replies of the devices until `now`, and answers.
+    pub(crate) fn look(&mut self, threads: &mut [BusThread], now: Nanos) {
+        for (thread, bus) in threads.iter_mut().zip(0..) {
+            while let Some((device, reply)) = thread.requests.take() {
+                self.replied(bus, device, reply);
+            }
+        }
+        let late = |waiting: &mut Waiting| now > waiting.limit;
+        let late: Vec<_> = self.waiting.extract_if(.., late).collect();
+        for Waiting { open, answer, .. } in late {
+            let names = open.into_iter().map(|(bus, device)| self.name(bus, device));
+            let names: Vec<_> = names.collect();
+            let _ = answer.send(refusal(&format!(
+                "{} did not reply: the thread of the bus may be stuck",
+                names.join(", ")
+            )));
+        }
+    }
+
+    /// A device has replied.
+    fn replied(&mut self, bus: usize, device: u16, reply: Reply) {
+        let name = self.name(bus, device);
+        let outcome = match reply {
+            Reply::Ended(Ok(CommandOutcome::Tared(added))) => {
+                let (force, torque) = (added.force, added.torque);
+                tracing::warn!(
+                    device = name,
+                    "tared: the board adds {force:?} N, {torque:?} Nm from now on; offsets \
+                     identified before no longer hold"
+                );
+                Ok(json!({
+                    "ok": true, "device": name,
+                    "added": { "force_n": force, "torque_nm": torque },
+                }))
+            }
+            Reply::Ended(Ok(other)) => Ok(json!({ "ok": true, "outcome": format!("{other:?}") })),
+            Reply::Ended(Err(failed)) => Err(failed.to_string()),
+            Reply::Refused(refused) => Err(refused.to_string()),
+            Reply::Replaced(_) => return,
+        };
+        let answer = outcome.unwrap_or_else(|error| {
+            tracing::warn!(device = name, "not tared: {error}");
+            refusal(&format!("device {name:?}: {error}"))
+        });
+        let own = |waiting: &Waiting| waiting.open.contains(&(bus, device));
+        if let Some(at) = self.waiting.iter().position(own) {
+            let _ = self.waiting.swap_remove(at).answer.send(answer);
+        }
+    }
+
+    fn name(&self, bus: usize, device: u16) -> String {
+        let devices = self.plan.buses.get(bus).map(|bus| &bus.devices);
+        let device = devices.and_then(|devices| devices.get(usize::from(device)));
+        device.map_or_else(String::new, |device| device.name.clone())
+    }
+
+    /// The numbers of the device `name`, or `bus/name`.
+    fn find(&self, name: &str) -> Result<(usize, u16), String> {
+        let all = || {
+            self.plan.buses.iter().zip(0..).flat_map(|(bus, number)| {
+                let devices = bus.devices.iter().zip(0..);
+                devices.map(move |(device, at)| ((number, at), &bus.name, &device.name))
+            })
+        };
+        let found: Vec<_> = all()
+            .filter(|(_, bus, device)| {
+                *device == name || name.split_once('/') == Some((bus.as_str(), device.as_str()))
+            })
+            .collect();
+        match found[..] {
+            [(numbers, ..)] => Ok(numbers),
+            [] => {
+                let names: Vec<_> = all().map(|(_, _, device)| device.as_str()).collect();
+                Err(format!(
+                    "there is no device {name:?}{}; there is {}",
+                    did_you_mean(name, names.iter().copied()),
+                    names.join(", ")
+                ))
+            }
+            [..] => {
+                let names: Vec<_> = found
+                    .iter()
+                    .map(|(_, bus, _)| format!("{bus}/{name}"))
+                    .collect();
+                Err(format!(
+                    "several devices are named {name:?}: {}",
+                    names.join(", ")
+                ))
+            }
+        }
+    }
+
+    fn tare(&self, device: &str, threads: &mut [BusThread]) -> Result<Vec<(usize, u16)>, String> {
+        let (bus, number) = self.find(device)?;
+        let thread = threads.get_mut(bus).filter(|thread| !thread.has_ended());
+        let thread =
+            thread.ok_or_else(|| format!("device {device:?}: the log of its bus has ended"))?;
+        let sent = thread
+            .requests
+            .send(number, Request::Command(Command::Tare));
+        sent.map_err(|busy| format!("device {device:?}: {busy}"))?;
+        Ok(vec![(bus, number)])
+    }
+
+    fn status(&self, health: &GatewayHealth, now: Nanos) -> Json {
+        let buses: Vec<_> = (health.buses().iter())
+            .map(|bus| {
+                json!({
+                    "name": bus.name.as_str(),
+                    "link": bus.link.get().map(LinkState::word),
+                    "frames": bus.frames, "dropped": bus.dropped,
+                    "error_frames": bus.error_frames,
+                    "sent": bus.sent, "send_failures": bus.send_failures,
+                })
+            })
+            .collect();
+        let streams = |device: &&DeviceHealth| device.state == DeviceState::Streaming;
+        json!({
+            "ok": true,
+            "robot": self.plan.robot,
+            "process": std::process::id(),
+            "config": self.config,
+            "up_s": (now - health.started).seconds(),
+            "buses": buses,
+            "devices": health.devices().len(),
+            "streaming": health.devices().iter().filter(streams).count(),
+        })
+    }
+
+    fn devices(&self, threads: &[BusThread], health: &GatewayHealth) -> Json {
+        let buses = self.plan.buses.iter().zip(threads);
+        let devices = buses.flat_map(|(bus, thread)| {
+            let devices = bus.devices.iter();
+            devices.map(move |device| (bus, device, thread.mode.unwrap_or(device.spec.mode)))
+        });
+        let devices: Vec<_> = devices
+            .zip(health.devices())
+            .map(|((bus, device, mode), health)| {
+                let channels: Vec<_> = (device.routes.iter())
+                    .filter_map(|route| self.plan.channels.get(route.channel as usize))
+                    .map(|channel| channel.name.as_str())
+                    .collect();
+                let count = |counter: Counter| health.counters.get(counter as usize);
+                json!({
+                    "name": device.name, "bus": bus.name, "driver": device.driver,
+                    "address": device.spec.address,
+                    "listen_only": mode == Mode::Listen,
+                    "state": health.state.get().map(DeviceState::word),
+                    "refusal": Refusal::from_code(health.refusal).map(|r| r.to_string()),
+                    "frames": count(Counter::Frames), "readings": count(Counter::Readings),
+                    "channels": channels,
+                })
+            })
+            .collect();
+        json!({ "ok": true, "robot": self.plan.robot, "devices": devices })
+    }
+}

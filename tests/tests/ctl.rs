@@ -1,0 +1,402 @@
+//! A running gateway that is asked over its control socket: it answers, tares, and is disturbed by
+//! nobody.
+
+use proprio_gateway::control::{MAX_CLIENTS, MAX_LINE, ask};
+use proprio_tests::watch::{Newest, Recorder, count};
+use proprio_tests::{Arm, PATIENCE, Process, Rig, Written, until};
+use proprio_topics::ipc::Domain;
+use proprio_topics::{Counter, DeviceState, GatewayHealth, Nanos, Quality, Reading, Sample};
+use serde_json::{Value as Json, json};
+use std::io::{BufReader, Read as _, Write as _};
+use std::os::unix::fs::{FileTypeExt as _, PermissionsExt as _};
+use std::os::unix::net::UnixStream;
+use std::path::PathBuf;
+
+const ROBOT: &str = "icub_left_arm";
+
+/// A simulated arm and its gateway; all devices stream.
+struct Running {
+    rig: Rig,
+    arm: Written,
+    simulator: Process,
+    gateway: Process,
+    domain: Option<Domain>,
+}
+
+impl Running {
+    fn new(arm: Arm) -> Self {
+        Self::start(arm, &[])
+    }
+
+    /// The arm does not move.
+    fn still(arm: Arm) -> Self {
+        Self::start(arm, &["--still", "600"])
+    }
+
+    fn start(arm: Arm, options: &[&str]) -> Self {
+        let rig = Rig::new();
+        // Buses of its own: other tests' arms are on the virtual bus, too.
+        let folder = rig.path("");
+        let own = folder
+            .file_name()
+            .and_then(|name| name.to_str())
+            .expect("a name");
+        let arm = arm
+            .periods(4, 10, 4)
+            .patience(1000.0, 100.0)
+            .on_virtual([&format!("{own}a"), &format!("{own}b")])
+            .write(&rig.path("robot"));
+        let simulate = [&["simulate", "--robot", &arm.folder], options].concat();
+        let simulator = rig.start(&simulate);
+        let gateway = rig.start(&["gateway", "--config", &arm.gateway]);
+        let domain = Some(rig.open());
+        let running = Self {
+            rig,
+            arm,
+            simulator,
+            gateway,
+            domain,
+        };
+        running.all_stream();
+        running
+    }
+
+    fn domain(&self) -> &Domain {
+        self.domain.as_ref().expect("it is open until the end")
+    }
+
+    fn all_stream(&self) -> GatewayHealth {
+        Newest::<GatewayHealth>::open(self.domain(), ROBOT).wait("all stream", |health| {
+            let devices = health.devices();
+            devices.len() > 4 && devices.iter().all(|d| d.state == DeviceState::Streaming)
+        })
+    }
+
+    fn ask(&self, line: &Json) -> Json {
+        self.send(&line.to_string())
+    }
+
+    fn send(&self, line: &str) -> Json {
+        let answer = ask(&self.rig.domain, ROBOT, line);
+        let answer =
+            answer.unwrap_or_else(|error| panic!("{line}: {error}\n{}", self.gateway.log()));
+        serde_json::from_str(&answer).expect("JSON")
+    }
+
+    /// The answer to an order that must be refused, for a reason with these parts.
+    fn refused(&self, line: &Json, parts: &[&str]) {
+        let answer = self.ask(line);
+        assert_eq!(answer["ok"], false, "{line}: {answer}");
+        let error = answer["error"].as_str().expect("a reason");
+        for part in parts {
+            assert!(
+                error.contains(part),
+                "{line}: the reason lacks {part:?}: {error}"
+            );
+        }
+    }
+
+    fn socket(&self) -> PathBuf {
+        let domain = &self.rig.domain;
+        domain
+            .base
+            .join(&domain.name)
+            .join(format!("{ROBOT}.gateway.sock"))
+    }
+
+    fn connect(&self) -> UnixStream {
+        let stream = UnixStream::connect(self.socket()).expect("the socket");
+        stream
+            .set_read_timeout(Some(std::time::Duration::from_secs(20)))
+            .expect("a time-out");
+        stream
+    }
+
+    /// The number of a channel.
+    fn channel(&self, name: &str) -> u32 {
+        self.arm.robot.plan.channel(name).expect("a channel")
+    }
+
+    fn end(mut self) {
+        self.gateway.end();
+        self.simulator.end();
+        self.domain = None;
+        self.rig.assert_nothing_left();
+    }
+}
+
+fn line_of(reader: &mut impl std::io::BufRead) -> Option<Json> {
+    let mut line = String::new();
+    match reader.read_line(&mut line) {
+        Ok(0) | Err(_) => None,
+        Ok(_) => serde_json::from_str(&line).ok(),
+    }
+}
+
+#[test]
+fn it_says_what_it_runs() {
+    let running = Running::new(Arm::new());
+    let status = running.ask(&json!({ "do": "status" }));
+    assert_eq!(
+        (&status["ok"], &status["robot"]),
+        (&json!(true), &json!(ROBOT))
+    );
+    assert_eq!(status["process"], running.gateway.id());
+    assert_eq!(status["config"], running.arm.gateway);
+    assert_eq!(status["buses"].as_array().map(Vec::len), Some(2));
+    assert_eq!(status["buses"][0]["link"], "up");
+    assert!(status["buses"][0]["frames"].as_u64() > Some(0), "{status}");
+    assert_eq!(status["streaming"], status["devices"]);
+
+    let answer = running.ask(&json!({ "do": "devices" }));
+    let devices = answer["devices"].as_array().expect("a list");
+    let plan = &running.arm.robot.plan;
+    let names: Vec<_> = (plan.buses.iter())
+        .flat_map(|b| b.devices.iter().map(|d| &d.name))
+        .collect();
+    assert_eq!(
+        devices.iter().map(|d| &d["name"]).collect::<Vec<_>>(),
+        names
+    );
+    let sensor = devices
+        .iter()
+        .find(|d| d["name"] == "l_arm_ft_sensor")
+        .expect("the sensor");
+    assert_eq!(
+        (&sensor["driver"], &sensor["state"]),
+        (&json!("icub_strain"), &json!("streaming"))
+    );
+    assert_eq!(sensor["channels"], json!(["l_arm_ft_sensor"]));
+    assert_eq!(sensor["listen_only"], false);
+    assert!(sensor["readings"].as_u64() > Some(0), "{sensor}");
+
+    running.refused(&json!({ "do": "devises" }), &["did you mean \"devices\"?"]);
+    running.refused(
+        &json!({ "do": "tare", "device": "l_arm_ft_sensr" }),
+        &[
+            "no device \"l_arm_ft_sensr\"",
+            "did you mean \"l_arm_ft_sensor\"?",
+        ],
+    );
+    running.end();
+}
+
+/// The wrenches of the sensor after `since`.
+fn wrenches(samples: &[Sample], channel: u32, since: Nanos) -> Vec<([f64; 6], Quality)> {
+    let of = samples
+        .iter()
+        .filter(|s| s.channel == channel && s.header.acquired > since);
+    of.filter_map(|sample| match sample.reading() {
+        Some(Reading::Wrench(w)) => {
+            let ([a, b, c], [d, e, f]) = (w.force, w.torque);
+            Some(([a, b, c, d, e, f], sample.header.quality))
+        }
+        _ => None,
+    })
+    .collect()
+}
+
+#[test]
+fn a_tare_makes_the_present_load_the_zero() {
+    let running = Running::still(Arm::new());
+    let sensor = running.channel("l_arm_ft_sensor");
+    let mut recorder = Recorder::of_samples(running.domain(), ROBOT);
+    let began = proprio_tests::now();
+    let some = |recorder: &mut Recorder, since: Nanos| {
+        let enough = until(PATIENCE, || {
+            recorder.take();
+            (wrenches(&recorder.taken, sensor, since).len() >= 20).then_some(())
+        });
+        enough.expect("readings of the sensor");
+    };
+    some(&mut recorder, began);
+    let answer = running.ask(&json!({ "do": "tare", "device": "l_arm_ft_sensor" }));
+    let tared = proprio_tests::now();
+    assert_eq!(
+        (&answer["ok"], &answer["device"]),
+        (&json!(true), &json!("l_arm_ft_sensor"))
+    );
+    some(&mut recorder, tared);
+    let wrenches = wrenches(&recorder.taken, sensor, began);
+    let force = |w: &[f64; 6]| w[..3].iter().map(|f| f * f).sum::<f64>().sqrt();
+    // The arm stands still: the load is the weight beyond the sensor, and its noise is below 1 N.
+    let first = wrenches
+        .iter()
+        .position(|(w, _)| force(w) < 3.0)
+        .expect("a zero");
+    assert!(first > 10, "{wrenches:?}");
+    assert!(
+        wrenches[..first].iter().all(|(w, _)| force(w) > 6.0),
+        "{wrenches:?}"
+    );
+    assert!(
+        wrenches[first..].iter().all(|(w, _)| force(w) < 3.0),
+        "{wrenches:?}"
+    );
+    assert!(
+        wrenches[first].1.contains(Quality::GAP_BEFORE),
+        "{:?}",
+        wrenches[first]
+    );
+    let marked = wrenches
+        .iter()
+        .filter(|(_, q)| q.contains(Quality::GAP_BEFORE));
+    assert!((1..10).contains(&marked.count()));
+    assert!(
+        !wrenches
+            .last()
+            .expect("some")
+            .1
+            .contains(Quality::GAP_BEFORE)
+    );
+    // The answer is what was added.
+    for axis in 0..3 {
+        let added = answer["added"]["force_n"][axis].as_f64().expect("a number");
+        assert!(
+            (added + wrenches[first - 1].0[axis]).abs() < 3.0,
+            "{answer}"
+        );
+    }
+    assert!(running.gateway.log().contains("tared: the board adds"));
+    // Nothing was lost, and no other channel is marked.
+    let since = recorder.taken.iter().filter(|s| s.header.acquired > began);
+    let others: Vec<_> = since
+        .filter(|s| s.channel != sensor && s.header.quality.contains(Quality::GAP_BEFORE))
+        .collect();
+    assert!(others.is_empty(), "{others:?}");
+    assert_eq!(recorder.lost(), 0);
+    drop(recorder);
+    let devices = &running.arm.robot.plan.buses[1].devices;
+    let joints = devices
+        .iter()
+        .find(|d| d.driver == "icub_motor")
+        .expect("a board of joints");
+    let order = json!({ "do": "tare", "device": joints.name });
+    running.refused(&order, &[&joints.name, "no such command"]);
+    running.end();
+
+    let listens = Running::still(Arm::new().each_device(|driver, device| {
+        if driver == "icub_strain" {
+            device.insert("listen_only".into(), true.into());
+            device.insert("full_scale_n".into(), vec![1804.0; 3].into());
+            device.insert("full_scale_nm".into(), vec![31.0; 3].into());
+        }
+    }));
+    listens.refused(
+        &json!({ "do": "tare", "device": "l_arm_ft_sensor" }),
+        &[
+            "l_arm_ft_sensor",
+            "only listens",
+            "another program commands its board",
+        ],
+    );
+    listens.end();
+}
+
+#[test]
+fn nobody_disturbs_it() {
+    let mut running = Running::new(Arm::new());
+    let meta = std::fs::symlink_metadata(running.socket()).expect("the socket");
+    assert!(meta.file_type().is_socket());
+    assert_eq!(meta.permissions().mode() & 0o777, 0o600);
+
+    // Nonsense, and then a line that is right, over the same connection.
+    let stream = running.connect();
+    let mut reader = BufReader::new(stream.try_clone().expect("a second handle"));
+    let say = |bytes: &[u8]| (&stream).write_all(bytes).expect("it is taken");
+    for nonsense in [
+        &b"hello\n"[..],
+        b"\n",
+        b"\0\xff\xfe\n",
+        b"{\"do\": \"status\"\n",
+    ] {
+        say(nonsense);
+        let answer = line_of(&mut reader).expect("an answer");
+        assert_eq!(answer["ok"], false, "{answer}");
+    }
+    say(&vec![b'x'; 1 << 20]);
+    say(b"\n{\"do\": \"sta");
+    let answer = line_of(&mut reader).expect("an answer");
+    let limit = MAX_LINE.to_string();
+    assert!(
+        answer["error"].as_str().is_some_and(|e| e.contains(&limit)),
+        "{answer}"
+    );
+    say(b"tus\"}\n{\"do\": \"devices\"}\n");
+    assert!(line_of(&mut reader).expect("an answer")["buses"].is_array());
+    assert!(line_of(&mut reader).expect("an answer")["devices"].is_array());
+
+    // Clients that say nothing, half of something, or do not listen.
+    let silent: Vec<_> = (0..MAX_CLIENTS + 4).map(|_| running.connect()).collect();
+    for (stream, number) in silent.iter().zip(0..) {
+        let mut stream = stream;
+        let _ = match number % 3 {
+            0 => stream.write_all(b"{\"do\""),
+            1 => stream.write_all(&b"{\"do\": \"devices\"}\n".repeat(50)),
+            _ => Ok(()),
+        };
+    }
+    let answer = running.ask(&json!({ "do": "status" }));
+    assert!(
+        answer["error"]
+            .as_str()
+            .is_some_and(|e| e.contains("16 clients")),
+        "{answer}"
+    );
+    // The samples go on, and the silent ones are sent away.
+    running.all_stream();
+    let served = until(PATIENCE, || {
+        std::thread::sleep(std::time::Duration::from_millis(200));
+        let answer = ask(&running.rig.domain, ROBOT, "{\"do\": \"status\"}").ok()?;
+        answer.contains("\"buses\"").then_some(())
+    });
+    served.expect("places are free again");
+    let mut rest = Vec::new();
+    let _ = { &silent[2] }.read_to_end(&mut rest);
+    assert!(rest.is_empty(), "{rest:?}");
+    running.gateway.assert_runs();
+    let health = running.all_stream();
+    for device in health.devices() {
+        assert_eq!(count(device, Counter::Silences), 0, "{device:?}");
+    }
+    drop((silent, reader, stream));
+
+    // A gateway that is killed leaves its socket; the next one replaces it.
+    running.gateway.kill();
+    assert!(running.socket().exists());
+    let gone = ask(&running.rig.domain, ROBOT, "{\"do\": \"status\"}");
+    assert_eq!(
+        gone.map_err(|e| e.kind()),
+        Err(std::io::ErrorKind::ConnectionRefused)
+    );
+    running.gateway = running
+        .rig
+        .start(&["gateway", "--config", &running.arm.gateway]);
+    let answered = until(PATIENCE, || {
+        ask(&running.rig.domain, ROBOT, "{\"do\": \"status\"}").ok()
+    });
+    let status: Json = serde_json::from_str(&answered.expect("an answer")).expect("JSON");
+    assert_eq!(status["process"], running.gateway.id());
+    let mode = std::fs::symlink_metadata(running.socket()).expect("the socket");
+    assert_eq!(mode.permissions().mode() & 0o777, 0o600);
+    // A second gateway of this robot does not take it away.
+    let second = running
+        .rig
+        .command(&["gateway", "--config", &running.arm.gateway])
+        .output();
+    assert_eq!(second.expect("it runs").status.code(), Some(1));
+    assert_eq!(
+        running.ask(&json!({ "do": "status" }))["process"],
+        running.gateway.id()
+    );
+    running.all_stream();
+    // The folder in which it was made is gone, and at the end the socket, too.
+    running.gateway.end();
+    let left: Vec<_> = std::fs::read_dir(running.socket().parent().expect("a folder"))
+        .expect("the domain")
+        .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
+        .filter(|name| name.contains("gateway"))
+        .collect();
+    assert_eq!(left, [""; 0]);
+    running.end();
+}
