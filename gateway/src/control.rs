@@ -8,6 +8,13 @@
 //! | `{"do": "status"}` | the gateway and its buses |
 //! | `{"do": "devices"}` | the devices: state, bus, driver, channels |
 //! | `{"do": "tare", "device": "..."}` | `added`: what the board adds from then on \[N, Nm\] |
+//! | `{"do": "reload"}` | `changed`: the devices that have changed, and which of their keys |
+//!
+//! `reload` reads the configuration file again. A device whose driver's keys or `listen_only`
+//! differ is stopped, replaced and started, as a restart of the gateway would; changed conversions of
+//! joints and `max_silence_ms` apply without that. Devices that are equal do not notice. All is
+//! taken over or nothing: nothing if the file is wrong, or if something has changed that needs a
+//! restart of the gateway, which the answer names under `restart`.
 //!
 //! Every answer has `ok`: true, or false with an `error` in words. A device is given by its name,
 //! or by `bus/name` if several buses have one of that name.
@@ -52,6 +59,7 @@ pub(crate) enum Order {
     Status,
     Devices,
     Tare { device: String },
+    Reload,
 }
 
 /// An order, and where its answer goes.
@@ -66,7 +74,7 @@ pub(crate) fn refusal(error: &dyn std::fmt::Display) -> Json {
 }
 
 impl Order {
-    const WORDS: [&str; 3] = ["status", "devices", "tare"];
+    const WORDS: [&str; 4] = ["status", "devices", "tare", "reload"];
 
     /// The order in a line.
     fn parse(line: &[u8]) -> Result<Self, String> {
@@ -83,6 +91,7 @@ impl Order {
             ("tare", None) => return Err("tare needs a device".into()),
             ("status", None) => Self::Status,
             ("devices", None) => Self::Devices,
+            ("reload", None) => Self::Reload,
             (word, Some(_)) if Self::WORDS.contains(&word) => {
                 return Err(format!("{word} takes no device"));
             }
@@ -338,7 +347,7 @@ mod tests {
                 &[
                     "no order \"tara\"",
                     "did you mean \"tare\"?",
-                    "status, devices, tare",
+                    "status, devices, tare, reload",
                 ],
             ),
             (r#"{"do": "zzz"}"#, &["no order \"zzz\"; there is status"]),

@@ -141,6 +141,9 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
             Some(asked) = asked.recv() => {
                 fill_health(&mut health, &statuses(&threads), &observer.newest());
                 operator.begin(asked, &mut threads, &health, clock.now());
+                if operator.has_reloaded() {
+                    let _ = description_writer.send(&operator.plan().description(), clock.now());
+                }
                 continue;
             }
             () = tokio::time::sleep(LOOK), if operator.waits() => {

@@ -5,7 +5,9 @@ use crate::dispatch::Dispatch;
 use crate::inbox::{Replacement, Reply, Request};
 use crate::plan::{BusPlan, DevicePlan, Route};
 use crate::status::BusStatus;
-use proprio_drivers::{Claim, Decoded, Device, Frame, Mode, NotSent, SpecError, State, Transmit};
+use proprio_drivers::{
+    Claim, CommandFailed, Decoded, Device, Frame, Mode, NotSent, SpecError, State, Transmit,
+};
 use proprio_topics::{Counter, Header, MAX_CHANNELS, Nanos, Quality, Reading, Sample};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
@@ -222,7 +224,10 @@ impl Decoder {
     pub fn request(&mut self, number: u16, request: Request, now: Nanos) -> Option<Reply> {
         let running = self.devices.get_mut(usize::from(number))?;
         match request {
-            Request::Command(command) => match running.device.command(command, now) {
+            Request::Command { until, .. } if now > until => {
+                return Some(Reply::Ended(Err(CommandFailed::NotSent)));
+            }
+            Request::Command { command, .. } => match running.device.command(command, now) {
                 Ok(()) => running.request = Open::Command,
                 Err(refused) => return Some(Reply::Refused(refused)),
             },

@@ -16,8 +16,13 @@ use rtrb::{Consumer, Producer, RingBuffer};
 
 /// What is asked of one device of the bus.
 pub enum Request {
-    /// To execute a command.
-    Command(Command),
+    /// To execute a command, if the bus thread takes it in time.
+    Command {
+        /// The command.
+        command: Command,
+        /// After this it is too late \[ns\].
+        until: Nanos,
+    },
     /// To go on as a changed configuration says.
     Replace(Replacement),
 }
@@ -129,7 +134,10 @@ mod tests {
     #[test]
     fn a_device_has_one_request_open_and_no_queue_is_ever_full() {
         let (mut requests, mut inbox) = inbox(3);
-        let tare = || Request::Command(Command::Tare);
+        let tare = || Request::Command {
+            command: Command::Tare,
+            until: Nanos::MAX,
+        };
         for _ in 0..5 {
             for device in 0..3 {
                 assert_eq!(requests.send(device, tare()), Ok(()));

@@ -34,5 +34,6 @@ pub mod offline;
 mod operator;
 pub mod plan;
 pub mod publish;
+mod reload;
 pub mod status;
 mod thread;

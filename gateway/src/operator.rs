@@ -2,25 +2,45 @@
 //! buses, and answers when the devices have replied.
 
 use crate::control::{Asked, Order, refusal};
-use crate::inbox::{Reply, Request};
+use crate::decoder::build;
+use crate::inbox::{Busy, Replacement, Reply, Request};
 use crate::plan::{Plan, did_you_mean};
+use crate::reload::{Change, changes};
 use crate::thread::BusThread;
+use anyhow::{Context as _, ensure};
 use proprio_drivers::{COMMAND_TIME, Command, CommandOutcome, Mode};
 use proprio_topics::{
     Counter, DeviceHealth, DeviceState, GatewayHealth, LinkState, Nanos, Refusal,
 };
 use serde_json::{Value as Json, json};
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use tokio::sync::oneshot;
 
 /// How long the devices may take to reply: a command, and a few turns of a bus without frames.
 const REPLY_TIME: Nanos = Nanos(COMMAND_TIME.0 * 3 / 2);
 
+/// A command that a bus has not taken by then is not begun any more.
+const TAKE_TIME: Nanos = Nanos(REPLY_TIME.0 - COMMAND_TIME.0);
+
+/// The devices that will reply and the answer when they have, or the answer at once.
+type Begun = Result<(Vec<(usize, u16)>, Json), Json>;
+
+/// The thread of the bus of `device`, if it can be asked something of this device.
+fn free(threads: &mut [BusThread], device: (usize, u16)) -> anyhow::Result<&mut BusThread> {
+    let thread = threads.get_mut(device.0).context("its bus does not run")?;
+    ensure!(!thread.has_ended(), "the log of its bus has ended");
+    ensure!(!thread.requests.is_open(device.1), Busy);
+    Ok(thread)
+}
+
 /// What is being carried out, and on what.
 pub(crate) struct Operator {
     config: PathBuf,
     plan: Plan,
     waiting: Vec<Waiting>,
+    /// Whether the plan has changed and nobody was told.
+    reloaded: bool,
 }
 
 /// An order whose devices have not all replied.
@@ -30,6 +50,8 @@ struct Waiting {
     /// Given up after this.
     limit: Nanos,
     answer: oneshot::Sender<Json>,
+    /// The answer when all devices have taken over what is new.
+    done: Json,
 }
 
 impl Operator {
@@ -39,12 +61,18 @@ impl Operator {
             config: config.to_owned(),
             plan,
             waiting: Vec::new(),
+            reloaded: false,
         }
     }
 
     /// What the gateway runs.
     pub(crate) fn plan(&self) -> &Plan {
         &self.plan
+    }
+
+    /// Whether the plan has changed since the last call.
+    pub(crate) fn has_reloaded(&mut self) -> bool {
+        std::mem::take(&mut self.reloaded)
     }
 
     /// Whether a device has not replied.
@@ -71,17 +99,20 @@ impl Operator {
                 let _ = answer.send(self.devices(threads, health));
                 return;
             }
-            Order::Tare { device } => self.tare(device, threads),
+            Order::Tare { device } => self.tare(device, threads, now),
+            Order::Reload => self.reload(threads),
         };
         match begun {
-            Ok(open) => self.waiting.push(Waiting {
+            Ok((open, done)) if open.is_empty() => drop(answer.send(done)),
+            Ok((open, done)) => self.waiting.push(Waiting {
                 open,
                 limit: now + REPLY_TIME,
                 answer,
+                done,
             }),
-            Err(error) => {
-                tracing::warn!("refused: {error}");
-                let _ = answer.send(refusal(&error));
+            Err(refused) => {
+                tracing::warn!("refused: {}", refused["error"].as_str().unwrap_or_default());
+                drop(answer.send(refused));
             }
         }
     }
@@ -99,7 +130,7 @@ impl Operator {
             let names = open.into_iter().map(|(bus, device)| self.name(bus, device));
             let names: Vec<_> = names.collect();
             let _ = answer.send(refusal(&format!(
-                "{} did not reply: the thread of the bus may be stuck",
+                "no reply of {}: the thread of the bus may be stuck",
                 names.join(", ")
             )));
         }
@@ -124,7 +155,8 @@ impl Operator {
             Reply::Ended(Ok(other)) => Ok(json!({ "ok": true, "outcome": format!("{other:?}") })),
             Reply::Ended(Err(failed)) => Err(failed.to_string()),
             Reply::Refused(refused) => Err(refused.to_string()),
-            Reply::Replaced(_) => return,
+            // What was replaced is freed here.
+            Reply::Replaced(_) => return self.replaced(bus, device),
         };
         let answer = outcome.unwrap_or_else(|error| {
             tracing::warn!(device = name, "not tared: {error}");
@@ -133,6 +165,19 @@ impl Operator {
         let own = |waiting: &Waiting| waiting.open.contains(&(bus, device));
         if let Some(at) = self.waiting.iter().position(own) {
             let _ = self.waiting.swap_remove(at).answer.send(answer);
+        }
+    }
+
+    /// A device has taken over what is new.
+    fn replaced(&mut self, bus: usize, device: u16) {
+        for waiting in &mut self.waiting {
+            waiting.open.retain(|open| *open != (bus, device));
+        }
+        let done = self
+            .waiting
+            .extract_if(.., |waiting| waiting.open.is_empty());
+        for Waiting { answer, done, .. } in done {
+            let _ = answer.send(done);
         }
     }
 
@@ -178,16 +223,70 @@ impl Operator {
         }
     }
 
-    fn tare(&self, device: &str, threads: &mut [BusThread]) -> Result<Vec<(usize, u16)>, String> {
-        let (bus, number) = self.find(device)?;
-        let thread = threads.get_mut(bus).filter(|thread| !thread.has_ended());
-        let thread =
-            thread.ok_or_else(|| format!("device {device:?}: the log of its bus has ended"))?;
-        let sent = thread
-            .requests
-            .send(number, Request::Command(Command::Tare));
-        sent.map_err(|busy| format!("device {device:?}: {busy}"))?;
-        Ok(vec![(bus, number)])
+    fn tare(&self, name: &str, threads: &mut [BusThread], now: Nanos) -> Begun {
+        let device = self.find(name).map_err(|e| refusal(&e))?;
+        let command = Request::Command {
+            command: Command::Tare,
+            until: now + TAKE_TIME,
+        };
+        free(threads, device)
+            .and_then(|thread| Ok(thread.requests.send(device.1, command)?))
+            .map_err(|why| refusal(&format!("device {name:?}: {why}")))?;
+        Ok((vec![device], Json::Null))
+    }
+
+    fn reload(&mut self, threads: &mut [BusThread]) -> Begun {
+        let new = Plan::load_live(&self.config).map_err(|e| refusal(&e))?;
+        let changes = changes(&self.plan, &new).map_err(|places| {
+            let error = format!(
+                "nothing was changed, because this needs a restart of the gateway: {}",
+                places.join("; ")
+            );
+            json!({ "ok": false, "error": error, "restart": places })
+        })?;
+        // Everything that can fail comes before the first change.
+        let mut requests = Vec::new();
+        for Change {
+            device, restarts, ..
+        } in &changes
+        {
+            let failed = |why: &dyn Display| {
+                let name = self.name(device.0, device.1);
+                refusal(&format!("nothing was changed: device {name:?}: {why}"))
+            };
+            let thread = free(threads, *device).map_err(|why| failed(&why))?;
+            let devices = new.buses.get(device.0).map(|bus| &bus.devices);
+            let plan = devices.and_then(|devices| devices.get(usize::from(device.1)));
+            let plan = plan.ok_or_else(|| failed(&"it is not in the file"))?;
+            let built = restarts.then(|| build(plan, thread.mode)).transpose();
+            let replacement = Replacement {
+                device: built.map_err(|why| failed(&why))?,
+                max_silence: plan.spec.max_silence,
+                routes: plan.routes.clone(),
+            };
+            requests.push((*device, Request::Replace(replacement)));
+        }
+        for ((bus, device), request) in requests {
+            if let Some(thread) = threads.get_mut(bus) {
+                // It is free, as was seen above.
+                let _ = thread.requests.send(device, request);
+            }
+        }
+        self.plan = new;
+        self.reloaded = !changes.is_empty();
+        let mut changed = Vec::new();
+        for Change {
+            device,
+            what,
+            restarts,
+        } in &changes
+        {
+            let name = self.name(device.0, device.1);
+            tracing::info!(device = name, restarts, "reloaded: {}", what.join(", "));
+            changed.push(json!({ "device": name, "what": what, "restarted": restarts }));
+        }
+        let open = changes.into_iter().map(|change| change.device).collect();
+        Ok((open, json!({ "ok": true, "changed": changed })))
     }
 
     fn status(&self, health: &GatewayHealth, now: Nanos) -> Json {

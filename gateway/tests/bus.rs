@@ -1,7 +1,7 @@
 //! The loop of a bus over a scripted link: what is sent, when, in which order, and what is dropped,
 //! while frames keep being received.
 
-use proprio_drivers::{Command, CommandRefused, Frame, Id};
+use proprio_drivers::{Command, CommandFailed, CommandRefused, Frame, Id};
 use proprio_gateway::bus::{Bus, RETRY};
 use proprio_gateway::clock::Manual;
 use proprio_gateway::decoder::{Decoder, build};
@@ -174,6 +174,14 @@ fn start_commands(boards: u32) -> Vec<Frame> {
     assert_eq!(sent.len(), 2 * boards as usize);
     assert_eq!(rig.unsent(), (0, 0));
     sent
+}
+
+/// A tare, unless the bus thread takes it after `until`.
+fn tare(until: Nanos) -> Request {
+    Request::Command {
+        command: Command::Tare,
+        until,
+    }
 }
 
 /// Attempts that find the link's queue full.
@@ -385,10 +393,7 @@ fn requests_are_answered_over_a_lost_link_too() {
     rig.script().receives = [Received::StateChanged].into();
     let whole = rig.replacement(0, true);
     assert_eq!(rig.requests.send(0, whole), Ok(()));
-    assert_eq!(
-        rig.requests.send(1, Request::Command(Command::Tare)),
-        Ok(())
-    );
+    assert_eq!(rig.requests.send(1, tare(rig.now)), Ok(()));
     rig.script().sent.clear();
     rig.turns(3);
     let mut replies: Vec<_> = std::iter::from_fn(|| rig.requests.take()).collect();
@@ -399,6 +404,14 @@ fn requests_are_answered_over_a_lost_link_too() {
             (0, Reply::Replaced(_)),
             (1, Reply::Refused(CommandRefused::NotStreaming))
         ]
+    ));
+    // A command that the bus takes too late is not begun.
+    let late = tare(rig.now - Nanos(1));
+    assert_eq!(rig.requests.send(1, late), Ok(()));
+    rig.turns(1);
+    assert!(matches!(
+        rig.requests.take(),
+        Some((1, Reply::Ended(Err(CommandFailed::NotSent))))
     ));
     // Back again, the new device starts its board.
     rig.script().state = LinkState::Up;

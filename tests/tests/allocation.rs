@@ -250,7 +250,10 @@ fn run_bus<S: Sink>(
             });
             turn_until(&mut || status.frames.load(Relaxed) >= frames + FRAMES / 2);
             for device in 0..devices {
-                let command = Request::Command(Command::Tare);
+                let command = Request::Command {
+                    command: Command::Tare,
+                    until: Nanos::MAX,
+                };
                 assert_eq!(requests.send(device as u16, command), Ok(()));
             }
             turn_until(&mut || {

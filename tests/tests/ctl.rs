@@ -5,18 +5,22 @@ use proprio_gateway::control::{MAX_CLIENTS, MAX_LINE, ask};
 use proprio_tests::watch::{Newest, Recorder, count};
 use proprio_tests::{Arm, PATIENCE, Process, Rig, Written, until};
 use proprio_topics::ipc::Domain;
-use proprio_topics::{Counter, DeviceState, GatewayHealth, Nanos, Quality, Reading, Sample};
+use proprio_topics::{
+    Counter, Description, DeviceState, GatewayHealth, Nanos, Quality, Reading, Sample,
+};
 use serde_json::{Value as Json, json};
 use std::io::{BufReader, Read as _, Write as _};
 use std::os::unix::fs::{FileTypeExt as _, PermissionsExt as _};
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
+use toml::{Table, Value};
 
 const ROBOT: &str = "icub_left_arm";
 
 /// A simulated arm and its gateway; all devices stream.
 struct Running {
     rig: Rig,
+    table: Arm,
     arm: Written,
     simulator: Process,
     gateway: Process,
@@ -41,17 +45,18 @@ impl Running {
             .file_name()
             .and_then(|name| name.to_str())
             .expect("a name");
-        let arm = arm
+        let table = arm
             .periods(4, 10, 4)
             .patience(1000.0, 100.0)
-            .on_virtual([&format!("{own}a"), &format!("{own}b")])
-            .write(&rig.path("robot"));
+            .on_virtual([&format!("{own}a"), &format!("{own}b")]);
+        let arm = table.write(&rig.path("robot"));
         let simulate = [&["simulate", "--robot", &arm.folder], options].concat();
         let simulator = rig.start(&simulate);
         let gateway = rig.start(&["gateway", "--config", &arm.gateway]);
         let domain = Some(rig.open());
         let running = Self {
             rig,
+            table,
             arm,
             simulator,
             gateway,
@@ -94,6 +99,24 @@ impl Running {
                 "{line}: the reason lacks {part:?}: {error}"
             );
         }
+    }
+
+    /// Writes gateway.toml with a change of device `name`.
+    fn change(&self, name: &str, change: impl Fn(&mut Table)) {
+        let changed = self.table.clone().each_device(|_, device| {
+            if device.get("name").and_then(Value::as_str) == Some(name) {
+                change(device);
+            }
+        });
+        self.write(&changed.gateway.to_string());
+    }
+
+    fn write(&self, gateway: &str) {
+        std::fs::write(&self.arm.gateway, gateway).expect("a configuration can be written");
+    }
+
+    fn reload(&self) -> Json {
+        self.ask(&json!({ "do": "reload" }))
     }
 
     fn socket(&self) -> PathBuf {
@@ -202,21 +225,14 @@ fn a_tare_makes_the_present_load_the_zero() {
     let sensor = running.channel("l_arm_ft_sensor");
     let mut recorder = Recorder::of_samples(running.domain(), ROBOT);
     let began = proprio_tests::now();
-    let some = |recorder: &mut Recorder, since: Nanos| {
-        let enough = until(PATIENCE, || {
-            recorder.take();
-            (wrenches(&recorder.taken, sensor, since).len() >= 20).then_some(())
-        });
-        enough.expect("readings of the sensor");
-    };
-    some(&mut recorder, began);
+    some(&mut recorder, sensor, began);
     let answer = running.ask(&json!({ "do": "tare", "device": "l_arm_ft_sensor" }));
     let tared = proprio_tests::now();
     assert_eq!(
         (&answer["ok"], &answer["device"]),
         (&json!(true), &json!("l_arm_ft_sensor"))
     );
-    some(&mut recorder, tared);
+    some(&mut recorder, sensor, tared);
     let wrenches = wrenches(&recorder.taken, sensor, began);
     let force = |w: &[f64; 6]| w[..3].iter().map(|f| f * f).sum::<f64>().sqrt();
     // The arm stands still: the load is the weight beyond the sensor, and its noise is below 1 N.
@@ -398,5 +414,201 @@ fn nobody_disturbs_it() {
         .filter(|name| name.contains("gateway"))
         .collect();
     assert_eq!(left, [""; 0]);
+    running.end();
+}
+
+/// Takes samples until the channel has sent some more after `since`.
+fn some(recorder: &mut Recorder, channel: u32, since: Nanos) {
+    let enough = until(PATIENCE, || {
+        recorder.take();
+        let new = |s: &&Sample| s.channel == channel && s.header.acquired > since;
+        (recorder.taken.iter().filter(new).count() >= 20).then_some(())
+    });
+    enough.expect("samples of the channel");
+}
+
+/// Asserts that no sample of any bus was lost, and that each of these channels, and no other, has
+/// one reading that does not continue the one before.
+fn assert_continuous(recorder: &Recorder, channels: &[u32], since: Nanos) {
+    assert_eq!(recorder.lost(), 0);
+    let taken = || recorder.taken.iter().filter(|s| s.header.acquired > since);
+    for bus in 0..2 {
+        let numbers: Vec<u64> = taken()
+            .filter(|s| s.header.bus == bus)
+            .map(|s| s.header.sequence)
+            .collect();
+        assert!(numbers.len() > 10);
+        assert!(
+            numbers.windows(2).all(|w| w[1] == w[0] + 1),
+            "bus {bus}: {numbers:?}"
+        );
+    }
+    let marked = |s: &&Sample| s.header.quality.contains(Quality::GAP_BEFORE);
+    let mut marked: Vec<u32> = taken().filter(marked).map(|s| s.channel).collect();
+    marked.sort_unstable();
+    assert_eq!(marked, channels);
+}
+
+#[test]
+fn a_reload_changes_one_device_and_the_others_do_not_notice() {
+    let running = Running::still(Arm::new());
+    let elbow = running.channel("l_elbow");
+    let mut recorder = Recorder::of_samples(running.domain(), ROBOT);
+    let began = proprio_tests::now();
+    some(&mut recorder, elbow, began);
+    assert_eq!(
+        running.reload(),
+        json!({ "ok": true, "changed": [] }),
+        "nothing is new"
+    );
+
+    // A joint's offset: the device goes on.
+    running.change("l_elbow_motor", |device| {
+        let joints = device["joint"].as_array_mut().expect("a list");
+        joints[0]
+            .as_table_mut()
+            .expect("a table")
+            .insert("offset_rad".into(), 0.5.into());
+    });
+    let changed = json!({ "device": "l_elbow_motor", "what": ["joints"], "restarted": false });
+    assert_eq!(
+        running.reload(),
+        json!({ "ok": true, "changed": [changed] })
+    );
+    some(&mut recorder, elbow, proprio_tests::now());
+    assert_continuous(&recorder, &[elbow], began);
+    let angles: Vec<(f64, Quality)> = (recorder.taken.iter())
+        .filter(|s| s.channel == elbow && s.header.acquired > began)
+        .filter_map(|s| match s.reading() {
+            Some(Reading::Joint(joint)) => Some((joint.position, s.header.quality)),
+            _ => None,
+        })
+        .collect();
+    let at = angles
+        .iter()
+        .position(|(_, q)| q.contains(Quality::GAP_BEFORE))
+        .expect("a mark");
+    let step = |(angle, _): &(f64, Quality)| angle - angles[0].0;
+    assert!(
+        angles[..at].iter().all(|a| step(a).abs() < 0.01),
+        "{angles:?}"
+    );
+    assert!(
+        angles[at..].iter().all(|a| (step(a) - 0.5).abs() < 0.01),
+        "{angles:?}"
+    );
+
+    // The driver's keys: the sensor is stopped and started, the IMU on its bus goes on. (And the
+    // elbow, whose offset is not in this file, goes back.)
+    let sensor = running.channel("l_arm_ft_sensor");
+    let before = running.all_stream();
+    let rate = |device: &Table| device["period_ms"].as_integer();
+    running.change("l_arm_ft_sensor", |device| {
+        assert_eq!(rate(device), Some(4));
+        device.insert("period_ms".into(), 8.into());
+        device.insert("max_silence_ms".into(), 900.0.into());
+    });
+    let began = proprio_tests::now();
+    let answer = running.reload();
+    let what = ["keys of the driver", "max_silence_ms"];
+    let sensor_changed = json!({ "device": "l_arm_ft_sensor", "what": what, "restarted": true });
+    let elbow_changed =
+        json!({ "device": "l_elbow_motor", "what": ["joints"], "restarted": false });
+    assert_eq!(
+        answer,
+        json!({ "ok": true, "changed": [sensor_changed, elbow_changed] })
+    );
+    some(&mut recorder, sensor, proprio_tests::now());
+    let mut channels = [sensor, elbow];
+    channels.sort_unstable();
+    assert_continuous(&recorder, &channels, began);
+    let marked = |s: &&Sample| s.header.quality.contains(Quality::GAP_BEFORE);
+    let times: Vec<Nanos> = (recorder.taken.iter())
+        .filter(|s| s.channel == sensor && s.header.acquired > began)
+        .skip_while(|s| !marked(s))
+        .map(|s| s.header.acquired)
+        .collect();
+    let periods = times.windows(2).map(|w| (w[1] - w[0]).seconds());
+    let mean = periods.sum::<f64>() / (times.len() - 1) as f64;
+    assert!((0.007..0.02).contains(&mean), "8 ms: {mean}");
+    let after = running.all_stream();
+    for (before, after) in before.devices().iter().zip(after.devices()) {
+        let starts = |d: &proprio_topics::DeviceHealth| count(d, Counter::Starts);
+        let restarted = u64::from(after.name.as_str() == "l_arm_ft_sensor");
+        assert_eq!(starts(after), starts(before) + restarted, "{after:?}");
+        assert_eq!(count(after, Counter::Silences), 0, "{after:?}");
+    }
+    // Readers are told of the new time-out.
+    let mut description = Newest::<Description>::open(running.domain(), ROBOT);
+    description.wait("the new time-out", |description| {
+        let entries = description.entries();
+        entries.iter().any(|e| {
+            e.name.as_str() == "l_arm_ft_sensor" && e.max_silence == Nanos::from_millis(900)
+        })
+    });
+    drop((recorder, description));
+    running.end();
+}
+
+#[test]
+fn a_reload_that_cannot_be_done_changes_nothing() {
+    let running = Running::still(Arm::new());
+    let good = running.table.gateway.to_string();
+    let mut recorder = Recorder::of_samples(running.domain(), ROBOT);
+    let began = proprio_tests::now();
+    let elbow = running.channel("l_elbow");
+    // Each of these has a change that could be done, too.
+    let offset = good.replacen("ratio = 100.0", "ratio = 50.0", 1);
+    assert_ne!(offset, good);
+    let other_robot = offset.replace(&format!("\"{ROBOT}\""), "\"other\"");
+    let bus = "\n[[bus]]\nname = \"third\"\nsource = { kind = \"virtual\", name = \"third\" }\n";
+    for (text, parts) in [
+        (other_robot, &["needs a restart of the gateway: robot"][..]),
+        (
+            format!("{offset}{bus}"),
+            &["needs a restart of the gateway", "bus \"third\": added"],
+        ),
+        (
+            offset.replace("address = 13", "address = 12"),
+            &["\"l_arm_ft_sensor\": address"],
+        ),
+    ] {
+        running.write(&text);
+        running.refused(&json!({ "do": "reload" }), parts);
+        let places = &running.reload()["restart"];
+        assert_eq!(places.as_array().map(Vec::len), Some(1), "{places}");
+    }
+    // A wrong file is refused with the words of --check.
+    running.write(&offset.replace("period_ms = 10", "period_ms = 1000"));
+    let check = running
+        .rig
+        .command(&["gateway", "--config", &running.arm.gateway, "--check"]);
+    let check = { check }.output().expect("it runs");
+    let message = String::from_utf8_lossy(&check.stderr).into_owned();
+    let message = message.trim().strip_prefix("error: ").expect("a message");
+    assert!(message.contains("period_ms = 1000"), "{message}");
+    assert_eq!(running.reload(), json!({ "ok": false, "error": message }));
+    std::fs::remove_file(&running.arm.gateway).expect("the file");
+    running.refused(
+        &json!({ "do": "reload" }),
+        &["gateway.toml: cannot be read"],
+    );
+
+    some(&mut recorder, elbow, proprio_tests::now());
+    let marked = |s: &Sample| s.header.quality.contains(Quality::GAP_BEFORE);
+    let since: Vec<_> = recorder
+        .taken
+        .iter()
+        .filter(|s| s.header.acquired > began)
+        .collect();
+    assert!(!since.iter().any(|s| marked(s)));
+    assert_eq!(recorder.lost(), 0);
+    // And then the good change is done.
+    running.write(&offset);
+    assert_eq!(
+        running.reload()["changed"].as_array().map(Vec::len),
+        Some(1)
+    );
+    drop(recorder);
     running.end();
 }
