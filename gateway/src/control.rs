@@ -11,10 +11,10 @@
 //! | `{"do": "reload"}` | `changed`: the devices that have changed, and which of their keys |
 //!
 //! `reload` reads the configuration file again. A device whose driver's keys or `listen_only`
-//! differ is stopped, replaced and started, as a restart of the gateway would; changed conversions of
-//! joints and `max_silence_ms` apply without that. Devices that are equal do not notice. All is
-//! taken over or nothing: nothing if the file is wrong, or if something has changed that needs a
-//! restart of the gateway, which the answer names under `restart`.
+//! differ is stopped, replaced and started, as a restart of the gateway would; changed conversions
+//! of joints and `max_silence_ms` apply without that. Devices that are equal do not notice. All is
+//! taken over or nothing. Nothing, if the file is wrong (`file` and `problem` say why), or if it
+//! differs where a restart of the gateway is needed (`restart` names the places).
 //!
 //! Every answer has `ok`: true, or false with an `error` in words. A device is given by its name,
 //! or by `bus/name` if several buses have one of that name.
@@ -45,7 +45,7 @@ use tokio::time::{sleep, timeout};
 
 /// Maximum number of clients at a time: several people and scripts.
 pub const MAX_CLIENTS: usize = 16;
-/// Maximum length of a line in bytes: ten times the longest that has a meaning.
+/// Maximum length of a line in bytes: many times the longest that has a meaning, a tare.
 pub const MAX_LINE: usize = 4096;
 /// How long the gateway waits for a line, or for a client to take its answer.
 pub const PATIENCE: Duration = Duration::from_secs(10);
@@ -314,6 +314,44 @@ pub fn ask(domain: &DomainConfig, robot: &str, line: &str) -> io::Result<String>
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// The longest folder, domain and robot make a path longer than a socket may have.
+    #[test]
+    fn the_longest_names_have_a_socket() {
+        let base = tempfile::tempdir().unwrap();
+        let fill = 65 - base.path().as_os_str().len() - 1;
+        let domain = DomainConfig::new(base.path().join("b".repeat(fill)), &"d".repeat(32));
+        let robot = "r".repeat(64);
+        let folder = domain.base.join(&domain.name);
+        // What a gateway has left that was killed on the way.
+        let left = folder.join(format!("{robot}.gateway.new"));
+        fs::create_dir_all(&left).unwrap();
+        fs::write(left.join("socket"), "").unwrap();
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()
+            .unwrap();
+        runtime.block_on(async {
+            let (orders, mut asked) = mpsc::channel(1);
+            let socket = Socket::open(&domain, &robot, orders).unwrap();
+            let (there, who) = (domain.clone(), robot.clone());
+            let client = tokio::task::spawn_blocking(move || {
+                (gateways(&there), ask(&there, &who, "{\"do\": \"status\"}"))
+            });
+            let Asked { order, answer } = asked.recv().await.unwrap();
+            assert_eq!(order, Order::Status);
+            answer.send(json!({ "ok": true })).unwrap();
+            let (found, answer) = client.await.unwrap();
+            assert_eq!(
+                (found, answer.unwrap().as_str()),
+                (vec![robot.clone()], "{\"ok\":true}")
+            );
+            let names = || fs::read_dir(&folder).unwrap().count();
+            assert_eq!(names(), 1, "the socket alone");
+            drop(socket);
+            assert_eq!(names(), 0);
+        });
+    }
 
     #[test]
     fn a_wrong_line_says_what_would_be_right() {

@@ -236,7 +236,10 @@ impl Operator {
     }
 
     fn reload(&mut self, threads: &mut [BusThread]) -> Begun {
-        let new = Plan::load_live(&self.config).map_err(|e| refusal(&e))?;
+        let new = Plan::load_live(&self.config).map_err(|e| {
+            let error = e.to_string();
+            json!({ "ok": false, "error": error, "file": e.file, "problem": e.problem })
+        })?;
         let changes = changes(&self.plan, &new).map_err(|places| {
             let error = format!(
                 "nothing was changed, because this needs a restart of the gateway: {}",

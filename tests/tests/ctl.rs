@@ -587,7 +587,11 @@ fn a_reload_that_cannot_be_done_changes_nothing() {
     let message = String::from_utf8_lossy(&check.stderr).into_owned();
     let message = message.trim().strip_prefix("error: ").expect("a message");
     assert!(message.contains("period_ms = 1000"), "{message}");
-    assert_eq!(running.reload(), json!({ "ok": false, "error": message }));
+    let answer = running.reload();
+    assert_eq!(
+        (&answer["ok"], &answer["error"]),
+        (&json!(false), &json!(message))
+    );
     std::fs::remove_file(&running.arm.gateway).expect("the file");
     running.refused(
         &json!({ "do": "reload" }),
@@ -610,5 +614,135 @@ fn a_reload_that_cannot_be_done_changes_nothing() {
         Some(1)
     );
     drop(recorder);
+    running.end();
+}
+
+#[test]
+fn the_command_says_it_in_words() {
+    let rig = Rig::new();
+    let out = |rig: &Rig, arguments: &[&str]| {
+        let output = rig
+            .command(&[&["ctl"], arguments].concat())
+            .output()
+            .expect("it runs");
+        let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+        (
+            output.status.code(),
+            text(&output.stdout),
+            text(&output.stderr),
+        )
+    };
+    let (code, _, err) = out(&rig, &["status"]);
+    assert_eq!(code, Some(1));
+    assert!(err.contains("no gateway runs in the domain test"), "{err}");
+    assert!(
+        err.contains("start one with `proprio gateway --config FILE`"),
+        "{err}"
+    );
+    assert_eq!(out(&rig, &[]).0, Some(2));
+    assert_eq!(out(&rig, &["tare"]).0, Some(2), "it needs a device");
+    assert!(!rig.domain.base.exists(), "nothing was created");
+
+    let running = Running::still(Arm::new());
+    let rig = &running.rig;
+    let good = |arguments: &[&str], parts: &[&str]| {
+        let (code, text, err) = out(rig, arguments);
+        assert_eq!((code, err.as_str()), (Some(0), ""), "{arguments:?}");
+        for part in parts {
+            assert!(
+                text.contains(part),
+                "{arguments:?}: {part:?} is not in {text}"
+            );
+        }
+        text
+    };
+    let process = format!("process {}", running.gateway.id());
+    good(
+        &["status"],
+        &[
+            "robot icub_left_arm",
+            &process,
+            "bus left_arm ",
+            "9 of 9 devices stream",
+        ],
+    );
+    good(
+        &["devices", "--robot", ROBOT],
+        &[
+            "l_arm_ft_sensor          streaming  icub_strain, address 13 on left_arm;",
+            "address 1 on left_arm_motors, listens only; channels: l_shoulder_pitch",
+        ],
+    );
+    let text = good(&["--json", "devices"], &[]);
+    let json: Json = serde_json::from_str(&text).expect("JSON");
+    assert_eq!(json["devices"].as_array().map(Vec::len), Some(9));
+    good(
+        &["tare", "l_arm_ft_sensor"],
+        &[
+            "l_arm_ft_sensor is tared: its board adds",
+            " Nm until",
+            "no longer hold",
+        ],
+    );
+    good(&["tare", "left_arm/l_arm_ft_sensor"], &["is tared"]);
+    good(&["reload"], &["nothing has changed"]);
+    running.change("chest_imu", |device| {
+        device.insert("period_ms".into(), 20.into());
+    });
+    good(
+        &["reload"],
+        &["chest_imu: keys of the driver; it was restarted"],
+    );
+
+    let bad = |arguments: &[&str], wanted: i32, part: &str| {
+        let (code, text, err) = out(rig, arguments);
+        assert_eq!(code, Some(wanted), "{arguments:?}: {err}");
+        assert!(
+            err.starts_with("error: ") && err.contains(part),
+            "{arguments:?}: {err}"
+        );
+        text
+    };
+    bad(
+        &["tare", "l_arm_ft"],
+        1,
+        "did you mean \"l_arm_ft_sensor\"?",
+    );
+    bad(&["tare", "l_elbow_motor"], 1, "no such command");
+    bad(
+        &["status", "--robot", "icub"],
+        1,
+        "no gateway of robot \"icub\"",
+    );
+    let text = bad(&["tare", "nobody", "--json"], 1, "no device");
+    assert_eq!(
+        serde_json::from_str::<Json>(&text).expect("JSON")["ok"],
+        false
+    );
+    running.write("schema = 1\nrobot = 7\n");
+    bad(&["reload"], 2, "gateway.toml: ");
+
+    // A second robot in the same domain.
+    let other = "schema = 1\nrobot = \"other\"\n[[bus]]\nname = \"b\"\n\
+                 source = { kind = \"virtual\", name = \"nobody\" }\n";
+    let file = rig.path("other.toml");
+    std::fs::write(&file, other).expect("a configuration can be written");
+    let mut second = rig.start(&[
+        "gateway",
+        "--config",
+        file.to_str().expect("a path in UTF-8"),
+    ]);
+    let both = until(PATIENCE, || {
+        let (_, _, err) = out(rig, &["status"]);
+        err.contains("name a robot with --robot: icub_left_arm, other")
+            .then_some(())
+    });
+    both.expect("both are named");
+    good(
+        &["status", "--robot", "other"],
+        &["robot other", "0 of 0 devices stream"],
+    );
+    second.end();
+    good(&["status"], &["robot icub_left_arm"]);
     running.end();
 }
