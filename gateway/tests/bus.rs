@@ -417,12 +417,16 @@ fn requests_are_answered_over_a_lost_link_too() {
     rig.script().state = LinkState::Up;
     rig.turns(START);
     assert_eq!(rig.sent(), start_commands(2));
-    // A gateway that stops takes no more requests.
+    // A gateway that stops starts no board again, not even one that was to be replaced.
     let whole = rig.replacement(0, true);
     assert_eq!(rig.requests.send(0, whole), Ok(()));
-    rig.script().sent.clear();
+    rig.turns(2);
+    let whole = rig.replacement(1, true);
+    assert_eq!(rig.requests.send(1, whole), Ok(()));
     rig.bus.stop(&rig.clock);
-    assert_eq!(rig.sent().len(), 2, "one stop command per board");
+    let sent = rig.sent().split_off(start_commands(2).len());
+    let stops = [1, 2].map(|board| Frame::new(Id::standard(0x200 | board), &[7, 1]));
+    assert_eq!(sent, stops);
     assert!(rig.requests.take().is_none());
 }
 

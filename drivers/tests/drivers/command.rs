@@ -6,7 +6,7 @@ use proprio_drivers::{
     Command, CommandFailed, CommandOutcome, CommandRefused, Device, Frame, Frames, Mode, NotSent,
     State,
 };
-use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind, Wrench};
+use proprio_topics::{Counter, Nanos, Quality, Reading, Wrench};
 
 const SCALES: &str = "full_scale_n = [1804, 1804, 1804]\nfull_scale_nm = [31, 31, 31]\n";
 
@@ -219,44 +219,118 @@ fn a_tare_that_fails_says_how_and_leaves_the_stream_alone() {
     assert!(!rig.sent.contains(&"201#1501".to_owned()));
 }
 
+/// A device that streams, without a board: every frame is given by hand.
+struct ByHand {
+    device: Box<dyn Device>,
+    /// \[ms\]
+    now: i64,
+}
+
+impl ByHand {
+    fn new() -> Self {
+        let device = options("icub_strain", SCALES)
+            .device(&spec(1, Mode::Supervise, &[]))
+            .expect("a legal configuration");
+        let mut this = Self { device, now: 0 };
+        for _ in 0..2 {
+            let start = this.poll().expect("a start command");
+            this.device.on_sent(&start, Ok(this.at()));
+        }
+        assert_eq!(
+            (this.reading(), this.poll(), this.reading()),
+            (false, None, false)
+        );
+        assert_eq!(this.device.command(Command::Tare, this.at()), Ok(()));
+        assert_eq!(this.device.next_wake(), Some(Nanos::MIN), "at once");
+        this
+    }
+
+    fn at(&self) -> Nanos {
+        Nanos::from_millis(self.now)
+    }
+
+    fn poll(&mut self) -> Option<Frame> {
+        let now = self.at();
+        let transmit = self
+            .device
+            .poll_transmit(now, &mut proprio_drivers::Decoded::new())?;
+        assert!(transmit.deadline > now && transmit.deadline <= now + Nanos::from_millis(100));
+        Some(transmit.frame)
+    }
+
+    /// The frame that it sends now.
+    fn send(&mut self) -> String {
+        let frame = self.poll().expect("a frame");
+        self.device.on_sent(&frame, Ok(self.at()));
+        frame.to_string()
+    }
+
+    /// Whether a reading that comes a millisecond later is marked.
+    fn reading(&mut self) -> bool {
+        self.now += 1;
+        let halves = ["31A#008000800080", "31B#008000800080"];
+        let frames = halves.map(|half| frame(half, self.now as f64));
+        let (readings, _) = decode(&mut *self.device, &frames);
+        readings[0].quality.contains(Quality::GAP_BEFORE)
+    }
+
+    fn answer(&mut self, text: &str) {
+        let (_, faults) = decode(&mut *self.device, &[frame(text, self.now as f64)]);
+        assert!(faults.is_empty(), "{faults:?}");
+    }
+}
+
 #[test]
 fn a_command_given_up_on_its_way_still_marks_the_readings() {
-    let mut device = options("icub_strain", SCALES)
-        .device(&spec(1, Mode::Supervise, &[]))
-        .unwrap();
-    let mut out = proprio_drivers::Decoded::new();
-    let at = |ms: i64| Nanos::from_millis(ms);
-    let pair = |device: &mut dyn Device, ms: i64| {
-        let frames = [
-            frame("31A#008000800080", ms as f64),
-            frame("31B#008000800080", ms as f64),
-        ];
-        let (readings, _) = decode(device, &frames);
-        readings[0].quality.contains(Quality::GAP_BEFORE)
-    };
-    for _ in 0..2 {
-        let start = device
-            .poll_transmit(at(0), &mut out)
-            .expect("a start command");
-        device.on_sent(&start.frame, Ok(at(0)));
-    }
-    let _ = pair(&mut *device, 1);
-    assert_eq!(device.poll_transmit(at(1), &mut out), None);
-    assert!(!pair(&mut *device, 2));
-    assert_eq!(device.command(Command::Tare, at(2)), Ok(()));
-    assert_eq!(device.next_wake(), Some(Nanos::MIN), "at once");
-    let command = device.poll_transmit(at(2), &mut out).expect("the command");
+    let mut by_hand = ByHand::new();
+    let command = by_hand.poll().expect("the command");
+    assert_eq!(command.to_string(), "201#1501");
+    // The board falls silent, comes back, and then the interface takes the frame.
+    by_hand.now += 60;
+    assert_eq!(by_hand.poll(), None);
     assert_eq!(
-        command.frame,
-        frame("201#1501", 0.0).at(Nanos::ZERO, StampKind::default())
+        by_hand.device.outcome(),
+        Some(Err(CommandFailed::Interrupted))
     );
-    assert_eq!(command.deadline, at(102));
-    // The board falls silent, and then the interface takes the frame.
-    assert_eq!(device.poll_transmit(at(60), &mut out), None);
-    assert_eq!(device.outcome(), Some(Err(CommandFailed::Interrupted)));
-    device.on_sent(&command.frame, Ok(at(61)));
-    assert!(pair(&mut *device, 62), "after the silence");
-    assert_eq!(device.outcome(), None);
+    assert!(by_hand.reading(), "after the silence");
+    assert!(!by_hand.reading());
+    by_hand.device.on_sent(&command, Ok(by_hand.at()));
+    assert!(by_hand.reading(), "the zero may be another one");
+    assert!(!by_hand.reading());
+    assert_eq!(by_hand.device.outcome(), None);
+}
+
+#[test]
+fn answers_come_late_and_twice() {
+    let mut by_hand = ByHand::new();
+    assert_eq!(by_hand.send(), "201#1501");
+    assert!(by_hand.reading(), "it may have been on its way");
+    assert_eq!(by_hand.send(), "201#1600");
+    by_hand.now += 20;
+    assert_eq!(by_hand.send(), "201#1600");
+    for _ in 0..2 {
+        by_hand.answer(ANSWERS[0]);
+    }
+    for (axis, answer) in ANSWERS.iter().enumerate().skip(1) {
+        assert_eq!(by_hand.send(), format!("201#160{axis}"));
+        assert_eq!(by_hand.device.outcome(), None);
+        by_hand.answer(answer);
+    }
+    assert!(by_hand.reading(), "the first that surely has the new zero");
+    assert!(!by_hand.reading());
+    let Some(Ok(CommandOutcome::Tared(added))) = by_hand.device.outcome() else {
+        panic!("no outcome")
+    };
+    // -227 and 264 steps.
+    assert!(
+        (added.force[0] + 227.0 * 1804.0 / 32768.0).abs() < 1e-9,
+        "{added:?}"
+    );
+    assert!(
+        (added.torque[2] + 264.0 * 31.0 / 32768.0).abs() < 1e-9,
+        "{added:?}"
+    );
+    assert_eq!(by_hand.poll(), None);
 }
 
 #[test]
