@@ -17,6 +17,7 @@ macro_rules! print_part {
 }
 
 mod convert;
+mod ctl;
 mod demo;
 mod doctor;
 mod estimator;
@@ -69,6 +70,8 @@ enum Verb {
     Echo(system::Echo),
     /// Record samples and declared contacts into the table that `identify` reads
     Record(system::Record),
+    /// Ask a running gateway: its state, its devices, a tare, a changed configuration
+    Ctl(ctl::Args),
     /// Check this machine: CAN, permissions, shared memory, buffers, real-time limits
     Doctor(doctor::Args),
 }
@@ -102,6 +105,7 @@ fn main() -> ExitCode {
         Verb::Status(args) => system::status(&args, &domain),
         Verb::Echo(args) => system::echo(&args, &domain),
         Verb::Record(args) => system::record(&args, &domain),
+        Verb::Ctl(args) => ctl::run(&args, &domain),
         Verb::Doctor(args) => doctor::run(&args, &domain),
     };
     match result {

@@ -264,6 +264,34 @@ impl Bringup {
         self.mode
     }
 
+    /// Changes the maximum silence from now on.
+    pub(crate) const fn set_max_silence(&mut self, max_silence: Nanos) {
+        self.max_silence = max_silence;
+    }
+
+    /// Whether the board is started and nothing is under way: what its device wants to send beside
+    /// the bring-up may be sent.
+    pub(crate) fn is_idle(&self) -> bool {
+        matches!(self.phase, Phase::Watching { .. }) && self.under_way.is_none()
+    }
+
+    /// Whether the board is started, and not about to be started again.
+    pub(crate) const fn is_watching(&self) -> bool {
+        matches!(self.phase, Phase::Watching { .. })
+    }
+
+    /// Sends `frame` of its device at `now`; [`Bringup::on_sent`] must be told of it as of others.
+    pub(crate) fn lend(&mut self, frame: Frame, now: Nanos) -> Transmit {
+        self.under_way = Some(UnderWay {
+            frame,
+            again: now + self.patience.answer_timeout,
+        });
+        Transmit {
+            frame,
+            deadline: now + self.patience.send_within,
+        }
+    }
+
     /// Whether it has been silent for too long.
     pub(crate) const fn is_silent(&self) -> bool {
         self.silent

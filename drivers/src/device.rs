@@ -6,7 +6,9 @@ use alloc::borrow::Cow;
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
-use proprio_topics::{Counter, DeviceState, Kind, Nanos, Quality, Reading, Refusal, StampKind};
+use proprio_topics::{
+    Counter, DeviceState, Kind, Nanos, Quality, Reading, Refusal, StampKind, Wrench,
+};
 
 /// A set of identifiers whose frames a device receives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -243,6 +245,62 @@ pub enum Mode {
     Listen,
 }
 
+/// What an operator may ask of a device while it runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Command {
+    /// Take the present load of a sensor as its zero, until the board is restarted.
+    Tare,
+}
+
+/// Why a command was not begun. Nothing was sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum CommandRefused {
+    /// The family has no such command.
+    #[error("this device has no such command")]
+    Unsupported,
+    /// The keys of this device leave nothing for the command to act on.
+    #[error("{0}")]
+    Useless(&'static str),
+    /// [`Mode::Listen`].
+    #[error(
+        "the gateway only listens to this device: another program commands its board, and would \
+         not know of it"
+    )]
+    ListenOnly,
+    /// The board's readings do not arrive.
+    #[error("the device does not stream")]
+    NotStreaming,
+    /// The command before has not ended.
+    #[error("an earlier command to this device has not ended")]
+    Busy,
+}
+
+/// How a command that was begun has ended well.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub enum CommandOutcome {
+    /// What the board adds to its measurement from now on, as it reads it back: minus the load at
+    /// the tare \[N, Nm\].
+    Tared(Wrench),
+}
+
+/// Why a command that was begun has not ended well.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum CommandFailed {
+    /// The bus did not take the command: the board knows nothing of it.
+    #[error("the command could not be sent")]
+    NotSent,
+    /// The command was sent, and the questions after it were not answered.
+    #[error("the board did not confirm it: whether it took effect is not known")]
+    NoAnswer,
+    /// The device was started again or stopped meanwhile.
+    #[error("the device was restarted meanwhile: whether it took effect is not known")]
+    Interrupted,
+}
+
 /// The outputs of a device that the configuration uses.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Outputs(pub ArrayVec<u8, 16>);
@@ -350,7 +408,30 @@ pub trait Device: Send {
 
     /// Starts again at `now` after a link loss, because the board may have been reset.
     fn restart(&mut self, now: Nanos);
+
+    /// Changes the maximum silence \[ns\] from now on.
+    fn set_max_silence(&mut self, max_silence: Nanos);
+
+    /// Begins `command` at `now`. Its frames leave through [`Device::poll_transmit`] while readings
+    /// go on, and [`Device::outcome`] tells how it ended.
+    ///
+    /// # Errors
+    /// [`CommandRefused`]: nothing was begun, and there will be no outcome.
+    fn command(&mut self, command: Command, now: Nanos) -> Result<(), CommandRefused> {
+        let _ = (command, now);
+        Err(CommandRefused::Unsupported)
+    }
+
+    /// How the last command ended; `None` while it is under way. Each outcome is given once, and
+    /// it comes within [`COMMAND_TIME`] as long as the device is polled.
+    fn outcome(&mut self) -> Option<Result<CommandOutcome, CommandFailed>> {
+        None
+    }
 }
+
+/// The longest time from a command to its outcome. A board answers within milliseconds; within
+/// this time it has been asked as often as at its start.
+pub const COMMAND_TIME: Nanos = Nanos::from_millis(1000);
 
 /// Frames that a board sends at once.
 pub type Frames = ArrayVec<Frame, 16>;

@@ -54,6 +54,11 @@ pub mod command {
     /// Class 2: period of the streams, `[08, ms]`. (The document's drawing shows 07; its example,
     /// the header and the code 08.)
     pub const SET_CANDATARATE: u8 = 0x08;
+    /// Class 2: `[15, mode]`, or `[15, 2, channel, high, low]`: what the board adds to each
+    /// calibrated axis. Mode 0 nothing, 1 minus the present load, 2 a given value of one channel.
+    pub const SET_CURR_TARE: u8 = 0x15;
+    /// Class 2: `[16, channel]`, answered by `[16, channel, high, low]`.
+    pub const GET_CURR_TARE: u8 = 0x16;
     /// Class 2: `[18, set << 4 | channel]`, answered by `[18, set << 4 | channel, high, low]`.
     pub const GET_FULL_SCALES: u8 = 0x18;
     /// Class 2: `[1C, protocol major, minor]`, answered by `[1C, board, major, minor, build,

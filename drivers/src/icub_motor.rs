@@ -330,6 +330,10 @@ impl Device for Motor {
         self.status = Quality::GOOD;
         self.gap |= self.seen;
     }
+
+    fn set_max_silence(&mut self, max_silence: Nanos) {
+        self.bringup.set_max_silence(max_silence);
+    }
 }
 
 /// The board's own side: it streams without commands, as if it were commanded once a period.

@@ -360,6 +360,10 @@ impl Device for Pos {
         self.bringup.restart();
         self.gap = self.seen;
     }
+
+    fn set_max_silence(&mut self, max_silence: Nanos) {
+        self.bringup.set_max_silence(max_silence);
+    }
 }
 
 /// The board's own side. It sends each value in a separate frame (n = 1), which the protocol

@@ -29,6 +29,8 @@
 //! | `18 ch` | full scale of axis ch, 0 to 5 | `18 ch high low` |
 //! | `08 ms` | period | none |
 //! | `07 00`, `07 03`, `07 04`, `07 01` | send calibrated, uncalibrated, both; stop | none |
+//! | `15 01` | tare: take minus the present load as what is added to each axis | none |
+//! | `16 ch` | what is added to axis ch, signed, in steps of the stream | `16 ch high low` |
 //! | `39 01`, `3A s` | select the thermometer; its period in s, 0 stops | none |
 //!
 //! Sources: `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12 and
@@ -42,6 +44,19 @@
 //! scale of zero (a corrupt memory) is [`Refusal::ZeroFullScale`]. One that differs from the
 //! board's earlier answer is [`Refusal::Changed`], permanently: the readings in between cannot be
 //! trusted.
+//!
+//! # Tare
+//! [`Command::Tare`](crate::Command::Tare) makes the present load the zero of the calibrated
+//! stream: the board adds minus that load from then on, until its next tare or power-on. (It
+//! forgets the tare with its power, and does not tell.) The host sends the command once, then reads
+//! back all six axes, which confirms it and gives what is added. The board does not say which
+//! reading is the first with the new zero, so every reading from the command to the confirmation,
+//! and the first after it, has [`Quality::GAP_BEFORE`].
+//!
+//! A tare changes the sensor's offset: offsets that were identified before it no longer hold. It
+//! takes what the sensor carries at that instant, gravity and contacts too.
+//!
+//! [`Quality::GAP_BEFORE`]: proprio_topics::Quality::GAP_BEFORE
 //!
 //! # Keys
 //! ```toml
@@ -64,6 +79,7 @@ mod board;
 mod device;
 mod frames;
 mod options;
+mod tare;
 
 pub use board::StrainBoard;
 pub use device::Strain;

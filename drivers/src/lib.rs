@@ -34,8 +34,9 @@ mod pairing;
 mod registry;
 
 pub use device::{
-    Board, Claim, Decoded, Device, Driver, EncodeError, Fault, Frames, Mode, NotSent, Output,
-    OutputInfo, Outputs, Spec, SpecError, State, Transmit,
+    Board, COMMAND_TIME, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded,
+    Device, Driver, EncodeError, Fault, Frames, Mode, NotSent, Output, OutputInfo, Outputs, Spec,
+    SpecError, State, Transmit,
 };
 pub use frame::{Format, Frame, Id};
 pub use registry::{DRIVERS, Options, OptionsError};

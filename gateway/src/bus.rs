@@ -13,9 +13,14 @@
 //! stale command moves robots. Every device learns what became of its frames. (What the kernel's
 //! queue holds when an interface goes down, the kernel drops; a frame that the controller has begun
 //! to send can not be recalled.)
+//!
+//! **Requests.** Once per turn the loop looks into its [`Inbox`], by which the control plane
+//! commands a device or replaces it. Its frames go the same way as all others, and the other
+//! devices do not notice. Replies go back by the inbox too, with what was replaced.
 
 use crate::clock::Clock;
 use crate::decoder::Decoder;
+use crate::inbox::Inbox;
 use crate::link::error_frame::ErrorFrame;
 use crate::link::{Link, Received, SendError};
 use crate::publish::Sink;
@@ -49,6 +54,7 @@ pub struct Bus<S> {
     status: Arc<BusStatus>,
     link_was_up: bool,
     queue: Queue,
+    inbox: Option<Inbox>,
 }
 
 /// Whether more frames can come.
@@ -91,7 +97,15 @@ impl<S: Sink> Bus<S> {
                 refused: Vec::with_capacity(QUEUE),
                 retry: Nanos::MIN,
             },
+            inbox: None,
         }
+    }
+
+    /// The same with an inbox.
+    #[must_use]
+    pub fn with_inbox(mut self, inbox: Inbox) -> Self {
+        self.inbox = Some(inbox);
+        self
     }
 
     /// One turn: send what waits, wait for a frame, process it.
@@ -99,6 +113,7 @@ impl<S: Sink> Bus<S> {
         let now = clock.now();
         self.status.last_turn.store(now.0, Relaxed);
         self.follow_link(now);
+        self.serve(now);
         let mut deadline = now + MAX_TURN;
         if self.link_was_up {
             self.send(now, clock);
@@ -159,6 +174,18 @@ impl<S: Sink> Bus<S> {
         self.link_was_up = up;
         self.give_up();
         self.decoder.restart(now);
+    }
+
+    /// Takes requests from the inbox, and replies to those that have ended.
+    fn serve(&mut self, now: Nanos) {
+        let Some(inbox) = &mut self.inbox else { return };
+        while let Some((device, request)) = inbox.take() {
+            if let Some(reply) = self.decoder.request(device, request, now) {
+                inbox.reply(device, reply);
+            }
+        }
+        self.decoder
+            .settle(self.link_was_up, |device, reply| inbox.reply(device, reply));
     }
 
     /// Lets the time of the devices pass until `then` and queues what they want to send.
@@ -241,6 +268,8 @@ impl<S: Sink> Bus<S> {
     /// Stops the devices, within [`STOP_TIME`].
     pub fn stop(&mut self, clock: &impl Clock) {
         let now = clock.now();
+        // A device that took over now would start its board again.
+        self.inbox = None;
         self.decoder.stop(now);
         let end = now + STOP_TIME;
         while !(self.decoder.stopped() && self.queue.waiting.is_empty())

@@ -2,10 +2,13 @@
 //! has no link, clock or sink, so it serves the live gateway and the offline tools alike.
 
 use crate::dispatch::Dispatch;
-use crate::plan::{BusPlan, Route};
+use crate::inbox::{Replacement, Reply, Request};
+use crate::plan::{BusPlan, DevicePlan, Route};
 use crate::status::BusStatus;
-use proprio_drivers::{Claim, Decoded, Device, Frame, Mode, NotSent, SpecError, State, Transmit};
-use proprio_topics::{Counter, Header, MAX_CHANNELS, Nanos, Reading, Sample};
+use proprio_drivers::{
+    Claim, CommandFailed, Decoded, Device, Frame, Mode, NotSent, SpecError, State, Transmit,
+};
+use proprio_topics::{Counter, Header, MAX_CHANNELS, Nanos, Quality, Reading, Sample};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 
@@ -16,6 +19,11 @@ pub struct Decoder {
     dispatch: Dispatch,
     /// Stamp of the last main reading per channel.
     last: [Nanos; MAX_CHANNELS],
+    /// Channels whose next main reading has GAP_BEFORE, because their device or conversion was
+    /// replaced.
+    replaced: [bool; MAX_CHANNELS],
+    /// Number of devices with a request open.
+    open: usize,
     decoded: Decoded,
     status: Arc<BusStatus>,
 }
@@ -23,6 +31,26 @@ pub struct Decoder {
 struct Running {
     device: Box<dyn Device>,
     routes: Vec<Route>,
+    request: Open,
+}
+
+/// The request of a device that has not been replied to.
+enum Open {
+    None,
+    /// The command's outcome is waited for.
+    Command,
+    /// The device stops; this one takes over then.
+    Replacement(Replacement),
+}
+
+/// The host's side of `device`; `mode`, if given, overrides its mode.
+///
+/// # Errors
+/// [`SpecError`]: a device that its driver cannot build.
+pub fn build(device: &DevicePlan, mode: Option<Mode>) -> Result<Box<dyn Device>, SpecError> {
+    let mut spec = device.spec.clone();
+    spec.mode = mode.unwrap_or(spec.mode);
+    device.options.device(&spec)
 }
 
 impl Decoder {
@@ -41,11 +69,10 @@ impl Decoder {
             .devices
             .iter()
             .map(|device| {
-                let mut spec = device.spec.clone();
-                spec.mode = mode.unwrap_or(spec.mode);
                 Ok(Running {
-                    device: device.options.device(&spec)?,
+                    device: build(device, mode)?,
                     routes: device.routes.clone(),
+                    request: Open::None,
                 })
             })
             .collect::<Result<Vec<_>, SpecError>>()?;
@@ -60,6 +87,8 @@ impl Decoder {
             devices,
             dispatch,
             last,
+            replaced: [false; MAX_CHANNELS],
+            open: 0,
             decoded: Decoded::new(),
             status,
         };
@@ -103,12 +132,18 @@ impl Decoder {
                     continue;
                 };
                 let main = output.reading.kind() == route.kind;
+                let mut quality = output.quality;
                 if main && let Some(last) = self.last.get_mut(route.channel as usize) {
                     if output.acquired < *last {
                         self.status.count(number, Counter::Backward, 1);
                         continue;
                     }
                     *last = output.acquired;
+                    if let Some(replaced) = self.replaced.get_mut(route.channel as usize)
+                        && std::mem::take(replaced)
+                    {
+                        quality |= Quality::GAP_BEFORE;
+                    }
                 }
                 let reading = match output.reading {
                     Reading::Joint(state) => Reading::Joint(route.map.joint(state)),
@@ -118,7 +153,7 @@ impl Decoder {
                     acquired: output.acquired,
                     device_time: output.device_time,
                     device_counter: output.device_counter,
-                    quality: output.quality,
+                    quality,
                     stamp: output.stamp.in_memory(),
                     bus: self.bus,
                     ..Header::default()
@@ -181,6 +216,87 @@ impl Decoder {
             running.device.restart(now);
         }
         self.store_states();
+    }
+
+    /// Passes a request to device number `number` at `now`. Returns the reply, unless
+    /// [`Decoder::settle`] gives it later.
+    #[must_use]
+    pub fn request(&mut self, number: u16, request: Request, now: Nanos) -> Option<Reply> {
+        let running = self.devices.get_mut(usize::from(number))?;
+        match request {
+            Request::Command { until, .. } if now > until => {
+                return Some(Reply::Ended(Err(CommandFailed::NotSent)));
+            }
+            Request::Command { command, .. } => match running.device.command(command, now) {
+                Ok(()) => running.request = Open::Command,
+                Err(refused) => return Some(Reply::Refused(refused)),
+            },
+            Request::Replace(replacement) if replacement.device.is_some() => {
+                running.device.stop(now);
+                running.request = Open::Replacement(replacement);
+            }
+            Request::Replace(replacement) => {
+                running.device.set_max_silence(replacement.max_silence);
+                return Some(self.replace(number, replacement));
+            }
+        }
+        self.open += 1;
+        None
+    }
+
+    /// Calls `reply` for every request that has ended, with the number of its device. `up` says
+    /// whether the link is up: over a link that is not, no device can stop its board.
+    pub fn settle(&mut self, up: bool, mut reply: impl FnMut(u16, Reply)) {
+        if self.open == 0 {
+            return;
+        }
+        for number in 0_u16.. {
+            let Some(running) = self.devices.get_mut(usize::from(number)) else {
+                return;
+            };
+            let ended = match std::mem::replace(&mut running.request, Open::None) {
+                Open::None => continue,
+                Open::Command => running
+                    .device
+                    .outcome()
+                    .map(Reply::Ended)
+                    .ok_or(Open::Command),
+                Open::Replacement(new) if up && running.device.state() != State::Stopped => {
+                    Err(Open::Replacement(new))
+                }
+                Open::Replacement(new) => Ok(self.replace(number, new)),
+            };
+            match ended {
+                Ok(ended) => {
+                    self.open -= 1;
+                    reply(number, ended);
+                }
+                Err(open) => {
+                    if let Some(running) = self.devices.get_mut(usize::from(number)) {
+                        running.request = open;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Puts `new` in the place of what device number `number` has.
+    fn replace(&mut self, number: u16, mut new: Replacement) -> Reply {
+        if let Some(running) = self.devices.get_mut(usize::from(number)) {
+            if new.device.is_some() || new.routes != running.routes {
+                for route in &new.routes {
+                    if let Some(replaced) = self.replaced.get_mut(route.channel as usize) {
+                        *replaced = true;
+                    }
+                }
+            }
+            if let Some(device) = &mut new.device {
+                std::mem::swap(device, &mut running.device);
+            }
+            std::mem::swap(&mut new.routes, &mut running.routes);
+            self.status.set_state(number, running.device.state());
+        }
+        Reply::Replaced(new)
     }
 
     /// Begins to stop all devices.
@@ -275,6 +391,8 @@ mod tests {
         fn restart(&mut self, now: Nanos) {
             self.next = now;
         }
+
+        fn set_max_silence(&mut self, _max_silence: Nanos) {}
     }
 
     #[test]
@@ -297,6 +415,7 @@ mod tests {
                 stopped: false,
             }),
             routes: Vec::new(),
+            request: Open::None,
         };
         let mut decoder = Decoder::of(0, vec![running], Arc::clone(&status));
         assert_eq!(decoder.claims(), [Claim::exclusive(answer)]);

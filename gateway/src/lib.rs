@@ -12,22 +12,28 @@
 //! - [`link`]: one trait and three links to a bus; [`candump`]: the log format of replay, decode
 //!   and encode.
 //! - [`decoder`]: all devices of one bus, without input or output; [`bus`]: the loop that moves
-//!   frames through it.
+//!   frames through it; [`inbox`]: what the control plane asks of it while it runs.
 //! - [`publish`]: the destinations of samples; [`status`]: the counters of a bus thread.
 //! - [`offline`]: converts a log to a table of samples and back, without a daemon.
-//! - [`daemon`]: the control plane: threads, signals, health, log lines, watchdog.
+//! - [`daemon`]: the control plane: threads, signals, health, log lines, watchdog; [`control`]: the
+//!   socket over which it is asked while it runs.
 //! - [`clock`]: the only place that reads a clock.
 
 pub mod bus;
 pub mod candump;
 pub mod clock;
 pub mod config;
+pub mod control;
 pub mod daemon;
 pub mod decoder;
 mod dispatch;
 mod health;
+pub mod inbox;
 pub mod link;
 pub mod offline;
+mod operator;
 pub mod plan;
 pub mod publish;
+mod reload;
 pub mod status;
+mod thread;

@@ -147,6 +147,34 @@ impl Plan {
         Self::parse(&text, file.parent().unwrap_or(Path::new("."))).map_err(error)
     }
 
+    /// As [`Plan::load`], for a daemon, which replays logs only as they were recorded.
+    ///
+    /// # Errors
+    /// As [`Plan::load`].
+    pub fn load_live(file: &Path) -> Result<Self, ConfigError> {
+        let plan = Self::load(file)?;
+        let fast = |bus: &&BusPlan| {
+            matches!(
+                bus.source,
+                Source::Replay {
+                    pace: Pace::Fast,
+                    ..
+                }
+            )
+        };
+        match plan.buses.iter().find(fast) {
+            None => Ok(plan),
+            Some(bus) => Err(ConfigError {
+                file: file.to_owned(),
+                problem: format!(
+                    "bus {:?}: pace = \"fast\" is for offline use (proprio decode); a daemon \
+                     replays with pace = \"recorded\"",
+                    bus.name
+                ),
+            }),
+        }
+    }
+
     /// Checks a configuration given as text; paths in it are relative to `folder`.
     ///
     /// # Errors
@@ -330,7 +358,7 @@ impl Builder<'_> {
                 raw.driver,
                 one_line(&e),
                 RawDevice::KEYS.join(", "),
-                did_you_mean(&e)
+                suggest_key(&e)
             ),
         })?;
         if !(raw.max_silence_ms > 0.0 && raw.max_silence_ms <= 3.6e6) {
@@ -542,23 +570,26 @@ fn one_line(error: &toml::de::Error) -> String {
 }
 
 /// A suggestion for an unknown key of a device, out of the driver's and the common keys.
-fn did_you_mean(error: &toml::de::Error) -> String {
+fn suggest_key(error: &toml::de::Error) -> String {
     // The message names the key first, then the driver's keys, each between backquotes.
     let mut words = error.message().split('`').skip(1).step_by(2);
-    let Some(unknown) = words
-        .next()
-        .filter(|_| error.message().starts_with("unknown field"))
-    else {
-        return String::new();
-    };
-    // Winkler's similarity, because most mistakes are at the end of a key; above 0.85 two keys
+    match words.next() {
+        Some(unknown) if error.message().starts_with("unknown field") => {
+            did_you_mean(unknown, words.chain(RawDevice::KEYS))
+        }
+        _ => String::new(),
+    }
+}
+
+/// The word that was probably meant, as the end of a message; empty if none is near.
+pub(crate) fn did_you_mean<'a>(unknown: &str, words: impl Iterator<Item = &'a str>) -> String {
+    // Winkler's similarity, because most mistakes are at the end of a key; above 0.85 two words
     // share most letters, or one is the beginning of the other.
     words
-        .chain(RawDevice::KEYS)
-        .map(|key| (strsim::jaro_winkler(unknown, key), key))
+        .map(|word| (strsim::jaro_winkler(unknown, word), word))
         .filter(|(similarity, _)| *similarity > 0.85)
         .max_by(|(a, _), (b, _)| a.total_cmp(b))
-        .map_or_else(String::new, |(_, key)| format!("; did you mean {key:?}?"))
+        .map_or_else(String::new, |(_, word)| format!("; did you mean {word:?}?"))
 }
 
 fn check_name(place: &str, name: &str) -> Result<(), String> {

@@ -1,15 +1,16 @@
 //! The loop of a bus over a scripted link: what is sent, when, in which order, and what is dropped,
 //! while frames keep being received.
 
-use proprio_drivers::{Frame, Id};
+use proprio_drivers::{Command, CommandFailed, CommandRefused, Frame, Id};
 use proprio_gateway::bus::{Bus, RETRY};
 use proprio_gateway::clock::Manual;
-use proprio_gateway::decoder::Decoder;
+use proprio_gateway::decoder::{Decoder, build};
+use proprio_gateway::inbox::{Replacement, Reply, Request, Requests, inbox};
 use proprio_gateway::link::{Link, LinkCounters, ListenOnly, Received, SendError};
 use proprio_gateway::plan::Plan;
 use proprio_gateway::publish::Memory;
 use proprio_gateway::status::BusStatus;
-use proprio_topics::{BusError, Counter, LinkState, Nanos, StampKind};
+use proprio_topics::{BusError, Counter, LinkState, Nanos, Quality, StampKind};
 use std::collections::VecDeque;
 use std::fmt::Write as _;
 use std::path::Path;
@@ -59,6 +60,8 @@ impl Link for Scripted {
 struct Rig {
     script: Arc<Mutex<Script>>,
     status: Arc<BusStatus>,
+    plan: Plan,
+    requests: Requests,
     bus: Bus<Memory>,
     clock: Manual,
     now: Nanos,
@@ -87,11 +90,15 @@ impl Rig {
         let decoder = Decoder::new(0, &plan.buses[0], None, Arc::clone(&status)).unwrap();
         let script = Arc::new(Mutex::new(Script::default()));
         let link = link(Scripted(Arc::clone(&script)));
+        let (requests, inbox) = inbox(plan.buses[0].devices.len());
         let bus = Bus::new(link, decoder, Memory::default(), Arc::clone(&status));
+        let bus = bus.with_inbox(inbox);
         let now = Nanos::from_millis(1000);
         Self {
             script,
             status,
+            plan,
+            requests,
             bus,
             clock: Manual::new(now),
             now,
@@ -114,6 +121,31 @@ impl Rig {
     fn pass(&mut self, time: Nanos) {
         self.now += time;
         self.clock.set(self.now);
+    }
+
+    /// What replaces board `number`: a new device, or only the routes.
+    fn replacement(&self, number: u16, whole: bool) -> Request {
+        let plan = &self.plan.buses[0].devices[usize::from(number)];
+        Request::Replace(Replacement {
+            device: whole.then(|| build(plan, None).expect("a device")),
+            max_silence: Nanos::from_millis(77),
+            routes: plan.routes.clone(),
+        })
+    }
+
+    /// Lets every board send one reading.
+    fn readings(&mut self, boards: u16) {
+        for address in 1..=boards {
+            for kind in [0xA, 0xB] {
+                let frame = Frame::new(
+                    Id::standard(0x300 | address << 4 | kind),
+                    &[0, 0x80].repeat(3),
+                );
+                let frame = frame.at(self.now, StampKind::Software);
+                self.script().receives.push_back(Received::Frame(frame));
+            }
+        }
+        self.turns(2 * usize::from(boards));
     }
 
     fn turns(&mut self, count: usize) {
@@ -142,6 +174,14 @@ fn start_commands(boards: u32) -> Vec<Frame> {
     assert_eq!(sent.len(), 2 * boards as usize);
     assert_eq!(rig.unsent(), (0, 0));
     sent
+}
+
+/// A tare, unless the bus thread takes it after `until`.
+fn tare(until: Nanos) -> Request {
+    Request::Command {
+        command: Command::Tare,
+        until,
+    }
 }
 
 /// Attempts that find the link's queue full.
@@ -276,6 +316,118 @@ fn stop_commands_are_sent_before_the_end() {
     rig.bus.stop(&rig.clock);
     assert_eq!(rig.sent().len(), 2, "one per board");
     assert_eq!(rig.unsent(), (0, 0));
+}
+
+#[test]
+fn a_replaced_device_stops_its_board_before_the_new_one_starts_it() {
+    let (start, boards) = (start_commands(2), 2);
+    let mut rig = Rig::new(2);
+    rig.turns(START);
+    rig.readings(boards);
+    rig.script().sent.clear();
+    let whole = rig.replacement(0, true);
+    assert_eq!(rig.requests.send(0, whole), Ok(()));
+    assert!(
+        rig.requests.take().is_none(),
+        "not before the board is stopped"
+    );
+    rig.turns(START);
+    let to_first = |frames: &[Frame]| -> Vec<Frame> {
+        let mine = |frame: &&Frame| frame.id == Id::standard(0x201);
+        frames.iter().filter(mine).copied().collect()
+    };
+    let mut wanted = vec![Frame::new(Id::standard(0x201), &[7, 1])];
+    wanted.extend(to_first(&start));
+    assert_eq!(rig.sent(), wanted, "nothing is sent to the other board");
+    let Some((0, Reply::Replaced(old))) = rig.requests.take() else {
+        panic!("no reply")
+    };
+    assert!(
+        old.device
+            .is_some_and(|old| old.state() == proprio_drivers::State::Stopped)
+    );
+    rig.pass(Nanos::from_millis(10));
+    rig.readings(boards);
+
+    // New routes alone: the device goes on, and nothing is sent. Only a different one leaves a gap.
+    for offset in [0.0, 1.0] {
+        rig.script().sent.clear();
+        let Request::Replace(mut part) = rig.replacement(1, false) else {
+            unreachable!()
+        };
+        part.routes[0].map.offset = offset;
+        assert_eq!(rig.requests.send(1, Request::Replace(part)), Ok(()));
+        rig.turns(2);
+        assert!(matches!(rig.requests.take(), Some((1, Reply::Replaced(_)))));
+        rig.pass(Nanos::from_millis(10));
+        rig.readings(boards);
+        assert_eq!(rig.sent(), []);
+    }
+    // The maximum silence is the new one.
+    rig.pass(Nanos::from_millis(70));
+    rig.turns(2);
+    let silences = |rig: &Rig| -> Vec<u64> {
+        let of = |d: proprio_topics::DeviceHealth| d.counters[Counter::Silences as usize];
+        rig.status.devices().map(of).collect()
+    };
+    assert_eq!(silences(&rig), [0, 0]);
+    rig.pass(Nanos::from_millis(8));
+    rig.turns(2);
+    assert_eq!(silences(&rig), [0, 1]);
+
+    let memory = rig.bus.into_sink();
+    let gaps = |channel: u32| -> Vec<bool> {
+        let of = memory.samples.iter().filter(|s| s.channel == channel);
+        of.map(|s| s.header.quality.contains(Quality::GAP_BEFORE))
+            .collect()
+    };
+    assert_eq!(gaps(0), [false, true, false, false]);
+    assert_eq!(gaps(1), [false, false, false, true]);
+}
+
+#[test]
+fn requests_are_answered_over_a_lost_link_too() {
+    let mut rig = Rig::new(2);
+    rig.turns(START);
+    rig.script().state = LinkState::Down;
+    rig.script().receives = [Received::StateChanged].into();
+    let whole = rig.replacement(0, true);
+    assert_eq!(rig.requests.send(0, whole), Ok(()));
+    assert_eq!(rig.requests.send(1, tare(rig.now)), Ok(()));
+    rig.script().sent.clear();
+    rig.turns(3);
+    let mut replies: Vec<_> = std::iter::from_fn(|| rig.requests.take()).collect();
+    replies.sort_by_key(|(device, _)| *device);
+    assert!(matches!(
+        replies[..],
+        [
+            (0, Reply::Replaced(_)),
+            (1, Reply::Refused(CommandRefused::NotStreaming))
+        ]
+    ));
+    // A command that the bus takes too late is not begun.
+    let late = tare(rig.now - Nanos(1));
+    assert_eq!(rig.requests.send(1, late), Ok(()));
+    rig.turns(1);
+    assert!(matches!(
+        rig.requests.take(),
+        Some((1, Reply::Ended(Err(CommandFailed::NotSent))))
+    ));
+    // Back again, the new device starts its board.
+    rig.script().state = LinkState::Up;
+    rig.turns(START);
+    assert_eq!(rig.sent(), start_commands(2));
+    // A gateway that stops starts no board again, not even one that was to be replaced.
+    let whole = rig.replacement(0, true);
+    assert_eq!(rig.requests.send(0, whole), Ok(()));
+    rig.turns(2);
+    let whole = rig.replacement(1, true);
+    assert_eq!(rig.requests.send(1, whole), Ok(()));
+    rig.bus.stop(&rig.clock);
+    let sent = rig.sent().split_off(start_commands(2).len());
+    let stops = [1, 2].map(|board| Frame::new(Id::standard(0x200 | board), &[7, 1]));
+    assert_eq!(sent, stops);
+    assert!(rig.requests.take().is_none());
 }
 
 #[test]

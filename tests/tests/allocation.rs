@@ -8,7 +8,7 @@
 // A global allocator needs unsafe code.
 #![allow(unsafe_code)]
 
-use proprio_drivers::{Claim, Frame, Id, Mode, NotSent};
+use proprio_drivers::{Claim, Command, Frame, Id, Mode, NotSent};
 use proprio_dynamics::model::{self, Model};
 use proprio_dynamics::regressor::{
     Actuator, Coupling, EstimateRows, MotorRegressor, Regressor, StackedRegressor, Transmission,
@@ -26,7 +26,8 @@ use proprio_estimator::setup::Setup;
 use proprio_gateway::bus::{Bus, Turn};
 use proprio_gateway::candump;
 use proprio_gateway::clock::{Clock, Monotonic};
-use proprio_gateway::decoder::Decoder;
+use proprio_gateway::decoder::{Decoder, build};
+use proprio_gateway::inbox::{Replacement, Reply, Request, inbox};
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, Received, send_by};
 use proprio_gateway::publish::{Memory, Shared, Sink};
@@ -191,8 +192,9 @@ fn far_end(
     }
 }
 
-/// Runs the gateway's loop of bus `number` against its far end, with the sink from `sink`. Returns
-/// the allocations of the measured part, the number of samples published, and the bus's status.
+/// Runs the gateway's loop of bus `number` against its far end, with the sink from `sink`, while
+/// every device is replaced and commanded. Returns the allocations of the measured part, the number
+/// of samples published, and the bus's status.
 fn run_bus<S: Sink>(
     number: usize,
     test: &str,
@@ -209,23 +211,60 @@ fn run_bus<S: Sink>(
         format!("{test}-{number}"),
     );
     let link = VirtualBus::open(&domain, &name, &decoder.claims()).expect("a virtual bus");
-    let mut bus = Bus::new(Box::new(link), decoder, sink(), Arc::clone(&status));
+    let devices = plan.devices.len();
+    let (mut requests, inbox) = inbox(devices);
+    let mut replacements: Vec<_> = (plan.devices.iter().zip(0_u16..))
+        .map(|(device, number)| {
+            let replacement = Replacement {
+                device: Some(build(device, None).expect("a device")),
+                max_silence: device.spec.max_silence,
+                routes: device.routes.clone(),
+            };
+            (number, Request::Replace(replacement))
+        })
+        .collect();
+    let mut bus = Bus::new(Box::new(link), decoder, sink(), Arc::clone(&status)).with_inbox(inbox);
     let clock = Monotonic;
     let (nonsense, stop) = (AtomicBool::new(false), AtomicBool::new(false));
     let result = std::thread::scope(|scope| {
         scope.spawn(|| far_end(&robot, number, &domain, &name, &nonsense, &stop));
         let end = clock.now() + Nanos::from_millis(60_000);
-        let mut turn_until = |done: &dyn Fn() -> bool| {
+        let mut turn_until = |done: &mut dyn FnMut() -> bool| {
             while !done() && clock.now() < end {
                 assert_eq!(bus.turn(&clock), Turn::Continue);
             }
         };
         // Warm-up: every device has sent something.
         let readings = |d: &DeviceHealth| d.counters[Counter::Readings as usize];
-        turn_until(&|| status.devices().all(|d| readings(&d) > 10));
+        turn_until(&mut || status.devices().all(|d| readings(&d) > 10));
         nonsense.store(true, Relaxed);
         let (frames, published) = (status.frames.load(Relaxed), status.published.load(Relaxed));
-        let allocated = counted(|| turn_until(&|| status.frames.load(Relaxed) >= frames + FRAMES));
+        let mut replies = Vec::with_capacity(2 * devices);
+        let allocated = counted(|| {
+            for (device, request) in replacements.drain(..) {
+                assert_eq!(requests.send(device, request), Ok(()));
+            }
+            turn_until(&mut || {
+                replies.extend(requests.take());
+                replies.len() == devices
+            });
+            turn_until(&mut || status.frames.load(Relaxed) >= frames + FRAMES / 2);
+            for device in 0..devices {
+                let command = Request::Command {
+                    command: Command::Tare,
+                    until: Nanos::MAX,
+                };
+                assert_eq!(requests.send(device as u16, command), Ok(()));
+            }
+            turn_until(&mut || {
+                replies.extend(requests.take());
+                replies.len() == 2 * devices
+            });
+            turn_until(&mut || status.frames.load(Relaxed) >= frames + FRAMES);
+        });
+        let replaced = |(_, reply): &&(u16, Reply)| matches!(reply, Reply::Replaced(_));
+        assert_eq!(replies.len(), 2 * devices);
+        assert_eq!(replies.iter().filter(replaced).count(), devices);
         let received = status.frames.load(Relaxed) - frames;
         let published_there = status.published.load(Relaxed) - published;
         let stopped = counted(|| bus.stop(&clock));

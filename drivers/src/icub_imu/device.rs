@@ -397,4 +397,8 @@ impl Device for ImuDevice {
         self.bringup.restart();
         self.reset();
     }
+
+    fn set_max_silence(&mut self, max_silence: Nanos) {
+        self.bringup.set_max_silence(max_silence);
+    }
 }

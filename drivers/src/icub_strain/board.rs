@@ -3,6 +3,7 @@
 
 use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind, saturation_bytes};
 use super::options::{Options, Stream};
+use super::tare::MINUS_PRESENT;
 use crate::icub::{self, class, command};
 use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
 use proprio_topics::{Nanos, Quality, Reading, Saturation, Temperature};
@@ -25,8 +26,12 @@ pub struct StrainBoard {
     period: Nanos,
     /// The stream selected by the host; `None` while it is silent.
     stream: Option<Stream>,
-    /// The counts of the last vector that was not saturated.
+    /// The calibrated counts of the last vector that was not saturated.
     last_good: Option<[u16; 6]>,
+    /// The gauges of the last vector.
+    gauges: [u16; 6],
+    /// What is added to each calibrated axis, in steps; lost with the power.
+    tare: [i16; 6],
 }
 
 impl StrainBoard {
@@ -47,6 +52,8 @@ impl StrainBoard {
             period,
             stream: (spec.mode == Mode::Listen).then_some(options.stream),
             last_good: None,
+            gauges: [ZERO; 6],
+            tare: [0; 6],
         })
     }
 
@@ -61,6 +68,11 @@ impl StrainBoard {
             let _ = out.try_push(Half { counts, saturation }.frame(id));
         }
     }
+}
+
+/// `steps`, limited to the range of a Q15 number.
+fn signed(steps: i32) -> i16 {
+    i16::try_from(steps).unwrap_or(if steps > 0 { i16::MAX } else { i16::MIN })
 }
 
 impl Board for StrainBoard {
@@ -87,6 +99,26 @@ impl Board for StrainBoard {
                     &[command::GET_FULL_SCALES, channel, high, low],
                 ));
                 self.scale_known = true;
+            }
+            Some(&[command::SET_CURR_TARE, 0, ..]) => self.tare = [0; 6],
+            Some(&[command::SET_CURR_TARE, MINUS_PRESENT, ..]) => {
+                self.tare = self
+                    .gauges
+                    .map(|gauge| signed(i32::from(ZERO) - i32::from(gauge)));
+            }
+            Some(&[command::SET_CURR_TARE, 2, channel, high, low]) => {
+                if let Some(tare) = self.tare.get_mut(usize::from(channel)) {
+                    *tare = i16::from_be_bytes([high, low]);
+                }
+            }
+            Some(&[command::GET_CURR_TARE, channel]) => {
+                let tare = self.tare.get(usize::from(channel)).copied().unwrap_or(0);
+                let [high, low] = tare.to_be_bytes();
+                let id = icub::to_host(class::POLLING_ANALOG, self.address);
+                let _ = out.try_push(Frame::new(
+                    id,
+                    &[command::GET_CURR_TARE, channel, high, low],
+                ));
             }
             Some(&[command::SET_CANDATARATE, ms]) if ms > 0 => {
                 self.period = Nanos::from_millis(i64::from(ms));
@@ -148,6 +180,12 @@ impl Board for StrainBoard {
                     });
                 }
                 let raw = counts;
+                self.gauges = raw;
+                for (count, tare) in counts.iter_mut().zip(self.tare) {
+                    let sum = signed(i32::from(*count) - i32::from(ZERO) + i32::from(tare));
+                    // Back to the code of the stream: the sign bit is inverted.
+                    *count = sum.cast_unsigned() ^ ZERO;
+                }
                 if !quality.contains(Quality::SATURATED) {
                     self.last_good = Some(counts);
                 } else if !quality.contains(Quality::FROZEN) {

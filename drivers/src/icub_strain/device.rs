@@ -3,11 +3,13 @@
 
 use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind};
 use super::options::{Options, Stream};
+use super::tare::Tare;
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry};
 use crate::icub::{self, class, command};
 use crate::pairing::{Limit, Paired, Pairing};
 use crate::{
-    Claim, Decoded, Device, Frame, Mode, NotSent, Output, Spec, SpecError, State, Transmit,
+    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Mode,
+    NotSent, Output, Spec, SpecError, State, Transmit,
 };
 use arrayvec::ArrayVec;
 use proprio_topics::{
@@ -233,6 +235,8 @@ pub struct Strain {
     claims: ArrayVec<Claim, 7>,
     bringup: Bringup,
     scales: FullScales,
+    tare: Tare,
+    stream: Stream,
     calibrated: Pair,
     raw: Pair,
     /// Whether there was a reading: from then on a restart leaves a gap.
@@ -299,6 +303,8 @@ impl Strain {
             claims,
             bringup,
             scales: FullScales::new(address, configured, options.stream),
+            tare: Tare::new(address),
+            stream: options.stream,
             calibrated: Pair::new(limit),
             raw: Pair::new(limit),
             seen: false,
@@ -358,7 +364,12 @@ impl Strain {
         } else {
             Quality::GOOD
         };
-        let quality = whole.quality | frozen | self.calibrated.take_gap();
+        let step = if self.tare.in_doubt() {
+            Quality::GAP_BEFORE
+        } else {
+            Quality::GOOD
+        };
+        let quality = whole.quality | frozen | step | self.calibrated.take_gap();
         self.give(&whole, quality, reading, frame, out);
     }
 
@@ -403,6 +414,9 @@ impl Device for Strain {
                 Some(&command::GET_FULL_SCALES) => {
                     self.scales.answer(data, self.bringup.mode(), frame, out);
                 }
+                Some(&command::GET_CURR_TARE) if self.bringup.mode() == Mode::Supervise => {
+                    self.calibrated.gap |= self.tare.answer(data, frame, out);
+                }
                 // Answers to other questions are for other devices.
                 Some(_) => {}
                 None => out.fault(Counter::Length, 1, frame.id),
@@ -411,15 +425,29 @@ impl Device for Strain {
     }
 
     fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
-        self.bringup.poll(now, &mut self.scales, out)
+        if let Some(transmit) = self.bringup.poll(now, &mut self.scales, out) {
+            return Some(transmit);
+        }
+        if !self.bringup.is_watching() {
+            self.tare.interrupt();
+        }
+        if !self.bringup.is_idle() {
+            return None;
+        }
+        let frame = self.tare.poll(now)?;
+        Some(self.bringup.lend(frame, now))
     }
 
     fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
         self.bringup.on_sent(frame, outcome, &mut self.scales);
+        // Also a command that was given up on its way takes effect.
+        self.calibrated.gap |= self.tare.sent(frame, outcome);
     }
 
     fn next_wake(&self) -> Option<Nanos> {
-        self.bringup.next_wake(&self.scales)
+        let tare = self.tare.wake().filter(|_| self.bringup.is_idle());
+        let bringup = self.bringup.next_wake(&self.scales);
+        bringup.into_iter().chain(tare).min()
     }
 
     fn state(&self) -> State {
@@ -428,14 +456,53 @@ impl Device for Strain {
 
     fn stop(&mut self, _now: Nanos) {
         self.bringup.stop();
+        self.tare.interrupt();
     }
 
     fn restart(&mut self, _now: Nanos) {
         self.bringup.restart();
+        self.tare.interrupt();
         for pair in [&mut self.calibrated, &mut self.raw] {
             pair.pairing.reset();
             pair.gap |= self.seen;
         }
+    }
+
+    fn set_max_silence(&mut self, max_silence: Nanos) {
+        self.bringup.set_max_silence(max_silence);
+    }
+
+    fn command(&mut self, command: Command, now: Nanos) -> Result<(), CommandRefused> {
+        let Command::Tare = command;
+        if self.bringup.mode() == Mode::Listen {
+            return Err(CommandRefused::ListenOnly);
+        }
+        if self.stream == Stream::Uncalibrated {
+            return Err(CommandRefused::Useless(
+                "this device streams raw gauges alone, which a tare does not change",
+            ));
+        }
+        if self.tare.is_open() {
+            return Err(CommandRefused::Busy);
+        }
+        if self.state() != State::Streaming || !self.bringup.is_idle() {
+            return Err(CommandRefused::NotStreaming);
+        }
+        self.tare.begin(now);
+        Ok(())
+    }
+
+    fn outcome(&mut self) -> Option<Result<CommandOutcome, CommandFailed>> {
+        let counts = match self.tare.outcome()? {
+            Ok(counts) => counts,
+            Err(failed) => return Some(Err(failed)),
+        };
+        let [fx, fy, fz, tx, ty, tz] = self.scales.per_step.unwrap_or([f64::NAN; 6]);
+        let [a, b, c, d, e, f] = counts.map(f64::from);
+        Some(Ok(CommandOutcome::Tared(Wrench {
+            force: [a * fx, b * fy, c * fz],
+            torque: [d * tx, e * ty, f * tz],
+        })))
     }
 }
 

@@ -4,6 +4,7 @@
 
 mod any_frame;
 mod bringup;
+mod command;
 mod golden;
 mod pairing;
 mod rig;

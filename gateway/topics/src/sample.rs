@@ -53,7 +53,8 @@ pub struct Quality(pub u32);
 impl Quality {
     /// No flag is set.
     pub const GOOD: Self = Self(0);
-    /// At least one reading of this channel was lost just before this one.
+    /// This reading does not continue the one before: at least one was lost in between, or the zero
+    /// of the channel was changed there (a tare, a joint's offset).
     pub const GAP_BEFORE: Self = Self(1);
     /// At least one channel of the sensor is at an end of its range; see [`Quality::saturation`].
     pub const SATURATED: Self = Self(1 << 1);

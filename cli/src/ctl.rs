@@ -1,0 +1,202 @@
+//! `proprio ctl`: asks a running gateway over its control socket.
+
+use anyhow::{Context, anyhow, bail};
+use proprio_gateway::control::{ask, gateways};
+use proprio_gateway::plan::ConfigError;
+use proprio_topics::ipc::DomainConfig;
+use serde_json::{Value as Json, json};
+
+/// `proprio ctl`.
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    verb: Verb,
+    /// The robot; default: the only one whose gateway runs
+    #[arg(long, global = true, value_name = "NAME")]
+    robot: Option<String>,
+    /// Print the gateway's answer as JSON, one object
+    #[arg(long, global = true)]
+    json: bool,
+}
+
+#[derive(clap::Subcommand)]
+enum Verb {
+    /// The gateway and its buses
+    Status,
+    /// The devices: state, driver, bus, channels
+    Devices,
+    /// Make the present load of an F/T sensor its zero, until its board is switched off
+    ///
+    /// Gravity and contacts of this moment count, too. Offsets that were identified before no
+    /// longer hold.
+    Tare {
+        /// The device's name, or BUS/NAME
+        device: String,
+    },
+    /// Read the gateway's configuration file again
+    ///
+    /// Takes over the keys of devices, max_silence_ms, listen_only, and ratio, sign and offset of
+    /// joints; the other devices do not notice. If anything else has changed, nothing is taken
+    /// over, and the message names what needs a restart of the gateway.
+    Reload,
+}
+
+/// Asks the gateway.
+pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
+    let robot = robot(args.robot.as_deref(), domain)?;
+    let line = match &args.verb {
+        Verb::Status => json!({ "do": "status" }),
+        Verb::Devices => json!({ "do": "devices" }),
+        Verb::Tare { device } => json!({ "do": "tare", "device": device }),
+        Verb::Reload => json!({ "do": "reload" }),
+    };
+    let text = ask(domain, &robot, &line.to_string())
+        .with_context(|| format!("the gateway of {robot} does not answer"))?;
+    let answer: Json = serde_json::from_str(&text).context("the answer is not JSON")?;
+    if args.json {
+        print_line!("{text}");
+    }
+    if answer["ok"] != true {
+        let word = |key: &str| answer[key].as_str().map(str::to_owned);
+        return Err(match (word("file"), word("problem")) {
+            (Some(file), Some(problem)) => ConfigError {
+                file: file.into(),
+                problem,
+            }
+            .into(),
+            _ => anyhow!(word("error").unwrap_or_else(|| "refused".into())),
+        });
+    }
+    if !args.json {
+        match args.verb {
+            Verb::Status => status(&answer),
+            Verb::Devices => devices(&answer),
+            Verb::Tare { .. } => tared(&answer),
+            Verb::Reload => reloaded(&answer),
+        }
+    }
+    Ok(())
+}
+
+/// The robot to ask: the named one, or the only one whose gateway runs.
+fn robot(name: Option<&str>, domain: &DomainConfig) -> anyhow::Result<String> {
+    let running = gateways(domain);
+    let which = format!("domain {} in {}", domain.name, domain.base.display());
+    match (name, running.as_slice()) {
+        (Some(name), _) if running.iter().any(|robot| robot == name) => Ok(name.to_owned()),
+        (None, [only]) => Ok(only.clone()),
+        (_, []) => {
+            let others: Vec<_> = domain.siblings();
+            let others = match others.iter().any(|other| *other != domain.name) {
+                true => format!("; the domains here are {}", others.join(", ")),
+                false => String::new(),
+            };
+            bail!(
+                "no gateway runs in the {which}; start one with `proprio gateway --config \
+                 FILE`{others}"
+            )
+        }
+        (Some(name), _) => bail!(
+            "no gateway of robot {name:?} runs in the {which}; there is {}",
+            running.join(", ")
+        ),
+        (None, _) => bail!(
+            "several gateways run: name a robot with --robot: {}",
+            running.join(", ")
+        ),
+    }
+}
+
+/// A text of the answer, without quotes.
+fn word<'a>(object: &'a Json, key: &str) -> &'a str {
+    object[key].as_str().unwrap_or("unknown")
+}
+
+/// The elements of a list of the answer.
+fn list<'a>(object: &'a Json, key: &str) -> &'a [Json] {
+    object[key].as_array().map_or(&[], Vec::as_slice)
+}
+
+fn status(answer: &Json) {
+    print_line!("robot {}", word(answer, "robot"));
+    print_line!(
+        "  gateway is process {}, up {:.1} s, with {}",
+        answer["process"],
+        answer["up_s"].as_f64().unwrap_or(f64::NAN),
+        word(answer, "config")
+    );
+    for bus in list(answer, "buses") {
+        print_line!(
+            "  bus {:<24} {:<10} {} frames, {} dropped, {} error frames, {} not sent",
+            word(bus, "name"),
+            word(bus, "link"),
+            bus["frames"],
+            bus["dropped"],
+            bus["error_frames"],
+            bus["send_failures"]
+        );
+    }
+    print_line!(
+        "  {} of {} devices stream",
+        answer["streaming"],
+        answer["devices"]
+    );
+}
+
+fn devices(answer: &Json) {
+    for device in list(answer, "devices") {
+        let channels: Vec<_> = list(device, "channels")
+            .iter()
+            .filter_map(Json::as_str)
+            .collect();
+        let listens = match device["listen_only"] == true {
+            true => ", listens only",
+            false => "",
+        };
+        let refusal = device["refusal"].as_str().map(|why| format!(": {why}"));
+        print_line!(
+            "{:<24} {:<10} {}, address {} on {}{listens}; channels: {}{}",
+            word(device, "name"),
+            word(device, "state"),
+            word(device, "driver"),
+            device["address"],
+            word(device, "bus"),
+            channels.join(", "),
+            refusal.unwrap_or_default()
+        );
+    }
+}
+
+fn tared(answer: &Json) {
+    let three = |key: &str| -> String {
+        let axes = list(&answer["added"], key).iter().filter_map(Json::as_f64);
+        axes.map(|axis| format!("{axis:.3}"))
+            .collect::<Vec<_>>()
+            .join(" ")
+    };
+    print_line!(
+        "{} is tared: its board adds {} N, {} Nm until it is tared again or switched off",
+        word(answer, "device"),
+        three("force_n"),
+        three("torque_nm")
+    );
+    print_line!("offsets that were identified before no longer hold");
+}
+
+fn reloaded(answer: &Json) {
+    let changed = list(answer, "changed");
+    if changed.is_empty() {
+        print_line!("nothing has changed");
+    }
+    for device in changed {
+        let what: Vec<_> = list(device, "what")
+            .iter()
+            .filter_map(Json::as_str)
+            .collect();
+        let restarted = match device["restarted"] == true {
+            true => "; it was restarted",
+            false => "",
+        };
+        print_line!("{}: {}{restarted}", word(device, "device"), what.join(", "));
+    }
+}

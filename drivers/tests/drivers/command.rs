@@ -1,0 +1,377 @@
+//! Commands to a device that streams: the tare of an F/T board, with the bytes of its protocol, its
+//! confirmation, and every way in which it can fail.
+
+use crate::rig::{Rig, board, decode, frame, listener, options, spec};
+use proprio_drivers::{
+    Command, CommandFailed, CommandOutcome, CommandRefused, Device, Frame, Frames, Mode, NotSent,
+    State,
+};
+use proprio_topics::{Counter, Nanos, Quality, Reading, Wrench};
+
+const SCALES: &str = "full_scale_n = [1804, 1804, 1804]\nfull_scale_nm = [31, 31, 31]\n";
+
+/// The load of the protocol's worked example, whose frames are 31A#E380B76A1887 and
+/// 31B#2184BE770881.
+const LOAD: Wrench = Wrench {
+    force: [12.5, -300.0, 100.0],
+    torque: [1.0, -2.0, 0.25],
+};
+
+/// Minus the numbers of these frames.
+const ANSWERS: [&str; 6] = [
+    "210#1600FF1D",
+    "210#16011549",
+    "210#1602F8E8",
+    "210#1603FBDF",
+    "210#16040842",
+    "210#1605FEF8",
+];
+
+fn streaming(keys: &str) -> Rig {
+    let mut rig = Rig::new("icub_strain", keys, &[], (0, Reading::Wrench(LOAD)));
+    rig.run(50);
+    assert_eq!(rig.device.state(), State::Streaming);
+    rig.sent.clear();
+    rig.readings.clear();
+    rig
+}
+
+fn tare(rig: &mut Rig) -> Result<(), CommandRefused> {
+    rig.device.command(Command::Tare, rig.now)
+}
+
+/// The outcome and the time until it came \[ms\].
+fn outcome(rig: &mut Rig) -> (Result<CommandOutcome, CommandFailed>, u32) {
+    for ms in 0..2000 {
+        if let Some(outcome) = rig.device.outcome() {
+            assert_eq!(rig.device.outcome(), None, "it is given once");
+            return (outcome, ms);
+        }
+        rig.run(1);
+    }
+    panic!("a command without an outcome")
+}
+
+fn values(rig: &Rig) -> Vec<([f64; 6], bool)> {
+    let of = |reading: &Reading| match reading {
+        Reading::Wrench(w) => {
+            let ([a, b, c], [d, e, f]) = (w.force, w.torque);
+            [a, b, c, d, e, f]
+        }
+        other => panic!("{other:?}"),
+    };
+    let readings = rig.readings.iter();
+    readings
+        .map(|r| (of(&r.reading), r.quality.contains(Quality::GAP_BEFORE)))
+        .collect()
+}
+
+#[test]
+fn a_tare_is_commanded_once_and_read_back() {
+    let mut rig = streaming(SCALES);
+    rig.run(20);
+    assert_eq!(tare(&mut rig), Ok(()));
+    assert_eq!(tare(&mut rig), Err(CommandRefused::Busy));
+    let (outcome, _) = outcome(&mut rig);
+    let Ok(CommandOutcome::Tared(added)) = outcome else {
+        panic!("{outcome:?}")
+    };
+    for (added, load) in [(added.force, LOAD.force), (added.torque, LOAD.torque)] {
+        for (added, load) in added.iter().zip(load) {
+            assert!((added + load).abs() < 0.03, "{added} {load}");
+        }
+    }
+    rig.run(40);
+    let questions = (0..6).map(|axis| format!("201#160{axis}"));
+    let wanted: Vec<_> = std::iter::once("201#1501".to_owned())
+        .chain(questions)
+        .collect();
+    assert_eq!(rig.sent, wanted);
+    assert_eq!(rig.device.state(), State::Streaming);
+    assert!(rig.faults.iter().all(|f| f.counter == Counter::Starts));
+    // The first reading with the new zero is marked, and those after it are not.
+    let values = values(&rig);
+    let first = values
+        .iter()
+        .position(|(v, _)| *v == [0.0; 6])
+        .expect("a zero");
+    assert!(first > 0 && values[0].0 != [0.0; 6]);
+    let marked: Vec<bool> = values.iter().map(|(_, gap)| *gap).collect();
+    assert!(marked[first] && !marked[..first].contains(&true));
+    assert!(marked.len() > first + 3 && !marked[first + 1..].contains(&true));
+    // It can be repeated; the zero stays.
+    assert_eq!(tare(&mut rig), Ok(()));
+}
+
+#[test]
+fn the_board_answers_with_what_it_adds() {
+    let mut board = board("icub_strain", SCALES, &[]);
+    let ask = |board: &mut dyn proprio_drivers::Board, text: &str| -> Vec<String> {
+        let mut out = Frames::new();
+        board.on_frame(&frame(text, 0.0), &mut out);
+        out.iter().map(Frame::to_string).collect()
+    };
+    let sends = |board: &mut dyn proprio_drivers::Board| -> Vec<String> {
+        let frames = crate::rig::encode(board, 0, &Reading::Wrench(LOAD), Quality::GOOD);
+        frames.iter().map(Frame::to_string).collect()
+    };
+    assert_eq!(ask(&mut *board, "201#0700"), [""; 0]);
+    assert_eq!(sends(&mut *board), ["31A#E380B76A1887", "31B#2184BE770881"]);
+    assert_eq!(ask(&mut *board, "201#1602"), ["210#16020000"]);
+    assert_eq!(ask(&mut *board, "201#1501"), [""; 0], "not acknowledged");
+    for (axis, answer) in ANSWERS.iter().enumerate() {
+        assert_eq!(ask(&mut *board, &format!("201#160{axis}")), [*answer]);
+    }
+    assert_eq!(sends(&mut *board), ["31A#008000800080", "31B#008000800080"]);
+    // A second tare does not add to the first one.
+    assert_eq!(ask(&mut *board, "201#1501"), [""; 0]);
+    assert_eq!(ask(&mut *board, "201#1600"), [ANSWERS[0]]);
+    // A given value, and none.
+    assert_eq!(ask(&mut *board, "201#1502010001"), [""; 0]);
+    assert_eq!(ask(&mut *board, "201#1601"), ["210#16010001"]);
+    assert_eq!(ask(&mut *board, "201#1500"), [""; 0]);
+    assert_eq!(sends(&mut *board), ["31A#E380B76A1887", "31B#2184BE770881"]);
+}
+
+#[test]
+fn every_reading_is_marked_until_a_lost_answer_is_there() {
+    let mut rig = streaming(SCALES);
+    rig.run(20);
+    let mut lost = 3;
+    rig.board_loses = Box::new(move |_, frame| {
+        let lose = frame.data().starts_with(&[0x16, 4]) && lost > 0;
+        lost -= i32::from(lose);
+        lose
+    });
+    assert_eq!(tare(&mut rig), Ok(()));
+    let (outcome, ms) = outcome(&mut rig);
+    assert!(
+        matches!(outcome, Ok(CommandOutcome::Tared(_))),
+        "{outcome:?}"
+    );
+    assert!((60..70).contains(&ms), "three times 20 ms: {ms}");
+    let asked = |text: &str| rig.sent.iter().filter(|sent| *sent == text).count();
+    assert_eq!(
+        (asked("201#1501"), asked("201#1603"), asked("201#1604")),
+        (1, 1, 4)
+    );
+    rig.run(40);
+    let marked: Vec<bool> = values(&rig).iter().map(|(_, gap)| *gap).collect();
+    let first = marked.iter().position(|gap| *gap).expect("a mark");
+    let count = marked.iter().filter(|gap| **gap).count();
+    assert!((6..=8).contains(&count), "{marked:?}");
+    assert!(
+        marked[first..first + count].iter().all(|gap| *gap),
+        "{marked:?}"
+    );
+    assert!(marked.len() > first + count);
+}
+
+#[test]
+fn a_tare_that_fails_says_how_and_leaves_the_stream_alone() {
+    // No answer: whether it took effect is not known, so readings are marked.
+    let mut rig = streaming(SCALES);
+    rig.board_loses = Box::new(|_, frame| frame.data().first() == Some(&0x16));
+    assert_eq!(tare(&mut rig), Ok(()));
+    let (failed, ms) = outcome(&mut rig);
+    assert_eq!(failed, Err(CommandFailed::NoAnswer));
+    assert!((1000..=1010).contains(&ms), "{ms}");
+    let asked = rig.sent.iter().filter(|s| *s == "201#1600").count();
+    assert!((15..=18).contains(&asked), "{asked}");
+    assert_eq!(rig.sent.iter().filter(|s| *s == "201#1501").count(), 1);
+    assert_eq!(rig.device.state(), State::Streaming);
+    assert_eq!(rig.count(Counter::Silences), 0);
+    let sent = rig.sent.len();
+    rig.run(100);
+    assert_eq!(rig.sent.len(), sent, "it is over");
+
+    // Not sent: nothing follows, and nothing is marked.
+    let mut rig = streaming(SCALES);
+    rig.interface =
+        Box::new(|frame| (frame.data().first() == Some(&0x15)).then_some(NotSent::Deadline));
+    assert_eq!(tare(&mut rig), Ok(()));
+    assert_eq!(outcome(&mut rig).0, Err(CommandFailed::NotSent));
+    rig.run(50);
+    assert_eq!((rig.sent.len(), rig.unsent.len()), (0, 1));
+    assert!(values(&rig).iter().all(|(_, gap)| !gap));
+
+    // A restart, a stop and a silence end it.
+    type End = fn(&mut Rig);
+    let ends: [End; 3] = [
+        |rig| rig.device.restart(rig.now),
+        |rig| rig.device.stop(rig.now),
+        |rig| rig.board_loses = Box::new(|_, _| true),
+    ];
+    for end in ends {
+        let mut rig = streaming(SCALES);
+        rig.board_loses = Box::new(|_, frame| frame.data().first() == Some(&0x16));
+        assert_eq!(tare(&mut rig), Ok(()));
+        rig.run(3);
+        end(&mut rig);
+        assert_eq!(outcome(&mut rig).0, Err(CommandFailed::Interrupted));
+    }
+    // Before it was sent, it is known to have had no effect.
+    let mut rig = streaming(SCALES);
+    assert_eq!(tare(&mut rig), Ok(()));
+    rig.device.restart(rig.now);
+    assert_eq!(outcome(&mut rig).0, Err(CommandFailed::NotSent));
+    rig.run(50);
+    assert!(!rig.sent.contains(&"201#1501".to_owned()));
+}
+
+/// A device that streams, without a board: every frame is given by hand.
+struct ByHand {
+    device: Box<dyn Device>,
+    /// \[ms\]
+    now: i64,
+}
+
+impl ByHand {
+    fn new() -> Self {
+        let device = options("icub_strain", SCALES)
+            .device(&spec(1, Mode::Supervise, &[]))
+            .expect("a legal configuration");
+        let mut this = Self { device, now: 0 };
+        for _ in 0..2 {
+            let start = this.poll().expect("a start command");
+            this.device.on_sent(&start, Ok(this.at()));
+        }
+        assert_eq!(
+            (this.reading(), this.poll(), this.reading()),
+            (false, None, false)
+        );
+        assert_eq!(this.device.command(Command::Tare, this.at()), Ok(()));
+        assert_eq!(this.device.next_wake(), Some(Nanos::MIN), "at once");
+        this
+    }
+
+    fn at(&self) -> Nanos {
+        Nanos::from_millis(self.now)
+    }
+
+    fn poll(&mut self) -> Option<Frame> {
+        let now = self.at();
+        let transmit = self
+            .device
+            .poll_transmit(now, &mut proprio_drivers::Decoded::new())?;
+        assert!(transmit.deadline > now && transmit.deadline <= now + Nanos::from_millis(100));
+        Some(transmit.frame)
+    }
+
+    /// The frame that it sends now.
+    fn send(&mut self) -> String {
+        let frame = self.poll().expect("a frame");
+        self.device.on_sent(&frame, Ok(self.at()));
+        frame.to_string()
+    }
+
+    /// Whether a reading that comes a millisecond later is marked.
+    fn reading(&mut self) -> bool {
+        self.now += 1;
+        let halves = ["31A#008000800080", "31B#008000800080"];
+        let frames = halves.map(|half| frame(half, self.now as f64));
+        let (readings, _) = decode(&mut *self.device, &frames);
+        readings[0].quality.contains(Quality::GAP_BEFORE)
+    }
+
+    fn answer(&mut self, text: &str) {
+        let (_, faults) = decode(&mut *self.device, &[frame(text, self.now as f64)]);
+        assert!(faults.is_empty(), "{faults:?}");
+    }
+}
+
+#[test]
+fn a_command_given_up_on_its_way_still_marks_the_readings() {
+    let mut by_hand = ByHand::new();
+    let command = by_hand.poll().expect("the command");
+    assert_eq!(command.to_string(), "201#1501");
+    // The board falls silent, comes back, and then the interface takes the frame.
+    by_hand.now += 60;
+    assert_eq!(by_hand.poll(), None);
+    assert_eq!(
+        by_hand.device.outcome(),
+        Some(Err(CommandFailed::Interrupted))
+    );
+    assert!(by_hand.reading(), "after the silence");
+    assert!(!by_hand.reading());
+    by_hand.device.on_sent(&command, Ok(by_hand.at()));
+    assert!(by_hand.reading(), "the zero may be another one");
+    assert!(!by_hand.reading());
+    assert_eq!(by_hand.device.outcome(), None);
+}
+
+#[test]
+fn answers_come_late_and_twice() {
+    let mut by_hand = ByHand::new();
+    assert_eq!(by_hand.send(), "201#1501");
+    assert!(by_hand.reading(), "it may have been on its way");
+    assert_eq!(by_hand.send(), "201#1600");
+    by_hand.now += 20;
+    assert_eq!(by_hand.send(), "201#1600");
+    for _ in 0..2 {
+        by_hand.answer(ANSWERS[0]);
+    }
+    for (axis, answer) in ANSWERS.iter().enumerate().skip(1) {
+        assert_eq!(by_hand.send(), format!("201#160{axis}"));
+        assert_eq!(by_hand.device.outcome(), None);
+        by_hand.answer(answer);
+    }
+    assert!(by_hand.reading(), "the first that surely has the new zero");
+    assert!(!by_hand.reading());
+    let Some(Ok(CommandOutcome::Tared(added))) = by_hand.device.outcome() else {
+        panic!("no outcome")
+    };
+    // -227 and 264 steps.
+    assert!(
+        (added.force[0] + 227.0 * 1804.0 / 32768.0).abs() < 1e-9,
+        "{added:?}"
+    );
+    assert!(
+        (added.torque[2] + 264.0 * 31.0 / 32768.0).abs() < 1e-9,
+        "{added:?}"
+    );
+    assert_eq!(by_hand.poll(), None);
+}
+
+#[test]
+fn a_tare_is_refused_where_it_cannot_be() {
+    let mut rig = Rig::new("icub_strain", SCALES, &[], (0, Reading::Wrench(LOAD)));
+    assert_eq!(tare(&mut rig), Err(CommandRefused::NotStreaming));
+    let mut listens = Rig::started(
+        "icub_strain",
+        SCALES,
+        Mode::Listen,
+        (0, Reading::Wrench(LOAD)),
+    );
+    listens.run(30);
+    assert_eq!(listens.device.state(), State::Streaming);
+    assert_eq!(tare(&mut listens), Err(CommandRefused::ListenOnly));
+    let mut raw = streaming(&format!("{SCALES}stream = \"uncalibrated\""));
+    assert!(matches!(tare(&mut raw), Err(CommandRefused::Useless(_))));
+    for (driver, keys, outputs) in [("icub_imu", "", &[][..]), ("icub_motor", "", &[0])] {
+        let mut device = listener(driver, keys, outputs);
+        let refused = device.command(Command::Tare, Nanos::ZERO);
+        assert_eq!(refused, Err(CommandRefused::Unsupported), "{driver}");
+        assert_eq!(device.outcome(), None);
+    }
+    for rig in [&mut rig, &mut listens, &mut raw] {
+        assert_eq!(rig.device.outcome(), None);
+        assert!(!rig.sent.contains(&"201#1501".to_owned()));
+    }
+}
+
+#[test]
+fn an_answer_that_nobody_asked_for_is_counted() {
+    let mut rig = streaming(SCALES);
+    let answers = ["210#16000001", "210#160001", "210#16060001"].map(|text| frame(text, 2000.0));
+    let (readings, faults) = decode(&mut *rig.device, &answers);
+    assert!(readings.is_empty());
+    let counted: Vec<_> = faults.iter().map(|fault| fault.counter).collect();
+    assert_eq!(
+        counted,
+        [Counter::Unexpected, Counter::Length, Counter::Value]
+    );
+    // Another program's answers are not for a device that only listens.
+    let mut device = listener("icub_strain", SCALES, &[]);
+    assert!(decode(&mut *device, &answers).1.is_empty());
+}

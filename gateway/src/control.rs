@@ -1,0 +1,400 @@
+//! The control socket: what an operator asks of a running gateway, and the answers.
+//!
+//! It is `<robot>.gateway.sock` in the folder of the domain, for the user of the gateway alone
+//! (mode 0600). A client sends one JSON object per line and gets one line for each:
+//!
+//! | line | answer |
+//! |---|---|
+//! | `{"do": "status"}` | the gateway and its buses |
+//! | `{"do": "devices"}` | the devices: state, bus, driver, channels |
+//! | `{"do": "tare", "device": "..."}` | `added`: what the board adds from then on \[N, Nm\] |
+//! | `{"do": "reload"}` | `changed`: the devices that have changed, and which of their keys |
+//!
+//! `reload` reads the configuration file again. A device whose driver's keys or `listen_only`
+//! differ is stopped, replaced and started, as a restart of the gateway would; changed conversions
+//! of joints and `max_silence_ms` apply without that. Devices that are equal do not notice. All is
+//! taken over or nothing. Nothing, if the file is wrong (`file` and `problem` say why), or if it
+//! differs where a restart of the gateway is needed (`restart` names the places).
+//!
+//! Every answer has `ok`: true, or false with an `error` in words. A device is given by its name,
+//! or by `bus/name` if several buses have one of that name.
+//!
+//! No client can disturb the gateway: it serves at most [`MAX_CLIENTS`] at a time, forgets what of
+//! a line is beyond [`MAX_LINE`], and parts with a client that has sent no line, or has not taken
+//! an answer, for [`PATIENCE`].
+//!
+//! The socket is made in a folder that only its user can enter and then moved into place. So nobody
+//! else can connect at any moment, and the socket that a killed gateway has left is replaced.
+
+use crate::plan::did_you_mean;
+use proprio_topics::ipc::DomainConfig;
+use serde::Deserialize;
+use serde_json::{Value as Json, json};
+use std::fs::{self, DirBuilder, File, Permissions};
+use std::io::{self, BufRead as _, BufReader, Write as _};
+use std::os::fd::AsRawFd as _;
+use std::os::unix::fs::{DirBuilderExt as _, PermissionsExt as _};
+use std::os::unix::net;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::net::{UnixListener, UnixStream};
+use tokio::sync::{Semaphore, mpsc, oneshot};
+use tokio::task::JoinHandle;
+use tokio::time::{sleep, timeout};
+
+/// Maximum number of clients at a time: several people and scripts.
+pub const MAX_CLIENTS: usize = 16;
+/// Maximum length of a line in bytes: many times the longest that has a meaning, a tare.
+pub const MAX_LINE: usize = 4096;
+/// How long the gateway waits for a line, or for a client to take its answer.
+pub const PATIENCE: Duration = Duration::from_secs(10);
+
+/// The end of a socket's name, after the robot's.
+const SUFFIX: &str = ".gateway.sock";
+
+/// What is asked.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Order {
+    Status,
+    Devices,
+    Tare { device: String },
+    Reload,
+}
+
+/// An order, and where its answer goes.
+pub(crate) struct Asked {
+    pub(crate) order: Order,
+    pub(crate) answer: oneshot::Sender<Json>,
+}
+
+/// The answer to an order that is not carried out.
+pub(crate) fn refusal(error: &dyn std::fmt::Display) -> Json {
+    json!({ "ok": false, "error": error.to_string() })
+}
+
+impl Order {
+    const WORDS: [&str; 4] = ["status", "devices", "tare", "reload"];
+
+    /// The order in a line.
+    fn parse(line: &[u8]) -> Result<Self, String> {
+        #[derive(Deserialize)]
+        #[serde(deny_unknown_fields)]
+        struct Raw {
+            r#do: String,
+            device: Option<String>,
+        }
+        let Raw { r#do: word, device } = serde_json::from_slice(line)
+            .map_err(|e| format!("a line is a JSON object such as {{\"do\": \"status\"}}: {e}"))?;
+        let order = match (word.as_str(), device) {
+            ("tare", Some(device)) => return Ok(Self::Tare { device }),
+            ("tare", None) => return Err("tare needs a device".into()),
+            ("status", None) => Self::Status,
+            ("devices", None) => Self::Devices,
+            ("reload", None) => Self::Reload,
+            (word, Some(_)) if Self::WORDS.contains(&word) => {
+                return Err(format!("{word} takes no device"));
+            }
+            (word, _) => {
+                return Err(format!(
+                    "there is no order {word:?}{}; there is {}",
+                    did_you_mean(word, Self::WORDS.into_iter()),
+                    Self::WORDS.join(", ")
+                ));
+            }
+        };
+        Ok(order)
+    }
+}
+
+// ---------------------------------------------------------------- the gateway's end
+
+/// The socket of a running gateway; removed when dropped.
+pub(crate) struct Socket {
+    folder: Folder,
+    robot: String,
+    server: JoinHandle<()>,
+}
+
+impl Socket {
+    /// Makes the socket and serves its clients; what they ask goes to `orders`. No other gateway of
+    /// this robot may be there.
+    pub(crate) fn open(
+        domain: &DomainConfig,
+        robot: &str,
+        orders: mpsc::Sender<Asked>,
+    ) -> io::Result<Self> {
+        let folder = Folder::open(domain)?;
+        let (home, place) = (
+            folder.path(&format!("{robot}.gateway.new")),
+            folder.socket(robot),
+        );
+        match fs::remove_dir_all(&home) {
+            // A gateway that was killed while it did the same.
+            Ok(()) => {}
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            Err(error) => return Err(error),
+        }
+        DirBuilder::new().mode(0o700).create(&home)?;
+        let new = home.join("socket");
+        let listener = UnixListener::bind(&new)?;
+        fs::set_permissions(&new, Permissions::from_mode(0o600))?;
+        fs::rename(&new, place)?;
+        fs::remove_dir(&home)?;
+        Ok(Self {
+            folder,
+            robot: robot.to_owned(),
+            server: tokio::spawn(serve(listener, orders)),
+        })
+    }
+}
+
+impl Drop for Socket {
+    fn drop(&mut self) {
+        self.server.abort();
+        let _ = fs::remove_file(self.folder.socket(&self.robot));
+    }
+}
+
+/// The folder of a domain. Sockets are reached through its descriptor, because their paths may have
+/// at most 107 bytes, and those of folder and robot may be longer.
+struct Folder(File);
+
+impl Folder {
+    fn open(domain: &DomainConfig) -> io::Result<Self> {
+        File::open(domain.base.join(&domain.name)).map(Self)
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        PathBuf::from(format!("/proc/self/fd/{}", self.0.as_raw_fd())).join(name)
+    }
+
+    fn socket(&self, robot: &str) -> PathBuf {
+        self.path(&format!("{robot}{SUFFIX}"))
+    }
+}
+
+async fn serve(listener: UnixListener, orders: mpsc::Sender<Asked>) {
+    let places = Arc::new(Semaphore::new(MAX_CLIENTS));
+    loop {
+        let Ok((stream, _)) = listener.accept().await else {
+            // No descriptor is free: do not ask again at once.
+            sleep(Duration::from_millis(100)).await;
+            continue;
+        };
+        let (orders, place) = (orders.clone(), Arc::clone(&places).try_acquire_owned());
+        tokio::spawn(async move {
+            match place {
+                Ok(_place) => attend(&stream, &orders).await,
+                Err(_) => {
+                    let full = refusal(&format!("{MAX_CLIENTS} clients are there already"));
+                    send(&stream, &full).await
+                }
+            }
+        });
+    }
+}
+
+/// Serves one client until it leaves, or is too slow.
+async fn attend(stream: &UnixStream, orders: &mpsc::Sender<Asked>) -> Option<()> {
+    let mut lines = Lines::default();
+    loop {
+        let line = timeout(PATIENCE, lines.next(stream)).await.ok()?.ok()??;
+        let order = match line.len() {
+            0..=MAX_LINE => Order::parse(&line),
+            _ => Err(format!("a line has at most {MAX_LINE} bytes")),
+        };
+        let answer = match order {
+            Ok(order) => carry_out(order, orders).await,
+            Err(error) => refusal(&error),
+        };
+        send(stream, &answer).await?;
+    }
+}
+
+/// The answer of the control plane.
+async fn carry_out(order: Order, orders: &mpsc::Sender<Asked>) -> Json {
+    let (answer, answered) = oneshot::channel();
+    let sent = orders.send(Asked { order, answer }).await;
+    match answered.await {
+        Ok(answer) if sent.is_ok() => answer,
+        _ => refusal(&"the gateway is stopping"),
+    }
+}
+
+/// Sends a line; `None` if the client does not take it.
+async fn send(stream: &UnixStream, answer: &Json) -> Option<()> {
+    let line = format!("{answer}\n");
+    let all = async {
+        let mut rest = line.as_bytes();
+        while !rest.is_empty() {
+            stream.writable().await?;
+            match stream.try_write(rest) {
+                Ok(sent) => rest = rest.get(sent..).unwrap_or_default(),
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(())
+    };
+    timeout(PATIENCE, all).await.ok()?.ok()
+}
+
+/// The bytes of a client that are not yet taken as lines.
+#[derive(Default)]
+struct Lines {
+    waiting: Vec<u8>,
+}
+
+impl Lines {
+    /// The next line, without its end; `None` at the end of the stream. Of one that is too long,
+    /// a part that is too long, too.
+    async fn next(&mut self, stream: &UnixStream) -> io::Result<Option<Vec<u8>>> {
+        let mut part = [0; 1024];
+        loop {
+            if let Some(end) = self.waiting.iter().position(|byte| *byte == b'\n') {
+                let mut line: Vec<u8> = self.waiting.drain(..=end).collect();
+                line.pop();
+                return Ok(Some(line));
+            }
+            // Enough to be too long; what follows is forgotten up to the end of the line.
+            self.waiting.truncate(MAX_LINE + 1);
+            stream.readable().await?;
+            match stream.try_read(&mut part) {
+                Ok(0) => return Ok(None),
+                Ok(count) => self.waiting.extend(part.iter().take(count)),
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+                Err(error) => return Err(error),
+            }
+        }
+    }
+}
+
+// ---------------------------------------------------------------- the operator's end
+
+/// How long a client waits for an answer: longer than the gateway for its devices.
+const ANSWER: Duration = Duration::from_secs(5);
+
+/// The robots whose gateways can be asked, by name.
+#[must_use]
+pub fn gateways(domain: &DomainConfig) -> Vec<String> {
+    let Ok(folder) = Folder::open(domain) else {
+        return Vec::new();
+    };
+    let entries = fs::read_dir(folder.path(""))
+        .into_iter()
+        .flatten()
+        .flatten();
+    let mut robots: Vec<String> = entries
+        .filter_map(|entry| Some(entry.file_name().to_str()?.strip_suffix(SUFFIX)?.to_owned()))
+        // Nobody listens on what a killed gateway has left.
+        .filter(|robot| net::UnixStream::connect(folder.socket(robot)).is_ok())
+        .collect();
+    robots.sort();
+    robots
+}
+
+/// Asks the gateway of `robot` with one line of JSON, and waits for its answer, a line too.
+///
+/// # Errors
+/// [`io::Error`]: no gateway of this robot is there ([`io::ErrorKind::NotFound`],
+/// [`io::ErrorKind::ConnectionRefused`]), or it does not answer.
+pub fn ask(domain: &DomainConfig, robot: &str, line: &str) -> io::Result<String> {
+    let mut stream = net::UnixStream::connect(Folder::open(domain)?.socket(robot))?;
+    stream.set_read_timeout(Some(ANSWER))?;
+    stream.set_write_timeout(Some(ANSWER))?;
+    stream.write_all(format!("{line}\n").as_bytes())?;
+    let mut answer = String::new();
+    match BufReader::new(stream).read_line(&mut answer)? {
+        0 => Err(io::ErrorKind::UnexpectedEof.into()),
+        _ => Ok(answer.trim_end().to_owned()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The longest folder, domain and robot make a path longer than a socket may have.
+    #[test]
+    fn the_longest_names_have_a_socket() {
+        let base = tempfile::tempdir().unwrap();
+        let fill = 65 - base.path().as_os_str().len() - 1;
+        let domain = DomainConfig::new(base.path().join("b".repeat(fill)), &"d".repeat(32));
+        let robot = "r".repeat(64);
+        let folder = domain.base.join(&domain.name);
+        // What a gateway has left that was killed on the way.
+        let left = folder.join(format!("{robot}.gateway.new"));
+        fs::create_dir_all(&left).unwrap();
+        fs::write(left.join("socket"), "").unwrap();
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()
+            .unwrap();
+        runtime.block_on(async {
+            let (orders, mut asked) = mpsc::channel(1);
+            let socket = Socket::open(&domain, &robot, orders).unwrap();
+            let (there, who) = (domain.clone(), robot.clone());
+            let client = tokio::task::spawn_blocking(move || {
+                (gateways(&there), ask(&there, &who, "{\"do\": \"status\"}"))
+            });
+            let Asked { order, answer } = asked.recv().await.unwrap();
+            assert_eq!(order, Order::Status);
+            answer.send(json!({ "ok": true })).unwrap();
+            let (found, answer) = client.await.unwrap();
+            assert_eq!(
+                (found, answer.unwrap().as_str()),
+                (vec![robot.clone()], "{\"ok\":true}")
+            );
+            let names = || fs::read_dir(&folder).unwrap().count();
+            assert_eq!(names(), 1, "the socket alone");
+            drop(socket);
+            assert_eq!(names(), 0);
+        });
+    }
+
+    #[test]
+    fn a_wrong_line_says_what_would_be_right() {
+        let tare = Order::Tare {
+            device: "a".to_owned(),
+        };
+        for (line, order) in [
+            (r#"{"do": "status"}"#, Order::Status),
+            (r#" { "do" : "devices" } "#, Order::Devices),
+            (r#"{"device": "a", "do": "tare"}"#, tare),
+        ] {
+            assert_eq!(Order::parse(line.as_bytes()), Ok(order));
+        }
+        for (line, parts) in [
+            ("", &["a JSON object such as {\"do\": \"status\"}"][..]),
+            ("\u{0}", &["such as"]),
+            ("[1]", &["such as"]),
+            (r#"{"do": 1}"#, &["such as"]),
+            (
+                r#"{"do": "status", "robot": "r"}"#,
+                &["unknown field `robot`"],
+            ),
+            (r#"{"device": "a"}"#, &["missing field `do`"]),
+            (r#"{"do": "tare"}"#, &["tare needs a device"]),
+            (
+                r#"{"do": "status", "device": "a"}"#,
+                &["status takes no device"],
+            ),
+            (
+                r#"{"do": "tara", "device": "a"}"#,
+                &[
+                    "no order \"tara\"",
+                    "did you mean \"tare\"?",
+                    "status, devices, tare, reload",
+                ],
+            ),
+            (r#"{"do": "zzz"}"#, &["no order \"zzz\"; there is status"]),
+        ] {
+            let error = Order::parse(line.as_bytes()).expect_err(line);
+            for part in parts {
+                assert!(error.contains(part), "{line}: {error}");
+            }
+        }
+        assert!(Order::parse(&[0xFF, 0xFE]).is_err());
+    }
+}

@@ -1,0 +1,194 @@
+//! The thread of a bus: opens link and port, runs the loop, and ends when it is told to.
+
+use crate::bus::{Bus, Turn};
+use crate::clock::Monotonic;
+use crate::config::Source;
+use crate::decoder::Decoder;
+use crate::inbox::{Requests, inbox};
+use crate::link::replay::Replay;
+use crate::link::socketcan::SocketCan;
+use crate::link::virtual_bus::VirtualBus;
+use crate::link::{Link, ListenOnly, OpenError};
+use crate::plan::{BusPlan, Plan};
+use crate::publish::Shared;
+use crate::status::BusStatus;
+use anyhow::{Context, anyhow};
+use proprio_drivers::{Claim, Mode};
+use proprio_topics::ipc::{Domain, Writer};
+use proprio_topics::realtime;
+use proprio_topics::{Nanos, Sample};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::sync::atomic::Ordering::{Acquire, Relaxed, Release};
+use std::sync::mpsc;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+/// A bus thread without a turn for this long is stuck.
+const STUCK: Nanos = Nanos::from_millis(500);
+
+/// The counters of all buses.
+pub(crate) fn statuses(threads: &[BusThread]) -> Vec<&BusStatus> {
+    threads.iter().map(|t| &*t.status).collect()
+}
+
+/// Stops all bus threads and waits for them; returns the name of the first that panicked.
+pub(crate) fn join(threads: &mut [BusThread], stop: &AtomicBool) -> Option<String> {
+    stop.store(true, Release);
+    let mut panicked = None;
+    for bus in threads {
+        if let Some(thread) = bus.take()
+            && thread.join().is_err()
+        {
+            panicked.get_or_insert_with(|| bus.name.clone());
+        }
+    }
+    panicked
+}
+
+/// The control plane's handle of a bus thread.
+pub(crate) struct BusThread {
+    name: String,
+    pub(crate) status: Arc<BusStatus>,
+    ended: Arc<AtomicBool>,
+    /// The way into its inbox.
+    pub(crate) requests: Requests,
+    /// The mode that overrides the devices' own.
+    pub(crate) mode: Option<Mode>,
+    thread: Finished,
+}
+
+/// A thread that can be joined once.
+struct Finished(Option<JoinHandle<()>>);
+
+impl Finished {
+    fn is_finished(&self) -> bool {
+        self.0.as_ref().is_none_or(JoinHandle::is_finished)
+    }
+}
+
+impl BusThread {
+    /// Whether its log has ended, or it was stopped.
+    pub(crate) fn has_ended(&self) -> bool {
+        self.ended.load(Acquire)
+    }
+
+    /// Whether it has ended without having been asked to.
+    pub(crate) fn is_lost(&self) -> bool {
+        self.thread.is_finished() && !self.has_ended()
+    }
+
+    /// Whether it has made no turn for [`STUCK`] at `now`.
+    pub(crate) fn is_stuck(&self, now: Nanos) -> bool {
+        !self.has_ended() && now - Nanos(self.status.last_turn.load(Relaxed)) > STUCK
+    }
+
+    fn take(&mut self) -> Option<JoinHandle<()>> {
+        self.thread.0.take()
+    }
+
+    /// Opens link and port and starts the loop; returns once it runs.
+    pub(crate) fn start(
+        plan: &Plan,
+        bus: &BusPlan,
+        number: u32,
+        domain: &Domain,
+        epoch: u64,
+        stop: &Arc<AtomicBool>,
+        replay_start: Nanos,
+    ) -> anyhow::Result<Self> {
+        let status = Arc::new(BusStatus::new(number, bus));
+        // A log is not interactive: its boards answered the program that commanded them during the
+        // recording.
+        let listens = bus.listen_only || matches!(bus.source, Source::Replay { .. });
+        let mode = listens.then_some(Mode::Listen);
+        let decoder = Decoder::new(number, bus, mode, Arc::clone(&status))?;
+        let mut link: Box<dyn Link> = if let Source::Replay { log, pace } = &bus.source {
+            let mut replay = Replay::open(
+                log,
+                *pace,
+                plan.matching(number as usize),
+                &decoder.claims(),
+            )?;
+            replay.start_at(replay_start);
+            Box::new(replay)
+        } else {
+            open_link(bus, &domain.config().name, &decoder.claims())?
+        };
+        if bus.listen_only {
+            link = Box::new(ListenOnly(link));
+        }
+        let ended = Arc::new(AtomicBool::new(false));
+        let (requests, inbox) = inbox(bus.devices.len());
+        let (ready, is_ready) = mpsc::channel();
+        let (domain, robot, realtime) = (domain.clone(), plan.robot.clone(), bus.realtime);
+        let (stop, ended_there, status_there) =
+            (Arc::clone(stop), Arc::clone(&ended), Arc::clone(&status));
+        let body = move || {
+            // A port belongs to the thread that creates it.
+            let writer = match Writer::<Sample>::create(&domain, &robot, epoch) {
+                Ok(writer) => writer,
+                Err(error) => return drop(ready.send(Err(error))),
+            };
+            let refused = realtime
+                .map(|r| realtime::apply(r.cpu, r.priority))
+                .unwrap_or_default();
+            let _ = ready.send(Ok(refused));
+            let clock = Monotonic;
+            let mut bus = Bus::new(link, decoder, Shared(writer), status_there).with_inbox(inbox);
+            while !stop.load(Acquire) {
+                if bus.turn(&clock) == Turn::Ended {
+                    if let Some(note) = bus.link_note() {
+                        tracing::warn!("{note}");
+                    }
+                    ended_there.store(true, Release);
+                    // Readers may still read the last samples: keep the port until the gateway
+                    // stops.
+                    while !stop.load(Acquire) {
+                        std::thread::sleep(Duration::from_millis(20));
+                    }
+                }
+            }
+            ended_there.store(true, Release);
+            bus.stop(&clock);
+        };
+        let name: String = format!("bus {}", bus.name).chars().take(15).collect();
+        let thread = std::thread::Builder::new()
+            .name(name)
+            .spawn(body)
+            .context("cannot start a thread")?;
+        let refused = is_ready
+            .recv()
+            .map_err(|_| anyhow!("its thread ended at once"))??;
+        for refusal in refused {
+            tracing::warn!(
+                bus = bus.name,
+                "real-time scheduling not granted: {refusal}"
+            );
+        }
+        Ok(Self {
+            name: bus.name.clone(),
+            status,
+            ended,
+            requests,
+            mode,
+            thread: Finished(Some(thread)),
+        })
+    }
+}
+
+/// Opens the link of `bus`; from a log it takes every frame.
+///
+/// # Errors
+/// [`OpenError`], with the remedy in its message.
+pub fn open_link(
+    bus: &BusPlan,
+    domain: &str,
+    claims: &[Claim],
+) -> Result<Box<dyn Link>, OpenError> {
+    Ok(match &bus.source {
+        Source::SocketCan { interface } => Box::new(SocketCan::open(interface, claims)?),
+        Source::Virtual { name } => Box::new(VirtualBus::open(domain, name, claims)?),
+        Source::Replay { log, pace } => Box::new(Replay::open(log, *pace, None, claims)?),
+    })
+}
