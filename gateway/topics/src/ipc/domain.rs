@@ -324,8 +324,8 @@ impl<S: Service> Domain<S> {
         &self.inner.iceoryx
     }
 
-    /// The process that runs a node; 0 if it is not known.
-    pub(super) fn process_of(&self, node: u128) -> i32 {
+    /// The process that runs a node, 0 if it is not known; `None` if the node is dead.
+    pub(super) fn process_of(&self, node: u128) -> Option<i32> {
         sweep::holder_of(&self.inner.place, node)
     }
 

@@ -40,7 +40,7 @@ mod writer;
 pub use clock::monotonic;
 pub use domain::{Domain, DomainConfig, fnv1a};
 pub use error::{DomainError, PortError, SendError, TakeError};
-pub use presence::{Presence, RobotPresence};
+pub use presence::{Presence, RobotPresence, Watch};
 pub use reader::{Freshness, Reader};
 pub use robot::{
     ChannelHandle, Contact, ContactHandle, Measured, Missing, RobotReader, Torque, TorqueHandle,

@@ -282,12 +282,12 @@ fn monitor_holder(path: &Path) -> Option<i32> {
     }
 }
 
-/// The process id of another process's node; 0 if it is not known.
-pub(super) fn holder_of(place: &Place, node: u128) -> i32 {
+/// The process id of a node, 0 if it is not known; `None` if the node is dead.
+pub(super) fn holder_of(place: &Place, node: u128) -> Option<i32> {
     if is_own(place, node) {
-        return i32::try_from(std::process::id()).unwrap_or(0);
+        return Some(i32::try_from(std::process::id()).unwrap_or(0));
     }
-    monitor_holder(&place.monitor(node)).unwrap_or(0)
+    monitor_holder(&place.monitor(node))
 }
 
 /// Removes a file; returns whether this call removed it.

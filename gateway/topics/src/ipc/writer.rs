@@ -94,7 +94,7 @@ impl<T: Topic> Writer<T> {
                     PublisherCreateError::ExceedsMaxSupportedPublishers => {
                         let mut holder = 0;
                         service.dynamic_config().list_publishers(|p| {
-                            holder = domain.process_of(p.node_id.value());
+                            holder = domain.process_of(p.node_id.value()).unwrap_or(0);
                             CallbackProgression::Stop
                         });
                         PortError::Taken {
@@ -215,6 +215,7 @@ impl<T: Topic> Writer<T> {
 impl<T: Topic> Drop for Writer<T> {
     fn drop(&mut self) {
         self.bell.change();
+        self.bell.say_farewell();
         let ports = self.ports.take();
         self.domain.drop_locked(ports);
     }
