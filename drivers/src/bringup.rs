@@ -9,6 +9,9 @@
 //! ```
 //! (1) No reading: again, doubling the wait. (2) No reading for `max_silence`: counted once.
 //!
+//! A board that sends no reading after `Patience::attempts` starts is silent too. One that is only
+//! listened to has as much time.
+//!
 //! A family gives a [`Bringup`] its [`Patience`], its start and stop commands, and an [`Inquiry`]:
 //! the questions that a board must answer before it is started ([`NoInquiry`] if there are none).
 //! One frame is under way at a time. A question or a start command that was not sent is tried again
@@ -73,7 +76,8 @@ pub(crate) struct Patience {
     pub(crate) power_on_silence: Nanos,
     /// Time to wait for an answer before the question is repeated.
     pub(crate) answer_timeout: Nanos,
-    /// Number of attempts at that pace; then the board counts as not answering.
+    /// Number of attempts at that pace; then the board counts as not answering. Also the number of
+    /// starts without a reading after which it counts as silent.
     pub(crate) attempts: u8,
     /// Interval between attempts after that.
     pub(crate) slow_attempt: Nanos,
@@ -222,6 +226,8 @@ pub(crate) struct Bringup {
     /// Time of the last reading; `None` while the board is silent.
     last: Option<Nanos>,
     silent: bool,
+    /// Starts since the last reading, at most `Patience::attempts`: then it counts as silent.
+    starts: u8,
     /// Whether a start sequence was begun since the last known power-on.
     begun: bool,
 }
@@ -241,6 +247,7 @@ impl Bringup {
             start_patience: patience.start,
             last: None,
             silent: false,
+            starts: 0,
             begun: false,
         }
     }
@@ -277,6 +284,7 @@ impl Bringup {
     /// Records a reading at `t`. Returns whether it is the first after a silence.
     pub(crate) fn reading(&mut self, t: Nanos) -> bool {
         self.last = Some(t);
+        self.starts = 0;
         if let Phase::Waiting { .. } = self.phase {
             // A board that streams has left its bootloader.
             self.phase = Phase::Waiting { until: Nanos::MIN };
@@ -324,7 +332,12 @@ impl Bringup {
         loop {
             match self.phase {
                 Phase::Fresh if self.mode == Mode::Listen => {
-                    self.phase = Phase::Watching { until: Nanos::MAX }
+                    let until = if self.silent {
+                        Nanos::MAX
+                    } else {
+                        now + self.patience.power_on_silence + self.listens_for()
+                    };
+                    self.phase = Phase::Watching { until };
                 }
                 Phase::Fresh => {
                     let until = if self.patience.power_on_silence > Nanos::ZERO {
@@ -369,8 +382,14 @@ impl Bringup {
                     return None;
                 }
                 Phase::Watching { until } if self.last.is_some() || now < until => return None,
-                Phase::Watching { .. } if self.mode == Mode::Listen => return None,
-                Phase::Watching { .. } => self.phase = Phase::Fresh,
+                Phase::Watching { .. } if self.mode == Mode::Listen => {
+                    self.starts = self.patience.attempts;
+                    self.phase = Phase::Watching { until: Nanos::MAX };
+                }
+                Phase::Watching { .. } => {
+                    self.starts = self.patience.attempts.min(self.starts.saturating_add(1));
+                    self.phase = Phase::Fresh;
+                }
                 Phase::Stopping { next } => {
                     if let Some(&frame) = self.stop.get(next) {
                         return Some(Transmit {
@@ -383,6 +402,12 @@ impl Bringup {
                 Phase::Stopped => return None,
             }
         }
+    }
+
+    /// The time that all starts of a silent board take.
+    fn listens_for(&self) -> Nanos {
+        let start = self.max_silence + self.patience.start_most;
+        Nanos(i64::from(self.patience.attempts) * start.0)
     }
 
     /// Takes the outcome of a frame that [`Bringup::poll`] gave.
@@ -436,7 +461,7 @@ impl Bringup {
         }
         match self.phase {
             _ if self.last.is_some() => State::Streaming,
-            _ if self.silent => State::Silent,
+            _ if self.silent || self.starts >= self.patience.attempts => State::Silent,
             Phase::Fresh if self.mode == Mode::Listen => State::Starting,
             Phase::Fresh | Phase::Waiting { .. } => State::Waiting,
             Phase::Asking => State::Asking,
@@ -471,6 +496,7 @@ impl Bringup {
             self.start_patience = self.patience.start;
             self.last = None;
             self.silent = false;
+            self.starts = 0;
         }
     }
 }
