@@ -71,7 +71,7 @@ impl ImuDevice {
     /// range.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let plan = Plan::new(spec, options)?;
-        let patience = icub::patience(options.power_on_silence_ms)?;
+        let timing = icub::timing(options.power_on_silence_ms)?;
         let is_legacy = plan.legacy != Legacy::None;
         let kinds: &[u8] = if is_legacy {
             &[kind::LEGACY_ACCELEROMETER, kind::LEGACY_GYROSCOPE]
@@ -83,7 +83,7 @@ impl ImuDevice {
             plan.address,
             *kinds.first().unwrap_or(&kind::TRIPLE),
         );
-        let mut bringup = Bringup::new(spec, spec.mode, patience, watched);
+        let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
         let id = icub::to_board(class::POLLING_ANALOG, plan.address);
         let mut claims: ArrayVec<Claim, 4> =
             icub::claims(class::PERIODIC_INERTIAL, plan.address, kinds);
@@ -112,7 +112,7 @@ impl ImuDevice {
             claims,
             bringup,
             // Legacy boards have no such configuration.
-            configure: Configure::new(spec, (!is_legacy).then_some(setting), icub::PATIENCE),
+            configure: Configure::new(spec, (!is_legacy).then_some(setting), icub::TIMING),
             acquisition: Acquisition::NONE,
             sequence: None,
             may_jump: Nanos::MIN,
@@ -393,7 +393,7 @@ impl Device for ImuDevice {
         self.bringup.on_sent(frame, outcome, &mut self.configure);
         // It takes the command within the time of an answer, and sends a period later.
         if let Ok(t) = outcome {
-            self.may_jump = t + icub::PATIENCE.answer_timeout + self.together + self.together;
+            self.may_jump = t + icub::TIMING.answer_timeout + self.together + self.together;
         }
     }
 
