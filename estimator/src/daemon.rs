@@ -16,6 +16,7 @@ use anyhow::{Context, anyhow};
 use proprio_identification::online::Paused;
 use proprio_topics::ipc::{
     Domain, DomainConfig, DomainError, PortError, Reader, Topic, Watch, Writer, monotonic,
+    open_files_remedy,
 };
 use proprio_topics::{
     ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth,
@@ -66,11 +67,15 @@ pub fn check(config: &Path) -> anyhow::Result<Setup> {
 /// means a wrong configuration.
 pub fn run(config: &Path, domain: &DomainConfig) -> anyhow::Result<()> {
     let (config, setup) = load(config, |_| {})?;
-    let runtime = tokio::runtime::Builder::new_current_thread()
+    let served = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
-        .context("cannot start")?;
-    runtime.block_on(serve(&config, setup, domain))
+        .context("cannot start")
+        .and_then(|runtime| runtime.block_on(serve(&config, setup, domain)));
+    served.map_err(|error| match open_files_remedy(&format!("{error:#}")) {
+        Some(remedy) => error.context(remedy),
+        None => error,
+    })
 }
 
 /// Reads a configuration, applies `adjust` to it, then reads the files that it names (model,

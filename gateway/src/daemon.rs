@@ -20,7 +20,7 @@ use crate::publish::Shared;
 use crate::status::BusStatus;
 use anyhow::{Context, anyhow, bail};
 use proprio_drivers::{Claim, Mode};
-use proprio_topics::ipc::{Domain, DomainConfig, DomainError, Writer};
+use proprio_topics::ipc::{Domain, DomainConfig, DomainError, Writer, open_files_remedy};
 use proprio_topics::realtime;
 use proprio_topics::{Description, GatewayHealth, Nanos, Sample};
 use sd_notify::NotifyState;
@@ -70,11 +70,15 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
         let _ = write!(std::io::stdout(), "{plan}");
         return Ok(());
     }
-    let runtime = tokio::runtime::Builder::new_current_thread()
+    let served = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
-        .context("cannot start")?;
-    runtime.block_on(serve(&plan, domain))
+        .context("cannot start")
+        .and_then(|runtime| runtime.block_on(serve(&plan, domain)));
+    served.map_err(|error| match open_files_remedy(&format!("{error:#}")) {
+        Some(remedy) => error.context(remedy),
+        None => error,
+    })
 }
 
 /// Whether an error of [`run`] is a wrong configuration (exit code 2, otherwise 1).

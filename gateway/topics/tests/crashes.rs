@@ -502,7 +502,7 @@ fn what_is_half_made_is_removed_while_others_work() {
     assert_eq!((swept.nodes, swept.failures, swept.alive), (1, 0, 1));
     assert_eq!(
         domain.sweep().unwrap(),
-        proprio_topics::ipc::Swept {
+        proprio_topics::ipc::SweepCounts {
             alive: 1,
             ..Default::default()
         }

@@ -2,6 +2,7 @@
 
 use super::bell::{Bell, Rings};
 use super::domain::service_name;
+use super::error::transport;
 use super::writer::explain;
 use super::{Domain, PortError, TakeError, Topic};
 use crate::{Header, Nanos};
@@ -135,7 +136,7 @@ impl<T: Topic, S: Service> Reader<T, S> {
                 },
                 e => PortError::Transport {
                     service: name.to_string(),
-                    problem: e.to_string(),
+                    problem: transport(e),
                 },
             })?;
             Ok((subscriber, service, predecessors, (bell, changes)))
