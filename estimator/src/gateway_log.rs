@@ -91,6 +91,13 @@ impl GatewayLog {
 
     /// Logs what has changed since the last call. `channels` are those of the configuration.
     pub(crate) fn tell(&mut self, gateway: Presence, channels: &[ChannelStatus], now: Nanos) {
+        let gateway = match (gateway, self.told) {
+            // One that had gone before this estimator started is no news.
+            (Presence::Ended | Presence::Killed, None | Some(Presence::NotStarted)) => {
+                Presence::NotStarted
+            }
+            _ => gateway,
+        };
         let before = self.told.replace(gateway);
         if before != Some(gateway) {
             self.tell_gateway(gateway, before);
@@ -233,7 +240,7 @@ mod tests {
         let mut now = Nanos::ZERO;
         for (gateway, told) in [
             (
-                Presence::NotStarted,
+                Presence::Ended,
                 "INFO waiting for the gateway of robot \"icub\" in domain",
             ),
             (Presence::Running, "INFO the gateway is running"),
