@@ -702,11 +702,13 @@ mod tests {
             thread: Some(thread),
             reported: Vec::new(),
         };
+        let end = monotonic() + Nanos::from_millis(20_000);
         while !identification
             .thread
             .as_ref()
             .is_some_and(std::thread::JoinHandle::is_finished)
         {
+            assert!(monotonic() < end, "the thread does not end");
             std::thread::yield_now();
         }
         assert!(identification.finished_job().is_none() && identification.jobs.is_none());

@@ -147,7 +147,8 @@ fn the_estimator_says_when_the_gateway_goes_and_comes() {
 }
 
 /// The gateway's F/T device has another address than the board, and the gateway does not have the
-/// IMU, so this gateway.toml is no robot's own: both logs say which is missing, once, and what to check.
+/// IMU, so this gateway.toml is no robot's own: both logs say which is missing, once, and what to
+/// check.
 #[test]
 fn a_board_that_never_answers_and_a_channel_that_is_missing_are_named() {
     let rig = Rig::new();
