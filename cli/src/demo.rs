@@ -97,8 +97,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let outcome = watch(args, &robot, &experiment, &mut processes);
     let ended = processes.end();
     let removed = Domain::remove_if_unused(&domain);
-    if !matches!(removed, Ok(true)) {
-        eprintln!("note: shared memory of the demonstration could not be removed: {removed:?}");
+    let left = match removed {
+        Ok(true) => None,
+        Ok(false) => Some("another process still uses it".to_owned()),
+        Err(error) => Some(error.to_string()),
+    };
+    if let Some(why) = left {
+        eprintln!("note: shared memory of the demonstration could not be removed: {why}");
     }
     if processes.stop.load(Relaxed) {
         bail!("interrupted");

@@ -48,6 +48,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
         virtual_bus(domain),
         shared_memory(domain),
         buffers(),
+        open_files(),
         realtime(),
         locked_memory(),
     ]);
@@ -341,6 +342,27 @@ fn buffers() -> Finding {
             most / 768
         ),
         "`sysctl -w net.core.rmem_max=4194304`, or grant the gateway CAP_NET_ADMIN",
+    )
+}
+
+fn open_files() -> Finding {
+    // With two buses and three readers, a gateway holds 41 and an estimator 58; a bus or a reader
+    // more adds two or three to each. The most buses and a dozen readers stay below this.
+    const WANTED: u64 = 256;
+    let limit = getrlimit(Resource::RLIMIT_NOFILE).map_or(0, |(soft, _)| soft);
+    if limit >= WANTED {
+        return finding(
+            "open files",
+            Verdict::Ok,
+            format!("a process may open {limit}; a run needs {WANTED} at most"),
+            "",
+        );
+    }
+    finding(
+        "open files",
+        Verdict::Lacking,
+        format!("a process may open {limit}; a run needs {WANTED} at most"),
+        "`ulimit -n 1024` in the shell, or LimitNOFILE=1024 in the systemd unit",
     )
 }
 

@@ -9,10 +9,13 @@
 //! ```
 //! (1) No reading: again, doubling the wait. (2) No reading for `max_silence`: counted once.
 //!
-//! A family gives a [`Bringup`] its [`Patience`], its start and stop commands, and an [`Inquiry`]:
+//! A board that sends no reading after `Timing::attempts` starts is silent too. One that is only
+//! listened to has as much time.
+//!
+//! A family gives a [`Bringup`] its [`Timing`], its start and stop commands, and an [`Inquiry`]:
 //! the questions that a board must answer before it is started ([`NoInquiry`] if there are none).
 //! One frame is under way at a time. A question or a start command that was not sent is tried again
-//! after `Patience::answer_timeout`, and such a question is no attempt: a device does not count as
+//! after `Timing::answer_timeout`, and such a question is no attempt: a device does not count as
 //! silent because the host's own bus could not send. A stop command is sent once.
 //!
 //! Its device tells the bring-up of every reading ([`Bringup::reading`]) and passes on the calls of
@@ -68,12 +71,13 @@ impl Inquiry for NoInquiry {
 
 /// How long the host waits for boards of a family.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Patience {
+pub(crate) struct Timing {
     /// Silence kept after power-on and before each attempt to wake a silent board; 0: none.
     pub(crate) power_on_silence: Nanos,
     /// Time to wait for an answer before the question is repeated.
     pub(crate) answer_timeout: Nanos,
-    /// Number of attempts at that pace; then the board counts as not answering.
+    /// Number of attempts at that pace; then the board counts as not answering. Also the number of
+    /// starts without a reading after which it counts as silent.
     pub(crate) attempts: u8,
     /// Interval between attempts after that.
     pub(crate) slow_attempt: Nanos,
@@ -89,12 +93,12 @@ pub(crate) struct Patience {
     pub(crate) send_within: Nanos,
 }
 
-/// The pace of one question: it is repeated after `Patience::answer_timeout`, and after
-/// `Patience::attempts` times every `Patience::slow_attempt`.
+/// The pace of one question: it is repeated after `Timing::answer_timeout`, and after
+/// `Timing::attempts` times every `Timing::slow_attempt`.
 #[derive(Debug)]
 pub(crate) struct Attempts {
-    patience: Patience,
-    /// How often it was sent, at most `Patience::attempts`.
+    timing: Timing,
+    /// How often it was sent, at most `Timing::attempts`.
     count: u8,
     /// Earliest time of the next attempt.
     next: Nanos,
@@ -107,9 +111,9 @@ pub(crate) struct Attempts {
 }
 
 impl Attempts {
-    pub(crate) const fn new(patience: Patience) -> Self {
+    pub(crate) const fn new(timing: Timing) -> Self {
         Self {
-            patience,
+            timing,
             count: 0,
             next: Nanos::MIN,
             pause: Nanos::ZERO,
@@ -128,17 +132,17 @@ impl Attempts {
     pub(crate) fn ask(&mut self, now: Nanos) {
         self.before = (self.count, self.counts_until);
         self.pause = if self.exhausted() {
-            self.patience.slow_attempt
+            self.timing.slow_attempt
         } else {
             self.count += 1;
-            self.patience.answer_timeout
+            self.timing.answer_timeout
         };
         self.asked(now);
     }
 
     fn asked(&mut self, t: Nanos) {
         self.next = t + self.pause;
-        self.counts_until = t + self.patience.answer_counts;
+        self.counts_until = t + self.timing.answer_counts;
     }
 
     /// The time of the last attempt; one that was not sent does not count.
@@ -151,8 +155,8 @@ impl Attempts {
 
     /// The answer at `t` cannot be used: asks slowly from now on.
     pub(crate) fn slow_down(&mut self, t: Nanos) {
-        self.count = self.patience.attempts;
-        self.next = t + self.patience.slow_attempt;
+        self.count = self.timing.attempts;
+        self.next = t + self.timing.slow_attempt;
     }
 
     /// The answer cannot be used: asks again at once.
@@ -162,7 +166,7 @@ impl Attempts {
 
     /// Whether the board counts as not answering.
     pub(crate) const fn exhausted(&self) -> bool {
-        self.count >= self.patience.attempts
+        self.count >= self.timing.attempts
     }
 
     /// Earliest time of the next attempt.
@@ -208,7 +212,7 @@ struct UnderWay {
 pub(crate) struct Bringup {
     mode: Mode,
     max_silence: Nanos,
-    patience: Patience,
+    timing: Timing,
     start: ArrayVec<Frame, 8>,
     stop: ArrayVec<Frame, 4>,
     /// The stream that is watched, for the faults.
@@ -218,29 +222,32 @@ pub(crate) struct Bringup {
     /// After a frame that was not sent: nothing is asked or started before this.
     hold: Nanos,
     /// Time to the first reading, in addition to the maximum silence, of the next attempt.
-    start_patience: Nanos,
+    start_wait: Nanos,
     /// Time of the last reading; `None` while the board is silent.
     last: Option<Nanos>,
     silent: bool,
+    /// Starts since the last reading, at most `Timing::attempts`: then it counts as silent.
+    starts: u8,
     /// Whether a start sequence was begun since the last known power-on.
     begun: bool,
 }
 
 impl Bringup {
-    pub(crate) fn new(spec: &Spec, mode: Mode, patience: Patience, watched: Id) -> Self {
+    pub(crate) fn new(spec: &Spec, mode: Mode, timing: Timing, watched: Id) -> Self {
         Self {
             mode,
             max_silence: spec.max_silence,
-            patience,
+            timing,
             start: ArrayVec::new(),
             stop: ArrayVec::new(),
             watched,
             phase: Phase::Fresh,
             under_way: None,
             hold: Nanos::MIN,
-            start_patience: patience.start,
+            start_wait: timing.start,
             last: None,
             silent: false,
+            starts: 0,
             begun: false,
         }
     }
@@ -284,11 +291,11 @@ impl Bringup {
     pub(crate) fn lend(&mut self, frame: Frame, now: Nanos) -> Transmit {
         self.under_way = Some(UnderWay {
             frame,
-            again: now + self.patience.answer_timeout,
+            again: now + self.timing.answer_timeout,
         });
         Transmit {
             frame,
-            deadline: now + self.patience.send_within,
+            deadline: now + self.timing.send_within,
         }
     }
 
@@ -305,6 +312,7 @@ impl Bringup {
     /// Records a reading at `t`. Returns whether it is the first after a silence.
     pub(crate) fn reading(&mut self, t: Nanos) -> bool {
         self.last = Some(t);
+        self.starts = 0;
         if let Phase::Waiting { .. } = self.phase {
             // A board that streams has left its bootloader.
             self.phase = Phase::Waiting { until: Nanos::MIN };
@@ -326,7 +334,7 @@ impl Bringup {
             self.silent = true;
             out.fault(Counter::Silences, 1, self.watched);
             if matches!(self.phase, Phase::Watching { .. }) {
-                self.start_patience = self.patience.start;
+                self.start_wait = self.timing.start;
                 self.phase = Phase::Fresh;
             }
         }
@@ -336,7 +344,7 @@ impl Bringup {
         let transmit = self.step(now, inquiry, out)?;
         self.under_way = Some(UnderWay {
             frame: transmit.frame,
-            again: now + self.patience.answer_timeout,
+            again: now + self.timing.answer_timeout,
         });
         Some(transmit)
     }
@@ -352,11 +360,16 @@ impl Bringup {
         loop {
             match self.phase {
                 Phase::Fresh if self.mode == Mode::Listen => {
-                    self.phase = Phase::Watching { until: Nanos::MAX }
+                    let until = if self.silent {
+                        Nanos::MAX
+                    } else {
+                        now + self.timing.power_on_silence + self.listens_for()
+                    };
+                    self.phase = Phase::Watching { until };
                 }
                 Phase::Fresh => {
-                    let until = if self.patience.power_on_silence > Nanos::ZERO {
-                        now + self.patience.power_on_silence
+                    let until = if self.timing.power_on_silence > Nanos::ZERO {
+                        now + self.timing.power_on_silence
                     } else {
                         Nanos::MIN
                     };
@@ -374,7 +387,7 @@ impl Bringup {
                     Ask::Send(frame) => {
                         return Some(Transmit {
                             frame,
-                            deadline: now + self.patience.answer_timeout,
+                            deadline: now + self.timing.answer_timeout,
                         });
                     }
                     Ask::Wait => return None,
@@ -384,26 +397,32 @@ impl Bringup {
                     if let Some(&frame) = self.start.get(next) {
                         return Some(Transmit {
                             frame,
-                            deadline: now + self.patience.send_within,
+                            deadline: now + self.timing.send_within,
                         });
                     }
                     self.phase = Phase::Watching {
-                        until: now + self.max_silence + self.start_patience,
+                        until: now + self.max_silence + self.start_wait,
                     };
-                    self.start_patience = self
-                        .patience
+                    self.start_wait = self
+                        .timing
                         .start_most
-                        .min(self.start_patience + self.start_patience);
+                        .min(self.start_wait + self.start_wait);
                     return None;
                 }
                 Phase::Watching { until } if self.last.is_some() || now < until => return None,
-                Phase::Watching { .. } if self.mode == Mode::Listen => return None,
-                Phase::Watching { .. } => self.phase = Phase::Fresh,
+                Phase::Watching { .. } if self.mode == Mode::Listen => {
+                    self.starts = self.timing.attempts;
+                    self.phase = Phase::Watching { until: Nanos::MAX };
+                }
+                Phase::Watching { .. } => {
+                    self.starts = self.timing.attempts.min(self.starts.saturating_add(1));
+                    self.phase = Phase::Fresh;
+                }
                 Phase::Stopping { next } => {
                     if let Some(&frame) = self.stop.get(next) {
                         return Some(Transmit {
                             frame,
-                            deadline: now + self.patience.send_within,
+                            deadline: now + self.timing.send_within,
                         });
                     }
                     self.phase = Phase::Stopped;
@@ -411,6 +430,12 @@ impl Bringup {
                 Phase::Stopped => return None,
             }
         }
+    }
+
+    /// The time that all starts of a silent board take.
+    fn listens_for(&self) -> Nanos {
+        let start = self.max_silence + self.timing.start_most;
+        Nanos(i64::from(self.timing.attempts) * start.0)
     }
 
     /// Takes the outcome of a frame that [`Bringup::poll`] gave.
@@ -464,7 +489,7 @@ impl Bringup {
         }
         match self.phase {
             _ if self.last.is_some() => State::Streaming,
-            _ if self.silent => State::Silent,
+            _ if self.silent || self.starts >= self.timing.attempts => State::Silent,
             Phase::Fresh if self.mode == Mode::Listen => State::Starting,
             Phase::Fresh | Phase::Waiting { .. } => State::Waiting,
             Phase::Asking => State::Asking,
@@ -480,7 +505,7 @@ impl Bringup {
         let waiting = matches!(self.phase, Phase::Fresh | Phase::Waiting { .. });
         let quiet = self.mode == Mode::Listen
             || !self.begun
-            || (waiting && self.patience.power_on_silence > Nanos::ZERO);
+            || (waiting && self.timing.power_on_silence > Nanos::ZERO);
         if self.active() {
             self.phase = if quiet {
                 Phase::Stopped
@@ -496,9 +521,10 @@ impl Bringup {
             self.phase = Phase::Fresh;
             self.under_way = None;
             self.hold = Nanos::MIN;
-            self.start_patience = self.patience.start;
+            self.start_wait = self.timing.start;
             self.last = None;
             self.silent = false;
+            self.starts = 0;
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Sends a board its configuration, reads it back, and repeats it until both agree: for boards that
 //! do not acknowledge a configuration.
 
-use crate::bringup::{Ask, Attempts, Inquiry, Patience};
+use crate::bringup::{Ask, Attempts, Inquiry, Timing};
 use crate::{Decoded, Frame, Mode, NotSent, Spec};
 use core::ops::Range;
 use proprio_topics::{Counter, Nanos, Refusal};
@@ -32,13 +32,13 @@ pub(crate) struct Configure {
 impl Configure {
     /// Sends `setting`. If it is `None`, the board keeps its own, and in [`Mode::Listen`] another
     /// program sets it: there is nothing to confirm.
-    pub(crate) fn new(spec: &Spec, setting: Option<Setting>, patience: Patience) -> Self {
+    pub(crate) fn new(spec: &Spec, setting: Option<Setting>, timing: Timing) -> Self {
         let setting = setting.filter(|_| spec.mode == Mode::Supervise);
         Self {
             settled: setting.is_none(),
             confirmed: setting.is_none(),
             setting,
-            attempts: Attempts::new(patience),
+            attempts: Attempts::new(timing),
             told: false,
         }
     }

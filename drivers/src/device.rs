@@ -191,7 +191,8 @@ pub enum State {
     Starting,
     /// Readings arrive.
     Streaming,
-    /// No reading for longer than the maximum silence; the board is started again.
+    /// No reading for longer than the maximum silence, or none at all after many starts; the board
+    /// is started again.
     Silent,
     /// Not usable.
     Refused(Refusal),

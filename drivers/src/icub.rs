@@ -24,7 +24,7 @@
 //! robotology/icub-main at 24c1a003. Certain (document and independent code agree), unless stated
 //! otherwise.
 
-use crate::bringup::Patience;
+use crate::bringup::Timing;
 use crate::{Claim, Decoded, Format, Frame, Frames, Id, Spec, SpecError};
 use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Nanos};
@@ -140,7 +140,7 @@ pub fn address(spec: &Spec) -> Result<u8, SpecError> {
 }
 
 /// How long the host waits for these boards, apart from the silence after power-on.
-pub(crate) const PATIENCE: Patience = Patience {
+pub(crate) const TIMING: Timing = Timing {
     power_on_silence: Nanos::ZERO,
     // A board answers within a few ms; icub-main repeats after 20 ms.
     answer_timeout: Nanos::from_millis(20),
@@ -155,11 +155,11 @@ pub(crate) const PATIENCE: Patience = Patience {
     send_within: Nanos::from_millis(100),
 };
 
-/// [`PATIENCE`] with the silence after power-on of the key `power_on_silence_ms`.
+/// [`TIMING`] with the silence after power-on of the key `power_on_silence_ms`.
 ///
 /// # Errors
 /// [`SpecError::Key`] above a minute.
-pub(crate) fn patience(ms: u32) -> Result<Patience, SpecError> {
+pub(crate) fn timing(ms: u32) -> Result<Timing, SpecError> {
     if ms > 60_000 {
         return Err(SpecError::Key {
             key: "power_on_silence_ms",
@@ -167,9 +167,9 @@ pub(crate) fn patience(ms: u32) -> Result<Patience, SpecError> {
             expected: "at most 60000",
         });
     }
-    Ok(Patience {
+    Ok(Timing {
         power_on_silence: Nanos::from_millis(i64::from(ms)),
-        ..PATIENCE
+        ..TIMING
     })
 }
 

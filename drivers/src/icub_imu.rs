@@ -27,6 +27,8 @@
 //!   quaternion, status. A reading is complete when all of `quantities` have arrived. Its stamp is
 //!   that of its first frame, its device counter is SEQ. An incomplete reading is counted
 //!   (unpaired) and dropped; a gap in SEQ is counted (lost). Both set GAP_BEFORE.
+//!   The first acquisition that is heard may have begun before; after a command to the board SEQ
+//!   may jump once, because the board begins anew. Neither is a fault.
 //! - A frame that is up to 4 acquisitions old is late: it is counted as unpaired.
 //! - The quaternion has no SEQ: it belongs to the current acquisition, if that began within half a
 //!   period.

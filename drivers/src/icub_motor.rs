@@ -229,7 +229,7 @@ impl Motor {
         Ok(Self {
             address,
             claims: icub::claims(class::PERIODIC_MOTOR, address, &kinds),
-            bringup: Bringup::new(spec, Mode::Listen, icub::PATIENCE, watched),
+            bringup: Bringup::new(spec, Mode::Listen, icub::TIMING, watched),
             velocity: options.velocity,
             status: Quality::GOOD,
             seen: false,

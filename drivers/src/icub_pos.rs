@@ -240,9 +240,9 @@ impl Pos {
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
-        let patience = icub::patience(options.power_on_silence_ms)?;
+        let timing = icub::timing(options.power_on_silence_ms)?;
         let watched = icub::stream(class::PERIODIC_ANALOG, address, POS);
-        let mut bringup = Bringup::new(spec, spec.mode, patience, watched);
+        let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
         let id = icub::to_board(class::POLLING_ANALOG, address);
         let setting = options.configuration()?.map(|set| Setting {
             get: Frame::new(
@@ -262,7 +262,7 @@ impl Pos {
             address,
             claims,
             bringup,
-            configure: Configure::new(spec, setting, icub::PATIENCE),
+            configure: Configure::new(spec, setting, icub::TIMING),
             quantity: options.quantity,
             outputs: spec.outputs.clone(),
             gap: 0,

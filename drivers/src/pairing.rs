@@ -11,6 +11,9 @@
 //! its first as quickly as usual on this bus, until one does or a surplus second half shows that
 //! one was late.
 //!
+//! The stream may be joined between two halves: the first half that is heard, if its other half was
+//! sent before, is dropped and not counted.
+//!
 //! # Time
 //! The order does not show that a second half *and* the next first half were lost; the time does.
 //! With a period P, a second half L after the first, and a delay of each frame of 0 to J on its way
@@ -109,6 +112,8 @@ pub(crate) struct Pairing<T> {
     limit: Limit,
     /// Whether the first half always comes first. If not, either half waits for the other.
     ordered: bool,
+    /// Nothing but the waiting half was heard: its other half may have been sent before.
+    joined: bool,
     pending: Option<(bool, Nanos, StampKind, T)>,
     /// A second half is missing and may still arrive.
     owed: bool,
@@ -128,6 +133,7 @@ impl<T: Copy> Pairing<T> {
         Self {
             limit,
             ordered,
+            joined: true,
             pending: None,
             owed: false,
             doubt: false,
@@ -150,14 +156,17 @@ impl<T: Copy> Pairing<T> {
                 // Either its first half was lost, or it is the missing second half.
                 self.owed = false;
                 self.doubt = false;
-                *unpaired += 1;
+                *unpaired += u32::from(!core::mem::take(&mut self.joined));
                 return Paired::Alone;
             }
+            // A first half is followed by its second.
+            self.joined &= !self.ordered;
             self.pending = Some(waiting);
             return Paired::Waiting;
         };
+        let joined = core::mem::take(&mut self.joined);
         if was_second == second {
-            *unpaired += 1;
+            *unpaired += u32::from(!joined);
             self.owed = true;
             self.pending = Some(waiting);
             return Paired::Waiting;
@@ -190,7 +199,7 @@ impl<T: Copy> Pairing<T> {
         }
         self.doubt |= self.owed;
         self.owed = false;
-        *unpaired += 1;
+        *unpaired += u32::from(!joined);
         if self.ordered || in_time {
             *unpaired += 1;
             return Paired::Alone;
@@ -201,6 +210,7 @@ impl<T: Copy> Pairing<T> {
 
     /// Drops the waiting half.
     pub(crate) fn reset(&mut self) {
+        self.joined = true;
         self.pending = None;
         self.owed = false;
         self.doubt = false;

@@ -9,16 +9,19 @@ use crate::check::Check;
 use crate::config::{Config, ConfigError};
 use crate::files;
 use crate::first_look::FirstLook;
+use crate::gateway_log::{ChannelStatus, GatewayLog};
 use crate::pipeline::{Job, Pipeline};
 use crate::setup::Setup;
 use anyhow::{Context, anyhow};
 use proprio_identification::online::Paused;
 use proprio_topics::ipc::{
-    Domain, DomainConfig, DomainError, PortError, Reader, Topic, Writer, monotonic,
+    Domain, DomainConfig, DomainError, PortError, Reader, Topic, Watch, Writer, monotonic,
+    open_files_remedy,
 };
 use proprio_topics::{
-    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, IdentificationHealth,
-    InertiaEstimate, Nanos, Publisher, Role, Sample, TorqueEstimate, realtime,
+    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth,
+    IdentificationHealth, InertiaEstimate, Nanos, Publisher, Role, Sample, TorqueEstimate,
+    realtime,
 };
 use sd_notify::NotifyState;
 use std::io::Write as _;
@@ -64,11 +67,15 @@ pub fn check(config: &Path) -> anyhow::Result<Setup> {
 /// means a wrong configuration.
 pub fn run(config: &Path, domain: &DomainConfig) -> anyhow::Result<()> {
     let (config, setup) = load(config, |_| {})?;
-    let runtime = tokio::runtime::Builder::new_current_thread()
+    let served = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
-        .context("cannot start")?;
-    runtime.block_on(serve(&config, setup, domain))
+        .context("cannot start")
+        .and_then(|runtime| runtime.block_on(serve(&config, setup, domain)));
+    served.map_err(|error| match open_files_remedy(&format!("{error:#}")) {
+        Some(remedy) => error.context(remedy),
+        None => error,
+    })
 }
 
 /// Reads a configuration, applies `adjust` to it, then reads the files that it names (model,
@@ -105,16 +112,25 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
     let stop = Arc::new(AtomicBool::new(false));
     let last_turn = Arc::new(AtomicI64::new(monotonic().0));
     let (ready, is_ready) = mpsc::channel();
-    let (robot, realtime, domain) = (config.robot.clone(), config.realtime, domain.clone());
+    let (robot, realtime, domain) = (config.robot.clone(), config.realtime, Domain::open(domain)?);
     let state_file = config.identification.state.clone().map(|file| StateFile {
         file,
         every: Nanos::from_seconds(config.identification.save_every_s),
     });
-    let (stop_there, turn_there) = (Arc::clone(&stop), Arc::clone(&last_turn));
+    let channels: Arc<[ChannelStatus]> = std::iter::repeat_with(ChannelStatus::default)
+        .take(setup.robot.channels.len())
+        .collect();
+    let mut gateway_log = GatewayLog::new(&setup.robot, &domain.config().name);
+    let mut gateway = Watch::<GatewayHealth>::default();
+    let shared = Shared {
+        last_turn: Arc::clone(&last_turn),
+        channels: Arc::clone(&channels),
+    };
+    let (stop_there, domain_there) = (Arc::clone(&stop), domain.clone());
     let thread = std::thread::Builder::new()
         .name("estimate".into())
         .spawn(move || {
-            let mut plane = match DataPlane::open(&domain, &robot, setup, state_file, turn_there) {
+            let mut plane = match DataPlane::open(domain_there, &robot, setup, state_file, shared) {
                 Ok(plane) => plane,
                 Err(error) => return drop(ready.send(Err(error))),
             };
@@ -145,7 +161,9 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
         if thread.is_finished() {
             break "the data plane has ended";
         }
-        if watchdog.is_some() && monotonic() - Nanos(last_turn.load(Relaxed)) < STALLED {
+        let now = monotonic();
+        gateway_log.tell(gateway.look(&domain, &config.robot, now), &channels, now);
+        if watchdog.is_some() && now - Nanos(last_turn.load(Relaxed)) < STALLED {
             let _ = sd_notify::notify(&[NotifyState::Watchdog]);
         }
     };
@@ -155,6 +173,14 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
     thread
         .join()
         .map_err(|_| anyhow!("the data plane panicked; this is a bug in the program: report it"))
+}
+
+/// What the data plane tells the control plane, without a lock.
+struct Shared {
+    /// The time of the last turn of its loop.
+    last_turn: Arc<AtomicI64>,
+    /// Per channel of the configuration, what has come of it.
+    channels: Arc<[ChannelStatus]>,
 }
 
 /// What the data-plane thread owns.
@@ -186,18 +212,17 @@ struct DataPlane {
     first_look: FirstLook,
     next_connect: Nanos,
     next_health: Nanos,
-    last_turn: Arc<AtomicI64>,
+    shared: Shared,
 }
 
 impl DataPlane {
     fn open(
-        domain: &DomainConfig,
+        domain: Domain,
         robot: &str,
         setup: Setup,
         state_file: Option<StateFile>,
-        last_turn: Arc<AtomicI64>,
+        shared: Shared,
     ) -> anyhow::Result<Self> {
-        let domain = Domain::open(domain)?;
         let epoch = domain.epoch();
         // The health topic first: it admits one writer, so a second estimator of this robot fails
         // here.
@@ -253,7 +278,7 @@ impl DataPlane {
             },
             next_connect: Nanos::ZERO,
             next_health: Nanos::ZERO,
-            last_turn,
+            shared,
             domain,
         })
     }
@@ -261,7 +286,7 @@ impl DataPlane {
     fn run(&mut self, stop: &AtomicBool) {
         while !stop.load(Acquire) {
             let now = monotonic();
-            self.last_turn.store(now.0, Relaxed);
+            self.shared.last_turn.store(now.0, Relaxed);
             self.health.last_turn = now;
             if now >= self.next_connect {
                 self.next_connect = now + CONNECT_PERIOD;
@@ -406,21 +431,8 @@ impl DataPlane {
                     .push(entry.and_then(|e| robot.channel(e.kind.get()?, e.name.as_str())));
             }
             self.map_epoch = description.header.epoch;
-            let missing = (0..self.pipeline.setup().robot.channels.len())
-                .filter(|c| !self.map.contains(&Some(*c)));
-            for channel in missing {
-                let name = self
-                    .pipeline
-                    .setup()
-                    .robot
-                    .channels
-                    .get(channel)
-                    .map_or("", |c| c.name.as_str());
-                tracing::error!(
-                    channel = name,
-                    "the gateway does not have this channel: estimates that depend on it are \
-                     withheld; add the channel to the gateway, or lock the joint in [locked]"
-                );
+            for (number, channel) in self.shared.channels.iter().enumerate() {
+                channel.set_described(self.map.contains(&Some(number)));
             }
         }
     }
@@ -474,6 +486,11 @@ impl DataPlane {
 
     fn publish_health(&mut self, now: Nanos) {
         self.report_temperatures();
+        for (number, channel) in self.shared.channels.iter().enumerate() {
+            if let Some(t) = self.first_look.newest(number) {
+                channel.set_newest(t);
+            }
+        }
         let counts = self.pipeline.counts();
         (
             self.health.late,
@@ -698,11 +715,13 @@ mod tests {
             thread: Some(thread),
             reported: Vec::new(),
         };
+        let end = monotonic() + Nanos::from_millis(20_000);
         while !identification
             .thread
             .as_ref()
             .is_some_and(std::thread::JoinHandle::is_finished)
         {
+            assert!(monotonic() < end, "the thread does not end");
             std::thread::yield_now();
         }
         assert!(identification.finished_job().is_none() && identification.jobs.is_none());

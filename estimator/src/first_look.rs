@@ -113,6 +113,11 @@ impl FirstLook {
         }
     }
 
+    /// The stamp of a channel's newest sample, to within [`MIN_INTERVAL`]; `None` before the first.
+    pub(crate) fn newest(&self, channel: usize) -> Option<Nanos> {
+        self.last.get(channel).copied().filter(|t| *t > Nanos::MIN)
+    }
+
     /// Takes a declaration of a contact at `now`.
     pub(crate) fn declare(&mut self, now: Nanos, contact: usize, t: Nanos, active: bool) {
         let Some(declared) = self.declared.get_mut(contact) else {

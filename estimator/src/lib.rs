@@ -30,7 +30,8 @@
 //! - Uncertainty: [`propagation`] turns the covariance of the parameters into standard deviations.
 //! - Programs: [`daemon`] and [`offline`] run the pipeline, [`check`] and `description` print what
 //!   `--check` shows, [`assessment`] measures the accuracy of a run, `first_look` tests the first
-//!   samples for implausible readings, [`files`] replaces files atomically.
+//!   samples for implausible readings, `gateway_log` says who is missing, [`files`] replaces files
+//!   atomically.
 //!
 //! # Notation
 //! That of [`proprio_dynamics`] and [`proprio_identification`]; `t` is a stamp of the trigger
@@ -45,6 +46,7 @@ pub mod differentiate;
 pub mod export;
 pub mod files;
 mod first_look;
+mod gateway_log;
 pub mod history;
 pub mod inertial;
 pub mod offline;

@@ -361,6 +361,23 @@ pub(crate) fn gravity_loads(model: &Model) -> Vec<f64> {
     loads
 }
 
+/// A frame, as the configuration and the URDF name it.
+const fn frame_word(frame: MeasurementFrame) -> &'static str {
+    match frame {
+        MeasurementFrame::Child => "child",
+        MeasurementFrame::Parent => "parent",
+        MeasurementFrame::Sensor => "sensor",
+    }
+}
+
+/// A direction, as the configuration and the URDF name it.
+const fn direction_word(direction: MeasurementDirection) -> &'static str {
+    match direction {
+        MeasurementDirection::ChildToParent => "child_to_parent",
+        MeasurementDirection::ParentToChild => "parent_to_child",
+    }
+}
+
 fn sensors(
     config: &Config,
     model: &Model,
@@ -380,17 +397,20 @@ fn sensors(
             Direction::ParentToChild => MeasurementDirection::ParentToChild,
         });
         if let Some(element) = element {
-            if frame.is_some_and(|f| f != element.frame) {
-                warnings.push(format!(
-                    "{at}: frame is {:?} here and {:?} in the URDF; this file's value is used",
-                    frame, element.frame
-                ));
+            let mut differs = |key: &str, here: &str, urdf: &str| {
+                if here != urdf {
+                    warnings.push(format!(
+                        "{at}: {key} is \"{here}\" here and \"{urdf}\" in the URDF; this file's \
+                         value is used"
+                    ));
+                }
+            };
+            if let Some(frame) = frame {
+                differs("frame", frame_word(frame), frame_word(element.frame));
             }
-            if direction.is_some_and(|d| d != element.direction) {
-                warnings.push(format!(
-                    "{at}: direction is {:?} here and {:?} in the URDF; this file's value is used",
-                    direction, element.direction
-                ));
+            if let Some(direction) = direction {
+                let urdf = direction_word(element.direction);
+                differs("direction", direction_word(direction), urdf);
             }
         }
         let frame = frame

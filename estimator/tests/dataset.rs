@@ -771,6 +771,17 @@ fn each_defect_put_into_a_clean_log_is_found_and_nothing_else() {
             "no joint moves",
         ),
         (
+            "a log whose time runs backward",
+            Box::new(|t| {
+                let last = t.rows.len() - 1;
+                let stamps: Vec<i64> = t.rows.iter().map(|row| row.0).collect();
+                (0..=last).for_each(|i| t.rows[i].0 = stamps[last - i]);
+            }),
+            // One sample is left of each channel.
+            &["stamps", "stamps", "still", "still", "too short"],
+            "its time runs backward, first at 1",
+        ),
+        (
             "too short",
             Box::new(|t| t.rows.truncate(300)),
             &["too short"],

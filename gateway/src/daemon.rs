@@ -17,7 +17,7 @@ use crate::operator::Operator;
 use crate::plan::{ConfigError, Plan};
 use crate::thread::{BusThread, join, statuses};
 use anyhow::{Context, anyhow, bail};
-use proprio_topics::ipc::{Domain, DomainConfig, DomainError, Writer};
+use proprio_topics::ipc::{Domain, DomainConfig, DomainError, Writer, open_files_remedy};
 use proprio_topics::{Description, GatewayHealth, Nanos};
 use sd_notify::NotifyState;
 use std::io::Write as _;
@@ -46,11 +46,15 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
         let _ = write!(std::io::stdout(), "{plan}");
         return Ok(());
     }
-    let runtime = tokio::runtime::Builder::new_current_thread()
+    let served = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
-        .context("cannot start")?;
-    runtime.block_on(serve(config, plan, domain))
+        .context("cannot start")
+        .and_then(|runtime| runtime.block_on(serve(config, plan, domain)));
+    served.map_err(|error| match open_files_remedy(&format!("{error:#}")) {
+        Some(remedy) => error.context(remedy),
+        None => error,
+    })
 }
 
 /// Whether an error of [`run`] is a wrong configuration (exit code 2, otherwise 1).

@@ -58,11 +58,51 @@ impl Run {
     }
 }
 
+/// The ticks for which a device has been silent or refused, and when that is told again.
+#[derive(Clone, Copy)]
+struct Trouble {
+    ticks: u32,
+    again: u32,
+}
+
+impl Trouble {
+    /// It is told again after one minute, two, four and so on, ...
+    const FIRST: u32 = 600;
+    /// ... and at last once an hour: a person who looks at the end of a log must find it.
+    const MOST: u32 = 36_000;
+
+    const BEGUN: Self = Self {
+        ticks: 0,
+        again: Self::FIRST,
+    };
+
+    /// To be called at every tick; returns whether it is to be told again.
+    fn goes_on(&mut self) -> bool {
+        self.ticks = self.ticks.saturating_add(1);
+        let due = self.ticks >= self.again;
+        if due {
+            self.again = self.ticks.saturating_add(self.ticks.min(Self::MOST));
+        }
+        due
+    }
+
+    fn seconds(self) -> u32 {
+        self.ticks / 10
+    }
+}
+
+/// What has been told of a device.
+#[derive(Clone, Copy)]
+struct DeviceRuns {
+    faults: [Run; Counter::ALL.len()],
+    trouble: Option<Trouble>,
+}
+
 /// Turns health into log lines.
 #[derive(Default)]
 pub(crate) struct HealthLog {
     last: Option<Box<GatewayHealth>>,
-    devices: Vec<[Run; Counter::ALL.len()]>,
+    devices: Vec<DeviceRuns>,
     buses: Vec<BusRuns>,
 }
 
@@ -157,27 +197,25 @@ impl HealthLog {
     }
 
     fn log_devices(&mut self, health: &GatewayHealth, last: Option<&GatewayHealth>) {
-        self.devices
-            .resize(health.devices().len(), [Run::NONE; Counter::ALL.len()]);
+        let none = DeviceRuns {
+            faults: [Run::NONE; Counter::ALL.len()],
+            trouble: None,
+        };
+        self.devices.resize(health.devices().len(), none);
         for (i, (device, runs)) in health.devices().iter().zip(&mut self.devices).enumerate() {
             let before = last.and_then(|l| l.devices().get(i));
             let name = device.name.as_str();
-            if before.is_none_or(|b| (b.state, b.refusal) != (device.state, device.refusal)) {
-                match Refusal::from_code(device.refusal) {
-                    Some(refusal) => tracing::error!(device = name, "refused: {refusal}"),
-                    None => {
-                        let state = device.state.get().map_or("unknown", DeviceState::word);
-                        tracing::info!(device = name, "{state}");
-                    }
-                }
-            }
+            log_state(device, before, &mut runs.trouble);
+            let runs = &mut runs.faults;
             for (counter, run) in Counter::ALL.into_iter().zip(runs).filter(|(c, _)| {
                 !matches!(c, Counter::Frames | Counter::Readings | Counter::Starts)
             }) {
                 let of = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
                 let count = of(device).unwrap_or(0);
                 let new = increase(count, before.and_then(of));
-                if run.begins(new > 0) {
+                // A silence that goes on has been told by the state.
+                let told = counter == Counter::Silences && device.state == DeviceState::Silent;
+                if run.begins(new > 0) && !told {
                     tracing::warn!(
                         device = name,
                         total = count,
@@ -188,6 +226,63 @@ impl HealthLog {
             }
         }
     }
+}
+
+/// Logs a device that begins to stream, falls silent, is refused or stops, and from time to time
+/// one that is still silent or refused. The steps of its bring-up are told only at first.
+fn log_state(device: &DeviceHealth, before: Option<&DeviceHealth>, trouble: &mut Option<Trouble>) {
+    let name = device.name.as_str();
+    let state = device.state.get().unwrap_or_default();
+    let changed = before.is_none_or(|b| (b.state, b.refusal) != (device.state, device.refusal));
+    let again = trouble.as_mut().is_some_and(Trouble::goes_on);
+    let since = trouble.map_or_else(String::new, |t| format!(" for {} s", t.seconds()));
+    match (Refusal::from_code(device.refusal), state) {
+        (Some(refusal), _) => {
+            if changed {
+                tracing::error!(device = name, "refused: {refusal}");
+            } else if again {
+                tracing::warn!(device = name, "still refused{since}: {refusal}");
+            }
+            trouble.get_or_insert(Trouble::BEGUN);
+        }
+        (None, DeviceState::Silent) => {
+            if changed || again {
+                let still = if changed { "" } else { "still " };
+                tracing::warn!(device = name, "{still}silent{since}: {}", remedy(device));
+            }
+            trouble.get_or_insert(Trouble::BEGUN);
+        }
+        (None, DeviceState::Streaming) if changed => {
+            let after = trouble
+                .take()
+                .map_or_else(String::new, |t| format!(", after {} s", t.seconds()));
+            tracing::info!(device = name, "streaming{after}");
+        }
+        (None, state) => {
+            if changed && (before.is_none() || state == DeviceState::Stopped) {
+                tracing::info!(device = name, "{}", state.word());
+            }
+        }
+    }
+}
+
+/// What to check of a silent board.
+fn remedy(device: &DeviceHealth) -> String {
+    let count = |counter: Counter| device.counters.get(counter as usize).copied().unwrap_or(0);
+    let (starts, readings) = (count(Counter::Starts), count(Counter::Readings));
+    let what = match (starts, readings) {
+        (0, 0) => "nothing is received from it".to_owned(),
+        (_, 0) => format!("no reading after {starts} starts"),
+        _ => "no more readings".to_owned(),
+    };
+    let other = match starts {
+        0 => "whether the program that starts it runs",
+        _ => "whether another program commands it",
+    };
+    format!(
+        "{what}; check its power and cable, its bus and address in gateway.toml, the bit rate, the \
+         termination of the bus (120 Ohm at both ends), and {other}"
+    )
 }
 
 /// Logs a change of the controller's error state.
@@ -365,6 +460,60 @@ mod tests {
                 assert!(line.contains(told), "{line}, not {told}");
             }
         }
+    }
+
+    /// One line when it falls silent, one after each doubled time, one when it comes.
+    #[test]
+    fn a_silent_board_is_told_with_what_to_check_then_rarely() {
+        let mut log = HealthLog::default();
+        let mut tick = |state: DeviceState, starts: u64, minutes: u32| {
+            let mut health = health(BusHealth::EMPTY);
+            health.device_count = 1;
+            health.devices[0].state = state.in_memory();
+            health.devices[0].counters[Counter::Starts as usize] = starts;
+            logged(|| {
+                for _ in 0..minutes * 600 {
+                    log.log_changes(&health, &[]);
+                }
+            })
+        };
+        assert_eq!(tick(DeviceState::Starting, 1, 1).len(), 1);
+        assert_eq!(
+            tick(DeviceState::Asking, 2, 1),
+            [""; 0],
+            "the bring-up goes on"
+        );
+        let lines = tick(DeviceState::Silent, 15, 10);
+        assert_eq!(
+            lines.len(),
+            5,
+            "at once, after 1, 2, 4 and 8 minutes: {lines:?}"
+        );
+        for line in &lines {
+            assert!(line.starts_with("WARN"), "{line}");
+            for word in [
+                "15 starts",
+                "power",
+                "bus",
+                "address",
+                "bit rate",
+                "termination",
+            ] {
+                assert!(line.contains(word), "{line}");
+            }
+        }
+        assert!(lines[1].contains("still silent for 60 s"), "{lines:?}");
+        let hours = tick(DeviceState::Silent, 999, 600);
+        assert!((10..16).contains(&hours.len()), "{hours:?}");
+        let [line] = &tick(DeviceState::Streaming, 999, 1)[..] else {
+            panic!()
+        };
+        assert!(line.starts_with("INFO streaming, after 366"), "{line}");
+        assert_eq!(tick(DeviceState::Streaming, 999, 10), [""; 0]);
+        // One that is only listened to.
+        assert_eq!(tick(DeviceState::Silent, 0, 1).len(), 1);
+        let lines = tick(DeviceState::Silent, 0, 1);
+        assert!(lines[0].contains("the program that starts it"), "{lines:?}");
     }
 
     #[test]

@@ -2,12 +2,12 @@
 //! while frames keep being received.
 
 use proprio_drivers::{Command, CommandFailed, CommandRefused, Frame, Id};
-use proprio_gateway::bus::{Bus, RETRY};
+use proprio_gateway::bus::{Bus, QUEUE, RETRY};
 use proprio_gateway::clock::Manual;
 use proprio_gateway::decoder::{Decoder, build};
 use proprio_gateway::inbox::{Replacement, Reply, Request, Requests, inbox};
 use proprio_gateway::link::{Link, LinkCounters, ListenOnly, Received, SendError};
-use proprio_gateway::plan::Plan;
+use proprio_gateway::plan::{BusPlan, Plan};
 use proprio_gateway::publish::Memory;
 use proprio_gateway::status::BusStatus;
 use proprio_topics::{BusError, Counter, LinkState, Nanos, Quality, StampKind};
@@ -60,7 +60,7 @@ impl Link for Scripted {
 struct Rig {
     script: Arc<Mutex<Script>>,
     status: Arc<BusStatus>,
-    plan: Plan,
+    plan: BusPlan,
     requests: Requests,
     bus: Bus<Memory>,
     clock: Manual,
@@ -73,6 +73,10 @@ impl Rig {
     }
 
     fn over(boards: u32, link: impl Fn(Scripted) -> Box<dyn Link>) -> Self {
+        Self::of(&Self::plan(boards), link)
+    }
+
+    fn plan(boards: u32) -> BusPlan {
         let mut text = "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\n\
                         source = { kind = \"virtual\", name = \"b\" }\n"
             .to_owned();
@@ -85,19 +89,22 @@ impl Rig {
             )
             .unwrap();
         }
-        let plan = Plan::parse(&text, Path::new(".")).unwrap();
-        let status = Arc::new(BusStatus::new(0, &plan.buses[0]));
-        let decoder = Decoder::new(0, &plan.buses[0], None, Arc::clone(&status)).unwrap();
+        Plan::parse(&text, Path::new(".")).unwrap().buses.remove(0)
+    }
+
+    fn of(plan: &BusPlan, link: impl Fn(Scripted) -> Box<dyn Link>) -> Self {
+        let status = Arc::new(BusStatus::new(0, plan));
+        let decoder = Decoder::new(0, plan, None, Arc::clone(&status)).unwrap();
         let script = Arc::new(Mutex::new(Script::default()));
         let link = link(Scripted(Arc::clone(&script)));
-        let (requests, inbox) = inbox(plan.buses[0].devices.len());
+        let (requests, inbox) = inbox(plan.devices.len());
         let bus = Bus::new(link, decoder, Memory::default(), Arc::clone(&status));
         let bus = bus.with_inbox(inbox);
         let now = Nanos::from_millis(1000);
         Self {
             script,
             status,
-            plan,
+            plan: plan.clone(),
             requests,
             bus,
             clock: Manual::new(now),
@@ -125,7 +132,7 @@ impl Rig {
 
     /// What replaces board `number`: a new device, or only the routes.
     fn replacement(&self, number: u16, whole: bool) -> Request {
-        let plan = &self.plan.buses[0].devices[usize::from(number)];
+        let plan = &self.plan.devices[usize::from(number)];
         Request::Replace(Replacement {
             device: whole.then(|| build(plan, None).expect("a device")),
             max_silence: Nanos::from_millis(77),
@@ -218,6 +225,37 @@ fn a_full_queue_is_tried_again_in_order_while_frames_are_received() {
     assert_eq!((rig.status.bus().queue_full, rig.unsent()), (3, (0, 0)));
     rig.turns(1);
     assert!(rig.script().deadline > rig.now + RETRY, "nothing waits");
+}
+
+/// More devices than the queue has places, each with a frame, while the link takes none: the frames
+/// without a place are counted, and their devices, which are told, give them again later.
+#[test]
+fn frames_that_find_no_place_in_the_queue_are_refused_and_told() {
+    let mut plan = Rig::plan(14);
+    for _ in 0..4 {
+        plan.devices.extend(Rig::plan(14).devices);
+    }
+    let devices = plan.devices.len();
+    let mut rig = Rig::of(&plan, |link| Box::new(link));
+    rig.script().answers = full(2);
+    rig.turns(1);
+    let surplus = (devices - QUEUE) as u64;
+    assert_eq!(rig.unsent(), (surplus, surplus));
+    // Of the last devices, not of those that have a place.
+    let told: Vec<u64> = rig
+        .status
+        .devices()
+        .map(|d| d.counters[Counter::Unsent as usize])
+        .collect();
+    let expected = (0..devices).map(|number| u64::from(number >= QUEUE));
+    assert_eq!(told, expected.collect::<Vec<_>>());
+    assert_eq!(rig.sent(), []);
+    for _ in 0..100 {
+        rig.pass(RETRY);
+        rig.turns(1);
+    }
+    assert_eq!(rig.unsent(), (surplus, surplus), "nothing else was lost");
+    assert_eq!(rig.sent().len(), 2 * devices, "every board gets its start");
 }
 
 #[test]

@@ -492,6 +492,26 @@ fn a_link_that_only_listens_sends_nothing(bus: &dyn Fixture) {
 
 type Property = fn(&dyn Fixture);
 
+/// Not when it is read: a gateway that was not scheduled for a while has true stamps.
+fn a_frame_is_stamped_when_it_comes(bus: &dyn Fixture) {
+    let mut link = bus.join(&[]);
+    let mut peer = bus.join(&[]);
+    let before = now();
+    send(&mut *peer, &Frame::new(Id::standard(7), &[1]));
+    let sent = now();
+    sleep_until(sent + Nanos::from_millis(100));
+    let frame = frame(&mut *link);
+    assert_ne!(frame.stamp, StampKind::User);
+    // The two clocks are not read at the same instant.
+    let slack = Nanos::from_millis(1);
+    assert!(frame.t > before - slack, "{} before {before}", frame.t);
+    assert!(
+        frame.t < sent + Nanos::from_millis(50),
+        "{} after {sent}",
+        frame.t
+    );
+}
+
 /// Properties of every link.
 const EVERY: [Property; 6] = [
     sending_never_waits,
@@ -503,7 +523,8 @@ const EVERY: [Property; 6] = [
 ];
 
 /// Properties of links to a bus with other participants.
-const LIVE: [Property; 5] = [
+const LIVE: [Property; 6] = [
+    a_frame_is_stamped_when_it_comes,
     a_link_that_only_listens_sends_nothing,
     deadlines_are_honoured,
     own_frames_do_not_come_back,

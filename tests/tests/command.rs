@@ -1017,6 +1017,7 @@ fn the_doctor_looks_at_everything() {
         "virtual bus",
         "shared memory",
         "receive buffers",
+        "open files",
         "real-time",
         "locked memory",
     ] {

@@ -2,7 +2,7 @@
 #![allow(missing_docs)]
 
 use proprio_tests::watch::{open, valid_since};
-use proprio_tests::{Arm, PATIENCE, Rig};
+use proprio_tests::{Arm, PATIENCE, Rig, until};
 use proprio_topics::csv::{Reader, Row, Value, What};
 use proprio_topics::{Kind, Nanos, TorqueEstimate};
 use serde_json::Value as Json;
@@ -102,7 +102,11 @@ fn a_running_system_says_what_it_does() {
     let table = rig.path("samples.csv");
     let table_text = table.to_string_lossy().into_owned();
     let mut recording = rig.start(&["record", "--out", &table_text, "--seconds", "3"]);
-    std::thread::sleep(std::time::Duration::from_millis(1000));
+    let begun = || std::fs::metadata(&table).is_ok_and(|m| m.len() > 64 << 10);
+    assert!(
+        until(PATIENCE, || begun().then_some(())).is_some(),
+        "no rows"
+    );
     gateway.kill();
     gateway = rig.start(&["gateway", "--config", &arm.gateway]);
     recording.wait();

@@ -21,6 +21,8 @@ const LATE: u8 = 4;
 #[derive(Debug, Clone, Copy)]
 struct Acquisition {
     open: bool,
+    /// It is the first that was heard: frames of it may have been sent before.
+    joined: bool,
     acquired: Nanos,
     stamp: StampKind,
     /// The quantities received, as bits of the mask.
@@ -31,6 +33,7 @@ struct Acquisition {
 impl Acquisition {
     const NONE: Self = Self {
         open: false,
+        joined: false,
         acquired: Nanos::ZERO,
         stamp: StampKind::None,
         have: 0,
@@ -48,6 +51,8 @@ pub struct ImuDevice {
     acquisition: Acquisition,
     /// SEQ of the last acquisition begun.
     sequence: Option<u8>,
+    /// Until then SEQ may jump once: a command makes the board begin anew.
+    may_jump: Nanos,
     /// The sensors in use that are not calibrated according to the last status.
     not_calibrated: bool,
     legacy: Pairing<[i16; 3]>,
@@ -66,7 +71,7 @@ impl ImuDevice {
     /// range.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let plan = Plan::new(spec, options)?;
-        let patience = icub::patience(options.power_on_silence_ms)?;
+        let timing = icub::timing(options.power_on_silence_ms)?;
         let is_legacy = plan.legacy != Legacy::None;
         let kinds: &[u8] = if is_legacy {
             &[kind::LEGACY_ACCELEROMETER, kind::LEGACY_GYROSCOPE]
@@ -78,7 +83,7 @@ impl ImuDevice {
             plan.address,
             *kinds.first().unwrap_or(&kind::TRIPLE),
         );
-        let mut bringup = Bringup::new(spec, spec.mode, patience, watched);
+        let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
         let id = icub::to_board(class::POLLING_ANALOG, plan.address);
         let mut claims: ArrayVec<Claim, 4> =
             icub::claims(class::PERIODIC_INERTIAL, plan.address, kinds);
@@ -107,9 +112,10 @@ impl ImuDevice {
             claims,
             bringup,
             // Legacy boards have no such configuration.
-            configure: Configure::new(spec, (!is_legacy).then_some(setting), icub::PATIENCE),
+            configure: Configure::new(spec, (!is_legacy).then_some(setting), icub::TIMING),
             acquisition: Acquisition::NONE,
             sequence: None,
+            may_jump: Nanos::MIN,
             not_calibrated: false,
             // A BNO055 board sends the accelerometer first; the order of an mtb is not documented.
             legacy: Pairing::new(Limit::of_period(period), plan.legacy == Legacy::Bno055),
@@ -123,16 +129,20 @@ impl ImuDevice {
     /// Whether a frame with `sequence` belongs to the open acquisition; a later `sequence` opens a
     /// new one.
     fn belongs(&mut self, sequence: u8, frame: &Frame, out: &mut Decoded) -> bool {
+        let joined = self.sequence.is_none();
         if let Some(last) = self.sequence {
             match sequence.wrapping_sub(last) {
                 // If it is not open, it is complete, and this frame is not needed.
                 0 => return self.acquisition.open,
+                1 => self.abandon(frame, out),
+                _ if frame.t <= self.may_jump => {
+                    self.may_jump = Nanos::MIN;
+                    self.gap |= self.seen;
+                }
                 ahead if ahead <= u8::MAX - LATE => {
                     self.abandon(frame, out);
-                    if ahead > 1 {
-                        out.fault(Counter::Lost, u32::from(ahead) - 1, frame.id);
-                        self.gap = true;
-                    }
+                    out.fault(Counter::Lost, u32::from(ahead) - 1, frame.id);
+                    self.gap = true;
                 }
                 _ => {
                     out.fault(Counter::Unpaired, 1, frame.id);
@@ -144,6 +154,7 @@ impl ImuDevice {
         self.sequence = Some(sequence);
         self.acquisition = Acquisition {
             open: true,
+            joined,
             acquired: frame.t,
             stamp: frame.stamp,
             ..Acquisition::NONE
@@ -153,7 +164,7 @@ impl ImuDevice {
 
     /// Drops an incomplete acquisition.
     fn abandon(&mut self, frame: &Frame, out: &mut Decoded) {
-        if core::mem::take(&mut self.acquisition.open) {
+        if core::mem::take(&mut self.acquisition.open) && !self.acquisition.joined {
             out.fault(Counter::Unpaired, 1, frame.id);
             self.gap = true;
         }
@@ -232,7 +243,8 @@ impl ImuDevice {
 
     fn quaternion(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
         let bit = Quantity::Orientation.bit();
-        if self.plan.want & bit == 0 {
+        // Before the first acquisition that is heard it belongs to an earlier one.
+        if self.plan.want & bit == 0 || self.sequence.is_none() {
             return;
         }
         let begun = (self.acquisition.acquired, self.acquisition.stamp);
@@ -379,6 +391,10 @@ impl Device for ImuDevice {
 
     fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
         self.bringup.on_sent(frame, outcome, &mut self.configure);
+        // It takes the command within the time of an answer, and sends a period later.
+        if let Ok(t) = outcome {
+            self.may_jump = t + icub::TIMING.answer_timeout + self.together + self.together;
+        }
     }
 
     fn next_wake(&self) -> Option<Nanos> {

@@ -44,7 +44,7 @@ impl FullScales {
             refusal: None,
             address,
             axis: 0,
-            attempts: Attempts::new(icub::PATIENCE),
+            attempts: Attempts::new(icub::TIMING),
             asked: 0,
             open: [0; 6],
         }
@@ -253,7 +253,7 @@ impl Strain {
         let address = icub::address(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
         let configured = options.full_scale(false)?;
-        let patience = icub::patience(options.power_on_silence_ms)?;
+        let timing = icub::timing(options.power_on_silence_ms)?;
         let limit = match options.pair_timeout_ms {
             None => Limit::of_period(Nanos::from_millis(i64::from(period))),
             Some(ms) if ms.is_finite() && ms > 0.0 && ms <= 1000.0 => {
@@ -275,7 +275,7 @@ impl Strain {
             Stream::Uncalibrated => icub::stream(class::PERIODIC_ANALOG, address, kind::RAW_FORCE),
             Stream::Calibrated | Stream::Both => force,
         };
-        let mut bringup = Bringup::new(spec, spec.mode, patience, watched);
+        let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
         bringup.start_with(command_id, &[command::SET_CANDATARATE, period]);
         if let Some(seconds) = options.temperature_period_s {
             let seconds = icub::period_ms("temperature_period_s", seconds)?;

@@ -44,7 +44,7 @@ impl Tare {
             address,
             step: Step::Idle,
             limit: Nanos::MIN,
-            attempts: Attempts::new(icub::PATIENCE),
+            attempts: Attempts::new(icub::TIMING),
             under_way: None,
             open: [0; 6],
             counts: [0; 6],

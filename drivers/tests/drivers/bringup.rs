@@ -525,6 +525,77 @@ fn a_silent_imu_is_started_again_and_its_counter_begins_anew() {
     assert_eq!(rig.readings[before].device_counter, 1);
 }
 
+/// A gateway that is started anew beside a board that streams: its first acquisition is heard from
+/// the middle, and the start makes the counter begin anew. Neither is a loss; a gap later is.
+#[test]
+fn an_imu_that_streams_already_loses_nothing_at_the_start() {
+    let keys = "quantities = [\"acceleration\", \"angular_velocity\", \"orientation\"]";
+    let mut rig = Rig::new("icub_imu", keys, &[], imu());
+    rig.reading.1 = Reading::Imu(Imu {
+        orientation: [1.0, 0.0, 0.0, 0.0],
+        ..match imu().1 {
+            Reading::Imu(imu) => imu,
+            other => panic!("{other:?}"),
+        }
+    });
+    rig.run(1130);
+    let fresh = options("icub_imu", keys).device(&spec(1, Mode::Supervise, &[]));
+    rig.device = fresh.unwrap();
+    // It begins to listen after the acceleration, and its first question is lost, so that the board
+    // streams on for some time.
+    let from = rig.received;
+    let sent = rig.sent.len();
+    rig.board_loses = Box::new(move |number, _| number == from + 1);
+    rig.host_loses = Box::new(move |number, _| number <= sent + 2);
+    rig.run(500);
+    assert_eq!(rig.device.state(), State::Streaming);
+    assert_eq!(
+        rig.faults
+            .iter()
+            .filter(|f| f.counter != Counter::Starts)
+            .count(),
+        0
+    );
+    let last = rig.readings.last().expect("readings").device_counter;
+    assert!(last < 60, "the counter began anew: {last}");
+    let from = rig.received;
+    rig.board_loses = Box::new(move |number, _| number <= from + 9);
+    rig.run(100);
+    assert_eq!(rig.count(Counter::Lost), 3);
+}
+
+/// As many starts as a question has attempts, then the board counts as silent. Over again until it
+/// comes.
+#[test]
+fn a_board_that_never_sends_counts_as_silent() {
+    let mut rig = Rig::new("icub_imu", "", &[], imu());
+    rig.board_loses = Box::new(|_, _| true);
+    rig.run(3000);
+    assert!(!rig.states.contains(&State::Silent), "{:?}", rig.states);
+    rig.run(20_000);
+    let starts = rig.count(Counter::Starts);
+    assert_eq!(rig.device.state(), State::Silent);
+    assert!(starts > 15, "{starts}");
+    rig.board_loses = Box::new(|_, _| false);
+    rig.run(2000);
+    assert_eq!(rig.device.state(), State::Streaming);
+    assert!(!rig.readings[0].quality.contains(Quality::GAP_BEFORE));
+}
+
+#[test]
+fn a_board_that_is_listened_to_and_never_sends_counts_as_silent() {
+    let mut rig = Rig::started("icub_imu", "", Mode::Listen, imu());
+    rig.board_loses = Box::new(|_, _| true);
+    rig.run(8000);
+    assert_eq!(rig.states, [State::Starting]);
+    rig.run(1000);
+    assert_eq!(rig.device.state(), State::Silent);
+    assert!(rig.sent.is_empty(), "it only listens");
+    rig.board_loses = Box::new(|_, _| false);
+    rig.run(100);
+    assert_eq!(rig.device.state(), State::Streaming);
+}
+
 #[test]
 fn a_legacy_imu_is_started_with_its_own_command() {
     let mut rig = Rig::new("icub_imu", "legacy = \"mtb\"\nperiod_ms = 20", &[], imu());

@@ -95,6 +95,24 @@ fn a_late_torque_is_not_paired_with_the_next_force() {
     );
 }
 
+/// The first torque's force was sent before anybody listened: nothing is lost, and no gap is in
+/// what follows. A later torque without its force is counted.
+#[test]
+fn a_stream_may_be_joined_between_two_halves() {
+    let (numbers, gaps, unpaired) = numbers(&sequence(&[
+        ("T0", 0.015),
+        ("F1", 1.0),
+        ("T1", 1.015),
+        ("T2", 2.015),
+        ("F3", 3.0),
+        ("T3", 3.015),
+    ]));
+    assert_eq!(
+        (numbers, gaps, unpaired),
+        (vec![1, 3], vec![false, true], 1)
+    );
+}
+
 #[test]
 fn order_alone_decides_where_there_are_no_stamps() {
     let mut frames = sequence(&[

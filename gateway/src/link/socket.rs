@@ -7,12 +7,12 @@
 //! off. New `MultiHeaders` per call would allocate.
 #![allow(unsafe_code)]
 
-use crate::clock::{Clock, Monotonic, RealtimeToMonotonic};
+use crate::clock::{Clock, HardwareToMonotonic, Monotonic, RealtimeToMonotonic};
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, ppoll};
 use nix::sys::socket::{setsockopt, sockopt};
 use nix::sys::time::TimeSpec;
-use proprio_topics::Nanos;
+use proprio_topics::{Nanos, StampKind};
 use std::mem::MaybeUninit;
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd};
 
@@ -67,6 +67,27 @@ pub(super) struct Control {
     pub(super) hardware: Option<Nanos>,
     /// Number of datagrams that the socket has dropped so far, modulo 2^32.
     pub(super) drops: Option<u32>,
+}
+
+impl Control {
+    /// When the datagram arrived (CLOCK_MONOTONIC \[ns\]), and whose stamp that is: the adapter's,
+    /// else the kernel's, else this program's.
+    pub(super) fn stamp(
+        &self,
+        times: &RealtimeToMonotonic,
+        adapter: &mut HardwareToMonotonic,
+    ) -> (Nanos, StampKind) {
+        let software = self.software.map(|t| times.convert(t));
+        let hardware = self
+            .hardware
+            .zip(software)
+            .and_then(|(h, s)| adapter.convert(h, s));
+        match (hardware, software) {
+            (Some(stamp), _) => (stamp, StampKind::Hardware),
+            (None, Some(stamp)) => (stamp, StampKind::Software),
+            (None, None) => (times.now(), StampKind::User),
+        }
+    }
 }
 
 impl<const SIZE: usize> Batch<SIZE> {
@@ -341,6 +362,33 @@ mod tests {
 
     fn times(numbers: &[libc::c_long]) -> Vec<u8> {
         numbers.iter().flat_map(|n| n.to_ne_bytes()).collect()
+    }
+
+    /// Two frames that came 9 and 4 ms ago, by the wall clock and by the clock of an adapter, which
+    /// counts from its start.
+    #[test]
+    fn every_stamp_is_on_the_monotonic_clock() {
+        let mut times = RealtimeToMonotonic::default();
+        times.refresh();
+        let (now, offset) = (times.now(), crate::clock::realtime_offset());
+        let mut adapter = HardwareToMonotonic::default();
+        let ms = |n: i64| Nanos::from_millis(n);
+        for (ago, hardware) in [(9, 1000), (4, 1005)] {
+            let mut control = Control {
+                software: Some(now + offset - ms(ago)),
+                hardware: Some(ms(hardware)),
+                drops: None,
+            };
+            for kind in [StampKind::Hardware, StampKind::Software] {
+                let (stamp, from) = control.stamp(&times, &mut adapter);
+                assert_eq!(from, kind);
+                let error = (stamp - (now - ms(ago))).0.abs();
+                assert!(error < ms(1).0, "{kind:?}: {error} ns");
+                control.hardware = None;
+            }
+        }
+        let stamp = Control::default().stamp(&times, &mut adapter);
+        assert_eq!(stamp, (now, StampKind::User));
     }
 
     #[test]

@@ -31,7 +31,7 @@ use crate::clock::{Clock, HardwareToMonotonic, Monotonic, sleep_until};
 use nix::errno::Errno;
 use nix::sys::socket::{MsgFlags, send, setsockopt, sockopt};
 use proprio_drivers::{Claim, Format, Frame, Id};
-use proprio_topics::{BusError, LinkState, Nanos, StampKind};
+use proprio_topics::{BusError, LinkState, Nanos};
 use socketcan::{CanAddr, CanFdSocket, Socket, SocketOptions};
 use std::io;
 use std::os::fd::{AsFd, AsRawFd};
@@ -177,18 +177,8 @@ impl SocketCan {
                 }
                 _ => continue,
             };
-            let (adapter, times) = (&mut self.adapter, &mut self.receiver.times);
-            let software = message.control.software.map(|t| times.convert(t));
-            let hardware = message
-                .control
-                .hardware
-                .zip(software)
-                .and_then(|(h, s)| adapter.convert(h, s));
-            let (stamp, kind) = match (hardware, software) {
-                (Some(stamp), _) => (stamp, StampKind::Hardware),
-                (None, Some(stamp)) => (stamp, StampKind::Software),
-                (None, None) => (times.now(), StampKind::User),
-            };
+            let times = &mut self.receiver.times;
+            let (stamp, kind) = message.control.stamp(times, &mut self.adapter);
             let frame = frame.at(times.limit(stamp), kind);
             if let Some(error) = ErrorFrame::of(&frame) {
                 self.counters.error_frames += 1;

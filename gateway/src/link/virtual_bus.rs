@@ -32,11 +32,11 @@
 
 use super::socket::{RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, newly_dropped};
 use super::{Link, LinkCounters, OpenError, Received, SendError, passes};
-use crate::clock::{Clock, Monotonic, sleep_until};
+use crate::clock::{Clock, HardwareToMonotonic, Monotonic, sleep_until};
 use nix::sys::socket::{setsockopt, sockopt};
 use proprio_drivers::{Claim, Format, Frame, Id};
 use proprio_topics::ipc::fnv1a;
-use proprio_topics::{LinkState, Nanos, StampKind};
+use proprio_topics::{LinkState, Nanos};
 use socket2::{Domain, Protocol, Socket, Type};
 use std::hash::{BuildHasher, Hasher};
 use std::io;
@@ -289,10 +289,9 @@ impl Link for VirtualBus {
                     continue;
                 }
                 let times = &mut self.receiver.times;
-                let (stamp, kind) = match message.control.software {
-                    Some(stamp) => (times.convert(stamp), StampKind::Software),
-                    None => (times.now(), StampKind::User),
-                };
+                // It has no adapter.
+                let adapter = &mut HardwareToMonotonic::default();
+                let (stamp, kind) = message.control.stamp(times, adapter);
                 self.counters.received += 1;
                 return Received::Frame(frame.at(times.limit(stamp), kind));
             }

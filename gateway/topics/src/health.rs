@@ -299,7 +299,8 @@ pub enum DeviceState {
     Starting = 2,
     /// Readings arrive.
     Streaming = 3,
-    /// No reading for longer than the maximum silence; the board is started again.
+    /// No reading for longer than the maximum silence, or none at all after many starts; the board
+    /// is started again.
     Silent = 4,
     /// Not usable: see the refusal.
     Refused = 5,

@@ -5,13 +5,14 @@ use nix::sched::{CpuSet, sched_setaffinity};
 use nix::sys::mman::{MlockAllFlags, mlockall};
 use nix::unistd::Pid;
 use std::format;
+use std::io;
 use std::string::{String, ToString};
 use std::vec::Vec;
 use thread_priority::unix::{
     RealtimeThreadSchedulePolicy, ThreadSchedulePolicy, set_thread_priority_and_policy,
     thread_native_id,
 };
-use thread_priority::{ThreadPriority, ThreadPriorityValue};
+use thread_priority::{Error, ThreadPriority, ThreadPriorityValue};
 
 /// Binds the calling thread to `cpu`; gives it SCHED_FIFO `priority` (1 to 99) and locks the
 /// process's memory. `None` leaves a setting as it is. A setting that is not granted is not fatal.
@@ -47,7 +48,10 @@ pub fn apply(cpu: Option<usize>, priority: Option<i32>) -> Vec<String> {
                     ThreadPriority::Crossplatform(p),
                     policy,
                 )
-                .map_err(|e| format!("{e:?}"))
+                .map_err(|e| match e {
+                    Error::OS(code) => io::Error::from_raw_os_error(code).to_string(),
+                    e => e.to_string(),
+                })
             });
         if let Err(error) = set {
             refused.push(format!(

@@ -6,7 +6,9 @@
 #![allow(missing_docs, clippy::unwrap_used)]
 
 use nix::fcntl::{FcntlArg, OFlag, fcntl};
-use proprio_topics::ipc::{Domain, DomainConfig, PortError, Reader, Writer, monotonic};
+use proprio_topics::ipc::{
+    Domain, DomainConfig, PortError, Presence, Reader, Watch, Writer, monotonic,
+};
 use proprio_topics::{GatewayHealth, Header, JointState, Nanos, Reading, Sample};
 use std::io::{Read, Write};
 use std::process::{Child, Command, Stdio};
@@ -122,6 +124,40 @@ fn stop(mut child: Child) {
 fn kill(mut child: Child) {
     child.kill().unwrap();
     child.wait().unwrap();
+}
+
+/// Another gateway that starts at once hides neither.
+#[test]
+fn a_watch_tells_a_killed_gateway_from_one_that_has_left() {
+    let base = tempfile::tempdir().unwrap();
+    let config = DomainConfig::new(base.path(), "test");
+    let domain = Domain::open(&config).unwrap();
+    let mut watch = Watch::<GatewayHealth>::default();
+    let mut look = || watch.look(&domain, "icub", monotonic());
+    assert_eq!(look(), Presence::NotStarted);
+    let start = || {
+        let mut child = spawn("writer", &config);
+        await_ready(&mut child, || ());
+        child
+    };
+    let ends: [(fn(Child), Presence); 3] = [
+        (kill, Presence::Killed),
+        (stop, Presence::Ended),
+        (kill, Presence::Killed),
+    ];
+    for (end, went) in ends {
+        let first = start();
+        assert_eq!(look(), Presence::Running);
+        end(first);
+        assert_eq!([look(), look()], [went; 2]);
+        let second = start();
+        assert_eq!(look(), Presence::Running);
+        end(second);
+        let third = start();
+        assert_eq!([look(), look()], [went, Presence::Running]);
+        end(third);
+        assert_eq!(look(), went);
+    }
 }
 
 /// Waits `delay` by polling the clock: sleeping is too coarse for steps of microseconds.
@@ -466,7 +502,7 @@ fn what_is_half_made_is_removed_while_others_work() {
     assert_eq!((swept.nodes, swept.failures, swept.alive), (1, 0, 1));
     assert_eq!(
         domain.sweep().unwrap(),
-        proprio_topics::ipc::Swept {
+        proprio_topics::ipc::SweepCounts {
             alive: 1,
             ..Default::default()
         }

@@ -5,15 +5,19 @@
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 use proprio_topics::ipc::{
-    Domain, DomainConfig, DomainError, PortError, QualityOfService, Reader, Topic, Writer,
+    Domain, DomainConfig, DomainError, Freshness, PortError, QualityOfService, Reader, Topic,
+    Writer,
 };
 use proprio_topics::{
     Code, ContactDeclaration, Description, Entry, EstimatorHealth, GatewayHealth, Header,
     InertiaEstimate, JointState, JointTorque, Kind, LinkInertia, MAX_JOINTS, Name, Nanos,
     Publisher, Reading, Role, Sample, TorqueEstimate,
 };
+use std::fs::File;
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::time::Duration;
 use zerocopy::FromBytes;
 
 fn place() -> (tempfile::TempDir, DomainConfig) {
@@ -669,4 +673,57 @@ fn a_forwarded_payload_is_that_of_its_first_publisher() {
         (1, 0, Nanos(9))
     );
     assert_eq!((sent.acquired, sent.device_time), (Nanos(5), Nanos(7)));
+}
+
+/// An estimate of an old instant is old, however late it was published.
+#[test]
+fn freshness_counts_from_the_acquisition() {
+    let (_base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    let mut writer = Writer::<Sample>::create(&domain, "icub", 1).unwrap();
+    let mut reader = Reader::<Sample>::open(&domain, "icub").unwrap();
+    let mut sent = sample(0);
+    sent.header.acquired = Nanos(1000);
+    writer.send(&sent, Nanos(1100)).unwrap();
+    reader.latest().unwrap().unwrap();
+    let age = Nanos(150);
+    assert_eq!(
+        reader.freshness(Nanos(1150), Nanos(120)),
+        Freshness::Stale { age }
+    );
+    assert_eq!(reader.freshness(Nanos(1150), age), Freshness::Fresh { age });
+}
+
+/// A port that is dropped without the domain's lock could be seen half removed. Whoever holds the
+/// lock here, as another process would, delays the drop.
+#[test]
+fn ports_are_dropped_under_the_domains_lock() {
+    let (base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    let _service = Writer::<Sample>::create(&domain, "icub", 1).unwrap();
+    for port in ["writer", "reader"] {
+        let (say, said) = channel();
+        let (go, may_go) = channel::<()>();
+        let there = domain.clone();
+        let thread = std::thread::spawn(move || {
+            let (writer, reader) = match port {
+                "writer" => (Writer::<Sample>::create(&there, "icub", 2).ok(), None),
+                _ => (None, Reader::<Sample>::open(&there, "icub").ok()),
+            };
+            assert!(writer.is_some() || reader.is_some(), "no {port}");
+            say.send("open").unwrap();
+            may_go.recv().unwrap();
+            drop((writer, reader));
+            say.send("dropped").unwrap();
+        });
+        assert_eq!(said.recv(), Ok("open"));
+        let lock = File::open(base.path().join("test.lock")).unwrap();
+        lock.lock().unwrap();
+        go.send(()).unwrap();
+        let early = said.recv_timeout(Duration::from_millis(100));
+        assert_eq!(early, Err(RecvTimeoutError::Timeout), "the {port}");
+        drop(lock);
+        assert_eq!(said.recv(), Ok("dropped"));
+        thread.join().unwrap();
+    }
 }

@@ -150,6 +150,8 @@ pub enum Defect {
         seconds: f64,
         /// Number of rows.
         rows: u64,
+        /// Where its time begins to run backward, if most samples were excluded because of that.
+        backward: Option<Nanos>,
     },
     /// A reading that changes suddenly and permanently, unexplained by motion.
     Jump {
@@ -337,7 +339,17 @@ impl fmt::Display for Defect {
                 "no joint moves by more than {most:.4} rad: without motion, weights are not \
                  separable from offsets; record motion"
             ),
-            Self::TooShort { seconds, rows } if *seconds > 0.0 => {
+            Self::TooShort {
+                seconds,
+                rows,
+                backward: Some(at),
+            } => write!(
+                f,
+                "its time runs backward, first at {at} s: in order are only \
+                 {seconds:.2} s of its {rows} rows; t must grow from row to row: sort the rows, or \
+                 correct the recorder's clock"
+            ),
+            Self::TooShort { seconds, rows, .. } if *seconds > 0.0 => {
                 write!(
                     f,
                     "the log of {seconds:.2} s ({rows} rows) is too short: record at least \

@@ -381,7 +381,18 @@ fn motion(recording: &Recording, found: &mut Vec<Defect>) {
     let seconds =
         recording.duration().seconds() * (1.0 + 1.0 / rows.max(2).saturating_sub(1) as f64) + 1e-9;
     if (recording.stamped && seconds < LEAST_SECONDS) || (!recording.stamped && rows < LEAST_ROWS) {
-        found.push(Defect::TooShort { seconds, rows });
+        let kept = recording.longest_stream();
+        let backward = found.iter().find_map(|defect| match defect {
+            Defect::Stamps {
+                backward, first, ..
+            } if *backward > kept => Some(*first),
+            _ => None,
+        });
+        found.push(Defect::TooShort {
+            seconds,
+            rows,
+            backward,
+        });
         return;
     }
     let mut most: f64 = 0.0;

@@ -206,6 +206,13 @@ impl Recording {
         }
     }
 
+    /// The number of samples of the joint or sensor that has the most.
+    pub(crate) fn longest_stream(&self) -> usize {
+        let joints = self.joints.iter().map(|joint| joint.position.t.len());
+        let sensors = self.sensors.iter().map(|sensor| sensor.t.len());
+        joints.chain(sensors).max().unwrap_or(0)
+    }
+
     /// Median sample spacing of the joint or base that is sampled the fastest.
     pub(crate) fn spacing(&self) -> Nanos {
         let joints = self.joints.iter().map(|joint| joint.position.spacing);

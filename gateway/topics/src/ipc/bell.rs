@@ -7,6 +7,8 @@
 //!
 //! A second word counts the changes of the service's writers. A reader that must not make file
 //! operations compares it before it reads, because iceoryx2 connects to new writers while reading.
+//!
+//! A third word counts the writers that have left in order, which tells them from killed ones.
 
 use super::PortError;
 use crate::Nanos;
@@ -25,8 +27,8 @@ use std::path::{Path, PathBuf};
 const WAITED_FOR: u32 = 1;
 const RING: u32 = 2;
 
-/// The rings, and the changes of the writers.
-type Words = [AtomicU32; 2];
+/// The rings, the changes of the writers, and the writers that have left in order.
+type Words = [AtomicU32; 3];
 
 /// The bell of one service, in every process that writes or reads it.
 #[derive(Debug)]
@@ -85,20 +87,32 @@ impl Bell {
     }
 
     fn word(&self) -> &AtomicU32 {
-        let [rings, _] = self.words();
+        let [rings, ..] = self.words();
         rings
     }
 
     /// The number of changes of the service's writers.
     pub(super) fn changes(&self) -> u32 {
-        let [_, changes] = self.words();
+        let [_, changes, _] = self.words();
         changes.load(Acquire)
     }
 
     /// Counts a change of the service's writers. Call it before the change.
     pub(super) fn change(&self) {
-        let [_, changes] = self.words();
+        let [_, changes, _] = self.words();
         changes.fetch_add(1, AcqRel);
+    }
+
+    /// The number of writers that have left in order.
+    pub(super) fn farewells(&self) -> u32 {
+        let [.., farewells] = self.words();
+        farewells.load(Acquire)
+    }
+
+    /// Counts a writer that leaves in order. Call it before it leaves.
+    pub(super) fn say_farewell(&self) {
+        let [.., farewells] = self.words();
+        farewells.fetch_add(1, AcqRel);
     }
 
     /// Counts a change of the writers of every service under the domain's directory `root`.

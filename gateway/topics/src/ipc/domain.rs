@@ -1,8 +1,9 @@
 //! A shared-memory domain: a directory and a name. Processes communicate only within one domain.
 
 use super::bell::Bell;
+use super::error::transport;
 use super::lock::Lock;
-use super::sweep::{self, Place, SHM, Swept};
+use super::sweep::{self, Place, SHM, SweepCounts};
 use super::{DomainError, PortError};
 use iceoryx2::prelude::{
     Config, FileName, LogLevel, Node, NodeBuilder, Path as IoxPath, SemanticString, ServiceName,
@@ -15,7 +16,7 @@ use std::format;
 use std::fs::{self, DirBuilder, File, Metadata};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
-use std::string::{String, ToString};
+use std::string::String;
 use std::sync::{Arc, Mutex, Once, PoisonError};
 
 /// Directory and name of a domain.
@@ -236,7 +237,7 @@ impl<S: Service> Domain<S> {
             .config(&iceoryx)
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<S>()
-            .map_err(|e| failed(e.to_string()))?;
+            .map_err(|e| failed(transport(e)))?;
         let id = node.id().value();
         sweep::register(&place, id);
         let folder = File::open(&place.root).map_err(|cause| DomainError::Io {
@@ -275,7 +276,7 @@ impl<S: Service> Domain<S> {
     ///
     /// # Errors
     /// As [`Domain::open`].
-    pub fn sweep(&self) -> Result<Swept, DomainError> {
+    pub fn sweep(&self) -> Result<SweepCounts, DomainError> {
         let _lock = Lock::take(&self.inner.place.lock)?;
         sweep::sweep(&self.inner.place, &self.inner.iceoryx)
     }
@@ -324,8 +325,8 @@ impl<S: Service> Domain<S> {
         &self.inner.iceoryx
     }
 
-    /// The process that runs a node; 0 if it is not known.
-    pub(super) fn process_of(&self, node: u128) -> i32 {
+    /// The process that runs a node, 0 if it is not known; `None` if the node is dead.
+    pub(super) fn process_of(&self, node: u128) -> Option<i32> {
         sweep::holder_of(&self.inner.place, node)
     }
 
@@ -386,7 +387,7 @@ pub(super) fn service_name(robot: &str, suffix: &str) -> Result<ServiceName, Por
     let name = format!("{robot}/{suffix}");
     ServiceName::new(&name).map_err(|e| PortError::Transport {
         service: name,
-        problem: e.to_string(),
+        problem: transport(e),
     })
 }
 
@@ -401,10 +402,10 @@ fn iceoryx(place: &Place) -> Result<Config, DomainError> {
     let mut config = Config::default();
     let root = place.root.as_os_str().as_encoded_bytes();
     config.global.prefix =
-        FileName::new(place.prefix.as_bytes()).map_err(|e| failed(format!("{e:?}")))?;
+        FileName::new(place.prefix.as_bytes()).map_err(|e| failed(transport(e)))?;
     config
         .global
-        .set_root_path(&IoxPath::new(root).map_err(|e| failed(format!("{e:?}")))?);
+        .set_root_path(&IoxPath::new(root).map_err(|e| failed(transport(e)))?);
     // `sweep` does all cleaning; iceoryx2's own runs without the lock.
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;

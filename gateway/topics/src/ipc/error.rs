@@ -1,9 +1,49 @@
 //! Errors of domains and ports, with the information needed to correct them.
 
+use core::fmt;
+use nix::sys::resource::{Resource, getrlimit};
+use nix::sys::statvfs::statvfs;
+use std::format;
 use std::io;
 use std::path::PathBuf;
 use std::string::String;
 use thiserror::Error;
+
+/// The operating system's words for EMFILE.
+const TOO_MANY: &str = "Too many open files";
+
+/// What to do if `problem`, an error with its causes, says that no more files can be opened.
+#[must_use]
+pub fn open_files_remedy(problem: &str) -> Option<String> {
+    problem.contains(TOO_MANY).then(|| {
+        let limit = getrlimit(Resource::RLIMIT_NOFILE).map_or(0, |(soft, _)| soft);
+        format!(
+            "the limit of {limit} open files is too low: `ulimit -n 1024` in the shell, or \
+             LimitNOFILE=1024 in the systemd unit"
+        )
+    })
+}
+
+/// An error of iceoryx2 in words: it does not tell what the operating system refused.
+pub(super) fn transport(word: impl fmt::Display) -> String {
+    /// More than it opens at once.
+    const FILES: usize = 16;
+    /// Less than one port's segment of any topic.
+    const BYTES: u64 = 64 << 10;
+    let limit = getrlimit(Resource::RLIMIT_NOFILE).map_or(u64::MAX, |(soft, _)| soft);
+    let open = std::fs::read_dir("/proc/self/fd").map_or(usize::MAX, Iterator::count);
+    let room = statvfs(super::sweep::SHM)
+        .map_or(u64::MAX, |fs| fs.blocks_available() * fs.fragment_size());
+    let cause = if open.saturating_add(FILES) as u64 > limit {
+        TOO_MANY
+    } else if room < BYTES {
+        "/dev/shm is full: `df /dev/shm`; in a container --shm-size makes it larger"
+    } else {
+        "shared memory cannot be used; `proprio doctor` tests it; if it finds nothing, end all \
+         processes of this domain and start them again"
+    };
+    format!("{cause} (iceoryx2: {word})")
+}
 
 /// Why a domain cannot be used.
 #[derive(Debug, Error)]
@@ -90,7 +130,7 @@ pub enum DomainError {
         root: PathBuf,
         /// What was tried.
         doing: &'static str,
-        /// iceoryx2's message.
+        /// What is wrong, and what to do.
         problem: String,
     },
 }
@@ -176,7 +216,7 @@ pub enum PortError {
     Transport {
         /// The service.
         service: String,
-        /// iceoryx2's message.
+        /// What is wrong, and what to do.
         problem: String,
     },
 }

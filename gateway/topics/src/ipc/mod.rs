@@ -16,7 +16,7 @@
 //! files then make every later opening fail or hang. Therefore this module holds the domain's file
 //! lock whenever it creates or removes a resource. The lock dies with its process, so the next
 //! holder knows that an unfinished resource belongs to a dead process, and removes it at once
-//! ([`Swept`] counts it). `send` and `try_take` need no lock: both kinds of port make their
+//! ([`SweepCounts`] counts it). `send` and `try_take` need no lock: both kinds of port make their
 //! connections before they register, so the other side opens only finished ones.
 //!
 //! # Threads
@@ -39,13 +39,13 @@ mod writer;
 
 pub use clock::monotonic;
 pub use domain::{Domain, DomainConfig, fnv1a};
-pub use error::{DomainError, PortError, SendError, TakeError};
-pub use presence::{Presence, RobotPresence};
+pub use error::{DomainError, PortError, SendError, TakeError, open_files_remedy};
+pub use presence::{Presence, RobotPresence, Watch};
 pub use reader::{Freshness, Reader};
 pub use robot::{
     ChannelHandle, Contact, ContactHandle, Measured, Missing, RobotReader, Torque, TorqueHandle,
     Unavailable,
 };
-pub use sweep::Swept;
+pub use sweep::SweepCounts;
 pub use topic::{QualityOfService, Topic};
 pub use writer::{Sent, Writer};

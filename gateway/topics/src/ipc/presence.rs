@@ -5,7 +5,7 @@ use super::clock::monotonic;
 use super::{Domain, DomainConfig, Reader, Topic};
 use crate::{EstimatorHealth, GatewayHealth, Nanos};
 use core::fmt;
-use iceoryx2::prelude::CallbackProgression;
+use iceoryx2::prelude::{CallbackProgression, ipc};
 use iceoryx2::service::Service;
 use std::collections::BTreeSet;
 use std::fs;
@@ -26,8 +26,10 @@ pub enum Presence {
         /// Its process.
         process: i32,
     },
-    /// It has ended, or was killed.
+    /// It has ended in order, or had gone before anybody looked.
     Ended,
+    /// It was killed, or has crashed: it went without leaving the domain in order.
+    Killed,
 }
 
 impl fmt::Display for Presence {
@@ -35,8 +37,11 @@ impl fmt::Display for Presence {
         match self {
             Self::NotStarted => f.write_str("was not started"),
             Self::Running => f.write_str("is running"),
+            // In another container its number is not known.
+            Self::Stuck { process: 0 } => f.write_str("is stopped or stuck"),
             Self::Stuck { process } => write!(f, "(process {process}) is stopped or stuck"),
             Self::Ended => f.write_str("has ended"),
+            Self::Killed => f.write_str("was killed or has crashed"),
         }
     }
 }
@@ -44,27 +49,35 @@ impl fmt::Display for Presence {
 /// A health message comes every 0.1 s; ten in a row cannot be late on a machine that works.
 const SILENCE: Nanos = Nanos::from_millis(1000);
 
-/// Follows the health of a gateway or estimator.
+/// Follows the health of a gateway or estimator: `T` is the topic of that health.
 #[derive(Debug)]
-pub(super) struct Watch<T: Topic, S: Service> {
+pub struct Watch<T: Topic, S: Service = ipc::Service> {
     reader: Option<Reader<T, S>>,
-    /// When the last health was published, and at first when this was opened.
+    /// When the last health was published, and at first when its writer was seen.
     last: Nanos,
+    /// The writer: its node, and how many had left in order when it was first seen.
+    writer: Option<(u128, u32)>,
+    /// How the last writer went.
+    went: Presence,
 }
 
-impl<T: Topic, S: Service> Watch<T, S> {
-    pub(super) const fn new() -> Self {
+impl<T: Topic, S: Service> Default for Watch<T, S> {
+    fn default() -> Self {
         Self {
             reader: None,
             last: Nanos::MIN,
+            writer: None,
+            went: Presence::Ended,
         }
     }
+}
 
-    /// Whether it is there at `now`.
-    pub(super) fn look(&mut self, domain: &Domain<S>, robot: &str, now: Nanos) -> Presence {
+impl<T: Topic, S: Service> Watch<T, S> {
+    /// Whether it is there at `now`. Makes system calls; the first that finds it opens a port. If
+    /// it has ended and another one has started since the last call, that is told by two calls.
+    pub fn look(&mut self, domain: &Domain<S>, robot: &str, now: Nanos) -> Presence {
         if self.reader.is_none() {
             self.reader = Reader::open_in(domain, robot).ok();
-            self.last = now;
         }
         let Some(reader) = &mut self.reader else {
             return Presence::NotStarted;
@@ -72,11 +85,32 @@ impl<T: Topic, S: Service> Watch<T, S> {
         if let Ok(Some(health)) = reader.latest() {
             self.last = health.header().published;
         }
-        match reader.writer_process() {
-            0 => Presence::Ended,
-            _ if now.saturating_sub(self.last) <= SILENCE => Presence::Running,
-            process => Presence::Stuck { process },
+        let alive = reader.live_writer();
+        match (self.writer, alive) {
+            (Some((node, _)), Some((same, process))) if node == same => {
+                return if now.saturating_sub(self.last) <= SILENCE {
+                    Presence::Running
+                } else {
+                    Presence::Stuck { process }
+                };
+            }
+            (Some((_, farewells)), _) => {
+                self.went = if reader.farewells() == farewells {
+                    Presence::Killed
+                } else {
+                    Presence::Ended
+                };
+                self.writer = None;
+            }
+            (None, Some((node, _))) => {
+                self.writer = Some((node, reader.farewells()));
+                // Its first health is yet to come.
+                self.last = self.last.max(now);
+                return Presence::Running;
+            }
+            (None, None) => {}
         }
+        self.went
     }
 }
 
@@ -99,7 +133,7 @@ impl Domain {
         let mut watches: Vec<(String, Watch<GatewayHealth, _>, Watch<EstimatorHealth, _>)> = self
             .robot_names()
             .into_iter()
-            .map(|name| (name, Watch::new(), Watch::new()))
+            .map(|name| (name, Watch::default(), Watch::default()))
             .collect();
         let mut look = || -> Vec<RobotPresence> {
             let robots = watches.iter_mut().map(|(name, gateway, estimator)| {

@@ -2,6 +2,7 @@
 
 use super::bell::{Bell, Rings};
 use super::domain::service_name;
+use super::error::transport;
 use super::writer::explain;
 use super::{Domain, PortError, TakeError, Topic};
 use crate::{Header, Nanos};
@@ -135,7 +136,7 @@ impl<T: Topic, S: Service> Reader<T, S> {
                 },
                 e => PortError::Transport {
                     service: name.to_string(),
-                    problem: e.to_string(),
+                    problem: transport(e),
                 },
             })?;
             Ok((subscriber, service, predecessors, (bell, changes)))
@@ -251,16 +252,26 @@ impl<T: Topic, S: Service> Reader<T, S> {
         self.bell.changes() == self.changes
     }
 
-    /// The process of a live writer; 0 if there is none, or it is not known.
-    pub(super) fn writer_process(&self) -> i32 {
-        let mut process = 0;
+    /// A live writer: the number of its node, which no other start of a process has, and its
+    /// process (0 if it is not known).
+    pub(super) fn live_writer(&self) -> Option<(u128, i32)> {
+        let mut writer = None;
         if let Some((_, service)) = &self.ports {
             service.dynamic_config().list_publishers(|p| {
-                process = process.max(self.domain.process_of(p.node_id.value()));
-                CallbackProgression::Continue
+                let node = p.node_id.value();
+                writer = self.domain.process_of(node).map(|process| (node, process));
+                match writer {
+                    Some(_) => CallbackProgression::Stop,
+                    None => CallbackProgression::Continue,
+                }
             });
         }
-        process
+        writer
+    }
+
+    /// The number of its writers so far that have left in order.
+    pub(super) fn farewells(&self) -> u32 {
+        self.bell.farewells()
     }
 
     /// Whether the bell has rung since nothing was waiting: a payload may be waiting. One load from

@@ -577,8 +577,8 @@ impl Attaching {
                     returned,
                     domain: None,
                     passed: [false; PORTS],
-                    gateway: Watch::new(),
-                    estimator: Watch::new(),
+                    gateway: Watch::default(),
+                    estimator: Watch::default(),
                 };
                 while !attacher.shared.stop.load(Acquire) {
                     attacher.turn(monotonic());
@@ -701,7 +701,7 @@ impl Attacher {
                     ..Missing::default()
                 };
             }
-            (self.gateway, self.estimator) = (Watch::new(), Watch::new());
+            (self.gateway, self.estimator) = (Watch::default(), Watch::default());
             self.domain = None;
         }
         self.shared.recall.store(false, Relaxed);

@@ -31,7 +31,7 @@ const KEPT: &str = "kept";
 
 /// Counts of the files that a sweep has removed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Swept {
+pub struct SweepCounts {
     /// Dead nodes (processes).
     pub nodes: usize,
     /// Shared-memory segments: unfinished, or without a live owner.
@@ -80,8 +80,8 @@ fn is_own(place: &Place, node: u128) -> bool {
 }
 
 /// Removes the files of dead processes; if no node is alive, all files and the directory itself.
-pub(super) fn sweep(place: &Place, config: &Config) -> Result<Swept, DomainError> {
-    let mut swept = Swept::default();
+pub(super) fn sweep(place: &Place, config: &Config) -> Result<SweepCounts, DomainError> {
+    let mut swept = SweepCounts::default();
     let nodes = place.nodes()?;
     let (alive, dead): (Vec<u128>, Vec<u128>) = nodes
         .into_iter()
@@ -124,7 +124,7 @@ pub(super) fn sweep(place: &Place, config: &Config) -> Result<Swept, DomainError
     Ok(swept)
 }
 
-fn clean_dead(place: &Place, config: &Config, dead: &[u128], swept: &mut Swept) {
+fn clean_dead(place: &Place, config: &Config, dead: &[u128], swept: &mut SweepCounts) {
     for &node in dead {
         keep_tags(place, node);
     }
@@ -181,7 +181,11 @@ fn keep_tags(place: &Place, node: u128) {
     }
 }
 
-fn remove_ownerless(place: &Place, config: &Config, swept: &mut Swept) -> Result<(), DomainError> {
+fn remove_ownerless(
+    place: &Place,
+    config: &Config,
+    swept: &mut SweepCounts,
+) -> Result<(), DomainError> {
     let nodes = place.nodes()?;
     for (kept, _) in list(&place.root.join(KEPT))? {
         let node = kept.file_name().and_then(|n| number(&n.to_string_lossy()));
@@ -282,12 +286,12 @@ fn monitor_holder(path: &Path) -> Option<i32> {
     }
 }
 
-/// The process id of another process's node; 0 if it is not known.
-pub(super) fn holder_of(place: &Place, node: u128) -> i32 {
+/// The process id of a node, 0 if it is not known; `None` if the node is dead.
+pub(super) fn holder_of(place: &Place, node: u128) -> Option<i32> {
     if is_own(place, node) {
-        return i32::try_from(std::process::id()).unwrap_or(0);
+        return Some(i32::try_from(std::process::id()).unwrap_or(0));
     }
-    monitor_holder(&place.monitor(node)).unwrap_or(0)
+    monitor_holder(&place.monitor(node))
 }
 
 /// Removes a file; returns whether this call removed it.

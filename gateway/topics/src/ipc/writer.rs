@@ -2,6 +2,7 @@
 
 use super::bell::Bell;
 use super::domain::service_name;
+use super::error::transport;
 use super::{Domain, PortError, SendError, Topic};
 use crate::{Header, Nanos};
 use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
@@ -80,7 +81,7 @@ impl<T: Topic> Writer<T> {
                     }
                     e => PortError::Transport {
                         service: name.to_string(),
-                        problem: e.to_string(),
+                        problem: transport(e),
                     },
                 })?;
             let bell = domain.bell(&name)?;
@@ -94,7 +95,7 @@ impl<T: Topic> Writer<T> {
                     PublisherCreateError::ExceedsMaxSupportedPublishers => {
                         let mut holder = 0;
                         service.dynamic_config().list_publishers(|p| {
-                            holder = domain.process_of(p.node_id.value());
+                            holder = domain.process_of(p.node_id.value()).unwrap_or(0);
                             CallbackProgression::Stop
                         });
                         PortError::Taken {
@@ -105,7 +106,7 @@ impl<T: Topic> Writer<T> {
                     }
                     e => PortError::Transport {
                         service: name.to_string(),
-                        problem: e.to_string(),
+                        problem: transport(e),
                     },
                 })?;
             Ok((publisher, service, bell))
@@ -215,6 +216,7 @@ impl<T: Topic> Writer<T> {
 impl<T: Topic> Drop for Writer<T> {
     fn drop(&mut self) {
         self.bell.change();
+        self.bell.say_farewell();
         let ports = self.ports.take();
         self.domain.drop_locked(ports);
     }
@@ -269,14 +271,14 @@ pub(super) fn explain<T: Topic, S: Service>(
                         .payload;
                     if offered == needed {
                         format!(
-                            "{} with a different quality of service ({e:?})",
+                            "{} with another capacity (iceoryx2: {e})",
                             describe(&offered)
                         )
                     } else {
                         describe(&offered)
                     }
                 }
-                _ => format!("something else ({e:?})"),
+                _ => format!("something else (iceoryx2: {e})"),
             };
             PortError::Incompatible {
                 service,
@@ -286,7 +288,7 @@ pub(super) fn explain<T: Topic, S: Service>(
         }
         e => PortError::Transport {
             service,
-            problem: e.to_string(),
+            problem: transport(e),
         },
     }
 }
