@@ -1,8 +1,8 @@
 //! Frames per second on one core: from a log to a table, and from a bus to shared memory.
 //!
 //! `cargo bench -p proprio-gateway` prints the time for one round of [`FRAMES`] frames and the
-//! rate. The bare loop only reads the same datagrams from the same kind of socket: the ratio shows
-//! the gateway's overhead.
+//! rate. The bare loops only read the same datagrams from the same kind of socket, one of them also
+//! publishes as many samples: the ratio shows what decoding costs.
 
 use divan::Bencher;
 use divan::counter::ItemsCount;
@@ -19,7 +19,7 @@ use proprio_gateway::publish::Shared;
 use proprio_gateway::status::BusStatus;
 use proprio_topics::csv::Columns;
 use proprio_topics::ipc::{Domain, DomainConfig, Writer};
-use proprio_topics::{LinkState, Nanos, Sample};
+use proprio_topics::{Header, JointState, LinkState, Nanos, Reading, Sample};
 use std::fmt::Write as _;
 use std::path::Path;
 use std::sync::Arc;
@@ -143,6 +143,33 @@ fn bare_receive(bencher: Bencher<'_, '_>) {
             let mut count = 0;
             while let Received::Frame(_) = receiver.borrow_mut().recv(Nanos::ZERO) {
                 count += 1;
+            }
+            assert_eq!(count, FRAMES);
+        });
+}
+
+/// Reads the datagrams that have arrived, and publishes a sample for two of every three: as many as
+/// the data plane publishes.
+#[divan::bench(sample_count = 50)]
+fn bare_receive_and_send(bencher: Bencher<'_, '_>) {
+    let base = tempfile::tempdir().unwrap();
+    let domain = Domain::open(&DomainConfig::new(base.path(), "bare")).unwrap();
+    let mut writer = Writer::<Sample>::create(&domain, "bench", domain.epoch()).unwrap();
+    let name = format!("bench{}", std::process::id());
+    let mut sender = VirtualBus::open(&name, "both", &[]).unwrap();
+    let mut receiver = VirtualBus::open(&name, "both", &[]).unwrap();
+    let frames = frames();
+    let sample = Sample::new(Header::default(), 0, &Reading::Joint(JointState::ABSENT));
+    bencher
+        .counter(ItemsCount::new(FRAMES))
+        .with_inputs(|| fill(&mut sender, &frames))
+        .bench_local_values(|()| {
+            let mut count = 0;
+            while let Received::Frame(frame) = receiver.recv(Nanos::ZERO) {
+                count += 1;
+                if count % 3 != 0 {
+                    writer.send(&sample, frame.t).unwrap();
+                }
             }
             assert_eq!(count, FRAMES);
         });
