@@ -5,6 +5,7 @@ use proprio_gateway::control::{ask, gateways};
 use proprio_gateway::plan::ConfigError;
 use proprio_topics::ipc::DomainConfig;
 use serde_json::{Value as Json, json};
+use std::io;
 
 /// `proprio ctl`.
 #[derive(clap::Args)]
@@ -51,6 +52,13 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
         Verb::Reload => json!({ "do": "reload" }),
     };
     let text = ask(domain, &robot, &line.to_string())
+        .map_err(|error| match error.kind() {
+            io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut => {
+                anyhow!("no answer within 5 s: `proprio status` shows whether it is stuck")
+            }
+            io::ErrorKind::UnexpectedEof => anyhow!("it has ended meanwhile"),
+            _ => anyhow!(error),
+        })
         .with_context(|| format!("the gateway of {robot} does not answer"))?;
     let answer: Json = serde_json::from_str(&text).context("the answer is not JSON")?;
     if args.json {
@@ -80,8 +88,14 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
 
 /// The robot to ask: the named one, or the only one whose gateway runs.
 fn robot(name: Option<&str>, domain: &DomainConfig) -> anyhow::Result<String> {
-    let running = gateways(domain);
     let which = format!("domain {} in {}", domain.name, domain.base.display());
+    let running = gateways(domain).map_err(|error| match error.kind() {
+        io::ErrorKind::PermissionDenied => anyhow!(
+            "the {which} belongs to another user: run this as the user of the gateway, for example \
+             `sudo -u proprio proprio ctl ...`"
+        ),
+        _ => anyhow!(error).context(format!("the {which} cannot be read")),
+    })?;
     match (name, running.as_slice()) {
         (Some(name), _) if running.iter().any(|robot| robot == name) => Ok(name.to_owned()),
         (None, [only]) => Ok(only.clone()),

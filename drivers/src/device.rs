@@ -271,7 +271,7 @@ pub enum CommandRefused {
     )]
     ListenOnly,
     /// The board's readings do not arrive.
-    #[error("the device does not stream")]
+    #[error("its readings do not arrive; `proprio ctl devices` shows its state")]
     NotStreaming,
     /// The command before has not ended.
     #[error("an earlier command to this device has not ended")]

@@ -51,12 +51,12 @@
 //! forgets the tare with its power, and does not tell.) The host sends the command once, then reads
 //! back all six axes, which confirms it and gives what is added. The board does not say which
 //! reading is the first with the new zero, so every reading from the command to the confirmation,
-//! and the first after it, has [`Quality::GAP_BEFORE`].
+//! and the first after it, has [`Quality::ZERO_CHANGED`].
 //!
 //! A tare changes the sensor's offset: offsets that were identified before it no longer hold. It
 //! takes what the sensor carries at that instant, gravity and contacts too.
 //!
-//! [`Quality::GAP_BEFORE`]: proprio_topics::Quality::GAP_BEFORE
+//! [`Quality::ZERO_CHANGED`]: proprio_topics::Quality::ZERO_CHANGED
 //!
 //! # Keys
 //! ```toml

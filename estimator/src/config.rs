@@ -537,6 +537,13 @@ impl Config {
         positive("identification.gain_std", self.identification.gain_std, 1.0)?;
         // Buffers for a waiting instant: 32 samples of a channel beside those of its window, and
         // 256 instants.
+        if self.output.timing == Some(Timing::Immediate) && self.output.max_wait_ms.is_some() {
+            return Err(
+                "output.max_wait_ms is of no use with timing = \"immediate\"; remove one of them, \
+                 or set timing = \"aligned\""
+                    .into(),
+            );
+        }
         let max_wait_ms = self.output.max_wait_ms();
         if !(0.0..=250.0).contains(&max_wait_ms) {
             return Err(format!(

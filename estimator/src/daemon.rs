@@ -1,9 +1,10 @@
 //! The estimator daemon: one data-plane thread turns samples into estimates, and a control plane
 //! supervises it.
 //!
-//! The data-plane thread waits for samples in shared memory. It takes no lock and allocates nothing
-//! once its ports are open. It retries services that are not there yet, so gateway and estimator
-//! can start in any order, and either can be killed and started again.
+//! The data-plane thread waits for samples in shared memory. Once its ports are open it takes no
+//! lock, and allocates nothing but the 48 bytes with which iceoryx2 lends each payload. It retries
+//! services that are not there yet, so gateway and estimator can start in any order, and either can
+//! be killed and started again.
 
 use crate::check::Check;
 use crate::config::{Config, ConfigError};

@@ -433,8 +433,9 @@ impl Pipeline {
                     Some(sample) => {
                         let celsius = temperature_at(temperatures, t, self.setup.max_wait);
                         let state = &self.setup.state;
-                        let raw = predicted(t, &sample, predictor, &mut self.grid)
-                            .unwrap_or((sample.value, [0.0; 6]));
+                        let (predicted, starting) =
+                            predicted(t, &sample, predictor, &mut self.grid);
+                        let raw = predicted.unwrap_or((sample.value, [0.0; 6]));
                         if let (Some(reading), Some(missing), Some(corrected)) = (
                             self.readings.get_mut(number),
                             self.missing_temperature.get_mut(number),
@@ -444,6 +445,7 @@ impl Pipeline {
                         }
                         stale(&sample, self.setup.robot.max_silence)
                             .or(Reason::of_quality(sample.quality, Quality::DEVICE_FAULT))
+                            .or(starting)
                     }
                 },
                 (ChannelBuffer::Imu(history, window, predictor), ChannelRole::Base) => {
@@ -457,7 +459,8 @@ impl Pipeline {
                                 (window, &mut self.grid),
                                 self.setup.robot.max_silence,
                             );
-                            let predicted = predicted(t, &sample, predictor, &mut self.grid);
+                            let (predicted, starting) =
+                                predicted(t, &sample, predictor, &mut self.grid);
                             if let Some((value, _)) = predicted {
                                 measured.proper_acceleration = Vec3::from(value);
                             }
@@ -468,7 +471,9 @@ impl Pipeline {
                                 imu = Some((measured, *pose));
                             }
                             self.motion.set_angular(&deviation);
-                            Reason::of_quality(sample.quality, Quality::DEVICE_FAULT).or(reason)
+                            Reason::of_quality(sample.quality, Quality::DEVICE_FAULT)
+                                .or(reason)
+                                .or(starting)
                         }
                     }
                 }
@@ -497,17 +502,21 @@ fn sensor_predictor(setup: &Setup, number: usize) -> Option<Predictor<6>> {
 }
 
 /// The values of a channel whose last sample is earlier than `t`, extrapolated to `t`, and their
-/// standard deviations. None if a sample was measured at `t` or later, or there is no predictor.
+/// standard deviations. None if a sample was measured at `t` or later, or there is no predictor; or
+/// with [`Reason::Starting`], if too few good samples are at hand.
 fn predicted<const N: usize, const D: usize>(
     t: Nanos,
     sample: &ChannelValue<N>,
     predictor: &Option<Predictor<D>>,
     grid: &mut Grid,
-) -> Option<([f64; D], [f64; D])> {
-    let predictor = predictor.as_ref()?;
-    match sample.exact || sample.interpolated {
-        true => None,
-        false => predictor.at(t, grid),
+) -> (Option<([f64; D], [f64; D])>, Reason) {
+    match predictor {
+        Some(predictor) if !(sample.exact || sample.interpolated) => {
+            let predicted = predictor.at(t, grid);
+            let reason = predicted.map_or(Reason::Starting, |_| Reason::None);
+            (predicted, reason)
+        }
+        _ => (None, Reason::None),
     }
 }
 

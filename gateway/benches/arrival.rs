@@ -2,8 +2,8 @@
 //!
 //! `cargo bench -p proprio-gateway --bench arrival` prints the CPU time per frame of the bus
 //! threads and the time from a frame's stamp to its sample in the hands of the reader. The bare
-//! loop receives from the same kind of socket and publishes as many samples through the same kind of
-//! port, and decodes nothing: the machine's own wake-up is in both. The two take turns, a second
+//! loop receives from the same kind of socket and publishes as many samples through the same kind
+//! of port, and decodes nothing: the machine's own wake-up is in both. The two take turns, a second
 //! each.
 
 use proprio_drivers::Frame;

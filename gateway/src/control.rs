@@ -276,22 +276,33 @@ impl Lines {
 const ANSWER: Duration = Duration::from_secs(5);
 
 /// The robots whose gateways can be asked, by name.
-#[must_use]
-pub fn gateways(domain: &DomainConfig) -> Vec<String> {
-    let Ok(folder) = Folder::open(domain) else {
-        return Vec::new();
+///
+/// # Errors
+/// [`io::Error`]: the domain's folder or a socket is another user's
+/// ([`io::ErrorKind::PermissionDenied`]), or cannot be read.
+pub fn gateways(domain: &DomainConfig) -> io::Result<Vec<String>> {
+    let none = |error: io::Error| match error.kind() {
+        // Nobody has been here, or nobody listens on what a killed gateway has left.
+        io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused => Ok(false),
+        _ => Err(error),
     };
-    let entries = fs::read_dir(folder.path(""))
-        .into_iter()
-        .flatten()
-        .flatten();
-    let mut robots: Vec<String> = entries
-        .filter_map(|entry| Some(entry.file_name().to_str()?.strip_suffix(SUFFIX)?.to_owned()))
-        // Nobody listens on what a killed gateway has left.
-        .filter(|robot| net::UnixStream::connect(folder.socket(robot)).is_ok())
-        .collect();
+    let folder = match Folder::open(domain) {
+        Ok(folder) => folder,
+        Err(error) => return none(error).map(|_| Vec::new()),
+    };
+    let mut robots = Vec::new();
+    for entry in fs::read_dir(folder.path(""))? {
+        let name = entry?.file_name();
+        let Some(robot) = name.to_str().and_then(|name| name.strip_suffix(SUFFIX)) else {
+            continue;
+        };
+        let connected = net::UnixStream::connect(folder.socket(robot));
+        if connected.map(|_| true).or_else(none)? {
+            robots.push(robot.to_owned());
+        }
+    }
     robots.sort();
-    robots
+    Ok(robots)
 }
 
 /// Asks the gateway of `robot` with one line of JSON, and waits for its answer, a line too.
@@ -343,7 +354,7 @@ mod tests {
             answer.send(json!({ "ok": true })).unwrap();
             let (found, answer) = client.await.unwrap();
             assert_eq!(
-                (found, answer.unwrap().as_str()),
+                (found.unwrap(), answer.unwrap().as_str()),
                 (vec![robot.clone()], "{\"ok\":true}")
             );
             let names = || fs::read_dir(&folder).unwrap().count();

@@ -19,7 +19,7 @@ pub struct Decoder {
     dispatch: Dispatch,
     /// Stamp of the last main reading per channel.
     last: [Nanos; MAX_CHANNELS],
-    /// Channels whose next main reading has GAP_BEFORE, because their device or conversion was
+    /// Channels whose next main reading has ZERO_CHANGED, because their device or conversion was
     /// replaced.
     replaced: [bool; MAX_CHANNELS],
     /// Number of devices with a request open.
@@ -142,7 +142,7 @@ impl Decoder {
                     if let Some(replaced) = self.replaced.get_mut(route.channel as usize)
                         && std::mem::take(replaced)
                     {
-                        quality |= Quality::GAP_BEFORE;
+                        quality |= Quality::GAP_BEFORE | Quality::ZERO_CHANGED;
                     }
                 }
                 let reading = match output.reading {

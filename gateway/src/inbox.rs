@@ -3,8 +3,9 @@
 //!
 //! Two queues of one producer and one consumer each: requests to the bus thread, replies back.
 //! Neither side ever waits for the other, and the bus thread neither takes a lock nor allocates.
-//! Every request gets one reply, and a device has at most one request open ([`Requests::send`]
-//! refuses a second one). As each queue has a place per device, neither is ever full.
+//! Every request gets one reply while the bus runs, and a device has at most one request open
+//! ([`Requests::send`] refuses a second one). As each queue has a place per device, neither is ever
+//! full.
 //!
 //! What a request replaces goes back with its reply, so that its memory is freed in the control
 //! plane.

@@ -110,10 +110,7 @@ impl Operator {
                 answer,
                 done,
             }),
-            Err(refused) => {
-                tracing::warn!("refused: {}", refused["error"].as_str().unwrap_or_default());
-                drop(answer.send(refused));
-            }
+            Err(refused) => drop(answer.send(refused)),
         }
     }
 
@@ -130,7 +127,8 @@ impl Operator {
             let names = open.into_iter().map(|(bus, device)| self.name(bus, device));
             let names: Vec<_> = names.collect();
             let _ = answer.send(refusal(&format!(
-                "no reply of {}: the thread of the bus may be stuck",
+                "no reply of {}: its bus may be stuck. What was asked is carried out as soon as it \
+                 goes on; if it does not, restart the gateway",
                 names.join(", ")
             )));
         }

@@ -79,8 +79,14 @@ impl Arm {
             device.insert("max_silence_ms".into(), max_silence_ms.into());
         });
         this.set("input", "max_silence_ms", max_silence_ms);
-        this.set("output", "max_wait_ms", max_wait_ms);
-        this
+        this.aligned(max_wait_ms)
+    }
+
+    /// Makes each estimate wait for the samples of other channels, at most so long \[ms\].
+    #[must_use]
+    pub fn aligned(mut self, max_wait_ms: f64) -> Self {
+        self.set("output", "max_wait_ms", max_wait_ms);
+        self
     }
 
     /// Sets the peak error of joint positions that the estimator assumes \[rad\].

@@ -131,7 +131,7 @@ const CLOCKS: [(&str, &str); 2] = [
 
 /// The files that may call these clocks: the outermost loops of programs, and tests that wait for
 /// processes.
-const OUTERMOST: [(&str, &str); 9] = [
+const OUTERMOST: [(&str, &str); 11] = [
     ("gateway/topics/src/ipc/clock.rs", "is it"),
     ("gateway/src/clock.rs", "the gateway's clock"),
     ("gateway/topics/src/ipc/bell.rs", "tests of waiting"),
@@ -144,6 +144,8 @@ const OUTERMOST: [(&str, &str); 9] = [
         "the loop of the thread that opens ports",
     ),
     ("gateway/topics/examples/consumer.rs", "a program"),
+    ("gateway/topics/benches/", "measure"),
+    ("gateway/benches/", "measure"),
     ("estimator/src/daemon.rs", "the daemon's loop"),
     ("cli/src/", "programs"),
     ("tests/", "tests of processes"),
@@ -716,6 +718,7 @@ fn leaked_paths(sources: &[Source]) -> Vec<String> {
     let ipc = [
         ("gateway/topics/src/ipc/", "the ports"),
         ("gateway/topics/tests/", "their tests"),
+        ("gateway/topics/benches/", "measured beside it"),
         here,
     ];
     wrong.extend(outside(sources, &ipc, |l| {

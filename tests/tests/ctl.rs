@@ -273,20 +273,20 @@ fn a_tare_makes_the_present_load_the_zero() {
         "{wrenches:?}"
     );
     assert!(
-        wrenches[first].1.contains(Quality::GAP_BEFORE),
+        wrenches[first].1.contains(Quality::ZERO_CHANGED),
         "{:?}",
         wrenches[first]
     );
     let marked = wrenches
         .iter()
-        .filter(|(_, q)| q.contains(Quality::GAP_BEFORE));
+        .filter(|(_, q)| q.contains(Quality::ZERO_CHANGED));
     assert!((1..10).contains(&marked.count()));
     assert!(
         !wrenches
             .last()
             .expect("some")
             .1
-            .contains(Quality::GAP_BEFORE)
+            .contains(Quality::ZERO_CHANGED)
     );
     // The answer is what was added.
     for axis in 0..3 {
@@ -300,7 +300,7 @@ fn a_tare_makes_the_present_load_the_zero() {
     // Nothing was lost, and no other channel is marked.
     let since = recorder.taken.iter().filter(|s| s.header.acquired > began);
     let others: Vec<_> = since
-        .filter(|s| s.channel != sensor && s.header.quality.contains(Quality::GAP_BEFORE))
+        .filter(|s| s.channel != sensor && s.header.quality.contains(Quality::ZERO_CHANGED))
         .collect();
     assert!(others.is_empty(), "{others:?}");
     assert_eq!(recorder.lost(), 0);
@@ -466,7 +466,7 @@ fn assert_continuous(recorder: &Recorder, channels: &[u32], since: Nanos) {
             "bus {bus}: {numbers:?}"
         );
     }
-    let marked = |s: &&Sample| s.header.quality.contains(Quality::GAP_BEFORE);
+    let marked = |s: &&Sample| s.header.quality.contains(Quality::ZERO_CHANGED);
     let mut marked: Vec<u32> = taken().filter(marked).map(|s| s.channel).collect();
     marked.sort_unstable();
     assert_eq!(marked, channels);
@@ -509,7 +509,7 @@ fn a_reload_changes_one_device_and_the_others_do_not_notice() {
         .collect();
     let at = angles
         .iter()
-        .position(|(_, q)| q.contains(Quality::GAP_BEFORE))
+        .position(|(_, q)| q.contains(Quality::ZERO_CHANGED))
         .expect("a mark");
     let step = |(angle, _): &(f64, Quality)| angle - angles[0].0;
     assert!(
@@ -548,7 +548,7 @@ fn a_reload_changes_one_device_and_the_others_do_not_notice() {
     let mut channels = [sensor, elbow];
     channels.sort_unstable();
     assert_continuous(&recorder, &channels, began);
-    let marked = |s: &&Sample| s.header.quality.contains(Quality::GAP_BEFORE);
+    let marked = |s: &&Sample| s.header.quality.contains(Quality::ZERO_CHANGED);
     let times: Vec<Nanos> = (recorder.taken.iter())
         .filter(|s| s.channel == sensor && s.header.acquired > began)
         .skip_while(|s| !marked(s))
@@ -625,7 +625,7 @@ fn a_reload_that_cannot_be_done_changes_nothing() {
     );
 
     some(&mut recorder, elbow, proprio_tests::now());
-    let marked = |s: &Sample| s.header.quality.contains(Quality::GAP_BEFORE);
+    let marked = |s: &Sample| s.header.quality.contains(Quality::ZERO_CHANGED);
     let since: Vec<_> = recorder
         .taken
         .iter()

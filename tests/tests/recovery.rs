@@ -196,7 +196,8 @@ fn samples_lost_while_the_estimator_is_stopped_are_counted() {
 #[test]
 fn samples_that_can_not_be_used_are_counted_by_kind() {
     let rig = Rig::new();
-    let arm = Arm::new().on_virtual(["a", "b"]).write(&rig.path("robot"));
+    let arm = Arm::new().aligned(1.0).on_virtual(["a", "b"]);
+    let arm = arm.write(&rig.path("robot"));
     let domain = rig.open();
     let robot = "icub_left_arm";
     let channels = [("l_arm_ft_sensor", Kind::Wrench), ("l_elbow", Kind::Joint)];

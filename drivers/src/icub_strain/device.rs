@@ -364,8 +364,8 @@ impl Strain {
         } else {
             Quality::GOOD
         };
-        let step = if self.tare.in_doubt() {
-            Quality::GAP_BEFORE
+        let step = if self.tare.take_step() {
+            Quality::ZERO_CHANGED
         } else {
             Quality::GOOD
         };
@@ -415,7 +415,7 @@ impl Device for Strain {
                     self.scales.answer(data, self.bringup.mode(), frame, out);
                 }
                 Some(&command::GET_CURR_TARE) if self.bringup.mode() == Mode::Supervise => {
-                    self.calibrated.gap |= self.tare.answer(data, frame, out);
+                    self.tare.answer(data, frame, out);
                 }
                 // Answers to other questions are for other devices.
                 Some(_) => {}
@@ -425,14 +425,12 @@ impl Device for Strain {
     }
 
     fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
-        if let Some(transmit) = self.bringup.poll(now, &mut self.scales, out) {
-            return Some(transmit);
-        }
+        let transmit = self.bringup.poll(now, &mut self.scales, out);
         if !self.bringup.is_watching() {
             self.tare.interrupt();
         }
-        if !self.bringup.is_idle() {
-            return None;
+        if transmit.is_some() || !self.bringup.is_idle() {
+            return transmit;
         }
         let frame = self.tare.poll(now)?;
         Some(self.bringup.lend(frame, now))
@@ -440,8 +438,7 @@ impl Device for Strain {
 
     fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
         self.bringup.on_sent(frame, outcome, &mut self.scales);
-        // Also a command that was given up on its way takes effect.
-        self.calibrated.gap |= self.tare.sent(frame, outcome);
+        self.tare.sent(frame, outcome);
     }
 
     fn next_wake(&self) -> Option<Nanos> {
@@ -482,11 +479,11 @@ impl Device for Strain {
                 "this device streams raw gauges alone, which a tare does not change",
             ));
         }
-        if self.tare.is_open() {
-            return Err(CommandRefused::Busy);
-        }
-        if self.state() != State::Streaming || !self.bringup.is_idle() {
+        if self.state() != State::Streaming {
             return Err(CommandRefused::NotStreaming);
+        }
+        if self.tare.is_open() || !self.bringup.is_idle() {
+            return Err(CommandRefused::Busy);
         }
         self.tare.begin(now);
         Ok(())

@@ -35,6 +35,8 @@ pub(super) struct Tare {
     /// Questions per axis whose answers may still arrive.
     open: [u8; 6],
     counts: Counts,
+    /// Whether the next reading may be the first with the new zero.
+    may_step: bool,
     outcome: Option<Result<Counts, CommandFailed>>,
 }
 
@@ -48,6 +50,7 @@ impl Tare {
             under_way: None,
             open: [0; 6],
             counts: [0; 6],
+            may_step: false,
             outcome: None,
         }
     }
@@ -57,10 +60,10 @@ impl Tare {
         !matches!(self.step, Step::Idle) || self.outcome.is_some()
     }
 
-    /// Whether the command was sent and is not confirmed: any reading may be the first with the new
-    /// zero.
-    pub(super) const fn in_doubt(&self) -> bool {
-        matches!(self.step, Step::Confirming { .. })
+    /// Whether this reading may be the first with the new zero: each one from the command to the
+    /// end of the tare, and the next.
+    pub(super) fn take_step(&mut self) -> bool {
+        core::mem::take(&mut self.may_step) || matches!(self.step, Step::Confirming { .. })
     }
 
     pub(super) fn begin(&mut self, now: Nanos) {
@@ -98,12 +101,14 @@ impl Tare {
         self.under_way
     }
 
-    /// Takes the outcome of a frame that [`Tare::poll`] gave. Returns whether the command was sent.
-    pub(super) fn sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) -> bool {
+    /// Takes the outcome of a frame that [`Tare::poll`] gave.
+    pub(super) fn sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
         if self.under_way.take_if(|last| last == frame).is_none() {
-            return false;
+            return;
         }
         let commanded = *frame == self.command();
+        // A command that was given up on its way takes effect, too.
+        self.may_step |= commanded && outcome.is_ok();
         match (self.step, frame.data()) {
             (Step::Commanding, _) if commanded && outcome.is_ok() => {
                 self.step = Step::Confirming { axis: 0 };
@@ -123,39 +128,36 @@ impl Tare {
             }
             _ => {}
         }
-        commanded && outcome.is_ok()
     }
 
-    /// Takes an answer of the board: `[16, axis, high, low]`. Returns whether it is the last one.
-    pub(super) fn answer(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) -> bool {
+    /// Takes an answer of the board: `[16, axis, high, low]`.
+    pub(super) fn answer(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
         let &[_, channel, high, low] = data else {
             out.fault(Counter::Length, 1, frame.id);
-            return false;
+            return;
         };
         let at = usize::from(channel);
         let (Some(open), Some(count)) = (self.open.get_mut(at), self.counts.get_mut(at)) else {
             out.fault(Counter::Value, 1, frame.id);
-            return false;
+            return;
         };
         if *open == 0 {
             out.fault(Counter::Unexpected, 1, frame.id);
-            return false;
+            return;
         }
         *open -= 1;
         let Step::Confirming { axis } = &mut self.step else {
-            return false;
+            return;
         };
         if channel != *axis {
-            return false;
+            return;
         }
         *count = i16::from_be_bytes([high, low]);
         *axis += 1;
         self.attempts.begin();
-        let last = *axis > 5;
-        if last {
+        if *axis > 5 {
             self.end(Ok(self.counts));
         }
-        last
     }
 
     /// Ends it, if it is under way: the device is started again or stopped.
@@ -172,6 +174,7 @@ impl Tare {
     }
 
     fn end(&mut self, outcome: Result<Counts, CommandFailed>) {
+        self.may_step |= matches!(self.step, Step::Confirming { .. });
         self.step = Step::Idle;
         self.outcome = Some(outcome);
     }

@@ -62,7 +62,7 @@ fn values(rig: &Rig) -> Vec<([f64; 6], bool)> {
     };
     let readings = rig.readings.iter();
     readings
-        .map(|r| (of(&r.reading), r.quality.contains(Quality::GAP_BEFORE)))
+        .map(|r| (of(&r.reading), r.quality.contains(Quality::ZERO_CHANGED)))
         .collect()
 }
 
@@ -271,7 +271,7 @@ impl ByHand {
         let halves = ["31A#008000800080", "31B#008000800080"];
         let frames = halves.map(|half| frame(half, self.now as f64));
         let (readings, _) = decode(&mut *self.device, &frames);
-        readings[0].quality.contains(Quality::GAP_BEFORE)
+        readings[0].quality.contains(Quality::ZERO_CHANGED)
     }
 
     fn answer(&mut self, text: &str) {
@@ -292,8 +292,7 @@ fn a_command_given_up_on_its_way_still_marks_the_readings() {
         by_hand.device.outcome(),
         Some(Err(CommandFailed::Interrupted))
     );
-    assert!(by_hand.reading(), "after the silence");
-    assert!(!by_hand.reading());
+    assert!(!by_hand.reading(), "the command has not been sent");
     by_hand.device.on_sent(&command, Ok(by_hand.at()));
     assert!(by_hand.reading(), "the zero may be another one");
     assert!(!by_hand.reading());
@@ -374,4 +373,23 @@ fn an_answer_that_nobody_asked_for_is_counted() {
     // Another program's answers are not for a device that only listens.
     let mut device = listener("icub_strain", SCALES, &[]);
     assert!(decode(&mut *device, &answers).1.is_empty());
+}
+
+#[test]
+fn a_tare_that_a_silence_ends_marks_the_reading_after_it() {
+    let mut by_hand = ByHand::new();
+    assert_eq!(by_hand.send(), "201#1501");
+    // No reading comes before the silence.
+    by_hand.now += 60;
+    for _ in 0..3 {
+        if let Some(frame) = by_hand.poll() {
+            by_hand.device.on_sent(&frame, Ok(by_hand.at()));
+        }
+    }
+    assert_eq!(
+        by_hand.device.outcome(),
+        Some(Err(CommandFailed::Interrupted))
+    );
+    assert!(by_hand.reading(), "the first after it");
+    assert!(!by_hand.reading());
 }

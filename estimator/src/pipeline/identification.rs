@@ -290,7 +290,7 @@ impl OnlineIdentification {
                         from,
                         to,
                         setup.robot.max_silence,
-                        Quality::UNTRUSTED_ENCODER,
+                        Quality::UNTRUSTED_ENCODER | Quality::ZERO_CHANGED,
                     );
                     *fault = gathered.err().unwrap_or(Reason::None);
                     let highest = (0..3)

@@ -19,6 +19,7 @@ impl Pipeline {
         let newest = buffer.newest().unwrap_or(Nanos::MIN);
         let all_finite = |values: &[f64]| values.iter().all(|v| v.is_finite());
         let finite_or_absent = |values: &[f64]| values.iter().all(|v| !v.is_infinite());
+        let is_continued = !quality.intersects(Quality::ZERO_CHANGED);
         // Decide first whether the sample may be taken; then push it to window and history.
         let (mut late, mut backward) = (false, false);
         let mut admit = |is_valid: bool| {
@@ -35,6 +36,9 @@ impl Pipeline {
                     return;
                 }
                 if admit(is_valid) {
+                    if !is_continued {
+                        window.interrupt();
+                    }
                     // A position that the encoder itself marks as untrusted is kept, but not
                     // differentiated.
                     if Reason::of_quality(quality, Quality::UNTRUSTED_ENCODER) == Reason::None {
@@ -77,7 +81,7 @@ impl Pipeline {
                 if admit(is_valid) {
                     if let Some(predictor) = predictor {
                         let fault = Reason::of_quality(quality, Quality::DEVICE_FAULT);
-                        predictor.push(t, &value, fault == Reason::None);
+                        predictor.push(t, &value, fault == Reason::None, is_continued);
                     }
                     history.push(t, value, quality);
                 }
@@ -90,7 +94,12 @@ impl Pipeline {
                 if admit(is_valid) {
                     let fault = Reason::of_quality(quality, Quality::DEVICE_FAULT);
                     if let Some(predictor) = predictor {
-                        predictor.push(t, &i.proper_acceleration, fault == Reason::None);
+                        predictor.push(
+                            t,
+                            &i.proper_acceleration,
+                            fault == Reason::None,
+                            is_continued,
+                        );
                     }
                     if fault == Reason::None {
                         let _ = window.push(t, i.angular_velocity);

@@ -11,7 +11,8 @@
 //! different channels are independent. The error of a position is its noise, which includes the
 //! jitter of stamps, and the encoder offset, [`ENCODER_OFFSET_STD`]. The error of the base's proper
 //! acceleration is [`BASE_ACCELERATION_STD`]: bias and mounting of an IMU, or a fixed base that is
-//! not level. These two are typical calibration accuracies, not properties of one robot.
+//! not level; both errors grow where an immediate estimate extrapolates. These two are typical
+//! calibration accuracies, not properties of one robot.
 //!
 //! A column of S is a finite difference. S is computed with the first estimate of each tenth of a
 //! second and when contacts or base change, and held in between. The tenths are those

@@ -29,8 +29,12 @@ impl<const D: usize> Predictor<D> {
         })
     }
 
-    /// Takes a sample; one that must not be fitted together with others separates them.
-    pub(super) fn push(&mut self, t: Nanos, value: &[f64; D], is_good: bool) {
+    /// Takes a sample. One that is not good is left out; it and one that does not continue those
+    /// before separate them from what follows.
+    pub(super) fn push(&mut self, t: Nanos, value: &[f64; D], is_good: bool, is_continued: bool) {
+        if !is_continued {
+            self.window.interrupt();
+        }
         if is_good {
             let scaled = std::array::from_fn(|i| value[i] / self.noise[i]);
             let _ = self.window.push(t, scaled);

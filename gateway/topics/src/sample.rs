@@ -53,8 +53,7 @@ pub struct Quality(pub u32);
 impl Quality {
     /// No flag is set.
     pub const GOOD: Self = Self(0);
-    /// This reading does not continue the one before: at least one was lost in between, or the zero
-    /// of the channel was changed there (a tare, a joint's offset).
+    /// At least one reading was lost between this one and the one before.
     pub const GAP_BEFORE: Self = Self(1);
     /// At least one channel of the sensor is at an end of its range; see [`Quality::saturation`].
     pub const SATURATED: Self = Self(1 << 1);
@@ -71,10 +70,14 @@ impl Quality {
     /// its encoder: the position is good.
     pub const DRIVE_FAULT: Self = Self(1 << 6);
 
+    /// The zero of the channel may have changed between this reading and the one before (a tare, a
+    /// joint's new offset): no motion or load lies between them.
+    pub const ZERO_CHANGED: Self = Self(1 << 7);
+
     /// The flags that make an encoder's position unusable.
     pub const UNTRUSTED_ENCODER: Self = Self(Self::DEVICE_FAULT.0 | Self::NOT_CALIBRATED.0);
 
-    const NAMED: [(Self, &'static str); 7] = [
+    const NAMED: [(Self, &'static str); 8] = [
         (Self::GAP_BEFORE, "gap_before"),
         (Self::SATURATED, "saturated"),
         (Self::FROZEN, "frozen"),
@@ -82,6 +85,7 @@ impl Quality {
         (Self::NOT_CALIBRATED, "not_calibrated"),
         (Self::DEVICE_COUNTER, "device_counter"),
         (Self::DRIVE_FAULT, "drive_fault"),
+        (Self::ZERO_CHANGED, "zero_changed"),
     ];
     const SATURATION_SHIFT: u32 = 16;
 

@@ -138,12 +138,16 @@ impl Gateway {
             samples: Writer::create(domain, "icub", epoch).unwrap(),
             descriptions: Writer::create(domain, "icub", epoch).unwrap(),
         };
+        this.describe(first);
+        this
+    }
+
+    fn describe(&mut self, first: u32) {
         let entries: Vec<_> = (CHANNELS.into_iter().zip(first..))
             .map(|((name, kind), number)| (name, Role::Channel, kind, number))
             .collect();
         let description = description(Publisher::Gateway, &entries);
-        this.descriptions.send(&description, monotonic()).unwrap();
-        this
+        self.descriptions.send(&description, monotonic()).unwrap();
     }
 
     fn send(&mut self, t: Nanos, first: u32, quality: Quality) {
@@ -234,6 +238,11 @@ fn values_come_with_a_reason_when_they_do_not_come() {
         gateway.send(t, 5, Quality::GOOD);
         robot.who_is_missing().is_nobody()
     });
+
+    // A gateway that describes itself again (a reload) has lost nothing.
+    gateway.describe(5);
+    robot.update(t + Nanos(1000));
+    assert!(robot.joint(encoder).is_ok() && robot.wrench(ft).is_ok());
 
     // An estimate that refers to long ago is old, however late it was published.
     estimator.send(t - MAX_AGE, [1.5, 2.5]);

@@ -1,9 +1,9 @@
 //! A shared-memory domain: a directory and a name. Processes communicate only within one domain.
 
 use super::bell::Bell;
-use super::error::transport;
+use super::error::{SHM, transport};
 use super::lock::Lock;
-use super::sweep::{self, Place, SHM, SweepCounts};
+use super::sweep::{self, Place, SweepCounts};
 use super::{DomainError, PortError};
 use iceoryx2::prelude::{
     Config, FileName, LogLevel, Node, NodeBuilder, Path as IoxPath, SemanticString, ServiceName,

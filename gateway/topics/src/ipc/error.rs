@@ -24,6 +24,9 @@ pub fn open_files_remedy(problem: &str) -> Option<String> {
     })
 }
 
+/// Where shared memory lies.
+pub(super) const SHM: &str = "/dev/shm";
+
 /// An error of iceoryx2 in words: it does not tell what the operating system refused.
 pub(super) fn transport(word: impl fmt::Display) -> String {
     /// More than it opens at once.
@@ -32,8 +35,7 @@ pub(super) fn transport(word: impl fmt::Display) -> String {
     const BYTES: u64 = 64 << 10;
     let limit = getrlimit(Resource::RLIMIT_NOFILE).map_or(u64::MAX, |(soft, _)| soft);
     let open = std::fs::read_dir("/proc/self/fd").map_or(usize::MAX, Iterator::count);
-    let room = statvfs(super::sweep::SHM)
-        .map_or(u64::MAX, |fs| fs.blocks_available() * fs.fragment_size());
+    let room = statvfs(SHM).map_or(u64::MAX, |fs| fs.blocks_available() * fs.fragment_size());
     let cause = if open.saturating_add(FILES) as u64 > limit {
         TOO_MANY
     } else if room < BYTES {

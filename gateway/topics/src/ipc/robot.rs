@@ -257,11 +257,14 @@ impl RobotReader {
                     (wanted.iter_mut())
                         .filter(|wanted| wanted.publisher == publisher)
                         .for_each(|wanted| wanted.resolve(&description));
-                    if publisher == Publisher::Gateway {
-                        // The numbers may mean other channels now.
-                        samples.fill(None);
-                    }
                     if let Some(place) = descriptions.get_mut(publisher as usize) {
+                        // A gateway that has started again may give the numbers to other channels.
+                        let epoch = place.as_ref().map(|known| known.header.epoch);
+                        if publisher == Publisher::Gateway
+                            && epoch != Some(description.header.epoch)
+                        {
+                            samples.fill(None);
+                        }
                         *place = Some(description);
                     }
                 }

@@ -8,6 +8,7 @@
 
 use super::DomainError;
 use super::bell::Bell;
+use super::error::SHM;
 use iceoryx2::node::NodeView;
 use iceoryx2::prelude::{CallbackProgression, Config, Node, NodeState, ipc};
 use iceoryx2::service::Service;
@@ -25,7 +26,6 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 use std::vec::Vec;
 
-pub(super) const SHM: &str = "/dev/shm";
 /// Directory, next to iceoryx2's own, of the tags of nodes that are being cleaned.
 const KEPT: &str = "kept";
 
