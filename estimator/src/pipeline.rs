@@ -77,7 +77,7 @@ use buffers::{ChannelBuffer, Declarations, OrReason, stale, temperature_at};
 use channels::{imu_at, joint_at, wrench_at};
 use identification::OnlineIdentification;
 use motion::{ENCODER_OFFSET_STD, MotionErrors};
-use prediction::Predictor;
+use prediction::{Extrapolated, Predictor};
 use proprio_dynamics::model::{JointKind, Model};
 use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
 use proprio_dynamics::{ContactSet, Dependence, FrameMotion, Kinematics, Noise, Solver};
@@ -435,7 +435,10 @@ impl Pipeline {
                         let state = &self.setup.state;
                         let (predicted, starting) =
                             predicted(t, &sample, predictor, &mut self.grid);
-                        let raw = predicted.unwrap_or((sample.value, [0.0; 6]));
+                        let raw = predicted.unwrap_or(Extrapolated {
+                            value: sample.value,
+                            std: [0.0; 6],
+                        });
                         if let (Some(reading), Some(missing), Some(corrected)) = (
                             self.readings.get_mut(number),
                             self.missing_temperature.get_mut(number),
@@ -461,10 +464,11 @@ impl Pipeline {
                             );
                             let (predicted, starting) =
                                 predicted(t, &sample, predictor, &mut self.grid);
-                            if let Some((value, _)) = predicted {
-                                measured.proper_acceleration = Vec3::from(value);
+                            let mut std = [0.0; 3];
+                            if let Some(predicted) = predicted {
+                                measured.proper_acceleration = Vec3::from(predicted.value);
+                                std = predicted.std;
                             }
-                            let std = predicted.map_or([0.0; 3], |(_, std)| std);
                             self.motion.set_proper(&std);
                             if let BaseMotion::Imu(pose) = &self.setup.robot.base {
                                 base = FrameMotion::of_link_from_imu(&measured, pose);
@@ -509,11 +513,14 @@ fn predicted<const N: usize, const D: usize>(
     sample: &ChannelValue<N>,
     predictor: &Option<Predictor<D>>,
     grid: &mut Grid,
-) -> (Option<([f64; D], [f64; D])>, Reason) {
+) -> (Option<Extrapolated<D>>, Reason) {
     match predictor {
         Some(predictor) if !(sample.exact || sample.interpolated) => {
             let predicted = predictor.at(t, grid);
-            let reason = predicted.map_or(Reason::Starting, |_| Reason::None);
+            let reason = match predicted {
+                Some(_) => Reason::None,
+                None => Reason::Starting,
+            };
             (predicted, reason)
         }
         _ => (None, Reason::None),

@@ -2,6 +2,7 @@
 //! sensor, corrected for calibration, temperature and offset.
 
 use super::buffers::stale;
+use super::prediction::Extrapolated;
 use crate::differentiate::{Grid, Unavailable, Window};
 use crate::history::ChannelValue;
 use crate::inertial::InertialState;
@@ -116,7 +117,7 @@ pub(crate) fn imu_at(
 pub(crate) fn wrench_at(
     state: &InertialState,
     number: usize,
-    (raw, raw_std): ([f64; 6], [f64; 6]),
+    raw: Extrapolated<6>,
     (celsius, age): (f64, Option<Nanos>),
     propagation: &mut Propagation,
 ) -> Option<(Wrench, bool)> {
@@ -124,11 +125,11 @@ pub(crate) fn wrench_at(
     let offset = state.offsets.get(number)?;
     let excess = (state.excess_variance.get(number).copied()).unwrap_or_default();
     let by_temperature = calibration.temperature_variance(age.map(Nanos::seconds));
-    let [fx, fy, fz, tx, ty, tz] = raw_std;
+    let [fx, fy, fz, tx, ty, tz] = raw.std;
     let extrapolation = calibration.variance_of(&Wrench::from_parts([fx, fy, fz], [tx, ty, tz]));
     let extra = std::array::from_fn(|i| by_temperature[i] + excess[i] + extrapolation[i]);
     propagation.set_extra_variance(number, extra);
-    let [fx, fy, fz, tx, ty, tz] = raw;
+    let [fx, fy, fz, tx, ty, tz] = raw.value;
     let corrected = calibration.apply(&Wrench::from_parts([fx, fy, fz], [tx, ty, tz]), celsius);
     // The effect of an uncertain calibration depends on the reading.
     let kelvin = calibration.temperature_rise(celsius);

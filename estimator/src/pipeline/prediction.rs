@@ -12,6 +12,12 @@ pub(super) struct Predictor<const D: usize> {
     noise: [f64; D],
 }
 
+/// Values at an instant after the last sample, and their standard deviations.
+pub(super) struct Extrapolated<const D: usize> {
+    pub(super) value: [f64; D],
+    pub(super) std: [f64; D],
+}
+
 impl<const D: usize> Predictor<D> {
     /// A predictor without samples. `noise` is the peak noise of each number, as in
     /// [`Settings::noise`], which is ignored; the samples may show more. None if it is not
@@ -43,11 +49,14 @@ impl<const D: usize> Predictor<D> {
         }
     }
 
-    /// The value at `t`, after the last sample, and its standard deviation. None if too few samples
-    /// are at hand, or the last one is too old.
-    pub(super) fn at(&self, t: Nanos, grid: &mut Grid) -> Option<([f64; D], [f64; D])> {
+    /// The values at `t`, after the last sample. None if too few samples are at hand, or the last one
+    /// is too old.
+    pub(super) fn at(&self, t: Nanos, grid: &mut Grid) -> Option<Extrapolated<D>> {
         let estimate = self.window.at_sharing(t, t, grid).ok()?;
         let scaled = |x: [f64; D]| std::array::from_fn(|i| x[i] * self.noise[i]);
-        Some((scaled(estimate.value), scaled(estimate.value_std)))
+        Some(Extrapolated {
+            value: scaled(estimate.value),
+            std: scaled(estimate.value_std),
+        })
     }
 }
