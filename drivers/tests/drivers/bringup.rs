@@ -283,6 +283,13 @@ fn silence_is_kept_after_power_on() {
     rig.run(30);
     assert_eq!(rig.device.state(), State::Streaming);
     assert_eq!(rig.sent.len(), 2);
+    // One that has fallen silent may be in it: nothing is sent, not even a stop.
+    rig.board_loses = Box::new(|_, _| true);
+    rig.run(100);
+    assert_eq!(rig.device.state(), State::Silent);
+    rig.device.stop(rig.now);
+    rig.run(10);
+    assert_eq!((rig.device.state(), rig.sent.len()), (State::Stopped, 2));
 }
 
 #[test]
@@ -564,6 +571,28 @@ fn an_imu_that_streams_already_loses_nothing_at_the_start() {
     assert_eq!(rig.count(Counter::Lost), 3);
 }
 
+/// A command makes the counter begin anew once. What jumps after that is lost.
+#[test]
+fn a_command_excuses_one_jump_of_an_imus_counter() {
+    let device = options("icub_imu", "").device(&spec(1, Mode::Supervise, &[]));
+    let (mut device, now) = (device.unwrap(), Nanos::from_millis(1000));
+    let command = device.poll_transmit(now, &mut Decoded::new()).unwrap();
+    device.on_sent(&command.frame, Ok(now));
+    let acquisitions = [(7, 1001.0), (100, 1010.0), (150, 1020.0)].map(|(sequence, ms)| {
+        [0, 2].map(|sensor| {
+            let text = format!("513#{sequence:02X}{sensor:02X}000000000000");
+            frame(&text, ms)
+        })
+    });
+    let (readings, faults) = decode(&mut *device, acquisitions.as_flattened());
+    let gaps = readings
+        .iter()
+        .map(|reading| reading.quality.contains(Quality::GAP_BEFORE));
+    assert_eq!(gaps.collect::<Vec<_>>(), [false, true, true]);
+    let counted: Vec<_> = faults.iter().map(|f| (f.counter, f.count)).collect();
+    assert_eq!(counted, [(Counter::Lost, 49)]);
+}
+
 /// As many starts as a question has attempts, then the board counts as silent. Over again until it
 /// comes.
 #[test]
@@ -643,6 +672,18 @@ fn a_motor_board_is_only_listened_to() {
     assert_eq!((rig.device.state(), rig.sent.len()), (State::Stopped, 0));
 }
 
+/// What a motor board has said before the link was lost does not hold after it is back.
+#[test]
+fn a_fault_of_a_motor_board_ends_with_a_restart() {
+    let mut device = listener("icub_motor", "", &[0]);
+    let (broken, motion) = ("113#0601000000000000", "110#0000000000000000");
+    let (readings, _) = decode(&mut *device, &[broken, motion].map(|text| frame(text, 1.0)));
+    assert_eq!(readings[1].quality, Quality::DEVICE_FAULT);
+    device.restart(Nanos::from_millis(2));
+    let (readings, _) = decode(&mut *device, &[frame(motion, 3.0)]);
+    assert_eq!(readings[0].quality, Quality::GAP_BEFORE);
+}
+
 #[test]
 fn a_pos_board_is_configured_and_started() {
     let joint = (
@@ -718,12 +759,21 @@ fn an_angle_is_good_only_when_the_board_has_confirmed_its_configuration() {
     rig.run(600);
     let after = &rig.readings[before..];
     assert!(after.len() > 10 && rig.device.state() == State::Streaming);
+    assert!(after[0].quality.contains(Quality::GAP_BEFORE));
     assert!(
         after
             .iter()
             .all(|reading| reading.quality.contains(Quality::NOT_CALIBRATED))
     );
     assert_eq!(rig.count(Counter::Changed), 0);
+    // An answer that comes after the start confirms it, too.
+    let set = rig.sent.iter().find(|sent| sent.starts_with("201#52"));
+    let answer = set.expect("a command").replace("201#52", "210#51");
+    let now = rig.now.seconds() * 1e3;
+    let late = [&answer, "311#0021840300000000"].map(|text| frame(text, now));
+    let (readings, faults) = decode(&mut *rig.device, &late);
+    assert_eq!(readings[0].quality, Quality::GOOD);
+    assert!(faults.is_empty(), "{faults:?}");
 }
 
 #[test]
