@@ -586,3 +586,20 @@ const _: () = {
     assert!(size_of::<IdentificationHealth>() == 15 * 8);
     assert!(size_of::<EstimatorHealth>() == 56 + 13 * 8 + 15 * 8);
 };
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_refusal_is_found_by_its_number() {
+        let scales = (0..6).map(|channel| Refusal::ZeroFullScale { channel });
+        let refusals = [Refusal::NoFullScale, Refusal::Changed];
+        for refusal in refusals.into_iter().chain(scales) {
+            assert_eq!(Refusal::from_code(refusal.code()), Some(refusal));
+        }
+        for none in [0, 3, 0xFF, 0x200, u32::MAX] {
+            assert_eq!(Refusal::from_code(none), None, "{none}");
+        }
+    }
+}

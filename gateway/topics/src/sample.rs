@@ -257,6 +257,11 @@ mod tests {
     use std::string::ToString;
 
     #[test]
+    fn a_header_without_a_device_time_says_so() {
+        assert_eq!(Header::default().device_time, Nanos::MIN);
+    }
+
+    #[test]
     fn saturation_is_kept_per_axis() {
         let q = Quality::FROZEN
             .with_saturation(0, Saturation::Low)

@@ -244,6 +244,22 @@ fn a_late_reader_gets_the_last_description_of_each_publisher() {
     assert_eq!(reader.lost(), 0);
 }
 
+/// Whoever waits for what was sent before it came is woken when it gets it.
+#[test]
+fn a_late_reader_that_waits_is_woken_for_the_history() {
+    let (_base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    let mut writer = Writer::<Description>::create(&domain, "icub", 1).unwrap();
+    let sent = description(Publisher::Gateway, &[("elbow", Role::Channel, 0)]);
+    writer.send(&sent, Nanos(1)).unwrap();
+    let mut reader = Reader::<Description>::open(&domain, "icub").unwrap();
+    assert!(reader.try_take().unwrap().is_none());
+    assert!(!reader.wait(Nanos::ZERO));
+    assert_eq!(writer.update_connections(), Ok(1));
+    assert!(reader.wait(Nanos::ZERO));
+    assert!(reader.try_take().unwrap().is_some());
+}
+
 #[test]
 fn a_reader_before_the_writer_is_told_so_and_then_works() {
     let (_base, config) = place();

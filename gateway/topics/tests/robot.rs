@@ -325,6 +325,33 @@ fn handles_survive_restarts_in_any_order() {
     }
 }
 
+/// What was sent under a number before is not the value of the channel that has it now.
+#[test]
+fn a_channel_with_a_new_number_has_no_value_of_another() {
+    let (_base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    let mut robot = RobotReader::new(&config, "icub", MAX_AGE).unwrap();
+    let elbow = robot.channel_handle(Kind::Joint, "elbow");
+    let wrist = robot.channel_handle(Kind::Joint, "wrist");
+    let mut gateway = Gateway::start(&domain, 1, 5);
+    let mut t = Nanos::ZERO;
+    until("the first values", || {
+        t = monotonic();
+        gateway.send(t, 5, Quality::GOOD);
+        robot.update(t);
+        robot.joint(elbow).is_ok()
+    });
+    assert_eq!(robot.joint(wrist), Err(Unavailable::Unknown));
+    let entries = [("wrist", Role::Channel, Kind::Joint, 5)];
+    let renumbered = description(Publisher::Gateway, &entries);
+    gateway.descriptions.send(&renumbered, t).unwrap();
+    until("the new names", || {
+        robot.update(t);
+        robot.joint(elbow) == Err(Unavailable::Unknown)
+    });
+    assert_eq!(robot.joint(wrist), Err(Unavailable::NeverSeen));
+}
+
 #[test]
 fn a_reader_knows_who_is_missing() {
     let (base, config) = place();

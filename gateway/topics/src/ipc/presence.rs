@@ -185,3 +185,37 @@ impl DomainConfig {
         names
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ipc::Writer;
+
+    /// The first health of a gateway that was restarted is yet to come: it is not stuck because the
+    /// last one of its predecessor is old.
+    #[test]
+    fn a_restarted_gateway_is_not_stuck_before_its_first_health() {
+        let base = tempfile::tempdir().unwrap();
+        let domain = Domain::open(&DomainConfig::new(base.path(), "test")).unwrap();
+        let start = || Writer::<GatewayHealth>::create(&domain, "icub", 1).unwrap();
+        let mut watch = Watch::<GatewayHealth>::default();
+        let mut look = |now| watch.look(&domain, "icub", now);
+        let (t, tick) = (Nanos::from_millis(5000), Nanos(1));
+
+        let mut first = start();
+        assert_eq!(look(t), Presence::Running);
+        first.send(&GatewayHealth::new(t), t).unwrap();
+        assert_eq!(look(t + SILENCE), Presence::Running);
+        drop(first);
+        assert_eq!(look(t + SILENCE), Presence::Ended);
+
+        let later = t + SILENCE + SILENCE;
+        let _second = start();
+        assert_eq!(look(later), Presence::Running);
+        assert_eq!(look(later + SILENCE), Presence::Running);
+        assert!(matches!(
+            look(later + SILENCE + tick),
+            Presence::Stuck { .. }
+        ));
+    }
+}

@@ -416,6 +416,17 @@ mod tests {
         assert_eq!((tally.epochs, tally.lost), (100, 0));
     }
 
+    /// A bus that goes on is not forgotten for those that come and go.
+    #[test]
+    fn restarts_of_others_are_no_loss_of_one_that_goes_on() {
+        let mut tally = Tally::new(vec![]);
+        for restart in 0..100 {
+            tally.count(u128::from(1000 + restart), &header(1000 + restart, 0));
+            tally.count(1, &header(1, restart));
+        }
+        assert_eq!(tally.lost, 0);
+    }
+
     #[test]
     fn freshness_is_a_comparison_of_ages() {
         let max_age = Nanos(10);
