@@ -96,11 +96,12 @@ mod tests {
             assert_eq!(crowded(claims(5)), Some(id));
             assert_eq!(Dispatch::new(claims(4)).find(id).len(), 4);
         }
-        // Two claims of one device are one listener.
-        let twice = [
-            Claim::shared(Id::extended(7)),
-            Claim::shared(Id::extended(7)),
-        ];
-        assert_eq!(crowded(std::iter::repeat_n(&twice[..], 4)), None);
+        // Two claims of one device are one listener, which gets each frame once.
+        for id in [Id::standard(7), Id::extended(7)] {
+            let twice = [Claim::shared(id), Claim::shared(id)];
+            let claims = || std::iter::repeat_n(&twice[..], 4);
+            assert_eq!(crowded(claims()), None);
+            assert_eq!(Dispatch::new(claims()).find(id)[..], [0, 1, 2, 3]);
+        }
     }
 }

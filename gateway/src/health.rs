@@ -516,6 +516,34 @@ mod tests {
         assert!(lines[0].contains("the program that starts it"), "{lines:?}");
     }
 
+    /// As a silent one: whoever looks at the end of a log must find it.
+    #[test]
+    fn a_refused_board_is_told_with_the_reason_then_rarely() {
+        let mut log = HealthLog::default();
+        let mut health = health(BusHealth::EMPTY);
+        health.device_count = 1;
+        health.devices[0].state = DeviceState::Refused.in_memory();
+        health.devices[0].refusal = Refusal::Changed.code();
+        let lines = logged(|| {
+            for _ in 0..10 * 600 {
+                log.log_changes(&health, &[]);
+            }
+        });
+        assert_eq!(
+            lines.len(),
+            5,
+            "at once, after 1, 2, 4 and 8 minutes: {lines:?}"
+        );
+        assert!(
+            lines[0].starts_with("ERROR refused: it reports"),
+            "{lines:?}"
+        );
+        for (line, seconds) in lines.iter().skip(1).zip([60, 120, 240, 480]) {
+            let told = format!("WARN still refused for {seconds} s: it reports");
+            assert!(line.starts_with(&told), "{line}, not {told}");
+        }
+    }
+
     #[test]
     fn the_first_error_frame_of_a_run_is_told_in_words() {
         let status = status();

@@ -192,3 +192,82 @@ pub fn open_link(
         Source::Replay { log, pace } => Box::new(Replay::open(log, *pace, None, claims)?),
     })
 }
+
+#[cfg(test)]
+impl BusThread {
+    /// A bus that makes no turn, and its end of the inbox.
+    pub(crate) fn still(bus: &BusPlan) -> (Self, crate::inbox::Inbox) {
+        let (requests, inbox) = inbox(bus.devices.len());
+        let this = Self {
+            name: bus.name.clone(),
+            status: Arc::new(BusStatus::new(0, bus)),
+            ended: Arc::default(),
+            requests,
+            mode: matches!(bus.source, Source::Replay { .. }).then_some(Mode::Listen),
+            thread: Finished(None),
+        };
+        (this, inbox)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::clock::Clock;
+    use proprio_topics::ipc::{DomainConfig, Reader};
+    use std::fmt::Write as _;
+    use std::path::Path;
+
+    #[test]
+    fn a_log_that_has_ended_is_not_stuck() {
+        let text = "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\n\
+                    source = { kind = \"virtual\", name = \"b\" }\n";
+        let plan = Plan::parse(text, Path::new(".")).unwrap();
+        let (thread, _inbox) = BusThread::still(&plan.buses[0]);
+        let turn = Nanos::from_millis(1000);
+        thread.status.last_turn.store(turn.0, Relaxed);
+        assert!(!thread.is_stuck(turn + STUCK));
+        assert!(thread.is_stuck(turn + STUCK + Nanos(1)));
+        thread.ended.store(true, Release);
+        assert!(!thread.is_stuck(turn + STUCK + Nanos(1)));
+    }
+
+    /// The buses of one log begin at the instant that is common to all, not when each is opened.
+    #[test]
+    fn the_buses_of_one_log_are_in_step() {
+        let folder = tempfile::tempdir().unwrap();
+        let log = "(7.0) a 140#0000000000000000\n(7.0) b 140#0000000000000000\n";
+        std::fs::write(folder.path().join("both.log"), log).unwrap();
+        let mut text = "schema = 1\nrobot = \"r\"\n".to_owned();
+        for bus in ["a", "b"] {
+            write!(
+                text,
+                "[[bus]]\nname = \"{bus}\"\nsource = {{ kind = \"replay\", log = \"both.log\" }}\n\
+                 [[bus.device]]\ndriver = \"icub_motor\"\nname = \"{bus}_board\"\naddress = 4\n\
+                 [[bus.device.joint]]\nname = \"{bus}_joint\"\n"
+            )
+            .unwrap();
+        }
+        let plan = Plan::parse(&text, folder.path()).unwrap();
+        let domain = Domain::open(&DomainConfig::new(folder.path(), "test")).unwrap();
+        let stop = Arc::new(AtomicBool::new(false));
+        let start = Monotonic.now() + Nanos::from_millis(300);
+        let mut threads = Vec::new();
+        for (bus, number) in plan.buses.iter().zip(0..) {
+            let thread = BusThread::start(&plan, bus, number, &domain, 1, &stop, start);
+            threads.push(thread.unwrap());
+        }
+        let mut reader = Reader::<Sample>::open(&domain, "r").unwrap();
+        let mut begun = Vec::new();
+        let end = start + Nanos::from_millis(20_000);
+        while begun.len() < 2 {
+            assert!(Monotonic.now() < end, "{begun:?}");
+            match reader.try_take().unwrap() {
+                Some(sample) => begun.push(sample.header.acquired),
+                None => std::thread::sleep(Duration::from_millis(1)),
+            }
+        }
+        assert_eq!(begun, [start; 2]);
+        assert_eq!(join(&mut threads, &stop), None);
+    }
+}

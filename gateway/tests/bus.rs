@@ -280,6 +280,19 @@ fn what_is_not_sent_by_its_deadline_is_dropped() {
     assert_eq!(rig.unsent(), (2, 2));
 }
 
+/// After a stall a device catches up with the frames that have waited. What it wants to send
+/// meanwhile has as much time as it would have had then.
+#[test]
+fn what_a_device_sends_while_it_catches_up_is_not_late() {
+    let mut rig = Rig::new(1);
+    let waited = Frame::new(Id::standard(0x7FF), &[]).at(rig.now, StampKind::Software);
+    rig.pass(Nanos::from_millis(500));
+    rig.script().receives.push_back(Received::Frame(waited));
+    rig.turns(START);
+    assert_eq!(rig.sent(), start_commands(1));
+    assert_eq!(rig.unsent(), (0, 0));
+}
+
 #[test]
 fn what_waits_is_dropped_when_the_link_is_lost() {
     let wanted = start_commands(2);

@@ -622,6 +622,21 @@ fn a_log_at_its_pace_is_moved_to_now() {
     }
 }
 
+/// It has the stamp of the line before it, as it was recorded after that one.
+#[test]
+fn a_line_without_a_stamp_comes_with_the_one_before_it() {
+    let bus = Log::new(Pace::Recorded);
+    let path = bus.write(b"(1.00) can0 001#\n(1.02) can0 002#\ncan0 003#\n(1.03) can0 004#\n");
+    let mut link = Replay::open(&path, Pace::Recorded, None, &[]).unwrap();
+    let start = now() - Nanos::from_millis(100);
+    link.start_at(start);
+    let times = exactly(&mut link, 4)
+        .into_iter()
+        .map(|frame| frame.t - start);
+    let wanted = [0, 20, 20, 30].map(Nanos::from_millis);
+    assert_eq!(times.collect::<Vec<_>>(), wanted);
+}
+
 #[test]
 fn a_log_at_once_keeps_its_stamps_and_its_lack_of_them() {
     let bus = Log::new(Pace::Fast);

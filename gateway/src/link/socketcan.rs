@@ -480,6 +480,19 @@ mod tests {
         assert_eq!(bytes[4..16], [3, 0, 0, 0, 1, 2, 3, 0, 0, 0, 0, 0]);
     }
 
+    /// The kernel marks its own messages with a flag; their identifiers are class bits.
+    #[test]
+    fn an_error_frame_is_not_taken_for_data() {
+        let mut bytes = [0; CLASSIC];
+        let classes = libc::CAN_ERR_BUSOFF | libc::CAN_ERR_CNT;
+        bytes[..4].copy_from_slice(&(libc::CAN_ERR_FLAG | classes).to_ne_bytes());
+        bytes[4..].copy_from_slice(&[8, 0, 0, 0, 0, 0, 0, 0, 0, 0, 248, 7]);
+        let frame = decode(&bytes).unwrap();
+        assert_eq!(frame.format, Format::Error);
+        let data = [0, 0, 0, 0, 0, 0, 248, 7];
+        assert_eq!(ErrorFrame::of(&frame), Some(ErrorFrame { classes, data }));
+    }
+
     /// What the flags of an interface mean, without and with an error frame that told of bus-off.
     #[test]
     fn the_state_follows_the_flags() {
