@@ -343,3 +343,99 @@ impl Operator {
         json!({ "ok": true, "robot": self.plan.robot, "devices": devices })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::inbox::Inbox;
+    use proprio_drivers::Decoded;
+
+    const FILE: &str = r#"
+schema = 1
+robot = "r"
+[[bus]]
+name = "b"
+source = { kind = "virtual", name = "b" }
+[[bus.device]]
+driver = "icub_strain"
+name = "ft"
+address = 1
+full_scale_n = [1804.0, 1804.0, 1804.0]
+full_scale_nm = [31.0, 31.0, 31.0]
+"#;
+
+    /// An operator of a gateway whose bus makes no turn.
+    struct Rig {
+        _folder: tempfile::TempDir,
+        config: PathBuf,
+        operator: Operator,
+        threads: [BusThread; 1],
+        inbox: Inbox,
+        health: Box<GatewayHealth>,
+    }
+
+    impl Rig {
+        fn new(text: &str) -> Self {
+            let folder = tempfile::tempdir().unwrap();
+            let config = folder.path().join("gateway.toml");
+            std::fs::write(&config, text).unwrap();
+            let plan = Plan::load_live(&config).unwrap();
+            let (thread, inbox) = BusThread::still(&plan.buses[0]);
+            Self {
+                operator: Operator::new(&config, plan),
+                threads: [thread],
+                inbox,
+                health: Box::new(GatewayHealth::new(Nanos::ZERO)),
+                config,
+                _folder: folder,
+            }
+        }
+
+        fn begin(&mut self, order: Order, now: Nanos) -> oneshot::Receiver<Json> {
+            let (answer, answered) = oneshot::channel();
+            let (asked, health) = (Asked { order, answer }, &self.health);
+            self.operator.begin(asked, &mut self.threads, health, now);
+            answered
+        }
+    }
+
+    #[test]
+    fn who_asks_a_bus_that_is_stuck_is_told_so() {
+        let mut rig = Rig::new(FILE);
+        let now = Nanos::from_millis(1000);
+        let tare = || Order::Tare {
+            device: "ft".to_owned(),
+        };
+        let mut answered = rig.begin(tare(), now);
+        rig.operator.look(&mut rig.threads, now + REPLY_TIME);
+        assert!(answered.try_recv().is_err() && rig.operator.waits());
+        let late = now + REPLY_TIME + Nanos(1);
+        rig.operator.look(&mut rig.threads, late);
+        let error = answered.try_recv().unwrap()["error"].to_string();
+        assert!(error.contains("no reply of ft"), "{error}");
+        assert!(!rig.operator.waits());
+        // It has not forgotten that the bus may still take the first one.
+        let error = rig.begin(tare(), late).try_recv().unwrap()["error"].to_string();
+        assert!(error.contains("still open"), "{error}");
+    }
+
+    /// A log does not answer: what takes over there only listens, as what it replaces.
+    #[test]
+    fn a_reload_beside_a_log_asks_it_nothing() {
+        let live = "{ kind = \"virtual\", name = \"b\" }";
+        let replay = "{ kind = \"replay\", log = \"b.log\" }";
+        for (source, asks) in [(live, true), (replay, false)] {
+            let file = FILE.replace(live, source);
+            let mut rig = Rig::new(&file);
+            let changed = file.replace("address = 1", "address = 1\nperiod_ms = 2");
+            std::fs::write(&rig.config, changed).unwrap();
+            let _answered = rig.begin(Order::Reload, Nanos::ZERO);
+            let Some((0, Request::Replace(new))) = rig.inbox.take() else {
+                panic!("nothing is replaced")
+            };
+            let mut device = new.device.expect("a device");
+            let first = device.poll_transmit(Nanos::ZERO, &mut Decoded::new());
+            assert_eq!(first.is_some(), asks, "{source}");
+        }
+    }
+}

@@ -267,6 +267,10 @@ ratio = 100.0
                 &["bus \"a\", device \"imu\": address"],
             ),
             (
+                FILE.replace("address = 2", "address = 2\nlegacy = \"mtb\""),
+                &["bus \"a\", device \"imu\": keys that change its identifiers"],
+            ),
+            (
                 FILE.replace("\"elbow\"", "\"knee\""),
                 &["bus \"b\", device \"elbow_motor\": joints or outputs"],
             ),
