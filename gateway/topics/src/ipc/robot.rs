@@ -258,12 +258,22 @@ impl RobotReader {
                         .filter(|wanted| wanted.publisher == publisher)
                         .for_each(|wanted| wanted.resolve(&description));
                     if let Some(place) = descriptions.get_mut(publisher as usize) {
-                        // A gateway that has started again may give the numbers to other channels.
-                        let epoch = place.as_ref().map(|known| known.header.epoch);
-                        if publisher == Publisher::Gateway
-                            && epoch != Some(description.header.epoch)
-                        {
-                            samples.fill(None);
+                        // Numbers that mean other channels now have no value yet. (A gateway that
+                        // has reloaded describes the same ones again.)
+                        let name = |of: &Description, number| {
+                            let entry = of.find(Role::Channel, number);
+                            entry.map(|entry| (entry.name, entry.kind))
+                        };
+                        let is_same = |number: u32| {
+                            place.as_ref().is_some_and(|known| {
+                                known.header.epoch == description.header.epoch
+                                    && name(known, number) == name(&description, number)
+                            })
+                        };
+                        if publisher == Publisher::Gateway {
+                            (samples.iter_mut().zip(0..))
+                                .filter(|(_, number)| !is_same(*number))
+                                .for_each(|(sample, _)| *sample = None);
                         }
                         *place = Some(description);
                     }
