@@ -49,8 +49,8 @@ impl<const D: usize> Predictor<D> {
         }
     }
 
-    /// The values at `t`, after the last sample. None if too few samples are at hand, or the last one
-    /// is too old.
+    /// The values at `t`, after the last sample. None if too few samples are at hand, or the last
+    /// one is too old.
     pub(super) fn at(&self, t: Nanos, grid: &mut Grid) -> Option<Extrapolated<D>> {
         let estimate = self.window.at_sharing(t, t, grid).ok()?;
         let scaled = |x: [f64; D]| std::array::from_fn(|i| x[i] * self.noise[i]);
