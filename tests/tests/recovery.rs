@@ -24,6 +24,20 @@ fn setting(name: &str, default: u64) -> u64 {
     })
 }
 
+/// The number of the domain's segments as soon as it stays the same for half a second: until then
+/// processes still open each other's services.
+fn settled_segments(rig: &Rig) -> usize {
+    let (mut count, mut since) = (0, now());
+    until(PATIENCE, || {
+        let before = std::mem::replace(&mut count, rig.segments().len());
+        if before != count {
+            since = now();
+        }
+        (now() - since > Nanos::from_millis(500)).then_some(count)
+    })
+    .expect("the number of segments settles")
+}
+
 fn sleep(random: &mut fastrand::Rng, most: Duration) {
     std::thread::sleep(most.mul_f64(random.f64()));
 }
@@ -56,9 +70,7 @@ fn the_chain_recovers_from_kills_at_any_instant() {
         valid_since(&mut torques, Nanos::ZERO, PATIENCE).is_some(),
         "the chain does not start"
     );
-    // All services of both exist by then.
-    health.fresh();
-    let segments = rig.segments().len();
+    let segments = settled_segments(&rig);
 
     let mut random = fastrand::Rng::with_seed(7);
     let mut times: Vec<(Nanos, usize, bool)> = Vec::new();
