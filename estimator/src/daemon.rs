@@ -195,6 +195,7 @@ struct DataPlane {
     descriptions: Option<Reader<Description>>,
     declarations: Reader<ContactDeclaration>,
     unknown_contact_reported: bool,
+    refusal_reported: bool,
     /// Consecutive health periods in which a sensor lacked the temperature that its calibration
     /// needs.
     without_temperature: u32,
@@ -265,6 +266,7 @@ impl DataPlane {
                 reader
             },
             unknown_contact_reported: false,
+            refusal_reported: false,
             without_temperature: 0,
             map: Vec::with_capacity(proprio_topics::MAX_CHANNELS),
             map_epoch: 0,
@@ -346,9 +348,19 @@ impl DataPlane {
         // would be late. So sort by stamp first.
         self.inbox.clear();
         while self.inbox.len() < INBOX
-            && let Some(Ok(Some(sample))) = self.samples.as_mut().map(Reader::try_take)
+            && let Some(taken) = self.samples.as_mut().map(Reader::try_take)
         {
-            self.inbox.push(sample);
+            match taken {
+                Ok(Some(sample)) => self.inbox.push(sample),
+                Ok(None) => break,
+                Err(error) => {
+                    // The reader tries again; once is enough in the log.
+                    if !std::mem::replace(&mut self.refusal_reported, true) {
+                        tracing::warn!("no samples of a bus of the gateway: {error}; trying again");
+                    }
+                    break;
+                }
+            }
         }
         self.inbox
             .sort_unstable_by_key(|s| (s.header.acquired, s.header.bus, s.header.sequence));

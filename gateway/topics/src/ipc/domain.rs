@@ -299,6 +299,17 @@ impl<S: Service> Domain<S> {
         }
     }
 
+    /// Runs `change` under the domain's lock, after a sweep; `None` if another process holds it, or
+    /// if the domain's directory has gone. Never waits.
+    pub(super) fn try_locked<R>(&self, change: impl FnOnce() -> R) -> Option<R> {
+        let _lock = Lock::try_take(&self.inner.place.lock).ok()?;
+        if !self.is_there() {
+            return None;
+        }
+        sweep::sweep(&self.inner.place, &self.inner.iceoryx).ok()?;
+        Some(change())
+    }
+
     /// Drops a port under the domain's lock, so that no process sees it half removed.
     pub(super) fn drop_locked<P>(&self, port: P) {
         // If a stopped process holds the lock, drop without it: a program must be able to end.

@@ -25,6 +25,15 @@ pub(super) struct Lock {
 impl Lock {
     /// Takes the lock at `path`; creates the file if it does not exist.
     pub(super) fn take(path: &Path) -> Result<Self, DomainError> {
+        Self::take_within(path, STEPS)
+    }
+
+    /// As [`Lock::take`], without waiting.
+    pub(super) fn try_take(path: &Path) -> Result<Self, DomainError> {
+        Self::take_within(path, 0)
+    }
+
+    fn take_within(path: &Path, mut steps: u32) -> Result<Self, DomainError> {
         let io = |doing| {
             move |cause| DomainError::Io {
                 doing,
@@ -32,7 +41,6 @@ impl Lock {
                 cause,
             }
         };
-        let mut steps = STEPS;
         loop {
             let mut file = OpenOptions::new()
                 .read(true)

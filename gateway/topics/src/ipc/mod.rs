@@ -29,6 +29,7 @@ mod bell;
 mod clock;
 mod domain;
 mod error;
+mod failures;
 mod lock;
 mod presence;
 mod reader;

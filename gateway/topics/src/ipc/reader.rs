@@ -3,6 +3,7 @@
 use super::bell::{Bell, Rings};
 use super::domain::service_name;
 use super::error::transport;
+use super::failures::Failures;
 use super::writer::explain;
 use super::{Domain, PortError, TakeError, Topic};
 use crate::{Header, Nanos};
@@ -60,6 +61,7 @@ pub struct Reader<T: Topic, S: Service = ipc::Service> {
     ports: Option<Ports<T, S>>,
     domain: Domain<S>,
     bell: Bell,
+    failures: Failures,
     /// The rings heard when nothing was waiting.
     heard: Rings,
     /// The changes of the writers before it was opened.
@@ -116,6 +118,7 @@ impl<T: Topic, S: Service> Reader<T, S> {
                 service: name.to_string(),
             });
         }
+        let failures = Failures::default();
         let (subscriber, service, predecessors, (bell, changes)) = domain.locked(|node| {
             let bell = domain.bell(&name)?;
             let changes = bell.changes();
@@ -129,22 +132,14 @@ impl<T: Topic, S: Service> Reader<T, S> {
                 predecessors.push(p.publisher_id.value());
                 CallbackProgression::Continue
             });
-            let subscriber = service.subscriber_builder().create().map_err(|e| match e {
-                SubscriberCreateError::ExceedsMaxSupportedSubscribers => PortError::Full {
-                    service: name.to_string(),
-                    what: "reader",
-                },
-                e => PortError::Transport {
-                    service: name.to_string(),
-                    problem: transport(e),
-                },
-            })?;
+            let subscriber = subscribe(&service, &failures)?;
             Ok((subscriber, service, predecessors, (bell, changes)))
         })?;
         Ok(Self {
             ports: Some((subscriber, service)),
             domain: domain.clone(),
             bell,
+            failures,
             heard: Rings::default(),
             changes,
             tally: Tally::new(predecessors),
@@ -157,8 +152,12 @@ impl<T: Topic, S: Service> Reader<T, S> {
     /// never allocates. A payload whose numbers have no meaning ([`Topic::is_valid`]) is skipped
     /// and counted.
     ///
+    /// Connects to new writers, with file operations. If a connection fails, as without free file
+    /// descriptors, the port is opened again every 0.1 s, when no payload is waiting, until all
+    /// connections are made.
+    ///
     /// # Errors
-    /// [`TakeError`]; the reader stays usable.
+    /// [`TakeError`], once for each attempt; the reader stays usable.
     pub fn try_take(&mut self) -> Result<Option<T>, TakeError> {
         let Some((subscriber, _)) = &self.ports else {
             return Err(TakeError::Internal);
@@ -172,6 +171,9 @@ impl<T: Topic, S: Service> Reader<T, S> {
             })?;
             let Some(sample) = sample else {
                 self.heard = rings;
+                if self.failures.is_due() {
+                    self.reopen()?;
+                }
                 return Ok(None);
             };
             let value = *sample.payload();
@@ -186,6 +188,31 @@ impl<T: Topic, S: Service> Reader<T, S> {
             return Ok(Some(value));
         }
         Ok(None)
+    }
+
+    /// Replaces the port by a new one, which connects to all writers. What they have sent meanwhile
+    /// counts as lost.
+    #[cold]
+    fn reopen(&mut self) -> Result<(), TakeError> {
+        let Some((port, service)) = &mut self.ports else {
+            return Err(TakeError::Internal);
+        };
+        let failures = &self.failures;
+        failures.forget();
+        let reopened = self.domain.try_locked(|| {
+            let new = subscribe(service, failures)?;
+            drop(std::mem::replace(port, new));
+            Ok::<_, PortError>(())
+        });
+        if !matches!(reopened, Some(Ok(()))) {
+            failures.note();
+        }
+        // Its payloads wait in the new port.
+        self.heard = Rings::default();
+        match failures.any() {
+            false => Ok(()),
+            true => Err(TakeError::Connection),
+        }
     }
 
     /// Waits until a payload may be waiting, at most until CLOCK_MONOTONIC shows `deadline` \[ns\];
@@ -249,7 +276,7 @@ impl<T: Topic, S: Service> Reader<T, S> {
     /// Whether its writers are those that it is connected to. If not, [`Reader::try_take`] will
     /// connect to them, with file operations.
     pub(super) fn is_connected(&self) -> bool {
-        self.bell.changes() == self.changes
+        self.bell.changes() == self.changes && !self.failures.any()
     }
 
     /// A live writer: the number of its node, which no other start of a process has, and its
@@ -295,6 +322,25 @@ impl<T: Topic, S: Service> Drop for Reader<T, S> {
         let ports = self.ports.take();
         self.domain.drop_locked(ports);
     }
+}
+
+/// A new port of `service`.
+fn subscribe<T: Topic, S: Service>(
+    service: &PortFactory<S, T, ()>,
+    failures: &Failures,
+) -> Result<Subscriber<S, T, ()>, PortError> {
+    let builder = service.subscriber_builder();
+    let created = builder.set_degradation_handler(failures.handler()).create();
+    created.map_err(|e| match e {
+        SubscriberCreateError::ExceedsMaxSupportedSubscribers => PortError::Full {
+            service: service.name().to_string(),
+            what: "reader",
+        },
+        e => PortError::Transport {
+            service: service.name().to_string(),
+            problem: transport(e),
+        },
+    })
 }
 
 /// The last writers seen with their next sequence numbers. Their number is fixed, so that counting

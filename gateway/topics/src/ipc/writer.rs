@@ -3,6 +3,7 @@
 use super::bell::Bell;
 use super::domain::service_name;
 use super::error::transport;
+use super::failures::Failures;
 use super::{Domain, PortError, SendError, Topic};
 use crate::{Header, Nanos};
 use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
@@ -44,6 +45,7 @@ pub struct Writer<T: Topic> {
     ports: Option<Ports<T>>,
     domain: Domain,
     bell: Bell,
+    failures: Failures,
     epoch: u64,
     sequence: u64,
     readers: usize,
@@ -63,6 +65,7 @@ impl<T: Topic> Writer<T> {
     pub fn create(domain: &Domain, robot: &str, epoch: u64) -> Result<Self, PortError> {
         let name = service_name(robot, T::SUFFIX)?;
         let quality = T::QUALITY;
+        let failures = Failures::default();
         let (publisher, service, bell) = domain.locked(|node| {
             let service = node
                 .service_builder(&name)
@@ -90,6 +93,7 @@ impl<T: Topic> Writer<T> {
                 .publisher_builder()
                 .max_loaned_samples(1)
                 .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .set_degradation_handler(failures.handler())
                 .create()
                 .map_err(|e| match e {
                     PublisherCreateError::ExceedsMaxSupportedPublishers => {
@@ -116,6 +120,7 @@ impl<T: Topic> Writer<T> {
             ports: Some((publisher, service)),
             domain: domain.clone(),
             bell,
+            failures,
             epoch,
             sequence: 0,
             readers,
@@ -127,7 +132,8 @@ impl<T: Topic> Writer<T> {
     ///
     /// A reader that is too slow loses its oldest payloads. Allocates once, 48 bytes in iceoryx2.
     /// Makes no system call unless a reader has opened or closed, or waits
-    /// ([`Reader::wait`](super::Reader::wait)).
+    /// ([`Reader::wait`](super::Reader::wait)). If a reader cannot be connected, as without free
+    /// file descriptors, tries again every 0.1 s.
     ///
     /// # Errors
     /// [`SendError`]; the sequence number is used up, so that readers count the loss.
@@ -158,6 +164,7 @@ impl<T: Topic> Writer<T> {
     /// [`SendError::Connection`] if one could not be made.
     pub fn update_connections(&mut self) -> Result<usize, SendError> {
         let connected = self.newcomers();
+        self.retry();
         let Some((publisher, _)) = &self.ports else {
             return Err(SendError::Internal);
         };
@@ -166,7 +173,10 @@ impl<T: Topic> Writer<T> {
             .map_err(|_| SendError::Connection)?;
         // A new reader has the history now.
         self.bell.ring();
-        Ok(connected)
+        match self.failures.any() {
+            false => Ok(connected),
+            true => Err(SendError::Connection),
+        }
     }
 
     /// The sequence number of the next payload.
@@ -185,6 +195,7 @@ impl<T: Topic> Writer<T> {
 
     fn put(&mut self, value: &T, fill: impl FnOnce(&mut Header)) -> Result<Sent, SendError> {
         let connected = self.newcomers();
+        self.retry();
         let Some((publisher, _)) = &self.ports else {
             return Err(SendError::Internal);
         };
@@ -197,11 +208,32 @@ impl<T: Topic> Writer<T> {
         let sequence = header.sequence;
         let readers = sample.send().map_err(send_error)?;
         self.bell.ring();
+        if self.failures.any() {
+            return Err(SendError::Connection);
+        }
         Ok(Sent {
             sequence,
             readers,
             connected,
         })
+    }
+
+    /// Lets iceoryx2 connect to the readers again after a failure: it does so whenever a reader
+    /// comes or goes.
+    fn retry(&mut self) {
+        if !self.failures.is_due() {
+            return;
+        }
+        let Some((_, service)) = &self.ports else {
+            return;
+        };
+        self.failures.forget();
+        let came_and_went = self
+            .domain
+            .try_locked(|| service.subscriber_builder().create().is_ok());
+        if came_and_went != Some(true) {
+            self.failures.note();
+        }
     }
 
     /// Increase of the number of readers since the last call. A reader that opens while another
