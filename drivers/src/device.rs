@@ -497,6 +497,9 @@ pub trait Board: Send {
 pub trait Driver {
     /// Its name in gateway.toml: that of its file.
     const NAME: &'static str;
+    /// The address of a device whose table has none: the one that its maker delivers it with. None
+    /// if each device needs an address of its own.
+    const ADDRESS: Option<u32> = None;
 
     /// The outputs of a device with these keys, in the order of its channels. None: it takes part
     /// in the bus and measures nothing.

@@ -25,9 +25,9 @@
 //! otherwise.
 
 use crate::bringup::Timing;
-use crate::{Claim, Decoded, Format, Frame, Frames, Id, Spec, SpecError};
+use crate::{Claim, Format, Frame, Frames, Id, Spec, SpecError};
 use arrayvec::ArrayVec;
-use proprio_topics::{Counter, Nanos};
+use proprio_topics::Nanos;
 
 /// The classes of messages: bits 10:8 of the identifier.
 pub mod class {
@@ -188,58 +188,12 @@ pub(crate) fn period_ms(key: &'static str, ms: u32) -> Result<u8, SpecError> {
     }
 }
 
-/// Little-endian 16 bits at `at`; 0 beyond the end (callers have checked the length).
-pub(crate) fn u16_le(data: &[u8], at: usize) -> u16 {
-    match data.get(at..at + 2) {
-        Some(&[low, high]) => u16::from_le_bytes([low, high]),
-        _ => 0,
-    }
-}
-
-/// As [`u16_le`], in two's complement.
-pub(crate) fn i16_le(data: &[u8], at: usize) -> i16 {
-    u16_le(data, at).cast_signed()
-}
-
-/// Little-endian 32 bits at `at`; 0 beyond the end.
-pub(crate) fn u32_le(data: &[u8], at: usize) -> u32 {
-    u32::from(u16_le(data, at)) | u32::from(u16_le(data, at + 2)) << 16
-}
-
-/// `value` in units of `lsb`, rounded to the nearest integer and limited to `least..=most`. `value`
-/// must be finite.
-#[allow(clippy::cast_possible_truncation)]
-pub(crate) fn quantise(value: f64, lsb: f64, least: i64, most: i64) -> i64 {
-    let scaled = value / lsb;
-    // The cast truncates towards zero and saturates: adding half a unit away from zero rounds.
-    let nearest = (scaled + if scaled < 0.0 { -0.5 } else { 0.5 }) as i64;
-    nearest.clamp(least, most)
-}
-
-/// As [`quantise`], to 16 bits in two's complement.
-#[allow(clippy::cast_possible_truncation)]
-pub(crate) fn quantise_i16(value: f64, lsb: f64) -> i16 {
-    quantise(value, lsb, i64::from(i16::MIN), i64::from(i16::MAX)) as i16
-}
-
 /// The type of a frame of streaming class `class` of board `address`, if it is one.
 pub(crate) const fn stream_type(id: Id, class: u16, address: u8) -> Option<u8> {
     match id {
         Id::Standard(raw) if raw >> 4 == class << 4 | address as u16 => Some((raw & 0xF) as u8),
         _ => None,
     }
-}
-
-/// The payload of a classic data frame. Other frames are counted, except error frames, which belong
-/// to no device.
-pub(crate) fn payload<'f>(frame: &'f Frame, out: &mut Decoded) -> Option<&'f [u8]> {
-    match frame.format {
-        Format::Classic => return Some(frame.data()),
-        Format::Fd { .. } => out.fault(Counter::Value, 1, frame.id),
-        Format::Remote => out.fault(Counter::Length, 1, frame.id),
-        Format::Error => {}
-    }
-    None
 }
 
 /// Claims on the streams `kinds` of a class.

@@ -61,6 +61,7 @@
 //! ```
 
 use crate::bringup::{Bringup, NoInquiry};
+use crate::bytes;
 use crate::icub::{self, class};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, NotSent, Output,
@@ -249,11 +250,11 @@ impl Motor {
             quality |= Quality::GAP_BEFORE;
         }
         self.seen = true;
-        let velocity = f64::from(icub::i16_le(data, 2)) * RAD_PER_S_PER_LSB;
+        let velocity = f64::from(bytes::i16_le(data, 2)) * RAD_PER_S_PER_LSB;
         let reading = Reading::Joint(JointState {
-            position: f64::from(icub::u32_le(data, 4).cast_signed()) * RAD_PER_LSB,
+            position: f64::from(bytes::u32_le(data, 4).cast_signed()) * RAD_PER_LSB,
             velocity: if self.velocity { velocity } else { f64::NAN },
-            current: f64::from(icub::i16_le(data, 0)) * AMPERE_PER_LSB,
+            current: f64::from(bytes::i16_le(data, 0)) * AMPERE_PER_LSB,
             ..JointState::ABSENT
         });
         out.push(Output::new(0, frame, quality, reading), frame.id);
@@ -262,10 +263,10 @@ impl Motor {
     fn status(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
         let &[mode, encoder, ..] = data else { return };
         let actuator = Actuator {
-            duty: f64::from(icub::i16_le(data, 2)) * DUTY_PER_LSB,
+            duty: f64::from(bytes::i16_le(data, 2)) * DUTY_PER_LSB,
             mode: u32::from(mode),
             encoder: u32::from(encoder),
-            faults: icub::u32_le(data, 4),
+            faults: bytes::u32_le(data, 4),
         };
         self.status = quality_of(&actuator);
         out.push(
@@ -293,7 +294,7 @@ impl Device for Motor {
         ) {
             return;
         }
-        let Some(data) = icub::payload(frame, out) else {
+        let Some(data) = bytes::payload(frame, out) else {
             return;
         };
         match (stream, data.len()) {
@@ -370,7 +371,7 @@ impl MotorBoard {
         let (mode, encoder) = (actuator.mode as u8, actuator.encoder as u8);
         #[allow(clippy::cast_possible_truncation)] // limited to 16 bits
         let [d0, d1] =
-            (icub::quantise(actuator.duty, DUTY_PER_LSB, -32000, 32000) as i16).to_le_bytes();
+            (bytes::quantise(actuator.duty, DUTY_PER_LSB, -32000, 32000) as i16).to_le_bytes();
         let [f0, f1, f2, f3] = actuator.faults.to_le_bytes();
         let id = icub::stream(class::PERIODIC_MOTOR, self.address, kind::STATUS);
         let _ = out.try_push(Frame::new(id, &[mode, encoder, d0, d1, f0, f1, f2, f3]));
@@ -436,9 +437,9 @@ impl Board for MotorBoard {
                 } else {
                     0.0
                 };
-                let [c0, c1] = icub::quantise_i16(current, AMPERE_PER_LSB).to_le_bytes();
-                let [v0, v1] = icub::quantise_i16(velocity, RAD_PER_S_PER_LSB).to_le_bytes();
-                let position = icub::quantise(
+                let [c0, c1] = bytes::quantise_i16(current, AMPERE_PER_LSB).to_le_bytes();
+                let [v0, v1] = bytes::quantise_i16(velocity, RAD_PER_S_PER_LSB).to_le_bytes();
+                let position = bytes::quantise(
                     joint.position,
                     RAD_PER_LSB,
                     i64::from(i32::MIN),

@@ -44,6 +44,7 @@
 //! ```
 
 use crate::bringup::Bringup;
+use crate::bytes;
 use crate::configure::{Configure, Setting};
 use crate::icub::{self, class, command};
 use crate::{
@@ -134,7 +135,7 @@ impl Sensor {
                 expected: "from -360 to 360",
             });
         }
-        let [low, high] = icub::quantise_i16(self.zero_deg, 0.1).to_le_bytes();
+        let [low, high] = bytes::quantise_i16(self.zero_deg, 0.1).to_le_bytes();
         Ok([
             0x80 | u8::from(self.inverted) << 6 | rotation << 4 | self.label,
             low,
@@ -282,7 +283,7 @@ impl Device for Pos {
         }
         if frame.id == icub::to_host(class::POLLING_ANALOG, self.address) {
             // Answers to other questions are for other devices.
-            if let Some(data) = icub::payload(frame, out)
+            if let Some(data) = bytes::payload(frame, out)
                 && data.first() == Some(&command::POS_CONFIG_GET)
             {
                 self.configure.answer(data, frame, out);
@@ -292,7 +293,7 @@ impl Device for Pos {
         if icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address) != Some(POS) {
             return;
         }
-        let Some(data) = icub::payload(frame, out) else {
+        let Some(data) = bytes::payload(frame, out) else {
             return;
         };
         let &[quantity, label_and_count, ref values @ ..] = data else {
@@ -326,7 +327,7 @@ impl Device for Pos {
             }
             self.gap &= !bit;
             self.seen |= bit;
-            let position = f64::from(icub::i16_le(value, 0)) * lsb;
+            let position = f64::from(bytes::i16_le(value, 0)) * lsb;
             let reading = Reading::Joint(JointState {
                 position,
                 ..JointState::ABSENT
@@ -450,7 +451,7 @@ impl Board for PosBoard {
             return Err(EncodeError::NotFinite);
         }
         let (code, lsb) = self.quantity.code_and_lsb();
-        let [low, high] = icub::quantise_i16(joint.position, lsb).to_le_bytes();
+        let [low, high] = bytes::quantise_i16(joint.position, lsb).to_le_bytes();
         let id = icub::stream(class::PERIODIC_ANALOG, self.address, POS);
         let _ = out.try_push(Frame::new(
             id,

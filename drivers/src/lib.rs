@@ -14,14 +14,16 @@
 //!
 //! To add a family, write a module with a `Device`, a `Board`, and an `Options` type (its keys in
 //! gateway.toml, documented at the top of the module) that implements [`Driver`], and add its line
-//! to the list in `registry.rs`. `bringup.rs`, `configure.rs` and `pairing.rs` hold what families
-//! share: starting a board, confirming its configuration, combining two frames.
+//! to the list in `registry.rs`. Families share `bringup.rs` (starting a board), `configure.rs`
+//! (confirming its configuration), `pairing.rs` (combining two frames) and `bytes.rs` (the numbers
+//! of a payload).
 #![no_std]
 extern crate alloc;
 #[cfg(test)]
 extern crate std;
 
 mod bringup;
+mod bytes;
 mod configure;
 pub mod device;
 pub mod frame;

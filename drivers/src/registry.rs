@@ -47,6 +47,14 @@ macro_rules! drivers {
                 Err(OptionsError::UnknownDriver)
             }
 
+            /// The address of a device whose table has none ([`Driver::ADDRESS`]).
+            #[must_use]
+            pub const fn default_address(&self) -> Option<u32> {
+                match self {
+                    $(Self::$variant(_) => <$module::Options as Driver>::ADDRESS,)+
+                }
+            }
+
             /// The outputs of its devices.
             #[must_use]
             pub fn outputs(&self) -> Vec<OutputInfo> {

@@ -89,7 +89,7 @@ pub struct RawDevice {
     /// Its name; for a sensor also the channel's name.
     pub name: String,
     /// Its address, as the driver defines it.
-    pub address: u32,
+    pub address: Option<u32>,
     /// Maximum silence \[ms\].
     #[serde(default = "default_max_silence_ms")]
     pub max_silence_ms: f64,

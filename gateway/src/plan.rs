@@ -374,8 +374,14 @@ impl Builder<'_> {
             .buses
             .last()
             .map_or((0, false), |b| (b.devices.len(), b.listen_only));
+        let address = raw.address.or(options.default_address()).ok_or_else(|| {
+            format!(
+                "{name:?} ({}): address is missing; the driver's page says what it is",
+                raw.driver
+            )
+        })?;
         let mut spec = Spec {
-            address: raw.address,
+            address,
             max_silence,
             mode: if raw.listen_only || quiet_bus {
                 Mode::Listen
@@ -821,7 +827,11 @@ mod tests {
                 "address = 15",
                 "address = 15 is outside 1 to 14",
             ),
-            ("address = 13", "", "missing field `address`"),
+            (
+                "address = 13",
+                "",
+                "\"ft\" (icub_strain): address is missing",
+            ),
             (
                 "offset_rad = 0.5",
                 "offset_rad = 90.0",

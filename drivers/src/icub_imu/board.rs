@@ -5,6 +5,7 @@ use super::frames::{
     sensor,
 };
 use super::options::{Options, Plan};
+use crate::bytes;
 use crate::icub::{self, class, command};
 use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
 use proprio_topics::{Nanos, Quality, Reading};
@@ -147,7 +148,7 @@ impl Board for ImuBoard {
         }
         let bytes = |values: [f64; 3], lsb: f64| {
             let [[a, b], [c, d], [e, f]] =
-                values.map(|value| icub::quantise_i16(value, lsb).to_le_bytes());
+                values.map(|value| bytes::quantise_i16(value, lsb).to_le_bytes());
             [a, b, c, d, e, f]
         };
         let [acceleration_lsb, rate_lsb] = self.plan.legacy.lsb();
@@ -181,7 +182,7 @@ impl Board for ImuBoard {
         }
         if sends(Quantity::Orientation) {
             let [w, x, y, z] = imu.orientation;
-            let [w0, w1] = icub::quantise_i16(w, QUATERNION_LSB).to_le_bytes();
+            let [w0, w1] = bytes::quantise_i16(w, QUATERNION_LSB).to_le_bytes();
             let [a, b, c, d, e, f] = bytes([x, y, z], QUATERNION_LSB);
             self.send(kind::QUATERNION, &[w0, w1, a, b, c, d, e, f], out);
         }

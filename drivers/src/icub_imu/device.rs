@@ -6,6 +6,7 @@ use super::frames::{
 };
 use super::options::{Options, Plan};
 use crate::bringup::Bringup;
+use crate::bytes;
 use crate::configure::{Configure, Setting};
 use crate::icub::{self, class, command};
 use crate::pairing::{self, Limit, Paired, Pairing};
@@ -255,7 +256,7 @@ impl ImuDevice {
             return;
         }
         let [x, y, z] = vector(data, 2);
-        let w = icub::i16_le(data, 0);
+        let w = bytes::i16_le(data, 0);
         self.acquisition.imu.orientation =
             [w, x, y, z].map(|count| f64::from(count) * QUATERNION_LSB);
         self.hold(bit, frame, out);
@@ -331,9 +332,9 @@ impl ImuDevice {
 /// Three signed 16-bit numbers at `at`.
 fn vector(data: &[u8], at: usize) -> [i16; 3] {
     [
-        icub::i16_le(data, at),
-        icub::i16_le(data, at + 2),
-        icub::i16_le(data, at + 4),
+        bytes::i16_le(data, at),
+        bytes::i16_le(data, at + 2),
+        bytes::i16_le(data, at + 4),
     ]
 }
 
@@ -355,7 +356,7 @@ impl Device for ImuDevice {
                 kind::TRIPLE | kind::QUATERNION | kind::STATUS if !is_legacy => 8,
                 _ => return,
             };
-            let Some(data) = icub::payload(frame, out) else {
+            let Some(data) = bytes::payload(frame, out) else {
                 return;
             };
             match stream {
@@ -367,7 +368,7 @@ impl Device for ImuDevice {
             }
         } else if !is_legacy
             && frame.id == icub::to_host(class::POLLING_ANALOG, self.plan.address)
-            && let Some(data) = icub::payload(frame, out)
+            && let Some(data) = bytes::payload(frame, out)
         {
             match data.first() {
                 Some(&command::IMU_CONFIG_GET) => {

@@ -4,6 +4,7 @@
 use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind, saturation_bytes};
 use super::options::{Options, Stream};
 use super::tare::MINUS_PRESENT;
+use crate::bytes;
 use crate::icub::{self, class, command};
 use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
 use proprio_topics::{Nanos, Quality, Reading, Saturation, Temperature};
@@ -92,7 +93,7 @@ impl Board for StrainBoard {
                 #[allow(clippy::cast_sign_loss, clippy::cast_possible_truncation)]
                 // limited to 16 bits
                 let [high, low] =
-                    (icub::quantise(full_scale, 1.0, 0, i64::from(u16::MAX)) as u16).to_be_bytes();
+                    (bytes::quantise(full_scale, 1.0, 0, i64::from(u16::MAX)) as u16).to_be_bytes();
                 let id = icub::to_host(class::POLLING_ANALOG, self.address);
                 let _ = out.try_push(Frame::new(
                     id,
@@ -164,7 +165,7 @@ impl Board for StrainBoard {
                         f64::INFINITY
                     };
                     let steps =
-                        icub::quantise(value, per_step, i64::from(i32::MIN), i64::from(i32::MAX))
+                        bytes::quantise(value, per_step, i64::from(i32::MIN), i64::from(i32::MAX))
                             + i64::from(ZERO);
                     *count = u16::try_from(steps).unwrap_or_else(|_| {
                         let high = steps > 0;
@@ -216,7 +217,7 @@ impl Board for StrainBoard {
                 if !celsius.is_finite() {
                     return Err(EncodeError::NotFinite);
                 }
-                let [low, high] = icub::quantise_i16(*celsius, CELSIUS_PER_LSB).to_le_bytes();
+                let [low, high] = bytes::quantise_i16(*celsius, CELSIUS_PER_LSB).to_le_bytes();
                 let id = icub::stream(class::PERIODIC_ANALOG, self.address, kind::THERMOMETER);
                 let _ = out.try_push(Frame::new(id, &[1, low, high, 0, 0]));
             }

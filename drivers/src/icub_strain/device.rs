@@ -5,6 +5,7 @@ use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind};
 use super::options::{Options, Stream};
 use super::tare::Tare;
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry};
+use crate::bytes;
 use crate::icub::{self, class, command};
 use crate::pairing::{Limit, Paired, Pairing};
 use crate::{
@@ -397,7 +398,7 @@ impl Device for Strain {
         }
         if let Some(stream) = icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address) {
             let known = matches!(stream, kind::RAW_FORCE..=kind::TORQUE | kind::THERMOMETER..);
-            let Some(data) = known.then(|| icub::payload(frame, out)).flatten() else {
+            let Some(data) = known.then(|| bytes::payload(frame, out)).flatten() else {
                 return;
             };
             match stream {
@@ -408,7 +409,7 @@ impl Device for Strain {
                 _ => temperature(data, frame, out),
             }
         } else if frame.id == icub::to_host(class::POLLING_ANALOG, self.address)
-            && let Some(data) = icub::payload(frame, out)
+            && let Some(data) = bytes::payload(frame, out)
         {
             match data.first() {
                 Some(&command::GET_FULL_SCALES) => {
@@ -507,7 +508,7 @@ impl Device for Strain {
 fn temperature(data: &[u8], frame: &Frame, out: &mut Decoded) {
     match *data {
         [mask, _, _, _, _] if mask & 1 == 1 => {
-            let celsius = f64::from(icub::i16_le(data, 1)) * CELSIUS_PER_LSB;
+            let celsius = f64::from(bytes::i16_le(data, 1)) * CELSIUS_PER_LSB;
             let reading = Reading::Temperature(Temperature { celsius });
             let output = Output::new(0, frame, Quality::GOOD, reading);
             out.push(output, frame.id);

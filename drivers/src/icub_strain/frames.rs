@@ -1,7 +1,7 @@
 //! The contents of an F/T board's frames: types of its streams, step sizes, and the half of a
 //! reading in one frame with its saturation byte.
 
-use crate::icub;
+use crate::bytes;
 use crate::{Frame, Id};
 use proprio_topics::{Counter, Quality, Saturation};
 
@@ -41,9 +41,9 @@ impl Half {
         };
         Ok(Self {
             counts: [
-                icub::u16_le(data, 0),
-                icub::u16_le(data, 2),
-                icub::u16_le(data, 4),
+                bytes::u16_le(data, 0),
+                bytes::u16_le(data, 2),
+                bytes::u16_le(data, 4),
             ],
             saturation,
         })

@@ -2,12 +2,12 @@
 //! number in a wrench.
 
 use crate::rig::{options, spec};
-use proprio_drivers::{Board, Decoded, Device, Format, Frame, Frames, Id, Mode, NotSent};
+use proprio_drivers::{Board, Claim, Decoded, Device, Format, Frame, Frames, Id, Mode, NotSent};
 use proprio_topics::{Nanos, Quality, Reading, StampKind};
 use proptest::prelude::*;
 
 /// Every family in all its configurations.
-const SETUPS: [(&str, &str, &[u8]); 10] = [
+const SETUPS: &[(&str, &str, &[u8])] = &[
     ("icub_strain", "", &[]),
     (
         "icub_strain",
@@ -41,6 +41,7 @@ const YEARS: i64 = 1 << 59;
 enum Event {
     Frame {
         id: u16,
+        pick: u32,
         any: Option<u32>,
         format: u8,
         data: Vec<u8>,
@@ -63,8 +64,9 @@ fn event() -> impl Strategy<Value = Event> {
         8 => proptest::collection::vec(any::<u8>(), 4..=8),
         1 => proptest::collection::vec(any::<u8>(), 0..=8),
     ];
-    // Streams and replies of address 1 in all classes, so that most frames concern the device. Also
-    // commands to address 1 and to all boards, to exercise the board too.
+    // For iCub boards: streams and replies of address 1 in all classes, and commands to address 1
+    // and to all boards, to exercise the board too. Half of the frames have an identifier that the
+    // device claims, or that of its last command, whatever the family.
     let id = prop_oneof![
         4 => (0_u16..8, 0_u16..16).prop_map(|(class, low)| class << 8 | 0x10 | low),
         1 => prop_oneof![Just(0x001), Just(0x201), Just(0x20F), Just(0x701), Just(0x70F)],
@@ -80,9 +82,12 @@ fn event() -> impl Strategy<Value = Event> {
     ]);
     let any_id = proptest::option::weighted(0.1, any::<u32>());
     prop_oneof![
-        40 => (id, any_id, 0_u8..20, data, command, proptest::bool::weighted(0.9))
-            .prop_map(|(id, any, format, data, command, stamped)| {
-                Event::Frame { id, any, format, data, command, stamped }
+        40 => (
+            (id, any::<u32>(), any_id),
+            0_u8..20, data, command, proptest::bool::weighted(0.9)
+        )
+            .prop_map(|((id, pick, any), format, data, command, stamped)| {
+                Event::Frame { id, pick, any, format, data, command, stamped }
             }),
         10 => prop_oneof![
             0_i64..1_000_000, 0_i64..100_000_000, -5_000_000_i64..2_000_000_000, -YEARS..YEARS
@@ -94,9 +99,10 @@ fn event() -> impl Strategy<Value = Event> {
     ]
 }
 
-fn to_frame(event: &Event, now: Nanos) -> Option<Frame> {
+fn to_frame(event: &Event, claims: &[Claim], command_id: Option<Id>, now: Nanos) -> Option<Frame> {
     let Event::Frame {
         id,
+        pick,
         any,
         format,
         data,
@@ -110,7 +116,17 @@ fn to_frame(event: &Event, now: Nanos) -> Option<Frame> {
     if let (Some(command), Some(first)) = (command, data.first_mut()) {
         *first = *command;
     }
-    let id = any.map_or(Id::standard(*id), Id::extended);
+    let of = |claim: &Claim| match claim.id {
+        Id::Standard(raw) => Id::standard(raw | (*pick & !claim.mask) as u16),
+        Id::Extended(raw) => Id::extended(raw | *pick & !claim.mask),
+    };
+    let claimed = claims.get(*pick as usize / 8 % claims.len().max(1)).map(of);
+    let id = match (any, pick % 8) {
+        (Some(any), _) => Id::extended(*any),
+        (None, 0) => command_id.unwrap_or(Id::standard(*id)),
+        (None, 1..=3) => claimed.unwrap_or(Id::standard(*id)),
+        (None, _) => Id::standard(*id),
+    };
     let format = match format {
         0 => Format::Fd {
             bit_rate_switch: true,
@@ -150,11 +166,12 @@ fn is_finite(reading: &Reading) -> bool {
 fn drive(device: &mut dyn Device, board: &mut dyn Board, events: &[Event], listens: bool) {
     let mut now = Nanos::from_millis(1000);
     let mut out = Decoded::new();
+    let mut command_id = None;
     for event in events {
         out.clear();
         match event {
             Event::Frame { .. } => {
-                let Some(frame) = to_frame(event, now) else {
+                let Some(frame) = to_frame(event, device.claims(), command_id, now) else {
                     continue;
                 };
                 device.on_frame(&frame, &mut out);
@@ -172,6 +189,7 @@ fn drive(device: &mut dyn Device, board: &mut dyn Board, events: &[Event], liste
                         break;
                     };
                     assert!(!listens, "a listener sends {transmit:?}");
+                    command_id = Some(transmit.frame.id);
                     let outcome = if *sent {
                         Ok(now)
                     } else {
@@ -209,7 +227,7 @@ proptest! {
         let (driver, keys, outputs) = SETUPS[setup];
         let mode = if listens { Mode::Listen } else { Mode::Supervise };
         let options = options(driver, keys);
-        let spec = spec(1, mode, outputs);
+        let spec = spec(options.default_address().unwrap_or(1), mode, outputs);
         let mut device = options.device(&spec).unwrap();
         let mut board = options.board(&spec).unwrap();
         drive(&mut *device, &mut *board, &events, listens || driver == "icub_motor");
@@ -226,7 +244,7 @@ fn claims_are_exclusive_within_a_kind_only() {
             .unwrap();
         device.claims().to_vec()
     };
-    let collide = |a: &[proprio_drivers::Claim], b: &[proprio_drivers::Claim]| {
+    let collide = |a: &[Claim], b: &[Claim]| {
         a.iter().any(|a| {
             b.iter()
                 .any(|b| a.exclusive && b.exclusive && a.overlaps(b))
