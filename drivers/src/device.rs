@@ -1,9 +1,11 @@
 //! The two sides of a device's protocol as sans-I/O state machines: [`Device`] on the host,
 //! [`Board`] on the device; and [`Driver`], which makes both from a device's keys.
 
+use crate::signal::Message;
 use crate::{Frame, Id};
 use alloc::borrow::Cow;
 use alloc::boxed::Box;
+use alloc::string::String;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
 use proprio_topics::{
@@ -369,6 +371,9 @@ pub enum SpecError {
         /// The highest.
         most: u8,
     },
+    /// What the keys say of a description ([`Driver::description`]) does not fit it.
+    #[error("{0}")]
+    Description(String),
     /// A joint device without a joint, or a sensor with joints.
     #[error("{0}")]
     Joints(&'static str),
@@ -500,6 +505,16 @@ pub trait Driver {
     /// The address of a device whose table has none: the one that its maker delivers it with. None
     /// if each device needs an address of its own.
     const ADDRESS: Option<u32> = None;
+
+    /// The .dbc file that the keys name, relative to the configuration.
+    fn description(&self) -> Option<&str> {
+        None
+    }
+
+    /// Takes the messages of that file, before anything else is asked of it.
+    fn describe(&mut self, messages: Vec<Message>) {
+        let _ = messages;
+    }
 
     /// The outputs of a device with these keys, in the order of its channels. None: it takes part
     /// in the bus and measures nothing.

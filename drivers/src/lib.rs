@@ -7,6 +7,7 @@
 //! | [`icub_imu`] | IMU of strain2, strain2c, mtb4, mtb4c, rfe; legacy frames of mtb | imu |
 //! | [`icub_motor`] | 2FOC and its successors amcbldc, amc2c, amcfoc | joint, actuator |
 //! | [`icub_pos`] | POS encoders: psc, mtb4fap | joint |
+//! | [`dbc`] | any device that a .dbc file describes | any |
 //!
 //! Each family has two sides. A [`Device`] is the host's side: it decodes the frames of its
 //! identifiers into readings and starts its board. A [`Board`] is the board's own side: it answers
@@ -25,6 +26,7 @@ extern crate std;
 mod bringup;
 mod bytes;
 mod configure;
+pub mod dbc;
 pub mod device;
 pub mod frame;
 pub mod icub;
@@ -34,6 +36,8 @@ pub mod icub_pos;
 pub mod icub_strain;
 mod pairing;
 mod registry;
+pub mod signal;
+mod unit;
 
 pub use device::{
     Board, COMMAND_TIME, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded,

@@ -1,7 +1,9 @@
 //! The drivers: one list from which their names, their keys and their devices follow.
 
+use crate::signal::Message;
 use crate::{
-    Board, Device, Driver, OutputInfo, Spec, SpecError, icub_imu, icub_motor, icub_pos, icub_strain,
+    Board, Device, Driver, OutputInfo, Spec, SpecError, dbc, icub_imu, icub_motor, icub_pos,
+    icub_strain,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -55,6 +57,21 @@ macro_rules! drivers {
                 }
             }
 
+            /// The file that describes the device ([`Driver::description`]).
+            #[must_use]
+            pub fn description(&self) -> Option<&str> {
+                match self {
+                    $(Self::$variant(options) => options.description(),)+
+                }
+            }
+
+            /// Takes the contents of that file.
+            pub fn describe(&mut self, messages: Vec<Message>) {
+                match self {
+                    $(Self::$variant(options) => options.describe(messages),)+
+                }
+            }
+
             /// The outputs of its devices.
             #[must_use]
             pub fn outputs(&self) -> Vec<OutputInfo> {
@@ -97,6 +114,8 @@ drivers! {
     IcubMotor: icub_motor,
     /// iCub POS encoders.
     IcubPos: icub_pos,
+    /// Devices that a .dbc file describes.
+    Dbc: dbc,
 }
 
 /// Checks that the joints of `spec` are outputs of the driver, and that one that measures joints

@@ -9,6 +9,7 @@
 //!
 //! - [`config`]: the raw contents of gateway.toml; [`plan`]: the checked and resolved form, which
 //!   everything else uses.
+//! - `dbc`: files that describe devices, as tables for the drivers.
 //! - [`link`]: one trait and three links to a bus; [`candump`]: the log format of replay, decode
 //!   and encode.
 //! - [`decoder`]: all devices of one bus, without input or output; [`bus`]: the loop that moves
@@ -25,6 +26,7 @@ pub mod clock;
 pub mod config;
 pub mod control;
 pub mod daemon;
+mod dbc;
 pub mod decoder;
 mod dispatch;
 mod health;

@@ -1,6 +1,7 @@
 //! The checked and resolved form of gateway.toml, which the rest of the gateway uses.
 
 use crate::config::{Pace, Raw, RawBus, RawDevice, RawJoint, Realtime, Source};
+use crate::dbc;
 use crate::dispatch::{SHARERS, crowded};
 use crate::link::replay::Matching;
 use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, OutputInfo, Outputs, Spec};
@@ -347,7 +348,7 @@ impl Builder<'_> {
             .map_err(|e: toml::de::Error| one_line(&e))?;
         let name = &raw.name;
         check_name("name", name)?;
-        let options = Options::deserialize(&raw.driver, table).map_err(|e| match e {
+        let mut options = Options::deserialize(&raw.driver, table).map_err(|e| match e {
             OptionsError::UnknownDriver => format!(
                 "driver = {:?} is not known; there is {}",
                 raw.driver,
@@ -361,6 +362,10 @@ impl Builder<'_> {
                 suggest_key(&e)
             ),
         })?;
+        if let Some(file) = options.description() {
+            let messages = dbc::read(&self.folder.join(file));
+            options.describe(messages.map_err(|e| format!("{name:?}: file {e}"))?);
+        }
         if !(raw.max_silence_ms > 0.0 && raw.max_silence_ms <= 3.6e6) {
             return Err(format!(
                 "{name:?}: max_silence_ms = {} must be above 0, at most an hour",

@@ -131,10 +131,14 @@ const CLOCKS: [(&str, &str); 2] = [
 
 /// The files that may call these clocks: the outermost loops of programs, and tests that wait for
 /// processes.
-const OUTERMOST: [(&str, &str); 11] = [
+const OUTERMOST: [(&str, &str); 12] = [
     ("gateway/topics/src/ipc/clock.rs", "is it"),
     ("gateway/src/clock.rs", "the gateway's clock"),
     ("gateway/topics/src/ipc/bell.rs", "tests of waiting"),
+    (
+        "gateway/topics/src/ipc/failures.rs",
+        "the pause between two attempts to connect, after a failure only",
+    ),
     (
         "gateway/topics/src/ipc/presence.rs",
         "watches for a second who sends",

@@ -31,6 +31,9 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
     ("icub_motor", "", &[0]),
     ("icub_pos", "", &[0, 1, 2, 15]),
     ("icub_pos", "sensors = [{ label = 2 }]", &[2, 3]),
+    ("dbc", crate::dbc::WRENCH, &[]),
+    ("dbc", crate::dbc::DRIVE, &[0]),
+    ("dbc", crate::dbc::PAGES, &[]),
 ];
 
 /// About 18 years: clocks may jump, but not to the limits of `i64` nanoseconds.
@@ -155,7 +158,7 @@ fn is_finite(reading: &Reading) -> bool {
             .proper_acceleration
             .iter()
             .chain(&imu.angular_velocity)
-            .all(|value| value.is_finite()),
+            .all(|value| !value.is_infinite()),
         Reading::Joint(joint) => joint.position.is_finite(),
         Reading::Temperature(temperature) => temperature.celsius.is_finite(),
         Reading::Actuator(actuator) => actuator.duty.is_finite(),

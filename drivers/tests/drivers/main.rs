@@ -5,6 +5,7 @@
 mod any_frame;
 mod bringup;
 mod command;
+mod dbc;
 mod golden;
 mod pairing;
 mod rig;

@@ -11,7 +11,12 @@ use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind};
 pub(crate) fn options(driver: &str, keys: &str) -> Options {
     let table: toml::Table = keys.parse().expect("test keys are TOML");
     match Options::deserialize(driver, table) {
-        Ok(options) => options,
+        Ok(mut options) => {
+            if options.description().is_some() {
+                options.describe(crate::dbc::messages());
+            }
+            options
+        }
         Err(error) => panic!("{driver}: {error:?}"),
     }
 }
@@ -29,15 +34,19 @@ pub(crate) fn spec(address: u32, mode: Mode, outputs: &[u8]) -> Spec {
 
 /// A device that only listens.
 pub(crate) fn listener(driver: &str, keys: &str, outputs: &[u8]) -> Box<dyn Device> {
-    options(driver, keys)
-        .device(&spec(1, Mode::Listen, outputs))
+    let options = options(driver, keys);
+    let address = options.default_address().unwrap_or(1);
+    options
+        .device(&spec(address, Mode::Listen, outputs))
         .expect("a legal configuration")
 }
 
 /// A board.
 pub(crate) fn board(driver: &str, keys: &str, outputs: &[u8]) -> Box<dyn Board> {
-    options(driver, keys)
-        .board(&spec(1, Mode::Supervise, outputs))
+    let options = options(driver, keys);
+    let address = options.default_address().unwrap_or(1);
+    options
+        .board(&spec(address, Mode::Supervise, outputs))
         .expect("a legal configuration")
 }
 

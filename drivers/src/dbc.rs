@@ -1,0 +1,166 @@
+//! Any device whose frames a .dbc file describes.
+//!
+//! The file says where the bits of each signal are and what they mean; the keys say which signal is
+//! which value of a reading. Decoding follows a table that is made at start. The driver listens
+//! only: a .dbc file does not say how a device is started.
+//!
+//! - Signals: Intel and Motorola order, signed and unsigned, IEEE floats (`SIG_VALTYPE_`),
+//!   multiplexed ones, also by a multiplexed multiplexor or by ranges (`SG_MUL_VAL_`), frames of
+//!   CAN FD, standard and extended identifiers. A signal that all pages of a multiplexed message
+//!   have is taken from the pages that have other signals of the reading.
+//! - Units: the file's own unit is converted to SI, and must fit the value. Where the file has none
+//!   (or one that is not known), `units` gives it; `units` also overrides the file's.
+//! - A reading is complete when each of its signals has come once. If they come in several frames,
+//!   `first` names the message that opens a reading, and the others must follow within
+//!   `pair_timeout_ms`: less than half the period, so that a lost frame never leads to a mixture of
+//!   two readings. A frame that comes again before the others have come may mean that they are
+//!   lost, or late: both readings are dropped (counted as unpaired), so that none is wrong.
+//! - A signal with `hold_ms` does not wait: its last value is used, if it is not older than that,
+//!   else none. So a drive's torque, sent ten times a second, joins its position.
+//!
+//! `address` is added to the identifiers of the file: for a file that describes node 0 of a
+//! protocol with the node in the identifier.
+//!
+//! Sources: the format as Vector's "DBC File Format Documentation" 1.0.5 and `cantools` 45.1 read
+//! it (certain: the tests compare with frames that cantools encodes). The contents of a file are
+//! as certain as the file.
+//!
+//! # Keys
+//! ```toml
+//! file = "drive.dbc"       # relative to gateway.toml
+//! period_ms = 10           # of the readings; only a simulated device uses it
+//!
+//! [[reading]]
+//! kind = "joint"           # joint, wrench, imu, gauges, temperature, actuator or skin
+//! # The values of that kind, by the names of the columns of `proprio decode`.
+//! fields.position = "Encoder.Position"
+//! fields.velocity = "Encoder.Velocity"
+//! fields.torque = "Motor.Torque"
+//! units = { position = "rev", velocity = "rev/s" }
+//! hold_ms = { torque = 200.0 }
+//! fault = "State.Error"    # any other value than 0: DEVICE_FAULT
+//! counter = "Encoder.Count" # counts the readings: tells the lost ones
+//!
+//! [[reading]]
+//! kind = "temperature"
+//! name = "motor"           # the channel is <device>_motor; without `name` it is the device's
+//! fields = { temperature = "State.Temperature" }
+//!
+//! [[reading]]
+//! kind = "wrench"
+//! name = "flange"
+//! fields = { fx = "F.X", fy = "F.Y", fz = "F.Z", tx = "T.X", ty = "T.Y", tz = "T.Z" }
+//! first = "F"              # the message that is sent first
+//! pair_timeout_ms = 2.0
+//! ```
+//! The joint `[[bus.device.joint]]` of a reading has its number in the list, from 0, as `channel`.
+
+mod board;
+mod device;
+mod layout;
+
+pub use board::DbcBoard;
+pub use device::DbcDevice;
+
+use crate::signal::Message;
+use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
+use alloc::borrow::Cow;
+use alloc::boxed::Box;
+use alloc::collections::BTreeMap;
+use alloc::string::String;
+use alloc::vec::Vec;
+use proprio_topics::Kind;
+use serde::{Deserialize, Deserializer, de};
+
+/// The keys of one device.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Options {
+    /// The .dbc file, relative to the configuration.
+    pub file: String,
+    /// The period of the readings of a simulated device \[ms\].
+    #[serde(default = "ten")]
+    pub period_ms: u32,
+    /// What is read.
+    pub reading: Vec<ReadingKeys>,
+    /// The contents of `file`, which the gateway reads.
+    #[serde(skip)]
+    pub messages: Vec<Message>,
+}
+
+/// One reading: the signals of its values.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ReadingKeys {
+    /// Its kind.
+    #[serde(deserialize_with = "kind")]
+    pub kind: Kind,
+    /// The end of its channel's name; empty for the device's own.
+    #[serde(default)]
+    pub name: String,
+    /// Per value of the kind, by the names of [`Kind::fields`], `Message.Signal`.
+    pub fields: BTreeMap<String, String>,
+    /// Per value, the unit of its signal.
+    #[serde(default)]
+    pub units: BTreeMap<String, String>,
+    /// Per value, how long the last one is used \[ms\].
+    #[serde(default)]
+    pub hold_ms: BTreeMap<String, f64>,
+    /// The message that opens a reading; that of the first value if absent.
+    pub first: Option<String>,
+    /// The longest time from the first to the last frame of a reading \[ms\].
+    pub pair_timeout_ms: Option<f64>,
+    /// The signal that is not 0 while the device has a fault.
+    pub fault: Option<String>,
+    /// The signal that counts the readings.
+    pub counter: Option<String>,
+}
+
+const fn ten() -> u32 {
+    10
+}
+
+fn kind<'de, D: Deserializer<'de>>(word: D) -> Result<Kind, D::Error> {
+    const WORDS: &[&str] = &[
+        "joint",
+        "wrench",
+        "imu",
+        "gauges",
+        "temperature",
+        "actuator",
+        "skin",
+    ];
+    let word = String::deserialize(word)?;
+    let known = Kind::ALL.into_iter().find(|kind| kind.word() == word);
+    known.ok_or_else(|| de::Error::unknown_variant(&word, WORDS))
+}
+
+impl Driver for Options {
+    const NAME: &'static str = "dbc";
+    const ADDRESS: Option<u32> = Some(0);
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        let info = |(number, reading): (u8, &ReadingKeys)| OutputInfo {
+            number,
+            kind: reading.kind,
+            suffix: Cow::Owned(reading.name.clone()),
+        };
+        (0..).zip(&self.reading).map(info).collect()
+    }
+
+    fn description(&self) -> Option<&str> {
+        Some(&self.file)
+    }
+
+    fn describe(&mut self, messages: Vec<Message>) {
+        self.messages = messages;
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        Ok(Box::new(DbcDevice::new(spec, self)?))
+    }
+
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(DbcBoard::new(spec, self)?))
+    }
+}

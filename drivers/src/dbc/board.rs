@@ -1,0 +1,167 @@
+//! The device's own side: sends its readings in the frames that the file describes, from power-on.
+
+use super::Options;
+use super::layout::{Layout, Part, Role};
+use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
+use alloc::vec::Vec;
+use proprio_topics::{Nanos, Quality, Reading};
+
+/// A simulated device that a .dbc file describes. Signals that the keys do not name are zero.
+#[derive(Debug)]
+pub struct DbcBoard {
+    layout: Layout,
+    period: Nanos,
+    frames: Vec<Pending>,
+    /// The messages of each reading, in the order that they are sent in.
+    orders: Vec<Vec<usize>>,
+    /// The number of readings encoded so far, per reading.
+    counts: Vec<u64>,
+}
+
+/// A frame on its way: the parts of one message that are sent together.
+#[derive(Debug)]
+struct Pending {
+    message: usize,
+    parts: Vec<Part>,
+    data: [u8; 64],
+    /// The parts whose values are new, one bit each.
+    fresh: u32,
+}
+
+impl DbcBoard {
+    /// A device after power-on.
+    ///
+    /// # Errors
+    /// As [`DbcDevice::new`](super::DbcDevice::new); [`SpecError::Key`] for a period outside 1 to
+    /// 60000 ms.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        let layout = Layout::new(spec, options)?;
+        if !(1..=60_000).contains(&options.period_ms) {
+            return Err(SpecError::Key {
+                key: "period_ms",
+                value: f64::from(options.period_ms),
+                expected: "1 to 60000",
+            });
+        }
+        let mut frames: Vec<Pending> = Vec::new();
+        for (message, layout) in layout.messages.iter().enumerate() {
+            for part in &layout.parts {
+                let same = |pending: &&mut Pending| {
+                    let first = pending.parts.first();
+                    pending.message == message
+                        && first.is_some_and(|first| first.conditions == part.conditions)
+                };
+                match frames.iter_mut().find(same) {
+                    Some(pending) => pending.parts.push(part.clone()),
+                    None => {
+                        let mut data = [0; 64];
+                        for condition in &part.conditions {
+                            let raw = condition.ranges.first().map_or(0, |range| range.0);
+                            condition.bits.set(raw, &mut data);
+                        }
+                        frames.push(Pending {
+                            message,
+                            parts: [part.clone()].to_vec(),
+                            data,
+                            fresh: 0,
+                        });
+                    }
+                }
+            }
+        }
+        let readings = 0..layout.readings.len();
+        Ok(Self {
+            orders: readings
+                .clone()
+                .map(|reading| layout.order(reading))
+                .collect(),
+            counts: readings.map(|_| 0).collect(),
+            layout,
+            period: Nanos::from_millis(i64::from(options.period_ms)),
+            frames,
+        })
+    }
+}
+
+impl Board for DbcBoard {
+    fn on_frame(&mut self, _frame: &Frame, _out: &mut Frames) {}
+
+    fn period(&self) -> Option<Nanos> {
+        Some(self.period)
+    }
+
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        let number = usize::from(output);
+        let Some(layout) = self.layout.readings.get(number) else {
+            return Err(EncodeError::Output(output));
+        };
+        if reading.kind() != layout.kind {
+            return Err(EncodeError::Kind);
+        }
+        let values = reading.values();
+        let needed = |index: usize| layout.needed & 1 << index != 0;
+        if values
+            .iter()
+            .enumerate()
+            .any(|(index, value)| needed(index) && !value.is_finite())
+        {
+            return Err(EncodeError::NotFinite);
+        }
+        let count = self.counts.get_mut(number).map_or(0, |count| {
+            *count = count.wrapping_add(1);
+            *count
+        });
+        for message in self.orders.get(number).into_iter().flatten() {
+            let Some(layout) = self.layout.messages.get(*message) else {
+                continue;
+            };
+            for pending in self
+                .frames
+                .iter_mut()
+                .filter(|frame| frame.message == *message)
+            {
+                let all = pending
+                    .parts
+                    .iter()
+                    .map(|_| 1)
+                    .fold(0, |all, bit| all << 1 | bit);
+                for (place, part) in pending.parts.iter().enumerate() {
+                    if part.reading != number {
+                        continue;
+                    }
+                    pending.fresh |= 1 << place;
+                    for field in &part.fields {
+                        let length = field.bits.length();
+                        let raw = match field.role {
+                            Role::Counter => count,
+                            Role::Fault => u64::from(quality.contains(Quality::DEVICE_FAULT)),
+                            Role::Value {
+                                index,
+                                gain,
+                                offset,
+                                ..
+                            } => {
+                                let value = values.get(index).copied().unwrap_or(0.0);
+                                field.raw.bits((value - offset) / gain, length)
+                            }
+                        };
+                        field.bits.set(raw, &mut pending.data);
+                    }
+                }
+                if pending.fresh == all {
+                    pending.fresh = 0;
+                    let data = pending.data.get(..layout.size).unwrap_or_default();
+                    let frame = Frame::with_format(layout.id, layout.format(), data);
+                    let _ = frame.map(|frame| out.try_push(frame));
+                }
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,342 @@
+//! The host's side: collects the values of each reading out of the frames, and watches that they
+//! come.
+
+use super::Options;
+use super::layout::{Field, Layout, Part, ReadingLayout, Role};
+use crate::bringup::{Bringup, NoInquiry, Timing};
+use crate::pairing::within;
+use crate::{
+    Claim, Decoded, Device, Format, Frame, Id, Mode, NotSent, Output, Spec, SpecError, State,
+    Transmit,
+};
+use alloc::vec::Vec;
+use proprio_topics::reading::VALUES;
+use proprio_topics::{
+    Actuator, Counter, Imu, JointState, Kind, Nanos, Quality, Reading, Skin, StampKind,
+};
+
+/// Only the watching counts: nothing is sent. A device that was heard of never in the first second
+/// and a half is silent.
+const TIMING: Timing = Timing {
+    power_on_silence: Nanos::ZERO,
+    answer_timeout: Nanos::from_millis(100),
+    attempts: 3,
+    slow_attempt: Nanos::from_millis(500),
+    answer_counts: Nanos::from_millis(100),
+    start: Nanos::from_millis(250),
+    start_most: Nanos::from_millis(500),
+    send_within: Nanos::from_millis(100),
+};
+
+/// The host's side of a device that a .dbc file describes.
+#[derive(Debug)]
+pub struct DbcDevice {
+    layout: Layout,
+    claims: Vec<Claim>,
+    readings: Vec<Assembly>,
+    bringup: Bringup,
+}
+
+/// A reading on its way.
+#[derive(Debug)]
+struct Assembly {
+    layout: ReadingLayout,
+    /// Without a value: not a number, or zero where the value is a number of things.
+    absent: [f64; VALUES],
+    values: [f64; VALUES],
+    /// The values that have come.
+    have: u16,
+    t: Nanos,
+    stamp: StampKind,
+    /// A frame came again before the others: the next reading may be a mixture.
+    suspect: bool,
+    /// No reading was opened yet: a frame before it belongs to one that was not heard from its
+    /// beginning.
+    joined: bool,
+    gap: bool,
+    /// The held values: until when they are used.
+    held: [Option<(Nanos, f64)>; VALUES],
+    fault: bool,
+    /// The count of this reading, and of the last.
+    count: Option<u64>,
+    last_count: Option<u64>,
+    /// The largest count.
+    most: u64,
+}
+
+impl DbcDevice {
+    /// A device in its initial state.
+    ///
+    /// # Errors
+    /// [`SpecError::Description`]: keys and file do not fit each other.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        let layout = Layout::new(spec, options)?;
+        let claims: Vec<Claim> = (layout.messages.iter())
+            .map(|message| Claim::shared(message.id))
+            .collect();
+        let watched = (layout.order(0).first())
+            .and_then(|number| layout.messages.get(*number))
+            .map_or(Id::standard(0), |message| message.id);
+        let readings = layout.readings.iter().enumerate();
+        let readings = readings.map(|(number, reading)| {
+            let parts = layout.messages.iter().flat_map(|message| &message.parts);
+            let fields = parts
+                .filter(|part| part.reading == number)
+                .flat_map(|part| &part.fields);
+            let counter = fields.filter(|field| field.role == Role::Counter);
+            let most = counter
+                .map(|field| u64::MAX >> (64 - field.bits.length()))
+                .max();
+            Assembly::new(reading, most.unwrap_or(0))
+        });
+        Ok(Self {
+            readings: readings.collect(),
+            claims,
+            bringup: Bringup::new(spec, Mode::Listen, TIMING, watched),
+            layout,
+        })
+    }
+}
+
+impl Assembly {
+    fn new(layout: &ReadingLayout, most: u64) -> Self {
+        let absent = match layout.kind {
+            Kind::Joint => Reading::Joint(JointState::ABSENT).values(),
+            Kind::Imu => Reading::Imu(Imu::ABSENT).values(),
+            Kind::Actuator => Reading::Actuator(Actuator {
+                duty: f64::NAN,
+                mode: 0,
+                encoder: 0,
+                faults: 0,
+            })
+            .values(),
+            Kind::Skin => Reading::Skin(Skin {
+                triangle: 0,
+                taxels: [f64::NAN; 12],
+            })
+            .values(),
+            Kind::Wrench | Kind::Gauges | Kind::Temperature => [0.0; VALUES],
+        };
+        Self {
+            layout: layout.clone(),
+            absent,
+            values: absent,
+            have: 0,
+            t: Nanos::ZERO,
+            stamp: StampKind::None,
+            suspect: false,
+            joined: true,
+            gap: false,
+            held: [None; VALUES],
+            fault: false,
+            count: None,
+            last_count: None,
+            most,
+        }
+    }
+
+    /// Takes the values of a frame. True if the reading is complete.
+    fn take(&mut self, part: &Part, data: &[u8], frame: &Frame, out: &mut Decoded) -> bool {
+        let mut values = [0.0; VALUES];
+        // The values that have come, and those that ride along, one bit each.
+        let (mut come, mut along): (u16, u16) = (0, 0);
+        for Field { role, bits, raw } in &part.fields {
+            let Some(found) = bits.of(data) else { continue };
+            match *role {
+                Role::Counter => self.count = Some(found),
+                Role::Fault => self.fault = found != 0,
+                Role::Value {
+                    index,
+                    gain,
+                    offset,
+                    hold,
+                    rides,
+                } => {
+                    let value = gain * raw.number(found, bits.length()) + offset;
+                    if !value.is_finite() {
+                        out.fault(Counter::Value, 1, frame.id);
+                        if hold.is_none() {
+                            return false;
+                        }
+                    } else if let Some(hold) = hold {
+                        if let Some(held) = self.held.get_mut(index) {
+                            *held = Some((frame.t + hold, value));
+                        }
+                    } else if let Some(place) = values.get_mut(index) {
+                        *place = value;
+                        let values = if rides { &mut along } else { &mut come };
+                        *values |= 1 << index;
+                    }
+                }
+            }
+        }
+        if come == 0 {
+            return false;
+        }
+        let begun = (self.t, self.stamp);
+        let again = self.have & come != 0;
+        if self.have != 0 && (again || !within(begun, (frame.t, frame.stamp), self.layout.limit)) {
+            self.drop_one(frame, out);
+            self.suspect = again;
+        }
+        if self.have == 0 {
+            if come & self.layout.opening == 0 {
+                // Its first frame was lost, or it is the late rest of a reading that was dropped.
+                self.suspect = false;
+                if !self.joined {
+                    self.drop_one(frame, out);
+                }
+                return false;
+            }
+            self.joined = false;
+            (self.t, self.stamp) = (frame.t, frame.stamp);
+        }
+        for (index, (place, value)) in self.values.iter_mut().zip(values).enumerate() {
+            if (come | along) & 1 << index != 0 {
+                *place = value;
+            }
+        }
+        self.have |= come;
+        if self.have != self.layout.needed {
+            return false;
+        }
+        if core::mem::take(&mut self.suspect) {
+            self.drop_one(frame, out);
+            return false;
+        }
+        self.have = 0;
+        true
+    }
+
+    fn drop_one(&mut self, frame: &Frame, out: &mut Decoded) {
+        self.have = 0;
+        self.gap = true;
+        out.fault(Counter::Unpaired, 1, frame.id);
+    }
+
+    /// The complete reading; `after_silence` says whether the device was silent before it. `None`
+    /// if it has come before, or its values mean nothing.
+    fn finish(
+        &mut self,
+        number: u8,
+        after_silence: bool,
+        frame: &Frame,
+        out: &mut Decoded,
+    ) -> Option<Output> {
+        let mut quality = Quality::GOOD;
+        if self.fault {
+            quality |= Quality::DEVICE_FAULT;
+            out.fault(Counter::DeviceFault, 1, frame.id);
+        }
+        let mut values = self.values;
+        for (held, (value, absent)) in self.held.iter().zip(values.iter_mut().zip(self.absent)) {
+            if let Some((until, last)) = held {
+                *value = if frame.t <= *until { *last } else { absent };
+            }
+        }
+        if let Some(count) = self.count {
+            quality |= Quality::DEVICE_COUNTER;
+            if let Some(last) = self.last_count.replace(count).filter(|_| !after_silence) {
+                if count == last {
+                    out.fault(Counter::Unexpected, 1, frame.id);
+                    return None;
+                }
+                let lost = count.wrapping_sub(last).wrapping_sub(1) & self.most;
+                if lost > 0 {
+                    self.gap = true;
+                    let lost = u32::try_from(lost).unwrap_or(u32::MAX);
+                    out.fault(Counter::Lost, lost, frame.id);
+                }
+            }
+        }
+        if core::mem::take(&mut self.gap) | after_silence {
+            quality |= Quality::GAP_BEFORE;
+        }
+        let Some(reading) = Reading::from_values(self.layout.kind, &values) else {
+            out.fault(Counter::Value, 1, frame.id);
+            return None;
+        };
+        #[allow(clippy::cast_possible_truncation)] // the number of such a device's readings
+        let device_counter = self.count.unwrap_or(0) as u32;
+        Some(Output {
+            acquired: self.t,
+            stamp: self.stamp,
+            device_counter,
+            ..Output::new(number, frame, quality, reading)
+        })
+    }
+}
+
+impl Device for DbcDevice {
+    fn claims(&self) -> &[Claim] {
+        &self.claims
+    }
+
+    fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
+        if !self.bringup.active() || frame.format == Format::Error {
+            return;
+        }
+        let found = self
+            .layout
+            .messages
+            .binary_search_by_key(&frame.id, |message| message.id);
+        let Some(message) = found.ok().and_then(|at| self.layout.messages.get(at)) else {
+            return;
+        };
+        let data = frame.data();
+        for part in &message.parts {
+            let Some(assembly) = self.readings.get_mut(part.reading) else {
+                continue;
+            };
+            if data.len() < part.reach {
+                out.fault(Counter::Length, 1, frame.id);
+                continue;
+            }
+            let has = part
+                .conditions
+                .iter()
+                .all(|condition| condition.holds(data));
+            if !has || !assembly.take(part, data, frame, out) {
+                continue;
+            }
+            let after_silence = self.bringup.reading(frame.t);
+            let number = u8::try_from(part.reading).unwrap_or(u8::MAX);
+            if let Some(output) = assembly.finish(number, after_silence, frame, out) {
+                out.push(output, frame.id);
+            }
+        }
+    }
+
+    fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
+        self.bringup.poll(now, &mut NoInquiry, out)
+    }
+
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        self.bringup.on_sent(frame, outcome, &mut NoInquiry);
+    }
+
+    fn next_wake(&self) -> Option<Nanos> {
+        self.bringup.next_wake(&NoInquiry)
+    }
+
+    fn state(&self) -> State {
+        self.bringup.state(&NoInquiry)
+    }
+
+    fn stop(&mut self, _now: Nanos) {
+        self.bringup.stop();
+    }
+
+    fn restart(&mut self, _now: Nanos) {
+        for assembly in &mut self.readings {
+            let fresh = Assembly::new(&assembly.layout, assembly.most);
+            let seen = !core::mem::replace(assembly, fresh).joined;
+            assembly.gap = seen;
+        }
+        self.bringup.restart();
+    }
+
+    fn set_max_silence(&mut self, max_silence: Nanos) {
+        self.bringup.set_max_silence(max_silence);
+    }
+}
