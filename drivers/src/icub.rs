@@ -54,6 +54,8 @@ pub mod command {
     /// Class 2: period of the streams, `[08, ms]`. (The document's drawing shows 07; its example,
     /// the header and the code 08.)
     pub const SET_CANDATARATE: u8 = 0x08;
+    /// Class 2, mais: `[10, code]`: the resolution; 2 is 8 bits.
+    pub const SET_RESOLUTION: u8 = 0x10;
     /// Class 2: `[15, mode]`, or `[15, 2, channel, high, low]`: what the board adds to each
     /// calibrated axis. Mode 0 nothing, 1 minus the present load, 2 a given value of one channel.
     pub const SET_CURR_TARE: u8 = 0x15;
@@ -74,8 +76,12 @@ pub mod command {
     pub const THERMOMETER_CONFIG_SET: u8 = 0x39;
     /// Class 2: `[3A, period in s]`, 0 stops.
     pub const THERMOMETER_TRANSMIT: u8 = 0x3A;
+    /// Class 2, skin: `[4D, compensation, period in ms, value without load]`.
+    pub const SKIN_CONFIG: u8 = 0x4D;
     /// Class 2: `[4F, mask, period in ms]`: legacy accelerometer and gyroscope.
     pub const ACC_GYRO_SETUP: u8 = 0x4F;
+    /// Class 2, skin: `[50, first, last, shift, enabled, offset low, high]`: the triangles in use.
+    pub const SKIN_TRIANGLES: u8 = 0x50;
     /// Class 2: `[51, type]`, answered by 8 bytes like those of [`POS_CONFIG_SET`].
     pub const POS_CONFIG_GET: u8 = 0x51;
     /// Class 2: `[52, id << 4 | type, sensor 0 (3 bytes), sensor 1 (3 bytes)]`.
@@ -92,6 +98,8 @@ pub mod command {
 pub mod board {
     /// mtb: skin and legacy inertial sensors.
     pub const MTB: u8 = 0x05;
+    /// mais: Hall sensors.
+    pub const MAIS: u8 = 0x07;
     /// 2foc: motor control.
     pub const TWO_FOC: u8 = 0x08;
     /// strain2: F/T and IMU.

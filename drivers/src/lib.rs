@@ -7,6 +7,8 @@
 //! | [`icub_imu`] | IMU of strain2, strain2c, mtb4, mtb4c, rfe; legacy frames of mtb | imu |
 //! | [`icub_motor`] | 2FOC and its successors amcbldc, amc2c, amcfoc | joint, actuator |
 //! | [`icub_pos`] | POS encoders: psc, mtb4fap | joint |
+//! | [`icub_mais`] | MAIS: Hall sensors of hands | joint |
+//! | [`icub_skin`] | skin of mtb, mtb4, mtb4c | skin |
 //! | [`dbc`] | any device that a .dbc file describes | any |
 //!
 //! Each family has two sides. A [`Device`] is the host's side: it decodes the frames of its
@@ -31,8 +33,10 @@ pub mod device;
 pub mod frame;
 pub mod icub;
 pub mod icub_imu;
+pub mod icub_mais;
 pub mod icub_motor;
 pub mod icub_pos;
+pub mod icub_skin;
 pub mod icub_strain;
 mod pairing;
 mod registry;

@@ -2,8 +2,8 @@
 
 use crate::signal::Message;
 use crate::{
-    Board, Device, Driver, OutputInfo, Spec, SpecError, dbc, icub_imu, icub_motor, icub_pos,
-    icub_strain,
+    Board, Device, Driver, OutputInfo, Spec, SpecError, dbc, icub_imu, icub_mais, icub_motor,
+    icub_pos, icub_skin, icub_strain,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -114,6 +114,10 @@ drivers! {
     IcubMotor: icub_motor,
     /// iCub POS encoders.
     IcubPos: icub_pos,
+    /// iCub skin.
+    IcubSkin: icub_skin,
+    /// iCub Hall sensors.
+    IcubMais: icub_mais,
     /// Devices that a .dbc file describes.
     Dbc: dbc,
 }

@@ -31,6 +31,13 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
     ("icub_motor", "", &[0]),
     ("icub_pos", "", &[0, 1, 2, 15]),
     ("icub_pos", "sensors = [{ label = 2 }]", &[2, 3]),
+    ("icub_skin", "", &[]),
+    (
+        "icub_skin",
+        "triangles = [3, 5]\npair_timeout_ms = 4.0",
+        &[],
+    ),
+    ("icub_mais", "", &[0, 6, 7, 14]),
     ("dbc", crate::dbc::WRENCH, &[]),
     ("dbc", crate::dbc::DRIVE, &[0]),
     ("dbc", crate::dbc::PAGES, &[]),
@@ -253,11 +260,13 @@ fn claims_are_exclusive_within_a_kind_only() {
                 .any(|b| a.exclusive && b.exclusive && a.overlaps(b))
         })
     };
-    let families: [(&str, &[u8]); 4] = [
+    let families: [(&str, &[u8]); 6] = [
         ("icub_strain", &[]),
         ("icub_imu", &[]),
         ("icub_motor", &[0]),
         ("icub_pos", &[0]),
+        ("icub_skin", &[]),
+        ("icub_mais", &[0]),
     ];
     for (k, (driver, outputs)) in families.iter().enumerate() {
         let mine = claims(driver, outputs, 13);

@@ -10,3 +10,4 @@ mod golden;
 mod pairing;
 mod rig;
 mod round_trip;
+mod skin_and_mais;

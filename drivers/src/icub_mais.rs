@@ -1,0 +1,290 @@
+//! iCub MAIS boards: fifteen Hall sensors, usually of the joints of a hand.
+//!
+//! Streams of address `a`, class 3:
+//!
+//! | identifier | name | bytes | content |
+//! |---|---|---|---|
+//! | `3aC` | HES0TO6 | 7 | sensors 0 to 6 u8 |
+//! | `3aD` | HES7TO14 | 8 | sensors 7 to 14 u8 |
+//!
+//! - A sensor's number is the joint's `channel`. Its value is the field that it measures, in
+//!   counts: the upper 8 of 12 bits. **It is no angle**: `ratio` of the joint is the number of
+//!   counts per rad (with `sign` if they fall), `offset_rad` the angle at count 0. The board knows
+//!   nothing of either.
+//! - The frames are independent: each gives the readings of its own sensors.
+//! - The document says 7 bytes for `3aD`, which is a misprint: eight sensors need eight.
+//!
+//! Commands on `20a`, none of them answered: `10 02` resolution 8 bits, `08 ms` period, `07 00`
+//! start, `07 01` stop.
+//!
+//! Sources: `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12 and
+//! `sensorReaderDspic30f4013/mais` (icub-firmware b4299211), `canBusAnalogSensor` (icub-main
+//! 24c1a003). Certain.
+//!
+//! # Keys
+//! ```toml
+//! period_ms = 10            # 1 to 255
+//! power_on_silence_ms = 0   # see `crate::icub`
+//! ```
+
+use crate::bringup::{Bringup, NoInquiry};
+use crate::bytes;
+use crate::icub::{self, class, command};
+use crate::{
+    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, NotSent, Output,
+    OutputInfo, Outputs, Spec, SpecError, State, Transmit,
+};
+use alloc::boxed::Box;
+use alloc::vec::Vec;
+use arrayvec::ArrayVec;
+use proprio_topics::{Counter, JointState, Kind, Nanos, Quality, Reading};
+use serde::Deserialize;
+
+/// Types of the streams.
+const HES0TO6: u8 = 0xC;
+const HES7TO14: u8 = 0xD;
+/// The first sensor of the second frame, and how many there are.
+const SECOND: u8 = 7;
+const SENSORS: u8 = 15;
+/// 8 bits.
+const RESOLUTION: u8 = 2;
+
+/// The keys of `driver = "icub_mais"`.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// Period \[ms\], 1 to 255; default 10.
+    pub period_ms: u32,
+    /// Silence kept after power-on \[ms\]; default 0.
+    pub power_on_silence_ms: u32,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            period_ms: 10,
+            power_on_silence_ms: 0,
+        }
+    }
+}
+
+impl Driver for Options {
+    const NAME: &'static str = "icub_mais";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        (0..SENSORS)
+            .map(|sensor| OutputInfo::new(sensor, Kind::Joint))
+            .collect()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        Ok(Box::new(Mais::new(spec, self)?))
+    }
+
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(MaisBoard::new(spec, self)?))
+    }
+}
+
+/// The host's side of a MAIS board.
+#[derive(Debug)]
+pub struct Mais {
+    address: u8,
+    claims: ArrayVec<Claim, 2>,
+    bringup: Bringup,
+    outputs: Outputs,
+    /// Sensors whose next reading follows a gap, one bit each.
+    gap: u16,
+    /// Sensors that have been read, one bit each.
+    seen: u16,
+}
+
+impl Mais {
+    /// A device in its initial state.
+    ///
+    /// # Errors
+    /// [`SpecError`]: an address outside 1 to 14, a period out of range.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        let address = icub::address(spec)?;
+        let period = icub::period_ms("period_ms", options.period_ms)?;
+        let timing = icub::timing(options.power_on_silence_ms)?;
+        let watched = icub::stream(class::PERIODIC_ANALOG, address, HES0TO6);
+        let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
+        let id = icub::to_board(class::POLLING_ANALOG, address);
+        bringup.start_with(id, &[command::SET_RESOLUTION, RESOLUTION]);
+        bringup.start_with(id, &[command::SET_CANDATARATE, period]);
+        bringup.start_with(id, &[command::SET_TXMODE, 0]);
+        bringup.stop_with(id, &[command::SET_TXMODE, 1]);
+        Ok(Self {
+            address,
+            claims: icub::claims(class::PERIODIC_ANALOG, address, &[HES0TO6, HES7TO14]),
+            bringup,
+            outputs: spec.outputs.clone(),
+            gap: 0,
+            seen: 0,
+        })
+    }
+}
+
+impl Device for Mais {
+    fn claims(&self) -> &[Claim] {
+        &self.claims
+    }
+
+    fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
+        if !self.bringup.active() {
+            return;
+        }
+        let stream = icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address);
+        let (first, length) = match stream {
+            Some(HES0TO6) => (0, SECOND),
+            Some(HES7TO14) => (SECOND, SENSORS - SECOND),
+            _ => return,
+        };
+        let Some(data) = bytes::payload(frame, out) else {
+            return;
+        };
+        if data.len() != usize::from(length) {
+            return out.fault(Counter::Length, 1, frame.id);
+        }
+        if self.bringup.reading(frame.t) {
+            self.gap = self.seen;
+        }
+        for (output, count) in (first..).zip(data) {
+            if !self.outputs.0.contains(&output) {
+                continue;
+            }
+            let bit = 1 << output;
+            let quality = match self.gap & bit {
+                0 => Quality::GOOD,
+                _ => Quality::GAP_BEFORE,
+            };
+            self.gap &= !bit;
+            self.seen |= bit;
+            let reading = Reading::Joint(JointState {
+                position: f64::from(*count),
+                ..JointState::ABSENT
+            });
+            out.push(Output::new(output, frame, quality, reading), frame.id);
+        }
+    }
+
+    fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
+        self.bringup.poll(now, &mut NoInquiry, out)
+    }
+
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        self.bringup.on_sent(frame, outcome, &mut NoInquiry);
+    }
+
+    fn next_wake(&self) -> Option<Nanos> {
+        self.bringup.next_wake(&NoInquiry)
+    }
+
+    fn state(&self) -> State {
+        self.bringup.state(&NoInquiry)
+    }
+
+    fn stop(&mut self, _now: Nanos) {
+        self.bringup.stop();
+    }
+
+    fn restart(&mut self, _now: Nanos) {
+        self.bringup.restart();
+        self.gap = self.seen;
+    }
+
+    fn set_max_silence(&mut self, max_silence: Nanos) {
+        self.bringup.set_max_silence(max_silence);
+    }
+}
+
+/// The board's own side. It sends a frame when all sensors of it that are joints are new.
+#[derive(Debug)]
+pub struct MaisBoard {
+    address: u8,
+    period: Nanos,
+    streaming: bool,
+    counts: [u8; SENSORS as usize],
+    /// The joints, and those of them that are new, one bit each.
+    joints: u16,
+    fresh: u16,
+}
+
+impl MaisBoard {
+    /// A board after power-on; in [`Mode::Listen`] another program has already started it.
+    ///
+    /// # Errors
+    /// As [`Mais::new`].
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        let ms = icub::period_ms("period_ms", options.period_ms)?;
+        Ok(Self {
+            address: icub::address(spec)?,
+            period: Nanos::from_millis(i64::from(ms)),
+            streaming: spec.mode == Mode::Listen,
+            counts: [0; SENSORS as usize],
+            joints: spec
+                .outputs
+                .0
+                .iter()
+                .fold(0, |all, sensor| all | 1 << sensor),
+            fresh: 0,
+        })
+    }
+}
+
+impl Board for MaisBoard {
+    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
+        icub::answer_management(
+            frame,
+            class::POLLING_ANALOG,
+            self.address,
+            icub::board::MAIS,
+            out,
+        );
+        match icub::command_for(frame, class::POLLING_ANALOG, self.address) {
+            Some(&[command::SET_CANDATARATE, ms]) if ms > 0 => {
+                self.period = Nanos::from_millis(i64::from(ms));
+            }
+            Some(&[command::SET_TXMODE, mode]) => self.streaming = mode == 0,
+            _ => {}
+        }
+    }
+
+    fn period(&self) -> Option<Nanos> {
+        self.streaming.then_some(self.period)
+    }
+
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        _quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        let Reading::Joint(joint) = reading else {
+            return Err(EncodeError::Kind);
+        };
+        if !joint.position.is_finite() {
+            return Err(EncodeError::NotFinite);
+        }
+        let Some(count) = self.counts.get_mut(usize::from(output)) else {
+            return Err(EncodeError::Output(output));
+        };
+        let quantised = bytes::quantise(joint.position, 1.0, 0, 255);
+        *count = u8::try_from(quantised).unwrap_or(u8::MAX);
+        self.fresh |= 1 << output;
+        let (first, second) = self.counts.split_at(usize::from(SECOND));
+        let lower: u16 = (1 << SECOND) - 1;
+        for (kind, counts, mask) in [(HES0TO6, first, lower), (HES7TO14, second, !lower)] {
+            let joints = self.joints & mask;
+            let has_this = 1 << output & mask != 0;
+            if has_this && self.fresh & joints == joints {
+                self.fresh &= !mask;
+                let id = icub::stream(class::PERIODIC_ANALOG, self.address, kind);
+                let _ = out.try_push(Frame::new(id, counts));
+            }
+        }
+        Ok(())
+    }
+}
