@@ -331,6 +331,7 @@ pub struct SkinBoard {
     address: u8,
     period: Nanos,
     no_load: u8,
+    triangles: [u8; 2],
     streaming: bool,
 }
 
@@ -346,6 +347,7 @@ impl SkinBoard {
             address: icub::address(spec)?,
             period: Nanos::from_millis(i64::from(ms)),
             no_load: options.no_load,
+            triangles: options.triangles,
             streaming: spec.mode == Mode::Listen,
         })
     }
@@ -370,6 +372,7 @@ impl Board for SkinBoard {
                 self.period = Nanos::from_millis(i64::from(ms));
                 self.no_load = no_load;
             }
+            Some(&[command::SKIN_TRIANGLES, first, last, ..]) => self.triangles = [first, last],
             Some(&[command::SET_TXMODE, mode]) => self.streaming = mode == 0,
             _ => {}
         }
@@ -389,11 +392,11 @@ impl Board for SkinBoard {
         let Reading::Skin(skin) = reading else {
             return Err(EncodeError::Kind);
         };
-        if output != 0 || skin.triangle as usize >= TRIANGLES {
+        let [first, last] = self.triangles;
+        let triangle = u8::try_from(skin.triangle).unwrap_or(u8::MAX);
+        if output != 0 || !(first..=last).contains(&triangle) {
             return Err(EncodeError::Output(output));
         }
-        #[allow(clippy::cast_possible_truncation)] // below 16
-        let triangle = skin.triangle as u8;
         let mut out_of_range = 0_u16;
         let mut bytes = [self.no_load; 12];
         for (number, (byte, taxel)) in bytes.iter_mut().zip(skin.taxels).enumerate() {

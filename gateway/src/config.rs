@@ -26,6 +26,10 @@ pub struct RawBus {
     pub name: String,
     /// The source of its frames.
     pub source: Source,
+    /// Its bit rate \[bit/s\]; that of the arbitration phase for CAN FD.
+    pub bit_rate: Option<u32>,
+    /// The bit rate of the data phase of CAN FD \[bit/s\].
+    pub data_bit_rate: Option<u32>,
     /// Scheduling of its thread.
     pub realtime: Option<Realtime>,
     /// Never send to it: every device of the bus has `listen_only`.

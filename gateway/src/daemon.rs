@@ -79,6 +79,14 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
     let mut description_writer = Writer::<Description>::create(&domain, &plan.robot, epoch)?;
     description_writer.send(&plan.description(), clock.now())?;
 
+    for bus in plan.buses.iter().filter(|bus| bus.load.is_high()) {
+        tracing::warn!(
+            bus = bus.name,
+            "its devices need up to {:.0} % of the bus: frames of low priority come late; make \
+             periods longer, or move devices to another bus",
+            bus.load.share * 100.0
+        );
+    }
     let stop = Arc::new(AtomicBool::new(false));
     // A common start keeps the buses of one log in step; by then all of them are open.
     let replay_start = clock.now() + REPLAY_DELAY;

@@ -12,6 +12,7 @@
 //! - `dbc`: files that describe devices, as tables for the drivers.
 //! - [`link`]: one trait and three links to a bus; [`candump`]: the log format of replay, decode
 //!   and encode.
+//! - [`load`]: the share of a bus's time that its devices need.
 //! - [`decoder`]: all devices of one bus, without input or output; [`bus`]: the loop that moves
 //!   frames through it; [`inbox`]: what the control plane asks of it while it runs.
 //! - [`publish`]: the destinations of samples; [`status`]: the counters of a bus thread.
@@ -32,6 +33,7 @@ mod dispatch;
 mod health;
 pub mod inbox;
 pub mod link;
+pub mod load;
 pub mod offline;
 mod operator;
 pub mod plan;

@@ -4,6 +4,7 @@ use crate::config::{Pace, Raw, RawBus, RawDevice, RawJoint, Realtime, Source};
 use crate::dbc;
 use crate::dispatch::{SHARERS, crowded};
 use crate::link::replay::Matching;
+use crate::load::{self, BitRates, Load};
 use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, OutputInfo, Outputs, Spec};
 use proprio_topics::{
     Description, Entry, JointState, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, Role,
@@ -44,6 +45,12 @@ pub struct BusPlan {
     pub realtime: Option<Realtime>,
     /// Nothing is ever sent to it: all its devices only listen.
     pub listen_only: bool,
+    /// Its bit rates, for its load.
+    pub rates: BitRates,
+    /// The rates are not those of the configuration, but the highest possible.
+    pub rates_assumed: bool,
+    /// What its devices need of it.
+    pub load: Load,
     /// Its devices.
     pub devices: Vec<DevicePlan>,
 }
@@ -245,6 +252,20 @@ impl Plan {
     }
 }
 
+/// The highest rates that transceivers are made for: with these a load is never overestimated.
+const HIGHEST: BitRates = BitRates {
+    nominal: 1_000_000,
+    data: 8_000_000,
+};
+
+/// A bit rate in words.
+fn bit_rate(rate: u32) -> String {
+    match rate {
+        1_000_000.. => format!("{} Mbit/s", f64::from(rate) / 1e6),
+        _ => format!("{} kbit/s", f64::from(rate) / 1e3),
+    }
+}
+
 struct Builder<'a> {
     text: &'a str,
     folder: &'a Path,
@@ -318,11 +339,29 @@ impl Builder<'_> {
                 "{place}: realtime.priority = {priority} must be 1 to 99"
             ));
         }
+        for (key, rate) in [
+            ("bit_rate", raw.bit_rate),
+            ("data_bit_rate", raw.data_bit_rate),
+        ] {
+            if let Some(rate) = rate
+                && !(10_000..=10_000_000).contains(&rate)
+            {
+                return Err(format!(
+                    "{place}: {key} = {rate} must be 10000 to 10000000 bit/s"
+                ));
+            }
+        }
         self.plan.buses.push(BusPlan {
             name: raw.name,
             source,
             realtime: raw.realtime,
             listen_only: raw.listen_only,
+            rates: BitRates {
+                nominal: raw.bit_rate.unwrap_or(HIGHEST.nominal),
+                data: raw.data_bit_rate.unwrap_or(HIGHEST.data),
+            },
+            rates_assumed: raw.bit_rate.is_none(),
+            load: Load::default(),
             devices: Vec::new(),
         });
         for table in raw.device {
@@ -333,7 +372,25 @@ impl Builder<'_> {
             self.device(table.into_inner())
                 .map_err(|e| format!("{place}, device at line {line}: {e}"))?;
         }
-        self.check_claims(&place)
+        self.check_claims(&place)?;
+        self.check_load(&place)
+    }
+
+    /// Computes the load of the last bus, and refuses more than it can carry.
+    fn check_load(&mut self, place: &str) -> Result<(), String> {
+        let Some(bus) = self.plan.buses.last_mut() else {
+            return Ok(());
+        };
+        bus.load = load::of_bus(bus, bus.rates).map_err(|e| format!("{place}: {e}"))?;
+        if bus.load.share > 1.0 {
+            return Err(format!(
+                "{place}: its devices need up to {:.0} % of {}: make periods longer, or move \
+                 devices to another bus",
+                bus.load.share * 100.0,
+                bit_rate(bus.rates.nominal)
+            ));
+        }
+        Ok(())
     }
 
     fn device(&mut self, mut table: toml::Table) -> Result<(), String> {
@@ -668,7 +725,20 @@ impl fmt::Display for Plan {
             if bus.listen_only {
                 write!(f, ", listens only")?;
             }
-            writeln!(f)?;
+            writeln!(
+                f,
+                "\n  load at most {:.0} % of {}{}, {:.0} frames/s{}",
+                bus.load.share * 100.0,
+                bit_rate(bus.rates.nominal),
+                if bus.rates_assumed { " (assumed)" } else { "" },
+                bus.load.frames,
+                if bus.load.is_high() {
+                    "; above 70 % frames of low priority come late, and there is no room for \
+                     others"
+                } else {
+                    ""
+                }
+            )?;
             for device in &bus.devices {
                 let mut ids = String::new();
                 if let Ok(built) = device.options.device(&device.spec) {
