@@ -12,8 +12,8 @@
 //!   fabric and is not part of the protocol.)
 //! - Taxels 6 and 10 measure the temperature of the patch, no pressure: not a number, as is a taxel
 //!   that the board reports out of range.
-//! - Flags: bit 0 the triangle's chip does not answer, bit 1 it is not connected. Such readings have
-//!   DEVICE_FAULT.
+//! - Flags: bit 0 the triangle's chip does not answer, bit 1 it is not connected. Such readings
+//!   have DEVICE_FAULT.
 //! - The two frames have no sequence number: they are paired by order and time (`pairing.rs`), per
 //!   triangle. The reading's `triangle` is T.
 //!
@@ -26,8 +26,8 @@
 //! | `07 00`, `07 01` | start, stop |
 //!
 //! Sources: `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12 (icub-firmware b4299211),
-//! `canBusSkin` (icub-main 24c1a003). Certain, except the thermal taxels and the shift and offset of
-//! `50`, which are the values that icub-main's configurations send.
+//! `canBusSkin` (icub-main 24c1a003). Certain, except the thermal taxels and the shift and offset
+//! of `50`, which are the values that icub-main's configurations send.
 //!
 //! # Keys
 //! ```toml

@@ -1,8 +1,9 @@
 //! The share of a bus's time that its devices need, from their own frames: what `--check` shows,
 //! and what a configuration that cannot work is refused by.
 
-use crate::plan::{BusPlan, DevicePlan};
-use proprio_drivers::{Board, Decoded, EncodeError, Format, Frame, Frames, Id, Mode, SpecError};
+use proprio_drivers::{
+    Board, Decoded, EncodeError, Format, Frame, Frames, Id, Mode, Options, Spec, SpecError,
+};
 use proprio_topics::{
     Actuator, Gauges, Imu, JointState, Kind, Nanos, Quality, Reading, Skin, StampKind, Temperature,
     Wrench,
@@ -45,11 +46,11 @@ impl Load {
 /// the first five at most one in four (Davis et al., Controller Area Network schedulability
 /// analysis, Real-Time Systems 35, 2007). An extended frame has 20 bits more.
 ///
-/// CAN FD (ISO 11898-1:2015): of a standard frame, 17 bits before the data phase and 13 after it are
-/// sent at the nominal rate; the data phase has 5 + 8 n bits, a stuff count of 4, a checksum of 17
-/// (21 above 16 bytes), and a fixed stuff bit before each four of these. Bits before the stuff count
-/// are stuffed as above; the stuff bits are counted where they can fall. An extended frame has 19
-/// bits more in arbitration.
+/// CAN FD (ISO 11898-1:2015): of a standard frame, 17 bits before the data phase and 13 after it
+/// are sent at the nominal rate; the data phase has 5 + 8 n bits, a stuff count of 4, a checksum of
+/// 17 (21 above 16 bytes), and a fixed stuff bit before each four of these. Bits before the stuff
+/// count are stuffed as above; the stuff bits are counted where they can fall. An extended frame
+/// has 19 bits more in arbitration.
 #[must_use]
 pub fn seconds_on_wire(frame: &Frame, rates: BitRates) -> f64 {
     let bytes = frame.data().len();
@@ -76,25 +77,22 @@ pub fn seconds_on_wire(frame: &Frame, rates: BitRates) -> f64 {
     }
 }
 
-/// The load of all devices of `bus`.
+/// The load of a device whose outputs in use have these numbers and kinds.
 ///
 /// # Errors
-/// [`SpecError`]: a device that its driver cannot build.
-pub fn of_bus(bus: &BusPlan, rates: BitRates) -> Result<Load, SpecError> {
-    let mut all = Load::default();
-    for device in &bus.devices {
-        let load = of_device(device, rates)?;
-        all.frames += load.frames;
-        all.share += load.share;
-    }
-    Ok(all)
-}
-
-fn of_device(device: &DevicePlan, rates: BitRates) -> Result<Load, SpecError> {
-    let mut spec = device.spec.clone();
+/// [`SpecError`]: the driver cannot build it.
+pub fn of_device(
+    options: &Options,
+    spec: &Spec,
+    outputs: &[(u8, Kind)],
+    rates: BitRates,
+) -> Result<Load, SpecError> {
     // A board that has been started.
-    spec.mode = Mode::Listen;
-    let mut board = device.options.board(&spec)?;
+    let mode = Mode::Listen;
+    let mut board = options.board(&Spec {
+        mode,
+        ..spec.clone()
+    })?;
     let sum = |frames: &[Frame], period: f64| Load {
         frames: frames.len() as f64 / period,
         share: frames
@@ -104,22 +102,22 @@ fn of_device(device: &DevicePlan, rates: BitRates) -> Result<Load, SpecError> {
             / period,
     };
     match board.period() {
-        Some(period) => Ok(sum(&at_once(device, &mut *board), period.seconds())),
-        None => polled(device).map(|frames| sum(&frames, 1.0)),
+        Some(period) => Ok(sum(&at_once(outputs, &mut *board), period.seconds())),
+        None => polled(options, spec, outputs).map(|frames| sum(&frames, 1.0)),
     }
 }
 
 /// The frames of one period of a board that streams.
-fn at_once(device: &DevicePlan, board: &mut dyn Board) -> Vec<Frame> {
+fn at_once(outputs: &[(u8, Kind)], board: &mut dyn Board) -> Vec<Frame> {
     let mut frames = Vec::new();
-    for route in &device.routes {
+    for &(output, kind) in outputs {
         let mut send = |reading| -> Result<(), EncodeError> {
             let mut sent = Frames::new();
-            board.encode(route.output, &reading, Quality::GOOD, &mut sent)?;
+            board.encode(output, &reading, Quality::GOOD, &mut sent)?;
             frames.extend(sent);
             Ok(())
         };
-        let first = at_rest(route.kind);
+        let first = at_rest(kind);
         let _ = send(first);
         match first {
             // Beside the joint's state, its drive's.
@@ -137,16 +135,18 @@ fn at_once(device: &DevicePlan, board: &mut dyn Board) -> Vec<Frame> {
 }
 
 /// The frames of a second between a device that asks and its board.
-fn polled(device: &DevicePlan) -> Result<Vec<Frame>, SpecError> {
+fn polled(options: &Options, spec: &Spec, outputs: &[(u8, Kind)]) -> Result<Vec<Frame>, SpecError> {
     const STEP: Nanos = Nanos::from_micros(500);
     const BEGIN: i64 = 20_000;
     const END: i64 = BEGIN + 2_000;
-    let mut spec = device.spec.clone();
-    spec.mode = Mode::Supervise;
-    let mut host = device.options.device(&spec)?;
-    let mut board = device.options.board(&spec)?;
-    for route in &device.routes {
-        board.present(route.output, &at_rest(route.kind), Quality::GOOD);
+    let mode = Mode::Supervise;
+    let spec = Spec {
+        mode,
+        ..spec.clone()
+    };
+    let (mut host, mut board) = (options.device(&spec)?, options.board(&spec)?);
+    for &(output, kind) in outputs {
+        board.present(output, &at_rest(kind), Quality::GOOD);
     }
     let (mut frames, mut out) = (Vec::new(), Decoded::new());
     // The start is over by then: boards may wait for six seconds before they are asked.

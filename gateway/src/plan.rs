@@ -381,7 +381,13 @@ impl Builder<'_> {
         let Some(bus) = self.plan.buses.last_mut() else {
             return Ok(());
         };
-        bus.load = load::of_bus(bus, bus.rates).map_err(|e| format!("{place}: {e}"))?;
+        for device in &bus.devices {
+            let outputs: Vec<_> = device.routes.iter().map(|r| (r.output, r.kind)).collect();
+            let load = load::of_device(&device.options, &device.spec, &outputs, bus.rates)
+                .map_err(|e| format!("{place}, {:?}: {e}", device.name))?;
+            bus.load.frames += load.frames;
+            bus.load.share += load.share;
+        }
         if bus.load.share > 1.0 {
             return Err(format!(
                 "{place}: its devices need up to {:.0} % of {}: make periods longer, or move \

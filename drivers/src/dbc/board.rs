@@ -1,7 +1,7 @@
 //! The device's own side: sends its readings in the frames that the file describes, from power-on.
 
-use super::Options;
 use super::layout::{Layout, Part, Role};
+use super::options::Options;
 use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
 use alloc::vec::Vec;
 use proprio_topics::{Nanos, Quality, Reading};

@@ -1,8 +1,8 @@
 //! The host's side: collects the values of each reading out of the frames, and watches that they
 //! come.
 
-use super::Options;
 use super::layout::{Field, Layout, Part, ReadingLayout, Role};
+use super::options::Options;
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::pairing::within;
 use crate::{

@@ -1,7 +1,7 @@
 //! The table that decoding and encoding follow: per message, which of its bits are which value of
 //! which reading. Made from the keys and the file at start; every mistake in either is found here.
 
-use super::{Options, ReadingKeys};
+use super::options::{Options, ReadingKeys};
 use crate::signal::{Bits, Message, Raw, Signal};
 use crate::unit::{Unit, quantities, spellings, unit};
 use crate::{Format, Id, Spec, SpecError};

@@ -1,0 +1,71 @@
+//! The keys of a described device in gateway.toml.
+
+use crate::signal::Message;
+use alloc::collections::BTreeMap;
+use alloc::string::String;
+use alloc::vec::Vec;
+use proprio_topics::Kind;
+use serde::{Deserialize, Deserializer, de};
+
+/// The keys of one device.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Options {
+    /// The .dbc file, relative to the configuration.
+    pub file: String,
+    /// The period of the readings of a simulated device \[ms\].
+    #[serde(default = "ten")]
+    pub period_ms: u32,
+    /// What is read.
+    pub reading: Vec<ReadingKeys>,
+    /// The contents of `file`, which the gateway reads.
+    #[serde(skip)]
+    pub messages: Vec<Message>,
+}
+
+/// One reading: the signals of its values.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ReadingKeys {
+    /// Its kind.
+    #[serde(deserialize_with = "kind")]
+    pub kind: Kind,
+    /// The end of its channel's name; empty for the device's own.
+    #[serde(default)]
+    pub name: String,
+    /// Per value of the kind, by the names of [`Kind::fields`], `Message.Signal`.
+    pub fields: BTreeMap<String, String>,
+    /// Per value, the unit of its signal.
+    #[serde(default)]
+    pub units: BTreeMap<String, String>,
+    /// Per value, how long the last one is used \[ms\].
+    #[serde(default)]
+    pub hold_ms: BTreeMap<String, f64>,
+    /// The message that opens a reading; that of the first value if absent.
+    pub first: Option<String>,
+    /// The longest time from the first to the last frame of a reading \[ms\].
+    pub pair_timeout_ms: Option<f64>,
+    /// The signal that is not 0 while the device has a fault.
+    pub fault: Option<String>,
+    /// The signal that counts the readings.
+    pub counter: Option<String>,
+}
+
+const fn ten() -> u32 {
+    10
+}
+
+fn kind<'de, D: Deserializer<'de>>(word: D) -> Result<Kind, D::Error> {
+    const WORDS: &[&str] = &[
+        "joint",
+        "wrench",
+        "imu",
+        "gauges",
+        "temperature",
+        "actuator",
+        "skin",
+    ];
+    let word = String::deserialize(word)?;
+    let known = Kind::ALL.into_iter().find(|kind| kind.word() == word);
+    known.ok_or_else(|| de::Error::unknown_variant(&word, WORDS))
+}
