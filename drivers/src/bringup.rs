@@ -18,8 +18,8 @@
 //! after `Timing::answer_timeout`, and such a question is no attempt: a device does not count as
 //! silent because the host's own bus could not send. A stop command is sent once.
 //!
-//! Its device tells the bring-up of every reading ([`Bringup::reading`]) and passes on the calls of
-//! [`crate::Device`].
+//! Its device tells the bring-up of every reading ([`Bringup::reading`]); `family.rs` passes on the
+//! calls of [`crate::Device`].
 
 use crate::{Decoded, Frame, Id, Mode, NotSent, Spec, State, Transmit};
 use arrayvec::ArrayVec;
@@ -28,16 +28,25 @@ use proprio_topics::{Counter, Nanos, Refusal};
 /// The questions that a board must answer before it can be started.
 pub(crate) trait Inquiry {
     /// Starts again: the board may have been reset or replaced.
-    fn begin(&mut self);
+    fn begin(&mut self) {}
     /// The next step at `now`. A question counts as sent at `now` until [`Inquiry::sent`] says
     /// otherwise, because its answer may come before that call.
-    fn poll(&mut self, now: Nanos) -> Ask;
+    fn poll(&mut self, now: Nanos) -> Ask {
+        let _ = now;
+        Ask::Done
+    }
     /// The last question was sent at this time, or not at all.
-    fn sent(&mut self, outcome: Result<Nanos, NotSent>);
+    fn sent(&mut self, outcome: Result<Nanos, NotSent>) {
+        let _ = outcome;
+    }
     /// Time of the next poll.
-    fn wake(&self) -> Option<Nanos>;
+    fn wake(&self) -> Option<Nanos> {
+        None
+    }
     /// Why the board cannot be used.
-    fn refusal(&self) -> Option<Refusal>;
+    fn refusal(&self) -> Option<Refusal> {
+        None
+    }
 }
 
 /// The next step of an [`Inquiry`].
@@ -55,19 +64,7 @@ pub(crate) enum Ask {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct NoInquiry;
 
-impl Inquiry for NoInquiry {
-    fn begin(&mut self) {}
-    fn poll(&mut self, _now: Nanos) -> Ask {
-        Ask::Done
-    }
-    fn sent(&mut self, _outcome: Result<Nanos, NotSent>) {}
-    fn wake(&self) -> Option<Nanos> {
-        None
-    }
-    fn refusal(&self) -> Option<Refusal> {
-        None
-    }
-}
+impl Inquiry for NoInquiry {}
 
 /// How long the host waits for boards of a family.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -230,6 +227,10 @@ pub(crate) struct Bringup {
     starts: u8,
     /// Whether a start sequence was begun since the last known power-on.
     begun: bool,
+    /// Whether there was a reading: from then on a restart leaves a gap.
+    seen: bool,
+    /// Readings were lost since the last one.
+    gap: bool,
 }
 
 impl Bringup {
@@ -249,6 +250,8 @@ impl Bringup {
             silent: false,
             starts: 0,
             begun: false,
+            seen: false,
+            gap: false,
         }
     }
 
@@ -282,6 +285,11 @@ impl Bringup {
         matches!(self.phase, Phase::Watching { .. }) && self.under_way.is_none()
     }
 
+    /// Whether its device may send a request: [`Bringup::is_idle`], of a board that is commanded.
+    pub(crate) fn may_lend(&self) -> bool {
+        self.mode == Mode::Supervise && self.is_idle()
+    }
+
     /// Whether the board is started, and not about to be started again.
     pub(crate) const fn is_watching(&self) -> bool {
         matches!(self.phase, Phase::Watching { .. })
@@ -309,15 +317,22 @@ impl Bringup {
         !matches!(self.phase, Phase::Stopping { .. } | Phase::Stopped)
     }
 
-    /// Records a reading at `t`. Returns whether it is the first after a silence.
+    /// Records that readings were lost.
+    pub(crate) const fn lost(&mut self) {
+        self.gap = true;
+    }
+
+    /// Records a reading at `t`. Returns whether it is the first after a gap: after a silence, a
+    /// restart, or [`Bringup::lost`].
     pub(crate) fn reading(&mut self, t: Nanos) -> bool {
         self.last = Some(t);
+        self.seen = true;
         self.starts = 0;
         if let Phase::Waiting { .. } = self.phase {
             // A board that streams has left its bootloader.
             self.phase = Phase::Waiting { until: Nanos::MIN };
         }
-        core::mem::take(&mut self.silent)
+        core::mem::take(&mut self.silent) | core::mem::take(&mut self.gap)
     }
 
     pub(crate) fn poll(
@@ -525,6 +540,7 @@ impl Bringup {
             self.last = None;
             self.silent = false;
             self.starts = 0;
+            self.gap |= self.seen;
         }
     }
 }

@@ -61,7 +61,6 @@ mod layout;
 mod options;
 
 pub use board::DbcBoard;
-pub use device::DbcDevice;
 pub use options::{Options, ReadingKeys};
 
 use crate::signal::Message;
@@ -69,6 +68,7 @@ use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
 use alloc::borrow::Cow;
 use alloc::boxed::Box;
 use alloc::vec::Vec;
+use device::DbcDevice;
 
 impl Driver for Options {
     const NAME: &'static str = "dbc";
@@ -92,7 +92,7 @@ impl Driver for Options {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Ok(Box::new(DbcDevice::new(spec, self)?))
+        DbcDevice::device(spec, self)
     }
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {

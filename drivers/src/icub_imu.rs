@@ -77,13 +77,13 @@ mod frames;
 mod options;
 
 pub use board::ImuBoard;
-pub use device::ImuDevice;
 pub use frames::{Fusion, Legacy, Quantity};
 pub use options::Options;
 
 use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
+use device::ImuDevice;
 use proprio_topics::Kind;
 
 impl Driver for Options {
@@ -94,7 +94,7 @@ impl Driver for Options {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Ok(Box::new(ImuDevice::new(spec, self)?))
+        ImuDevice::device(spec, self)
     }
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {

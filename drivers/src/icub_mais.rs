@@ -29,10 +29,11 @@
 
 use crate::bringup::{Bringup, NoInquiry};
 use crate::bytes;
+use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
 use crate::{
-    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, NotSent, Output,
-    OutputInfo, Outputs, Spec, SpecError, State, Transmit,
+    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
+    Outputs, Spec, SpecError,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -78,7 +79,7 @@ impl Driver for Options {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Ok(Box::new(Mais::new(spec, self)?))
+        Mais::device(spec, self)
     }
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
@@ -88,10 +89,8 @@ impl Driver for Options {
 
 /// The host's side of a MAIS board.
 #[derive(Debug)]
-pub struct Mais {
+struct Mais {
     address: u8,
-    claims: ArrayVec<Claim, 2>,
-    bringup: Bringup,
     outputs: Outputs,
     /// Sensors whose next reading follows a gap, one bit each.
     gap: u16,
@@ -100,11 +99,7 @@ pub struct Mais {
 }
 
 impl Mais {
-    /// A device in its initial state.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, a period out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
         let address = icub::address(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
         let timing = icub::timing(options.power_on_silence_ms)?;
@@ -115,26 +110,22 @@ impl Mais {
         bringup.start_with(id, &[command::SET_CANDATARATE, period]);
         bringup.start_with(id, &[command::SET_TXMODE, 0]);
         bringup.stop_with(id, &[command::SET_TXMODE, 1]);
-        Ok(Self {
+        let claims: ArrayVec<Claim, 2> =
+            icub::claims(class::PERIODIC_ANALOG, address, &[HES0TO6, HES7TO14]);
+        let this = Self {
             address,
-            claims: icub::claims(class::PERIODIC_ANALOG, address, &[HES0TO6, HES7TO14]),
-            bringup,
             outputs: spec.outputs.clone(),
             gap: 0,
             seen: 0,
-        })
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
 }
 
-impl Device for Mais {
-    fn claims(&self) -> &[Claim] {
-        &self.claims
-    }
+impl Family for Mais {
+    type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
-        if !self.bringup.active() {
-            return;
-        }
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address);
         let (first, length) = match stream {
             Some(HES0TO6) => (0, SECOND),
@@ -147,7 +138,7 @@ impl Device for Mais {
         if data.len() != usize::from(length) {
             return out.fault(Counter::Length, 1, frame.id);
         }
-        if self.bringup.reading(frame.t) {
+        if link.bringup.reading(frame.t) {
             self.gap = self.seen;
         }
         for (output, count) in (first..).zip(data) {
@@ -168,35 +159,6 @@ impl Device for Mais {
             out.push(Output::new(output, frame, quality, reading), frame.id);
         }
     }
-
-    fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
-        self.bringup.poll(now, &mut NoInquiry, out)
-    }
-
-    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
-        self.bringup.on_sent(frame, outcome, &mut NoInquiry);
-    }
-
-    fn next_wake(&self) -> Option<Nanos> {
-        self.bringup.next_wake(&NoInquiry)
-    }
-
-    fn state(&self) -> State {
-        self.bringup.state(&NoInquiry)
-    }
-
-    fn stop(&mut self, _now: Nanos) {
-        self.bringup.stop();
-    }
-
-    fn restart(&mut self, _now: Nanos) {
-        self.bringup.restart();
-        self.gap = self.seen;
-    }
-
-    fn set_max_silence(&mut self, max_silence: Nanos) {
-        self.bringup.set_max_silence(max_silence);
-    }
 }
 
 /// The board's own side. It sends a frame when all sensors of it that are joints are new.
@@ -215,7 +177,7 @@ impl MaisBoard {
     /// A board after power-on; in [`Mode::Listen`] another program has already started it.
     ///
     /// # Errors
-    /// As [`Mais::new`].
+    /// [`SpecError`]: an address outside 1 to 14, a period out of range.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let ms = icub::period_ms("period_ms", options.period_ms)?;
         Ok(Self {

@@ -62,10 +62,11 @@
 
 use crate::bringup::{Bringup, NoInquiry};
 use crate::bytes;
+use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class};
 use crate::{
-    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, NotSent, Output,
-    OutputInfo, Spec, SpecError, State, Transmit,
+    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
+    Spec, SpecError,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -175,7 +176,7 @@ impl Driver for Options {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Ok(Box::new(Motor::new(spec, self)?))
+        Motor::device(spec, self)
     }
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
@@ -200,24 +201,15 @@ fn quality_of(actuator: &Actuator) -> Quality {
 
 /// The host's side of a motor board.
 #[derive(Debug)]
-pub struct Motor {
+struct Motor {
     address: u8,
-    claims: ArrayVec<Claim, 4>,
-    bringup: Bringup,
     velocity: bool,
     /// The quality from the last status.
     status: Quality,
-    /// Whether there was a reading: from then on a restart leaves a gap.
-    seen: bool,
-    gap: bool,
 }
 
 impl Motor {
-    /// A device in its initial state.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, a period out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
         let address = icub::address(spec)?;
         icub::period_ms("period_ms", options.period_ms)?;
         let kinds = [
@@ -227,18 +219,17 @@ impl Motor {
             kind::OVERFLOW,
         ];
         let watched = icub::stream(class::PERIODIC_MOTOR, address, kind::TWO_FOC);
-        Ok(Self {
+        let claims: ArrayVec<Claim, 4> = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
+        let bringup = Bringup::new(spec, Mode::Listen, icub::TIMING, watched);
+        let this = Self {
             address,
-            claims: icub::claims(class::PERIODIC_MOTOR, address, &kinds),
-            bringup: Bringup::new(spec, Mode::Listen, icub::TIMING, watched),
             velocity: options.velocity,
             status: Quality::GOOD,
-            seen: false,
-            gap: false,
-        })
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
 
-    fn motion(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    fn motion(&self, data: &[u8], frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
         let mut quality = self.status;
         if quality.contains(Quality::DEVICE_FAULT) {
             out.fault(Counter::DeviceFault, 1, frame.id);
@@ -246,10 +237,9 @@ impl Motor {
         if quality.contains(Quality::DRIVE_FAULT) {
             out.fault(Counter::DriveFault, 1, frame.id);
         }
-        if core::mem::take(&mut self.gap) | self.bringup.reading(frame.t) {
+        if link.bringup.reading(frame.t) {
             quality |= Quality::GAP_BEFORE;
         }
-        self.seen = true;
         let velocity = f64::from(bytes::i16_le(data, 2)) * RAD_PER_S_PER_LSB;
         let reading = Reading::Joint(JointState {
             position: f64::from(bytes::u32_le(data, 4).cast_signed()) * RAD_PER_LSB,
@@ -276,15 +266,10 @@ impl Motor {
     }
 }
 
-impl Device for Motor {
-    fn claims(&self) -> &[Claim] {
-        &self.claims
-    }
+impl Family for Motor {
+    type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
-        if !self.bringup.active() {
-            return;
-        }
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
         let Some(stream) = icub::stream_type(frame.id, class::PERIODIC_MOTOR, self.address) else {
             return;
         };
@@ -298,7 +283,7 @@ impl Device for Motor {
             return;
         };
         match (stream, data.len()) {
-            (kind::TWO_FOC, 8) => self.motion(data, frame, out),
+            (kind::TWO_FOC, 8) => self.motion(data, frame, link, out),
             (kind::STATUS, 8) => self.status(data, frame, out),
             (kind::ADDITIONAL_STATUS, 4) => {}
             (kind::OVERFLOW, _) => out.fault(Counter::DeviceFault, 1, frame.id),
@@ -306,34 +291,8 @@ impl Device for Motor {
         }
     }
 
-    fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
-        self.bringup.poll(now, &mut NoInquiry, out)
-    }
-
-    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
-        self.bringup.on_sent(frame, outcome, &mut NoInquiry);
-    }
-
-    fn next_wake(&self) -> Option<Nanos> {
-        self.bringup.next_wake(&NoInquiry)
-    }
-
-    fn state(&self) -> State {
-        self.bringup.state(&NoInquiry)
-    }
-
-    fn stop(&mut self, _now: Nanos) {
-        self.bringup.stop();
-    }
-
-    fn restart(&mut self, _now: Nanos) {
-        self.bringup.restart();
+    fn reset(&mut self) {
         self.status = Quality::GOOD;
-        self.gap |= self.seen;
-    }
-
-    fn set_max_silence(&mut self, max_silence: Nanos) {
-        self.bringup.set_max_silence(max_silence);
     }
 }
 
@@ -351,7 +310,7 @@ impl MotorBoard {
     /// A board that streams at once.
     ///
     /// # Errors
-    /// As [`Motor::new`].
+    /// [`SpecError`]: an address outside 1 to 14, a period out of range.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let period =
             Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));

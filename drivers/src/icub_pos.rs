@@ -46,10 +46,11 @@
 use crate::bringup::Bringup;
 use crate::bytes;
 use crate::configure::{Configure, Setting};
+use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
 use crate::{
-    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, NotSent, Output,
-    OutputInfo, Outputs, Spec, SpecError, State, Transmit,
+    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
+    Outputs, Spec, SpecError,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -210,7 +211,7 @@ impl Driver for Options {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Ok(Box::new(Pos::new(spec, self)?))
+        Pos::device(spec, self)
     }
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
@@ -220,11 +221,8 @@ impl Driver for Options {
 
 /// The host's side of a POS board.
 #[derive(Debug)]
-pub struct Pos {
+struct Pos {
     address: u8,
-    claims: ArrayVec<Claim, 2>,
-    bringup: Bringup,
-    configure: Configure,
     quantity: Quantity,
     outputs: Outputs,
     /// Labels whose next reading follows a gap, one bit each.
@@ -234,11 +232,7 @@ pub struct Pos {
 }
 
 impl Pos {
-    /// A device in its initial state.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
         let address = icub::address(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
         let timing = icub::timing(options.power_on_silence_ms)?;
@@ -259,34 +253,28 @@ impl Pos {
         if setting.is_some() {
             claims.push(Claim::shared(icub::to_host(class::POLLING_ANALOG, address)));
         }
-        Ok(Self {
+        let configure = Configure::new(spec, setting, icub::TIMING);
+        let this = Self {
             address,
-            claims,
-            bringup,
-            configure: Configure::new(spec, setting, icub::TIMING),
             quantity: options.quantity,
             outputs: spec.outputs.clone(),
             gap: 0,
             seen: 0,
-        })
+        };
+        Ok(Supervised::boxed(claims, bringup, configure, this))
     }
 }
 
-impl Device for Pos {
-    fn claims(&self) -> &[Claim] {
-        &self.claims
-    }
+impl Family for Pos {
+    type Questions = Configure;
 
-    fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
-        if !self.bringup.active() {
-            return;
-        }
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Configure>, out: &mut Decoded) {
         if frame.id == icub::to_host(class::POLLING_ANALOG, self.address) {
             // Answers to other questions are for other devices.
             if let Some(data) = bytes::payload(frame, out)
                 && data.first() == Some(&command::POS_CONFIG_GET)
             {
-                self.configure.answer(data, frame, out);
+                link.questions.answer(data, frame, out);
             }
             return;
         }
@@ -307,7 +295,7 @@ impl Device for Pos {
         if quantity != code || !(1..=VALUES).contains(&count) || label + count - 1 > LABEL_MOST {
             return out.fault(Counter::Value, 1, frame.id);
         }
-        if self.bringup.reading(frame.t) {
+        if link.bringup.reading(frame.t) {
             self.gap = self.seen;
         }
         for (output, value) in (label..)
@@ -322,7 +310,7 @@ impl Device for Pos {
             if self.gap & bit != 0 {
                 quality |= Quality::GAP_BEFORE;
             }
-            if !self.configure.confirmed() {
+            if !link.questions.confirmed() {
                 quality |= Quality::NOT_CALIBRATED;
             }
             self.gap &= !bit;
@@ -335,35 +323,6 @@ impl Device for Pos {
             let output = Output::new(output, frame, quality, reading);
             out.push(output, frame.id);
         }
-    }
-
-    fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
-        self.bringup.poll(now, &mut self.configure, out)
-    }
-
-    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
-        self.bringup.on_sent(frame, outcome, &mut self.configure);
-    }
-
-    fn next_wake(&self) -> Option<Nanos> {
-        self.bringup.next_wake(&self.configure)
-    }
-
-    fn state(&self) -> State {
-        self.bringup.state(&self.configure)
-    }
-
-    fn stop(&mut self, _now: Nanos) {
-        self.bringup.stop();
-    }
-
-    fn restart(&mut self, _now: Nanos) {
-        self.bringup.restart();
-        self.gap = self.seen;
-    }
-
-    fn set_max_silence(&mut self, max_silence: Nanos) {
-        self.bringup.set_max_silence(max_silence);
     }
 }
 
@@ -383,7 +342,7 @@ impl PosBoard {
     /// A board after power-on; in [`Mode::Listen`] another program has already started it.
     ///
     /// # Errors
-    /// As [`Pos::new`].
+    /// [`SpecError`]: an address outside 1 to 14, a key out of range.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         options.configuration()?;
         let period =

@@ -42,11 +42,12 @@
 
 use crate::bringup::{Bringup, NoInquiry};
 use crate::bytes;
+use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{Limit, Paired, Pairing};
 use crate::{
-    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Id, Mode, NotSent, Output,
-    OutputInfo, Spec, SpecError, State, Transmit,
+    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Id, Mode, Output,
+    OutputInfo, Spec, SpecError,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -142,7 +143,7 @@ impl Driver for Options {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Ok(Box::new(Patch::new(spec, self)?))
+        Patch::device(spec, self)
     }
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
@@ -152,10 +153,8 @@ impl Driver for Options {
 
 /// The host's side of a skin board.
 #[derive(Debug)]
-pub struct Patch {
+struct Patch {
     address: u8,
-    claims: [Claim; 1],
-    bringup: Bringup,
     no_load: u8,
     triangles: [u8; 2],
     pairing: [Pairing<[u8; 7]>; TRIANGLES],
@@ -166,11 +165,7 @@ pub struct Patch {
 }
 
 impl Patch {
-    /// A device in its initial state.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
         options.check()?;
         let address = icub::address(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
@@ -202,19 +197,19 @@ impl Patch {
         );
         bringup.start_with(id, &[command::SET_TXMODE, 0]);
         bringup.stop_with(id, &[command::SET_TXMODE, 1]);
-        Ok(Self {
+        let claim = Claim {
+            mask: !0xF,
+            ..Claim::exclusive(icub::stream(class::PERIODIC_SKIN, address, 0))
+        };
+        let this = Self {
             address,
-            claims: [Claim {
-                mask: !0xF,
-                ..Claim::exclusive(icub::stream(class::PERIODIC_SKIN, address, 0))
-            }],
-            bringup,
             no_load: options.no_load,
             triangles: options.triangles,
             pairing: core::array::from_fn(|_| Pairing::new(limit, true)),
             gap: 0,
             seen: 0,
-        })
+        };
+        Ok(Supervised::boxed([claim], bringup, NoInquiry, this))
     }
 
     /// The reading of both frames' bytes.
@@ -237,15 +232,10 @@ impl Patch {
     }
 }
 
-impl Device for Patch {
-    fn claims(&self) -> &[Claim] {
-        &self.claims
-    }
+impl Family for Patch {
+    type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
-        if !self.bringup.active() {
-            return;
-        }
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_SKIN, self.address);
         let Some(triangle) = stream else { return };
         let Some(data) = bytes::payload(frame, out) else {
@@ -274,7 +264,7 @@ impl Device for Patch {
         let Paired::With(acquired, stamp, other) = paired else {
             return;
         };
-        if self.bringup.reading(frame.t) {
+        if link.bringup.reading(frame.t) {
             self.gap = self.seen;
         }
         let (skin, mut quality) = self.skin(triangle, other, half);
@@ -294,34 +284,8 @@ impl Device for Patch {
         out.push(output, frame.id);
     }
 
-    fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
-        self.bringup.poll(now, &mut NoInquiry, out)
-    }
-
-    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
-        self.bringup.on_sent(frame, outcome, &mut NoInquiry);
-    }
-
-    fn next_wake(&self) -> Option<Nanos> {
-        self.bringup.next_wake(&NoInquiry)
-    }
-
-    fn state(&self) -> State {
-        self.bringup.state(&NoInquiry)
-    }
-
-    fn stop(&mut self, _now: Nanos) {
-        self.bringup.stop();
-    }
-
-    fn restart(&mut self, _now: Nanos) {
-        self.bringup.restart();
+    fn reset(&mut self) {
         self.pairing.iter_mut().for_each(Pairing::reset);
-        self.gap = self.seen;
-    }
-
-    fn set_max_silence(&mut self, max_silence: Nanos) {
-        self.bringup.set_max_silence(max_silence);
     }
 }
 
@@ -339,7 +303,7 @@ impl SkinBoard {
     /// A board after power-on; in [`Mode::Listen`] another program has already started it.
     ///
     /// # Errors
-    /// As [`Patch::new`].
+    /// [`SpecError`]: an address outside 1 to 14, a key out of range.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         options.check()?;
         let ms = icub::period_ms("period_ms", options.period_ms)?;

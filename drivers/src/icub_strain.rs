@@ -82,12 +82,12 @@ mod options;
 mod tare;
 
 pub use board::StrainBoard;
-pub use device::Strain;
 pub use options::{Options, Stream};
 
 use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
+use device::Strain;
 use proprio_topics::Kind;
 
 impl Driver for Options {
@@ -98,7 +98,7 @@ impl Driver for Options {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Ok(Box::new(Strain::new(spec, self)?))
+        Strain::device(spec, self)
     }
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {

@@ -30,6 +30,7 @@ mod bytes;
 mod configure;
 pub mod dbc;
 pub mod device;
+mod family;
 pub mod frame;
 pub mod icub;
 pub mod icub_imu;

@@ -32,7 +32,7 @@ impl DbcBoard {
     /// A device after power-on.
     ///
     /// # Errors
-    /// As [`DbcDevice::new`](super::DbcDevice::new); [`SpecError::Key`] for a period outside 1 to
+    /// [`SpecError::Description`]: keys and file do not fit each other; [`SpecError::Key`] for a period outside 1 to
     /// 60000 ms.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let layout = Layout::new(spec, options)?;

@@ -4,11 +4,10 @@
 use super::layout::{Field, Layout, Part, ReadingLayout, Role};
 use super::options::Options;
 use crate::bringup::{Bringup, NoInquiry, Timing};
+use crate::family::{Family, Link, Supervised};
 use crate::pairing::within;
-use crate::{
-    Claim, Decoded, Device, Format, Frame, Id, Mode, NotSent, Output, Spec, SpecError, State,
-    Transmit,
-};
+use crate::{Claim, Decoded, Device, Format, Frame, Id, Mode, Output, Spec, SpecError};
+use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::reading::VALUES;
 use proprio_topics::{
@@ -30,11 +29,9 @@ const TIMING: Timing = Timing {
 
 /// The host's side of a device that a .dbc file describes.
 #[derive(Debug)]
-pub struct DbcDevice {
+pub(super) struct DbcDevice {
     layout: Layout,
-    claims: Vec<Claim>,
     readings: Vec<Assembly>,
-    bringup: Bringup,
 }
 
 /// A reading on its way.
@@ -69,7 +66,7 @@ impl DbcDevice {
     ///
     /// # Errors
     /// [`SpecError::Description`]: keys and file do not fit each other.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
         let layout = Layout::new(spec, options)?;
         let claims: Vec<Claim> = (layout.messages.iter())
             .map(|message| Claim::shared(message.id))
@@ -89,12 +86,12 @@ impl DbcDevice {
                 .max();
             Assembly::new(reading, most.unwrap_or(0))
         });
-        Ok(Self {
+        let bringup = Bringup::new(spec, Mode::Listen, TIMING, watched);
+        let this = Self {
             readings: readings.collect(),
-            claims,
-            bringup: Bringup::new(spec, Mode::Listen, TIMING, watched),
             layout,
-        })
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
 }
 
@@ -267,13 +264,11 @@ impl Assembly {
     }
 }
 
-impl Device for DbcDevice {
-    fn claims(&self) -> &[Claim] {
-        &self.claims
-    }
+impl Family for DbcDevice {
+    type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
-        if !self.bringup.active() || frame.format == Format::Error {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+        if frame.format == Format::Error {
             return;
         }
         let found = self
@@ -299,7 +294,7 @@ impl Device for DbcDevice {
             if !has || !assembly.take(part, data, frame, out) {
                 continue;
             }
-            let after_silence = self.bringup.reading(frame.t);
+            let after_silence = link.bringup.reading(frame.t);
             let number = u8::try_from(part.reading).unwrap_or(u8::MAX);
             if let Some(output) = assembly.finish(number, after_silence, frame, out) {
                 out.push(output, frame.id);
@@ -307,36 +302,11 @@ impl Device for DbcDevice {
         }
     }
 
-    fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
-        self.bringup.poll(now, &mut NoInquiry, out)
-    }
-
-    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
-        self.bringup.on_sent(frame, outcome, &mut NoInquiry);
-    }
-
-    fn next_wake(&self) -> Option<Nanos> {
-        self.bringup.next_wake(&NoInquiry)
-    }
-
-    fn state(&self) -> State {
-        self.bringup.state(&NoInquiry)
-    }
-
-    fn stop(&mut self, _now: Nanos) {
-        self.bringup.stop();
-    }
-
-    fn restart(&mut self, _now: Nanos) {
+    fn reset(&mut self) {
         for assembly in &mut self.readings {
             let fresh = Assembly::new(&assembly.layout, assembly.most);
             let seen = !core::mem::replace(assembly, fresh).joined;
             assembly.gap = seen;
         }
-        self.bringup.restart();
-    }
-
-    fn set_max_silence(&mut self, max_silence: Nanos) {
-        self.bringup.set_max_silence(max_silence);
     }
 }

@@ -8,9 +8,11 @@ use super::options::{Options, Plan};
 use crate::bringup::Bringup;
 use crate::bytes;
 use crate::configure::{Configure, Setting};
+use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{self, Limit, Paired, Pairing};
-use crate::{Claim, Decoded, Device, Frame, NotSent, Output, Spec, SpecError, State, Transmit};
+use crate::{Claim, Decoded, Device, Frame, NotSent, Output, Spec, SpecError};
+use alloc::boxed::Box;
 use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Imu, Nanos, Quality, Reading, StampKind};
 
@@ -44,11 +46,8 @@ impl Acquisition {
 
 /// The host's side of an IMU.
 #[derive(Debug)]
-pub struct ImuDevice {
+pub(super) struct ImuDevice {
     plan: Plan,
-    claims: ArrayVec<Claim, 4>,
-    bringup: Bringup,
-    configure: Configure,
     acquisition: Acquisition,
     /// SEQ of the last acquisition begun.
     sequence: Option<u8>,
@@ -65,12 +64,7 @@ pub struct ImuDevice {
 }
 
 impl ImuDevice {
-    /// A device in its initial state.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, incompatible quantities, a key out of
-    /// range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
         let plan = Plan::new(spec, options)?;
         let timing = icub::timing(options.power_on_silence_ms)?;
         let is_legacy = plan.legacy != Legacy::None;
@@ -109,11 +103,9 @@ impl ImuDevice {
             compared: 1..5,
         };
         let period = Nanos::from_millis(i64::from(plan.period_ms));
-        Ok(Self {
-            claims,
-            bringup,
-            // Legacy boards have no such configuration.
-            configure: Configure::new(spec, (!is_legacy).then_some(setting), icub::TIMING),
+        // Legacy boards have no such configuration.
+        let configure = Configure::new(spec, (!is_legacy).then_some(setting), icub::TIMING);
+        let this = Self {
             acquisition: Acquisition::NONE,
             sequence: None,
             may_jump: Nanos::MIN,
@@ -124,7 +116,8 @@ impl ImuDevice {
             gap: false,
             seen: false,
             plan,
-        })
+        };
+        Ok(Supervised::boxed(claims, bringup, configure, this))
     }
 
     /// Whether a frame with `sequence` belongs to the open acquisition; a later `sequence` opens a
@@ -173,7 +166,7 @@ impl ImuDevice {
 
     /// Records that the acquisition has `bit`; outputs the reading when all wanted quantities are
     /// present.
-    fn hold(&mut self, bit: u16, frame: &Frame, out: &mut Decoded) {
+    fn hold(&mut self, bit: u16, frame: &Frame, link: &mut Link<Configure>, out: &mut Decoded) {
         self.acquisition.have |= bit;
         if self.acquisition.have & self.plan.want != self.plan.want {
             return;
@@ -190,7 +183,7 @@ impl ImuDevice {
             quality |= Quality::NOT_CALIBRATED;
         }
         let counter = u32::from(self.sequence.unwrap_or(0));
-        self.give(imu, acquired, stamp, counter, quality, frame, out);
+        self.give(imu, acquired, stamp, counter, quality, frame, link, out);
     }
 
     #[allow(clippy::too_many_arguments)]
@@ -202,9 +195,10 @@ impl ImuDevice {
         device_counter: u32,
         mut quality: Quality,
         frame: &Frame,
+        link: &mut Link<Configure>,
         out: &mut Decoded,
     ) {
-        if core::mem::take(&mut self.gap) | self.bringup.reading(frame.t) {
+        if core::mem::take(&mut self.gap) | link.bringup.reading(frame.t) {
             quality |= Quality::GAP_BEFORE;
         }
         self.seen = true;
@@ -217,7 +211,13 @@ impl ImuDevice {
         out.push(output, frame.id);
     }
 
-    fn triple(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    fn triple(
+        &mut self,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Link<Configure>,
+        out: &mut Decoded,
+    ) {
         let &[sequence, sensor, ..] = data else {
             return;
         };
@@ -239,10 +239,16 @@ impl ImuDevice {
             _ => (&mut imu.angular_velocity, RATE_LSB),
         };
         *field = vector(data, 2).map(|count| f64::from(count) * lsb);
-        self.hold(bit, frame, out);
+        self.hold(bit, frame, link, out);
     }
 
-    fn quaternion(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    fn quaternion(
+        &mut self,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Link<Configure>,
+        out: &mut Decoded,
+    ) {
         let bit = Quantity::Orientation.bit();
         // Before the first acquisition that is heard it belongs to an earlier one.
         if self.plan.want & bit == 0 || self.sequence.is_none() {
@@ -259,10 +265,16 @@ impl ImuDevice {
         let w = bytes::i16_le(data, 0);
         self.acquisition.imu.orientation =
             [w, x, y, z].map(|count| f64::from(count) * QUATERNION_LSB);
-        self.hold(bit, frame, out);
+        self.hold(bit, frame, link, out);
     }
 
-    fn status(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    fn status(
+        &mut self,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Link<Configure>,
+        out: &mut Decoded,
+    ) {
         let &[sequence, gyroscope, accelerometer, magnetometer, ..] = data else {
             return;
         };
@@ -279,10 +291,17 @@ impl ImuDevice {
         self.not_calibrated = lacks(Quantity::Acceleration, accelerometer)
             || lacks(Quantity::AngularVelocity, gyroscope)
             || lacks(Quantity::MagneticField, magnetometer);
-        self.hold(bit, frame, out);
+        self.hold(bit, frame, link, out);
     }
 
-    fn legacy(&mut self, is_gyroscope: bool, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    fn legacy(
+        &mut self,
+        is_gyroscope: bool,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Link<Configure>,
+        out: &mut Decoded,
+    ) {
         let quantity = if is_gyroscope {
             Quantity::AngularVelocity
         } else {
@@ -316,16 +335,7 @@ impl ImuDevice {
             set(!is_gyroscope, first);
             (acquired, stamp) = (t, kind);
         }
-        self.give(imu, acquired, stamp, 0, Quality::GOOD, frame, out);
-    }
-
-    /// Drops the incomplete acquisition: the counter may restart.
-    fn reset(&mut self) {
-        self.acquisition.open = false;
-        self.sequence = None;
-        self.not_calibrated = false;
-        self.legacy.reset();
-        self.gap |= self.seen;
+        self.give(imu, acquired, stamp, 0, Quality::GOOD, frame, link, out);
     }
 }
 
@@ -338,15 +348,10 @@ fn vector(data: &[u8], at: usize) -> [i16; 3] {
     ]
 }
 
-impl Device for ImuDevice {
-    fn claims(&self) -> &[Claim] {
-        &self.claims
-    }
+impl Family for ImuDevice {
+    type Questions = Configure;
 
-    fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
-        if !self.bringup.active() {
-            return;
-        }
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Configure>, out: &mut Decoded) {
         let is_legacy = self.plan.legacy != Legacy::None;
         if let Some(stream) =
             icub::stream_type(frame.id, class::PERIODIC_INERTIAL, self.plan.address)
@@ -361,10 +366,10 @@ impl Device for ImuDevice {
             };
             match stream {
                 _ if data.len() != expected => out.fault(Counter::Length, 1, frame.id),
-                kind::TRIPLE => self.triple(data, frame, out),
-                kind::QUATERNION => self.quaternion(data, frame, out),
-                kind::STATUS => self.status(data, frame, out),
-                _ => self.legacy(stream == kind::LEGACY_GYROSCOPE, data, frame, out),
+                kind::TRIPLE => self.triple(data, frame, link, out),
+                kind::QUATERNION => self.quaternion(data, frame, link, out),
+                kind::STATUS => self.status(data, frame, link, out),
+                _ => self.legacy(stream == kind::LEGACY_GYROSCOPE, data, frame, link, out),
             }
         } else if !is_legacy
             && frame.id == icub::to_host(class::POLLING_ANALOG, self.plan.address)
@@ -372,7 +377,7 @@ impl Device for ImuDevice {
         {
             match data.first() {
                 Some(&command::IMU_CONFIG_GET) => {
-                    self.configure.answer(data, frame, out);
+                    link.questions.answer(data, frame, out);
                 }
                 // Answers to other questions are for other devices.
                 Some(_) => {}
@@ -381,41 +386,17 @@ impl Device for ImuDevice {
         }
     }
 
-    fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
-        let was_silent = self.bringup.is_silent();
-        let transmit = self.bringup.poll(now, &mut self.configure, out);
-        if self.bringup.is_silent() && !was_silent {
-            self.reset();
-        }
-        transmit
-    }
-
-    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
-        self.bringup.on_sent(frame, outcome, &mut self.configure);
+    fn on_sent(&mut self, _frame: &Frame, outcome: Result<Nanos, NotSent>) {
         // It takes the command within the time of an answer, and sends a period later.
         if let Ok(t) = outcome {
             self.may_jump = t + icub::TIMING.answer_timeout + self.together + self.together;
         }
     }
 
-    fn next_wake(&self) -> Option<Nanos> {
-        self.bringup.next_wake(&self.configure)
-    }
-
-    fn state(&self) -> State {
-        self.bringup.state(&self.configure)
-    }
-
-    fn stop(&mut self, _now: Nanos) {
-        self.bringup.stop();
-    }
-
-    fn restart(&mut self, _now: Nanos) {
-        self.bringup.restart();
-        self.reset();
-    }
-
-    fn set_max_silence(&mut self, max_silence: Nanos) {
-        self.bringup.set_max_silence(max_silence);
+    fn reset(&mut self) {
+        self.acquisition.open = false;
+        self.sequence = None;
+        self.not_calibrated = false;
+        self.legacy.reset();
     }
 }

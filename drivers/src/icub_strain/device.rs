@@ -6,12 +6,14 @@ use super::options::{Options, Stream};
 use super::tare::Tare;
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry};
 use crate::bytes;
+use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{Limit, Paired, Pairing};
 use crate::{
     Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Mode,
-    NotSent, Output, Spec, SpecError, State, Transmit,
+    NotSent, Output, Spec, SpecError, State,
 };
+use alloc::boxed::Box;
 use arrayvec::ArrayVec;
 use proprio_topics::{
     Counter, Gauges, Nanos, Quality, Reading, Refusal, StampKind, Temperature, Wrench,
@@ -19,7 +21,7 @@ use proprio_topics::{
 
 /// The full scales: configured, requested axis by axis, or from replies to another program.
 #[derive(Debug)]
-struct FullScales {
+pub(super) struct FullScales {
     /// The scale is configured, or not needed because only raw gauges are streamed: nothing to ask.
     settled: bool,
     /// N or Nm per step of the stream, once all six are known.
@@ -231,26 +233,16 @@ impl Pair {
 
 /// The host's side of an F/T board.
 #[derive(Debug)]
-pub struct Strain {
+pub(super) struct Strain {
     address: u8,
-    claims: ArrayVec<Claim, 7>,
-    bringup: Bringup,
-    scales: FullScales,
     tare: Tare,
     stream: Stream,
     calibrated: Pair,
     raw: Pair,
-    /// Whether there was a reading: from then on a restart leaves a gap.
-    seen: bool,
 }
 
 impl Strain {
-    /// A device in its initial state.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, a period or time out of range, a full
-    /// scale that is not positive or incomplete.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
         let address = icub::address(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
         let configured = options.full_scale(false)?;
@@ -299,17 +291,15 @@ impl Strain {
             ],
         );
         claims.push(Claim::shared(icub::to_host(class::POLLING_ANALOG, address)));
-        Ok(Self {
+        let scales = FullScales::new(address, configured, options.stream);
+        let this = Self {
             address,
-            claims,
-            bringup,
-            scales: FullScales::new(address, configured, options.stream),
             tare: Tare::new(address),
             stream: options.stream,
             calibrated: Pair::new(limit),
             raw: Pair::new(limit),
-            seen: false,
-        })
+        };
+        Ok(Supervised::boxed(claims, bringup, scales, this))
     }
 
     /// Outputs a reading from its two frames.
@@ -319,13 +309,13 @@ impl Strain {
         quality: Quality,
         reading: Reading,
         frame: &Frame,
+        link: &mut Link<FullScales>,
         out: &mut Decoded,
     ) {
-        self.seen = true;
         if quality.contains(Quality::SATURATED) {
             out.fault(Counter::Saturated, 1, frame.id);
         }
-        let gap = if self.bringup.reading(frame.t) {
+        let gap = if link.bringup.reading(frame.t) {
             Quality::GAP_BEFORE
         } else {
             Quality::GOOD
@@ -338,18 +328,25 @@ impl Strain {
         out.push(output, frame.id);
     }
 
-    fn wrench(&mut self, second: bool, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    fn wrench(
+        &mut self,
+        second: bool,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Link<FullScales>,
+        out: &mut Decoded,
+    ) {
         let Some(whole) = self.calibrated.push(second, data, frame, out) else {
             return;
         };
-        let Some(per_step) = self.scales.per_step else {
-            if self.bringup.mode() == Mode::Listen
-                && !self.scales.settled
-                && self.scales.refusal.is_none()
+        let Some(per_step) = link.questions.per_step else {
+            if link.bringup.mode() == Mode::Listen
+                && !link.questions.settled
+                && link.questions.refusal.is_none()
             {
                 // The board streams already, its scale is unknown, and no other program will
                 // request it for this host.
-                self.scales.refusal = Some(Refusal::NoFullScale);
+                link.questions.refusal = Some(Refusal::NoFullScale);
             }
             return;
         };
@@ -371,10 +368,17 @@ impl Strain {
             Quality::GOOD
         };
         let quality = whole.quality | frozen | step | self.calibrated.take_gap();
-        self.give(&whole, quality, reading, frame, out);
+        self.give(&whole, quality, reading, frame, link, out);
     }
 
-    fn gauges(&mut self, second: bool, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    fn gauges(
+        &mut self,
+        second: bool,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Link<FullScales>,
+        out: &mut Decoded,
+    ) {
         let Some(whole) = self.raw.push(second, data, frame, out) else {
             return;
         };
@@ -383,29 +387,24 @@ impl Strain {
             counts: [a, b, c, d, e, f].map(i32::from),
         });
         let quality = whole.quality | self.raw.take_gap();
-        self.give(&whole, quality, reading, frame, out);
+        self.give(&whole, quality, reading, frame, link, out);
     }
 }
 
-impl Device for Strain {
-    fn claims(&self) -> &[Claim] {
-        &self.claims
-    }
+impl Family for Strain {
+    type Questions = FullScales;
 
-    fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
-        if !self.bringup.active() {
-            return;
-        }
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<FullScales>, out: &mut Decoded) {
         if let Some(stream) = icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address) {
             let known = matches!(stream, kind::RAW_FORCE..=kind::TORQUE | kind::THERMOMETER..);
             let Some(data) = known.then(|| bytes::payload(frame, out)).flatten() else {
                 return;
             };
             match stream {
-                kind::FORCE => self.wrench(false, data, frame, out),
-                kind::TORQUE => self.wrench(true, data, frame, out),
-                kind::RAW_FORCE => self.gauges(false, data, frame, out),
-                kind::RAW_TORQUE => self.gauges(true, data, frame, out),
+                kind::FORCE => self.wrench(false, data, frame, link, out),
+                kind::TORQUE => self.wrench(true, data, frame, link, out),
+                kind::RAW_FORCE => self.gauges(false, data, frame, link, out),
+                kind::RAW_TORQUE => self.gauges(true, data, frame, link, out),
                 _ => temperature(data, frame, out),
             }
         } else if frame.id == icub::to_host(class::POLLING_ANALOG, self.address)
@@ -413,9 +412,9 @@ impl Device for Strain {
         {
             match data.first() {
                 Some(&command::GET_FULL_SCALES) => {
-                    self.scales.answer(data, self.bringup.mode(), frame, out);
+                    link.questions.answer(data, link.bringup.mode(), frame, out);
                 }
-                Some(&command::GET_CURR_TARE) if self.bringup.mode() == Mode::Supervise => {
+                Some(&command::GET_CURR_TARE) if link.bringup.mode() == Mode::Supervise => {
                     self.tare.answer(data, frame, out);
                 }
                 // Answers to other questions are for other devices.
@@ -425,54 +424,35 @@ impl Device for Strain {
         }
     }
 
-    fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
-        let transmit = self.bringup.poll(now, &mut self.scales, out);
-        if !self.bringup.is_watching() {
-            self.tare.interrupt();
-        }
-        if transmit.is_some() || !self.bringup.is_idle() {
-            return transmit;
-        }
-        let frame = self.tare.poll(now)?;
-        Some(self.bringup.lend(frame, now))
+    fn reset(&mut self) {
+        self.calibrated.pairing.reset();
+        self.raw.pairing.reset();
+    }
+
+    fn request(&mut self, now: Nanos) -> Option<Frame> {
+        self.tare.poll(now)
+    }
+
+    fn request_at(&self) -> Option<Nanos> {
+        self.tare.wake()
     }
 
     fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
-        self.bringup.on_sent(frame, outcome, &mut self.scales);
         self.tare.sent(frame, outcome);
     }
 
-    fn next_wake(&self) -> Option<Nanos> {
-        let tare = self.tare.wake().filter(|_| self.bringup.is_idle());
-        let bringup = self.bringup.next_wake(&self.scales);
-        bringup.into_iter().chain(tare).min()
-    }
-
-    fn state(&self) -> State {
-        self.bringup.state(&self.scales)
-    }
-
-    fn stop(&mut self, _now: Nanos) {
-        self.bringup.stop();
+    fn interrupt(&mut self) {
         self.tare.interrupt();
     }
 
-    fn restart(&mut self, _now: Nanos) {
-        self.bringup.restart();
-        self.tare.interrupt();
-        for pair in [&mut self.calibrated, &mut self.raw] {
-            pair.pairing.reset();
-            pair.gap |= self.seen;
-        }
-    }
-
-    fn set_max_silence(&mut self, max_silence: Nanos) {
-        self.bringup.set_max_silence(max_silence);
-    }
-
-    fn command(&mut self, command: Command, now: Nanos) -> Result<(), CommandRefused> {
+    fn command(
+        &mut self,
+        command: Command,
+        now: Nanos,
+        link: &Link<FullScales>,
+    ) -> Result<(), CommandRefused> {
         let Command::Tare = command;
-        if self.bringup.mode() == Mode::Listen {
+        if link.bringup.mode() == Mode::Listen {
             return Err(CommandRefused::ListenOnly);
         }
         if self.stream == Stream::Uncalibrated {
@@ -480,22 +460,25 @@ impl Device for Strain {
                 "this device streams raw gauges alone, which a tare does not change",
             ));
         }
-        if self.state() != State::Streaming {
+        if link.state() != State::Streaming {
             return Err(CommandRefused::NotStreaming);
         }
-        if self.tare.is_open() || !self.bringup.is_idle() {
+        if self.tare.is_open() || !link.bringup.is_idle() {
             return Err(CommandRefused::Busy);
         }
         self.tare.begin(now);
         Ok(())
     }
 
-    fn outcome(&mut self) -> Option<Result<CommandOutcome, CommandFailed>> {
+    fn outcome(
+        &mut self,
+        link: &Link<FullScales>,
+    ) -> Option<Result<CommandOutcome, CommandFailed>> {
         let counts = match self.tare.outcome()? {
             Ok(counts) => counts,
             Err(failed) => return Some(Err(failed)),
         };
-        let [fx, fy, fz, tx, ty, tz] = self.scales.per_step.unwrap_or([f64::NAN; 6]);
+        let [fx, fy, fz, tx, ty, tz] = link.questions.per_step.unwrap_or([f64::NAN; 6]);
         let [a, b, c, d, e, f] = counts.map(f64::from);
         Some(Ok(CommandOutcome::Tared(Wrench {
             force: [a * fx, b * fy, c * fz],

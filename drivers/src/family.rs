@@ -1,0 +1,174 @@
+//! The host's side of a device: what its family has of its own ([`Family`]), and what all families
+//! share ([`Supervised`]).
+//!
+//! A family decodes its frames. Its boards' bring-up, silence and restarts are those of
+//! `bringup.rs`, which needs their start and stop commands and the questions that they must answer.
+//! A family whose boards do not stream also says when to ask for the next reading.
+
+use crate::bringup::{Bringup, Inquiry};
+use crate::{
+    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, NotSent,
+    State, Transmit,
+};
+use alloc::boxed::Box;
+use alloc::vec::Vec;
+use proprio_topics::Nanos;
+
+/// What the host's side of a family has of its own.
+pub(crate) trait Family: Send {
+    /// What a board is asked before it is started.
+    type Questions: Inquiry + Send;
+
+    /// As [`Device::on_frame`], until the board is stopped.
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Self::Questions>, out: &mut Decoded);
+
+    /// The board was silent, or may have been reset: an incomplete reading stays incomplete.
+    fn reset(&mut self) {}
+
+    /// A frame for a board that is started, if one is due: a request for a reading, for example.
+    fn request(&mut self, now: Nanos) -> Option<Frame> {
+        let _ = now;
+        None
+    }
+
+    /// When the next one is due.
+    fn request_at(&self) -> Option<Nanos> {
+        None
+    }
+
+    /// What became of a frame, of the bring-up's too.
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        let _ = (frame, outcome);
+    }
+
+    /// The board is not started: requests are not sent, and their answers do not come.
+    fn interrupt(&mut self) {}
+
+    /// As [`Device::command`].
+    fn command(
+        &mut self,
+        command: Command,
+        now: Nanos,
+        link: &Link<Self::Questions>,
+    ) -> Result<(), CommandRefused> {
+        let _ = (command, now, link);
+        Err(CommandRefused::Unsupported)
+    }
+
+    /// As [`Device::outcome`].
+    fn outcome(
+        &mut self,
+        link: &Link<Self::Questions>,
+    ) -> Option<Result<CommandOutcome, CommandFailed>> {
+        let _ = link;
+        None
+    }
+}
+
+/// The bring-up of a board, and what it has been asked.
+#[derive(Debug)]
+pub(crate) struct Link<Q> {
+    pub(crate) bringup: Bringup,
+    pub(crate) questions: Q,
+}
+
+impl<Q: Inquiry> Link<Q> {
+    pub(crate) fn state(&self) -> State {
+        self.bringup.state(&self.questions)
+    }
+}
+
+/// A device of family `F`.
+#[derive(Debug)]
+pub(crate) struct Supervised<F: Family> {
+    claims: Vec<Claim>,
+    link: Link<F::Questions>,
+    family: F,
+}
+
+impl<F: Family + 'static> Supervised<F> {
+    pub(crate) fn boxed(
+        claims: impl IntoIterator<Item = Claim>,
+        bringup: Bringup,
+        questions: F::Questions,
+        family: F,
+    ) -> Box<dyn Device>
+    where
+        F::Questions: 'static,
+    {
+        Box::new(Self {
+            claims: claims.into_iter().collect(),
+            link: Link { bringup, questions },
+            family,
+        })
+    }
+}
+
+impl<F: Family> Device for Supervised<F> {
+    fn claims(&self) -> &[Claim] {
+        &self.claims
+    }
+
+    fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
+        if self.link.bringup.active() {
+            self.family.on_frame(frame, &mut self.link, out);
+        }
+    }
+
+    fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
+        let Link { bringup, questions } = &mut self.link;
+        let was_silent = bringup.is_silent();
+        let transmit = bringup.poll(now, questions, out);
+        if bringup.is_silent() && !was_silent {
+            self.family.reset();
+        }
+        if !bringup.is_watching() {
+            self.family.interrupt();
+        }
+        if transmit.is_some() || !bringup.may_lend() {
+            return transmit;
+        }
+        let frame = self.family.request(now)?;
+        Some(bringup.lend(frame, now))
+    }
+
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        let Link { bringup, questions } = &mut self.link;
+        bringup.on_sent(frame, outcome, questions);
+        self.family.on_sent(frame, outcome);
+    }
+
+    fn next_wake(&self) -> Option<Nanos> {
+        let Link { bringup, questions } = &self.link;
+        let request = (self.family.request_at()).filter(|_| bringup.may_lend());
+        let bringup = bringup.next_wake(questions);
+        bringup.into_iter().chain(request).min()
+    }
+
+    fn state(&self) -> State {
+        self.link.state()
+    }
+
+    fn stop(&mut self, _now: Nanos) {
+        self.link.bringup.stop();
+        self.family.interrupt();
+    }
+
+    fn restart(&mut self, _now: Nanos) {
+        self.link.bringup.restart();
+        self.family.interrupt();
+        self.family.reset();
+    }
+
+    fn set_max_silence(&mut self, max_silence: Nanos) {
+        self.link.bringup.set_max_silence(max_silence);
+    }
+
+    fn command(&mut self, command: Command, now: Nanos) -> Result<(), CommandRefused> {
+        self.family.command(command, now, &self.link)
+    }
+
+    fn outcome(&mut self) -> Option<Result<CommandOutcome, CommandFailed>> {
+        self.family.outcome(&self.link)
+    }
+}
