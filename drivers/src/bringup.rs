@@ -171,6 +171,11 @@ impl Attempts {
         self.next
     }
 
+    /// Answers may arrive until then.
+    pub(crate) const fn counted_until(&self) -> Nanos {
+        self.counts_until
+    }
+
     /// Whether an answer at `t` may belong to an attempt.
     pub(crate) fn counts(&self, t: Nanos) -> bool {
         t <= self.counts_until

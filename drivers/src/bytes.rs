@@ -34,19 +34,16 @@ pub(crate) fn u32_le(data: &[u8], at: usize) -> u32 {
 }
 
 /// Big-endian 16 bits at `at`; 0 beyond the end.
-#[allow(dead_code)] // until the next families
 pub(crate) fn u16_be(data: &[u8], at: usize) -> u16 {
     u16_le(data, at).swap_bytes()
 }
 
 /// As [`u16_be`], in two's complement.
-#[allow(dead_code)] // until the next families
 pub(crate) fn i16_be(data: &[u8], at: usize) -> i16 {
     u16_be(data, at).cast_signed()
 }
 
 /// Big-endian 32 bits at `at`; 0 beyond the end.
-#[allow(dead_code)] // until the next families
 pub(crate) fn u32_be(data: &[u8], at: usize) -> u32 {
     u32_le(data, at).swap_bytes()
 }

@@ -26,8 +26,13 @@ pub(crate) trait Family: Send {
     fn reset(&mut self) {}
 
     /// A frame for a board that is started, if one is due: a request for a reading, for example.
-    fn request(&mut self, now: Nanos) -> Option<Frame> {
-        let _ = now;
+    fn request(
+        &mut self,
+        now: Nanos,
+        link: &mut Link<Self::Questions>,
+        out: &mut Decoded,
+    ) -> Option<Frame> {
+        let _ = (now, link, out);
         None
     }
 
@@ -128,8 +133,8 @@ impl<F: Family> Device for Supervised<F> {
         if transmit.is_some() || !bringup.may_lend() {
             return transmit;
         }
-        let frame = self.family.request(now)?;
-        Some(bringup.lend(frame, now))
+        let frame = self.family.request(now, &mut self.link, out)?;
+        Some(self.link.bringup.lend(frame, now))
     }
 
     fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {

@@ -9,6 +9,7 @@
 //! | [`icub_pos`] | POS encoders: psc, mtb4fap | joint |
 //! | [`icub_mais`] | MAIS: Hall sensors of hands | joint |
 //! | [`icub_skin`] | skin of mtb, mtb4, mtb4c | skin |
+//! | [`ati_netcanoem`] | ATI F/T sensors with the NETCANOEM board | wrench |
 //! | [`dbc`] | any device that a .dbc file describes | any |
 //!
 //! Each family has two sides. A [`Device`] is the host's side: it decodes the frames of its
@@ -25,6 +26,7 @@ extern crate alloc;
 #[cfg(test)]
 extern crate std;
 
+pub mod ati_netcanoem;
 mod bringup;
 mod bytes;
 mod configure;

@@ -2,8 +2,8 @@
 
 use crate::signal::Message;
 use crate::{
-    Board, Device, Driver, OutputInfo, Spec, SpecError, dbc, icub_imu, icub_mais, icub_motor,
-    icub_pos, icub_skin, icub_strain,
+    Board, Device, Driver, OutputInfo, Spec, SpecError, ati_netcanoem, dbc, icub_imu, icub_mais,
+    icub_motor, icub_pos, icub_skin, icub_strain,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -118,6 +118,8 @@ drivers! {
     IcubSkin: icub_skin,
     /// iCub Hall sensors.
     IcubMais: icub_mais,
+    /// ATI F/T sensors.
+    AtiNetcanoem: ati_netcanoem,
     /// Devices that a .dbc file describes.
     Dbc: dbc,
 }

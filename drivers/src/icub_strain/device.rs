@@ -429,7 +429,12 @@ impl Family for Strain {
         self.raw.pairing.reset();
     }
 
-    fn request(&mut self, now: Nanos) -> Option<Frame> {
+    fn request(
+        &mut self,
+        now: Nanos,
+        _link: &mut Link<FullScales>,
+        _out: &mut Decoded,
+    ) -> Option<Frame> {
         self.tare.poll(now)
     }
 

@@ -38,6 +38,8 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
         &[],
     ),
     ("icub_mais", "", &[0, 6, 7, 14]),
+    ("ati_netcanoem", "", &[]),
+    ("ati_netcanoem", crate::ati::KEYS, &[]),
     ("dbc", crate::dbc::WRENCH, &[]),
     ("dbc", crate::dbc::DRIVE, &[0]),
     ("dbc", crate::dbc::PAGES, &[]),

@@ -3,6 +3,7 @@
 //! that answers like a real one.
 
 mod any_frame;
+mod ati;
 mod bringup;
 mod command;
 mod dbc;

@@ -156,11 +156,11 @@ impl Rig {
         outputs: &[u8],
         reading: (u8, Reading),
     ) -> Self {
-        let spec = spec(1, Mode::Supervise, outputs);
+        let host = options(driver, keys);
+        let address = host.default_address().unwrap_or(1);
+        let spec = spec(address, Mode::Supervise, outputs);
         Self {
-            device: options(driver, keys)
-                .device(&spec)
-                .expect("a legal configuration"),
+            device: host.device(&spec).expect("a legal configuration"),
             board: options(driver, board_keys)
                 .board(&spec)
                 .expect("a legal configuration"),
@@ -204,6 +204,8 @@ impl Rig {
     pub(crate) fn run(&mut self, ms: u32) -> &mut Self {
         for _ in 0..ms {
             let mut out = Decoded::new();
+            let (output, reading) = self.reading;
+            self.board.present(output, &reading, Quality::GOOD);
             while let Some(transmit) = self.device.poll_transmit(self.now, &mut out) {
                 assert!(transmit.deadline > self.now, "a frame after its deadline");
                 let under_way = self.device.poll_transmit(self.now, &mut out);
@@ -231,7 +233,6 @@ impl Rig {
                     let due = *self.due.get_or_insert(self.now);
                     if self.now >= due {
                         self.due = Some(due + period);
-                        let (output, reading) = self.reading;
                         let frames = encode(&mut *self.board, output, &reading, Quality::GOOD);
                         self.deliver(&frames);
                     }

@@ -330,6 +330,13 @@ pub enum Refusal {
     },
     /// It reports a different configuration than before: its readings since then cannot be trusted.
     Changed,
+    /// It did not report its calibration in time, and the configuration has none.
+    NoCalibration,
+    /// Its calibration cannot be used for this channel: zeros, or no numbers.
+    BadCalibration {
+        /// The channel, 0 to 5.
+        channel: u8,
+    },
 }
 
 impl Refusal {
@@ -340,6 +347,8 @@ impl Refusal {
             Self::NoFullScale => 1,
             Self::ZeroFullScale { channel } => 0x100 | channel as u32,
             Self::Changed => 2,
+            Self::NoCalibration => 3,
+            Self::BadCalibration { channel } => 0x200 | channel as u32,
         }
     }
 
@@ -350,7 +359,11 @@ impl Refusal {
         match code {
             1 => Some(Self::NoFullScale),
             2 => Some(Self::Changed),
+            3 => Some(Self::NoCalibration),
             0x100..=0x1FF => Some(Self::ZeroFullScale {
+                channel: (code & 0xFF) as u8,
+            }),
+            0x200..=0x2FF => Some(Self::BadCalibration {
                 channel: (code & 0xFF) as u8,
             }),
             _ => None,
@@ -373,6 +386,15 @@ impl fmt::Display for Refusal {
             Self::Changed => f.write_str(
                 "it reports a different configuration than before; check the board, then restart \
                  the gateway",
+            ),
+            Self::NoCalibration => f.write_str(
+                "it did not report its calibration; check its power, cable and address, or \
+                 configure it (matrix, counts, units)",
+            ),
+            Self::BadCalibration { channel } => write!(
+                f,
+                "its calibration cannot be used for channel {channel} (zeros, or no numbers); \
+                 its memory needs repair, or configure it (matrix, counts, units)"
             ),
         }
     }

@@ -1,0 +1,257 @@
+//! The host's side: asks for the readings, and combines the two halves of each.
+
+use super::calibration::{Calibration, TIMING};
+use super::frames::{STATUS_ANY, STATUS_BUS, STATUS_FAULTS, id, opcode, opcode_of};
+use super::options::Options;
+use crate::bringup::Bringup;
+use crate::bytes::{self, i16_be, u16_be};
+use crate::family::{Family, Link, Supervised};
+use crate::pairing::within;
+use crate::{Claim, Decoded, Device, Frame, Mode, NotSent, Output, Spec, SpecError};
+use alloc::boxed::Box;
+use arrayvec::ArrayVec;
+use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind, Wrench};
+
+/// So many readings wait for second halves before a half counts as lost.
+const DEPTH: usize = 4;
+/// And so long: three periods at 100 Hz.
+const LIMIT: Nanos = Nanos::from_millis(30);
+/// A request that is not answered within this time is given up.
+const ANSWER: Nanos = Nanos::from_millis(10);
+/// Then its answer may still come for this long: nothing is asked.
+const LATE: Nanos = Nanos::from_millis(20);
+
+/// A first half: status and gauges 0, 2, 4.
+#[derive(Debug, Clone, Copy)]
+struct First {
+    t: Nanos,
+    stamp: StampKind,
+    status: u16,
+    gauges: [i16; 3],
+}
+
+/// The host's side of the sensor.
+#[derive(Debug)]
+pub(super) struct Netcanoem {
+    base: u8,
+    mode: Mode,
+    period: Nanos,
+    /// The halves that wait, each in the order of the requests.
+    firsts: ArrayVec<First, DEPTH>,
+    seconds: ArrayVec<[i16; 3], DEPTH>,
+    /// Nothing was heard yet: the first second half may belong to a request before.
+    joined: bool,
+    /// The request under way: when it is given up.
+    open: Option<Nanos>,
+    /// When the next is due.
+    next: Nanos,
+}
+
+impl Netcanoem {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        let (base, period) = options.check(spec)?;
+        let bringup = Bringup::new(spec, spec.mode, TIMING, id(base, opcode::GAUGES));
+        let claim = Claim {
+            mask: !0xF,
+            ..Claim::exclusive(id(base, 0))
+        };
+        let calibration = Calibration::new(base, spec.mode, options);
+        let this = Self {
+            base,
+            mode: spec.mode,
+            period,
+            firsts: ArrayVec::new(),
+            seconds: ArrayVec::new(),
+            joined: true,
+            open: None,
+            next: Nanos::MIN,
+        };
+        Ok(Supervised::boxed([claim], bringup, calibration, this))
+    }
+
+    /// Drops the halves that wait.
+    fn drop_all(&mut self, link: &mut Link<Calibration>, frame: &Frame, out: &mut Decoded) {
+        let halves = self.firsts.len() + self.seconds.len();
+        if halves > 0 {
+            link.bringup.lost();
+            out.fault(
+                Counter::Unpaired,
+                u32::try_from(halves).unwrap_or(1),
+                frame.id,
+            );
+        }
+        self.firsts.clear();
+        self.seconds.clear();
+    }
+
+    fn first(
+        &mut self,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Link<Calibration>,
+        out: &mut Decoded,
+    ) {
+        self.joined = false;
+        let in_time = self
+            .firsts
+            .first()
+            .is_none_or(|first| within((first.t, first.stamp), (frame.t, frame.stamp), LIMIT));
+        if self.firsts.is_full() || !in_time {
+            self.drop_all(link, frame, out);
+        }
+        let first = First {
+            t: frame.t,
+            stamp: frame.stamp,
+            status: u16_be(data, 0),
+            gauges: [2, 4, 6].map(|at| i16_be(data, at)),
+        };
+        let _ = self.firsts.try_push(first);
+    }
+
+    fn second(
+        &mut self,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Link<Calibration>,
+        out: &mut Decoded,
+    ) {
+        let in_time = self
+            .firsts
+            .first()
+            .is_some_and(|first| within((first.t, first.stamp), (frame.t, frame.stamp), LIMIT));
+        if !in_time {
+            if !core::mem::take(&mut self.joined) {
+                link.bringup.lost();
+                out.fault(Counter::Unpaired, 1, frame.id);
+            }
+            return self.drop_all(link, frame, out);
+        }
+        let _ = self.seconds.try_push([0, 2, 4].map(|at| i16_be(data, at)));
+        if self.seconds.len() < self.firsts.len() {
+            return;
+        }
+        self.open = None;
+        let (firsts, seconds) = (self.firsts.take(), self.seconds.take());
+        for (first, second) in firsts.into_iter().zip(seconds) {
+            give(first, second, frame, link, out);
+        }
+    }
+}
+
+/// The reading of two halves.
+fn give(
+    first: First,
+    second: [i16; 3],
+    frame: &Frame,
+    link: &mut Link<Calibration>,
+    out: &mut Decoded,
+) {
+    let Some(per_count) = link.questions.per_count() else {
+        if link.bringup.mode() == Mode::Listen {
+            link.questions.missed();
+        }
+        return;
+    };
+    let ([g0, g2, g4], [g1, g3, g5]) = (first.gauges, second);
+    let gauges = [g0, g1, g2, g3, g4, g5].map(f64::from);
+    let dot = |row: &[f64; 6]| row.iter().zip(gauges).map(|(m, g)| m * g).sum::<f64>();
+    let [fx, fy, fz, tx, ty, tz] = per_count.each_ref().map(dot);
+    let reading = Reading::Wrench(Wrench {
+        force: [fx, fy, fz],
+        torque: [tx, ty, tz],
+    });
+    let mut quality = Quality::GOOD;
+    if gauges.iter().any(|gauge| gauge.abs() >= 32767.0) {
+        quality |= Quality::SATURATED;
+        out.fault(Counter::Saturated, 1, frame.id);
+    }
+    let unnamed = first.status & (STATUS_ANY | STATUS_BUS) == STATUS_ANY;
+    if first.status & STATUS_FAULTS != 0 || unnamed {
+        quality |= Quality::DEVICE_FAULT;
+        out.fault(Counter::DeviceFault, 1, frame.id);
+    }
+    if link.bringup.reading(frame.t) {
+        quality |= Quality::GAP_BEFORE;
+    }
+    let output = Output {
+        acquired: first.t,
+        stamp: first.stamp,
+        ..Output::new(0, frame, quality, reading)
+    };
+    out.push(output, frame.id);
+}
+
+impl Family for Netcanoem {
+    type Questions = Calibration;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Calibration>, out: &mut Decoded) {
+        let Some(opcode) = opcode_of(frame.id, self.base) else {
+            return;
+        };
+        let Some(data) = bytes::payload(frame, out) else {
+            return;
+        };
+        match (opcode, data) {
+            (opcode::GAUGES, []) | (opcode::COUNTS | opcode::UNITS, []) => {}
+            (opcode::GAUGES, data) if data.len() == 8 => self.first(data, frame, link, out),
+            (opcode::GAUGES_SECOND, data) if data.len() == 6 => {
+                self.second(data, frame, link, out);
+            }
+            (opcode::GAUGES | opcode::GAUGES_SECOND, _) => out.fault(Counter::Length, 1, frame.id),
+            (opcode::MATRIX, &[row]) if self.mode == Mode::Listen => link.questions.asked(row),
+            (opcode::MATRIX, [_]) => {}
+            (opcode::MATRIX..=opcode::MATRIX_LAST | opcode::SELECT..=opcode::UNITS, data) => {
+                link.questions.answer(opcode, data, frame, out);
+            }
+            // Serial number, diagnosis, and what others change.
+            _ => {}
+        }
+    }
+
+    fn reset(&mut self) {
+        self.firsts.clear();
+        self.seconds.clear();
+        self.joined = true;
+    }
+
+    fn request(
+        &mut self,
+        now: Nanos,
+        link: &mut Link<Calibration>,
+        out: &mut Decoded,
+    ) -> Option<Frame> {
+        if now < self.request_at()? {
+            return None;
+        }
+        if self.open.take().is_some() {
+            // Not answered: what may still come of its answer must not meet the next.
+            link.bringup.lost();
+            out.fault(Counter::Lost, 1, id(self.base, opcode::GAUGES));
+            self.reset();
+            self.next = now + LATE;
+            return None;
+        }
+        self.open = Some(now + ANSWER);
+        let due = self.next + self.period;
+        self.next = if due > now { due } else { now + self.period };
+        Some(Frame::new(id(self.base, opcode::GAUGES), &[]))
+    }
+
+    fn request_at(&self) -> Option<Nanos> {
+        Some(self.open.unwrap_or(self.next))
+    }
+
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        let is_request = frame.id == id(self.base, opcode::GAUGES);
+        match outcome {
+            Ok(t) if is_request && self.open.is_some() => self.open = Some(t + ANSWER),
+            Err(_) if is_request => self.open = None,
+            _ => {}
+        }
+    }
+
+    fn interrupt(&mut self) {
+        self.open = None;
+        self.next = Nanos::MIN;
+    }
+}

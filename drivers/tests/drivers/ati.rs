@@ -1,0 +1,546 @@
+//! ATI NETCANOEM: a session that Python wrote from the manual's tables, halves out of step, and the
+//! questions for the calibration.
+
+use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, spec};
+use proprio_drivers::{Device, Fault, Frame, Mode, NotSent, Options, Output, SpecError, State};
+use proprio_topics::{Counter, Quality, Reading, Refusal, Wrench};
+use proptest::prelude::*;
+
+/// A calibration in the keys: 0.01 N and 0.001 Nm per count.
+pub(crate) const KEYS: &str = r#"
+counts_per_force = 100
+counts_per_torque = 1000
+force_unit = "N"
+torque_unit = "Nm"
+matrix = [
+    [1, 0, 0, 0, 0, 0],
+    [0, 1, 0, 0, 0, 0],
+    [0, 0, 1, 0, 0, 0],
+    [0, 0, 0, 1, 0, 0],
+    [0, 0, 0, 0, 1, 0],
+    [0, 0, 0, 0, 0, 1],
+]
+"#;
+
+fn values(reading: &Reading) -> [f64; 6] {
+    match reading {
+        Reading::Wrench(Wrench { force, torque }) => {
+            let ([fx, fy, fz], [tx, ty, tz]) = (*force, *torque);
+            [fx, fy, fz, tx, ty, tz]
+        }
+        other => panic!("{other:?}"),
+    }
+}
+
+fn wrench(values: [f64; 6]) -> Reading {
+    let [fx, fy, fz, tx, ty, tz] = values;
+    Reading::Wrench(Wrench {
+        force: [fx, fy, fz],
+        torque: [tx, ty, tz],
+    })
+}
+
+const LOAD: [f64; 6] = [10.0, -20.0, 30.0, 1.0, -0.5, 0.25];
+
+/// A session, `tests/oracle/frames/ati.py`.
+const SESSION: &str = include_str!("ati.txt");
+
+/// Its frames in the order of the file, 0.2 ms apart or without stamps, and its wrenches.
+fn session(stamped: bool) -> (Vec<Frame>, Vec<[f64; 6]>) {
+    let (mut frames, mut wrenches) = (Vec::new(), Vec::new());
+    for line in SESSION.lines() {
+        if let Some(numbers) = line.strip_prefix("wrench ") {
+            let numbers: Vec<f64> = numbers.split(' ').map(|n| n.parse().unwrap()).collect();
+            wrenches.push(numbers.try_into().unwrap());
+        } else {
+            let mut frame = frame(line, frames.len() as f64 * 0.2);
+            if !stamped {
+                frame.stamp = proprio_topics::StampKind::None;
+            }
+            frames.push(frame);
+        }
+    }
+    (frames, wrenches)
+}
+
+fn session_listener(keys: &str) -> Box<dyn Device> {
+    let listen = spec(0x3F, Mode::Listen, &[]);
+    options("ati_netcanoem", keys).device(&listen).unwrap()
+}
+
+fn assert_read(readings: &[Output], wrenches: &[[f64; 6]]) {
+    assert_eq!(readings.len(), wrenches.len());
+    for (reading, right) in readings.iter().zip(wrenches) {
+        for (a, b) in values(&reading.reading).iter().zip(right) {
+            assert!(
+                (a - b).abs() <= 1e-9 * b.abs().max(1.0),
+                "{reading:?} {right:?}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_log_of_another_programs_session_decodes_without_keys() {
+    for stamped in [true, false] {
+        let (frames, wrenches) = session(stamped);
+        let mut device = session_listener("");
+        let (readings, faults) = decode(&mut *device, &frames);
+        assert!(faults.is_empty(), "{faults:?}");
+        assert_read(&readings, &wrenches);
+        assert_eq!(readings[0].quality, Quality::GOOD);
+        // The stamp is that of the first half.
+        assert!(
+            frames
+                .iter()
+                .any(|f| f.t == readings[4].acquired && f.data().len() == 8)
+        );
+        assert_eq!(device.state(), State::Streaming);
+    }
+}
+
+#[test]
+fn the_keys_stand_before_the_sensors_own() {
+    let (frames, wrenches) = session(true);
+    let (mut readings, _) = decode(
+        &mut *session_listener("counts_per_force = 8896\ncounts_per_torque = 2000"),
+        &frames,
+    );
+    let halved: Vec<_> = wrenches
+        .iter()
+        .map(|[a, b, c, d, e, f]| [a / 2.0, b / 2.0, c / 2.0, *d, *e, *f])
+        .collect();
+    assert_read(&readings, &halved);
+    let units = "force_unit = \"N\"\ntorque_unit = \"Nmm\"";
+    (readings, _) = decode(&mut *session_listener(units), &frames);
+    let in_si: Vec<_> = wrenches
+        .iter()
+        .map(|[a, b, c, d, e, f]| {
+            let (n, nm) = (4.448_221_615_260_5, 112.984_829_027_616_7);
+            [a / n, b / n, c / n, d / nm, e / nm, f / nm]
+        })
+        .collect();
+    assert_read(&readings, &in_si);
+    let (readings, _) = decode(&mut *session_listener(KEYS), &frames[frames.len() - 3..]);
+    let gauge = |at| {
+        i16::from_be_bytes(
+            frames[frames.len() - 2].data()[at..at + 2]
+                .try_into()
+                .unwrap(),
+        )
+    };
+    assert_eq!(values(&readings[0].reading)[0], f64::from(gauge(2)) / 100.0);
+}
+
+/// A reading whose six gauges are all `n`.
+fn halves(n: i16, status: u16, ms: f64) -> [Frame; 2] {
+    let gauge = format!("{n:04X}").repeat(3);
+    [
+        frame(&format!("200#{status:04X}{gauge}"), ms),
+        frame(&format!("201#{gauge}"), ms + 0.2),
+    ]
+}
+
+fn decode_keys(frames: &[Frame]) -> (Vec<Output>, Vec<Fault>) {
+    decode(&mut *listener("ati_netcanoem", KEYS, &[]), frames)
+}
+
+/// The number of each reading, if its halves belong together, and whether it follows a gap.
+fn numbers(readings: &[Output]) -> Vec<(i32, bool)> {
+    let number = |reading: &Output| {
+        let [a, b, ..] = values(&reading.reading);
+        assert_eq!(a, b, "halves of different readings");
+        let gap = reading.quality.contains(Quality::GAP_BEFORE);
+        ((a * 100.0).round() as i32, gap)
+    };
+    readings.iter().map(number).collect()
+}
+
+#[test]
+fn halves_out_of_step_are_paired_in_their_order() {
+    let [a, a2] = halves(1, 0, 0.0);
+    let [b, b2] = halves(2, 0, 2.0);
+    let [c, c2] = halves(3, 0, 4.0);
+    let (readings, faults) = decode_keys(&[a, b, c, a2, b2, c2]);
+    assert_eq!(numbers(&readings), [(1, false), (2, false), (3, false)]);
+    assert!(faults.is_empty());
+}
+
+#[test]
+fn a_lost_half_costs_few_readings_and_none_is_wrong() {
+    let all: Vec<Frame> = (1..=12)
+        .flat_map(|n| halves(n, 0, f64::from(n) * 2.0))
+        .collect();
+    for lost in 0..24 {
+        let mut frames = all.clone();
+        frames.remove(lost);
+        let (readings, faults) = decode_keys(&frames);
+        let read = numbers(&readings);
+        // The stream may begin with the second half of a request before it.
+        let expected: &[i32] = match lost {
+            0 => &[],
+            _ if lost % 2 == 0 => &[1],
+            _ => &[4, 1],
+        };
+        let gone = 12 - read.len() as i32;
+        let tail = lost >= 17 && lost % 2 == 1;
+        assert!(
+            tail || lost == 0 || expected.contains(&gone),
+            "{lost}: {gone} are gone"
+        );
+        if lost == 0 {
+            assert!(faults.is_empty(), "{faults:?}");
+            assert!(!read[0].1);
+        } else if !tail {
+            let total = count(&faults, Counter::Unpaired);
+            assert_eq!(total, if lost % 2 == 0 { 1 } else { 7 }, "{lost}");
+        }
+        if let Some((_, gap)) = read.get(lost / 2).filter(|_| lost > 0 && !tail) {
+            assert!(gap, "{lost}");
+        }
+    }
+}
+
+/// A first half is not kept for ever: 30 ms.
+#[test]
+fn halves_that_are_far_apart_are_not_paired() {
+    let [a, _] = halves(1, 0, 0.0);
+    let [_, b2] = halves(1, 0, 29.8);
+    assert_eq!(decode_keys(&[a, b2]).0.len(), 1);
+    let [_, b2] = halves(1, 0, 30.0);
+    let (readings, faults) = decode_keys(&[a, b2]);
+    assert!(readings.is_empty());
+    assert_eq!(count(&faults, Counter::Unpaired), 2);
+    let [c, c2] = halves(3, 0, 40.0);
+    let (readings, faults) = decode_keys(&[a, c, c2]);
+    assert_eq!(numbers(&readings), [(3, true)]);
+    assert_eq!(count(&faults, Counter::Unpaired), 1);
+}
+
+#[test]
+fn faults_and_saturation_are_told() {
+    let fault = |status| {
+        let (readings, faults) = decode_keys(&halves(7, status, 0.0));
+        let told = readings[0].quality.contains(Quality::DEVICE_FAULT);
+        assert_eq!(count(&faults, Counter::DeviceFault), u32::from(told));
+        told
+    };
+    for bit in 0..16 {
+        let concerns = matches!(bit, 0..=8 | 11 | 12 | 15);
+        assert_eq!(fault(1 << bit), concerns, "bit {bit}");
+    }
+    assert!(!fault(1 << 14 | 1 << 15), "the bus alone");
+    assert!(fault(1 << 14 | 1 << 15 | 1 << 6));
+    for (gauge, saturated) in [
+        (32767, true),
+        (-32767, true),
+        (-32768, true),
+        (32766, false),
+        (-32766, false),
+    ] {
+        let (readings, faults) = decode_keys(&halves(gauge, 0, 0.0));
+        assert_eq!(readings[0].quality.contains(Quality::SATURATED), saturated);
+        assert_eq!(count(&faults, Counter::Saturated), u32::from(saturated));
+    }
+}
+
+#[test]
+fn frames_that_are_none_of_the_sensor_are_counted() {
+    let (readings, faults) = decode_keys(&[
+        frame("200#", 0.0),
+        frame("200#0000", 1.0),
+        frame("201#00000000000000", 2.0),
+        frame("205#4654313233", 3.0),
+        frame("209#0A", 4.0),
+    ]);
+    assert!(readings.is_empty());
+    assert_eq!(count(&faults, Counter::Length), 2);
+    assert_eq!(faults.len(), 2, "{faults:?}");
+}
+
+fn rig(keys: &str) -> Rig {
+    Rig::new("ati_netcanoem", keys, &[], (0, wrench(LOAD)))
+}
+
+#[test]
+fn the_sensor_is_asked_for_its_calibration_and_then_for_readings() {
+    let mut rig = rig("calibration = 3\nperiod_ms = 4");
+    rig.run(50);
+    let asked = [
+        "206#03", "207#", "208#", "202#00", "202#01", "202#02", "202#03", "202#04", "202#05",
+    ];
+    assert_eq!(rig.sent[..9], asked);
+    assert!(rig.sent[9..].iter().all(|frame| frame == "200#"));
+    assert_eq!(rig.device.state(), State::Streaming);
+    assert!(
+        (12..=13).contains(&rig.readings.len()),
+        "{}",
+        rig.readings.len()
+    );
+    for (read, right) in values(&rig.readings[3].reading).iter().zip(LOAD) {
+        assert!((read - right).abs() < 0.02, "{read} {right}");
+    }
+    assert_eq!((rig.faults.len(), rig.count(Counter::Starts)), (1, 1));
+    let sent = rig.sent.len();
+    rig.device.stop(rig.now);
+    rig.run(30);
+    assert_eq!((rig.device.state(), rig.sent.len()), (State::Stopped, sent));
+}
+
+#[test]
+fn what_the_keys_tell_is_not_asked() {
+    let mut rig = rig(KEYS);
+    rig.run(20);
+    assert!(rig.sent.iter().all(|frame| frame == "200#"));
+    assert_eq!(rig.readings.len(), 10);
+    for (read, right) in values(&rig.readings[3].reading).iter().zip(LOAD) {
+        assert!((read - right).abs() < 0.0051);
+    }
+}
+
+/// A request is sent when the last one is answered, or 30 ms after it.
+#[test]
+fn a_request_without_an_answer_costs_one_reading() {
+    let mut rig = rig(KEYS);
+    let second = |frame: &Frame| frame.to_string().starts_with("201#");
+    rig.board_loses = Box::new(move |n, frame| n == 20 && second(frame));
+    rig.run(100);
+    assert_eq!(rig.count(Counter::Lost), 1);
+    assert_eq!(rig.readings.len(), 9 + (100 - 18 - 30) / 2);
+    assert!(rig.readings[9].quality.contains(Quality::GAP_BEFORE));
+    let gaps = rig.readings.iter().filter(|r| r.quality != Quality::GOOD);
+    assert_eq!(gaps.count(), 1);
+    // A request that could not be sent is no lost reading.
+    rig.interface = Box::new(|_| Some(NotSent::Refused));
+    rig.run(10);
+    rig.interface = Box::new(|_| None);
+    rig.run(50);
+    assert_eq!(rig.count(Counter::Lost), 1);
+    assert_eq!(rig.device.state(), State::Streaming);
+}
+
+#[test]
+fn each_lost_request_and_answer_at_the_start_is_made_up_for() {
+    for lost in 1..=26 {
+        for host in [true, false] {
+            let mut rig = rig("");
+            let lose = move |n: usize, _: &Frame| n == lost;
+            if host {
+                rig.host_loses = Box::new(lose);
+            } else {
+                rig.board_loses = Box::new(lose);
+            }
+            rig.run(600);
+            assert_eq!(rig.device.state(), State::Streaming, "{lost} {host}");
+            for (read, right) in values(&rig.readings[0].reading).iter().zip(LOAD) {
+                assert!(
+                    (read - right).abs() < 0.02,
+                    "{lost} {host}: {:?}",
+                    rig.readings[0]
+                );
+            }
+        }
+    }
+}
+
+/// The first of two answers is late: the second must not be taken for that of the next row.
+#[test]
+fn an_answer_that_comes_twice_is_not_taken_for_another_row() {
+    let options = options("ati_netcanoem", "");
+    let spec = spec(0x20, Mode::Supervise, &[]);
+    let (mut device, mut board) = (
+        options.device(&spec).unwrap(),
+        options.board(&spec).unwrap(),
+    );
+    board.present(0, &wrench(LOAD), Quality::GOOD);
+    let mut late: Vec<(i64, Frame)> = Vec::new();
+    let mut readings = Vec::new();
+    for ms in 1000..2500 {
+        let now = proprio_topics::Nanos::from_millis(ms);
+        let mut out = proprio_drivers::Decoded::new();
+        while let Some(sent) = device.poll_transmit(now, &mut out) {
+            device.on_sent(&sent.frame, Ok(now));
+            let mut answers = proprio_drivers::Frames::new();
+            board.on_frame(&sent.frame, &mut answers);
+            // Matrix rows take 25 ms, longer than the host waits before it asks again.
+            let delay = if sent.frame.to_string().starts_with("202") {
+                25
+            } else {
+                0
+            };
+            late.extend(answers.into_iter().map(|frame| (ms + delay, frame)));
+        }
+        let due = late
+            .iter()
+            .filter(|(t, _)| *t <= ms)
+            .map(|(_, frame)| *frame);
+        let due: Vec<Frame> = due.collect();
+        late.retain(|(t, _)| *t > ms);
+        for frame in due {
+            let frame = frame.at(now, proprio_topics::StampKind::Software);
+            device.on_frame(&frame, &mut out);
+        }
+        readings.extend(out.readings);
+    }
+    assert!(readings.len() > 100);
+    for (read, right) in values(&readings[0].reading).iter().zip(LOAD) {
+        assert!((read - right).abs() < 0.02, "{:?}", readings[0]);
+    }
+}
+
+#[test]
+fn a_sensor_that_does_not_tell_its_calibration_is_refused_by_name() {
+    let mut silent = rig("");
+    silent.board_loses = Box::new(|_, frame| frame.to_string().starts_with("204"));
+    silent.run(400);
+    let refused = State::Refused(Refusal::NoCalibration);
+    assert_eq!(silent.device.state(), refused);
+    silent.board_loses = Box::new(|_, _| false);
+    silent.run(1500);
+    assert_eq!(silent.device.state(), State::Streaming);
+
+    // Zero counts, a row of zeros, a row that is not a number; the state names the channel.
+    let told = |frames: &[&str]| {
+        let mut device = session_listener("");
+        let frames: Vec<Frame> = frames.iter().map(|text| frame(text, 0.0)).collect();
+        let (_, faults) = decode(&mut *device, &frames);
+        assert_eq!(count(&faults, Counter::Value), 1, "{faults:?}");
+        device.state()
+    };
+    let bad = |channel| State::Refused(Refusal::BadCalibration { channel });
+    assert_eq!(told(&["3F7#00000000000007D0"]), bad(0));
+    assert_eq!(told(&["3F7#000007D000000000"]), bad(3));
+    assert_eq!(told(&["3F8#0007"]), bad(0));
+    assert_eq!(told(&["3F8#0200"]), bad(3));
+    let zeros = [
+        "3F2#04",
+        "3F2#0000000000000000",
+        "3F3#0000000000000000",
+        "3F4#0000000000000000",
+    ];
+    assert_eq!(told(&zeros), bad(4));
+    let nan = [
+        "3F2#05",
+        "3F2#FFFFFFFFFFFFFFFF",
+        "3F3#3F80000000000000",
+        "3F4#0000000000000000",
+    ];
+    assert_eq!(told(&nan), bad(5));
+}
+
+#[test]
+fn a_calibration_that_changes_is_refused() {
+    let (mut frames, _) = session(true);
+    // Counts, then units, then a row, told again with another value.
+    for (request, reply) in [
+        ("3F7#", "3F7#00001161000007D0"),
+        ("3F8#", "3F8#0203"),
+        ("3F2#02", "3F3#C117F112C06119F4"),
+    ] {
+        let mut device = session_listener("");
+        frames.push(frame(request, 900.0));
+        frames.push(frame(reply, 900.1));
+        let (_, faults) = decode(&mut *device, &frames);
+        frames.truncate(frames.len() - 2);
+        assert_eq!(device.state(), State::Refused(Refusal::Changed), "{reply}");
+        assert_eq!(count(&faults, Counter::Changed), 1);
+        let (readings, _) = decode(&mut *device, &halves_at_3f(950.0));
+        assert!(readings.is_empty());
+    }
+    // Another calibration is selected: all is read anew.
+    let mut device = session_listener("");
+    decode(&mut *device, &frames);
+    let (readings, _) = decode(
+        &mut *device,
+        &[frame("3F6#05", 990.0), frame("3F6#05", 990.1)],
+    );
+    assert!(readings.is_empty());
+    let (readings, _) = decode(&mut *device, &halves_at_3f(991.0));
+    assert!(readings.is_empty());
+    assert_eq!(device.state(), State::Refused(Refusal::NoCalibration));
+    let (again, wrenches) = session(true);
+    let (readings, _) = decode(&mut *device, &again);
+    assert_eq!(readings.len(), wrenches.len());
+}
+
+fn halves_at_3f(ms: f64) -> [Frame; 2] {
+    halves(5, 0, ms).map(|f| frame(&f.to_string().replacen("20", "3F", 1), ms))
+}
+
+/// Replies without a request do not say which row they are; the host's own are not awaited.
+#[test]
+fn replies_that_nobody_asked_for_are_counted() {
+    let (frames, _) = session(true);
+    let replies: Vec<Frame> = frames
+        .iter()
+        .filter(|f| f.data().len() > 1)
+        .copied()
+        .collect();
+    let mut device = session_listener("");
+    let (readings, faults) = decode(&mut *device, &replies);
+    assert!(readings.is_empty());
+    assert_eq!(count(&faults, Counter::Unexpected), 18);
+    assert_eq!(device.state(), State::Refused(Refusal::NoCalibration));
+
+    let mut rig = rig("");
+    rig.run(100);
+    let before = rig.readings.len();
+    let stray = ["207#0000000100000001", "208#0101", "203#3F8000003F800000"];
+    let (_, faults) = decode(&mut *rig.device, &stray.map(|text| frame(text, 1100.0)));
+    assert_eq!(count(&faults, Counter::Unexpected), 3);
+    rig.run(20);
+    assert_eq!(rig.device.state(), State::Streaming);
+    assert_eq!(
+        rig.readings[before].reading,
+        rig.readings[before - 1].reading
+    );
+}
+
+#[test]
+fn wrong_keys_are_refused() {
+    let refused = |keys: &str| {
+        let device = options("ati_netcanoem", keys).device(&spec(1, Mode::Listen, &[]));
+        device.map(|_| ()).unwrap_err().to_string()
+    };
+    assert_eq!(refused("period_ms = 0"), "period_ms = 0 must be 1 to 1000");
+    assert_eq!(
+        refused("calibration = 16"),
+        "calibration = 16 must be 0 to 15"
+    );
+    assert!(refused("counts_per_force = 1").contains("counts_per_torque is missing"));
+    assert!(refused("torque_unit = \"Nm\"").contains("force_unit is missing"));
+    let zero = "counts_per_force = 0\ncounts_per_torque = 1";
+    assert!(refused(zero).contains("counts_per_force = 0 must be above 0"));
+    assert!(refused(&KEYS.replace("[1, 0", "[0, 0")).contains("matrix must be six rows"));
+    let options: Options = options("ati_netcanoem", &KEYS.replace("[1, 0,", "[0, 1,"));
+    assert!(matches!(
+        options.board(&spec(1, Mode::Listen, &[])).map(|_| ()),
+        Err(SpecError::Keys { key: "matrix", .. })
+    ));
+    let address = options.device(&spec(0x80, Mode::Listen, &[]));
+    assert!(matches!(
+        address.map(|_| ()),
+        Err(SpecError::Address { most: 127, .. })
+    ));
+}
+
+proptest! {
+    #[test]
+    fn wrenches_are_read_back(load in proptest::array::uniform6(-300.0_f64..300.0)) {
+        let [fx, fy, fz, tx, ty, tz] = load;
+        let load = [fx, fy, fz, tx / 10.0, ty / 10.0, tz / 10.0];
+        let frames = encode(&mut *board("ati_netcanoem", KEYS, &[]), 0, &wrench(load), Quality::GOOD);
+        let (readings, faults) = decode_keys(&frames);
+        let steps = [0.01, 0.01, 0.01, 0.001, 0.001, 0.001];
+        let clamped = load.iter().zip(steps).any(|(x, lsb)| (x / lsb).abs() >= 32766.5);
+        prop_assert_eq!(count(&faults, Counter::Saturated), u32::from(clamped));
+        for ((a, b), lsb) in values(&readings[0].reading).iter().zip(load).zip(steps) {
+            let right = b.clamp(-32768.0 * lsb, 32767.0 * lsb);
+            prop_assert!((a - right).abs() <= 0.5001 * lsb, "{} {}", a, b);
+        }
+        let faulty = encode(
+            &mut *board("ati_netcanoem", KEYS, &[]), 0, &wrench(load), Quality::DEVICE_FAULT,
+        );
+        prop_assert!(decode_keys(&faulty).0[0].quality.contains(Quality::DEVICE_FAULT));
+    }
+}
