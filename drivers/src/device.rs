@@ -391,6 +391,12 @@ pub trait Device: Send {
     /// input.
     fn on_frame(&mut self, frame: &Frame, out: &mut Decoded);
 
+    /// Another device of this host has sent `frame` at its stamp: the interface does not return
+    /// what it sends. There is no reading in it.
+    fn overhear(&mut self, frame: &Frame, out: &mut Decoded) {
+        let _ = (frame, out);
+    }
+
     /// The next frame to send at `now`. While the outcome of the last one is open
     /// ([`Device::on_sent`]), and in [`Mode::Listen`], there is none.
     ///

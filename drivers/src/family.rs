@@ -120,6 +120,12 @@ impl<F: Family> Device for Supervised<F> {
         }
     }
 
+    fn overhear(&mut self, frame: &Frame, out: &mut Decoded) {
+        if self.claims.iter().any(|claim| claim.matches(frame.id)) {
+            self.on_frame(frame, out);
+        }
+    }
+
     fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
         let Link { bringup, questions } = &mut self.link;
         let was_silent = bringup.is_silent();

@@ -10,6 +10,9 @@
 //! | [`icub_mais`] | MAIS: Hall sensors of hands | joint |
 //! | [`icub_skin`] | skin of mtb, mtb4, mtb4c | skin |
 //! | [`ati_netcanoem`] | ATI F/T sensors with the NETCANOEM board | wrench |
+//! | [`canopen_drive`] | CANopen drives (CiA 402) | joint, actuator |
+//! | [`canopen_encoder`] | CANopen encoders (CiA 406) | joint |
+//! | [`canopen_sync`] | sends a CANopen bus its SYNC | none |
 //! | [`dbc`] | any device that a .dbc file describes | any |
 //!
 //! Each family has two sides. A [`Device`] is the host's side: it decodes the frames of its
@@ -29,6 +32,10 @@ extern crate std;
 pub mod ati_netcanoem;
 mod bringup;
 mod bytes;
+mod canopen;
+pub mod canopen_drive;
+pub mod canopen_encoder;
+pub mod canopen_sync;
 mod configure;
 pub mod dbc;
 pub mod device;

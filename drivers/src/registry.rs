@@ -2,8 +2,9 @@
 
 use crate::signal::Message;
 use crate::{
-    Board, Device, Driver, OutputInfo, Spec, SpecError, ati_netcanoem, dbc, icub_imu, icub_mais,
-    icub_motor, icub_pos, icub_skin, icub_strain,
+    Board, Device, Driver, OutputInfo, Spec, SpecError, ati_netcanoem, canopen_drive,
+    canopen_encoder, canopen_sync, dbc, icub_imu, icub_mais, icub_motor, icub_pos, icub_skin,
+    icub_strain,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -120,6 +121,12 @@ drivers! {
     IcubMais: icub_mais,
     /// ATI F/T sensors.
     AtiNetcanoem: ati_netcanoem,
+    /// CANopen drives.
+    CanopenDrive: canopen_drive,
+    /// CANopen encoders.
+    CanopenEncoder: canopen_encoder,
+    /// The SYNC of a CANopen bus.
+    CanopenSync: canopen_sync,
     /// Devices that a .dbc file describes.
     Dbc: dbc,
 }

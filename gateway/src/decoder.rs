@@ -8,7 +8,7 @@ use crate::status::BusStatus;
 use proprio_drivers::{
     Claim, CommandFailed, Decoded, Device, Frame, Mode, NotSent, SpecError, State, Transmit,
 };
-use proprio_topics::{Counter, Header, MAX_CHANNELS, Nanos, Quality, Reading, Sample};
+use proprio_topics::{Counter, Header, MAX_CHANNELS, Nanos, Quality, Reading, Sample, StampKind};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 
@@ -195,10 +195,24 @@ impl Decoder {
             return;
         };
         running.device.on_sent(frame, outcome);
+        if let Ok(t) = outcome {
+            let sent = frame.at(t, StampKind::Software);
+            let others = self.devices.iter_mut().zip(0_u16..);
+            for (other, number) in others.filter(|(_, number)| *number != device) {
+                self.decoded.clear();
+                other.device.overhear(&sent, &mut self.decoded);
+                for fault in &self.decoded.faults {
+                    let count = u64::from(fault.count);
+                    self.status.count(number, fault.counter, count);
+                }
+            }
+        }
         if outcome.is_err() {
             self.status.count(device, Counter::Unsent, 1);
         }
-        self.status.set_state(device, running.device.state());
+        if let Some(running) = self.devices.get(usize::from(device)) {
+            self.status.set_state(device, running.device.state());
+        }
     }
 
     /// The earliest instant at which a device must be polled.

@@ -40,6 +40,18 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
     ("icub_mais", "", &[0, 6, 7, 14]),
     ("ati_netcanoem", "", &[]),
     ("ati_netcanoem", crate::ati::KEYS, &[]),
+    ("canopen_encoder", "", &[0]),
+    ("canopen_encoder", "counts_per_turn = 10\nsync = 1", &[0]),
+    ("canopen_drive", "", &[0]),
+    (
+        "canopen_drive",
+        "counts_per_turn = 10\nrated_torque = 1.0\nrated_current = 1.0\n\
+         pdos = [{ number = 1, objects = [0x6041, 0x6064], sync = 1 }, \
+         { number = 2, objects = [0x606C, 0x6077], sync = 1 }, \
+         { number = 3, objects = [0x603F, 0x6061, 0x6078] }]",
+        &[0],
+    ),
+    ("canopen_sync", "", &[]),
     ("dbc", crate::dbc::WRENCH, &[]),
     ("dbc", crate::dbc::DRIVE, &[0]),
     ("dbc", crate::dbc::PAGES, &[]),
@@ -170,7 +182,7 @@ fn is_finite(reading: &Reading) -> bool {
             .all(|value| !value.is_infinite()),
         Reading::Joint(joint) => joint.position.is_finite(),
         Reading::Temperature(temperature) => temperature.celsius.is_finite(),
-        Reading::Actuator(actuator) => actuator.duty.is_finite(),
+        Reading::Actuator(actuator) => !actuator.duty.is_infinite(),
         Reading::Gauges(_) | Reading::Skin(_) => true,
     }
 }

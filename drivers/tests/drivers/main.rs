@@ -5,6 +5,7 @@
 mod any_frame;
 mod ati;
 mod bringup;
+mod canopen;
 mod command;
 mod dbc;
 mod golden;

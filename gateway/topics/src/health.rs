@@ -337,6 +337,20 @@ pub enum Refusal {
         /// The channel, 0 to 5.
         channel: u8,
     },
+    /// It does not answer.
+    NoAnswer,
+    /// It is a device of another kind.
+    OtherDevice {
+        /// What it says it is: the CiA profile of a CANopen node.
+        profile: u16,
+    },
+    /// It refuses something that is needed.
+    Rejected {
+        /// What: the index of the object of a CANopen node.
+        object: u16,
+    },
+    /// It does not send what is needed of it.
+    NotMapped,
 }
 
 impl Refusal {
@@ -349,6 +363,10 @@ impl Refusal {
             Self::Changed => 2,
             Self::NoCalibration => 3,
             Self::BadCalibration { channel } => 0x200 | channel as u32,
+            Self::NoAnswer => 4,
+            Self::NotMapped => 5,
+            Self::OtherDevice { profile } => 0x1_0000 | profile as u32,
+            Self::Rejected { object } => 0x2_0000 | object as u32,
         }
     }
 
@@ -360,11 +378,19 @@ impl Refusal {
             1 => Some(Self::NoFullScale),
             2 => Some(Self::Changed),
             3 => Some(Self::NoCalibration),
+            4 => Some(Self::NoAnswer),
+            5 => Some(Self::NotMapped),
             0x100..=0x1FF => Some(Self::ZeroFullScale {
                 channel: (code & 0xFF) as u8,
             }),
             0x200..=0x2FF => Some(Self::BadCalibration {
                 channel: (code & 0xFF) as u8,
+            }),
+            0x1_0000..=0x1_FFFF => Some(Self::OtherDevice {
+                profile: (code & 0xFFFF) as u16,
+            }),
+            0x2_0000..=0x2_FFFF => Some(Self::Rejected {
+                object: (code & 0xFFFF) as u16,
             }),
             _ => None,
         }
@@ -395,6 +421,20 @@ impl fmt::Display for Refusal {
                 f,
                 "its calibration cannot be used for channel {channel} (zeros, or no numbers); \
                  its memory needs repair, or configure it (matrix, counts, units)"
+            ),
+            Self::NoAnswer => {
+                f.write_str("it does not answer; check its power, cable, address and bit rate")
+            }
+            Self::OtherDevice { profile } => write!(
+                f,
+                "it is a device of another kind (profile {profile}); check its address and driver"
+            ),
+            Self::Rejected { object } => write!(
+                f,
+                "it refuses object {object:04X}; the driver's page says which key replaces it"
+            ),
+            Self::NotMapped => f.write_str(
+                "none of its process data has the position; map it with the maker's tool",
             ),
         }
     }

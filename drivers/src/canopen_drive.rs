@@ -1,0 +1,83 @@
+//! CANopen drives (CiA 402): position, velocity, torque and current of a motor.
+//!
+//! The address is the node, 1 to 127. The drive sends what its process data (TPDO 1 to 4) are mapped
+//! to; the driver asks for that mapping at start and changes nothing in it. Little-endian:
+//!
+//! | object | meaning | |
+//! |---|---|---|
+//! | 6064, else 6063 | position | i32 counts |
+//! | 606C | velocity | i32 `velocity_unit` |
+//! | 6077 | torque | i16, a thousandth of the rated torque |
+//! | 6078 | current | i16, a thousandth of the rated current, or mA |
+//! | 6041 | status word; bit 3: fault | u16, `encoder` of the actuator reading |
+//! | 6061 | mode of operation | i8, `mode` |
+//! | 603F | error code | u16, `faults`; without it the code of the last emergency message |
+//!
+//! At start the driver checks that the profile (object 1000) is 402, asks for identifier (1800 sub
+//! 1), transmission (sub 2) and mapping (1A00) of each TPDO, and for what the keys do not tell:
+//! counts per turn (608F: counts, turns), rated torque (6076, mNm) and rated current (6075, mA). Then
+//! it sets the node operational. It never enables or moves a motor, and at the gateway's end the node
+//! stays operational.
+//!
+//! - If the position is sent by SYNC (transmission 0 to 240), a reading holds the values of all TPDOs
+//!   that one SYNC has caused, and `acquired` is the time of that SYNC. An incomplete reading is
+//!   dropped, and the next one too: it may hold a late value of the one before.
+//! - If the position is sent by events or a timer (254, 255), each makes a reading, with the last
+//!   values of the others if they are not older than `hold_ms`.
+//! - DRIVE_FAULT: the fault bit of the status word, or an emergency message; DEVICE_FAULT: an
+//!   emergency message about a sensor (73xx), which makes the position doubtful.
+//!
+//! A node that boots or leaves the operational state is started again. If another program commands
+//! the drive (`listen_only`, or a recorded log), the mapping is that of its answers to that program,
+//! or the key `pdos`.
+//!
+//! Sources: CiA 301 4.2, CiA 402 4.0 (IEC 61800-7-201). Certain, but for the units of velocity and
+//! current, in which makers differ: hence the keys.
+//!
+//! # Keys
+//! ```toml
+//! counts_per_turn = 4096        # of the motor; default: the drive's own
+//! velocity_unit = "counts/s"    # "counts/s", "0.1 counts/s", "rpm" or "0.1 rpm"
+//! rated_torque = 0.5            # Nm; default: the drive's own
+//! rated_current = 3.0           # A; default: the drive's own
+//! current_unit = "per_mille"    # "per_mille" or "mA"
+//! hold_ms = 100.0
+//! # The process data, if the drive is not to be asked: objects as indices, in their order.
+//! pdos = [
+//!     { number = 1, objects = [0x6041, 0x6064, 0x6077], sync = 1 },
+//!     { number = 2, objects = [0x606C, 0x6078], sync = 1 },   # sync = 0: by events or a timer
+//! ]
+//! # Only a simulated drive uses these.
+//! period_ms = 10
+//! sync = 0
+//! ```
+
+mod board;
+mod device;
+mod layout;
+mod options;
+mod start;
+
+pub use board::DriveBoard;
+pub use options::{CurrentUnit, Options, PdoKeys, VelocityUnit};
+
+use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
+use alloc::boxed::Box;
+use alloc::vec::Vec;
+use proprio_topics::Kind;
+
+impl Driver for Options {
+    const NAME: &'static str = "canopen_drive";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Joint)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        device::Drive::device(spec, self)
+    }
+
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(DriveBoard::new(spec, self)?))
+    }
+}

@@ -1,0 +1,196 @@
+//! A drive's own side: a node with mapped process data.
+
+use super::layout::{Field, Layout, Quantity};
+use super::options::{CurrentUnit, Options, PdoKeys};
+use super::start::{COUNTS, PROFILE, RATED_CURRENT, RATED_TORQUE, TURNS};
+use crate::canopen::{NO_RTR, Node, TPDO_OFF, node_of, object, tpdo};
+use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
+use alloc::vec::Vec;
+use core::f64::consts::TAU;
+use proprio_topics::{JointState, Nanos, Quality, Reading};
+
+/// A simulated drive without keys: an encoder of 1024 lines, 1 Nm, 5 A.
+const COUNTS_PER_TURN: f64 = 4096.0;
+const TORQUE: f64 = 1.0;
+const CURRENT: f64 = 5.0;
+/// Operation enabled; with a fault.
+const ENABLED: f64 = 0x0627 as f64;
+const FAULTY: f64 = 0x0628 as f64;
+/// Cyclic synchronous torque.
+const CST: f64 = 10.0;
+/// The error code of a simulated fault: of the position sensor, or of the drive.
+const SENSOR: u16 = 0x7305;
+const OVERCURRENT: u16 = 0x2310;
+
+/// The drive's own side.
+#[derive(Debug)]
+pub struct DriveBoard {
+    node: Node,
+    layout: Layout,
+    /// SI units per step of position, velocity, torque and current.
+    per_step: [f64; Quantity::JOINT],
+    state: JointState,
+    quality: Quality,
+}
+
+impl DriveBoard {
+    /// A drive after power-on; in [`Mode::Listen`] another program has already started it.
+    ///
+    /// # Errors
+    /// [`SpecError`]: a node outside 1 to 127, a key out of range.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // casts saturate
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        options.check()?;
+        let id = node_of(spec)?;
+        let mut options = options.clone();
+        if options.pdos.is_empty() {
+            let pdo = |number, objects: &[u16]| PdoKeys {
+                number,
+                objects: objects.to_vec(),
+                sync: options.sync,
+            };
+            options.pdos = Vec::from([
+                pdo(1, &[0x6041, 0x6064, 0x6077]),
+                pdo(2, &[0x606C, 0x6078, 0x6061]),
+            ]);
+        }
+        let layout = Layout::of_keys(id, &options)?;
+        let counts_per_turn = options.counts_per_turn.unwrap_or(COUNTS_PER_TURN);
+        let torque = options.rated_torque.unwrap_or(TORQUE);
+        let current = options.rated_current.unwrap_or(CURRENT);
+        let mut entries = Vec::from([
+            (object::DEVICE_TYPE, 0x0002_0000 | PROFILE, 4),
+            (COUNTS, counts_per_turn as u32, 4),
+            (TURNS, 1, 4),
+            (RATED_TORQUE, (torque * 1e3) as u32, 4),
+            (RATED_CURRENT, (current * 1e3) as u32, 4),
+        ]);
+        for (number, pdo) in (0_u8..).zip(&layout.pdos) {
+            let id = pdo.id.unwrap_or(tpdo(id, number).raw() | TPDO_OFF);
+            entries.push((object::tpdo_id(number), id | NO_RTR, 4));
+            entries.push((
+                object::tpdo_transmission(number),
+                pdo.transmission.into(),
+                1,
+            ));
+            entries.push((object::tpdo_timer(number), options.period_ms, 2));
+            entries.push((object::tpdo_mapping(number, 0), pdo.count.into(), 1));
+            for (sub, entry) in (1..).zip(&pdo.mapping) {
+                entries.push((object::tpdo_mapping(number, sub), *entry, 4));
+            }
+        }
+        Ok(Self {
+            node: Node::new(id, spec.mode == Mode::Listen, &entries),
+            layout,
+            per_step: [
+                TAU / counts_per_turn,
+                options.velocity_unit.rad_per_s(counts_per_turn),
+                torque * 1e-3,
+                match options.current_unit {
+                    CurrentUnit::Milliampere => 1e-3,
+                    CurrentUnit::PerMille => current * 1e-3,
+                },
+            ],
+            state: JointState::ABSENT,
+            quality: Quality::GOOD,
+        })
+    }
+
+    /// The raw number of a field; 0 for a value that the joint does not have.
+    fn raw(&self, field: &Field) -> f64 {
+        let JointState {
+            position,
+            velocity,
+            torque,
+            current,
+            ..
+        } = self.state;
+        let has_fault = self
+            .quality
+            .intersects(Quality::DRIVE_FAULT | Quality::DEVICE_FAULT);
+        let value = match field.quantity {
+            Quantity::Position => position,
+            Quantity::Velocity => velocity,
+            Quantity::Torque => torque,
+            Quantity::Current => current,
+            Quantity::Status => return if has_fault { FAULTY } else { ENABLED },
+            Quantity::Mode => return CST,
+            Quantity::Error => return f64::from(self.error()),
+        };
+        let per_step = self.per_step.get(field.quantity as usize);
+        let steps = value / per_step.copied().unwrap_or(1.0);
+        if steps.is_finite() { steps } else { 0.0 }
+    }
+
+    const fn error(&self) -> u16 {
+        if self.quality.contains(Quality::DEVICE_FAULT) {
+            SENSOR
+        } else if self.quality.contains(Quality::DRIVE_FAULT) {
+            OVERCURRENT
+        } else {
+            0
+        }
+    }
+
+    /// Sends the TPDOs in `which`, one bit each.
+    fn send(&mut self, which: u8, out: &mut Frames) {
+        self.node.report(self.error(), out);
+        for (number, pdo) in (0_u8..).zip(&self.layout.pdos) {
+            if which & 1 << number == 0 || !pdo.is_on() {
+                continue;
+            }
+            let (fields, bytes) = pdo.fields();
+            let mut data = [0; 8];
+            for field in &fields {
+                let raw = field.raw.bits(self.raw(field), field.bits.length());
+                field.bits.set(raw, &mut data);
+            }
+            let data = data.get(..bytes).unwrap_or_default();
+            let _ = out.try_push(Frame::new(self.node.tpdo_id(number), data));
+        }
+    }
+}
+
+impl Board for DriveBoard {
+    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
+        let due = self.node.on_frame(frame, out);
+        if due != 0 {
+            self.send(due, out);
+        }
+    }
+
+    fn period(&self) -> Option<Nanos> {
+        let number = u8::try_from(self.layout.position()?).ok()?;
+        self.node.period(number)
+    }
+
+    fn present(&mut self, _output: u8, reading: &Reading, quality: Quality) {
+        if let Reading::Joint(joint) = reading {
+            (self.state, self.quality) = (*joint, quality);
+        }
+    }
+
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        let joint = match reading {
+            Reading::Joint(joint) => joint,
+            // Its status is sent with the joint's state.
+            Reading::Actuator(_) => return Ok(()),
+            _ => return Err(EncodeError::Kind),
+        };
+        if output != 0 {
+            return Err(EncodeError::Output(output));
+        }
+        if !joint.position.is_finite() {
+            return Err(EncodeError::NotFinite);
+        }
+        (self.state, self.quality) = (*joint, quality);
+        self.send(0b1111, out);
+        Ok(())
+    }
+}

@@ -1,0 +1,303 @@
+//! The host's side of a drive: puts the values of its TPDOs together.
+
+use super::layout::{Layout, Quantity};
+use super::options::Options;
+use super::start::{Scales, Start};
+use crate::bringup::Bringup;
+use crate::bytes;
+use crate::canopen::{
+    self, Cycle, NMT, NodeState, Plan, SYNC, Script, nmt, node_of, sdo_from, tpdo,
+};
+use crate::family::{Family, Link, Supervised};
+use crate::{Claim, Decoded, Device, Frame, Id, Output, Spec, SpecError};
+use alloc::boxed::Box;
+use arrayvec::ArrayVec;
+use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, StampKind};
+
+/// The fault bit of the status word.
+const FAULT: u32 = 1 << 3;
+
+/// A TPDO that is used.
+#[derive(Debug, Clone)]
+struct Used {
+    id: Id,
+    /// Its bit in the group.
+    bit: u8,
+    fields: ArrayVec<super::layout::Field, 8>,
+    bytes: usize,
+}
+
+/// How its frames are read: made from the mapping once the drive is ready.
+#[derive(Debug)]
+struct Table {
+    scales: Scales,
+    used: ArrayVec<Used, 4>,
+    /// The TPDOs of one reading.
+    group: u8,
+    /// The reading is made by a SYNC.
+    by_sync: bool,
+}
+
+impl Table {
+    fn new(layout: &Layout, scales: Scales) -> Option<(Self, u8)> {
+        let position = layout.position()?;
+        let mut used = ArrayVec::new();
+        for (at, pdo) in layout
+            .pdos
+            .iter()
+            .enumerate()
+            .filter(|(_, pdo)| pdo.is_on())
+        {
+            let (fields, bytes) = pdo.fields();
+            #[allow(clippy::cast_possible_truncation)] // 11 bits
+            let id = Id::standard((pdo.id.unwrap_or(0) & 0x7FF) as u16);
+            let bit = 1 << at;
+            let _ = used.try_push(Used {
+                id,
+                bit,
+                fields,
+                bytes,
+            });
+        }
+        let every = layout.pdos.get(position)?.transmission;
+        let group = layout.group();
+        let this = Self {
+            scales,
+            used,
+            group: group.unwrap_or(1 << position),
+            by_sync: group.is_some(),
+        };
+        Some((this, if group.is_some() { every.max(1) } else { 0 }))
+    }
+}
+
+/// The host's side of a drive.
+#[derive(Debug)]
+pub(super) struct Drive {
+    node: u8,
+    hold: Nanos,
+    table: Option<Table>,
+    cycle: Cycle,
+    /// When the current reading was measured.
+    measured: Option<(Nanos, StampKind)>,
+    /// The TPDOs of it that have come, and when the first one did.
+    have: u8,
+    began: Nanos,
+    /// The reading before was incomplete: a late value of it may be in the next.
+    suspect: bool,
+    /// The last values in SI units, and when they came.
+    values: [Option<(Nanos, f64)>; Quantity::JOINT],
+    status: u32,
+    mode: u32,
+    /// The error code, if it is mapped.
+    error: Option<u32>,
+    state: NodeState,
+}
+
+impl Drive {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        options.check()?;
+        let node = node_of(spec)?;
+        let layout = Layout::of_keys(node, options)?;
+        let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, tpdo(node, 0));
+        bringup.start_with(NMT, &[nmt::START, node]);
+        let pdos = (0..4).map(|number| Claim::exclusive(tpdo(node, number)));
+        let claims = canopen::claims(node)
+            .into_iter()
+            .chain(pdos)
+            .chain([Claim::shared(SYNC)]);
+        let script = Script::new(node, spec.mode, Start::new(options, layout));
+        let this = Self {
+            node,
+            hold: Nanos::from_seconds(options.hold_ms * 1e-3),
+            table: None,
+            cycle: Cycle::new(0),
+            measured: None,
+            have: 0,
+            began: Nanos::MIN,
+            suspect: false,
+            values: [None; Quantity::JOINT],
+            status: 0,
+            mode: 0,
+            error: None,
+            state: NodeState::default(),
+        };
+        Ok(Supervised::boxed(claims, bringup, script, this))
+    }
+
+    /// Makes the table, if all that it needs is known.
+    fn prepare(&mut self, plan: &Start) {
+        let scales = plan.scales().filter(|_| plan.ready().is_ok());
+        if let Some((table, every)) = scales.and_then(|scales| Table::new(&plan.layout, scales)) {
+            self.table = Some(table);
+            self.cycle.set_every(every);
+        }
+    }
+
+    /// A reading ends without some of its values.
+    fn abandon(&mut self, id: Id, link: &mut Link<Script<Start>>, out: &mut Decoded) {
+        if core::mem::take(&mut self.have) != 0 {
+            out.fault(Counter::Unpaired, 1, id);
+            link.bringup.lost();
+            self.suspect = true;
+        }
+        self.measured = None;
+    }
+
+    fn pdo(
+        &mut self,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Link<Script<Start>>,
+        out: &mut Decoded,
+    ) {
+        if self.table.is_none() {
+            self.prepare(&link.questions.plan);
+        }
+        let Some(table) = &self.table else {
+            return link.questions.missed();
+        };
+        let Some(used) = table.used.iter().find(|used| used.id == frame.id) else {
+            return;
+        };
+        if data.len() < used.bytes {
+            return out.fault(Counter::Length, 1, frame.id);
+        }
+        let mut tells_status = false;
+        for field in &used.fields {
+            let Some(raw) = field.bits.of(data) else {
+                continue;
+            };
+            let number = field.raw.number(raw, field.bits.length());
+            let at = field.quantity as usize;
+            #[allow(clippy::cast_possible_truncation)] // at most 16 bits
+            let word = raw as u32;
+            if let (Some(value), Some(per_step)) =
+                (self.values.get_mut(at), table.scales.per_step.get(at))
+            {
+                *value = Some((frame.t, number * per_step));
+            } else {
+                tells_status = true;
+                match field.quantity {
+                    Quantity::Status => self.status = word,
+                    Quantity::Mode => self.mode = word,
+                    _ => self.error = Some(word),
+                }
+            }
+        }
+        let (bit, group, by_sync) = (used.bit, table.group, table.by_sync);
+        if tells_status {
+            let reading = Reading::Actuator(Actuator {
+                duty: f64::NAN,
+                mode: self.mode,
+                encoder: self.status,
+                faults: self.error.unwrap_or(u32::from(self.state.error)),
+            });
+            out.push(Output::new(0, frame, self.quality(), reading), frame.id);
+        }
+        if group & bit == 0 {
+            return;
+        }
+        let too_long = self.have != 0 && !self.is_fresh(self.began, frame.t);
+        if self.have & bit != 0 || too_long {
+            self.abandon(frame.id, link, out);
+        }
+        if self.have == 0 {
+            self.began = frame.t;
+            self.measured = Some(self.cycle.measured(frame));
+        }
+        self.have |= bit;
+        if self.have != group {
+            return;
+        }
+        self.have = 0;
+        if core::mem::take(&mut self.suspect) && by_sync && group.count_ones() > 1 {
+            out.fault(Counter::Unpaired, 1, frame.id);
+            return link.bringup.lost();
+        }
+        self.give(frame, link, out);
+    }
+
+    fn quality(&self) -> Quality {
+        let mut quality = Quality::GOOD;
+        if self.status & FAULT != 0 || self.state.error != 0 {
+            quality |= Quality::DRIVE_FAULT;
+        }
+        // Errors of sensors.
+        if self.state.error & 0xFF00 == 0x7300 {
+            quality |= Quality::DEVICE_FAULT;
+        }
+        quality
+    }
+
+    /// Whether a value that came at `t` is used at `now`.
+    fn is_fresh(&self, t: Nanos, now: Nanos) -> bool {
+        (t..=t + self.hold).contains(&now)
+    }
+
+    fn give(&mut self, frame: &Frame, link: &mut Link<Script<Start>>, out: &mut Decoded) {
+        let values = self.values.map(|value| match value {
+            Some((t, value)) if self.is_fresh(t, frame.t) => value,
+            _ => f64::NAN,
+        });
+        if !values[0].is_finite() {
+            // Only where stamps run backward.
+            return out.fault(Counter::Value, 1, frame.id);
+        }
+        let mut quality = self.quality();
+        if quality.contains(Quality::DRIVE_FAULT) {
+            out.fault(Counter::DriveFault, 1, frame.id);
+        }
+        if quality.contains(Quality::DEVICE_FAULT) {
+            out.fault(Counter::DeviceFault, 1, frame.id);
+        }
+        if link.bringup.reading(frame.t) {
+            quality |= Quality::GAP_BEFORE;
+        }
+        let [position, velocity, torque, current] = values;
+        let reading = Reading::Joint(JointState {
+            position,
+            velocity,
+            torque,
+            current,
+            ..JointState::ABSENT
+        });
+        let mut output = Output::new(0, frame, quality, reading);
+        (output.acquired, output.stamp) = self.measured.take().unwrap_or((frame.t, frame.stamp));
+        out.push(output, frame.id);
+    }
+}
+
+impl Family for Drive {
+    type Questions = Script<Start>;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Script<Start>>, out: &mut Decoded) {
+        if self.state.on_frame(self.node, frame, link, out) {
+            // An answer may have changed the mapping.
+            if frame.id == sdo_from(self.node) {
+                self.table = None;
+            }
+            return;
+        }
+        let Some(data) = bytes::payload(frame, out) else {
+            return;
+        };
+        if frame.id == SYNC {
+            if self.table.as_ref().is_some_and(|table| table.by_sync) {
+                self.abandon(frame.id, link, out);
+            }
+            self.cycle.sync(frame);
+        } else {
+            self.pdo(data, frame, link, out);
+        }
+    }
+
+    fn reset(&mut self) {
+        self.cycle.reset();
+        self.have = 0;
+        self.measured = None;
+        self.suspect = false;
+        self.values = [None; Quantity::JOINT];
+        self.table = None;
+    }
+}

@@ -1,0 +1,193 @@
+//! Which bytes of which TPDO are which quantity: from a drive's mapping.
+
+use super::options::Options;
+use crate::SpecError;
+use crate::canopen::{Object, TPDO_OFF};
+use crate::signal::{Bits, Raw};
+use arrayvec::ArrayVec;
+
+/// What a drive sends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Quantity {
+    Position,
+    Velocity,
+    Torque,
+    Current,
+    Status,
+    Mode,
+    Error,
+}
+
+impl Quantity {
+    /// The quantities that make a joint reading.
+    pub(super) const JOINT: usize = 4;
+
+    /// The quantity of an object, and the length of the object \[bits\].
+    pub(super) const fn of(object: Object) -> Option<(Self, u8)> {
+        if object.sub != 0 {
+            return None;
+        }
+        match object.index {
+            0x6064 | 0x6063 => Some((Self::Position, 32)),
+            0x606C => Some((Self::Velocity, 32)),
+            0x6077 => Some((Self::Torque, 16)),
+            0x6078 => Some((Self::Current, 16)),
+            0x6041 => Some((Self::Status, 16)),
+            0x6061 => Some((Self::Mode, 8)),
+            0x603F => Some((Self::Error, 16)),
+            _ => None,
+        }
+    }
+
+    const fn raw(self) -> Raw {
+        match self {
+            Self::Status | Self::Error => Raw::Unsigned,
+            _ => Raw::Signed,
+        }
+    }
+}
+
+/// One number in a TPDO.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Field {
+    pub(super) quantity: Quantity,
+    pub(super) bits: Bits,
+    pub(super) raw: Raw,
+}
+
+/// A TPDO as a drive tells it.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct Pdo {
+    /// Object 1800 sub 1; `None`: there is none.
+    pub(super) id: Option<u32>,
+    /// 0 to 240: by SYNC.
+    pub(super) transmission: u8,
+    /// How many entries of the mapping count.
+    pub(super) count: u8,
+    pub(super) mapping: [u32; 8],
+}
+
+impl Pdo {
+    /// Whether it is sent at all.
+    pub(super) fn is_on(&self) -> bool {
+        self.id.is_some_and(|id| id & TPDO_OFF == 0)
+    }
+
+    pub(super) fn by_sync(&self) -> bool {
+        self.transmission <= 240
+    }
+
+    /// The mapped objects with their lengths \[bits\].
+    fn objects(&self) -> impl Iterator<Item = (Object, u64)> {
+        let mapped = self.mapping.iter().take(usize::from(self.count));
+        mapped.map(|entry| {
+            let [bits, sub, low, high] = entry.to_le_bytes();
+            let index = u16::from_le_bytes([low, high]);
+            (Object::new(index, sub), u64::from(bits))
+        })
+    }
+
+    /// The quantities that are used, and the length of its frames \[bytes\]. An object of another
+    /// length than the profile's is not used.
+    pub(super) fn fields(&self) -> (ArrayVec<Field, 8>, usize) {
+        let (mut fields, mut at) = (ArrayVec::new(), 0);
+        for (object, length) in self.objects() {
+            if let Some((quantity, expected)) = Quantity::of(object)
+                && length == u64::from(expected)
+                && let Some(bits) = Bits::new(at, length, false)
+            {
+                let raw = quantity.raw();
+                let _ = fields.try_push(Field {
+                    quantity,
+                    bits,
+                    raw,
+                });
+            }
+            at += length;
+        }
+        let bytes = usize::try_from(at.div_ceil(8)).unwrap_or(usize::MAX);
+        (fields, bytes)
+    }
+
+    fn has(&self, wanted: Quantity) -> bool {
+        self.fields().0.iter().any(|field| field.quantity == wanted)
+    }
+}
+
+/// All TPDOs of a drive.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(super) struct Layout {
+    pub(super) pdos: [Pdo; 4],
+}
+
+impl Layout {
+    /// As the keys state it, with the identifiers that CiA 301 gives a node.
+    pub(super) fn of_keys(node: u8, options: &Options) -> Result<Self, SpecError> {
+        let mut this = Self::default();
+        for keys in &options.pdos {
+            let wrong = |expected| SpecError::Keys {
+                key: "pdos",
+                expected,
+            };
+            let number = keys.number.wrapping_sub(1);
+            let Some(pdo) = this.pdos.get_mut(usize::from(number)) else {
+                return Err(wrong("numbers 1 to 4"));
+            };
+            if pdo.is_on() || keys.sync > 240 {
+                return Err(wrong("each number once, with sync from 0 to 240"));
+            }
+            pdo.id = Some(crate::canopen::tpdo(node, number).raw());
+            pdo.transmission = if keys.sync == 0 { 254 } else { keys.sync };
+            let mut bits = 0;
+            for index in &keys.objects {
+                let object = Object::new(*index, 0);
+                let Some((_, length)) = Quantity::of(object) else {
+                    return Err(wrong(
+                        "of objects 0x6041, 0x6061, 0x6063, 0x6064, 0x606C, 0x6077, 0x6078, 0x603F",
+                    ));
+                };
+                bits += u32::from(length);
+                if let Some(entry) = pdo.mapping.get_mut(usize::from(pdo.count)) {
+                    *entry = object.mapped(length);
+                    pdo.count += 1;
+                }
+            }
+            if bits > 64 || bits == 0 {
+                return Err(wrong("of 1 to 8 bytes per number"));
+            }
+        }
+        if !options.pdos.is_empty() && this.position().is_none() {
+            return Err(SpecError::Keys {
+                key: "pdos",
+                expected: "with a position, 0x6064 or 0x6063",
+            });
+        }
+        Ok(this)
+    }
+
+    /// The number of the TPDO that has the position.
+    pub(super) fn position(&self) -> Option<usize> {
+        let has = |pdo: &Pdo| pdo.is_on() && pdo.has(Quantity::Position);
+        self.pdos.iter().position(has)
+    }
+
+    /// Whether some TPDO has `wanted`.
+    pub(super) fn has(&self, wanted: Quantity) -> bool {
+        self.pdos.iter().any(|pdo| pdo.is_on() && pdo.has(wanted))
+    }
+
+    /// The TPDOs that make one reading with the position, one bit each, if a SYNC causes them.
+    pub(super) fn group(&self) -> Option<u8> {
+        let position = self.pdos.get(self.position()?)?;
+        if !position.by_sync() {
+            return None;
+        }
+        let belongs = |pdo: &Pdo| {
+            let (fields, _) = pdo.fields();
+            let is_joint = |field: &Field| (field.quantity as usize) < Quantity::JOINT;
+            pdo.is_on() && pdo.transmission == position.transmission && fields.iter().any(is_joint)
+        };
+        let bits = self.pdos.iter().enumerate();
+        Some(bits.fold(0, |all, (at, pdo)| all | u8::from(belongs(pdo)) << at))
+    }
+}

@@ -1,0 +1,450 @@
+//! CANopen encoders (CiA 406), absolute, single-turn or multi-turn.
+//!
+//! The address is the node, 1 to 127. The position comes in TPDO 1 (`180` + node): u32, little-endian,
+//! counts. It covers all turns of a multi-turn encoder, and begins anew at the end of its range.
+//!
+//! At start the driver sets the node pre-operational, checks that its profile (object 1000) is 406,
+//! asks for the counts per turn, maps object 6004 alone to TPDO 1, sets its timer or its SYNC, and
+//! sets the node operational:
+//!
+//! | object | meaning | value |
+//! |---|---|---|
+//! | 6000 | operating parameters; bit 2: scaled | read |
+//! | 6001 | counts per turn of a scaled encoder | read |
+//! | 6501 | counts per turn of one that is not | read |
+//! | 1800 sub 1 | identifier of TPDO 1 | off, and on at the end |
+//! | 1A00 | mapping of TPDO 1 | 6004 00, 32 bits |
+//! | 1800 sub 2 | transmission | 254, or `sync` |
+//! | 1800 sub 5 | timer \[ms\]; 6200 if the node has none | `period_ms` |
+//! | 1017 | heartbeat \[ms\] | 500 |
+//!
+//! Nothing is stored in the node. A node that boots or leaves the operational state is started
+//! again. While its last emergency message (EMCY) is an error, readings have DEVICE_FAULT.
+//!
+//! With `sync = n` the node sends after each n-th SYNC, and `acquired` is the time of that SYNC:
+//! the moment at which the encoder has measured. Something must send SYNC: `canopen_sync`, or another
+//! node.
+//!
+//! If another program commands the node (`listen_only`, or a recorded log), the counts per turn are
+//! those of its answers to that program, or the key.
+//!
+//! Sources: CiA 301 4.2, CiA 406 3.2 as public drivers use it. Certain; makers differ in objects
+//! that they leave out: 6000 and 1017 may be missing, and 6200 replaces the timer.
+//!
+//! # Keys
+//! ```toml
+//! period_ms = 10          # 1 to 65535
+//! counts_per_turn = 8192  # default: the node's own
+//! sync = 0                # 1 to 240: after each n-th SYNC; 0: by its timer
+//! configure = true        # false: TPDO 1 is mapped already, and begins with the position
+//! ```
+
+use crate::bringup::Bringup;
+use crate::bytes::{self, u32_le};
+use crate::canopen::{
+    self, Cycle, NMT, NO_RTR, Node, NodeState, Object, Plan, SYNC, Script, Step, TPDO_OFF, nmt,
+    node_of, object, tpdo,
+};
+use crate::family::{Family, Link, Supervised};
+use crate::{
+    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
+    Spec, SpecError,
+};
+use alloc::boxed::Box;
+use alloc::vec::Vec;
+use core::f64::consts::TAU;
+use proprio_topics::{Counter, JointState, Kind, Nanos, Quality, Reading, Refusal};
+use serde::Deserialize;
+
+/// The profile of encoders.
+const PROFILE: u32 = 406;
+const OPERATING: Object = Object::new(0x6000, 0);
+const SCALED: u32 = 1 << 2;
+const SCALED_PER_TURN: Object = Object::new(0x6001, 0);
+const PER_TURN: Object = Object::new(0x6501, 0);
+const POSITION: Object = Object::new(0x6004, 0);
+const CYCLE: Object = Object::new(0x6200, 0);
+const HEARTBEAT_MS: u32 = 500;
+/// Transmission by events, and by the timer.
+const BY_EVENT: u8 = 254;
+
+/// The keys of `driver = "canopen_encoder"`.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// Period \[ms\], 1 to 65535; default 10.
+    pub period_ms: u32,
+    /// Counts per turn; default the node's own.
+    pub counts_per_turn: Option<f64>,
+    /// Send after each n-th SYNC; 0, the default: by the timer.
+    pub sync: u8,
+    /// Map and time TPDO 1; default true.
+    pub configure: bool,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            period_ms: 10,
+            counts_per_turn: None,
+            sync: 0,
+            configure: true,
+        }
+    }
+}
+
+impl Options {
+    fn check(&self) -> Result<(), SpecError> {
+        let (key, value, expected) = if !(1..=65_535).contains(&self.period_ms) {
+            ("period_ms", f64::from(self.period_ms), "1 to 65535")
+        } else if self.sync > 240 {
+            ("sync", f64::from(self.sync), "0 to 240")
+        } else if let Some(counts) = self
+            .counts_per_turn
+            .filter(|n| !(*n > 0.0 && n.is_finite()))
+        {
+            ("counts_per_turn", counts, "above 0")
+        } else {
+            return Ok(());
+        };
+        Err(SpecError::Key {
+            key,
+            value,
+            expected,
+        })
+    }
+}
+
+impl Driver for Options {
+    const NAME: &'static str = "canopen_encoder";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Joint)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        Encoder::device(spec, self)
+    }
+
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(EncoderBoard::new(spec, self)?))
+    }
+}
+
+/// The start of an encoder.
+#[derive(Debug)]
+struct Start {
+    node: u8,
+    options: Options,
+    scaled: bool,
+    counts_per_turn: Option<f64>,
+    /// The node has no timer in object 1800.
+    no_timer: bool,
+}
+
+impl Plan for Start {
+    fn step(&self, at: usize) -> Option<Step> {
+        let write = |object, value, bytes| Step::Write {
+            object,
+            value,
+            bytes,
+        };
+        let id = tpdo(self.node, 0).raw() | NO_RTR;
+        let transmission = match self.options.sync {
+            0 => BY_EVENT,
+            n => n,
+        };
+        let asks = self.options.counts_per_turn.is_none();
+        let (configures, by_timer) = (self.options.configure, self.options.sync == 0);
+        let period = self.options.period_ms;
+        let (step, needed) = match at {
+            0 => (Step::Nmt(nmt::PRE_OPERATIONAL), true),
+            1 => (Step::Read(object::DEVICE_TYPE), true),
+            2 => (Step::Read(OPERATING), asks),
+            3 if self.scaled => (Step::Read(SCALED_PER_TURN), asks),
+            3 => (Step::Read(PER_TURN), asks),
+            4 => (write(object::tpdo_id(0), id | TPDO_OFF, 4), configures),
+            5 => (write(object::tpdo_mapping(0, 0), 0, 1), configures),
+            6 => (
+                write(object::tpdo_mapping(0, 1), POSITION.mapped(32), 4),
+                configures,
+            ),
+            7 => (write(object::tpdo_mapping(0, 0), 1, 1), configures),
+            8 => (
+                write(object::tpdo_transmission(0), transmission.into(), 1),
+                configures,
+            ),
+            9 => (
+                write(object::tpdo_timer(0), period, 2),
+                configures && by_timer,
+            ),
+            10 => (
+                write(CYCLE, period, 2),
+                configures && by_timer && self.no_timer,
+            ),
+            11 => (write(object::tpdo_id(0), id, 4), configures),
+            _ => (write(object::HEARTBEAT, HEARTBEAT_MS, 2), true),
+        };
+        needed.then_some(step)
+    }
+
+    fn steps(&self) -> usize {
+        13
+    }
+
+    fn take(&mut self, object: Object, answer: Result<Option<u32>, u32>) -> Result<(), Refusal> {
+        match (object, answer) {
+            (object::DEVICE_TYPE, Ok(Some(device))) if device & 0xFFFF != PROFILE => {
+                #[allow(clippy::cast_possible_truncation)] // 16 bits
+                let profile = (device & 0xFFFF) as u16;
+                Err(Refusal::OtherDevice { profile })
+            }
+            (OPERATING, Ok(Some(parameters))) => {
+                self.scaled = parameters & SCALED != 0;
+                Ok(())
+            }
+            // Old encoders have no scaling.
+            (OPERATING, Err(_)) => {
+                self.scaled = false;
+                Ok(())
+            }
+            (PER_TURN | SCALED_PER_TURN, Ok(Some(counts))) => {
+                // In a log, the one that does not apply may be read too.
+                let applies = (object == SCALED_PER_TURN) == self.scaled;
+                if self.options.counts_per_turn.is_some() || !applies {
+                    return Ok(());
+                }
+                if counts == 0 {
+                    return Err(Refusal::BadCalibration { channel: 0 });
+                }
+                let counts = f64::from(counts);
+                match self.counts_per_turn {
+                    Some(known) if known != counts => Err(Refusal::Changed),
+                    _ => {
+                        self.counts_per_turn = Some(counts);
+                        Ok(())
+                    }
+                }
+            }
+            (object, Err(_)) if object == object::tpdo_timer(0) => {
+                self.no_timer = true;
+                Ok(())
+            }
+            (object::HEARTBEAT, Err(_)) => Ok(()),
+            (object, Err(_)) => Err(Refusal::Rejected {
+                object: object.index,
+            }),
+            _ => Ok(()),
+        }
+    }
+
+    fn ready(&self) -> Result<(), Refusal> {
+        let known = self.counts_per_turn;
+        known.map(|_| ()).ok_or(Refusal::NoCalibration)
+    }
+
+    fn begin(&mut self) {
+        // It may be another encoder.
+        self.counts_per_turn = self.options.counts_per_turn;
+        self.no_timer = false;
+    }
+}
+
+/// The host's side of an encoder.
+#[derive(Debug)]
+struct Encoder {
+    node: u8,
+    cycle: Cycle,
+    state: NodeState,
+}
+
+impl Encoder {
+    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        options.check()?;
+        let node = node_of(spec)?;
+        let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, tpdo(node, 0));
+        bringup.start_with(NMT, &[nmt::START, node]);
+        bringup.stop_with(NMT, &[nmt::PRE_OPERATIONAL, node]);
+        let start = Start {
+            node,
+            counts_per_turn: options.counts_per_turn,
+            options: options.clone(),
+            scaled: false,
+            no_timer: false,
+        };
+        let claims = canopen::claims(node)
+            .into_iter()
+            .chain([Claim::exclusive(tpdo(node, 0)), Claim::shared(SYNC)]);
+        let script = Script::new(node, spec.mode, start);
+        let this = Self {
+            node,
+            cycle: Cycle::new(options.sync),
+            state: NodeState::default(),
+        };
+        Ok(Supervised::boxed(claims, bringup, script, this))
+    }
+
+    fn position(
+        &mut self,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Link<Script<Start>>,
+        out: &mut Decoded,
+    ) {
+        if data.len() < 4 {
+            return out.fault(Counter::Length, 1, frame.id);
+        }
+        let Some(counts_per_turn) = link.questions.plan.counts_per_turn else {
+            return link.questions.missed();
+        };
+        let mut quality = Quality::GOOD;
+        if self.state.error != 0 {
+            quality |= Quality::DEVICE_FAULT;
+            out.fault(Counter::DeviceFault, 1, frame.id);
+        }
+        if link.bringup.reading(frame.t) {
+            quality |= Quality::GAP_BEFORE;
+        }
+        let reading = Reading::Joint(JointState {
+            position: f64::from(u32_le(data, 0)) / counts_per_turn * TAU,
+            ..JointState::ABSENT
+        });
+        let mut output = Output::new(0, frame, quality, reading);
+        (output.acquired, output.stamp) = self.cycle.measured(frame);
+        out.push(output, frame.id);
+    }
+}
+
+impl Family for Encoder {
+    type Questions = Script<Start>;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Script<Start>>, out: &mut Decoded) {
+        if self.state.on_frame(self.node, frame, link, out) {
+            return;
+        }
+        let Some(data) = bytes::payload(frame, out) else {
+            return;
+        };
+        if frame.id == SYNC {
+            self.cycle.sync(frame);
+        } else if frame.id == tpdo(self.node, 0) {
+            self.position(data, frame, link, out);
+        }
+    }
+
+    fn reset(&mut self) {
+        self.cycle.reset();
+    }
+}
+
+/// Counts per turn of a simulated encoder without the key, and its turns.
+const USUAL_PER_TURN: u32 = 8192;
+/// The error code of a simulated encoder with a fault: its hardware.
+const HARDWARE: u16 = 0x5000;
+
+/// The encoder's own side.
+#[derive(Debug)]
+pub struct EncoderBoard {
+    node: Node,
+    counts: u32,
+    quality: Quality,
+}
+
+impl EncoderBoard {
+    /// An encoder after power-on; in [`Mode::Listen`] another program has already started it.
+    ///
+    /// # Errors
+    /// [`SpecError`]: a node outside 1 to 127, a key out of range.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // casts saturate
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        options.check()?;
+        let id = node_of(spec)?;
+        let per_turn = options.counts_per_turn.map_or(USUAL_PER_TURN, |n| n as u32);
+        // As another program, or the maker's tool, has left it.
+        let set = spec.mode == Mode::Listen || !options.configure;
+        let (off, map) = if set {
+            (0, POSITION.mapped(32))
+        } else {
+            (TPDO_OFF, 0)
+        };
+        let transmission = match options.sync {
+            0 => BY_EVENT,
+            n => n,
+        };
+        let entries = [
+            (object::DEVICE_TYPE, 0x0002_0000 | PROFILE, 4),
+            (object::HEARTBEAT, 0, 2),
+            (object::tpdo_id(0), tpdo(id, 0).raw() | NO_RTR | off, 4),
+            (object::tpdo_transmission(0), u32::from(transmission), 1),
+            (object::tpdo_timer(0), options.period_ms, 2),
+            (object::tpdo_mapping(0, 0), u32::from(set), 1),
+            (object::tpdo_mapping(0, 1), map, 4),
+            (OPERATING, 0, 2),
+            (PER_TURN, per_turn, 4),
+        ];
+        Ok(Self {
+            node: Node::new(id, spec.mode == Mode::Listen, &entries),
+            counts: 0,
+            quality: Quality::GOOD,
+        })
+    }
+
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // limited to 32 bits
+    fn set(&mut self, position: f64, quality: Quality) {
+        let counts_per_turn = f64::from(self.node.value(PER_TURN));
+        let counts = bytes::quantise(position * counts_per_turn, TAU, i64::MIN, i64::MAX);
+        // It begins anew at the end of its range.
+        self.counts = counts.rem_euclid(1 << 32) as u32;
+        self.quality = quality;
+    }
+
+    fn send(&mut self, out: &mut Frames) {
+        let fault = self.quality.contains(Quality::DEVICE_FAULT);
+        self.node.report(if fault { HARDWARE } else { 0 }, out);
+        if self.node.value(object::tpdo_mapping(0, 1)) == POSITION.mapped(32) {
+            let frame = Frame::new(self.node.tpdo_id(0), &self.counts.to_le_bytes());
+            let _ = out.try_push(frame);
+        }
+    }
+}
+
+impl Board for EncoderBoard {
+    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
+        if self.node.on_frame(frame, out) & 1 != 0 {
+            self.send(out);
+        }
+    }
+
+    fn period(&self) -> Option<Nanos> {
+        self.node.period(0)
+    }
+
+    fn present(&mut self, _output: u8, reading: &Reading, quality: Quality) {
+        if let Reading::Joint(joint) = reading
+            && joint.position.is_finite()
+        {
+            self.set(joint.position, quality);
+        }
+    }
+
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        let Reading::Joint(joint) = reading else {
+            return Err(EncodeError::Kind);
+        };
+        if output != 0 {
+            return Err(EncodeError::Output(output));
+        }
+        if !joint.position.is_finite() {
+            return Err(EncodeError::NotFinite);
+        }
+        self.set(joint.position, quality);
+        self.send(out);
+        Ok(())
+    }
+}

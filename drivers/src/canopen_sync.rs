@@ -1,0 +1,133 @@
+//! Sends the SYNC of a CANopen bus: all nodes that are set to it measure at once, when it comes.
+//!
+//! It has no channel and no address. It sends `080` without data each `period_ms`, from the start
+//! of the gateway on; at most one device of a bus does. Nodes such as drives can do it too (their
+//! objects 1005 and 1006).
+//!
+//! Sources: CiA 301 4.2. Certain.
+//!
+//! # Keys
+//! ```toml
+//! period_ms = 10.0   # 0.5 to 1000, less than max_silence_ms
+//! ```
+
+use crate::bringup::{Bringup, NoInquiry};
+use crate::canopen::{self, SYNC};
+use crate::family::{Family, Link, Supervised};
+use crate::{
+    Board, Decoded, Device, Driver, EncodeError, Frame, Frames, OutputInfo, Spec, SpecError,
+};
+use alloc::boxed::Box;
+use alloc::vec::Vec;
+use proprio_topics::{Nanos, Quality, Reading};
+use serde::Deserialize;
+
+/// The keys of `driver = "canopen_sync"`.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// Period \[ms\], 0.5 to 1000; default 10.
+    pub period_ms: f64,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { period_ms: 10.0 }
+    }
+}
+
+impl Options {
+    fn period(&self, spec: &Spec) -> Result<Nanos, SpecError> {
+        let key = |expected| SpecError::Key {
+            key: "period_ms",
+            value: self.period_ms,
+            expected,
+        };
+        if !(self.period_ms >= 0.5 && self.period_ms <= 1000.0) {
+            return Err(key("0.5 to 1000"));
+        }
+        let period = Nanos::from_seconds(self.period_ms * 1e-3);
+        if period >= spec.max_silence {
+            return Err(key("less than max_silence_ms"));
+        }
+        Ok(period)
+    }
+}
+
+impl Driver for Options {
+    const NAME: &'static str = "canopen_sync";
+    const ADDRESS: Option<u32> = Some(0);
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        Vec::new()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let bringup = Bringup::new(spec, spec.mode, canopen::TIMING, SYNC);
+        let this = Producer {
+            period: self.period(spec)?,
+            next: Nanos::MIN,
+        };
+        Ok(Supervised::boxed([], bringup, NoInquiry, this))
+    }
+
+    fn board(&self, _spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(Nothing))
+    }
+}
+
+/// The host's side: all of it.
+#[derive(Debug)]
+struct Producer {
+    period: Nanos,
+    next: Nanos,
+}
+
+impl Family for Producer {
+    type Questions = NoInquiry;
+
+    fn on_frame(&mut self, _frame: &Frame, _link: &mut Link<NoInquiry>, _out: &mut Decoded) {}
+
+    fn request(
+        &mut self,
+        now: Nanos,
+        link: &mut Link<NoInquiry>,
+        _out: &mut Decoded,
+    ) -> Option<Frame> {
+        if now < self.next {
+            return None;
+        }
+        // In step with the first; what was missed is left out.
+        let due = self.next.max(now - self.period) + self.period;
+        self.next = if due > now { due } else { now + self.period };
+        // It works as long as the bus takes them.
+        link.bringup.reading(now);
+        Some(Frame::new(SYNC, &[]))
+    }
+
+    fn request_at(&self) -> Option<Nanos> {
+        Some(self.next)
+    }
+}
+
+/// There is nothing at the other end.
+#[derive(Debug)]
+struct Nothing;
+
+impl Board for Nothing {
+    fn on_frame(&mut self, _frame: &Frame, _out: &mut Frames) {}
+
+    fn period(&self) -> Option<Nanos> {
+        None
+    }
+
+    fn encode(
+        &mut self,
+        output: u8,
+        _reading: &Reading,
+        _quality: Quality,
+        _out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        Err(EncodeError::Output(output))
+    }
+}
