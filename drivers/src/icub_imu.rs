@@ -67,7 +67,7 @@
 //!                           # "amg", "imu", "compass", "m4g", "ndof_fmc_off"
 //! placement = 6             # axes P0 to P7 of the BNO055's datasheet; default: the board's own
 //! legacy = "none"           # "mtb" or "bno055": legacy frames of that scale instead
-//! legacy_mask = 6           # which legacy sensors; default accelerometer and gyroscope
+//! # legacy_mask = 6         # with legacy: which sensors; default accelerometer and gyroscope
 //! power_on_silence_ms = 0   # see `crate::icub`
 //! ```
 
