@@ -13,6 +13,7 @@
 //! | [`canopen_drive`] | CANopen drives (CiA 402) | joint, actuator |
 //! | [`canopen_encoder`] | CANopen encoders (CiA 406) | joint |
 //! | [`canopen_sync`] | sends a CANopen bus its SYNC | none |
+//! | [`moteus`] | moteus controllers (CAN FD) | joint, actuator, temperature |
 //! | [`dbc`] | any device that a .dbc file describes | any |
 //!
 //! Each family has two sides. A [`Device`] is the host's side: it decodes the frames of its
@@ -48,6 +49,7 @@ pub mod icub_motor;
 pub mod icub_pos;
 pub mod icub_skin;
 pub mod icub_strain;
+pub mod moteus;
 mod pairing;
 mod registry;
 pub mod signal;

@@ -4,7 +4,7 @@ use crate::signal::Message;
 use crate::{
     Board, Device, Driver, OutputInfo, Spec, SpecError, ati_netcanoem, canopen_drive,
     canopen_encoder, canopen_sync, dbc, icub_imu, icub_mais, icub_motor, icub_pos, icub_skin,
-    icub_strain,
+    icub_strain, moteus,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -55,6 +55,14 @@ macro_rules! drivers {
             pub const fn default_address(&self) -> Option<u32> {
                 match self {
                     $(Self::$variant(_) => <$module::Options as Driver>::ADDRESS,)+
+                }
+            }
+
+            /// Whether its devices need a bus with CAN FD ([`Driver::NEEDS_FD`]).
+            #[must_use]
+            pub const fn needs_fd(&self) -> bool {
+                match self {
+                    $(Self::$variant(_) => <$module::Options as Driver>::NEEDS_FD,)+
                 }
             }
 
@@ -127,6 +135,8 @@ drivers! {
     CanopenEncoder: canopen_encoder,
     /// The SYNC of a CANopen bus.
     CanopenSync: canopen_sync,
+    /// moteus controllers.
+    Moteus: moteus,
     /// Devices that a .dbc file describes.
     Dbc: dbc,
 }

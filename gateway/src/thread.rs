@@ -5,6 +5,7 @@ use crate::clock::Monotonic;
 use crate::config::Source;
 use crate::decoder::Decoder;
 use crate::inbox::{Requests, inbox};
+use crate::link::interface::{Interfaces, Netlink};
 use crate::link::replay::Replay;
 use crate::link::socketcan::SocketCan;
 use crate::link::virtual_bus::VirtualBus;
@@ -187,10 +188,29 @@ pub fn open_link(
     claims: &[Claim],
 ) -> Result<Box<dyn Link>, OpenError> {
     Ok(match &bus.source {
-        Source::SocketCan { interface } => Box::new(SocketCan::open(interface, claims)?),
+        Source::SocketCan { interface } => {
+            let link = SocketCan::open(interface, claims)?;
+            check_fd(bus, interface, &mut Netlink::default())?;
+            Box::new(link)
+        }
         Source::Virtual { name } => Box::new(VirtualBus::open(domain, name, claims)?),
         Source::Replay { log, pace } => Box::new(Replay::open(log, *pace, None, claims)?),
     })
+}
+
+/// Refuses an interface without CAN FD for a device that needs it. If the kernel does not tell, the
+/// counters of frames that were not sent will.
+fn check_fd(bus: &BusPlan, interface: &str, kernel: &mut impl Interfaces) -> Result<(), OpenError> {
+    let needs = bus.devices.iter().find(|device| device.options.needs_fd());
+    match needs {
+        Some(device) if kernel.ask(interface).is_ok_and(|health| health.fd == 0) => {
+            Err(OpenError::NoFd {
+                interface: interface.to_owned(),
+                device: device.name.clone(),
+            })
+        }
+        _ => Ok(()),
+    }
 }
 
 #[cfg(test)]
@@ -214,6 +234,8 @@ impl BusThread {
 mod tests {
     use super::*;
     use crate::clock::Clock;
+    use nix::errno::Errno;
+    use proprio_topics::InterfaceHealth;
     use proprio_topics::ipc::{DomainConfig, Reader};
     use std::fmt::Write as _;
     use std::path::Path;
@@ -230,6 +252,37 @@ mod tests {
         assert!(thread.is_stuck(turn + STUCK + Nanos(1)));
         thread.ended.store(true, Release);
         assert!(!thread.is_stuck(turn + STUCK + Nanos(1)));
+    }
+
+    #[test]
+    fn a_device_that_needs_fd_is_not_started_without() {
+        let plan = |driver: &str| {
+            let text = format!(
+                "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\n\
+                 source = {{ kind = \"socketcan\", interface = \"can0\" }}\n\
+                 [[bus.device]]\ndriver = \"{driver}\"\nname = \"knee_drive\"\naddress = 4\n\
+                 [[bus.device.joint]]\nname = \"knee\"\n"
+            );
+            Plan::parse(&text, Path::new(".")).unwrap()
+        };
+        let told = |driver: &str, answer: Result<u32, Errno>| {
+            let mut kernel = |_: &str| {
+                let health = |fd| InterfaceHealth {
+                    fd,
+                    ..InterfaceHealth::default()
+                };
+                answer.map(health)
+            };
+            check_fd(&plan(driver).buses[0], "can0", &mut kernel)
+        };
+        let refused = told("moteus", Ok(0)).unwrap_err().to_string();
+        assert!(
+            refused.contains("can0") && refused.contains("\"knee_drive\""),
+            "{refused}"
+        );
+        assert!(refused.contains("fd on"), "{refused}");
+        assert!(told("moteus", Ok(1)).is_ok() && told("icub_motor", Ok(0)).is_ok());
+        assert!(told("moteus", Err(Errno::EPERM)).is_ok());
     }
 
     /// The buses of one log begin at the instant that is common to all, not when each is opened.

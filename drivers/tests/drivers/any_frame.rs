@@ -52,6 +52,8 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
         &[0],
     ),
     ("canopen_sync", "", &[]),
+    ("moteus", "", &[0]),
+    ("moteus", "host = 7", &[0]),
     ("dbc", crate::dbc::WRENCH, &[]),
     ("dbc", crate::dbc::DRIVE, &[0]),
     ("dbc", crate::dbc::PAGES, &[]),

@@ -9,6 +9,7 @@ mod canopen;
 mod command;
 mod dbc;
 mod golden;
+mod moteus;
 mod pairing;
 mod rig;
 mod round_trip;

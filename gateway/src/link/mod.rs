@@ -163,6 +163,18 @@ pub enum OpenError {
         /// Its name.
         interface: String,
     },
+    /// The interface carries classic frames alone, and a device needs CAN FD.
+    #[error(
+        "{interface} carries no CAN FD, which {device:?} needs; if the adapter can, `ip link set \
+         {interface} down`, then `ip link set {interface} up type can bitrate 1000000 dbitrate \
+         5000000 fd on` (a vcan: `ip link set {interface} mtu 72`)"
+    )]
+    NoFd {
+        /// Its name.
+        interface: String,
+        /// The device's.
+        device: String,
+    },
     /// The kernel has no CAN support.
     #[error(
         "this kernel has no CAN (modules can and can-raw are not available: {cause}); \

@@ -1,0 +1,632 @@
+//! moteus controllers (mjbots) on CAN FD: position, velocity and torque at the output.
+//!
+//! The address is the controller's, 1 to 127. A controller sends nothing by itself: the driver asks
+//! each `period_ms`. Frames are CAN FD with the higher bit rate; the bus must carry it (1 Mbit/s, 5
+//! Mbit/s for the data). Identifiers are source << 8 | destination, extended above 7FF; bit 15 asks
+//! for a reply:
+//!
+//! | identifier | content |
+//! |---|---|
+//! | `8000` \| host << 8 \| address | query: `11 00 1F 01 13 0D` |
+//! | address << 8 \| host | reply |
+//!
+//! A frame is a sequence of subframes; numbers are little-endian:
+//!
+//! | opcode | meaning |
+//! |---|---|
+//! | `10` + type + count | read: register |
+//! | `20` + type + count | reply: register, values |
+//! | `30`, `31` | write or read error: register, code |
+//! | `50` | nothing: fills the frame up to a legal length |
+//!
+//! - Type: 0 i8, 4 i16, 8 i32, C f32. Count: the two low bits, 1 to 3 registers from this one on; 0:
+//!   the count follows as a varuint. Registers and codes are varuints.
+//! - Registers: 0 mode, 1 position \[turn\], 2 velocity \[turn/s\], 3 torque \[Nm\], D voltage, E
+//!   temperature \[deg C\], F fault. One step is, as i8, i16, i32: position 0.01, 1e-4, 1e-5; velocity
+//!   0.1, 2.5e-4, 1e-5; torque 0.5, 0.01, 0.001; temperature 1, 0.1, 0.001. The lowest integer means
+//!   not a number.
+//! - Any type is read, so another program may ask (`listen_only`, or a recorded log). A reply without
+//!   the position is no reading of the joint.
+//! - Mode 1, fault: DRIVE_FAULT. Faults 35 (encoder), 36 (not configured), 42 (theta invalid) and 43
+//!   (position invalid) make the position doubtful: DEVICE_FAULT. They are the `faults` of the
+//!   actuator reading, the mode is its `mode`.
+//!
+//! The driver never commands: it reads registers, and sends nothing at the end.
+//!
+//! Sources: `docs/protocol/can.md` and `registers.md` (moteus db1a7623). Certain: the tests compare
+//! with the package `moteus` 1.1.1.
+//!
+//! # Keys
+//! ```toml
+//! period_ms = 2     # of the queries, 1 to 1000
+//! host = 0          # the host's own address, 0 to 127
+//! ```
+
+use crate::bringup::{Bringup, NoInquiry, Timing};
+use crate::bytes::{self, i16_le, u32_le};
+use crate::family::{Family, Link, Supervised};
+use crate::{
+    Board, Claim, Decoded, Device, Driver, EncodeError, Format, Frame, Frames, Id, Output,
+    OutputInfo, Spec, SpecError,
+};
+use alloc::boxed::Box;
+use alloc::vec::Vec;
+use arrayvec::ArrayVec;
+use core::f64::consts::TAU;
+use proprio_topics::{Actuator, Counter, JointState, Kind, Nanos, Quality, Reading, Temperature};
+use serde::Deserialize;
+
+/// Registers.
+mod register {
+    pub(super) const MODE: u32 = 0x0;
+    pub(super) const POSITION: u32 = 0x1;
+    pub(super) const VELOCITY: u32 = 0x2;
+    pub(super) const TORQUE: u32 = 0x3;
+    pub(super) const VOLTAGE: u32 = 0xD;
+    pub(super) const TEMPERATURE: u32 = 0xE;
+    pub(super) const FAULT: u32 = 0xF;
+}
+
+/// Opcodes without type and count.
+const READ: u8 = 0x10;
+const REPLY: u8 = 0x20;
+const WRITE_ERROR: u8 = 0x30;
+const READ_ERROR: u8 = 0x31;
+const NOTHING: u8 = 0x50;
+/// Mode and three others as i8, three as f32.
+const QUERY: [u8; 6] = [0x11, 0x00, 0x1F, 0x01, 0x13, 0x0D];
+/// Asks for a reply.
+const WANTED: u16 = 0x8000;
+/// Mode of a controller with a fault, and of one that is stopped.
+const MODE_FAULT: f64 = 1.0;
+const MODE_STOPPED: f64 = 0.0;
+/// Faults that concern the position.
+const POSITION_FAULTS: [u32; 4] = [35, 36, 42, 43];
+/// The fault of a simulated controller: of the encoder, or too hot.
+const ENCODER_FAULT: f64 = 35.0;
+const TOO_HOT: f64 = 38.0;
+
+/// A query that was not taken by the bus within this time is useless.
+const TIMING: Timing = Timing {
+    power_on_silence: Nanos::ZERO,
+    answer_timeout: Nanos::from_millis(20),
+    attempts: 5,
+    slow_attempt: Nanos::from_millis(500),
+    answer_counts: Nanos::from_millis(100),
+    start: Nanos::from_millis(100),
+    start_most: Nanos::from_millis(2000),
+    send_within: Nanos::from_millis(5),
+};
+
+/// The keys of `driver = "moteus"`.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// Period of the queries \[ms\], 1 to 1000; default 2.
+    pub period_ms: u32,
+    /// The host's own address; default 0.
+    pub host: u8,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            period_ms: 2,
+            host: 0,
+        }
+    }
+}
+
+impl Options {
+    /// The controller's address and the period.
+    fn check(&self, spec: &Spec) -> Result<(u8, Nanos), SpecError> {
+        let address = spec.address;
+        let (least, most) = (1, 127);
+        let range = SpecError::Address {
+            address,
+            least,
+            most,
+        };
+        let node = u8::try_from(address).ok();
+        let node = node.filter(|n| (1..=127).contains(n)).ok_or(range)?;
+        let key = |key, value, expected| SpecError::Key {
+            key,
+            value,
+            expected,
+        };
+        if !(1..=1000).contains(&self.period_ms) {
+            return Err(key("period_ms", f64::from(self.period_ms), "1 to 1000"));
+        }
+        if self.host > 127 || self.host == node {
+            let expected = "0 to 127, and not the controller's address";
+            return Err(key("host", f64::from(self.host), expected));
+        }
+        Ok((node, Nanos::from_millis(i64::from(self.period_ms))))
+    }
+}
+
+impl Driver for Options {
+    const NAME: &'static str = "moteus";
+    const ADDRESS: Option<u32> = Some(1);
+    const NEEDS_FD: bool = true;
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Joint)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        Controller::device(spec, self)
+    }
+
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(MoteusBoard::new(spec, self)?))
+    }
+}
+
+/// The identifier of a frame from `source` to `destination`.
+fn id(source: u8, destination: u8, flags: u16) -> Id {
+    let raw = flags | u16::from(source) << 8 | u16::from(destination);
+    if raw > 0x7FF {
+        Id::extended(u32::from(raw))
+    } else {
+        Id::standard(raw)
+    }
+}
+
+/// A frame with `data`, filled up to a length that CAN FD has.
+fn fd(id: Id, data: &[u8]) -> Option<Frame> {
+    const LENGTHS: [usize; 7] = [12, 16, 20, 24, 32, 48, 64];
+    let length = match data.len() {
+        short @ 0..=8 => short,
+        long => LENGTHS.into_iter().find(|length| *length >= long)?,
+    };
+    let mut filled: ArrayVec<u8, 64> = data.iter().copied().take(64).collect();
+    while filled.len() < length {
+        filled.push(NOTHING);
+    }
+    let format = Format::Fd {
+        bit_rate_switch: true,
+        error_state: false,
+    };
+    Frame::with_format(id, format, &filled)
+}
+
+/// The type of the numbers of a subframe.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Type {
+    I8,
+    I16,
+    I32,
+    F32,
+}
+
+impl Type {
+    const fn of(opcode: u8) -> Self {
+        match opcode >> 2 & 3 {
+            0 => Self::I8,
+            1 => Self::I16,
+            2 => Self::I32,
+            _ => Self::F32,
+        }
+    }
+
+    const fn bytes(self) -> usize {
+        match self {
+            Self::I8 => 1,
+            Self::I16 => 2,
+            Self::I32 | Self::F32 => 4,
+        }
+    }
+
+    /// The number in `data`; the lowest integer is not a number.
+    fn number(self, data: &[u8]) -> f64 {
+        let integer = |value: i32, lowest: i32| match value {
+            value if value == lowest => f64::NAN,
+            value => f64::from(value),
+        };
+        match self {
+            Self::I8 => {
+                let byte = data.first().map_or(0, |byte| byte.cast_signed());
+                integer(i32::from(byte), i32::from(i8::MIN))
+            }
+            Self::I16 => integer(i32::from(i16_le(data, 0)), i32::from(i16::MIN)),
+            Self::I32 => integer(u32_le(data, 0).cast_signed(), i32::MIN),
+            Self::F32 => f64::from(f32::from_bits(u32_le(data, 0))),
+        }
+    }
+
+    /// One step of `register` in this type, in the register's unit.
+    fn step(self, register: u32) -> f64 {
+        let steps = match register {
+            register::POSITION => [0.01, 1e-4, 1e-5],
+            register::VELOCITY => [0.1, 2.5e-4, 1e-5],
+            register::TORQUE => [0.5, 0.01, 0.001],
+            register::VOLTAGE => [0.5, 0.1, 0.001],
+            register::TEMPERATURE => [1.0, 0.1, 0.001],
+            _ => [1.0; 3],
+        };
+        let [i8_step, i16_step, i32_step] = steps;
+        match self {
+            Self::I8 => i8_step,
+            Self::I16 => i16_step,
+            Self::I32 => i32_step,
+            Self::F32 => 1.0,
+        }
+    }
+}
+
+/// Reads the numbers of a frame from the left.
+#[derive(Debug)]
+struct Cursor<'d>(&'d [u8]);
+
+impl<'d> Cursor<'d> {
+    fn take(&mut self, bytes: usize) -> Option<&'d [u8]> {
+        let (taken, rest) = self.0.split_at_checked(bytes)?;
+        self.0 = rest;
+        Some(taken)
+    }
+
+    fn byte(&mut self) -> Option<u8> {
+        self.take(1)?.first().copied()
+    }
+
+    /// Seven bits a byte, the lowest first; the highest bit of a byte says that one follows.
+    fn varuint(&mut self) -> Option<u32> {
+        let mut value = 0;
+        for shift in [0, 7, 14, 21] {
+            let byte = self.byte()?;
+            value |= u32::from(byte & 0x7F) << shift;
+            if byte & 0x80 == 0 {
+                return Some(value);
+            }
+        }
+        None
+    }
+
+    /// The type, the count and the first register of the subframe with this opcode.
+    fn registers(&mut self, opcode: u8) -> Option<(Type, u32, u32)> {
+        let count = match opcode & 3 {
+            0 => self.varuint()?,
+            count => u32::from(count),
+        };
+        Some((Type::of(opcode), count, self.varuint()?))
+    }
+}
+
+/// What a reply tells.
+#[derive(Debug, Clone, Copy, Default)]
+struct Told {
+    mode: Option<f64>,
+    position: Option<f64>,
+    velocity: Option<f64>,
+    torque: Option<f64>,
+    temperature: Option<f64>,
+    fault: Option<f64>,
+}
+
+impl Told {
+    /// Reads a reply; `None` if it is none, or cut off.
+    fn parse(data: &[u8]) -> Option<Self> {
+        let (mut told, mut cursor) = (Self::default(), Cursor(data));
+        let mut replies = false;
+        while let Some(opcode) = cursor.byte() {
+            match opcode {
+                REPLY..WRITE_ERROR => {
+                    let (kind, count, first) = cursor.registers(opcode)?;
+                    replies = true;
+                    for register in first..first.checked_add(count)? {
+                        let number = kind.number(cursor.take(kind.bytes())?);
+                        told.set(register, number * kind.step(register));
+                    }
+                }
+                WRITE_ERROR | READ_ERROR => {
+                    cursor.varuint()?;
+                    cursor.varuint()?;
+                    replies = true;
+                }
+                NOTHING => {}
+                _ => return None,
+            }
+        }
+        replies.then_some(told)
+    }
+
+    const fn set(&mut self, register: u32, value: f64) {
+        let place = match register {
+            register::MODE => &mut self.mode,
+            register::POSITION => &mut self.position,
+            register::VELOCITY => &mut self.velocity,
+            register::TORQUE => &mut self.torque,
+            register::TEMPERATURE => &mut self.temperature,
+            register::FAULT => &mut self.fault,
+            _ => return,
+        };
+        *place = Some(value);
+    }
+}
+
+/// The host's side of a controller.
+#[derive(Debug)]
+struct Controller {
+    query: Frame,
+    reply: Id,
+    period: Nanos,
+    next: Nanos,
+    /// The last mode and fault.
+    mode: u32,
+    fault: u32,
+}
+
+impl Controller {
+    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        let (node, period) = options.check(spec)?;
+        let reply = id(node, options.host, 0);
+        let query = id(options.host, node, WANTED);
+        let bringup = Bringup::new(spec, spec.mode, TIMING, reply);
+        let Some(query) = fd(query, &QUERY) else {
+            return Err(SpecError::Joints("the query does not fit a frame"));
+        };
+        let this = Self {
+            query,
+            reply,
+            period,
+            next: Nanos::MIN,
+            mode: 0,
+            fault: 0,
+        };
+        let claims = [Claim::exclusive(reply)];
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+
+    fn quality(&self) -> Quality {
+        let mut quality = Quality::GOOD;
+        if f64::from(self.mode) == MODE_FAULT {
+            quality |= Quality::DRIVE_FAULT;
+            if POSITION_FAULTS.contains(&self.fault) {
+                quality |= Quality::DEVICE_FAULT;
+            }
+        }
+        quality
+    }
+}
+
+impl Family for Controller {
+    type Questions = NoInquiry;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+        // Short frames are sent as classic ones by some programs.
+        let data = match frame.format {
+            Format::Classic | Format::Fd { .. } => frame.data(),
+            Format::Remote => return out.fault(Counter::Length, 1, frame.id),
+            Format::Error => return,
+        };
+        if frame.id != self.reply {
+            return;
+        }
+        let Some(told) = Told::parse(data) else {
+            return out.fault(Counter::Value, 1, frame.id);
+        };
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // casts saturate
+        let code = |value: f64| value.max(0.0) as u32;
+        if let Some(fault) = told.fault {
+            self.fault = code(fault);
+        }
+        if let Some(mode) = told.mode {
+            self.mode = code(mode);
+            let reading = Reading::Actuator(Actuator {
+                duty: f64::NAN,
+                mode: self.mode,
+                encoder: 0,
+                faults: self.fault,
+            });
+            out.push(Output::new(0, frame, self.quality(), reading), frame.id);
+        }
+        if let Some(celsius) = told.temperature.filter(|celsius| celsius.is_finite()) {
+            let reading = Reading::Temperature(Temperature { celsius });
+            out.push(Output::new(0, frame, Quality::GOOD, reading), frame.id);
+        }
+        let Some(position) = told.position else {
+            return;
+        };
+        if !position.is_finite() {
+            return out.fault(Counter::Value, 1, frame.id);
+        }
+        let mut quality = self.quality();
+        if quality.contains(Quality::DRIVE_FAULT) {
+            out.fault(Counter::DriveFault, 1, frame.id);
+        }
+        if quality.contains(Quality::DEVICE_FAULT) {
+            out.fault(Counter::DeviceFault, 1, frame.id);
+        }
+        if link.bringup.reading(frame.t) {
+            quality |= Quality::GAP_BEFORE;
+        }
+        let finite = |value: Option<f64>| value.filter(|v| v.is_finite()).unwrap_or(f64::NAN);
+        let reading = Reading::Joint(JointState {
+            position: position * TAU,
+            velocity: finite(told.velocity) * TAU,
+            torque: finite(told.torque),
+            ..JointState::ABSENT
+        });
+        out.push(Output::new(0, frame, quality, reading), frame.id);
+    }
+
+    fn reset(&mut self) {
+        (self.mode, self.fault) = (0, 0);
+    }
+
+    fn request(
+        &mut self,
+        now: Nanos,
+        _link: &mut Link<NoInquiry>,
+        _out: &mut Decoded,
+    ) -> Option<Frame> {
+        if now < self.next {
+            return None;
+        }
+        let due = self.next.max(now - self.period) + self.period;
+        self.next = if due > now { due } else { now + self.period };
+        Some(self.query)
+    }
+
+    fn request_at(&self) -> Option<Nanos> {
+        Some(self.next)
+    }
+}
+
+/// The controller's own side: answers queries with the joint's state.
+#[derive(Debug)]
+pub struct MoteusBoard {
+    node: u8,
+    /// The host to which readings are encoded that nobody has asked for.
+    host: u8,
+    joint: JointState,
+    celsius: f64,
+    quality: Quality,
+}
+
+/// The supply of a simulated controller \[V\].
+const SUPPLY: f64 = 24.0;
+
+impl MoteusBoard {
+    /// A controller after power-on.
+    ///
+    /// # Errors
+    /// [`SpecError`]: an address outside 1 to 127, a key out of range.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        Ok(Self {
+            node: options.check(spec)?.0,
+            host: options.host,
+            joint: JointState::ABSENT,
+            celsius: 25.0,
+            quality: Quality::GOOD,
+        })
+    }
+
+    /// The value of a register in its unit.
+    fn value(&self, register: u32) -> f64 {
+        let (sensor, drive) = (
+            self.quality.contains(Quality::DEVICE_FAULT),
+            self.quality.contains(Quality::DRIVE_FAULT),
+        );
+        match register {
+            register::MODE if sensor || drive => MODE_FAULT,
+            register::MODE => MODE_STOPPED,
+            register::POSITION => self.joint.position / TAU,
+            register::VELOCITY => self.joint.velocity / TAU,
+            register::TORQUE => self.joint.torque,
+            register::VOLTAGE => SUPPLY,
+            register::TEMPERATURE => self.celsius,
+            register::FAULT if sensor => ENCODER_FAULT,
+            register::FAULT if drive => TOO_HOT,
+            _ => 0.0,
+        }
+    }
+
+    /// The reply to `query`; `None` if it is no query.
+    fn reply(&self, query: &[u8]) -> Option<ArrayVec<u8, 64>> {
+        let (mut reply, mut cursor) = (ArrayVec::new(), Cursor(query));
+        while let Some(opcode) = cursor.byte() {
+            if opcode == NOTHING {
+                continue;
+            }
+            if !(READ..REPLY).contains(&opcode) {
+                return None;
+            }
+            let (kind, count, first) = cursor.registers(opcode)?;
+            let low = u8::try_from(count).ok().filter(|count| *count <= 32)?;
+            reply
+                .try_push(REPLY | opcode & 0xC | if low > 3 { 0 } else { low })
+                .ok()?;
+            if low > 3 {
+                reply.try_push(low).ok()?;
+            }
+            reply
+                .try_push(u8::try_from(first).ok().filter(|first| *first < 0x80)?)
+                .ok()?;
+            for register in first..first + count {
+                let value = self.value(register);
+                reply
+                    .try_extend_from_slice(&number(kind, register, value))
+                    .ok()?;
+            }
+        }
+        (!reply.is_empty()).then_some(reply)
+    }
+}
+
+/// The bytes of `value`, in a register's unit.
+#[allow(clippy::cast_possible_truncation)] // quantised to the type
+fn number(kind: Type, register: u32, value: f64) -> ArrayVec<u8, 4> {
+    let step = kind.step(register);
+    let whole = |most: i64| match value {
+        value if value.is_finite() => bytes::quantise(value, step, -most, most),
+        _ => -most - 1,
+    };
+    let mut number = ArrayVec::new();
+    let _ = match kind {
+        Type::I8 => number.try_extend_from_slice(&(whole(127) as i8).to_le_bytes()),
+        Type::I16 => number.try_extend_from_slice(&(whole(32767) as i16).to_le_bytes()),
+        Type::I32 => {
+            number.try_extend_from_slice(&(whole(i64::from(i32::MAX)) as i32).to_le_bytes())
+        }
+        Type::F32 => number.try_extend_from_slice(&(value as f32).to_le_bytes()),
+    };
+    number
+}
+
+impl Board for MoteusBoard {
+    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
+        let Id::Extended(raw) = frame.id else { return };
+        let [node, source, 0, 0] = raw.to_le_bytes() else {
+            return;
+        };
+        if node != self.node || source & 0x80 == 0 || frame.format == Format::Remote {
+            return;
+        }
+        let reply = self.reply(frame.data());
+        let reply = reply.and_then(|data| fd(id(self.node, source & 0x7F, 0), &data));
+        out.extend(reply.into_iter().take(out.remaining_capacity()));
+    }
+
+    fn period(&self) -> Option<Nanos> {
+        None
+    }
+
+    fn present(&mut self, _output: u8, reading: &Reading, quality: Quality) {
+        match reading {
+            Reading::Joint(joint) => (self.joint, self.quality) = (*joint, quality),
+            Reading::Temperature(Temperature { celsius }) => self.celsius = *celsius,
+            _ => {}
+        }
+    }
+
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        let joint = match reading {
+            Reading::Joint(joint) => joint,
+            // They are sent with the joint's state.
+            Reading::Actuator(_) | Reading::Temperature(_) => {
+                self.present(output, reading, quality);
+                return Ok(());
+            }
+            _ => return Err(EncodeError::Kind),
+        };
+        if output != 0 {
+            return Err(EncodeError::Output(output));
+        }
+        if !joint.position.is_finite() {
+            return Err(EncodeError::NotFinite);
+        }
+        (self.joint, self.quality) = (*joint, quality);
+        let reply = self.reply(&QUERY);
+        let reply = reply.and_then(|data| fd(id(self.node, self.host, 0), &data));
+        out.extend(reply.into_iter().take(out.remaining_capacity()));
+        Ok(())
+    }
+}
