@@ -134,38 +134,81 @@ pub(crate) fn claims(node: u8) -> [Claim; 3] {
     [emcy(node), sdo_from(node), heartbeat(node)].map(Claim::exclusive)
 }
 
-/// The SYNC by which a node measures.
+/// Which SYNC a node answers.
+///
+/// A node that answers each SYNC answers one before the next. If it does not, its next answer may
+/// be a late one or that of the newest SYNC; only its stamp can tell, if it is before the newest
+/// SYNC. Else it is dropped, and so are others until one SYNC is left, or the next one comes: then
+/// an answer was lost.
 #[derive(Debug)]
 pub(crate) struct Cycle {
     /// The node answers each n-th; 0: it does not measure by SYNC.
     every: u8,
+    /// The last two.
     last: Option<(Nanos, StampKind)>,
+    before: Option<(Nanos, StampKind)>,
+    /// How many are not answered.
+    open: u8,
+    /// An answer was dropped since the last one.
+    dropped: bool,
 }
 
 impl Cycle {
     pub(crate) const fn new(every: u8) -> Self {
-        Self { every, last: None }
+        Self {
+            every,
+            last: None,
+            before: None,
+            open: 0,
+            dropped: false,
+        }
     }
 
     pub(crate) const fn set_every(&mut self, every: u8) {
         self.every = every;
     }
 
-    /// A SYNC. If the node has not answered the last one it may still do so: then neither is known
-    /// to be the one of its next answer.
+    /// A SYNC.
     pub(crate) fn sync(&mut self, frame: &Frame) {
-        let unanswered = self.every == 1 && self.last.is_some();
-        self.last = (!unanswered).then_some((frame.t, frame.stamp));
+        self.before = self.last.replace((frame.t, frame.stamp));
+        if core::mem::take(&mut self.dropped) {
+            self.open = 0;
+        }
+        self.open = self.open.saturating_add(1);
     }
 
-    /// When the node measured what `frame` holds: at its SYNC, else at its own stamp.
-    pub(crate) fn measured(&mut self, frame: &Frame) -> (Nanos, StampKind) {
-        let sync = self.last.take().filter(|_| self.every > 0);
-        sync.unwrap_or((frame.t, frame.stamp))
+    /// When the node measured what `frame` holds: at its SYNC; at its own stamp if it measures by
+    /// itself, or no SYNC is heard. `None` if it is not known which SYNC was its.
+    pub(crate) fn measured(&mut self, frame: &Frame) -> Option<(Nanos, StampKind)> {
+        let own = (frame.t, frame.stamp);
+        let (Some(last), 1..) = (self.last, self.every) else {
+            return Some(own);
+        };
+        let is_late = last.1 != StampKind::None && frame.t < last.0;
+        if self.every > 1 {
+            return if is_late { self.before } else { self.last };
+        }
+        match self.open {
+            0 => Some(own),
+            1 => {
+                self.open = 0;
+                Some(last)
+            }
+            _ => {
+                self.open -= 1;
+                match self.before.filter(|_| is_late && self.open == 1) {
+                    None => {
+                        self.dropped = true;
+                        None
+                    }
+                    before => before,
+                }
+            }
+        }
     }
 
     pub(crate) const fn reset(&mut self) {
-        self.last = None;
+        *self = Self::new(self.every);
     }
 }
 

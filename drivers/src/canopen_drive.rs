@@ -47,7 +47,7 @@
 //!     { number = 1, objects = [0x6041, 0x6064, 0x6077], sync = 1 },
 //!     { number = 2, objects = [0x606C, 0x6078], sync = 1 },   # sync = 0: by events or a timer
 //! ]
-//! # Only a simulated drive uses these.
+//! # Only a simulated drive uses these; without `pdos` it sends status, position, mode and velocity.
 //! period_ms = 10
 //! sync = 0
 //! ```

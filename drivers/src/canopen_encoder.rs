@@ -297,6 +297,10 @@ impl Encoder {
         let Some(counts_per_turn) = link.questions.plan.counts_per_turn else {
             return link.questions.missed();
         };
+        let Some((acquired, stamp)) = self.cycle.measured(frame) else {
+            link.bringup.lost();
+            return out.fault(Counter::Unpaired, 1, frame.id);
+        };
         let mut quality = Quality::GOOD;
         if self.state.error != 0 {
             quality |= Quality::DEVICE_FAULT;
@@ -309,8 +313,11 @@ impl Encoder {
             position: f64::from(u32_le(data, 0)) / counts_per_turn * TAU,
             ..JointState::ABSENT
         });
-        let mut output = Output::new(0, frame, quality, reading);
-        (output.acquired, output.stamp) = self.cycle.measured(frame);
+        let output = Output {
+            acquired,
+            stamp,
+            ..Output::new(0, frame, quality, reading)
+        };
         out.push(output, frame.id);
     }
 }
@@ -417,6 +424,10 @@ impl Board for EncoderBoard {
 
     fn period(&self) -> Option<Nanos> {
         self.node.period(0)
+    }
+
+    fn measures_at(&self, frame: &Frame) -> bool {
+        frame.id == SYNC
     }
 
     fn present(&mut self, _output: u8, reading: &Reading, quality: Quality) {

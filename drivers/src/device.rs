@@ -481,6 +481,12 @@ pub trait Board: Send {
     /// The current streaming period of its main reading \[ns\]; `None` while it does not stream.
     fn period(&self) -> Option<Nanos>;
 
+    /// Whether the board measures when this frame arrives, however late it answers.
+    fn measures_at(&self, frame: &Frame) -> bool {
+        let _ = frame;
+        false
+    }
+
     /// The reading of output `output` at this instant, with which a polled board answers a request.
     /// A board that streams does not need it.
     fn present(&mut self, output: u8, reading: &Reading, quality: Quality) {

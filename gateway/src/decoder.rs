@@ -113,8 +113,6 @@ impl Decoder {
         self.status.frames.fetch_add(1, Relaxed);
         self.status.last_frame.store(frame.t.0, Relaxed);
         let mut claimed = false;
-        // Iterates over a copy of the device numbers (at most four), so that the dispatch table is
-        // not borrowed while a device runs.
         for number in self.dispatch.find(frame.id) {
             claimed = true;
             let Some(running) = self.devices.get_mut(usize::from(number)) else {

@@ -77,34 +77,46 @@ pub fn seconds_on_wire(frame: &Frame, rates: BitRates) -> f64 {
     }
 }
 
-/// The load of a device whose outputs in use have these numbers and kinds.
+/// A device: its driver with its keys, its settings, and the numbers and kinds of its outputs in use.
+#[derive(Debug, Clone, Copy)]
+pub struct Member<'p> {
+    /// The driver with its keys.
+    pub options: &'p Options,
+    /// Address, silence, joints.
+    pub spec: &'p Spec,
+    /// The outputs in use.
+    pub outputs: &'p [(u8, Kind)],
+}
+
+/// The load of a bus with these devices: boards that stream send each period; what the others send,
+/// and the host, is counted for a second.
 ///
 /// # Errors
-/// [`SpecError`]: the driver cannot build it.
-pub fn of_device(
-    options: &Options,
-    spec: &Spec,
-    outputs: &[(u8, Kind)],
-    rates: BitRates,
-) -> Result<Load, SpecError> {
-    // A board that has been started.
-    let mode = Mode::Listen;
-    let mut board = options.board(&Spec {
-        mode,
-        ..spec.clone()
-    })?;
-    let sum = |frames: &[Frame], period: f64| Load {
-        frames: frames.len() as f64 / period,
-        share: frames
-            .iter()
-            .map(|f| seconds_on_wire(f, rates))
-            .sum::<f64>()
-            / period,
+/// [`SpecError`]: a device that its driver cannot build.
+pub fn of_bus(members: &[Member<'_>], rates: BitRates) -> Result<Load, SpecError> {
+    let mut all = Load::default();
+    let mut add = |frames: &[Frame], period: f64| {
+        all.frames += frames.len() as f64 / period;
+        let time: f64 = frames.iter().map(|f| seconds_on_wire(f, rates)).sum();
+        all.share += time / period;
     };
-    match board.period() {
-        Some(period) => Ok(sum(&at_once(outputs, &mut *board), period.seconds())),
-        None => polled(options, spec, outputs).map(|frames| sum(&frames, 1.0)),
+    let mut polled = Vec::new();
+    for member in members {
+        // A board that has been started.
+        let mode = Mode::Listen;
+        let mut board = member.options.board(&Spec {
+            mode,
+            ..member.spec.clone()
+        })?;
+        match board.period() {
+            Some(period) => add(&at_once(member.outputs, &mut *board), period.seconds()),
+            None => polled.push(*member),
+        }
     }
+    if !polled.is_empty() {
+        add(&conversation(&polled)?, 1.0);
+    }
+    Ok(all)
 }
 
 /// The frames of one period of a board that streams.
@@ -134,37 +146,56 @@ fn at_once(outputs: &[(u8, Kind)], board: &mut dyn Board) -> Vec<Frame> {
     frames
 }
 
-/// The frames of a second between a device that asks and its board.
-fn polled(options: &Options, spec: &Spec, outputs: &[(u8, Kind)]) -> Result<Vec<Frame>, SpecError> {
+/// The frames of a second between devices that ask, or that others ask, and their boards.
+fn conversation(members: &[Member<'_>]) -> Result<Vec<Frame>, SpecError> {
     const STEP: Nanos = Nanos::from_micros(500);
     const BEGIN: i64 = 20_000;
     const END: i64 = BEGIN + 2_000;
-    let mode = Mode::Supervise;
-    let spec = Spec {
-        mode,
-        ..spec.clone()
-    };
-    let (mut host, mut board) = (options.device(&spec)?, options.board(&spec)?);
-    for &(output, kind) in outputs {
-        board.present(output, &at_rest(kind), Quality::GOOD);
+    let (mut hosts, mut boards) = (Vec::new(), Vec::new());
+    for member in members {
+        let mode = Mode::Supervise;
+        let spec = Spec {
+            mode,
+            ..member.spec.clone()
+        };
+        hosts.push(member.options.device(&spec)?);
+        let mut board = member.options.board(&spec)?;
+        for &(output, kind) in member.outputs {
+            board.present(output, &at_rest(kind), Quality::GOOD);
+        }
+        boards.push(board);
     }
     let (mut frames, mut out) = (Vec::new(), Decoded::new());
     // The start is over by then: boards may wait for six seconds before they are asked.
     for step in 0..END {
         let now = Nanos(step * STEP.0);
-        while let Some(sent) = host.poll_transmit(now, &mut out) {
-            host.on_sent(&sent.frame, Ok(now));
-            let mut answers = Frames::new();
-            board.on_frame(&sent.frame, &mut answers);
-            let received = answers
-                .iter()
-                .map(|frame| frame.at(now, StampKind::Software));
-            for frame in received {
-                host.on_frame(&frame, &mut out);
-            }
-            if step >= BEGIN {
-                frames.push(sent.frame);
-                frames.extend(answers);
+        for number in 0..hosts.len() {
+            while let Some(sent) = hosts
+                .get_mut(number)
+                .and_then(|host| host.poll_transmit(now, &mut out))
+            {
+                let mut on_bus = vec![sent.frame];
+                for board in &mut boards {
+                    let mut answers = Frames::new();
+                    board.on_frame(&sent.frame, &mut answers);
+                    on_bus.extend(answers);
+                }
+                for (at, host) in hosts.iter_mut().enumerate() {
+                    let heard = sent.frame.at(now, StampKind::Software);
+                    match at == number {
+                        true => host.on_sent(&sent.frame, Ok(now)),
+                        false => host.overhear(&heard, &mut out),
+                    }
+                    for frame in on_bus.iter().skip(1) {
+                        if host.claims().iter().any(|claim| claim.matches(frame.id)) {
+                            host.on_frame(&frame.at(now, StampKind::Software), &mut out);
+                        }
+                    }
+                }
+                out.clear();
+                if step >= BEGIN {
+                    frames.extend(on_bus);
+                }
             }
         }
         out.clear();
@@ -212,6 +243,7 @@ fn at_rest(kind: Kind) -> Reading {
 mod tests {
     use super::*;
     use crate::plan::Plan;
+    use std::fmt::Write as _;
     use std::path::Path;
 
     const RATES: BitRates = BitRates {
@@ -288,6 +320,28 @@ mod tests {
                     triangles = [4, 13]\n";
         let load = plan(skin, "").unwrap().buses[0].load;
         assert!((load.frames - 20.0 / 0.05).abs() < 1e-9, "{load:?}");
+    }
+
+    /// The sensor is asked 250 times a second: three frames of 55, 135 and 115 bits. The two drives
+    /// answer each SYNC (55 bits) with frames of 7 and 4 bytes: 125 and 95 bits.
+    #[test]
+    fn the_load_of_devices_that_are_asked_is_that_of_questions_and_answers() {
+        let sensor = "[[bus.device]]\ndriver = \"ati_netcanoem\"\nname = \"ft\"\nperiod_ms = 4\n";
+        let load = plan(sensor, "").unwrap().buses[0].load;
+        assert!((load.share - 250.0 * 305e-6).abs() < 2e-3, "{load:?}");
+        let mut devices =
+            "[[bus.device]]\ndriver = \"canopen_sync\"\nname = \"s\"\nperiod_ms = 4.0\n".to_owned();
+        for node in [1, 2] {
+            write!(
+                devices,
+                "[[bus.device]]\ndriver = \"canopen_drive\"\nname = \"d{node}\"\naddress = {node}\n\
+                 sync = 1\n[[bus.device.joint]]\nname = \"j{node}\"\n"
+            )
+            .unwrap();
+        }
+        let load = plan(&devices, "").unwrap().buses[0].load;
+        assert!((load.frames - 1250.0).abs() < 10.0, "{load:?}");
+        assert!((load.share - 250.0 * 495e-6).abs() < 2e-3, "{load:?}");
     }
 
     #[test]

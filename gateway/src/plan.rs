@@ -2,9 +2,8 @@
 
 use crate::config::{Pace, Raw, RawBus, RawDevice, RawJoint, Realtime, Source};
 use crate::dbc;
-use crate::dispatch::{SHARERS, crowded};
 use crate::link::replay::Matching;
-use crate::load::{self, BitRates, Load};
+use crate::load::{self, BitRates, Load, Member};
 use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, OutputInfo, Outputs, Spec};
 use proprio_topics::{
     Description, Entry, JointState, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, Role,
@@ -381,13 +380,18 @@ impl Builder<'_> {
         let Some(bus) = self.plan.buses.last_mut() else {
             return Ok(());
         };
-        for device in &bus.devices {
-            let outputs: Vec<_> = device.routes.iter().map(|r| (r.output, r.kind)).collect();
-            let load = load::of_device(&device.options, &device.spec, &outputs, bus.rates)
-                .map_err(|e| format!("{place}, {:?}: {e}", device.name))?;
-            bus.load.frames += load.frames;
-            bus.load.share += load.share;
-        }
+        let outputs = |device: &DevicePlan| -> Vec<(u8, Kind)> {
+            device.routes.iter().map(|r| (r.output, r.kind)).collect()
+        };
+        let outputs: Vec<_> = bus.devices.iter().map(outputs).collect();
+        let members: Vec<Member<'_>> = (bus.devices.iter().zip(&outputs))
+            .map(|(device, outputs)| Member {
+                options: &device.options,
+                spec: &device.spec,
+                outputs,
+            })
+            .collect();
+        bus.load = load::of_bus(&members, bus.rates).map_err(|e| format!("{place}: {e}"))?;
         if bus.load.share > 1.0 {
             return Err(format!(
                 "{place}: its devices need up to {:.0} % of {}: make periods longer, or move \
@@ -584,17 +588,6 @@ impl Builder<'_> {
                 }
             }
             claimed.push((&plan.name, device));
-        }
-        if let Some(id) = crowded(claimed.iter().map(|(_, device)| device.claims())) {
-            let names: Vec<&str> = claimed
-                .iter()
-                .filter(|(_, device)| device.claims().iter().any(|claim| claim.matches(id)))
-                .map(|(name, _)| *name)
-                .collect();
-            return Err(format!(
-                "{place}: devices {} all listen to identifier {id}; at most {SHARERS} can",
-                names.join(", ")
-            ));
         }
         Ok(())
     }

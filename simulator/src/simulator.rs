@@ -253,19 +253,30 @@ impl BusSimulator {
     /// Takes a frame from the bus at `now`; [`BusSimulator::poll`] gives the answers.
     pub fn on_frame(&mut self, frame: &Frame, now: Nanos) {
         let t = (now - self.t0).seconds();
-        let mut answers = Frames::new();
-        for node in &mut self.nodes {
+        let arrival = match frame.stamp {
+            StampKind::None => now,
+            _ => frame.t.min(now),
+        };
+        for number in 0..self.nodes.len() {
+            let Some(node) = self.nodes.get_mut(number) else {
+                return;
+            };
             if node.is_silent(t) {
                 continue;
             }
             if node.board.period().is_none() {
                 // It may be a request for a reading.
-                node.present(&mut self.simulation, t);
+                let measured = match node.board.measures_at(frame) {
+                    true => (arrival - self.t0).seconds(),
+                    false => t,
+                };
+                node.present(&mut self.simulation, measured);
             }
+            let mut answers = Frames::new();
             node.board.on_frame(frame, &mut answers);
             node.follow(now);
+            self.post(&answers, t);
         }
-        self.post(&answers, t);
     }
 
     /// The next frame that is due at `now`, with that stamp; call until `None`.

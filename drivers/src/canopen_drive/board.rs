@@ -3,13 +3,14 @@
 use super::layout::{Field, Layout, Quantity};
 use super::options::{CurrentUnit, Options, PdoKeys};
 use super::start::{COUNTS, PROFILE, RATED_CURRENT, RATED_TORQUE, TURNS};
-use crate::canopen::{NO_RTR, Node, TPDO_OFF, node_of, object, tpdo};
+use crate::canopen::{NO_RTR, Node, SYNC, TPDO_OFF, node_of, object, tpdo};
 use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
 use alloc::vec::Vec;
 use core::f64::consts::TAU;
 use proprio_topics::{JointState, Nanos, Quality, Reading};
 
-/// A simulated drive without keys: an encoder of 1024 lines, 1 Nm, 5 A.
+/// A simulated drive without keys: an encoder of 1024 lines, 1 Nm, 5 A. It sends no torque, because
+/// a simulated joint has none.
 const COUNTS_PER_TURN: f64 = 4096.0;
 const TORQUE: f64 = 1.0;
 const CURRENT: f64 = 5.0;
@@ -49,10 +50,7 @@ impl DriveBoard {
                 objects: objects.to_vec(),
                 sync: options.sync,
             };
-            options.pdos = Vec::from([
-                pdo(1, &[0x6041, 0x6064, 0x6077]),
-                pdo(2, &[0x606C, 0x6078, 0x6061]),
-            ]);
+            options.pdos = Vec::from([pdo(1, &[0x6041, 0x6064, 0x6061]), pdo(2, &[0x606C])]);
         }
         let layout = Layout::of_keys(id, &options)?;
         let counts_per_turn = options.counts_per_turn.unwrap_or(COUNTS_PER_TURN);
@@ -162,6 +160,10 @@ impl Board for DriveBoard {
     fn period(&self) -> Option<Nanos> {
         let number = u8::try_from(self.layout.position()?).ok()?;
         self.node.period(number)
+    }
+
+    fn measures_at(&self, frame: &Frame) -> bool {
+        frame.id == SYNC
     }
 
     fn present(&mut self, _output: u8, reading: &Reading, quality: Quality) {

@@ -204,14 +204,15 @@ impl Drive {
         }
         if self.have == 0 {
             self.began = frame.t;
-            self.measured = Some(self.cycle.measured(frame));
+            self.measured = self.cycle.measured(frame);
+            self.suspect |= self.measured.is_none();
         }
         self.have |= bit;
         if self.have != group {
             return;
         }
         self.have = 0;
-        if core::mem::take(&mut self.suspect) && by_sync && group.count_ones() > 1 {
+        if core::mem::take(&mut self.suspect) && by_sync {
             out.fault(Counter::Unpaired, 1, frame.id);
             return link.bringup.lost();
         }

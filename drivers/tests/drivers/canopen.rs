@@ -151,11 +151,11 @@ struct Synced {
 }
 
 impl Synced {
-    fn new(driver: &str, keys: &str, reading: Reading) -> Self {
+    fn new(driver: &str, keys: &str, board_keys: &str, reading: Reading) -> Self {
         let spec = spec(1, Mode::Supervise, &[0]);
         Self {
             device: options(driver, keys).device(&spec).unwrap(),
-            board: options(driver, keys).board(&spec).unwrap(),
+            board: options(driver, board_keys).board(&spec).unwrap(),
             reading,
             period: 5,
             now: 1000,
@@ -207,6 +207,12 @@ impl Synced {
         self
     }
 }
+
+/// A drive that sends all that it knows, by a timer or at each SYNC.
+const FULL: &str = "pdos = [{ number = 1, objects = [0x6041, 0x6064, 0x6077] }, \
+                    { number = 2, objects = [0x606C, 0x6078, 0x6061] }]";
+const FULL_BY_SYNC: &str = "pdos = [{ number = 1, objects = [0x6041, 0x6064, 0x6077], sync = 1 }, \
+                            { number = 2, objects = [0x606C, 0x6078, 0x6061], sync = 1 }]";
 
 const STATE: JointState = JointState {
     position: 1.5,
@@ -273,7 +279,12 @@ fn each_lost_frame_of_the_start_is_made_up_for() {
 
 #[test]
 fn an_encoder_can_measure_by_sync() {
-    let mut synced = Synced::new("canopen_encoder", "sync = 2", Reading::Joint(STATE));
+    let mut synced = Synced::new(
+        "canopen_encoder",
+        "sync = 2",
+        "sync = 2",
+        Reading::Joint(STATE),
+    );
     synced.run(200);
     assert!(synced.sent.contains(&"601#2F00180202000000".to_owned()));
     assert!(
@@ -290,28 +301,97 @@ fn an_encoder_can_measure_by_sync() {
     }
 }
 
-/// A SYNC without an answer: the next answer may belong to it, so its own stamp counts.
+/// Which SYNC is whose: frames by their stamps \[ms\], an answer by its number, a SYNC by 0; and the
+/// stamps of the readings.
 #[test]
 fn a_late_answer_does_not_get_the_stamp_of_a_later_sync() {
-    let mut device = at(
-        "canopen_encoder",
-        "counts_per_turn = 4\nsync = 1",
-        1,
-        Mode::Listen,
-    );
-    let frames = [
-        frame("080#", 10.0),
-        frame("181#01000000", 10.5),
-        frame("080#", 20.0),
-        frame("080#", 30.0),
-        frame("181#02000000", 30.1),
-        frame("181#03000000", 30.5),
-        frame("080#", 40.0),
-        frame("181#04000000", 40.5),
+    type Case = (&'static [(f64, u8)], &'static [(u32, f64)], u32);
+    let cases: &[Case] = &[
+        // One answer is lost: the next could be it.
+        (
+            &[
+                (10.0, 0),
+                (10.5, 1),
+                (20.0, 0),
+                (30.0, 0),
+                (30.5, 3),
+                (40.0, 0),
+                (40.5, 4),
+            ],
+            &[(1, 10.0), (4, 40.0)],
+            1,
+        ),
+        // One comes after the next SYNC; then both SYNC are answered.
+        (
+            &[
+                (10.0, 0),
+                (20.0, 0),
+                (20.1, 1),
+                (20.5, 2),
+                (30.0, 0),
+                (30.5, 3),
+            ],
+            &[(2, 20.0), (3, 30.0)],
+            1,
+        ),
+        // It was taken after it, but its stamp is before.
+        (
+            &[
+                (10.0, 0),
+                (20.0, 0),
+                (10.4, 1),
+                (20.5, 2),
+                (30.0, 0),
+                (30.5, 3),
+            ],
+            &[(1, 10.0), (2, 20.0), (3, 30.0)],
+            0,
+        ),
+        // Two late ones.
+        (
+            &[
+                (10.0, 0),
+                (20.0, 0),
+                (30.0, 0),
+                (30.1, 1),
+                (30.2, 2),
+                (30.3, 3),
+            ],
+            &[(3, 30.0)],
+            2,
+        ),
+        // A SYNC that was not heard: its own stamp.
+        (
+            &[(10.0, 0), (10.5, 1), (20.5, 2)],
+            &[(1, 10.0), (2, 20.5)],
+            0,
+        ),
     ];
-    let (readings, _) = decode(&mut *device, &frames);
-    let stamps: Vec<f64> = readings.iter().map(|r| r.acquired.0 as f64 / 1e6).collect();
-    assert_eq!(stamps, [10.0, 30.1, 30.5, 40.0]);
+    for (frames, right, unpaired) in cases {
+        let mut device = at(
+            "canopen_encoder",
+            "counts_per_turn = 4\nsync = 1",
+            1,
+            Mode::Listen,
+        );
+        let to_frame = |(ms, number): &(f64, u8)| match number {
+            0 => frame("080#", *ms),
+            number => frame(&format!("181#{number:02X}000000"), *ms),
+        };
+        let frames: Vec<Frame> = frames.iter().map(to_frame).collect();
+        let (readings, faults) = decode(&mut *device, &frames);
+        let read = |output: &Output| {
+            let number = joint(&output.reading).position * 4.0 / TAU;
+            (number.round() as u32, output.acquired.0 as f64 / 1e6)
+        };
+        let read: Vec<(u32, f64)> = readings.iter().map(read).collect();
+        assert_eq!(read, *right);
+        assert_eq!(count(&faults, Counter::Unpaired), *unpaired);
+        let gaps = readings
+            .iter()
+            .filter(|r| r.quality.contains(Quality::GAP_BEFORE));
+        assert_eq!(gaps.count(), usize::from(*unpaired > 0));
+    }
 }
 
 /// A node without the optional objects: 6000 and 1017 refused, 6200 instead of the timer.
@@ -408,7 +488,13 @@ fn a_drive_that_is_set_up_later_is_used() {
         "pdos = [{ number = 1, objects = [0x6041, 0x6064] }]",
         "counts_per_turn = 4096",
     );
-    let mut rig = Rig::new("canopen_drive", mapped, &[0], (0, Reading::Joint(STATE)));
+    let mut rig = Rig::with_board(
+        "canopen_drive",
+        mapped,
+        FULL,
+        &[0],
+        (0, Reading::Joint(STATE)),
+    );
     rig.board_loses = Box::new(|_, frame| frame.to_string().starts_with("581#43001A"));
     rig.run(400);
     assert_eq!(rig.device.state(), State::Refused(Refusal::NoAnswer));
@@ -435,7 +521,7 @@ fn a_drive_that_is_set_up_later_is_used() {
 
 #[test]
 fn a_drive_is_asked_for_its_mapping_and_started() {
-    let mut rig = Rig::new("canopen_drive", "", &[0], (0, Reading::Joint(STATE)));
+    let mut rig = Rig::with_board("canopen_drive", "", FULL, &[0], (0, Reading::Joint(STATE)));
     rig.run(100);
     let sent = &rig.sent;
     assert_eq!(sent[0], "601#4000100000000000");
@@ -474,6 +560,14 @@ fn a_drive_is_asked_for_its_mapping_and_started() {
         assert_eq!(output.quality, Quality::GOOD);
     }
     assert!(joint(&read[0].reading).velocity.is_nan());
+    let plain = encode(
+        &mut *board("canopen_drive", "", &[0]),
+        0,
+        &Reading::Joint(STATE),
+        Quality::GOOD,
+    );
+    let lengths: Vec<usize> = plain.iter().map(|frame| frame.data().len()).collect();
+    assert_eq!(lengths, [7, 4], "without the keys: no torque");
     let count = sent.len();
     rig.device.stop(rig.now);
     rig.run(30);
@@ -619,7 +713,7 @@ fn values_of_other_events_are_held_for_a_time() {
 
 #[test]
 fn a_drive_measures_by_sync_of_the_host() {
-    let mut synced = Synced::new("canopen_drive", "sync = 1", Reading::Joint(STATE));
+    let mut synced = Synced::new("canopen_drive", "", FULL_BY_SYNC, Reading::Joint(STATE));
     synced.run(200);
     let read = joints(&synced.readings);
     assert!(read.len() >= 34, "{}", read.len());
