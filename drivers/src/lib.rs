@@ -14,6 +14,7 @@
 //! | [`canopen_encoder`] | CANopen encoders (CiA 406) | joint |
 //! | [`canopen_sync`] | sends a CANopen bus its SYNC | none |
 //! | [`moteus`] | moteus controllers (CAN FD) | joint, actuator, temperature |
+//! | [`odrive`] | ODrive motor controllers | joint, actuator, temperature |
 //! | [`dbc`] | any device that a .dbc file describes | any |
 //!
 //! Each family has two sides. A [`Device`] is the host's side: it decodes the frames of its
@@ -50,6 +51,7 @@ pub mod icub_pos;
 pub mod icub_skin;
 pub mod icub_strain;
 pub mod moteus;
+pub mod odrive;
 mod pairing;
 mod registry;
 pub mod signal;

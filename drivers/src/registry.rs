@@ -4,7 +4,7 @@ use crate::signal::Message;
 use crate::{
     Board, Device, Driver, OutputInfo, Spec, SpecError, ati_netcanoem, canopen_drive,
     canopen_encoder, canopen_sync, dbc, icub_imu, icub_mais, icub_motor, icub_pos, icub_skin,
-    icub_strain, moteus,
+    icub_strain, moteus, odrive,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -137,6 +137,8 @@ drivers! {
     CanopenSync: canopen_sync,
     /// moteus controllers.
     Moteus: moteus,
+    /// ODrive motor controllers.
+    Odrive: odrive,
     /// Devices that a .dbc file describes.
     Dbc: dbc,
 }

@@ -54,6 +54,13 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
     ("canopen_sync", "", &[]),
     ("moteus", "", &[0]),
     ("moteus", "host = 7", &[0]),
+    ("odrive", "", &[0]),
+    (
+        "odrive",
+        "request_period_ms = 5\ntorque_constant = 0.1",
+        &[0],
+    ),
+    ("odrive", "firmware = \"0.5\"\nrequest_period_ms = 2", &[0]),
     ("dbc", crate::dbc::WRENCH, &[]),
     ("dbc", crate::dbc::DRIVE, &[0]),
     ("dbc", crate::dbc::PAGES, &[]),

@@ -10,6 +10,7 @@ mod command;
 mod dbc;
 mod golden;
 mod moteus;
+mod odrive;
 mod pairing;
 mod rig;
 mod round_trip;

@@ -21,6 +21,16 @@ pub(crate) fn options(driver: &str, keys: &str) -> Options {
     }
 }
 
+/// The keys that the page of a driver shows, from its source.
+pub(crate) fn shown_keys(source: &str) -> String {
+    let block = source
+        .split("//! ```toml\n")
+        .nth(1)
+        .expect("a block of keys");
+    let block = block.split("//! ```\n").next().unwrap_or_default();
+    block.replace("//!", "")
+}
+
 /// A device at `address` with a maximum silence of 50 ms.
 pub(crate) fn spec(address: u32, mode: Mode, outputs: &[u8]) -> Spec {
     let outputs = Outputs(outputs.iter().copied().collect());

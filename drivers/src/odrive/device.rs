@@ -1,0 +1,223 @@
+//! The host's side: joins current and torque to the estimates, and asks for them if it is told to.
+
+use super::firmware::{Firmware, error};
+use super::frames::{FET, JOINT, LENGTH, MOTOR, command, is_request};
+use super::options::{Checked, Options};
+use crate::bringup::{Bringup, NoInquiry, Timing};
+use crate::bytes;
+use crate::family::{Family, Link, Supervised};
+use crate::pairing::within;
+use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
+use alloc::boxed::Box;
+use core::f64::consts::TAU;
+use proprio_topics::{
+    Actuator, Counter, JointState, Nanos, Quality, Reading, StampKind, Temperature,
+};
+
+/// The pace of watching: an ODrive that was not heard of for a second and a half is silent. With
+/// requests that is also how long they last before they begin again.
+const TIMING: Timing = Timing {
+    power_on_silence: Nanos::ZERO,
+    answer_timeout: Nanos::from_millis(20),
+    attempts: 3,
+    slow_attempt: Nanos::from_millis(500),
+    answer_counts: Nanos::from_millis(100),
+    start: Nanos::from_millis(250),
+    start_most: Nanos::from_millis(500),
+    send_within: Nanos::from_millis(100),
+};
+
+/// A value that joins later readings.
+#[derive(Debug, Clone, Copy)]
+struct Held {
+    t: Nanos,
+    stamp: StampKind,
+    value: f64,
+}
+
+impl Held {
+    const ABSENT: Self = Self {
+        t: Nanos::MIN,
+        stamp: StampKind::None,
+        value: f64::NAN,
+    };
+
+    fn new(frame: &Frame, value: f64) -> Self {
+        Self {
+            t: frame.t,
+            stamp: frame.stamp,
+            value: if value.is_finite() { value } else { f64::NAN },
+        }
+    }
+
+    /// The value for a reading in `frame`; NaN if it is older than `hold`.
+    fn at(self, frame: &Frame, hold: Nanos) -> f64 {
+        if within((self.t, self.stamp), (frame.t, frame.stamp), hold) {
+            self.value
+        } else {
+            f64::NAN
+        }
+    }
+}
+
+/// The float in half `half` of a payload.
+fn float(data: &[u8], half: usize) -> f64 {
+    f64::from(f32::from_bits(bytes::u32_le(data, 4 * half)))
+}
+
+/// The host's side of an axis.
+#[derive(Debug)]
+pub(super) struct Axis {
+    keys: Checked,
+    /// The quality from the last heartbeat.
+    status: Quality,
+    current: Held,
+    torque: Held,
+    /// The next request: its place in [`Firmware::requests`], and when that round is due.
+    next: usize,
+    due: Nanos,
+}
+
+impl Axis {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        let keys = Checked::new(spec, options)?;
+        let mode = match keys.request_period {
+            Some(_) => spec.mode,
+            None => Mode::Listen,
+        };
+        let bringup = Bringup::new(spec, mode, TIMING, keys.id(command::ESTIMATES));
+        let commands = keys.firmware.commands().iter();
+        let claims = commands.map(|command| Claim::exclusive(keys.id(*command)));
+        let this = Self {
+            keys,
+            status: Quality::GOOD,
+            current: Held::ABSENT,
+            torque: Held::ABSENT,
+            next: 0,
+            due: Nanos::MIN,
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+
+    fn estimates(&self, data: &[u8], frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+        let (position, velocity) = (float(data, 0) * TAU, float(data, 1) * TAU);
+        if !position.is_finite() {
+            link.bringup.lost();
+            return out.fault(Counter::Value, 1, frame.id);
+        }
+        let mut quality = self.status;
+        if quality.contains(Quality::DEVICE_FAULT) {
+            out.fault(Counter::DeviceFault, 1, frame.id);
+        }
+        if quality.contains(Quality::DRIVE_FAULT) {
+            out.fault(Counter::DriveFault, 1, frame.id);
+        }
+        if link.bringup.reading(frame.t) {
+            quality |= Quality::GAP_BEFORE;
+        }
+        let current = self.current.at(frame, self.keys.hold);
+        let torque = match self.keys.torque_constant {
+            Some(constant) => constant * current,
+            None => self.torque.at(frame, self.keys.hold),
+        };
+        let reading = Reading::Joint(JointState {
+            position,
+            velocity: if velocity.is_finite() {
+                velocity
+            } else {
+                f64::NAN
+            },
+            torque,
+            current,
+            ..JointState::ABSENT
+        });
+        out.push(Output::new(JOINT, frame, quality, reading), frame.id);
+    }
+
+    fn heartbeat(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+        let &[_, _, _, _, state, ref flags @ ..] = data else {
+            return;
+        };
+        let mut faults = bytes::u32_le(data, 0);
+        if self.keys.firmware == Firmware::V0_5 {
+            for (flag, error) in flags.iter().zip(error::FLAGS) {
+                faults |= if flag & 1 != 0 { error } else { 0 };
+            }
+        }
+        self.status = self.keys.firmware.quality(faults);
+        let reading = Reading::Actuator(Actuator {
+            duty: f64::NAN,
+            mode: u32::from(state),
+            encoder: faults & self.keys.firmware.encoder_errors(),
+            faults,
+        });
+        out.push(Output::new(JOINT, frame, self.status, reading), frame.id);
+    }
+}
+
+/// The reading of a thermometer, if there is one.
+fn temperature(output: u8, celsius: f64, frame: &Frame, out: &mut Decoded) {
+    if celsius.is_finite() {
+        let reading = Reading::Temperature(Temperature { celsius });
+        out.push(Output::new(output, frame, Quality::GOOD, reading), frame.id);
+    }
+}
+
+impl Family for Axis {
+    type Questions = NoInquiry;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+        let Some(command) = self.keys.command(frame.id) else {
+            return;
+        };
+        if is_request(frame) {
+            return;
+        }
+        let Some(data) = bytes::payload(frame, out) else {
+            return;
+        };
+        if data.len() != usize::from(LENGTH) {
+            return out.fault(Counter::Length, 1, frame.id);
+        }
+        match command {
+            command::ESTIMATES => self.estimates(data, frame, link, out),
+            command::IQ => self.current = Held::new(frame, float(data, 1)),
+            command::TORQUES => self.torque = Held::new(frame, float(data, 1)),
+            command::TEMPERATURE => {
+                temperature(FET, float(data, 0), frame, out);
+                temperature(MOTOR, float(data, 1), frame, out);
+            }
+            _ => self.heartbeat(data, frame, out),
+        }
+    }
+
+    fn reset(&mut self) {
+        self.status = Quality::GOOD;
+        (self.current, self.torque) = (Held::ABSENT, Held::ABSENT);
+    }
+
+    fn request(
+        &mut self,
+        now: Nanos,
+        _link: &mut Link<NoInquiry>,
+        _out: &mut Decoded,
+    ) -> Option<Frame> {
+        let period = self.keys.request_period?;
+        if now < self.due {
+            return None;
+        }
+        let requests = self.keys.firmware.requests();
+        let command = *requests.get(self.next)?;
+        self.next += 1;
+        if self.next == requests.len() {
+            self.next = 0;
+            let due = self.due + period;
+            self.due = if due > now { due } else { now + period };
+        }
+        Some(Frame::remote(self.keys.id(command), LENGTH))
+    }
+
+    fn request_at(&self) -> Option<Nanos> {
+        self.keys.request_period.map(|_| self.due)
+    }
+}
