@@ -15,6 +15,7 @@
 //! | [`canopen_sync`] | sends a CANopen bus its SYNC | none |
 //! | [`moteus`] | moteus controllers (CAN FD) | joint, actuator, temperature |
 //! | [`odrive`] | ODrive motor controllers | joint, actuator, temperature |
+//! | [`cubemars`] | CubeMars AK actuators | joint, actuator, temperature |
 //! | [`dbc`] | any device that a .dbc file describes | any |
 //!
 //! Each family has two sides. A [`Device`] is the host's side: it decodes the frames of its
@@ -39,6 +40,7 @@ pub mod canopen_drive;
 pub mod canopen_encoder;
 pub mod canopen_sync;
 mod configure;
+pub mod cubemars;
 pub mod dbc;
 pub mod device;
 mod family;

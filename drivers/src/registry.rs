@@ -3,8 +3,8 @@
 use crate::signal::Message;
 use crate::{
     Board, Device, Driver, OutputInfo, Spec, SpecError, ati_netcanoem, canopen_drive,
-    canopen_encoder, canopen_sync, dbc, icub_imu, icub_mais, icub_motor, icub_pos, icub_skin,
-    icub_strain, moteus, odrive,
+    canopen_encoder, canopen_sync, cubemars, dbc, icub_imu, icub_mais, icub_motor, icub_pos,
+    icub_skin, icub_strain, moteus, odrive,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -139,6 +139,8 @@ drivers! {
     Moteus: moteus,
     /// ODrive motor controllers.
     Odrive: odrive,
+    /// CubeMars actuators.
+    Cubemars: cubemars,
     /// Devices that a .dbc file describes.
     Dbc: dbc,
 }

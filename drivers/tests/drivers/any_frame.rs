@@ -61,6 +61,17 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
         &[0],
     ),
     ("odrive", "firmware = \"0.5\"\nrequest_period_ms = 2", &[0]),
+    ("cubemars", "model = \"AK80-9\"", &[0]),
+    (
+        "cubemars",
+        "model = \"AK60-6\"\nhost_id = 1\neffort = \"current\"\neffort_max = 40.0",
+        &[0],
+    ),
+    (
+        "cubemars",
+        "mode = \"servo\"\nmodel = \"AK10-9\"\nangle = \"electrical\"\ntorque_constant = 1.0",
+        &[0],
+    ),
     ("dbc", crate::dbc::WRENCH, &[]),
     ("dbc", crate::dbc::DRIVE, &[0]),
     ("dbc", crate::dbc::PAGES, &[]),

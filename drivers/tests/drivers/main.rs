@@ -7,6 +7,7 @@ mod ati;
 mod bringup;
 mod canopen;
 mod command;
+mod cubemars;
 mod dbc;
 mod golden;
 mod moteus;

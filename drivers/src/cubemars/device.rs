@@ -1,0 +1,137 @@
+//! The host's side: takes the replies or uploads of one motor, and watches that they come.
+
+use super::frames::{DRIVE, ENCODER_ERROR, JOINT, Layout, Stage, quality_of};
+use super::options::{Checked, Effort, Options};
+use crate::bringup::{Bringup, NoInquiry, Timing};
+use crate::bytes;
+use crate::family::{Family, Link, Supervised};
+use crate::pairing::within;
+use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
+use alloc::boxed::Box;
+use proprio_topics::{
+    Actuator, Counter, JointState, Nanos, Quality, Reading, StampKind, Temperature,
+};
+
+/// Only the watching counts: nothing is sent. A motor that was not heard of for a second and a half
+/// is silent.
+const TIMING: Timing = Timing {
+    power_on_silence: Nanos::ZERO,
+    answer_timeout: Nanos::from_millis(100),
+    attempts: 3,
+    slow_attempt: Nanos::from_millis(500),
+    answer_counts: Nanos::from_millis(100),
+    start: Nanos::from_millis(250),
+    start_most: Nanos::from_millis(500),
+    send_within: Nanos::from_millis(100),
+};
+
+/// How long the state of the power stage is not told again if its error stays the same.
+const STAGE_PERIOD: Nanos = Nanos::from_millis(1000);
+
+/// The host's side of a motor.
+#[derive(Debug)]
+pub(super) struct Motor {
+    keys: Checked,
+    /// The error that was told last, and when.
+    told: Option<(u8, Nanos, StampKind)>,
+}
+
+impl Motor {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        let keys = Checked::new(spec, options)?;
+        let claim = match keys.layout {
+            Layout::Mit { .. } => Claim::shared(keys.id),
+            Layout::Servo => Claim::exclusive(keys.id),
+        };
+        let bringup = Bringup::new(spec, Mode::Listen, TIMING, keys.id);
+        let this = Self { keys, told: None };
+        Ok(Supervised::boxed([claim], bringup, NoInquiry, this))
+    }
+
+    /// Tells the state of the power stage if its error is new, and now and then.
+    fn stage(&mut self, stage: Stage, frame: &Frame, out: &mut Decoded) {
+        let known = self.told.is_some_and(|(error, t, stamp)| {
+            error == stage.error && within((t, stamp), (frame.t, frame.stamp), STAGE_PERIOD)
+        });
+        if known {
+            return;
+        }
+        self.told = Some((stage.error, frame.t, frame.stamp));
+        let actuator = Reading::Actuator(Actuator {
+            duty: f64::NAN,
+            mode: 0,
+            encoder: u32::from(stage.error == ENCODER_ERROR),
+            faults: u32::from(stage.error),
+        });
+        let quality = quality_of(stage.error);
+        out.push(Output::new(JOINT, frame, quality, actuator), frame.id);
+        let celsius = stage.celsius;
+        let temperature = Reading::Temperature(Temperature { celsius });
+        out.push(
+            Output::new(DRIVE, frame, Quality::GOOD, temperature),
+            frame.id,
+        );
+    }
+}
+
+impl Family for Motor {
+    type Questions = NoInquiry;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+        if frame.id != self.keys.id {
+            return;
+        }
+        // Replies of other motors, and commands, are none of this motor's.
+        let others = matches!(self.keys.layout, Layout::Mit { .. })
+            && frame.data().first() != Some(&self.keys.number);
+        if others {
+            return;
+        }
+        let Some(data) = bytes::payload(frame, out) else {
+            return;
+        };
+        let Some((raw, stage)) = self.keys.layout.unpack(data) else {
+            return out.fault(Counter::Length, 1, frame.id);
+        };
+        let mut quality = Quality::GOOD;
+        if let Some(stage) = stage {
+            quality = quality_of(stage.error);
+            self.stage(stage, frame, out);
+        }
+        let [p, v, e] = self.keys.scales;
+        let [position, velocity, effort] = raw;
+        if p.is_saturated(position) || v.is_saturated(velocity) || e.is_saturated(effort) {
+            quality |= Quality::SATURATED;
+            out.fault(Counter::Saturated, 1, frame.id);
+        }
+        if quality.contains(Quality::DEVICE_FAULT) {
+            out.fault(Counter::DeviceFault, 1, frame.id);
+        }
+        if quality.contains(Quality::DRIVE_FAULT) {
+            out.fault(Counter::DriveFault, 1, frame.id);
+        }
+        if link.bringup.reading(frame.t) {
+            quality |= Quality::GAP_BEFORE;
+        }
+        let effort = e.value(effort);
+        let (torque, current) = match self.keys.effort {
+            Effort::Torque => (effort, f64::NAN),
+            Effort::Current => (
+                self.keys.torque_constant.map_or(f64::NAN, |k| k * effort),
+                effort,
+            ),
+        };
+        let reading = Reading::Joint(JointState {
+            position: p.value(position),
+            velocity: v.value(velocity),
+            torque,
+            current,
+            ..JointState::ABSENT
+        });
+        out.push(Output::new(JOINT, frame, quality, reading), frame.id);
+    }
+
+    fn reset(&mut self) {
+        self.told = None;
+    }
+}
