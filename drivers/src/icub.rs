@@ -96,6 +96,8 @@ pub mod command {
 
 /// Board types, as boards name themselves.
 pub mod board {
+    /// mc4: control of four DC motors.
+    pub const MC4: u8 = 0x03;
     /// mtb: skin and legacy inertial sensors.
     pub const MTB: u8 = 0x05;
     /// mais: Hall sensors.

@@ -6,6 +6,7 @@
 //! | [`icub_strain`] | iCub F/T boards strain, strain2, strain2c | wrench, gauges, temperature |
 //! | [`icub_imu`] | IMU of strain2, strain2c, mtb4, mtb4c, rfe; legacy frames of mtb | imu |
 //! | [`icub_motor`] | 2FOC and its successors amcbldc, amc2c, amcfoc | joint, actuator |
+//! | [`icub_mc4`] | older iCub motor boards: mc4, bll | joint, actuator |
 //! | [`icub_pos`] | POS encoders: psc, mtb4fap | joint |
 //! | [`icub_mais`] | MAIS: Hall sensors of hands | joint |
 //! | [`icub_skin`] | skin of mtb, mtb4, mtb4c | skin |
@@ -25,8 +26,8 @@
 //! To add a family, write a module with a `Device`, a `Board`, and an `Options` type (its keys in
 //! gateway.toml, documented at the top of the module) that implements [`Driver`], and add its line
 //! to the list in `registry.rs`. Families share `bringup.rs` (starting a board), `configure.rs`
-//! (confirming its configuration), `pairing.rs` (combining two frames) and `bytes.rs` (the numbers
-//! of a payload).
+//! (confirming its configuration), `pairing.rs` (combining two frames), `held.rs` (values of
+//! other instants) and `bytes.rs` (the numbers of a payload).
 #![no_std]
 extern crate alloc;
 #[cfg(test)]
@@ -45,9 +46,11 @@ pub mod dbc;
 pub mod device;
 mod family;
 pub mod frame;
+mod held;
 pub mod icub;
 pub mod icub_imu;
 pub mod icub_mais;
+pub mod icub_mc4;
 pub mod icub_motor;
 pub mod icub_pos;
 pub mod icub_skin;

@@ -3,8 +3,8 @@
 use crate::signal::Message;
 use crate::{
     Board, Device, Driver, OutputInfo, Spec, SpecError, ati_netcanoem, canopen_drive,
-    canopen_encoder, canopen_sync, cubemars, dbc, icub_imu, icub_mais, icub_motor, icub_pos,
-    icub_skin, icub_strain, moteus, odrive,
+    canopen_encoder, canopen_sync, cubemars, dbc, icub_imu, icub_mais, icub_mc4, icub_motor,
+    icub_pos, icub_skin, icub_strain, moteus, odrive,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -121,6 +121,8 @@ drivers! {
     IcubImu: icub_imu,
     /// iCub 2FOC motor boards.
     IcubMotor: icub_motor,
+    /// Older iCub motor boards.
+    IcubMc4: icub_mc4,
     /// iCub POS encoders.
     IcubPos: icub_pos,
     /// iCub skin.

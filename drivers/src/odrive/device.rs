@@ -6,13 +6,11 @@ use super::options::{Checked, Options};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes;
 use crate::family::{Family, Link, Supervised};
-use crate::pairing::within;
+use crate::held::Held;
 use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
 use alloc::boxed::Box;
 use core::f64::consts::TAU;
-use proprio_topics::{
-    Actuator, Counter, JointState, Nanos, Quality, Reading, StampKind, Temperature,
-};
+use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
 
 /// The pace of watching: an ODrive that was not heard of for a second and a half is silent. With
 /// requests that is also how long they last before they begin again.
@@ -26,39 +24,6 @@ const TIMING: Timing = Timing {
     start_most: Nanos::from_millis(500),
     send_within: Nanos::from_millis(100),
 };
-
-/// A value that joins later readings.
-#[derive(Debug, Clone, Copy)]
-struct Held {
-    t: Nanos,
-    stamp: StampKind,
-    value: f64,
-}
-
-impl Held {
-    const ABSENT: Self = Self {
-        t: Nanos::MIN,
-        stamp: StampKind::None,
-        value: f64::NAN,
-    };
-
-    fn new(frame: &Frame, value: f64) -> Self {
-        Self {
-            t: frame.t,
-            stamp: frame.stamp,
-            value: if value.is_finite() { value } else { f64::NAN },
-        }
-    }
-
-    /// The value for a reading in `frame`; NaN if it is older than `hold`.
-    fn at(self, frame: &Frame, hold: Nanos) -> f64 {
-        if within((self.t, self.stamp), (frame.t, frame.stamp), hold) {
-            self.value
-        } else {
-            f64::NAN
-        }
-    }
-}
 
 /// The float in half `half` of a payload.
 fn float(data: &[u8], half: usize) -> f64 {

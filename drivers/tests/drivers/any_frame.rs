@@ -29,6 +29,8 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
     ("icub_imu", r#"legacy = "mtb""#, &[]),
     ("icub_imu", r#"legacy = "bno055""#, &[]),
     ("icub_motor", "", &[0]),
+    ("icub_mc4", "", &[0, 1]),
+    ("icub_mc4", "velocity_shift = [0, 15]\nhold_ms = 1000", &[1]),
     ("icub_pos", "", &[0, 1, 2, 15]),
     ("icub_pos", "sensors = [{ label = 2 }]", &[2, 3]),
     ("icub_skin", "", &[]),

@@ -10,6 +10,7 @@ mod command;
 mod cubemars;
 mod dbc;
 mod golden;
+mod icub_mc4;
 mod moteus;
 mod odrive;
 mod pairing;

@@ -1,0 +1,40 @@
+//! Values that come in other frames than the reading they belong to, and at another rate.
+
+use crate::Frame;
+use crate::pairing::within;
+use proprio_topics::{Nanos, StampKind};
+
+/// A value that joins the readings after it, for a while.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Held {
+    t: Nanos,
+    stamp: StampKind,
+    value: f64,
+}
+
+impl Held {
+    /// No value.
+    pub(crate) const ABSENT: Self = Self {
+        t: Nanos::MIN,
+        stamp: StampKind::None,
+        value: f64::NAN,
+    };
+
+    /// The value in `frame`; not a finite number: none.
+    pub(crate) fn new(frame: &Frame, value: f64) -> Self {
+        Self {
+            t: frame.t,
+            stamp: frame.stamp,
+            value: if value.is_finite() { value } else { f64::NAN },
+        }
+    }
+
+    /// The value for a reading in `frame`; NaN if it is older than `hold`, or later.
+    pub(crate) fn at(self, frame: &Frame, hold: Nanos) -> f64 {
+        if within((self.t, self.stamp), (frame.t, frame.stamp), hold) {
+            self.value
+        } else {
+            f64::NAN
+        }
+    }
+}
