@@ -17,6 +17,7 @@
 //! | [`moteus`] | moteus controllers (CAN FD) | joint, actuator, temperature |
 //! | [`odrive`] | ODrive motor controllers | joint, actuator, temperature |
 //! | [`cubemars`] | CubeMars AK actuators | joint, actuator, temperature |
+//! | [`xsens_mti`] | Xsens MTi-600, Avior, Sirius | imu |
 //! | [`dbc`] | any device that a .dbc file describes | any |
 //!
 //! Each family has two sides. A [`Device`] is the host's side: it decodes the frames of its
@@ -28,6 +29,8 @@
 //! to the list in `registry.rs`. Families share `bringup.rs` (starting a board), `configure.rs`
 //! (confirming its configuration), `pairing.rs` (combining two frames), `held.rs` (values of
 //! other instants) and `bytes.rs` (the numbers of a payload).
+//! (confirming its configuration), `pairing.rs` and `group.rs` (combining two frames, or more) and
+//! `bytes.rs` (the numbers of a payload).
 #![no_std]
 extern crate alloc;
 #[cfg(test)]
@@ -46,6 +49,7 @@ pub mod dbc;
 pub mod device;
 mod family;
 pub mod frame;
+mod group;
 mod held;
 pub mod icub;
 pub mod icub_imu;
@@ -61,6 +65,7 @@ mod pairing;
 mod registry;
 pub mod signal;
 mod unit;
+pub mod xsens_mti;
 
 pub use device::{
     Board, COMMAND_TIME, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded,

@@ -73,6 +73,24 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
         "cubemars",
         "mode = \"servo\"\nmodel = \"AK10-9\"\nangle = \"electrical\"\ntorque_constant = 1.0",
         &[0],
+    ("xsens_mti", "", &[]),
+    (
+        "xsens_mti",
+        "quantities = [\"sample_time\", \"group_counter\", \"status\", \"orientation\", \
+         \"angular_velocity\", \"acceleration\", \"magnetic_field\"]\nmagnetic_unit = 50e-6\n\
+         sample_time_unit_us = 1\nquaternion_one = 32768",
+        &[],
+    ),
+    (
+        "xsens_mti",
+        "quantities = [\"acceleration\", \"angular_velocity\"]\nhigh_rate = \"rate_first\"\n\
+         extended = true\nperiod_ms = 1.0",
+        &[],
+    ),
+    (
+        "xsens_mti",
+        "quantities = [\"group_counter\", \"orientation\"]\nidentifiers = { error = 2 }",
+        &[],
     ),
     ("dbc", crate::dbc::WRENCH, &[]),
     ("dbc", crate::dbc::DRIVE, &[0]),

@@ -17,3 +17,4 @@ mod pairing;
 mod rig;
 mod round_trip;
 mod skin_and_mais;
+mod xsens_mti;

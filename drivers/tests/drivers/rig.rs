@@ -67,9 +67,12 @@ pub(crate) fn frame(text: &str, ms: f64) -> Frame {
         .step_by(2)
         .map(|at| u8::from_str_radix(&data[at..at + 2], 16).unwrap())
         .collect();
-    let id = u32::from_str_radix(id, 16).unwrap();
-    Frame::new(Id::standard(u16::try_from(id).unwrap()), &bytes)
-        .at(Nanos::from_seconds(ms * 1e-3), StampKind::Software)
+    let raw = u32::from_str_radix(id, 16).unwrap();
+    let id = match id.len() {
+        8 => Id::extended(raw),
+        _ => Id::standard(u16::try_from(raw).unwrap()),
+    };
+    Frame::new(id, &bytes).at(Nanos::from_seconds(ms * 1e-3), StampKind::Software)
 }
 
 /// The readings and faults decoded from `frames`, in order.
@@ -149,11 +152,12 @@ impl Rig {
     pub(crate) fn started(driver: &str, keys: &str, mode: Mode, reading: (u8, Reading)) -> Self {
         let mut rig = Self::new(driver, keys, &[], reading);
         let options = options(driver, keys);
+        let address = options.default_address().unwrap_or(1);
         rig.device = options
-            .device(&spec(1, mode, &[]))
+            .device(&spec(address, mode, &[]))
             .expect("a legal configuration");
         rig.board = options
-            .board(&spec(1, Mode::Listen, &[]))
+            .board(&spec(address, Mode::Listen, &[]))
             .expect("a legal configuration");
         rig
     }

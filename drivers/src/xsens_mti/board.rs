@@ -1,0 +1,105 @@
+//! The sensor's own side.
+
+use super::frames::{ACCELERATION_LSB, Message, RATE_LSB, status};
+use super::options::{Options, Plan};
+use crate::bytes;
+use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
+use proprio_topics::{Nanos, Quality, Reading, Saturation};
+
+/// The sensor's own side. It streams from power-on, as it was configured over its serial port.
+#[derive(Debug)]
+pub struct MtiBoard {
+    plan: Plan,
+    /// The sensor's clock at the next sample.
+    clock: Nanos,
+    counter: u16,
+}
+
+impl MtiBoard {
+    /// A sensor that streams at once.
+    ///
+    /// # Errors
+    /// [`SpecError`]: identifiers or keys out of range.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        Ok(Self {
+            plan: Plan::new(spec, options)?,
+            clock: Nanos::ZERO,
+            counter: 0,
+        })
+    }
+
+    /// The status word of a sample with `quality`.
+    fn status(quality: Quality) -> u32 {
+        let mut word = status::SELF_TEST | status::FILTER_VALID;
+        if quality.contains(Quality::DEVICE_FAULT) {
+            word &= !status::SELF_TEST;
+        }
+        if quality.contains(Quality::SATURATED) {
+            word |= status::CLIPPED;
+        }
+        for axis in 0..6 {
+            if quality.saturation(axis) != Saturation::None {
+                word |= 1 << (status::FIRST_AXIS + axis);
+            }
+        }
+        word
+    }
+}
+
+impl Board for MtiBoard {
+    fn on_frame(&mut self, _frame: &Frame, _out: &mut Frames) {}
+
+    fn period(&self) -> Option<Nanos> {
+        Some(self.plan.period)
+    }
+
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        let Reading::Imu(imu) = reading else {
+            return Err(EncodeError::Kind);
+        };
+        if output != 0 {
+            return Err(EncodeError::Output(output));
+        }
+        let mut sent = Frames::new();
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // it overflows
+        let ticks = (self.clock.0 / self.plan.tick.0) as u32;
+        for &(id, message) in &self.plan.messages {
+            let (values, lsb): (&[f64], f64) = match message {
+                Message::Orientation => (&imu.orientation, self.plan.quaternion_lsb),
+                Message::AngularVelocity => (&imu.angular_velocity, RATE_LSB),
+                Message::Acceleration => (&imu.proper_acceleration, ACCELERATION_LSB),
+                Message::MagneticField => (&imu.magnetic_field, self.plan.field_lsb),
+                _ => (&[], 1.0),
+            };
+            if !values.iter().all(|value| value.is_finite()) {
+                return Err(EncodeError::NotFinite);
+            }
+            let mut counts = [[0; 2]; 4];
+            for (count, value) in counts.iter_mut().zip(values) {
+                *count = bytes::quantise_i16(*value, lsb).to_be_bytes();
+            }
+            let frame = match message {
+                Message::SampleTime => Frame::new(id, &ticks.to_be_bytes()),
+                Message::GroupCounter => Frame::new(id, &self.counter.to_be_bytes()),
+                Message::Status => Frame::new(id, &Self::status(quality).to_be_bytes()),
+                _ => Frame::new(
+                    id,
+                    counts.as_flattened().get(..message.length()).unwrap_or(&[]),
+                ),
+            };
+            let _ = sent.try_push(frame);
+        }
+        self.clock += self.plan.period;
+        self.counter = self.counter.wrapping_add(1);
+        for frame in sent {
+            let _ = out.try_push(frame);
+        }
+        Ok(())
+    }
+}

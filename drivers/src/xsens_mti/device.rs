@@ -1,0 +1,229 @@
+//! The host's side of an MTi. It combines the messages of each sample into a reading.
+
+use super::frames::{ACCELERATION_LSB, BUFFER_OVERFLOW, Message, RATE_LSB, status};
+use super::options::{Options, Plan};
+use crate::bringup::{Bringup, NoInquiry, Timing};
+use crate::bytes;
+use crate::family::{Family, Link, Supervised};
+use crate::group::{Group, Part};
+use crate::pairing::Limit;
+use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
+use alloc::boxed::Box;
+use alloc::vec::Vec;
+use proprio_topics::{Counter, Imu, Nanos, Quality, Reading, Saturation};
+
+/// Only the watching counts: nothing is sent. A sensor that was never heard is silent after a
+/// second and a half.
+const TIMING: Timing = Timing {
+    power_on_silence: Nanos::ZERO,
+    answer_timeout: Nanos::from_millis(100),
+    attempts: 3,
+    slow_attempt: Nanos::from_millis(500),
+    answer_counts: Nanos::from_millis(100),
+    start: Nanos::from_millis(250),
+    start_most: Nanos::from_millis(500),
+    send_within: Nanos::from_millis(100),
+};
+
+/// What the messages of a sample hold.
+#[derive(Debug, Clone, Copy)]
+struct Sample {
+    ticks: u32,
+    counter: u16,
+    status: u32,
+    imu: Imu,
+}
+
+impl Sample {
+    const EMPTY: Self = Self {
+        ticks: 0,
+        counter: 0,
+        status: 0,
+        imu: Imu::ABSENT,
+    };
+
+    /// Adds what `message` holds.
+    fn add(&mut self, plan: &Plan, message: Message, data: &[u8]) {
+        let vector = |lsb: f64| [0, 2, 4].map(|at| f64::from(bytes::i16_be(data, at)) * lsb);
+        let imu = &mut self.imu;
+        match message {
+            Message::Error => {}
+            Message::SampleTime => self.ticks = bytes::u32_be(data, 0),
+            Message::GroupCounter => self.counter = bytes::u16_be(data, 0),
+            Message::Status => self.status = bytes::u32_be(data, 0),
+            Message::Orientation => {
+                imu.orientation =
+                    [0, 2, 4, 6].map(|at| f64::from(bytes::i16_be(data, at)) * plan.quaternion_lsb);
+            }
+            Message::AngularVelocity => imu.angular_velocity = vector(RATE_LSB),
+            Message::Acceleration => imu.proper_acceleration = vector(ACCELERATION_LSB),
+            Message::MagneticField => imu.magnetic_field = vector(plan.field_lsb),
+        }
+    }
+
+    /// What the status word says of the sensors in use.
+    fn quality(&self, plan: &Plan) -> Quality {
+        let mut quality = Quality::GOOD;
+        if !plan.wants(Message::Status) {
+            return quality;
+        }
+        let word = self.status;
+        let invalid = word & status::FILTER_VALID == 0 && plan.wants(Message::Orientation);
+        if word & status::SELF_TEST == 0 || invalid {
+            quality |= Quality::DEVICE_FAULT;
+        }
+        let accelerometer = self.imu.proper_acceleration.into_iter();
+        let gyroscope = self.imu.angular_velocity.into_iter();
+        let axes = (accelerometer.map(|value| (Message::Acceleration, value)))
+            .chain(gyroscope.map(|value| (Message::AngularVelocity, value)));
+        for (axis, (sensor, value)) in (0..).zip(axes) {
+            if plan.wants(sensor) && word >> (status::FIRST_AXIS + axis) & 1 != 0 {
+                let low = value < 0.0;
+                let end = if low {
+                    Saturation::Low
+                } else {
+                    Saturation::High
+                };
+                quality = quality.with_saturation(axis, end);
+            }
+        }
+        let magnetometer = word & status::MAGNETOMETER != 0 && plan.wants(Message::MagneticField);
+        if magnetometer || (word & status::CLIPPED != 0 && word & status::AXES == 0) {
+            quality |= Quality::SATURATED;
+        }
+        quality
+    }
+}
+
+/// The host's side of an MTi.
+#[derive(Debug)]
+pub(super) struct Mti {
+    plan: Plan,
+    group: Group<Sample>,
+    /// The last reading's sample time as sent, and without overflow.
+    clock: Option<(u32, Nanos)>,
+    /// The last reading's counter.
+    counter: Option<u16>,
+}
+
+impl Mti {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        let plan = Plan::new(spec, options)?;
+        let watched = plan.messages.first().map_or(plan.error, |(id, _)| *id);
+        let bringup = Bringup::new(spec, Mode::Listen, TIMING, watched);
+        let streams = plan.messages.iter().map(|(id, _)| *id);
+        let claims: Vec<Claim> = (streams.chain([plan.error]))
+            .map(Claim::exclusive)
+            .collect();
+        let this = Self {
+            group: Group::new(plan.messages.len(), Limit::of_period(plan.period)),
+            clock: None,
+            counter: None,
+            plan,
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+
+    /// The sample time in ns, without overflow. A clock that goes back has started again.
+    fn time(&mut self, ticks: u32) -> Nanos {
+        let since = |earlier: u32| ticks.wrapping_sub(earlier);
+        let (from, passed) = match self.clock {
+            Some((last, time)) if since(last) <= u32::MAX / 2 => (time, since(last)),
+            _ => (Nanos::ZERO, ticks),
+        };
+        let time = from + Nanos(i64::from(passed) * self.plan.tick.0);
+        self.clock = Some((ticks, time));
+        time
+    }
+
+    /// Outputs a complete sample.
+    fn give(
+        &mut self,
+        whole: &Part<Sample>,
+        frame: &Frame,
+        link: &mut Link<NoInquiry>,
+        out: &mut Decoded,
+    ) {
+        let sample = &whole.content;
+        let mut quality = sample.quality(&self.plan);
+        if self.plan.wants(Message::GroupCounter) {
+            quality |= Quality::DEVICE_COUNTER;
+            let last = self.counter.replace(sample.counter);
+            match last.map(|last| sample.counter.wrapping_sub(last)) {
+                Some(0) => return out.fault(Counter::Unexpected, 1, frame.id),
+                Some(ahead) if ahead > 1 => {
+                    out.fault(Counter::Lost, u32::from(ahead) - 1, frame.id);
+                    link.bringup.lost();
+                }
+                _ => {}
+            }
+        }
+        for (flag, counter) in [
+            (Quality::DEVICE_FAULT, Counter::DeviceFault),
+            (Quality::SATURATED, Counter::Saturated),
+        ] {
+            if quality.contains(flag) {
+                out.fault(counter, 1, frame.id);
+            }
+        }
+        if link.bringup.reading(frame.t) {
+            quality |= Quality::GAP_BEFORE;
+        }
+        let device_time = if self.plan.wants(Message::SampleTime) {
+            self.time(sample.ticks)
+        } else {
+            Nanos::MIN
+        };
+        let output = Output {
+            acquired: whole.acquired,
+            stamp: whole.stamp,
+            device_time,
+            device_counter: u32::from(sample.counter),
+            ..Output::new(0, frame, quality, Reading::Imu(sample.imu))
+        };
+        out.push(output, frame.id);
+    }
+}
+
+impl Family for Mti {
+    type Questions = NoInquiry;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+        let mut numbered = (0..).zip(&self.plan.messages);
+        let found = numbered.find(|(_, (id, _))| *id == frame.id);
+        let (position, message) = match found {
+            Some((position, (_, message))) => (position, *message),
+            None if frame.id == self.plan.error => (0, Message::Error),
+            None => return,
+        };
+        let Some(data) = bytes::payload(frame, out) else {
+            return;
+        };
+        if data.len() != message.length() {
+            return out.fault(Counter::Length, 1, frame.id);
+        }
+        if message == Message::Error {
+            if data.first() != Some(&BUFFER_OVERFLOW) {
+                return out.fault(Counter::Value, 1, frame.id);
+            }
+            link.bringup.lost();
+            return out.fault(Counter::DeviceFault, 1, frame.id);
+        }
+        let mut dropped = 0;
+        let add = |sample: &mut Sample| sample.add(&self.plan, message, data);
+        let whole = (self.group).push(position, frame, Sample::EMPTY, add, &mut dropped);
+        if dropped > 0 {
+            link.bringup.lost();
+            out.fault(Counter::Unpaired, dropped, frame.id);
+        }
+        if let Some(whole) = whole {
+            self.give(&whole, frame, link, out);
+        }
+    }
+
+    fn reset(&mut self) {
+        self.group.reset();
+        self.clock = None;
+        self.counter = None;
+    }
+}
