@@ -18,19 +18,18 @@
 //! | [`odrive`] | ODrive motor controllers | joint, actuator, temperature |
 //! | [`cubemars`] | CubeMars AK actuators | joint, actuator, temperature |
 //! | [`xsens_mti`] | Xsens MTi-600, Avior, Sirius | imu |
+//! | [`openimu`] | Aceinna OpenIMU300RI, OpenIMU335RI, MTLT | imu |
 //! | [`dbc`] | any device that a .dbc file describes | any |
 //!
 //! Each family has two sides. A [`Device`] is the host's side: it decodes the frames of its
 //! identifiers into readings and starts its board. A [`Board`] is the board's own side: it answers
 //! commands and encodes readings. The simulator, `proprio encode` and the round-trip tests use it.
 //!
-//! To add a family, write a module with a `Device`, a `Board`, and an `Options` type (its keys in
+//! To add a family, write a module with a `Family` (`family.rs`), a `Board`, and an `Options` type (its keys in
 //! gateway.toml, documented at the top of the module) that implements [`Driver`], and add its line
 //! to the list in `registry.rs`. Families share `bringup.rs` (starting a board), `configure.rs`
-//! (confirming its configuration), `pairing.rs` (combining two frames), `held.rs` (values of
-//! other instants) and `bytes.rs` (the numbers of a payload).
-//! (confirming its configuration), `pairing.rs` and `group.rs` (combining two frames, or more) and
-//! `bytes.rs` (the numbers of a payload).
+//! (confirming its configuration), `pairing.rs` and `group.rs` (combining two frames, or more),
+//! `held.rs` (values of other instants) and `bytes.rs` (the numbers of a payload).
 #![no_std]
 extern crate alloc;
 #[cfg(test)]
@@ -61,6 +60,7 @@ pub mod icub_skin;
 pub mod icub_strain;
 pub mod moteus;
 pub mod odrive;
+pub mod openimu;
 mod pairing;
 mod registry;
 pub mod signal;

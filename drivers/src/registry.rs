@@ -4,7 +4,7 @@ use crate::signal::Message;
 use crate::{
     Board, Device, Driver, OutputInfo, Spec, SpecError, ati_netcanoem, canopen_drive,
     canopen_encoder, canopen_sync, cubemars, dbc, icub_imu, icub_mais, icub_mc4, icub_motor,
-    icub_pos, icub_skin, icub_strain, moteus, odrive, xsens_mti,
+    icub_pos, icub_skin, icub_strain, moteus, odrive, openimu, xsens_mti,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -145,6 +145,8 @@ drivers! {
     Cubemars: cubemars,
     /// Xsens MTi.
     XsensMti: xsens_mti,
+    /// Aceinna OpenIMU and MTLT.
+    OpenImu: openimu,
     /// Devices that a .dbc file describes.
     Dbc: dbc,
 }

@@ -75,7 +75,7 @@ const ALWAYS_IN_TOPICS: [&str; 2] = ["iceoryx2-bb-elementary-traits", "iceoryx2-
 
 /// All libraries that drivers and topics (without features) may depend on, directly or not: all are
 /// no_std.
-const BARE: [&str; 19] = [
+const BARE: [&str; 20] = [
     "arrayvec",
     "iceoryx2-bb-concurrency",
     "iceoryx2-bb-derive-macros",
@@ -84,6 +84,7 @@ const BARE: [&str; 19] = [
     "iceoryx2-log",
     "iceoryx2-log-types",
     "iceoryx2-pal-concurrency-sync",
+    "libm",
     "proc-macro2",
     "proprio-topics",
     "quote",

@@ -73,6 +73,7 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
         "cubemars",
         "mode = \"servo\"\nmodel = \"AK10-9\"\nangle = \"electrical\"\ntorque_constant = 1.0",
         &[0],
+    ),
     ("xsens_mti", "", &[]),
     (
         "xsens_mti",
@@ -92,6 +93,14 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
         "quantities = [\"group_counter\", \"orientation\"]\nidentifiers = { error = 2 }",
         &[],
     ),
+    ("openimu", "", &[]),
+    (
+        "openimu",
+        "quantities = [\"orientation\", \"acceleration\", \"angular_velocity\"]\naxes = \"xyz\"\n\
+         acceleration_z = \"down\"\nperiod_ms = 500",
+        &[],
+    ),
+    ("openimu", "quantities = [\"orientation\"]", &[]),
     ("dbc", crate::dbc::WRENCH, &[]),
     ("dbc", crate::dbc::DRIVE, &[0]),
     ("dbc", crate::dbc::PAGES, &[]),

@@ -13,6 +13,7 @@ mod golden;
 mod icub_mc4;
 mod moteus;
 mod odrive;
+mod openimu;
 mod pairing;
 mod rig;
 mod round_trip;

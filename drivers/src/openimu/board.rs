@@ -1,0 +1,137 @@
+//! The sensor's own side.
+
+use super::frames::{
+    ACCELERATION, ANGLE, Quantity, RATE, RATE_LIMIT, REPETITION, group_and_source, merit, period,
+    pgn, pitch_and_roll,
+};
+use super::options::{Options, Plan};
+use crate::{Board, EncodeError, Format, Frame, Frames, Mode, Spec, SpecError};
+use proprio_topics::{Imu, Nanos, Quality, Reading, Saturation};
+
+/// The sensor's own side. From power-on it sends the quantities of its keys at 100 Hz.
+#[derive(Debug)]
+pub struct OpenImuBoard {
+    plan: Plan,
+    /// The messages to send, as bits of the command.
+    types: u8,
+    /// 0: quiet.
+    divider: u8,
+}
+
+impl OpenImuBoard {
+    /// A sensor after power-on; in [`Mode::Listen`] another program has set its rate already.
+    ///
+    /// # Errors
+    /// [`SpecError`]: an address outside 0x80 to 0xF7, a period that is none.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        let plan = Plan::new(spec, options)?;
+        Ok(Self {
+            types: plan.types(),
+            divider: match spec.mode {
+                Mode::Supervise => 1,
+                Mode::Listen => plan.divider,
+            },
+            plan,
+        })
+    }
+
+    /// Six bytes of three values in x, y, z.
+    fn six(&self, counts: [u32; 3]) -> [u8; 6] {
+        let [[a, b, ..], [c, d, ..], [e, f, ..]] =
+            (self.plan.axes.exchange(counts)).map(u32::to_le_bytes);
+        [a, b, c, d, e, f]
+    }
+
+    /// The payload of the message that holds `quantity`.
+    fn payload(
+        &self,
+        quantity: Quantity,
+        imu: &Imu,
+        quality: Quality,
+    ) -> Result<[u8; 8], EncodeError> {
+        let said = if quality.contains(Quality::DEVICE_FAULT) {
+            merit::ERROR
+        } else {
+            merit::NOT_KNOWN
+        };
+        let merits = |bits: &[u8]| bits.iter().fold(0, |all, bit| all | said << bit);
+        let finite = |values: &[f64]| {
+            let all = values.iter().all(|value| value.is_finite());
+            all.then_some(()).ok_or(EncodeError::NotFinite)
+        };
+        let [a, b, c, d, e, f, merits] = match quantity {
+            Quantity::Orientation => {
+                finite(&imu.orientation)?;
+                let [[a, b, c, _], [d, e, f, _]] =
+                    pitch_and_roll(imu.orientation).map(|angle| ANGLE.count(angle).to_le_bytes());
+                [a, b, c, d, e, f, merits(&merit::OF_ANGLES)]
+            }
+            Quantity::Acceleration => {
+                finite(&imu.proper_acceleration)?;
+                let turned = self.plan.upright.turn(imu.proper_acceleration);
+                let counts = turned.map(|value| ACCELERATION.count(value));
+                let [a, b, c, d, e, f] = self.six(counts);
+                [a, b, c, d, e, f, merits(&merit::OF_AXES) | REPETITION]
+            }
+            Quantity::AngularVelocity => {
+                finite(&imu.angular_velocity)?;
+                let mut counts = imu
+                    .angular_velocity
+                    .map(|value| RATE.count(value).min(RATE_LIMIT));
+                for (axis, count) in (3..).zip(&mut counts) {
+                    match quality.saturation(axis) {
+                        Saturation::None => {}
+                        Saturation::Low => *count = 0,
+                        Saturation::High => *count = RATE_LIMIT,
+                    }
+                }
+                let [a, b, c, d, e, f] = self.six(counts);
+                [a, b, c, d, e, f, merits(&merit::OF_AXES)]
+            }
+        };
+        Ok([a, b, c, d, e, f, merits, 0])
+    }
+}
+
+impl Board for OpenImuBoard {
+    fn on_frame(&mut self, frame: &Frame, _out: &mut Frames) {
+        let (Some((pgn, _)), Format::Classic) = (group_and_source(frame.id), frame.format) else {
+            return;
+        };
+        match (pgn, frame.data()) {
+            (pgn::PACKET_TYPE, &[to, types, ..]) if to == self.plan.address => self.types = types,
+            (pgn::PACKET_RATE, &[to, by, ..]) if to == self.plan.address => self.divider = by,
+            _ => {}
+        }
+    }
+
+    fn period(&self) -> Option<Nanos> {
+        (self.divider > 0).then_some(period(self.divider))
+    }
+
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        let Reading::Imu(imu) = reading else {
+            return Err(EncodeError::Kind);
+        };
+        if output != 0 {
+            return Err(EncodeError::Output(output));
+        }
+        let mut sent = Frames::new();
+        for quantity in Quantity::ALL {
+            if self.types & quantity.pgn_priority_bit().2 != 0 {
+                let payload = self.payload(quantity, imu, quality)?;
+                let _ = sent.try_push(Frame::new(self.plan.message(quantity), &payload));
+            }
+        }
+        for frame in sent {
+            let _ = out.try_push(frame);
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,177 @@
+//! The host's side of a sensor. It sets its messages and their rate, and combines those of each
+//! period into a reading.
+
+use super::frames::{
+    ACCELERATION, ANGLE, ANY_PRIORITY, COMMANDS, HOST, Quantity, RATE, RATE_LIMIT,
+    group_and_source, identifier, merit, period, pgn, quaternion,
+};
+use super::options::{Options, Plan};
+use crate::bringup::{Bringup, NoInquiry, Timing};
+use crate::bytes;
+use crate::family::{Family, Link, Supervised};
+use crate::group::Group;
+use crate::pairing::Limit;
+use crate::{Claim, Decoded, Device, Frame, Output, Spec, SpecError};
+use alloc::boxed::Box;
+use proprio_topics::{Counter, Imu, Nanos, Quality, Reading, Saturation};
+
+/// How long the host waits for these sensors, which answer nothing.
+const TIMING: Timing = Timing {
+    power_on_silence: Nanos::ZERO,
+    answer_timeout: Nanos::from_millis(100),
+    attempts: 5,
+    slow_attempt: Nanos::from_millis(500),
+    answer_counts: Nanos::from_millis(100),
+    // A period of half a second, and time to claim an address.
+    start: Nanos::from_millis(1000),
+    start_most: Nanos::from_millis(2000),
+    send_within: Nanos::from_millis(100),
+};
+
+/// What the messages of a period hold.
+#[derive(Debug, Clone, Copy)]
+struct Sample {
+    imu: Imu,
+    quality: Quality,
+}
+
+impl Sample {
+    const EMPTY: Self = Self {
+        imu: Imu::ABSENT,
+        quality: Quality::GOOD,
+    };
+
+    /// With what `data` of a message with `quantity` holds; `None` if a value is none.
+    fn with(mut self, plan: &Plan, quantity: Quantity, data: &[u8; 8]) -> Option<Self> {
+        let merits = data[6];
+        let is_wrong = |bit: &u8| merits >> bit & 3 == merit::ERROR;
+        let counts = [0, 2, 4].map(|at| u32::from(bytes::u16_le(data, at)));
+        let mut wrong = false;
+        match quantity {
+            Quantity::Orientation => {
+                let angle = |at| ANGLE.value(bytes::u32_le(data, at) & 0xFF_FFFF);
+                self.imu.orientation = quaternion(angle(0)?, angle(3)?);
+                wrong = merit::OF_ANGLES.iter().any(is_wrong);
+            }
+            Quantity::Acceleration => {
+                let values = all(counts.map(|count| ACCELERATION.value(count)))?;
+                self.imu.proper_acceleration = plan.upright.turn(plan.axes.exchange(values));
+                wrong = merit::OF_AXES.iter().any(is_wrong);
+            }
+            Quantity::AngularVelocity => {
+                let values = all(counts.map(|count| RATE.value(count)))?;
+                self.imu.angular_velocity = plan.axes.exchange(values);
+                let bits = plan.axes.exchange(merit::OF_AXES);
+                let counts = plan.axes.exchange(counts);
+                for (axis, (count, bit)) in (3..).zip(counts.into_iter().zip(&bits)) {
+                    let end = match count {
+                        0 => Saturation::Low,
+                        RATE_LIMIT.. => Saturation::High,
+                        _ => Saturation::None,
+                    };
+                    self.quality = self.quality.with_saturation(axis, end);
+                    wrong |= end == Saturation::None && is_wrong(bit);
+                }
+            }
+        }
+        if wrong {
+            self.quality |= Quality::DEVICE_FAULT;
+        }
+        Some(self)
+    }
+}
+
+/// Three values, if none of them is absent.
+const fn all(values: [Option<f64>; 3]) -> Option<[f64; 3]> {
+    match values {
+        [Some(a), Some(b), Some(c)] => Some([a, b, c]),
+        _ => None,
+    }
+}
+
+/// The host's side of a sensor.
+#[derive(Debug)]
+pub(super) struct Sensor {
+    plan: Plan,
+    group: Group<Sample>,
+}
+
+impl Sensor {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        let plan = Plan::new(spec, options)?;
+        let watched = plan.quantities.first().unwrap_or(&Quantity::Acceleration);
+        let mut bringup = Bringup::new(spec, spec.mode, TIMING, plan.message(*watched));
+        let command = |pgn| identifier(COMMANDS, pgn, HOST);
+        let types = [plan.address, plan.types(), 0, 0, 0];
+        bringup.start_with(command(pgn::PACKET_TYPE), &types);
+        bringup.start_with(command(pgn::PACKET_RATE), &[plan.address, plan.divider]);
+        bringup.stop_with(command(pgn::PACKET_RATE), &[plan.address, 0]);
+        let claims = Quantity::ALL.map(|quantity| Claim {
+            mask: !ANY_PRIORITY,
+            ..Claim::exclusive(plan.message(quantity))
+        });
+        let limit = Limit::of_period(period(plan.divider));
+        let this = Self {
+            group: Group::new(plan.quantities.len(), limit),
+            plan,
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+}
+
+impl Family for Sensor {
+    type Questions = NoInquiry;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+        let Some((pgn, source)) = group_and_source(frame.id) else {
+            return;
+        };
+        let mut numbered = (0..).zip(&self.plan.quantities);
+        let found = numbered.find(|(_, quantity)| quantity.pgn_priority_bit().0 == pgn);
+        let Some((position, &quantity)) = found.filter(|_| source == self.plan.address) else {
+            return;
+        };
+        let Some(data) = bytes::payload(frame, out) else {
+            return;
+        };
+        let Ok(data) = <&[u8; 8]>::try_from(data) else {
+            return out.fault(Counter::Length, 1, frame.id);
+        };
+        let plan = &self.plan;
+        if Sample::EMPTY.with(plan, quantity, data).is_none() {
+            return out.fault(Counter::Value, 1, frame.id);
+        }
+        let mut dropped = 0;
+        let add = |sample: &mut Sample| {
+            *sample = sample.with(plan, quantity, data).unwrap_or(*sample);
+        };
+        let whole = (self.group).push(position, frame, Sample::EMPTY, add, &mut dropped);
+        if dropped > 0 {
+            link.bringup.lost();
+            out.fault(Counter::Unpaired, dropped, frame.id);
+        }
+        let Some(whole) = whole else { return };
+        let Sample { imu, mut quality } = whole.content;
+        for (flag, counter) in [
+            (Quality::DEVICE_FAULT, Counter::DeviceFault),
+            (Quality::SATURATED, Counter::Saturated),
+        ] {
+            if quality.contains(flag) {
+                out.fault(counter, 1, frame.id);
+            }
+        }
+        if link.bringup.reading(frame.t) {
+            quality |= Quality::GAP_BEFORE;
+        }
+        let output = Output {
+            acquired: whole.acquired,
+            stamp: whole.stamp,
+            ..Output::new(0, frame, quality, Reading::Imu(imu))
+        };
+        out.push(output, frame.id);
+    }
+
+    fn reset(&mut self) {
+        self.group.reset();
+    }
+}

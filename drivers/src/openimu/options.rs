@@ -1,0 +1,89 @@
+//! The keys of a sensor in gateway.toml, and what they mean to both sides of the driver.
+
+use super::frames::{ADDRESSES, Axes, BASE_PERIOD_MS, DIVIDERS, Quantity, Upright, identifier};
+use crate::{Id, Spec, SpecError};
+use alloc::vec::Vec;
+use serde::Deserialize;
+
+/// The keys of `driver = "openimu"`.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// The quantities of a reading; default acceleration and angular velocity.
+    pub quantities: Vec<Quantity>,
+    /// Period \[ms\]; default 10.
+    pub period_ms: u32,
+    /// Order of the axes; default y, x, z.
+    pub axes: Axes,
+    /// Axes of the acceleration; default z up.
+    pub acceleration_z: Upright,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            quantities: [Quantity::Acceleration, Quantity::AngularVelocity].to_vec(),
+            period_ms: u32::from(BASE_PERIOD_MS),
+            axes: Axes::Yxz,
+            acceleration_z: Upright::Up,
+        }
+    }
+}
+
+/// What the keys mean.
+#[derive(Debug)]
+pub(super) struct Plan {
+    pub(super) address: u8,
+    /// In the order of their messages.
+    pub(super) quantities: Vec<Quantity>,
+    pub(super) divider: u8,
+    pub(super) axes: Axes,
+    pub(super) upright: Upright,
+}
+
+impl Plan {
+    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        let wrong_address = SpecError::Address {
+            address: spec.address,
+            least: *ADDRESSES.start(),
+            most: *ADDRESSES.end(),
+        };
+        let address = u8::try_from(spec.address).ok();
+        let address = address.filter(|_| ADDRESSES.contains(&spec.address));
+        let mut dividers = DIVIDERS.into_iter();
+        let period = options.period_ms;
+        let divider = dividers.find(|by| u32::from(*by) * u32::from(BASE_PERIOD_MS) == period);
+        let quantities = Quantity::ALL.into_iter();
+        let quantities: Vec<Quantity> = quantities
+            .filter(|quantity| options.quantities.contains(quantity))
+            .collect();
+        if quantities.is_empty() {
+            return Err(SpecError::Keys {
+                key: "quantities",
+                expected: "a list with at least one quantity",
+            });
+        }
+        Ok(Self {
+            address: address.ok_or(wrong_address)?,
+            quantities,
+            divider: divider.ok_or(SpecError::Key {
+                key: "period_ms",
+                value: f64::from(period),
+                expected: "10, 20, 40, 50, 100, 200, 250 or 500",
+            })?,
+            axes: options.axes,
+            upright: options.acceleration_z,
+        })
+    }
+
+    /// The bits of its quantities in a command.
+    pub(super) fn types(&self) -> u8 {
+        (self.quantities.iter()).fold(0, |bits, quantity| bits | quantity.pgn_priority_bit().2)
+    }
+
+    /// The identifier of the messages that hold `quantity`.
+    pub(super) const fn message(&self, quantity: Quantity) -> Id {
+        let (pgn, priority, _) = quantity.pgn_priority_bit();
+        identifier(priority, pgn, self.address)
+    }
+}
