@@ -90,6 +90,21 @@ pub(crate) struct Timing {
     pub(crate) send_within: Nanos,
 }
 
+impl Timing {
+    /// Of devices of which nothing else is known: they answer within milliseconds, and one that is
+    /// powered later starts within a second, at the cost of a few frames.
+    pub(crate) const USUAL: Self = Self {
+        power_on_silence: Nanos::ZERO,
+        answer_timeout: Nanos::from_millis(20),
+        attempts: 15,
+        slow_attempt: Nanos::from_millis(500),
+        answer_counts: Nanos::from_millis(1000),
+        start: Nanos::from_millis(250),
+        start_most: Nanos::from_millis(500),
+        send_within: Nanos::from_millis(100),
+    };
+}
+
 /// The pace of one question: it is repeated after `Timing::answer_timeout`, and after
 /// `Timing::attempts` times every `Timing::slow_attempt`.
 #[derive(Debug)]

@@ -19,22 +19,28 @@
 //! | [`cubemars`] | CubeMars AK actuators | joint, actuator, temperature |
 //! | [`xsens_mti`] | Xsens MTi-600, Avior, Sirius | imu |
 //! | [`openimu`] | Aceinna OpenIMU300RI, OpenIMU335RI, MTLT | imu |
+//! | [`robotous_rft`] | Robotous RFT force/torque sensors | wrench |
+//! | [`aidin_aft200`] | AIDIN AFT200-D80-C force/torque sensors | wrench |
+//! | [`jr3_can`] | JR3 force/torque sensors at UC3M's CAN boards | wrench |
+//! | [`optoforce_daq`] | OptoForce three-axis force sensors at a DAQ unit | wrench without torque |
 //! | [`dbc`] | any device that a .dbc file describes | any |
 //!
 //! Each family has two sides. A [`Device`] is the host's side: it decodes the frames of its
 //! identifiers into readings and starts its board. A [`Board`] is the board's own side: it answers
 //! commands and encodes readings. The simulator, `proprio encode` and the round-trip tests use it.
 //!
-//! To add a family, write a module with a `Family` (`family.rs`), a `Board`, and an `Options` type (its keys in
-//! gateway.toml, documented at the top of the module) that implements [`Driver`], and add its line
-//! to the list in `registry.rs`. Families share `bringup.rs` (starting a board), `configure.rs`
-//! (confirming its configuration), `pairing.rs` and `group.rs` (combining two frames, or more),
-//! `held.rs` (values of other instants) and `bytes.rs` (the numbers of a payload).
+//! To add a family, write a module with a `Family` (see `family.rs`), a `Board`, and an `Options`
+//! type (its keys in gateway.toml, documented at the top of the module) that implements [`Driver`],
+//! and add its line to the list in `registry.rs`. Families share `bringup.rs` (starting a board),
+//! `configure.rs` (confirming its configuration), `pairing.rs` and `group.rs` (combining two frames,
+//! or more), `held.rs` (values of other instants), `bytes.rs` (the numbers of a payload), `wrench.rs`
+//! (force/torque sensors) and `keys.rs` (addresses and identifiers).
 #![no_std]
 extern crate alloc;
 #[cfg(test)]
 extern crate std;
 
+pub mod aidin_aft200;
 pub mod ati_netcanoem;
 mod bringup;
 mod bytes;
@@ -58,13 +64,18 @@ pub mod icub_motor;
 pub mod icub_pos;
 pub mod icub_skin;
 pub mod icub_strain;
+pub mod jr3_can;
+mod keys;
 pub mod moteus;
 pub mod odrive;
 pub mod openimu;
+pub mod optoforce_daq;
 mod pairing;
 mod registry;
+pub mod robotous_rft;
 pub mod signal;
 mod unit;
+mod wrench;
 pub mod xsens_mti;
 
 pub use device::{

@@ -2,9 +2,10 @@
 
 use crate::signal::Message;
 use crate::{
-    Board, Device, Driver, OutputInfo, Spec, SpecError, ati_netcanoem, canopen_drive,
+    Board, Device, Driver, OutputInfo, Spec, SpecError, aidin_aft200, ati_netcanoem, canopen_drive,
     canopen_encoder, canopen_sync, cubemars, dbc, icub_imu, icub_mais, icub_mc4, icub_motor,
-    icub_pos, icub_skin, icub_strain, moteus, odrive, openimu, xsens_mti,
+    icub_pos, icub_skin, icub_strain, jr3_can, moteus, odrive, openimu, optoforce_daq,
+    robotous_rft, xsens_mti,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -147,6 +148,14 @@ drivers! {
     XsensMti: xsens_mti,
     /// Aceinna OpenIMU and MTLT.
     OpenImu: openimu,
+    /// Robotous RFT force/torque sensors.
+    RobotousRft: robotous_rft,
+    /// AIDIN AFT200 force/torque sensors.
+    AidinAft200: aidin_aft200,
+    /// JR3 force/torque sensors.
+    Jr3Can: jr3_can,
+    /// OptoForce force sensors.
+    OptoforceDaq: optoforce_daq,
     /// Devices that a .dbc file describes.
     Dbc: dbc,
 }

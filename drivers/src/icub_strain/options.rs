@@ -1,8 +1,8 @@
 //! The keys of an F/T board in gateway.toml, for both sides of the driver.
 
 use crate::SpecError;
-use serde::de::Error as _;
-use serde::{Deserialize, Deserializer};
+use crate::wrench;
+use serde::Deserialize;
 
 /// The streamed quantities.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
@@ -38,24 +38,15 @@ impl Stream {
     }
 }
 
-/// Deserializes exactly three numbers; a plain array would ignore further ones.
-fn three<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<[f64; 3]>, D::Error> {
-    let numbers = alloc::vec::Vec::<f64>::deserialize(deserializer)?;
-    let three = <[f64; 3]>::try_from(numbers.as_slice());
-    three
-        .map(Some)
-        .map_err(|_| D::Error::invalid_length(numbers.len(), &"3 numbers"))
-}
-
 /// The keys of `driver = "icub_strain"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Full scale of fx fy fz \[N\]; default: the board's own.
-    #[serde(deserialize_with = "three")]
+    #[serde(deserialize_with = "wrench::three")]
     pub full_scale_n: Option<[f64; 3]>,
     /// Full scale of tx ty tz \[Nm\]; goes with `full_scale_n`.
-    #[serde(deserialize_with = "three")]
+    #[serde(deserialize_with = "wrench::three")]
     pub full_scale_nm: Option<[f64; 3]>,
     /// Period \[ms\], 1 to 255; default 10.
     pub period_ms: u32,
@@ -86,32 +77,6 @@ impl Default for Options {
 impl Options {
     /// The configured full scale, force then torque.
     pub(super) fn full_scale(&self, zero_allowed: bool) -> Result<Option<[f64; 6]>, SpecError> {
-        let incomplete = |given, missing| Err(SpecError::Incomplete { given, missing });
-        let ([fx, fy, fz], [tx, ty, tz]) = match (self.full_scale_n, self.full_scale_nm) {
-            (None, None) => return Ok(None),
-            (Some(_), None) => return incomplete("full_scale_n", "full_scale_nm"),
-            (None, Some(_)) => return incomplete("full_scale_nm", "full_scale_n"),
-            (Some(force), Some(torque)) => (force, torque),
-        };
-        let all = [fx, fy, fz, tx, ty, tz];
-        for (axis, value) in all.into_iter().enumerate() {
-            // The upper limit is the largest value in the board's 16 bits.
-            let legal = value.is_finite()
-                && value <= f64::from(u16::MAX)
-                && (value > 0.0 || (zero_allowed && value == 0.0));
-            if !legal {
-                let key = if axis < 3 {
-                    "full_scale_n"
-                } else {
-                    "full_scale_nm"
-                };
-                return Err(SpecError::Key {
-                    key,
-                    value,
-                    expected: "above 0 and at most 65535",
-                });
-            }
-        }
-        Ok(Some(all))
+        wrench::full_scale(self.full_scale_n, self.full_scale_nm, zero_allowed)
     }
 }

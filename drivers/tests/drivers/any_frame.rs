@@ -1,5 +1,5 @@
 //! Arbitrary frames in any order at any time cause no panic, no endless loop, and no non-finite
-//! number in a wrench.
+//! number in a wrench, but for the torque of a sensor that measures none.
 
 use crate::rig::{options, spec};
 use proprio_drivers::{Board, Claim, Decoded, Device, Format, Frame, Frames, Id, Mode, NotSent};
@@ -101,6 +101,21 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
         &[],
     ),
     ("openimu", "quantities = [\"orientation\"]", &[]),
+    ("robotous_rft", "", &[]),
+    ("robotous_rft", "rate_hz = 1000", &[]),
+    ("aidin_aft200", "", &[]),
+    ("jr3_can", "", &[]),
+    (
+        "jr3_can",
+        "full_scale_n = [9, 9, 9]\nfull_scale_nm = [1, 1, 1]\nperiod_ms = 1",
+        &[],
+    ),
+    ("optoforce_daq", "counts_per_newton = [26, 28, 3]", &[]),
+    (
+        "optoforce_daq",
+        "counts_per_newton = [26, 28, 3]\nrate_hz = 1000\nzero = true\nfill = false",
+        &[],
+    ),
     ("dbc", crate::dbc::WRENCH, &[]),
     ("dbc", crate::dbc::DRIVE, &[0]),
     ("dbc", crate::dbc::PAGES, &[]),
@@ -219,11 +234,15 @@ fn to_frame(event: &Event, claims: &[Claim], command_id: Option<Id>, now: Nanos)
 
 fn is_finite(reading: &Reading) -> bool {
     match reading {
-        Reading::Wrench(wrench) => wrench
-            .force
-            .iter()
-            .chain(&wrench.torque)
-            .all(|value| value.is_finite()),
+        // A sensor with three axes reports no torque at all.
+        Reading::Wrench(wrench) => {
+            let absent = wrench.torque.iter().all(|value| value.is_nan());
+            let mut torque = wrench
+                .torque
+                .iter()
+                .map(|value| absent || value.is_finite());
+            wrench.force.iter().all(|value| value.is_finite()) && torque.all(|finite| finite)
+        }
         Reading::Imu(imu) => imu
             .proper_acceleration
             .iter()
@@ -303,7 +322,12 @@ proptest! {
         let spec = spec(options.default_address().unwrap_or(1), mode, outputs);
         let mut device = options.device(&spec).unwrap();
         let mut board = options.board(&spec).unwrap();
-        drive(&mut *device, &mut *board, &events, listens || driver == "icub_motor");
+        let silent = match driver {
+            "icub_motor" => true,
+            "optoforce_daq" => !keys.contains("rate_hz"),
+            _ => false,
+        };
+        drive(&mut *device, &mut *board, &events, listens || silent);
     }
 }
 

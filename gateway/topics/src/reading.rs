@@ -42,7 +42,7 @@ impl JointState {
 pub struct Wrench {
     /// Force \[N\], sensor axes.
     pub force: [f64; 3],
-    /// Torque \[Nm\], sensor axes, about the sensor's origin.
+    /// Torque \[Nm\], sensor axes, about the sensor's origin. NaN if the sensor measures none.
     pub torque: [f64; 3],
 }
 

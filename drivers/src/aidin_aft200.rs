@@ -1,0 +1,303 @@
+//! AIDIN Robotics AFT200-D80-C force/torque sensors.
+//!
+//! The bit rate is 1 Mbit/s. Streams, big-endian:
+//!
+//! | identifier | name | bytes | content |
+//! |---|---|---|---|
+//! | `id_force` | force | 6 to 8 | fx fy fz u16; further bytes are unused |
+//! | `id_torque` | torque | 6 to 8 | tx ty tz u16; further bytes are unused |
+//!
+//! - force = u16 / 100 - 300 N, torque = u16 / 500 - 50 Nm. A value at an end of the 16 bits is
+//!   reported as saturated.
+//! - The frames have no sequence number: force and torque are paired by order and time
+//!   (`pairing.rs`).
+//!
+//! Commands on `102`, 8 bytes, unused ones zero. The first byte is the sensor's own number, which
+//! is the device's `address`. No answers are known:
+//!
+//! | bytes | meaning |
+//! |---|---|
+//! | `address 05 high low` | period in us, at most 65535 |
+//! | `address 03 01` | send continuously |
+//!
+//! - No command that ends the stream is known: at a stop nothing is sent, and the sensor goes on.
+//! - Do not set the sensor's bias (`address 02 01`, by another program) while readings are in use:
+//!   it changes the zero, and for about a second the sensor sends other contents on the identifiers
+//!   1 to 6, which look like readings.
+//!
+//! Sources: `sensors.py`, `imu_test.py` and `README.md` of rise-lab-skku/rise-aft-can 9705f731,
+//! which was run with one sensor; no document of the maker. Highly probable: the contents and the
+//! start. Probable: the period's unit. Not known: whether the identifiers of the streams follow a
+//! new number of the sensor, therefore they are keys of their own; whether the sensor keeps its
+//! period; what it sends after its six bytes (the source's remark has two more).
+//!
+//! # Keys
+//! ```toml
+//! period_ms = 10    # 1 to 65
+//! id_force = 1      # identifiers of the streams, 0 to 0x7FF
+//! id_torque = 2
+//! ```
+
+use crate::bringup::{Bringup, NoInquiry, Timing};
+use crate::family::{Family, Link, Supervised};
+use crate::pairing::{Limit, Paired, Pairing};
+use crate::{
+    Board, Claim, Decoded, Device, Driver, EncodeError, Format, Frame, Frames, Id, Mode, Output,
+    OutputInfo, Spec, SpecError, bytes, keys, wrench,
+};
+use alloc::boxed::Box;
+use alloc::vec::Vec;
+use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, Saturation, Wrench};
+use serde::Deserialize;
+
+/// The identifier of all sensors' commands.
+const COMMAND: Id = Id::standard(0x102);
+/// Commands: the second byte.
+mod command {
+    pub(super) const TRANSMIT: u8 = 0x03;
+    pub(super) const PERIOD: u8 = 0x05;
+}
+/// The argument of TRANSMIT: continuously.
+const CONTINUOUSLY: u8 = 1;
+/// One step, and the value of code 0 \[N\].
+const NEWTON: (f64, f64) = (0.01, -300.0);
+/// One step, and the value of code 0 \[Nm\].
+const NEWTON_METRE: (f64, f64) = (0.002, -50.0);
+
+/// The keys of `driver = "aidin_aft200"`.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// Period \[ms\], 1 to 65; default 10.
+    pub period_ms: u32,
+    /// Identifier of the force; default 1.
+    pub id_force: u16,
+    /// Identifier of the torque; default 2.
+    pub id_torque: u16,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            period_ms: 10,
+            id_force: 1,
+            id_torque: 2,
+        }
+    }
+}
+
+impl Options {
+    fn period(&self) -> Result<Nanos, SpecError> {
+        match self.period_ms {
+            1..=65 => Ok(Nanos::from_millis(i64::from(self.period_ms))),
+            other => Err(SpecError::Key {
+                key: "period_ms",
+                value: f64::from(other),
+                expected: "an integer from 1 to 65",
+            }),
+        }
+    }
+
+    /// The identifiers of force and torque.
+    fn ids(&self) -> Result<[Id; 2], SpecError> {
+        let expected = "from 0 to 0x7FF";
+        let force = keys::id("id_force", self.id_force, 0..=0x7FF, expected)?;
+        let torque = keys::id("id_torque", self.id_torque, 0..=0x7FF, expected)?;
+        if force == torque {
+            return Err(SpecError::Keys {
+                key: "id_torque",
+                expected: "another identifier than id_force",
+            });
+        }
+        Ok([force, torque])
+    }
+}
+
+/// The number of the sensor. FF in its place is a command to all sensors.
+fn number(spec: &Spec) -> Result<u8, SpecError> {
+    #[allow(clippy::cast_possible_truncation)] // at most 254
+    keys::address(spec, 1..=254).map(|number| number as u8)
+}
+
+impl Driver for Options {
+    const NAME: &'static str = "aidin_aft200";
+    const ADDRESS: Option<u32> = Some(1);
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Wrench)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        Aft::device(spec, self)
+    }
+
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(AftBoard::new(spec, self)?))
+    }
+}
+
+/// The host's side of a sensor.
+#[derive(Debug)]
+struct Aft {
+    ids: [Id; 2],
+    pairing: Pairing<[u8; 6]>,
+}
+
+impl Aft {
+    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        let number = number(spec)?;
+        let (ids, period) = (options.ids()?, options.period()?);
+        let [force, _] = ids;
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // at most 65000
+        let [high, low] = ((period.0 / 1000) as u16).to_be_bytes();
+        let mut bringup = Bringup::new(spec, spec.mode, Timing::USUAL, force);
+        bringup.start_with(COMMAND, &[number, command::PERIOD, high, low, 0, 0, 0, 0]);
+        let start = [number, command::TRANSMIT, CONTINUOUSLY, 0, 0, 0, 0, 0];
+        bringup.start_with(COMMAND, &start);
+        let pairing = Pairing::new(Limit::of_period(period), true);
+        let claims = ids.map(Claim::exclusive);
+        let this = Self { ids, pairing };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+}
+
+/// The values of one frame, and `quality` with the saturation of the axes `axis..axis + 3`.
+fn axes(half: [u8; 6], scale: (f64, f64), axis: u32, quality: &mut Quality) -> [f64; 3] {
+    let [a, b, c, d, e, f] = half;
+    let counts = [[a, b], [c, d], [e, f]].map(u16::from_be_bytes);
+    for (axis, count) in (axis..).zip(counts) {
+        *quality = quality.with_saturation(axis, wrench::at_end(count, 0, u16::MAX));
+    }
+    let (step, least) = scale;
+    counts.map(|count| f64::from(count) * step + least)
+}
+
+impl Family for Aft {
+    type Questions = NoInquiry;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+        let [force, torque] = self.ids;
+        let second = frame.id == torque;
+        if !second && frame.id != force {
+            return;
+        }
+        let Some(data) = bytes::payload(frame, out) else {
+            return;
+        };
+        let Some(&half) = data.first_chunk() else {
+            return out.fault(Counter::Length, 1, frame.id);
+        };
+        let mut unpaired = 0;
+        let paired = self.pairing.push(second, frame, half, &mut unpaired);
+        if unpaired > 0 {
+            link.bringup.lost();
+            out.fault(Counter::Unpaired, unpaired, frame.id);
+        }
+        let Paired::With(acquired, stamp, first) = paired else {
+            return;
+        };
+        let mut quality = Quality::GOOD;
+        let force = axes(first, NEWTON, 0, &mut quality);
+        let torque = axes(half, NEWTON_METRE, 3, &mut quality);
+        if quality.contains(Quality::SATURATED) {
+            out.fault(Counter::Saturated, 1, frame.id);
+        }
+        if link.bringup.reading(frame.t) {
+            quality |= Quality::GAP_BEFORE;
+        }
+        let output = Output {
+            acquired,
+            stamp,
+            ..Output::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
+        };
+        out.push(output, frame.id);
+    }
+
+    fn reset(&mut self) {
+        self.pairing.reset();
+    }
+}
+
+/// The sensor's own side.
+#[derive(Debug)]
+pub struct AftBoard {
+    number: u8,
+    ids: [Id; 2],
+    period: Nanos,
+    streaming: bool,
+}
+
+impl AftBoard {
+    /// A sensor after power-on; in [`Mode::Listen`] another program has already started it.
+    ///
+    /// # Errors
+    /// [`SpecError`]: an identifier, a number or a period out of range.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        Ok(Self {
+            number: number(spec)?,
+            ids: options.ids()?,
+            period: options.period()?,
+            streaming: spec.mode == Mode::Listen,
+        })
+    }
+}
+
+impl Board for AftBoard {
+    fn on_frame(&mut self, frame: &Frame, _out: &mut Frames) {
+        if frame.id != COMMAND || frame.format != Format::Classic {
+            return;
+        }
+        match *frame.data() {
+            [number, ..] if number != self.number => {}
+            [_, command::PERIOD, high, low, ..] if (high, low) != (0, 0) => {
+                self.period = Nanos::from_micros(i64::from(u16::from_be_bytes([high, low])));
+            }
+            [_, command::TRANSMIT, CONTINUOUSLY, ..] => self.streaming = true,
+            _ => {}
+        }
+    }
+
+    fn period(&self) -> Option<Nanos> {
+        self.streaming.then_some(self.period)
+    }
+
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        let Reading::Wrench(wrench) = reading else {
+            return Err(EncodeError::Kind);
+        };
+        if output != 0 {
+            return Err(EncodeError::Output(output));
+        }
+        let [force, torque] = self.ids;
+        let halves = [
+            (force, wrench.force, NEWTON, 0),
+            (torque, wrench.torque, NEWTON_METRE, 3),
+        ];
+        let mut values = wrench.force.iter().chain(&wrench.torque);
+        if !values.all(|value| value.is_finite()) {
+            return Err(EncodeError::NotFinite);
+        }
+        for (id, values, (step, least), first) in halves {
+            let mut data = [0; 6];
+            for (axis, (to, value)) in (first..).zip(data.chunks_exact_mut(2).zip(values)) {
+                let count = match quality.saturation(axis) {
+                    Saturation::None => {
+                        let count = bytes::quantise(value - least, step, 0, u16::MAX.into());
+                        u16::try_from(count).unwrap_or(u16::MAX)
+                    }
+                    Saturation::Low => 0,
+                    Saturation::High => u16::MAX,
+                };
+                to.copy_from_slice(&count.to_be_bytes());
+            }
+            let _ = out.try_push(Frame::new(id, &data));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,233 @@
+//! The host's side of a board. It asks for the full scales, starts the board, and combines the
+//! frames of force and moment.
+
+use super::options::Options;
+use super::protocol::{READY, SAMPLE, id, node, op, op_of};
+use super::scales::{FullScales, Question};
+use crate::bringup::{Bringup, Timing};
+use crate::bytes;
+use crate::family::{Family, Link, Supervised};
+use crate::wrench::{NewZero, at_end};
+use crate::{Claim, Decoded, Device, Frame, Mode, NotSent, Output, Spec, SpecError};
+use alloc::boxed::Box;
+use proprio_topics::{Counter, Nanos, Quality, Reading, Refusal, StampKind, Wrench};
+
+/// A command that is not acknowledged within this time has taken effect, or was lost.
+const ACKNOWLEDGED: Nanos = Nanos::from_millis(100);
+
+/// One frame of a reading.
+#[derive(Debug, Clone, Copy)]
+struct Half {
+    counts: [i16; 3],
+    counter: u16,
+}
+
+impl Half {
+    fn parse(data: &[u8]) -> Option<Self> {
+        let &[a, b, c, d, e, f, g, h] = data else {
+            return None;
+        };
+        Some(Self {
+            counts: [[a, b], [c, d], [e, f]].map(i16::from_le_bytes),
+            counter: u16::from_le_bytes([g, h]),
+        })
+    }
+}
+
+/// The host's side of a board.
+#[derive(Debug)]
+pub(super) struct Jr3 {
+    node: u16,
+    period: Nanos,
+    /// The force that waits for its moment, and its stamp.
+    waiting: Option<(Nanos, StampKind, Half)>,
+    /// Whether a force was heard: the moment of an earlier one is not missing anything.
+    joined: bool,
+    /// The counter of the last reading.
+    last: Option<u16>,
+    zero: NewZero,
+}
+
+impl Jr3 {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        let node = node(spec)?;
+        let (period, cutoff) = (options.period()?, options.cutoff()?);
+        let scales = FullScales::new(node, options.full_scale()?);
+        let mut bringup = Bringup::new(spec, spec.mode, Timing::USUAL, id(op::FORCE, node));
+        let [c0, c1] = cutoff.to_le_bytes();
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // at most a second
+        let [p0, p1, p2, p3] = ((period.0 / 1000) as u32).to_le_bytes();
+        bringup.start_with(id(op::START, node), &[c0, c1, p0, p1, p2, p3]);
+        bringup.stop_with(id(op::STOP, node), &[]);
+        let own = [op::FORCE, op::MOMENT, op::ACKNOWLEDGE, op::BOOT_UP];
+        let heard = [
+            op::START_SYNC,
+            op::START,
+            op::ZERO,
+            op::GET_FORCE_SCALES,
+            op::GET_MOMENT_SCALES,
+        ];
+        let own = own.map(|op| Claim::exclusive(id(op, node)));
+        let heard = heard.map(|op| Claim::shared(id(op, node)));
+        let this = Self {
+            node,
+            period,
+            waiting: None,
+            joined: false,
+            last: None,
+            zero: NewZero::default(),
+        };
+        let claims = own.into_iter().chain(heard);
+        Ok(Supervised::boxed(claims, bringup, scales, this))
+    }
+
+    /// A command that changes the zero was sent at `t`.
+    fn expect_zero(&mut self, t: Nanos) {
+        self.zero.expect(t + ACKNOWLEDGED);
+    }
+
+    fn acknowledge(
+        &mut self,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Link<FullScales>,
+        out: &mut Decoded,
+    ) {
+        match *data {
+            [state] => {
+                self.zero.confirm(frame.t);
+                if state != READY {
+                    out.fault(Counter::DeviceFault, 1, frame.id);
+                }
+            }
+            [state, ref scales @ ..] if scales.len() == 6 => {
+                let scales = [0, 2, 4].map(|at| bytes::u16_le(scales, at));
+                let mode = link.bringup.mode();
+                link.questions.answer(state, scales, mode, frame, out);
+            }
+            _ => out.fault(Counter::Length, 1, frame.id),
+        }
+    }
+
+    fn force(&mut self, half: Half, frame: &Frame, link: &mut Link<FullScales>, out: &mut Decoded) {
+        self.joined = true;
+        if self.waiting.replace((frame.t, frame.stamp, half)).is_some() {
+            link.bringup.lost();
+            out.fault(Counter::Unpaired, 1, frame.id);
+        }
+    }
+
+    fn moment(
+        &mut self,
+        half: Half,
+        frame: &Frame,
+        link: &mut Link<FullScales>,
+        out: &mut Decoded,
+    ) {
+        let force = (self.waiting).take_if(|(_, _, force)| force.counter == half.counter);
+        let Some((acquired, stamp, force)) = force else {
+            if self.joined {
+                link.bringup.lost();
+                out.fault(Counter::Unpaired, 1, frame.id);
+            }
+            return;
+        };
+        let mut quality = Quality::DEVICE_COUNTER;
+        if let Some(last) = self.last.replace(half.counter) {
+            match half.counter.wrapping_sub(last) {
+                0 => quality |= Quality::FROZEN,
+                samples => {
+                    let lost = self.periods(samples).saturating_sub(1);
+                    if lost > 0 {
+                        link.bringup.lost();
+                        out.fault(Counter::Lost, lost, frame.id);
+                    }
+                }
+            }
+        }
+        let Some(per_step) = link.questions.per_step else {
+            if link.bringup.mode() == Mode::Listen && link.questions.refusal.is_none() {
+                // The board streams already, and no other program asks for this host.
+                link.questions.refusal = Some(Refusal::NoFullScale);
+            }
+            return;
+        };
+        let ([a, b, c], [d, e, f]) = (force.counts, half.counts);
+        let mut values = per_step;
+        for (axis, (value, count)) in (0..).zip(values.iter_mut().zip([a, b, c, d, e, f])) {
+            *value *= f64::from(count);
+            quality = quality.with_saturation(axis, at_end(count, i16::MIN, i16::MAX));
+        }
+        if quality.contains(Quality::SATURATED) {
+            out.fault(Counter::Saturated, 1, frame.id);
+        }
+        if link.bringup.reading(frame.t) {
+            quality |= Quality::GAP_BEFORE;
+        }
+        quality |= self.zero.mark(frame.t);
+        let [fx, fy, fz, tx, ty, tz] = values;
+        let (force, torque) = ([fx, fy, fz], [tx, ty, tz]);
+        let output = Output {
+            acquired,
+            stamp,
+            device_counter: u32::from(half.counter),
+            ..Output::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
+        };
+        out.push(output, frame.id);
+    }
+
+    /// The number of periods in which the sensor takes `samples`, to the nearest.
+    fn periods(&self, samples: u16) -> u32 {
+        let passed = i64::from(samples) * SAMPLE.0;
+        u32::try_from((passed + self.period.0 / 2) / self.period.0).unwrap_or(0)
+    }
+}
+
+impl Family for Jr3 {
+    type Questions = FullScales;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<FullScales>, out: &mut Decoded) {
+        let Some(op) = op_of(frame.id, self.node) else {
+            return;
+        };
+        match op {
+            op::START | op::START_SYNC | op::ZERO => return self.expect_zero(frame.t),
+            op::GET_FORCE_SCALES if link.bringup.mode() == Mode::Listen => {
+                return link.questions.overhear(Question::Forces);
+            }
+            op::GET_MOMENT_SCALES if link.bringup.mode() == Mode::Listen => {
+                return link.questions.overhear(Question::Moments);
+            }
+            op::FORCE | op::MOMENT | op::ACKNOWLEDGE | op::BOOT_UP => {}
+            _ => return,
+        }
+        let Some(data) = bytes::payload(frame, out) else {
+            return;
+        };
+        match (op, Half::parse(data)) {
+            (op::ACKNOWLEDGE, _) => self.acknowledge(data, frame, link, out),
+            (op::FORCE, Some(half)) => self.force(half, frame, link, out),
+            (op::MOMENT, Some(half)) => self.moment(half, frame, link, out),
+            (op::BOOT_UP, _) if data.is_empty() => {
+                link.bringup.restart();
+                self.reset();
+                self.zero.expect(frame.t);
+            }
+            _ => out.fault(Counter::Length, 1, frame.id),
+        }
+    }
+
+    fn reset(&mut self) {
+        self.waiting = None;
+        self.joined = false;
+        self.last = None;
+    }
+
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        if let Ok(t) = outcome
+            && frame.id == id(op::START, self.node)
+        {
+            self.expect_zero(t);
+        }
+    }
+}

@@ -1,0 +1,63 @@
+//! The keys of a board in gateway.toml, for both sides of the driver.
+
+use crate::{SpecError, bytes, wrench};
+use proprio_topics::Nanos;
+use serde::Deserialize;
+
+/// The keys of `driver = "jr3_can"`.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// Full scale of fx fy fz \[N\]; default: the board's own.
+    #[serde(deserialize_with = "wrench::three")]
+    pub full_scale_n: Option<[f64; 3]>,
+    /// Full scale of tx ty tz \[Nm\]; goes with `full_scale_n`.
+    #[serde(deserialize_with = "wrench::three")]
+    pub full_scale_nm: Option<[f64; 3]>,
+    /// Period \[ms\], 1 to 1000; default 10.
+    pub period_ms: u32,
+    /// Cut-off frequency of the board's filter \[Hz\]; default 0, no filter.
+    pub cutoff_hz: f64,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            full_scale_n: None,
+            full_scale_nm: None,
+            period_ms: 10,
+            cutoff_hz: 0.0,
+        }
+    }
+}
+
+impl Options {
+    /// The configured full scale, force then torque.
+    pub(super) fn full_scale(&self) -> Result<Option<[f64; 6]>, SpecError> {
+        wrench::full_scale(self.full_scale_n, self.full_scale_nm, false)
+    }
+
+    pub(super) fn period(&self) -> Result<Nanos, SpecError> {
+        match self.period_ms {
+            1..=1000 => Ok(Nanos::from_millis(i64::from(self.period_ms))),
+            other => Err(SpecError::Key {
+                key: "period_ms",
+                value: f64::from(other),
+                expected: "an integer from 1 to 1000",
+            }),
+        }
+    }
+
+    /// The cut-off frequency in the start command.
+    pub(super) fn cutoff(&self) -> Result<u16, SpecError> {
+        if !(self.cutoff_hz >= 0.0 && self.cutoff_hz <= 655.35) {
+            return Err(SpecError::Key {
+                key: "cutoff_hz",
+                value: self.cutoff_hz,
+                expected: "from 0 to 655.35",
+            });
+        }
+        let hundredths = bytes::quantise(self.cutoff_hz, 0.01, 0, u16::MAX.into());
+        Ok(u16::try_from(hundredths).unwrap_or(u16::MAX))
+    }
+}

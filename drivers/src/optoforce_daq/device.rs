@@ -1,0 +1,215 @@
+//! The host's side of a unit. It configures the unit if the keys say so, and combines the two
+//! frames of each packet.
+
+use super::options::Options;
+use super::protocol::{
+    ANSWER, CONFIGURATION, ERRORS, Ids, OVERLOAD_FX, PACKET, Settings, ZERO_OWN, sum,
+};
+use crate::bringup::{Bringup, NoInquiry, Timing};
+use crate::bytes;
+use crate::family::{Family, Link, Supervised};
+use crate::wrench::{self, NewZero};
+use crate::{Claim, Decoded, Device, Frame, Id, Mode, NotSent, Output, Spec, SpecError};
+use alloc::boxed::Box;
+use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind, Wrench};
+
+/// A configuration that is not answered within this time has taken effect, or was lost.
+const ANSWERED: Nanos = Nanos::from_millis(100);
+
+/// The frames of a configuration.
+fn frames(id: Id, settings: Settings, fill: bool) -> [Frame; 2] {
+    let [a, b, c, d] = CONFIGURATION;
+    let Settings {
+        speed,
+        filter,
+        zero,
+    } = settings;
+    let [high, low] = sum(&[a, b, c, d, speed, filter, zero]).to_be_bytes();
+    let second = [low, 0, 0, 0, 0, 0, 0, 0];
+    let length = if fill { 8 } else { 1 };
+    [
+        Frame::new(id, &[a, b, c, d, speed, filter, zero, high]),
+        Frame::new(id, second.get(..length).unwrap_or(&second)),
+    ]
+}
+
+/// The host's side of a unit.
+#[derive(Debug)]
+pub(super) struct Opto {
+    ids: Ids,
+    /// Steps per N.
+    scale: [f64; 3],
+    /// The first frame that waits for its second, and its stamp.
+    waiting: Option<(Nanos, StampKind, [u8; 8])>,
+    /// Whether a first frame was heard: the second one of an earlier packet is not missing
+    /// anything.
+    joined: bool,
+    /// The counter of the last packet.
+    last: Option<u16>,
+    zero: NewZero,
+}
+
+impl Opto {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        let ids = options.ids(spec)?;
+        let settings = options.settings()?;
+        let mode = match settings {
+            Some(_) => spec.mode,
+            None => Mode::Listen,
+        };
+        let mut bringup = Bringup::new(spec, mode, Timing::USUAL, ids.data);
+        if let Some(settings) = settings {
+            for frame in frames(ids.config, settings, options.fill) {
+                bringup.start_with(frame.id, frame.data());
+            }
+            let stopped = Settings {
+                speed: 0,
+                zero: ZERO_OWN,
+                ..settings
+            };
+            for frame in frames(ids.config, stopped, options.fill) {
+                bringup.stop_with(frame.id, frame.data());
+            }
+        }
+        let this = Self {
+            ids,
+            scale: options.scale()?,
+            waiting: None,
+            joined: false,
+            last: None,
+            zero: NewZero::default(),
+        };
+        let claims = [Claim::exclusive(ids.data)];
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+
+    /// Takes a frame that is not half a packet.
+    fn answer(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+        let Some((&[a, b, c, d, error], _)) = data.split_first_chunk() else {
+            return out.fault(Counter::Length, 1, frame.id);
+        };
+        if data.len() != 7 {
+            out.fault(Counter::Length, 1, frame.id);
+        } else if [a, b, c, d] != ANSWER
+            || sum(&[a, b, c, d, error]) != bytes::u16_be(data, 5)
+            || error != 0
+        {
+            out.fault(Counter::Value, 1, frame.id);
+        } else {
+            self.zero.confirm(frame.t);
+        }
+    }
+
+    /// Takes a packet with a right checksum.
+    fn packet(
+        &mut self,
+        halves: [[u8; 8]; 2],
+        first: (Nanos, StampKind),
+        frame: &Frame,
+        link: &mut Link<NoInquiry>,
+        out: &mut Decoded,
+    ) {
+        let [[_, _, _, _, c0, c1, s0, s1], [a, b, c, d, e, f, _, _]] = halves;
+        let counter = u16::from_be_bytes([c0, c1]);
+        let status = u16::from_be_bytes([s0, s1]);
+        let mut quality = Quality::DEVICE_COUNTER;
+        if let Some(last) = self.last.replace(counter) {
+            match counter.wrapping_sub(last) {
+                0 => quality |= Quality::FROZEN,
+                1 => {}
+                step => {
+                    link.bringup.lost();
+                    // A large step is a unit that was started again.
+                    if step <= u16::MAX / 2 {
+                        out.fault(Counter::Lost, u32::from(step) - 1, frame.id);
+                    }
+                }
+            }
+        }
+        let mut force = self.scale;
+        let counts = [[a, b], [c, d], [e, f]].map(i16::from_be_bytes);
+        for (value, count) in force.iter_mut().zip(counts) {
+            *value = f64::from(count) / *value;
+        }
+        let [x, y, z] = force;
+        for (axis, value) in (0..).zip([x, y, z, 0.0, 0.0, 0.0]) {
+            if status >> (OVERLOAD_FX - axis) & 1 == 1 {
+                quality = wrench::overloaded(quality, axis, value);
+            }
+        }
+        if quality.contains(Quality::SATURATED) {
+            out.fault(Counter::Saturated, 1, frame.id);
+        }
+        if status & ERRORS != 0 {
+            quality |= Quality::DEVICE_FAULT;
+            out.fault(Counter::DeviceFault, 1, frame.id);
+        }
+        if link.bringup.reading(frame.t) {
+            quality |= Quality::GAP_BEFORE;
+        }
+        quality |= self.zero.mark(frame.t);
+        let torque = [f64::NAN; 3];
+        let (acquired, stamp) = first;
+        let output = Output {
+            acquired,
+            stamp,
+            device_counter: u32::from(counter),
+            ..Output::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
+        };
+        out.push(output, frame.id);
+    }
+}
+
+impl Family for Opto {
+    type Questions = NoInquiry;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+        if frame.id != self.ids.data {
+            return;
+        }
+        let Some(data) = bytes::payload(frame, out) else {
+            return;
+        };
+        let Ok(half) = <[u8; 8]>::try_from(data) else {
+            return self.answer(data, frame, out);
+        };
+        let waiting = self.waiting.take();
+        if let Some((t, stamp, first)) = waiting {
+            let before = sum(&first).wrapping_add(sum(half.get(..6).unwrap_or(&half)));
+            if before == bytes::u16_be(&half, 6) {
+                return self.packet([first, half], (t, stamp), frame, link, out);
+            }
+        }
+        let begins = half.starts_with(&PACKET);
+        if begins {
+            self.waiting = Some((frame.t, frame.stamp, half));
+        }
+        match (waiting, begins) {
+            // The second frame is missing.
+            (Some(_), true) => out.fault(Counter::Unpaired, 1, frame.id),
+            // The checksum is wrong.
+            (Some(_), false) => out.fault(Counter::Value, 1, frame.id),
+            // The first frame is missing.
+            (None, false) if self.joined => out.fault(Counter::Unpaired, 1, frame.id),
+            (None, _) => {
+                self.joined |= begins;
+                return;
+            }
+        }
+        link.bringup.lost();
+    }
+
+    fn reset(&mut self) {
+        self.waiting = None;
+        self.joined = false;
+        self.last = None;
+    }
+
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        if let Ok(t) = outcome
+            && frame.id == self.ids.config
+        {
+            self.zero.expect(t + ANSWERED);
+        }
+    }
+}

@@ -1,0 +1,123 @@
+//! The sensor's own side.
+
+use super::options::Options;
+use super::protocol::{DEFAULT_RATE, Ids, OVERLOAD_FX, RATES, command, period};
+use crate::bytes;
+use crate::{Board, EncodeError, Format, Frame, Frames, Mode, Spec, SpecError};
+use proprio_topics::{Nanos, Quality, Reading, Saturation};
+
+/// In the answer to SET_RATE: done; and the error for a code out of range.
+const DONE: u8 = 1;
+const RANGE_ERROR: u8 = 2;
+
+/// The sensor's own side.
+#[derive(Debug)]
+pub struct RftBoard {
+    ids: Ids,
+    divisors: [f64; 6],
+    rate_code: u8,
+    period: Nanos,
+    streaming: bool,
+}
+
+impl RftBoard {
+    /// A new sensor after power-on; in [`Mode::Listen`] another program has already set its rate
+    /// and started it.
+    ///
+    /// # Errors
+    /// [`SpecError`]: an identifier or a rate out of range.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        let rate_code = options.rate_code()?;
+        let mut this = Self {
+            ids: options.ids(spec)?,
+            divisors: options.model.divisors(),
+            rate_code,
+            period: period(options.rate_hz),
+            streaming: spec.mode == Mode::Listen,
+        };
+        if !this.streaming {
+            this.set_rate(DEFAULT_RATE);
+        }
+        Ok(this)
+    }
+
+    /// Returns whether there is such a rate.
+    fn set_rate(&mut self, code: u8) -> bool {
+        let meant = if code == 0 { DEFAULT_RATE } else { code };
+        let Some((hz, _)) = RATES.iter().find(|(_, code)| *code == meant) else {
+            return false;
+        };
+        self.period = period(*hz);
+        self.rate_code = code;
+        true
+    }
+
+    fn answer(&self, bytes: [u8; 3], out: &mut Frames) {
+        let [a, b, c] = bytes;
+        let _ = out.try_push(Frame::new(self.ids.first, &[a, b, c, 0, 0, 0, 0, 0]));
+        let _ = out.try_push(Frame::new(self.ids.second, &[0; 8]));
+    }
+}
+
+impl Board for RftBoard {
+    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
+        if frame.id != self.ids.command || frame.format != Format::Classic {
+            return;
+        }
+        match *frame.data() {
+            [command::STOP, ..] => self.streaming = false,
+            _ if self.streaming => {}
+            [command::START, ..] => self.streaming = true,
+            [command::GET_RATE, ..] => self.answer([command::GET_RATE, self.rate_code, 0], out),
+            [command::SET_RATE, code, ..] => {
+                let answer = match self.set_rate(code) {
+                    true => [command::SET_RATE, DONE, 0],
+                    false => [command::SET_RATE, 0, RANGE_ERROR],
+                };
+                self.answer(answer, out);
+            }
+            _ => {}
+        }
+    }
+
+    fn period(&self) -> Option<Nanos> {
+        self.streaming.then_some(self.period)
+    }
+
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        let Reading::Wrench(wrench) = reading else {
+            return Err(EncodeError::Kind);
+        };
+        if output != 0 {
+            return Err(EncodeError::Output(output));
+        }
+        let ([fx, fy, fz], [tx, ty, tz]) = (wrench.force, wrench.torque);
+        let values = [fx, fy, fz, tx, ty, tz];
+        if !values.iter().all(|value| value.is_finite()) {
+            return Err(EncodeError::NotFinite);
+        }
+        let mut counts = [[0; 2]; 6];
+        let mut overload = 0;
+        let axes = values.into_iter().zip(self.divisors);
+        for (axis, (count, (value, divisor))) in (0..).zip(counts.iter_mut().zip(axes)) {
+            *count = bytes::quantise_i16(value, 1.0 / divisor).to_be_bytes();
+            if quality.saturation(axis) != Saturation::None {
+                overload |= 1 << (OVERLOAD_FX - axis);
+            }
+        }
+        let [[a, b], [c, d], [e, f], [g, h], [i, j], [k, l]] = counts;
+        for (id, data) in [
+            (self.ids.first, [command::START, a, b, c, d, e, f, g]),
+            (self.ids.second, [h, i, j, k, l, overload, 0, 0]),
+        ] {
+            let _ = out.try_push(Frame::new(id, &data));
+        }
+        Ok(())
+    }
+}

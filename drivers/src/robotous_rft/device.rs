@@ -1,0 +1,208 @@
+//! The host's side of a sensor. It sets the rate, starts the sensor, and combines the two halves of
+//! each response.
+
+use super::options::Options;
+use super::protocol::{DEFAULT_RATE, Ids, OVERLOAD_FX, command, period, send};
+use crate::bringup::{Ask, Attempts, Bringup, Inquiry, Timing};
+use crate::family::{Family, Link, Supervised};
+use crate::pairing::{Limit, Paired, Pairing};
+use crate::{Claim, Decoded, Device, Frame, Id, Mode, NotSent, Output, Spec, SpecError};
+use crate::{bytes, wrench};
+use alloc::boxed::Box;
+use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind, Wrench};
+
+/// The next step of [`Rate`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Step {
+    Stop,
+    Get,
+    Set,
+    Done,
+}
+
+/// Stops the sensor, asks for its rate, and sets it if it is another one.
+#[derive(Debug)]
+pub(super) struct Rate {
+    id: Id,
+    code: u8,
+    attempts: Attempts,
+    step: Step,
+    /// The step of the last frame; its answer may have come since.
+    sent: Step,
+}
+
+impl Rate {
+    /// Takes the sensor's answer, in `frame`.
+    fn answer(&mut self, code: u8, frame: &Frame, out: &mut Decoded) {
+        if !self.attempts.counts(frame.t) {
+            return out.fault(Counter::Unexpected, 1, frame.id);
+        }
+        self.attempts.again();
+        self.step = match code {
+            0 if self.code == DEFAULT_RATE => Step::Done,
+            _ if code == self.code => Step::Done,
+            _ if self.attempts.exhausted() => {
+                out.fault(Counter::Changed, 1, frame.id);
+                Step::Done
+            }
+            _ => Step::Set,
+        };
+    }
+}
+
+impl Inquiry for Rate {
+    fn begin(&mut self) {
+        self.step = Step::Stop;
+        self.attempts.begin();
+    }
+
+    fn poll(&mut self, now: Nanos) -> Ask {
+        self.sent = self.step;
+        Ask::Send(match self.step {
+            Step::Stop => send(self.id, command::STOP, 0),
+            Step::Set => send(self.id, command::SET_RATE, self.code),
+            Step::Get if now < self.attempts.next() => return Ask::Wait,
+            Step::Get if !self.attempts.exhausted() => {
+                self.attempts.ask(now);
+                send(self.id, command::GET_RATE, 0)
+            }
+            Step::Get | Step::Done => {
+                self.step = Step::Done;
+                return Ask::Done;
+            }
+        })
+    }
+
+    fn sent(&mut self, outcome: Result<Nanos, NotSent>) {
+        match self.sent {
+            Step::Stop | Step::Set if outcome.is_ok() => self.step = Step::Get,
+            Step::Get => self.attempts.sent(outcome),
+            _ => {}
+        }
+    }
+
+    fn wake(&self) -> Option<Nanos> {
+        Some(self.attempts.next())
+    }
+}
+
+/// The host's side of a sensor.
+#[derive(Debug)]
+pub(super) struct Rft {
+    ids: Ids,
+    divisors: [f64; 6],
+    pairing: Pairing<[u8; 8]>,
+}
+
+impl Rft {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        let ids = options.ids(spec)?;
+        let rate = Rate {
+            id: ids.command,
+            code: options.rate_code()?,
+            attempts: Attempts::new(Timing::USUAL),
+            step: Step::Stop,
+            sent: Step::Stop,
+        };
+        let mut bringup = Bringup::new(spec, spec.mode, Timing::USUAL, ids.first);
+        bringup.start_with(ids.command, send(ids.command, command::START, 0).data());
+        bringup.stop_with(ids.command, send(ids.command, command::STOP, 0).data());
+        let claims = [ids.first, ids.second].map(Claim::exclusive);
+        let this = Self {
+            ids,
+            divisors: options.model.divisors(),
+            pairing: Pairing::new(Limit::of_period(period(options.rate_hz)), true),
+        };
+        Ok(Supervised::boxed(claims, bringup, rate, this))
+    }
+
+    /// The reading of both frames' bytes.
+    fn wrench(&self, first: [u8; 8], second: [u8; 8]) -> (Wrench, Quality) {
+        let [_, fx, fx_low, fy, fy_low, fz, fz_low, tx] = first;
+        let [tx_low, ty, ty_low, tz, tz_low, overload, _, _] = second;
+        let mut values = self.divisors;
+        let mut quality = Quality::GOOD;
+        let counts = [
+            [fx, fx_low],
+            [fy, fy_low],
+            [fz, fz_low],
+            [tx, tx_low],
+            [ty, ty_low],
+            [tz, tz_low],
+        ];
+        for (axis, (value, count)) in (0..).zip(values.iter_mut().zip(counts)) {
+            *value = f64::from(i16::from_be_bytes(count)) / *value;
+            if overload >> (OVERLOAD_FX - axis) & 1 == 1 {
+                quality = wrench::overloaded(quality, axis, *value);
+            }
+        }
+        let [fx, fy, fz, tx, ty, tz] = values;
+        let (force, torque) = ([fx, fy, fz], [tx, ty, tz]);
+        (Wrench { force, torque }, quality)
+    }
+
+    fn give(
+        &self,
+        halves: [[u8; 8]; 2],
+        first: (Nanos, StampKind),
+        frame: &Frame,
+        link: &mut Link<Rate>,
+        out: &mut Decoded,
+    ) {
+        let [a, b] = halves;
+        let (wrench, mut quality) = self.wrench(a, b);
+        if quality.contains(Quality::SATURATED) {
+            out.fault(Counter::Saturated, 1, frame.id);
+        }
+        if link.bringup.reading(frame.t) {
+            quality |= Quality::GAP_BEFORE;
+        }
+        let (acquired, stamp) = first;
+        let output = Output {
+            acquired,
+            stamp,
+            ..Output::new(0, frame, quality, Reading::Wrench(wrench))
+        };
+        out.push(output, frame.id);
+    }
+}
+
+impl Family for Rft {
+    type Questions = Rate;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Rate>, out: &mut Decoded) {
+        let second = frame.id == self.ids.second;
+        if !second && frame.id != self.ids.first {
+            return;
+        }
+        let Some(data) = bytes::payload(frame, out) else {
+            return;
+        };
+        let Ok(half) = <[u8; 8]>::try_from(data) else {
+            return out.fault(Counter::Length, 1, frame.id);
+        };
+        let mut unpaired = 0;
+        let paired = self.pairing.push(second, frame, half, &mut unpaired);
+        if unpaired > 0 {
+            link.bringup.lost();
+            out.fault(Counter::Unpaired, unpaired, frame.id);
+        }
+        let Paired::With(acquired, stamp, first) = paired else {
+            return;
+        };
+        match first {
+            [command::START, ..] => {
+                self.give([first, half], (acquired, stamp), frame, link, out);
+            }
+            [command::GET_RATE, code, ..] if link.bringup.mode() == Mode::Supervise => {
+                link.questions.answer(code, frame, out);
+            }
+            // Answers to other questions are for other programs.
+            _ => {}
+        }
+    }
+
+    fn reset(&mut self) {
+        self.pairing.reset();
+    }
+}
