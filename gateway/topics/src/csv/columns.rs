@@ -50,7 +50,8 @@ const fn groups(kind: Kind) -> &'static [(Range<usize>, &'static str)] {
             (12..16, "qw qx qy qz"),
         ],
         Kind::Gauges => &[(0..6, "g0 to g5")],
-        Kind::Actuator => &[(0..4, "duty, mode, encoder, faults")],
+        // Many drives report no duty.
+        Kind::Actuator => &[(1..4, "mode, encoder, faults")],
     }
 }
 
@@ -208,7 +209,7 @@ pub(super) fn spread(value: &Value, cells: &mut Cells) {
 mod tests {
     use super::*;
     use crate::csv::{Columns, Reader, Row, Writer};
-    use crate::{Imu, JointState, Nanos, Temperature, Wrench};
+    use crate::{Actuator, Imu, JointState, Nanos, Temperature, Wrench};
     use std::vec;
     use std::vec::Vec;
 
@@ -266,6 +267,18 @@ mod tests {
                 ),
             ),
             (2, Value::Reading(Reading::Imu(imu), Quality::GOOD)),
+            (
+                0,
+                Value::Reading(
+                    Reading::Actuator(Actuator {
+                        duty: f64::NAN,
+                        mode: 3,
+                        encoder: 0,
+                        faults: 7,
+                    }),
+                    Quality::GOOD,
+                ),
+            ),
             (3, Value::Active(true)),
         ];
         let mut writer = Writer::new(Vec::new(), &series, Columns::All).unwrap();
