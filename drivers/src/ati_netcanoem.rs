@@ -11,8 +11,8 @@
 //! | 7 | empty | counts per unit of force, of torque (u32) |
 //! | 8 | empty | unit of force, of torque (u8) |
 //!
-//! - Wrench: axis i is the sum over j of matrix\[i\]\[j\] gauge\[j\], divided by the counts per unit
-//!   of force (i = 0 to 2) or torque (3 to 5).
+//! - Wrench: axis i is the sum over j of matrix\[i\]\[j\] gauge\[j\], divided by the counts per
+//!   unit of force (i = 0 to 2) or torque (3 to 5).
 //! - Units: force 1 lbf, 2 N, 3 klbf, 4 kN, 5 kgf, 6 gf; torque 1 lbf-in, 2 lbf-ft, 3 Nm, 4 Nmm,
 //!   5 kgf-cm, 6 kNm.
 //! - Status: bit 0 watchdog, 1 and 2 converters, 3 ground, 4 and 5 supply, 6 calibration, 7 memory,
@@ -22,15 +22,16 @@
 //!   SATURATED, without an axis.
 //!
 //! The driver asks for matrix, counts and units before it asks for readings, and refuses the sensor
-//! (`Refusal::NoCalibration`) as long as one is missing; a row of zeros, a number that is not finite
-//! and zero counts are refused by name. A reply that differs from an earlier one is refused too.
+//! (`Refusal::NoCalibration`) as long as one is missing; a row of zeros, a number that is not
+//! finite and zero counts are refused by name. A reply that differs from an earlier one is refused
+//! too.
 //!
 //! Both halves of a reading have identifiers of different priority: the second may leave the board
 //! after the first half of the next reading. Each half comes in the order of the requests, so they
 //! are paired first in, first out, and given once there are as many second halves as first ones.
 //! A lost half therefore costs up to four readings, and none is wrong, unless a first half is lost
-//! within four readings of a second one. The driver itself sends a request only after the replies to
-//! the last one, or 30 ms after a request that was not answered.
+//! within four readings of a second one. The driver itself sends a request only after the replies
+//! to the last one, or 30 ms after a request that was not answered.
 //!
 //! If another program polls the sensor (`listen_only`, or a recorded log), its requests tell which
 //! row of the matrix a reply holds. So a log of such a program's start decodes without any key.

@@ -1,7 +1,7 @@
 //! CANopen drives (CiA 402): position, velocity, torque and current of a motor.
 //!
-//! The address is the node, 1 to 127. The drive sends what its process data (TPDO 1 to 4) are mapped
-//! to; the driver asks for that mapping at start and changes nothing in it. Little-endian:
+//! The address is the node, 1 to 127. The drive sends what its process data (TPDO 1 to 4) are
+//! mapped to; the driver asks for that mapping at start and changes nothing in it. Little-endian:
 //!
 //! | object | meaning | |
 //! |---|---|---|
@@ -15,21 +15,21 @@
 //!
 //! At start the driver checks that the profile (object 1000) is 402, asks for identifier (1800 sub
 //! 1), transmission (sub 2) and mapping (1A00) of each TPDO, and for what the keys do not tell:
-//! counts per turn (608F: counts, turns), rated torque (6076, mNm) and rated current (6075, mA). Then
-//! it sets the node operational. It never enables or moves a motor, and at the gateway's end the node
-//! stays operational.
+//! counts per turn (608F: counts, turns), rated torque (6076, mNm) and rated current (6075, mA).
+//! Then it sets the node operational. It never enables or moves a motor, and at the gateway's end
+//! the node stays operational.
 //!
-//! - If the position is sent by SYNC (transmission 0 to 240), a reading holds the values of all TPDOs
-//!   that one SYNC has caused, and `acquired` is the time of that SYNC. An incomplete reading is
-//!   dropped, and the next one too: it may hold a late value of the one before.
+//! - If the position is sent by SYNC (transmission 0 to 240), a reading holds the values of all
+//!   TPDOs that one SYNC has caused, and `acquired` is the time of that SYNC. An incomplete reading
+//!   is dropped, and the next one too: it may hold a late value of the one before.
 //! - If the position is sent by events or a timer (254, 255), each makes a reading, with the last
 //!   values of the others if they are not older than `hold_ms`.
 //! - DRIVE_FAULT: the fault bit of the status word, or an emergency message; DEVICE_FAULT: an
 //!   emergency message about a sensor (73xx), which makes the position doubtful.
 //!
 //! A node that boots or leaves the operational state is started again. If another program commands
-//! the drive (`listen_only`, or a recorded log), the mapping is that of its answers to that program,
-//! or the key `pdos`.
+//! the drive (`listen_only`, or a recorded log), the mapping is that of its answers to that
+//! program, or the key `pdos`.
 //!
 //! Sources: CiA 301 4.2, CiA 402 4.0 (IEC 61800-7-201). Certain, but for the units of velocity and
 //! current, in which makers differ: hence the keys.
@@ -47,7 +47,7 @@
 //!     { number = 1, objects = [0x6041, 0x6064, 0x6077], sync = 1 },
 //!     { number = 2, objects = [0x606C, 0x6078], sync = 1 },   # sync = 0: by events or a timer
 //! ]
-//! # Only a simulated drive uses these; without `pdos` it sends status, position, mode and velocity.
+//! # Only a simulated drive uses these; without `pdos` it sends status, position, mode, velocity.
 //! period_ms = 10
 //! sync = 0
 //! ```

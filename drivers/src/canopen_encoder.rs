@@ -1,7 +1,8 @@
 //! CANopen encoders (CiA 406), absolute, single-turn or multi-turn.
 //!
-//! The address is the node, 1 to 127. The position comes in TPDO 1 (`180` + node): u32, little-endian,
-//! counts. It covers all turns of a multi-turn encoder, and begins anew at the end of its range.
+//! The address is the node, 1 to 127. The position comes in TPDO 1 (`180` + node): u32,
+//! little-endian, counts. It covers all turns of a multi-turn encoder, and begins anew at the end
+//! of its range.
 //!
 //! At start the driver sets the node pre-operational, checks that its profile (object 1000) is 406,
 //! asks for the counts per turn, maps object 6004 alone to TPDO 1, sets its timer or its SYNC, and
@@ -22,8 +23,8 @@
 //! again. While its last emergency message (EMCY) is an error, readings have DEVICE_FAULT.
 //!
 //! With `sync = n` the node sends after each n-th SYNC, and `acquired` is the time of that SYNC:
-//! the moment at which the encoder has measured. Something must send SYNC: `canopen_sync`, or another
-//! node.
+//! the moment at which the encoder has measured. Something must send SYNC: `canopen_sync`, or
+//! another node.
 //!
 //! If another program commands the node (`listen_only`, or a recorded log), the counts per turn are
 //! those of its answers to that program, or the key.

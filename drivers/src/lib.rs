@@ -32,9 +32,9 @@
 //! To add a family, write a module with a `Family` (see `family.rs`), a `Board`, and an `Options`
 //! type (its keys in gateway.toml, documented at the top of the module) that implements [`Driver`],
 //! and add its line to the list in `registry.rs`. Families share `bringup.rs` (starting a board),
-//! `configure.rs` (confirming its configuration), `pairing.rs` and `group.rs` (combining two frames,
-//! or more), `held.rs` (values of other instants), `bytes.rs` (the numbers of a payload), `wrench.rs`
-//! (force/torque sensors) and `keys.rs` (addresses and identifiers).
+//! `configure.rs` (confirming its configuration), `pairing.rs` and `group.rs` (combining two
+//! frames, or more), `held.rs` (values of other instants), `bytes.rs` (the numbers of a payload),
+//! `wrench.rs` (force/torque sensors) and `keys.rs` (addresses and identifiers).
 #![no_std]
 extern crate alloc;
 #[cfg(test)]

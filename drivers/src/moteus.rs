@@ -19,16 +19,16 @@
 //! | `30`, `31` | write or read error: register, code |
 //! | `50` | nothing: fills the frame up to a legal length |
 //!
-//! - Type: 0 i8, 4 i16, 8 i32, C f32. Count: the two low bits, 1 to 3 registers from this one on; 0:
-//!   the count follows as a varuint. Registers and codes are varuints.
+//! - Type: 0 i8, 4 i16, 8 i32, C f32. Count: the two low bits, 1 to 3 registers from this one on;
+//!   0: the count follows as a varuint. Registers and codes are varuints.
 //! - Registers: 0 mode, 1 position \[turn\], 2 velocity \[turn/s\], 3 torque \[Nm\], D voltage, E
-//!   temperature \[deg C\], F fault. One step is, as i8, i16, i32: position 0.01, 1e-4, 1e-5; velocity
-//!   0.1, 2.5e-4, 1e-5; torque 0.5, 0.01, 0.001; temperature 1, 0.1, 0.001. The lowest integer means
-//!   not a number.
-//! - Any type is read, so another program may ask (`listen_only`, or a recorded log). A reply without
-//!   the position is no reading of the joint.
-//! - Mode 1, fault: DRIVE_FAULT. Faults 35 (encoder), 36 (not configured), 42 (theta invalid) and 43
-//!   (position invalid) make the position doubtful: DEVICE_FAULT. They are the `faults` of the
+//!   temperature \[deg C\], F fault. One step is, as i8, i16, i32: position 0.01, 1e-4, 1e-5;
+//!   velocity 0.1, 2.5e-4, 1e-5; torque 0.5, 0.01, 0.001; temperature 1, 0.1, 0.001. The lowest
+//!   integer means not a number.
+//! - Any type is read, so another program may ask (`listen_only`, or a recorded log). A reply
+//!   without the position is no reading of the joint.
+//! - Mode 1, fault: DRIVE_FAULT. Faults 35 (encoder), 36 (not configured), 42 (theta invalid) and
+//!   43 (position invalid) make the position doubtful: DEVICE_FAULT. They are the `faults` of the
 //!   actuator reading, the mode is its `mode`.
 //!
 //! The driver never commands: it reads registers, and sends nothing at the end.

@@ -35,13 +35,14 @@
 //!   or for 0.1 s, and the first after that have ZERO_CHANGED.
 //!
 //! Sources: `optoforce_can.c` and `.h` (Felix Widmaier, for the BLMC boards of
-//! open-dynamic-robot-initiative), `OptoforceSensor.cpp` (RCPRG-ros-pkg/optoforce_can 06cff09e), `optoforce` 0.3.0 on PyPI, whose
-//! tests hold a recording of the unit's serial interface: packets are the same there. Certain: the
-//! packet. Highly probable: the configuration (the first source has its checksum in the other
-//! order; the other two, one of them tested, agree with this page). Probable: the answer, which
-//! was recorded on the serial interface. Open: whether the configuration's second frame has one
-//! byte (first source) or is filled with zeros (second source), therefore `fill` is a key. Packets
-//! of other sensors (22 bytes with six axes, 34 with four sensors) are not read.
+//! open-dynamic-robot-initiative), `OptoforceSensor.cpp` (RCPRG-ros-pkg/optoforce_can 06cff09e),
+//! `optoforce` 0.3.0 on PyPI, whose tests hold a recording of the unit's serial interface: packets
+//! are the same there. Certain: the packet. Highly probable: the configuration (the first source
+//! has its checksum in the other order; the other two, one of them tested, agree with this page).
+//! Probable: the answer, which was recorded on the serial interface. Open: whether the
+//! configuration's second frame has one byte (first source) or is filled with zeros (second
+//! source), therefore `fill` is a key. Packets of other sensors (22 bytes with six axes, 34 with
+//! four sensors) are not read.
 //!
 //! # Keys
 //! ```toml

@@ -77,7 +77,8 @@ pub fn seconds_on_wire(frame: &Frame, rates: BitRates) -> f64 {
     }
 }
 
-/// A device: its driver with its keys, its settings, and the numbers and kinds of its outputs in use.
+/// A device: its driver with its keys, its settings, and the numbers and kinds of its outputs in
+/// use.
 #[derive(Debug, Clone, Copy)]
 pub struct Member<'p> {
     /// The driver with its keys.

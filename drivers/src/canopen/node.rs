@@ -1,6 +1,8 @@
 //! A node's own side: its object dictionary, NMT state and SDO server.
 
-use super::{NMT, Object, SYNC, TPDO_OFF, emcy, heartbeat, nmt, object, sdo_from, sdo_to};
+use super::protocol::{
+    NMT, Object, SYNC, TPDO_OFF, emcy, heartbeat, nmt, object, sdo_from, sdo_to,
+};
 use crate::bytes::{u16_le, u32_le};
 use crate::{Format, Frame, Frames, Id};
 use alloc::collections::BTreeMap;

@@ -1,6 +1,6 @@
 //! The start of a node: a list of SDO transfers, one at a time, each repeated until it is answered.
 
-use super::{NMT, Object, sdo_to};
+use super::protocol::{NMT, Object, TIMING, sdo_to};
 use crate::bringup::{Ask, Attempts, Inquiry};
 use crate::bytes::{u16_le, u32_le};
 use crate::{Decoded, Frame, Mode, NotSent};
@@ -29,8 +29,8 @@ pub(crate) trait Plan: Send {
     /// The number of steps.
     fn steps(&self) -> usize;
 
-    /// Takes the value that was read, or that the node has written (`None`); or why the node refuses
-    /// the step: the abort code. In [`Mode::Listen`], what it answers to another program.
+    /// Takes the value that was read, or that the node has written (`None`); or why the node
+    /// refuses the step: the abort code. In [`Mode::Listen`], what it answers to another program.
     ///
     /// # Errors
     /// Why the node cannot be used.
@@ -76,7 +76,7 @@ impl<P: Plan> Script<P> {
             plan,
             at: 0,
             told: false,
-            attempts: Attempts::new(super::TIMING),
+            attempts: Attempts::new(TIMING),
             refusal: None,
         }
     }

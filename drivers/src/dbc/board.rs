@@ -32,8 +32,8 @@ impl DbcBoard {
     /// A device after power-on.
     ///
     /// # Errors
-    /// [`SpecError::Description`]: keys and file do not fit each other; [`SpecError::Key`] for a period outside 1 to
-    /// 60000 ms.
+    /// [`SpecError::Description`]: keys and file do not fit each other; [`SpecError::Key`] for a
+    /// period outside 1 to 60000 ms.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let layout = Layout::new(spec, options)?;
         if !(1..=60_000).contains(&options.period_ms) {

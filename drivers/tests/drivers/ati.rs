@@ -529,7 +529,8 @@ proptest! {
     fn wrenches_are_read_back(load in proptest::array::uniform6(-300.0_f64..300.0)) {
         let [fx, fy, fz, tx, ty, tz] = load;
         let load = [fx, fy, fz, tx / 10.0, ty / 10.0, tz / 10.0];
-        let frames = encode(&mut *board("ati_netcanoem", KEYS, &[]), 0, &wrench(load), Quality::GOOD);
+        let mut sensor = board("ati_netcanoem", KEYS, &[]);
+        let frames = encode(&mut *sensor, 0, &wrench(load), Quality::GOOD);
         let (readings, faults) = decode_keys(&frames);
         let steps = [0.01, 0.01, 0.01, 0.001, 0.001, 0.001];
         let clamped = load.iter().zip(steps).any(|(x, lsb)| (x / lsb).abs() >= 32766.5);

@@ -301,8 +301,8 @@ fn an_encoder_can_measure_by_sync() {
     }
 }
 
-/// Which SYNC is whose: frames by their stamps \[ms\], an answer by its number, a SYNC by 0; and the
-/// stamps of the readings.
+/// Which SYNC is whose: frames by their stamps \[ms\], an answer by its number, a SYNC by 0; and
+/// the stamps of the readings.
 #[test]
 fn a_late_answer_does_not_get_the_stamp_of_a_later_sync() {
     type Case = (&'static [(f64, u8)], &'static [(u32, f64)], u32);
@@ -998,7 +998,8 @@ proptest! {
                     pdos = [{ number = 1, objects = [0x6041, 0x6064, 0x6077], sync = 1 }, \
                     { number = 2, objects = [0x606C, 0x6078], sync = 1 }]";
         let quality = if faulty { Quality::DRIVE_FAULT } else { Quality::GOOD };
-        let frames = encode(&mut *board("canopen_drive", keys, &[0]), 0, &Reading::Joint(state), quality);
+        let mut drive = board("canopen_drive", keys, &[0]);
+        let frames = encode(&mut *drive, 0, &Reading::Joint(state), quality);
         let (readings, _) = decode(&mut *listener("canopen_drive", keys, &[0]), &frames);
         let read = joints(&readings);
         let back = joint(&read[0].reading);
@@ -1015,7 +1016,8 @@ proptest! {
         let sent = Reading::Joint(JointState { position: turns * TAU, ..JointState::ABSENT });
         let keys = "counts_per_turn = 8192";
         let quality = if faulty { Quality::DEVICE_FAULT } else { Quality::GOOD };
-        let mut node = options("canopen_encoder", keys).board(&spec(1, Mode::Listen, &[0])).unwrap();
+        let started = spec(1, Mode::Listen, &[0]);
+        let mut node = options("canopen_encoder", keys).board(&started).unwrap();
         let frames = encode(&mut *node, 0, &sent, quality);
         let (readings, _) = decode(&mut *listener("canopen_encoder", keys, &[0]), &frames);
         let back = joint(&readings[0].reading).position;

@@ -332,7 +332,8 @@ proptest! {
     ) {
         let state = JointState { position, velocity, torque, ..JointState::ABSENT };
         let quality = if faulty { Quality::DRIVE_FAULT } else { Quality::GOOD };
-        let frames = encode(&mut *board("moteus", "host = 9", &[0]), 0, &Reading::Joint(state), quality);
+        let mut node = board("moteus", "host = 9", &[0]);
+        let frames = encode(&mut *node, 0, &Reading::Joint(state), quality);
         let (readings, _) = decode(&mut *listener("moteus", "host = 9", &[0]), &frames);
         let back = readings.last().unwrap();
         prop_assert_eq!(back.quality.contains(Quality::DRIVE_FAULT), faulty);
