@@ -104,7 +104,8 @@ impl Cycle {
             0 => Some(own),
             1 => {
                 self.open = 0;
-                Some(last)
+                // The host may have noted its own SYNC late.
+                Some(if is_late { own } else { last })
             }
             _ => {
                 self.open -= 1;

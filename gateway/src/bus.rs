@@ -238,8 +238,10 @@ impl<S: Sink> Bus<S> {
             return;
         }
         while let Some(waiting) = self.queue.waiting.front() {
+            // Before the call: within it a receiver may be woken and take the processor.
+            let then = clock.now();
             let outcome = match self.link.send(&waiting.frame) {
-                Ok(()) => Ok(clock.now()),
+                Ok(()) => Ok(then),
                 Err(SendError::Full) => {
                     self.status.queue_full.fetch_add(1, Relaxed);
                     self.queue.retry = now + RETRY;

@@ -360,6 +360,12 @@ fn a_late_answer_does_not_get_the_stamp_of_a_later_sync() {
             &[(3, 30.0)],
             2,
         ),
+        // The host has noted its SYNC after the answer's stamp.
+        (
+            &[(10.0, 0), (9.9, 1), (20.0, 0), (20.5, 2)],
+            &[(1, 9.9), (2, 20.0)],
+            0,
+        ),
         // A SYNC that was not heard: its own stamp.
         (
             &[(10.0, 0), (10.5, 1), (20.5, 2)],
