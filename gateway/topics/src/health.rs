@@ -656,11 +656,21 @@ mod tests {
     #[test]
     fn a_refusal_is_found_by_its_number() {
         let scales = (0..6).map(|channel| Refusal::ZeroFullScale { channel });
-        let refusals = [Refusal::NoFullScale, Refusal::Changed];
-        for refusal in refusals.into_iter().chain(scales) {
+        let calibrations = (0..6).map(|channel| Refusal::BadCalibration { channel });
+        let refusals = [
+            Refusal::NoFullScale,
+            Refusal::Changed,
+            Refusal::NoCalibration,
+            Refusal::NoAnswer,
+            Refusal::NotMapped,
+            Refusal::OtherDevice { profile: 0 },
+            Refusal::OtherDevice { profile: 0xFFFF },
+            Refusal::Rejected { object: 0x608F },
+        ];
+        for refusal in refusals.into_iter().chain(scales).chain(calibrations) {
             assert_eq!(Refusal::from_code(refusal.code()), Some(refusal));
         }
-        for none in [0, 3, 0xFF, 0x200, u32::MAX] {
+        for none in [0, 6, 0xFF, 0x300, 0xFFFF, 0x3_0000, u32::MAX] {
             assert_eq!(Refusal::from_code(none), None, "{none}");
         }
     }

@@ -214,6 +214,35 @@ mod tests {
     use std::vec::Vec;
 
     #[test]
+    fn a_drive_may_report_no_duty() {
+        let series = Series {
+            what: What::Channel(Kind::Joint),
+            name: "elbow".into(),
+        };
+        let told = |values: [f64; 4]| {
+            let mut cells = Cells::EMPTY;
+            cells.values[Kind::Actuator as usize][..4].copy_from_slice(&values);
+            let mut readings = Vec::new();
+            let result = items_of(&series, &cells, |value| readings.push(value));
+            (result.is_ok(), readings)
+        };
+        let (good, readings) = told([f64::NAN, 3.0, 0.0, 7.0]);
+        let [
+            Value::Reading(
+                Reading::Actuator(Actuator {
+                    mode, faults, duty, ..
+                }),
+                _,
+            ),
+        ] = &readings[..]
+        else {
+            panic!("{readings:?}")
+        };
+        assert!(good && duty.is_nan() && (*mode, *faults) == (3, 7));
+        assert!(!told([0.5, 3.0, f64::NAN, 7.0]).0);
+    }
+
+    #[test]
     fn what_is_written_is_read_back_bit_for_bit() {
         let series = [
             Series {
@@ -267,18 +296,6 @@ mod tests {
                 ),
             ),
             (2, Value::Reading(Reading::Imu(imu), Quality::GOOD)),
-            (
-                0,
-                Value::Reading(
-                    Reading::Actuator(Actuator {
-                        duty: f64::NAN,
-                        mode: 3,
-                        encoder: 0,
-                        faults: 7,
-                    }),
-                    Quality::GOOD,
-                ),
-            ),
             (3, Value::Active(true)),
         ];
         let mut writer = Writer::new(Vec::new(), &series, Columns::All).unwrap();
