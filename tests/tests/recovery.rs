@@ -8,14 +8,18 @@
 //! instants. Start-up kills are drawn from the first `PROPRIO_STARTUP_MS` (default 15).
 #![allow(missing_docs)]
 
-use proprio_tests::watch::{Newest, open, valid_since};
+use proprio_tests::watch::{Newest, all_valid, open, valid_since};
 use proprio_tests::{Arm, PATIENCE, Process, Rig, now, until};
-use proprio_topics::ipc::{Topic, Writer};
+use proprio_topics::ipc::{Reader, Topic, Writer};
 use proprio_topics::{
     Description, Entry, EstimatorHealth, Header, JointState, Kind, Name, Nanos, Publisher, Reading,
     Role, Sample, TorqueEstimate, Wrench,
 };
+use std::collections::BTreeMap;
 use std::time::Duration;
+
+/// A recovery that took longer is told in detail.
+const SLOW: Nanos = Nanos::from_millis(1000);
 
 fn setting(name: &str, default: u64) -> u64 {
     std::env::var(name).map_or(default, |v| {
@@ -40,6 +44,31 @@ fn settled_segments(rig: &Rig) -> usize {
 
 fn sleep(random: &mut fastrand::Rng, most: Duration) {
     std::thread::sleep(most.mul_f64(random.f64()));
+}
+
+/// Waits until every torque is valid again after `since`; returns whether it is, and what came
+/// meanwhile, in words: how many estimates were withheld and why, and the longest time for which
+/// this process itself was not scheduled.
+fn recovery(torques: &mut Reader<TorqueEstimate>, since: Nanos) -> (bool, String) {
+    let (mut withheld, mut paused, mut last) = (BTreeMap::new(), Nanos::ZERO, now());
+    let recovered = until(PATIENCE, || {
+        let turn = now();
+        paused = paused.max(turn - std::mem::replace(&mut last, turn));
+        while let Some(estimate) = torques.try_take().expect("shared memory can be read") {
+            if estimate.header.acquired <= since {
+                continue;
+            }
+            if all_valid(&estimate) {
+                return Some(());
+            }
+            let invalid = estimate.joints().iter().find(|joint| joint.valid != 1);
+            let why = invalid.map(|joint| format!("{:?}, channel {}", joint.reason, joint.cause));
+            *withheld.entry(why.unwrap_or_default()).or_insert(0) += 1;
+        }
+        None
+    });
+    let story = format!("withheld: {withheld:?}; this process paused for {paused} s at most");
+    (recovered.is_some(), story)
 }
 
 #[test]
@@ -86,13 +115,20 @@ fn the_chain_recovers_from_kills_at_any_instant() {
         processes[victim].kill();
         let restarted = now();
         processes[victim] = start(victim);
-        let valid = valid_since(&mut torques, restarted, PATIENCE);
-        let what = ["gateway", "estimator"][victim];
-        assert!(
-            valid.is_some(),
-            "kill {kill} of the {what} (start-up: {at_startup}): no recovery"
-        );
-        times.push((now() - restarted, victim, at_startup));
+        let (recovered, story) = recovery(&mut torques, restarted);
+        let (what, after) = (["gateway", "estimator"][victim], now() - restarted);
+        let story = || {
+            let [gateway, estimator] = processes.each_ref().map(Process::log);
+            format!(
+                "kill {kill} of the {what} (start-up: {at_startup}), {after} s: {story}\n\
+                 gateway:\n{gateway}\nestimator:\n{estimator}"
+            )
+        };
+        assert!(recovered, "no recovery: {}", story());
+        if after > SLOW {
+            println!("{}", story());
+        }
+        times.push((after, victim, at_startup));
         processes
             .iter_mut()
             .chain([&mut simulator])
