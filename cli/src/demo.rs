@@ -75,7 +75,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         .prefix("proprio-")
         .tempdir()
         .context("cannot create a temporary folder")?;
-    let domain = DomainConfig::new(private.path(), &format!("demo-{}", std::process::id()));
+    // In memory: on a disk, processes start when it has time for them.
+    let shared = tempfile::Builder::new()
+        .prefix("proprio-")
+        .tempdir_in("/dev/shm")
+        .context("cannot create a folder in shared memory")?;
+    let domain = DomainConfig::new(shared.path(), &format!("demo-{}", std::process::id()));
     let folder = private.path().join("robot");
     copy_robot(&original, &args.bus, &folder)?;
     let robot = Robot::load(&folder)?;

@@ -3,6 +3,7 @@
 use anyhow::bail;
 use nix::sys::resource::{Resource, getrlimit};
 use nix::sys::socket::{AddressFamily, SockFlag, SockType};
+use nix::sys::statfs::{FsType, TMPFS_MAGIC, statfs};
 use proprio_drivers::{Frame, Id};
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::link::interface::{Interfaces as _, Netlink};
@@ -13,6 +14,9 @@ use proprio_topics::{Controller, InterfaceHealth, Nanos};
 use serde_json::json;
 use std::fmt::Write as _;
 use std::fs;
+
+/// Of a file system in memory that cannot be swapped (linux/magic.h).
+const RAMFS_MAGIC: FsType = FsType(0x8584_58f6);
 
 /// `proprio doctor`.
 #[derive(clap::Args)]
@@ -302,7 +306,20 @@ fn shared_memory(domain: &DomainConfig) -> Finding {
     };
     let opened = Domain::open(&probe).map(drop);
     let _ = Domain::remove_if_unused(&probe);
+    let in_memory = statfs(&probe.base)
+        .is_ok_and(|system| [TMPFS_MAGIC, RAMFS_MAGIC].contains(&system.filesystem_type()));
     match opened {
+        Ok(()) if !in_memory => finding(
+            "shared memory",
+            Verdict::Lacking,
+            format!(
+                "a domain opens, but its folder {} is on a disk: starts and restarts wait for the \
+                 disk, for seconds if others write to it",
+                probe.base.display()
+            ),
+            "set PROPRIO_RUNTIME_DIR to a folder in memory, the same for all programs: \
+             /dev/shm/proprio",
+        ),
         Ok(()) => finding(
             "shared memory",
             Verdict::Ok,

@@ -48,6 +48,8 @@ pub fn until<R>(limit: Nanos, mut ask: impl FnMut() -> Option<R>) -> Option<R> {
 /// A folder and a shared-memory domain for one test.
 pub struct Rig {
     folder: tempfile::TempDir,
+    // In memory, as on a robot: on a disk, a start waits while others write.
+    _shared: tempfile::TempDir,
     /// The domain of all processes started here.
     pub domain: DomainConfig,
     prefix: OnceCell<String>,
@@ -71,9 +73,14 @@ impl Rig {
             .prefix("proprio-")
             .tempdir()
             .expect("a temporary folder");
-        let domain = DomainConfig::new(folder.path().join("domain"), "test");
+        let shared = tempfile::Builder::new()
+            .prefix("proprio-test-")
+            .tempdir_in("/dev/shm")
+            .expect("a folder in shared memory");
+        let domain = DomainConfig::new(shared.path(), "test");
         Self {
             folder,
+            _shared: shared,
             domain,
             prefix: OnceCell::new(),
             starts: Cell::new(0),

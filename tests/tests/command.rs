@@ -1,6 +1,7 @@
 //! The `proprio` command from the user's side: help, exit codes, one clear message per error,
 //! output files that are complete or absent, and the demonstration.
 
+use nix::sys::statfs::{TMPFS_MAGIC, statfs};
 use proprio_dynamics::model::Model;
 use proprio_gateway::offline;
 use proprio_simulator::record::record;
@@ -1041,6 +1042,17 @@ fn the_doctor_looks_at_everything() {
     assert_eq!(can["verdict"] == "ok", has_can(), "{can}");
     let words = place.run(&["doctor"]).good().out;
     assert!(checks.iter().all(|c| words.contains(c)), "{words}");
+    // The folder of a domain belongs in memory.
+    let verdict = |base: &Path| {
+        let mut command = place.command(&["doctor", "--json"]);
+        command.env("PROPRIO_RUNTIME_DIR", base);
+        let told = finish(command, b"", "doctor").good().json();
+        let mut of_memory = told.as_array().unwrap().iter();
+        of_memory.find(|f| f["check"] == "shared memory").unwrap()["verdict"].clone()
+    };
+    assert_eq!(verdict(&place.rig.domain.base), "ok");
+    let on_disk = statfs(&place.path("")).unwrap().filesystem_type() != TMPFS_MAGIC;
+    assert_eq!(verdict(&place.path("folder")) == "lacking", on_disk);
     // Without shared memory nothing runs: this is a failure.
     let mut command = place.command(&["doctor"]);
     command.env("PROPRIO_RUNTIME_DIR", "/proc/nowhere");
@@ -1414,7 +1426,6 @@ fn what_is_no_log_at_all_is_told_and_leaves_no_file() {
     let names = |place: &Place| {
         let mut names = place.names();
         names.remove("tmp");
-        names.remove("domain");
         names
     };
     let there = names(&place);

@@ -179,10 +179,9 @@ fn the_chain_recovers_from_kills_at_any_instant() {
         at(0.99),
         at(1.0)
     );
-    // The requirement is one second; on a machine that is busy with other tests the worst case may
-    // take longer.
-    assert!(at(0.5) < 1.0, "median {} s", at(0.5));
-    assert!(at(1.0) < 5.0, "at worst {} s", at(1.0));
+    // The requirement, kept on a machine that is busy with other tests too: sixteen processes that
+    // compete for two processors leave half of it.
+    assert!(at(1.0) < 1.0, "at worst {} s", at(1.0));
 
     drop((torques, health, domain));
     let [gateway, estimator] = &mut processes;

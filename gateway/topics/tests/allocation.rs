@@ -45,7 +45,7 @@ fn counted(run: impl FnOnce()) -> (usize, usize) {
 
 #[test]
 fn only_iceoryx2s_loan_allocates() {
-    let base = tempfile::tempdir().unwrap();
+    let base = tempfile::tempdir_in("/dev/shm").unwrap();
     let domain = Domain::open(&DomainConfig::new(base.path(), "test")).unwrap();
     assert_ne!(
         counted(|| drop(std::hint::black_box(vec![0_u8; 8]))).0,

@@ -129,7 +129,7 @@ fn kill(mut child: Child) {
 /// Another gateway that starts at once hides neither.
 #[test]
 fn a_watch_tells_a_killed_gateway_from_one_that_has_left() {
-    let base = tempfile::tempdir().unwrap();
+    let base = tempfile::tempdir_in("/dev/shm").unwrap();
     let config = DomainConfig::new(base.path(), "test");
     let domain = Domain::open(&config).unwrap();
     let mut watch = Watch::<GatewayHealth>::default();
@@ -214,7 +214,7 @@ fn summary(what: &str, times: &mut [Nanos]) {
 
 #[test]
 fn a_reader_outlives_its_writer_and_a_restarted_one_is_not_refused() {
-    let base = tempfile::tempdir().unwrap();
+    let base = tempfile::tempdir_in("/dev/shm").unwrap();
     let config = DomainConfig::new(base.path(), "test");
     let domain = Domain::open(&config).unwrap();
     let prefix = prefix(&config);
@@ -297,7 +297,7 @@ fn sweep_start(role: &str, kills: u32, config: &DomainConfig, mut work: impl FnM
 
 #[test]
 fn a_writer_killed_anywhere_in_its_start_hinders_nobody() {
-    let base = tempfile::tempdir().unwrap();
+    let base = tempfile::tempdir_in("/dev/shm").unwrap();
     let config = DomainConfig::new(base.path(), "test");
     let domain = Domain::open(&config).unwrap();
     let prefix = prefix(&config);
@@ -332,7 +332,7 @@ fn a_writer_killed_anywhere_in_its_start_hinders_nobody() {
 
 #[test]
 fn a_reader_killed_anywhere_in_its_start_hinders_nobody() {
-    let base = tempfile::tempdir().unwrap();
+    let base = tempfile::tempdir_in("/dev/shm").unwrap();
     let config = DomainConfig::new(base.path(), "test");
     let domain = Domain::open(&config).unwrap();
     let prefix = prefix(&config);
@@ -351,7 +351,7 @@ fn a_reader_killed_anywhere_in_its_start_hinders_nobody() {
 /// too.
 #[test]
 fn a_lonely_process_killed_in_its_start_or_end_hinders_nobody() {
-    let base = tempfile::tempdir().unwrap();
+    let base = tempfile::tempdir_in("/dev/shm").unwrap();
     let config = DomainConfig::new(base.path(), "test");
     let mut first = spawn("writer", &config);
     await_ready(&mut first, || ());
@@ -381,7 +381,7 @@ fn a_lonely_process_killed_in_its_start_or_end_hinders_nobody() {
 
 #[test]
 fn a_writer_killed_in_its_end_hinders_nobody() {
-    let base = tempfile::tempdir().unwrap();
+    let base = tempfile::tempdir_in("/dev/shm").unwrap();
     let config = DomainConfig::new(base.path(), "test");
     let domain = Domain::open(&config).unwrap();
     let prefix = prefix(&config);
@@ -414,7 +414,7 @@ fn a_writer_killed_in_its_end_hinders_nobody() {
 /// hang for ever.
 #[test]
 fn what_is_half_made_is_removed_while_others_work() {
-    let base = tempfile::tempdir().unwrap();
+    let base = tempfile::tempdir_in("/dev/shm").unwrap();
     let config = DomainConfig::new(base.path(), "test");
     let domain = Domain::open(&config).unwrap();
     let prefix = prefix(&config);
@@ -516,7 +516,7 @@ fn what_is_half_made_is_removed_while_others_work() {
 /// freeing the port's place in its service.
 #[test]
 fn a_place_is_freed_although_who_was_freeing_it_died() {
-    let base = tempfile::tempdir().unwrap();
+    let base = tempfile::tempdir_in("/dev/shm").unwrap();
     let config = DomainConfig::new(base.path(), "test");
     let domain = Domain::open(&config).unwrap();
     let prefix = prefix(&config);
@@ -564,7 +564,7 @@ fn a_place_is_freed_although_who_was_freeing_it_died() {
 
 #[test]
 fn a_domain_in_use_is_not_removed() {
-    let base = tempfile::tempdir().unwrap();
+    let base = tempfile::tempdir_in("/dev/shm").unwrap();
     let config = DomainConfig::new(base.path(), "test");
     assert!(
         Domain::remove_if_unused(&config).unwrap(),

@@ -29,7 +29,7 @@ fn soon<R>(mut attempt: impl FnMut() -> Option<R>) -> R {
 
 #[test]
 fn a_connection_that_failed_is_made_later() {
-    let base = tempfile::tempdir().unwrap();
+    let base = tempfile::tempdir_in("/dev/shm").unwrap();
     let domain = Domain::open(&DomainConfig::new(base.path(), "test")).unwrap();
     let health = EstimatorHealth::default();
     let create = || Writer::<EstimatorHealth>::create(&domain, "icub", 1).unwrap();

@@ -21,7 +21,7 @@ use std::time::Duration;
 use zerocopy::FromBytes;
 
 fn place() -> (tempfile::TempDir, DomainConfig) {
-    let base = tempfile::tempdir().unwrap();
+    let base = tempfile::tempdir_in("/dev/shm").unwrap();
     let config = DomainConfig::new(base.path(), "test");
     (base, config)
 }

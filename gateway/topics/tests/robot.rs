@@ -21,7 +21,7 @@ const PATIENCE: Nanos = Nanos::from_millis(20_000);
 const MAX_AGE: Nanos = Nanos::from_millis(50);
 
 fn place() -> (tempfile::TempDir, DomainConfig) {
-    let base = tempfile::tempdir().unwrap();
+    let base = tempfile::tempdir_in("/dev/shm").unwrap();
     let config = DomainConfig::new(base.path(), "test");
     (base, config)
 }

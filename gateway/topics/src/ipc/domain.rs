@@ -43,7 +43,8 @@ impl DomainConfig {
     ///
     /// Name: `PROPRIO_DOMAIN`, else `default`. Base: `PROPRIO_RUNTIME_DIR`; else `/run/proprio` if
     /// it is writable (or can be created), or if it already holds a domain of this name; else
-    /// `$XDG_RUNTIME_DIR/proprio`; else `/tmp/proprio-<uid>`.
+    /// `$XDG_RUNTIME_DIR/proprio`; else `/dev/shm/proprio-<uid>`. These are in memory on most
+    /// machines: in a directory on a disk, a start waits as long as the disk does.
     #[must_use]
     pub fn from_env() -> Self {
         let set = |key| std::env::var_os(key).filter(|v| !v.is_empty());
@@ -65,7 +66,7 @@ impl DomainConfig {
                 }
                 match set("XDG_RUNTIME_DIR") {
                     Some(dir) => PathBuf::from(dir).join("proprio"),
-                    None => PathBuf::from(format!("/tmp/proprio-{}", geteuid())),
+                    None => PathBuf::from(format!("{SHM}/proprio-{}", geteuid())),
                 }
             });
         Self { base, name }
@@ -105,9 +106,9 @@ impl DomainConfig {
         for path in [&root, &lock] {
             owned_by_us(path)?;
         }
-        // /tmp is writable by everybody: a directory that another user has created there is not
+        // These are writable by everybody: a directory that another user has created there is not
         // trusted.
-        if self.base.starts_with("/tmp") && base.mode() & 0o1000 == 0 {
+        if ["/tmp", SHM].iter().any(|all| self.base.starts_with(all)) && base.mode() & 0o1000 == 0 {
             owned_by_us(&self.base)?;
         }
         access(&self.base, AccessFlags::W_OK | AccessFlags::X_OK)

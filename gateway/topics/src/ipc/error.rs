@@ -47,6 +47,14 @@ pub(super) fn transport(word: impl fmt::Display) -> String {
     format!("{cause} (iceoryx2: {word})")
 }
 
+/// A process in words; 0 is one that is not known.
+fn process(number: u32) -> String {
+    match number {
+        0 => String::from("another process"),
+        number => format!("process {number}"),
+    }
+}
+
 /// Why a domain cannot be used.
 #[derive(Debug, Error)]
 #[non_exhaustive]
@@ -116,13 +124,13 @@ pub enum DomainError {
     },
     /// Another process holds the domain's lock for too long.
     #[error(
-        "shared-memory domain: process {holder} does not release the lock {}; is it stopped?",
-        path.display()
+        "shared-memory domain: {} does not release the lock {}; is it stopped?",
+        process(*holder), path.display()
     )]
     Busy {
         /// The lock file.
         path: PathBuf,
-        /// The process that wrote its number there; 0 if it is not known.
+        /// The process that holds it; 0 if it is not known.
         holder: u32,
     },
     /// iceoryx2 could not do its part.

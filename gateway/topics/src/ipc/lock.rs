@@ -3,10 +3,8 @@
 
 use super::DomainError;
 use std::fs::{File, OpenOptions, TryLockError};
-use std::io::{Read, Seek, Write};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
-use std::string::ToString;
 use std::time::Duration;
 
 /// How long to wait for the lock, about five seconds: a hundred times the duration of a creation
@@ -42,7 +40,7 @@ impl Lock {
             }
         };
         loop {
-            let mut file = OpenOptions::new()
+            let file = OpenOptions::new()
                 .read(true)
                 .write(true)
                 .create(true)
@@ -60,7 +58,7 @@ impl Lock {
                     Err(TryLockError::WouldBlock) => {
                         return Err(DomainError::Busy {
                             path: path.to_path_buf(),
-                            holder: holder(&mut file),
+                            holder: holder(&file),
                         });
                     }
                     Err(TryLockError::Error(e)) if e.kind() == std::io::ErrorKind::Interrupted => {}
@@ -72,10 +70,6 @@ impl Lock {
             let ours = file.metadata().map_err(io("cannot examine lock file"))?;
             if std::fs::metadata(path).is_ok_and(|m| m.ino() == ours.ino() && m.dev() == ours.dev())
             {
-                // Only for the error message of a process that waits too long.
-                let _ = file
-                    .set_len(0)
-                    .and_then(|()| file.write_all(std::process::id().to_string().as_bytes()));
                 return Ok(Self {
                     path: path.to_path_buf(),
                     _file: file,
@@ -90,15 +84,40 @@ impl Lock {
     }
 }
 
-fn holder(file: &mut File) -> u32 {
-    let mut text = [0; 16];
-    let read = file
-        .rewind()
-        .and_then(|()| file.read(&mut text))
-        .unwrap_or(0);
-    let text = text.get(..read).unwrap_or_default();
-    core::str::from_utf8(text)
-        .ok()
-        .and_then(|t| t.trim().parse().ok())
-        .unwrap_or(0)
+/// The process that holds the lock of `file`, from the kernel's list; 0 if it is not in it.
+///
+/// Nothing is written to the file for this: on a disk that others write to, a write can wait for
+/// seconds.
+fn holder(file: &File) -> u32 {
+    let locks = std::fs::read_to_string("/proc/locks").unwrap_or_default();
+    let inode = file.metadata().map_or(0, |meta| meta.ino());
+    let of_file = |line: &&str| line.split_whitespace().nth(1) == Some("FLOCK");
+    // 1: FLOCK  ADVISORY  WRITE 15653 fe:00:5489643 0 EOF
+    let held = locks.lines().filter(of_file).find_map(|line| {
+        let mut words = line.split_whitespace().skip(4);
+        let (process, place) = (words.next()?, words.next()?);
+        let (_, number) = place.rsplit_once(':')?;
+        (number.parse() == Ok(inode)).then(|| process.parse().ok())?
+    });
+    held.unwrap_or(0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_holder_of_a_lock_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("test.lock");
+        let lock = Lock::take(&path).unwrap();
+        match Lock::try_take(&path) {
+            Err(DomainError::Busy { holder, .. }) => assert_eq!(holder, std::process::id()),
+            other => panic!("{other:?}"),
+        }
+        drop(lock);
+        Lock::try_take(&path).unwrap();
+        assert_eq!(holder(&File::open(&path).unwrap()), 0);
+        assert_eq!(path.metadata().unwrap().len(), 0, "nothing is written");
+    }
 }
