@@ -41,8 +41,9 @@ impl Sample {
         quality: Quality::GOOD,
     };
 
-    /// With what `data` of a message with `quantity` holds; `None` if a value is none.
-    fn with(mut self, plan: &Plan, quantity: Quantity, data: &[u8; 8]) -> Option<Self> {
+    /// What `data` of a message with `quantity` holds; `None` if a value is none.
+    fn of(plan: &Plan, quantity: Quantity, data: &[u8; 8]) -> Option<Self> {
+        let mut this = Self::EMPTY;
         let merits = data[6];
         let is_wrong = |bit: &u8| merits >> bit & 3 == merit::ERROR;
         let counts = [0, 2, 4].map(|at| u32::from(bytes::u16_le(data, at)));
@@ -50,17 +51,17 @@ impl Sample {
         match quantity {
             Quantity::Orientation => {
                 let angle = |at| ANGLE.value(bytes::u32_le(data, at) & 0xFF_FFFF);
-                self.imu.orientation = quaternion(angle(0)?, angle(3)?);
+                this.imu.orientation = quaternion(angle(0)?, angle(3)?);
                 wrong = merit::OF_ANGLES.iter().any(is_wrong);
             }
             Quantity::Acceleration => {
                 let values = all(counts.map(|count| ACCELERATION.value(count)))?;
-                self.imu.proper_acceleration = plan.upright.turn(plan.axes.exchange(values));
+                this.imu.proper_acceleration = plan.upright.turn(plan.axes.exchange(values));
                 wrong = merit::OF_AXES.iter().any(is_wrong);
             }
             Quantity::AngularVelocity => {
                 let values = all(counts.map(|count| RATE.value(count)))?;
-                self.imu.angular_velocity = plan.axes.exchange(values);
+                this.imu.angular_velocity = plan.axes.exchange(values);
                 let bits = plan.axes.exchange(merit::OF_AXES);
                 let counts = plan.axes.exchange(counts);
                 for (axis, (count, bit)) in (3..).zip(counts.into_iter().zip(&bits)) {
@@ -69,15 +70,26 @@ impl Sample {
                         RATE_LIMIT.. => Saturation::High,
                         _ => Saturation::None,
                     };
-                    self.quality = self.quality.with_saturation(axis, end);
+                    this.quality = this.quality.with_saturation(axis, end);
                     wrong |= end == Saturation::None && is_wrong(bit);
                 }
             }
         }
         if wrong {
-            self.quality |= Quality::DEVICE_FAULT;
+            this.quality |= Quality::DEVICE_FAULT;
         }
-        Some(self)
+        Some(this)
+    }
+
+    /// Adds `part`, which holds `quantity`.
+    fn add(&mut self, quantity: Quantity, part: Self) {
+        self.quality |= part.quality;
+        let (to, from) = (&mut self.imu, part.imu);
+        match quantity {
+            Quantity::Orientation => to.orientation = from.orientation,
+            Quantity::Acceleration => to.proper_acceleration = from.proper_acceleration,
+            Quantity::AngularVelocity => to.angular_velocity = from.angular_velocity,
+        }
     }
 }
 
@@ -137,14 +149,11 @@ impl Family for Sensor {
         let Ok(data) = <&[u8; 8]>::try_from(data) else {
             return out.fault(Counter::Length, 1, frame.id);
         };
-        let plan = &self.plan;
-        if Sample::EMPTY.with(plan, quantity, data).is_none() {
+        let Some(part) = Sample::of(&self.plan, quantity, data) else {
             return out.fault(Counter::Value, 1, frame.id);
-        }
-        let mut dropped = 0;
-        let add = |sample: &mut Sample| {
-            *sample = sample.with(plan, quantity, data).unwrap_or(*sample);
         };
+        let mut dropped = 0;
+        let add = |sample: &mut Sample| sample.add(quantity, part);
         let whole = (self.group).push(position, frame, Sample::EMPTY, add, &mut dropped);
         if dropped > 0 {
             link.bringup.lost();
