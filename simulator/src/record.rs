@@ -6,7 +6,7 @@ use crate::settings::Settings;
 use crate::simulator::{BusCounts, Simulator, SimulatorError};
 use crate::truth::Simulation;
 use proprio_drivers::{Frame, State};
-use proprio_gateway::candump::write_log_line;
+use proprio_gateway::log::candump::write_log_line;
 use proprio_gateway::config::Source;
 use proprio_gateway::decoder::Decoder;
 use proprio_gateway::plan::BusPlan;

@@ -33,9 +33,10 @@
 //!
 //! An absolute stamp has ten digits of seconds or a date. A shorter stamp is relative. In the log
 //! format it counts from the origin of the log (other programs write such stamps). In the screen
-//! format it is `-t z` or `-t d`, which one line cannot distinguish; therefore [`Reader`] looks
+//! format it is `-t z` or `-t d`, which one line cannot distinguish; therefore [`Reader`](super::Reader)
+//! looks
 //! ahead in its buffer. Stamps since the first line never decrease. Stamps since the previous line
-//! soon do, because of the bus's jitter; the reader adds those up. [`Reader::with_stamps`] sets the
+//! soon do, because of the bus's jitter; the reader adds those up. [`Reader::with_stamps`](super::Reader::with_stamps) sets the
 //! meaning explicitly.
 //!
 //! Sources: can-utils `candump.c`, `lib.c` (`parse_canframe`, `sprint_canframe`,
@@ -43,10 +44,9 @@
 //! candump 2020.11.
 
 mod line;
-mod reader;
 mod stamp;
 mod writer;
 
-pub use line::{Direction, Line, LineError, Record, parse_frame};
-pub use reader::{REORDER, Reader, Report, Stamps};
+pub(super) use line::parse_line;
+pub use line::{Line, parse_frame};
 pub use writer::{Writer, write_log_line};
