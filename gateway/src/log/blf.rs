@@ -10,8 +10,8 @@
 //! type 100      u16 channel, u8 flags, u8 length code, u32 id, u32, u8, u8 FD flags (1 FD, 2 BRS,
 //!               4 ESI), u8 bytes, 5 bytes, data
 //! type 101      u8 channel, u8 length code, u8 bytes, u8, u32 id, u32, u32 flags (0x10 remote,
-//!               0x1000 FD, 0x2000 BRS, 0x4000 ESI), 16 bytes, u16, u8 direction (1 sent), u8 offset
-//!               of more, u32, data
+//!               0x1000 FD, 0x2000 BRS, 0x4000 ESI), 16 bytes, u16, u8 direction (1 sent), u8
+//!               offset of more, u32, data
 //! type 2, 73    u16 channel of an error frame;  type 104 the same, u8
 //! ```
 //!
@@ -53,6 +53,9 @@ const CONTAINER: usize = 32;
 const CONTAINER_TYPE: u32 = 10;
 /// The longest part of an object that is used: its header and the longest of the frames.
 const LONGEST: usize = LONGEST_HEADER + 40 + Frame::MAX_LEN;
+/// The most bytes of an object with a frame; a longer one is damaged. The longest that is known, a
+/// CAN FD frame with everything that may follow it, has less than half.
+const MOST: usize = 512;
 /// The bit of an extended identifier.
 const EXTENDED: u32 = 0x8000_0000;
 /// The most bytes of padding; python-can, too, searches so far.
@@ -68,6 +71,8 @@ struct Contents {
     read: u64,
     /// Whether the file ended in the middle of a part.
     cut: bool,
+    /// Whether damage was reported after which the next part is not found yet.
+    lost: bool,
     /// The header of an object outside any container, which belongs to the sequence.
     outside: Option<[u8; BASE]>,
     /// Unpacked bytes, of which those from `start` to `end` are not used yet.
@@ -106,7 +111,8 @@ impl Contents {
         self.buffer.get(self.start..self.end).unwrap_or_default()
     }
 
-    /// Reads until `count` bytes (at most [`LONGEST`]) are available; false if the file ends before.
+    /// Reads until `count` bytes (at most [`LONGEST`]) are available; false if the file ends
+    /// before.
     fn fill(&mut self, inner: &mut impl BufRead, count: usize) -> Result<bool, Break> {
         while self.end - self.start < count {
             // So that more than the header of an object fits behind.
@@ -206,7 +212,7 @@ impl Contents {
                 Part::End
             }
             _ => {
-                self.part = Part::Between;
+                (self.part, self.lost) = (Part::Between, true);
                 return Err(Break::Damage(LineError::Container));
             }
         };
@@ -243,6 +249,7 @@ impl Contents {
         }
         let size = u64::from(u32_at(&header, 8).unwrap_or_default());
         let left = size.checked_sub(have as u64);
+        let was_lost = std::mem::replace(&mut self.lost, left.is_none());
         let left = left.ok_or(Break::Damage(LineError::Object))?;
         self.part = match u16_at(&header, 16) {
             _ if have < CONTAINER => {
@@ -255,11 +262,12 @@ impl Contents {
                 Part::Packed { left }
             }
             packing => {
+                self.lost = true;
                 let packing = packing.unwrap_or_default();
                 return Err(Break::Damage(LineError::Packing(packing)));
             }
         };
-        if before > PADDING {
+        if before > PADDING && !was_lost {
             return Err(Break::Damage(LineError::Gap(before)));
         }
         Ok(())
@@ -308,6 +316,7 @@ impl Blf {
                 inflate: Decompress::new(true),
                 read: 0,
                 cut: false,
+                lost: false,
                 outside: None,
                 buffer: vec![0; BUFFER],
                 start: 0,
@@ -370,13 +379,13 @@ impl Blf {
         let (size, kind) = (at(8).unwrap_or_default(), u32_at(bytes, 12));
         let header = usize::from(u16_at(bytes, 4).unwrap_or_default());
         let version = u16_at(bytes, 6).unwrap_or_default();
-        if header < BASE || size < header {
+        let is_frame = matches!(kind, Some(1 | 2 | 73 | 86 | 100 | 101 | 104));
+        if header < BASE || size < header || is_frame && size > MOST {
             self.contents.start += OBJECT.len();
             self.lost = true;
             return Ok(Some(Err(LineError::Object)));
         }
         let used = size.min(LONGEST);
-        let is_frame = matches!(kind, Some(1 | 2 | 73 | 86 | 100 | 101 | 104));
         let parsed = if is_frame && matches!(version, 1 | 2) {
             if !self.contents.fill(inner, used)? {
                 return Ok(self.end(true));

@@ -183,7 +183,8 @@ pub enum LineError {
     },
     /// A TRC file whose columns are not known.
     #[error(
-        "the version of the TRC file is not 1.0 to 2.1, or ;$COLUMNS= does not name O, T and I"
+        "the version of the TRC file is not 1.0 to 2.1, or ;$COLUMNS= does not name O, T, I, and l \
+         or L"
     )]
     Columns,
     /// A table of another program.

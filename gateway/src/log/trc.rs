@@ -18,9 +18,9 @@
 //! `R` reserved, `l` length in bytes, `L` length code, `D` data.
 //!
 //! Types: `DT` classic; `FD`, `FB` (with bit rate switch), `FE` (error state), `BI` (both) CAN FD;
-//! `RR` remote request; `ER` error frame. `ST`, `EC` and `EV` (state of the adapter, error counters,
-//! the user's notes) and, in older versions, `Warng` are no frames. (python-can takes `FE` for both
-//! bits and `BI` for the error state.)
+//! `RR` remote request; `ER` error frame. `ST`, `EC` and `EV` (state of the adapter, error
+//! counters, the user's notes) and, in older versions, `Warng` are no frames. (python-can takes
+//! `FE` for both bits and `BI` for the error state.)
 //!
 //! The start is rounded to whole microseconds: as the double that the programs keep, it is no more
 //! exact.
@@ -109,6 +109,10 @@ impl Trc {
                 };
                 let pushed = self.columns.try_push(*name);
                 pushed.map_err(|_| LineError::Columns)?;
+            }
+            let has = |name| self.columns.contains(name);
+            if !b"OTI".iter().all(has) || !b"lL".iter().any(has) {
+                return Err(LineError::Columns);
             }
         } else if let Some(days) = line.strip_prefix(b"$STARTTIME=") {
             let epoch = civil([1899, 12, 30], [0; 3]).unwrap_or_default();

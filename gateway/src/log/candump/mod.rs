@@ -33,11 +33,13 @@
 //!
 //! An absolute stamp has ten digits of seconds or a date. A shorter stamp is relative. In the log
 //! format it counts from the origin of the log (other programs write such stamps). In the screen
-//! format it is `-t z` or `-t d`, which one line cannot distinguish; therefore [`Reader`](super::Reader)
-//! looks
+//! format it is `-t z` or `-t d`, which one line cannot distinguish; therefore [`Reader`] looks
 //! ahead in its buffer. Stamps since the first line never decrease. Stamps since the previous line
-//! soon do, because of the bus's jitter; the reader adds those up. [`Reader::with_stamps`](super::Reader::with_stamps) sets the
+//! soon do, because of the bus's jitter; the reader adds those up. [`Reader::with_stamps`] sets the
 //! meaning explicitly.
+//!
+//! [`Reader`]: super::Reader
+//! [`Reader::with_stamps`]: super::Reader::with_stamps
 //!
 //! Sources: can-utils `candump.c`, `lib.c` (`parse_canframe`, `sprint_canframe`,
 //! `sprint_long_canframe`) and `lib.h`; the golden lines of tests/candump.rs were printed by
