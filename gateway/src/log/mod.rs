@@ -20,7 +20,8 @@
 //!
 //! **Interfaces.** ASC, BLF and TRC number their channels from 1. Channel 1 is read as interface
 //! `can0`, channel 2 as `can1` and so on: python-can and log2asc number them this way, too. A CSV
-//! and a TRC without a column for the bus have one channel: `can0`.
+//! and a TRC without a column for the bus have one channel: `can0`. Which frames a bus takes, given
+//! these names: [`Matching`](crate::link::replay::Matching).
 //!
 //! **Times** are whole nanoseconds, never a floating-point number. A stamp is absolute if the
 //! file tells when the recording began, which is taken as UTC (Vector's and PEAK's programs write
