@@ -210,6 +210,7 @@ Begin Triggerblock Sam Sep 30 15:06:13.191 2017
    1.9 CANFD   7 Tx        716x                 0 1 9 12 1 2 3 4 5 6 7 8 9 a b ff 0 0 5000 0 0 0
    2.0 CANFD   3 Tx     50005x                  0 1 5 0 140000 73 200050 7a60 46500250 460a0250
    2.1 CANFD   3 Rx        117                  0 0 2  2 AB CD 130000 130 0 0 0 0 0 0
+   2.15 CANFD  3 Rx        117                  0 0 9 12 1 2 3 4 5 6 7 8 9 a b c 0 0 0 0 0 0
    2.2 CANFD   5 Tx ErrorFrame Not Acknowledge error, dominant error flag fffe c7 31ca Arb. 556 44
    2.3 SV: 3 0 1 ::CANoe::UnknownSysVar = \"::CANoe::Simulation\"
    2.4 1  OverloadFrame
@@ -241,6 +242,13 @@ fn asc_frames() -> Vec<Frame> {
         ),
         Frame::remote(Id::extended(0x50005), 5),
         classic(0x117, &[0xAB, 0xCD]),
+        // Whatever its flags say: no classic frame is so long.
+        fd(
+            Id::standard(0x117),
+            false,
+            false,
+            &[1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12],
+        ),
         bus_error(),
     ]
 }
@@ -256,7 +264,7 @@ fn what_vector_writes_as_text_is_read() {
         assert_eq!(found.report.bad, 0, "{:?}", found.report);
         assert_eq!(frames(&found), asc_frames());
         let ms = [
-            1100, 1300, 1400, 1500, 1600, 1700, 1800, 1900, 2000, 2100, 2200,
+            1100, 1300, 1400, 1500, 1600, 1700, 1800, 1900, 2000, 2100, 2150, 2200,
         ];
         // 2017-09-30 15:06:13.191.
         assert_eq!(
@@ -264,11 +272,11 @@ fn what_vector_writes_as_text_is_read() {
             ms.map(|ms| (1_506_783_973_191 + ms) * 1_000_000)
         );
         let interfaces: Vec<&str> = found.entries.iter().map(|e| e.interface.as_str()).collect();
-        let numbers = [0, 1, 1, 2, 3, 0, 5, 6, 2, 2, 4];
+        let numbers = [0, 1, 1, 2, 3, 0, 5, 6, 2, 2, 2, 4];
         assert_eq!(interfaces, numbers.map(|n| format!("can{n}")));
         let (r, t) = (Some(Direction::Received), Some(Direction::Sent));
         let directions: Vec<_> = found.entries.iter().map(|e| e.direction).collect();
-        assert_eq!(directions, [r, t, r, t, r, None, r, t, t, r, None]);
+        assert_eq!(directions, [r, t, r, t, r, None, r, t, t, r, r, None]);
     }
     // A part without the header: hexadecimal, and from an unknown start.
     let part = ASC.split_once("0.00%\n").unwrap().1;
@@ -608,9 +616,11 @@ fn faults_in_a_log_of_peak_are_named() {
 fn tables_of_python_can_are_read_and_others_refused() {
     const HEADER: &str = "timestamp,arbitration_id,extended,remote,error,dlc,data\n";
     // Times as Python prints doubles.
-    let rows = "5e-05,0x123,0,0,0,1,AQ==\n0.1000001,0x123,1,0,0,0,\n1e+02,0x0,1,0,1,0,\n\
+    let rows = "1.9e-09,0x7,0,0,0,0,\n5e-05,0x123,0,0,0,1,AQ==\n0.1000001,0x123,1,0,0,0,\n\
+                1e+02,0x0,1,0,1,0,\n\
                 1483389946.1970001,0xdadada,1,1,0,6,\n";
     let expected = [
+        (2, classic(7, &[])),
         (50_000, classic(0x123, &[1])),
         (100_000_100, Frame::new(Id::extended(0x123), &[])),
         (100_000_000_000, bus_error()),
@@ -1010,6 +1020,22 @@ fn damage_to_a_binary_log_costs_what_it_hits() {
         found.why_empty
     );
 
+    // A container that ends in the middle of its last object, at the end of the file.
+    let begun = &first[..first.len() - 20];
+    let found = read(&blf(&[&container(2, begun)]));
+    let expected = (vec![LineError::CutOff], 39);
+    assert_eq!((error(&found), found.entries.len()), expected);
+
+    // A container that is read in many pieces, of which one in the middle is damaged.
+    let noise = (0..200_000_u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 13) as u8);
+    let noise = padded(object(65, 1, 2, 0, &noise.collect::<Vec<u8>>()));
+    let mut long = container(2, &[&second[..], &noise].concat());
+    let middle = long.len() / 2;
+    long[middle..middle + 2_000].fill(0);
+    let found = read_with(&blf(&[&packed[0], &long, &packed[2]]), 512);
+    assert_eq!(error(&found), [LineError::Container]);
+    assert_eq!(numbers(&found), (0..120).collect::<Vec<u8>>());
+
     // The file's header states more than there is.
     let mut file = blf(&[&packed[0]]);
     file[16] += 1;
@@ -1029,6 +1055,11 @@ fn logs() -> Vec<(String, Vec<u8>)> {
         .map(|(name, _)| ((*name).to_owned(), file(name)))
         .collect();
     logs.push(("asc".to_owned(), ASC.into()));
+    // Lengths that are the beginning of others, and a word that may be missing.
+    let rtr = ";$FILEVERSION=1.1\n 1) 1.0 Rx 0100 0 RTR\n";
+    let long = ";$FILEVERSION=2.1\n;$COLUMNS=O,T,I,d,L,D\n1.0 RR 0100 Rx 12\n";
+    logs.push(("rtr".to_owned(), rtr.into()));
+    logs.push(("long".to_owned(), long.into()));
     logs.extend(trcs().map(|(version, text, _)| (version.to_owned(), text.into())));
     logs
 }
@@ -1082,7 +1113,7 @@ proptest! {
     #[test]
     fn any_bytes_are_legal_input(
         bytes in proptest::collection::vec(any::<u8>(), 0..300),
-        start in 0..14_usize,
+        start in 0..16_usize,
     ) {
         read(&bytes);
         // After the beginning of a log.
@@ -1099,7 +1130,7 @@ proptest! {
     fn damaged_logs_are_legal_input(
         at in any::<usize>(),
         byte in any::<u8>(),
-        start in 0..14_usize,
+        start in 0..16_usize,
     ) {
         let (_, mut log) = logs().swap_remove(start);
         let at = at % log.len();
@@ -1177,9 +1208,9 @@ fn what_is_no_log_is_named() {
         );
     }
     // A line of candump's first decides, as does a garbled line before the others' headers.
-    let log = format!("garbage\n{ASC}");
+    let log = format!("garbage\nMon, Tue, Wed\n{ASC}");
     let found = read(log.as_bytes());
-    assert_eq!((found.entries.len(), found.report.bad), (11, 1));
+    assert_eq!((found.entries.len(), found.report.bad), (12, 2));
     let found = read(format!("(1.0) can0 123#\n{ASC}").as_bytes());
     assert_eq!(
         (found.entries.len(), found.format),

@@ -17,14 +17,11 @@ use super::text::{decimal, number};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use proprio_drivers::{Format, Frame};
-use proprio_topics::Nanos;
 
 /// The names of the columns.
 const HEADER: &[u8] = b"timestamp,arbitration_id,extended,remote,error,dlc,data";
 /// A second \[ns\].
 const SECOND: u64 = 1_000_000_000;
-/// Seconds from which on a time counts from 1970: candump's ten digits.
-const ABSOLUTE: Nanos = Nanos(1_000_000_000 * 1_000_000_000);
 
 /// Whether only this format has such a line.
 pub(super) fn has(line: &[u8]) -> bool {
@@ -89,17 +86,12 @@ pub(super) fn parse(line: &[u8]) -> Result<ParsedLine, LineError> {
         };
         Frame::with_format(id, format, data).ok_or(LineError::TooLong { most: 64 })?
     };
-    let form = if t >= ABSOLUTE {
-        StampForm::Absolute
-    } else {
-        StampForm::Origin
-    };
     Ok(ParsedLine::Record(Parsed {
-        stamp: Some((t, form)),
+        stamp: Some((t, StampForm::Origin)),
         interface: Interface::channel(1),
         direction: None,
         // The text of so many bytes is so long, and no longer.
-        whole: !remote && declared > 0 || error,
+        whole: true,
         frame,
     }))
 }
