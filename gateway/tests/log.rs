@@ -1005,7 +1005,7 @@ fn damage_to_a_binary_log_costs_what_it_hits() {
         &[&first[..], &short, &third].concat(),
     )]));
     assert_eq!(error(&found), [LineError::Object]);
-    assert_eq!(numbers(&found), [before, after].concat());
+    assert_eq!(numbers(&found), [before.clone(), after.clone()].concat());
     let mut range = numbered(1);
     range[32 + 6] = 1;
     let found = read(&blf(&[&container(0, &range)]));
@@ -1026,15 +1026,12 @@ fn damage_to_a_binary_log_costs_what_it_hits() {
     let expected = (vec![LineError::CutOff], 39);
     assert_eq!((error(&found), found.entries.len()), expected);
 
-    // A container that is read in many pieces, of which one in the middle is damaged.
-    let noise = (0..200_000_u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 13) as u8);
-    let noise = padded(object(65, 1, 2, 0, &noise.collect::<Vec<u8>>()));
-    let mut long = container(2, &[&second[..], &noise].concat());
-    let middle = long.len() / 2;
-    long[middle..middle + 2_000].fill(0);
-    let found = read_with(&blf(&[&packed[0], &long, &packed[2]]), 512);
+    // A container that cannot be unpacked at all: a block of a kind that zlib does not have.
+    let mut broken = packed[1].clone();
+    broken[34] = 0xFF;
+    let found = read(&blf(&[&packed[0], &broken, &packed[2]]));
     assert_eq!(error(&found), [LineError::Container]);
-    assert_eq!(numbers(&found), (0..120).collect::<Vec<u8>>());
+    assert_eq!(numbers(&found), [before, after].concat());
 
     // The file's header states more than there is.
     let mut file = blf(&[&packed[0]]);

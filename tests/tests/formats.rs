@@ -9,6 +9,7 @@ use proprio_simulator::{Robot, Settings};
 use proprio_tests::watch::Recorder;
 use proprio_tests::{Arm, PATIENCE, Rig, until};
 use proprio_topics::Nanos;
+use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::process::Output;
 
@@ -253,7 +254,17 @@ fn a_misleading_file_gives_one_message() {
 fn a_gateway_replays_every_format() {
     let rig = Rig::new();
     let arm = Arm::new().on_interfaces(BUSES).write(&rig.path("arm"));
-    let (frames, log) = session(&arm.robot, 1.0);
+    let (mut frames, mut log) = session(&arm.robot, 1.0);
+    // A frame of nobody and a silence, so that the reader of the samples comes in time.
+    let early = (
+        T0 - Nanos::from_millis(2_000),
+        0,
+        Frame::new(Id::standard(0x7FF), &[0]),
+    );
+    frames.insert(0, early);
+    let mut all_of_it = b"(0000000098.000000) can0 7FF#00\n".to_vec();
+    all_of_it.append(&mut log);
+    let log = all_of_it;
     let mut all = Vec::new();
     for (name, log) in [
         ("candump", log),
@@ -291,24 +302,31 @@ fn a_gateway_replays_every_format() {
             process.log()
         );
         samples.take();
-        assert!(!process.log().contains("skipped"), "{}", process.log());
-        all.push((name, samples.by_channel()));
+        let told = process.log();
+        assert!(!told.contains("skipped"), "{told}");
+        let ends = told
+            .lines()
+            .filter_map(|line| line.split_once("the log has ended "));
+        let ends: BTreeSet<String> = ends.map(|(_, end)| end.to_owned()).collect();
+        all.push((name, ends, samples.by_channel()));
     }
-    // A reader that comes late misses the first ones.
-    let (_, truth) = &all[0];
-    assert!(truth.len() > 8, "{} channels", truth.len());
-    for (name, found) in &all[1..] {
-        for (channel, truth) in truth {
-            let found = &found[channel];
+    // A reader that comes late misses the first samples.
+    let (_, ends, truth) = &all[0];
+    assert!(
+        ends.len() == 2 && truth.len() > 8,
+        "{ends:?}, {} channels",
+        truth.len()
+    );
+    for (name, found_ends, found) in &all[1..] {
+        assert_eq!(found_ends, ends, "{name}");
+        let mut compared = 0;
+        for (channel, found) in found {
+            let truth = &truth[channel];
             let common = truth.len().min(found.len());
-            assert!(
-                common > 20,
-                "{name}: {channel}: {} of {}",
-                found.len(),
-                truth.len()
-            );
             let last = |samples: &[String]| samples[samples.len() - common..].to_vec();
             assert_eq!(last(found), last(truth), "{name}: {channel}");
+            compared += common;
         }
+        assert!(compared > 200, "{name}: {compared} samples");
     }
 }

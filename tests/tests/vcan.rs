@@ -9,11 +9,11 @@
 
 use proprio_drivers::{Claim, Frame};
 use proprio_estimator::setup::Setup;
-use proprio_gateway::log;
 use proprio_gateway::clock::{Clock as _, Monotonic, sleep_until};
 use proprio_gateway::decoder::Decoder;
 use proprio_gateway::link::send_by;
 use proprio_gateway::link::socketcan::SocketCan;
+use proprio_gateway::log;
 use proprio_gateway::plan::Plan;
 use proprio_gateway::status::BusStatus;
 use proprio_simulator::{Settings, record};

@@ -22,7 +22,7 @@
 //! the same sequence. Other types are skipped.
 //!
 //! Damage: after a container that cannot be unpacked, and after bytes that are no object, the next
-//! "LOBJ" is searched.
+//! "LOBJ" is searched. A container's checksum is at its end: what comes before is already read.
 //!
 //! Sources: python-can `io/blf.py`; Technica Engineering `vector_blf`; Wireshark `blf.h`.
 

@@ -203,7 +203,7 @@ pub enum LineError {
     #[error("it is {0}")]
     NoLog(&'static str),
     /// A container of objects is damaged.
-    #[error("a container cannot be unpacked: the file is damaged here, and objects are lost")]
+    #[error("a container is damaged: some of its objects are lost or wrong")]
     Container,
     /// A container is packed in an unknown way.
     #[error("a container is packed with method {0}; 0 (not at all) and 2 (zlib) are known")]
