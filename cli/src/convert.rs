@@ -8,6 +8,7 @@ use proprio_estimator::config::ConfigError;
 use proprio_estimator::reading::{self, ReadingError};
 use proprio_estimator::setup::Setup;
 use proprio_estimator::{files, offline as estimates};
+use proprio_gateway::log::LogFormat;
 use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
 use proprio_identification::{Role, implausible};
@@ -23,7 +24,8 @@ pub(crate) struct Decode {
     /// gateway.toml, which lists the devices; its sources are not opened
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// The recorded log, in any of candump's formats; - for standard input
+    /// The recorded log: candump, Vector ASC or BLF, PEAK TRC, or CSV of python-can, whatever its
+    /// name; - for standard input
     #[arg(long, value_name = "FILE")]
     log: PathBuf,
     /// The table to write; - for standard output
@@ -233,14 +235,15 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
     }
     if report.dropped > 0 {
         eprintln!(
-            "{}: {} frames were lost during the recording, as candump reports in it",
+            "{}: {} frames were lost during the recording, as it says",
             args.log.display(),
             report.dropped
         );
     }
+    let parts = report.format.map_or("lines", LogFormat::parts);
     if report.bad_lines > report.bad.len() as u64 {
         eprintln!(
-            "{}: {} lines skipped in all",
+            "{}: {} {parts} skipped in all",
             args.log.display(),
             report.bad_lines
         );
@@ -268,7 +271,9 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
                 })
             })
             .collect();
+        let format = report.format.map(|format| format.to_string());
         let summary = json!({
+            "format": format,
             "frames": report.frames, "samples": report.samples, "unclaimed": report.unclaimed,
             "bad_lines": report.bad_lines, "other_interfaces": report.other_interfaces,
             "error_frames": report.error_frames, "dropped": report.dropped,
@@ -277,8 +282,8 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
         print_json(&args.out, &summary);
     } else {
         eprintln!(
-            "{} frames, {} samples; {} frames of unknown devices, {} of other interfaces, {} lines \
-             skipped",
+            "{} frames, {} samples; {} frames of unknown devices, {} of other interfaces, {} \
+             {parts} skipped",
             report.frames,
             report.samples,
             report.unclaimed,

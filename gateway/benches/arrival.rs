@@ -8,11 +8,11 @@
 
 use proprio_drivers::Frame;
 use proprio_gateway::bus::Bus;
-use proprio_gateway::candump;
 use proprio_gateway::clock::Monotonic;
 use proprio_gateway::decoder::Decoder;
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, Received, send_by};
+use proprio_gateway::log;
 use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
 use proprio_gateway::publish::Shared;
@@ -77,7 +77,7 @@ fn frames() -> Vec<Frame> {
     }
     let mut log = Vec::new();
     offline::encode(&plan("a"), table.as_bytes(), &mut log).expect("frames");
-    let mut reader = candump::Reader::new(log.as_slice());
+    let mut reader = log::Reader::new(log.as_slice());
     let mut frames = Vec::new();
     while let Some(record) = reader.next_record().expect("a log") {
         frames.push(record.frame);

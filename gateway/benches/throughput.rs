@@ -8,11 +8,11 @@ use divan::Bencher;
 use divan::counter::ItemsCount;
 use proprio_drivers::Frame;
 use proprio_gateway::bus::{Bus, Turn};
-use proprio_gateway::candump;
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::decoder::Decoder;
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, LinkCounters, Received, SendError, send_by};
+use proprio_gateway::log;
 use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
 use proprio_gateway::publish::Shared;
@@ -103,7 +103,7 @@ fn parse_log(bencher: Bencher<'_, '_>) {
     let log = log(300_000);
     let frames = log.iter().filter(|b| **b == b'\n').count();
     bencher.counter(ItemsCount::new(frames)).bench(|| {
-        let mut reader = candump::Reader::new(log.as_slice());
+        let mut reader = log::Reader::new(log.as_slice());
         let mut count = 0;
         while reader.next_record().unwrap().is_some() {
             count += 1;
@@ -114,7 +114,7 @@ fn parse_log(bencher: Bencher<'_, '_>) {
 
 fn frames() -> Vec<Frame> {
     let log = log(FRAMES + 3);
-    let mut reader = candump::Reader::new(log.as_slice());
+    let mut reader = log::Reader::new(log.as_slice());
     let mut frames = Vec::new();
     while let (Ok(Some(record)), true) = (reader.next_record(), (frames.len() as u64) < FRAMES) {
         frames.push(record.frame);

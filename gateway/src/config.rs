@@ -54,7 +54,7 @@ pub enum Source {
         /// Its name.
         name: String,
     },
-    /// A recorded log.
+    /// A recorded log, of any format of [`crate::log`].
     Replay {
         /// The file, relative to the configuration.
         log: PathBuf,

@@ -10,8 +10,8 @@
 //! - [`config`]: the raw contents of gateway.toml; [`plan`]: the checked and resolved form, which
 //!   everything else uses.
 //! - `dbc`: files that describe devices, as tables for the drivers.
-//! - [`link`]: one trait and three links to a bus; [`candump`]: the log format of replay, decode
-//!   and encode.
+//! - [`link`]: one trait and three links to a bus; [`log`]: recorded buses, which replay and decode
+//!   read, and the log format that encode writes.
 //! - [`load`]: the share of a bus's time that its devices need.
 //! - [`decoder`]: all devices of one bus, without input or output; [`bus`]: the loop that moves
 //!   frames through it; [`inbox`]: what the control plane asks of it while it runs.
@@ -22,7 +22,6 @@
 //! - [`clock`]: the only place that reads a clock.
 
 pub mod bus;
-pub mod candump;
 pub mod clock;
 pub mod config;
 pub mod control;
@@ -34,6 +33,7 @@ mod health;
 pub mod inbox;
 pub mod link;
 pub mod load;
+pub mod log;
 pub mod offline;
 mod operator;
 pub mod plan;

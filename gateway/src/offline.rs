@@ -1,10 +1,10 @@
 //! Converts a recorded log to a table of samples and back: `proprio decode` and `proprio encode`.
 //! No daemon, no clock.
 
-use crate::candump;
 use crate::config::Source;
 use crate::decoder::Decoder;
 use crate::link::replay::Matching;
+use crate::log::{self, LogFormat, candump};
 use crate::plan::{BusPlan, Plan};
 use crate::status::BusStatus;
 use proprio_drivers::{Board, Format, Frame, Frames, Mode, Spec};
@@ -17,7 +17,7 @@ use std::sync::atomic::Ordering::Relaxed;
 
 /// Maximum delay of a sample that is still sorted into its place in the table. Samples can be late
 /// because a wrench has the stamp of its first frame but is complete only with its second.
-const REORDER: Nanos = candump::REORDER;
+const REORDER: Nanos = log::REORDER;
 
 /// Why a log or table cannot be converted at all.
 #[derive(Debug, thiserror::Error)]
@@ -53,15 +53,17 @@ pub struct DecodeReport {
     pub unclaimed: u64,
     /// Of these, error frames of the interface.
     pub error_frames: u64,
-    /// Frames that candump reports as lost while recording.
+    /// Frames that were lost while recording, as the log says.
     pub dropped: u64,
     /// Samples written.
     pub samples: u64,
     /// Samples that were too late to be sorted: the table is out of order there.
     pub out_of_order: u64,
-    /// Lines that are not frames.
+    /// The log's format.
+    pub format: Option<LogFormat>,
+    /// Lines (or objects of a BLF file) that cannot be read.
     pub bad_lines: u64,
-    /// The first bad lines, with line number and error.
+    /// The first of them, with number and error.
     pub bad: Vec<String>,
     /// The result per device.
     pub devices: Vec<DeviceReport>,
@@ -188,7 +190,7 @@ pub fn decode(
     let mut report = DecodeReport::default();
     let mut order = InOrder::new(REORDER);
     let mut failure = None;
-    let mut reader = candump::Reader::new(log);
+    let mut reader = log::Reader::new(log);
     let mut last_bus = 0;
     let takes = |matching: &Option<Matching>, interface: &str| {
         matching.as_ref().is_none_or(|m| m.takes(interface))
@@ -243,18 +245,10 @@ pub fn decode(
     writer.finish()?;
     report.out_of_order = order.out_of_order();
     (report.bad_lines, report.dropped) = (reader.report().bad, reader.report().dropped);
-    report.bad = reader
-        .report()
-        .first_bad
-        .iter()
-        .map(|(line, error)| format!("line {line}: {error}"))
-        .collect();
+    report.format = reader.format();
+    report.bad = reader.bad().collect();
     if report.frames == 0 {
-        let why = report.bad.first().map_or_else(
-            || "it is empty".to_owned(),
-            |bad| format!("the first bad line: {bad}"),
-        );
-        return Err(OfflineError::NoFrame(why));
+        return Err(OfflineError::NoFrame(reader.why_empty()));
     }
     for ((_, decoder, status), bus) in buses.iter().zip(&plan.buses) {
         report.unclaimed += status.unclaimed.load(Relaxed);

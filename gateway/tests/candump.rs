@@ -1,9 +1,8 @@
 //! candump's text formats: lines printed by candump itself, and round trips of written lines.
 
 use proprio_drivers::{Format, Frame, Id};
-use proprio_gateway::candump::{
-    Direction, Line, LineError, Reader, Record, Stamps, Writer, parse_frame, write_log_line,
-};
+use proprio_gateway::log::candump::{Line, Writer, parse_frame, write_log_line};
+use proprio_gateway::log::{Direction, LineError, Reader, Record, Stamps};
 use proprio_topics::{Nanos, StampKind};
 use proptest::prelude::*;
 use std::io::{BufReader, Cursor};

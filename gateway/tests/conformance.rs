@@ -5,7 +5,6 @@
 //! vcan0).
 
 use proprio_drivers::{Claim, Format, Frame, Id};
-use proprio_gateway::candump::write_log_line;
 use proprio_gateway::clock::{Clock, Monotonic, sleep_until};
 use proprio_gateway::link::error_frame::ErrorFrame;
 use proprio_gateway::link::interface::{Interfaces as _, Netlink};
@@ -13,6 +12,7 @@ use proprio_gateway::link::replay::{Matching, Pace, Replay};
 use proprio_gateway::link::socketcan::SocketCan;
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, ListenOnly, OpenError, Received, SendError, send_by};
+use proprio_gateway::log::candump::write_log_line;
 use proprio_topics::{BusError, Controller, LinkState, Nanos, StampKind};
 use std::path::PathBuf;
 use std::process::Command;

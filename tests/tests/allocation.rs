@@ -24,12 +24,12 @@ use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::propagation::{Covariance, Propagation};
 use proprio_estimator::setup::Setup;
 use proprio_gateway::bus::{Bus, Turn};
-use proprio_gateway::candump;
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::decoder::{Decoder, build};
 use proprio_gateway::inbox::{Replacement, Reply, Request, inbox};
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, Received, send_by};
+use proprio_gateway::log;
 use proprio_gateway::publish::{Memory, Shared, Sink};
 use proprio_gateway::status::BusStatus;
 use proprio_simulator::record::record;
@@ -349,7 +349,7 @@ fn session(robot: &Robot, seconds: f64) -> Vec<(usize, Frame)> {
         &mut log,
     )
     .unwrap();
-    let mut reader = candump::Reader::new(&log[..]);
+    let mut reader = log::Reader::new(&log[..]);
     let mut frames = Vec::new();
     while let Some(record) = reader.next_record().unwrap() {
         let takes = |bus: &usize| {

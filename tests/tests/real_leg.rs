@@ -8,9 +8,9 @@ use proprio_estimator::export::parameters;
 use proprio_estimator::offline::estimate;
 use proprio_estimator::reading;
 use proprio_estimator::setup::Setup;
-use proprio_gateway::candump;
 use proprio_gateway::link::send_by;
 use proprio_gateway::link::virtual_bus::VirtualBus;
+use proprio_gateway::log;
 use proprio_gateway::offline::{decode, encode};
 use proprio_gateway::plan::Plan;
 use proprio_identification::{Options, Role, identify};
@@ -265,7 +265,7 @@ fn played_onto_virtual_buses_the_live_estimates_are_those_of_the_samples_receive
                 .each_ref()
                 .map(|name| VirtualBus::open(&domain, name, &[]).expect("a virtual bus"));
             let file = std::fs::File::open(log).expect("the log");
-            let mut reader = candump::Reader::new(std::io::BufReader::new(file));
+            let mut reader = log::Reader::new(std::io::BufReader::new(file));
             let begin = now();
             let mut first = None;
             while let Some(record) = reader.next_record().expect("the log") {

@@ -9,11 +9,11 @@
 
 use proprio_drivers::{Claim, Frame};
 use proprio_estimator::setup::Setup;
-use proprio_gateway::candump;
 use proprio_gateway::clock::{Clock as _, Monotonic, sleep_until};
 use proprio_gateway::decoder::Decoder;
 use proprio_gateway::link::send_by;
 use proprio_gateway::link::socketcan::SocketCan;
+use proprio_gateway::log;
 use proprio_gateway::plan::Plan;
 use proprio_gateway::status::BusStatus;
 use proprio_simulator::{Settings, record};
@@ -988,7 +988,7 @@ fn play(frames: &[(Nanos, usize, Frame)], mut meanwhile: impl FnMut()) {
 
 /// The frames of a log in order, with those of the second interface delayed by `skew`.
 fn skewed(log: &Path, interfaces: [&str; 2], skew: Nanos) -> Vec<(Nanos, usize, Frame)> {
-    let mut reader = candump::Reader::new(BufReader::new(File::open(log).expect("the log")));
+    let mut reader = log::Reader::new(BufReader::new(File::open(log).expect("the log")));
     let mut frames = Vec::new();
     while let Some(record) = reader.next_record().expect("a log") {
         let interface = interfaces

@@ -1,5 +1,5 @@
-//! A recorded log as a link: candump's formats, replayed at the recorded pace or as fast as
-//! possible.
+//! A recorded log as a link: any format of [`crate::log`], replayed at the recorded pace or as fast
+//! as possible.
 //!
 //! | pace | when a frame is returned | its stamp |
 //! |---|---|---|
@@ -12,9 +12,9 @@
 //! only listen never send.
 
 use super::{Link, LinkCounters, OpenError, Received, SendError, passes};
-use crate::candump::{Reader, Report};
 use crate::clock::{Clock, Monotonic, sleep_until};
 pub use crate::config::Pace;
+use crate::log::{LogFormat, Reader, Report};
 use proprio_drivers::{Claim, Format, Frame};
 use proprio_topics::{LinkState, Nanos, StampKind};
 use std::fs::File;
@@ -120,14 +120,12 @@ impl Replay {
             .map_err(fail)?
             .map(|r| (r.stamp, matches(r.interface), r.frame));
         match first {
-            None => match replay.log.report().first_bad.first() {
-                // The log is empty.
-                None => replay.ended = true,
-                Some((line, error)) => {
-                    let why = format!("it is not a log: it holds no frame; line {line}: {error}");
-                    return Err(fail(io::Error::new(io::ErrorKind::InvalidData, why)));
-                }
-            },
+            // The log is empty.
+            None if replay.log.report().bad == 0 => replay.ended = true,
+            None => {
+                let why = format!("it holds no frame: {}", replay.log.why_empty());
+                return Err(fail(io::Error::new(io::ErrorKind::InvalidData, why)));
+            }
             Some((None, ..)) if pace == Pace::Recorded => {
                 let cause = "it has no time stamps, which pace = \"recorded\" needs; record with \
                      `candump -l`, or use pace = \"fast\"";
@@ -214,9 +212,10 @@ impl Link for Replay {
         if let Some(failure) = self.failure {
             notes.push(format!("the log could not be read to its end: {failure}"));
         }
-        if let Some((line, error)) = report.first_bad.first() {
+        if let Some(first) = self.log.bad().next() {
+            let parts = self.log.format().map_or("lines", LogFormat::parts);
             notes.push(format!(
-                "{} lines of the log were skipped; the first is line {line}: {error}",
+                "{} {parts} of the log were skipped; the first is {first}",
                 report.bad
             ));
         }

@@ -1,18 +1,8 @@
 //! Parses the time stamp of a line: seconds or a date.
 
+use crate::log::text::civil;
 use proprio_topics::Nanos;
 use std::ops::Range;
-
-/// The origin of a stamp.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum StampForm {
-    /// Ten digits of seconds, or a date.
-    Absolute,
-    /// Fewer digits, in the log format: since the log's origin.
-    Origin,
-    /// Fewer digits, in the screen format: since the first line or since the previous line.
-    Relative,
-}
 
 pub(super) struct Stamp {
     pub(super) t: Nanos,
@@ -92,22 +82,5 @@ fn parse_date(text: &[u8]) -> Option<(i64, &[u8])> {
     }
     let (year, month, day) = (number(0..4)?, number(5..7)?, number(8..10)?);
     let (hour, minute, second) = (number(11..13)?, number(14..16)?, number(17..19)?);
-    if !(1..=12).contains(&month)
-        || !(1..=31).contains(&day)
-        || hour > 23
-        || minute > 59
-        || second > 60
-    {
-        return None;
-    }
-    // Days since 1970-01-01. Years begin in March, so that the leap day is the last day: H.
-    // Hinnant, "chrono-compatible low-level date algorithms", days_from_civil.
-    let year = if month <= 2 { year - 1 } else { year };
-    let era = year.div_euclid(400);
-    let year_of_era = year.rem_euclid(400);
-    let day_of_year = (153 * (if month > 2 { month - 3 } else { month + 9 }) + 2) / 5 + day - 1;
-    let days = era * 146_097 + year_of_era * 365 + year_of_era / 4 - year_of_era / 100
-        + day_of_year
-        - 719_468;
-    Some((days * 86_400 + hour * 3_600 + minute * 60 + second, rest))
+    Some((civil([year, month, day], [hour, minute, second])?, rest))
 }

@@ -38,15 +38,17 @@
 //! soon do, because of the bus's jitter; the reader adds those up. [`Reader::with_stamps`] sets the
 //! meaning explicitly.
 //!
+//! [`Reader`]: super::Reader
+//! [`Reader::with_stamps`]: super::Reader::with_stamps
+//!
 //! Sources: can-utils `candump.c`, `lib.c` (`parse_canframe`, `sprint_canframe`,
 //! `sprint_long_canframe`) and `lib.h`; the golden lines of tests/candump.rs were printed by
 //! candump 2020.11.
 
 mod line;
-mod reader;
 mod stamp;
 mod writer;
 
-pub use line::{Direction, Line, LineError, Record, parse_frame};
-pub use reader::{REORDER, Reader, Report, Stamps};
+pub(super) use line::parse_line;
+pub use line::{Line, parse_frame};
 pub use writer::{Writer, write_log_line};

@@ -1,38 +1,12 @@
 //! Parses one line of a log, in either format, into a record: the frame with its stamp, interface
 //! and direction.
 
-use super::stamp::{StampForm, parse_stamp};
+use super::stamp::parse_stamp;
+use crate::log::record::{
+    Direction, ERROR_FLAG, Interface, LineError, Parsed, ParsedLine, Record, StampForm,
+};
+use crate::log::text::{hex, hex_byte};
 use proprio_drivers::{Format, Frame, Id};
-use proprio_topics::{Nanos, StampKind};
-use std::ops::Range;
-
-/// The error flag of a SocketCAN identifier, which the text formats show.
-pub(super) const ERROR_FLAG: u32 = 0x2000_0000;
-/// The longest line that is read; candump's longest (64 bytes in binary) has about 650 characters.
-pub(super) const MAX_LINE: usize = 4096;
-
-/// Whether a frame was received or sent by the host that recorded it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Direction {
-    /// `R`, `RX`: it came from the bus.
-    Received,
-    /// `T`, `TX`: that host sent it.
-    Sent,
-}
-
-/// One frame of a log.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Record<'a> {
-    /// The stamp in the line; `None` if there is none. From a [`Reader`](super::Reader): relative
-    /// to the log's origin, with stamps since the previous line added up.
-    pub stamp: Option<Nanos>,
-    /// The interface it was seen on.
-    pub interface: &'a str,
-    /// Whether it was received or sent, if the line states it.
-    pub direction: Option<Direction>,
-    /// The frame, with `t` the stamp and [`StampKind::Log`], or zero and [`StampKind::None`].
-    pub frame: Frame,
-}
 
 /// One line of a log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -45,138 +19,9 @@ pub enum Line<'a> {
     Note,
 }
 
-/// Why a line cannot be read.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[non_exhaustive]
-pub enum LineError {
-    /// The stamp cannot be read.
-    #[error(
-        "the time stamp is not (SECONDS.FRACTION) with at most nine decimals, nor (YYYY-MM-DD \
-         HH:MM:SS.FRACTION)"
-    )]
-    Stamp,
-    /// The stamp is far later than that of the next frame.
-    #[error("the time stamp is {ahead} s later than that of the next frame")]
-    Ahead {
-        /// By how much \[ns\].
-        ahead: Nanos,
-    },
-    /// There is no interface, or it is not text.
-    #[error("there is no interface name")]
-    Interface,
-    /// The line has no frame.
-    #[error("there is no frame after the interface name")]
-    NoFrame,
-    /// The identifier has neither three nor eight hexadecimal digits.
-    #[error(
-        "the identifier has {digits} hexadecimal digits; 3 make a standard one, 8 an extended one"
-    )]
-    Identifier {
-        /// Its number of digits.
-        digits: usize,
-    },
-    /// The identifier is larger than 11 or 29 bits.
-    #[error("the identifier {id:X} is larger than its {bits} bits")]
-    IdentifierRange {
-        /// The identifier read.
-        id: u32,
-        /// The number of bits: 11 or 29.
-        bits: u8,
-    },
-    /// Neither `#` nor `[` follows the identifier.
-    #[error("after the identifier there is neither #DATA nor [LENGTH]")]
-    Separator,
-    /// The hexadecimal digit of the CAN FD flags is missing.
-    #[error("after ## there is no hexadecimal digit of CAN FD flags")]
-    Flags,
-    /// A CAN XL frame.
-    #[error("CAN XL frames are not supported")]
-    Xl,
-    /// The data are not pairs of hexadecimal digits.
-    #[error("the data are not whole bytes in hexadecimal digits")]
-    Data,
-    /// More data than this kind of frame can have.
-    #[error("the frame has more than {most} bytes")]
-    TooLong {
-        /// The maximum number of bytes.
-        most: usize,
-    },
-    /// The length in brackets cannot be read.
-    #[error("the length in brackets is not a number up to 8, or with two digits up to 64")]
-    Length,
-    /// Fewer bytes follow than the length in brackets.
-    #[error("{declared} bytes are declared, but {found} follow")]
-    Missing {
-        /// The length in brackets.
-        declared: usize,
-        /// The number of bytes read.
-        found: usize,
-    },
-    /// A remote request or an error frame that is marked as CAN FD.
-    #[error("a remote request or an error frame cannot be CAN FD")]
-    Contradiction,
-    /// Something follows the frame.
-    #[error("there is unexpected text after the frame")]
-    Trailing,
-    /// The line is longer than any that candump writes.
-    #[error("the line is longer than {MAX_LINE} bytes")]
-    LineTooLong,
-    /// The last line has no line end and could be the beginning of a longer line.
-    #[error("the last line is incomplete (it has no line end)")]
-    Unfinished,
-}
-
-/// The value of each hexadecimal digit; 0xFF for other characters.
-const HEX: [u8; 256] = {
-    let mut table = [0xFF; 256];
-    let mut i = 0;
-    while i < 10 {
-        table[b'0' as usize + i] = i as u8;
-        i += 1;
-    }
-    let mut i = 0;
-    while i < 6 {
-        table[b'A' as usize + i] = 10 + i as u8;
-        table[b'a' as usize + i] = 10 + i as u8;
-        i += 1;
-    }
-    table
-};
-
-fn hex(digit: u8) -> Option<u8> {
-    HEX.get(digit as usize).copied().filter(|v| *v < 16)
-}
-
-fn hex_byte(high: u8, low: u8) -> Option<u8> {
-    let (high, low) = (*HEX.get(high as usize)?, *HEX.get(low as usize)?);
-    // Only the 0xFF of a wrong digit has bits in the high half.
-    if (high | low) & 0xF0 == 0 {
-        Some(high << 4 | low)
-    } else {
-        None
-    }
-}
-
-/// A record with its interface as a range of the line instead of a borrow.
-#[derive(Debug)]
-pub(super) struct Parsed {
-    pub(super) stamp: Option<(Nanos, StampForm)>,
-    interface: Range<usize>,
-    direction: Option<Direction>,
-    frame: Frame,
-    /// Whether no continuation of this line could make it another frame.
-    pub(super) whole: bool,
-}
-
-pub(super) enum ParsedLine {
-    Record(Parsed),
-    Dropped(u64),
-    Note,
-}
-
 impl<'a> Line<'a> {
     /// Parses one line, with or without its line end. A relative stamp is returned as written; see
-    /// [`Reader`](super::Reader).
+    /// [`Reader`](crate::log::Reader).
     ///
     /// # Errors
     /// [`LineError`] names the part that cannot be read.
@@ -192,23 +37,7 @@ impl<'a> Line<'a> {
     }
 }
 
-impl Parsed {
-    pub(super) fn record(self, line: &[u8], stamp: Option<Nanos>) -> Option<Record<'_>> {
-        let interface = std::str::from_utf8(line.get(self.interface)?).ok()?;
-        let frame = match stamp {
-            Some(t) => self.frame.at(t, StampKind::Log),
-            None => self.frame,
-        };
-        Some(Record {
-            stamp,
-            interface,
-            direction: self.direction,
-            frame,
-        })
-    }
-}
-
-pub(super) fn parse_line(line: &[u8]) -> Result<ParsedLine, LineError> {
+pub(in crate::log) fn parse_line(line: &[u8]) -> Result<ParsedLine, LineError> {
     // candump -e explains an error frame in lines that begin with a tab.
     if line.first() == Some(&b'\t') {
         return Ok(ParsedLine::Note);
@@ -289,7 +118,7 @@ pub(super) fn parse_line(line: &[u8]) -> Result<ParsedLine, LineError> {
     };
     Ok(ParsedLine::Record(Parsed {
         stamp: stamp.map(|s| (s.t, form(s.absolute))),
-        interface,
+        interface: Interface::Text(interface),
         direction,
         frame: frame.frame,
         whole: frame.whole,

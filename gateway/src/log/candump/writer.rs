@@ -1,6 +1,6 @@
 //! Writes frames in the log format, one line each.
 
-use super::line::ERROR_FLAG;
+use crate::log::record::ERROR_FLAG;
 use proprio_drivers::{Format, Frame, Id};
 use proprio_topics::Nanos;
 use std::io::{self, Write};

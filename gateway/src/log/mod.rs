@@ -1,0 +1,46 @@
+//! Recorded buses: reads the logs that people have, whatever program wrote them.
+//!
+//! ```text
+//! bytes -> Reader: which format? -> candump | asc | trc | csv (lines), blf (objects)
+//!            |                          |
+//!            |  stamps, report  <-  frame, time, interface, direction
+//!            v
+//!          Record
+//! ```
+//!
+//! | format | written by | file |
+//! |---|---|---|
+//! | candump, on the screen or as a log | can-utils, python-can, SavvyCAN | [`candump`] |
+//! | Vector ASC | CANoe, CANalyzer, CANape, python-can, can-utils' log2asc | `asc` |
+//! | Vector BLF | the same | `blf` |
+//! | PEAK TRC 1.0 to 2.1 | PCAN-View, PCAN-Explorer, python-can | `trc` |
+//! | CSV with python-can's columns | python-can | `csv` |
+//!
+//! The first bytes or lines tell the format, not the file's name.
+//!
+//! **Interfaces.** ASC, BLF and TRC number their channels from 1. Channel 1 is read as interface
+//! `can0`, channel 2 as `can1` and so on: python-can and log2asc number them this way, too. A CSV
+//! and a TRC without a column for the bus have one channel: `can0`. Which frames a bus takes, given
+//! these names: [`Matching`](crate::link::replay::Matching).
+//!
+//! **Times** are whole nanoseconds, never a floating-point number. A stamp is absolute if the
+//! file tells when the recording began, which is taken as UTC (Vector's and PEAK's programs write
+//! local time without its zone); else it counts from the start of the recording.
+//!
+//! **Error frames** of other formats than candump's become an error frame of class bus error
+//! without data: what more they tell differs between programs and adapters.
+//!
+//! **Damage.** A line or object that cannot be read is skipped, counted and reported; so is the
+//! end of a file that was cut off. What comes before and after is read.
+
+mod asc;
+mod blf;
+pub mod candump;
+mod csv;
+mod reader;
+mod record;
+mod text;
+mod trc;
+
+pub use reader::{REORDER, Reader, Report, Stamps};
+pub use record::{Direction, LineError, LogFormat, Record};

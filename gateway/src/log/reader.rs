@@ -1,0 +1,480 @@
+//! Reads a whole log record by record. Detects the format and the origin of the stamps; skips and
+//! reports what cannot be read.
+
+use super::asc::Asc;
+use super::blf::{self, Blf};
+use super::candump::parse_line;
+use super::csv;
+use super::record::{
+    Interface, LineError, LogFormat, MAX_LINE, Parsed, ParsedLine, Record, StampForm,
+};
+use super::trc::Trc;
+use arrayvec::ArrayVec;
+use proprio_topics::Nanos;
+use std::io::{self, BufRead, Read, Write};
+
+/// Maximum number of bad lines in a [`Report`].
+const NAMED: usize = 8;
+/// The order of the frames in a log is that of their stamps, except within this time \[ns\]: the
+/// recorder reads one interface after the other.
+pub const REORDER: Nanos = Nanos::from_millis(100);
+
+/// The meaning of the relative stamps of candump's screen format.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Stamps {
+    /// Detect it, as the module documentation describes.
+    #[default]
+    Detect,
+    /// Each counts from the log's origin.
+    SinceOrigin,
+    /// Each counts from the previous line (`candump -t d`).
+    SincePrevious,
+}
+
+/// The counts of a [`Reader`] so far.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Report {
+    /// Lines (or objects of a BLF file), including bad ones.
+    pub lines: u64,
+    /// Frames.
+    pub records: u64,
+    /// Frames without a stamp.
+    pub unstamped: u64,
+    /// Frames with an earlier stamp than the previous frame.
+    pub backwards: u64,
+    /// Frames that candump reports as lost.
+    pub dropped: u64,
+    /// Lines or objects that could not be read; they are skipped.
+    pub bad: u64,
+    /// Number and error of the first eight of them.
+    pub first_bad: ArrayVec<(u64, LineError), NAMED>,
+}
+
+/// The beginnings of files that people take for logs; what they are, and what to do.
+const NO_LOGS: [(&[u8], &str); 15] = [
+    (b"%PDF", "a PDF document, not a log"),
+    (
+        b"\x1F\x8B",
+        "compressed with gzip: unpack it first (zcat FILE)",
+    ),
+    (
+        b"BZh",
+        "compressed with bzip2: unpack it first (bzcat FILE)",
+    ),
+    (
+        b"\xFD7zXZ",
+        "compressed with xz: unpack it first (xzcat FILE)",
+    ),
+    (
+        b"\x28\xB5\x2F\xFD",
+        "compressed with zstd: unpack it first (zstdcat FILE)",
+    ),
+    (
+        b"PK\x03\x04",
+        "a zip archive or an office document, not a log",
+    ),
+    (b"MDF  ", "an MDF file: convert it to BLF or ASC first"),
+    (
+        b"UnFinMF",
+        "an unfinished MDF file: convert it to BLF or ASC first",
+    ),
+    (
+        b"SQLite ",
+        "an SQLite database: convert it first, as with python-can's can_logconvert",
+    ),
+    (
+        b"\n\r\r\n",
+        "a pcapng capture: convert it to a candump log first",
+    ),
+    (
+        b"\xD4\xC3\xB2\xA1",
+        "a pcap capture: convert it to a candump log first",
+    ),
+    (
+        b"\xA1\xB2\xC3\xD4",
+        "a pcap capture: convert it to a candump log first",
+    ),
+    (b"\xFF\xFE", UTF_16),
+    (b"\xFE\xFF", UTF_16),
+    (b"\x7FELF", "a program, not a log"),
+];
+const UTF_16: &str = "text in UTF-16: save it as UTF-8 first (iconv -f UTF-16 -t UTF-8)";
+/// The mark that Windows programs put before UTF-8 text.
+const UTF_8_MARK: &[u8] = b"\xEF\xBB\xBF";
+/// Bytes that are read first: the longest of these beginnings.
+const HEAD: usize = 8;
+
+/// The source of lines or objects.
+#[derive(Debug)]
+enum Source {
+    /// Nothing is read yet.
+    Unopened,
+    /// Text, of which no line told the format yet.
+    Unknown,
+    Candump,
+    Asc(Asc),
+    Blf(Box<Blf>),
+    Trc(Trc),
+    Csv,
+    /// Nothing more can be read.
+    Ended,
+}
+
+impl Report {
+    fn reject(&mut self, line: u64, error: LineError) {
+        self.bad += 1;
+        // The ninth and later ones are only counted.
+        let _ = self.first_bad.try_push((line, error));
+    }
+}
+
+/// Reads the records of a log one after the other; allocates nothing after the first.
+///
+/// The format is that of the first line that only one format has. A candump line is one that holds
+/// a frame; for the others a line of their header will do.
+///
+/// A line that cannot be read is skipped and reported. A last line without a line end, as a stopped
+/// recorder leaves it, counts only if no continuation could make it another frame: half a payload
+/// is not returned as a short one.
+///
+/// A stamp that is later than the next frame's by more than [`REORDER`], while the next is not
+/// earlier than the one before, is wrong: its frame is skipped and reported. (Everything after it
+/// would otherwise seem late.)
+#[derive(Debug)]
+pub struct Reader<R> {
+    /// The first bytes, which tell what the file is, and the others.
+    inner: io::Chain<io::Cursor<ArrayVec<u8, HEAD>>, R>,
+    source: Source,
+    format: Option<LogFormat>,
+    line: Vec<u8>,
+    /// The frame after the current one, if it has been read already: its text, the number of its
+    /// line, and the frame.
+    next_line: Vec<u8>,
+    next: Option<(u64, Parsed)>,
+    stamps: Stamps,
+    sum: Nanos,
+    last: Option<Nanos>,
+    report: Report,
+}
+
+impl<R: BufRead> Reader<R> {
+    /// Reads from `inner`. To detect the meaning of relative stamps it looks ahead in `inner`'s
+    /// buffer.
+    pub fn new(inner: R) -> Self {
+        Self::with_stamps(inner, Stamps::Detect)
+    }
+
+    /// Reads from `inner`; relative stamps have the meaning `stamps`.
+    pub fn with_stamps(inner: R, stamps: Stamps) -> Self {
+        let line = || Vec::with_capacity(MAX_LINE + 16);
+        Self {
+            inner: io::Cursor::new(ArrayVec::new()).chain(inner),
+            source: Source::Unopened,
+            format: None,
+            next_line: line(),
+            line: line(),
+            next: None,
+            stamps,
+            sum: Nanos::ZERO,
+            last: None,
+            report: Report::default(),
+        }
+    }
+
+    /// The counts so far.
+    pub const fn report(&self) -> &Report {
+        &self.report
+    }
+
+    /// The format; `None` as long as nothing told it.
+    pub const fn format(&self) -> Option<LogFormat> {
+        self.format
+    }
+
+    /// The first lines or objects that could not be read: `line 7: why`.
+    pub fn bad(&self) -> impl Iterator<Item = String> {
+        let part = self.part();
+        let told = move |(number, error): &(u64, LineError)| match error {
+            // Of the whole file.
+            LineError::NoLog(_) => error.to_string(),
+            _ => format!("{part} {number}: {error}"),
+        };
+        self.report.first_bad.iter().map(told)
+    }
+
+    /// Why a log without a frame has none.
+    pub fn why_empty(&self) -> String {
+        match (self.bad().next(), self.report.first_bad.first()) {
+            (Some(bad), Some((_, LineError::NoLog(_) | LineError::Table))) => bad,
+            (Some(bad), _) if self.format.is_none() => format!(
+                "it is in none of the formats that can be read ({}); as a candump log, {bad}",
+                LogFormat::ALL
+            ),
+            (Some(bad), _) => format!("the first that cannot be read is {bad}"),
+            (None, _) if self.report.lines == 0 => "it is empty".to_owned(),
+            (None, _) => format!("none of its {} {}s is one", self.report.lines, self.part()),
+        }
+    }
+
+    fn part(&self) -> &'static str {
+        match self.format {
+            Some(LogFormat::Blf) => "object",
+            _ => "line",
+        }
+    }
+
+    /// The meaning of relative stamps; [`Stamps::Detect`] until the first one was read.
+    pub const fn stamps(&self) -> Stamps {
+        self.stamps
+    }
+
+    /// The next record; `None` at the end of the log.
+    ///
+    /// # Errors
+    /// A read error of `inner`. A bad line is not an error: see [`Reader::report`].
+    pub fn next_record(&mut self) -> io::Result<Option<Record<'_>>> {
+        let parsed = loop {
+            let Some((number, parsed)) = self.next_frame()? else {
+                return Ok(None);
+            };
+            match self.ahead(&parsed)? {
+                None => break parsed,
+                Some(ahead) => self.report.reject(number, LineError::Ahead { ahead }),
+            }
+        };
+        let stamp = match parsed.stamp {
+            None => {
+                self.report.unstamped += 1;
+                None
+            }
+            Some((t, StampForm::Relative)) => {
+                if self.stamps == Stamps::Detect {
+                    self.stamps = look_ahead(t, self.inner.fill_buf()?);
+                }
+                self.sum = self.sum.saturating_add(t);
+                Some(if self.stamps == Stamps::SincePrevious {
+                    self.sum
+                } else {
+                    t
+                })
+            }
+            Some((t, _)) => Some(t),
+        };
+        if stamp.is_some() {
+            self.report.backwards += u64::from(stamp < self.last);
+            self.last = stamp;
+        }
+        self.report.records += 1;
+        Ok(parsed.record(&self.line, stamp))
+    }
+
+    /// The next frame and the number of its line; its text is in `line`. Lines without a frame are
+    /// skipped.
+    fn next_frame(&mut self) -> io::Result<Option<(u64, Parsed)>> {
+        if let Some(next) = self.next.take() {
+            std::mem::swap(&mut self.line, &mut self.next_line);
+            return Ok(Some(next));
+        }
+        loop {
+            match self.next_parsed()? {
+                None => return Ok(None),
+                Some(Ok(ParsedLine::Record(parsed))) => {
+                    return Ok(Some((self.report.lines, parsed)));
+                }
+                Some(Ok(ParsedLine::Dropped(count))) => {
+                    self.report.dropped = self.report.dropped.saturating_add(count);
+                }
+                Some(Ok(ParsedLine::Note)) => {}
+                Some(Err(error)) => self.report.reject(self.report.lines, error),
+            }
+        }
+    }
+
+    /// By how much the stamp of `parsed` is too late to be right \[ns\], if it is. Only a stamp
+    /// that jumps is compared with the next one, which is then read.
+    fn ahead(&mut self, parsed: &Parsed) -> io::Result<Option<Nanos>> {
+        let counts_from_origin = |form: StampForm| match form {
+            StampForm::Absolute | StampForm::Origin => true,
+            StampForm::Relative => self.stamps == Stamps::SinceOrigin,
+        };
+        let Some((t, form)) = parsed.stamp else {
+            return Ok(None);
+        };
+        let last = self.last.unwrap_or(Nanos::MIN);
+        if !counts_from_origin(form) || t.saturating_sub(last) <= REORDER {
+            return Ok(None);
+        }
+        std::mem::swap(&mut self.line, &mut self.next_line);
+        self.next = self.next_frame()?;
+        std::mem::swap(&mut self.line, &mut self.next_line);
+        let Some((next, _)) = self.next.as_ref().and_then(|(_, next)| next.stamp) else {
+            return Ok(None);
+        };
+        let ahead = t.saturating_sub(next);
+        Ok((ahead > REORDER && next >= last.saturating_sub(REORDER)).then_some(ahead))
+    }
+
+    /// Reads and parses the next line or object; `None` at the end.
+    fn next_parsed(&mut self) -> io::Result<Option<Result<ParsedLine, LineError>>> {
+        if matches!(self.source, Source::Unopened)
+            && let Err(error) = self.open()?
+        {
+            self.report.lines = 1;
+            return Ok(Some(Err(error)));
+        }
+        let next = match &mut self.source {
+            Source::Ended => return Ok(None),
+            Source::Blf(blf) => {
+                self.line.clear();
+                let next = blf.next(&mut self.inner)?;
+                self.report.lines += u64::from(next.is_some());
+                next
+            }
+            _ => self.next_line()?,
+        };
+        Ok(match next {
+            Some(Err(error)) if error.is_final() => {
+                self.source = Source::Ended;
+                Some(Err(error))
+            }
+            Some(Ok(ParsedLine::Record(mut parsed))) => {
+                if let Interface::Channel(channel) = parsed.interface {
+                    // The line ends with the name, as if it had been written there.
+                    let start = self.line.len();
+                    write!(self.line, "can{channel}")?;
+                    parsed.interface = Interface::Text(start..self.line.len());
+                }
+                Some(Ok(ParsedLine::Record(parsed)))
+            }
+            next => next,
+        })
+    }
+
+    /// Reads the first bytes; the error is that they are no log's.
+    fn open(&mut self) -> io::Result<Result<(), LineError>> {
+        let (head, rest) = self.inner.get_mut();
+        let head = head.get_mut();
+        while head.len() < HEAD {
+            let byte = rest.fill_buf()?.first().copied();
+            rest.consume(usize::from(byte.is_some()));
+            let Some(byte) = byte else { break };
+            head.push(byte);
+        }
+        let is_utf_16 = matches!(
+            head.as_slice(),
+            [_, 0, _, 0, _, 0, ..] | [0, _, 0, _, 0, _, ..]
+        ) && head.iter().any(|c| *c != 0);
+        let what = NO_LOGS
+            .iter()
+            .find(|(beginning, _)| head.starts_with(beginning));
+        if let Some((_, what)) = what {
+            self.source = Source::Ended;
+            return Ok(Err(LineError::NoLog(what)));
+        }
+        if is_utf_16 {
+            self.source = Source::Ended;
+            return Ok(Err(LineError::NoLog(UTF_16)));
+        }
+        if head.starts_with(UTF_8_MARK) {
+            head.drain(..UTF_8_MARK.len());
+        }
+        self.source = if head.starts_with(blf::SIGNATURE) {
+            self.format = Some(LogFormat::Blf);
+            Source::Blf(Box::new(Blf::new()))
+        } else {
+            Source::Unknown
+        };
+        Ok(Ok(()))
+    }
+
+    /// Reads and parses the next line; `None` at the end.
+    fn next_line(&mut self) -> io::Result<Option<Result<ParsedLine, LineError>>> {
+        self.line.clear();
+        let most = MAX_LINE as u64 + 1;
+        if self
+            .inner
+            .by_ref()
+            .take(most)
+            .read_until(b'\n', &mut self.line)?
+            == 0
+        {
+            return Ok(None);
+        }
+        self.report.lines += 1;
+        let ended = self.line.last() == Some(&b'\n');
+        if !ended && self.line.len() > MAX_LINE {
+            // The rest of the line, in parts.
+            while self.line.last() != Some(&b'\n') {
+                self.line.clear();
+                if self
+                    .inner
+                    .by_ref()
+                    .take(most)
+                    .read_until(b'\n', &mut self.line)?
+                    == 0
+                {
+                    break;
+                }
+            }
+            return Ok(Some(Err(LineError::LineTooLong)));
+        }
+        let parsed = match &mut self.source {
+            Source::Candump => parse_line(&self.line),
+            Source::Asc(asc) => asc.parse(&self.line),
+            Source::Trc(trc) => trc.parse(&self.line),
+            Source::Csv => csv::parse(&self.line),
+            _ => self.first_line(),
+        };
+        Ok(Some(match parsed {
+            Ok(ParsedLine::Record(ref record)) if !ended && !record.whole => {
+                Err(LineError::Unfinished)
+            }
+            Err(error) if !ended && !error.is_final() => Err(LineError::Unfinished),
+            parsed => parsed,
+        }))
+    }
+
+    /// Parses a line of text whose format is not known, and learns the format if it tells.
+    fn first_line(&mut self) -> Result<ParsedLine, LineError> {
+        let line = &self.line;
+        let parsed = parse_line(line);
+        let is_candump = matches!(parsed, Ok(ParsedLine::Record(_) | ParsedLine::Dropped(_)));
+        let (format, source, parsed) = if is_candump {
+            (LogFormat::Candump, Source::Candump, parsed)
+        } else if Asc::has(line) {
+            let mut asc = Asc::new();
+            let parsed = asc.parse(line);
+            (LogFormat::Asc, Source::Asc(asc), parsed)
+        } else if Trc::has(line) {
+            let mut trc = Trc::new();
+            let parsed = trc.parse(line);
+            (LogFormat::Trc, Source::Trc(trc), parsed)
+        } else if csv::has(line) {
+            (LogFormat::Csv, Source::Csv, csv::parse(line))
+        } else if self.report.lines == 1 && csv::is_other_table(line) {
+            return Err(LineError::Table);
+        } else {
+            return parsed;
+        };
+        (self.format, self.source) = (Some(format), source);
+        parsed
+    }
+}
+
+/// Whether the stamps that follow `first` in `buffered` ever decrease.
+fn look_ahead(first: Nanos, buffered: &[u8]) -> Stamps {
+    let mut last = first;
+    for line in buffered.split(|c| *c == b'\n') {
+        if let Ok(ParsedLine::Record(Parsed {
+            stamp: Some((t, StampForm::Relative)),
+            ..
+        })) = parse_line(line)
+        {
+            if t < last {
+                return Stamps::SincePrevious;
+            }
+            last = t;
+        }
+    }
+    Stamps::SinceOrigin
+}
