@@ -164,7 +164,10 @@ impl Decoder {
                     continue;
                 }
                 let main = output.reading.kind() == route.kind;
-                let mut quality = output.quality;
+                let mut quality = match &route.feed {
+                    Some(feed) => self.joints.flags(feed, output.quality),
+                    None => output.quality,
+                };
                 if main && let Some(last) = self.last.get_mut(route.channel as usize) {
                     if output.acquired < *last {
                         self.status.count(number, Counter::Backward, 1);

@@ -245,6 +245,19 @@ impl Joints {
         }
     }
 
+    /// The flags, for its joint's channel, of a reading that is no joint's state, such as a drive's.
+    /// Where the device is not the joint's only source, what spoils its own readings does not spoil
+    /// the joint's.
+    pub(crate) fn flags(&self, feed: &Feed, quality: Quality) -> Quality {
+        let alone = |(shaft, target): &(Shaft, Target)| {
+            shaft.sources.len() == 1 && matches!(target, Target::Channel(_))
+        };
+        match self.shafts.get(feed.shaft).is_some_and(alone) {
+            true => quality,
+            false => Quality(quality.0 & Quality::DRIVE_FAULT.0),
+        }
+    }
+
     /// Takes the reading `output` of a device, with its `state`, through the gear `map`; calls
     /// `publish` with the channel of each sample that it completes. False: its stamp runs backward,
     /// and it was not taken.

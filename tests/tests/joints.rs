@@ -292,7 +292,7 @@ fn a_gateway_publishes_one_channel_for_each_joint() {
             moves || velocity.abs() <= ROW * HALF_VELOCITY || velocity.is_nan(),
             "{velocity}"
         );
-        *counts.entry(name).or_insert([0, 0])[usize::from(moves)] += 1;
+        counts.entry(name).or_insert([0, 0])[usize::from(moves)] += 1;
     }
     assert_eq!(counts.len(), 7, "{counts:?}");
     assert!(counts.values().flatten().all(|n| *n > 20), "{counts:?}");
