@@ -5,7 +5,7 @@
 //! rest on needs a restart of the gateway: also which device gives what of a joint (`takes`), and
 //! couplings.
 
-use crate::joints::{CouplingPlan, Layout, Matrix, Takes};
+use crate::joints::{CouplingPlan, Layout, Matrix, Takes, Target};
 use crate::plan::{BusPlan, DevicePlan, Plan, Route};
 use proprio_drivers::Claim;
 use std::collections::BTreeSet;
@@ -122,7 +122,9 @@ fn compare_buses(old: (&Plan, &BusPlan), new: (&Plan, &BusPlan), blocked: &mut V
                         route.output,
                         route.kind,
                         names,
-                        shaft.map(|s| s.target),
+                        shaft
+                            .filter(|s| matches!(s.target, Target::Motor(..)))
+                            .map(|s| s.target),
                         takes,
                     )
                 })
