@@ -245,7 +245,8 @@ impl Joints {
         }
     }
 
-    /// The flags, for its joint's channel, of a reading that is no joint's state, such as a drive's.
+    /// The flags, for its joint's channel, of a reading that is no joint's state, such as a
+    /// drive's.
     /// Where the device is not the joint's only source, what spoils its own readings does not spoil
     /// the joint's.
     pub(crate) fn flags(&self, feed: &Feed, quality: Quality) -> Quality {

@@ -407,8 +407,9 @@ fn a_silent_motor_silences_its_coupling() {
 #[test]
 fn flags_of_a_motor_are_those_of_its_joints() {
     let text = SHOULDER.replace("joints = ", "takes = [\"position\"]\n joints = ");
-    let encoders = "[[bus.device]]\n driver = \"icub_motor\"\n name = \"board_9\"\n period_ms = 4\n address = 9\n\
-                    [[bus.device.joint]]\n name = \"yaw\"\n takes = [\"velocity\"]\n";
+    let encoders = "[[bus.device]]\n driver = \"icub_motor\"\n name = \"board_9\"\n period_ms = 4\n\
+                    address = 9\n[[bus.device.joint]]\n name = \"yaw\"\n\
+                    takes = [\"velocity\"]\n";
     let with_yaw = text.replace("[[bus.coupling]]", &format!("{encoders}[[bus.coupling]]"));
     for text in [SHOULDER, &with_yaw] {
         let mut rig = Rig::new(text);
@@ -691,7 +692,8 @@ fn a_coupling_can_give_torques_alone() {
         );
     }
     text += "[[bus.coupling]]\njoints = [\"pitch\", \"roll\"]\n\
-             motors = [\"motor_1\", \"motor_2\"]\nmatrix = [[0.5, 0.5], [0.5, -0.5]]\ntakes = [\"torque\"]\n";
+             motors = [\"motor_1\", \"motor_2\"]\nmatrix = [[0.5, 0.5], [0.5, -0.5]]\n\
+             takes = [\"torque\"]\n";
     let mut rig = Rig::new(&text);
     assert_eq!(rig.plan.channels.len(), 2);
     let torque = |torque: f64| JointState {
@@ -929,7 +931,7 @@ fn each_mistake_has_one_clear_message() {
             "\"roll\", \"yaw\"]",
             "\"roll\", \"elbow\"]",
             "joint \"elbow\": its position comes from device \"encoder\" and from its coupling; \
-             say with takes",
+             give them different names or",
         ),
         ("\"roll\", \"yaw\"]", "\"roll\", \"\"]", "must have 1 to"),
         (
@@ -947,7 +949,8 @@ fn each_mistake_has_one_clear_message() {
             "takes = [\"velocity\", \"torque\", \"current\"]",
             "",
             "joint \"elbow\": its position comes from device \"encoder\" and from device \
-             \"drive\"; say with takes = [...] which of them gives what, each quantity once: \"position\", \
+             \"drive\"; give them different names or, if both measure this joint, say with takes = \
+             [...] what each of them gives: \"position\", \
              \"velocity\", \"acceleration\", \"torque\", \"current\"",
         ),
         (
@@ -1041,8 +1044,8 @@ fn the_plan_shows_where_each_output_leads() {
     let shown = plan(&format!("{ELBOW}{SHOULDER}")).unwrap().to_string();
     for line in [
         "    channel   0 joint elbow = -1 * output 0 of the device +0.2 rad (position alone), \
-         turns counted, certain over 0.314159265 s, else right from -2.6416 to 3.6416 rad, stale after \
-         0.04 s\n",
+         turns counted, certain over 0.314159265 s, else right from -2.6416 to 3.6416 rad, stale \
+         after 0.04 s\n",
         "    channel   0 joint elbow = 0.01 * output 0 of the device +0 rad (velocity, torque, \
          current alone), stale after",
         "    channel   2 joint roll, by the coupling; motor motor_2 = -0.01 * output 0 of the \

@@ -26,8 +26,8 @@ use proprio_topics::{
 };
 use std::collections::VecDeque;
 
-/// Standard deviation of a simulated position, of a joint or of a motor's shaft behind its gear: the
-/// error of gears and bearings in addition to the encoder's steps \[rad or m\].
+/// Standard deviation of a simulated position, of a joint or of a motor's shaft behind its gear:
+/// the error of gears and bearings in addition to the encoder's steps \[rad or m\].
 pub const JOINT_NOISE: f64 = 2e-5;
 /// Standard deviation of a simulated IMU's acceleration \[m/s^2\].
 pub const ACCELERATION_NOISE: f64 = 0.03;

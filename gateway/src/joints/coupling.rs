@@ -1,9 +1,10 @@
 //! The motors of a coupling, brought together to one instant.
 //!
 //! The joints of a coupling have a state when every motor has given a new reading since the last
-//! one. It has the stamp of the newest reading; the others, each younger than the period of its own
-//! device, are carried to that stamp ([`super::track`]). While a motor is silent there is no state,
-//! and the joints' channels become stale.
+//! one. It has the stamp of the newest reading; the others are carried to that stamp
+//! ([`super::track`]). They are younger than the period of their own device, or, where frames are
+//! lost, than its maximum silence. While a motor is silent there is no state, and the joints'
+//! channels become stale.
 
 use super::matrix::Matrix;
 use super::track::{Measured, Track};

@@ -191,7 +191,8 @@ impl Wiring {
                     let known = shafts.iter().map(|shaft| shaft.name.as_str());
                     return Err(format!(
                         "{at}: motor {name:?} is no [[bus.device.joint]] of this bus; all motors \
-                         of a coupling must be on one bus, because each bus has a thread of its own{}",
+                         of a coupling must be on one bus, because each bus has a thread of its \
+                         own{}",
                         did_you_mean(name, known)
                     ));
                 };
@@ -246,8 +247,8 @@ impl Wiring {
                 };
                 let word = word(quantity);
                 return Err(format!(
-                    "{at}: its {word} comes from {} and from {}; say with takes = [...] which of \
-                     them gives what, each quantity once: {}",
+                    "{at}: its {word} comes from {} and from {}; give them different names or, if \
+                     both measure this joint, say with takes = [...] what each of them gives: {}",
                     by(other),
                     by(source),
                     quoted(Takes::ALL.quantities().map(self::word))
