@@ -409,16 +409,15 @@ impl EncoderBoard {
     fn send(&mut self, out: &mut Frames) {
         let fault = self.quality.contains(Quality::DEVICE_FAULT);
         self.node.report(if fault { HARDWARE } else { 0 }, out);
-        if self.node.value(object::tpdo_mapping(0, 1)) == POSITION.mapped(32) {
-            let frame = Frame::new(self.node.tpdo_id(0), &self.counts.to_le_bytes());
-            let _ = out.try_push(frame);
-        }
+        let frame = Frame::new(self.node.tpdo_id(0), &self.counts.to_le_bytes());
+        let _ = out.try_push(frame);
     }
 }
 
 impl Board for EncoderBoard {
     fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
-        if self.node.on_frame(frame, out) & 1 != 0 {
+        let is_due = self.node.on_frame(frame, out) & 1 != 0;
+        if is_due && self.node.value(object::tpdo_mapping(0, 1)) == POSITION.mapped(32) {
             self.send(out);
         }
     }

@@ -38,6 +38,9 @@ pub struct RawBus {
     /// `[[bus.device]]`: common keys and the driver's own keys in one table.
     #[serde(default)]
     pub device: Vec<Spanned<toml::Table>>,
+    /// `[[bus.coupling]]`: joints that several motors move together.
+    #[serde(default)]
+    pub coupling: Vec<RawCoupling>,
 }
 
 /// The source of a bus's frames.
@@ -121,12 +124,13 @@ const fn default_max_silence_ms() -> f64 {
     100.0
 }
 
-/// `[[bus.device.joint]]`: the joint that a channel of the device measures: joint = sign * device /
-/// ratio + offset.
+/// `[[bus.device.joint]]`: the joint, or the motor of a coupling, that a channel of the device
+/// measures: joint = sign * device / ratio + offset.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RawJoint {
-    /// The joint's name.
+    /// The name of the joint, or of the motor. Several devices of a bus may measure one joint if
+    /// `takes` says which gives what.
     pub name: String,
     /// The device's channel.
     #[serde(default)]
@@ -140,6 +144,51 @@ pub struct RawJoint {
     /// The joint's angle where the device reports zero \[rad\].
     #[serde(default)]
     pub offset_rad: f64,
+    /// What is taken of this device; all by default.
+    pub takes: Option<Vec<Quantity>>,
+    /// The ends of the range in which the device reports its angle and begins anew \[rad\], if the
+    /// joint goes beyond: `[0.0, 6.283185307179586]` for one turn of the device. Needs the two keys
+    /// below.
+    pub wraps_rad: Option<[f64; 2]>,
+    /// The joint's angle to which the turn is chosen nearest, at start and after a gap \[rad\].
+    /// Right if the joint is within half a range (divided by `ratio`) of it: `--check` prints the
+    /// limits.
+    pub centre_rad: Option<f64>,
+    /// The highest speed of the device's shaft, not of the joint \[rad/s\]. While no two readings
+    /// are so far apart in time that it could have turned by half the range, the turn is certain.
+    pub max_speed_radps: Option<f64>,
+}
+
+/// A quantity that a device measures of a joint.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Quantity {
+    /// `"position"`.
+    Position,
+    /// `"velocity"`.
+    Velocity,
+    /// `"acceleration"`.
+    Acceleration,
+    /// `"torque"`.
+    Torque,
+    /// `"current"`: of the motor.
+    Current,
+}
+
+/// `[[bus.coupling]]`: joints = matrix * motors. Velocities and accelerations follow the same
+/// matrix, torques the transpose of its inverse: power is conserved.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RawCoupling {
+    /// The joints' names.
+    pub joints: Vec<String>,
+    /// The motors, as many: names of `[[bus.device.joint]]` of this bus. `ratio`, `sign` and
+    /// `offset_rad` there are applied before the matrix.
+    pub motors: Vec<String>,
+    /// A row for each joint, a column for each motor.
+    pub matrix: Vec<Vec<f64>>,
+    /// What is taken of the motors; all by default. The rest comes from devices at the joints.
+    pub takes: Option<Vec<Quantity>>,
 }
 
 const fn one() -> f64 {

@@ -3,6 +3,7 @@
 
 use crate::dispatch::Dispatch;
 use crate::inbox::{Replacement, Reply, Request};
+use crate::joints::Joints;
 use crate::plan::{BusPlan, DevicePlan, Route};
 use crate::status::BusStatus;
 use proprio_drivers::{
@@ -17,9 +18,10 @@ pub struct Decoder {
     bus: u32,
     devices: Vec<Running>,
     dispatch: Dispatch,
-    /// Stamp of the last main reading per channel.
+    joints: Joints,
+    /// Stamp of the last main reading per channel that is no joint's.
     last: [Nanos; MAX_CHANNELS],
-    /// Channels whose next main reading has ZERO_CHANGED, because their device or conversion was
+    /// Channels, no joint's, whose next main reading has ZERO_CHANGED, because their device was
     /// replaced.
     replaced: [bool; MAX_CHANNELS],
     /// Number of devices with a request open.
@@ -76,16 +78,18 @@ impl Decoder {
                 })
             })
             .collect::<Result<Vec<_>, SpecError>>()?;
-        Ok(Self::of(bus, devices, status))
+        let joints = Joints::new(&plan.joints);
+        Ok(Self::of(bus, devices, joints, status))
     }
 
-    fn of(bus: u32, devices: Vec<Running>, status: Arc<BusStatus>) -> Self {
+    fn of(bus: u32, devices: Vec<Running>, joints: Joints, status: Arc<BusStatus>) -> Self {
         let dispatch = Dispatch::new(devices.iter().map(|d| d.device.claims()));
         let last = [Nanos::MIN; MAX_CHANNELS];
         let this = Self {
             bus,
             devices,
             dispatch,
+            joints,
             last,
             replaced: [false; MAX_CHANNELS],
             open: 0,
@@ -129,8 +133,41 @@ impl Decoder {
                 let Some(route) = running.routes.iter().find(|r| r.output == output.output) else {
                     continue;
                 };
+                let header = Header {
+                    acquired: output.acquired,
+                    device_time: output.device_time,
+                    device_counter: output.device_counter,
+                    quality: output.quality,
+                    stamp: output.stamp.in_memory(),
+                    bus: self.bus,
+                    ..Header::default()
+                };
+                if let (Reading::Joint(state), Some(feed)) = (output.reading, &route.feed) {
+                    let joints = &mut self.joints;
+                    let taken = joints.push(feed, &route.map, output, state, |channel, whole| {
+                        let header = Header {
+                            acquired: whole.acquired,
+                            device_time: whole.device_time,
+                            device_counter: whole.device_counter,
+                            quality: whole.quality,
+                            stamp: whole.stamp.in_memory(),
+                            ..header
+                        };
+                        publish(&mut Sample::new(
+                            header,
+                            channel,
+                            &Reading::Joint(whole.state),
+                        ));
+                    });
+                    let counter = [Counter::Backward, Counter::Readings][usize::from(taken)];
+                    self.status.count(number, counter, 1);
+                    continue;
+                }
                 let main = output.reading.kind() == route.kind;
-                let mut quality = output.quality;
+                let mut quality = match &route.feed {
+                    Some(feed) => self.joints.flags(feed, output.quality),
+                    None => output.quality,
+                };
                 if main && let Some(last) = self.last.get_mut(route.channel as usize) {
                     if output.acquired < *last {
                         self.status.count(number, Counter::Backward, 1);
@@ -143,21 +180,9 @@ impl Decoder {
                         quality |= Quality::GAP_BEFORE | Quality::ZERO_CHANGED;
                     }
                 }
-                let reading = match output.reading {
-                    Reading::Joint(state) => Reading::Joint(route.map.joint(state)),
-                    other => other,
-                };
-                let header = Header {
-                    acquired: output.acquired,
-                    device_time: output.device_time,
-                    device_counter: output.device_counter,
-                    quality,
-                    stamp: output.stamp.in_memory(),
-                    bus: self.bus,
-                    ..Header::default()
-                };
+                let header = Header { quality, ..header };
                 self.status.count(number, Counter::Readings, 1);
-                publish(&mut Sample::new(header, route.channel, &reading));
+                publish(&mut Sample::new(header, route.channel, &output.reading));
             }
             self.status.set_state(number, running.device.state());
         }
@@ -297,10 +322,18 @@ impl Decoder {
         if let Some(running) = self.devices.get_mut(usize::from(number)) {
             if new.device.is_some() || new.routes != running.routes {
                 for route in &new.routes {
-                    if let Some(replaced) = self.replaced.get_mut(route.channel as usize) {
-                        *replaced = true;
+                    match &route.feed {
+                        Some(feed) => self.joints.replaced(feed),
+                        None => {
+                            if let Some(replaced) = self.replaced.get_mut(route.channel as usize) {
+                                *replaced = true;
+                            }
+                        }
                     }
                 }
+            }
+            for feed in new.routes.iter().filter_map(|route| route.feed.as_ref()) {
+                self.joints.set_max_silence(feed, new.max_silence);
             }
             if let Some(device) = &mut new.device {
                 std::mem::swap(device, &mut running.device);
@@ -429,7 +462,7 @@ mod tests {
             routes: Vec::new(),
             request: Open::None,
         };
-        let mut decoder = Decoder::of(0, vec![running], Arc::clone(&status));
+        let mut decoder = Decoder::of(0, vec![running], Joints::default(), Arc::clone(&status));
         assert_eq!(decoder.claims(), [Claim::exclusive(answer)]);
         let count = |counter: Counter| status.devices().next().unwrap().counters[counter as usize];
         let sent = |decoder: &mut Decoder, now| {

@@ -1,8 +1,8 @@
 //! The gateway reads CAN buses and publishes SI samples in shared memory.
 //!
 //! ```text
-//! CAN bus <-> Link -> Frame -> Device -> Reading -> JointMap -> Sink -> shared memory
-//!             socketcan        (drivers)            (plan)      publish
+//! CAN bus <-> Link -> Frame -> Device -> Reading -> Joints -> Sink -> shared memory
+//!             socketcan        (drivers)                      publish
 //!             replay
 //!             virtual bus
 //! ```
@@ -12,6 +12,8 @@
 //! - `dbc`: files that describe devices, as tables for the drivers.
 //! - [`link`]: one trait and three links to a bus; [`log`]: recorded buses, which replay and decode
 //!   read, and the log format that encode writes.
+//! - [`joints`]: from the outputs of devices to joints: gears, turns, couplings, several devices at
+//!   one joint; and back.
 //! - [`load`]: the share of a bus's time that its devices need.
 //! - [`decoder`]: all devices of one bus, without input or output; [`bus`]: the loop that moves
 //!   frames through it; [`inbox`]: what the control plane asks of it while it runs.
@@ -31,6 +33,7 @@ pub mod decoder;
 mod dispatch;
 mod health;
 pub mod inbox;
+pub mod joints;
 pub mod link;
 pub mod load;
 pub mod log;

@@ -3,14 +3,16 @@
 
 use crate::config::Source;
 use crate::decoder::Decoder;
+use crate::joints::Inverse;
 use crate::link::replay::Matching;
 use crate::log::{self, LogFormat, candump};
-use crate::plan::{BusPlan, Plan};
+use crate::plan::{BusPlan, ChannelPlan, Plan};
 use crate::status::BusStatus;
 use proprio_drivers::{Board, Format, Frame, Frames, Mode, Spec};
 use proprio_topics::csv::{self, Columns, Item, Series, Value, What};
-use proprio_topics::{Counter, Nanos, Reading, Sample, StampKind};
-use std::collections::VecDeque;
+use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Sample, StampKind};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::fmt::Display;
 use std::io::{self, BufRead, Write};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
@@ -302,14 +304,138 @@ pub struct EncodeReport {
     pub table: csv::Report,
 }
 
+impl EncodeReport {
+    /// Notes why a sample of this line is refused, if it is the first one.
+    fn reason(&mut self, line: u64, error: &dyn Display) {
+        self.first_refusal
+            .get_or_insert_with(|| format!("line {line}: {error}"));
+    }
+}
+
+/// The frames of an encoded log, sorted by their stamps.
+struct Encoded<'p> {
+    /// Per bus.
+    interfaces: Vec<&'p str>,
+    waiting: VecDeque<(Nanos, usize, Frame)>,
+    frames: u64,
+}
+
+impl Encoded<'_> {
+    /// Adds the frames of a reading of instant `t`, at intervals of `spacing`.
+    fn push(
+        &mut self,
+        t: Option<Nanos>,
+        bus: usize,
+        frames: &Frames,
+        spacing: Nanos,
+        log: &mut impl Write,
+    ) -> io::Result<()> {
+        let interface = self.interfaces.get(bus).unwrap_or(&"can0");
+        let mut next = t.unwrap_or(Nanos::ZERO);
+        for frame in frames {
+            self.frames += 1;
+            if t.is_none() {
+                // The log format without a stamp: only the order is known.
+                writeln!(log, "{interface} {frame}")?;
+                continue;
+            }
+            let last = self.waiting.iter().rposition(|(other, ..)| *other <= next);
+            self.waiting
+                .insert(last.map_or(0, |i| i + 1), (next, bus, *frame));
+            next += spacing;
+        }
+        Ok(())
+    }
+
+    /// Writes the frames before `t`.
+    fn write_before(&mut self, t: Option<Nanos>, log: &mut impl Write) -> io::Result<()> {
+        while let Some((stamp, bus, frame)) = self.waiting.front()
+            && t.is_some_and(|t| *stamp < t)
+        {
+            let interface = self.interfaces.get(*bus).unwrap_or(&"can0");
+            candump::write_log_line(&mut *log, *stamp, interface, frame)?;
+            self.waiting.pop_front();
+        }
+        Ok(())
+    }
+}
+
 /// Approximate duration of a frame on the bus: the interval between the frames of one reading in an
 /// encoded log.
 const FRAME_TIME: Nanos = Nanos::from_micros(130);
 
+/// Where a joint's state goes in a log: to an output of a device, which measures it.
+struct Measures {
+    bus: usize,
+    device: usize,
+    output: u8,
+    inverse: Inverse,
+    /// Its reading completes a sample, and follows those that do not.
+    completes: bool,
+}
+
+/// The outputs that measure the plan's joints, in the order in which a row's readings are encoded.
+fn measures(plan: &Plan) -> Vec<Measures> {
+    let mut all = Vec::new();
+    for (bus, bus_plan) in plan.buses.iter().enumerate() {
+        for (device, device_plan) in bus_plan.devices.iter().enumerate() {
+            for route in &device_plan.routes {
+                let Some(feed) = &route.feed else { continue };
+                let inverse = bus_plan.joints.inverse(feed, route.map);
+                all.extend(inverse.map(|inverse| Measures {
+                    bus,
+                    device,
+                    output: route.output,
+                    inverse,
+                    completes: bus_plan.joints.completes(feed),
+                }));
+            }
+        }
+    }
+    all.sort_by_key(|measures| measures.completes);
+    all
+}
+
+/// The joints of a row: state and quality by channel.
+type Joints = BTreeMap<u32, (JointState, Quality)>;
+
+impl Measures {
+    /// What the device reports of the joints of a row. `None`: it measures none of them. An error:
+    /// not all of them are there.
+    fn reading(&self, joints: &Joints) -> Option<Result<(Reading, Quality), &'static str>> {
+        let channels = self.inverse.channels.iter();
+        let states: Vec<_> = channels
+            .filter_map(|channel| joints.get(channel).copied())
+            .collect();
+        if states.is_empty() {
+            return None;
+        }
+        if states.len() < self.inverse.channels.len() {
+            return Some(Err("the joints of a coupling must be in one row"));
+        }
+        let of_joints: Vec<JointState> = states.iter().map(|(state, _)| *state).collect();
+        // A flag of all joints that it moves may be its own. Those of an encoder are of the device
+        // that gives the position.
+        let moved = states
+            .iter()
+            .enumerate()
+            .filter(|(place, _)| self.inverse.moves(*place));
+        let common = moved.fold(u32::MAX, |common, (_, (_, quality))| common & quality.0);
+        let quality = match self.completes {
+            true => common,
+            false => common & Quality::DRIVE_FAULT.0,
+        };
+        let state = self.inverse.device(self.inverse.shaft(&of_joints));
+        Some(Ok((Reading::Joint(state), Quality(quality))))
+    }
+}
+
 /// Encodes a table of samples as a CAN log, through the drivers' own encoders: the inverse of
 /// [`decode`].
 ///
-/// A reading's first frame has the row's stamp; the others follow at the duration of a frame.
+/// A reading's first frame has the row's stamp; the others follow at the duration of a frame. Where
+/// several devices measure one joint, the readings that its sample carries along come before the
+/// one that makes it, all with the row's stamp.
 ///
 /// # Errors
 /// [`OfflineError`]: a file that cannot be read or written, or a device that cannot be built.
@@ -320,23 +446,18 @@ pub fn encode(
 ) -> Result<EncodeReport, OfflineError> {
     let mut reader = csv::Reader::new(table)?;
     let mut report = EncodeReport::default();
-    // Per series: bus, device number and route.
-    let mut targets = Vec::new();
+    // Per series, its channel.
+    let mut channels = Vec::new();
     for series in reader.series() {
-        let channel = plan
-            .channels
-            .iter()
-            .find(|c| What::Channel(c.kind) == series.what && c.name == series.name);
+        let matches =
+            |c: &&ChannelPlan| What::Channel(c.kind) == series.what && c.name == series.name;
+        let channel = plan.channels.iter().find(matches);
         if channel.is_none() && series.what != What::Contact {
             report.unknown_channels.push(series.name.clone());
         }
-        targets.push(channel.and_then(|channel| {
-            let number = plan.channel(&channel.name)?;
-            let device = plan.buses.get(channel.bus)?.devices.get(channel.device)?;
-            let route = *device.routes.iter().find(|r| r.channel == number)?;
-            Some((channel.bus, channel.device, route))
-        }));
+        channels.push(channel.and_then(|c| Some((plan.channel(&c.name)?, c))));
     }
+    let joint_outputs = measures(plan);
     let mut boards: Vec<Vec<Box<dyn Board>>> = Vec::new();
     for bus in &plan.buses {
         let mut of_bus = Vec::new();
@@ -354,60 +475,85 @@ pub fn encode(
         }
         boards.push(of_bus);
     }
-    let interfaces: Vec<&str> = plan.buses.iter().map(interface).collect();
-    let mut waiting: VecDeque<(Nanos, usize, Frame)> = VecDeque::new();
+    let mut output = Encoded {
+        interfaces: plan.buses.iter().map(interface).collect(),
+        waiting: VecDeque::new(),
+        frames: 0,
+    };
     let mut row = csv::Row::default();
     let mut frames = Frames::new();
+    let mut joints = Joints::new();
     while reader.next_row(&mut row)? {
+        joints.clear();
         for Item { series, value } in &row.items {
-            let (Some(Some((bus, device, route))), Value::Reading(reading, quality)) =
-                (targets.get(*series), value)
+            let (Some(Some((number, channel))), Value::Reading(reading, quality)) =
+                (channels.get(*series), value)
             else {
                 continue;
             };
-            let Some(board) = boards.get_mut(*bus).and_then(|b| b.get_mut(*device)) else {
+            if let Reading::Joint(state) = reading {
+                joints.insert(*number, (*state, *quality));
+                continue;
+            }
+            let routes = plan
+                .buses
+                .get(channel.bus)
+                .and_then(|b| b.devices.get(channel.device));
+            let route = routes.and_then(|d| d.routes.iter().find(|r| r.channel == *number));
+            let board = boards
+                .get_mut(channel.bus)
+                .and_then(|b| b.get_mut(channel.device));
+            let (Some(route), Some(board)) = (route, board) else {
                 continue;
             };
-            let reading = match reading {
-                Reading::Joint(state) => Reading::Joint(route.map.device(*state)),
-                other => *other,
-            };
             frames.clear();
-            if let Err(error) = board.encode(route.output, &reading, *quality, &mut frames) {
+            if let Err(error) = board.encode(route.output, reading, *quality, &mut frames) {
                 report.refused += 1;
-                report
-                    .first_refusal
-                    .get_or_insert_with(|| format!("line {}: {error}", row.line));
+                report.reason(row.line, &error);
                 continue;
             }
             report.samples += 1;
-            let mut t = row.t.unwrap_or(Nanos::ZERO);
-            for frame in &frames {
-                report.frames += 1;
-                if row.t.is_none() {
-                    // The log format without a stamp: only the order is known.
-                    writeln!(log, "{} {frame}", interfaces.get(*bus).unwrap_or(&"can0"))?;
-                    continue;
-                }
-                let at = waiting
-                    .iter()
-                    .rposition(|(other, ..)| *other <= t)
-                    .map_or(0, |i| i + 1);
-                waiting.insert(at, (t, *bus, *frame));
-                t += FRAME_TIME;
+            output.push(row.t, channel.bus, &frames, FRAME_TIME, &mut log)?;
+        }
+        let mut refused = BTreeSet::new();
+        for measures in &joint_outputs {
+            let Some(reading) = measures.reading(&joints) else {
+                continue;
+            };
+            let board = boards
+                .get_mut(measures.bus)
+                .and_then(|b| b.get_mut(measures.device));
+            let Some(board) = board else { continue };
+            frames.clear();
+            let encoded = reading
+                .map_err(str::to_owned)
+                .and_then(|(reading, quality)| {
+                    let encoded = board.encode(measures.output, &reading, quality, &mut frames);
+                    encoded.map_err(|error| error.to_string())
+                });
+            if let Err(error) = encoded {
+                let channels = measures.inverse.channels.iter();
+                refused.extend(
+                    channels
+                        .copied()
+                        .filter(|channel| joints.contains_key(channel)),
+                );
+                report.reason(row.line, &error);
+                continue;
             }
+            let spacing = match measures.completes {
+                true => FRAME_TIME,
+                false => Nanos::ZERO,
+            };
+            output.push(row.t, measures.bus, &frames, spacing, &mut log)?;
         }
-        while let Some((t, bus, frame)) = waiting.front()
-            && row.t.is_some_and(|now| now - *t > REORDER)
-        {
-            candump::write_log_line(&mut log, *t, interfaces.get(*bus).unwrap_or(&"can0"), frame)?;
-            waiting.pop_front();
-        }
+        report.refused += refused.len() as u64;
+        report.samples += (joints.len() - refused.len()) as u64;
+        output.write_before(row.t.map(|now| now - REORDER), &mut log)?;
     }
-    for (t, bus, frame) in waiting {
-        candump::write_log_line(&mut log, t, interfaces.get(bus).unwrap_or(&"can0"), &frame)?;
-    }
+    output.write_before(Some(Nanos::MAX), &mut log)?;
     log.flush()?;
+    report.frames = output.frames;
     report.table = reader.report().clone();
     Ok(report)
 }

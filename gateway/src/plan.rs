@@ -1,16 +1,28 @@
 //! The checked and resolved form of gateway.toml, which the rest of the gateway uses.
+//!
+//! A joint is measured by one output of a device, or by several (`takes`), or by the motors of a
+//! coupling: `wiring` resolves that to the bus's [`Layout`], and each output's [`Route`] says where
+//! it leads.
+
+mod wiring;
+mod words;
+
+pub use crate::joints::JointMap;
+pub(crate) use words::did_you_mean;
 
 use crate::config::{Pace, Raw, RawBus, RawDevice, RawJoint, Realtime, Source};
 use crate::dbc;
+use crate::joints::{CouplingPlan, Feed, Layout, Takes, Target};
 use crate::link::replay::Matching;
 use crate::load::{self, BitRates, Load, Member};
 use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, OutputInfo, Outputs, Spec};
 use proprio_topics::{
-    Description, Entry, JointState, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, Role,
+    Description, Entry, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, Role,
 };
 use std::f64::consts::TAU;
 use std::fmt::{self, Write as _};
 use std::path::{Path, PathBuf};
+use wiring::Wiring;
 
 /// An unusable configuration: exit code 2.
 #[derive(Debug, thiserror::Error)]
@@ -52,6 +64,8 @@ pub struct BusPlan {
     pub load: Load,
     /// Its devices.
     pub devices: Vec<DevicePlan>,
+    /// Its joints: which outputs of devices give them, and how.
+    pub joints: Layout,
 }
 
 /// One device.
@@ -80,48 +94,9 @@ pub struct Route {
     pub kind: Kind,
     /// The conversion from device angle to joint angle; the identity for sensors.
     pub map: JointMap,
-}
-
-/// joint = sign * device / ratio + offset.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct JointMap {
-    /// sign / ratio.
-    pub gain: f64,
-    /// \[rad\].
-    pub offset: f64,
-}
-
-impl JointMap {
-    /// The identity.
-    pub const IDENTITY: Self = Self {
-        gain: 1.0,
-        offset: 0.0,
-    };
-
-    /// The joint's state from the device's: gain and offset apply to position, the gain to its
-    /// derivatives, and its inverse to the torque (of an ideal gear). The current passes unchanged.
-    #[must_use]
-    pub fn joint(&self, device: JointState) -> JointState {
-        JointState {
-            position: device.position * self.gain + self.offset,
-            velocity: device.velocity * self.gain,
-            acceleration: device.acceleration * self.gain,
-            torque: device.torque / self.gain,
-            ..device
-        }
-    }
-
-    /// The device's state from the joint's: the inverse of [`JointMap::joint`].
-    #[must_use]
-    pub fn device(&self, joint: JointState) -> JointState {
-        JointState {
-            position: (joint.position - self.offset) / self.gain,
-            velocity: joint.velocity / self.gain,
-            acceleration: joint.acceleration / self.gain,
-            torque: joint.torque * self.gain,
-            ..joint
-        }
-    }
+    /// Where a joint's state leads, in [`BusPlan::joints`]; `None` for sensors. Then `channel` is
+    /// only that of readings that are no joint's states.
+    pub feed: Option<Feed>,
 }
 
 /// One channel.
@@ -362,14 +337,25 @@ impl Builder<'_> {
             rates_assumed: raw.bit_rate.is_none(),
             load: Load::default(),
             devices: Vec::new(),
+            joints: Layout::default(),
         });
+        let mut wiring = Wiring::new(raw.coupling).map_err(|e| format!("{place}, {e}"))?;
         for table in raw.device {
             let line = self
                 .text
                 .get(..table.span().start)
                 .map_or(0, |before| before.matches('\n').count() + 1);
-            self.device(table.into_inner())
+            self.device(table.into_inner(), &mut wiring)
                 .map_err(|e| format!("{place}, device at line {line}: {e}"))?;
+        }
+        let (joints, shown) = wiring.finish().map_err(|e| format!("{place}, {e}"))?;
+        for shown in shown {
+            if let Some(channel) = self.plan.channels.get_mut(shown.channel as usize) {
+                (channel.device, channel.max_silence) = (shown.device, shown.max_silence);
+            }
+        }
+        if let Some(bus) = self.plan.buses.last_mut() {
+            bus.joints = joints;
         }
         self.check_claims(&place)?;
         self.check_load(&place)
@@ -403,7 +389,7 @@ impl Builder<'_> {
         Ok(())
     }
 
-    fn device(&mut self, mut table: toml::Table) -> Result<(), String> {
+    fn device(&mut self, mut table: toml::Table, wiring: &mut Wiring) -> Result<(), String> {
         let mut common = toml::Table::new();
         for key in RawDevice::KEYS {
             if let Some(value) = table.remove(key) {
@@ -412,7 +398,7 @@ impl Builder<'_> {
         }
         let raw: RawDevice = common
             .try_into()
-            .map_err(|e: toml::de::Error| one_line(&e))?;
+            .map_err(|e: toml::de::Error| one_line(&e) + &suggest_key(&e))?;
         let name = &raw.name;
         check_name("name", name)?;
         let mut options = Options::deserialize(&raw.driver, table).map_err(|e| match e {
@@ -486,12 +472,19 @@ impl Builder<'_> {
                     spec.outputs.0.capacity()
                 ));
             }
-            let channel = self.channel(channel(joint.name, Kind::Joint))?;
+            let of = wiring.channel_name(&joint.name).to_owned();
+            check_name(&at, &of)?;
+            let channel = match wiring.channel(&of) {
+                Some(known) => known,
+                None => self.channel(channel(of, Kind::Joint))?,
+            };
+            let device = (device, name.as_str(), max_silence);
             routes.push(Route {
                 output: joint.channel,
                 channel,
                 kind: Kind::Joint,
                 map,
+                feed: Some(wiring.add(&at, &joint, device, channel, &map)?),
             });
         }
         // Built here once so that --check reports a wrong address or value; the bus thread builds
@@ -499,6 +492,7 @@ impl Builder<'_> {
         options
             .device(&spec)
             .map_err(|e| format!("{name:?}: {e}"))?;
+        check_turns(&options, &spec, &routes).map_err(|e| format!("{name:?}: {e}"))?;
         let plan = DevicePlan {
             name: raw.name,
             driver: raw.driver,
@@ -545,13 +539,24 @@ impl Builder<'_> {
                 channel: self.channel(channel(name, output.kind))?,
                 kind: output.kind,
                 map: JointMap::IDENTITY,
+                feed: None,
             });
         }
         Ok(routes)
     }
 
     fn channel(&mut self, channel: ChannelPlan) -> Result<u32, String> {
-        if self.plan.channel(&channel.name).is_some() {
+        let named = self.plan.channels.iter().find(|c| c.name == channel.name);
+        if let Some(other) = named.filter(|c| c.kind == channel.kind && c.bus != channel.bus) {
+            let bus = |number: usize| self.plan.buses.get(number).map_or("", |b| &b.name);
+            return Err(format!(
+                "{:?} is on bus {:?} too; devices that measure one joint must be on one bus, \
+                 because each bus has a thread of its own",
+                channel.name,
+                bus(other.bus)
+            ));
+        }
+        if named.is_some() {
             return Err(format!(
                 "two channels are named {:?}; joints and sensors need different names",
                 channel.name
@@ -625,6 +630,33 @@ fn joint_map(at: &str, joint: &RawJoint) -> Result<JointMap, String> {
     })
 }
 
+/// Checks that turns can be counted: a board that streams sends before its shaft has turned by half
+/// its range.
+fn check_turns(options: &Options, spec: &Spec, routes: &[Route]) -> Result<(), String> {
+    let wraps = |route: &Route| route.feed.and_then(|feed| feed.wrap);
+    let Some(wrap) = routes
+        .iter()
+        .filter_map(wraps)
+        .min_by_key(|wrap| wrap.certain)
+    else {
+        return Ok(());
+    };
+    // A board that has been started.
+    let mode = Mode::Listen;
+    let board = options.board(&Spec {
+        mode,
+        ..spec.clone()
+    });
+    match board.map_err(|e| e.to_string())?.period() {
+        Some(period) if period >= wrap.certain => Err(format!(
+            "at max_speed_radps its shaft turns by half the range of wraps_rad in {} s, and it \
+             sends only every {period} s: the turns cannot be counted; make its period shorter",
+            wrap.certain
+        )),
+        _ => Ok(()),
+    }
+}
+
 /// A TOML error in one line, with the key that it is about.
 fn one_line(error: &toml::de::Error) -> String {
     error
@@ -646,17 +678,6 @@ fn suggest_key(error: &toml::de::Error) -> String {
         }
         _ => String::new(),
     }
-}
-
-/// The word that was probably meant, as the end of a message; empty if none is near.
-pub(crate) fn did_you_mean<'a>(unknown: &str, words: impl Iterator<Item = &'a str>) -> String {
-    // Winkler's similarity, because most mistakes are at the end of a key; above 0.85 two words
-    // share most letters, or one is the beginning of the other.
-    words
-        .map(|word| (strsim::jaro_winkler(unknown, word), word))
-        .filter(|(similarity, _)| *similarity > 0.85)
-        .max_by(|(a, _), (b, _)| a.total_cmp(b))
-        .map_or_else(String::new, |(_, word)| format!("; did you mean {word:?}?"))
 }
 
 fn check_name(place: &str, name: &str) -> Result<(), String> {
@@ -771,49 +792,97 @@ impl fmt::Display for Plan {
                         channel.kind.word(),
                         channel.name
                     )?;
-                    if channel.kind == Kind::Joint {
-                        write!(
-                            f,
-                            " = {} * output {} of the device {:+} rad",
-                            route.map.gain, route.output, route.map.offset
-                        )?;
+                    if let Some(feed) = &route.feed {
+                        show_feed(f, &bus.joints, route, feed)?;
                     }
                     writeln!(f, ", stale after {} s", channel.max_silence)?;
                 }
+            }
+            for coupling in &bus.joints.couplings {
+                show_coupling(f, &bus.joints, coupling)?;
             }
         }
         writeln!(f, "\n* shared with other devices of the same board")
     }
 }
 
+/// The way of a device's output to a joint.
+fn show_feed(
+    f: &mut fmt::Formatter<'_>,
+    joints: &Layout,
+    route: &Route,
+    feed: &Feed,
+) -> fmt::Result {
+    let shaft = joints.shafts.get(feed.shaft);
+    if let Some(motor) = shaft.filter(|s| matches!(s.target, Target::Motor(..))) {
+        write!(f, ", by the coupling; motor {}", motor.name)?;
+    }
+    let JointMap { gain, offset } = route.map;
+    write!(
+        f,
+        " = {gain} * output {} of the device {offset:+} rad",
+        route.output
+    )?;
+    show_takes(
+        f,
+        joints
+            .source(feed)
+            .map_or(Takes::ALL, |source| source.takes),
+    )?;
+    if let Some(wrap) = feed.wrap {
+        let (centre, half) = (gain * wrap.centre + offset, 0.5 * (gain * wrap.range).abs());
+        write!(
+            f,
+            ", turns counted, certain over {} s, else right from {:.4} to {:.4} rad",
+            wrap.certain,
+            centre - half,
+            centre + half
+        )?;
+    }
+    Ok(())
+}
+
+fn show_takes(f: &mut fmt::Formatter<'_>, takes: Takes) -> fmt::Result {
+    if takes == Takes::ALL {
+        return Ok(());
+    }
+    let words: Vec<_> = takes.quantities().map(wiring::word).collect();
+    write!(f, " ({} alone)", words.join(", "))
+}
+
+/// The rows of a coupling.
+fn show_coupling(
+    f: &mut fmt::Formatter<'_>,
+    joints: &Layout,
+    coupling: &CouplingPlan,
+) -> fmt::Result {
+    let name = |shaft: usize| joints.shafts.get(shaft).map_or("", |shaft| &shaft.name);
+    let condition = coupling.matrix.condition();
+    write!(f, "  coupling, condition number {condition:.1}")?;
+    let source = coupling
+        .joints
+        .first()
+        .and_then(|(shaft, place)| joints.shafts.get(*shaft)?.sources.get(*place));
+    show_takes(f, source.map_or(Takes::ALL, |source| source.takes))?;
+    writeln!(f)?;
+    for (number, (shaft, _)) in coupling.joints.iter().enumerate() {
+        let weights = coupling.matrix.row(number).zip(&coupling.motors);
+        let used = weights.filter(|(weight, _)| *weight != 0.0);
+        let terms = used.map(|(weight, motor)| format!("{weight} * {}", name(*motor)));
+        writeln!(
+            f,
+            "    {} = {}",
+            name(*shaft),
+            terms.collect::<Vec<_>>().join(" + ")
+        )?;
+    }
+    Ok(())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// A gear of 100 that turns the other way: a hundredth of the angle, 100 times the torque.
-    #[test]
-    fn a_gear_transmits_angles_and_torques() {
-        let map = JointMap {
-            gain: -1.0 / 100.0,
-            offset: 0.5,
-        };
-        let motor = JointState {
-            position: 200.0,
-            velocity: 30.0,
-            acceleration: 4.0,
-            torque: 0.25,
-            current: 1.5,
-        };
-        let joint = map.joint(motor);
-        assert_eq!((joint.position, joint.velocity), (-1.5, -0.3));
-        assert_eq!((joint.acceleration, joint.torque), (-0.04, -25.0));
-        assert_eq!(joint.current, motor.current);
-        let power = |state: JointState| state.torque * state.velocity;
-        assert_eq!(power(joint), power(motor));
-        let back = map.device(joint);
-        assert!((back.position - motor.position).abs() < 1e-9);
-        assert_eq!((back.velocity, back.torque), (30.0, 0.25));
-    }
+    use proprio_topics::JointState;
 
     const ARM: &str = r#"
         schema = 1

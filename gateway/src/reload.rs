@@ -1,10 +1,12 @@
 //! Which parts of a changed configuration a running gateway can take over.
 //!
-//! Of a device: its driver's keys, `listen_only`, `max_silence_ms`, and ratio, sign and offset of
-//! its joints. Everything that buses, filters, channels or other processes rest on needs a restart
-//! of the gateway.
+//! Of a device: its driver's keys, `listen_only`, `max_silence_ms`, and of its joints ratio, sign,
+//! offset and the keys of their turns. Everything that buses, filters, channels or other processes
+//! rest on needs a restart of the gateway: also which device gives what of a joint (`takes`), and
+//! couplings.
 
-use crate::plan::{BusPlan, DevicePlan, Plan};
+use crate::joints::{CouplingPlan, Layout, Matrix, Takes, Target};
+use crate::plan::{BusPlan, DevicePlan, Plan, Route};
 use proprio_drivers::Claim;
 use std::collections::BTreeSet;
 
@@ -70,7 +72,8 @@ fn compare_lists<'a, T>(
 }
 
 fn compare_buses(old: (&Plan, &BusPlan), new: (&Plan, &BusPlan), blocked: &mut Vec<String>) {
-    let ((old_plan, old), (new_plan, new)) = (old, new);
+    let ((old_plan, old_bus), (new_plan, new_bus)) = (old, new);
+    let (old, new) = (old_bus, new_bus);
     let place = format!("bus {:?}", new.name);
     let keys = [
         ("source", old.source == new.source),
@@ -79,6 +82,9 @@ fn compare_buses(old: (&Plan, &BusPlan), new: (&Plan, &BusPlan), blocked: &mut V
     ];
     for (key, _) in keys.iter().filter(|(_, equal)| !equal) {
         blocked.push(format!("{place}: {key}"));
+    }
+    if couplings(&old.joints) != couplings(&new.joints) {
+        blocked.push(format!("{place}: couplings"));
     }
     let inside = format!("{place}, ");
     compare_lists(
@@ -98,12 +104,29 @@ fn compare_buses(old: (&Plan, &BusPlan), new: (&Plan, &BusPlan), blocked: &mut V
             let built = device.options.device(&device.spec).ok()?;
             Some(built.claims().to_vec())
         };
-        let channels = |plan: &Plan, device: &DevicePlan| -> Vec<_> {
+        let channels = |plan: &Plan, bus: &BusPlan, device: &DevicePlan| -> Vec<_> {
             let routes = device.routes.iter();
             routes
                 .map(|route| {
                     let channel = plan.channels.get(route.channel as usize);
-                    (route.output, route.kind, channel.map(|c| c.name.clone()))
+                    let feed = route.feed.as_ref();
+                    let shaft = feed.and_then(|feed| bus.joints.shafts.get(feed.shaft));
+                    let takes = feed
+                        .and_then(|feed| bus.joints.source(feed))
+                        .map(|s| s.takes);
+                    let names = (
+                        channel.map(|c| c.name.clone()),
+                        shaft.map(|s| s.name.clone()),
+                    );
+                    (
+                        route.output,
+                        route.kind,
+                        names,
+                        shaft
+                            .filter(|s| matches!(s.target, Target::Motor(..)))
+                            .map(|s| s.target),
+                        takes,
+                    )
                 })
                 .collect()
         };
@@ -114,15 +137,44 @@ fn compare_buses(old: (&Plan, &BusPlan), new: (&Plan, &BusPlan), blocked: &mut V
         } else if claims(old) != claims(new) {
             blocked.push(format!("{place}: keys that change its identifiers"));
         }
-        if channels(old_plan, old) != channels(new_plan, new) {
+        if channels(old_plan, old_bus, old) != channels(new_plan, new_bus, new) {
             blocked.push(format!("{place}: joints or outputs"));
         }
     }
 }
 
+/// The couplings of a bus, by the names of their joints and motors.
+fn couplings(layout: &Layout) -> Vec<(Vec<&str>, Vec<&str>, &Matrix, Option<Takes>)> {
+    let shaft = |number: usize| layout.shafts.get(number);
+    let name = |number: usize| shaft(number).map_or("", |shaft| shaft.name.as_str());
+    let of = |coupling: &'_ CouplingPlan| {
+        let first = coupling.joints.first().copied();
+        let source = first.and_then(|(joint, place)| shaft(joint)?.sources.get(place));
+        (
+            coupling
+                .joints
+                .iter()
+                .map(|(joint, _)| name(*joint))
+                .collect(),
+            coupling.motors.iter().map(|motor| name(*motor)).collect(),
+            source.map(|source| source.takes),
+        )
+    };
+    let parts = layout
+        .couplings
+        .iter()
+        .map(|coupling| (of(coupling), &coupling.matrix));
+    parts
+        .map(|((joints, motors, takes), matrix)| (joints, motors, matrix, takes))
+        .collect()
+}
+
 /// What changes of one device of the same name, driver, address and channels.
 fn change(device: (usize, u16), old: &DevicePlan, new: &DevicePlan) -> Option<Change> {
-    let maps = |plan: &DevicePlan| -> Vec<_> { plan.routes.iter().map(|r| r.map).collect() };
+    let maps = |plan: &DevicePlan| -> Vec<_> {
+        let wrap = |route: &Route| route.feed.and_then(|feed| feed.wrap);
+        plan.routes.iter().map(|r| (r.map, wrap(r))).collect()
+    };
     let keys = [
         ("keys of the driver", old.options != new.options),
         ("listen_only", old.spec.mode != new.spec.mode),
@@ -207,6 +259,12 @@ ratio = 100.0
                 Some(change((1, 0), &["joints"], false)),
             ),
             (
+                "ratio",
+                "wraps_rad = [0.0, 6.283185307179586]\ncentre_rad = 0.1\n\
+                 max_speed_radps = 100.0\nratio",
+                Some(change((1, 0), &["joints"], false)),
+            ),
+            (
                 "address = 3",
                 "address = 3\nmax_silence_ms = 7",
                 Some(change((1, 0), &["max_silence_ms"], false)),
@@ -271,6 +329,20 @@ ratio = 100.0
                 &["bus \"a\", device \"imu\": keys that change its identifiers"],
             ),
             (
+                FILE.replace("ratio", "takes = [\"position\"]\nratio"),
+                &["bus \"b\", device \"elbow_motor\": joints or outputs"],
+            ),
+            (
+                format!(
+                    "{FILE}[[bus.coupling]]\njoints = [\"knee\"]\nmotors = [\"elbow\"]\n\
+                     matrix = [[1.0]]\n"
+                ),
+                &[
+                    "bus \"b\": couplings",
+                    "bus \"b\", device \"elbow_motor\": joints or outputs",
+                ],
+            ),
+            (
                 FILE.replace("\"elbow\"", "\"knee\""),
                 &["bus \"b\", device \"elbow_motor\": joints or outputs"],
             ),
@@ -280,5 +352,30 @@ ratio = 100.0
                 Err(wanted.iter().map(|w| (*w).to_owned()).collect())
             );
         }
+    }
+
+    /// What a coupling consists of needs a restart; the gears of its motors do not.
+    #[test]
+    fn a_coupling_is_not_changed_while_it_runs() {
+        let second = "[[bus.device]]\ndriver = \"icub_motor\"\nname = \"other_motor\"\n\
+                      address = 4\n[[bus.device.joint]]\nname = \"other\"\n";
+        let coupled = format!(
+            "{FILE}{second}[[bus.coupling]]\njoints = [\"a\", \"b\"]\n\
+             motors = [\"elbow\", \"other\"]\nmatrix = [[1.0, 0.0], [1.0, 2.0]]\n"
+        );
+        let compared = |from: &str, to: &str| {
+            let plan = |text: &str| Plan::parse(text, Path::new(".")).unwrap();
+            assert!(coupled.contains(from), "{from}");
+            changes(&plan(&coupled), &plan(&coupled.replacen(from, to, 1)))
+        };
+        let whole = vec!["bus \"b\": couplings".to_owned()];
+        assert_eq!(compared("[1.0, 2.0]", "[1.0, 3.0]"), Err(whole.clone()));
+        let takes = "takes = [\"position\", \"torque\"]\njoints = [\"a\"";
+        assert_eq!(compared("joints = [\"a\"", takes), Err(whole.clone()));
+        let swapped = compared("[\"elbow\", \"other\"]", "[\"other\", \"elbow\"]");
+        assert_eq!(swapped.unwrap_err()[0], whole[0]);
+        let gear = compared("ratio = 100.0", "ratio = 50.0").unwrap();
+        assert_eq!((gear.len(), gear[0].what.as_slice()), (1, &["joints"][..]));
+        assert_eq!(compared("schema", "# Nothing.\nschema"), Ok(vec![]));
     }
 }

@@ -16,16 +16,18 @@ use crate::fault::{Fault, FaultError, Window};
 use crate::noise::Random;
 use crate::robot::{Robot, RobotError};
 use crate::settings::Settings;
+use crate::trajectory::Point;
 use crate::truth::Simulation;
 use proprio_drivers::{Board, Frame, Frames, Options, Spec};
-use proprio_gateway::plan::{DevicePlan, JointMap};
+use proprio_gateway::joints::{Inverse, Layout};
+use proprio_gateway::plan::DevicePlan;
 use proprio_topics::{
     Actuator, Imu, JointState, Kind, Nanos, Quality, Reading, Saturation, StampKind, Wrench,
 };
 use std::collections::VecDeque;
 
-/// Standard deviation of a simulated joint position: the error of gears and bearings in addition to
-/// the encoder's steps \[rad or m\].
+/// Standard deviation of a simulated position, of a joint or of a motor's shaft behind its gear:
+/// the error of gears and bearings in addition to the encoder's steps \[rad or m\].
 pub const JOINT_NOISE: f64 = 2e-5;
 /// Standard deviation of a simulated IMU's acceleration \[m/s^2\].
 pub const ACCELERATION_NOISE: f64 = 0.03;
@@ -93,7 +95,8 @@ impl Simulator {
             let mut nodes = Vec::new();
             for device in &bus.devices {
                 let stream = nodes.len() + 1000 * number;
-                nodes.push(Node::new(robot, &simulation, device, settings, stream, t0)?);
+                let sources = sources(robot, &simulation, device, &bus.joints)?;
+                nodes.push(Node::new(robot, device, sources, settings, stream, t0)?);
             }
             buses.push(BusSimulator {
                 name: bus.name.clone(),
@@ -355,10 +358,10 @@ impl BusSimulator {
 }
 
 /// The quantity that an output of a board measures.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 enum Source {
-    /// Joint of this number in the simulation.
-    Joint(usize),
+    /// A shaft, which the joints of these numbers in the simulation turn.
+    Shaft(Inverse, Vec<usize>),
     /// F/T sensor of this number, with its noise.
     Wrench(usize, [f64; 3], [f64; 3]),
     /// IMU of this number.
@@ -371,7 +374,7 @@ struct Node {
     options: Options,
     spec: Spec,
     board: Box<dyn Board>,
-    outputs: Vec<(u8, JointMap, Source)>,
+    outputs: Vec<(u8, Source)>,
     noise: bool,
     random: Random,
     /// The noise of presented readings, so that requests do not change what it streams later.
@@ -405,46 +408,12 @@ impl std::fmt::Debug for Node {
 impl Node {
     fn new(
         robot: &Robot,
-        simulation: &Simulation,
         device: &DevicePlan,
+        outputs: Vec<(u8, Source)>,
         settings: &Settings,
         stream: usize,
         t0: Nanos,
     ) -> Result<Self, RobotError> {
-        let mut outputs = Vec::new();
-        for route in &device.routes {
-            let Some(channel) = robot.plan.channels.get(route.channel as usize) else {
-                continue;
-            };
-            let missing = |problem: &str| {
-                robot.mismatch(format!("gateway.toml has {:?}: {problem}", channel.name))
-            };
-            let source = match channel.kind {
-                Kind::Joint => Source::Joint(
-                    simulation
-                        .joint(&channel.name)
-                        .ok_or_else(|| missing("the URDF has no moving joint of that name"))?,
-                ),
-                Kind::Wrench => {
-                    let number = simulation.wrench(&channel.name);
-                    let number = number.ok_or_else(|| {
-                        missing("estimator.toml has no [[force_torque]] with that sensor")
-                    })?;
-                    let ft = robot.config.force_torque.get(number);
-                    let ft = ft.ok_or_else(|| missing("it is not configured"))?;
-                    Source::Wrench(number, ft.noise_n, ft.noise_nm)
-                }
-                Kind::Imu => Source::Imu(simulation.imu(&channel.name).ok_or_else(|| {
-                    missing(
-                        "its place is not known: it is not the [base] of estimator.toml, and no \
-                         link of the URDF has its name",
-                    )
-                })?),
-                // What is not simulated is silent.
-                Kind::Gauges | Kind::Temperature | Kind::Actuator | Kind::Skin => continue,
-            };
-            outputs.push((route.output, route.map, source));
-        }
         let mut random = Random::new(settings.seed, "board", stream);
         let mut node = Self {
             kinds: device.routes.iter().map(|route| route.kind).collect(),
@@ -584,31 +553,96 @@ impl Node {
     }
 }
 
+/// What each output of a board measures.
+fn sources(
+    robot: &Robot,
+    simulation: &Simulation,
+    device: &DevicePlan,
+    joints: &Layout,
+) -> Result<Vec<(u8, Source)>, RobotError> {
+    let mut outputs = Vec::new();
+    for route in &device.routes {
+        let name = |channel: u32| {
+            let channel = robot.plan.channels.get(channel as usize);
+            channel.map_or("", |channel| channel.name.as_str())
+        };
+        let of_route = name(route.channel);
+        let missing = |name: &str, problem: &str| {
+            robot.mismatch(format!("gateway.toml has {name:?}: {problem}"))
+        };
+        let source = match route.kind {
+            Kind::Joint => {
+                let inverse = route
+                    .feed
+                    .as_ref()
+                    .and_then(|f| joints.inverse(f, route.map));
+                let Some(inverse) = inverse else { continue };
+                let number = |channel: &u32| {
+                    let no_joint = "the URDF has no moving joint of that name";
+                    let joint = simulation.joint(name(*channel));
+                    joint.ok_or_else(|| missing(name(*channel), no_joint))
+                };
+                let joints = inverse.channels.iter().map(number);
+                let joints = joints.collect::<Result<_, _>>()?;
+                Source::Shaft(inverse, joints)
+            }
+            Kind::Wrench => {
+                let number = simulation.wrench(of_route);
+                let number = number.ok_or_else(|| {
+                    missing(
+                        of_route,
+                        "estimator.toml has no [[force_torque]] with that sensor",
+                    )
+                })?;
+                let ft = robot.config.force_torque.get(number);
+                let ft = ft.ok_or_else(|| missing(of_route, "it is not configured"))?;
+                Source::Wrench(number, ft.noise_n, ft.noise_nm)
+            }
+            Kind::Imu => Source::Imu(simulation.imu(of_route).ok_or_else(|| {
+                missing(
+                    of_route,
+                    "its place is not known: it is not the [base] of estimator.toml, and no link \
+                     of the URDF has its name",
+                )
+            })?),
+            // What is not simulated is silent.
+            Kind::Gauges | Kind::Temperature | Kind::Actuator | Kind::Skin => continue,
+        };
+        outputs.push((route.output, source));
+    }
+    Ok(outputs)
+}
+
 /// The readings of a board's outputs at `t`, with noise if there is a source of it.
 fn measure(
-    outputs: &[(u8, JointMap, Source)],
+    outputs: &[(u8, Source)],
     simulation: &mut Simulation,
     t: f64,
     spike: bool,
     mut random: Option<&mut Random>,
 ) -> Vec<(u8, Reading)> {
     let mut readings = Vec::with_capacity(outputs.len());
-    for (output, map, source) in outputs {
+    for (output, source) in outputs {
         let reading = match *source {
-            Source::Joint(joint) => {
-                let Some(point) = simulation.motion(joint, t) else {
-                    continue;
-                };
-                let noise = random
-                    .as_mut()
-                    .map_or(0.0, |random| JOINT_NOISE * random.normal());
-                let state = JointState {
-                    position: point.position + noise,
+            Source::Shaft(ref inverse, ref joints) => {
+                let points = joints
+                    .iter()
+                    .filter_map(|joint| simulation.motion(*joint, t));
+                let state = |point: Point| JointState {
+                    position: point.position,
                     velocity: point.velocity,
                     acceleration: point.acceleration,
                     ..JointState::ABSENT
                 };
-                Reading::Joint(map.device(state))
+                let states: Vec<JointState> = points.map(state).collect();
+                if states.len() < joints.len() {
+                    continue;
+                }
+                let mut shaft = inverse.shaft(&states);
+                shaft.position += random
+                    .as_mut()
+                    .map_or(0.0, |random| JOINT_NOISE * random.normal());
+                Reading::Joint(inverse.device(shaft))
             }
             Source::Wrench(number, noise_n, noise_nm) => {
                 let Some(&[fx, fy, fz, tx, ty, tz]) = simulation.at(t).wrenches.get(number) else {

@@ -30,14 +30,16 @@ use proprio_gateway::inbox::{Replacement, Reply, Request, inbox};
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, Received, send_by};
 use proprio_gateway::log;
+use proprio_gateway::plan::Plan;
 use proprio_gateway::publish::{Memory, Shared, Sink};
 use proprio_gateway::status::BusStatus;
 use proprio_simulator::record::record;
 use proprio_simulator::{Robot, Settings, Simulator};
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, Writer};
-use proprio_topics::{Counter, DeviceHealth, Nanos, Reading, Sample, Wrench};
+use proprio_topics::{Counter, DeviceHealth, Nanos, Reading, Sample, StampKind, Wrench};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
@@ -307,6 +309,46 @@ fn a_bus_allocates_nothing_from_link_to_sink() {
             status.devices().collect::<Vec<_>>()
         );
     }
+}
+
+/// Two coupled motors, of which one wraps, and the velocity of a third board at one of the joints.
+#[test]
+fn joints_of_several_devices_allocate_nothing() {
+    let mut text = "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\n\
+                    source = { kind = \"virtual\", name = \"b\" }\n"
+        .to_owned();
+    for (address, joint) in [
+        (1, "name = \"m\""),
+        (
+            2,
+            "name = \"n\"\nwraps_rad = [0.0, 3.0]\ncentre_rad = 0.0\nmax_speed_radps = 9.0",
+        ),
+        (3, "name = \"q\"\ntakes = [\"velocity\"]"),
+    ] {
+        text += &format!(
+            "[[bus.device]]\ndriver = \"icub_motor\"\nname = \"{address}\"\n\
+             address = {address}\n[[bus.device.joint]]\n{joint}\n"
+        );
+    }
+    text += "[[bus.coupling]]\njoints = [\"q\", \"r\"]\nmotors = [\"m\", \"n\"]\n\
+             matrix = [[1.0, 2.0], [1.0, -1.0]]\ntakes = [\"position\", \"current\"]\n";
+    let plan = Plan::parse(&text, Path::new(".")).expect("a plan");
+    let bus = &plan.buses[0];
+    let status = Arc::new(BusStatus::new(0, bus));
+    let mut decoder = Decoder::new(0, bus, None, status).expect("devices");
+    let mut samples = 0;
+    let allocated = counted(|| {
+        for k in 0..1000_u16 {
+            for address in 1..4 {
+                let [low, high] = k.to_le_bytes();
+                let id = Id::standard(0x100 | address << 4);
+                let frame = Frame::new(id, &[0, 0, low, 0, 0, low, high, 0]);
+                let t = Nanos::from_millis(i64::from(k));
+                decoder.on_frame(&frame.at(t, StampKind::Software), |_| samples += 1);
+            }
+        }
+    });
+    assert_eq!((allocated, samples), ((0, 0), 2000));
 }
 
 #[test]

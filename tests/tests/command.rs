@@ -436,7 +436,7 @@ fn a_wrong_gateway_toml_is_told_with_file_place_and_what_would_be_legal() {
         (
             "name = \"l_elbow\"",
             "name = \"l_wrist_yaw\"",
-            &["two channels are named \"l_wrist_yaw\""],
+            &["joint \"l_wrist_yaw\"", "give them different names"],
         ),
         ("schema = 1", "schema = 1 = 2", &["line ", "schema = 1 = 2"]),
         (

@@ -1,0 +1,100 @@
+//! The motors of a coupling, brought together to one instant.
+//!
+//! The joints of a coupling have a state when every motor has given a new reading since the last
+//! one. It has the stamp of the newest reading; the others are carried to that stamp
+//! ([`super::track`]). They are younger than the period of their own device, or, where frames are
+//! lost, than its maximum silence. While a motor is silent there is no state, and the joints'
+//! channels become stale.
+
+use super::matrix::Matrix;
+use super::track::{Measured, Track};
+use proprio_topics::{Nanos, Quality, StampKind};
+
+/// Flags of what happened since the reading before; the others tell of one reading alone.
+const EVENTS: Quality = Quality(Quality::GAP_BEFORE.0 | Quality::ZERO_CHANGED.0);
+
+#[derive(Debug, Clone, Copy, Default)]
+struct Motor {
+    track: Track,
+    is_new: bool,
+    /// Events since the last state.
+    events: Quality,
+    /// Its part of the present state.
+    now: Option<Measured>,
+}
+
+/// A coupling while it runs.
+#[derive(Debug)]
+pub(crate) struct Coupling {
+    matrix: Matrix,
+    motors: Vec<Motor>,
+}
+
+impl Coupling {
+    /// A coupling without readings.
+    pub(crate) fn new(matrix: Matrix, motors: usize) -> Self {
+        Self {
+            matrix,
+            motors: vec![Motor::default(); motors],
+        }
+    }
+
+    /// Takes a state of motor number `place`. Whether the joints have a new state with it, which
+    /// [`Coupling::joint`] gives.
+    pub(crate) fn give(&mut self, place: usize, measured: Measured) -> bool {
+        if let Some(motor) = self.motors.get_mut(place) {
+            motor.events |= Quality(measured.quality.0 & EVENTS.0);
+            motor.track.push(measured);
+            motor.is_new = true;
+        }
+        let newest = |motor: &Motor| motor.track.newest().filter(|_| motor.is_new).copied();
+        if self.motors.iter().any(|motor| newest(motor).is_none()) {
+            return false;
+        }
+        let stamps = self
+            .motors
+            .iter()
+            .filter_map(newest)
+            .map(|m| (m.acquired, m.stamp));
+        let (t, stamp) = (stamps.max_by_key(|(t, _)| *t)).unwrap_or((Nanos::MIN, StampKind::None));
+        for motor in &mut self.motors {
+            // One that is no longer fresh has to give another.
+            motor.is_new = motor.track.at(t).is_some();
+        }
+        if !self.motors.iter().all(|motor| motor.is_new) {
+            return false;
+        }
+        for motor in &mut self.motors {
+            motor.is_new = false;
+            let events = std::mem::take(&mut motor.events);
+            motor.now = motor.track.at(t).map(|now| Measured {
+                acquired: t,
+                stamp,
+                quality: Quality(now.quality.0 & !EVENTS.0) | events,
+                ..now
+            });
+        }
+        true
+    }
+
+    /// The present state of joint number `joint`; its flags are those of the motors that move it.
+    pub(crate) fn joint(&self, joint: usize) -> Option<Measured> {
+        let motors = self.motors.iter().filter_map(|motor| motor.now.as_ref());
+        let first = motors.clone().next()?;
+        let mut quality = Quality::GOOD;
+        for (weight, motor) in self.matrix.row(joint).zip(motors.clone()) {
+            if weight != 0.0 {
+                quality |= motor.quality;
+            }
+        }
+        let max_silence = motors.clone().map(|motor| motor.max_silence).max();
+        Some(Measured {
+            device_time: Nanos::MIN,
+            device_counter: 0,
+            quality: Quality(quality.0 & !Quality::DEVICE_COUNTER.0),
+            state: self.matrix.joint(joint, motors.map(|motor| motor.state)),
+            max_silence: max_silence.unwrap_or(first.max_silence),
+            ..*first
+        })
+    }
+}

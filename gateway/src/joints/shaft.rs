@@ -1,0 +1,128 @@
+//! A shaft (a joint, or a motor of a coupling) and its sources: one state out of what each gives.
+//!
+//! The source of the position makes the samples: its stamp, flags and sequence number are the
+//! shaft's. The others' newest values are carried along ([`super::track`]) while they are fresh,
+//! else they are absent. A fault belongs to what it spoils: an encoder's fault in another source
+//! takes that source's velocity and acceleration away, and leaves the position as it is. A drive's
+//! fault is passed on, as it condemns nothing.
+
+use super::track::{Measured, Track};
+use super::wrap::Turns;
+use crate::config::Quantity;
+use proprio_topics::{JointState, Nanos, Quality};
+
+/// What is taken of a source: a set of quantities.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Takes(u8);
+
+impl Takes {
+    /// Everything.
+    pub const ALL: Self = Self(0b1_1111);
+
+    /// The quantities of a list.
+    #[must_use]
+    pub fn of(list: &[Quantity]) -> Self {
+        Self(list.iter().fold(0, |set, q| set | 1 << *q as u8))
+    }
+
+    /// Whether `quantity` is in it.
+    #[must_use]
+    pub const fn has(self, quantity: Quantity) -> bool {
+        self.0 >> quantity as u8 & 1 == 1
+    }
+
+    /// Its quantities.
+    pub fn quantities(self) -> impl Iterator<Item = Quantity> {
+        let all = [
+            Quantity::Position,
+            Quantity::Velocity,
+            Quantity::Acceleration,
+            Quantity::Torque,
+            Quantity::Current,
+        ];
+        all.into_iter().filter(move |q| self.has(*q))
+    }
+
+    /// Puts these quantities of `from` in the place of those of `into`.
+    fn copy(self, from: &JointState, into: &mut JointState) {
+        for quantity in self.quantities() {
+            match quantity {
+                Quantity::Position => into.position = from.position,
+                Quantity::Velocity => into.velocity = from.velocity,
+                Quantity::Acceleration => into.acceleration = from.acceleration,
+                Quantity::Torque => into.torque = from.torque,
+                Quantity::Current => into.current = from.current,
+            }
+        }
+    }
+}
+
+/// A source of a shaft while it runs.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Source {
+    takes: Takes,
+    track: Track,
+    /// The turns of a device that wraps.
+    pub(crate) turns: Turns,
+    /// The stamp of its last reading.
+    pub(crate) last: Nanos,
+    /// Its device or conversion was replaced: the next reading has ZERO_CHANGED.
+    pub(crate) replaced: bool,
+    /// The longest time for which a reading may be used \[ns\].
+    pub(crate) max_silence: Nanos,
+}
+
+/// A shaft.
+#[derive(Debug)]
+pub(crate) struct Shaft {
+    pub(crate) sources: Vec<Source>,
+}
+
+impl Shaft {
+    /// A shaft whose sources give this, and may be silent for so long \[ns\].
+    pub(crate) fn new(sources: impl Iterator<Item = (Takes, Nanos)>) -> Self {
+        let source = |(takes, max_silence)| Source {
+            takes,
+            track: Track::default(),
+            turns: Turns::default(),
+            last: Nanos::MIN,
+            replaced: false,
+            max_silence,
+        };
+        Self {
+            sources: sources.map(source).collect(),
+        }
+    }
+
+    /// Takes a reading of source number `place`. The shaft's state, if that source gives its
+    /// position.
+    pub(crate) fn give(&mut self, place: usize, measured: Measured) -> Option<Measured> {
+        let source = self.sources.get_mut(place)?;
+        if !source.takes.has(Quantity::Position) {
+            source.track.push(measured);
+            return None;
+        }
+        let mut whole = Measured {
+            state: JointState::ABSENT,
+            ..measured
+        };
+        source.takes.copy(&measured.state, &mut whole.state);
+        let others = (0..)
+            .zip(&self.sources)
+            .filter(|(other, _)| *other != place);
+        for (_, other) in others {
+            let Some(mut held) = other.track.at(measured.acquired) else {
+                continue;
+            };
+            if held.quality.intersects(Quality::UNTRUSTED_ENCODER) {
+                held.state.velocity = f64::NAN;
+                held.state.acceleration = f64::NAN;
+            }
+            if held.quality.contains(Quality::DRIVE_FAULT) {
+                whole.quality |= Quality::DRIVE_FAULT;
+            }
+            other.takes.copy(&held.state, &mut whole.state);
+        }
+        Some(whole)
+    }
+}

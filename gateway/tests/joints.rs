@@ -1,0 +1,1058 @@
+//! Joints from coupled motors, from devices that wrap, and from several devices, through real
+//! drivers: against the truth, with silences, faults, replacements, and back to a log.
+#![allow(missing_docs, clippy::unwrap_used)]
+
+use proprio_drivers::{Board, Frames, Mode, Spec};
+use proprio_gateway::decoder::{Decoder, build};
+use proprio_gateway::inbox::{Replacement, Reply, Request};
+use proprio_gateway::offline::{decode, encode};
+use proprio_gateway::plan::Plan;
+use proprio_gateway::status::BusStatus;
+use proprio_topics::csv::Columns;
+use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Sample, StampKind};
+use std::collections::BTreeMap;
+use std::f64::consts::{PI, TAU};
+use std::path::Path;
+use std::sync::Arc;
+
+const GAP: Quality = Quality::GAP_BEFORE;
+const ZERO: Quality = Quality::ZERO_CHANGED;
+
+/// Half a step of an icub_motor's shaft: position, velocity.
+const HALF_POSITION: f64 = 0.5 * TAU / 65536.0;
+const HALF_VELOCITY: f64 = HALF_POSITION * 1000.0;
+
+/// The motors of iCub's shoulder.
+const SHOULDER: &str = r#"
+      [[bus.device]]
+      driver = "icub_motor"
+      name = "board_1"
+      address = 1
+      max_silence_ms = 30
+        [[bus.device.joint]]
+        name = "motor_1"
+        ratio = 100.0
+      [[bus.device]]
+      driver = "icub_motor"
+      name = "board_2"
+      address = 2
+      max_silence_ms = 50
+        [[bus.device.joint]]
+        name = "motor_2"
+        ratio = 100.0
+        sign = -1
+        offset_rad = 0.5
+      [[bus.device]]
+      driver = "icub_motor"
+      name = "board_3"
+      address = 3
+      max_silence_ms = 30
+        [[bus.device.joint]]
+        name = "motor_3"
+        ratio = 100.0
+      [[bus.coupling]]
+      joints = ["pitch", "roll", "yaw"]
+      motors = ["motor_1", "motor_2", "motor_3"]
+      matrix = [[1.0, 0.0, 0.0], [1.0, 0.615, 0.0], [0.0, -0.615, 0.615]]
+"#;
+
+/// An encoder at the joint, which wraps, and a drive.
+const ELBOW: &str = r#"
+      [[bus.device]]
+      driver = "canopen_encoder"
+      name = "encoder"
+      address = 20
+      counts_per_turn = 65536.0
+      max_silence_ms = 40
+        [[bus.device.joint]]
+        name = "elbow"
+        sign = -1
+        offset_rad = 0.2
+        takes = ["position"]
+        wraps_rad = [0.0, 6.283185307179586]
+        centre_rad = 0.5
+        max_speed_radps = 10.0
+      [[bus.device]]
+      driver = "canopen_drive"
+      name = "drive"
+      address = 21
+      counts_per_turn = 4096.0
+      rated_torque = 0.5
+      rated_current = 3.0
+      max_silence_ms = 20
+      pdos = [
+          { number = 1, objects = [0x606C, 0x6078], sync = 0 },
+          { number = 2, objects = [0x6041, 0x6064, 0x6077], sync = 0 },
+      ]
+        [[bus.device.joint]]
+        name = "elbow"
+        ratio = 100.0
+        takes = ["velocity", "torque", "current"]
+"#;
+
+fn plan(devices: &str) -> Result<Plan, String> {
+    let text = format!(
+        "schema = 1\nrobot = \"arm\"\n[[bus]]\nname = \"arm\"\n\
+         source = {{ kind = \"virtual\", name = \"arm\" }}\n{devices}"
+    );
+    Plan::parse(&text, Path::new("."))
+}
+
+fn ms(ms: f64) -> Nanos {
+    Nanos::from_seconds(ms * 1e-3)
+}
+
+/// A bus with its boards.
+struct Rig {
+    plan: Plan,
+    decoder: Decoder,
+    boards: Vec<Box<dyn Board>>,
+    status: Arc<BusStatus>,
+}
+
+impl Rig {
+    fn new(devices: &str) -> Self {
+        let plan = plan(devices).unwrap();
+        let bus = &plan.buses[0];
+        let status = Arc::new(BusStatus::new(0, bus));
+        let mode = Mode::Listen;
+        let decoder = Decoder::new(0, bus, Some(mode), Arc::clone(&status)).unwrap();
+        let boards = bus.devices.iter().map(|device| {
+            let spec = Spec {
+                mode,
+                ..device.spec.clone()
+            };
+            device.options.board(&spec).unwrap()
+        });
+        Self {
+            boards: boards.collect(),
+            decoder,
+            status,
+            plan,
+        }
+    }
+
+    /// Device number `device` reports `state`, of its own shaft, at `t`.
+    fn send(
+        &mut self,
+        device: usize,
+        t: Nanos,
+        state: JointState,
+        quality: Quality,
+    ) -> Vec<Sample> {
+        let mut frames = Frames::new();
+        let reading = Reading::Joint(state);
+        self.boards[device]
+            .encode(0, &reading, quality, &mut frames)
+            .unwrap();
+        let mut samples = Vec::new();
+        self.decoder.poll_transmit(t, |_, _| {});
+        for frame in &frames {
+            let frame = frame.at(t, StampKind::Software);
+            self.decoder.on_frame(&frame, |sample| {
+                if matches!(sample.reading(), Some(Reading::Joint(_))) {
+                    samples.push(*sample);
+                }
+            });
+        }
+        samples
+    }
+
+    /// Device number `device` reports what it measures of joints in these states.
+    fn measure(
+        &mut self,
+        device: usize,
+        t: Nanos,
+        joints: &BTreeMap<&str, JointState>,
+    ) -> Vec<Sample> {
+        let bus = &self.plan.buses[0];
+        let route = bus.devices[device].routes[0];
+        let inverse = bus.joints.inverse(&route.feed.unwrap(), route.map).unwrap();
+        let of = |channel: &u32| joints[self.plan.channels[*channel as usize].name.as_str()];
+        let states: Vec<JointState> = inverse.channels.iter().map(of).collect();
+        let state = inverse.device(inverse.shaft(&states));
+        self.send(device, t, state, Quality::GOOD)
+    }
+
+    fn name(&self, sample: &Sample) -> &str {
+        &self.plan.channels[sample.channel as usize].name
+    }
+
+    fn replace(&mut self, device: usize, text: &str, whole: bool) {
+        let new = plan(text).unwrap().buses.remove(0).devices.remove(device);
+        let request = Request::Replace(Replacement {
+            device: whole.then(|| build(&new, Some(Mode::Listen)).unwrap()),
+            max_silence: new.spec.max_silence,
+            routes: new.routes,
+        });
+        let number = u16::try_from(device).unwrap();
+        let reply = self.decoder.request(number, request, Nanos::ZERO);
+        assert!(matches!(reply, Some(Reply::Replaced(_))), "at once");
+    }
+
+    fn count(&self, device: usize, counter: Counter) -> u64 {
+        self.status.devices().nth(device).unwrap().counters[counter as usize]
+    }
+}
+
+fn joint(sample: &Sample) -> JointState {
+    match sample.reading() {
+        Some(Reading::Joint(state)) => state,
+        other => panic!("{other:?}"),
+    }
+}
+
+fn position(position: f64) -> JointState {
+    JointState {
+        position,
+        ..JointState::ABSENT
+    }
+}
+
+fn moving(position: f64, velocity: f64) -> JointState {
+    JointState {
+        position,
+        velocity,
+        ..JointState::ABSENT
+    }
+}
+
+/// A smooth motion of joint number `k` at `t` seconds.
+fn truth(k: usize, t: f64) -> JointState {
+    let (amplitude, rate) = (0.4 + 0.1 * k as f64, 2.0 + 0.7 * k as f64);
+    let (sin, cos) = (rate * t).sin_cos();
+    JointState {
+        position: amplitude * sin,
+        velocity: amplitude * rate * cos,
+        acceleration: -amplitude * rate * rate * sin,
+        torque: 3.0 * cos + k as f64,
+        current: 0.5 * sin,
+    }
+}
+
+fn shoulder_at(t: f64) -> BTreeMap<&'static str, JointState> {
+    let names = ["pitch", "roll", "yaw"];
+    names
+        .into_iter()
+        .enumerate()
+        .map(|(k, name)| (name, truth(k, t)))
+        .collect()
+}
+
+/// Three motors that keep no step. Each sample is the truth at its stamp, to half a step of the
+/// motors and what the carrying costs.
+#[test]
+fn coupled_joints_are_the_truth_at_their_stamp() {
+    // With the reported velocity, and with the difference of two positions.
+    for (velocity, carried) in [(true, 0.5), (false, 1.0)] {
+        let keys = format!("address = {{}}\n velocity = {velocity}\n");
+        let text = [1, 2, 3].iter().fold(SHOULDER.to_owned(), |text, n| {
+            let address = format!("address = {n}\n");
+            text.replace(&address, &keys.replace("{}", &n.to_string()))
+        });
+        let mut rig = Rig::new(&text);
+        // Phases of a period of 4 ms.
+        let phases = [0.0, 1.3, 2.9];
+        let mut last = [Nanos::MIN; 3];
+        let mut samples = 0;
+        let mut worst = 0.0_f64;
+        for k in 0..500 {
+            for (device, phase) in phases.iter().enumerate() {
+                let t = ms(4.0 * f64::from(k) + phase);
+                for sample in rig.measure(device, t, &shoulder_at(t.seconds())) {
+                    samples += 1;
+                    assert_eq!(device, 2, "the last one completes it");
+                    assert_eq!(sample.header.acquired, t);
+                    let number = sample.channel as usize;
+                    assert!(last[number] < t);
+                    last[number] = t;
+                    assert_eq!(rig.name(&sample), ["pitch", "roll", "yaw"][number]);
+                    assert_eq!(sample.header.quality, Quality::GOOD);
+                    if k == 0 {
+                        continue;
+                    }
+                    let (found, truth) = (joint(&sample), truth(number, t.seconds()));
+                    // The first motor is 2.9 ms old, the second one 1.6 ms; none of the motors
+                    // accelerates by more than 24 rad/s^2 (behind its gear). A row's sum is 1.615.
+                    let age: f64 = 2.9e-3;
+                    let period = if velocity { 0.0 } else { 4e-3 };
+                    let carry = carried * 24.0 * age * (age + period) / (2.0 * carried);
+                    let noise = if velocity {
+                        HALF_VELOCITY * age
+                    } else {
+                        2.5 * HALF_POSITION
+                    };
+                    let bound = 1.615 * (carry + (HALF_POSITION + noise) / 100.0);
+                    let off = (found.position - truth.position).abs();
+                    assert!(off < bound, "{number} {k}: {off} {bound}");
+                    worst = worst.max(off);
+                    assert_eq!(found.velocity.is_finite(), velocity);
+                    let off = (found.velocity - truth.velocity).abs();
+                    // Carried by the difference of two velocities, each off by half a step.
+                    let bound = 1.615 * (4.0 * HALF_VELOCITY / 100.0 + 100.0 * age * age);
+                    assert!(!velocity || off < bound, "{number} {k}: {off} {bound}");
+                }
+            }
+        }
+        assert_eq!(samples, 1500);
+        // Without carrying, a joint at 1 rad/s would be off by 2.9 mrad.
+        assert!(worst < 4e-4, "{worst}");
+    }
+}
+
+/// A motor that reports twice as often as the others does not make more samples.
+#[test]
+fn coupled_joints_follow_the_slowest_motor() {
+    let mut rig = Rig::new(SHOULDER);
+    let mut stamps = Vec::new();
+    for k in 0..40 {
+        let t = ms(f64::from(k));
+        for (device, every) in [1, 2, 5].into_iter().enumerate() {
+            if k % every == 0 {
+                let samples = rig.measure(device, t, &shoulder_at(t.seconds()));
+                stamps.extend(
+                    samples
+                        .iter()
+                        .filter(|s| s.channel == 0)
+                        .map(|s| s.header.acquired),
+                );
+            }
+        }
+    }
+    assert_eq!(
+        stamps,
+        (0..8).map(|k| ms(5.0 * f64::from(k))).collect::<Vec<_>>()
+    );
+    let silences = rig.plan.channels.iter().map(|c| c.max_silence);
+    assert_eq!(
+        silences.collect::<Vec<_>>(),
+        [ms(50.0); 3],
+        "that of the slowest"
+    );
+    let devices = rig.plan.channels.iter().map(|c| c.device);
+    assert_eq!(
+        devices.collect::<Vec<_>>(),
+        [0, 1, 2],
+        "the motor in the joint's place"
+    );
+}
+
+/// While one motor is silent there are no samples; when it is back, none is made of what the others
+/// sent before.
+#[test]
+fn a_silent_motor_silences_its_coupling() {
+    let mut rig = Rig::new(SHOULDER);
+    let mut all = Vec::new();
+    let mut send = |rig: &mut Rig, devices: &[usize], at: f64| {
+        for device in devices {
+            let t = ms(at + 0.1 * *device as f64);
+            all.extend(rig.measure(*device, t, &shoulder_at(t.seconds())));
+        }
+    };
+    send(&mut rig, &[0, 1, 2], 0.0);
+    send(&mut rig, &[0, 1, 2], 4.0);
+    // The second one is silent for longer than its maximum.
+    for k in 0..20 {
+        send(&mut rig, &[0, 2], 8.0 + 4.0 * f64::from(k));
+    }
+    send(&mut rig, &[0, 1, 2], 100.0);
+    send(&mut rig, &[0, 1, 2], 104.0);
+    // All are silent, and come back one by one: the first two readings are old by then.
+    send(&mut rig, &[0, 1], 108.0);
+    send(&mut rig, &[2], 300.0);
+    send(&mut rig, &[1], 301.0);
+    send(&mut rig, &[0], 302.0);
+    let yaw: Vec<(f64, Quality)> = (all.iter().filter(|s| s.channel == 2))
+        .map(|s| {
+            (
+                (s.header.acquired.seconds() * 1e5).round() / 100.0,
+                s.header.quality,
+            )
+        })
+        .collect();
+    let good = Quality::GOOD;
+    // The stamp is that of the newest reading, whoever completes it: at 100.1 ms the second motor.
+    assert_eq!(
+        yaw,
+        [
+            (0.2, good),
+            (4.2, good),
+            (100.1, GAP),
+            (104.1, good),
+            (108.1, good),
+            (302.0, GAP)
+        ]
+    );
+    for sample in all.iter().filter(|s| s.header.quality == GAP) {
+        let (found, truth) = (
+            joint(sample),
+            truth(sample.channel as usize, sample.header.acquired.seconds()),
+        );
+        let off = (found.position - truth.position).abs();
+        assert!(off < 2e-3, "{off}");
+    }
+    // The first joint does not depend on the second motor.
+    let pitch = all
+        .iter()
+        .filter(|s| s.channel == 0)
+        .map(|s| s.header.quality);
+    assert_eq!(
+        pitch.collect::<Vec<_>>(),
+        [good, good, good, good, good, GAP]
+    );
+}
+
+/// A fault of a motor spoils the joints that it moves, and no other; what happened in a reading
+/// that was overtaken is not lost.
+#[test]
+fn flags_of_a_motor_are_those_of_its_joints() {
+    let text = SHOULDER.replace("joints = ", "takes = [\"position\"]\n joints = ");
+    let encoders = "[[bus.device]]\n driver = \"icub_motor\"\n name = \"board_9\"\n period_ms = 4\n\
+                    address = 9\n[[bus.device.joint]]\n name = \"yaw\"\n\
+                    takes = [\"velocity\"]\n";
+    let with_yaw = text.replace("[[bus.coupling]]", &format!("{encoders}[[bus.coupling]]"));
+    for text in [SHOULDER, &with_yaw] {
+        let mut rig = Rig::new(text);
+        let mut of = |device: usize, quality: Quality, at: f64| -> Vec<Quality> {
+            let samples = rig.send(device, ms(at), moving(0.0, 0.0), quality);
+            samples.iter().map(|s| s.header.quality).collect()
+        };
+        let (good, fault) = (Quality::GOOD, Quality::DEVICE_FAULT);
+        of(0, good, 0.0);
+        of(1, fault, 1.0);
+        assert_eq!(of(2, good, 2.0), [good, fault, fault]);
+        // Replaced by a good one before it was used.
+        of(0, fault, 4.0);
+        of(0, good, 5.0);
+        of(1, good, 6.0);
+        assert_eq!(
+            of(2, Quality::DRIVE_FAULT, 7.0),
+            [good, good, Quality::DRIVE_FAULT]
+        );
+        // A gap before a reading that was overtaken is still a gap before the sample.
+        of(0, good, 40.0);
+        of(0, good, 41.0);
+        of(1, good, 42.0);
+        assert_eq!(of(2, good, 43.0), [GAP, GAP, GAP]);
+    }
+}
+
+/// What is drawn from the drive is carried along while it is fresh, and is absent after.
+#[test]
+fn a_joint_of_two_devices_is_one_sample() {
+    let mut rig = Rig::new(ELBOW);
+    assert_eq!(rig.plan.channels.len(), 1);
+    assert_eq!(
+        rig.plan.channels[0].max_silence,
+        ms(40.0),
+        "that of the encoder"
+    );
+    assert_eq!(rig.plan.channels[0].device, 0);
+    let encoder = |angle: f64| position((0.2 - angle).rem_euclid(TAU));
+    let drive = |velocity: f64, torque: f64| JointState {
+        velocity: 100.0 * velocity,
+        torque: torque / 100.0,
+        current: 1.5,
+        ..position(7.0)
+    };
+    let mut samples = rig.send(0, ms(0.0), encoder(0.5), Quality::GOOD);
+    assert_eq!(
+        rig.send(1, ms(1.0), drive(0.2, 4.0), Quality::GOOD),
+        [],
+        "it makes none"
+    );
+    samples.extend(rig.send(0, ms(2.0), encoder(0.4), Quality::GOOD));
+    rig.send(1, ms(3.0), drive(0.3, 5.0), Quality::GOOD);
+    samples.extend(rig.send(0, ms(4.0), encoder(0.3), Quality::GOOD));
+    samples.extend(rig.send(0, ms(23.0), encoder(0.1), Quality::GOOD));
+    samples.extend(rig.send(0, ms(23.1), encoder(-0.1), Quality::GOOD));
+    let states: Vec<JointState> = samples.iter().map(joint).collect();
+    let expected = [
+        (0.5, f64::NAN, f64::NAN),
+        (0.4, 0.2, 4.0),
+        // The velocity goes on by 0.1 rad/s in 2 ms.
+        (0.3, 0.35, 5.0),
+        (0.1, 1.3, 5.0),
+        (-0.1, f64::NAN, f64::NAN),
+    ];
+    for (state, (position, velocity, torque)) in states.iter().zip(expected) {
+        assert!((state.position - position).abs() < 1e-4, "{state:?}");
+        let near = |found: f64, wanted: f64, step: f64| {
+            (found.is_nan() && wanted.is_nan()) || (found - wanted).abs() < step
+        };
+        assert!(near(state.velocity, velocity, 1e-3), "{state:?} {velocity}");
+        assert!(near(state.torque, torque, 0.026), "{state:?} {torque}");
+        assert_eq!(state.current.is_nan(), torque.is_nan());
+    }
+    // Stamps and readings are the encoder's.
+    assert_eq!(samples[2].header.acquired, ms(4.0));
+    assert!(samples.iter().all(|s| s.header.quality == Quality::GOOD));
+    assert_eq!(
+        (
+            rig.count(0, Counter::Readings),
+            rig.count(1, Counter::Readings)
+        ),
+        (5, 4)
+    );
+}
+
+/// A fault belongs to what it spoils.
+#[test]
+fn a_drives_fault_does_not_condemn_the_encoder() {
+    let mut rig = Rig::new(ELBOW);
+    let drive = JointState {
+        torque: 0.03,
+        current: 1.5,
+        ..moving(7.0, 10.0)
+    };
+    let encoder = position(1.0);
+    let mut at = 0.0;
+    let mut after = |drive_quality: Quality, encoder_quality: Quality| {
+        at += 2.0;
+        rig.send(1, ms(at), drive, drive_quality);
+        let sample = rig.send(0, ms(at + 1.0), encoder, encoder_quality)[0];
+        (sample.header.quality, joint(&sample))
+    };
+    let (good, fault) = (Quality::GOOD, Quality::DEVICE_FAULT);
+    let (quality, state) = after(Quality::DRIVE_FAULT, good);
+    assert_eq!(quality, Quality::DRIVE_FAULT);
+    assert!(state.velocity.is_finite() && state.torque.is_finite());
+    // The drive's own encoder: its velocity is lost, the torque is not.
+    let (quality, state) = after(fault, good);
+    assert!(!quality.intersects(Quality::UNTRUSTED_ENCODER), "{quality}");
+    assert!(state.position.is_finite() && state.velocity.is_nan() && state.torque.is_finite());
+    let (quality, state) = after(good, fault);
+    assert_eq!(quality, fault);
+    assert!(state.velocity.is_finite() && state.torque.is_finite());
+    let (quality, _) = after(good, good);
+    assert_eq!(quality, good);
+}
+
+/// Readings of one device whose stamps run backward are counted and not taken, however the joint
+/// is made up.
+#[test]
+fn stamps_that_run_backward_are_not_taken() {
+    let mut rig = Rig::new(ELBOW);
+    rig.send(1, ms(10.0), moving(0.0, 1.0), Quality::GOOD);
+    assert_eq!(rig.send(0, ms(10.0), position(1.0), Quality::GOOD).len(), 1);
+    assert_eq!(rig.send(0, ms(9.0), position(1.0), Quality::GOOD).len(), 0);
+    assert_eq!(rig.send(0, ms(10.0), position(1.0), Quality::GOOD).len(), 1);
+    rig.send(1, ms(9.0), moving(0.0, 1.0), Quality::GOOD);
+    assert_eq!(
+        [0, 1].map(|device| rig.count(device, Counter::Backward)),
+        [1, 1]
+    );
+    assert_eq!(
+        // The drive's own state has no stamp to compare with.
+        [0, 1].map(|device| rig.count(device, Counter::Readings)),
+        [2, 3]
+    );
+    let mut rig = Rig::new(SHOULDER);
+    let mut stamps = Vec::new();
+    // Motors behind each other by more than a period.
+    for (device, at) in [
+        (0, 10.0),
+        (1, 3.0),
+        (2, 4.0),
+        (2, 6.0),
+        (1, 5.0),
+        (0, 9.0),
+        (0, 11.0),
+    ] {
+        let samples = rig.send(device, ms(at), moving(0.0, 0.0), Quality::GOOD);
+        stamps.extend(
+            samples
+                .iter()
+                .filter(|s| s.channel == 0)
+                .map(|s| s.header.acquired),
+        );
+    }
+    assert_eq!(stamps, [ms(10.0), ms(11.0)]);
+    assert_eq!(rig.count(0, Counter::Backward), 1);
+}
+
+/// A wheel that turns without end, seen through gaps.
+#[test]
+fn turns_are_counted_as_long_as_they_are_certain() {
+    let mut rig = Rig::new(ELBOW);
+    // 10 rad/s: the turn is certain over less than pi / 10 s.
+    let mut at = |t: f64, angle: f64, quality: Quality| {
+        let sample = rig.send(0, ms(t), position((0.2 - angle).rem_euclid(TAU)), quality)[0];
+        (joint(&sample).position, sample.header.quality)
+    };
+    let mut angle = 0.5;
+    for k in 0..200 {
+        let (found, quality) = at(f64::from(k) * 20.0, angle, Quality::GOOD);
+        assert!(
+            (found - angle).abs() < 1e-4 && quality == Quality::GOOD,
+            "{found} {angle}"
+        );
+        angle += 0.15;
+    }
+    // A silence that is short enough for the turns is a gap alone.
+    let (found, quality) = at(4200.0, angle, Quality::GOOD);
+    assert!((found - angle).abs() < 1e-4, "{found} {angle}");
+    assert_eq!(quality, GAP);
+    // A longer one: nearest to 0.5 rad.
+    let (found, quality) = at(4600.0, angle, Quality::GOOD);
+    let turns = (angle - found) / TAU;
+    assert!(
+        (turns - turns.round()).abs() < 1e-4 && (found - 0.5).abs() < PI,
+        "{found}"
+    );
+    assert_eq!(quality, GAP | ZERO);
+    assert_eq!(at(4620.0, angle, Quality::GOOD).1, Quality::GOOD);
+}
+
+/// A changed configuration: the gear and its turns, or the whole device, of one of a joint's
+/// sources.
+#[test]
+fn a_replaced_source_marks_what_it_changes() {
+    let mut rig = Rig::new(ELBOW);
+    let mut t = 0.0;
+    let mut send = |rig: &mut Rig, quality: Quality| {
+        t += 2.0;
+        rig.send(1, ms(t), moving(0.0, 10.0), Quality::GOOD);
+        let sample = rig.send(0, ms(t), position(6.2), quality)[0];
+        (joint(&sample), sample.header.quality)
+    };
+    // 0.2 - 6.2 + 2 pi = 0.28.
+    let (state, quality) = send(&mut rig, Quality::GOOD);
+    assert!((state.position - 0.2832).abs() < 1e-3 && quality == Quality::GOOD);
+    rig.replace(0, ELBOW, false);
+    assert_eq!(
+        send(&mut rig, Quality::GOOD).1,
+        Quality::GOOD,
+        "nothing has changed"
+    );
+    let changed = ELBOW.replace("centre_rad = 0.5", "centre_rad = -6.0");
+    rig.replace(0, &changed, false);
+    let (state, quality) = send(&mut rig, Quality::GOOD);
+    assert!((state.position + 6.0).abs() < 1e-3, "{state:?}");
+    assert_eq!(quality, GAP | ZERO);
+    assert_eq!(send(&mut rig, Quality::GOOD).1, Quality::GOOD);
+    // The drive's gear leaves the position as it is.
+    rig.replace(1, &changed.replace("ratio = 100.0", "ratio = 50.0"), false);
+    let (state, quality) = send(&mut rig, Quality::GOOD);
+    assert!(
+        (state.velocity - 0.2).abs() < 1e-3 && quality == Quality::GOOD,
+        "{state:?}"
+    );
+    // A shorter time for which it is fresh.
+    rig.replace(
+        1,
+        &changed.replace("max_silence_ms = 20", "max_silence_ms = 3"),
+        false,
+    );
+    assert!(send(&mut rig, Quality::GOOD).0.torque.is_finite());
+    let sample = rig.send(0, ms(100.0), position(6.2), Quality::GOOD)[0];
+    assert!(joint(&sample).velocity.is_nan());
+    // A motor of a coupling: its joints are marked, the others are not.
+    let mut rig = Rig::new(SHOULDER);
+    let round = |rig: &mut Rig, at: f64| -> Vec<Quality> {
+        let of = |device: usize| rig.send(device, ms(at), moving(0.0, 0.0), Quality::GOOD);
+        let samples: Vec<Sample> = [0, 1, 2].into_iter().flat_map(of).collect();
+        samples.iter().map(|s| s.header.quality).collect()
+    };
+    let good = Quality::GOOD;
+    assert_eq!(round(&mut rig, 1.0), [good; 3]);
+    rig.replace(
+        2,
+        &SHOULDER.replace("offset_rad = 0.5", "offset_rad = 0.4"),
+        false,
+    );
+    assert_eq!(round(&mut rig, 2.0), [good; 3]);
+    rig.replace(
+        1,
+        &SHOULDER.replace("offset_rad = 0.5", "offset_rad = 0.4"),
+        false,
+    );
+    assert_eq!(round(&mut rig, 3.0), [good, GAP | ZERO, GAP | ZERO]);
+    assert_eq!(round(&mut rig, 4.0), [good; 3]);
+}
+
+/// Encoders at the joints of coupled motors: positions from the one, torques from the other.
+#[test]
+fn a_coupling_can_give_torques_alone() {
+    let joints = ["pitch", "roll"];
+    let mut text = String::new();
+    for (node, name) in (30..).zip(joints) {
+        text += &format!(
+            "[[bus.device]]\ndriver = \"canopen_encoder\"\nname = \"encoder_{name}\"\n\
+             address = {node}\ncounts_per_turn = 65536.0\n[[bus.device.joint]]\nname = \"{name}\"\n\
+             takes = [\"position\"]\n"
+        );
+    }
+    for node in [1, 2] {
+        text += &format!(
+            "[[bus.device]]\ndriver = \"canopen_drive\"\nname = \"drive_{node}\"\n\
+             address = {node}\ncounts_per_turn = 4096.0\nrated_torque = 1.0\nrated_current = 1.0\n\
+             pdos = [{{ number = 1, objects = [0x6064, 0x6077], sync = 0 }}]\n\
+             [[bus.device.joint]]\nname = \"motor_{node}\"\n"
+        );
+    }
+    text += "[[bus.coupling]]\njoints = [\"pitch\", \"roll\"]\n\
+             motors = [\"motor_1\", \"motor_2\"]\nmatrix = [[0.5, 0.5], [0.5, -0.5]]\n\
+             takes = [\"torque\"]\n";
+    let mut rig = Rig::new(&text);
+    assert_eq!(rig.plan.channels.len(), 2);
+    let torque = |torque: f64| JointState {
+        torque,
+        ..position(50.0)
+    };
+    assert_eq!(rig.send(2, ms(1.0), torque(0.3), Quality::GOOD), []);
+    assert_eq!(
+        rig.send(3, ms(2.0), torque(0.1), Quality::GOOD),
+        [],
+        "they are held"
+    );
+    let mut state = |device: usize, at: f64| {
+        let sample = rig.send(device, ms(at), position(1.0), Quality::GOOD)[0];
+        (sample.channel, joint(&sample))
+    };
+    // M^-T = [[1, 1], [1, -1]].
+    for (device, expected) in [(0, 0.4), (1, 0.2)] {
+        let (channel, state) = state(device, 3.0);
+        assert_eq!(channel as usize, device);
+        assert!((state.position - 1.0).abs() < 1e-4, "{state:?}");
+        assert!((state.torque - expected).abs() < 1e-9, "{state:?}");
+        assert!(state.velocity.is_nan());
+    }
+    assert!(state(0, 103.0).1.torque.is_nan(), "no longer fresh");
+    let shown = plan(&text).unwrap().to_string();
+    assert!(
+        shown.contains("coupling, condition number 2.0 (torque alone)"),
+        "{shown}"
+    );
+    assert!(
+        shown.contains("    roll = 0.5 * motor_1 + -0.5 * motor_2\n"),
+        "{shown}"
+    );
+}
+
+/// A table, encoded as a log by the drivers' own boards and decoded again, is the same table to
+/// half a step: coupled motors that wrap, an encoder that wraps merged with a drive.
+#[test]
+fn a_table_is_the_same_after_encoding_and_decoding() {
+    // Every motor's angle is reported within a turn of its shaft.
+    let wraps = "ratio = 100.0\n wraps_rad = [-3.141592653589793, 3.141592653589793]\n\
+                 centre_rad = 0.0\n max_speed_radps = 600.0\n";
+    let text = format!("{ELBOW}{SHOULDER}").replace("max_silence_ms = 30\n", "");
+    let shoulder = text.find("board_1").unwrap();
+    let text = text[..shoulder].to_owned() + &text[shoulder..].replace("ratio = 100.0\n", wraps);
+    let plan = plan(&text).unwrap();
+    let names = ["elbow", "pitch", "roll", "yaw"];
+    let columns = ["position", "velocity", "torque", "current"];
+    let mut header = "t".to_owned();
+    for name in names {
+        for column in columns {
+            header += &format!(",joint/{name}/{column}");
+        }
+    }
+    let mut table = header.clone();
+    for k in 0..600 {
+        let t = 4e-3 * f64::from(k);
+        table += &format!("\n{:.6}", 10.0 + t);
+        for number in 0..names.len() {
+            let number = if number == 0 { 3 } else { number - 1 };
+            let mut state = truth(number, t);
+            // The elbow turns like a wheel.
+            if number == 3 {
+                (state.position, state.velocity) = (0.4 + 5.0 * t, 5.0);
+            }
+            for value in [state.position, state.velocity, state.torque, state.current] {
+                table += &format!(",{value}");
+            }
+        }
+    }
+    let mut log = Vec::new();
+    let report = encode(&plan, table.as_bytes(), &mut log).unwrap();
+    assert_eq!((report.samples, report.refused), (2400, 0), "{report:?}");
+    let mut decoded = Vec::new();
+    let report = decode(&plan, &log[..], &mut decoded, Columns::All).unwrap();
+    // With the drive's own state.
+    assert_eq!(report.samples, 2400 + 600, "{report:?}");
+    let (before, after) = (cells(&table), cells(&String::from_utf8(decoded).unwrap()));
+    assert_eq!(before.len(), after.len());
+    for (t, row) in &before {
+        for (column, value) in row {
+            let found = after[t].get(column).copied().unwrap_or(f64::NAN);
+            let is_elbow = column.contains("elbow");
+            let bound = match column.rsplit('/').next().unwrap() {
+                "position" if is_elbow => 0.5 * TAU / 65536.0,
+                "position" => 1.615 * HALF_POSITION / 100.0,
+                "velocity" if is_elbow => 0.5 * TAU / 4096.0 / 100.0,
+                "velocity" => 1.615 * HALF_VELOCITY / 100.0,
+                "torque" if is_elbow => 0.5 * 5e-4 * 100.0,
+                // These boards measure no torque.
+                "torque" => {
+                    assert!(found.is_nan(), "{column}");
+                    continue;
+                }
+                "current" if is_elbow => 0.5 * 3e-3,
+                _ => 0.5e-3,
+            };
+            let off = (found - value).abs();
+            assert!(off <= bound * 1.001, "{t} {column}: {value} {found}");
+        }
+        let quality = |name: &str| after[t][&format!("{name}/quality")];
+        assert!(
+            names.iter().all(|name| quality(name) == 0.0),
+            "{:?}",
+            after[t]
+        );
+    }
+    // A joint of a coupling alone can not be told in the motors' angles.
+    let alone = "t,joint/pitch/position,joint/elbow/position\n0.1,0.2,0.3\n";
+    let report = encode(&plan, alone.as_bytes(), Vec::new()).unwrap();
+    assert_eq!((report.samples, report.refused), (1, 1));
+    let reason = report.first_refusal.unwrap();
+    assert_eq!(
+        reason,
+        "line 2: the joints of a coupling must be in one row"
+    );
+}
+
+/// Flags go back to the device that they came from.
+#[test]
+fn flags_are_encoded_where_they_were_decoded() {
+    let plan = plan(&format!("{ELBOW}{SHOULDER}")).unwrap();
+    let fault = Quality::DEVICE_FAULT.0;
+    let drive = Quality::DRIVE_FAULT.0;
+    let mut table = "t".to_owned();
+    for name in ["elbow", "pitch", "roll", "yaw"] {
+        table += &format!(",joint/{name}/position,joint/{name}/velocity,{name}/quality");
+    }
+    // The elbow's encoder, its drive, the third motor, the second one, the first one, none.
+    let flags = [
+        [fault, 0, 0, 0],
+        [drive, 0, 0, 0],
+        [0, 0, 0, fault],
+        [0, 0, fault, fault],
+        [0, fault, fault, 0],
+        [0, 0, 0, 0],
+    ];
+    for (k, flags) in flags.iter().enumerate() {
+        table += &format!("\n{:.3}", 1.0 + 0.01 * k as f64);
+        for flag in flags {
+            table += &format!(",0.1,0.2,{flag}");
+        }
+    }
+    let (mut log, mut decoded) = (Vec::new(), Vec::new());
+    encode(&plan, table.as_bytes(), &mut log).unwrap();
+    decode(&plan, &log[..], &mut decoded, Columns::All).unwrap();
+    let rows = cells(&String::from_utf8(decoded).unwrap());
+    for (row, flags) in rows.values().zip(&flags) {
+        let quality =
+            ["elbow", "pitch", "roll", "yaw"].map(|name| row[&format!("{name}/quality")] as u32);
+        assert_eq!(quality, *flags);
+        assert_eq!(
+            row.get("joint/elbow/velocity")
+                .is_some_and(|v| v.is_finite()),
+            true
+        );
+    }
+}
+
+/// A table's cells by stamp and column.
+fn cells(table: &str) -> BTreeMap<String, BTreeMap<String, f64>> {
+    let mut lines = table.lines();
+    let columns: Vec<&str> = lines.next().unwrap().split(',').collect();
+    let rows = lines.map(|line| {
+        let cells: Vec<&str> = line.split(',').collect();
+        let t: f64 = cells[0].parse().unwrap();
+        let values = columns.iter().zip(&cells).skip(1);
+        let row = values.filter_map(|(c, v)| Some(((*c).to_owned(), v.parse().ok()?)));
+        // Within a millisecond: an emergency message comes a frame earlier than the reading.
+        (format!("{t:.3}"), row.collect())
+    });
+    let mut all = BTreeMap::<String, BTreeMap<String, f64>>::new();
+    for (t, row) in rows.collect::<Vec<(String, BTreeMap<String, f64>)>>() {
+        all.entry(t).or_default().extend(row);
+    }
+    all
+}
+
+#[test]
+fn each_mistake_has_one_clear_message() {
+    let text = format!("{ELBOW}{SHOULDER}");
+    let problem = |from: &str, to: &str| {
+        assert!(text.contains(from), "{from}");
+        plan(&text.replacen(from, to, 1))
+            .map(|p| p.to_string())
+            .unwrap_err()
+    };
+    for (from, to, expected) in [
+        // Couplings.
+        (
+            "[0.0, -0.615, 0.615]",
+            "[0.0, -0.615]",
+            "bus \"arm\", coupling of \"pitch\", \"roll\", \"yaw\": matrix must have 3 rows of 3 \
+             numbers: a row for each joint",
+        ),
+        (
+            "-0.615, 0.615]",
+            "-0.615, nan]",
+            "matrix must hold finite numbers",
+        ),
+        ("-0.615, 0.615]", "-0.615, 0.0]", "matrix is singular"),
+        (
+            "-0.615, 0.615]",
+            "-0.615, 0.0001]",
+            "matrix is nearly singular: its condition number is",
+        ),
+        (
+            "motors = [\"motor_1\", ",
+            "motors = [",
+            "there are 3 joints and 2 motors; it must be as many of both, 1 to 8",
+        ),
+        (
+            "\"motor_2\", \"motor_3\"]",
+            "\"motor_2\", \"motor_4\"]",
+            "motor \"motor_4\" is no [[bus.device.joint]] of this bus; all motors of a coupling \
+             must be on one bus, because each bus has a thread of its own; did you mean \"motor_",
+        ),
+        (
+            "\"motor_2\", \"motor_3\"]",
+            "\"motor_2\", \"motor_2\"]",
+            "\"motor_2\" is in a coupling",
+        ),
+        (
+            "\"roll\", \"yaw\"]",
+            "\"roll\", \"roll\"]",
+            "\"roll\" is in a coupling already",
+        ),
+        (
+            "\"roll\", \"yaw\"]",
+            "\"roll\", \"motor_1\"]",
+            "\"motor_1\" is a joint and a motor",
+        ),
+        (
+            "\"roll\", \"yaw\"]",
+            "\"roll\", \"elbow\"]",
+            "joint \"elbow\": its position comes from device \"encoder\" and from its coupling; \
+             give them different names or",
+        ),
+        ("\"roll\", \"yaw\"]", "\"roll\", \"\"]", "must have 1 to"),
+        (
+            "matrix = ",
+            "matirx = ",
+            "unknown field `matirx`, expected one of `joints`, `motors`",
+        ),
+        (
+            "[[bus.coupling]]",
+            "[[bus.coupling]]\ntakes = [\"torque\"]",
+            "joint \"pitch\": no device gives its position (only its coupling)",
+        ),
+        // Several devices.
+        (
+            "takes = [\"velocity\", \"torque\", \"current\"]",
+            "",
+            "joint \"elbow\": its position comes from device \"encoder\" and from device \
+             \"drive\"; give them different names or, if both measure this joint, say with takes = \
+             [...] what each of them gives: \"position\", \
+             \"velocity\", \"acceleration\", \"torque\", \"current\"",
+        ),
+        (
+            "takes = [\"velocity\", \"torque\", \"current\"]",
+            "takes = [\"speed\"]",
+            "unknown variant `speed`, expected one of `position`, `velocity`",
+        ),
+        (
+            "takes = [\"velocity\", \"torque\", \"current\"]",
+            "takes = []",
+            "takes is empty",
+        ),
+        (
+            "takes = [\"position\"]\n        wraps_rad = [0.0, 6.283185307179586]\n        \
+             centre_rad = 0.5\n        max_speed_radps = 10.0",
+            "takes = [\"acceleration\"]",
+            "joint \"elbow\": no device gives its position (only device \"encoder\", device \
+             \"drive\")",
+        ),
+        (
+            "takes = [\"position\"]",
+            "takes = [\"current\"]",
+            "wraps_rad is given, but takes has no",
+        ),
+        ("takes = ", "take = ", "unknown field `take`"),
+        ("takes = ", "take = ", "did you mean \"takes\"?"),
+        // Turns.
+        (
+            "centre_rad = 0.5",
+            "",
+            "centre_rad is missing; wraps_rad, centre_rad and max_speed_radps",
+        ),
+        (
+            "wraps_rad = [0.0, 6.283185307179586]",
+            "",
+            "\"encoder\", joint \"elbow\": wraps_rad is missing",
+        ),
+        (
+            "6.283185307179586]",
+            "-1.0]",
+            "wraps_rad = [0, -1] must be the lower and the upper end",
+        ),
+        (
+            "6.283185307179586]",
+            "6.2832]",
+            "wraps_rad = [0, 6.2832] looks like one turn of the device, rounded: the error would \
+             grow with each turn; write [0, 6.283185307179586]",
+        ),
+        (
+            "[0.0, 6.283185307179586]",
+            "[0.0, 25735.9]",
+            "looks like 4096 turns of the device",
+        ),
+        (
+            "centre_rad = 0.5",
+            "centre_rad = 90.0",
+            "centre_rad = 90 looks like degrees",
+        ),
+        (
+            "max_speed_radps = 10.0",
+            "max_speed_radps = 0.0",
+            "max_speed_radps = 0 must be above 0",
+        ),
+        (
+            "max_speed_radps = 10.0",
+            "max_speed_radps = 400.0",
+            "\"encoder\": at max_speed_radps its shaft turns by half the range of wraps_rad in \
+             0.007853982 s, and it sends only every 0.01 s: the turns cannot be counted",
+        ),
+    ] {
+        let problem = problem(from, to);
+        assert!(problem.contains(expected), "{from} -> {to}: {problem}");
+    }
+    // A range that is no number of turns is legal.
+    let odd = text.replace("[0.0, 6.283185307179586]", "[-12.5, 12.5]");
+    assert!(plan(&odd).is_ok(), "{:?}", plan(&odd));
+    // Devices of one joint on two buses.
+    let bus = "[[bus]]\nname = \"other\"\nsource = { kind = \"virtual\", name = \"other\" }\n";
+    let drive = ELBOW
+        .find("[[bus.device]]\n      driver = \"canopen_drive\"")
+        .unwrap();
+    let split = format!("{}{bus}{}", &ELBOW[..drive], &ELBOW[drive..]);
+    let problem = plan(&split).unwrap_err();
+    let expected = "\"elbow\" is on bus \"arm\" too; devices that measure one joint must be on one \
+                    bus, because each bus has a thread of its own";
+    assert!(problem.contains(expected), "{problem}");
+}
+
+#[test]
+fn the_plan_shows_where_each_output_leads() {
+    let shown = plan(&format!("{ELBOW}{SHOULDER}")).unwrap().to_string();
+    for line in [
+        "    channel   0 joint elbow = -1 * output 0 of the device +0.2 rad (position alone), \
+         turns counted, certain over 0.314159265 s, else right from -2.6416 to 3.6416 rad, stale \
+         after 0.04 s\n",
+        "    channel   0 joint elbow = 0.01 * output 0 of the device +0 rad (velocity, torque, \
+         current alone), stale after",
+        "    channel   2 joint roll, by the coupling; motor motor_2 = -0.01 * output 0 of the \
+         device +0.5 rad, stale after 0.05 s\n",
+        "  coupling, condition number 7.9\n    pitch = 1 * motor_1\n    roll = 1 * motor_1 + 0.615 \
+         * motor_2\n    yaw = -0.615 * motor_2 + 0.615 * motor_3\n",
+    ] {
+        assert!(shown.contains(line), "{line}\n{shown}");
+    }
+}
