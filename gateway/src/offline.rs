@@ -4,6 +4,7 @@
 use crate::candump;
 use crate::config::Source;
 use crate::decoder::Decoder;
+use crate::link::adapter::Adapter;
 use crate::link::replay::Matching;
 use crate::plan::{BusPlan, Plan};
 use crate::status::BusStatus;
@@ -421,8 +422,7 @@ pub fn encode(
 /// The interface name of `bus` in a log.
 fn interface(bus: &BusPlan) -> &str {
     match &bus.source {
-        Source::SocketCan { interface } => interface,
-        Source::Virtual { name } => name,
-        Source::Replay { .. } => &bus.name,
+        Source::SocketCan(Adapter::Interface(name)) | Source::Virtual { name } => name,
+        Source::SocketCan(_) | Source::Replay { .. } => &bus.name,
     }
 }
