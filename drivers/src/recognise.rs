@@ -356,6 +356,18 @@ impl<'t> Evidence<'t> {
         })
     }
 
+    /// As [`Evidence::sends`], of a protocol in which a frame without data asks for another of the
+    /// same identifier. Questions alone say nothing.
+    pub(crate) fn answers(
+        &mut self,
+        id: Id,
+        bits: f64,
+        rule: impl Fn(&Frame) -> bool,
+    ) -> Option<&'t Stream> {
+        let has_answer = (self.traffic.stream(id)).is_some_and(|stream| stream.lengths.1 > 0);
+        has_answer.then(|| self.sends(id, bits, |frame| frame.is_empty() || rule(frame)))?
+    }
+
     /// `id` counts, and `bits` more.
     pub(crate) fn explains(&mut self, id: Id, bits: f64) {
         if !self.explains.contains(&id) {

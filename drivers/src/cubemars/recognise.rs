@@ -73,8 +73,13 @@ fn mit(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
         } else {
             0.0
         };
-        // The first byte is constant, or that of few motors.
-        let number_bits = BYTE.min(byte_of(numbers.len()));
+        // The first byte is the identifier, or keeps to few numbers.
+        let few = stream.frames >= 8 * numbers.len() as u64;
+        let number_bits = match (host, few) {
+            (1.., _) => BYTE,
+            (0, true) => byte_of(numbers.len()),
+            (0, false) => 0.0,
+        };
         evidence.sends(stream.id, length_of(2) + stage + number_bits, is_reply)?;
         evidence.belongs(Id::standard((*number).into()));
         let what = "CubeMars motor in MIT mode";

@@ -51,8 +51,8 @@ fn told(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Result<Option
         if let Some(told) = &mut told {
             evidence.add(byte_of(types.len()) + length_of(2));
             if texts.iter().all(Option::is_some) {
-                // Eight numbers in frames of one length.
-                evidence.add(BYTE + LENGTH);
+                // A command, a length, and eight numbers in their order.
+                evidence.add(2.0 * BYTE + LENGTH);
                 let bytes = texts.iter().flatten().flatten();
                 let text = bytes
                     .take_while(|byte| **byte != 0)

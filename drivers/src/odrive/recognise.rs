@@ -1,7 +1,7 @@
 //! Recognising axes: by heartbeat and estimates, and by the version that they tell.
 
-use super::frames::{NODE_MOST, command, is_request};
-use crate::recognise::{Evidence, Finding, Key, LENGTH, Stream, Traffic, byte_of};
+use super::frames::{NODE_MOST, command};
+use crate::recognise::{BYTE, Evidence, Finding, Key, LENGTH, Stream, Traffic, byte_of};
 use crate::{Format, Frame, Id, bytes};
 use alloc::format;
 use alloc::vec::Vec;
@@ -19,13 +19,13 @@ fn is_answer(frame: &Frame) -> bool {
     frame.format == Format::Classic && frame.len() == 8
 }
 
-/// Whether a frame is an answer with two floats of an ordinary size, or none.
+/// Whether a frame has two floats of an ordinary size, or none.
 fn is_measured(frame: &Frame) -> bool {
     let is_usual = |at| {
         let value = f32::from_bits(bytes::u32_le(frame.data(), at)).abs();
         value == 0.0 || value.is_nan() || (1e-7..1e8).contains(&value)
     };
-    is_request(frame) || is_answer(frame) && is_usual(0) && is_usual(4)
+    is_answer(frame) && is_usual(0) && is_usual(4)
 }
 
 fn is_heartbeat(frame: &Frame) -> bool {
@@ -38,33 +38,28 @@ pub(super) fn axis(seen: &Traffic, driver: &'static str, node: u16) -> Option<Fi
     let mut evidence = Evidence::new(seen, usize::from(NODE_MOST) + 1);
     let heartbeat = id(node, command::HEARTBEAT);
     let beats = evidence.sends(heartbeat, LENGTH + byte_of(STATES), is_heartbeat);
-    let estimates = id(node, command::ESTIMATES);
-    let floats = LENGTH + 2.0 * byte_of(EXPONENTS);
-    let estimates = evidence.sends(estimates, floats, is_measured);
+    let mut measured = |command| {
+        let bits = LENGTH + 2.0 * byte_of(EXPONENTS);
+        evidence.answers(id(node, command), bits, is_measured)
+    };
+    let estimates = measured(command::ESTIMATES);
     if beats.is_none() && estimates.is_none() {
         return None;
     }
     for command in [command::IQ, command::TEMPERATURE, command::TORQUES] {
-        evidence.sends(id(node, command), floats, is_measured);
+        measured(command);
     }
-    // Firmware 0.6 leaves the last byte 0, and 0.5 has a flag in its highest bit alone.
     let mut what = "ODrive".into();
     let mut firmware = "";
     let version = seen.stream(id(node, command::VERSION)).into_iter();
     let answer = version
         .flat_map(Stream::kept)
         .find(|frame| is_answer(frame));
-    if let Some(&[_, hardware, revision, _, major, minor, patch, _]) = answer.map(Frame::data) {
-        // The version of the firmware is 0.5 or 0.6, of the hardware 3 to 6.
-        evidence.explains(
-            id(node, command::VERSION),
-            LENGTH + byte_of(1) + byte_of(2) + 5.0,
-        );
-        what = format!("ODrive {hardware}.{revision}, firmware {major}.{minor}.{patch}");
-        firmware = match (major, minor) {
-            (0, ..6) => "0.5",
-            _ => "0.6",
-        };
+    if let Some(&[_, hardware, revision, _, 0, minor @ (5 | 6), patch, _]) = answer.map(Frame::data)
+    {
+        evidence.explains(id(node, command::VERSION), LENGTH + BYTE + byte_of(2));
+        what = format!("ODrive {hardware}.{revision}, firmware 0.{minor}.{patch}");
+        firmware = if minor == 5 { "0.5" } else { "0.6" };
     }
     let is_joint = |frame: &Frame| is_answer(frame);
     let period = estimates.and_then(|stream| stream.period_of(is_joint));
