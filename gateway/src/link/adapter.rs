@@ -224,6 +224,35 @@ pub fn present(sys: &Path) -> Vec<Present> {
 }
 
 impl Adapter {
+    /// The best way to name `interface` for a configuration that lasts, of the interfaces in
+    /// `present`: the serial number, unless another adapter has the same; else the USB port; else
+    /// the interface's name.
+    #[must_use]
+    pub fn lasting(interface: &str, present: &[Present]) -> Self {
+        let by_name = Self::Interface(interface.to_owned());
+        let Some(this) = present.iter().find(|p| p.interface == interface) else {
+            return by_name;
+        };
+        let Some(usb) = &this.usb else {
+            return by_name;
+        };
+        let others = || (present.iter()).filter(|other| other.interface != interface);
+        let others = || others().filter_map(|other| other.usb.as_ref());
+        let has_more = others().any(|other| other.port == usb.port);
+        let channel = has_more.then_some(this.channel);
+        let is_copy = |other: &Usb| other.port != usb.port && other.serial == usb.serial;
+        match &usb.serial {
+            Some(serial) if !others().any(is_copy) => Self::Serial {
+                serial: serial.clone(),
+                channel,
+            },
+            _ => Self::UsbPort {
+                port: usb.port.clone(),
+                channel,
+            },
+        }
+    }
+
     /// The name of its interface at this moment, from the sysfs at `sys` ([`SYS`]). A name is
     /// returned as it is, whether there is such an interface or not.
     ///
@@ -398,6 +427,36 @@ mod tests {
         fs::write(sys.path().join("class/net/can1/dev_id"), "0x0\n").unwrap();
         let fourth = resolve(&sys, "serial = \"7\"\nchannel = 3");
         assert_eq!(fourth.as_deref(), Ok("can1"));
+    }
+
+    /// The name that is chosen for an interface leads back to it.
+    #[test]
+    fn a_lasting_name_is_the_serial_number_if_it_is_the_only_one() {
+        let sys = Sys::new();
+        sys.plug("can0", "1-2", Some("7"), 0);
+        sys.plug("can1", "1-2", Some("7"), 1);
+        sys.plug("can2", "1-3", Some("8"), 0);
+        sys.plug("can3", "1-4", Some("9"), 0);
+        sys.plug("can4", "1-5", Some("9"), 0);
+        sys.plug("can5", "1-6", None, 0);
+        let all = present(sys.path());
+        let chosen = all.iter().map(|present| {
+            let lasting = Adapter::lasting(&present.interface, &all);
+            let back = lasting.resolve(sys.path());
+            assert_eq!(back.as_deref(), Ok(present.interface.as_str()));
+            lasting.to_string()
+        });
+        let expected = [
+            "serial = \"7\", channel = 0",
+            "serial = \"7\", channel = 1",
+            "serial = \"8\"",
+            "usb_port = \"1-4\"",
+            "usb_port = \"1-5\"",
+            "usb_port = \"1-6\"",
+            "vcan0",
+        ];
+        assert_eq!(chosen.collect::<Vec<_>>(), expected);
+        assert_eq!(Adapter::lasting("can9", &all).to_string(), "can9");
     }
 
     #[test]
