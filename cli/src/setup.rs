@@ -18,8 +18,8 @@ use std::path::{Path, PathBuf};
 ///
 /// Scans the CAN interfaces of this machine, or the given buses, and writes DIR/gateway.toml with
 /// the devices found, which `proprio gateway --check` accepts. Adapters are named by their serial
-/// number, else by their USB port. What nobody but a person knows (names of joints, gear ratios) has
-/// a placeholder and the comment `fill in`.
+/// number, else by their USB port. What nobody but a person knows (names of joints, gear ratios)
+/// has a placeholder and the comment `fill in`.
 #[derive(clap::Args)]
 pub(crate) struct Args {
     /// The folder of the configuration; it is made if it is not there

@@ -32,8 +32,8 @@
 //! period; what it sends after its six bytes (the source's remark has two more).
 //!
 //! # Recognition
-//! A sensor that streams on the identifiers 1 and 2 is recognised by them and the lengths alone, and
-//! never as certain. No question is known that it answers.
+//! A sensor that streams on the identifiers 1 and 2 is recognised by them and the lengths alone,
+//! and never as certain. No question is known that it answers.
 //!
 //! # Keys
 //! ```toml

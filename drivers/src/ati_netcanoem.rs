@@ -43,9 +43,9 @@
 //!
 //! # Recognition
 //! A scan that is told to ask for this family sends opcode 8 (units) to all bases, then 5 (serial
-//! number) and 7 to those that answer. It must be told, because the identifiers are those of commands
-//! to CANopen nodes and JR3 boards (`208` is a start). Without questions a board is recognised by
-//! what it answers to another program.
+//! number) and 7 to those that answer. It must be told, because the identifiers are those of
+//! commands to CANopen nodes and JR3 boards (`208` is a start). Without questions a board is
+//! recognised by what it answers to another program.
 //!
 //! # Keys
 //! ```toml

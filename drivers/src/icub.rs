@@ -19,10 +19,10 @@
 //! has left its bootloader.
 //!
 //! # Recognition
-//! A scan sends DISCOVER to all boards (`70F`, `FF`), and GET_ADDITIONAL_INFO (`70a`, `0C`) to those
-//! that have answered. It does not ask for the protocol's version: the identifier of that question,
-//! `20a`, is a command to the motor of a CANopen drive. Without questions boards are recognised by
-//! their streams, or by what they answer to another program.
+//! A scan sends DISCOVER to all boards (`70F`, `FF`), and GET_ADDITIONAL_INFO (`70a`, `0C`) to
+//! those that have answered. It does not ask for the protocol's version: the identifier of that
+//! question, `20a`, is a command to the motor of a CANopen drive. Without questions boards are
+//! recognised by their streams, or by what they answer to another program.
 //!
 //! Sources: robotology/icub-firmware `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12 (25 Nov
 //! 2024) and the firmware under `emBODY/eBcode/arch-arm/embot` at b4299211;

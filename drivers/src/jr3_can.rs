@@ -46,9 +46,9 @@
 //! the streams): its boards are not read.
 //!
 //! # Recognition
-//! Boards are recognised by the counter that both halves of a reading have. A scan that is told to ask
-//! for this family sends the questions for full scales to all numbers. It must be told, because their
-//! identifiers are those of commands to CANopen nodes.
+//! Boards are recognised by the counter that both halves of a reading have. A scan that is told to
+//! ask for this family sends the questions for full scales to all numbers. It must be told, because
+//! their identifiers are those of commands to CANopen nodes.
 //!
 //! # Keys
 //! ```toml

@@ -37,8 +37,8 @@
 //! and add its line to the list in `registry.rs`. Families share `bringup.rs` (starting a board),
 //! `configure.rs` (confirming its configuration), `pairing.rs` and `group.rs` (combining two
 //! frames, or more), `held.rs` (values of other instants), `bytes.rs` (the numbers of a payload),
-//! `wrench.rs` (force/torque sensors), `keys.rs` (addresses and identifiers) and [`mod@recognise`] (the
-//! evidence for a device in the traffic of a bus).
+//! `wrench.rs` (force/torque sensors), `keys.rs` (addresses and identifiers) and [`mod@recognise`]
+//! (the evidence for a device in the traffic of a bus).
 #![no_std]
 extern crate alloc;
 #[cfg(test)]

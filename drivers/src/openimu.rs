@@ -53,8 +53,8 @@
 //! `CAN_MTLT.py` (Aceinna/python-mtlt 1b99f92e), `Imu.hpp` (leggedrobotics/tcan ed86f6c6).
 //!
 //! # Recognition
-//! By two of its messages from one address; other makers' J1939 sensors may send the same. Nothing is
-//! asked.
+//! By two of its messages from one address; other makers' J1939 sensors may send the same. Nothing
+//! is asked.
 //!
 //! # Keys
 //! ```toml

@@ -50,11 +50,11 @@
 //! the manual and 300 Hz in the header, so `rate_hz` may be either and means code 6.
 //!
 //! # Recognition
-//! A sensor with the identifiers of delivery is recognised by its data. A scan that is told to ask for
-//! this family sends the commands `01` (name), `02` (serial number) and `10`, which a sensor that
-//! streams ignores; each is answered by 15 characters. It must be told, because `64` may be the number
-//! of a CubeMars motor, for which these bytes are a command. A sensor with other identifiers is not
-//! recognised.
+//! A sensor with the identifiers of delivery is recognised by its data. A scan that is told to ask
+//! for this family sends the commands `01` (name), `02` (serial number) and `10`, which a sensor
+//! that streams ignores; each is answered by 15 characters. It must be told, because `64` may be
+//! the number of a CubeMars motor, for which these bytes are a command. A sensor with other
+//! identifiers is not recognised.
 //!
 //! # Keys
 //! ```toml

@@ -1,24 +1,22 @@
 //! What is on a bus: listens, asks if it is told to, and names the devices found.
 //!
 //! ```text
-//! Link or log -> Traffic -> findings of all drivers -> Device (what explains a frame best)
+//! Link or log -> Traffic -> findings of all drivers -> Device (found.rs)
 //!                                                      -> tables of gateway.toml (tables.rs)
 //! ```
 //!
-//! Recognition belongs to the drivers ([`proprio_drivers::recognise()`]). Where the devices of two
-//! findings would read the same frames, the one with more evidence is the device, and the other is
-//! kept as its rival.
+//! Recognition belongs to the drivers ([`proprio_drivers::recognise()`]).
 
+mod found;
 mod tables;
 
+pub use found::{Device, devices};
 pub use tables::{Bus, file, tables};
 
 use crate::candump;
 use crate::clock::Clock;
 use crate::link::{Link, Received, SendError, send_by};
-use proprio_drivers::{
-    Claim, Finding, Format, Id, Mode, Options, Outputs, Spec, Traffic, questions, recognise,
-};
+use proprio_drivers::{Format, Traffic, questions};
 use proprio_topics::{LinkState, Nanos};
 use std::collections::BTreeMap;
 use std::io::{self, BufRead};
@@ -70,8 +68,8 @@ pub fn hear(link: &mut dyn Link, clock: &impl Clock, time: Nanos) -> Result<Traf
 }
 
 /// Asks the devices on `link` what they are: all that can be asked safely, and the families in
-/// `named` ([`proprio_drivers::ASKED_BY_NAME`]). Adds what is heard to `heard`, and returns how many
-/// questions were sent. Without `fd`, questions in CAN FD are not sent.
+/// `named` ([`proprio_drivers::ASKED_BY_NAME`]). Adds what is heard to `heard`, and returns how
+/// many questions were sent. Without `fd`, questions in CAN FD are not sent.
 ///
 /// # Errors
 /// [`ScanError::Send`].
@@ -124,95 +122,12 @@ pub fn log(file: impl BufRead) -> io::Result<(BTreeMap<String, Traffic>, candump
     Ok((buses, report))
 }
 
-/// A device on a bus.
-#[derive(Debug, Clone)]
-pub struct Device {
-    /// Its name in the configuration: driver and address, after a prefix.
-    pub name: String,
-    /// What speaks for it.
-    pub finding: Finding,
-    /// Other devices that the same frames might come from, with less evidence.
-    pub rivals: Vec<Finding>,
-    claims: Vec<Claim>,
-}
-
-impl Device {
-    /// Whether the frames of `id` are explained by it.
-    #[must_use]
-    pub fn explains(&self, id: Id) -> bool {
-        let claimed = self.claims.iter().any(|claim| claim.matches(id));
-        claimed || self.finding.explains.contains(&id)
-    }
-}
-
-/// The driver and its keys, for the device of `finding`; placeholders stand for what a person has
-/// to fill in.
-fn options(finding: &Finding) -> Result<(Options, Spec), String> {
-    let keys: String = (finding.keys.iter())
-        .map(|key| format!("{} = {}\n", key.name, key.value))
-        .collect();
-    let table: toml::Table = keys.parse().map_err(|e: toml::de::Error| e.to_string())?;
-    let options = Options::deserialize(finding.driver, table);
-    let spec = Spec {
-        address: finding.address,
-        max_silence: Nanos::from_millis(100),
-        mode: Mode::Listen,
-        outputs: Outputs(finding.joints.iter().copied().take(16).collect()),
-    };
-    Ok((options.map_err(|e| format!("{e:?}"))?, spec))
-}
-
-/// The identifiers that the device of `finding` reads.
-fn claims(finding: &Finding) -> Result<Vec<Claim>, String> {
-    let (options, spec) = options(finding)?;
-    let device = options.device(&spec).map_err(|e| e.to_string())?;
-    Ok(device.claims().to_vec())
-}
-
-/// The devices on the bus of `heard`, those with most evidence first. `prefix` begins their names.
-#[must_use]
-pub fn devices(heard: &Traffic, prefix: &str) -> Vec<Device> {
-    let mut devices: Vec<Device> = Vec::new();
-    for finding in recognise(heard) {
-        let claims = match (finding.unusable, claims(&finding)) {
-            ("", Ok(claims)) => claims,
-            ("", Err(problem)) => {
-                tracing::warn!(driver = finding.driver, "a finding is not legal: {problem}");
-                continue;
-            }
-            _ => Vec::new(),
-        };
-        // As the plan refuses it: one identifier, two readers.
-        let rivals = |device: &Device| {
-            let mut pairs = claims
-                .iter()
-                .flat_map(|a| device.claims.iter().map(move |b| (a, b)));
-            pairs.any(|(a, b)| a.overlaps(b) && (a.exclusive || b.exclusive))
-        };
-        if let Some(better) = devices.iter_mut().find(|device| rivals(device)) {
-            better.rivals.push(finding);
-            continue;
-        }
-        let base = format!("{prefix}{}_{}", finding.driver, finding.address);
-        let is_free = |name: &String| devices.iter().all(|device| device.name != *name);
-        let more = (2..).map(|number| format!("{base}_{number}"));
-        let name = std::iter::once(base.clone()).chain(more).find(is_free);
-        devices.push(Device {
-            name: name.unwrap_or(base),
-            finding,
-            rivals: Vec::new(),
-            claims,
-        });
-    }
-    devices
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::clock::Monotonic;
     use crate::link::{LinkCounters, ListenOnly};
-    use proprio_drivers::{Board, Frame, Frames};
+    use proprio_drivers::{Board, Frame, Frames, Id, Mode, Options, Outputs, Spec};
     use std::collections::VecDeque;
 
     /// A bus with boards that answer at once, and a link that counts what it sends.

@@ -63,7 +63,8 @@ pub(super) fn sensor(seen: &Traffic, driver: &'static str, base: u8) -> Option<F
     Some(finding.with_keys(Key::period_ms(period, 1, 1000)))
 }
 
-/// All bases are asked for their units; those that have answered for their serial number and counts.
+/// All bases are asked for their units; those that have answered for their serial number and
+/// counts.
 pub(super) fn questions(seen: &Traffic) -> Vec<Frame> {
     let mut questions = Vec::new();
     for base in 0..=BASE_MOST {

@@ -95,10 +95,7 @@ impl fmt::Display for Adapter {
 #[non_exhaustive]
 pub enum NotFound {
     /// No adapter of this name.
-    #[error(
-        "there is no CAN adapter with {adapter}; there {}",
-        if present.is_empty() { "is none".to_owned() } else { format!("are {}", present.join("; ")) }
-    )]
+    #[error("there is no CAN adapter with {adapter}; there {}", are(.present))]
     Absent {
         /// The keys.
         adapter: Adapter,
@@ -125,6 +122,14 @@ pub enum NotFound {
         /// Its interfaces, in words.
         found: Vec<String>,
     },
+}
+
+/// What there is, for a message.
+fn are(present: &[String]) -> String {
+    match present {
+        [] => "is none".to_owned(),
+        all => format!("are {}", all.join("; ")),
+    }
 }
 
 /// A CAN interface of this machine.

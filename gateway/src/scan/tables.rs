@@ -1,7 +1,7 @@
 //! The tables of gateway.toml for the devices found, with comments about what a person has to fill
 //! in.
 
-use super::Device;
+use super::found::Device;
 use crate::config::Source;
 use crate::link::adapter::Adapter;
 use proprio_drivers::{Certainty, Finding};
@@ -170,7 +170,7 @@ pub fn file(robot: &str, buses: &[Bus]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::devices;
+    use super::super::found::devices;
     use super::*;
     use crate::plan::Plan;
     use proprio_drivers::recognise::Key;
