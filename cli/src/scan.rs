@@ -20,14 +20,17 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
+/// What a person must know before a scan.
+pub(crate) const WARNING: &str = "\
+Without --active and --ask nothing is sent. (A controller acknowledges the frames of others as any
+does; `ip link set can0 type can listen-only on` prevents that too.)
+
+iCub boards that are switched on wait 5 s in their bootloader, and stay in it if they hear any
+frame meanwhile: switch them on at least 6 s before a scan that asks.";
+
 /// `proprio scan`.
-///
-/// Without --active nothing is sent. (A controller acknowledges the frames of others as any does;
-/// `ip link set can0 type can listen-only on` prevents that too.)
-///
-/// iCub boards that are switched on wait 5 s in their bootloader, and stay there if they hear any
-/// frame meanwhile: switch them on at least 6 s before a scan with --active.
 #[derive(clap::Args)]
+#[command(after_help = WARNING)]
 pub(crate) struct Args {
     /// The bus: can0 or virtual:NAME
     #[arg(
@@ -219,7 +222,7 @@ fn as_text(name: &str, how: &str, heard: &Traffic, devices: &[Device]) -> String
             "{:<9} {}: {}",
             certainty(finding),
             device.name,
-            finding.what.escape_debug()
+            finding.what
         );
         if !finding.unusable.is_empty() {
             let _ = writeln!(text, "{:<9} {}", "", finding.unusable);

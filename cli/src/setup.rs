@@ -1,6 +1,7 @@
-//! `proprio setup`: scans buses and writes a gateway.toml for what is on them.
+//! `proprio setup`: scans buses and writes a gateway.toml for what is on them. It asks nothing that
+//! it can find out; the rest has a placeholder and the comment `fill in`.
 
-use crate::scan::How;
+use crate::scan::{How, WARNING};
 use anyhow::{Context as _, bail};
 use proprio_gateway::config::Source;
 use proprio_gateway::link::adapter::{self, Adapter};
@@ -15,12 +16,8 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 /// `proprio setup`.
-///
-/// Scans the CAN interfaces of this machine, or the given buses, and writes DIR/gateway.toml with
-/// the devices found, which `proprio gateway --check` accepts. Adapters are named by their serial
-/// number, else by their USB port. What nobody but a person knows (names of joints, gear ratios)
-/// has a placeholder and the comment `fill in`.
 #[derive(clap::Args)]
+#[command(after_help = WARNING)]
 pub(crate) struct Args {
     /// The folder of the configuration; it is made if it is not there
     #[arg(long, value_name = "DIR")]

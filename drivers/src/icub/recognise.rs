@@ -1,7 +1,7 @@
 //! Recognising boards of the protocol: by what they tell of themselves, and by their streams.
 
 use super::{ADDRESSES, BROADCAST, board, class, command, to_board, to_host};
-use crate::recognise::{BYTE, Evidence, Finding, Key, LENGTH, Traffic, byte_of, length_of};
+use crate::recognise::{BYTE, Evidence, Finding, Key, LENGTH, Stream, Traffic, byte_of, length_of};
 use crate::{Format, Frame};
 use alloc::format;
 use alloc::string::String;
@@ -71,7 +71,7 @@ fn told(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Result<Option
             .traffic
             .stream(id)
             .into_iter()
-            .flat_map(|s| s.kept());
+            .flat_map(Stream::kept);
         for frame in frames {
             if let [command, board, major, minor, build, _, _, 0 | 1] = *frame.data()
                 && command == version
@@ -143,7 +143,7 @@ pub(crate) fn questions(seen: &Traffic) -> Vec<Frame> {
     let mut questions = Vec::from([Frame::new(everyone, &[command::DISCOVER])]);
     for address in ADDRESSES.filter_map(|address| u8::try_from(address).ok()) {
         let heard = seen.stream(to_host(class::MANAGEMENT, address));
-        let mut frames = heard.into_iter().flat_map(|stream| stream.kept());
+        let mut frames = heard.into_iter().flat_map(Stream::kept);
         // A bootloader is left alone.
         if frames.any(|f| f.data().first() == Some(&command::DISCOVER) && f.len() == 5) {
             let id = to_board(class::MANAGEMENT, address);
