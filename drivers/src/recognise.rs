@@ -553,7 +553,7 @@ mod tests {
     #[test]
     fn frames_of_one_instant_and_counters_are_seen() {
         let mut frames = vec![];
-        let counts: vec::Vec<[u8; 1]> = (250..=255).chain(0..30).map(|c| [c]).collect();
+        let counts: Vec<[u8; 1]> = (250..=255).chain(0..30).map(|c| [c]).collect();
         for (k, count) in counts.iter().enumerate() {
             let t = k as f64 * 10.0;
             frames.push((0x20, &count[..], t));
