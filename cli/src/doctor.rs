@@ -6,6 +6,7 @@ use nix::sys::socket::{AddressFamily, SockFlag, SockType};
 use nix::sys::statfs::{FsType, TMPFS_MAGIC, statfs};
 use proprio_drivers::{Frame, Id};
 use proprio_gateway::clock::{Clock, Monotonic};
+use proprio_gateway::link::adapter;
 use proprio_gateway::link::interface::{Interfaces as _, Netlink};
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, Received, send_by};
@@ -14,6 +15,7 @@ use proprio_topics::{Controller, InterfaceHealth, Nanos};
 use serde_json::json;
 use std::fmt::Write as _;
 use std::fs;
+use std::path::Path;
 
 /// Of a file system in memory that cannot be swapped (linux/magic.h).
 const RAMFS_MAGIC: FsType = FsType(0x8584_58f6);
@@ -142,37 +144,33 @@ fn can() -> Finding {
 }
 
 fn interfaces() -> Vec<Finding> {
-    const ARPHRD_CAN: &str = "280";
     let mut netlink = Netlink::default();
     let mut findings = Vec::new();
-    for entry in fs::read_dir("/sys/class/net")
-        .into_iter()
-        .flatten()
-        .flatten()
-    {
+    let sys = Path::new(adapter::SYS);
+    for present in adapter::present(sys) {
+        let name = &present.interface;
+        let folder = sys.join("class/net").join(name);
         let read = |file: &str| {
-            fs::read_to_string(entry.path().join(file))
+            fs::read_to_string(folder.join(file))
                 .unwrap_or_default()
                 .trim()
                 .to_owned()
         };
-        if read("type") == ARPHRD_CAN {
-            let name = entry.file_name().to_string_lossy().into_owned();
-            let system = format!(
-                "{name}: {}, queue {}",
-                read("operstate"),
-                read("tx_queue_len")
-            );
-            findings.push(match netlink.ask(&name) {
-                Ok(health) => interface(&name, &system, &health),
-                Err(error) => finding(
-                    INTERFACE,
-                    Verdict::Lacking,
-                    format!("{system}; its controller is not known ({error})"),
-                    "allow AF_NETLINK sockets",
-                ),
-            });
-        }
+        // With what a configuration may call its adapter.
+        let system = format!(
+            "{present}: {}, queue {}",
+            read("operstate"),
+            read("tx_queue_len")
+        );
+        findings.push(match netlink.ask(name) {
+            Ok(health) => interface(name, &system, &health),
+            Err(error) => finding(
+                INTERFACE,
+                Verdict::Lacking,
+                format!("{system}; its controller is not known ({error})"),
+                "allow AF_NETLINK sockets",
+            ),
+        });
     }
     if findings.is_empty() {
         let hint = "`ip link add dev vcan0 type vcan && ip link set vcan0 up` creates a virtual \

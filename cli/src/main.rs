@@ -23,6 +23,8 @@ mod doctor;
 mod estimator;
 mod identify;
 mod report;
+mod scan;
+mod setup;
 mod simulate;
 mod system;
 
@@ -56,6 +58,10 @@ enum Verb {
     Estimator(estimator::Args),
     /// Run only the simulated robot: its boards on a bus
     Simulate(simulate::Args),
+    /// Find out which devices are on a bus, or in a recorded log
+    Scan(scan::Args),
+    /// Write a gateway.toml for the devices that are found on the buses of this machine
+    Setup(setup::Args),
     /// Convert a recorded CAN log to a table of samples in SI units
     Decode(convert::Decode),
     /// Convert a table of samples to a CAN log: the inverse of decode
@@ -98,6 +104,8 @@ fn main() -> ExitCode {
         Verb::Gateway(args) => proprio_gateway::daemon::run(&args.config, &domain, args.check),
         Verb::Estimator(args) => estimator::run(&args, &domain),
         Verb::Simulate(args) => simulate::run(&args, &domain),
+        Verb::Scan(args) => scan::run(&args, &domain),
+        Verb::Setup(args) => setup::run(&args, &domain),
         Verb::Decode(args) => convert::decode(&args),
         Verb::Encode(args) => convert::encode(&args),
         Verb::Estimate(args) => convert::estimate(&args),

@@ -31,6 +31,10 @@
 //! new number of the sensor, therefore they are keys of their own; whether the sensor keeps its
 //! period; what it sends after its six bytes (the source's remark has two more).
 //!
+//! # Recognition
+//! A sensor that streams on the identifiers 1 and 2 is recognised by them and the lengths alone,
+//! and never as certain. No question is known that it answers.
+//!
 //! # Keys
 //! ```toml
 //! period_ms = 10    # 1 to 65
@@ -41,6 +45,7 @@
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Link, Supervised};
 use crate::pairing::{Limit, Paired, Pairing};
+use crate::recognise::{Evidence, Finding, Key, Traffic, length_of};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Format, Frame, Frames, Id, Mode, Output,
     OutputInfo, Spec, SpecError, bytes, keys, wrench,
@@ -133,6 +138,26 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(AftBoard::new(spec, self)?))
+    }
+
+    /// By the identifiers of delivery and the lengths alone.
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let mut evidence = Evidence::new(seen, 1);
+        let [force, torque] = [Self::default().id_force, Self::default().id_torque].map(|raw| {
+            evidence.sends(Id::standard(raw), length_of(3), |frame| {
+                frame.format == Format::Classic && matches!(frame.len(), 6..=8)
+            })
+        });
+        let (Some(force), Some(torque)) = (force, torque) else {
+            return Vec::new();
+        };
+        evidence.together(force, torque);
+        let finding = evidence.finding(Self::NAME, 1, "AIDIN AFT200");
+        let period = Key::period_ms(force.period(), 1, 65);
+        (finding
+            .into_iter()
+            .map(|finding| finding.with_keys(period.clone())))
+        .collect()
     }
 }
 

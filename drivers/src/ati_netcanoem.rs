@@ -7,6 +7,7 @@
 //! |---|---|---|
 //! | 0 | empty | status u16, gauges 0, 2, 4 (i16); then opcode 1: gauges 1, 3, 5 |
 //! | 2 | axis 0 to 5 | opcodes 2, 3, 4: columns 0 and 1, 2 and 3, 4 and 5 of that row, as f32 |
+//! | 5 | empty | serial number, letters and digits |
 //! | 6 | calibration 0 to 15 | the same; selects the calibration in use |
 //! | 7 | empty | counts per unit of force, of torque (u32) |
 //! | 8 | empty | unit of force, of torque (u8) |
@@ -40,6 +41,12 @@
 //! that talk to these boards agree. Their baud rate is 2 Mbit/s / (divisor + 1), or 250 kbit/s by
 //! switch 2-1.
 //!
+//! # Recognition
+//! A scan that is told to ask for this family sends opcode 8 (units) to all bases, then 5 (serial
+//! number) and 7 to those that answer. It must be told, because the identifiers are those of
+//! commands to CANopen nodes and JR3 boards (`208` is a start). Without questions a board is
+//! recognised by what it answers to another program.
+//!
 //! # Keys
 //! ```toml
 //! period_ms = 2            # of the requests, 1 to 1000
@@ -64,14 +71,17 @@ mod calibration;
 mod device;
 mod frames;
 mod options;
+mod recognise;
 
 pub use board::NetcanoemBoard;
 pub use frames::{ForceUnit, TorqueUnit};
 pub use options::Options;
 
-use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
+use crate::recognise::{Finding, Traffic};
+use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
+use frames::BASE_MOST;
 use proprio_topics::Kind;
 
 impl Driver for Options {
@@ -89,4 +99,16 @@ impl Driver for Options {
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(NetcanoemBoard::new(spec, self)?))
     }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        (0..=BASE_MOST)
+            .filter_map(|base| recognise::sensor(seen, Self::NAME, base))
+            .collect()
+    }
+
+    fn questions(seen: &Traffic) -> Vec<Frame> {
+        recognise::questions(seen)
+    }
+
+    const ASKED_BY_NAME: bool = true;
 }

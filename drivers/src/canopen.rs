@@ -12,16 +12,21 @@
 //! | `580` + n | SDO answer | `4F`, `4B`, `47`, `43` index sub value; `60` written; `80` refused |
 //! | `600` + n | SDO | read: `40` index sub; write: `2F`, `2B`, `27`, `23` index sub value |
 //! | `700` + n | heartbeat | 00 boot-up, 04 stopped, 05 operational, 7F pre-operational |
+//!
+//! Nodes are recognised by heartbeats and by SDO answers that are heard. A scan that asks reads
+//! object 1000 (device type) of all nodes, and 1018 sub 1 to 4 (identity) of those that answer.
 
 mod node;
 mod protocol;
+mod recognise;
 mod script;
 
 pub(crate) use node::Node;
 pub(crate) use protocol::{
     MAPPED_MOST, NMT, NO_RTR, Object, SYNC, TIMING, TPDO_OFF, nmt, object, sdo_from, tpdo,
 };
-pub(crate) use script::{Plan, Script, Step};
+pub(crate) use recognise::{Recognised, questions, recognise};
+pub(crate) use script::{Plan, READ, Script, Step};
 
 use crate::bytes::u16_le;
 use crate::family::Link;

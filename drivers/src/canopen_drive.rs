@@ -61,8 +61,11 @@ mod start;
 pub use board::DriveBoard;
 pub use options::{CurrentUnit, Options, PdoKeys, VelocityUnit};
 
-use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
+use crate::canopen::{self, Recognised};
+use crate::recognise::{Finding, Traffic};
+use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
+use alloc::format;
 use alloc::vec::Vec;
 use proprio_topics::Kind;
 
@@ -79,5 +82,34 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(DriveBoard::new(spec, self)?))
+    }
+
+    /// Nodes of other profiles too, which no driver reads.
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let find = |node: Recognised<'_>| {
+            let (what, unusable) = match node.profile {
+                Some(406) => return None,
+                Some(402) => (format!("CANopen drive (CiA 402){}", node.identity), ""),
+                None => ("CANopen node whose profile was not heard".into(), ""),
+                Some(other) => {
+                    let what = format!("CANopen node of profile {other}{}", node.identity);
+                    (
+                        what,
+                        "no driver reads this profile; a .dbc file can describe it",
+                    )
+                }
+            };
+            let finding = (node.evidence).finding(Self::NAME, node.node.into(), what)?;
+            let finding = finding.with_joints([0]);
+            Some(Finding {
+                unusable,
+                ..finding
+            })
+        };
+        canopen::recognise(seen).filter_map(find).collect()
+    }
+
+    fn questions(seen: &Traffic) -> Vec<Frame> {
+        canopen::questions(seen)
     }
 }

@@ -43,15 +43,17 @@
 use crate::bringup::Bringup;
 use crate::bytes::{self, u32_le};
 use crate::canopen::{
-    self, Cycle, NMT, NO_RTR, Node, NodeState, Object, Plan, SYNC, Script, Step, TPDO_OFF, nmt,
-    node_of, object, tpdo,
+    self, Cycle, NMT, NO_RTR, Node, NodeState, Object, Plan, Recognised, SYNC, Script, Step,
+    TPDO_OFF, nmt, node_of, object, tpdo,
 };
 use crate::family::{Family, Link, Supervised};
+use crate::recognise::{Finding, Key, Stream, Traffic};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
     Spec, SpecError,
 };
 use alloc::boxed::Box;
+use alloc::format;
 use alloc::vec::Vec;
 use core::f64::consts::TAU;
 use proprio_topics::{Counter, JointState, Kind, Nanos, Quality, Reading, Refusal};
@@ -129,6 +131,32 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(EncoderBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let find = |node: Recognised<'_>| {
+            let [first, others @ ..] = node.tpdos;
+            let mut evidence = node.evidence;
+            let what = match node.profile {
+                Some(406) => format!("CANopen encoder (CiA 406){}", node.identity),
+                Some(_) => return None,
+                None => {
+                    // Four bytes in one TPDO are rather a position than a drive's status.
+                    let is_position = first.is_some_and(|stream| stream.lengths == (4, 4));
+                    let alone = others.iter().all(Option::is_none);
+                    evidence.add(if is_position && alone { 2.0 } else { -2.0 });
+                    "CANopen node whose profile was not heard".into()
+                }
+            };
+            let finding = evidence.finding(Self::NAME, node.node.into(), what)?;
+            let period = Key::period_ms(first.and_then(Stream::period), 1, 65_535);
+            Some(finding.with_keys(period).with_joints([0]))
+        };
+        canopen::recognise(seen).filter_map(find).collect()
+    }
+
+    fn questions(seen: &Traffic) -> Vec<Frame> {
+        canopen::questions(seen)
     }
 }
 

@@ -61,6 +61,10 @@
 //! - The identifier of replies is "0x00 + drive ID" in the manual, 0 in the MIT's own program:
 //!   `host_id`.
 //!
+//! # Recognition
+//! By uploads in servo mode, and by replies in MIT mode on identifier 0 or the motor's own number,
+//! while another program commands it. Nothing is asked: each question would be a command.
+//!
 //! # Keys
 //! ```toml
 //! mode = "mit"            # "mit" or "servo"
@@ -83,10 +87,12 @@ mod board;
 mod device;
 mod frames;
 mod options;
+mod recognise;
 
 pub use board::CubemarsBoard;
 pub use options::{Angle, Effort, Mode, Model, Options};
 
+use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
 use alloc::borrow::Cow;
 use alloc::boxed::Box;
@@ -112,5 +118,9 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(CubemarsBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        recognise::motors(seen)
     }
 }

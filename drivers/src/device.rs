@@ -1,6 +1,7 @@
 //! The two sides of a device's protocol as sans-I/O state machines: [`Device`] on the host,
 //! [`Board`] on the device; and [`Driver`], which makes both from a device's keys.
 
+use crate::recognise::{Finding, Traffic};
 use crate::signal::Message;
 use crate::{Frame, Id};
 use alloc::borrow::Cow;
@@ -545,4 +546,24 @@ pub trait Driver {
     /// # Errors
     /// As [`Driver::device`].
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError>;
+
+    /// The devices that `seen` shows ([`crate::recognise`](mod@crate::recognise)).
+    #[must_use]
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let _ = seen;
+        Vec::new()
+    }
+
+    /// Questions that make devices tell what they are. They start, move, write and reconfigure
+    /// nothing. `seen` is what was heard so far, so that a device that has answered can be asked
+    /// for more.
+    #[must_use]
+    fn questions(seen: &Traffic) -> Vec<Frame> {
+        let _ = seen;
+        Vec::new()
+    }
+
+    /// Some other family takes these questions for commands: they are sent only on a bus of which a
+    /// person says that such devices are there.
+    const ASKED_BY_NAME: bool = false;
 }

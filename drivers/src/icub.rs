@@ -18,11 +18,21 @@
 //! cannot keep other senders silent. A reading ends the wait at once, because a board that streams
 //! has left its bootloader.
 //!
+//! # Recognition
+//! A scan sends DISCOVER to all boards (`70F`, `FF`), and GET_ADDITIONAL_INFO (`70a`, `0C`) to
+//! those that have answered. It does not ask for the protocol's version: the identifier of that
+//! question, `20a`, is a command to the motor of a CANopen drive. Without questions boards are
+//! recognised by their streams, or by what they answer to another program.
+//!
 //! Sources: robotology/icub-firmware `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12 (25 Nov
 //! 2024) and the firmware under `emBODY/eBcode/arch-arm/embot` at b4299211;
 //! robotology/icub-firmware-shared `can/canProtocolLib` at 62f2818a; the hosts in
 //! robotology/icub-main at 24c1a003. Certain (document and independent code agree), unless stated
 //! otherwise.
+
+mod recognise;
+
+pub(crate) use recognise::{questions, recognise};
 
 use crate::bringup::Timing;
 use crate::{Claim, Format, Frame, Frames, Id, Spec, SpecError};
@@ -90,24 +100,68 @@ pub mod command {
     pub const POS_TRANSMIT: u8 = 0x53;
     /// Class 0: as [`GET_FIRMWARE_VERSION`].
     pub const MOTOR_GET_FIRMWARE_VERSION: u8 = 0x5B;
-    /// Class 7: `[FF]` to everyone, answered by `[FF, board, major, minor, build]`.
+    /// Class 7: `[FF]` to everyone, answered by `[FF, board, major, minor, build]`; in the
+    /// bootloader without `build`.
     pub const DISCOVER: u8 = 0xFF;
+    /// Class 7: `[0C]`, answered by eight frames `[0C, number, 4 characters]`: a text that was
+    /// written into the board.
+    pub const GET_ADDITIONAL_INFO: u8 = 0x0C;
 }
 
 /// Board types, as boards name themselves.
 pub mod board {
     /// mc4: control of four DC motors.
     pub const MC4: u8 = 0x03;
+    /// bll: control of brushless motors.
+    pub const BLL: u8 = 0x04;
     /// mtb: skin and legacy inertial sensors.
     pub const MTB: u8 = 0x05;
+    /// strain: F/T.
+    pub const STRAIN: u8 = 0x06;
     /// mais: Hall sensors.
     pub const MAIS: u8 = 0x07;
     /// 2foc: motor control.
     pub const TWO_FOC: u8 = 0x08;
+    /// mtb4: skin and IMU.
+    pub const MTB4: u8 = 0x0B;
     /// strain2: F/T and IMU.
     pub const STRAIN2: u8 = 0x0C;
+    /// rfe: face expressions and IMU.
+    pub const RFE: u8 = 0x0D;
     /// psc: finger encoders.
     pub const PSC: u8 = 0x0F;
+    /// mtb4w: as mtb4.
+    pub const MTB4W: u8 = 0x10;
+    /// amcbldc: motor control.
+    pub const AMCBLDC: u8 = 0x12;
+    /// mtb4c: as mtb4.
+    pub const MTB4C: u8 = 0x14;
+    /// amc2c: motor control.
+    pub const AMC2C: u8 = 0x15;
+    /// strain2c: as strain2.
+    pub const STRAIN2C: u8 = 0x16;
+    /// amcfoc2c: motor control.
+    pub const AMCFOC2C: u8 = 0x18;
+
+    /// The types and their names.
+    pub const NAMES: [(u8, &str); 16] = [
+        (MC4, "mc4"),
+        (BLL, "bll"),
+        (MTB, "mtb"),
+        (STRAIN, "strain"),
+        (MAIS, "mais"),
+        (TWO_FOC, "2foc"),
+        (MTB4, "mtb4"),
+        (STRAIN2, "strain2"),
+        (RFE, "rfe"),
+        (PSC, "psc"),
+        (MTB4W, "mtb4w"),
+        (AMCBLDC, "amcbldc"),
+        (MTB4C, "mtb4c"),
+        (AMC2C, "amc2c"),
+        (STRAIN2C, "strain2c"),
+        (AMCFOC2C, "amcfoc2c"),
+    ];
 }
 
 /// The address that all boards listen to.
@@ -223,6 +277,9 @@ pub(crate) fn command_for(frame: &Frame, class: u16, address: u8) -> Option<&[u8
     (ours && frame.format == Format::Classic && !frame.is_empty()).then(|| frame.data())
 }
 
+/// The text in a simulated board.
+const INFO: &[u8; 32] = b"simulated board\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0";
+
 /// Answers the management requests: board type and firmware version (a plausible one: 2.0.8,
 /// protocol 2.0).
 pub(crate) fn answer_management(
@@ -240,6 +297,13 @@ pub(crate) fn answer_management(
             id,
             &[command::DISCOVER, board, major, minor, build],
         ));
+    }
+    if let Some([command::GET_ADDITIONAL_INFO]) = command_for(frame, class::MANAGEMENT, address) {
+        for (number, text) in (0..).zip(INFO.as_chunks::<4>().0) {
+            let [a, b, c, d] = *text;
+            let data = [command::GET_ADDITIONAL_INFO, number, a, b, c, d];
+            let _ = out.try_push(Frame::new(to_host(class::MANAGEMENT, address), &data));
+        }
     }
     let version = if class == class::POLLING_MOTOR {
         command::MOTOR_GET_FIRMWARE_VERSION

@@ -75,12 +75,15 @@ mod board;
 mod device;
 mod frames;
 mod options;
+mod recognise;
 
 pub use board::ImuBoard;
 pub use frames::{Fusion, Legacy, Quantity};
 pub use options::Options;
 
-use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
+use crate::icub;
+use crate::recognise::{Finding, Traffic};
+use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use device::ImuDevice;
@@ -99,5 +102,13 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(ImuBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        recognise::boards(seen, Self::NAME)
+    }
+
+    fn questions(seen: &Traffic) -> Vec<Frame> {
+        icub::questions(seen)
     }
 }

@@ -31,6 +31,7 @@ use crate::bringup::{Bringup, NoInquiry};
 use crate::bytes;
 use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
+use crate::recognise::{Finding, Key, Stream, Traffic};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
     Outputs, Spec, SpecError,
@@ -84,6 +85,29 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(MaisBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        icub::recognise(
+            seen,
+            Self::NAME,
+            &[icub::board::MAIS],
+            &[],
+            |evidence, address, _| {
+                let id = |kind| icub::stream(class::PERIODIC_ANALOG, address, kind);
+                let first = evidence.sends_length(id(HES0TO6), usize::from(SECOND));
+                let second = evidence.sends_length(id(HES7TO14), usize::from(SENSORS - SECOND));
+                if let (Some(first), Some(second)) = (first, second) {
+                    evidence.together(first, second);
+                }
+                let keys = Key::period_ms(first.and_then(Stream::period), 1, 255);
+                (keys.into_iter().collect(), (0..SENSORS).collect())
+            },
+        )
+    }
+
+    fn questions(seen: &Traffic) -> Vec<Frame> {
+        icub::questions(seen)
     }
 }
 

@@ -53,6 +53,7 @@ use crate::family::{Family, Link, Supervised};
 use crate::held::Held;
 use crate::icub::{self, class};
 use crate::icub_motor::mode;
+use crate::recognise::{Finding, Key, LENGTH, Stream, Traffic, byte_of};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
     Outputs, Spec, SpecError,
@@ -91,7 +92,9 @@ const POSITION_CONTROL: u8 = 1;
 /// The joints of an address.
 const JOINTS: usize = 2;
 /// The length of each frame.
-const LENGTH: usize = 8;
+const FRAME: usize = 8;
+/// The modes of a joint.
+const MODES: [u8; 8] = [0x00, 0x01, 0x02, 0x03, 0x50, 0x60, 0xA0, 0xB0];
 
 /// The keys of `driver = "icub_mc4"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -170,6 +173,31 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(Mc4Board::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let types = [icub::board::MC4, icub::board::BLL];
+        icub::recognise(seen, Self::NAME, &types, &[], |evidence, address, _| {
+            let id = |kind| icub::stream(class::PERIODIC_MOTOR, address, kind);
+            let positions = evidence.sends_length(id(kind::POSITION), FRAME);
+            // Newer boards have a status of the same identifier.
+            if let Some(positions) = positions {
+                if let Some(velocities) = evidence.sends_length(id(kind::VELOCITY), FRAME) {
+                    evidence.together(velocities, positions);
+                }
+                let bits = LENGTH + 2.0 * byte_of(MODES.len());
+                evidence.sends(id(kind::STATUS), bits, |frame| match *frame.data() {
+                    [_, a, _, b, _, _, _, _] => MODES.contains(&a) && MODES.contains(&b),
+                    _ => false,
+                });
+            }
+            let keys = Key::period_ms(positions.and_then(Stream::period), 1, 255);
+            (keys.into_iter().collect(), Vec::from([0, 1]))
+        })
+    }
+
+    fn questions(seen: &Traffic) -> Vec<Frame> {
+        icub::questions(seen)
     }
 }
 
@@ -288,7 +316,7 @@ impl Family for Mc4 {
         let Some(data) = bytes::payload(frame, out) else {
             return;
         };
-        if data.len() != LENGTH {
+        if data.len() != FRAME {
             return out.fault(Counter::Length, 1, frame.id);
         }
         match kind {
@@ -355,7 +383,7 @@ impl Mc4Board {
         })
     }
 
-    fn send(&self, kind: u8, data: [u8; LENGTH], out: &mut Frames) {
+    fn send(&self, kind: u8, data: [u8; FRAME], out: &mut Frames) {
         let id = icub::stream(class::PERIODIC_MOTOR, self.address, kind);
         let _ = out.try_push(Frame::new(id, &data));
     }

@@ -64,6 +64,7 @@ use crate::bringup::{Bringup, NoInquiry};
 use crate::bytes;
 use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class};
+use crate::recognise::{Finding, Key, LENGTH, Stream, Traffic, byte_of};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
     Spec, SpecError,
@@ -138,6 +139,8 @@ pub mod mode {
     pub const HARDWARE_FAULT: u32 = 0xA0;
     /// The board has not received its motor's parameters.
     pub const NOT_CONFIGURED: u32 = 0xB0;
+    /// All modes.
+    pub const ALL: [u32; 8] = [0, 1, 6, 9, 0x0A, 0x50, HARDWARE_FAULT, NOT_CONFIGURED];
 }
 
 /// One icubdeg \[rad\].
@@ -181,6 +184,39 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(MotorBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let types = [
+            icub::board::TWO_FOC,
+            icub::board::AMCBLDC,
+            icub::board::AMC2C,
+            icub::board::AMCFOC2C,
+        ];
+        icub::recognise(seen, Self::NAME, &types, &[], |evidence, address, _| {
+            let id = |kind| icub::stream(class::PERIODIC_MOTOR, address, kind);
+            let motion = evidence.sends_length(id(kind::TWO_FOC), 8);
+            let bits = LENGTH + byte_of(mode::ALL.len()) + byte_of(32);
+            let is_status = |frame: &Frame| match *frame.data() {
+                [mode, encoder, _, _, _, _, _, _] => {
+                    mode::ALL.contains(&u32::from(mode)) && encoder < 32
+                }
+                _ => false,
+            };
+            // Older boards have a status of the same identifier.
+            if let Some(motion) = motion {
+                if let Some(status) = evidence.sends(id(kind::STATUS), bits, is_status) {
+                    evidence.together(motion, status);
+                }
+                evidence.sends_length(id(kind::ADDITIONAL_STATUS), 4);
+            }
+            let keys = Key::period_ms(motion.and_then(Stream::period), 1, 255);
+            (keys.into_iter().collect(), Vec::from([0]))
+        })
+    }
+
+    fn questions(seen: &Traffic) -> Vec<Frame> {
+        icub::questions(seen)
     }
 }
 

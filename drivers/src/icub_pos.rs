@@ -48,6 +48,7 @@ use crate::bytes;
 use crate::configure::{Configure, Setting};
 use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
+use crate::recognise::{Finding, Key, LENGTH, Traffic, byte_of};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
     Outputs, Spec, SpecError,
@@ -216,6 +217,48 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(PosBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let types = [icub::board::PSC, icub::board::MTB4];
+        let maybe = [icub::board::MTB4];
+        icub::recognise(seen, Self::NAME, &types, &maybe, |evidence, address, _| {
+            let id = icub::stream(class::PERIODIC_ANALOG, address, POS);
+            let bits = LENGTH + byte_of(2) + byte_of(3 * 16);
+            let stream = evidence.sends(id, bits, |frame| match *frame.data() {
+                [quantity, values, _, _, _, _, _, _] => {
+                    quantity < 2 && (1..=VALUES).contains(&(values & 0xF))
+                }
+                _ => false,
+            });
+            let Some(stream) = stream else {
+                return (Vec::new(), Vec::from([0, 1]));
+            };
+            let mut keys: Vec<Key> = Vec::new();
+            let mut joints: Vec<u8> = Vec::new();
+            for frame in stream.kept() {
+                let &[quantity, values, ..] = frame.data() else {
+                    continue;
+                };
+                let (label, count) = (values >> 4, values & 0xF);
+                joints.extend(label..(label + count).min(LABEL_MOST + 1));
+                if quantity == 1 && keys.is_empty() {
+                    keys.push(Key::new("quantity", "\"length\""));
+                }
+            }
+            joints.sort_unstable();
+            joints.dedup();
+            let first = |frame: &Frame| {
+                let label = frame.data().get(1).map(|values| values >> 4);
+                label == joints.first().copied()
+            };
+            keys.extend(Key::period_ms(stream.period_of(first), 1, 255));
+            (keys, joints)
+        })
+    }
+
+    fn questions(seen: &Traffic) -> Vec<Frame> {
+        icub::questions(seen)
     }
 }
 

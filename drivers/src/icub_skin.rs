@@ -45,11 +45,13 @@ use crate::bytes;
 use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{Limit, Paired, Pairing};
+use crate::recognise::{Finding, Key, LENGTH, Traffic, byte_of};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Id, Mode, Output,
     OutputInfo, Spec, SpecError,
 };
 use alloc::boxed::Box;
+use alloc::format;
 use alloc::vec::Vec;
 use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, Skin};
 use serde::Deserialize;
@@ -148,6 +150,36 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(SkinBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        // An mtb4 may be an IMU alone.
+        let maybe = [icub::board::MTB4, icub::board::MTB4W, icub::board::MTB4C];
+        let types = [&[icub::board::MTB][..], &maybe].concat();
+        icub::recognise(seen, Self::NAME, &types, &maybe, |evidence, address, _| {
+            let mut keys: Vec<Key> = Vec::new();
+            let mut triangles: Option<(u8, u8)> = None;
+            for triangle in 0..16 {
+                let id = icub::stream(class::PERIODIC_SKIN, address, triangle);
+                let stream = evidence.sends(id, LENGTH + byte_of(2), |frame| {
+                    matches!(*frame.data(), [FIRST | SECOND, _, _, _, _, _, _, _])
+                });
+                let Some(stream) = stream else { continue };
+                let first = |frame: &Frame| frame.data().first() == Some(&FIRST);
+                if triangles.is_none() {
+                    keys.extend(Key::period_ms(stream.period_of(first), 1, 255));
+                }
+                triangles = Some((triangles.map_or(triangle, |(first, _)| first), triangle));
+            }
+            if let Some((first, last)) = triangles {
+                keys.push(Key::new("triangles", format!("[{first}, {last}]")));
+            }
+            (keys, Vec::new())
+        })
+    }
+
+    fn questions(seen: &Traffic) -> Vec<Frame> {
+        icub::questions(seen)
     }
 }
 

@@ -45,6 +45,11 @@
 //! rate of samples). Highly probable. An older firmware has other identifiers (`580` and `600` for
 //! the streams): its boards are not read.
 //!
+//! # Recognition
+//! Boards are recognised by the counter that both halves of a reading have. A scan that is told to
+//! ask for this family sends the questions for full scales to all numbers. It must be told, because
+//! their identifiers are those of commands to CANopen nodes.
+//!
 //! # Keys
 //! ```toml
 //! full_scale_n = [115, 111, 185]    # both or neither; overrides the board's own
@@ -61,12 +66,14 @@ mod board;
 mod device;
 mod options;
 mod protocol;
+mod recognise;
 mod scales;
 
 pub use board::Jr3Board;
 pub use options::Options;
 
-use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
+use crate::recognise::{Finding, Traffic};
+use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use device::Jr3;
@@ -87,4 +94,16 @@ impl Driver for Options {
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(Jr3Board::new(spec, self)?))
     }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        (1..=0x7F)
+            .filter_map(|node| recognise::board(seen, Self::NAME, node))
+            .collect()
+    }
+
+    fn questions(_seen: &Traffic) -> Vec<Frame> {
+        recognise::questions()
+    }
+
+    const ASKED_BY_NAME: bool = true;
 }

@@ -29,12 +29,16 @@
 //! identifiers into readings and starts its board. A [`Board`] is the board's own side: it answers
 //! commands and encodes readings. The simulator, `proprio encode` and the round-trip tests use it.
 //!
+//! [`recognise()`] tells which devices a bus has, and [`questions()`] what to ask them: each family
+//! knows its own.
+//!
 //! To add a family, write a module with a `Family` (see `family.rs`), a `Board`, and an `Options`
 //! type (its keys in gateway.toml, documented at the top of the module) that implements [`Driver`],
 //! and add its line to the list in `registry.rs`. Families share `bringup.rs` (starting a board),
 //! `configure.rs` (confirming its configuration), `pairing.rs` and `group.rs` (combining two
 //! frames, or more), `held.rs` (values of other instants), `bytes.rs` (the numbers of a payload),
-//! `wrench.rs` (force/torque sensors) and `keys.rs` (addresses and identifiers).
+//! `wrench.rs` (force/torque sensors), `keys.rs` (addresses and identifiers) and [`mod@recognise`]
+//! (the evidence for a device in the traffic of a bus).
 #![no_std]
 extern crate alloc;
 #[cfg(test)]
@@ -71,6 +75,7 @@ pub mod odrive;
 pub mod openimu;
 pub mod optoforce_daq;
 mod pairing;
+pub mod recognise;
 mod registry;
 pub mod robotous_rft;
 pub mod signal;
@@ -84,4 +89,5 @@ pub use device::{
     SpecError, State, Transmit,
 };
 pub use frame::{Format, Frame, Id};
-pub use registry::{DRIVERS, Options, OptionsError};
+pub use recognise::{Certainty, Finding, Traffic};
+pub use registry::{ASKED_BY_NAME, DRIVERS, Options, OptionsError, questions, recognise};

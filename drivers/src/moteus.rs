@@ -36,6 +36,10 @@
 //! Sources: `docs/protocol/can.md` and `registers.md` (moteus db1a7623). Certain: the tests compare
 //! with the package `moteus` 1.1.1.
 //!
+//! # Recognition
+//! A scan that asks sends the query above, from host 0, to all numbers: on a bus with CAN FD alone.
+//! Without questions controllers are recognised by the form of their replies to another program.
+//!
 //! # Keys
 //! ```toml
 //! period_ms = 2     # of the queries, 1 to 1000
@@ -45,6 +49,7 @@
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes::{self, i16_le, u32_le};
 use crate::family::{Family, Link, Supervised};
+use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Format, Frame, Frames, Id, Output,
     OutputInfo, Spec, SpecError,
@@ -160,6 +165,43 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(MoteusBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let find = |stream: &Stream| {
+            let [host, node, 0, 0] = stream.id.raw().to_le_bytes() else {
+                return None;
+            };
+            if !(1..=127).contains(&node) || host > 127 || stream.id != id(node, host, 0) {
+                return None;
+            }
+            let first = stream.kept().next()?;
+            let bits = f64::from(Told::parse(first.data())?.structure);
+            // Of 127 controllers and 128 hosts.
+            let mut evidence = Evidence::new(seen, 127 * 128);
+            evidence.sends(stream.id, bits, |frame| Told::parse(frame.data()).is_some());
+            let query = id(host, node, WANTED);
+            evidence.sends(query, f64::from(BITS), |frame| {
+                let opcode = frame.data().first();
+                opcode.is_some_and(|opcode| *opcode < READ_ERROR)
+            });
+            let what = "moteus controller";
+            let finding = evidence.finding(Self::NAME, node.into(), what)?;
+            let host = (host != 0).then(|| Key::new("host", host));
+            let period = Key::period_ms(stream.period(), 1, 1000);
+            Some(
+                finding
+                    .with_keys(host.into_iter().chain(period))
+                    .with_joints([0]),
+            )
+        };
+        seen.streams().filter_map(find).collect()
+    }
+
+    /// The driver's own query.
+    fn questions(_seen: &Traffic) -> Vec<Frame> {
+        let query = |node| fd(id(0, node, WANTED), &QUERY);
+        (1..=127).filter_map(query).collect()
     }
 }
 
@@ -302,7 +344,12 @@ struct Told {
     torque: Option<f64>,
     temperature: Option<f64>,
     fault: Option<f64>,
+    /// The bits of its form: what arbitrary bytes do not have.
+    structure: u32,
 }
+
+/// Four bits of an opcode are fixed, and four of a register that is read here; all of a filler.
+const BITS: u32 = 4;
 
 impl Told {
     /// Reads a reply; `None` if it is none, or cut off.
@@ -314,6 +361,7 @@ impl Told {
                 REPLY..WRITE_ERROR => {
                     let (kind, count, first) = cursor.registers(opcode)?;
                     replies = true;
+                    told.structure += BITS + if first <= register::FAULT { BITS } else { 0 };
                     for register in first..first.checked_add(count)? {
                         let number = kind.number(cursor.take(kind.bytes())?);
                         told.set(register, number * kind.step(register));
@@ -324,7 +372,7 @@ impl Told {
                     cursor.varuint()?;
                     replies = true;
                 }
-                NOTHING => {}
+                NOTHING => told.structure += 2 * BITS,
                 _ => return None,
             }
         }

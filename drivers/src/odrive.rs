@@ -53,6 +53,12 @@
 //! the heartbeat of 0.6, whose firmware is not public. Not known: whether 0.6 feeds its watchdog by
 //! remote frames.
 //!
+//! # Recognition
+//! Axes are recognised by heartbeat and estimates. A scan that asks sends each axis that it hears a
+//! remote frame for its version (command 00; firmware 0.6 answers: protocol, hardware 3 bytes,
+//! firmware 3 bytes, unreleased). Axis 0 is not asked: the identifier is that of CANopen's network
+//! management.
+//!
 //! # Keys
 //! ```toml
 //! firmware = "0.6"          # "0.6" or "0.5"
@@ -67,17 +73,19 @@ mod device;
 mod firmware;
 mod frames;
 mod options;
+mod recognise;
 
 pub use board::OdriveBoard;
 pub use firmware::{Firmware, error_words};
 pub use options::Options;
 
-use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
+use crate::recognise::{Finding, Traffic};
+use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::borrow::Cow;
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use device::Axis;
-use frames::{FET, JOINT, MOTOR};
+use frames::{FET, JOINT, MOTOR, NODE_MOST};
 use proprio_topics::Kind;
 
 impl Driver for Options {
@@ -103,5 +111,15 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(OdriveBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        (0..=NODE_MOST)
+            .filter_map(|node| recognise::axis(seen, Self::NAME, node))
+            .collect()
+    }
+
+    fn questions(seen: &Traffic) -> Vec<Frame> {
+        recognise::questions(seen)
     }
 }

@@ -52,6 +52,10 @@
 //! (Aceinna/openIMU300-lib 1182d149), `j1939.rst` 1.3.4 (Aceinna/can_j1939_doc f24e0e6c),
 //! `CAN_MTLT.py` (Aceinna/python-mtlt 1b99f92e), `Imu.hpp` (leggedrobotics/tcan ed86f6c6).
 //!
+//! # Recognition
+//! By two of its messages from one address; other makers' J1939 sensors may send the same. Nothing
+//! is asked.
+//!
 //! # Keys
 //! ```toml
 //! quantities = ["acceleration", "angular_velocity"]   # also "orientation"
@@ -64,16 +68,18 @@ mod board;
 mod device;
 mod frames;
 mod options;
+mod recognise;
 
 pub use board::OpenImuBoard;
 pub use frames::{Axes, Quantity, Upright};
 pub use options::Options;
 
+use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use device::Sensor;
-use frames::DELIVERED;
+use frames::{ADDRESSES, DELIVERED};
 use proprio_topics::Kind;
 
 impl Driver for Options {
@@ -90,5 +96,11 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(OpenImuBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        ADDRESSES
+            .filter_map(|address| recognise::sensor(seen, address))
+            .collect()
     }
 }

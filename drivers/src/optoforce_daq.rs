@@ -44,6 +44,9 @@
 //! source), therefore `fill` is a key. Packets of other sensors (22 bytes with six axes, 34 with
 //! four sensors) are not read.
 //!
+//! # Recognition
+//! By its packets, on any identifier. Nothing is asked.
+//!
 //! # Keys
 //! ```toml
 //! counts_per_newton = [26.42, 28.80, 3.02]   # no default: from the sensor's sensitivity report
@@ -58,10 +61,12 @@ mod board;
 mod device;
 mod options;
 mod protocol;
+mod recognise;
 
 pub use board::OptoBoard;
 pub use options::Options;
 
+use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -82,5 +87,11 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(OptoBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        seen.streams()
+            .filter_map(|stream| recognise::unit(seen, stream))
+            .collect()
     }
 }

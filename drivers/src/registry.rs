@@ -1,10 +1,11 @@
 //! The drivers: one list from which their names, their keys and their devices follow.
 
+use crate::recognise::{Finding, Traffic};
 use crate::signal::Message;
 use crate::{
-    Board, Device, Driver, OutputInfo, Spec, SpecError, aidin_aft200, ati_netcanoem, canopen_drive,
-    canopen_encoder, canopen_sync, cubemars, dbc, icub_imu, icub_mais, icub_mc4, icub_motor,
-    icub_pos, icub_skin, icub_strain, jr3_can, moteus, odrive, openimu, optoforce_daq,
+    Board, Device, Driver, Frame, OutputInfo, Spec, SpecError, aidin_aft200, ati_netcanoem,
+    canopen_drive, canopen_encoder, canopen_sync, cubemars, dbc, icub_imu, icub_mais, icub_mc4,
+    icub_motor, icub_pos, icub_skin, icub_strain, jr3_can, moteus, odrive, openimu, optoforce_daq,
     robotous_rft, xsens_mti,
 };
 use alloc::boxed::Box;
@@ -25,6 +26,38 @@ macro_rules! drivers {
     ($($(#[$doc:meta])* $variant:ident: $module:ident,)+) => {
         /// The names of all drivers, as gateway.toml writes them.
         pub const DRIVERS: &[&str] = &[$(<$module::Options as Driver>::NAME),+];
+
+        /// The drivers whose questions are sent only if they are named
+        /// ([`Driver::ASKED_BY_NAME`]).
+        pub const ASKED_BY_NAME: &[(&str, bool)] = &[
+            $((<$module::Options as Driver>::NAME, <$module::Options as Driver>::ASKED_BY_NAME),)+
+        ];
+
+        /// The devices that `seen` shows, each driver's own, those with most bits first.
+        #[must_use]
+        pub fn recognise(seen: &Traffic) -> Vec<Finding> {
+            let mut all = Vec::new();
+            $(all.extend(<$module::Options as Driver>::recognise(seen));)+
+            all.sort_by(|a: &Finding, b: &Finding| b.bits.total_cmp(&a.bits));
+            all
+        }
+
+        /// The questions of all drivers ([`Driver::questions`]), each once; of those that are asked
+        /// by name only, the drivers in `named`.
+        #[must_use]
+        pub fn questions(seen: &Traffic, named: &[&str]) -> Vec<Frame> {
+            let mut all: Vec<Frame> = Vec::new();
+            $(if !<$module::Options as Driver>::ASKED_BY_NAME
+                || named.contains(&<$module::Options as Driver>::NAME)
+            {
+                for question in <$module::Options as Driver>::questions(seen) {
+                    if !all.contains(&question) {
+                        all.push(question);
+                    }
+                }
+            })+
+            all
+        }
 
         /// A driver with its keys.
         #[derive(Debug, Clone, PartialEq)]

@@ -49,6 +49,13 @@
 //! RFT76-HA01 (one user's code, which says that it is that of RFT40); code 6, which is 333 Hz in
 //! the manual and 300 Hz in the header, so `rate_hz` may be either and means code 6.
 //!
+//! # Recognition
+//! A sensor with the identifiers of delivery is recognised by its data. A scan that is told to ask
+//! for this family sends the commands `01` (name), `02` (serial number) and `10`, which a sensor
+//! that streams ignores; each is answered by 15 characters. It must be told, because `64` may be
+//! the number of a CubeMars motor, for which these bytes are a command. A sensor with other
+//! identifiers is not recognised.
+//!
 //! # Keys
 //! ```toml
 //! model = "RFT40-SA01"
@@ -61,11 +68,13 @@ mod board;
 mod device;
 mod options;
 mod protocol;
+mod recognise;
 
 pub use board::RftBoard;
 pub use options::{Model, Options};
 
-use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
+use crate::recognise::{Finding, Traffic};
+use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use device::Rft;
@@ -86,4 +95,14 @@ impl Driver for Options {
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(RftBoard::new(spec, self)?))
     }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        recognise::sensor(seen).into_iter().collect()
+    }
+
+    fn questions(_seen: &Traffic) -> Vec<Frame> {
+        recognise::questions()
+    }
+
+    const ASKED_BY_NAME: bool = true;
 }

@@ -51,6 +51,9 @@
 //! Sources: document MT1604P rev. A (16 Sept 2019), mtidocs.movella.com/canmessages, `xsens.dbc`
 //! and `xsens_parser.cpp` of jiminghe/Xsens_MTi_CAN_ROS_Driver e305ce34.
 //!
+//! # Recognition
+//! By the messages and lengths of delivery, with 11 or 29 bits. Nothing is asked.
+//!
 //! # Keys
 //! ```toml
 //! quantities = ["sample_time", "angular_velocity", "acceleration"]
@@ -70,11 +73,13 @@ mod board;
 mod device;
 mod frames;
 mod options;
+mod recognise;
 
 pub use board::MtiBoard;
 pub use frames::{HighRate, Message};
 pub use options::Options;
 
+use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -95,5 +100,10 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(MtiBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let found = [false, true].map(|extended| recognise::sensor(seen, extended));
+        found.into_iter().flatten().collect()
     }
 }

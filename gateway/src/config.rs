@@ -1,6 +1,7 @@
 //! The contents of gateway.toml, unchecked. [`crate::plan`] checks and resolves them; nothing else
 //! uses this form.
 
+use crate::link::adapter::Adapter;
 use serde::Deserialize;
 use std::path::PathBuf;
 use toml::Spanned;
@@ -47,11 +48,10 @@ pub struct RawBus {
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
 pub enum Source {
-    /// A CAN interface of the kernel.
-    SocketCan {
-        /// Its name, such as `can0`.
-        interface: String,
-    },
+    /// A CAN interface of the kernel: `interface = "can0"`, or its adapter by `serial = "..."` or
+    /// `usb_port = "1-2.3"`, with `channel = 0` if that has several interfaces. The adapter is
+    /// looked for whenever the link is opened.
+    SocketCan(Adapter),
     /// The virtual bus on the loopback interface.
     Virtual {
         /// Its name.

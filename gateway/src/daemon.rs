@@ -12,6 +12,7 @@ use crate::clock::{Clock, Monotonic};
 use crate::config::Source;
 use crate::control;
 use crate::health::{HealthLog, fill_health};
+use crate::link::adapter::{self, Adapter};
 use crate::link::interface::{Netlink, Observer};
 use crate::operator::Operator;
 use crate::plan::{ConfigError, Plan};
@@ -43,7 +44,11 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
     let plan = Plan::load_live(config)?;
     if check {
         // The reader of standard output may close it early.
-        let _ = write!(std::io::stdout(), "{plan}");
+        let _ = write!(
+            std::io::stdout(),
+            "{plan}{}",
+            adapters(&plan, Path::new(adapter::SYS))
+        );
         return Ok(());
     }
     let served = tokio::runtime::Builder::new_current_thread()
@@ -55,6 +60,21 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
         Some(remedy) => error.context(remedy),
         None => error,
     })
+}
+
+/// Which interface each adapter of `plan` is at this moment, a line each, by the sysfs at `sys`.
+/// That it is not there is no error of the configuration: it may be plugged in later.
+fn adapters(plan: &Plan, sys: &Path) -> String {
+    let lines = plan.buses.iter().filter_map(|bus| match &bus.source {
+        Source::SocketCan(named @ (Adapter::Serial { .. } | Adapter::UsbPort { .. })) => {
+            Some(match named.resolve(sys) {
+                Ok(interface) => format!("bus {}: its adapter is {interface} now\n", bus.name),
+                Err(problem) => format!("bus {}: {problem}\n", bus.name),
+            })
+        }
+        _ => None,
+    });
+    lines.collect()
 }
 
 /// Whether an error of [`run`] is a wrong configuration (exit code 2, otherwise 1).
@@ -107,7 +127,7 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
         return Err(error);
     }
     let interfaces = plan.buses.iter().map(|bus| match &bus.source {
-        Source::SocketCan { interface } => Some(interface.clone()),
+        Source::SocketCan(adapter) => Some(adapter.clone()),
         Source::Virtual { .. } | Source::Replay { .. } => None,
     });
     let observer = Observer::start(

@@ -18,6 +18,7 @@
 //! - [`decoder`]: all devices of one bus, without input or output; [`bus`]: the loop that moves
 //!   frames through it; [`inbox`]: what the control plane asks of it while it runs.
 //! - [`publish`]: the destinations of samples; [`status`]: the counters of a bus thread.
+//! - [`scan`]: which devices are on a bus, and a configuration for them.
 //! - [`offline`]: converts a log to a table of samples and back, without a daemon.
 //! - [`daemon`]: the control plane: threads, signals, health, log lines, watchdog; [`control`]: the
 //!   socket over which it is asked while it runs.
@@ -42,5 +43,6 @@ mod operator;
 pub mod plan;
 pub mod publish;
 mod reload;
+pub mod scan;
 pub mod status;
 mod thread;

@@ -4,6 +4,7 @@
 use crate::config::Source;
 use crate::decoder::Decoder;
 use crate::joints::Inverse;
+use crate::link::adapter::Adapter;
 use crate::link::replay::Matching;
 use crate::log::{self, LogFormat, candump};
 use crate::plan::{BusPlan, ChannelPlan, Plan};
@@ -561,8 +562,7 @@ pub fn encode(
 /// The interface name of `bus` in a log.
 fn interface(bus: &BusPlan) -> &str {
     match &bus.source {
-        Source::SocketCan { interface } => interface,
-        Source::Virtual { name } => name,
-        Source::Replay { .. } => &bus.name,
+        Source::SocketCan(Adapter::Interface(name)) | Source::Virtual { name } => name,
+        Source::SocketCan(_) | Source::Replay { .. } => &bus.name,
     }
 }

@@ -13,6 +13,7 @@ pub(crate) use words::did_you_mean;
 use crate::config::{Pace, Raw, RawBus, RawDevice, RawJoint, Realtime, Source};
 use crate::dbc;
 use crate::joints::{CouplingPlan, Feed, Layout, Takes, Target};
+use crate::link::adapter::Adapter;
 use crate::link::replay::Matching;
 use crate::load::{self, BitRates, Load, Member};
 use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, OutputInfo, Outputs, Spec};
@@ -184,7 +185,9 @@ impl Plan {
         let mut buses = Vec::new();
         for (number, other) in self.buses.iter().enumerate() {
             let interface = match (&other.source, own) {
-                (Source::SocketCan { interface }, _) => Some(interface.as_str()),
+                (Source::SocketCan(Adapter::Interface(name)), _) => Some(name.as_str()),
+                // Which interface an adapter was when a log was recorded is not known.
+                (Source::SocketCan(_), _) => None,
                 (Source::Virtual { name }, _) => Some(name.as_str()),
                 (Source::Replay { log, .. }, Some(Source::Replay { log: own, .. }))
                     if log != own =>
@@ -275,15 +278,9 @@ impl Builder<'_> {
         check_name("bus: name", &raw.name)?;
         let mut source = raw.source;
         match &mut source {
-            Source::SocketCan { interface } if interface.is_empty() || interface.len() > 15 => {
-                return Err(format!(
-                    "{place}: interface = {interface:?} must have 1 to 15 characters, such as \
-                     \"can0\""
-                ));
-            }
             Source::Virtual { name } => check_name(&format!("{place}: source.name"), name)?,
             Source::Replay { log, .. } => *log = self.folder.join(&*log),
-            Source::SocketCan { .. } => {}
+            Source::SocketCan(_) => {}
         }
         for other in &self.plan.buses {
             if other.name == raw.name {
@@ -719,7 +716,8 @@ impl fmt::Display for Plan {
         )?;
         for bus in &self.buses {
             let source = match &bus.source {
-                Source::SocketCan { interface } => format!("CAN interface {interface}"),
+                Source::SocketCan(Adapter::Interface(name)) => format!("CAN interface {name}"),
+                Source::SocketCan(named) => format!("CAN adapter with {named}"),
                 Source::Virtual { name } => format!("virtual bus {name}"),
                 Source::Replay { log, pace } => {
                     format!(

@@ -5,6 +5,7 @@ use crate::clock::Monotonic;
 use crate::config::Source;
 use crate::decoder::Decoder;
 use crate::inbox::{Requests, inbox};
+use crate::link::adapter;
 use crate::link::interface::{Interfaces, Netlink};
 use crate::link::replay::Replay;
 use crate::link::socketcan::SocketCan;
@@ -18,6 +19,7 @@ use proprio_drivers::{Claim, Mode};
 use proprio_topics::ipc::{Domain, Writer};
 use proprio_topics::realtime;
 use proprio_topics::{Nanos, Sample};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::{Acquire, Relaxed, Release};
@@ -188,9 +190,9 @@ pub fn open_link(
     claims: &[Claim],
 ) -> Result<Box<dyn Link>, OpenError> {
     Ok(match &bus.source {
-        Source::SocketCan { interface } => {
-            let link = SocketCan::open(interface, claims)?;
-            check_fd(bus, interface, &mut Netlink::default())?;
+        Source::SocketCan(named) => {
+            let link = SocketCan::open_adapter(named, Path::new(adapter::SYS), claims)?;
+            check_fd(bus, link.interface(), &mut Netlink::default())?;
             Box::new(link)
         }
         Source::Virtual { name } => Box::new(VirtualBus::open(domain, name, claims)?),
@@ -238,7 +240,6 @@ mod tests {
     use proprio_topics::InterfaceHealth;
     use proprio_topics::ipc::{DomainConfig, Reader};
     use std::fmt::Write as _;
-    use std::path::Path;
 
     #[test]
     fn a_log_that_has_ended_is_not_stuck() {

@@ -6,6 +6,7 @@
 
 use proprio_drivers::{Claim, Format, Frame, Id};
 use proprio_gateway::clock::{Clock, Monotonic, sleep_until};
+use proprio_gateway::link::adapter::Adapter;
 use proprio_gateway::link::error_frame::ErrorFrame;
 use proprio_gateway::link::interface::{Interfaces as _, Netlink};
 use proprio_gateway::link::replay::{Matching, Pace, Replay};
@@ -938,6 +939,57 @@ fn a_lost_interface_is_told_and_found_again() {
     assert_eq!(
         (counters.losses, counters.received, counters.sent),
         (4, 4, 1)
+    );
+}
+
+/// An adapter is unplugged, and comes back as another interface.
+#[test]
+fn an_adapter_is_found_again_under_another_name() {
+    if !vcan() {
+        return;
+    }
+    let (first, second) = (OwnInterface::new(), OwnInterface::new());
+    let sys = tempfile::tempdir().unwrap();
+    let device = sys.path().join("devices/usb1/1-2");
+    std::fs::create_dir_all(device.join("1-2:1.0")).unwrap();
+    std::fs::write(device.join("idVendor"), "1d50\n").unwrap();
+    std::fs::write(device.join("serial"), "0042\n").unwrap();
+    let plugged = |name: &str| {
+        let net = sys.path().join("class/net");
+        let _ = std::fs::remove_dir_all(&net);
+        std::fs::create_dir_all(net.join(name)).unwrap();
+        std::fs::write(net.join(name).join("type"), "280\n").unwrap();
+        std::os::unix::fs::symlink(device.join("1-2:1.0"), net.join(name).join("device")).unwrap();
+    };
+    plugged(&first.name);
+    let named = Adapter::Serial {
+        serial: "0042".into(),
+        channel: None,
+    };
+    let mut link = SocketCan::open_adapter(&named, sys.path(), &[]).unwrap();
+    assert_eq!(link.interface(), first.name);
+    let wanted = Frame::new(Id::standard(7), &[1]);
+    first.peer_sends(&wanted);
+    assert_eq!(bare(&frame(&mut link)), wanted);
+    first.ip("link del dev NAME");
+    changes_to(&mut link, LinkState::Gone);
+    // The old name is somebody else's now.
+    plugged(&second.name);
+    first.create();
+    changes_to(&mut link, LinkState::Up);
+    assert_eq!(link.interface(), second.name);
+    first.peer_sends(&Frame::new(Id::standard(8), &[]));
+    second.peer_sends(&wanted);
+    assert_eq!(bare(&frame(&mut link)), wanted);
+    assert_eq!(link.counters().losses, 1);
+    let other = Adapter::Serial {
+        serial: "0043".into(),
+        channel: None,
+    };
+    let missing = SocketCan::open_adapter(&other, sys.path(), &[]).unwrap_err();
+    assert!(
+        missing.to_string().contains("serial = \"0042\""),
+        "{missing}"
     );
 }
 

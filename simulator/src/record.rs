@@ -8,6 +8,7 @@ use crate::truth::Simulation;
 use proprio_drivers::{Frame, State};
 use proprio_gateway::config::Source;
 use proprio_gateway::decoder::Decoder;
+use proprio_gateway::link::adapter::Adapter;
 use proprio_gateway::log::candump::write_log_line;
 use proprio_gateway::plan::BusPlan;
 use proprio_gateway::status::BusStatus;
@@ -184,9 +185,8 @@ impl Host<'_> {
 /// The interface name of `bus` in a log.
 fn interface(bus: &BusPlan) -> &str {
     match &bus.source {
-        Source::SocketCan { interface } => interface,
-        Source::Virtual { name } => name,
-        Source::Replay { .. } => &bus.name,
+        Source::SocketCan(Adapter::Interface(name)) | Source::Virtual { name } => name,
+        Source::SocketCan(_) | Source::Replay { .. } => &bus.name,
     }
 }
 

@@ -10,6 +10,7 @@ use anyhow::Context as _;
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::config::Source;
 use proprio_gateway::daemon::open_link;
+use proprio_gateway::link::adapter::Adapter;
 use proprio_gateway::link::{Link, LinkCounters, Received, send_by};
 use proprio_topics::Nanos;
 use serde::Serialize;
@@ -94,9 +95,7 @@ pub fn parse_bus(text: &str) -> Result<Source, OptionsError> {
             name: name.to_owned(),
         }),
         None if !text.is_empty() && text.len() <= 15 && text != "virtual" => {
-            Ok(Source::SocketCan {
-                interface: text.to_owned(),
-            })
+            Ok(Source::SocketCan(Adapter::Interface(text.to_owned())))
         }
         _ => Err(OptionsError::Bus(text.to_owned())),
     }
@@ -375,7 +374,7 @@ fn sources(robot: &Robot, options: &Options) -> Result<Vec<Source>, OptionsError
 
 fn source_text(source: &Source) -> String {
     match source {
-        Source::SocketCan { interface } => interface.clone(),
+        Source::SocketCan(adapter) => adapter.to_string(),
         Source::Virtual { name } => format!("virtual:{name}"),
         Source::Replay { log, .. } => log.display().to_string(),
     }

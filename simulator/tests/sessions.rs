@@ -3,6 +3,7 @@
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::config::Source;
 use proprio_gateway::decoder::Decoder;
+use proprio_gateway::link::adapter::Adapter;
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, Received};
 use proprio_gateway::offline::decode;
@@ -385,9 +386,7 @@ fn options_that_can_not_be_followed_are_told() {
     assert_eq!(parse_bus("virtual:left_arm"), Ok(virtual_bus("left_arm")));
     assert_eq!(
         parse_bus("vcan0"),
-        Ok(Source::SocketCan {
-            interface: "vcan0".into()
-        })
+        Ok(Source::SocketCan(Adapter::Interface("vcan0".into())))
     );
     for wrong in ["", "virtual", "virtual:", "udp:x", "an_interface_too_long"] {
         assert_eq!(parse_bus(wrong), Err(OptionsError::Bus(wrong.into())));

@@ -695,6 +695,30 @@ fn nothing_is_sent_on_a_bus_to_listen_to() {
     rig.assert_nothing_left();
 }
 
+/// A scan that is not active sends nothing, and hears what others send.
+#[test]
+fn a_scan_of_an_interface_sends_nothing() {
+    if !vcan() {
+        return;
+    }
+    let rig = Rig::new();
+    for active in [false, true] {
+        let dump = Candump::start(&rig, "vcan0", "", "7FF#");
+        let mut arguments = vec!["scan", "--bus", "vcan0", "--seconds", "1"];
+        if active {
+            arguments.push("--active");
+        }
+        let mut scan = rig.start(&arguments);
+        std::thread::sleep(Duration::from_millis(500));
+        can::run("cansend vcan0 31A#008000800080");
+        scan.wait();
+        let output = scan.output();
+        assert!(output.contains("31A"), "{output}");
+        // Its questions are the others: all in classic frames and, on this interface, in CAN FD.
+        assert_eq!(dump.count() == 1, !active, "{}", dump.log());
+    }
+}
+
 /// The gateway's claims on bus number `number`, that is, its filters.
 fn claims(plan: &Plan, number: usize) -> Vec<Claim> {
     let bus = &plan.buses[number];

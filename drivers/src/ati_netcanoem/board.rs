@@ -16,6 +16,8 @@ const MATRIX: [[f64; 6]; 6] = [
     [21.0, 730.0, 17.0, 725.0, 26.0, 740.0],
 ];
 const COUNTS: [f64; 2] = [1e6, 1e6];
+/// The serial number of a simulated sensor.
+const SERIAL: &[u8; 8] = b"FT00000\0";
 /// Newton and newton metre.
 const UNITS: [u8; 2] = [2, 3];
 /// Status of a sensor with a fault: its calibration.
@@ -122,6 +124,7 @@ impl Board for NetcanoemBoard {
                 let counts = self.counts.map(|count| (count as u32).to_be_bytes());
                 self.reply(opcode, &counts.concat(), out);
             }
+            (opcode::SERIAL, []) => self.reply(opcode, SERIAL, out),
             (opcode::UNITS, []) => self.reply(opcode, &self.units, out),
             _ => {}
         }

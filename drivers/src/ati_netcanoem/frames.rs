@@ -9,6 +9,7 @@ pub(super) mod opcode {
     pub(crate) const GAUGES_SECOND: u8 = 1;
     pub(crate) const MATRIX: u8 = 2;
     pub(crate) const MATRIX_LAST: u8 = 4;
+    pub(crate) const SERIAL: u8 = 5;
     pub(crate) const SELECT: u8 = 6;
     pub(crate) const COUNTS: u8 = 7;
     pub(crate) const UNITS: u8 = 8;

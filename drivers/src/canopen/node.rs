@@ -33,8 +33,16 @@ const COMMAND: u32 = 0x0504_0001;
 impl Node {
     /// A node with these entries; `operational`: another program has started it.
     pub(crate) fn new(id: u8, operational: bool, entries: &[(Object, u32, u8)]) -> Self {
-        let memory: BTreeMap<_, _> = entries
-            .iter()
+        // The identity of a simulated node: no vendor; its number is its serial number.
+        let identity = [
+            (0, 4, 1),
+            (1, 0, 4),
+            (2, 0, 4),
+            (3, 0, 4),
+            (4, id.into(), 4),
+        ]
+        .map(|(sub, value, bytes)| (Object::new(0x1018, sub), value, bytes));
+        let memory: BTreeMap<_, _> = (identity.iter().chain(entries))
             .map(|(object, value, bytes)| (*object, (*value, *bytes)))
             .collect();
         Self {

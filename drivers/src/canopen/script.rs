@@ -60,7 +60,7 @@ pub(crate) struct Script<P> {
 }
 
 /// Bytes of an SDO command: the low bits are the number of unused bytes, and that it is stated.
-const READ: u8 = 0x40;
+pub(crate) const READ: u8 = 0x40;
 const WRITE: u8 = 0x23;
 const WRITTEN: u8 = 0x60;
 const ABORT: u8 = 0x80;

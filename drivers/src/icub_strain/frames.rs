@@ -13,6 +13,7 @@ pub(super) mod kind {
     pub(in crate::icub_strain) const TORQUE: u8 = 0xB;
     pub(in crate::icub_strain) const THERMOMETER: u8 = 0xE;
     pub(in crate::icub_strain) const THERMOMETER_FIRMWARE: u8 = 0xF;
+    pub(in crate::icub_strain) const THERMOMETERS: [u8; 2] = [THERMOMETER, THERMOMETER_FIRMWARE];
 }
 
 /// The code of zero in a stream.

@@ -8,6 +8,9 @@ use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
 use proprio_topics::{Nanos, Quality, Reading};
 
+/// Protocol 2; hardware 4.4, variant 58 (an ODrive Pro); firmware 0.6.9, released.
+const VERSION: [u8; 8] = [2, 4, 4, 58, 0, 6, 9, 0];
+
 /// The device's own side of an axis. It streams the estimates, or answers requests if the keys say
 /// that it is asked.
 #[derive(Debug)]
@@ -54,6 +57,7 @@ impl OdriveBoard {
             command::IQ => floats([self.current; 2]),
             command::TORQUES => floats([self.torque; 2]),
             command::TEMPERATURE => floats(self.temperatures),
+            command::VERSION => VERSION,
             _ => self.heartbeat(),
         };
         Frame::new(self.keys.id(command), &data)
@@ -132,10 +136,14 @@ impl OdriveBoard {
 
 impl Board for OdriveBoard {
     fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
-        if let Some(command) = self.keys.command(frame.id)
-            && is_request(frame)
-        {
+        if !is_request(frame) {
+            return;
+        }
+        if let Some(command) = self.keys.command(frame.id) {
             let _ = out.try_push(self.frame(command));
+        } else if frame.id == self.keys.id(command::VERSION) && self.keys.firmware == Firmware::V0_6
+        {
+            let _ = out.try_push(self.frame(command::VERSION));
         }
     }
 

@@ -4,6 +4,7 @@ use crate::{Format, Frame};
 
 /// The commands.
 pub(super) mod command {
+    pub(in crate::odrive) const VERSION: u8 = 0x00;
     pub(in crate::odrive) const HEARTBEAT: u8 = 0x01;
     pub(in crate::odrive) const ESTIMATES: u8 = 0x09;
     pub(in crate::odrive) const IQ: u8 = 0x14;

@@ -1,6 +1,6 @@
 //! The sensor's own side.
 
-use super::options::Options;
+use super::options::{Model, Options};
 use super::protocol::{DEFAULT_RATE, Ids, OVERLOAD_FX, RATES, command, period};
 use crate::bytes;
 use crate::{Board, EncodeError, Format, Frame, Frames, Mode, Spec, SpecError};
@@ -14,6 +14,7 @@ const RANGE_ERROR: u8 = 2;
 #[derive(Debug)]
 pub struct RftBoard {
     ids: Ids,
+    name: &'static str,
     divisors: [f64; 6],
     rate_code: u8,
     period: Nanos,
@@ -30,6 +31,7 @@ impl RftBoard {
         let rate_code = options.rate_code()?;
         let mut this = Self {
             ids: options.ids(spec)?,
+            name: (Model::NAMES.get(options.model as usize).copied()).unwrap_or_default(),
             divisors: options.model.divisors(),
             rate_code,
             period: period(options.rate_hz),
@@ -52,6 +54,18 @@ impl RftBoard {
         true
     }
 
+    /// Answers with a text, in both frames.
+    fn tell(&self, command: u8, text: &str, out: &mut Frames) {
+        let mut bytes = [0; 16];
+        let text = core::iter::once(command).chain(text.bytes());
+        for (to, from) in bytes.iter_mut().zip(text) {
+            *to = from;
+        }
+        let (first, second) = bytes.split_at(8);
+        let _ = out.try_push(Frame::new(self.ids.first, first));
+        let _ = out.try_push(Frame::new(self.ids.second, second));
+    }
+
     fn answer(&self, bytes: [u8; 3], out: &mut Frames) {
         let [a, b, c] = bytes;
         let _ = out.try_push(Frame::new(self.ids.first, &[a, b, c, 0, 0, 0, 0, 0]));
@@ -68,6 +82,8 @@ impl Board for RftBoard {
             [command::STOP, ..] => self.streaming = false,
             _ if self.streaming => {}
             [command::START, ..] => self.streaming = true,
+            [command::NAME, ..] => self.tell(command::NAME, self.name, out),
+            [command::SERIAL, ..] => self.tell(command::SERIAL, "RFT-SIMULATED", out),
             [command::GET_RATE, ..] => self.answer([command::GET_RATE, self.rate_code, 0], out),
             [command::SET_RATE, code, ..] => {
                 let answer = match self.set_rate(code) {

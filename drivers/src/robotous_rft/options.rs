@@ -38,6 +38,19 @@ pub enum Model {
 }
 
 impl Model {
+    /// Their names, in the order of the variants.
+    pub(super) const NAMES: [&'static str; 9] = [
+        "RFT40-SA01",
+        "RFT44-SB01",
+        "RFT60-HA01",
+        "RFT64-SB01",
+        "RFT64-6A01",
+        "RFT76-HA01",
+        "RFT80-6A01",
+        "RFT80-6A02",
+        "RFT80-6A03",
+    ];
+
     /// Steps per N for forces, per Nm for torques.
     pub(super) const fn divisors(self) -> [f64; 6] {
         let (force, torque) = match self {

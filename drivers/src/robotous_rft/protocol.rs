@@ -5,6 +5,9 @@ use proprio_topics::Nanos;
 
 /// The first byte of a command and of its response.
 pub(super) mod command {
+    pub(in crate::robotous_rft) const NAME: u8 = 0x01;
+    pub(in crate::robotous_rft) const SERIAL: u8 = 0x02;
+    pub(in crate::robotous_rft) const FIRMWARE: u8 = 0x03;
     pub(in crate::robotous_rft) const START: u8 = 0x0B;
     pub(in crate::robotous_rft) const STOP: u8 = 0x0C;
     pub(in crate::robotous_rft) const SET_RATE: u8 = 0x0F;

@@ -982,8 +982,11 @@ fn a_simulated_node_refuses_as_the_standard_says() {
     };
     let told = |text: &str| Some(text.to_owned());
     assert_eq!(ask("601#4000100000000000"), told("581#4300100096010200"));
-    assert_eq!(ask("601#4018100000000000"), told("581#8018100000000206"));
-    assert_eq!(ask("601#2318100000000000"), told("581#8018100000000206"));
+    assert_eq!(ask("601#4019100000000000"), told("581#8019100000000206"));
+    assert_eq!(ask("601#2319100000000000"), told("581#8019100000000206"));
+    // Its identity: how many entries, and the serial number.
+    assert_eq!(ask("601#4018100000000000"), told("581#4F18100004000000"));
+    assert_eq!(ask("601#4018100400000000"), told("581#4318100401000000"));
     assert_eq!(ask("601#2F00180500000000"), told("581#8000180510000706"));
     assert_eq!(ask("601#E000100000000000"), told("581#8000100001000405"));
     assert_eq!(ask("601#2B001805E8030000"), told("581#6000180500000000"));

@@ -16,6 +16,7 @@ mod moteus;
 mod odrive;
 mod openimu;
 mod pairing;
+mod recognise;
 mod rig;
 mod robotous_and_aidin;
 mod round_trip;

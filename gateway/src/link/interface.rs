@@ -2,6 +2,7 @@
 //! counters, bit-rates, modes and totals. For the control plane; the data plane does not wait for
 //! such queries.
 
+use super::adapter::{self, Adapter};
 use nix::errno::Errno;
 use nix::sys::socket::sockopt::ReceiveTimeout;
 use nix::sys::socket::{
@@ -10,6 +11,7 @@ use nix::sys::socket::{
 use nix::sys::time::TimeVal;
 use proprio_topics::{Controller, InterfaceHealth};
 use std::os::fd::{AsRawFd, OwnedFd};
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -213,12 +215,13 @@ impl<'a> Iterator for Attributes<'a> {
 pub struct Observer(Arc<Mutex<Vec<InterfaceHealth>>>);
 
 impl Observer {
-    /// Asks for each of `interfaces` (`None` has no answer) every `period` until `stop`.
+    /// Asks for each of `interfaces` (`None` has no answer) every `period` until `stop`. Adapters
+    /// are looked for each time, in [`adapter::SYS`].
     ///
     /// # Errors
     /// The system's: the thread could not be started.
     pub fn start(
-        interfaces: Vec<Option<String>>,
+        interfaces: Vec<Option<Adapter>>,
         mut source: impl Interfaces + 'static,
         period: Duration,
         stop: Arc<AtomicBool>,
@@ -235,10 +238,13 @@ impl Observer {
         let body = move || {
             while !stop.load(Relaxed) {
                 let answers = interfaces.iter().zip(&mut failing).map(|(name, failing)| {
-                    let Some(name) = name else {
+                    let name = name
+                        .as_ref()
+                        .map(|named| named.resolve(Path::new(adapter::SYS)));
+                    let Some(Ok(name)) = name else {
                         return InterfaceHealth::default();
                     };
-                    let answer = source.ask(name);
+                    let answer = source.ask(&name);
                     // That it is gone is told by the link's state.
                     let fails = answer.is_err_and(|error| error != Errno::ENODEV);
                     if let Err(error) = answer
@@ -415,7 +421,8 @@ mod tests {
                 _ => Err(Errno::EPERM),
             }
         };
-        let names = vec![Some("can0".to_owned()), None, Some("can1".to_owned())];
+        let name = |name: &str| Some(Adapter::Interface(name.to_owned()));
+        let names = vec![name("can0"), None, name("can1")];
         let period = Duration::from_millis(1);
         let observer = Observer::start(names, source, period, Arc::clone(&stop)).unwrap();
         while observer.newest()[0].rx_frames < 20 {

@@ -8,12 +8,14 @@
 //! | [`virtual_bus`] | IPv4 multicast on the loopback interface, without kernel CAN | kernel |
 //!
 //! [`ListenOnly`] takes from any of them the way to send. [`error_frame`] reads what a controller
-//! reports, and [`interface`] what the kernel knows of it.
+//! reports, [`interface`] what the kernel knows of it, and [`adapter`] which interface is whose.
 
 use crate::clock::{Clock, Monotonic, sleep_until};
+use adapter::NotFound;
 use proprio_drivers::{Claim, Format, Frame};
 use proprio_topics::{LinkState, Nanos};
 
+pub mod adapter;
 pub mod error_frame;
 pub mod interface;
 pub mod replay;
@@ -157,6 +159,9 @@ pub enum OpenError {
         /// Its name.
         interface: String,
     },
+    /// The adapter is no interface of this machine.
+    #[error("{0}")]
+    NoAdapter(NotFound),
     /// The interface is not a CAN interface.
     #[error("{interface} is not a CAN interface")]
     NotCan {

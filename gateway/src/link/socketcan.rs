@@ -11,6 +11,9 @@
 //! | too many errors: bus-off | [`LinkState::BusOff`] | controller restart (`restart-ms`) |
 //! | up without a carrier | [`LinkState::NoCarrier`] | when it has a carrier |
 //!
+//! An adapter that is named by its serial number or port is looked for again in sysfs while it is
+//! gone: it may come back as another interface ([`super::adapter`]).
+//!
 //! `ip link set can0 type can restart` restarts a controller by hand. A controller without a
 //! carrier is mostly bus-off since before the link was opened; only netlink tells
 //! ([`super::interface`]).
@@ -22,6 +25,7 @@
 //! controller that nobody acknowledges, or that is bus-off and restarted, sends what its queue and
 //! its own buffers hold (`ip link set can0 txqueuelen 10` keeps that short).
 
+use super::adapter::{self, Adapter};
 use super::error_frame::ErrorFrame;
 use super::socket::{
     RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, interface_flags, newly_dropped,
@@ -35,6 +39,7 @@ use proprio_topics::{BusError, LinkState, Nanos};
 use socketcan::{CanAddr, CanFdSocket, Socket, SocketOptions};
 use std::io;
 use std::os::fd::{AsFd, AsRawFd};
+use std::path::{Path, PathBuf};
 
 /// Interval between queries of the interface's flags.
 const CHECK: Nanos = Nanos::from_millis(50);
@@ -54,6 +59,10 @@ const ERROR_STATE: u8 = 2;
 
 /// A raw CAN socket on one interface.
 pub struct SocketCan {
+    named: Adapter,
+    /// Where sysfs is.
+    sys: PathBuf,
+    /// The adapter's interface since the last opening.
     interface: String,
     socket: CanFdSocket,
     /// `struct can_filter`s as bytes.
@@ -92,6 +101,17 @@ impl SocketCan {
     /// [`OpenError`]: there is no such interface, it is not a CAN interface, the kernel has no CAN,
     /// or permission is denied.
     pub fn open(interface: &str, claims: &[Claim]) -> Result<Self, OpenError> {
+        let adapter = Adapter::Interface(interface.to_owned());
+        Self::open_adapter(&adapter, Path::new(adapter::SYS), claims)
+    }
+
+    /// As [`SocketCan::open`]; the interface is that of `named` by the sysfs at `sys`
+    /// ([`adapter::SYS`]), now and whenever it is opened again.
+    ///
+    /// # Errors
+    /// As [`SocketCan::open`], and [`OpenError::NoAdapter`].
+    pub fn open_adapter(named: &Adapter, sys: &Path, claims: &[Claim]) -> Result<Self, OpenError> {
+        let interface = named.resolve(sys).map_err(OpenError::NoAdapter)?;
         let by_kernel = claims.len() <= MOST_FILTERS;
         let filters = if by_kernel {
             filters(claims)
@@ -99,11 +119,13 @@ impl SocketCan {
             filters(&[])
         };
         let mut receiver = Receiver::new();
-        let socket = open_socket(interface, &filters, &mut receiver)
-            .map_err(|e| open_error(interface, e))?;
-        let state = state_of(interface_flags(socket.as_fd(), interface), false);
+        let socket = open_socket(&interface, &filters, &mut receiver)
+            .map_err(|e| open_error(&interface, e))?;
+        let state = state_of(interface_flags(socket.as_fd(), &interface), false);
         Ok(Self {
-            interface: interface.to_owned(),
+            named: named.clone(),
+            sys: sys.to_owned(),
+            interface,
             socket,
             filters,
             claims: if by_kernel {
@@ -120,6 +142,12 @@ impl SocketCan {
             bus_off_until: Nanos::ZERO,
             counters: LinkCounters::default(),
         })
+    }
+
+    /// The name of the interface that it has opened last.
+    #[must_use]
+    pub fn interface(&self) -> &str {
+        &self.interface
     }
 
     /// Sets the state; returns whether it has changed.
@@ -155,8 +183,11 @@ impl SocketCan {
         self.check = now.saturating_add(CHECK);
         // An interface that was deleted and created again needs a new socket.
         if self.state == LinkState::Gone {
-            match open_socket(&self.interface, &self.filters, &mut self.receiver) {
-                Ok(socket) => self.socket = socket,
+            let Ok(interface) = self.named.resolve(&self.sys) else {
+                return false;
+            };
+            match open_socket(&interface, &self.filters, &mut self.receiver) {
+                Ok(socket) => (self.socket, self.interface) = (socket, interface),
                 Err(_) => return false,
             }
             self.adapter = HardwareToMonotonic::default();

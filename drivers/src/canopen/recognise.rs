@@ -1,0 +1,127 @@
+//! Recognising nodes: by heartbeats, and by what they answer to questions about their identity.
+
+use super::protocol::{emcy, heartbeat, object, sdo_from, sdo_to, tpdo};
+use super::{Object, READ};
+use crate::bytes::{u16_le, u32_le};
+use crate::recognise::{BYTE, Evidence, LENGTH, Stream, Traffic, byte_of};
+use crate::{Format, Frame};
+use alloc::format;
+use alloc::string::String;
+use alloc::vec::Vec;
+
+/// Vendor, product, revision, serial number.
+const IDENTITY: [(u8, &str); 4] = [
+    (1, "vendor"),
+    (2, "product"),
+    (3, "revision"),
+    (4, "serial"),
+];
+/// States in a heartbeat, without the bit that toggles in node guarding.
+const STATES: [u8; 4] = [0x00, 0x04, 0x05, 0x7F];
+
+/// A node.
+#[derive(Debug, Clone)]
+pub(crate) struct Recognised<'t> {
+    pub(crate) evidence: Evidence<'t>,
+    pub(crate) node: u8,
+    /// The device profile, if it has told.
+    pub(crate) profile: Option<u16>,
+    /// Its identity in words, after a comma; empty if it has not told.
+    pub(crate) identity: String,
+    /// TPDO 1 to 4, if they are sent.
+    pub(crate) tpdos: [Option<&'t Stream>; 4],
+}
+
+const fn identity(sub: u8) -> Object {
+    Object::new(0x1018, sub)
+}
+
+/// The value that node `node` has told of `object`.
+fn told(seen: &Traffic, node: u8, object: Object) -> Option<u32> {
+    let stream = seen.stream(sdo_from(node))?;
+    stream.kept().find_map(|frame| match *frame.data() {
+        [0x43, _, _, sub, _, _, _, _] if sub == object.sub => {
+            (u16_le(frame.data(), 1) == object.index).then(|| u32_le(frame.data(), 4))
+        }
+        _ => None,
+    })
+}
+
+/// Whether it is an answer to an SDO command: 8 bytes, one of about 40 first bytes.
+fn is_answer(frame: &Frame) -> bool {
+    let command = frame.data().first().copied();
+    let is_one = command.is_some_and(|command| {
+        matches!(command, 0x00..=0x20 | 0x30 | 0x41..=0x43 | 0x47 | 0x4B | 0x4F | 0x60 | 0x80)
+    });
+    frame.format == Format::Classic && frame.len() == 8 && is_one
+}
+
+fn is_heartbeat(frame: &Frame) -> bool {
+    match *frame.data() {
+        [state] => STATES.contains(&(state & 0x7F)),
+        _ => false,
+    }
+}
+
+/// The nodes that `seen` shows. Process data alone shows none: anything may be on their
+/// identifiers.
+pub(crate) fn recognise(seen: &Traffic) -> impl Iterator<Item = Recognised<'_>> {
+    (1..=127).filter_map(|node| {
+        let mut evidence = Evidence::new(seen, 127);
+        let beats = evidence.sends(
+            heartbeat(node),
+            LENGTH + byte_of(STATES.len()),
+            is_heartbeat,
+        );
+        let answers = evidence.sends(sdo_from(node), LENGTH + byte_of(40), is_answer);
+        if beats.is_none() && answers.is_none() {
+            return None;
+        }
+        let device_type = told(seen, node, object::DEVICE_TYPE);
+        let mut words = String::new();
+        if device_type.is_some() {
+            // An index and a sub-index, as in each of the following.
+            evidence.add(3.0 * BYTE);
+        }
+        for (sub, name) in IDENTITY {
+            if let Some(value) = told(seen, node, identity(sub)) {
+                evidence.add(3.0 * BYTE);
+                words += &format!(", {name} {value:#x}");
+            }
+        }
+        let tpdos = [0, 1, 2, 3].map(|number| {
+            evidence.sends(tpdo(node, number), 0.0, |frame| {
+                frame.format == Format::Classic
+            })
+        });
+        for id in [emcy(node), sdo_to(node)] {
+            evidence.belongs(id);
+        }
+        #[allow(clippy::cast_possible_truncation)] // the low 16 bits
+        let profile = device_type.map(|device_type| device_type as u16);
+        Some(Recognised {
+            evidence,
+            node,
+            profile,
+            identity: words,
+            tpdos,
+        })
+    })
+}
+
+/// All nodes are asked for their profile, those that have answered for their identity. To read an
+/// object changes nothing.
+pub(crate) fn questions(seen: &Traffic) -> Vec<Frame> {
+    let read = |node, object: Object| {
+        let [low, high] = object.index.to_le_bytes();
+        Frame::new(sdo_to(node), &[READ, low, high, object.sub, 0, 0, 0, 0])
+    };
+    let mut questions = Vec::new();
+    for node in 1..=127 {
+        questions.push(read(node, object::DEVICE_TYPE));
+        if told(seen, node, object::DEVICE_TYPE).is_some() {
+            questions.extend(IDENTITY.map(|(sub, _)| read(node, identity(sub))));
+        }
+    }
+    questions
+}

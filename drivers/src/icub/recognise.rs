@@ -1,0 +1,154 @@
+//! Recognising boards of the protocol: by what they tell of themselves, and by their streams.
+
+use super::{ADDRESSES, BROADCAST, board, class, command, to_board, to_host};
+use crate::recognise::{BYTE, Evidence, Finding, Key, LENGTH, Stream, Traffic, byte_of, length_of};
+use crate::{Format, Frame};
+use alloc::format;
+use alloc::string::String;
+use alloc::vec::Vec;
+
+/// What a board has told of itself.
+#[derive(Debug, Clone)]
+struct Told {
+    board: u8,
+    /// Major, minor; build in the application alone.
+    version: [u8; 2],
+    build: Option<u8>,
+    /// The text in it.
+    info: String,
+}
+
+/// Takes the answers of board `address`, if it is of one of `types`; `Err` if it is of another one.
+fn told(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Result<Option<Told>, ()> {
+    let mut told = None;
+    let id = to_host(class::MANAGEMENT, address);
+    // Commands of the bootloader are below 10.
+    let rule = |frame: &Frame| {
+        let first = frame.data().first().copied();
+        let is_command = first.is_some_and(|c| c == command::DISCOVER || c < 0x10);
+        frame.format == Format::Classic && is_command
+    };
+    if let Some(stream) = evidence.sends(id, byte_of(17), rule) {
+        let mut texts: [Option<[u8; 4]>; 8] = [None; 8];
+        for frame in stream.kept() {
+            match *frame.data() {
+                [command::DISCOVER, board, major, minor, ref build @ ..] if build.len() < 2 => {
+                    told = Some(Told {
+                        board,
+                        version: [major, minor],
+                        build: build.first().copied(),
+                        info: String::new(),
+                    });
+                }
+                [command::GET_ADDITIONAL_INFO, number, a, b, c, d] => {
+                    if let Some(text) = texts.get_mut(usize::from(number)) {
+                        *text = Some([a, b, c, d]);
+                    }
+                }
+                _ => {}
+            }
+        }
+        if let Some(told) = &mut told {
+            evidence.add(byte_of(types.len()) + length_of(2));
+            if texts.iter().all(Option::is_some) {
+                // A command, a length, and eight numbers in their order.
+                evidence.add(2.0 * BYTE + LENGTH);
+                let bytes = texts.iter().flatten().flatten();
+                let text = bytes
+                    .take_while(|byte| **byte != 0)
+                    .map(|byte| char::from(*byte));
+                told.info = text.filter(|letter| !letter.is_control()).collect();
+            }
+        }
+    }
+    // Somebody else has asked for its version.
+    for (class, version) in [
+        (class::POLLING_ANALOG, command::GET_FIRMWARE_VERSION),
+        (class::POLLING_MOTOR, command::MOTOR_GET_FIRMWARE_VERSION),
+    ] {
+        let id = to_host(class, address);
+        let frames = evidence
+            .traffic
+            .stream(id)
+            .into_iter()
+            .flat_map(Stream::kept);
+        for frame in frames {
+            if let [command, board, major, minor, build, _, _, 0 | 1] = *frame.data()
+                && command == version
+                && board::NAMES.iter().any(|(known, _)| *known == board)
+            {
+                evidence.explains(id, BYTE + LENGTH + byte_of(types.len()) + 7.0);
+                told.get_or_insert(Told {
+                    board,
+                    version: [major, minor],
+                    build: Some(build),
+                    info: String::new(),
+                });
+                break;
+            }
+        }
+        evidence.belongs(to_board(class, address));
+    }
+    match told {
+        Some(told) if !types.contains(&told.board) => Err(()),
+        told => Ok(told),
+    }
+}
+
+/// The boards of driver `driver`. `types` are those that it reads, of which some (`maybe`) may lack
+/// the part that it reads: they are found only if they send. `streams` adds what speaks for board
+/// `address`, and returns keys and joints.
+pub(crate) fn recognise(
+    seen: &Traffic,
+    driver: &'static str,
+    types: &[u8],
+    maybe: &[u8],
+    streams: impl Fn(&mut Evidence<'_>, u8, Option<u8>) -> (Vec<Key>, Vec<u8>),
+) -> Vec<Finding> {
+    let addresses = ADDRESSES.filter_map(|address| u8::try_from(address).ok());
+    let find = |address: u8| {
+        let mut evidence = Evidence::new(seen, ADDRESSES.count());
+        let told = told(&mut evidence, address, types).ok()?;
+        let board = told.as_ref().map(|told| told.board);
+        let before = evidence.clone();
+        let (keys, joints) = streams(&mut evidence, address, board);
+        if board.is_none_or(|board| maybe.contains(&board)) && !evidence.has_more_than(&before) {
+            return None;
+        }
+        let what = match &told {
+            None => "iCub board".into(),
+            Some(told) => {
+                let known = board::NAMES.iter().find(|(code, _)| *code == told.board);
+                let name = known.map_or("board", |(_, name)| name);
+                let [major, minor] = told.version;
+                let text = match told.info.as_str() {
+                    "" => String::new(),
+                    text => format!(", {text:?}"),
+                };
+                match told.build {
+                    Some(build) => format!("{name}, firmware {major}.{minor}.{build}{text}"),
+                    None => format!("{name}, in its bootloader {major}.{minor}: restart it{text}"),
+                }
+            }
+        };
+        let finding = evidence.finding(driver, address.into(), what)?;
+        Some(finding.with_keys(keys).with_joints(joints))
+    };
+    addresses.filter_map(find).collect()
+}
+
+/// All boards are asked who they are, and those that answer for the text in them.
+pub(crate) fn questions(seen: &Traffic) -> Vec<Frame> {
+    let everyone = to_board(class::MANAGEMENT, BROADCAST);
+    let mut questions = Vec::from([Frame::new(everyone, &[command::DISCOVER])]);
+    for address in ADDRESSES.filter_map(|address| u8::try_from(address).ok()) {
+        let heard = seen.stream(to_host(class::MANAGEMENT, address));
+        let mut frames = heard.into_iter().flat_map(Stream::kept);
+        // A bootloader is left alone.
+        if frames.any(|f| f.data().first() == Some(&command::DISCOVER) && f.len() == 5) {
+            let id = to_board(class::MANAGEMENT, address);
+            questions.push(Frame::new(id, &[command::GET_ADDITIONAL_INFO]));
+        }
+    }
+    questions
+}

@@ -1,0 +1,60 @@
+//! Recognising boards: by the counter in both halves of a reading, and by their full scales.
+
+use super::protocol::{READY, id, op};
+use crate::recognise::{BYTE, Evidence, Finding, Key, Stream, Traffic, byte_of, length_of};
+use crate::{Format, Frame, bytes};
+use alloc::vec::Vec;
+
+/// Board `node`, if `seen` shows it.
+pub(super) fn board(seen: &Traffic, driver: &'static str, node: u16) -> Option<Finding> {
+    let mut evidence = Evidence::new(seen, 127);
+    let force = evidence.sends_length(id(op::FORCE, node), 8);
+    let moment = evidence.sends_length(id(op::MOMENT, node), 8);
+    if let (Some(force), Some(moment)) = (force, moment) {
+        let counter = |frame: &Frame| bytes::u16_le(frame.data(), 6);
+        let shared = |frame: &&Frame| force.recent().any(|f| counter(f) == counter(frame));
+        let (all, same) = (
+            moment.recent().count(),
+            moment.recent().filter(shared).count(),
+        );
+        if same * 10 >= all * 9 {
+            // One of 48 that are kept, of 65536.
+            evidence.add(10.0);
+        }
+        evidence.together(force, moment);
+    }
+    // A state, alone or before three full scales.
+    let bits = length_of(2) + byte_of(2);
+    let acknowledged = evidence.sends(id(op::ACKNOWLEDGE, node), bits, |frame| {
+        let state = frame.data().first();
+        let is_state = state.is_some_and(|state| *state <= READY + 1);
+        frame.format == Format::Classic && is_state && matches!(frame.len(), 1 | 7)
+    });
+    let scales = acknowledged.is_some_and(|stream| {
+        let plausible = |frame: &Frame| {
+            let scale = |at| bytes::u16_le(frame.data(), at);
+            frame.len() == 7
+                && [1, 3, 5]
+                    .into_iter()
+                    .all(|at| (1..10_000).contains(&scale(at)))
+        };
+        stream.kept().any(plausible)
+    });
+    if scales {
+        evidence.add(BYTE);
+    }
+    let (Some(_), Some(_)) = (force, moment) else {
+        return scales.then(|| evidence.finding(driver, node.into(), WHAT))?;
+    };
+    let finding = evidence.finding(driver, node.into(), WHAT)?;
+    Some(finding.with_keys(Key::period_ms(force.and_then(Stream::period), 1, 1000)))
+}
+
+const WHAT: &str = "JR3 sensor at a board of UC3M";
+
+/// All boards are asked for their full scales.
+pub(super) fn questions() -> Vec<Frame> {
+    let ops = [op::GET_FORCE_SCALES, op::GET_MOMENT_SCALES];
+    let questions = (1..=0x7F).flat_map(|node| ops.map(|op| Frame::new(id(op, node), &[])));
+    questions.collect()
+}

@@ -1,0 +1,43 @@
+//! Recognising sensors: by the groups that they send.
+
+use super::frames::{ADDRESSES, DIVIDERS, Quantity, identifier, period};
+use super::options::Options;
+use crate::Driver;
+use crate::recognise::{Evidence, Finding, Key, Traffic};
+use alloc::format;
+use alloc::string::String;
+use alloc::vec::Vec;
+
+/// The sensor at `address`, if `seen` shows it. One group alone may be that of a tilt sensor of
+/// another maker.
+pub(super) fn sensor(seen: &Traffic, address: u32) -> Option<Finding> {
+    let source = u8::try_from(address).ok()?;
+    let mut evidence = Evidence::new(seen, ADDRESSES.count());
+    let mut quantities: Vec<&str> = Vec::new();
+    let mut measured = None;
+    for (quantity, name) in [
+        (Quantity::Orientation, "orientation"),
+        (Quantity::Acceleration, "acceleration"),
+        (Quantity::AngularVelocity, "angular_velocity"),
+    ] {
+        let (pgn, priority, _) = quantity.pgn_priority_bit();
+        if let Some(stream) = evidence.sends_length(identifier(priority, pgn, source), 8) {
+            quantities.push(name);
+            measured = measured.or(stream.period());
+        }
+    }
+    if quantities.len() < 2 {
+        return None;
+    }
+    let what = "Aceinna OpenIMU or MTLT (J1939)";
+    let finding = evidence.finding(Options::NAME, address, what)?;
+    let words: String = format!("{quantities:?}");
+    let mut keys = Vec::from([Key::new("quantities", words)]);
+    let is_near = |divider: &&u8| {
+        let ratio = measured.map(|measured| measured.seconds() / period(**divider).seconds());
+        ratio.is_some_and(|ratio| (ratio - 1.0).abs() < 0.1)
+    };
+    let divider = DIVIDERS.iter().find(is_near);
+    keys.extend(divider.map(|divider| Key::new("period_ms", period(*divider).0 / 1_000_000)));
+    Some(finding.with_keys(keys))
+}

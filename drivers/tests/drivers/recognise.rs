@@ -1,0 +1,557 @@
+//! Every simulated board is recognised as itself, by listening and by asking, and by no other
+//! driver with more certainty. Arbitrary traffic is nothing.
+
+use crate::rig::{options, spec};
+use proprio_drivers::{
+    ASKED_BY_NAME, Board, Certainty, Claim, DRIVERS, Decoded, Finding, Format, Frame, Frames, Id,
+    Mode, Options, Traffic, questions, recognise,
+};
+use proprio_topics::{
+    Actuator, Imu, JointState, Nanos, Quality, Reading, Skin, StampKind, Temperature, Wrench,
+};
+use proptest::prelude::*;
+
+/// Every family: driver, keys, address, outputs that are joints.
+const BOARDS: &[(&str, &str, u32, &[u8])] = &[
+    ("icub_strain", "", 13, &[]),
+    ("icub_strain", "stream = \"both\"", 1, &[]),
+    ("icub_imu", "", 3, &[]),
+    (
+        "icub_imu",
+        "quantities = [\"acceleration\", \"orientation\", \"status\"]\nperiod_ms = 20",
+        14,
+        &[],
+    ),
+    ("icub_imu", "legacy = \"mtb\"", 9, &[]),
+    ("icub_motor", "", 2, &[0]),
+    ("icub_mc4", "", 5, &[0, 1]),
+    ("icub_pos", "", 8, &[0, 1]),
+    ("icub_skin", "triangles = [2, 5]", 6, &[]),
+    ("icub_mais", "", 14, &[0, 6, 7, 14]),
+    ("ati_netcanoem", "", 0x20, &[]),
+    ("ati_netcanoem", "", 0x31, &[]),
+    ("canopen_drive", "", 3, &[0]),
+    ("canopen_drive", "sync = 1", 127, &[0]),
+    ("canopen_encoder", "", 32, &[0]),
+    ("moteus", "", 1, &[0]),
+    ("moteus", "host = 7", 11, &[0]),
+    ("odrive", "", 0, &[0]),
+    ("odrive", "firmware = \"0.5\"", 63, &[0]),
+    ("cubemars", "model = \"AK80-9\"", 7, &[0]),
+    ("cubemars", "model = \"AK80-9\"\nhost_id = 5", 5, &[0]),
+    (
+        "cubemars",
+        "mode = \"servo\"\nmodel = \"AK10-9\"",
+        104,
+        &[0],
+    ),
+    ("xsens_mti", "", 0, &[]),
+    (
+        "xsens_mti",
+        "quantities = [\"acceleration\", \"angular_velocity\"]\nextended = true\n\
+         high_rate = \"rate_first\"",
+        0,
+        &[],
+    ),
+    ("openimu", "", 0x80, &[]),
+    ("robotous_rft", "", 0x64, &[]),
+    (
+        "robotous_rft",
+        "model = \"RFT64-6A01\"\nrate_hz = 1000",
+        0x64,
+        &[],
+    ),
+    ("aidin_aft200", "", 1, &[]),
+    ("jr3_can", "", 1, &[]),
+    ("jr3_can", "", 100, &[]),
+    (
+        "optoforce_daq",
+        "counts_per_newton = [26, 28, 3]",
+        0x100,
+        &[],
+    ),
+];
+/// Drivers without a device that speaks, or with one that a file describes.
+const NOT_RECOGNISED: [&str; 2] = ["canopen_sync", "dbc"];
+
+#[test]
+fn no_driver_is_left_out() {
+    for driver in DRIVERS {
+        let tested = BOARDS.iter().any(|(tested, ..)| tested == driver);
+        assert_ne!(tested, NOT_RECOGNISED.contains(driver), "{driver}");
+    }
+}
+
+/// What a board measures at `t`, moving.
+fn readings(driver: &str, outputs: &[u8], t: Nanos) -> Vec<(u8, Reading)> {
+    let x = (t.seconds() * 7.0).sin();
+    let wrench = Wrench {
+        force: [12.0 + x, -30.0, 5.0 * x],
+        torque: [0.1, -0.2 * x, 0.3],
+    };
+    let joint = JointState {
+        position: 0.5 * x,
+        velocity: 3.5 * x,
+        acceleration: 0.0,
+        torque: 0.2,
+        current: 1.5,
+    };
+    let actuator = Actuator {
+        duty: 0.1,
+        mode: if driver == "odrive" { 8 } else { 1 },
+        encoder: 0,
+        faults: 0,
+    };
+    let imu = Imu {
+        proper_acceleration: [x, 0.5, 9.81],
+        angular_velocity: [0.1, -0.2, x],
+        angular_acceleration: [f64::NAN; 3],
+        orientation: [1.0, 0.0, 0.0, 0.0],
+        magnetic_field: [1e-5; 3],
+    };
+    if !outputs.is_empty() {
+        let joints = outputs.iter().flat_map(|output| {
+            [
+                (*output, Reading::Joint(joint)),
+                (*output, Reading::Actuator(actuator)),
+            ]
+        });
+        return joints.collect();
+    }
+    match driver {
+        "icub_imu" | "xsens_mti" | "openimu" => vec![(0, Reading::Imu(imu))],
+        "icub_skin" => (2..=5)
+            .map(|triangle| {
+                let skin = Skin {
+                    triangle,
+                    taxels: [3.0 + x.round(); 12],
+                };
+                (0, Reading::Skin(skin))
+            })
+            .collect(),
+        "icub_strain" => vec![
+            (0, Reading::Wrench(wrench)),
+            (0, Reading::Temperature(Temperature { celsius: 31.0 })),
+        ],
+        _ => vec![(0, Reading::Wrench(wrench))],
+    }
+}
+
+/// A board on a bus, with all that is heard of it.
+struct Bus {
+    board: Box<dyn Board>,
+    driver: &'static str,
+    outputs: &'static [u8],
+    now: Nanos,
+    due: Option<Nanos>,
+    heard: Traffic,
+}
+
+impl Bus {
+    fn new(row: &(&'static str, &'static str, u32, &'static [u8])) -> Self {
+        let (driver, keys, address, outputs) = *row;
+        let spec = spec(address, Mode::Supervise, outputs);
+        Self {
+            board: options(driver, keys).board(&spec).expect("legal keys"),
+            driver,
+            outputs,
+            now: Nanos::from_millis(1000),
+            due: None,
+            heard: Traffic::new(),
+        }
+    }
+
+    fn hear(&mut self, frames: &[Frame]) {
+        for frame in frames {
+            // A frame takes about 0.1 ms.
+            self.now += Nanos::from_micros(100);
+            self.heard
+                .on_frame(&frame.at(self.now, StampKind::Software));
+        }
+    }
+
+    fn ask(&mut self, question: &Frame) -> Frames {
+        let mut answers = Frames::new();
+        self.board.on_frame(question, &mut answers);
+        answers
+    }
+
+    /// A millisecond: the board sends what is due. Returns it.
+    fn turn(&mut self) -> Vec<Frame> {
+        let turn = self.now.0 / 1_000_000;
+        let mut sent = Frames::new();
+        for (output, reading) in readings(self.driver, self.outputs, self.now) {
+            self.board.present(output, &reading, Quality::GOOD);
+        }
+        match self.board.period() {
+            None => self.due = None,
+            Some(period) if self.now >= *self.due.get_or_insert(self.now) => {
+                self.due = self.due.map(|due| due + period);
+                let mut once = Frames::new();
+                for (output, reading) in readings(self.driver, self.outputs, self.now) {
+                    let encoded = self
+                        .board
+                        .encode(output, &reading, Quality::GOOD, &mut once);
+                    // Not every board has an actuator.
+                    assert!(encoded.is_ok() || !matches!(reading, Reading::Joint(_)));
+                }
+                sent.extend(once.into_iter().take(16));
+            }
+            Some(_) => {}
+        }
+        self.hear(&sent);
+        self.now = Nanos((turn + 1) * 1_000_000);
+        sent.to_vec()
+    }
+}
+
+/// What is heard while the board's own host starts it and reads it.
+fn overheard(row: &(&'static str, &'static str, u32, &'static [u8])) -> Traffic {
+    let (driver, keys, address, outputs) = *row;
+    let mut bus = Bus::new(row);
+    let mut host = options(driver, keys)
+        .device(&spec(address, Mode::Supervise, outputs))
+        .expect("legal keys");
+    for _ in 0..3000 {
+        let mut out = Decoded::new();
+        while let Some(transmit) = host.poll_transmit(bus.now, &mut out) {
+            host.on_sent(&transmit.frame, Ok(bus.now));
+            bus.hear(&[transmit.frame]);
+            let answers = bus.ask(&transmit.frame);
+            bus.hear(&answers);
+            for answer in answers {
+                host.on_frame(&answer.at(bus.now, StampKind::Software), &mut out);
+            }
+        }
+        if keys.contains("sync") && bus.now.0 / 1_000_000 % 10 == 0 {
+            let sync = Frame::new(Id::standard(0x80), &[]);
+            bus.hear(&[sync]);
+            let answers = bus.ask(&sync);
+            bus.hear(&answers);
+        }
+        for frame in bus.turn() {
+            host.on_frame(&frame.at(bus.now, StampKind::Software), &mut out);
+        }
+    }
+    bus.heard
+}
+
+/// What is heard of a board that nobody has started, when it is asked.
+fn asked(row: &(&'static str, &'static str, u32, &'static [u8])) -> Traffic {
+    let mut bus = Bus::new(row);
+    let mut done: Vec<Frame> = Vec::new();
+    let turns = |bus: &mut Bus| (0..500).for_each(|_| drop(bus.turn()));
+    turns(&mut bus);
+    loop {
+        let all = questions(&bus.heard, DRIVERS);
+        let new: Vec<Frame> = all.into_iter().filter(|q| !done.contains(q)).collect();
+        if new.is_empty() {
+            return bus.heard;
+        }
+        for question in new {
+            let answers = bus.ask(&question);
+            bus.hear(&answers);
+            done.push(question);
+        }
+        turns(&mut bus);
+    }
+}
+
+/// The best finding of `driver` at `address`, after checks that hold for all.
+fn own(heard: &Traffic, row: &(&'static str, &'static str, u32, &'static [u8])) -> Option<Finding> {
+    let (driver, _, address, _) = *row;
+    let findings = recognise(heard);
+    for finding in &findings {
+        // Its keys make a device, once somebody has filled in what is not known.
+        let keys: String = (finding.keys.iter())
+            .map(|key| format!("{} = {}\n", key.name, key.value))
+            .collect();
+        let table: toml::Table = keys.parse().expect("TOML");
+        let options = Options::deserialize(finding.driver, table)
+            .unwrap_or_else(|error| panic!("{finding:?}: {error:?}"));
+        let spec = spec(finding.address, Mode::Listen, &finding.joints);
+        let device = options.device(&spec);
+        assert!(device.is_ok(), "{finding:?}: {:?}", device.err());
+        assert!(!finding.explains.is_empty());
+        for id in &finding.explains {
+            assert!(heard.stream(*id).is_some(), "{finding:?}");
+        }
+    }
+    let own = findings
+        .iter()
+        .find(|f| (f.driver, f.address) == (driver, address));
+    let own = own.cloned();
+    for other in findings {
+        let sure = own.as_ref().and_then(Finding::certainty);
+        let is_other = (other.driver, other.address) != (driver, address);
+        assert!(
+            !is_other || other.certainty() <= sure,
+            "{row:?} is rather {other:?}\nthan {own:?}"
+        );
+    }
+    own
+}
+
+#[test]
+fn every_board_is_recognised_by_listening_to_it() {
+    for row in BOARDS {
+        let heard = overheard(row);
+        let own = own(&heard, row).unwrap_or_else(|| panic!("{row:?} is not found"));
+        assert!(own.certainty() >= Some(Certainty::Likely), "{own:?}");
+        assert_eq!(own.unusable, "");
+    }
+}
+
+/// Families that answer no question, and send nothing before they are started.
+const MUTE: [&str; 1] = ["aidin_aft200"];
+
+#[test]
+fn every_board_is_recognised_by_asking_it() {
+    for row in BOARDS {
+        let own = own(&asked(row), row);
+        if MUTE.contains(&row.0) {
+            assert_eq!(own, None);
+            continue;
+        }
+        let own = own.unwrap_or_else(|| panic!("{row:?} is not found"));
+        assert!(own.certainty() >= Some(Certainty::Likely), "{own:?}");
+    }
+}
+
+/// What a board tells of itself ends up in words and keys.
+#[test]
+fn findings_say_what_was_found() {
+    let found = |index: usize, active: bool| {
+        let row = &BOARDS[index];
+        let heard = if active { asked(row) } else { overheard(row) };
+        let found = own(&heard, row).unwrap();
+        let keys: Vec<String> = (found.keys.iter())
+            .map(|key| format!("{} = {}", key.name, key.value))
+            .collect();
+        let certainty = found.certainty().unwrap();
+        (found.what, keys.join("; "), certainty)
+    };
+    let row = |driver: &str, keys: &str| {
+        let is_it = |row: &&(&str, &str, u32, &[u8])| (row.0, row.1) == (driver, keys);
+        BOARDS.iter().position(|row| is_it(&row)).unwrap()
+    };
+    let (what, _, certainty) = found(row("icub_strain", ""), true);
+    assert_eq!(what, "strain2, firmware 2.0.8, \"simulated board\"");
+    assert_eq!(certainty, Certainty::Certain);
+    let (_, keys, _) = found(row("icub_strain", "stream = \"both\""), false);
+    assert_eq!(keys, "period_ms = 10; stream = \"both\"");
+    let (_, keys, _) = found(3, false);
+    assert_eq!(
+        keys,
+        "period_ms = 20; quantities = [\"acceleration\", \"orientation\", \"status\"]"
+    );
+    let (what, _, certainty) = found(row("canopen_encoder", ""), true);
+    let (head, tail) = ("CANopen encoder (CiA 406), vendor 0x0", "serial 0x20");
+    assert!(what.starts_with(head) && what.ends_with(tail), "{what}");
+    assert_eq!(certainty, Certainty::Certain);
+    let (what, keys, _) = found(row("odrive", "firmware = \"0.5\""), true);
+    assert_eq!(what, "ODrive");
+    assert_eq!(keys, "firmware = \"0.6\"; period_ms = 10");
+    let (what, _, certainty) = found(row("ati_netcanoem", ""), true);
+    assert_eq!(what, "ATI sensor at a NETCANOEM board, serial FT00000");
+    assert_eq!(certainty, Certainty::Certain);
+    let (what, keys, certainty) = found(
+        row("robotous_rft", "model = \"RFT64-6A01\"\nrate_hz = 1000"),
+        true,
+    );
+    assert_eq!(what, "RFT64-6A01, serial RFT-SIMULATED");
+    assert_eq!(keys, "model = \"RFT64-6A01\"");
+    assert_eq!(certainty, Certainty::Certain);
+    let (_, keys, _) = found(row("icub_skin", "triangles = [2, 5]"), false);
+    assert_eq!(keys, "period_ms = 50; triangles = [2, 5]");
+    let (_, keys, certainty) = found(row("moteus", "host = 7"), false);
+    assert_eq!(
+        (keys.as_str(), certainty),
+        ("host = 7; period_ms = 2", Certainty::Certain)
+    );
+}
+
+/// A question of one family starts, stops or changes nothing in the boards of another, nor in its
+/// own: afterwards a board sends what one that was not asked sends. The three families that are
+/// asked by name only are not asked here.
+#[test]
+fn questions_change_nothing() {
+    for row in BOARDS {
+        let (driver, keys, _, outputs) = *row;
+        for address in 0..=127 {
+            let spec = spec(address, Mode::Supervise, outputs);
+            let board = || options(driver, keys).board(&spec);
+            let (Ok(mut asked), Ok(mut other)) = (board(), board()) else {
+                continue;
+            };
+            // All that boards at any address would answer is heard, so that all is asked.
+            let mut heard = Traffic::new();
+            for _ in 0..3 {
+                for question in questions(&heard, &[]) {
+                    let mut answers = Frames::new();
+                    asked.on_frame(&question, &mut answers);
+                    for answer in answers {
+                        heard.on_frame(&answer);
+                    }
+                }
+            }
+            assert_eq!(asked.period(), other.period(), "{row:?} at {address}");
+            for (output, reading) in readings(driver, outputs, Nanos::ZERO) {
+                let mut frames = [Frames::new(), Frames::new()];
+                let [a, b] = &mut frames;
+                let _ = asked.encode(output, &reading, Quality::GOOD, a);
+                let _ = other.encode(output, &reading, Quality::GOOD, b);
+                assert_eq!(a, b, "{row:?} at {address}");
+            }
+        }
+    }
+}
+
+#[test]
+fn families_whose_questions_are_commands_are_asked_by_name_alone() {
+    let heard = Traffic::new();
+    let safe = questions(&heard, &[]);
+    // CANopen's network management, SYNC and the process data that nodes receive; the start of a
+    // JR3; motors of CubeMars.
+    let commands = |id: Id| match id {
+        Id::Standard(raw) => raw <= 0x17F || (0x200..=0x57F).contains(&raw) && raw & 0x80 == 0,
+        Id::Extended(_) => false,
+    };
+    for question in &safe {
+        assert!(!commands(question.id), "{question}");
+    }
+    let by_name: Vec<&str> = (ASKED_BY_NAME.iter())
+        .filter(|(_, by_name)| *by_name)
+        .map(|(driver, _)| *driver)
+        .collect();
+    assert_eq!(by_name, ["ati_netcanoem", "robotous_rft", "jr3_can"]);
+    for driver in by_name {
+        let more = questions(&heard, &[driver]);
+        assert!(more.len() > safe.len(), "{driver}");
+        assert!(
+            more.iter().any(|question| commands(question.id)),
+            "{driver}"
+        );
+    }
+}
+
+/// An iCub board that waits in its bootloader is named, and left alone.
+#[test]
+fn a_bootloader_is_named_and_left_alone() {
+    let mut heard = Traffic::new();
+    heard.on_frame(&crate::rig::frame("730#FF0C0102", 0.0));
+    let findings = recognise(&heard);
+    let strain = findings.iter().find(|f| f.driver == "icub_strain").unwrap();
+    assert_eq!(
+        (strain.address, strain.what.as_str()),
+        (3, "strain2, in its bootloader 1.2: restart it")
+    );
+    let asks = questions(&heard, &[]);
+    assert!(asks.iter().all(|q| q.id != Id::standard(0x703)), "{asks:?}");
+    let mut running = Traffic::new();
+    running.on_frame(&crate::rig::frame("730#FF0C020008", 0.0));
+    let asks = questions(&running, &[]);
+    assert!(asks.iter().any(|q| q.id == Id::standard(0x703)), "{asks:?}");
+}
+
+/// A node of a profile that nobody reads is told, and not taken for a drive.
+#[test]
+fn a_node_of_another_profile_is_no_drive() {
+    let mut heard = Traffic::new();
+    heard.on_frame(&crate::rig::frame("705#7F", 0.0));
+    heard.on_frame(&crate::rig::frame("585#4300100091010F00", 1.0));
+    let findings = recognise(&heard);
+    assert_eq!(findings.len(), 1, "{findings:?}");
+    assert!(findings[0].what.contains("profile 401"));
+    assert!(findings[0].unusable.contains(".dbc"));
+}
+
+/// A bus of streams, each of one length, whose bytes are constant, count, or are arbitrary.
+fn streams() -> impl Strategy<Value = Vec<Frame>> {
+    let id = prop_oneof![
+        4 => (0..=0x7FF_u16).prop_map(Id::standard),
+        1 => any::<u32>().prop_map(Id::extended),
+    ];
+    let stream = (
+        id,
+        proptest::array::uniform8(0..3_u8),
+        any::<[u8; 8]>(),
+        0..=8_usize,
+    );
+    proptest::collection::vec(stream, 1..40).prop_map(|streams| {
+        let mut frames = Vec::new();
+        let mut seed = 1_u32;
+        for turn in 0..60_u8 {
+            for (id, kinds, first, length) in &streams {
+                let mut data = *first;
+                for (byte, kind) in data.iter_mut().zip(kinds) {
+                    seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                    *byte = match kind {
+                        0 => *byte,
+                        1 => byte.wrapping_add(turn),
+                        _ => seed.to_le_bytes()[3],
+                    };
+                }
+                let t = Nanos::from_millis(i64::from(turn) * 10);
+                frames.push(Frame::new(*id, &data[..*length]).at(t, StampKind::Software));
+            }
+        }
+        frames
+    })
+}
+
+/// What is found with `least` or more.
+fn found(frames: &[Frame], least: Certainty) -> Vec<Finding> {
+    let mut heard = Traffic::new();
+    frames.iter().for_each(|frame| heard.on_frame(frame));
+    let mut found = recognise(&heard);
+    found.retain(|finding| finding.certainty() >= Some(least));
+    found
+}
+
+proptest! {
+    #[test]
+    fn nothing_is_certain_of_arbitrary_streams(frames in streams()) {
+        prop_assert_eq!(found(&frames, Certainty::Certain), []);
+    }
+
+    #[test]
+    fn nothing_is_likely_of_arbitrary_frames(
+        frames in proptest::collection::vec(
+            (any::<u32>(), proptest::collection::vec(any::<u8>(), 0..=8), 0..20_u8), 100..2000,
+        )
+    ) {
+        let frames: Vec<Frame> = frames
+            .into_iter()
+            .filter_map(|(id, data, format)| {
+                #[allow(clippy::cast_possible_truncation)]
+                let standard = Id::standard(id as u16);
+                let id = if id >> 31 == 0 { standard } else { Id::extended(id) };
+                let format = match format {
+                    0 => Format::Remote,
+                    1 => Format::Error,
+                    2 => Format::Fd { bit_rate_switch: true, error_state: false },
+                    _ => Format::Classic,
+                };
+                Frame::with_format(id, format, &data)
+            })
+            .collect();
+        prop_assert_eq!(found(&frames, Certainty::Likely), []);
+    }
+}
+
+/// Identifiers that a finding's device claims are those that the board sends on.
+#[test]
+fn a_device_made_of_a_finding_claims_its_frames() {
+    for row in BOARDS {
+        let heard = overheard(row);
+        let found = own(&heard, row).unwrap();
+        let claims: Vec<Claim> = options(row.0, row.1)
+            .device(&spec(row.2, Mode::Listen, row.3))
+            .unwrap()
+            .claims()
+            .to_vec();
+        let claimed = |id: &&Id| claims.iter().any(|claim| claim.matches(**id));
+        assert!(found.explains.iter().any(|id| claimed(&id)), "{found:?}");
+    }
+}

@@ -1,0 +1,90 @@
+//! The devices on a bus, of all that its drivers recognise. Where the devices of two findings would
+//! read the same frames, the one with more evidence is the device, and the other is kept as its
+//! rival.
+
+use proprio_drivers::{Claim, Finding, Id, Mode, Options, Outputs, Spec, Traffic, recognise};
+use proprio_topics::Nanos;
+
+/// A device on a bus.
+#[derive(Debug, Clone)]
+pub struct Device {
+    /// Its name in the configuration: driver and address, after a prefix.
+    pub name: String,
+    /// What speaks for it.
+    pub finding: Finding,
+    /// Other devices that the same frames might come from, with less evidence.
+    pub rivals: Vec<Finding>,
+    /// The identifiers that it reads.
+    pub(super) claims: Vec<Claim>,
+}
+
+impl Device {
+    /// Whether the frames of `id` are explained by it.
+    #[must_use]
+    pub fn explains(&self, id: Id) -> bool {
+        let claimed = self.claims.iter().any(|claim| claim.matches(id));
+        claimed || self.finding.explains.contains(&id)
+    }
+}
+
+/// The driver and its keys, for the device of `finding`; placeholders stand for what a person has
+/// to fill in.
+fn options(finding: &Finding) -> Result<(Options, Spec), String> {
+    let keys: String = (finding.keys.iter())
+        .map(|key| format!("{} = {}\n", key.name, key.value))
+        .collect();
+    let table: toml::Table = keys.parse().map_err(|e: toml::de::Error| e.to_string())?;
+    let options = Options::deserialize(finding.driver, table);
+    let spec = Spec {
+        address: finding.address,
+        max_silence: Nanos::from_millis(100),
+        mode: Mode::Listen,
+        outputs: Outputs(finding.joints.iter().copied().take(16).collect()),
+    };
+    Ok((options.map_err(|e| format!("{e:?}"))?, spec))
+}
+
+/// The identifiers that the device of `finding` reads.
+fn claims(finding: &Finding) -> Result<Vec<Claim>, String> {
+    let (options, spec) = options(finding)?;
+    let device = options.device(&spec).map_err(|e| e.to_string())?;
+    Ok(device.claims().to_vec())
+}
+
+/// The devices on the bus of `heard`, those with most evidence first. `prefix` begins their names.
+#[must_use]
+pub fn devices(heard: &Traffic, prefix: &str) -> Vec<Device> {
+    let mut devices: Vec<Device> = Vec::new();
+    for finding in recognise(heard) {
+        let claims = match (finding.unusable, claims(&finding)) {
+            ("", Ok(claims)) => claims,
+            ("", Err(problem)) => {
+                tracing::warn!(driver = finding.driver, "a finding is not legal: {problem}");
+                continue;
+            }
+            _ => Vec::new(),
+        };
+        // As the plan refuses it: one identifier, two readers.
+        let rivals = |device: &Device| {
+            let mut pairs = claims
+                .iter()
+                .flat_map(|a| device.claims.iter().map(move |b| (a, b)));
+            pairs.any(|(a, b)| a.overlaps(b) && (a.exclusive || b.exclusive))
+        };
+        if let Some(better) = devices.iter_mut().find(|device| rivals(device)) {
+            better.rivals.push(finding);
+            continue;
+        }
+        let base = format!("{prefix}{}_{}", finding.driver, finding.address);
+        let is_free = |name: &String| devices.iter().all(|device| device.name != *name);
+        let more = (2..).map(|number| format!("{base}_{number}"));
+        let name = std::iter::once(base.clone()).chain(more).find(is_free);
+        devices.push(Device {
+            name: name.unwrap_or(base),
+            finding,
+            rivals: Vec::new(),
+            claims,
+        });
+    }
+    devices
+}
