@@ -421,6 +421,12 @@ pub trait Device: Send {
     /// Starts again at `now` after a link loss, because the board may have been reset.
     fn restart(&mut self, now: Nanos);
 
+    /// The largest magnitudes fx fy fz tx ty tz for which an F/T sensor is made \[N, Nm\], if they
+    /// are known: values may be beyond them.
+    fn full_scale(&self) -> Option<[f64; 6]> {
+        None
+    }
+
     /// Changes the maximum silence \[ns\] from now on.
     fn set_max_silence(&mut self, max_silence: Nanos);
 

@@ -49,6 +49,12 @@ pub(crate) trait Family: Send {
     /// The board is not started: requests are not sent, and their answers do not come.
     fn interrupt(&mut self) {}
 
+    /// As [`Device::full_scale`].
+    fn full_scale(&self, link: &Link<Self::Questions>) -> Option<[f64; 6]> {
+        let _ = link;
+        None
+    }
+
     /// As [`Device::command`].
     fn command(
         &mut self,
@@ -169,6 +175,10 @@ impl<F: Family> Device for Supervised<F> {
         self.link.bringup.restart();
         self.family.interrupt();
         self.family.reset();
+    }
+
+    fn full_scale(&self) -> Option<[f64; 6]> {
+        self.family.full_scale(&self.link)
     }
 
     fn set_max_silence(&mut self, max_silence: Nanos) {

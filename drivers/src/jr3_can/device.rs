@@ -2,7 +2,7 @@
 //! frames of force and moment.
 
 use super::options::Options;
-use super::protocol::{READY, SAMPLE, id, node, op, op_of};
+use super::protocol::{READY, SAMPLE, STEPS, id, node, op, op_of};
 use super::scales::{FullScales, Question};
 use crate::bringup::{Bringup, Timing};
 use crate::bytes;
@@ -215,6 +215,10 @@ impl Family for Jr3 {
             }
             _ => out.fault(Counter::Length, 1, frame.id),
         }
+    }
+
+    fn full_scale(&self, link: &Link<FullScales>) -> Option<[f64; 6]> {
+        Some(link.questions.per_step?.map(|step| step * STEPS))
     }
 
     fn reset(&mut self) {
