@@ -7,8 +7,8 @@
 
 use crate::bringup::{Bringup, Inquiry};
 use crate::{
-    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, NotSent,
-    State, Transmit,
+    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Mode,
+    NotSent, State, Transmit,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -86,6 +86,19 @@ pub(crate) struct Link<Q> {
 impl<Q: Inquiry> Link<Q> {
     pub(crate) fn state(&self) -> State {
         self.bringup.state(&self.questions)
+    }
+
+    /// Whether a command can be sent to the board now.
+    pub(crate) fn takes_command(&self) -> Result<(), CommandRefused> {
+        if self.bringup.mode() == Mode::Listen {
+            Err(CommandRefused::ListenOnly)
+        } else if self.state() != State::Streaming {
+            Err(CommandRefused::NotStreaming)
+        } else if !self.bringup.is_idle() {
+            Err(CommandRefused::Busy)
+        } else {
+            Ok(())
+        }
     }
 }
 
