@@ -115,8 +115,10 @@ impl Calibration {
     #[must_use]
     pub fn defects(&self) -> Defects {
         let mut found = Defects::new();
-        // There is room for all.
-        let mut add = |defect| drop(found.try_push(defect));
+        let mut add = |defect| {
+            // There is room for all.
+            let _ = found.try_push(defect);
+        };
         for (axis, scale) in (0..).zip(self.full_scale().unwrap_or([1.0; 6])) {
             if scale <= 0.0 {
                 add(Defect::ZeroFullScale { axis });
@@ -166,7 +168,10 @@ impl fmt::Display for Defect {
             Self::ZeroFullScale { axis } => write!(f, "the full scale of {} is zero", name(axis)),
             Self::Erased { axis, gauge } => {
                 let axis = name(axis);
-                write!(f, "the entry of {axis}, gauge {gauge} is FFFF, as in erased memory")
+                write!(
+                    f,
+                    "the entry of {axis}, gauge {gauge} is FFFF, as in erased memory"
+                )
             }
             Self::NotFinite { axis, gauge } => {
                 write!(f, "the entry of {}, gauge {gauge} is no number", name(axis))

@@ -9,7 +9,9 @@ use crate::status::BusStatus;
 use proprio_drivers::{
     Claim, CommandFailed, Decoded, Device, Frame, Mode, NotSent, SpecError, State, Transmit,
 };
-use proprio_topics::{Counter, Header, MAX_CHANNELS, Nanos, Quality, Reading, Sample, StampKind, Wrench};
+use proprio_topics::{
+    Counter, Header, MAX_CHANNELS, Nanos, Quality, Reading, Sample, StampKind, Wrench,
+};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 
@@ -62,9 +64,9 @@ fn beyond(wrench: &Wrench, full_scale: Option<[f64; 6]>) -> u16 {
     let all = values.zip(full_scale.unwrap_or([f64::INFINITY; 6]));
     // Half a step of 16 bits: a value at the end of its range is not beyond it.
     let is_beyond = |(value, most): (&f64, f64)| value.abs() > most * (1.0 + 0.5 / 32768.0);
-    (0..)
-        .zip(all)
-        .fold(0, |mask, (axis, pair)| mask | u16::from(is_beyond(pair)) << axis)
+    (0..).zip(all).fold(0, |mask, (axis, pair)| {
+        mask | u16::from(is_beyond(pair)) << axis
+    })
 }
 
 impl Decoder {

@@ -55,12 +55,7 @@ impl Loads {
     }
 
     /// Writes the loads until `now` into `health`, which has been filled from `buses`.
-    pub(crate) fn measure(
-        &mut self,
-        health: &mut GatewayHealth,
-        buses: &[&BusStatus],
-        now: Nanos,
-    ) {
+    pub(crate) fn measure(&mut self, health: &mut GatewayHealth, buses: &[&BusStatus], now: Nanos) {
         let slots = health.buses.iter_mut().zip(buses);
         for ((slot, status), (meter, stated)) in slots.zip(&mut self.0) {
             let interface = &slot.interface;
@@ -706,5 +701,117 @@ mod tests {
             "{overflow:?}"
         );
         assert!(overflow[1].contains("frames were lost"), "{overflow:?}");
+    }
+
+    #[test]
+    fn a_frozen_axis_is_one_line_with_what_to_check() {
+        let mut log = HealthLog::default();
+        let mut health = health(BusHealth::EMPTY);
+        health.device_count = 1;
+        health.devices[0].state = DeviceState::Streaming.in_memory();
+        let mut tick = |frozen: u16, beyond: u16, count: u64| {
+            health.devices[0].frozen_axes = frozen;
+            health.devices[0].beyond_axes = beyond;
+            health.devices[0].counters[Counter::Frozen as usize] += count;
+            logged(|| log.log_changes(&health, &[]))
+        };
+        assert_eq!(tick(0, 0, 0).len(), 1, "it streams");
+        let lines = tick(0b10_0001, 0, 5);
+        let [line] = &lines[..] else {
+            panic!("{lines:?}")
+        };
+        for part in ["WARN fx, tz repeats itself", "cable", "saturated"] {
+            assert!(line.contains(part), "{line}");
+        }
+        // It comes and goes: one line.
+        for k in 0..100 {
+            assert_eq!(tick(if k % 2 == 0 { 0x3F } else { 0 }, 0, 0), [""; 0]);
+        }
+        let after: Vec<_> = (0..Run::REST + 5).flat_map(|_| tick(0, 0, 0)).collect();
+        assert_eq!(after.len(), 1, "{after:?}");
+        assert!(after[0].contains("INFO no longer frozen"), "{after:?}");
+        // One that has ended before anybody looked.
+        let lines = tick(0, 0, 3);
+        assert!(
+            lines.len() == 1 && lines[0].contains("a value repeats"),
+            "{lines:?}"
+        );
+        let lines = tick(0, 0b100, 0);
+        assert!(
+            lines.len() == 1 && lines[0].contains("fz is beyond"),
+            "{lines:?}"
+        );
+    }
+
+    #[test]
+    fn a_full_bus_is_told_once_and_its_end_too() {
+        let mut log = HealthLog::default();
+        let mut tick = |load| {
+            let bus = BusHealth {
+                load,
+                frame_rate: 5800.0,
+                ..status().bus()
+            };
+            logged(|| log.log_changes(&health(bus), &[]))
+        };
+        assert_eq!(tick(f64::NAN), [""; 0]);
+        assert_eq!(tick(0.7), [""; 0]);
+        let lines = tick(0.75);
+        assert!(lines.len() == 1 && lines[0].contains("up to 75 % of the bus (5800 frames/s)"));
+        for load in [0.72, 0.65, 0.9, 0.61] {
+            assert_eq!(tick(load), [""; 0]);
+        }
+        let lines = tick(0.3);
+        assert!(
+            lines.len() == 1 && lines[0].contains("its load is 30 % again"),
+            "{lines:?}"
+        );
+    }
+
+    /// A controller tells its bit rate and all frames on the bus; a virtual interface does not, and
+    /// without a stated bit rate there is no share.
+    #[test]
+    fn the_load_is_measured_with_what_is_known() {
+        let text = "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\nRATE\n\
+                    source = { kind = \"virtual\", name = \"b\" }\n";
+        let measured = |rate: &str, bit_rate: u32, fd: u32| {
+            let plan = Plan::parse(&text.replace("RATE", rate), Path::new(".")).unwrap();
+            let status = BusStatus::new(0, &plan.buses[0]);
+            let mut loads = Loads::new(&plan);
+            let mut health = Box::new(GatewayHealth::new(Nanos::ZERO));
+            let frame = proprio_drivers::Frame::new(proprio_drivers::Id::standard(1), &[0; 8]);
+            for second in 0..3 {
+                let interface = InterfaceHealth {
+                    rx_frames: 2000 * second,
+                    tx_frames: 1000 * second,
+                    rx_bytes: 16_000 * second,
+                    tx_bytes: 8000 * second,
+                    bit_rate,
+                    fd,
+                    ..InterfaceHealth::default()
+                };
+                fill_health(&mut health, &[&status], &[interface]);
+                loads.measure(&mut health, &[&status], Nanos::from_seconds(second as f64));
+                for _ in 0..1000 {
+                    status
+                        .frames
+                        .fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+                    status.on_wire(&frame);
+                }
+            }
+            // What is asked between two measurements shows the last one.
+            fill_health(&mut health, &[&status], &[]);
+            let bus = health.buses()[0];
+            (bus.frame_rate.round(), bus.load)
+        };
+        let (frames, share) = measured("", 0, 0);
+        assert!(frames == 1000.0 && share.is_nan(), "{frames} {share}");
+        let close = |(frames, share): (f64, f64), f: f64, s: f64| {
+            assert!(frames == f && (share - s).abs() < 1e-3, "{frames} {share}");
+        };
+        close(measured("bit_rate = 500000", 0, 0), 1000.0, 0.27);
+        close(measured("bit_rate = 500000", 1_000_000, 0), 3000.0, 0.405);
+        close(measured("", 1_000_000, 0), 3000.0, 0.405);
+        close(measured("", 1_000_000, 1), 1000.0, 0.135);
     }
 }

@@ -5,11 +5,11 @@
 use proprio_drivers::{
     Board, Decoded, EncodeError, Format, Frame, Frames, Id, Mode, Options, Spec, SpecError,
 };
-use std::collections::VecDeque;
 use proprio_topics::{
     Actuator, Gauges, Imu, JointState, Kind, Nanos, Quality, Reading, Skin, StampKind, Temperature,
     Wrench,
 };
+use std::collections::VecDeque;
 
 /// Bit rates of a bus \[bit/s\].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -48,7 +48,12 @@ impl Load {
     /// Whether a bus whose share was high before still is.
     #[must_use]
     pub fn stays_high(share: f64, was_high: bool) -> bool {
-        share > if was_high { Self::NO_LONGER } else { Self::HIGH }
+        share
+            > if was_high {
+                Self::NO_LONGER
+            } else {
+                Self::HIGH
+            }
     }
 }
 
@@ -499,5 +504,118 @@ mod tests {
         assert!(problem.contains("up to 138 % of 500 kbit/s"), "{problem}");
         let problem = plan(&boards(1), "bit_rate = 5").unwrap_err();
         assert!(problem.contains("bit_rate = 5 must be"), "{problem}");
+    }
+
+    /// A second of frames of 135 bits, one per millisecond.
+    fn traffic(ms: i64) -> Totals {
+        let ms = ms.unsigned_abs();
+        Totals {
+            frames: ms,
+            nominal_bits: 135 * ms,
+            ..Totals::default()
+        }
+    }
+
+    #[test]
+    fn the_load_is_that_of_the_last_second() {
+        let mut meter = Meter::new();
+        let mut measure =
+            |ms: i64, totals| meter.measure(Nanos::from_millis(ms), totals, Some(RATES));
+        assert!(measure(0, traffic(0)).share.is_nan());
+        assert!(
+            measure(100, traffic(100)).share.is_nan(),
+            "too short a time"
+        );
+        let close = |load: Load, frames: f64, share: f64| {
+            assert!((load.frames - frames).abs() < 1e-6, "{load:?}");
+            assert!((load.share - share).abs() < 1e-9, "{load:?}");
+        };
+        for ms in (200..3000).step_by(100) {
+            close(measure(ms, traffic(ms)), 1000.0, 0.135);
+        }
+        // Then silence: after half a second half of it is left, after one nothing.
+        for (ms, rest) in [(3400, 0.5), (3900, 0.0)] {
+            for now in ((ms - 400)..=ms).step_by(100) {
+                let load = measure(now, traffic(2900));
+                if now == ms {
+                    close(load, 1000.0 * rest, 0.135 * rest);
+                }
+            }
+        }
+        // Without a bit rate the frames are counted all the same.
+        let load = meter.measure(Nanos::from_millis(4900), traffic(3900), None);
+        assert!(
+            load.share.is_nan() && (load.frames - 1000.0).abs() < 1e-6,
+            "{load:?}"
+        );
+    }
+
+    #[test]
+    fn frames_that_the_filters_hide_are_counted() {
+        let at = |seconds: u64| Totals {
+            frames: 100 * seconds,
+            nominal_bits: 100 * 115 * seconds,
+            // 5000 frames of 8 bytes.
+            all_frames: 5000 * seconds,
+            all_bytes: 40_000 * seconds,
+            ..Totals::default()
+        };
+        let mut meter = Meter::new();
+        let mut load = Load::default();
+        for second in 0..3 {
+            let now = Nanos::from_seconds(second as f64);
+            load = meter.measure(now, at(second), Some(RATES));
+        }
+        assert!((load.frames - 5000.0).abs() < 1e-6, "{load:?}");
+        // 135 bits each, to a bit.
+        assert!((load.share - 0.675).abs() < 0.002, "{load:?}");
+        // An interface that was set up again counts from zero.
+        let load = meter.measure(Nanos::from_seconds(3.0), at(0), Some(RATES));
+        assert!((load.frames - 5000.0).abs() < 1e-6, "{load:?}");
+        let load = meter.measure(Nanos::from_seconds(4.0), at(1), Some(RATES));
+        assert!((load.share - 0.675).abs() < 0.002, "{load:?}");
+    }
+
+    #[test]
+    fn a_load_near_the_limit_is_told_once() {
+        let mut high = false;
+        let told = [
+            0.5,
+            0.69,
+            0.71,
+            0.69,
+            0.72,
+            0.61,
+            0.59,
+            0.69,
+            f64::NAN,
+            0.9,
+            f64::NAN,
+        ]
+        .map(|share| {
+            high = Load::stays_high(share, high);
+            high
+        });
+        let expected = [
+            false, false, true, true, true, true, false, false, false, true, false,
+        ];
+        assert_eq!(told, expected);
+    }
+
+    #[test]
+    fn the_bits_of_fd_frames_are_counted_by_their_rate() {
+        let format = Format::Fd {
+            bit_rate_switch: true,
+            error_state: false,
+        };
+        let frame = Frame::with_format(Id::standard(1), format, &[0; 64]).unwrap();
+        let bits = bits_on_wire(&frame);
+        assert_eq!((bits.nominal, bits.data), (34, 678));
+        let plan = plan("", "").unwrap();
+        let status = crate::status::BusStatus::new(0, &plan.buses[0]);
+        status.on_wire(&frame);
+        status.on_wire(&Frame::new(Id::standard(1), &[0; 8]));
+        let totals = status.totals();
+        assert_eq!((totals.nominal_bits, totals.data_bits), (34 + 135, 678));
     }
 }

@@ -153,7 +153,12 @@ impl BusStatus {
     /// Counts what `frame`, received or sent, can have taken of the bus. For one writer.
     pub fn on_wire(&self, frame: &Frame) {
         let Bits { nominal, data } = bits_on_wire(frame);
-        for (cell, bits) in self.bits.iter().zip([nominal, data]).filter(|(_, b)| *b > 0) {
+        for (cell, bits) in self
+            .bits
+            .iter()
+            .zip([nominal, data])
+            .filter(|(_, b)| *b > 0)
+        {
             cell.store(cell.load(Relaxed) + u64::from(bits), Relaxed);
         }
     }

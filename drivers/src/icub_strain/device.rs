@@ -10,8 +10,8 @@ use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{Limit, Paired, Pairing};
 use crate::{
-    Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Mode,
-    NotSent, Output, Spec, SpecError,
+    Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
+    Frame, Mode, NotSent, Output, Spec, SpecError,
 };
 use alloc::boxed::Box;
 use arrayvec::ArrayVec;
@@ -481,9 +481,7 @@ impl Family for Strain {
                 let per_step = link.questions.per_step.unwrap_or([f64::NAN; 6]);
                 Ok(CommandOutcome::Tared(Some(added(told, per_step))))
             }
-            Ok((Command::Calibration, told)) => {
-                Ok(CommandOutcome::Calibration(calibration(told)))
-            }
+            Ok((Command::Calibration, told)) => Ok(CommandOutcome::Calibration(calibration(told))),
             Err(failed) => Err(failed),
         })
     }

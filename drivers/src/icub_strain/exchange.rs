@@ -168,9 +168,12 @@ impl Exchange {
     /// The number of the question that `data` answers, and the number in it.
     fn parse(data: &[u8]) -> Result<(usize, u16), Counter> {
         let (at, most, high, low) = match *data {
-            [command::GET_CURR_TARE | command::GET_FULL_SCALES, channel, high, low] => {
-                (usize::from(channel), 6, high, low)
-            }
+            [
+                command::GET_CURR_TARE | command::GET_FULL_SCALES,
+                channel,
+                high,
+                low,
+            ] => (usize::from(channel), 6, high, low),
             [command::GET_MATRIX_RC, row, column, high, low] if column < 6 => {
                 let at = SCALES + 6 * usize::from(row) + usize::from(column);
                 (at, ALL, high, low)

@@ -8,8 +8,8 @@ use crate::family::{Family, Link, Supervised};
 use crate::pairing::{Limit, Paired, Pairing};
 use crate::wrench::{self, NewZero, TareCommand};
 use crate::{
-    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Id, Mode,
-    NotSent, Output, Spec, SpecError, bytes,
+    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Id,
+    Mode, NotSent, Output, Spec, SpecError, bytes,
 };
 use alloc::boxed::Box;
 use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind, Wrench};
@@ -217,12 +217,7 @@ impl Family for Rft {
         self.pairing.reset();
     }
 
-    fn request(
-        &mut self,
-        now: Nanos,
-        _link: &mut Link<Rate>,
-        _out: &mut Decoded,
-    ) -> Option<Frame> {
+    fn request(&mut self, now: Nanos, _link: &mut Link<Rate>, _out: &mut Decoded) -> Option<Frame> {
         let due = self.tare.poll(now);
         due.then(|| send(self.ids.command, command::BIAS, SET))
     }
