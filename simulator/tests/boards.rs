@@ -419,7 +419,7 @@ fn a_rebooted_board_comes_back_because_it_is_started_again() {
 #[test]
 fn a_sensor_that_freezes_without_a_word_is_found_out() {
     let session = session(&["freeze:l_arm_ft_sensor@3..3.5"], 4.0);
-    let (mut marked, mut repeated) = (0, 0);
+    let (mut marked, mut repeated) = (0_u32, 0_u32);
     let mut last = None;
     for sample in session.of("l_arm_ft_sensor") {
         let t = time_of(sample);
@@ -436,7 +436,7 @@ fn a_sensor_that_freezes_without_a_word_is_found_out() {
     );
     assert_eq!(
         session.count("l_arm_ft_sensor", Counter::Frozen),
-        marked.into()
+        u64::from(marked)
     );
 }
 

@@ -411,7 +411,8 @@ fn overwrite(rig: &mut Rig, row: u8, column: u8, entry: u16) {
 
 #[test]
 fn a_calibration_is_read_while_the_board_streams() {
-    for keys in [SCALES, "", "stream = \"uncalibrated\""] {
+    let raw = format!("{SCALES}stream = \"uncalibrated\"");
+    for keys in [SCALES, "", &raw] {
         let mut rig = streaming(keys);
         overwrite(&mut rig, 2, 5, 0xFD2E);
         overwrite(&mut rig, 5, 0, 0x0123);
