@@ -676,7 +676,8 @@ fn real_sensors_are_said_to_be_frozen_only_where_they_are() {
                 *last = reading;
                 let marked = quality.contains(proprio_topics::Quality::FROZEN);
                 let sensor = &series[item.series].name;
-                assert!(!marked || *run >= 16, "{name}: {sensor} at {t}, run {run}");
+                // An axis may have been equal by chance once or twice before the others.
+                assert!(!marked || *run >= 14, "{name}: {sensor} at {t}, run {run}");
                 assert!(marked || *run < 20, "{name}: {sensor} at {t}, run {run}");
                 readings += 1;
                 frozen += u32::from(marked);
