@@ -510,8 +510,15 @@ fn a_calibration_that_cannot_be_read_says_why() {
     let answers = answers.map(|text| frame(text, 2000.0));
     let (_, faults) = decode(&mut *rig.device, &answers);
     let counted: Vec<_> = faults.iter().map(|fault| fault.counter).collect();
-    use Counter::{Length, Unexpected, Value};
-    assert_eq!(counted, [Unexpected, Length, Value, Value]);
+    assert_eq!(
+        counted,
+        [
+            Counter::Unexpected,
+            Counter::Length,
+            Counter::Value,
+            Counter::Value
+        ]
+    );
 }
 
 #[test]
