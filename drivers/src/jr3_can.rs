@@ -31,8 +31,9 @@
 //! | `300` + n | none | take the present load as the zero |
 //!
 //! - **Each start takes the present load as the zero** (as does `180` + n, which other programs may
-//!   send, and `300` + n, which [`Command::Tare`](crate::Command::Tare) sends). Readings from such a command to its acknowledgement, and the first after
-//!   it, have ZERO_CHANGED; so has the first after a boot-up.
+//!   send, and `300` + n, which [`Command::Tare`](crate::Command::Tare) sends). Readings from such
+//!   a command to its acknowledgement, and the first after it, have ZERO_CHANGED; so has the first
+//!   after a boot-up.
 //! - After a boot-up the board waits for a start, so it is asked and started again at once.
 //! - The answers to both questions about full scales look alike. One question is asked at a time,
 //!   and the other one only when no answer to the first can be on its way any more. A device that

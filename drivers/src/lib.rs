@@ -34,7 +34,7 @@
 //! and add its line to the list in `registry.rs`. Families share `bringup.rs` (starting a board),
 //! `configure.rs` (confirming its configuration), `pairing.rs` and `group.rs` (combining two
 //! frames, or more), `held.rs` (values of other instants), `bytes.rs` (the numbers of a payload),
-//! `wrench.rs` and `calibration.rs` (force/torque sensors) and `keys.rs` (addresses and identifiers).
+//! `wrench.rs` and [`calibration`] (force/torque sensors) and `keys.rs` (addresses, identifiers).
 #![no_std]
 extern crate alloc;
 #[cfg(test)]

@@ -7,15 +7,15 @@
 //! |---|---|
 //! | `{"do": "status"}` | the gateway and its buses |
 //! | `{"do": "devices"}` | the devices: state, bus, driver, channels |
-//! | `{"do": "tare", "device": "..."}` | `added`: what the board adds from then on \[N, Nm\], or null |
-//! | `{"do": "calibration", "device": "..."}` | what the sensor's memory says of it, and `problems` |
+//! | `{"do": "tare", "device": "..."}` | `added`: what the board adds from now on \[N, Nm\] |
+//! | `{"do": "calibration", "device": "..."}` | the sensor's own, and `problems` of it |
 //! | `{"do": "reload"}` | `changed`: the devices that have changed, and which of their keys |
 //!
-//! `calibration` asks an F/T board while it streams, or tells what was read at its start. Of these
-//! an answer has what the sensor knows: `full_scale_n`, `full_scale_nm`; `matrix`, by axis (fx fy fz
-//! tx ty tz) and gauge, as the sensor stores it; `counts_per_unit` and `unit_n`, `unit_nm`; and
-//! `per_count`, the same matrix in N and Nm per count of a gauge. `problems` is empty if nothing is
-//! wrong with it (`Defect` in the drivers).
+//! `added` is null for a sensor that does not tell. `calibration` asks an F/T board while it
+//! streams, or tells what was read at its start: of these what the sensor knows. `full_scale_n`,
+//! `full_scale_nm`; `matrix`, by axis (fx fy fz tx ty tz) and gauge, as the sensor stores it;
+//! `counts_per_unit` and `unit_n`, `unit_nm`; and `per_count`, the same matrix in N and Nm per
+//! count of a gauge. `problems` is empty if nothing is wrong with it (`Defect` in the drivers).
 //!
 //! `reload` reads the configuration file again. A device whose driver's keys or `listen_only`
 //! differ is stopped, replaced and started, as a restart of the gateway would; changed conversions

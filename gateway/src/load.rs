@@ -35,8 +35,8 @@ impl Load {
     /// commands and repeated frames find no room.
     const HIGH: f64 = 0.7;
 
-    /// Below this, a bus that was nearly full is so no longer: a tenth less, so that a load near the
-    /// limit is told once.
+    /// Below this, a bus that was nearly full is so no longer: a tenth of the bus less, so that a
+    /// load near the limit is told once.
     const NO_LONGER: f64 = 0.6;
 
     /// Whether the bus is nearly full.

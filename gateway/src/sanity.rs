@@ -94,6 +94,13 @@ impl Axis {
         self.quiet = risen.min(self.noise);
     }
 
+    /// It was frozen with the others, which are no longer: its value is the same by chance.
+    const fn release(&mut self) {
+        self.run = 0;
+        self.frozen = false;
+        self.noise = self.quiet;
+    }
+
     /// What follows has no connection with what came before; its noise has.
     const fn interrupt(&mut self) {
         self.last = f64::NAN;
@@ -110,39 +117,54 @@ impl Axis {
 
 /// The past of one sensor.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Sanity([Axis; 6]);
+pub(crate) struct Sanity {
+    axes: [Axis; 6],
+    /// All axes together are frozen.
+    all: bool,
+}
 
 impl Sanity {
     pub(crate) const fn new() -> Self {
-        Self([Axis::NEW; 6])
+        Self {
+            axes: [Axis::NEW; 6],
+            all: false,
+        }
     }
 
     /// Takes a reading; returns the axes that are frozen, bit k for axis k of fx fy fz tx ty tz.
     ///
     /// A reading of which the device itself says that it is not a measurement is not judged.
     pub(crate) fn look(&mut self, wrench: &Wrench, quality: Quality) -> u16 {
-        let axes = &mut self.0;
+        let axes = &mut self.axes;
         if quality.intersects(Quality::FROZEN | Quality::SATURATED) {
             axes.iter_mut().for_each(Axis::interrupt);
+            self.all = false;
             return 0;
         }
         let values = wrench.force.into_iter().chain(wrench.torque);
         axes.iter_mut()
             .zip(values)
-            .for_each(|(axis, v)| axis.take(v));
+            .for_each(|(axis, value)| axis.take(value));
         // Axes that the sensor does not measure are not part of it.
         let measured = || axes.iter().filter(|axis| !axis.last.is_nan());
         let longest = measured().map(|axis| axis.run).max().unwrap_or(0);
+        let together = measured().map(|axis| axis.run).min().unwrap_or(0);
+        if self.all && together == 0 {
+            self.all = false;
+            let same = axes.iter_mut().filter(|axis| axis.run > 0);
+            same.for_each(Axis::release);
+            return 0;
+        }
         if longest < LEAST_RUN {
             return 0;
         }
-        let together = measured().map(|axis| axis.run).min().unwrap_or(0);
         let certain =
             |run: u32, surprise: f64| run >= LEAST_RUN && f64::from(run) * surprise >= CERTAINTY;
-        let all = certain(together, measured().map(Axis::surprise).sum());
+        self.all |= certain(together, measured().map(Axis::surprise).sum());
         let mut mask = 0;
-        for (number, axis) in (0..).zip(axes.iter_mut()).filter(|(_, a)| !a.last.is_nan()) {
-            axis.frozen |= all || certain(axis.run, axis.surprise());
+        let numbered = (0..).zip(axes.iter_mut());
+        for (number, axis) in numbered.filter(|(_, axis)| !axis.last.is_nan()) {
+            axis.frozen |= self.all || certain(axis.run, axis.surprise());
             mask |= u16::from(axis.frozen) << number;
         }
         mask

@@ -472,6 +472,7 @@ fn a_frozen_sensor_is_in_health_and_in_the_log() {
         health["buses"][0]["frame_rate_hz"].as_f64() > Some(0.0),
         "{health}"
     );
+    drop(reader);
     running.end();
 }
 
