@@ -1,5 +1,6 @@
 //! `proprio ctl`: asks a running gateway over its control socket.
 
+use crate::system::load;
 use anyhow::{Context, anyhow, bail};
 use proprio_gateway::control::{ask, gateways};
 use proprio_gateway::plan::ConfigError;
@@ -34,6 +35,15 @@ enum Verb {
         /// The device's name, or BUS/NAME
         device: String,
     },
+    /// The calibration in the memory of an F/T sensor, and what is wrong with it
+    ///
+    /// Full scales and matrix; the sensor goes on to measure. Exit code 1 if something is wrong:
+    /// a full scale of zero, entries of FFFF (erased memory), a row or column of zeros, a matrix
+    /// that is nearly singular.
+    Calibration {
+        /// The device's name, or BUS/NAME
+        device: String,
+    },
     /// Read the gateway's configuration file again
     ///
     /// Takes over the keys of devices, max_silence_ms, listen_only, and ratio, sign and offset of
@@ -49,6 +59,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
         Verb::Status => json!({ "do": "status" }),
         Verb::Devices => json!({ "do": "devices" }),
         Verb::Tare { device } => json!({ "do": "tare", "device": device }),
+        Verb::Calibration { device } => json!({ "do": "calibration", "device": device }),
         Verb::Reload => json!({ "do": "reload" }),
     };
     let text = ask(domain, &robot, &line.to_string())
@@ -80,8 +91,20 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
             Verb::Status => status(&answer),
             Verb::Devices => devices(&answer),
             Verb::Tare { .. } => tared(&answer),
+            Verb::Calibration { .. } => calibration(&answer),
             Verb::Reload => reloaded(&answer),
         }
+    }
+    let problems: Vec<_> = list(&answer, "problems")
+        .iter()
+        .filter_map(Json::as_str)
+        .collect();
+    if !problems.is_empty() {
+        let device = word(&answer, "device");
+        bail!(
+            "the calibration of {device} is wrong: {}; write it again with the maker's tool",
+            problems.join("; ")
+        );
     }
     Ok(())
 }
@@ -141,9 +164,13 @@ fn status(answer: &Json) {
     );
     for bus in list(answer, "buses") {
         print_line!(
-            "  bus {:<24} {:<10} {} frames, {} dropped, {} error frames, {} not sent",
+            "  bus {:<24} {:<10} {}, {} frames, {} dropped, {} error frames, {} not sent",
             word(bus, "name"),
             word(bus, "link"),
+            load(
+                bus["load"].as_f64().unwrap_or(f64::NAN),
+                bus["frame_rate_hz"].as_f64().unwrap_or(f64::NAN)
+            ),
             bus["frames"],
             bus["dropped"],
             bus["error_frames"],
@@ -168,8 +195,12 @@ fn devices(answer: &Json) {
             false => "",
         };
         let refusal = device["refusal"].as_str().map(|why| format!(": {why}"));
+        let frozen = match word(device, "frozen") {
+            "" => String::new(),
+            axes => format!("; {axes} frozen"),
+        };
         print_line!(
-            "{:<24} {:<10} {}, address {} on {}{listens}; channels: {}{}",
+            "{:<24} {:<10} {}, address {} on {}{listens}; channels: {}{frozen}{}",
             word(device, "name"),
             word(device, "state"),
             word(device, "driver"),
@@ -182,19 +213,48 @@ fn devices(answer: &Json) {
 }
 
 fn tared(answer: &Json) {
-    let three = |key: &str| -> String {
-        let axes = list(&answer["added"], key).iter().filter_map(Json::as_f64);
-        axes.map(|axis| format!("{axis:.3}"))
-            .collect::<Vec<_>>()
-            .join(" ")
-    };
-    print_line!(
-        "{} is tared: its board adds {} N, {} Nm until it is tared again or switched off",
-        word(answer, "device"),
-        three("force_n"),
-        three("torque_nm")
-    );
+    let three = |key: &str| numbers(list(&answer["added"], key), |axis| format!("{axis:.3}"));
+    let device = word(answer, "device");
+    match answer["added"].is_null() {
+        true => print_line!("{device} is tared, until it is tared again or switched off"),
+        false => print_line!(
+            "{device} is tared: its board adds {} N, {} Nm until it is tared again or switched off",
+            three("force_n"),
+            three("torque_nm")
+        ),
+    }
     print_line!("offsets that were identified before no longer hold");
+}
+
+/// Numbers in one line.
+fn numbers(list: &[Json], form: impl Fn(f64) -> String) -> String {
+    let all = list.iter().map(|x| form(x.as_f64().unwrap_or(f64::NAN)));
+    all.collect::<Vec<_>>().join(" ")
+}
+
+fn calibration(answer: &Json) {
+    print_line!("{}", word(answer, "device"));
+    let plain = |key: &str| numbers(list(answer, key), |x| x.to_string());
+    if !answer["full_scale_n"].is_null() {
+        let (force, torque) = (plain("full_scale_n"), plain("full_scale_nm"));
+        print_line!("  full scale: {force} N, {torque} Nm");
+    }
+    if !answer["counts_per_unit"].is_null() {
+        print_line!(
+            "  counts per unit of force and torque: {}; units: {} N, {} Nm",
+            plain("counts_per_unit"),
+            answer["unit_n"],
+            answer["unit_nm"]
+        );
+    }
+    let rows = list(answer, "matrix");
+    if !rows.is_empty() {
+        print_line!("  matrix, by gauge:");
+    }
+    for (axis, row) in ["fx", "fy", "fz", "tx", "ty", "tz"].into_iter().zip(rows) {
+        let row = row.as_array().map_or(&[][..], Vec::as_slice);
+        print_line!("    {axis} {}", numbers(row, |x| format!("{x:>13.6}")));
+    }
 }
 
 fn reloaded(answer: &Json) {

@@ -31,7 +31,7 @@ pub(crate) struct Args {
     #[arg(long)]
     skin: bool,
     /// A fault: "lost:0.01", "silent:BOARD@3..4", "saturate:BOARD@5..5.5", "spike:BOARD@6",
-    /// "late_half:BOARD@2..8", "push:LINK=20@8..9"; may be repeated
+    /// "freeze:BOARD@5..6", "late_half:BOARD@2..8", "push:LINK=20@8..9"; may be repeated
     #[arg(long, value_name = "FAULT")]
     fault: Vec<String>,
     /// The file for the truth, written at the end: a table of joint torques, wrenches and motion

@@ -8,7 +8,7 @@ use proprio_topics::ipc::{
 };
 use proprio_topics::{
     ContactDeclaration, Controller, Counter, Description, DeviceState, EstimatorHealth,
-    GatewayHealth, Kind, LinkState, MAX_CHANNELS, Nanos, Publisher, Quality, Role, Sample,
+    GatewayHealth, Kind, LinkState, MAX_CHANNELS, Nanos, Publisher, Quality, Role, Sample, axes,
 };
 use serde_json::{Value as Json, json};
 use std::fs::File;
@@ -272,6 +272,7 @@ impl Glance {
                         "send_failures": bus.send_failures, "queue_full": bus.queue_full,
                         "link_losses": bus.link_losses, "published": bus.published,
                         "publish_failures": bus.publish_failures,
+                        "load": bus.load, "frame_rate_hz": bus.frame_rate,
                         "controller": interface.controller.get().map(Controller::word),
                         "tx_error_counter": interface.tx_error_counter,
                         "rx_error_counter": interface.rx_error_counter,
@@ -295,6 +296,8 @@ impl Glance {
                         "state": device.state.get().map(DeviceState::word),
                         "refusal": proprio_topics::Refusal::from_code(device.refusal)
                             .map(|refusal| refusal.to_string()),
+                        "frozen": axes(device.frozen_axes).to_string(),
+                        "out_of_range": axes(device.beyond_axes).to_string(),
                         "counters": counters,
                     })
                 })
@@ -352,8 +355,9 @@ impl Glance {
         for bus in self.gateway.iter().flat_map(GatewayHealth::buses) {
             let link = bus.link.get().map_or("unknown", LinkState::word);
             print_line!(
-                "    bus {:<24} {link:<10} {} frames, {} dropped, {} error frames, {} not sent",
+                "    bus {:<24} {link:<10} {}, {} frames, {} dropped, {} error frames, {} not sent",
                 bus.name.as_str(),
+                load(bus.load, bus.frame_rate),
                 bus.frames,
                 bus.dropped,
                 bus.error_frames,
@@ -369,9 +373,13 @@ impl Glance {
                 .map(|(counter, count)| format!("{} {count}", counter.word()))
                 .collect();
             print_line!(
-                "    device {:<21} {state:<10} {}",
+                "    device {:<21} {state:<10} {}{}",
                 device.name.as_str(),
-                counts.join(", ")
+                counts.join(", "),
+                match device.frozen_axes {
+                    0 => String::new(),
+                    mask => format!("; {} frozen", axes(mask)),
+                }
             );
         }
         for (name, kind, rate, age, quality) in self.channels() {
@@ -398,6 +406,15 @@ impl Glance {
             }
         }
     }
+}
+
+/// The load of a bus: its share, if the bit rate is known, and its frames per second.
+pub(crate) fn load(share: f64, frame_rate: f64) -> String {
+    let share = match share.is_nan() {
+        true => String::new(),
+        false => format!("load {:.0} %, ", share * 100.0),
+    };
+    format!("{share}{frame_rate:.0} frames/s")
 }
 
 /// Shows the robots of the domain.

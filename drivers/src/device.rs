@@ -1,6 +1,7 @@
 //! The two sides of a device's protocol as sans-I/O state machines: [`Device`] on the host,
 //! [`Board`] on the device; and [`Driver`], which makes both from a device's keys.
 
+use crate::calibration::Calibration;
 use crate::recognise::{Finding, Traffic};
 use crate::signal::Message;
 use crate::{Frame, Id};
@@ -255,6 +256,8 @@ pub enum Mode {
 pub enum Command {
     /// Take the present load of a sensor as its zero, until the board is restarted.
     Tare,
+    /// Read the calibration that a sensor has in its memory.
+    Calibration,
 }
 
 /// Why a command was not begun. Nothing was sent.
@@ -267,6 +270,9 @@ pub enum CommandRefused {
     /// The keys of this device leave nothing for the command to act on.
     #[error("{0}")]
     Useless(&'static str),
+    /// What is asked for has not been read from the board yet.
+    #[error("{0} is not known yet; `proprio ctl devices` shows its state")]
+    Unknown(&'static str),
     /// [`Mode::Listen`].
     #[error(
         "the gateway only listens to this device: another program commands its board, and would \
@@ -286,8 +292,10 @@ pub enum CommandRefused {
 #[non_exhaustive]
 pub enum CommandOutcome {
     /// What the board adds to its measurement from now on, as it reads it back: minus the load at
-    /// the tare \[N, Nm\].
-    Tared(Wrench),
+    /// the tare \[N, Nm\]. `None`: it can not be asked.
+    Tared(Option<Wrench>),
+    /// The calibration in the sensor's memory.
+    Calibration(Calibration),
 }
 
 /// Why a command that was begun has not ended well.
@@ -421,6 +429,12 @@ pub trait Device: Send {
 
     /// Starts again at `now` after a link loss, because the board may have been reset.
     fn restart(&mut self, now: Nanos);
+
+    /// The largest magnitudes fx fy fz tx ty tz for which an F/T sensor is made \[N, Nm\], if they
+    /// are known: values may be beyond them.
+    fn full_scale(&self) -> Option<[f64; 6]> {
+        None
+    }
 
     /// Changes the maximum silence \[ns\] from now on.
     fn set_max_silence(&mut self, max_silence: Nanos);

@@ -7,8 +7,8 @@
 
 use crate::bringup::{Bringup, Inquiry};
 use crate::{
-    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, NotSent,
-    State, Transmit,
+    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Mode,
+    NotSent, State, Transmit,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -49,6 +49,12 @@ pub(crate) trait Family: Send {
     /// The board is not started: requests are not sent, and their answers do not come.
     fn interrupt(&mut self) {}
 
+    /// As [`Device::full_scale`].
+    fn full_scale(&self, link: &Link<Self::Questions>) -> Option<[f64; 6]> {
+        let _ = link;
+        None
+    }
+
     /// As [`Device::command`].
     fn command(
         &mut self,
@@ -80,6 +86,19 @@ pub(crate) struct Link<Q> {
 impl<Q: Inquiry> Link<Q> {
     pub(crate) fn state(&self) -> State {
         self.bringup.state(&self.questions)
+    }
+
+    /// Whether a command can be sent to the board now.
+    pub(crate) fn takes_command(&self) -> Result<(), CommandRefused> {
+        if self.bringup.mode() == Mode::Listen {
+            Err(CommandRefused::ListenOnly)
+        } else if self.state() != State::Streaming {
+            Err(CommandRefused::NotStreaming)
+        } else if !self.bringup.is_idle() {
+            Err(CommandRefused::Busy)
+        } else {
+            Ok(())
+        }
     }
 }
 
@@ -169,6 +188,10 @@ impl<F: Family> Device for Supervised<F> {
         self.link.bringup.restart();
         self.family.interrupt();
         self.family.reset();
+    }
+
+    fn full_scale(&self) -> Option<[f64; 6]> {
+        self.family.full_scale(&self.link)
     }
 
     fn set_max_silence(&mut self, max_silence: Nanos) {

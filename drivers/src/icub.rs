@@ -59,11 +59,17 @@ pub mod class {
 
 /// Commands: the first byte in a command class.
 pub mod command {
+    /// Class 2: `[03, set << 4 | row, column, high, low]`: an entry of the calibration matrix, in
+    /// 1/32768; set 0 is the one in use.
+    pub const SET_MATRIX_RC: u8 = 0x03;
     /// Class 2: start or stop streaming, `[07, mode]`.
     pub const SET_TXMODE: u8 = 0x07;
     /// Class 2: period of the streams, `[08, ms]`. (The document's drawing shows 07; its example,
     /// the header and the code 08.)
     pub const SET_CANDATARATE: u8 = 0x08;
+    /// Class 2: `[0A, set << 4 | row, column]`, answered by `[0A, set << 4 | row, column, high,
+    /// low]`.
+    pub const GET_MATRIX_RC: u8 = 0x0A;
     /// Class 2, mais: `[10, code]`: the resolution; 2 is 8 bits.
     pub const SET_RESOLUTION: u8 = 0x10;
     /// Class 2: `[15, mode]`, or `[15, 2, channel, high, low]`: what the board adds to each

@@ -31,6 +31,7 @@
 //! | `07 00`, `07 03`, `07 04`, `07 01` | send calibrated, uncalibrated, both; stop | none |
 //! | `15 01` | tare: take minus the present load as what is added to each axis | none |
 //! | `16 ch` | what is added to axis ch, signed, in steps of the stream | `16 ch high low` |
+//! | `0A row col` | entry of the calibration matrix, signed, in 1/32768 | `0A row col high low` |
 //! | `39 01`, `3A s` | select the thermometer; its period in s, 0 stops | none |
 //!
 //! Sources: `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12 and
@@ -58,6 +59,12 @@
 //!
 //! [`Quality::ZERO_CHANGED`]: proprio_topics::Quality::ZERO_CHANGED
 //!
+//! # Calibration
+//! [`Command::Calibration`](crate::Command::Calibration) reads the six full scales and the 36
+//! entries of the matrix that are in use (a strain2 stores three sets), one question at a time
+//! while the board streams. Boards have been found with entries of FFFF and full scales of zero.
+//! Nothing is read at the start but the full scales: a matrix that is wrong does not stop a board.
+//!
 //! # Keys
 //! ```toml
 //! full_scale_n = [1804, 1804, 1804]  # both or neither; overrides the board's own
@@ -77,9 +84,9 @@
 
 mod board;
 mod device;
+mod exchange;
 mod frames;
 mod options;
-mod tare;
 
 pub use board::StrainBoard;
 pub use options::{Options, Stream};

@@ -12,7 +12,8 @@
 //! | `100` + n | full scales | 7 | state, then three u16 \[N, or 0.1 Nm\] |
 //! | `700` + n | boot-up | 0 | the board has started |
 //!
-//! - value = i16 / 16384 x full scale of its axis. A value at an end of the 16 bits is reported as
+//! - value = i16 / 16384 x full scale of its axis; one above the full scale is counted as out of
+//!   range. A value at an end of the 16 bits is reported as
 //!   saturated.
 //! - `counter` is equal in both frames of a reading: they are paired by it. It counts the sensor's
 //!   own samples, one each 128.5 us, not the readings: how many readings were lost follows from it
@@ -27,10 +28,12 @@
 //! | `500` + n | none | full scales of moments, answered by them |
 //! | `200` + n | cut-off u16 \[0.01 Hz\], period u32 \[us\] | start |
 //! | `280` + n | none | stop |
+//! | `300` + n | none | take the present load as the zero |
 //!
-//! - **Each start takes the present load as the zero** (as do `180` + n and `300` + n, which other
-//!   programs may send). Readings from such a command to its acknowledgement, and the first after
-//!   it, have ZERO_CHANGED; so has the first after a boot-up.
+//! - **Each start takes the present load as the zero** (as does `180` + n, which other programs may
+//!   send, and `300` + n, which [`Command::Tare`](crate::Command::Tare) sends). Readings from such
+//!   a command to its acknowledgement, and the first after it, have ZERO_CHANGED; so has the first
+//!   after a boot-up.
 //! - After a boot-up the board waits for a start, so it is asked and started again at once.
 //! - The answers to both questions about full scales look alike. One question is asked at a time,
 //!   and the other one only when no answer to the first can be on its way any more. A device that

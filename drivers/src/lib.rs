@@ -37,8 +37,8 @@
 //! and add its line to the list in `registry.rs`. Families share `bringup.rs` (starting a board),
 //! `configure.rs` (confirming its configuration), `pairing.rs` and `group.rs` (combining two
 //! frames, or more), `held.rs` (values of other instants), `bytes.rs` (the numbers of a payload),
-//! `wrench.rs` (force/torque sensors), `keys.rs` (addresses and identifiers) and [`mod@recognise`]
-//! (the evidence for a device in the traffic of a bus).
+//! `wrench.rs` and [`calibration`] (force/torque sensors), `keys.rs` (addresses, identifiers) and
+//! [`mod@recognise`] (the evidence for a device in the traffic of a bus).
 #![no_std]
 extern crate alloc;
 #[cfg(test)]
@@ -48,6 +48,7 @@ pub mod aidin_aft200;
 pub mod ati_netcanoem;
 mod bringup;
 mod bytes;
+pub mod calibration;
 mod canopen;
 pub mod canopen_drive;
 pub mod canopen_encoder;
@@ -83,6 +84,7 @@ mod unit;
 mod wrench;
 pub mod xsens_mti;
 
+pub use calibration::Calibration;
 pub use device::{
     Board, COMMAND_TIME, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded,
     Device, Driver, EncodeError, Fault, Frames, Mode, NotSent, Output, OutputInfo, Outputs, Spec,

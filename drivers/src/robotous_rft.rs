@@ -35,10 +35,13 @@
 //! | `0C` | stop | none |
 //! | `10` | get the rate | `10 code` |
 //! | `0F code` | set the rate | `0F`, 1 or 0 for an error, error |
+//! | `11 01` | bias: the present load becomes the zero, until power-off | none |
 //!
 //! - Rates by code: 1 to 8 are 10, 20, 50, 100, 200, 333, 500, 1000 Hz; 0 is 200 Hz too.
-//! - While it streams, the sensor ignores all commands but stop (and bias, `11`, which this driver
-//!   never sends: it changes the zero). So it is stopped before it is asked.
+//! - While it streams, the sensor ignores all commands but stop and bias. So it is stopped before
+//!   it is asked.
+//! - [`Command::Tare`](crate::Command::Tare) sends bias. The sensor does not confirm it: readings
+//!   from then on for 100 ms, and the first after that, have ZERO_CHANGED.
 //! - The sensor keeps its rate without power. It is set only if the sensor reports another one,
 //!   because its memory wears. A sensor that does not report its rate is started all the same, and
 //!   one that never takes the rate is counted as changed: neither spoils a reading.

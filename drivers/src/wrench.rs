@@ -1,7 +1,7 @@
 //! What force/torque sensors have in common: full scales, the saturation of their axes, and
 //! commands that change their zero.
 
-use crate::SpecError;
+use crate::{COMMAND_TIME, CommandFailed, CommandOutcome, NotSent, SpecError};
 use alloc::vec::Vec;
 use proprio_topics::{Nanos, Quality, Saturation};
 use serde::de::Error as _;
@@ -107,5 +107,94 @@ impl NewZero {
             Some(_) => {}
         }
         Quality::ZERO_CHANGED
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+enum Step {
+    #[default]
+    Idle,
+    /// To be sent before this.
+    Due(Nanos),
+    UnderWay,
+    /// Sent; to be confirmed before this.
+    Sent(Nanos),
+}
+
+/// A tare of one frame, of a sensor that can not be asked what it has taken as its zero.
+#[derive(Debug, Default)]
+pub(crate) struct TareCommand {
+    step: Step,
+    outcome: Option<Result<CommandOutcome, CommandFailed>>,
+}
+
+impl TareCommand {
+    /// Whether one has begun and its outcome has not been taken.
+    pub(crate) fn is_open(&self) -> bool {
+        self.step != Step::Idle || self.outcome.is_some()
+    }
+
+    pub(crate) fn begin(&mut self, now: Nanos) {
+        self.step = Step::Due(now + COMMAND_TIME);
+    }
+
+    /// Whether the frame is to be sent at `now`.
+    pub(crate) fn poll(&mut self, now: Nanos) -> bool {
+        match self.step {
+            Step::Due(until) if now <= until => {
+                self.step = Step::UnderWay;
+                return true;
+            }
+            Step::Due(_) => self.end(Err(CommandFailed::NotSent)),
+            Step::Sent(until) if now > until => self.end(Err(CommandFailed::NoAnswer)),
+            _ => {}
+        }
+        false
+    }
+
+    /// What became of the frame. It is confirmed within `confirmed` after it was sent; `None`: not
+    /// at all.
+    pub(crate) fn sent(&mut self, outcome: Result<Nanos, NotSent>, confirmed: Option<Nanos>) {
+        match (self.step, outcome, confirmed) {
+            (Step::UnderWay, Ok(t), Some(within)) => self.step = Step::Sent(t + within),
+            (Step::UnderWay, Ok(_), None) => self.end(Ok(CommandOutcome::Tared(None))),
+            (Step::UnderWay, Err(_), _) => self.end(Err(CommandFailed::NotSent)),
+            _ => {}
+        }
+    }
+
+    /// The sensor has confirmed a command.
+    pub(crate) fn confirm(&mut self) {
+        // Its answer may come before the interface tells that the frame was sent.
+        if matches!(self.step, Step::UnderWay | Step::Sent(_)) {
+            self.end(Ok(CommandOutcome::Tared(None)));
+        }
+    }
+
+    /// The device is started again or stopped.
+    pub(crate) fn interrupt(&mut self) {
+        match self.step {
+            Step::Idle => {}
+            Step::Due(_) => self.end(Err(CommandFailed::NotSent)),
+            Step::UnderWay | Step::Sent(_) => self.end(Err(CommandFailed::Interrupted)),
+        }
+    }
+
+    fn end(&mut self, outcome: Result<CommandOutcome, CommandFailed>) {
+        self.step = Step::Idle;
+        self.outcome = Some(outcome);
+    }
+
+    pub(crate) fn outcome(&mut self) -> Option<Result<CommandOutcome, CommandFailed>> {
+        self.outcome.take()
+    }
+
+    /// Time of the next poll.
+    pub(crate) fn wake(&self) -> Option<Nanos> {
+        match self.step {
+            Step::Idle | Step::UnderWay => None,
+            Step::Due(_) => Some(Nanos::MIN),
+            Step::Sent(until) => Some(until + Nanos(1)),
+        }
     }
 }

@@ -241,7 +241,10 @@ impl<S: Sink> Bus<S> {
             // Before the call: within it a receiver may be woken and take the processor.
             let then = clock.now();
             let outcome = match self.link.send(&waiting.frame) {
-                Ok(()) => Ok(then),
+                Ok(()) => {
+                    self.status.on_wire(&waiting.frame);
+                    Ok(then)
+                }
                 Err(SendError::Full) => {
                     self.status.queue_full.fetch_add(1, Relaxed);
                     self.queue.retry = now + RETRY;

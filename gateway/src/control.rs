@@ -7,8 +7,15 @@
 //! |---|---|
 //! | `{"do": "status"}` | the gateway and its buses |
 //! | `{"do": "devices"}` | the devices: state, bus, driver, channels |
-//! | `{"do": "tare", "device": "..."}` | `added`: what the board adds from then on \[N, Nm\] |
+//! | `{"do": "tare", "device": "..."}` | `added`: what the board adds from now on \[N, Nm\] |
+//! | `{"do": "calibration", "device": "..."}` | the sensor's own, and `problems` of it |
 //! | `{"do": "reload"}` | `changed`: the devices that have changed, and which of their keys |
+//!
+//! `added` is null for a sensor that does not tell. `calibration` asks an F/T board while it
+//! streams, or tells what was read at its start: of these what the sensor knows. `full_scale_n`,
+//! `full_scale_nm`; `matrix`, by axis (fx fy fz tx ty tz) and gauge, as the sensor stores it;
+//! `counts_per_unit` and `unit_n`, `unit_nm`; and `per_count`, the same matrix in N and Nm per
+//! count of a gauge. `problems` is empty if nothing is wrong with it (`Defect` in the drivers).
 //!
 //! `reload` reads the configuration file again. A device whose driver's keys or `listen_only`
 //! differ is stopped, replaced and started, as a restart of the gateway would; changed conversions
@@ -59,6 +66,7 @@ pub(crate) enum Order {
     Status,
     Devices,
     Tare { device: String },
+    Calibration { device: String },
     Reload,
 }
 
@@ -74,7 +82,7 @@ pub(crate) fn refusal(error: &dyn std::fmt::Display) -> Json {
 }
 
 impl Order {
-    const WORDS: [&str; 4] = ["status", "devices", "tare", "reload"];
+    const WORDS: [&str; 5] = ["status", "devices", "tare", "calibration", "reload"];
 
     /// The order in a line.
     fn parse(line: &[u8]) -> Result<Self, String> {
@@ -88,7 +96,8 @@ impl Order {
             .map_err(|e| format!("a line is a JSON object such as {{\"do\": \"status\"}}: {e}"))?;
         let order = match (word.as_str(), device) {
             ("tare", Some(device)) => return Ok(Self::Tare { device }),
-            ("tare", None) => return Err("tare needs a device".into()),
+            ("calibration", Some(device)) => return Ok(Self::Calibration { device }),
+            ("tare" | "calibration", None) => return Err(format!("{word} needs a device")),
             ("status", None) => Self::Status,
             ("devices", None) => Self::Devices,
             ("reload", None) => Self::Reload,
@@ -366,13 +375,14 @@ mod tests {
 
     #[test]
     fn a_wrong_line_says_what_would_be_right() {
-        let tare = Order::Tare {
-            device: "a".to_owned(),
-        };
+        let device = || "a".to_owned();
+        let tare = Order::Tare { device: device() };
+        let calibration = Order::Calibration { device: device() };
         for (line, order) in [
             (r#"{"do": "status"}"#, Order::Status),
             (r#" { "do" : "devices" } "#, Order::Devices),
             (r#"{"device": "a", "do": "tare"}"#, tare),
+            (r#"{"do": "calibration", "device": "a"}"#, calibration),
         ] {
             assert_eq!(Order::parse(line.as_bytes()), Ok(order));
         }
@@ -387,6 +397,7 @@ mod tests {
             ),
             (r#"{"device": "a"}"#, &["missing field `do`"]),
             (r#"{"do": "tare"}"#, &["tare needs a device"]),
+            (r#"{"do": "calibration"}"#, &["calibration needs a device"]),
             (
                 r#"{"do": "status", "device": "a"}"#,
                 &["status takes no device"],
@@ -396,7 +407,7 @@ mod tests {
                 &[
                     "no order \"tara\"",
                     "did you mean \"tare\"?",
-                    "status, devices, tare, reload",
+                    "status, devices, tare, calibration, reload",
                 ],
             ),
             (r#"{"do": "zzz"}"#, &["no order \"zzz\"; there is status"]),

@@ -11,7 +11,7 @@ pub use crate::thread::open_link;
 use crate::clock::{Clock, Monotonic};
 use crate::config::Source;
 use crate::control;
-use crate::health::{HealthLog, fill_health};
+use crate::health::{HealthLog, Loads, fill_health};
 use crate::link::adapter::{self, Adapter};
 use crate::link::interface::{Netlink, Observer};
 use crate::operator::Operator;
@@ -152,6 +152,7 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
             None
         }
     };
+    let mut loads = Loads::new(&plan);
     let mut operator = Operator::new(config, plan);
     tracing::info!(
         robot = operator.plan().robot,
@@ -187,6 +188,7 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
         let now = clock.now();
         let statuses = statuses(&threads);
         fill_health(&mut health, &statuses, &observer.newest());
+        loads.measure(&mut health, &statuses, now);
         health_log.log_changes(&health, &statuses);
         // A reader that cannot be reached now is no reason to stop; the next health follows in 0.1
         // s.

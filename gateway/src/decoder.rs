@@ -5,11 +5,14 @@ use crate::dispatch::Dispatch;
 use crate::inbox::{Replacement, Reply, Request};
 use crate::joints::Joints;
 use crate::plan::{BusPlan, DevicePlan, Route};
+use crate::sanity::Sanity;
 use crate::status::BusStatus;
 use proprio_drivers::{
     Claim, CommandFailed, Decoded, Device, Frame, Mode, NotSent, SpecError, State, Transmit,
 };
-use proprio_topics::{Counter, Header, MAX_CHANNELS, Nanos, Quality, Reading, Sample, StampKind};
+use proprio_topics::{
+    Counter, Header, MAX_CHANNELS, Nanos, Quality, Reading, Sample, StampKind, Wrench,
+};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 
@@ -34,6 +37,8 @@ struct Running {
     device: Box<dyn Device>,
     routes: Vec<Route>,
     request: Open,
+    /// The past of its wrenches, per route.
+    sanity: Vec<Sanity>,
 }
 
 /// The request of a device that has not been replied to.
@@ -53,6 +58,17 @@ pub fn build(device: &DevicePlan, mode: Option<Mode>) -> Result<Box<dyn Device>,
     let mut spec = device.spec.clone();
     spec.mode = mode.unwrap_or(spec.mode);
     device.options.device(&spec)
+}
+
+/// The axes whose value is beyond the sensor's full scale, if that is known: bit k for axis k.
+fn beyond(wrench: &Wrench, full_scale: Option<[f64; 6]>) -> u16 {
+    let values = wrench.force.iter().chain(&wrench.torque);
+    let all = values.zip(full_scale.unwrap_or([f64::INFINITY; 6]));
+    // Half a step of 16 bits: a value at the end of its range is not beyond it.
+    let is_beyond = |(value, most): (&f64, f64)| value.abs() > most * (1.0 + 0.5 / 32768.0);
+    (0..).zip(all).fold(0, |mask, (axis, pair)| {
+        mask | u16::from(is_beyond(pair)) << axis
+    })
 }
 
 impl Decoder {
@@ -75,6 +91,7 @@ impl Decoder {
                     device: build(device, mode)?,
                     routes: device.routes.clone(),
                     request: Open::None,
+                    sanity: vec![Sanity::new(); device.routes.len()],
                 })
             })
             .collect::<Result<Vec<_>, SpecError>>()?;
@@ -115,6 +132,7 @@ impl Decoder {
     /// Processes a frame; calls `publish` for every sample that it completes.
     pub fn on_frame(&mut self, frame: &Frame, mut publish: impl FnMut(&mut Sample)) {
         self.status.frames.fetch_add(1, Relaxed);
+        self.status.on_wire(frame);
         self.status.last_frame.store(frame.t.0, Relaxed);
         let mut claimed = false;
         for number in self.dispatch.find(frame.id) {
@@ -130,7 +148,8 @@ impl Decoder {
                     .count(number, fault.counter, u64::from(fault.count));
             }
             for output in &self.decoded.readings {
-                let Some(route) = running.routes.iter().find(|r| r.output == output.output) else {
+                let mut routes = running.routes.iter().zip(0_usize..);
+                let Some((route, at)) = routes.find(|(r, _)| r.output == output.output) else {
                     continue;
                 };
                 let header = Header {
@@ -179,6 +198,19 @@ impl Decoder {
                     {
                         quality |= Quality::GAP_BEFORE | Quality::ZERO_CHANGED;
                     }
+                }
+                if let Reading::Wrench(wrench) = &output.reading {
+                    let sanity = running.sanity.get_mut(at);
+                    let frozen = sanity.map_or(0, |sanity| sanity.look(wrench, quality));
+                    let beyond = beyond(wrench, running.device.full_scale());
+                    if frozen != 0 {
+                        quality |= Quality::FROZEN;
+                        self.status.count(number, Counter::Frozen, 1);
+                    }
+                    if beyond != 0 {
+                        self.status.count(number, Counter::OutOfRange, 1);
+                    }
+                    self.status.set_axes(number, frozen, beyond);
                 }
                 let header = Header { quality, ..header };
                 self.status.count(number, Counter::Readings, 1);
@@ -337,6 +369,7 @@ impl Decoder {
             }
             if let Some(device) = &mut new.device {
                 std::mem::swap(device, &mut running.device);
+                running.sanity.fill(Sanity::new());
             }
             std::mem::swap(&mut new.routes, &mut running.routes);
             self.status.set_state(number, running.device.state());
@@ -461,6 +494,7 @@ mod tests {
             }),
             routes: Vec::new(),
             request: Open::None,
+            sanity: Vec::new(),
         };
         let mut decoder = Decoder::of(0, vec![running], Joints::default(), Arc::clone(&status));
         assert_eq!(decoder.claims(), [Claim::exclusive(answer)]);

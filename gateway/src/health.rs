@@ -3,10 +3,12 @@
 
 use crate::clock::realtime_offset;
 use crate::link::error_frame::ErrorFrame;
+use crate::load::{BitRates, Load, Meter};
+use crate::plan::{BusPlan, Plan};
 use crate::status::BusStatus;
 use proprio_topics::{
     BusError, BusHealth, Controller, Counter, DeviceHealth, DeviceState, GatewayHealth,
-    InterfaceHealth, LinkState, Refusal,
+    InterfaceHealth, LinkState, Nanos, Refusal, axes,
 };
 
 /// Fills the health message from the counters of the buses and what is known of their interfaces.
@@ -18,8 +20,13 @@ pub(crate) fn fill_health(
     health.realtime_offset = realtime_offset();
     (health.bus_count, health.device_count) = (0, 0);
     for (i, (slot, status)) in health.buses.iter_mut().zip(buses).enumerate() {
-        *slot = status.bus();
-        slot.interface = interfaces.get(i).copied().unwrap_or_default();
+        *slot = BusHealth {
+            // As they were measured last: see `Loads`.
+            load: slot.load,
+            frame_rate: slot.frame_rate,
+            interface: interfaces.get(i).copied().unwrap_or_default(),
+            ..status.bus()
+        };
         // A gateway that is started on a bus-off controller receives no error frame that says so.
         if slot.link == LinkState::NoCarrier && slot.interface.controller == Controller::BusOff {
             slot.link = LinkState::BusOff.in_memory();
@@ -33,6 +40,45 @@ pub(crate) fn fill_health(
     {
         *slot = device;
         health.device_count += 1;
+    }
+}
+
+/// Measures the loads of all buses.
+pub(crate) struct Loads(Vec<(Meter, Option<BitRates>)>);
+
+impl Loads {
+    /// For the buses of `plan`, with the bit rates that it states.
+    pub(crate) fn new(plan: &Plan) -> Self {
+        let stated = |bus: &BusPlan| (!bus.rates_assumed).then_some(bus.rates);
+        let buses = plan.buses.iter();
+        Self(buses.map(|bus| (Meter::new(), stated(bus))).collect())
+    }
+
+    /// Writes the loads until `now` into `health`, which has been filled from `buses`.
+    pub(crate) fn measure(&mut self, health: &mut GatewayHealth, buses: &[&BusStatus], now: Nanos) {
+        let slots = health.buses.iter_mut().zip(buses);
+        for ((slot, status), (meter, stated)) in slots.zip(&mut self.0) {
+            let interface = &slot.interface;
+            let mut totals = status.totals();
+            // A virtual interface has no bit rate, and counts what it sends as received, too. How
+            // many bits of CAN FD are sent at which rate, its totals do not tell.
+            if interface.bit_rate > 0 && interface.fd == 0 {
+                totals.all_frames = interface.rx_frames + interface.tx_frames;
+                totals.all_bytes = interface.rx_bytes + interface.tx_bytes;
+            }
+            let known = |rate: u32, other: Option<u32>| match rate {
+                0 => other,
+                rate => Some(rate),
+            };
+            let nominal = known(interface.bit_rate, stated.map(|rates| rates.nominal));
+            let data = known(interface.data_bit_rate, stated.map(|rates| rates.data));
+            let rates = nominal.map(|nominal| BitRates {
+                nominal,
+                data: data.unwrap_or(nominal),
+            });
+            let load = meter.measure(now, totals, rates);
+            (slot.load, slot.frame_rate) = (load.share, load.frames);
+        }
     }
 }
 
@@ -55,6 +101,11 @@ impl Run {
             (self.0 + 1).min(Self::REST)
         };
         begins
+    }
+
+    /// Whether it has not happened for long enough to begin anew.
+    const fn is_over(self) -> bool {
+        self.0 >= Self::REST
     }
 }
 
@@ -96,6 +147,8 @@ impl Trouble {
 struct DeviceRuns {
     faults: [Run; Counter::ALL.len()],
     trouble: Option<Trouble>,
+    /// It was told that axes are frozen, or beyond the full scale.
+    doubted: [bool; 2],
 }
 
 /// Turns health into log lines.
@@ -110,6 +163,8 @@ pub(crate) struct HealthLog {
 #[derive(Clone, Copy)]
 struct BusRuns {
     dropped: Run,
+    /// It was told that the bus is nearly full.
+    full: bool,
     errors: [Run; BusError::ALL.len()],
 }
 
@@ -137,6 +192,7 @@ impl HealthLog {
     ) {
         let none = BusRuns {
             dropped: Run::NONE,
+            full: false,
             errors: [Run::NONE; BusError::ALL.len()],
         };
         self.buses.resize(health.buses().len(), none);
@@ -168,6 +224,7 @@ impl HealthLog {
                 }
             }
             log_controller(bus, before);
+            log_load(bus, &mut runs.full);
             // One frame may report several causes: it is told once.
             let mut told: Vec<ErrorFrame> = Vec::new();
             for (cause, run) in BusError::ALL.into_iter().zip(&mut runs.errors) {
@@ -200,15 +257,18 @@ impl HealthLog {
         let none = DeviceRuns {
             faults: [Run::NONE; Counter::ALL.len()],
             trouble: None,
+            doubted: [false; 2],
         };
         self.devices.resize(health.devices().len(), none);
         for (i, (device, runs)) in health.devices().iter().zip(&mut self.devices).enumerate() {
             let before = last.and_then(|l| l.devices().get(i));
             let name = device.name.as_str();
             log_state(device, before, &mut runs.trouble);
+            log_doubts(device, before, runs);
             let runs = &mut runs.faults;
             for (counter, run) in Counter::ALL.into_iter().zip(runs).filter(|(c, _)| {
-                !matches!(c, Counter::Frames | Counter::Readings | Counter::Starts)
+                use Counter::{Frames, Frozen, OutOfRange, Readings, Starts};
+                !matches!(c, Frames | Frozen | OutOfRange | Readings | Starts)
             }) {
                 let of = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
                 let count = of(device).unwrap_or(0);
@@ -263,6 +323,65 @@ fn log_state(device: &DeviceHealth, before: Option<&DeviceHealth>, trouble: &mut
                 tracing::info!(device = name, "{}", state.word());
             }
         }
+    }
+}
+
+/// Logs when a sensor begins to send values that cannot be true, and when it has ended for 5 s.
+fn log_doubts(device: &DeviceHealth, before: Option<&DeviceHealth>, runs: &mut DeviceRuns) {
+    let name = device.name.as_str();
+    let doubts = [
+        (
+            Counter::Frozen,
+            device.frozen_axes,
+            "repeats itself, although its noise made that impossible: its readings are marked \
+             frozen. Check the sensor's cable, its temperature, and whether a gauge is saturated \
+             (too much load, an offset far from zero); switch its board off and on",
+        ),
+        (
+            Counter::OutOfRange,
+            device.beyond_axes,
+            "is beyond the sensor's full scale: the value is doubtful. Check the load, the offset \
+             (`proprio ctl calibration` shows the full scale), and full_scale_n and full_scale_nm \
+             in gateway.toml",
+        ),
+    ];
+    for ((counter, mask, what), doubted) in doubts.into_iter().zip(&mut runs.doubted) {
+        let of = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
+        let new = increase(of(device).unwrap_or(0), before.and_then(of));
+        let Some(run) = runs.faults.get_mut(counter as usize) else {
+            continue;
+        };
+        if run.begins(mask != 0 || new > 0) {
+            *doubted = true;
+            // It may have ended before this look at it.
+            let which = match mask {
+                0 => "a value".to_owned(),
+                mask => axes(mask).to_string(),
+            };
+            tracing::warn!(device = name, "{which} {what}");
+        } else if *doubted && run.is_over() {
+            *doubted = false;
+            tracing::info!(device = name, "no longer {}", counter.word());
+        }
+    }
+}
+
+/// Logs a bus that is nearly full, and when it is no longer.
+fn log_load(bus: &BusHealth, full: &mut bool) {
+    let (name, was) = (bus.name.as_str(), *full);
+    *full = Load::stays_high(bus.load, was);
+    match (was, *full) {
+        (false, true) => tracing::warn!(
+            bus = name,
+            "its frames need up to {:.0} % of the bus ({:.0} frames/s): frames of low priority \
+             come late; make periods longer, or move devices to another bus",
+            bus.load * 100.0,
+            bus.frame_rate
+        ),
+        (true, false) => {
+            tracing::info!(bus = name, "its load is {:.0} % again", bus.load * 100.0);
+        }
+        _ => {}
     }
 }
 
@@ -582,5 +701,117 @@ mod tests {
             "{overflow:?}"
         );
         assert!(overflow[1].contains("frames were lost"), "{overflow:?}");
+    }
+
+    #[test]
+    fn a_frozen_axis_is_one_line_with_what_to_check() {
+        let mut log = HealthLog::default();
+        let mut health = health(BusHealth::EMPTY);
+        health.device_count = 1;
+        health.devices[0].state = DeviceState::Streaming.in_memory();
+        let mut tick = |frozen: u16, beyond: u16, count: u64| {
+            health.devices[0].frozen_axes = frozen;
+            health.devices[0].beyond_axes = beyond;
+            health.devices[0].counters[Counter::Frozen as usize] += count;
+            logged(|| log.log_changes(&health, &[]))
+        };
+        assert_eq!(tick(0, 0, 0).len(), 1, "it streams");
+        let lines = tick(0b10_0001, 0, 5);
+        let [line] = &lines[..] else {
+            panic!("{lines:?}")
+        };
+        for part in ["WARN fx, tz repeats itself", "cable", "saturated"] {
+            assert!(line.contains(part), "{line}");
+        }
+        // It comes and goes: one line.
+        for k in 0..100 {
+            assert_eq!(tick(if k % 2 == 0 { 0x3F } else { 0 }, 0, 0), [""; 0]);
+        }
+        let after: Vec<_> = (0..Run::REST + 5).flat_map(|_| tick(0, 0, 0)).collect();
+        assert_eq!(after.len(), 1, "{after:?}");
+        assert!(after[0].contains("INFO no longer frozen"), "{after:?}");
+        // One that has ended before anybody looked.
+        let lines = tick(0, 0, 3);
+        assert!(
+            lines.len() == 1 && lines[0].contains("a value repeats"),
+            "{lines:?}"
+        );
+        let lines = tick(0, 0b100, 0);
+        assert!(
+            lines.len() == 1 && lines[0].contains("fz is beyond"),
+            "{lines:?}"
+        );
+    }
+
+    #[test]
+    fn a_full_bus_is_told_once_and_its_end_too() {
+        let mut log = HealthLog::default();
+        let mut tick = |load| {
+            let bus = BusHealth {
+                load,
+                frame_rate: 5800.0,
+                ..status().bus()
+            };
+            logged(|| log.log_changes(&health(bus), &[]))
+        };
+        assert_eq!(tick(f64::NAN), [""; 0]);
+        assert_eq!(tick(0.7), [""; 0]);
+        let lines = tick(0.75);
+        assert!(lines.len() == 1 && lines[0].contains("up to 75 % of the bus (5800 frames/s)"));
+        for load in [0.72, 0.65, 0.9, 0.61] {
+            assert_eq!(tick(load), [""; 0]);
+        }
+        let lines = tick(0.3);
+        assert!(
+            lines.len() == 1 && lines[0].contains("its load is 30 % again"),
+            "{lines:?}"
+        );
+    }
+
+    /// A controller tells its bit rate and all frames on the bus; a virtual interface does not, and
+    /// without a stated bit rate there is no share.
+    #[test]
+    fn the_load_is_measured_with_what_is_known() {
+        let text = "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\nRATE\n\
+                    source = { kind = \"virtual\", name = \"b\" }\n";
+        let measured = |rate: &str, bit_rate: u32, fd: u32| {
+            let plan = Plan::parse(&text.replace("RATE", rate), Path::new(".")).unwrap();
+            let status = BusStatus::new(0, &plan.buses[0]);
+            let mut loads = Loads::new(&plan);
+            let mut health = Box::new(GatewayHealth::new(Nanos::ZERO));
+            let frame = proprio_drivers::Frame::new(proprio_drivers::Id::standard(1), &[0; 8]);
+            for second in 0..3 {
+                let interface = InterfaceHealth {
+                    rx_frames: 2000 * second,
+                    tx_frames: 1000 * second,
+                    rx_bytes: 16_000 * second,
+                    tx_bytes: 8000 * second,
+                    bit_rate,
+                    fd,
+                    ..InterfaceHealth::default()
+                };
+                fill_health(&mut health, &[&status], &[interface]);
+                loads.measure(&mut health, &[&status], Nanos::from_seconds(second as f64));
+                for _ in 0..1000 {
+                    status
+                        .frames
+                        .fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+                    status.on_wire(&frame);
+                }
+            }
+            // What is asked between two measurements shows the last one.
+            fill_health(&mut health, &[&status], &[]);
+            let bus = health.buses()[0];
+            (bus.frame_rate.round(), bus.load)
+        };
+        let (frames, share) = measured("", 0, 0);
+        assert!(frames == 1000.0 && share.is_nan(), "{frames} {share}");
+        let close = |(frames, share): (f64, f64), f: f64, s: f64| {
+            assert!(frames == f && (share - s).abs() < 1e-3, "{frames} {share}");
+        };
+        close(measured("bit_rate = 500000", 0, 0), 1000.0, 0.27);
+        close(measured("bit_rate = 500000", 1_000_000, 0), 3000.0, 0.405);
+        close(measured("", 1_000_000, 0), 3000.0, 0.405);
+        close(measured("", 1_000_000, 1), 1000.0, 0.135);
     }
 }

@@ -1,5 +1,6 @@
-//! The share of a bus's time that its devices need, from their own frames: what `--check` shows,
-//! and what a configuration that cannot work is refused by.
+//! The share of a bus's time that frames take. [`of_bus`] is what its devices need, from their own
+//! frames: `--check` shows it, and a configuration that cannot work is refused by it. [`Meter`] is
+//! what is measured while the gateway runs.
 
 use proprio_drivers::{
     Board, Decoded, EncodeError, Format, Frame, Frames, Id, Mode, Options, Spec, SpecError,
@@ -8,6 +9,7 @@ use proprio_topics::{
     Actuator, Gauges, Imu, JointState, Kind, Nanos, Quality, Reading, Skin, StampKind, Temperature,
     Wrench,
 };
+use std::collections::VecDeque;
 
 /// Bit rates of a bus \[bit/s\].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -33,14 +35,38 @@ impl Load {
     /// commands and repeated frames find no room.
     const HIGH: f64 = 0.7;
 
+    /// Below this, a bus that was nearly full is so no longer: a tenth of the bus less, so that a
+    /// load near the limit is told once.
+    const NO_LONGER: f64 = 0.6;
+
     /// Whether the bus is nearly full.
     #[must_use]
     pub fn is_high(self) -> bool {
         self.share > Self::HIGH
     }
+
+    /// Whether a bus whose share was high before still is.
+    #[must_use]
+    pub fn stays_high(share: f64, was_high: bool) -> bool {
+        share
+            > if was_high {
+                Self::NO_LONGER
+            } else {
+                Self::HIGH
+            }
+    }
 }
 
-/// The longest time that `frame` needs on a bus \[s\], with the interframe space.
+/// The most bits that a frame can have on a bus, with the interframe space.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Bits {
+    /// At the nominal rate.
+    pub nominal: u32,
+    /// At the rate of the data phase of CAN FD.
+    pub data: u32,
+}
+
+/// The most bits of `frame`.
 ///
 /// Classic: a standard frame with n bytes has 47 + 8 n bits, of which 34 + 8 n are stuffed: after
 /// the first five at most one in four (Davis et al., Controller Area Network schedulability
@@ -52,15 +78,18 @@ impl Load {
 /// count are stuffed as above; the stuff bits are counted where they can fall. An extended frame
 /// has 19 bits more in arbitration.
 #[must_use]
-pub fn seconds_on_wire(frame: &Frame, rates: BitRates) -> f64 {
-    let bytes = frame.data().len();
-    let (nominal, data) = (f64::from(rates.nominal), f64::from(rates.data));
+#[allow(clippy::cast_possible_truncation)] // at most 64 bytes
+pub fn bits_on_wire(frame: &Frame) -> Bits {
+    let bytes = frame.data().len() as u32;
     let extended = matches!(frame.id, Id::Extended(_));
-    let stuffed = |bits: usize| (bits - 1) / 4;
+    let stuffed = |bits: u32| (bits - 1) / 4;
     match frame.format {
         Format::Classic | Format::Remote | Format::Error => {
             let bits = if extended { 54 } else { 34 } + 8 * bytes;
-            (bits + 13 + stuffed(bits)) as f64 / nominal
+            Bits {
+                nominal: bits + 13 + stuffed(bits),
+                data: 0,
+            }
         }
         Format::Fd {
             bit_rate_switch, ..
@@ -71,9 +100,114 @@ pub fn seconds_on_wire(frame: &Frame, rates: BitRates) -> f64 {
             let fast = payload + checksum + checksum.div_ceil(4) + stuffed(arbitration + payload)
                 - stuffed(arbitration);
             let slow = arbitration + stuffed(arbitration) + 13;
-            let fast_rate = if bit_rate_switch { data } else { nominal };
-            slow as f64 / nominal + fast as f64 / fast_rate
+            match bit_rate_switch {
+                true => Bits {
+                    nominal: slow,
+                    data: fast,
+                },
+                false => Bits {
+                    nominal: slow + fast,
+                    data: 0,
+                },
+            }
         }
+    }
+}
+
+/// The longest time that `frame` needs on a bus \[s\], with the interframe space.
+#[must_use]
+pub fn seconds_on_wire(frame: &Frame, rates: BitRates) -> f64 {
+    let Bits { nominal, data } = bits_on_wire(frame);
+    f64::from(nominal) / f64::from(rates.nominal) + f64::from(data) / f64::from(rates.data)
+}
+
+/// What has been on a bus until an instant: totals, of which differences are taken.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Totals {
+    /// Frames that the gateway has received and sent.
+    pub frames: u64,
+    /// Their bits at the nominal rate ([`bits_on_wire`]).
+    pub nominal_bits: u64,
+    /// Their bits at the rate of the data phase.
+    pub data_bits: u64,
+    /// Frames that the interface has received and sent, for all programs: also those that the
+    /// gateway's filters hide. 0: not known.
+    pub all_frames: u64,
+    /// The bytes of data in these.
+    pub all_bytes: u64,
+}
+
+/// Measures the load of one bus over the last [`Meter::WINDOW`].
+///
+/// Where the kernel tells of all frames on the bus, those that filters hide are counted, too: as
+/// classic frames with 11-bit identifiers, from their number and bytes. The greater of this and of
+/// the gateway's own frames is the load.
+#[derive(Debug, Clone)]
+pub struct Meter {
+    /// The newest first.
+    past: VecDeque<(Nanos, Totals)>,
+    /// The last load that was far enough apart to be measured.
+    load: Load,
+}
+
+impl Meter {
+    /// The time over which the load is measured.
+    pub const WINDOW: Nanos = Nanos::from_millis(1000);
+    /// A shorter time tells no rate yet.
+    const LEAST: Nanos = Nanos::from_millis(200);
+
+    /// A bus of which nothing was measured.
+    #[must_use]
+    pub const fn new() -> Self {
+        Self {
+            past: VecDeque::new(),
+            load: Load {
+                frames: 0.0,
+                share: f64::NAN,
+            },
+        }
+    }
+
+    /// The load of the time before `now`, with the totals until then. Without `rates` the share is
+    /// NaN.
+    pub fn measure(&mut self, now: Nanos, totals: Totals, rates: Option<BitRates>) -> Load {
+        // An interface that was set up again counts from zero.
+        if let Some((_, last)) = self.past.front()
+            && (last.all_frames > totals.all_frames || last.frames > totals.frames)
+        {
+            self.past.clear();
+        }
+        self.past.push_front((now, totals));
+        // The last one that is at least the window ago is the one to compare with.
+        while let [.., (before, _), _] = self.past.make_contiguous()
+            && now - *before >= Self::WINDOW
+        {
+            self.past.pop_back();
+        }
+        let Some((then, before)) = self.past.back().filter(|(t, _)| now - *t >= Self::LEAST) else {
+            return self.load;
+        };
+        let seconds = (now - *then).seconds();
+        let of = |part: fn(&Totals) -> u64| part(&totals).saturating_sub(part(before)) as f64;
+        let (all, bytes) = (of(|t| t.all_frames), of(|t| t.all_bytes));
+        let share = rates.map_or(f64::NAN, |rates| {
+            let (nominal, data) = (f64::from(rates.nominal), f64::from(rates.data));
+            let own = of(|t| t.nominal_bits) / nominal + of(|t| t.data_bits) / data;
+            // As `bits_on_wire`: 47 + 8 n bits and a quarter of 33 + 8 n.
+            let hidden = (55.25 * all + 10.0 * bytes) / nominal;
+            own.max(hidden) / seconds
+        });
+        self.load = Load {
+            frames: of(|t| t.frames).max(all) / seconds,
+            share,
+        };
+        self.load
+    }
+}
+
+impl Default for Meter {
+    fn default() -> Self {
+        Self::new()
     }
 }
 
@@ -370,5 +504,118 @@ mod tests {
         assert!(problem.contains("up to 138 % of 500 kbit/s"), "{problem}");
         let problem = plan(&boards(1), "bit_rate = 5").unwrap_err();
         assert!(problem.contains("bit_rate = 5 must be"), "{problem}");
+    }
+
+    /// A second of frames of 135 bits, one per millisecond.
+    fn traffic(ms: i64) -> Totals {
+        let ms = ms.unsigned_abs();
+        Totals {
+            frames: ms,
+            nominal_bits: 135 * ms,
+            ..Totals::default()
+        }
+    }
+
+    #[test]
+    fn the_load_is_that_of_the_last_second() {
+        let mut meter = Meter::new();
+        let mut measure =
+            |ms: i64, totals| meter.measure(Nanos::from_millis(ms), totals, Some(RATES));
+        assert!(measure(0, traffic(0)).share.is_nan());
+        assert!(
+            measure(100, traffic(100)).share.is_nan(),
+            "too short a time"
+        );
+        let close = |load: Load, frames: f64, share: f64| {
+            assert!((load.frames - frames).abs() < 1e-6, "{load:?}");
+            assert!((load.share - share).abs() < 1e-9, "{load:?}");
+        };
+        for ms in (200..3000).step_by(100) {
+            close(measure(ms, traffic(ms)), 1000.0, 0.135);
+        }
+        // Then silence: after half a second half of it is left, after one nothing.
+        for (ms, rest) in [(3400, 0.5), (3900, 0.0)] {
+            for now in ((ms - 400)..=ms).step_by(100) {
+                let load = measure(now, traffic(2900));
+                if now == ms {
+                    close(load, 1000.0 * rest, 0.135 * rest);
+                }
+            }
+        }
+        // Without a bit rate the frames are counted all the same.
+        let load = meter.measure(Nanos::from_millis(4900), traffic(3900), None);
+        assert!(
+            load.share.is_nan() && (load.frames - 1000.0).abs() < 1e-6,
+            "{load:?}"
+        );
+    }
+
+    #[test]
+    fn frames_that_the_filters_hide_are_counted() {
+        let at = |seconds: u64| Totals {
+            frames: 100 * seconds,
+            nominal_bits: 100 * 115 * seconds,
+            // 5000 frames of 8 bytes.
+            all_frames: 5000 * seconds,
+            all_bytes: 40_000 * seconds,
+            ..Totals::default()
+        };
+        let mut meter = Meter::new();
+        let mut load = Load::default();
+        for second in 0..3 {
+            let now = Nanos::from_seconds(second as f64);
+            load = meter.measure(now, at(second), Some(RATES));
+        }
+        assert!((load.frames - 5000.0).abs() < 1e-6, "{load:?}");
+        // 135 bits each, to a bit.
+        assert!((load.share - 0.675).abs() < 0.002, "{load:?}");
+        // An interface that was set up again counts from zero.
+        let load = meter.measure(Nanos::from_seconds(3.0), at(0), Some(RATES));
+        assert!((load.frames - 5000.0).abs() < 1e-6, "{load:?}");
+        let load = meter.measure(Nanos::from_seconds(4.0), at(1), Some(RATES));
+        assert!((load.share - 0.675).abs() < 0.002, "{load:?}");
+    }
+
+    #[test]
+    fn a_load_near_the_limit_is_told_once() {
+        let mut high = false;
+        let told = [
+            0.5,
+            0.69,
+            0.71,
+            0.69,
+            0.72,
+            0.61,
+            0.59,
+            0.69,
+            f64::NAN,
+            0.9,
+            f64::NAN,
+        ]
+        .map(|share| {
+            high = Load::stays_high(share, high);
+            high
+        });
+        let expected = [
+            false, false, true, true, true, true, false, false, false, true, false,
+        ];
+        assert_eq!(told, expected);
+    }
+
+    #[test]
+    fn the_bits_of_fd_frames_are_counted_by_their_rate() {
+        let format = Format::Fd {
+            bit_rate_switch: true,
+            error_state: false,
+        };
+        let frame = Frame::with_format(Id::standard(1), format, &[0; 64]).unwrap();
+        let bits = bits_on_wire(&frame);
+        assert_eq!((bits.nominal, bits.data), (34, 678));
+        let plan = plan("", "").unwrap();
+        let status = crate::status::BusStatus::new(0, &plan.buses[0]);
+        status.on_wire(&frame);
+        status.on_wire(&Frame::new(Id::standard(1), &[0; 8]));
+        let totals = status.totals();
+        assert_eq!((totals.nominal_bits, totals.data_bits), (34 + 135, 678));
     }
 }

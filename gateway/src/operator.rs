@@ -8,9 +8,9 @@ use crate::plan::{Plan, did_you_mean};
 use crate::reload::{Change, changes};
 use crate::thread::BusThread;
 use anyhow::{Context as _, ensure};
-use proprio_drivers::{COMMAND_TIME, Command, CommandOutcome, Mode};
+use proprio_drivers::{COMMAND_TIME, Calibration, Command, CommandOutcome, Mode};
 use proprio_topics::{
-    Counter, DeviceHealth, DeviceState, GatewayHealth, LinkState, Nanos, Refusal,
+    Counter, DeviceHealth, DeviceState, GatewayHealth, LinkState, Nanos, Refusal, Wrench, axes,
 };
 use serde_json::{Value as Json, json};
 use std::fmt::Display;
@@ -99,7 +99,10 @@ impl Operator {
                 let _ = answer.send(self.devices(threads, health));
                 return;
             }
-            Order::Tare { device } => self.tare(device, threads, now),
+            Order::Tare { device } => self.command(device, Command::Tare, threads, now),
+            Order::Calibration { device } => {
+                self.command(device, Command::Calibration, threads, now)
+            }
             Order::Reload => self.reload(threads),
         };
         match begun {
@@ -138,17 +141,9 @@ impl Operator {
     fn replied(&mut self, bus: usize, device: u16, reply: Reply) {
         let name = self.name(bus, device);
         let outcome = match reply {
-            Reply::Ended(Ok(CommandOutcome::Tared(added))) => {
-                let (force, torque) = (added.force, added.torque);
-                tracing::warn!(
-                    device = name,
-                    "tared: the board adds {force:?} N, {torque:?} Nm from now on; offsets \
-                     identified before no longer hold"
-                );
-                Ok(json!({
-                    "ok": true, "device": name,
-                    "added": { "force_n": force, "torque_nm": torque },
-                }))
+            Reply::Ended(Ok(CommandOutcome::Tared(added))) => Ok(tared(&name, added)),
+            Reply::Ended(Ok(CommandOutcome::Calibration(calibration))) => {
+                Ok(calibrated(&name, &calibration))
             }
             Reply::Ended(Ok(other)) => Ok(json!({ "ok": true, "outcome": format!("{other:?}") })),
             Reply::Ended(Err(failed)) => Err(failed.to_string()),
@@ -157,7 +152,7 @@ impl Operator {
             Reply::Replaced(_) => return self.replaced(bus, device),
         };
         let answer = outcome.unwrap_or_else(|error| {
-            tracing::warn!(device = name, "not tared: {error}");
+            tracing::warn!(device = name, "not done: {error}");
             refusal(&format!("device {name:?}: {error}"))
         });
         let own = |waiting: &Waiting| waiting.open.contains(&(bus, device));
@@ -221,10 +216,16 @@ impl Operator {
         }
     }
 
-    fn tare(&self, name: &str, threads: &mut [BusThread], now: Nanos) -> Begun {
+    fn command(
+        &self,
+        name: &str,
+        command: Command,
+        threads: &mut [BusThread],
+        now: Nanos,
+    ) -> Begun {
         let device = self.find(name).map_err(|e| refusal(&e))?;
         let command = Request::Command {
-            command: Command::Tare,
+            command,
             until: now + TAKE_TIME,
         };
         free(threads, device)
@@ -299,6 +300,7 @@ impl Operator {
                     "frames": bus.frames, "dropped": bus.dropped,
                     "error_frames": bus.error_frames,
                     "sent": bus.sent, "send_failures": bus.send_failures,
+                    "load": bus.load, "frame_rate_hz": bus.frame_rate,
                 })
             })
             .collect();
@@ -336,12 +338,69 @@ impl Operator {
                     "state": health.state.get().map(DeviceState::word),
                     "refusal": Refusal::from_code(health.refusal).map(|r| r.to_string()),
                     "frames": count(Counter::Frames), "readings": count(Counter::Readings),
+                    "frozen": axes(health.frozen_axes).to_string(),
+                    "out_of_range": axes(health.beyond_axes).to_string(),
                     "channels": channels,
                 })
             })
             .collect();
         json!({ "ok": true, "robot": self.plan.robot, "devices": devices })
     }
+}
+
+/// The answer to a tare, which is told in the log.
+fn tared(name: &str, added: Option<Wrench>) -> Json {
+    let told = match added {
+        Some(Wrench { force, torque }) => format!("the board adds {force:?} N, {torque:?} Nm"),
+        None => "the present load is its zero".to_owned(),
+    };
+    tracing::warn!(
+        device = name,
+        "tared: {told} from now on; offsets identified before no longer hold"
+    );
+    let added = added.map(|added| json!({ "force_n": added.force, "torque_nm": added.torque }));
+    json!({ "ok": true, "device": name, "added": added })
+}
+
+/// The answer to a question about a calibration; what is wrong with it is told in the log.
+fn calibrated(name: &str, calibration: &Calibration) -> Json {
+    let problems: Vec<_> = calibration
+        .defects()
+        .iter()
+        .map(ToString::to_string)
+        .collect();
+    if !problems.is_empty() {
+        tracing::warn!(
+            device = name,
+            "its calibration is wrong: {}; write it again with the maker's tool",
+            problems.join("; ")
+        );
+    }
+    let mut answer = json!({
+        "ok": true, "device": name,
+        "per_count": calibration.per_count(), "problems": problems,
+    });
+    if let Some([fx, fy, fz, tx, ty, tz]) = calibration.full_scale() {
+        answer["full_scale_n"] = json!([fx, fy, fz]);
+        answer["full_scale_nm"] = json!([tx, ty, tz]);
+    }
+    match calibration {
+        Calibration::Fractions { matrix, .. } => {
+            answer["matrix"] = json!(matrix.map(|row| row.map(|x| f64::from(x) / 32768.0)));
+        }
+        Calibration::Counts {
+            matrix,
+            counts,
+            units: [newton, newton_metre],
+        } => {
+            answer["matrix"] = json!(matrix);
+            answer["counts_per_unit"] = json!(counts);
+            answer["unit_n"] = json!(newton);
+            answer["unit_nm"] = json!(newton_metre);
+        }
+        Calibration::FullScale(_) => {}
+    }
+    answer
 }
 
 #[cfg(test)]

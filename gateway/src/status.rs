@@ -3,8 +3,9 @@
 
 use crate::link::LinkCounters;
 use crate::link::error_frame::ErrorFrame;
+use crate::load::{Bits, Totals, bits_on_wire};
 use crate::plan::BusPlan;
-use proprio_drivers::State;
+use proprio_drivers::{Frame, State};
 use proprio_topics::{
     BusError, BusHealth, Code, Counter, DeviceHealth, LinkState, Name, Nanos, Refusal,
 };
@@ -18,6 +19,8 @@ pub struct BusStatus {
     number: u32,
     /// Frames passed to the devices.
     pub frames: AtomicU64,
+    /// The most bits of the frames received and sent: nominal, and of the data phase of CAN FD.
+    bits: [AtomicU64; 2],
     /// Frames that no device claims.
     pub unclaimed: AtomicU64,
     /// Frames that were not sent.
@@ -83,6 +86,8 @@ struct DeviceStatus {
     counters: [AtomicU64; Counter::ALL.len()],
     state: AtomicU32,
     refusal: AtomicU32,
+    /// The frozen axes in the lower half, those beyond the full scale in the upper.
+    axes: AtomicU32,
 }
 
 impl BusStatus {
@@ -95,11 +100,13 @@ impl BusStatus {
             counters: [const { AtomicU64::new(0) }; Counter::ALL.len()],
             state: AtomicU32::new(0),
             refusal: AtomicU32::new(0),
+            axes: AtomicU32::new(0),
         });
         Self {
             name: name(&plan.name),
             number,
             frames: AtomicU64::new(0),
+            bits: Default::default(),
             unclaimed: AtomicU64::new(0),
             send_failures: AtomicU64::new(0),
             queue_full: AtomicU64::new(0),
@@ -132,6 +139,40 @@ impl BusStatus {
             let refusal = state.refusal().map_or(0, Refusal::code);
             status.state.store(state.published() as u32, Relaxed);
             status.refusal.store(refusal, Relaxed);
+        }
+    }
+
+    /// Sets which axes of an F/T sensor are frozen, and which are beyond its full scale.
+    pub fn set_axes(&self, device: u16, frozen: u16, beyond: u16) {
+        if let Some(status) = self.devices.get(usize::from(device)) {
+            let axes = u32::from(frozen) | u32::from(beyond) << 16;
+            status.axes.store(axes, Relaxed);
+        }
+    }
+
+    /// Counts what `frame`, received or sent, can have taken of the bus. For one writer.
+    pub fn on_wire(&self, frame: &Frame) {
+        let Bits { nominal, data } = bits_on_wire(frame);
+        for (cell, bits) in self
+            .bits
+            .iter()
+            .zip([nominal, data])
+            .filter(|(_, b)| *b > 0)
+        {
+            cell.store(cell.load(Relaxed) + u64::from(bits), Relaxed);
+        }
+    }
+
+    /// The frames so far and their bits, without what the kernel tells of the interface.
+    #[must_use]
+    pub fn totals(&self) -> Totals {
+        let [nominal_bits, data_bits] = self.bits.each_ref().map(|cell| cell.load(Relaxed));
+        let [_, _, sent, _] = self.link.each_ref().map(|cell| cell.load(Relaxed));
+        Totals {
+            frames: self.frames.load(Relaxed) + sent,
+            nominal_bits,
+            data_bits,
+            ..Totals::default()
         }
     }
 
@@ -208,13 +249,15 @@ impl BusStatus {
                 .iter_mut()
                 .zip(&d.counters)
                 .for_each(|(to, from)| *to = from.load(Relaxed));
+            let [f0, f1, b0, b1] = d.axes.load(Relaxed).to_le_bytes();
             DeviceHealth {
                 name: d.name,
                 counters,
                 state: Code::of_number(d.state.load(Relaxed)),
                 refusal: d.refusal.load(Relaxed),
                 bus: self.number,
-                reserved: 0,
+                frozen_axes: u16::from_le_bytes([f0, f1]),
+                beyond_axes: u16::from_le_bytes([b0, b1]),
             }
         })
     }

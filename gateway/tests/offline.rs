@@ -84,3 +84,59 @@ fn one_stamp_far_in_the_future_costs_one_frame() {
         report.bad
     );
 }
+
+/// The log of a board at 100 Hz whose axes are noisy, and that repeats its reading from `from` to
+/// `until`.
+fn noisy(readings: u32, from: u32, until: u32) -> String {
+    let (mut log, mut random) = (String::new(), 12_345_u32);
+    let mut counts = [0_u16; 6];
+    for k in 0..readings {
+        for count in &mut counts {
+            random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            if !(from..until).contains(&k) {
+                *count = (0x8000 + (random >> 28) as u16).swap_bytes();
+            }
+        }
+        let [a, b, c, d, e, f] = counts;
+        let t = f64::from(k) * 1e-2;
+        writeln!(log, "({t:.6}) can0 3DA#{a:04X}{b:04X}{c:04X}").unwrap();
+        writeln!(log, "({:.6}) can0 3DB#{d:04X}{e:04X}{f:04X}", t + 2e-4).unwrap();
+    }
+    log
+}
+
+#[test]
+fn a_frozen_sensor_in_a_log_is_marked_as_live() {
+    let ([_, ft], report) = decoded(&noisy(3000, 2000, 2100));
+    let marked: Vec<_> = (0..ft.len())
+        .filter(|k| ft[*k].contains(Quality::FROZEN))
+        .collect();
+    assert_eq!(marked.last(), Some(&2099), "{marked:?}");
+    assert!((2015..2020).contains(&marked[0]), "{marked:?}");
+    assert_eq!(marked.len(), 2100 - marked[0], "without a gap");
+    let counts = &report.devices[1].counts;
+    assert!(
+        counts.contains(&(Counter::Frozen, marked.len() as u64)),
+        "{counts:?}"
+    );
+    let ([_, ft], _) = decoded(&noisy(30_000, 0, 0));
+    assert!(ft.iter().all(|quality| !quality.contains(Quality::FROZEN)));
+}
+
+/// A value of a JR3 beyond its full scale is counted, and delivered.
+#[test]
+fn a_value_beyond_the_full_scale_is_counted() {
+    let text = "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\n\
+                source = { kind = \"virtual\", name = \"b\" }\n[[bus.device]]\n\
+                driver = \"jr3_can\"\nname = \"ft\"\naddress = 1\n\
+                full_scale_n = [100, 100, 100]\nfull_scale_nm = [5, 5, 5]\n";
+    let plan = Plan::parse(text, Path::new(".")).unwrap();
+    // At the full scale, beyond it on ty.
+    let log = "(1.0) can0 601#004000C000000100\n(1.0002) can0 681#0000000000000100\n\
+               (1.01) can0 601#004000C000004F00\n(1.0102) can0 681#0000024000004F00\n";
+    let mut table = Vec::new();
+    let report = decode(&plan, log.as_bytes(), &mut table, Columns::Main).unwrap();
+    assert_eq!((report.samples, report.bad_lines), (2, 0));
+    let counts = &report.devices[0].counts;
+    assert!(counts.contains(&(Counter::OutOfRange, 1)), "{counts:?}");
+}

@@ -6,6 +6,7 @@
 //! | `silent:BOARD@3..4` | the board neither sends nor listens, then continues |
 //! | `reboot:BOARD@5` | the board is off for half a second, then waits to be started |
 //! | `saturate:BOARD@5..5.5` | a gauge is at its upper end: flagged, values frozen |
+//! | `freeze:BOARD@5..6` | the board repeats its last reading, and does not say so |
 //! | `spike:BOARD@6` | one reading is wrong by 200 N and 5 Nm on every axis |
 //! | `late_half:BOARD@2..8` | second halves of about one reading in ten are late |
 //! | `push:l_forearm=20@8..9` | an undeclared force of 20 N pushes this link of the URDF |
@@ -45,6 +46,13 @@ pub enum Fault {
     },
     /// An F/T sensor is saturated.
     Saturate {
+        /// Which.
+        device: String,
+        /// When.
+        window: Window,
+    },
+    /// A board repeats its last reading.
+    Freeze {
         /// Which.
         device: String,
         /// When.
@@ -114,8 +122,8 @@ pub enum FaultError {
     },
     /// The kind of fault is not known.
     #[error(
-        "fault {text:?}: {kind:?} is not known; known are lost, silent, reboot, saturate, spike, \
-         late_half, push; for example {EXAMPLES}"
+        "fault {text:?}: {kind:?} is not known; known are lost, silent, reboot, saturate, \
+         freeze, spike, late_half, push; for example {EXAMPLES}"
     )]
     Kind {
         /// What was typed.
@@ -169,6 +177,7 @@ impl Fault {
             Self::Lost { window, .. }
             | Self::Silent { window, .. }
             | Self::Saturate { window, .. }
+            | Self::Freeze { window, .. }
             | Self::LateHalf { window, .. }
             | Self::Push { window, .. } => window.from,
             Self::Reboot { at, .. } | Self::Spike { at, .. } => *at,
@@ -183,6 +192,7 @@ impl Fault {
             Self::Silent { device, .. }
             | Self::Reboot { device, .. }
             | Self::Saturate { device, .. }
+            | Self::Freeze { device, .. }
             | Self::Spike { device, .. }
             | Self::LateHalf { device, .. } => Some(device),
         }
@@ -256,6 +266,14 @@ impl FromStr for Fault {
                     form(
                         "saturate:BOARD@FROM..UNTIL",
                         "\"saturate:l_arm_ft_sensor@5..5.5\"",
+                    )
+                }),
+            "freeze" => span
+                .map(|window| Self::Freeze { device, window })
+                .ok_or_else(|| {
+                    form(
+                        "freeze:BOARD@FROM..UNTIL",
+                        "\"freeze:l_arm_ft_sensor@5..6\"",
                     )
                 }),
             "reboot" => moment
@@ -335,6 +353,7 @@ impl fmt::Display for Fault {
             Self::Silent { device, window } => write!(f, "silent:{device}@{window}"),
             Self::Reboot { device, at } => write!(f, "reboot:{device}@{at}"),
             Self::Saturate { device, window } => write!(f, "saturate:{device}@{window}"),
+            Self::Freeze { device, window } => write!(f, "freeze:{device}@{window}"),
             Self::Spike { device, at } => write!(f, "spike:{device}@{at}"),
             Self::LateHalf {
                 device,
@@ -368,6 +387,7 @@ mod tests {
             "silent:l_arm_ft_sensor@3..",
             "reboot:chest_imu@5",
             "saturate:l_arm_ft_sensor@5..5.5",
+            "freeze:l_arm_ft_sensor@5..6",
             "spike:l_arm_ft_sensor@6",
             "late_half:l_arm_ft_sensor@2..8",
             "late_half:l_arm_ft_sensor@2.5",
@@ -398,6 +418,7 @@ mod tests {
             ("spike:ft@nan", "spike:BOARD@TIME"),
             ("reboot:ft@1..2", "reboot:BOARD@TIME"),
             ("saturate:ft@inf..", "saturate:BOARD@FROM..UNTIL"),
+            ("freeze:ft@5", "freeze:BOARD@FROM..UNTIL"),
             ("late_half:ft", "late_half:BOARD@FROM..UNTIL or"),
             ("push:hand@1..2", "push:LINK=NEWTONS@FROM..UNTIL"),
             ("push:=5@1..2", "push:LINK=NEWTONS@FROM..UNTIL"),

@@ -210,6 +210,7 @@ impl Simulator {
                 possible(node.measures(Kind::Wrench), "an F/T sensor")?;
                 node.saturations.push(*window);
             }
+            Fault::Freeze { window, .. } => node.freezes.push(*window),
             Fault::Spike { at, .. } => {
                 possible(node.measures(Kind::Wrench), "an F/T sensor")?;
                 node.spikes.push(*at);
@@ -389,6 +390,9 @@ struct Node {
     status: Option<Nanos>,
     silences: Vec<Window>,
     saturations: Vec<Window>,
+    freezes: Vec<Window>,
+    /// The readings that it repeats while it is frozen.
+    frozen: Option<Vec<(u8, Reading)>>,
     spikes: Vec<f64>,
     reboots: Vec<Nanos>,
     late: Vec<(Window, bool)>,
@@ -430,6 +434,8 @@ impl Node {
             status: matches!(device.options, Options::IcubMotor(_)).then_some(t0),
             silences: Vec::new(),
             saturations: Vec::new(),
+            freezes: Vec::new(),
+            frozen: None,
             spikes: Vec::new(),
             reboots: Vec::new(),
             late: Vec::new(),
@@ -480,11 +486,21 @@ impl Node {
         }
     }
 
+    /// What it measures, or the readings with which it froze.
+    fn frozen_at(&mut self, t: f64, readings: Vec<(u8, Reading)>) -> Vec<(u8, Reading)> {
+        if !self.freezes.iter().any(|w| w.contains(t)) {
+            self.frozen = None;
+            return readings;
+        }
+        self.frozen.get_or_insert(readings).clone()
+    }
+
     /// Gives a board that does not stream its readings at `t`.
     fn present(&mut self, simulation: &mut Simulation, t: f64) {
         let quality = self.quality(t);
         let noise = self.noise.then_some(&mut self.presented);
-        for (output, reading) in measure(&self.outputs, simulation, t, false, noise) {
+        let readings = measure(&self.outputs, simulation, t, false, noise);
+        for (output, reading) in self.frozen_at(t, readings) {
             self.board.present(output, &reading, quality);
         }
     }
@@ -503,7 +519,8 @@ impl Node {
         self.spikes.retain(|at| *at > t);
         let spike = self.spikes.len() < spikes;
         let noise = self.noise.then_some(&mut self.random);
-        for (output, reading) in measure(&self.outputs, simulation, t, spike, noise) {
+        let readings = measure(&self.outputs, simulation, t, spike, noise);
+        for (output, reading) in self.frozen_at(t, readings) {
             refused += u64::from(
                 self.board
                     .encode(output, &reading, quality, frames)

@@ -414,6 +414,33 @@ fn a_rebooted_board_comes_back_because_it_is_started_again() {
     );
 }
 
+/// The gateway's own judgement, with the noise of the simulated sensor: about the first fifteen
+/// repeated readings are not marked.
+#[test]
+fn a_sensor_that_freezes_without_a_word_is_found_out() {
+    let session = session(&["freeze:l_arm_ft_sensor@3..3.5"], 4.0);
+    let (mut marked, mut repeated) = (0_u32, 0_u32);
+    let mut last = None;
+    for sample in session.of("l_arm_ft_sensor") {
+        let t = time_of(sample);
+        let frozen = sample.header.quality.contains(Quality::FROZEN);
+        // (A frame is on its way for a while.)
+        assert!(!frozen || (3.0..3.502).contains(&t), "{t}");
+        repeated += u32::from(last == Some(sample.values));
+        marked += u32::from(frozen);
+        last = Some(sample.values);
+    }
+    assert!(repeated > 40, "{repeated}");
+    assert!(
+        (repeated - 30..=repeated - 13).contains(&marked),
+        "{marked} of {repeated}"
+    );
+    assert_eq!(
+        session.count("l_arm_ft_sensor", Counter::Frozen),
+        u64::from(marked)
+    );
+}
+
 #[test]
 fn a_saturated_sensor_says_so_and_freezes() {
     let session = session(&["saturate:l_arm_ft_sensor@2..2.5"], 3.0);

@@ -1,7 +1,10 @@
 //! A running gateway that is asked over its control socket: it answers, tares, and is disturbed by
 //! nobody.
 
+use proprio_drivers::{Frame, Id};
 use proprio_gateway::control::{MAX_CLIENTS, MAX_LINE, ask};
+use proprio_gateway::link::send_by;
+use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_tests::watch::{Newest, Recorder, count};
 use proprio_tests::{Arm, PATIENCE, Process, Rig, Written, until};
 use proprio_topics::ipc::Domain;
@@ -215,6 +218,21 @@ fn it_says_what_it_runs() {
     assert_eq!(sensor["listen_only"], false);
     assert!(sensor["readings"].as_u64() > Some(0), "{sensor}");
 
+    // The load is known once the bus was measured for a while; here without a bit rate.
+    let measured = until(PATIENCE, || {
+        let status = running.ask(&json!({ "do": "status" }));
+        let mut buses = status["buses"].as_array().expect("a list").iter();
+        assert!(buses.clone().all(|bus| bus["load"].is_null()), "{status}");
+        buses
+            .all(|bus| bus["frame_rate_hz"].as_f64() > Some(0.0))
+            .then_some(())
+    });
+    measured.expect("frames per second");
+    assert_eq!(
+        (&sensor["frozen"], &sensor["out_of_range"]),
+        (&json!(""), &json!(""))
+    );
+
     running.refused(&json!({ "do": "devises" }), &["did you mean \"devices\"?"]);
     running.refused(
         &json!({ "do": "tare", "device": "l_arm_ft_sensr" }),
@@ -330,6 +348,132 @@ fn a_tare_makes_the_present_load_the_zero() {
         ],
     );
     listens.end();
+}
+
+/// Also of a board whose memory was damaged: the message on the bus is that of the maker's tool.
+#[test]
+fn a_calibration_is_read_and_what_is_wrong_is_told() {
+    let running = Running::still(Arm::new());
+    let order = json!({ "do": "calibration", "device": "l_arm_ft_sensor" });
+    let mut recorder = Recorder::of_samples(running.domain(), ROBOT);
+    let began = proprio_tests::now();
+    let answer = running.ask_recording(&order, &mut recorder);
+    assert_eq!(answer["ok"], true, "{answer}");
+    assert_eq!(answer["problems"], json!([]));
+    assert_eq!(answer["full_scale_n"].as_array().map(Vec::len), Some(3));
+    let one = answer["matrix"][3][3].as_f64();
+    assert!(one.is_some_and(|x| (x - 1.0).abs() < 1e-4), "{answer}");
+    assert_eq!(answer["matrix"][3][4], 0.0);
+    let sensor = running.channel("l_arm_ft_sensor");
+    some(&mut recorder, sensor, began);
+    assert_continuous(&recorder, &[], began);
+
+    let proprio_gateway::config::Source::Virtual { name } = &running.arm.robot.plan.buses[0].source
+    else {
+        panic!("a virtual bus")
+    };
+    let mut bus = VirtualBus::open(&running.rig.domain.name, name, &[]).expect("the bus");
+    let patience = proprio_tests::now() + Nanos::from_millis(1000);
+    let damage = Frame::new(Id::standard(0x20D), &[0x03, 2, 4, 0xFF, 0xFF]);
+    send_by(&mut bus, &damage, patience).expect("a frame can be sent");
+    let damaged = until(PATIENCE, || {
+        let problems = running.ask(&order)["problems"].clone();
+        (problems != json!([])).then_some(problems)
+    });
+    let expected = "the entry of fz, gauge 4 is FFFF, as in erased memory";
+    assert_eq!(damaged.expect("it is noticed"), json!([expected]));
+    running.refused(
+        &json!({ "do": "calibration", "device": "l_elbow_motor" }),
+        &["no such command"],
+    );
+    let output = running
+        .rig
+        .command(&["ctl", "calibration", "l_arm_ft_sensor"])
+        .output()
+        .expect("it runs");
+    let (out, err) = (
+        String::from_utf8_lossy(&output.stdout).into_owned(),
+        String::from_utf8_lossy(&output.stderr).into_owned(),
+    );
+    assert_eq!(output.status.code(), Some(1), "{err}");
+    assert!(
+        err.contains(expected) && err.starts_with("error: "),
+        "{err}"
+    );
+    for part in ["full scale: ", " Nm\n", "matrix, by gauge", "    tz "] {
+        assert!(out.contains(part), "{out}");
+    }
+    assert!(running.gateway.log().contains(expected));
+    drop(recorder);
+    running.end();
+}
+
+#[test]
+fn a_board_that_does_not_answer_about_its_calibration_is_named() {
+    let running = Running::start(Arm::new(), &["--fault", "silent:l_arm_ft_sensor@15..600"]);
+    let order = json!({ "do": "calibration", "device": "l_arm_ft_sensor" });
+    let failed = until(PATIENCE, || {
+        let answer = running.ask(&order);
+        (answer["ok"] == false).then(|| answer["error"].to_string())
+    });
+    let failed = failed.expect("it falls silent");
+    let reasons = [
+        "did not confirm",
+        "restarted meanwhile",
+        "do not arrive",
+        "not ended",
+    ];
+    assert!(failed.contains("l_arm_ft_sensor"), "{failed}");
+    assert!(
+        reasons.iter().any(|reason| failed.contains(reason)),
+        "{failed}"
+    );
+    running.end();
+}
+
+#[test]
+fn a_frozen_sensor_is_in_health_and_in_the_log() {
+    let running = Running::start(Arm::new(), &["--fault", "freeze:l_arm_ft_sensor@15..600"]);
+    let mut reader = Newest::<GatewayHealth>::open(running.domain(), ROBOT);
+    let frozen = reader.wait("it freezes", |health| {
+        health.devices().iter().any(|d| d.frozen_axes == 0x3F)
+    });
+    let device = frozen
+        .devices()
+        .iter()
+        .find(|d| d.frozen_axes != 0)
+        .expect("one");
+    assert_eq!(device.name.as_str(), "l_arm_ft_sensor");
+    assert!(count(device, Counter::Frozen) > 0);
+    let answer = running.ask(&json!({ "do": "devices" }));
+    let named = (answer["devices"].as_array().expect("a list").iter())
+        .filter(|d| d["frozen"] == "fx, fy, fz, tx, ty, tz")
+        .count();
+    assert_eq!(named, 1, "{answer}");
+    let told = until(PATIENCE, || {
+        let log = running.gateway.log();
+        log.contains("fx, fy, fz, tx, ty, tz repeats itself")
+            .then_some(())
+    });
+    told.expect("a line of the log");
+    let output = running
+        .rig
+        .command(&["status", "--json"])
+        .output()
+        .expect("it runs");
+    let status: Json = serde_json::from_slice(&output.stdout).expect("JSON");
+    let health = &status["robots"][0]["gateway"]["health"];
+    let device = (health["devices"].as_array().expect("a list").iter())
+        .find(|d| d["name"] == "l_arm_ft_sensor");
+    let device = device.expect("the sensor");
+    assert_eq!(device["frozen"], "fx, fy, fz, tx, ty, tz", "{device}");
+    assert!(device["counters"]["frozen"].as_u64() > Some(0), "{device}");
+    assert!(
+        health["buses"][0]["frame_rate_hz"].as_f64() > Some(0.0),
+        "{health}"
+    );
+    drop(reader);
+    running.end();
 }
 
 #[test]

@@ -221,8 +221,10 @@ fn encoded_and_decoded_every_value_is_within_half_a_step() {
     let (original, quantised) = (leg.estimates(&leg.table), leg.estimates(&decoded));
     assert_eq!(original.len(), quantised.len());
     let (differences, count) = rms(&original, &quantised, &pairs(&decoded, &decoded));
+    // For nearly half of the log the sensor of the left leg is frozen, and what rests on it is not
+    // used.
     assert!(
-        count * 10 > original.len() * 9,
+        count * 20 > original.len() * 9,
         "{count} of {}",
         original.len()
     );
@@ -494,8 +496,10 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
          over {count} instants",
         live.len() - 1
     );
+    // For nearly half of the log the sensor of the left leg is frozen, and what rests on it is not
+    // used.
     assert!(
-        count * 10 > original.len() * 9,
+        count * 20 > original.len() * 9,
         "{count} of {}",
         original.len()
     );
@@ -631,4 +635,62 @@ fn on_line_the_torques_of_a_real_leg_are_what_they_are_from_its_log() {
     let mean = all.iter().sum::<f64>() / all.len() as f64;
     println!("{:.0} % within in all", 100.0 * mean);
     assert!(mean >= 0.85, "{all:?}");
+}
+
+/// How often the four sensors of a real robot are said to be frozen, in the counts of their boards
+/// (the logs' values are encoded to frames): never where they measure. The left leg's sensor does
+/// freeze in two of the logs, for up to nine seconds while the robot moves and its other sensors go
+/// on: a gauge was saturated, which the tables do not tell. There, each repeated reading is marked
+/// from the sixteenth on.
+#[test]
+fn real_sensors_are_said_to_be_frozen_only_where_they_are() {
+    let Some(data) = std::env::var_os("PROPRIO_DATA") else {
+        println!("skipped: PROPRIO_DATA (recorded logs) is not set");
+        return;
+    };
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("real_leg");
+    let plan = Plan::load(&folder.join("gateway.toml")).expect("the plan");
+    let (mut readings, mut frozen) = (0, 0);
+    for name in ["12_24", "24_44", "57_70"] {
+        let file = PathBuf::from(&data).join(format!("icub_leg_{name}s.csv"));
+        let Ok(table) = std::fs::read_to_string(&file) else {
+            println!("skipped: there is no {}", file.display());
+            return;
+        };
+        let (mut log, mut decoded) = (Vec::new(), Vec::new());
+        encode(&plan, table.as_bytes(), &mut log).expect("frames");
+        decode(&plan, &log[..], &mut decoded, Columns::Main).expect("samples");
+        let mut reader = csv::Reader::new(&decoded[..]).expect("a table");
+        let series = reader.series().to_vec();
+        // Per sensor: the last reading, how often it was repeated, and its first stamp.
+        let mut past: HashMap<usize, (Reading, u32, Nanos)> = HashMap::new();
+        let mut row = Row::default();
+        while reader.next_row(&mut row).expect("a row") {
+            for item in &row.items {
+                let Value::Reading(reading @ Reading::Wrench(_), quality) = item.value else {
+                    continue;
+                };
+                let t = row.t.expect("a stamp");
+                let (last, run, first) = past.entry(item.series).or_insert((reading, 0, t));
+                *run = if *last == reading && t > *first {
+                    *run + 1
+                } else {
+                    0
+                };
+                *last = reading;
+                let marked = quality.contains(proprio_topics::Quality::FROZEN);
+                let sensor = &series[item.series].name;
+                // An axis may have been equal by chance once or twice before the others.
+                assert!(!marked || *run >= 14, "{name}: {sensor} at {t}, run {run}");
+                assert!(marked || *run < 20, "{name}: {sensor} at {t}, run {run}");
+                readings += 1;
+                frozen += u32::from(marked);
+                if marked {
+                    assert_eq!(sensor, "l_leg_ft_sensor");
+                }
+            }
+        }
+    }
+    println!("{frozen} of {readings} readings marked, all of them repeated; 0 false alarms");
+    assert!(frozen > 1000 && readings > 15_000, "{frozen} of {readings}");
 }

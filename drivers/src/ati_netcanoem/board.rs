@@ -2,6 +2,7 @@
 
 use super::frames::{STATUS_ANY, id, opcode, opcode_of};
 use super::options::Options;
+use crate::calibration::inverse;
 use crate::{Board, EncodeError, Format, Frame, Frames, Spec, SpecError, bytes};
 use proprio_topics::{Nanos, Quality, Reading, Wrench};
 
@@ -160,36 +161,4 @@ impl Board for NetcanoemBoard {
         self.readings(wrench, quality, out);
         Ok(())
     }
-}
-
-/// The inverse, by Gauss and Jordan with pivots; `None` if it is singular.
-fn inverse(matrix: [[f64; 6]; 6]) -> Option<[[f64; 6]; 6]> {
-    let mut left = matrix;
-    let mut right = core::array::from_fn(|i| core::array::from_fn(|j| f64::from(u8::from(i == j))));
-    for column in 0..6 {
-        let size = |row: &usize| {
-            left.get(*row)
-                .and_then(|r| r.get(column))
-                .map_or(0.0, |x| x.abs())
-        };
-        let pivot = (column..6).max_by(|a, b| size(a).total_cmp(&size(b)))?;
-        left.swap(column, pivot);
-        right.swap(column, pivot);
-        let (l, r): ([f64; 6], [f64; 6]) = (*left.get(column)?, *right.get(column)?);
-        let divisor = *l.get(column)?;
-        if !divisor.is_normal() {
-            return None;
-        }
-        let (l, r) = (l.map(|x| x / divisor), r.map(|x| x / divisor));
-        for (row, (a, b)) in left.iter_mut().zip(&mut right).enumerate() {
-            if row == column {
-                (*a, *b) = (l, r);
-                continue;
-            }
-            let factor = *a.get(column)?;
-            a.iter_mut().zip(l).for_each(|(x, y)| *x -= factor * y);
-            b.iter_mut().zip(r).for_each(|(x, y)| *x -= factor * y);
-        }
-    }
-    Some(right)
 }

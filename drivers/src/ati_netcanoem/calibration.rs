@@ -86,6 +86,17 @@ impl Calibration {
         self.per_count.as_ref()
     }
 
+    /// Matrix, counts and units in use, once all are known.
+    #[allow(clippy::cast_possible_truncation)] // they came as 32-bit numbers, or were configured
+    pub(super) fn in_use(&self) -> Option<crate::Calibration> {
+        self.per_count?;
+        Some(crate::Calibration::Counts {
+            matrix: self.matrix.map(|row| row.map(|entry| entry as f32)),
+            counts: self.counts?,
+            units: self.units?,
+        })
+    }
+
     /// Readings come and the calibration is not known: another program has not asked for it.
     pub(super) fn missed(&mut self) {
         self.refusal.get_or_insert(Refusal::NoCalibration);

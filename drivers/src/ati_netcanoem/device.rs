@@ -7,7 +7,10 @@ use crate::bringup::Bringup;
 use crate::bytes::{self, i16_be, u16_be};
 use crate::family::{Family, Link, Supervised};
 use crate::pairing::within;
-use crate::{Claim, Decoded, Device, Frame, Mode, NotSent, Output, Spec, SpecError};
+use crate::{
+    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Mode,
+    NotSent, Output, Spec, SpecError,
+};
 use alloc::boxed::Box;
 use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind, Wrench};
@@ -45,6 +48,8 @@ pub(super) struct Netcanoem {
     open: Option<Nanos>,
     /// When the next is due.
     next: Nanos,
+    /// The outcome of a command that was not taken.
+    outcome: Option<CommandOutcome>,
 }
 
 impl Netcanoem {
@@ -65,6 +70,7 @@ impl Netcanoem {
             joined: true,
             open: None,
             next: Nanos::MIN,
+            outcome: None,
         };
         Ok(Supervised::boxed([claim], bringup, calibration, this))
     }
@@ -253,5 +259,28 @@ impl Family for Netcanoem {
     fn interrupt(&mut self) {
         self.open = None;
         self.next = Nanos::MIN;
+    }
+
+    /// The calibration was read at the start: what is in use is known, also while only listening.
+    fn command(
+        &mut self,
+        command: Command,
+        _now: Nanos,
+        link: &Link<Calibration>,
+    ) -> Result<(), CommandRefused> {
+        if command != Command::Calibration {
+            return Err(CommandRefused::Unsupported);
+        }
+        let known = link.questions.in_use();
+        let known = known.ok_or(CommandRefused::Unknown("its calibration"))?;
+        self.outcome = Some(CommandOutcome::Calibration(known));
+        Ok(())
+    }
+
+    fn outcome(
+        &mut self,
+        _link: &Link<Calibration>,
+    ) -> Option<Result<CommandOutcome, CommandFailed>> {
+        self.outcome.take().map(Ok)
     }
 }

@@ -1,9 +1,9 @@
 //! The F/T board's own side. It reports its full scales, executes the host's commands, and sends
 //! readings as frames.
 
+use super::exchange::MINUS_PRESENT;
 use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind, saturation_bytes};
 use super::options::{Options, Stream};
-use super::tare::MINUS_PRESENT;
 use crate::bytes;
 use crate::icub::{self, class, command};
 use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
@@ -16,7 +16,8 @@ const USUAL_FULL_SCALE: [f64; 6] = [1804.0, 1804.0, 1804.0, 31.0, 31.0, 31.0];
 /// The board's own side.
 ///
 /// It behaves as a strain2 with the unit calibration matrix: its raw gauges are its axes. Its
-/// memory holds the configured full scales, else 1804 N and 31 Nm.
+/// memory holds the configured full scales, else 1804 N and 31 Nm. The matrix in its memory can be
+/// overwritten and read, and is not used: what the board would then send is not simulated.
 #[derive(Debug)]
 pub struct StrainBoard {
     address: u8,
@@ -33,6 +34,8 @@ pub struct StrainBoard {
     gauges: [u16; 6],
     /// What is added to each calibrated axis, in steps; lost with the power.
     tare: [i16; 6],
+    /// In 1/32768, by axis and gauge.
+    matrix: [[i16; 6]; 6],
 }
 
 impl StrainBoard {
@@ -55,6 +58,9 @@ impl StrainBoard {
             last_good: None,
             gauges: [ZERO; 6],
             tare: [0; 6],
+            matrix: core::array::from_fn(|axis| {
+                core::array::from_fn(|gauge| if axis == gauge { i16::MAX } else { 0 })
+            }),
         })
     }
 
@@ -69,6 +75,13 @@ impl StrainBoard {
             let _ = out.try_push(Half { counts, saturation }.frame(id));
         }
     }
+}
+
+/// An entry of the matrix. The upper half of `row` selects a stored set; there is one.
+fn entry(matrix: &mut [[i16; 6]; 6], row: u8, column: u8) -> Option<&mut i16> {
+    matrix
+        .get_mut(usize::from(row & 0xF))?
+        .get_mut(usize::from(column))
 }
 
 /// `steps`, limited to the range of a Q15 number.
@@ -100,6 +113,20 @@ impl Board for StrainBoard {
                     &[command::GET_FULL_SCALES, channel, high, low],
                 ));
                 self.scale_known = true;
+            }
+            Some(&[command::SET_MATRIX_RC, row, column, high, low]) => {
+                if let Some(entry) = entry(&mut self.matrix, row, column) {
+                    *entry = i16::from_be_bytes([high, low]);
+                }
+            }
+            Some(&[command::GET_MATRIX_RC, row, column]) => {
+                let Some(entry) = entry(&mut self.matrix, row, column) else {
+                    return;
+                };
+                let [high, low] = entry.to_be_bytes();
+                let id = icub::to_host(class::POLLING_ANALOG, self.address);
+                let data = [command::GET_MATRIX_RC, row, column, high, low];
+                let _ = out.try_push(Frame::new(id, &data));
             }
             Some(&[command::SET_CURR_TARE, 0, ..]) => self.tare = [0; 6],
             Some(&[command::SET_CURR_TARE, MINUS_PRESENT, ..]) => {

@@ -1,17 +1,17 @@
 //! The host's side of an F/T board. It reads the full scales, starts the board, and combines the
 //! two halves of each reading.
 
+use super::exchange::{Exchange, Told};
 use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind};
 use super::options::{Options, Stream};
-use super::tare::Tare;
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry};
 use crate::bytes;
 use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{Limit, Paired, Pairing};
 use crate::{
-    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Mode,
-    NotSent, Output, Spec, SpecError, State,
+    Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
+    Frame, Mode, NotSent, Output, Spec, SpecError,
 };
 use alloc::boxed::Box;
 use arrayvec::ArrayVec;
@@ -235,7 +235,7 @@ impl Pair {
 #[derive(Debug)]
 pub(super) struct Strain {
     address: u8,
-    tare: Tare,
+    exchange: Exchange,
     stream: Stream,
     calibrated: Pair,
     raw: Pair,
@@ -294,7 +294,7 @@ impl Strain {
         let scales = FullScales::new(address, configured, options.stream);
         let this = Self {
             address,
-            tare: Tare::new(address),
+            exchange: Exchange::new(address),
             stream: options.stream,
             calibrated: Pair::new(limit),
             raw: Pair::new(limit),
@@ -362,7 +362,7 @@ impl Strain {
         } else {
             Quality::GOOD
         };
-        let step = if self.tare.take_step() {
+        let step = if self.exchange.take_step() {
             Quality::ZERO_CHANGED
         } else {
             Quality::GOOD
@@ -411,11 +411,13 @@ impl Family for Strain {
             && let Some(data) = bytes::payload(frame, out)
         {
             match data.first() {
-                Some(&command::GET_FULL_SCALES) => {
+                Some(&command::GET_FULL_SCALES) if !self.exchange.expects(data) => {
                     link.questions.answer(data, link.bringup.mode(), frame, out);
                 }
-                Some(&command::GET_CURR_TARE) if link.bringup.mode() == Mode::Supervise => {
-                    self.tare.answer(data, frame, out);
+                Some(
+                    &(command::GET_FULL_SCALES | command::GET_CURR_TARE | command::GET_MATRIX_RC),
+                ) if link.bringup.mode() == Mode::Supervise => {
+                    self.exchange.answer(data, frame, out);
                 }
                 // Answers to other questions are for other devices.
                 Some(_) => {}
@@ -435,19 +437,19 @@ impl Family for Strain {
         _link: &mut Link<FullScales>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
-        self.tare.poll(now)
+        self.exchange.poll(now)
     }
 
     fn request_at(&self) -> Option<Nanos> {
-        self.tare.wake()
+        self.exchange.wake()
     }
 
     fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
-        self.tare.sent(frame, outcome);
+        self.exchange.sent(frame, outcome);
     }
 
     fn interrupt(&mut self) {
-        self.tare.interrupt();
+        self.exchange.interrupt();
     }
 
     fn command(
@@ -456,22 +458,17 @@ impl Family for Strain {
         now: Nanos,
         link: &Link<FullScales>,
     ) -> Result<(), CommandRefused> {
-        let Command::Tare = command;
-        if link.bringup.mode() == Mode::Listen {
-            return Err(CommandRefused::ListenOnly);
-        }
-        if self.stream == Stream::Uncalibrated {
+        let tares = command == Command::Tare;
+        if tares && self.stream == Stream::Uncalibrated && link.bringup.mode() != Mode::Listen {
             return Err(CommandRefused::Useless(
                 "this device streams raw gauges alone, which a tare does not change",
             ));
         }
-        if link.state() != State::Streaming {
-            return Err(CommandRefused::NotStreaming);
-        }
-        if self.tare.is_open() || !link.bringup.is_idle() {
+        link.takes_command()?;
+        if self.exchange.is_open() {
             return Err(CommandRefused::Busy);
         }
-        self.tare.begin(now);
+        self.exchange.begin(command, now);
         Ok(())
     }
 
@@ -479,16 +476,37 @@ impl Family for Strain {
         &mut self,
         link: &Link<FullScales>,
     ) -> Option<Result<CommandOutcome, CommandFailed>> {
-        let counts = match self.tare.outcome()? {
-            Ok(counts) => counts,
-            Err(failed) => return Some(Err(failed)),
-        };
-        let [fx, fy, fz, tx, ty, tz] = link.questions.per_step.unwrap_or([f64::NAN; 6]);
-        let [a, b, c, d, e, f] = counts.map(f64::from);
-        Some(Ok(CommandOutcome::Tared(Wrench {
-            force: [a * fx, b * fy, c * fz],
-            torque: [d * tx, e * ty, f * tz],
-        })))
+        Some(match self.exchange.outcome()? {
+            Ok((Command::Tare, told)) => {
+                let per_step = link.questions.per_step.unwrap_or([f64::NAN; 6]);
+                Ok(CommandOutcome::Tared(Some(added(told, per_step))))
+            }
+            Ok((Command::Calibration, told)) => Ok(CommandOutcome::Calibration(calibration(told))),
+            Err(failed) => Err(failed),
+        })
+    }
+}
+
+/// What a tare has read back.
+fn added(told: Told, per_step: [f64; 6]) -> Wrench {
+    let [a, b, c, d, e, f, ..] = told.map(|count| f64::from(count.cast_signed()));
+    let [fx, fy, fz, tx, ty, tz] = per_step;
+    Wrench {
+        force: [a * fx, b * fy, c * fz],
+        torque: [d * tx, e * ty, f * tz],
+    }
+}
+
+/// What the answers about the calibration say.
+fn calibration(told: Told) -> Calibration {
+    let ([a, b, c, d, e, f, ..], mut matrix) = (told, [[0; 6]; 6]);
+    let entries = told.iter().skip(6);
+    for (to, from) in matrix.iter_mut().flatten().zip(entries) {
+        *to = from.cast_signed();
+    }
+    Calibration::Fractions {
+        full_scale: [a, b, c, d, e, f],
+        matrix,
     }
 }
 

@@ -2,13 +2,16 @@
 //! frames of force and moment.
 
 use super::options::Options;
-use super::protocol::{READY, SAMPLE, id, node, op, op_of};
+use super::protocol::{READY, SAMPLE, STEPS, id, node, op, op_of};
 use super::scales::{FullScales, Question};
 use crate::bringup::{Bringup, Timing};
 use crate::bytes;
 use crate::family::{Family, Link, Supervised};
-use crate::wrench::{NewZero, at_end};
-use crate::{Claim, Decoded, Device, Frame, Mode, NotSent, Output, Spec, SpecError};
+use crate::wrench::{NewZero, TareCommand, at_end};
+use crate::{
+    Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
+    Frame, Mode, NotSent, Output, Spec, SpecError,
+};
 use alloc::boxed::Box;
 use proprio_topics::{Counter, Nanos, Quality, Reading, Refusal, StampKind, Wrench};
 
@@ -46,6 +49,9 @@ pub(super) struct Jr3 {
     /// The counter of the last reading.
     last: Option<u16>,
     zero: NewZero,
+    tare: TareCommand,
+    /// The outcome of another command that was not taken.
+    outcome: Option<CommandOutcome>,
 }
 
 impl Jr3 {
@@ -76,6 +82,8 @@ impl Jr3 {
             joined: false,
             last: None,
             zero: NewZero::default(),
+            tare: TareCommand::default(),
+            outcome: None,
         };
         let claims = own.into_iter().chain(heard);
         Ok(Supervised::boxed(claims, bringup, scales, this))
@@ -96,7 +104,9 @@ impl Jr3 {
         match *data {
             [state] => {
                 self.zero.confirm(frame.t);
-                if state != READY {
+                if state == READY {
+                    self.tare.confirm();
+                } else {
                     out.fault(Counter::DeviceFault, 1, frame.id);
                 }
             }
@@ -217,17 +227,75 @@ impl Family for Jr3 {
         }
     }
 
+    fn full_scale(&self, link: &Link<FullScales>) -> Option<[f64; 6]> {
+        Some(link.questions.per_step?.map(|step| step * STEPS))
+    }
+
     fn reset(&mut self) {
         self.waiting = None;
         self.joined = false;
         self.last = None;
     }
 
+    fn request(
+        &mut self,
+        now: Nanos,
+        _link: &mut Link<FullScales>,
+        _out: &mut Decoded,
+    ) -> Option<Frame> {
+        let due = self.tare.poll(now);
+        due.then(|| Frame::new(id(op::ZERO, self.node), &[]))
+    }
+
+    fn request_at(&self) -> Option<Nanos> {
+        self.tare.wake()
+    }
+
     fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        let tares = frame.id == id(op::ZERO, self.node);
         if let Ok(t) = outcome
-            && frame.id == id(op::START, self.node)
+            && (tares || frame.id == id(op::START, self.node))
         {
             self.expect_zero(t);
         }
+        if tares {
+            self.tare.sent(outcome, Some(ACKNOWLEDGED));
+        }
+    }
+
+    fn interrupt(&mut self) {
+        self.tare.interrupt();
+    }
+
+    fn command(
+        &mut self,
+        command: Command,
+        now: Nanos,
+        link: &Link<FullScales>,
+    ) -> Result<(), CommandRefused> {
+        if self.tare.is_open() {
+            return Err(CommandRefused::Busy);
+        }
+        match command {
+            Command::Tare => {
+                link.takes_command()?;
+                self.tare.begin(now);
+            }
+            // They were read at the start.
+            Command::Calibration => {
+                let known = self.full_scale(link);
+                let scales = known.ok_or(CommandRefused::Unknown("its full scale"))?;
+                let scales = Calibration::FullScale(scales);
+                self.outcome = Some(CommandOutcome::Calibration(scales));
+            }
+        }
+        Ok(())
+    }
+
+    fn outcome(
+        &mut self,
+        _link: &Link<FullScales>,
+    ) -> Option<Result<CommandOutcome, CommandFailed>> {
+        self.outcome.take().map(Ok).or_else(|| self.tare.outcome())
     }
 }

@@ -1,7 +1,7 @@
 //! The sensor's own side.
 
 use super::options::{Model, Options};
-use super::protocol::{DEFAULT_RATE, Ids, OVERLOAD_FX, RATES, command, period};
+use super::protocol::{DEFAULT_RATE, Ids, OVERLOAD_FX, RATES, SET, command, period};
 use crate::bytes;
 use crate::{Board, EncodeError, Format, Frame, Frames, Mode, Spec, SpecError};
 use proprio_topics::{Nanos, Quality, Reading, Saturation};
@@ -19,6 +19,9 @@ pub struct RftBoard {
     rate_code: u8,
     period: Nanos,
     streaming: bool,
+    /// What is subtracted, in steps, and whether the next load becomes it; lost with the power.
+    zero: [i16; 6],
+    zeroing: bool,
 }
 
 impl RftBoard {
@@ -36,6 +39,8 @@ impl RftBoard {
             rate_code,
             period: period(options.rate_hz),
             streaming: spec.mode == Mode::Listen,
+            zero: [0; 6],
+            zeroing: false,
         };
         if !this.streaming {
             this.set_rate(DEFAULT_RATE);
@@ -80,6 +85,8 @@ impl Board for RftBoard {
         }
         match *frame.data() {
             [command::STOP, ..] => self.streaming = false,
+            [command::BIAS, SET, ..] => self.zeroing = true,
+            [command::BIAS, 0, ..] => self.zero = [0; 6],
             _ if self.streaming => {}
             [command::START, ..] => self.streaming = true,
             [command::NAME, ..] => self.tell(command::NAME, self.name, out),
@@ -118,16 +125,22 @@ impl Board for RftBoard {
         if !values.iter().all(|value| value.is_finite()) {
             return Err(EncodeError::NotFinite);
         }
-        let mut counts = [[0; 2]; 6];
+        let mut counts = [0; 6];
         let mut overload = 0;
         let axes = values.into_iter().zip(self.divisors);
         for (axis, (count, (value, divisor))) in (0..).zip(counts.iter_mut().zip(axes)) {
-            *count = bytes::quantise_i16(value, 1.0 / divisor).to_be_bytes();
+            *count = bytes::quantise_i16(value, 1.0 / divisor);
             if quality.saturation(axis) != Saturation::None {
                 overload |= 1 << (OVERLOAD_FX - axis);
             }
         }
-        let [[a, b], [c, d], [e, f], [g, h], [i, j], [k, l]] = counts;
+        if core::mem::take(&mut self.zeroing) {
+            self.zero = counts;
+        }
+        for (count, zero) in counts.iter_mut().zip(self.zero) {
+            *count = count.saturating_sub(zero);
+        }
+        let [[a, b], [c, d], [e, f], [g, h], [i, j], [k, l]] = counts.map(i16::to_be_bytes);
         for (id, data) in [
             (self.ids.first, [command::START, a, b, c, d, e, f, g]),
             (self.ids.second, [h, i, j, k, l, overload, 0, 0]),

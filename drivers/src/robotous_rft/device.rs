@@ -2,14 +2,20 @@
 //! each response.
 
 use super::options::Options;
-use super::protocol::{DEFAULT_RATE, Ids, OVERLOAD_FX, command, period, send};
+use super::protocol::{DEFAULT_RATE, Ids, OVERLOAD_FX, SET, command, period, send};
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry, Timing};
 use crate::family::{Family, Link, Supervised};
 use crate::pairing::{Limit, Paired, Pairing};
-use crate::{Claim, Decoded, Device, Frame, Id, Mode, NotSent, Output, Spec, SpecError};
-use crate::{bytes, wrench};
+use crate::wrench::{self, NewZero, TareCommand};
+use crate::{
+    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Id,
+    Mode, NotSent, Output, Spec, SpecError, bytes,
+};
 use alloc::boxed::Box;
 use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind, Wrench};
+
+/// A tare has taken effect within this time: it is not answered.
+const TARED: Nanos = Nanos::from_millis(100);
 
 /// The next step of [`Rate`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -92,6 +98,8 @@ pub(super) struct Rft {
     ids: Ids,
     divisors: [f64; 6],
     pairing: Pairing<[u8; 8]>,
+    tare: TareCommand,
+    zero: NewZero,
 }
 
 impl Rft {
@@ -112,6 +120,8 @@ impl Rft {
             ids,
             divisors: options.model.divisors(),
             pairing: Pairing::new(Limit::of_period(period(options.rate_hz)), true),
+            tare: TareCommand::default(),
+            zero: NewZero::default(),
         };
         Ok(Supervised::boxed(claims, bringup, rate, this))
     }
@@ -142,7 +152,7 @@ impl Rft {
     }
 
     fn give(
-        &self,
+        &mut self,
         halves: [[u8; 8]; 2],
         first: (Nanos, StampKind),
         frame: &Frame,
@@ -157,6 +167,7 @@ impl Rft {
         if link.bringup.reading(frame.t) {
             quality |= Quality::GAP_BEFORE;
         }
+        quality |= self.zero.mark(frame.t);
         let (acquired, stamp) = first;
         let output = Output {
             acquired,
@@ -204,5 +215,48 @@ impl Family for Rft {
 
     fn reset(&mut self) {
         self.pairing.reset();
+    }
+
+    fn request(&mut self, now: Nanos, _link: &mut Link<Rate>, _out: &mut Decoded) -> Option<Frame> {
+        let due = self.tare.poll(now);
+        due.then(|| send(self.ids.command, command::BIAS, SET))
+    }
+
+    fn request_at(&self) -> Option<Nanos> {
+        self.tare.wake()
+    }
+
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        if frame.id == self.ids.command && frame.data().first() == Some(&command::BIAS) {
+            if let Ok(t) = outcome {
+                self.zero.expect(t + TARED);
+            }
+            self.tare.sent(outcome, None);
+        }
+    }
+
+    fn interrupt(&mut self) {
+        self.tare.interrupt();
+    }
+
+    fn command(
+        &mut self,
+        command: Command,
+        now: Nanos,
+        link: &Link<Rate>,
+    ) -> Result<(), CommandRefused> {
+        if command != Command::Tare {
+            return Err(CommandRefused::Unsupported);
+        }
+        link.takes_command()?;
+        if self.tare.is_open() {
+            return Err(CommandRefused::Busy);
+        }
+        self.tare.begin(now);
+        Ok(())
+    }
+
+    fn outcome(&mut self, _link: &Link<Rate>) -> Option<Result<CommandOutcome, CommandFailed>> {
+        self.tare.outcome()
     }
 }

@@ -12,6 +12,7 @@ pub(super) mod command {
     pub(in crate::robotous_rft) const STOP: u8 = 0x0C;
     pub(in crate::robotous_rft) const SET_RATE: u8 = 0x0F;
     pub(in crate::robotous_rft) const GET_RATE: u8 = 0x10;
+    pub(in crate::robotous_rft) const BIAS: u8 = 0x11;
 }
 
 /// Rates \[Hz\] and their codes; where two have one code, the manual's first.
@@ -28,6 +29,8 @@ pub(super) const RATES: [(u32, u8); 9] = [
 ];
 /// The rate of a new sensor, which also has code 0.
 pub(super) const DEFAULT_RATE: u8 = 5;
+/// The argument of BIAS: the present load becomes the zero; 0 is the sensor's own zero.
+pub(super) const SET: u8 = 1;
 /// The overload bit of fx; the other axes follow downwards.
 pub(super) const OVERLOAD_FX: u32 = 5;
 

@@ -1,7 +1,8 @@
-//! Commands to a device that streams: the tare of an F/T board, with the bytes of its protocol, its
-//! confirmation, and every way in which it can fail.
+//! Commands to a device that streams: tares and calibrations of F/T boards, with the bytes of their
+//! protocols, their confirmation, and every way in which they can fail.
 
 use crate::rig::{Rig, board, decode, frame, listener, options, spec};
+use proprio_drivers::calibration::{Calibration, Defect, MOST_CONDITION};
 use proprio_drivers::{
     Command, CommandFailed, CommandOutcome, CommandRefused, Device, Frame, Frames, Mode, NotSent,
     State,
@@ -73,7 +74,7 @@ fn a_tare_is_commanded_once_and_read_back() {
     assert_eq!(tare(&mut rig), Ok(()));
     assert_eq!(tare(&mut rig), Err(CommandRefused::Busy));
     let (outcome, _) = outcome(&mut rig);
-    let Ok(CommandOutcome::Tared(added)) = outcome else {
+    let Ok(CommandOutcome::Tared(Some(added))) = outcome else {
         panic!("{outcome:?}")
     };
     for (added, load) in [(added.force, LOAD.force), (added.torque, LOAD.torque)] {
@@ -317,7 +318,7 @@ fn answers_come_late_and_twice() {
     }
     assert!(by_hand.reading(), "the first that surely has the new zero");
     assert!(!by_hand.reading());
-    let Some(Ok(CommandOutcome::Tared(added))) = by_hand.device.outcome() else {
+    let Some(Ok(CommandOutcome::Tared(Some(added)))) = by_hand.device.outcome() else {
         panic!("no outcome")
     };
     // -227 and 264 steps.
@@ -392,4 +393,294 @@ fn a_tare_that_a_silence_ends_marks_the_reading_after_it() {
     );
     assert!(by_hand.reading(), "the first after it");
     assert!(!by_hand.reading());
+}
+
+fn calibration(rig: &mut Rig) -> Calibration {
+    assert_eq!(rig.device.command(Command::Calibration, rig.now), Ok(()));
+    match outcome(rig).0 {
+        Ok(CommandOutcome::Calibration(calibration)) => calibration,
+        other => panic!("{other:?}"),
+    }
+}
+
+/// Writes an entry of the matrix into the memory of the board at address 1.
+fn overwrite(rig: &mut Rig, row: u8, column: u8, entry: u16) {
+    let text = format!("201#030{row}0{column}{entry:04X}");
+    rig.board.on_frame(&frame(&text, 0.0), &mut Frames::new());
+}
+
+#[test]
+fn a_calibration_is_read_while_the_board_streams() {
+    let raw = format!("{SCALES}stream = \"uncalibrated\"");
+    for keys in [SCALES, "", &raw] {
+        let mut rig = streaming(keys);
+        overwrite(&mut rig, 2, 5, 0xFD2E);
+        overwrite(&mut rig, 5, 0, 0x0123);
+        rig.run(20);
+        let told = calibration(&mut rig);
+        let Calibration::Fractions { full_scale, matrix } = told else {
+            panic!("{told:?}")
+        };
+        assert_eq!(full_scale, [1804, 1804, 1804, 31, 31, 31]);
+        let mut expected = [[0; 6]; 6];
+        (0..6).for_each(|axis| expected[axis][axis] = i16::MAX);
+        (expected[2][5], expected[5][0]) = (-722, 0x123);
+        assert_eq!(matrix, expected);
+        let scales = (0..6).map(|axis| format!("201#180{axis}"));
+        let entries = (0..36).map(|k| format!("201#0A0{}0{}", k / 6, k % 6));
+        assert_eq!(rig.sent, scales.chain(entries).collect::<Vec<_>>());
+        assert_eq!(told.defects().as_slice(), []);
+        // 1804 N at 32768 counts.
+        let per_count = told.per_count().unwrap();
+        assert!((per_count[2][5] * 32768.0 + 722.0 / 32768.0 * 1804.0).abs() < 1e-9);
+        // The stream did not notice.
+        rig.run(100);
+        assert_eq!(rig.device.state(), State::Streaming);
+        assert!(
+            rig.faults.iter().all(|f| f.counter == Counter::Starts),
+            "{:?}",
+            rig.faults
+        );
+        assert!(rig.readings.len() >= 11);
+        assert!(rig.readings.iter().all(|r| r.quality == Quality::GOOD));
+        assert_eq!(calibration(&mut rig), told, "again");
+        if keys == SCALES {
+            assert_eq!(tare(&mut rig), Ok(()));
+            assert!(matches!(
+                outcome(&mut rig).0,
+                Ok(CommandOutcome::Tared(Some(_)))
+            ));
+        }
+    }
+}
+
+#[test]
+fn a_calibration_that_cannot_be_read_says_why() {
+    // Every third answer is lost; each question is repeated after 20 ms.
+    let mut rig = streaming(SCALES);
+    let mut count = 0;
+    rig.board_loses = Box::new(move |_, frame| {
+        count += u32::from(frame.id == proprio_drivers::Id::standard(0x210));
+        frame.id == proprio_drivers::Id::standard(0x210) && count % 3 == 0
+    });
+    let told = calibration(&mut rig);
+    assert_eq!(told.defects().as_slice(), []);
+    assert_eq!(rig.count(Counter::Unexpected), 0);
+    // An old firmware that does not know the question.
+    let mut rig = streaming(SCALES);
+    rig.board_loses = Box::new(|_, frame| frame.data().first() == Some(&0x0A));
+    assert_eq!(rig.device.command(Command::Calibration, rig.now), Ok(()));
+    assert_eq!(
+        rig.device.command(Command::Calibration, rig.now),
+        Err(CommandRefused::Busy)
+    );
+    let (failed, ms) = outcome(&mut rig);
+    assert_eq!(failed, Err(CommandFailed::NoAnswer));
+    assert!((1000..=1010).contains(&ms), "{ms}");
+    rig.run(50);
+    assert_eq!(rig.device.state(), State::Streaming);
+    assert!(
+        values(&rig).iter().all(|(_, gap)| !gap),
+        "no zero has changed"
+    );
+    // A restart, then the full scales are asked for the bring-up again.
+    let mut rig = streaming("");
+    rig.board_loses = Box::new(|_, frame| frame.data().first() == Some(&0x18));
+    assert_eq!(rig.device.command(Command::Calibration, rig.now), Ok(()));
+    rig.run(3);
+    rig.device.restart(rig.now);
+    assert_eq!(outcome(&mut rig).0, Err(CommandFailed::Interrupted));
+    rig.board_loses = Box::new(|_, _| false);
+    rig.run(100);
+    assert_eq!(rig.device.state(), State::Streaming);
+    // Who only listens does not ask.
+    let mut listens = listener("icub_strain", SCALES, &[]);
+    let refused = listens.command(Command::Calibration, Nanos::ZERO);
+    assert_eq!(refused, Err(CommandRefused::ListenOnly));
+    let answers = ["210#0A00000001", "210#180000FF"].map(|text| frame(text, 1.0));
+    assert!(decode(&mut *listens, &answers[..1]).1.is_empty());
+    // Answers that nobody asked for, too short, and beyond the matrix.
+    let mut rig = streaming(SCALES);
+    let answers = [
+        "210#0A00007FFF",
+        "210#0A0000",
+        "210#0A06000001",
+        "210#0A00060001",
+    ];
+    let answers = answers.map(|text| frame(text, 2000.0));
+    let (_, faults) = decode(&mut *rig.device, &answers);
+    let counted: Vec<_> = faults.iter().map(|fault| fault.counter).collect();
+    assert_eq!(
+        counted,
+        [
+            Counter::Unexpected,
+            Counter::Length,
+            Counter::Value,
+            Counter::Value
+        ]
+    );
+}
+
+#[test]
+fn what_is_wrong_with_a_calibration_is_named() {
+    let mut rig = streaming(SCALES);
+    for column in 0..6 {
+        overwrite(&mut rig, 1, column, 0xFFFF);
+    }
+    overwrite(&mut rig, 4, 4, 0);
+    let told = calibration(&mut rig);
+    let words: Vec<String> = told.defects().iter().map(ToString::to_string).collect();
+    let expected = [
+        "the entry of fy, gauge 0 is FFFF, as in erased memory",
+        "the row of ty is zero: it always reads zero",
+    ];
+    assert_eq!(words, expected);
+    overwrite(&mut rig, 1, 4, 0);
+    let words: Vec<_> = calibration(&mut rig).defects().into_iter().collect();
+    assert_eq!(
+        words[1..],
+        [Defect::ZeroRow { axis: 4 }, Defect::ZeroColumn { gauge: 4 }]
+    );
+
+    let mut full_scale = [1804, 1804, 1804, 31, 31, 31];
+    let mut matrix = [[0; 6]; 6];
+    (0..6).for_each(|axis| matrix[axis][axis] = 20_000);
+    let defects = |full_scale, matrix| -> Vec<Defect> {
+        let told = Calibration::Fractions { full_scale, matrix };
+        told.defects().into_iter().collect()
+    };
+    assert_eq!(defects(full_scale, matrix), []);
+    full_scale[3] = 0;
+    assert_eq!(
+        defects(full_scale, matrix),
+        [Defect::ZeroFullScale { axis: 3 }]
+    );
+    full_scale[3] = 31;
+    // Two axes that are nearly the same, then the same.
+    matrix[0] = [10_000, 10_000, 0, 0, 0, 0];
+    matrix[1] = [10_000, 10_010, 0, 0, 0, 0];
+    let [Defect::Condition { number }] = defects(full_scale, matrix)[..] else {
+        panic!()
+    };
+    assert!(number > MOST_CONDITION && number.is_finite(), "{number}");
+    matrix[1] = [10_000, 12_000, 0, 0, 0, 0];
+    assert_eq!(defects(full_scale, matrix), []);
+    matrix[1] = matrix[0];
+    assert!(matches!(
+        defects(full_scale, matrix)[..],
+        [Defect::Condition { .. }]
+    ));
+    // The size of the numbers does not matter.
+    matrix = [[0; 6]; 6];
+    (0..6_i16).for_each(|axis| matrix[usize::try_from(axis).unwrap()][0] = 1 + axis);
+    for axis in 1..6 {
+        matrix[axis][axis] = 5 * i16::try_from(axis).unwrap();
+    }
+    assert_eq!(defects(full_scale, matrix), []);
+}
+
+#[test]
+fn an_ati_sensor_tells_what_was_read_at_its_start() {
+    let load = (0, Reading::Wrench(LOAD));
+    let mut rig = Rig::new("ati_netcanoem", "", &[], load);
+    let early = rig.device.command(Command::Calibration, rig.now);
+    assert!(
+        matches!(early, Err(CommandRefused::Unknown(_))),
+        "{early:?}"
+    );
+    rig.run(300);
+    assert_eq!(rig.device.state(), State::Streaming);
+    let told = calibration(&mut rig);
+    let Calibration::Counts {
+        matrix,
+        counts,
+        units,
+    } = told
+    else {
+        panic!("{told:?}")
+    };
+    assert_eq!((counts, units), ([1e6, 1e6], [1.0, 1.0]));
+    assert_eq!((matrix[0][3], matrix[5][5]), (-13_200.0, 740.0));
+    assert_eq!(told.defects().as_slice(), []);
+    assert!((told.per_count().unwrap()[0][3] + 0.0132).abs() < 1e-9);
+    assert_eq!(told.full_scale(), None);
+    assert_eq!(tare(&mut rig), Err(CommandRefused::Unsupported));
+    let mut broken = matrix;
+    broken[2][1] = f32::NAN;
+    let told = Calibration::Counts {
+        matrix: broken,
+        counts,
+        units,
+    };
+    assert_eq!(
+        told.defects().as_slice(),
+        [Defect::NotFinite { axis: 2, gauge: 1 }]
+    );
+}
+
+/// A tare of one frame: the readings with the old and with the new zero, and those marked.
+fn tared(driver: &str, frame: &str) -> (Rig, Vec<([f64; 6], bool)>) {
+    let mut rig = Rig::new(driver, "", &[], (0, Reading::Wrench(LOAD)));
+    rig.run(2000);
+    assert_eq!(rig.device.state(), State::Streaming);
+    rig.reading.1 = Reading::Wrench(Wrench {
+        force: [2.0, -3.0, 4.0],
+        torque: [0.1, 0.2, -0.3],
+    });
+    rig.run(500);
+    rig.readings.clear();
+    rig.sent.clear();
+    assert_eq!(tare(&mut rig), Ok(()));
+    assert_eq!(tare(&mut rig), Err(CommandRefused::Busy));
+    let (outcome, ms) = outcome(&mut rig);
+    assert_eq!(outcome, Ok(CommandOutcome::Tared(None)));
+    assert!(ms < 5, "{ms}");
+    rig.run(300);
+    assert_eq!(rig.sent, [frame]);
+    let values = values(&rig);
+    (rig, values)
+}
+
+#[test]
+fn sensors_that_do_not_tell_their_zero_are_tared() {
+    for (driver, command) in [
+        ("robotous_rft", "064#1101000000000000"),
+        ("jr3_can", "301#"),
+    ] {
+        let (mut rig, values) = tared(driver, command);
+        let last = values.last().expect("readings");
+        assert_eq!(*last, ([0.0; 6], false), "{driver}");
+        let first = values.iter().position(|(v, _)| *v == [0.0; 6]).unwrap();
+        assert!(
+            values[first].1,
+            "{driver}: the first with the new zero is marked"
+        );
+        // Not sent; given up before it was sent.
+        rig.interface = Box::new(|_| Some(NotSent::Deadline));
+        assert_eq!(tare(&mut rig), Ok(()));
+        assert_eq!(outcome(&mut rig).0, Err(CommandFailed::NotSent));
+        assert_eq!(tare(&mut rig), Ok(()));
+        rig.device.restart(rig.now);
+        assert_eq!(outcome(&mut rig).0, Err(CommandFailed::NotSent));
+        assert_eq!(tare(&mut rig), Err(CommandRefused::NotStreaming));
+        let mut listens = listener(driver, "", &[]);
+        let refused = listens.command(Command::Tare, Nanos::ZERO);
+        assert_eq!(refused, Err(CommandRefused::ListenOnly), "{driver}");
+    }
+    // A JR3 confirms; without its answer it is not known.
+    let (mut rig, _) = tared("jr3_can", "301#");
+    rig.board_loses = Box::new(|_, frame| frame.id == proprio_drivers::Id::standard(0x101));
+    assert_eq!(tare(&mut rig), Ok(()));
+    let (failed, ms) = outcome(&mut rig);
+    assert_eq!(failed, Err(CommandFailed::NoAnswer));
+    assert!((100..=103).contains(&ms), "{ms}");
+    // Its full scales are known since its start.
+    let told = calibration(&mut rig);
+    assert_eq!(told.full_scale().map(|all| all[0].round()), Some(115.0));
+    assert_eq!((told.per_count(), told.defects().len()), (None, 0));
+    let refused = rig.device.full_scale().map(|all| all[5]);
+    assert!(
+        refused.is_some_and(|most| (most - 6.1).abs() < 1e-9),
+        "{refused:?}"
+    );
 }

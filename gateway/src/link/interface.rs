@@ -116,10 +116,12 @@ fn parse(answer: &[u8]) -> Result<InterfaceHealth, Errno> {
             // CANFD_MTU or larger; 16 is classic CAN.
             libc::IFLA_MTU => health.fd = u32::from(word(data, 0).is_some_and(|mtu| mtu >= 72)),
             libc::IFLA_STATS64 => {
-                // struct rtnl_link_stats64, of which elements 2 and 3 count bytes.
+                // struct rtnl_link_stats64.
                 let total = |at| long(data, at).unwrap_or(0);
                 health.rx_frames = total(0);
                 health.tx_frames = total(1);
+                health.rx_bytes = total(2);
+                health.tx_bytes = total(3);
                 health.rx_errors = total(4);
                 health.tx_errors = total(5);
                 health.rx_dropped = total(6);
@@ -337,6 +339,8 @@ mod tests {
         let expected = InterfaceHealth {
             rx_frames: 100,
             tx_frames: 101,
+            rx_bytes: 102,
+            tx_bytes: 103,
             rx_errors: 104,
             tx_errors: 105,
             rx_dropped: 106,

@@ -43,6 +43,11 @@ pub enum Counter {
     DriveFault = 13,
     /// Frames to the device that could not be sent.
     Unsent = 14,
+    /// Readings with a value that has stopped to change although it was never that still: the
+    /// gateway's own judgement, see [`DeviceHealth::frozen_axes`].
+    Frozen = 15,
+    /// Readings with a value beyond the sensor's full scale.
+    OutOfRange = 16,
 }
 
 coded!(Counter {
@@ -61,6 +66,8 @@ coded!(Counter {
     Backward = "backward_stamp",
     DriveFault = "drive_fault",
     Unsent = "unsent",
+    Frozen = "frozen",
+    OutOfRange = "out_of_range",
 });
 
 /// The state of a link to a bus.
@@ -178,6 +185,10 @@ pub struct InterfaceHealth {
     pub rx_frames: u64,
     /// Frames sent by the interface.
     pub tx_frames: u64,
+    /// Bytes of data in the frames received.
+    pub rx_bytes: u64,
+    /// Bytes of data in the frames sent.
+    pub tx_bytes: u64,
     /// Receive errors.
     pub rx_errors: u64,
     /// Transmit errors.
@@ -239,6 +250,11 @@ pub struct BusHealth {
     pub last_frame: Nanos,
     /// Time of the last turn of the bus thread's loop \[ns\].
     pub last_turn: Nanos,
+    /// The share of the bus's time that the frames of the last second took, all participants', with
+    /// as many stuff bits as they can have; 1 is all of it. NaN: the bit rate is not known.
+    pub load: f64,
+    /// Frames per second, over the last second.
+    pub frame_rate: f64,
     /// The interface and its controller.
     pub interface: InterfaceHealth,
     /// The link's state.
@@ -265,9 +281,13 @@ impl BusHealth {
         connections: 0,
         last_frame: Nanos::MIN,
         last_turn: Nanos::MIN,
+        load: f64::NAN,
+        frame_rate: 0.0,
         interface: InterfaceHealth {
             rx_frames: 0,
             tx_frames: 0,
+            rx_bytes: 0,
+            tx_bytes: 0,
             rx_errors: 0,
             tx_errors: 0,
             rx_dropped: 0,
@@ -454,14 +474,36 @@ pub struct DeviceHealth {
     pub refusal: u32,
     /// The number of its bus.
     pub bus: u32,
-    /// Unused, zero.
-    pub reserved: u32,
+    /// The axes of an F/T sensor that are frozen: bit k is axis k of fx fy fz tx ty tz. The gateway
+    /// judges so: a value repeats itself that was too noisy before to do so by chance.
+    pub frozen_axes: u16,
+    /// The axes whose last value was beyond the sensor's full scale.
+    pub beyond_axes: u16,
+}
+
+/// The names of the axes in `mask`, as those of [`DeviceHealth::frozen_axes`]: "fx, tz".
+#[must_use]
+pub fn axes(mask: u16) -> impl fmt::Display {
+    struct Axes(u16);
+    impl fmt::Display for Axes {
+        fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+            let mut gap = "";
+            for (axis, name) in ["fx", "fy", "fz", "tx", "ty", "tz"].into_iter().enumerate() {
+                if self.0 >> axis & 1 == 1 {
+                    write!(f, "{gap}{name}")?;
+                    gap = ", ";
+                }
+            }
+            Ok(())
+        }
+    }
+    Axes(mask)
 }
 
 /// State and counters of the gateway, published ten times a second.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
-#[type_name("proprio/GatewayHealth/2")]
+#[type_name("proprio/GatewayHealth/3")]
 pub struct GatewayHealth {
     /// When.
     pub header: Header,
@@ -488,7 +530,8 @@ impl DeviceHealth {
         state: DeviceState::Waiting.in_memory(),
         refusal: 0,
         bus: 0,
-        reserved: 0,
+        frozen_axes: 0,
+        beyond_axes: 0,
     };
 }
 
@@ -641,10 +684,10 @@ pub struct EstimatorHealth {
 }
 
 const _: () = {
-    assert!(size_of::<InterfaceHealth>() == 6 * 8 + 8 * 4);
-    assert!(size_of::<BusHealth>() == 64 + 26 * 8 + size_of::<InterfaceHealth>() + 8);
-    assert!(size_of::<DeviceHealth>() == 64 + 15 * 8 + 16);
-    assert!(size_of::<GatewayHealth>() == 80 + 360 * MAX_BUSES + 200 * MAX_CHANNELS);
+    assert!(size_of::<InterfaceHealth>() == 8 * 8 + 8 * 4);
+    assert!(size_of::<BusHealth>() == 64 + 28 * 8 + size_of::<InterfaceHealth>() + 8);
+    assert!(size_of::<DeviceHealth>() == 64 + 17 * 8 + 16);
+    assert!(size_of::<GatewayHealth>() == 80 + 392 * MAX_BUSES + 216 * MAX_CHANNELS);
     assert!(size_of::<IdentificationHealth>() == 15 * 8);
     assert!(size_of::<EstimatorHealth>() == 56 + 13 * 8 + 15 * 8);
 };

@@ -54,7 +54,7 @@ pub use estimate::{
 };
 pub use health::{
     BusError, BusHealth, Controller, Counter, DeviceHealth, DeviceState, EstimatorHealth,
-    GatewayHealth, IdentificationHealth, InterfaceHealth, LinkState, Refusal,
+    GatewayHealth, IdentificationHealth, InterfaceHealth, LinkState, Refusal, axes,
 };
 pub use inertia::{InertiaEstimate, LinkInertia, SensorOffset};
 pub use reading::{

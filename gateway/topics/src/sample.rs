@@ -57,8 +57,8 @@ impl Quality {
     pub const GAP_BEFORE: Self = Self(1);
     /// At least one channel of the sensor is at an end of its range; see [`Quality::saturation`].
     pub const SATURATED: Self = Self(1 << 1);
-    /// The device repeats its last value instead of measuring (iCub strain boards do so while
-    /// saturated).
+    /// The device repeats its last value instead of measuring: it says so (iCub strain boards while
+    /// saturated), or values repeat themselves that were too noisy before to do so by chance.
     pub const FROZEN: Self = Self(1 << 2);
     /// The device reports a fault that makes this reading doubtful.
     pub const DEVICE_FAULT: Self = Self(1 << 3);
