@@ -3,7 +3,7 @@
 use anyhow::Context;
 use proprio_simulator::{Fault, Options, Robot, Settings, parse_bus};
 use proprio_topics::ipc::{Domain, DomainConfig, Writer, monotonic};
-use proprio_topics::{ContactDeclaration, Header, Name, Nanos};
+use proprio_topics::{ContactDeclaration, ContactState, Name, Nanos};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -110,16 +110,9 @@ impl Skin {
     }
 
     fn declare(&mut self, contact: &str, at: Nanos, active: bool) {
-        let header = Header {
-            acquired: at,
-            ..Header::default()
-        };
-        let declaration = ContactDeclaration {
-            header,
-            contact: Name::new(contact).unwrap_or(Name::EMPTY),
-            active: u32::from(active),
-            reserved: 0,
-        };
+        let contact = Name::new(contact).unwrap_or(Name::EMPTY);
+        let state = ContactState::configured(active);
+        let declaration = ContactDeclaration::new(contact, at, &state);
         if let Err(error) = self.0.send(&declaration, monotonic()) {
             tracing::warn!("a touch could not be declared: {error}");
         }

@@ -55,3 +55,4 @@ pub mod pipeline;
 pub mod propagation;
 pub mod reading;
 pub mod setup;
+pub mod skin;

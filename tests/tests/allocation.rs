@@ -35,7 +35,7 @@ use proprio_gateway::status::BusStatus;
 use proprio_simulator::record::record;
 use proprio_simulator::{Robot, Settings, Simulator};
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, Writer};
-use proprio_topics::{Counter, DeviceHealth, Nanos, Reading, Sample, Wrench};
+use proprio_topics::{ContactState, Counter, DeviceHealth, Nanos, Reading, Sample, Wrench};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::sync::Arc;
@@ -450,7 +450,7 @@ fn identification_in_the_pipeline_allocates_nothing_but_in_its_jobs() {
         let t = sample.header.acquired;
         let one = counted(|| {
             if number % 5000 == 0 {
-                pipeline.declare(hand, t, number % 10_000 == 0);
+                pipeline.declare(hand, t, &ContactState::configured(number % 10_000 == 0));
             }
             pipeline.push(
                 channel,
@@ -511,7 +511,12 @@ fn the_pipeline_allocates_nothing_once_it_runs() {
                     continue;
                 }
                 if number.is_multiple_of(500) {
-                    pipeline.declare(hand, t, number.is_multiple_of(1000));
+                    let state = ContactState {
+                        position: [1e-6 * number as f64, 0.0, 0.01],
+                        position_std: 0.002,
+                        ..ContactState::configured(number.is_multiple_of(1000))
+                    };
+                    pipeline.declare(hand, t, &state);
                 }
                 if number.is_multiple_of(7) {
                     pipeline.push(
