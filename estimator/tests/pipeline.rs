@@ -937,7 +937,7 @@ fn a_repeated_declaration_changes_nothing() {
     // More changes than are kept: before the first that is kept, the last one of those dropped is
     // valid.
     let start = events.last().unwrap().1 + Nanos::from_millis(10);
-    for i in 0..40 {
+    for i in 0..600 {
         let state = ContactState::configured(i % 2 == 1);
         pipeline.declare(hand, start + Nanos::from_millis(100 + i), &state);
     }
