@@ -8,7 +8,8 @@
 //!
 //! - **Rest.** What an untouched taxel reads: the mean of its first second, which must be without a
 //!   touch; then it follows slowly ([`REST_TIME`]) while the taxel is not pressed. A taxel that
-//!   reads far *less* than its rest was touched in its first second: the rest is corrected at once.
+//!   reads less than its rest by the threshold, twice in a row, was touched in its first second: it
+//!   begins anew.
 //! - **Pressed.** Two readings in a row change a taxel's state: above the threshold it becomes
 //!   pressed, below half of it released. So one wrong reading changes nothing.
 //! - **Threshold.** From the noise of an untouched taxel and the false alarms that are accepted
@@ -132,8 +133,6 @@ pub(crate) struct Patch {
 #[derive(Debug, Clone)]
 struct Triangle {
     taxels: [TaxelState; TRIANGLE],
-    /// The stamp of its first reading.
-    first: Option<Nanos>,
     /// Its touch at each reading: pressure, moment, normal.
     touches: History<7, KEPT>,
 }
@@ -142,6 +141,8 @@ struct Triangle {
 #[derive(Debug, Clone, Copy, Default)]
 struct TaxelState {
     rest: f64,
+    /// The stamp of its first reading, and how many there were.
+    first: Option<Nanos>,
     readings: u32,
     is_pressed: bool,
     /// The last reading said that `is_pressed` should change.
@@ -153,7 +154,7 @@ struct TaxelState {
 impl TaxelState {
     /// Takes a value; returns the pressure if it is pressed, else 0. `gain` is the share by which
     /// the rest follows.
-    fn update(&mut self, value: f64, threshold: f64, gain: f64, is_starting: bool) -> f64 {
+    fn update(&mut self, t: Nanos, value: f64, threshold: f64, gain: f64) -> f64 {
         if !(value.abs() < MEASURED) {
             // Not measured: not known to be pressed.
             (self.is_pressed, self.wants_change, self.is_below) = (false, false, false);
@@ -165,9 +166,19 @@ impl TaxelState {
             true => pressure < 0.5 * threshold,
         };
         let is_below = pressure < -threshold;
+        if is_below && self.is_below {
+            *self = Self {
+                rest: value,
+                first: Some(t),
+                readings: 1,
+                ..Self::default()
+            };
+            return 0.0;
+        }
         self.readings = self.readings.saturating_add(1);
-        if is_starting {
+        if t - *self.first.get_or_insert(t) < START {
             self.rest += pressure / f64::from(self.readings);
+            self.is_below = is_below && self.readings > 1;
             return 0.0;
         }
         if wants_change && self.wants_change {
@@ -176,9 +187,7 @@ impl TaxelState {
         } else {
             self.wants_change = wants_change;
         }
-        if is_below && self.is_below {
-            self.rest = value;
-        } else if !self.is_pressed && pressure <= threshold {
+        if !self.is_pressed && pressure <= threshold {
             self.rest += gain * pressure;
         }
         self.is_below = is_below;
@@ -194,7 +203,6 @@ impl Patch {
     pub(crate) fn new(setup: PatchSetup) -> Self {
         let triangle = || Triangle {
             taxels: [TaxelState::default(); TRIANGLE],
-            first: None,
             touches: History::default(),
         };
         let count = setup.taxels.len().div_ceil(TRIANGLE);
@@ -228,7 +236,6 @@ impl Patch {
         if before.is_some_and(|before| t <= before) {
             return Taken::Backward;
         }
-        let first = *triangle.first.get_or_insert(t);
         let since = before.map_or(Nanos::ZERO, |before| t - before);
         let gain = 1.0 - (-since.seconds() / REST_TIME.seconds()).exp();
         let places = self.setup.taxels.iter().skip(TRIANGLE * number);
@@ -237,7 +244,7 @@ impl Patch {
             let Some(Taxel { position, normal }) = place else {
                 continue;
             };
-            let pressure = state.update(value, self.setup.threshold, gain, t - first < START);
+            let pressure = state.update(t, value, self.setup.threshold, gain);
             let parts = std::iter::once(&1.0)
                 .chain(position.iter())
                 .chain(normal.iter());
@@ -392,9 +399,12 @@ mod tests {
         let mut patch = patch();
         run(&mut patch, 0, 1500, 0.0, &[(5, 50.0)]);
         assert!(!touch(&patch, MS(1500)).is_there(), "taken for its rest");
-        run(&mut patch, 1500, 1600, 0.0, &[]);
-        run(&mut patch, 1600, 1700, 0.0, &[(5, 50.0)]);
-        assert!(touch(&patch, MS(1700)).is_there());
+        run(&mut patch, 1500, 2700, 0.0, &[]);
+        run(&mut patch, 2700, 2800, 0.0, &[(5, 50.0)]);
+        assert!(touch(&patch, MS(2800)).is_there());
+        // The others never stopped.
+        run(&mut patch, 2800, 2900, 0.0, &[(4, 50.0), (5, 50.0)]);
+        assert!((touch(&patch, MS(2900)).place().0.x - 0.045).abs() < 1e-3);
     }
 
     #[test]
@@ -516,7 +526,7 @@ mod tests {
         );
         assert!(threshold(1.0, 160, 1.0) > threshold(1.0, 10, 1.0));
         assert!(threshold(1.0, 160, 0.01) > threshold(1.0, 160, 1.0));
-        assert_eq!(threshold(1.0, 1, 1e30), 0.0);
+        assert!(threshold(1.0, 1, 1e30).abs() < 1e-6);
     }
 
     proptest! {

@@ -168,14 +168,14 @@ impl Push {
         }
     }
 
-    /// What the skin reads, less the noise: 10 counts per newton under the middle.
+    /// What the skin reads, less the noise: 10 counts per newton under the middle, at least 10.
     fn skin(&self, triangle: u32, is_on: bool) -> Skin {
         let mut values = [f64::NAN; 12];
         let map = taxels().0;
         for (value, taxel) in values.iter_mut().zip(&map[12 * triangle as usize..]) {
             if let Some(taxel) = taxel {
                 let away = (taxel.position - self.at).norm() / PITCH;
-                let pressure = 10.0 * self.force * (-0.5 * away * away).exp();
+                let pressure = (10.0 * self.force).max(10.0) * (-0.5 * away * away).exp();
                 *value = if is_on { pressure.round() } else { 0.0 };
             }
         }
@@ -279,7 +279,7 @@ fn a_touch_says_where_a_contact_is() {
         (ContactKind::ForceAlong, 8.0),
         (ContactKind::Wrench, 8.0),
         // Too weak for the F/T sensor to show it, where masses are known to 20 %.
-        (ContactKind::Force, 0.8),
+        (ContactKind::Force, 0.1),
     ] {
         let (mut config, push) = (config(kind), Push::into_the_skin(force));
         if force < 1.0 {
@@ -327,22 +327,30 @@ fn a_touch_says_where_a_contact_is() {
              {std:.2} N",
             1e3 * away
         );
-        // Without the skin it is where the configuration says, or is not seen at all.
+        // Without the skin a weak touch is not seen at all. A strong one is, but a force at the
+        // configured place does not explain it: it is taken for one on the hand, or for none.
         let mut without = config.clone();
         without.skin.clear();
         let none = self::setup(&without);
-        let only: Vec<Event> = all
-            .iter()
-            .filter(|e| e.0 < none.robot.channels.len())
-            .copied()
-            .collect();
-        let blind = run(none, &only);
-        let seen = &at(&blind, 2000).contacts.contacts()[forearm];
-        assert_eq!(seen.located, 0);
-        assert_eq!(
-            force < 1.0,
-            seen.detected == 0 && seen.reason == Reason::Absent.in_memory()
+        let of_robot = |event: &&Event| event.0 < none.robot.channels.len();
+        let only: Vec<Event> = all.iter().filter(of_robot).copied().collect();
+        let blind = run(none.clone(), &only);
+        let estimate = at(&blind, 2000);
+        let (seen, elbow) = (
+            &estimate.contacts.contacts()[forearm],
+            &estimate.torques.joints()[3],
         );
+        assert_eq!(seen.located, 0);
+        match (kind, force < 1.0) {
+            (_, true) => assert_eq!((seen.valid, elbow.valid), (0, 1), "{seen:?} {elbow:?}"),
+            (ContactKind::Wrench, _) => assert_eq!(seen.detected, 1, "{seen:?}"),
+            _ => {
+                let hand = none.robot.contact("hand").unwrap();
+                let hand = estimate.contacts.contacts()[hand].detected == 1;
+                let is_unexplained = elbow.reason == Reason::Unexplained.in_memory();
+                assert!(seen.detected == 0 && (hand || is_unexplained), "{seen:?}");
+            }
+        }
     }
 }
 
@@ -502,7 +510,7 @@ fn a_declared_place_is_as_good_as_a_configured_one() {
     let (expected, _) = run_with(near.clone(), &all, told(ContactState::configured(true)));
     let (found, _) = run_with(far.clone(), &all, told(placed));
     for (a, b) in expected.iter().zip(&found) {
-        assert_eq!(a.torques, b.torques);
+        assert_eq!(a.torques.joints(), b.torques.joints());
         let (a, b) = (
             a.contacts.contacts()[forearm],
             b.contacts.contacts()[forearm],
@@ -564,6 +572,8 @@ fn all_zero(events: &[Event]) -> u64 {
 fn a_touch_that_is_lost_withholds_what_depends_on_it() {
     let mut config = config(ContactKind::Force);
     config.identification.urdf_relative_std = 0.2;
+    // It could be taken for a contact of the hand.
+    config.contact.retain(|contact| contact.name() != "hand");
     let setup = setup(&config);
     let (elbow, wrist) = (3, 6);
     let names: Vec<&str> = setup.robot.joint_names().collect();
@@ -571,7 +581,7 @@ fn a_touch_that_is_lost_withholds_what_depends_on_it() {
     let forearm = setup.robot.contact("forearm").unwrap();
     let skin = u32::try_from(setup.channel(Kind::Skin, "l_forearm_skin").unwrap()).unwrap();
     // Too weak for the F/T sensor to show it, where masses are known to 20 %.
-    let weak = Push::into_the_skin(0.8);
+    let weak = Push::into_the_skin(0.1);
     let estimates = run(setup.clone(), &events(&setup, &weak, 1800));
     let joint = |ms: i64, dof: usize| at(&estimates, ms).torques.joints()[dof];
     assert!(

@@ -196,7 +196,23 @@ fn a_touch_on_the_bus_becomes_a_wrench_where_it_is() {
             .map(|row| seconds(row) - FROM)
     };
     let (touched, detected) = (first(skin, "located"), first(blind, "detected"));
-    eprintln!("touched after {touched:?} s, without a skin detected after {detected:?} s");
+    let explains = |row: &usize| {
+        let told = blind
+            .iter()
+            .filter(|(name, _)| name.starts_with("residual/"));
+        let mut told = told.filter(|(name, _)| name.ends_with("/reason"));
+        seconds(*row) > FROM && told.any(|(_, cells)| !cells[*row].is_empty())
+    };
+    let unexplained = (0..rows).find(explains).map(|row| seconds(row) - FROM);
+    let hand = (0..rows).filter(|&row| (FROM..FROM + 2.0).contains(&seconds(row)));
+    let hand = hand
+        .filter(|&row| blind["contact/hand/detected"][row] == "1")
+        .count();
+    eprintln!(
+        "touched after {touched:?} s; without a skin the residual is significant after \
+         {unexplained:?} s, taken for the forearm's contact after {detected:?} s, for the hand's in \
+         {hand} estimates"
+    );
     // Two readings of 20 ms, and the delay of the skin.
     assert!(
         touched.is_some_and(|after| after > 0.0 && after < 0.07),
@@ -253,6 +269,40 @@ fn a_touch_on_the_bus_becomes_a_wrench_where_it_is() {
         settled.count(),
     );
     assert!(valid * 100 >= 97 * all, "{valid} of {all}");
+}
+
+/// A channel that the gateway does not publish is told before anything runs.
+#[test]
+fn a_misspelt_skin_is_told() {
+    let rig = Rig::new();
+    let written = arm(Arm::new(), &rig.path("robot"));
+    let gateway = fs::read_to_string(&written.gateway).unwrap();
+    let other = rig.path("robot/other.toml").to_string_lossy().into_owned();
+    let check = [
+        "estimator",
+        "--config",
+        &written.estimator,
+        "--check",
+        "--gateway",
+        &other,
+    ];
+    for (name, told) in [
+        (
+            "l_forearm_skn",
+            "skin/l_forearm_skin (did you mean \"l_forearm_skn\"?)",
+        ),
+        ("l_forearm_skin", ""),
+    ] {
+        fs::write(&other, gateway.replace("l_forearm_skin", name)).unwrap();
+        let output = rig.command(&check).output().unwrap();
+        let error = String::from_utf8_lossy(&output.stderr);
+        let code = if told.is_empty() { 0 } else { 2 };
+        assert_eq!(
+            (output.status.code(), error.contains(told)),
+            (Some(code), true),
+            "{error}"
+        );
+    }
 }
 
 /// The same live: simulator, gateway and estimator as processes.
