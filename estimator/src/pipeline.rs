@@ -8,8 +8,8 @@
 //! 3. Every channel is evaluated at `t` (`channels`). F/T readings are corrected for calibration,
 //!    temperature and offset.
 //! 4. The contacts that are present are put where declarations or skins say (`contacts`,
-//!    [`crate::skin`]). Kinematics and solver give torques and contact wrenches; standard deviations are propagated
-//!    (`solution`, `motion`, [`crate::propagation`]).
+//!    [`crate::skin`]). Kinematics and solver give torques and contact wrenches; standard
+//!    deviations are propagated (`solution`, `motion`, [`crate::propagation`]).
 //! 5. The F/T residual of each sub-tree is tested (`residuals`). A possible contact that explains a
 //!    significant residual is taken as present. Without such a contact, the torques of the sub-tree
 //!    are not valid.

@@ -18,8 +18,8 @@
 //!   a fault, shows no touch. If it showed one when it was last heard, the touch is lost: nobody
 //!   knows whether it is still there ([`Touch::lost`]).
 //!
-//! Several touches on one link are one contact, at their common centroid. The centroid of a touch on
-//! a curved surface lies below the surface: by 1.7 mm for a touch 2 cm wide on a forearm of 3 cm
+//! Several touches on one link are one contact, at their common centroid. The centroid of a touch
+//! on a curved surface lies below the surface: by 1.7 mm for a touch 2 cm wide on a forearm of 3 cm
 //! radius.
 //!
 //! A skin shows touches, never that there are none: it covers a part of a link only.
@@ -68,7 +68,7 @@ pub struct PatchSetup {
     pub max_silence: Nanos,
 }
 
-/// The threshold of a patch of `taxels` taxels, whose untouched values have this standard deviation,
+/// The threshold of a patch of `taxels` taxels whose untouched values have this standard deviation,
 /// for the accepted rate of false alarms of the patch.
 ///
 /// Two readings of a taxel in a row must be above it. If their noise is normal and independent, the

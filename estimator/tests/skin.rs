@@ -317,11 +317,13 @@ fn a_touch_says_where_a_contact_is() {
             );
             largest = largest.max((found - truth).abs() / std);
         }
-        // And what is stated is not idle: a strong push is known to a quarter.
+        // And what is stated is not idle: a strong push is known to a tenth. (Not along the normal
+        // alone, from which friction may turn it.)
         let std = touched.standard_deviation[..3]
             .iter()
             .fold(0.0_f64, |a, b| a.max(*b));
-        assert!(force < 5.0 || std < 0.25 * force, "{kind:?}: {std} N");
+        let is_sharp = force < 5.0 || kind == ContactKind::ForceAlong || std < 0.1 * force;
+        assert!(is_sharp, "{kind:?}: {std} N");
         eprintln!(
             "{kind:?}, {force} N: {:.1} mm away, deviations up to {largest:.1} of the stated, \
              {std:.2} N",
@@ -341,10 +343,9 @@ fn a_touch_says_where_a_contact_is() {
             &estimate.torques.joints()[3],
         );
         assert_eq!(seen.located, 0);
-        match (kind, force < 1.0) {
-            (_, true) => assert_eq!((seen.valid, elbow.valid), (0, 1), "{seen:?} {elbow:?}"),
-            (ContactKind::Wrench, _) => assert_eq!(seen.detected, 1, "{seen:?}"),
-            _ => {
+        match force < 1.0 {
+            true => assert_eq!((seen.valid, elbow.valid), (0, 1), "{seen:?} {elbow:?}"),
+            false => {
                 let hand = none.robot.contact("hand").unwrap();
                 let hand = estimate.contacts.contacts()[hand].detected == 1;
                 let is_unexplained = elbow.reason == Reason::Unexplained.in_memory();

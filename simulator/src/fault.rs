@@ -12,8 +12,8 @@
 //! | `push:l_forearm=20:0.03,-0.07,0:-1,0,0@8..9` | the same, at this point and in this direction |
 //!
 //! A late half follows just after the next reading's first half; `late_half:BOARD@6` delays one
-//! reading. A push acts at the origin of the link's frame along its x axis, or at the point \[m\] and
-//! in the direction given in that frame. A skin of estimator.toml feels it where it is.
+//! reading. A push acts at the origin of the link's frame along its x axis, or at the point \[m\]
+//! and in the direction given in that frame. A skin of estimator.toml feels it where it is.
 //!
 //! Times are seconds since the start of the simulation; the end may be omitted (`5..`). BOARD is
 //! the board's name in gateway.toml or the name of one of its channels.

@@ -210,8 +210,8 @@ fn a_touch_on_the_bus_becomes_a_wrench_where_it_is() {
         .count();
     eprintln!(
         "touched after {touched:?} s; without a skin the residual is significant after \
-         {unexplained:?} s, taken for the forearm's contact after {detected:?} s, for the hand's in \
-         {hand} estimates"
+         {unexplained:?} s, taken for the forearm's contact after {detected:?} s, for the \
+         hand's in {hand} estimates"
     );
     // Two readings of 20 ms, and the delay of the skin.
     assert!(

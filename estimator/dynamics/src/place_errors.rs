@@ -1,8 +1,8 @@
 //! Errors of torques and contact wrenches because a contact is not exactly where it is taken to be.
 //!
-//! A contact pushes with the force `f` at `p`, but acts at `p + dp`, along `d + dd`. Then its wrench
-//! differs by `w` from the one that the solver attributes to it (base coordinates, [torque; force]
-//! about the origin, `r` the contact's position):
+//! A contact of force `f` is taken to be at `p`, along `d`, but acts at `p + dp`, along `d + dd`.
+//! Then its wrench differs by `w` from the one that the solver attributes to it (base coordinates,
+//! [torque; force] about the origin, `r` the contact's position):
 //!
 //! ```text
 //! w = [dp x f + r x df; df],    df = |f| dd    (of a force along a direction; else 0)
@@ -10,8 +10,8 @@
 //! error of x_i   = (k_i - e_i) . w                        x_i = k_i . b, in truth e_i . (A x + w)
 //! ```
 //!
-//! With equal standard deviations of `dp` along each axis, and of `dd` across `d`, the covariance of
-//! `w` follows, and from it those of all results. A full wrench has no such error: its torque is
+//! With equal standard deviations of `dp` along each axis, and of `dd` across `d`, the covariance
+//! of `w` follows, and from it those of all results. A full wrench has no such error: its torque is
 //! unknown, too.
 
 use crate::error::{DynamicsError, check_size};

@@ -805,7 +805,8 @@ proptest! {
             }
             moved.place_contact(index, &contact.position, Some(&direction)).expect("finite");
         }
-        let (from_start, after) = (scene.solve(&scene.structure(), &active), scene.solve(&moved, &active));
+        let from_start = scene.solve(&scene.structure(), &active);
+        let after = scene.solve(&moved, &active);
         prop_assert_eq!(from_start.torque(), after.torque());
         prop_assert_eq!(from_start.torque_deviation(), after.torque_deviation());
         prop_assert_eq!(from_start.contacts(), after.contacts());
@@ -814,7 +815,8 @@ proptest! {
         for ((a, b), spec) in pairs {
             let alone = |solved: &Solver| {
                 let number = moved.subtree_of(spec.frame.link).expect("a link");
-                moved.subtrees()[number].contacts.len() == 1 && solved.balances()[number].degrees == 0
+                let is_single = moved.subtrees()[number].contacts.len() == 1;
+                is_single && solved.balances()[number].degrees == 0
             };
             if spec.kind == ContactKind::Wrench && alone(&before) {
                 prop_assert!(wrench_gap(&a.wrench, &b.wrench) < EXACT * scale);

@@ -15,9 +15,9 @@
 //! calibration accuracies, not properties of one robot.
 //!
 //! A column of S is a finite difference. S is computed with the first estimate of each tenth of a
-//! second and when contacts or base change or a contact jumps, and held in between. The tenths are those
-//! of the stamps, so that a replay which begins elsewhere gives the same. Errors of velocities are
-//! smaller by an order of magnitude and are neglected.
+//! second and when contacts or base change or a contact jumps, and held in between. The tenths are
+//! those of the stamps, so that a replay which begins elsewhere gives the same. Errors of velocities
+//! are smaller by an order of magnitude and are neglected.
 
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::model::Model;
@@ -42,8 +42,8 @@ const BASE_ACCELERATION_STD: f64 = 0.1;
 /// Step of positions for finite differences \[rad, m\].
 const STEP: f64 = 1e-4;
 
-/// A contact that moves less than this \[m\], or turns less \[rad\], within a tenth of a second does
-/// not change S more than the motion of the robot does in that time.
+/// A contact that moves less than this \[m\], or turns less \[rad\], within a tenth of a second
+/// does not change S more than the motion of the robot does in that time.
 const JUMP: [f64; 2] = [0.01, 0.1];
 
 /// The point of linearisation: the inputs and the result of one estimate.

@@ -1,11 +1,11 @@
 //! The file of a skin's taxels: where each one is and which way it faces.
 //!
 //! One row per taxel, in the order of their numbers (twelve per triangle, triangle after triangle),
-//! of six numbers: position \[m\] and outward normal in the axes of a link's frame, from its origin.
-//! Numbers are separated by spaces or commas. A normal of zeros: there is no taxel of that number.
-//! Lines that begin with `#` are comments. If there is a line `[calibration]`, the rows begin after
-//! it: that is the form of iCub's own files (`positions/*.txt` of skinGui in icub-main). Otherwise
-//! one line of column names may come first.
+//! of six numbers: position \[m\] and outward normal in the axes of a link's frame, from its
+//! origin. Numbers are separated by spaces or commas. A normal of zeros: there is no taxel of that
+//! number. Lines that begin with `#` are comments. If there is a line `[calibration]`, the rows
+//! begin after it: that is the form of iCub's own files (`positions/*.txt` of skinGui in
+//! icub-main). Otherwise one line of column names may come first.
 
 use proprio_dynamics::spatial::Vec3;
 use std::path::Path;
