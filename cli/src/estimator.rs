@@ -54,13 +54,7 @@ fn fits(config: &Path, setup: &Setup, gateway: &Path) -> anyhow::Result<()> {
         let file = gateway.display();
         return Err(wrong(format!("{file} publishes no {}", missing.join(", no "))).into());
     }
-    let reads = |name: &str| {
-        setup
-            .robot
-            .channels
-            .iter()
-            .any(|channel| channel.name == name)
-    };
+    let reads = |name: &str| setup.channels().any(|(_, own)| own == name);
     let unread: Vec<&str> = plan
         .channels
         .iter()
@@ -80,9 +74,8 @@ fn fits(config: &Path, setup: &Setup, gateway: &Path) -> anyhow::Result<()> {
 
 /// The channels that the estimator reads and the gateway does not publish, as text.
 fn missing(setup: &Setup, plan: &Plan) -> Vec<String> {
-    let absent = setup.robot.channels.iter().filter_map(|channel| {
-        let (kind, name) = (channel.kind, &channel.name);
-        let published = plan.channels.iter().find(|other| other.name == *name);
+    let absent = setup.channels().filter_map(|(kind, name)| {
+        let published = plan.channels.iter().find(|other| other.name == name);
         match published {
             Some(other) if other.kind == kind => None,
             Some(other) => Some(format!(

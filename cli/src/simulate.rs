@@ -3,7 +3,7 @@
 use anyhow::Context;
 use proprio_simulator::{Fault, Options, Robot, Settings, parse_bus};
 use proprio_topics::ipc::{Domain, DomainConfig, Writer, monotonic};
-use proprio_topics::{ContactDeclaration, Header, Name, Nanos};
+use proprio_topics::{ContactDeclaration, ContactState, Name, Nanos};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -31,7 +31,9 @@ pub(crate) struct Args {
     #[arg(long)]
     skin: bool,
     /// A fault: "lost:0.01", "silent:BOARD@3..4", "saturate:BOARD@5..5.5", "spike:BOARD@6",
-    /// "freeze:BOARD@5..6", "late_half:BOARD@2..8", "push:LINK=20@8..9"; may be repeated
+    /// "freeze:BOARD@5..6", "late_half:BOARD@2..8", "push:LINK=20@8..9",
+    /// "push:LINK=20:X,Y,Z:DX,DY,DZ@8..9" (where [m] and along what, in the link's frame); may be
+    /// repeated
     #[arg(long, value_name = "FAULT")]
     fault: Vec<String>,
     /// The file for the truth, written at the end: a table of joint torques, wrenches and motion
@@ -110,16 +112,9 @@ impl Skin {
     }
 
     fn declare(&mut self, contact: &str, at: Nanos, active: bool) {
-        let header = Header {
-            acquired: at,
-            ..Header::default()
-        };
-        let declaration = ContactDeclaration {
-            header,
-            contact: Name::new(contact).unwrap_or(Name::EMPTY),
-            active: u32::from(active),
-            reserved: 0,
-        };
+        let contact = Name::new(contact).unwrap_or(Name::EMPTY);
+        let state = ContactState::configured(active);
+        let declaration = ContactDeclaration::new(contact, at, &state);
         if let Err(error) = self.0.send(&declaration, monotonic()) {
             tracing::warn!("a touch could not be declared: {error}");
         }

@@ -595,7 +595,7 @@ pub(crate) fn record(args: &Record, config: &DomainConfig) -> anyhow::Result<()>
                 others += 1;
                 continue;
             };
-            let value = Value::Active(declared.active != 0);
+            let value = Value::Contact(declared.state());
             // What was declared long before arrives with the next declaration.
             let t = declared.header.acquired.max(order.passed_on());
             order.push(t, (at, value), |t, (at, value)| {

@@ -460,8 +460,8 @@ pub trait Device: Send {
 /// this time it has been asked as often as at its start.
 pub const COMMAND_TIME: Nanos = Nanos::from_millis(1000);
 
-/// Frames that a board sends at once.
-pub type Frames = ArrayVec<Frame, 16>;
+/// Frames that a board sends at once: two for each of a skin board's 16 triangles.
+pub type Frames = ArrayVec<Frame, 32>;
 
 /// Why a board cannot encode a reading.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]

@@ -26,7 +26,9 @@ use proprio_estimator::config::Config;
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
 use proprio_identification::robot::ChannelRole;
-use proprio_topics::{Imu, JointState as Encoder, Nanos, Quality, Reading, Wrench as ForceTorque};
+use proprio_topics::{
+    ContactState, Imu, JointState as Encoder, Nanos, Quality, Reading, Wrench as ForceTorque,
+};
 use std::path::Path;
 
 fn main() {
@@ -212,7 +214,7 @@ impl Bench {
         assert_eq!(touch.is_some(), stance.is_some());
         let mut pipeline = Pipeline::new(setup);
         if let Some(contact) = touch {
-            pipeline.declare(contact, Nanos::ZERO, true);
+            pipeline.declare(contact, Nanos::ZERO, &ContactState::configured(true));
         }
         let mut bench = Self {
             pipeline,

@@ -50,6 +50,9 @@ pub struct Config {
     /// The unknown external wrenches.
     #[serde(default)]
     pub contact: Vec<Contact>,
+    /// Patches of tactile skin, which show where contacts are.
+    #[serde(default)]
+    pub skin: Vec<Skin>,
     /// What is identified, and from which measurements.
     #[serde(default)]
     pub identification: Identification,
@@ -291,6 +294,53 @@ pub enum Presence {
     Possible,
 }
 
+/// A patch of tactile skin ([`crate::skin`]): while it is touched, its contact is present, at the
+/// place of the touch.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Skin {
+    /// Its channel.
+    pub channel: String,
+    /// The link or folded frame that its taxels are placed in.
+    pub link: String,
+    /// The contact, on the same link, that a touch belongs to.
+    pub contact: String,
+    /// The file of its taxels' positions and normals ([`crate::skin::TaxelMap`]), relative to this
+    /// file.
+    pub taxels: PathBuf,
+    /// The number in that file of the first taxel of the channel's triangle 0: 192 for the second
+    /// board of an iCub's limb. Default: 0.
+    #[serde(default)]
+    pub first_taxel: usize,
+    /// Standard deviation of an untouched taxel's value, in its unit (iCub: counts). Measure it
+    /// with the robot in motion and nobody near. Default: 1.
+    #[serde(default = "default_skin_noise")]
+    pub noise: f64,
+    /// How many touches that are none the patch may show per hour. This and `noise` give the
+    /// threshold of a taxel ([`crate::skin::threshold`]). Default: 1.
+    #[serde(default = "default_false_alarms")]
+    pub false_alarms_per_hour: f64,
+    /// Standard deviation of a touch's position, each axis \[m\]. Default: the median distance of
+    /// neighbouring taxels divided by the square root of 12.
+    pub position_std_m: Option<f64>,
+    /// The longest time without a reading of a triangle \[ms\]; default 250. A touch that was seen
+    /// before a longer silence is not known any more: what depends on it is withheld.
+    #[serde(default = "default_skin_silence_ms")]
+    pub max_silence_ms: f64,
+}
+
+const fn default_skin_noise() -> f64 {
+    1.0
+}
+
+const fn default_false_alarms() -> f64 {
+    1.0
+}
+
+const fn default_skin_silence_ms() -> f64 {
+    250.0
+}
+
 /// `[identification]`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -455,6 +505,9 @@ impl Config {
         let folder = file.parent().unwrap_or(Path::new("."));
         config.model = folder.join(&config.model);
         config.parameters = config.parameters.map(|p| folder.join(p));
+        for skin in &mut config.skin {
+            skin.taxels = folder.join(&skin.taxels);
+        }
         config.identification.state = config.identification.state.map(|p| folder.join(p));
         Ok(config)
     }
@@ -631,6 +684,16 @@ impl Config {
             finite(&at("offset_nm"), &ft.offset_nm.unwrap_or_default())?;
             finite(&at("xyz_m"), &ft.xyz_m.unwrap_or_default())?;
             finite(&at("rpy_rad"), &ft.rpy_rad.unwrap_or_default())?;
+        }
+        for skin in &self.skin {
+            let at = |key: &str| format!("skin {:?}: {key}", skin.channel);
+            positive(&at("noise"), skin.noise, 1e6)?;
+            let alarms = skin.false_alarms_per_hour;
+            positive(&at("false_alarms_per_hour"), alarms, 1e6)?;
+            positive(&at("max_silence_ms"), skin.max_silence_ms, 3.6e6)?;
+            if let Some(std) = skin.position_std_m {
+                positive(&at("position_std_m"), std, 1.0)?;
+            }
         }
         for contact in &self.contact {
             let at = |key: &str| format!("contact {:?}: {key}", contact.name());
@@ -831,6 +894,17 @@ mod tests {
                 "[output]",
                 "[identification]\nsave_every_s = 0\n[output]",
                 "identification.save_every_s = 0 must be 1 to",
+            ),
+            (
+                "[output]",
+                "[[skin]]\nchannel = \"s\"\nlink = \"a\"\ncontact = \"hand\"\ntaxels = \"t\"\n\
+                 noise = 0\n[output]",
+                "skin \"s\": noise = 0 must be above 0",
+            ),
+            (
+                "[output]",
+                "[[skin]]\nchannel = \"s\"\nlink = \"a\"\ncontact = \"hand\"\n[output]",
+                "missing field `taxels`",
             ),
             (
                 "trigger = \"ft\"",

@@ -119,9 +119,9 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
         every: Nanos::from_seconds(config.identification.save_every_s),
     });
     let channels: Arc<[ChannelStatus]> = std::iter::repeat_with(ChannelStatus::default)
-        .take(setup.robot.channels.len())
+        .take(setup.channels().count())
         .collect();
-    let mut gateway_log = GatewayLog::new(&setup.robot, &domain.config().name);
+    let mut gateway_log = GatewayLog::new(&setup, &domain.config().name);
     let mut gateway = Watch::<GatewayHealth>::default();
     let shared = Shared {
         last_turn: Arc::clone(&last_turn),
@@ -439,9 +439,9 @@ impl DataPlane {
                 let entry = u32::try_from(number)
                     .ok()
                     .and_then(|n| description.find(Role::Channel, n));
-                let robot = &self.pipeline.setup().robot;
+                let setup = self.pipeline.setup();
                 self.map
-                    .push(entry.and_then(|e| robot.channel(e.kind.get()?, e.name.as_str())));
+                    .push(entry.and_then(|e| setup.channel(e.kind.get()?, e.name.as_str())));
             }
             self.map_epoch = description.header.epoch;
             for (number, channel) in self.shared.channels.iter().enumerate() {
@@ -459,9 +459,9 @@ impl DataPlane {
                 .contact(declared.contact.as_str())
             {
                 Some(contact) => {
-                    let (t, active) = (declared.header.acquired, declared.active != 0);
-                    self.first_look.declare(now, contact, t, active);
-                    self.pipeline.declare(contact, t, active);
+                    let (t, state) = (declared.header.acquired, declared.state());
+                    self.first_look.declare(now, contact, t, state.active);
+                    self.pipeline.declare(contact, t, &state);
                 }
                 // Report once: a program may repeat a misspelt name a thousand times a second.
                 None if !self.unknown_contact_reported => {
@@ -500,7 +500,8 @@ impl DataPlane {
     fn publish_health(&mut self, now: Nanos) {
         self.report_temperatures();
         for (number, channel) in self.shared.channels.iter().enumerate() {
-            if let Some(t) = self.first_look.newest(number) {
+            let newest = self.first_look.newest(number);
+            if let Some(t) = newest.or_else(|| self.pipeline.newest_of_skin(number)) {
                 channel.set_newest(t);
             }
         }

@@ -194,12 +194,20 @@ impl Setup {
     #[must_use]
     pub fn description(&self) -> Box<Description> {
         let name = |text: &str| Name::new(text).unwrap_or(Name::EMPTY);
-        let channels = self.robot.channels.iter().map(|c| Entry {
-            name: name(&c.name),
-            kind: c.kind.in_memory(),
-            max_silence: self.robot.max_silence,
-            ..Entry::NONE
-        });
+        let of_skin = |number: usize| {
+            let skin = number.checked_sub(self.robot.channels.len());
+            skin.and_then(|skin| self.skins.get(skin))
+        };
+        let channels = self
+            .channels()
+            .enumerate()
+            .map(|(number, (kind, own))| Entry {
+                name: name(own),
+                kind: kind.in_memory(),
+                max_silence: of_skin(number)
+                    .map_or(self.robot.max_silence, |skin| skin.max_silence),
+                ..Entry::NONE
+            });
         let joints = self.robot.joint_names().map(|j| Entry {
             name: name(j),
             role: Role::Joint.in_memory(),
@@ -276,6 +284,18 @@ impl fmt::Display for Setup {
                 "  reads {} {}{trigger}",
                 channel.kind.word(),
                 channel.name
+            )?;
+        }
+        for skin in &self.skins {
+            let taxels = skin.taxels.iter().flatten().count();
+            writeln!(
+                f,
+                "  reads skin {}: {taxels} taxels, pressed above {:.1}; touches of {} within \
+                 {:.1} mm",
+                skin.channel,
+                skin.threshold,
+                self.robot.contact_label(skin.contact),
+                1e3 * skin.position_std
             )?;
         }
         for (dof, position) in self.robot.locked.iter().enumerate() {

@@ -10,7 +10,7 @@ use crate::setup::Setup;
 use anyhow::Context;
 use proprio_identification::{Dataset, Finding, Recording, Robot, Role, implausible};
 use proprio_topics::csv::Value;
-use proprio_topics::{Nanos, Quality, Reading};
+use proprio_topics::{ContactState, Nanos, Quality, Reading};
 use std::collections::BTreeSet;
 use std::sync::mpsc;
 
@@ -125,7 +125,8 @@ impl FirstLook {
         };
         // Only changes: a program may repeat its declaration a thousand times a second.
         if declared.replace(active) != Some(active) {
-            self.take(now, (self.last.len() + contact, t, Value::Active(active)));
+            let value = Value::Contact(ContactState::configured(active));
+            self.take(now, (self.last.len() + contact, t, value));
         }
     }
 
@@ -137,7 +138,8 @@ impl FirstLook {
             let (first, t) = (self.last.len(), received.1);
             for (contact, declared) in self.declared.iter().enumerate() {
                 if let (Some(active), Some(buffer)) = (declared, &mut self.buffer) {
-                    buffer.push((first + contact, t, Value::Active(*active)));
+                    let value = Value::Contact(ContactState::configured(*active));
+                    buffer.push((first + contact, t, value));
                 }
             }
         }
@@ -163,7 +165,9 @@ fn findings(robot: &Robot, window: &mut [Received]) -> Vec<Finding> {
     for (number, t, value) in &*window {
         match value {
             Value::Reading(reading, quality) => recording.push(*number, *t, reading, *quality),
-            Value::Active(active) => recording.declare(number - robot.channels.len(), *t, *active),
+            Value::Contact(state) => {
+                recording.declare(number - robot.channels.len(), *t, state.active);
+            }
         }
     }
     recording.set_rows(window.len() as u64, None);
@@ -303,7 +307,10 @@ mod tests {
         assert!(began < 1_000_000, "{:?}", window[0]);
         // The declaration of the first window is still valid.
         assert!(
-            matches!(window[0], (2, _, Value::Active(true))),
+            matches!(
+                window[0],
+                (2, _, Value::Contact(ContactState { active: true, .. }))
+            ),
             "{:?}",
             window[0]
         );

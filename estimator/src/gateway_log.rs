@@ -2,7 +2,7 @@
 //! which channels are missing. One line for each change, with what to do. Part of the control
 //! plane: the data plane only stores what has come ([`ChannelStatus`]).
 
-use proprio_identification::Robot;
+use crate::setup::Setup;
 use proprio_topics::Nanos;
 use proprio_topics::ipc::Presence;
 use std::sync::atomic::Ordering::Relaxed;
@@ -72,10 +72,11 @@ pub(crate) struct GatewayLog {
 }
 
 impl GatewayLog {
-    /// For the gateway of `robot` in the shared-memory domain `domain`.
-    pub(crate) fn new(robot: &Robot, domain: &str) -> Self {
-        let channels = robot.channels.iter().map(|channel| Channel {
-            name: channel.name.clone(),
+    /// For the gateway of the robot in the shared-memory domain `domain`.
+    pub(crate) fn new(setup: &Setup, domain: &str) -> Self {
+        let robot = &setup.robot;
+        let channels = setup.channels().map(|(_, name)| Channel {
+            name: name.to_owned(),
             newest: Nanos::MIN.0,
             due: Nanos::MAX,
             told: Missing::No,

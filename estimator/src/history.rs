@@ -7,11 +7,11 @@ use proprio_topics::{Nanos, Quality};
 /// identification, whose instants lie further back.
 pub const KEPT: usize = 1024;
 
-/// The last samples of one channel, `D` numbers each; NaN where one is absent.
+/// The last `K` samples of one channel, `D` numbers each; NaN where one is absent.
 #[derive(Debug, Clone)]
-pub struct History<const D: usize> {
-    samples: Box<[Entry<D>; KEPT]>,
-    /// How many were ever pushed; the newest is at `(count - 1) % KEPT`.
+pub struct History<const D: usize, const K: usize = KEPT> {
+    samples: Box<[Entry<D>; K]>,
+    /// How many were ever pushed; the newest is at `(count - 1) % K`.
     count: usize,
 }
 
@@ -37,7 +37,7 @@ pub struct ChannelValue<const D: usize> {
     pub interpolated: bool,
 }
 
-impl<const D: usize> Default for History<D> {
+impl<const D: usize, const K: usize> Default for History<D, K> {
     fn default() -> Self {
         let none = Entry {
             t: Nanos::MIN,
@@ -45,16 +45,16 @@ impl<const D: usize> Default for History<D> {
             quality: Quality::GOOD,
         };
         Self {
-            samples: Box::new([none; KEPT]),
+            samples: Box::new([none; K]),
             count: 0,
         }
     }
 }
 
-impl<const D: usize> History<D> {
+impl<const D: usize, const K: usize> History<D, K> {
     /// Adds a sample; its stamp must be later than the last one's.
     pub fn push(&mut self, t: Nanos, value: [f64; D], quality: Quality) {
-        if let Some(place) = self.samples.get_mut(self.count % KEPT) {
+        if let Some(place) = self.samples.get_mut(self.count % K) {
             *place = Entry { t, value, quality };
         }
         self.count += 1;
@@ -68,10 +68,10 @@ impl<const D: usize> History<D> {
 
     /// The sample that has `age` later ones.
     fn get(&self, age: usize) -> Option<&Entry<D>> {
-        if age >= self.count.min(KEPT) {
+        if age >= self.count.min(K) {
             return None;
         }
-        self.samples.get((self.count - 1 - age) % KEPT)
+        self.samples.get((self.count - 1 - age) % K)
     }
 
     /// The kept samples stamped `from` to `to`, newest first.
@@ -80,7 +80,7 @@ impl<const D: usize> History<D> {
         from: Nanos,
         to: Nanos,
     ) -> impl Iterator<Item = (Nanos, &[f64; D], Quality)> {
-        (0..KEPT)
+        (0..K)
             .map_while(|age| self.get(age))
             .skip_while(move |entry| entry.t > to)
             .take_while(move |entry| entry.t >= from)
@@ -137,7 +137,7 @@ mod tests {
 
     #[test]
     fn a_value_is_exact_interpolated_or_held() {
-        let mut history = History::<1>::default();
+        let mut history: History<1> = History::default();
         assert!(history.at(Nanos(5), Nanos(9)).is_none());
         history.push(Nanos(10), [1.0], Quality::GOOD);
         history.push(Nanos(20), [3.0], Quality::SATURATED);
@@ -158,7 +158,7 @@ mod tests {
 
     #[test]
     fn the_oldest_samples_are_dropped() {
-        let mut history = History::<1>::default();
+        let mut history: History<1> = History::default();
         for i in 0..5000 {
             history.push(Nanos(i), [0.0], Quality::GOOD);
         }

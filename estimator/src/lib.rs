@@ -25,6 +25,7 @@
 //!   with every name resolved, and [`reading`] reads logs.
 //! - Pipeline: [`pipeline`] does no input or output and reads no clock. [`history`] interpolates,
 //!   [`differentiate`] differentiates.
+//! - Contacts: [`skin`] turns the values of taxels into touches, and where they are.
 //! - Parameters: [`inertial`] holds the parameters in use, [`parameters`] is the file
 //!   parameters.toml, [`export`] writes it from an identification result.
 //! - Uncertainty: [`propagation`] turns the covariance of the parameters into standard deviations.
@@ -55,3 +56,4 @@ pub mod pipeline;
 pub mod propagation;
 pub mod reading;
 pub mod setup;
+pub mod skin;

@@ -10,6 +10,8 @@
 //! | `contact/<name>/fx_std fy_std fz_std tx_std ty_std tz_std` | their standard deviations |
 //! | `contact/<name>/valid`, `contact/<name>/reason` | as for a joint |
 //! | `contact/<name>/detected` | 1 if F/T readings show it without a declaration, else 0 |
+//! | `contact/<name>/px py pz` | where it is taken to be \[m\], in the same axes |
+//! | `contact/<name>/located` | 1 if a declaration or a skin says so, 0 if it is `position_m` |
 //! | `valid/<joint>` | 1 if the torque is valid, else 0 |
 //! | `reason/<joint>` | why it is not valid: a word, and the channel at fault after a colon |
 //! | `residual/<link>/fx fy fz tx ty tz` | \[N, Nm\], the residual of a sub-tree; see below |
@@ -23,10 +25,10 @@
 
 use crate::assessment::Assessor;
 use crate::pipeline::{Estimate, Pipeline};
-use crate::reading::{MissingChannels, Target, check_columns, targets};
+use crate::reading::{MissingChannels, Target, check_columns, check_skins, targets};
 use crate::setup::Setup;
-use proprio_topics::csv::{Item, Reader, Report, Row, Value};
-use proprio_topics::{ContactWrench, JointTorque, NO_CAUSE, Nanos, Reason, Residual};
+use proprio_topics::csv::{Item, Reader, Report, Row, Value, What};
+use proprio_topics::{ContactWrench, JointTorque, Kind, NO_CAUSE, Nanos, Reason, Residual};
 use std::collections::BTreeMap;
 use std::io::{self, Read, Write};
 
@@ -86,7 +88,16 @@ pub fn estimate(
     let mut pipeline = Pipeline::new(setup);
     let robot = &pipeline.setup().robot;
     check_columns(robot, reader.series(), |_| true)?;
-    let targets = targets(robot, reader.series());
+    check_skins(pipeline.setup(), reader.series())?;
+    let mut targets = targets(robot, reader.series());
+    for (series, target) in reader.series().iter().zip(&mut targets) {
+        if let What::Channel(kind @ Kind::Skin) = series.what {
+            *target = pipeline
+                .setup()
+                .channel(kind, &series.name)
+                .map(Target::Channel);
+        }
+    }
     for (series, target) in reader.series().iter().zip(&targets) {
         if target.is_none() {
             report.unused_channels.push(series.name.clone());
@@ -121,8 +132,8 @@ pub fn estimate(
                 (Some(Target::Channel(channel)), Value::Reading(reading, quality)) => {
                     pipeline.push(channel, t, reading, *quality);
                 }
-                (Some(Target::Contact(contact)), Value::Active(active)) => {
-                    pipeline.declare(contact, t, *active);
+                (Some(Target::Contact(contact)), Value::Contact(state)) => {
+                    pipeline.declare(contact, t, state);
                 }
                 _ => {}
             }
@@ -170,8 +181,8 @@ impl<W: Write> Table<W> {
                 .for_each(|j| header.push_str(&format!(",{part}/{j}")));
         }
         for contact in &contacts {
-            let columns =
-                "fx fy fz tx ty tz fx_std fy_std fz_std tx_std ty_std tz_std valid reason detected";
+            let columns = "fx fy fz tx ty tz fx_std fy_std fz_std tx_std ty_std tz_std valid \
+                           reason detected px py pz located";
             columns
                 .split(' ')
                 .for_each(|c| header.push_str(&format!(",contact/{contact}/{c}")));
@@ -189,12 +200,7 @@ impl<W: Write> Table<W> {
         }
         header.push('\n');
         out.write_all(header.as_bytes())?;
-        let channels = setup
-            .robot
-            .channels
-            .iter()
-            .map(|c| c.name.clone())
-            .collect();
+        let channels = setup.channels().map(|(_, name)| name.to_owned()).collect();
         Ok(Self {
             out,
             channels,
@@ -253,6 +259,9 @@ impl<W: Write> Table<W> {
                 contact.cause,
             );
             flag(&mut self.text, contact.detected);
+            let position = contact.position.into_iter();
+            position.for_each(|v| number(&mut self.text, v));
+            flag(&mut self.text, contact.located);
         }
         for joint in joints() {
             flag(&mut self.text, joint.valid);

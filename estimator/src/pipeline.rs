@@ -7,8 +7,9 @@
 //! 2. [`Pipeline::poll`] releases the oldest queued stamp `t` when all its samples are there.
 //! 3. Every channel is evaluated at `t` (`channels`). F/T readings are corrected for calibration,
 //!    temperature and offset.
-//! 4. Kinematics and solver give torques and contact wrenches; standard deviations are propagated
-//!    (`solution`, `motion`, [`crate::propagation`]).
+//! 4. The contacts that are present are put where declarations or skins say (`contacts`,
+//!    [`crate::skin`]). Kinematics and solver give torques and contact wrenches; standard
+//!    deviations are propagated (`solution`, `motion`, [`crate::propagation`]).
 //! 5. The F/T residual of each sub-tree is tested (`residuals`). A possible contact that explains a
 //!    significant residual is taken as present. Without such a contact, the torques of the sub-tree
 //!    are not valid.
@@ -51,11 +52,13 @@
 //!
 //! # Uncertainty
 //! Standard deviations contain F/T noise, the uncertainty of inertial parameters and F/T offsets
-//! ([`crate::propagation::Propagation`]), and that of differentiated accelerations, encoder offsets
-//! and the base's proper acceleration (`motion`). They do not contain the errors of velocities.
+//! ([`crate::propagation::Propagation`]), that of differentiated accelerations, encoder offsets and
+//! the base's proper acceleration (`motion`), and that of the places of declared and touched
+//! contacts ([`PlaceErrors`]). They do not contain the errors of velocities.
 
 mod buffers;
 mod channels;
+mod contacts;
 mod estimate;
 mod identification;
 mod input;
@@ -73,14 +76,17 @@ use crate::differentiate::{Grid, Window};
 use crate::history::{ChannelValue, History};
 use crate::propagation::Propagation;
 use crate::setup::Setup;
-use buffers::{ChannelBuffer, Declarations, OrReason, stale, temperature_at};
+use buffers::{ChannelBuffer, OrReason, stale, temperature_at};
 use channels::{imu_at, joint_at, wrench_at};
+use contacts::Contacts;
 use identification::OnlineIdentification;
 use motion::{ENCODER_OFFSET_STD, MotionErrors};
 use prediction::{Extrapolated, Predictor};
 use proprio_dynamics::model::{JointKind, Model};
 use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
-use proprio_dynamics::{ContactSet, Dependence, FrameMotion, Kinematics, Noise, Solver};
+use proprio_dynamics::{
+    ContactSet, Dependence, FrameMotion, Kinematics, Noise, PlaceErrors, Solver,
+};
 use proprio_identification::online::state::StateError;
 use proprio_identification::online::{Online, OnlineError};
 use proprio_identification::robot::{BaseMotion, ChannelRole};
@@ -99,8 +105,8 @@ pub struct Pipeline {
     faults: Vec<Reason>,
     /// Why the motion of the base is not valid, if no channel measures it.
     base_fault: Reason,
-    /// Per contact, when it was declared present or absent.
-    declarations: Vec<Declarations>,
+    /// Which contacts are present, and where.
+    contacts: Contacts,
     /// Stamps of the trigger channel that have no estimate yet, oldest first.
     waiting: VecDeque<Nanos>,
     /// The newest stamp of any channel.
@@ -115,6 +121,8 @@ pub struct Pipeline {
     propagation: Propagation,
     /// The same from errors of positions and accelerations.
     motion: Box<MotionErrors>,
+    /// The same from errors of the contacts' places.
+    place_errors: PlaceErrors,
     /// Tests the F/T residual of each sub-tree.
     residuals: ResidualMonitor,
     position: Vec<f64>,
@@ -202,7 +210,7 @@ impl Pipeline {
             grid: Box::default(),
             faults: vec![Reason::NeverSeen; setup.robot.channels.len()],
             base_fault: Reason::None,
-            declarations: vec![Declarations::default(); setup.robot.contacts.len()],
+            contacts: Contacts::new(&setup),
             waiting: VecDeque::with_capacity(Self::MAX_WAITING),
             newest: Nanos::MIN,
             released: Nanos::MIN,
@@ -212,6 +220,7 @@ impl Pipeline {
             solver: Solver::new(&setup.robot.structure),
             propagation,
             motion: Box::new(motion.expect("the base is a link of the model")),
+            place_errors: PlaceErrors::new(&setup.robot.structure),
             residuals: ResidualMonitor::new(&setup.robot.structure),
             position: setup.robot.position_without_samples(),
             velocity: vec![0.0; dofs],
@@ -350,10 +359,9 @@ impl Pipeline {
         self.identification = Some(identification);
     }
 
-    /// The contacts known to be present at `t`, by configuration or declaration.
+    /// The contacts known to be present at `t`, by configuration, declaration or touch.
     fn active_contacts(&self, t: Nanos) -> ContactSet {
-        let declared = |contact: usize| self.declarations.get(contact)?.at(t);
-        self.setup.robot.active_contacts(declared)
+        self.contacts.active(&self.setup.robot, t)
     }
 
     /// Makes the base link the start of the kinematics. Returns its motion, which the IMU replaces

@@ -5,7 +5,7 @@
 //! end of a line may not be the end of a row (a quoted cell can contain one), and where rows have
 //! no stamps and are counted instead.
 
-use crate::setup::similar_name;
+use crate::setup::{Setup, similar_name};
 use proprio_identification::dataset::DatasetError;
 use proprio_identification::dataset::recording::SkippedRows;
 use proprio_identification::robot::Channel;
@@ -271,8 +271,8 @@ impl PartialRecording {
                     (Some(Target::Channel(channel)), Value::Reading(reading, quality)) => {
                         self.recording.push(channel, t, reading, *quality);
                     }
-                    (Some(Target::Contact(contact)), Value::Active(active)) => {
-                        self.recording.declare(contact, t, *active);
+                    (Some(Target::Contact(contact)), Value::Contact(state)) => {
+                        self.recording.declare(contact, t, state.active);
                     }
                     _ => {}
                 }
@@ -344,11 +344,36 @@ pub fn check_columns(
     })
 }
 
+/// Checks that a log with columns of skins has those that the configuration names: its channel may
+/// be misspelt. A log without any skin is a log of before there was one.
+///
+/// # Errors
+/// The channels that it lacks.
+pub(crate) fn check_skins(setup: &Setup, series: &[Series]) -> Result<(), MissingChannels> {
+    let is_skin = |series: &&Series| series.what == What::Channel(Kind::Skin);
+    let logged: Vec<&str> = series
+        .iter()
+        .filter(is_skin)
+        .map(|one| one.name.as_str())
+        .collect();
+    let skins = setup.skins.iter().map(|skin| skin.channel.as_str());
+    let missing: Vec<&str> = skins.filter(|name| !logged.contains(name)).collect();
+    let Some(first) = missing.first().filter(|_| !logged.is_empty()) else {
+        return Ok(());
+    };
+    let configured = |name: &str| setup.skins.iter().any(|skin| skin.channel == name);
+    let others = logged.iter().copied().filter(|name| !configured(name));
+    Err(MissingChannels {
+        robot: setup.robot.name.clone(),
+        hint: similar_name(first, others).unwrap_or_default(),
+        missing: missing.iter().map(|name| format!("skin/{name}")).collect(),
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::config::Config;
-    use crate::setup::Setup;
     use std::path::Path;
 
     /// The recording of a log that is not cut.

@@ -8,6 +8,7 @@ use crate::config::{
 use crate::differentiate::Settings;
 use crate::inertial::InertialState;
 use crate::parameters::{Parameters, ParametersError};
+use crate::skin::{PatchSetup, TRIANGLE, TRIANGLES, Taxel, TaxelMap, threshold};
 use proprio_dynamics::calibration::{self, Calibration};
 use proprio_dynamics::model::{Frame, JointKind, MeasurementDirection, MeasurementFrame, Model};
 use proprio_dynamics::spatial::{Pose, Vec3};
@@ -41,6 +42,8 @@ pub struct Setup {
     /// a quarter of the joint's effort limit. Without a credible limit in the URDF, the limit is
     /// taken to be ten times the gravity load.
     pub max_deviation: Vec<f64>,
+    /// The patches of tactile skin.
+    pub skins: Vec<PatchSetup>,
     /// How joint positions are differentiated.
     pub joint_settings: Settings,
     /// How angular velocities are differentiated.
@@ -136,6 +139,7 @@ impl Setup {
             }
         }
         let (contacts, mut specs) = contacts(config, &model)?;
+        let skins = skins(config, &model, &contacts, &specs, &mut warnings)?;
         let (base_link, base) = match &config.base {
             Base::Fixed { link, gravity_mps2 } => {
                 let frame = frame(&model, link).map_err(|e| format!("base.link: {e}"))?;
@@ -216,6 +220,15 @@ impl Setup {
             // Sensors come first, then joints.
             None => 0,
         };
+        for skin in &skins {
+            if let Some(other) = channels.iter().find(|c| c.name == skin.channel) {
+                return Err(format!(
+                    "{:?} names a {} channel and a skin channel; give each its own name",
+                    skin.channel,
+                    other.kind.word()
+                ));
+            }
+        }
         if channels.is_empty() {
             return Err(
                 "no channel is read: add a [[force_torque]] sensor, a joint that is not locked, or \
@@ -277,6 +290,7 @@ impl Setup {
             max_wait: Nanos::from_seconds(config.output.max_wait_ms() * 1e-3),
             timing: config.output.timing(),
             max_deviation,
+            skins,
             joint_settings: settings(position_noise_rad),
             gyro_settings: settings(angular_velocity_noise_radps),
             identifies: identification.enabled,
@@ -298,6 +312,27 @@ impl Setup {
     /// then.
     pub fn apply(&mut self, parameters: &Parameters) -> Result<(), ParametersError> {
         self.state.apply(&self.robot, parameters)
+    }
+
+    /// The number of a channel: those of the robot come first, then the skins.
+    #[must_use]
+    pub fn channel(&self, kind: Kind, name: &str) -> Option<usize> {
+        if kind != Kind::Skin {
+            return self.robot.channel(kind, name);
+        }
+        let skin = self.skins.iter().position(|skin| skin.channel == name)?;
+        Some(self.robot.channels.len() + skin)
+    }
+
+    /// Kind and name of each channel, by number.
+    pub fn channels(&self) -> impl Iterator<Item = (Kind, &str)> {
+        let skins = self.skins.iter();
+        let of_robot = self
+            .robot
+            .channels
+            .iter()
+            .map(|c| (c.kind, c.name.as_str()));
+        of_robot.chain(skins.map(|skin| (Kind::Skin, skin.channel.as_str())))
     }
 
     /// Whether channel number `channel` is an F/T sensor whose calibration depends on the
@@ -518,6 +553,87 @@ fn contacts(
         });
     }
     Ok((names, specs))
+}
+
+/// The patches of skin, with their taxels in the frames of their contacts.
+fn skins(
+    config: &Config,
+    model: &Model,
+    contacts: &[NamedContact],
+    specs: &[ContactSpec],
+    warnings: &mut Vec<String>,
+) -> Result<Vec<PatchSetup>, String> {
+    /// Further from its link's origin than any taxel of a robot's limb \[m\].
+    const FAR: f64 = 2.0;
+    let mut skins = Vec::<PatchSetup>::new();
+    for skin in &config.skin {
+        let at = format!("skin {:?}", skin.channel);
+        if skins.iter().any(|other| other.channel == skin.channel) {
+            return Err(format!(
+                "{at}: two skins have this channel; give each its own"
+            ));
+        }
+        let frame = frame(model, &skin.link).map_err(|e| format!("{at}: link: {e}"))?;
+        let contact = (contacts.iter().position(|c| c.name == skin.contact)).ok_or_else(|| {
+            let names = nearest(&skin.contact, contacts.iter().map(|c| c.name.as_str()));
+            format!("{at}: contact = {:?} is not a contact{names}", skin.contact)
+        })?;
+        let Some(own) = specs.get(contact).map(|spec| spec.frame) else {
+            continue;
+        };
+        if own.link != frame.link {
+            return Err(format!(
+                "{at}: contact {:?} is on the link {:?}, the skin on {:?}; name a contact on the \
+                 skin's link",
+                skin.contact,
+                model.link_name(own.link),
+                model.link_name(frame.link)
+            ));
+        }
+        let map = TaxelMap::load(&skin.taxels).map_err(|e| format!("{at}: taxels: {e}"))?;
+        let rows = map.0.len();
+        let taxels = map.0.get(skin.first_taxel..).unwrap_or_default();
+        let taxels = taxels.get(..TRIANGLE * TRIANGLES).unwrap_or(taxels);
+        let count = taxels.iter().flatten().count();
+        if count == 0 {
+            return Err(format!(
+                "{at}: first_taxel = {}: {} has no taxel from there on; it has {rows} rows, \
+                 counted from 0",
+                skin.first_taxel,
+                skin.taxels.display()
+            ));
+        }
+        if taxels
+            .iter()
+            .flatten()
+            .any(|taxel| taxel.position.norm() > FAR)
+        {
+            warnings.push(format!(
+                "{at}: {} places a taxel more than {FAR} m from the origin of {:?}: positions are \
+                 in metres",
+                skin.taxels.display(),
+                skin.link
+            ));
+        }
+        let x_cs = own.pose.inverse() * frame.pose;
+        let placed = |taxel: &Taxel| Taxel {
+            position: x_cs.point(&taxel.position),
+            normal: x_cs.rotation * taxel.normal,
+        };
+        let of_pitch = || map.pitch().unwrap_or(0.0) / f64::sqrt(12.0);
+        skins.push(PatchSetup {
+            channel: skin.channel.clone(),
+            contact,
+            taxels: taxels
+                .iter()
+                .map(|taxel| taxel.as_ref().map(placed))
+                .collect(),
+            threshold: threshold(skin.noise, count, skin.false_alarms_per_hour),
+            position_std: skin.position_std_m.unwrap_or_else(of_pitch),
+            max_silence: Nanos::from_seconds(skin.max_silence_ms * 1e-3),
+        });
+    }
+    Ok(skins)
 }
 
 /// The motion of a link while `frame`, which is fixed to it, is at rest.

@@ -9,7 +9,7 @@ use proprio_estimator::offline;
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
 use proprio_topics::csv::{Reader, Row, Value, What};
-use proprio_topics::{JointState, Kind, Nanos, Quality, Reading, Reason, Wrench};
+use proprio_topics::{ContactState, JointState, Kind, Nanos, Quality, Reading, Reason, Wrench};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
@@ -497,7 +497,7 @@ fn recording_with(setup: &Setup, seconds: f64, phase: impl Fn(usize) -> f64) -> 
     while reader.next_row(&mut row).unwrap() {
         let items = row.items.iter().filter_map(|i| match i.value {
             Value::Reading(reading, _) => Some((series[i.series]?, reading)),
-            Value::Active(_) => None,
+            Value::Contact(_) => None,
         });
         rows.push((row.t.unwrap().seconds(), items.collect()));
     }
@@ -885,7 +885,7 @@ fn the_ground_reaction_of_a_fixed_base_cannot_be_declared_absent() {
         let events = recording(&setup, 0.2);
         let (want, _) = run(setup.clone(), &events);
         let mut pipeline = Pipeline::new(setup);
-        pipeline.declare(stand, Nanos::ZERO, false);
+        pipeline.declare(stand, Nanos::ZERO, &ContactState::configured(false));
         let mut got = vec![];
         for (channel, t, reading, quality) in &events {
             pipeline.push(*channel, *t, reading, *quality);
@@ -921,7 +921,7 @@ fn a_repeated_declaration_changes_nothing() {
     let mut next = Nanos::ZERO;
     for (channel, t, reading, quality) in &events {
         while next <= *t {
-            pipeline.declare(hand, next, true);
+            pipeline.declare(hand, next, &ContactState::configured(true));
             next += Nanos::from_millis(1);
         }
         pipeline.push(*channel, *t, reading, *quality);
@@ -937,8 +937,9 @@ fn a_repeated_declaration_changes_nothing() {
     // More changes than are kept: before the first that is kept, the last one of those dropped is
     // valid.
     let start = events.last().unwrap().1 + Nanos::from_millis(10);
-    for i in 0..40 {
-        pipeline.declare(hand, start + Nanos::from_millis(100 + i), i % 2 == 1);
+    for i in 0..600 {
+        let state = ContactState::configured(i % 2 == 1);
+        pipeline.declare(hand, start + Nanos::from_millis(100 + i), &state);
     }
     let (mut present, mut all) = (0, 0);
     for (channel, t, reading, quality) in &events {
@@ -965,7 +966,11 @@ fn a_possible_contact_is_absent_unless_declared() {
     let hand = setup.robot.contact("hand").unwrap();
     let events = recording(&setup, 0.3);
     let mut pipeline = Pipeline::new(setup);
-    pipeline.declare(hand, Nanos::from_millis(200), true);
+    pipeline.declare(
+        hand,
+        Nanos::from_millis(200),
+        &ContactState::configured(true),
+    );
     for (channel, t, reading, quality) in &events {
         pipeline.push(*channel, *t, reading, *quality);
         while let Some(estimate) = pipeline.poll() {
@@ -1085,7 +1090,7 @@ fn the_base_is_the_link_that_stands() {
         (hand, 30, true),
         (hand, 70, false),
     ] {
-        pipeline.declare(contact, ms(t), active);
+        pipeline.declare(contact, ms(t), &ContactState::configured(active));
     }
     for step in 0..100 {
         let t = ms(step);

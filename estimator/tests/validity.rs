@@ -5,7 +5,9 @@
 use proprio_estimator::config::{Config, Presence, Timing};
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
-use proprio_topics::{Code, Imu, JointState, Kind, Nanos, Quality, Reading, Reason, Wrench};
+use proprio_topics::{
+    Code, ContactState, Imu, JointState, Kind, Nanos, Quality, Reading, Reason, Wrench,
+};
 use std::path::{Path, PathBuf};
 
 const PERIOD: i64 = 10_000_000;
@@ -385,9 +387,9 @@ fn what_comes_too_late_is_counted() {
         }
     }
     assert_eq!(pipeline.counts().late, 0);
-    pipeline.declare(hand, released, true);
+    pipeline.declare(hand, released, &ContactState::configured(true));
     assert_eq!(pipeline.counts().late, 1);
-    pipeline.declare(hand, released + Nanos(1), false);
+    pipeline.declare(hand, released + Nanos(1), &ContactState::configured(false));
     assert_eq!(pipeline.counts().late, 1);
     // Taken, because it is later than the released instant, but that instant would have used it.
     let taken = pipeline.counts().taken;

@@ -10,9 +10,11 @@
 //! | `spike:BOARD@6` | one reading is wrong by 200 N and 5 Nm on every axis |
 //! | `late_half:BOARD@2..8` | second halves of about one reading in ten are late |
 //! | `push:l_forearm=20@8..9` | an undeclared force of 20 N pushes this link of the URDF |
+//! | `push:l_forearm=20:0.03,-0.07,0:-1,0,0@8..9` | the same, at this point and in this direction |
 //!
 //! A late half follows just after the next reading's first half; `late_half:BOARD@6` delays one
-//! reading. A push acts at the link's origin along its x axis.
+//! reading. A push acts at the origin of the link's frame along its x axis, or at the point \[m\]
+//! and in the direction given in that frame. A skin of estimator.toml feels it where it is.
 //!
 //! Times are seconds since the start of the simulation; the end may be omitted (`5..`). BOARD is
 //! the board's name in gateway.toml or the name of one of its channels.
@@ -76,10 +78,14 @@ pub enum Fault {
     },
     /// An undeclared force pushes the robot.
     Push {
-        /// The link of the URDF; the force acts at its origin along its x axis.
+        /// The link of the URDF.
         link: String,
         /// The force \[N\].
         force: f64,
+        /// Where it acts in the link's frame \[m\]; default: at its origin.
+        at: Option<[f64; 3]>,
+        /// Its direction in the link's frame, of any length; default: along the x axis.
+        along: Option<[f64; 3]>,
         /// When.
         window: Window,
     },
@@ -219,6 +225,13 @@ fn window(text: &str) -> Option<Window> {
     (from < until).then_some(Window { from, until })
 }
 
+/// `0.03,-0.07,0`.
+fn vector(text: &str) -> Option<[f64; 3]> {
+    let numbers: Option<Vec<f64>> = text.split(',').map(|x| x.trim().parse().ok()).collect();
+    let vector: [f64; 3] = numbers?.try_into().ok()?;
+    vector.iter().all(|x| x.is_finite()).then_some(vector)
+}
+
 impl FromStr for Fault {
     type Err = FaultError;
 
@@ -302,20 +315,25 @@ impl FromStr for Fault {
                 )),
             },
             "push" => {
-                let (link, force) = what.split_once('=').unwrap_or_default();
-                let force = force
-                    .trim()
-                    .parse()
-                    .ok()
-                    .filter(|force: &f64| force.is_finite());
+                let (link, rest) = what.split_once('=').unwrap_or_default();
+                let mut parts = rest.split(':');
+                let force = parts.next().and_then(|force| force.trim().parse().ok());
+                let force = force.filter(|force: &f64| force.is_finite());
+                let (at, along) = (parts.next().map(vector), parts.next().map(vector));
+                let is_good = !link.is_empty()
+                    && parts.next().is_none()
+                    && at != Some(None)
+                    && along.is_none_or(|along| along.is_some_and(|along| along != [0.0; 3]));
                 match (span, force) {
-                    (Some(window), Some(force)) if !link.is_empty() => Ok(Self::Push {
+                    (Some(window), Some(force)) if is_good => Ok(Self::Push {
                         link: link.to_owned(),
                         force,
+                        at: at.flatten(),
+                        along: along.flatten(),
                         window,
                     }),
                     _ => Err(form(
-                        "push:LINK=NEWTONS@FROM..UNTIL",
+                        "push:LINK=NEWTONS[:X,Y,Z[:DX,DY,DZ]]@FROM..UNTIL",
                         "\"push:l_forearm=20@8..9\"",
                     )),
                 }
@@ -368,8 +386,16 @@ impl fmt::Display for Fault {
             Self::Push {
                 link,
                 force,
+                at,
+                along,
                 window,
-            } => write!(f, "push:{link}={force}@{window}"),
+            } => {
+                write!(f, "push:{link}={force}")?;
+                for [x, y, z] in at.iter().chain(along) {
+                    write!(f, ":{x},{y},{z}")?;
+                }
+                write!(f, "@{window}")
+            }
         }
     }
 }
@@ -393,6 +419,8 @@ mod tests {
             "late_half:l_arm_ft_sensor@2.5",
             "push:l_forearm=20@8..9",
             "push:l_hand=-2.5@3..",
+            "push:l_hand=20:0.01,-0.02,0@3..4",
+            "push:l_hand=20:0.01,-0.02,0:0,-1,0.5@3..4",
         ] {
             assert_eq!(text.parse::<Fault>().unwrap().to_string(), text);
         }
@@ -420,10 +448,26 @@ mod tests {
             ("saturate:ft@inf..", "saturate:BOARD@FROM..UNTIL"),
             ("freeze:ft@5", "freeze:BOARD@FROM..UNTIL"),
             ("late_half:ft", "late_half:BOARD@FROM..UNTIL or"),
-            ("push:hand@1..2", "push:LINK=NEWTONS@FROM..UNTIL"),
-            ("push:=5@1..2", "push:LINK=NEWTONS@FROM..UNTIL"),
-            ("push:hand=5@3", "push:LINK=NEWTONS@FROM..UNTIL"),
-            ("push:hand=hard@1..2", "push:LINK=NEWTONS@FROM..UNTIL"),
+            (
+                "push:hand@1..2",
+                "push:LINK=NEWTONS[:X,Y,Z[:DX,DY,DZ]]@FROM..UNTIL",
+            ),
+            ("push:hand=2:1,2@1..2", "push:LINK=NEWTONS["),
+            ("push:hand=2:1,2,nan@1..2", "push:LINK=NEWTONS["),
+            ("push:hand=2:1,2,3:0,0,0@1..2", "push:LINK=NEWTONS["),
+            ("push:hand=2:1,2,3:0,0,1:4@1..2", "push:LINK=NEWTONS["),
+            (
+                "push:=5@1..2",
+                "push:LINK=NEWTONS[:X,Y,Z[:DX,DY,DZ]]@FROM..UNTIL",
+            ),
+            (
+                "push:hand=5@3",
+                "push:LINK=NEWTONS[:X,Y,Z[:DX,DY,DZ]]@FROM..UNTIL",
+            ),
+            (
+                "push:hand=hard@1..2",
+                "push:LINK=NEWTONS[:X,Y,Z[:DX,DY,DZ]]@FROM..UNTIL",
+            ),
         ] {
             let message = text.parse::<Fault>().unwrap_err().to_string();
             assert!(message.contains(expected), "{text}: {message}");

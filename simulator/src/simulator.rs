@@ -33,6 +33,8 @@ pub const JOINT_NOISE: f64 = 2e-5;
 pub const ACCELERATION_NOISE: f64 = 0.03;
 /// Standard deviation of a simulated IMU's angular velocity \[rad/s\].
 pub const ANGULAR_VELOCITY_NOISE: f64 = 0.002;
+/// Standard deviation of a simulated taxel \[counts\].
+pub const TAXEL_NOISE: f64 = 0.8;
 
 /// Error of a spike on every axis: \[N\] and \[Nm\].
 const SPIKE: (f64, f64) = (200.0, 5.0);
@@ -367,6 +369,8 @@ enum Source {
     Wrench(usize, [f64; 3], [f64; 3]),
     /// IMU of this number.
     Imu(usize),
+    /// Skin of this number.
+    Skin(usize),
 }
 
 /// One board with its measured quantities and its faults.
@@ -622,8 +626,13 @@ fn sources(
                      of the URDF has its name",
                 )
             })?),
+            // A skin that estimator.toml does not place feels nothing.
+            Kind::Skin => match simulation.skin(of_route) {
+                Some(skin) => Source::Skin(skin),
+                None => continue,
+            },
             // What is not simulated is silent.
-            Kind::Gauges | Kind::Temperature | Kind::Actuator | Kind::Skin => continue,
+            Kind::Gauges | Kind::Temperature | Kind::Actuator => continue,
         };
         outputs.push((route.output, source));
     }
@@ -641,6 +650,15 @@ fn measure(
     let mut readings = Vec::with_capacity(outputs.len());
     for (output, source) in outputs {
         let reading = match *source {
+            Source::Skin(number) => {
+                for mut skin in simulation.taxels(number, t) {
+                    if let Some(random) = &mut random {
+                        random.disturb(&mut skin.taxels, [TAXEL_NOISE; 12]);
+                    }
+                    readings.push((*output, Reading::Skin(skin)));
+                }
+                continue;
+            }
             Source::Shaft(ref inverse, ref joints) => {
                 let points = joints
                     .iter()

@@ -5,7 +5,7 @@
 //! link of the first contact on the IMU's link (else of the first contact that is not pushed).
 //! Gravity points along its frame's negative z axis, unless `gravity_mps2` is set. Other wrenches
 //! on the robot are a push on its hand (the contact named `hand`, else the last one that does not
-//! carry it) and the pushes of faults ([`Fault::Push`]).
+//! carry it) and the pushes of faults ([`Fault::Push`]), which the skins of estimator.toml feel.
 
 use crate::fault::{Fault, Window};
 use crate::noise::Random;
@@ -19,7 +19,8 @@ use proprio_dynamics::{
     SensorCut,
 };
 use proprio_estimator::config::{Base, Contact, ContactKind, Direction, ForceTorque, SensorFrame};
-use proprio_topics::Kind;
+use proprio_estimator::skin::{TRIANGLE, TRIANGLES, Taxel, TaxelMap};
+use proprio_topics::{Kind, Skin};
 
 /// Standard gravity \[m/s^2\].
 const GRAVITY: f64 = 9.80665;
@@ -27,6 +28,11 @@ const GRAVITY: f64 = 9.80665;
 const PUSH: (f64, f64) = (10.0, 0.3);
 /// Its start and end in a cycle, and the fraction of the push that each flank takes.
 const PUSH_TIME: (f64, f64, f64) = (0.4, 0.6, 0.25);
+
+/// Pressure of a taxel under the middle of a push \[counts per N\].
+const COUNTS_PER_NEWTON: f64 = 5.0;
+/// Width of a push on a skin, a standard deviation \[m\]: that of a finger tip.
+const WIDTH: f64 = 0.006;
 
 /// The beginning or end of a touch.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -101,9 +107,27 @@ pub struct Simulation {
     carries: Option<usize>,
     push: Option<Push>,
     /// Undeclared pushes and their windows.
-    pokes: Vec<(ExternalWrench, Window)>,
+    pokes: Vec<Poke>,
+    skins: Vec<SkinTruth>,
     state: [Vec<f64>; 3],
     truth: Truth,
+}
+
+/// An undeclared push.
+#[derive(Debug, Clone, Copy)]
+struct Poke {
+    external: ExternalWrench,
+    /// Where it acts, in its link's axes.
+    point: Vec3,
+    window: Window,
+}
+
+/// A skin: its taxels, in its link's axes.
+#[derive(Debug, Clone)]
+struct SkinTruth {
+    name: String,
+    link: usize,
+    taxels: Vec<Option<Vec3>>,
 }
 
 #[derive(Debug, Clone)]
@@ -253,6 +277,8 @@ impl Simulation {
             if let Fault::Push {
                 link,
                 force,
+                at,
+                along,
                 window,
             } = fault
             {
@@ -260,9 +286,37 @@ impl Simulation {
                     return Err(robot
                         .mismatch(format!("fault {fault}: {link:?} is not a link of the URDF")));
                 };
-                let wrench = Wrench::from_parts([*force, 0.0, 0.0], [0.0; 3]);
-                pokes.push((ExternalWrench { frame, wrench }, *window));
+                let point = Vec3::from(at.unwrap_or_default());
+                let along = Vec3::from(along.unwrap_or([1.0, 0.0, 0.0]));
+                let force = along.try_normalize(1e-9).unwrap_or_else(Vec3::x) * *force;
+                let torque = point.cross(&force);
+                pokes.push(Poke {
+                    external: ExternalWrench {
+                        frame,
+                        wrench: Wrench { torque, force },
+                    },
+                    point: frame.pose.point(&point),
+                    window: *window,
+                });
             }
+        }
+
+        let mut skins = Vec::new();
+        for skin in &robot.config.skin {
+            let place = format!("skin {:?}", skin.channel);
+            let frame = frame(&place, &skin.link)?;
+            let map = TaxelMap::load(&skin.taxels).map_err(|e| wrong(format!("{place}: {e}")))?;
+            let taxels = map
+                .0
+                .iter()
+                .skip(skin.first_taxel)
+                .take(TRIANGLE * TRIANGLES);
+            let point = |taxel: &Taxel| frame.pose.point(&taxel.position);
+            skins.push(SkinTruth {
+                name: skin.channel.clone(),
+                link: frame.link,
+                taxels: taxels.map(|taxel| taxel.as_ref().map(point)).collect(),
+            });
         }
 
         let dofs = model.dof_count();
@@ -318,6 +372,7 @@ impl Simulation {
             carries,
             push,
             pokes,
+            skins,
         };
         // Inconsistencies are reported here, not as absent readings later.
         this.evaluate(0.0).map_err(|e| wrong(e.to_string()))?;
@@ -340,6 +395,41 @@ impl Simulation {
     #[must_use]
     pub fn imu(&self, name: &str) -> Option<usize> {
         self.imus.iter().position(|(n, _)| n == name)
+    }
+
+    /// The number of the skin of this name.
+    #[must_use]
+    pub fn skin(&self, name: &str) -> Option<usize> {
+        self.skins.iter().position(|skin| skin.name == name)
+    }
+
+    /// The values of the taxels of skin `skin` at `t` seconds \[counts\], triangle by triangle; NaN
+    /// where there is no taxel. Triangles without any taxel are omitted.
+    #[must_use]
+    pub fn taxels(&self, skin: usize, t: f64) -> Vec<Skin> {
+        let Some(skin) = self.skins.get(skin) else {
+            return Vec::new();
+        };
+        let present = || self.pokes.iter().filter(|poke| poke.window.contains(t));
+        let value = |place: &Vec3| -> f64 {
+            let pushes = present().filter(|poke| poke.external.frame.link == skin.link);
+            let pressures = pushes.map(|poke| {
+                let away = (place - poke.point).norm() / WIDTH;
+                COUNTS_PER_NEWTON * poke.external.wrench.force.norm() * (-0.5 * away * away).exp()
+            });
+            pressures.sum()
+        };
+        let triangles = skin.taxels.chunks(TRIANGLE).zip(0..);
+        let triangles = triangles.filter(|(places, _)| places.iter().any(Option::is_some));
+        triangles
+            .map(|(places, triangle)| {
+                let mut taxels = [f64::NAN; TRIANGLE];
+                for (taxel, place) in taxels.iter_mut().zip(places) {
+                    *taxel = place.as_ref().map_or(f64::NAN, value);
+                }
+                Skin { triangle, taxels }
+            })
+            .collect()
     }
 
     /// The joints' names, by degree of freedom.
@@ -422,8 +512,8 @@ impl Simulation {
             }
         }
         let push = self.push.map(|push| (push, push.at(t)));
-        let present = self.pokes.iter().filter(|(_, when)| when.contains(t));
-        let poked: Vec<ExternalWrench> = present.map(|(poke, _)| *poke).collect();
+        let present = self.pokes.iter().filter(|poke| poke.window.contains(t));
+        let poked: Vec<ExternalWrench> = present.map(|poke| poke.external).collect();
         self.solve(push, &poked)?;
         self.truth.t = t;
         Ok(())

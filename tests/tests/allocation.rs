@@ -19,7 +19,7 @@ use proprio_dynamics::{
     ContactKind, ContactSet, ContactSpec, DynamicsError, EquationOfMotion, ExternalWrench,
     FrameMotion, InverseDynamics, JointState, Kinematics, Noise, SensorCut, Solver, Structure,
 };
-use proprio_estimator::config::Presence;
+use proprio_estimator::config::{Presence, Skin as SkinConfig};
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::propagation::{Covariance, Propagation};
 use proprio_estimator::setup::Setup;
@@ -36,7 +36,9 @@ use proprio_gateway::status::BusStatus;
 use proprio_simulator::record::record;
 use proprio_simulator::{Robot, Settings, Simulator};
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, Writer};
-use proprio_topics::{Counter, DeviceHealth, Nanos, Reading, Sample, StampKind, Wrench};
+use proprio_topics::{
+    ContactState, Counter, DeviceHealth, Kind, Nanos, Reading, Sample, Skin, StampKind, Wrench,
+};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::path::Path;
@@ -492,7 +494,7 @@ fn identification_in_the_pipeline_allocates_nothing_but_in_its_jobs() {
         let t = sample.header.acquired;
         let one = counted(|| {
             if number % 5000 == 0 {
-                pipeline.declare(hand, t, number % 10_000 == 0);
+                pipeline.declare(hand, t, &ContactState::configured(number % 10_000 == 0));
             }
             pipeline.push(
                 channel,
@@ -524,7 +526,23 @@ fn identification_in_the_pipeline_allocates_nothing_but_in_its_jobs() {
 #[test]
 fn the_pipeline_allocates_nothing_once_it_runs() {
     let robot = robot();
-    let setup = Setup::new(&robot.config).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let taxels = folder.path().join("taxels.csv");
+    std::fs::write(&taxels, "0.01 0.02 0.03 0 0 1\n".repeat(24)).unwrap();
+    let mut config = robot.config.clone();
+    config.skin.push(SkinConfig {
+        channel: "skin".into(),
+        link: "l_hand".into(),
+        contact: "hand".into(),
+        taxels,
+        first_taxel: 0,
+        noise: 1.0,
+        false_alarms_per_hour: 1.0,
+        position_std_m: None,
+        max_silence_ms: 250.0,
+    });
+    let setup = Setup::new(&config).unwrap();
+    let skin = setup.channel(Kind::Skin, "skin").expect("a skin");
     let channels: Vec<Option<usize>> = robot
         .plan
         .channels
@@ -547,13 +565,25 @@ fn the_pipeline_allocates_nothing_once_it_runs() {
             };
             let t = sample.header.acquired;
             if trouble {
+                // A touch that comes and goes, sometimes of no number.
+                let pressure = if number % 2000 < 1000 { 50.0 } else { f64::NAN };
+                let touch = Skin {
+                    triangle: (number % 3) as u32,
+                    taxels: [pressure; 12],
+                };
+                pipeline.push(skin, t, &Reading::Skin(touch), sample.header.quality);
                 // Half a second without the first joint; contacts that begin and end; samples that
                 // are repeated, late or invalid.
                 if number > 3000 && number < 5000 && sample.channel == 2 {
                     continue;
                 }
                 if number.is_multiple_of(500) {
-                    pipeline.declare(hand, t, number.is_multiple_of(1000));
+                    let state = ContactState {
+                        position: [1e-6 * number as f64, 0.0, 0.01],
+                        position_std: 0.002,
+                        ..ContactState::configured(number.is_multiple_of(1000))
+                    };
+                    pipeline.declare(hand, t, &state);
                 }
                 if number.is_multiple_of(7) {
                     pipeline.push(

@@ -894,9 +894,9 @@ fn told_from(log: &str, delay: usize, end: &mut Option<Pipeline>) -> Told {
                             pipeline.push(channel, t, reading, *quality);
                         }
                     }
-                    (What::Contact, Value::Active(active)) => {
+                    (What::Contact, Value::Contact(state)) => {
                         let contact = pipeline.setup().robot.contact(name).unwrap();
-                        pipeline.declare(contact, t, *active);
+                        pipeline.declare(contact, t, state);
                     }
                     _ => {}
                 }
@@ -1213,9 +1213,9 @@ fn inertias_by(
         } in &row.items
         {
             let (what, name) = &series[*number];
-            if let (What::Contact, Value::Active(active)) = (what, value) {
+            if let (What::Contact, Value::Contact(state)) = (what, value) {
                 let contact = pipeline.setup().robot.contact(name).unwrap();
-                pipeline.declare(contact, row.t.unwrap(), *active);
+                pipeline.declare(contact, row.t.unwrap(), state);
             }
             if let (What::Channel(kind), Value::Reading(reading, quality)) = (what, value)
                 && let Some(channel) = pipeline.setup().robot.channel(*kind, name)

@@ -51,7 +51,6 @@ impl Baseline {
                         let entry = description.find(Role::Channel, u32::try_from(number).ok()?)?;
                         self.pipeline
                             .setup()
-                            .robot
                             .channel(entry.kind.get()?, entry.name.as_str())
                     })
                     .collect();
@@ -66,7 +65,7 @@ impl Baseline {
                 .contact(declared.contact.as_str())
             {
                 self.pipeline
-                    .declare(contact, declared.header.acquired, declared.active != 0);
+                    .declare(contact, declared.header.acquired, &declared.state());
             }
         }
         while let Some(sample) = self.samples.try_take()? {

@@ -43,6 +43,7 @@ mod error;
 mod kinematics;
 mod least_squares;
 pub mod model;
+mod place_errors;
 pub mod regressor;
 mod solver;
 pub mod spatial;
@@ -52,6 +53,7 @@ pub use equation::EquationOfMotion;
 pub use error::{DynamicsError, check_size};
 pub use kinematics::{ExternalWrench, FrameMotion, InverseDynamics, JointState, Kinematics};
 pub use least_squares::{LeastSquares, noise_factor};
+pub use place_errors::{PlaceErrors, PlaceStd};
 pub use solver::{
     Balance, Certainty, ContactEstimate, Disagreement, SideTorque, Sides, Solver, unknowns,
 };

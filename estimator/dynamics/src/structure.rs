@@ -198,6 +198,28 @@ pub struct ContactSpec {
     pub position: Vec3,
 }
 
+impl ContactSpec {
+    fn place(
+        &mut self,
+        index: usize,
+        position: &Vec3,
+        direction: Option<&Vec3>,
+    ) -> Result<(), StructureError> {
+        if !position.iter().all(|x| x.is_finite()) {
+            return Err(StructureError::Contact { index });
+        }
+        if let (ContactKind::ForceAlong(own), Some(direction)) = (&mut self.kind, direction) {
+            let norm = direction.norm();
+            if !norm.is_finite() || norm < 1e-9 {
+                return Err(StructureError::Direction { index });
+            }
+            *own = direction / norm;
+        }
+        self.position = *position;
+        Ok(())
+    }
+}
+
 /// One part of the robot between F/T sensors.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SubTree {
@@ -256,8 +278,8 @@ pub(super) struct LinkPlace {
     pub(super) sensors_below: SensorSet,
 }
 
-/// The robot cut at its F/T sensors, with its possible contacts. Immutable; shared by any number of
-/// solvers.
+/// The robot cut at its F/T sensors, with its possible contacts; shared by any number of solvers.
+/// Only the places of the contacts can change ([`Structure::place_contact`]).
 #[derive(Clone, Debug)]
 pub struct Structure {
     sensors: Vec<SensorCut>,
@@ -300,18 +322,14 @@ impl Structure {
         }
         let mut contacts = contacts.to_vec();
         for (index, contact) in contacts.iter_mut().enumerate() {
-            let is_placed =
-                contact.frame.pose.is_finite() && contact.position.iter().all(|x| x.is_finite());
-            if contact.frame.link >= model.link_count() || !is_placed {
+            if contact.frame.link >= model.link_count() || !contact.frame.pose.is_finite() {
                 return Err(StructureError::Contact { index });
             }
-            if let ContactKind::ForceAlong(direction) = &mut contact.kind {
-                let norm = direction.norm();
-                if !norm.is_finite() || norm < 1e-9 {
-                    return Err(StructureError::Direction { index });
-                }
-                *direction /= norm;
+            let (position, mut direction) = (contact.position, None);
+            if let ContactKind::ForceAlong(configured) = contact.kind {
+                direction = Some(configured);
             }
+            contact.place(index, &position, direction.as_ref())?;
         }
 
         let mut places: Vec<LinkPlace> = (0..model.link_count())
@@ -409,6 +427,25 @@ impl Structure {
     /// The contacts.
     pub fn contacts(&self) -> &[ContactSpec] {
         &self.contacts
+    }
+
+    /// Moves a contact: its position [m] and, for [`ContactKind::ForceAlong`], its direction (of
+    /// any length; `None`: as it is), in its frame. A later solution is for this place. Does not
+    /// allocate.
+    ///
+    /// # Errors
+    /// [`StructureError`]: there is no such contact, or numbers are not finite, or the direction is
+    /// zero. Nothing is changed then.
+    pub fn place_contact(
+        &mut self,
+        index: usize,
+        position: &Vec3,
+        direction: Option<&Vec3>,
+    ) -> Result<(), StructureError> {
+        let contact = self.contacts.get_mut(index);
+        contact
+            .ok_or(StructureError::Contact { index })?
+            .place(index, position, direction)
     }
 
     /// The sub-trees. The first one contains the model's root.

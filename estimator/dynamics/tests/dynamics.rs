@@ -11,7 +11,8 @@ use proprio_dynamics::model::{Frame, MeasurementDirection, MeasurementFrame, Mod
 use proprio_dynamics::spatial::{Mat3, Motion, Pose, RigidInertia, Vec3, Wrench};
 use proprio_dynamics::{
     Certainty, ContactKind, ContactSet, ContactSpec, Disagreement, ExternalWrench, FrameMotion,
-    InverseDynamics, Kinematics, Noise, Route, SensorCut, SensorSet, Sides, Solver, Structure,
+    InverseDynamics, Kinematics, Noise, PlaceErrors, PlaceStd, Route, SensorCut, SensorSet, Sides,
+    Solver, Structure,
 };
 use proptest::prelude::*;
 
@@ -38,6 +39,7 @@ fn inverse(model: &Model, kinematics: &Kinematics, external: &[ExternalWrench]) 
 }
 
 /// A robot in motion under known wrenches, its sensor readings, and the objects to solve it.
+#[derive(Clone)]
 struct Scene {
     model: Model,
     sensors: Vec<SensorCut>,
@@ -160,6 +162,21 @@ impl Scene {
 
     fn all(&self) -> ContactSet {
         ContactSet::first(self.contacts.len())
+    }
+
+    /// Lets one more wrench act on the robot, of which the solver is not told.
+    fn act(&mut self, wrench: ExternalWrench) {
+        let kinematics = self.kinematics();
+        let mut acting = vec![self.known[0], wrench];
+        let own = self.contacts.iter().zip(&self.truth);
+        acting.extend(own.map(|(spec, wrench)| external(spec, *wrench)));
+        let inverse = inverse(&self.model, &kinematics, &acting);
+        self.known[1].wrench = inverse.base_wrench();
+        let cuts = self.readings.iter_mut().zip(&self.sensors);
+        for (reading, cut) in cuts {
+            *reading = cut.reading(&inverse.transmitted(&kinematics, cut.joint()));
+        }
+        self.torque = inverse.torque().to_vec();
     }
 
     /// Readings that are inconsistent with the motion.
@@ -768,6 +785,115 @@ proptest! {
             let (a, b) = (before.contacts()[old], after.contacts()[new]);
             prop_assert_eq!(a.certainty, b.certainty);
             prop_assert!(wrench_gap(&a.wrench, &b.wrench) < EXACT * scale);
+        }
+    }
+
+    /// A contact that was moved is solved to the last bit as one that was there from the start; and
+    /// a full wrench is the same wrench wherever its position is, if it is determined.
+    #[test]
+    fn a_moved_contact_is_one_that_was_there_from_the_start((links, seed) in robots()) {
+        let mut random = Random::new(seed ^ 4);
+        let mut scene = Scene::new(links, seed, 6);
+        scene.disturb(&mut random);
+        let (mut moved, active) = (scene.structure(), scene.all());
+        let before = scene.solve(&moved, &active);
+        for (index, contact) in scene.contacts.iter_mut().enumerate() {
+            contact.position = random.vector(0.3);
+            let direction = random.vector(1.0).add_scalar(0.01);
+            if let ContactKind::ForceAlong(own) = &mut contact.kind {
+                *own = direction;
+            }
+            moved.place_contact(index, &contact.position, Some(&direction)).expect("finite");
+        }
+        let from_start = scene.solve(&scene.structure(), &active);
+        let after = scene.solve(&moved, &active);
+        prop_assert_eq!(from_start.torque(), after.torque());
+        prop_assert_eq!(from_start.torque_deviation(), after.torque_deviation());
+        prop_assert_eq!(from_start.contacts(), after.contacts());
+        let scale = scene.size() * amplification(&before).max(amplification(&after));
+        let pairs = before.contacts().iter().zip(after.contacts()).zip(&scene.contacts);
+        for ((a, b), spec) in pairs {
+            let alone = |solved: &Solver| {
+                let number = moved.subtree_of(spec.frame.link).expect("a link");
+                let is_single = moved.subtrees()[number].contacts.len() == 1;
+                is_single && solved.balances()[number].degrees == 0
+            };
+            if spec.kind == ContactKind::Wrench && alone(&before) {
+                prop_assert!(wrench_gap(&a.wrench, &b.wrench) < EXACT * scale);
+            }
+        }
+    }
+
+    /// The stated standard deviations are the errors made by taking a contact to be where it is
+    /// not, added up over the axes.
+    #[test]
+    fn place_errors_are_the_errors_of_a_wrong_place((links, seed) in robots()) {
+        const STEP: f64 = 1e-6;
+        let scene = Scene::new(links, seed, 3);
+        if scene.contacts.is_empty() {
+            return Ok(());
+        }
+        let (structure, active) = (scene.structure(), scene.all());
+        let before = scene.solve(&structure, &active);
+        let which = Random::new(seed).below(scene.contacts.len());
+        let (spec, wrench) = (scene.contacts[which], scene.truth[which]);
+        // The errors of torques, contact wrenches and imbalance if the wrench differs by this.
+        let error = |difference: Wrench| {
+            let mut other = scene.clone();
+            let changed = ExternalWrench { frame: spec.frame, wrench: difference };
+            other.act(changed);
+            let after = other.solve(&structure, &active);
+            let mut errors: Vec<f64> = (after.torque().iter().zip(&other.torque))
+                .zip(before.torque().iter().zip(&scene.torque))
+                .map(|((a, b), (c, d))| (a - b - c + d) / STEP)
+                .collect();
+            for (number, (a, b)) in after.contacts().iter().zip(before.contacts()).enumerate() {
+                let own = if number == which { difference } else { Wrench::zero() };
+                errors.extend((a.wrench - b.wrench - own).force_first().map(|x| x / STEP));
+            }
+            errors
+        };
+        let estimated = before.contacts()[which].wrench.force;
+        let mut kinds = vec![PlaceStd { position: 1.0, direction: 0.0 }];
+        let along = match spec.kind {
+            ContactKind::ForceAlong(direction) => Some(direction.normalize()),
+            _ => None,
+        };
+        if along.is_some() {
+            kinds.push(PlaceStd { position: 0.0, direction: 1.0 });
+        }
+        let mut stated = PlaceErrors::new(&structure);
+        let kinematics = scene.kinematics();
+        for std in kinds {
+            let of = |contact: usize| if contact == which { std } else { PlaceStd::default() };
+            stated.update(&structure, &before, &kinematics, of).expect("solved");
+            let mut squares = vec![0.0; scene.torque.len() + 6 * scene.contacts.len()];
+            for axis in 0..3 {
+                let mut unit = Vec3::zeros();
+                unit[axis] = STEP;
+                // The force is the one that was estimated: the true one where it is determined.
+                let difference = match along.filter(|_| std.direction > 0.0) {
+                    None => Wrench { torque: unit.cross(&estimated), force: Vec3::zeros() },
+                    Some(along) => {
+                        let force = (unit - along * along.dot(&unit)) * estimated.norm();
+                        Wrench { torque: spec.position.cross(&force), force }
+                    }
+                };
+                for (sum, error) in squares.iter_mut().zip(error(difference)) {
+                    *sum += error * error;
+                }
+            }
+            let mut claimed = stated.torque_std().to_vec();
+            claimed.extend(stated.contact_std().iter().flatten());
+            if spec.kind == ContactKind::Wrench {
+                prop_assert!(claimed.iter().all(|std| *std == 0.0));
+                continue;
+            }
+            let scale = (size(&claimed) + wrench.force.norm()) * amplification(&before);
+            for (claimed, square) in claimed.iter().zip(squares) {
+                let made = square.sqrt();
+                prop_assert!((claimed - made).abs() < 1e-3 * scale, "{claimed} {made}");
+            }
         }
     }
 

@@ -1,13 +1,9 @@
-//! The buffers of the pipeline: the last samples of each channel, and the last declarations of each
-//! contact.
+//! The buffers of the pipeline: the last samples of each channel.
 
 use super::prediction::Predictor;
 use crate::differentiate::Window;
 use crate::history::{ChannelValue, History};
 use proprio_topics::{Nanos, Reason};
-
-/// How many declarations of a contact are kept: those that may come while an instant waits.
-pub(super) const DECLARATIONS: usize = 16;
 
 /// The last samples of one channel, and a window for the values that are differentiated.
 pub(super) enum ChannelBuffer {
@@ -28,48 +24,6 @@ impl ChannelBuffer {
             Self::Sensor(h, ..) => h.newest(),
             Self::Imu(h, ..) => h.newest(),
         }
-    }
-}
-
-/// When a contact was declared present or absent.
-#[derive(Clone, Default)]
-pub(super) struct Declarations {
-    /// The last changes, oldest first: from which stamp on, and whether present.
-    changes: arrayvec::ArrayVec<(Nanos, bool), DECLARATIONS>,
-    /// The state before these changes.
-    before: Option<bool>,
-}
-
-impl Declarations {
-    /// Records that the contact is present (`active`) or absent from `t` on.
-    pub(super) fn record(&mut self, t: Nanos, active: bool) {
-        let index = |changes: &[(Nanos, bool)]| {
-            changes
-                .iter()
-                .rposition(|(other, _)| *other <= t)
-                .map_or(0, |i| i + 1)
-        };
-        let previous = index(&self.changes)
-            .checked_sub(1)
-            .and_then(|i| self.changes.get(i))
-            .map_or(self.before, |(_, a)| Some(*a));
-        // A declaration that repeats the state at `t` changes nothing.
-        if previous == Some(active) {
-            return;
-        }
-        if self.changes.is_full() {
-            self.before = Some(self.changes.remove(0).1);
-        }
-        self.changes.insert(index(&self.changes), (t, active));
-    }
-
-    /// Whether the contact was declared present at `t`; none before the first declaration.
-    pub(super) fn at(&self, t: Nanos) -> Option<bool> {
-        self.changes
-            .iter()
-            .rev()
-            .find(|(from, _)| *from <= t)
-            .map_or(self.before, |(_, active)| Some(*active))
     }
 }
 

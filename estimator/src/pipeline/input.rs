@@ -1,9 +1,10 @@
-//! The pipeline's input: samples and declarations of contacts.
+//! The pipeline's input: samples, of skins too, and declarations of contacts.
 
 use super::Pipeline;
 use super::buffers::ChannelBuffer;
 use crate::config::Timing;
-use proprio_topics::{Nanos, Quality, Reading, Reason};
+use crate::skin::Taken;
+use proprio_topics::{ContactState, Nanos, Quality, Reading, Reason};
 
 impl Pipeline {
     /// Takes a sample of channel number `channel`, acquired at `t`. A temperature of an F/T
@@ -12,7 +13,7 @@ impl Pipeline {
     /// [`Pipeline::poll`] until it gives nothing before the next sample.
     pub fn push(&mut self, channel: usize, t: Nanos, reading: &Reading, quality: Quality) {
         let Some(buffer) = self.buffers.get_mut(channel) else {
-            return;
+            return self.push_skin(channel, t, reading, quality);
         };
         // Estimates that do not wait go by the order of arrival: no sample is late.
         let waits = self.setup.timing == Timing::Aligned;
@@ -140,13 +141,43 @@ impl Pipeline {
         }
     }
 
-    /// Declares contact number `contact` present (`active`) or absent from `t` on.
-    pub fn declare(&mut self, contact: usize, t: Nanos, active: bool) {
-        if let Some(declarations) = self.declarations.get_mut(contact) {
-            // Too late for instants that are already released; it counts from the next one on.
-            let waits = self.setup.timing == Timing::Aligned;
-            self.counts.late += u64::from(waits && t <= self.released);
-            declarations.record(t, active);
+    /// Takes a reading of a skin, whose channels follow those of the robot.
+    fn push_skin(&mut self, channel: usize, t: Nanos, reading: &Reading, quality: Quality) {
+        let (Some(number), Reading::Skin(skin)) =
+            (channel.checked_sub(self.buffers.len()), reading)
+        else {
+            return;
+        };
+        match self.contacts.push(number, t, skin, quality) {
+            Taken::Yes => {
+                self.counts.taken += 1;
+                // Taken, but too late for a released instant: a replay would use it there.
+                let waits = self.setup.timing == Timing::Aligned;
+                let late = waits && self.contacts.is_late(t, self.released);
+                self.counts.late += u64::from(late);
+            }
+            Taken::Backward => self.counts.backward += 1,
+            Taken::No => {}
         }
+    }
+
+    /// Declares that contact number `contact` has this state from `t` on. A place that makes no
+    /// sense (not finite, a direction of zero length) is ignored and counted as not finite.
+    pub fn declare(&mut self, contact: usize, t: Nanos, state: &ContactState) {
+        if contact >= self.setup.robot.contacts.len() {
+            return;
+        }
+        // Too late for instants that are already released; it counts from the next one on.
+        let waits = self.setup.timing == Timing::Aligned;
+        self.counts.late += u64::from(waits && t <= self.released);
+        let is_good = self.contacts.declare(contact, t, state);
+        self.counts.not_finite += u64::from(!is_good);
+    }
+
+    /// The stamp of the newest sample of channel number `channel`, if that is a skin.
+    #[must_use]
+    pub fn newest_of_skin(&self, channel: usize) -> Option<Nanos> {
+        self.contacts
+            .newest(channel.checked_sub(self.buffers.len())?)
     }
 }

@@ -15,15 +15,16 @@
 //! calibration accuracies, not properties of one robot.
 //!
 //! A column of S is a finite difference. S is computed with the first estimate of each tenth of a
-//! second and when contacts or base change, and held in between. The tenths are those
-//! of the stamps, so that a replay which begins elsewhere gives the same. Errors of velocities are
-//! smaller by an order of magnitude and are neglected.
+//! second and when contacts or base change or a contact jumps, and held in between. The tenths are
+//! those of the stamps, so that a replay which begins elsewhere gives the same. Errors of velocities
+//! are smaller by an order of magnitude and are neglected.
 
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::model::Model;
 use proprio_dynamics::spatial::{Pose, Wrench};
 use proprio_dynamics::{
-    ContactSet, DynamicsError, FrameMotion, JointState, Kinematics, Solver, Structure,
+    ContactKind, ContactSet, ContactSpec, DynamicsError, FrameMotion, JointState, Kinematics,
+    Solver, Structure,
 };
 use proprio_topics::Nanos;
 
@@ -41,6 +42,10 @@ const BASE_ACCELERATION_STD: f64 = 0.1;
 /// Step of positions for finite differences \[rad, m\].
 const STEP: f64 = 1e-4;
 
+/// A contact that moves less than this \[m\], or turns less \[rad\], within a tenth of a second
+/// does not change S more than the motion of the robot does in that time.
+const JUMP: [f64; 2] = [0.01, 0.1];
+
 /// The point of linearisation: the inputs and the result of one estimate.
 pub(super) struct OperatingPoint<'a> {
     pub(super) t: Nanos,
@@ -57,6 +62,17 @@ pub(super) struct OperatingPoint<'a> {
     pub(super) base_link: usize,
 }
 
+fn has_jumped(before: &ContactSpec, now: &ContactSpec) -> bool {
+    let [jump, turn] = JUMP;
+    let is_turned = match (before.kind, now.kind) {
+        (ContactKind::ForceAlong(before), ContactKind::ForceAlong(now)) => {
+            (now - before).norm() > turn
+        }
+        _ => false,
+    };
+    is_turned || (now.position - before.position).norm() > jump
+}
+
 /// Standard deviations of an estimate from errors of the motion.
 pub(super) struct MotionErrors {
     kinematics: Kinematics,
@@ -70,6 +86,8 @@ pub(super) struct MotionErrors {
     is_known: Vec<bool>,
     /// The contacts, base link and tenth of a second that S is valid for.
     valid_for: Option<(ContactSet, usize, i64)>,
+    /// The contacts that S is valid for.
+    contacts: Vec<ContactSpec>,
     perturbed: Vec<f64>,
     /// Standard deviation of each torque, then of `[fx fy fz tx ty tz]` of each contact.
     deviation: Vec<f64>,
@@ -99,6 +117,7 @@ impl MotionErrors {
             sensitivity: vec![0.0; columns * rows],
             is_known: vec![false; columns],
             valid_for: None,
+            contacts: structure.contacts().to_vec(),
             perturbed: vec![0.0; 2 * dofs],
             deviation: vec![0.0; dofs + 6 * contacts],
             dofs,
@@ -148,7 +167,10 @@ impl MotionErrors {
             point.base_link,
             point.t.0.div_euclid(POSTURE_PERIOD.0),
         ));
-        if self.valid_for != key {
+        let contacts = point.structure.contacts();
+        let mut pairs = self.contacts.iter().zip(contacts);
+        if self.valid_for != key || pairs.any(|(before, now)| has_jumped(before, now)) {
+            self.contacts.clone_from_slice(contacts);
             self.is_known.fill(false);
             self.kinematics.set_base(point.model, point.base_link)?;
             self.valid_for = key;

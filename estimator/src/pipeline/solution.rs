@@ -14,6 +14,7 @@ impl Pipeline {
     /// again if other contacts are detected, and writes the results.
     pub(super) fn compute_estimate(&mut self, t: Nanos) {
         let active = self.active_contacts(t);
+        self.contacts.place(&mut self.setup.robot, t);
         let (base, imu) = self.evaluate_channels(t, &active);
         // A contact detected at the last instant is most likely still there.
         let detected = self.residuals.detected().difference(&active);
@@ -77,6 +78,13 @@ impl Pipeline {
                     base_link: self.kinematics.base(),
                 })
             })
+            .and_then(|()| {
+                let places = self.contacts.places();
+                let std =
+                    |contact: usize| places.get(contact).map_or_else(Default::default, |p| p.std);
+                self.place_errors
+                    .update(structure, &self.solver, &self.kinematics, std)
+            })
             .is_ok()
     }
 
@@ -86,10 +94,13 @@ impl Pipeline {
         if !is_solved {
             return self.residuals.reset();
         }
+        // A touch that is lost does not matter here: the test shows whether it is still there.
         let validity = ValidityCheck {
             channels: &self.setup.robot.channels,
             faults: &self.faults,
             base_fault: self.base_fault,
+            lost: &[],
+            detected: ContactSet::EMPTY,
         };
         let solved = residuals::Solved {
             t,
@@ -102,7 +113,9 @@ impl Pipeline {
             let dependence = self.dependences.subtrees.get(number)?;
             let (reason, _) = validity.reason_and_cause(dependence);
             let parameters = self.propagation.imbalance_covariances().get(number)?;
-            (reason == Reason::None).then(|| parameters + self.motion.imbalance_covariance(number))
+            let places = self.place_errors.imbalance_covariances().get(number)?;
+            (reason == Reason::None)
+                .then(|| parameters + places + self.motion.imbalance_covariance(number))
         };
         self.residuals.update(&solved, covariance);
     }
@@ -112,10 +125,13 @@ impl Pipeline {
         self.estimate.t = t;
         self.estimate.torques.header.acquired = t;
         self.estimate.contacts.header.acquired = t;
+        let detected = self.residuals.detected();
         let validity = ValidityCheck {
             channels: &self.setup.robot.channels,
             faults: &self.faults,
             base_fault: self.base_fault,
+            lost: self.contacts.lost(),
+            detected,
         };
         let results = self
             .solver
@@ -124,7 +140,8 @@ impl Pipeline {
             .zip(self.solver.torque_deviation())
             .zip(self.propagation.torque_std())
             .zip(self.solver.torque_certainty())
-            .zip(self.motion.torque_std());
+            .zip(self.motion.torque_std())
+            .zip(self.place_errors.torque_std());
         let structure = &self.setup.robot.structure;
         let is_unexplained = |link: usize| {
             let residual = structure
@@ -133,18 +150,19 @@ impl Pipeline {
             residual.is_some_and(|residual| residual.is_unexplained)
         };
         let unexplained = |dof: usize| structure.link_of(dof).is_some_and(is_unexplained);
-        let detected = self.residuals.detected();
         let places = self
             .estimate
             .torques
             .joints
             .iter_mut()
             .zip(&self.dependences.torques);
-        for (dof, ((place, dependence), ((((torque, noise), model), certainty), motion))) in
-            places.zip(results).enumerate()
+        for (
+            dof,
+            ((place, dependence), (((((torque, noise), model), certainty), motion), located)),
+        ) in places.zip(results).enumerate()
         {
             let (mut reason, mut cause) = validity.reason_and_cause(dependence);
-            let deviation = noise.hypot(*model).hypot(*motion);
+            let deviation = noise.hypot(*model).hypot(*motion).hypot(*located);
             if reason == Reason::None && *certainty == Certainty::Assumed {
                 reason = Reason::Undetermined;
             }
@@ -185,9 +203,14 @@ impl Pipeline {
             .contacts()
             .iter()
             .zip(self.propagation.contact_std());
-        let results = results.zip(self.motion.contact_std());
-        let contacts = places.zip(results).take(self.setup.robot.contacts.len());
-        for (number, ((place, dependence), ((result, model), motion))) in contacts.enumerate() {
+        let results = results
+            .zip(self.motion.contact_std())
+            .zip(self.place_errors.contact_std())
+            .zip(self.contacts.places());
+        let contacts = places.zip(results);
+        for (number, ((place, dependence), ((((result, model), motion), located), at))) in
+            contacts.enumerate()
+        {
             let (mut reason, mut cause) = validity.reason_and_cause(dependence);
             let link = structure.contacts().get(number).map(|spec| spec.frame.link);
             if reason == Reason::None && link.is_some_and(is_unexplained) {
@@ -200,7 +223,10 @@ impl Pipeline {
             }
             let deviation: [f64; 6] = std::array::from_fn(|i| {
                 let motion = motion.get(i).copied().unwrap_or(0.0);
-                result.deviation[i].hypot(model[i]).hypot(motion)
+                result.deviation[i]
+                    .hypot(model[i])
+                    .hypot(motion)
+                    .hypot(located[i])
             });
             let is_finite = result.wrench.is_finite() && deviation.iter().all(|x| x.is_finite());
             if !is_solved || !is_finite {
@@ -220,6 +246,9 @@ impl Pipeline {
                 reason: reason.in_memory(),
                 cause,
                 detected: u32::from(detected.contains(number)),
+                position: at.position.into(),
+                located: u32::from(at.is_located),
+                reserved: 0,
             };
         }
         let places = self.estimate.contacts.residuals.iter_mut();

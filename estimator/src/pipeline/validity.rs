@@ -45,6 +45,10 @@ pub(crate) struct ValidityCheck<'a> {
     pub(crate) channels: &'a [Channel],
     pub(crate) faults: &'a [Reason],
     pub(crate) base_fault: Reason,
+    /// Per contact, the channel of the skin whose touch is lost, or [`NO_CAUSE`].
+    pub(crate) lost: &'a [u32],
+    /// The contacts that F/T readings show: they are known to be present.
+    pub(crate) detected: ContactSet,
 }
 
 impl ValidityCheck<'_> {
@@ -70,6 +74,14 @@ impl ValidityCheck<'_> {
         }
         if found.0 == Reason::None && dependence.base {
             found.0 = self.base_fault;
+        }
+        if found.0 == Reason::None {
+            let assumed = dependence.contacts.union(&dependence.absent);
+            let lost = assumed.difference(&self.detected).iter();
+            let lost = lost.filter_map(|contact| self.lost.get(contact).copied());
+            if let Some(skin) = lost.filter(|skin| *skin != NO_CAUSE).min() {
+                found = (Reason::Stale, skin);
+            }
         }
         found
     }

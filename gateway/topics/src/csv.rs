@@ -16,6 +16,9 @@
 //! | `joint/<joint>/duty` `mode` `encoder` `faults` | the motor board's own state |
 //! | `<channel>/quality` | the bits of [`Quality`](crate::Quality), as a number |
 //! | `contact/<name>/active` | 0 or 1: whether a contact is present from this instant on |
+//! | `contact/<name>/px` `py` `pz` `p_std` | where, and its standard deviation \[m\]; optional |
+//! | `contact/<name>/dx` `dy` `dz` | the direction of a `force_along`; optional |
+//! | `skin/<channel>/triangle` `p0` to `p11` | one triangle of a skin and its taxels, in counts |
 //!
 //! The components of one vector (`fx` to `tz`; `ax` to `az`; ...) are all present or all empty. A
 //! row that breaks this rule or holds a cell that is not a finite number is skipped, counted and

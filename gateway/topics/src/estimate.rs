@@ -2,7 +2,7 @@
 //! receives.
 
 use crate::code::coded;
-use crate::{Code, Header, MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name, Quality};
+use crate::{Code, Header, MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name, Nanos, Quality};
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 use zerocopy::FromBytes;
@@ -148,6 +148,13 @@ pub struct ContactWrench {
     pub cause: u32,
     /// 1 if the contact is not declared but F/T readings show that it is present, else 0.
     pub detected: u32,
+    /// The point that the estimate assumes the contact to be at \[m\], in the same axes, from the
+    /// same origin. A full wrench that is the only one of its sub-tree does not depend on it.
+    pub position: [f64; 3],
+    /// 1 if `position` comes from a declaration or a skin, 0 if it is the configured one.
+    pub located: u32,
+    /// Unused, zero.
+    pub reserved: u32,
 }
 
 impl ContactWrench {
@@ -160,6 +167,9 @@ impl ContactWrench {
         reason: Reason::NeverSeen.in_memory(),
         cause: NO_CAUSE,
         detected: 0,
+        position: [f64::NAN; 3],
+        located: 0,
+        reserved: 0,
     };
 }
 
@@ -202,7 +212,7 @@ impl Residual {
 /// `<robot>/estimate/contact`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
-#[type_name("proprio/ContactEstimate/3")]
+#[type_name("proprio/ContactEstimate/4")]
 pub struct ContactEstimate {
     /// `acquired` is the instant that the wrenches refer to.
     pub header: Header,
@@ -234,11 +244,39 @@ impl ContactEstimate {
     }
 }
 
-/// A declaration that a contact is present or absent, sent to the estimator: the payload of
-/// `<robot>/contact/declared`.
+/// What is declared of a contact: whether it is present and, if that is known, where.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ContactState {
+    /// Whether it is present.
+    pub active: bool,
+    /// The point where it acts \[m\], in the axes of the frame that the configuration's `link`
+    /// names, from that frame's origin; NaN: the configured `position_m`.
+    pub position: [f64; 3],
+    /// Standard deviation of `position`, each axis \[m\]; NaN: 0, it is exact.
+    pub position_std: f64,
+    /// The direction of a `force_along`, in the same axes, of any length; NaN: the configured
+    /// `direction`. Other kinds of contact ignore it.
+    pub direction: [f64; 3],
+}
+
+impl ContactState {
+    /// A contact that is present (`active`) at its configured place, or absent.
+    #[must_use]
+    pub const fn configured(active: bool) -> Self {
+        Self {
+            active,
+            position: [f64::NAN; 3],
+            position_std: f64::NAN,
+            direction: [f64::NAN; 3],
+        }
+    }
+}
+
+/// A declaration that a contact is present or absent, and where it is, sent to the estimator: the
+/// payload of `<robot>/contact/declared`.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend, FromBytes)]
-#[type_name("proprio/ContactDeclaration/2")]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
+#[type_name("proprio/ContactDeclaration/3")]
 pub struct ContactDeclaration {
     /// `acquired` is the instant from which the declaration holds.
     pub header: Header,
@@ -248,10 +286,46 @@ pub struct ContactDeclaration {
     pub active: u32,
     /// Unused, zero.
     pub reserved: u32,
+    /// As in [`ContactState`].
+    pub position: [f64; 3],
+    /// As in [`ContactState`].
+    pub position_std: f64,
+    /// As in [`ContactState`].
+    pub direction: [f64; 3],
 }
 
-const _: () = assert!(size_of::<JointTorque>() == 32 && size_of::<ContactWrench>() == 112);
+impl ContactDeclaration {
+    /// The declaration that `contact` has this `state` from `from` on.
+    #[must_use]
+    pub fn new(contact: Name, from: Nanos, state: &ContactState) -> Self {
+        Self {
+            header: Header {
+                acquired: from,
+                ..Header::default()
+            },
+            contact,
+            active: u32::from(state.active),
+            reserved: 0,
+            position: state.position,
+            position_std: state.position_std,
+            direction: state.direction,
+        }
+    }
+
+    /// What it declares.
+    #[must_use]
+    pub const fn state(&self) -> ContactState {
+        ContactState {
+            active: self.active != 0,
+            position: self.position,
+            position_std: self.position_std,
+            direction: self.direction,
+        }
+    }
+}
+
+const _: () = assert!(size_of::<JointTorque>() == 32 && size_of::<ContactWrench>() == 144);
 const _: () =
     assert!(size_of::<TorqueEstimate>() == 64 + 32 * MAX_JOINTS && size_of::<Residual>() == 64);
-const _: () = assert!(size_of::<ContactEstimate>() == 64 + 112 * MAX_CONTACTS + 64 * MAX_SUBTREES);
-const _: () = assert!(size_of::<ContactDeclaration>() == 128);
+const _: () = assert!(size_of::<ContactEstimate>() == 64 + 144 * MAX_CONTACTS + 64 * MAX_SUBTREES);
+const _: () = assert!(size_of::<ContactDeclaration>() == 184);

@@ -49,8 +49,8 @@ pub mod time;
 pub use code::{Code, Coded};
 pub use description::{Description, Entry, Name, Publisher, Role};
 pub use estimate::{
-    ContactDeclaration, ContactEstimate, ContactWrench, JointTorque, NO_CAUSE, NO_CONTACT, Reason,
-    Residual, TorqueEstimate,
+    ContactDeclaration, ContactEstimate, ContactState, ContactWrench, JointTorque, NO_CAUSE,
+    NO_CONTACT, Reason, Residual, TorqueEstimate,
 };
 pub use health::{
     BusError, BusHealth, Controller, Counter, DeviceHealth, DeviceState, EstimatorHealth,

@@ -9,8 +9,8 @@ use proprio_topics::ipc::{
     Writer,
 };
 use proprio_topics::{
-    Code, ContactDeclaration, Description, Entry, EstimatorHealth, GatewayHealth, Header,
-    InertiaEstimate, JointState, JointTorque, Kind, LinkInertia, MAX_JOINTS, Name, Nanos,
+    Code, ContactDeclaration, ContactState, Description, Entry, EstimatorHealth, GatewayHealth,
+    Header, InertiaEstimate, JointState, JointTorque, Kind, LinkInertia, MAX_JOINTS, Name, Nanos,
     Publisher, Reading, Role, Sample, TorqueEstimate,
 };
 use std::fs::File;
@@ -447,14 +447,21 @@ fn names_are_checked() {
     let robot = "r".repeat(64);
     let mut writer = Writer::<ContactDeclaration>::create(&domain, &robot, 1).unwrap();
     let mut reader = Reader::<ContactDeclaration>::open(&domain, &robot).unwrap();
-    let declared = ContactDeclaration {
-        header: Header::default(),
-        contact: Name::new("hand").unwrap(),
-        active: 1,
-        reserved: 0,
+    let state = ContactState {
+        position: [0.1, 0.2, 0.3],
+        ..ContactState::configured(true)
     };
+    let declared = ContactDeclaration::new(Name::new("hand").unwrap(), Nanos(7), &state);
     writer.send(&declared, Nanos(0)).unwrap();
-    assert_eq!(reader.latest().unwrap().unwrap().contact.as_str(), "hand");
+    let got = reader.latest().unwrap().unwrap();
+    assert_eq!(
+        (got.contact.as_str(), got.header.acquired),
+        ("hand", Nanos(7))
+    );
+    assert_eq!(
+        (got.state().active, got.state().position),
+        (true, [0.1, 0.2, 0.3])
+    );
     for robot in ["", "a/b", "a b", "ä", &"r".repeat(65)] {
         assert!(
             matches!(

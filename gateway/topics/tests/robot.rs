@@ -100,6 +100,8 @@ impl Estimator {
             valid: 1,
             reason: Reason::None.in_memory(),
             detected: 1,
+            position: [0.25, 0.0, 0.0],
+            located: 1,
             ..ContactWrench::ABSENT
         };
         let contacts = ContactEstimate {
@@ -228,6 +230,7 @@ fn values_come_with_a_reason_when_they_do_not_come() {
     assert_eq!(robot.torque(nobody), Err(Unavailable::Unknown));
     let contact = robot.contact(hand).unwrap();
     assert_eq!((contact.wrench.force[0], contact.is_detected), (7.0, true));
+    assert_eq!((contact.position[0], contact.is_located), (0.25, true));
     assert_eq!(robot.joint(encoder).unwrap().value.position, 0.25);
     assert_eq!(robot.wrench(ft).unwrap().value.torque, [4.0, 5.0, 6.0]);
     assert_eq!(robot.imu(imu).unwrap().value.proper_acceleration[2], 9.8);

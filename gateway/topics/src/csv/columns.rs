@@ -1,6 +1,6 @@
 //! The columns of a table: their names, and the conversion between a value and its cells.
 
-use crate::{Kind, Quality, Reading, VALUES};
+use crate::{ContactState, Kind, Quality, Reading, VALUES};
 use core::ops::Range;
 use std::format;
 use std::string::String;
@@ -11,7 +11,16 @@ pub(super) enum Field {
     /// A value of a reading of this kind: its place in [`Kind::fields`].
     Value(Kind, u8),
     Quality,
-    Active,
+    /// A value of a contact's state: its place in [`CONTACT`].
+    Contact(u8),
+}
+
+/// The names of the values of a contact's state.
+const CONTACT: [&str; 8] = ["active", "px", "py", "pz", "p_std", "dx", "dy", "dz"];
+
+/// All columns of a contact.
+pub(super) fn contact_fields() -> impl Iterator<Item = Field> {
+    (0_u8..).take(CONTACT.len()).map(Field::Contact)
 }
 
 /// The readings that a channel of kind `kind` can have, its main one first.
@@ -60,7 +69,7 @@ const fn groups(kind: Kind) -> &'static [(Range<usize>, &'static str)] {
 pub enum What {
     /// A channel of the gateway.
     Channel(Kind),
-    /// A contact that is declared present or absent.
+    /// A contact that is declared present or absent, and where.
     Contact,
 }
 
@@ -78,8 +87,8 @@ pub struct Series {
 pub enum Value {
     /// A reading and its quality flags.
     Reading(Reading, Quality),
-    /// Whether a contact is present from here on.
-    Active(bool),
+    /// Whether a contact is present from here on, and where.
+    Contact(ContactState),
 }
 
 /// The values of one series in the row that is being read or written.
@@ -88,21 +97,22 @@ pub(super) struct Cells {
     /// By the number of the reading's kind.
     values: [[f64; VALUES]; Kind::ALL.len()],
     quality: f64,
-    active: f64,
+    /// In the order of [`CONTACT`].
+    contact: [f64; CONTACT.len()],
 }
 
 impl Cells {
     pub(super) const EMPTY: Self = Self {
         values: [[f64::NAN; VALUES]; Kind::ALL.len()],
         quality: f64::NAN,
-        active: f64::NAN,
+        contact: [f64::NAN; CONTACT.len()],
     };
 
     pub(super) fn slot(&mut self, field: Field) -> Option<&mut f64> {
         match field {
             Field::Value(kind, i) => self.values.get_mut(kind as usize)?.get_mut(usize::from(i)),
             Field::Quality => Some(&mut self.quality),
-            Field::Active => Some(&mut self.active),
+            Field::Contact(i) => self.contact.get_mut(usize::from(i)),
         }
     }
 }
@@ -138,7 +148,8 @@ pub(super) fn parse_field(what: What, field: &str) -> Option<Field> {
         return Some(Field::Quality);
     }
     let What::Channel(kind) = what else {
-        return (field == "active").then_some(Field::Active);
+        let at = CONTACT.iter().position(|name| *name == field)?;
+        return Some(Field::Contact(u8::try_from(at).ok()?));
     };
     readings(kind).iter().find_map(|&kind| {
         let at = kind.fields().iter().position(|name| *name == field)?;
@@ -159,8 +170,8 @@ pub(super) fn items_of(
         Quality(cells.quality as u32)
     };
     let What::Channel(kind) = series.what else {
-        if !cells.active.is_nan() {
-            push(Value::Active(cells.active != 0.0));
+        if let Some(state) = contact_of(&cells.contact)? {
+            push(Value::Contact(state));
         }
         return Ok(());
     };
@@ -184,18 +195,49 @@ pub(super) fn items_of(
     Ok(())
 }
 
+/// The contact's state in these cells; `None` if they are empty.
+fn contact_of(cells: &[f64; CONTACT.len()]) -> Result<Option<ContactState>, String> {
+    let [active, px, py, pz, position_std, dx, dy, dz] = *cells;
+    let (position, direction) = ([px, py, pz], [dx, dy, dz]);
+    let given = |values: &[f64]| values.iter().filter(|value| !value.is_nan()).count();
+    for (values, names) in [(&position, "px py pz"), (&direction, "dx dy dz")] {
+        if !matches!(given(values), 0 | 3) {
+            return Err(format!("holds some of {names}, but not all"));
+        }
+    }
+    if !position_std.is_nan() && given(&position) == 0 {
+        return Err("holds p_std without px py pz".into());
+    }
+    if active.is_nan() {
+        return match given(cells) {
+            0 => Ok(None),
+            _ => Err("says where the contact is, but not whether it is present: active".into()),
+        };
+    }
+    Ok(Some(ContactState {
+        active: active != 0.0,
+        position,
+        position_std,
+        direction,
+    }))
+}
+
 pub(super) fn field_word(field: Field) -> &'static str {
     match field {
         Field::Value(kind, i) => (kind.fields().get(usize::from(i)).copied()).unwrap_or_default(),
         Field::Quality => "quality",
-        Field::Active => "active",
+        Field::Contact(i) => CONTACT.get(usize::from(i)).copied().unwrap_or_default(),
     }
 }
 
 /// The inverse of [`items_of`].
 pub(super) fn spread(value: &Value, cells: &mut Cells) {
     match value {
-        Value::Active(active) => cells.active = f64::from(u8::from(*active)),
+        Value::Contact(state) => {
+            let active = f64::from(u8::from(state.active));
+            let ([px, py, pz], [dx, dy, dz]) = (state.position, state.direction);
+            cells.contact = [active, px, py, pz, state.position_std, dx, dy, dz];
+        }
         Value::Reading(reading, quality) => {
             cells.quality = f64::from(quality.0);
             if let Some(values) = cells.values.get_mut(reading.kind() as usize) {
@@ -267,6 +309,12 @@ mod tests {
             angular_velocity: [0.1, -2.0, 3e10],
             ..Imu::ABSENT
         };
+        let touch = ContactState {
+            active: true,
+            position: [0.01, -0.07, 1.0 / 3.0],
+            position_std: 0.002,
+            direction: [0.6, 0.0, -0.8],
+        };
         let values = vec![
             (
                 0,
@@ -296,8 +344,9 @@ mod tests {
                 ),
             ),
             (2, Value::Reading(Reading::Imu(imu), Quality::GOOD)),
-            (3, Value::Active(true)),
+            (3, Value::Contact(touch)),
         ];
+        assert_ne!(touch, ContactState::configured(true));
         let mut writer = Writer::new(Vec::new(), &series, Columns::All).unwrap();
         for (number, value) in &values {
             writer
@@ -324,7 +373,7 @@ mod tests {
         let bits = |v: &Value| {
             let mut cells = Cells::EMPTY;
             spread(v, &mut cells);
-            let all = (cells.values.iter().flatten()).chain([&cells.active]);
+            let all = (cells.values.iter().flatten()).chain(&cells.contact);
             all.map(|x| if x.is_nan() { 0 } else { x.to_bits() })
                 .collect::<Vec<_>>()
         };
@@ -340,6 +389,35 @@ mod tests {
             panic!("a wrench")
         };
         assert_eq!(quality, Quality::SATURATED | Quality::FROZEN);
+    }
+
+    #[test]
+    fn a_place_is_whole_and_belongs_to_a_declaration() {
+        let nan = f64::NAN;
+        let of = |cells: [f64; 8]| contact_of(&cells);
+        assert_eq!(of([nan; 8]), Ok(None));
+        let state = of([1.0, nan, nan, nan, nan, nan, nan, nan])
+            .unwrap()
+            .unwrap();
+        assert!(state.active && state.position[0].is_nan() && state.direction[2].is_nan());
+        let state = of([0.0, 1.0, 2.0, 3.0, nan, 4.0, 5.0, 6.0])
+            .unwrap()
+            .unwrap();
+        assert_eq!(
+            (state.active, state.position, state.direction),
+            (false, [1.0, 2.0, 3.0], [4.0, 5.0, 6.0])
+        );
+        for (cells, told) in [
+            ([1.0, 1.0, nan, 3.0, nan, nan, nan, nan], "some of px py pz"),
+            ([1.0, nan, nan, nan, nan, 1.0, nan, nan], "some of dx dy dz"),
+            ([1.0, nan, nan, nan, 0.1, nan, nan, nan], "p_std without"),
+            (
+                [nan, 1.0, 2.0, 3.0, nan, nan, nan, nan],
+                "but not whether it is present",
+            ),
+        ] {
+            assert!(of(cells).unwrap_err().contains(told), "{told}");
+        }
     }
 
     /// A flag lost on the way would make a faulty sample a good one.

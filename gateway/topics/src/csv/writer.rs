@@ -1,13 +1,12 @@
 //! Writes a table row by row. Values of one instant share a row.
 
 use super::columns::{
-    Cells, Field, Series, Value, What, field_word, readings, spread, usual, word,
+    Cells, Field, Series, Value, What, contact_fields, field_word, readings, spread, usual, word,
 };
 use crate::{Kind, Nanos};
 use std::format;
 use std::io;
 use std::string::String;
-use std::vec;
 use std::vec::Vec;
 
 /// Which columns a [`Writer`] writes per channel, besides its quality.
@@ -187,7 +186,7 @@ fn write_integer(text: &mut Vec<u8>, value: i32) {
 
 fn fields_of(what: What, columns: Columns) -> Vec<Field> {
     let What::Channel(kind) = what else {
-        return vec![Field::Active];
+        return contact_fields().collect();
     };
     let values = |kind: Kind, count| (0_u8..).take(count).map(move |i| Field::Value(kind, i));
     let mut fields: Vec<Field> = match columns {

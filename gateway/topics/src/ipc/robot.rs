@@ -65,6 +65,10 @@ pub struct Contact {
     pub standard_deviation: [f64; 6],
     /// Whether it was not declared, but F/T readings show that it is present.
     pub is_detected: bool,
+    /// Where it is taken to act \[m\], in the same axes, from the same origin.
+    pub position: [f64; 3],
+    /// Whether a declaration or a skin says so; else it is the configured place.
+    pub is_located: bool,
     /// How old it is \[ns\].
     pub age: Nanos,
 }
@@ -354,6 +358,8 @@ impl RobotReader {
             },
             standard_deviation: contact.standard_deviation,
             is_detected: contact.detected == 1,
+            position: contact.position,
+            is_located: contact.located == 1,
             age,
         })
     }
