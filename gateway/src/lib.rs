@@ -9,7 +9,7 @@
 //!
 //! - [`config`]: the raw contents of gateway.toml; [`plan`]: the checked and resolved form, which
 //!   everything else uses.
-//! - `dbc`: files that describe devices, as tables for the drivers.
+//! - `dbc`, `eds`: files that describe devices, as tables for the drivers.
 //! - [`link`]: one trait and three links to a bus; [`candump`]: the log format of replay, decode
 //!   and encode.
 //! - [`load`]: the share of a bus's time that its devices need.
@@ -30,6 +30,7 @@ pub mod daemon;
 mod dbc;
 pub mod decoder;
 mod dispatch;
+mod eds;
 mod health;
 pub mod inbox;
 pub mod link;
