@@ -166,8 +166,8 @@ fn entry(section: &Section) -> Result<Option<Entry>, String> {
     const INTEGERS: [u32; 9] = [1, 2, 3, 4, 5, 6, 7, 0x10, 0x16];
     let is_integer = match number(section, "datatype")? {
         Some((kind, _)) if INTEGERS.contains(&kind) => true,
-        // The types of CiA 301: real numbers, texts, times, domains, longer integers.
-        Some((8..=0x1B, _)) => return Ok(None),
+        // Real numbers, texts, times, domains, longer integers, structures.
+        Some((8..0x80, _)) => return Ok(None),
         // A type that the file itself defines, or a file without types.
         _ => false,
     };

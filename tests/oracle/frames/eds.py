@@ -12,11 +12,13 @@ import sys
 
 try:
     import canopen
-    from canopen.objectdictionary import ODVariable, datatypes, import_od
+    from canopen.objectdictionary import ODVariable, import_od
 except ImportError as missing:
     print(missing, file=sys.stderr)
     sys.exit(3)
 
+# Boolean, and integers of up to 32 bits.
+KINDS = {1, 2, 3, 4, 5, 6, 7, 0x10, 0x16}
 node = int(sys.argv[1])
 for name in sys.argv[2:]:
     # It reads files in the system's encoding alone, and tells the format by the name.
@@ -27,7 +29,7 @@ for name in sys.argv[2:]:
         top = objects[index]
         variables = [top] if isinstance(top, ODVariable) else [top[sub] for sub in sorted(top)]
         for variable in variables:
-            if variable.data_type not in datatypes.INTEGER_TYPES:
+            if variable.data_type not in KINDS:
                 continue
             own = variable.value is not None
             value = variable.value if own else variable.default
