@@ -63,7 +63,11 @@ fn compare(golden: &str, folder: &Path, files: &[&str]) -> usize {
             let expected = golden
                 .lines()
                 .find_map(|line| line.strip_prefix(place.as_str()));
-            let expected = expected.unwrap_or_else(|| panic!("{place}is {value}"));
+            let Some(expected) = expected else {
+                // canopen does not count the entries of a short form.
+                assert_eq!(*sub, 0, "{place}is {value}");
+                continue;
+            };
             let (number, own) = expected.split_once(' ').unwrap();
             let number: i64 = number.parse().unwrap();
             assert_eq!(number as u32, value, "{place}");
