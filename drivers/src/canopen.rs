@@ -17,20 +17,24 @@
 //! object 1000 (device type) of all nodes, and 1018 sub 1 to 4 (identity) of those that answer.
 
 mod node;
+mod pdo;
 mod protocol;
 mod recognise;
 mod script;
 
 pub(crate) use node::Node;
+pub(crate) use pdo::{Pdo, identifier};
 pub(crate) use protocol::{
-    MAPPED_MOST, NMT, NO_RTR, Object, SYNC, TIMING, TPDO_OFF, nmt, object, sdo_from, tpdo,
+    MAPPED_MOST, NMT, NO_RTR, Object, SYNC, TIMING, TPDO_OFF, nmt, object, sdo_from, sdo_to, tpdo,
 };
 pub(crate) use recognise::{Recognised, questions, recognise};
 pub(crate) use script::{Plan, READ, Script, Step};
 
 use crate::bytes::u16_le;
 use crate::family::Link;
-use crate::{Claim, Decoded, Frame, Spec, SpecError, bytes};
+use crate::objects::Objects;
+use crate::{Claim, Decoded, Frame, Mode, Spec, SpecError, bytes};
+use alloc::format;
 use proprio_topics::{Counter, Nanos, StampKind};
 use protocol::{emcy, heartbeat};
 
@@ -46,9 +50,22 @@ pub(crate) fn node_of(spec: &Spec) -> Result<u8, SpecError> {
         })
 }
 
-/// The identifiers of a node that its device listens to, beside its PDOs.
-pub(crate) fn claims(node: u8) -> [Claim; 3] {
-    [emcy(node), sdo_from(node), heartbeat(node)].map(Claim::exclusive)
+/// Refuses a file that configures another node.
+pub(crate) fn check_file(node: u8, file: Option<&Objects>) -> Result<(), SpecError> {
+    match file.and_then(|file| file.node) {
+        Some(of) if of != node => Err(SpecError::Description(format!(
+            "its file is that of node {of} (NodeID), and address = {node}"
+        ))),
+        _ => Ok(()),
+    }
+}
+
+/// The identifiers of a node that its device listens to, beside its PDOs: in [`Mode::Listen`] what
+/// another program writes to it too.
+pub(crate) fn claims(node: u8, mode: Mode) -> impl Iterator<Item = Claim> {
+    let from_node = [emcy(node), sdo_from(node), heartbeat(node)].map(Claim::exclusive);
+    let to_node = (mode == Mode::Listen).then(|| Claim::shared(sdo_to(node)));
+    from_node.into_iter().chain(to_node)
 }
 
 /// Which SYNC a node answers.
@@ -147,7 +164,8 @@ impl NodeState {
         link: &mut Link<Script<P>>,
         out: &mut Decoded,
     ) -> bool {
-        if !claims(node).iter().any(|claim| claim.matches(frame.id)) {
+        let ids = [emcy(node), sdo_from(node), heartbeat(node), sdo_to(node)];
+        if !ids.contains(&frame.id) {
             return false;
         }
         let Some(data) = bytes::payload(frame, out) else {
@@ -155,6 +173,8 @@ impl NodeState {
         };
         if frame.id == sdo_from(node) {
             link.questions.answer(data, frame, out);
+        } else if frame.id == sdo_to(node) {
+            link.questions.overhear(data);
         } else if frame.id == emcy(node) {
             match data.len() {
                 8 => self.error = u16_le(data, 0),

@@ -27,11 +27,16 @@
 //! - DRIVE_FAULT: the fault bit of the status word, or an emergency message; DEVICE_FAULT: an
 //!   emergency message about a sensor (73xx), which makes the position doubtful.
 //!
-//! A node that boots or leaves the operational state is started again. If another program commands
-//! the drive (`listen_only`, or a recorded log), the mapping is that of its answers to that
-//! program, or the key `pdos`.
+//! A node that boots or leaves the operational state is started again.
 //!
-//! Sources: CiA 301 4.2, CiA 402 4.0 (IEC 61800-7-201). Certain, but for the units of velocity and
+//! Mapping and scales are those of the keys; else what the drive says; else those of the maker's
+//! file, `eds`. A drive is asked. If another program commands it (`listen_only`, or a recorded log),
+//! its answers to that program count, and what that program writes to it. Of scales a file counts
+//! if it is a DCF that states them (ParameterValue), or if they are constants: an EDS is of a kind
+//! of drive, and knows no motor. The bus is opened for the identifiers of the keys or the file, else
+//! those of CiA 301. A drive that sends at another one is refused, with that identifier.
+//!
+//! Sources: CiA 301 4.2, CiA 306 1.3, CiA 402 4.0 (IEC 61800-7-201). Certain, but for the units of velocity and
 //! current, in which makers differ: hence the keys.
 //!
 //! # Keys
@@ -42,12 +47,15 @@
 //! rated_current = 3.0           # A; default: the drive's own
 //! current_unit = "per_mille"    # "per_mille" or "mA"
 //! hold_ms = 100.0
+//! eds = "drive.eds"             # the maker's EDS or DCF file, relative to gateway.toml
 //! # The process data, if the drive is not to be asked: objects as indices, in their order.
 //! pdos = [
 //!     { number = 1, objects = [0x6041, 0x6064, 0x6077], sync = 1 },
-//!     { number = 2, objects = [0x606C, 0x6078], sync = 1 },   # sync = 0: by events or a timer
+//!     # sync = 0: by events or a timer; without id at 280 + node
+//!     { number = 2, objects = [0x606C, 0x6078], sync = 1, id = 0x2A1 },
 //! ]
-//! # Only a simulated drive uses these; without `pdos` it sends status, position, mode, velocity.
+//! # Only a simulated drive uses these; without `pdos` or `eds` it sends status, position, mode,
+//! # velocity.
 //! period_ms = 10
 //! sync = 0
 //! ```
@@ -62,6 +70,7 @@ pub use board::DriveBoard;
 pub use options::{CurrentUnit, Options, PdoKeys, VelocityUnit};
 
 use crate::canopen::{self, Recognised};
+use crate::objects::Objects;
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
@@ -74,6 +83,14 @@ impl Driver for Options {
 
     fn outputs(&self) -> Vec<OutputInfo> {
         [OutputInfo::new(0, Kind::Joint)].to_vec()
+    }
+
+    fn eds(&self) -> Option<&str> {
+        self.eds.as_deref()
+    }
+
+    fn describe_objects(&mut self, objects: Objects) {
+        self.objects = Some(objects);
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {

@@ -27,9 +27,11 @@
 //! another node.
 //!
 //! If another program commands the node (`listen_only`, or a recorded log), the counts per turn are
-//! those of its answers to that program, or the key.
+//! those of its answers to that program, or the key, or those of its DCF file, or of an EDS file if
+//! they are constants there. With `configure = false` such a file, `eds`, also says which TPDO has
+//! the position, and where in it.
 //!
-//! Sources: CiA 301 4.2, CiA 406 3.2 as public drivers use it. Certain; makers differ in objects
+//! Sources: CiA 301 4.2, CiA 306 1.3, CiA 406 3.2 as public drivers use it. Certain; makers differ in objects
 //! that they leave out: 6000 and 1017 may be missing, and 6200 replaces the timer.
 //!
 //! # Keys
@@ -38,22 +40,26 @@
 //! counts_per_turn = 8192  # default: the node's own
 //! sync = 0                # 1 to 240: after each n-th SYNC; 0: by its timer
 //! configure = true        # false: TPDO 1 is mapped already, and begins with the position
+//! eds = "encoder.eds"     # the maker's EDS or DCF file, relative to gateway.toml
 //! ```
 
 use crate::bringup::Bringup;
-use crate::bytes::{self, u32_le};
+use crate::bytes;
 use crate::canopen::{
-    self, Cycle, NMT, NO_RTR, Node, NodeState, Object, Plan, Recognised, SYNC, Script, Step,
-    TPDO_OFF, nmt, node_of, object, tpdo,
+    self, Cycle, NMT, NO_RTR, Node, NodeState, Object, Pdo, Plan, Recognised, SYNC, Script, Step,
+    TPDO_OFF, identifier, nmt, node_of, object, tpdo,
 };
 use crate::family::{Family, Link, Supervised};
+use crate::objects::Objects;
 use crate::recognise::{Finding, Key, Stream, Traffic};
+use crate::signal::Bits;
 use crate::{
-    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
-    Spec, SpecError,
+    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Id, Mode, Output,
+    OutputInfo, Spec, SpecError,
 };
 use alloc::boxed::Box;
 use alloc::format;
+use alloc::string::String;
 use alloc::vec::Vec;
 use core::f64::consts::TAU;
 use proprio_topics::{Counter, JointState, Kind, Nanos, Quality, Reading, Refusal};
@@ -83,6 +89,11 @@ pub struct Options {
     pub sync: u8,
     /// Map and time TPDO 1; default true.
     pub configure: bool,
+    /// The EDS or DCF file, relative to the configuration.
+    pub eds: Option<String>,
+    /// The contents of `eds`, which the gateway reads.
+    #[serde(skip)]
+    pub objects: Option<Objects>,
 }
 
 impl Default for Options {
@@ -92,6 +103,8 @@ impl Default for Options {
             counts_per_turn: None,
             sync: 0,
             configure: true,
+            eds: None,
+            objects: None,
         }
     }
 }
@@ -116,6 +129,58 @@ impl Options {
             expected,
         })
     }
+
+    /// The counts per turn of this very encoder by its file: of 6001 if 6000 says that it is
+    /// scaled.
+    fn counts_of_file(&self) -> Option<f64> {
+        let own = |object: Object| self.objects.as_ref()?.own(object.index, object.sub);
+        let scaled = own(OPERATING).is_some_and(|parameters| parameters & SCALED != 0);
+        own(if scaled { SCALED_PER_TURN } else { PER_TURN }).map(f64::from)
+    }
+}
+
+/// Where the position is: in which frame, and where in it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Place {
+    id: Id,
+    bits: Bits,
+    /// The node sends it after each n-th SYNC; 0: by itself.
+    sync: u8,
+}
+
+impl Place {
+    /// As the driver maps it, or as the file says of a node that it does not map.
+    fn new(node: u8, options: &Options) -> Result<Self, SpecError> {
+        let of_file = |file: &Objects| {
+            let pdos = (0..4).map(|number| Pdo::of_file(file, node, number));
+            pdos.filter(Pdo::is_on).find_map(|pdo| {
+                let found =
+                    |(object, _, bits): &(Object, u64, u64)| *object == POSITION && *bits == 32;
+                let (_, first, length) = pdo.objects().find(found)?;
+                Some(Self {
+                    id: identifier(pdo.id?),
+                    bits: Bits::new(first, length, false)?,
+                    sync: if pdo.by_sync() {
+                        pdo.transmission.max(1)
+                    } else {
+                        0
+                    },
+                })
+            })
+        };
+        let no_place = SpecError::Keys {
+            key: "eds",
+            expected: "a file in which a TPDO has the position (6004), if configure = false",
+        };
+        if let (false, Some(file)) = (options.configure, &options.objects) {
+            return of_file(file).ok_or(no_place);
+        }
+        Ok(Self {
+            id: tpdo(node, 0),
+            bits: Bits::new(0, 32, false).ok_or(no_place)?,
+            sync: options.sync,
+        })
+    }
 }
 
 impl Driver for Options {
@@ -123,6 +188,14 @@ impl Driver for Options {
 
     fn outputs(&self) -> Vec<OutputInfo> {
         [OutputInfo::new(0, Kind::Joint)].to_vec()
+    }
+
+    fn eds(&self) -> Option<&str> {
+        self.eds.as_deref()
+    }
+
+    fn describe_objects(&mut self, objects: Objects) {
+        self.objects = Some(objects);
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
@@ -167,6 +240,8 @@ struct Start {
     options: Options,
     scaled: bool,
     counts_per_turn: Option<f64>,
+    /// Those of the file, if the node is not asked.
+    of_file: Option<f64>,
     /// The node has no timer in object 1800.
     no_timer: bool,
 }
@@ -268,7 +343,7 @@ impl Plan for Start {
     }
 
     fn ready(&self) -> Result<(), Refusal> {
-        let known = self.counts_per_turn;
+        let known = self.known();
         known.map(|_| ()).ok_or(Refusal::NoCalibration)
     }
 
@@ -279,10 +354,18 @@ impl Plan for Start {
     }
 }
 
+impl Start {
+    /// The counts per turn: the node's own, else its file's.
+    fn known(&self) -> Option<f64> {
+        self.counts_per_turn.or(self.of_file)
+    }
+}
+
 /// The host's side of an encoder.
 #[derive(Debug)]
 struct Encoder {
     node: u8,
+    place: Place,
     cycle: Cycle,
     state: NodeState,
 }
@@ -291,23 +374,28 @@ impl Encoder {
     fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
         options.check()?;
         let node = node_of(spec)?;
-        let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, tpdo(node, 0));
+        canopen::check_file(node, options.objects.as_ref())?;
+        let place = Place::new(node, options)?;
+        let listens = spec.mode == Mode::Listen;
+        let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, place.id);
         bringup.start_with(NMT, &[nmt::START, node]);
         bringup.stop_with(NMT, &[nmt::PRE_OPERATIONAL, node]);
         let start = Start {
             node,
             counts_per_turn: options.counts_per_turn,
+            of_file: options.counts_of_file().filter(|_| listens),
             options: options.clone(),
             scaled: false,
             no_timer: false,
         };
-        let claims = canopen::claims(node)
-            .into_iter()
-            .chain([Claim::exclusive(tpdo(node, 0)), Claim::shared(SYNC)]);
+        let claims = canopen::claims(node, spec.mode)
+            .chain([Claim::exclusive(place.id), Claim::shared(SYNC)])
+            .collect::<Vec<_>>();
         let script = Script::new(node, spec.mode, start);
         let this = Self {
             node,
-            cycle: Cycle::new(options.sync),
+            place,
+            cycle: Cycle::new(place.sync),
             state: NodeState::default(),
         };
         Ok(Supervised::boxed(claims, bringup, script, this))
@@ -320,10 +408,10 @@ impl Encoder {
         link: &mut Link<Script<Start>>,
         out: &mut Decoded,
     ) {
-        if data.len() < 4 {
+        let Some(counts) = self.place.bits.of(data) else {
             return out.fault(Counter::Length, 1, frame.id);
-        }
-        let Some(counts_per_turn) = link.questions.plan.counts_per_turn else {
+        };
+        let Some(counts_per_turn) = link.questions.plan.known() else {
             return link.questions.missed();
         };
         let Some((acquired, stamp)) = self.cycle.measured(frame) else {
@@ -339,7 +427,7 @@ impl Encoder {
             quality |= Quality::GAP_BEFORE;
         }
         let reading = Reading::Joint(JointState {
-            position: f64::from(u32_le(data, 0)) / counts_per_turn * TAU,
+            position: counts as f64 / counts_per_turn * TAU,
             ..JointState::ABSENT
         });
         let output = Output {
@@ -363,7 +451,7 @@ impl Family for Encoder {
         };
         if frame.id == SYNC {
             self.cycle.sync(frame);
-        } else if frame.id == tpdo(self.node, 0) {
+        } else if frame.id == self.place.id {
             self.position(data, frame, link, out);
         }
     }
@@ -382,6 +470,7 @@ const HARDWARE: u16 = 0x5000;
 #[derive(Debug)]
 pub struct EncoderBoard {
     node: Node,
+    place: Place,
     counts: u32,
     quality: Quality,
 }
@@ -395,7 +484,10 @@ impl EncoderBoard {
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         options.check()?;
         let id = node_of(spec)?;
-        let per_turn = options.counts_per_turn.map_or(USUAL_PER_TURN, |n| n as u32);
+        canopen::check_file(id, options.objects.as_ref())?;
+        let place = Place::new(id, options)?;
+        let per_turn = options.counts_per_turn.or(options.counts_of_file());
+        let per_turn = per_turn.map_or(USUAL_PER_TURN, |n| n as u32);
         // As another program, or the maker's tool, has left it.
         let set = spec.mode == Mode::Listen || !options.configure;
         let (off, map) = if set {
@@ -403,7 +495,7 @@ impl EncoderBoard {
         } else {
             (TPDO_OFF, 0)
         };
-        let transmission = match options.sync {
+        let transmission = match place.sync {
             0 => BY_EVENT,
             n => n,
         };
@@ -420,6 +512,7 @@ impl EncoderBoard {
         ];
         Ok(Self {
             node: Node::new(id, spec.mode == Mode::Listen, &entries),
+            place,
             counts: 0,
             quality: Quality::GOOD,
         })
@@ -437,8 +530,12 @@ impl EncoderBoard {
     fn send(&mut self, out: &mut Frames) {
         let fault = self.quality.contains(Quality::DEVICE_FAULT);
         self.node.report(if fault { HARDWARE } else { 0 }, out);
-        let frame = Frame::new(self.node.tpdo_id(0), &self.counts.to_le_bytes());
-        let _ = out.try_push(frame);
+        if self.node.value(object::tpdo_mapping(0, 1)) == POSITION.mapped(32) {
+            let mut data = [0; 8];
+            self.place.bits.set(self.counts.into(), &mut data);
+            let data = data.get(..self.place.bits.reach()).unwrap_or_default();
+            let _ = out.try_push(Frame::new(self.place.id, data));
+        }
     }
 }
 

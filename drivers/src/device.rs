@@ -2,6 +2,7 @@
 //! [`Board`] on the device; and [`Driver`], which makes both from a device's keys.
 
 use crate::calibration::Calibration;
+use crate::objects::Objects;
 use crate::recognise::{Finding, Traffic};
 use crate::signal::Message;
 use crate::{Frame, Id};
@@ -543,6 +544,16 @@ pub trait Driver {
     /// Takes the messages of that file, before anything else is asked of it.
     fn describe(&mut self, messages: Vec<Message>) {
         let _ = messages;
+    }
+
+    /// The EDS or DCF file that the keys name, relative to the configuration.
+    fn eds(&self) -> Option<&str> {
+        None
+    }
+
+    /// Takes the objects of that file, before anything else is asked of it.
+    fn describe_objects(&mut self, objects: Objects) {
+        let _ = objects;
     }
 
     /// The outputs of a device with these keys, in the order of its channels. None: it takes part

@@ -72,6 +72,7 @@ pub mod icub_strain;
 pub mod jr3_can;
 mod keys;
 pub mod moteus;
+pub mod objects;
 pub mod odrive;
 pub mod openimu;
 pub mod optoforce_daq;

@@ -1,5 +1,6 @@
 //! The drivers: one list from which their names, their keys and their devices follow.
 
+use crate::objects::Objects;
 use crate::recognise::{Finding, Traffic};
 use crate::signal::Message;
 use crate::{
@@ -112,6 +113,21 @@ macro_rules! drivers {
             pub fn describe(&mut self, messages: Vec<Message>) {
                 match self {
                     $(Self::$variant(options) => options.describe(messages),)+
+                }
+            }
+
+            /// The EDS or DCF file that describes the device ([`Driver::eds`]).
+            #[must_use]
+            pub fn eds(&self) -> Option<&str> {
+                match self {
+                    $(Self::$variant(options) => options.eds(),)+
+                }
+            }
+
+            /// Takes the objects of that file.
+            pub fn describe_objects(&mut self, objects: Objects) {
+                match self {
+                    $(Self::$variant(options) => options.describe_objects(objects),)+
                 }
             }
 

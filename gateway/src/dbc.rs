@@ -15,11 +15,15 @@ const NO_MESSAGE: &str = "VECTOR__INDEPENDENT_SIG_MSG";
 /// A message with the file, the place and the problem.
 pub(crate) fn read(file: &Path) -> Result<Vec<Message>, String> {
     let at = |problem: String| format!("{}: {problem}", file.display());
-    let bytes = std::fs::read(file).map_err(|e| at(format!("cannot be read: {e}")))?;
+    text(file).and_then(|text| parse(&text)).map_err(at)
+}
+
+/// The text of a file that describes a device.
+pub(crate) fn text(file: &Path) -> Result<String, String> {
+    let bytes = std::fs::read(file).map_err(|e| format!("cannot be read: {e}"))?;
     // Most editors write Windows-1252, whose letters and degree signs are those of Latin-1.
-    let text = String::from_utf8(bytes)
-        .unwrap_or_else(|e| e.as_bytes().iter().copied().map(char::from).collect());
-    parse(&text).map_err(at)
+    let text = String::from_utf8(bytes);
+    Ok(text.unwrap_or_else(|e| e.as_bytes().iter().copied().map(char::from).collect()))
 }
 
 fn parse(text: &str) -> Result<Vec<Message>, String> {

@@ -9,7 +9,7 @@
 //!
 //! - [`config`]: the raw contents of gateway.toml; [`plan`]: the checked and resolved form, which
 //!   everything else uses.
-//! - `dbc`: files that describe devices, as tables for the drivers.
+//! - `dbc`, `eds`: files that describe devices, as tables for the drivers.
 //! - [`link`]: one trait and three links to a bus; [`log`]: recorded buses, which replay and decode
 //!   read, and the log format that encode writes.
 //! - [`joints`]: from the outputs of devices to joints: gears, turns, couplings, several devices at
@@ -33,6 +33,7 @@ pub mod daemon;
 mod dbc;
 pub mod decoder;
 mod dispatch;
+mod eds;
 mod health;
 pub mod inbox;
 pub mod joints;

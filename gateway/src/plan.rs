@@ -11,11 +11,11 @@ pub use crate::joints::JointMap;
 pub(crate) use words::did_you_mean;
 
 use crate::config::{Pace, Raw, RawBus, RawDevice, RawJoint, Realtime, Source};
-use crate::dbc;
 use crate::joints::{CouplingPlan, Feed, Layout, Takes, Target};
 use crate::link::adapter::Adapter;
 use crate::link::replay::Matching;
 use crate::load::{self, BitRates, Load, Member};
+use crate::{dbc, eds};
 use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, OutputInfo, Outputs, Spec};
 use proprio_topics::{
     Description, Entry, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, Role,
@@ -386,6 +386,20 @@ impl Builder<'_> {
         Ok(())
     }
 
+    /// Refuses a device that is configured for another bit rate than that of the last bus.
+    fn check_rate(&self, configured: Option<u32>) -> Result<(), String> {
+        match (configured, self.plan.buses.last()) {
+            (Some(rate), Some(bus)) if !bus.rates_assumed && rate != bus.rates.nominal => {
+                Err(format!(
+                    "is for a bus of {} (Baudrate), and bit_rate = {} of this bus is another",
+                    bit_rate(rate),
+                    bus.rates.nominal
+                ))
+            }
+            _ => Ok(()),
+        }
+    }
+
     fn device(&mut self, mut table: toml::Table, wiring: &mut Wiring) -> Result<(), String> {
         let mut common = toml::Table::new();
         for key in RawDevice::KEYS {
@@ -416,6 +430,15 @@ impl Builder<'_> {
             let messages = dbc::read(&self.folder.join(file));
             options.describe(messages.map_err(|e| format!("{name:?}: file {e}"))?);
         }
+        let mut own_address = options.default_address();
+        if let Some(file) = options.eds() {
+            let objects = eds::read(&self.folder.join(file));
+            let objects = objects.map_err(|e| format!("{name:?}: eds {e}"))?;
+            own_address = own_address.or(objects.node.map(u32::from));
+            self.check_rate(objects.bit_rate)
+                .map_err(|e| format!("{name:?}: eds {file:?} {e}"))?;
+            options.describe_objects(objects);
+        }
         if !(raw.max_silence_ms > 0.0 && raw.max_silence_ms <= 3.6e6) {
             return Err(format!(
                 "{name:?}: max_silence_ms = {} must be above 0, at most an hour",
@@ -429,7 +452,7 @@ impl Builder<'_> {
             .buses
             .last()
             .map_or((0, false), |b| (b.devices.len(), b.listen_only));
-        let address = raw.address.or(options.default_address()).ok_or_else(|| {
+        let address = raw.address.or(own_address).ok_or_else(|| {
             format!(
                 "{name:?} ({}): address is missing; the driver's page says what it is",
                 raw.driver

@@ -76,6 +76,12 @@ fn plan(driver: &str, keys: &str, folder: &Path) -> Result<Plan, String> {
 fn the_keys_of_each_page_load() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("drive.dbc"), DESCRIPTION).unwrap();
+    for name in ["drive.eds", "encoder.eds"] {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join("tests/eds")
+            .join(name);
+        std::fs::copy(file, folder.path().join(name)).unwrap();
+    }
     for driver in DRIVERS {
         let page = page(driver);
         let block = keys(&page);

@@ -30,7 +30,8 @@ pub(crate) trait Plan: Send {
     fn steps(&self) -> usize;
 
     /// Takes the value that was read, or that the node has written (`None`); or why the node
-    /// refuses the step: the abort code. In [`Mode::Listen`], what it answers to another program.
+    /// refuses the step: the abort code. In [`Mode::Listen`], what it answers to another program,
+    /// and the value that the other program has written.
     ///
     /// # Errors
     /// Why the node cannot be used.
@@ -57,6 +58,8 @@ pub(crate) struct Script<P> {
     told: bool,
     attempts: Attempts,
     refusal: Option<Refusal>,
+    /// What another program writes, until the node confirms it.
+    writes: Option<(Object, u32)>,
 }
 
 /// Bytes of an SDO command: the low bits are the number of unused bytes, and that it is stated.
@@ -78,6 +81,7 @@ impl<P: Plan> Script<P> {
             told: false,
             attempts: Attempts::new(TIMING),
             refusal: None,
+            writes: None,
         }
     }
 
@@ -87,6 +91,24 @@ impl<P: Plan> Script<P> {
             && let Err(refusal) = self.plan.ready()
         {
             self.refusal.get_or_insert(refusal);
+        }
+    }
+
+    /// Takes an SDO frame of another program to the node: its writes in one frame are of interest.
+    pub(crate) fn overhear(&mut self, data: &[u8]) {
+        const KIND: u8 = 0b1110_0010;
+        self.writes = None;
+        if let &[command, _, _, sub, ..] = data
+            && data.len() == 8
+            && command & KIND == 0x22
+        {
+            let unused = if command & 1 == 1 {
+                u32::from(command & UNUSED) * 2
+            } else {
+                0
+            };
+            let value = u32_le(data, 4) & u32::MAX >> unused;
+            self.writes = Some((Object::new(u16_le(data, 1), sub), value));
         }
     }
 
@@ -105,8 +127,13 @@ impl<P: Plan> Script<P> {
         let object = Object::new(u16_le(data, 1), sub);
         let value = u32_le(data, 4);
         let answer = match command {
+            // A write that is refused changes nothing.
+            ABORT if self.writes.take().is_some_and(|(to, _)| to == object) => return,
             ABORT => Err(value),
-            WRITTEN => Ok(None),
+            WRITTEN => {
+                let written = self.writes.take().filter(|(to, _)| *to == object);
+                Ok(written.map(|(_, value)| value))
+            }
             _ if command & !UNUSED == UPLOAD => {
                 let unused = u32::from(command & UNUSED) * 2;
                 Ok(Some(value & u32::MAX >> unused))

@@ -1,9 +1,9 @@
 //! A drive's own side: a node with mapped process data.
 
-use super::layout::{Field, Layout, Quantity};
+use super::layout::{Field, Layout, Quantity, fields};
 use super::options::{CurrentUnit, Options, PdoKeys};
-use super::start::{COUNTS, PROFILE, RATED_CURRENT, RATED_TORQUE, TURNS};
-use crate::canopen::{NO_RTR, Node, SYNC, TPDO_OFF, node_of, object, tpdo};
+use super::start::{COUNTS, PROFILE, RATED_CURRENT, RATED_TORQUE, TURNS, Told};
+use crate::canopen::{NO_RTR, Node, SYNC, TPDO_OFF, check_file, node_of, object, tpdo};
 use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
 use alloc::vec::Vec;
 use core::f64::consts::TAU;
@@ -43,19 +43,34 @@ impl DriveBoard {
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         options.check()?;
         let id = node_of(spec)?;
+        check_file(id, options.objects.as_ref())?;
         let mut options = options.clone();
+        let of_file = options
+            .objects
+            .as_ref()
+            .map(|file| Layout::of_file(id, file));
+        let of_file = of_file.filter(|file| options.pdos.is_empty() && file.position().is_some());
         if options.pdos.is_empty() {
             let pdo = |number, objects: &[u16]| PdoKeys {
                 number,
                 objects: objects.to_vec(),
                 sync: options.sync,
+                id: None,
             };
             options.pdos = Vec::from([pdo(1, &[0x6041, 0x6064, 0x6061]), pdo(2, &[0x606C])]);
         }
-        let layout = Layout::of_keys(id, &options)?;
-        let counts_per_turn = options.counts_per_turn.unwrap_or(COUNTS_PER_TURN);
-        let torque = options.rated_torque.unwrap_or(TORQUE);
-        let current = options.rated_current.unwrap_or(CURRENT);
+        let layout = match of_file {
+            Some(layout) => layout,
+            None => Layout::of_keys(id, &options)?,
+        };
+        let file = Told::of_file(options.objects.as_ref());
+        let counts_per_turn = options.counts_per_turn.or(file.counts_per_turn());
+        let counts_per_turn = counts_per_turn.unwrap_or(COUNTS_PER_TURN);
+        let torque = options.rated_torque.or(file.rated_torque).unwrap_or(TORQUE);
+        let current = options
+            .rated_current
+            .or(file.rated_current)
+            .unwrap_or(CURRENT);
         let mut entries = Vec::from([
             (object::DEVICE_TYPE, 0x0002_0000 | PROFILE, 4),
             (COUNTS, counts_per_turn as u32, 4),
@@ -137,7 +152,7 @@ impl DriveBoard {
             if which & 1 << number == 0 || !pdo.is_on() {
                 continue;
             }
-            let (fields, bytes) = pdo.fields();
+            let (fields, bytes) = fields(pdo);
             let mut data = [0; 8];
             for field in &fields {
                 let raw = field.raw.bits(self.raw(field), field.bits.length());

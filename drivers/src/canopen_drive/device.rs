@@ -1,16 +1,17 @@
 //! The host's side of a drive: puts the values of its TPDOs together.
 
-use super::layout::{Layout, Quantity};
+use super::layout::{Layout, Quantity, fields};
 use super::options::Options;
 use super::start::{Scales, Start};
 use crate::bringup::Bringup;
 use crate::bytes;
 use crate::canopen::{
-    self, Cycle, NMT, NodeState, Plan, SYNC, Script, nmt, node_of, sdo_from, tpdo,
+    self, Cycle, NMT, NodeState, Plan, SYNC, Script, identifier, nmt, node_of, sdo_from, tpdo,
 };
 use crate::family::{Family, Link, Supervised};
 use crate::{Claim, Decoded, Device, Frame, Id, Output, Spec, SpecError};
 use alloc::boxed::Box;
+use alloc::vec::Vec;
 use arrayvec::ArrayVec;
 use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, StampKind};
 
@@ -48,9 +49,8 @@ impl Table {
             .enumerate()
             .filter(|(_, pdo)| pdo.is_on())
         {
-            let (fields, bytes) = pdo.fields();
-            #[allow(clippy::cast_possible_truncation)] // 11 bits
-            let id = Id::standard((pdo.id.unwrap_or(0) & 0x7FF) as u16);
+            let (fields, bytes) = fields(pdo);
+            let id = identifier(pdo.id.unwrap_or(0));
             let bit = 1 << at;
             let _ = used.try_push(Used {
                 id,
@@ -98,15 +98,16 @@ impl Drive {
     pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
         options.check()?;
         let node = node_of(spec)?;
-        let layout = Layout::of_keys(node, options)?;
+        canopen::check_file(node, options.objects.as_ref())?;
+        let start = Start::new(node, spec.mode, options)?;
         let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, tpdo(node, 0));
         bringup.start_with(NMT, &[nmt::START, node]);
-        let pdos = (0..4).map(|number| Claim::exclusive(tpdo(node, number)));
-        let claims = canopen::claims(node)
-            .into_iter()
+        let pdos = start.ids.iter().map(|id| Claim::exclusive(*id));
+        let claims: Vec<Claim> = canopen::claims(node, spec.mode)
             .chain(pdos)
-            .chain([Claim::shared(SYNC)]);
-        let script = Script::new(node, spec.mode, Start::new(options, layout));
+            .chain([Claim::shared(SYNC)])
+            .collect();
+        let script = Script::new(node, spec.mode, start);
         let this = Self {
             node,
             hold: Nanos::from_seconds(options.hold_ms * 1e-3),

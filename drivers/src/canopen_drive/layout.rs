@@ -1,9 +1,10 @@
-//! Which bytes of which TPDO are which quantity: from a drive's mapping.
+//! Which bits of which TPDO are which quantity: from a drive's mapping.
 
 use super::options::Options;
-use crate::SpecError;
-use crate::canopen::{Object, TPDO_OFF};
+use crate::canopen::{Object, Pdo, identifier, tpdo};
+use crate::objects::Objects;
 use crate::signal::{Bits, Raw};
+use crate::{Id, SpecError};
 use arrayvec::ArrayVec;
 
 /// What a drive sends.
@@ -55,63 +56,32 @@ pub(super) struct Field {
     pub(super) raw: Raw,
 }
 
-/// A TPDO as a drive tells it.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Pdo {
-    /// Object 1800 sub 1; `None`: there is none.
-    pub(super) id: Option<u32>,
-    /// 0 to 240: by SYNC.
-    pub(super) transmission: u8,
-    /// How many entries of the mapping count.
-    pub(super) count: u8,
-    pub(super) mapping: [u32; 8],
+/// The quantities of `pdo` that are used, and the length of its frames \[bytes\]. An object of
+/// another length than the profile's is not used.
+pub(super) fn fields(pdo: &Pdo) -> (ArrayVec<Field, 8>, usize) {
+    let (mut fields, mut end) = (ArrayVec::new(), 0);
+    for (object, at, length) in pdo.objects() {
+        if let Some((quantity, expected)) = Quantity::of(object)
+            && length == u64::from(expected)
+            && let Some(bits) = Bits::new(at, length, false)
+        {
+            let raw = quantity.raw();
+            let _ = fields.try_push(Field {
+                quantity,
+                bits,
+                raw,
+            });
+        }
+        end = at + length;
+    }
+    (
+        fields,
+        usize::try_from(end.div_ceil(8)).unwrap_or(usize::MAX),
+    )
 }
 
-impl Pdo {
-    /// Whether it is sent at all.
-    pub(super) fn is_on(&self) -> bool {
-        self.id.is_some_and(|id| id & TPDO_OFF == 0)
-    }
-
-    pub(super) fn by_sync(&self) -> bool {
-        self.transmission <= 240
-    }
-
-    /// The mapped objects with their lengths \[bits\].
-    fn objects(&self) -> impl Iterator<Item = (Object, u64)> {
-        let mapped = self.mapping.iter().take(usize::from(self.count));
-        mapped.map(|entry| {
-            let [bits, sub, low, high] = entry.to_le_bytes();
-            let index = u16::from_le_bytes([low, high]);
-            (Object::new(index, sub), u64::from(bits))
-        })
-    }
-
-    /// The quantities that are used, and the length of its frames \[bytes\]. An object of another
-    /// length than the profile's is not used.
-    pub(super) fn fields(&self) -> (ArrayVec<Field, 8>, usize) {
-        let (mut fields, mut at) = (ArrayVec::new(), 0);
-        for (object, length) in self.objects() {
-            if let Some((quantity, expected)) = Quantity::of(object)
-                && length == u64::from(expected)
-                && let Some(bits) = Bits::new(at, length, false)
-            {
-                let raw = quantity.raw();
-                let _ = fields.try_push(Field {
-                    quantity,
-                    bits,
-                    raw,
-                });
-            }
-            at += length;
-        }
-        let bytes = usize::try_from(at.div_ceil(8)).unwrap_or(usize::MAX);
-        (fields, bytes)
-    }
-
-    fn has(&self, wanted: Quantity) -> bool {
-        self.fields().0.iter().any(|field| field.quantity == wanted)
-    }
+fn has(pdo: &Pdo, wanted: Quantity) -> bool {
+    pdo.is_on() && fields(pdo).0.iter().any(|field| field.quantity == wanted)
 }
 
 /// All TPDOs of a drive.
@@ -136,7 +106,10 @@ impl Layout {
             if pdo.is_on() || keys.sync > 240 {
                 return Err(wrong("each number once, with sync from 0 to 240"));
             }
-            pdo.id = Some(crate::canopen::tpdo(node, number).raw());
+            if keys.id.is_some_and(|id| !(0x181..=0x6FF).contains(&id)) {
+                return Err(wrong("with an id from 0x181 to 0x6FF"));
+            }
+            pdo.id = Some(keys.id.map_or(tpdo(node, number).raw(), u32::from));
             pdo.transmission = if keys.sync == 0 { 254 } else { keys.sync };
             let mut bits = 0;
             for index in &keys.objects {
@@ -165,15 +138,30 @@ impl Layout {
         Ok(this)
     }
 
+    /// As a file states it for `node`.
+    pub(super) fn of_file(node: u8, file: &Objects) -> Self {
+        Self {
+            pdos: [0, 1, 2, 3].map(|number| Pdo::of_file(file, node, number)),
+        }
+    }
+
     /// The number of the TPDO that has the position.
     pub(super) fn position(&self) -> Option<usize> {
-        let has = |pdo: &Pdo| pdo.is_on() && pdo.has(Quantity::Position);
-        self.pdos.iter().position(has)
+        self.pdos
+            .iter()
+            .position(|pdo| has(pdo, Quantity::Position))
     }
 
     /// Whether some TPDO has `wanted`.
     pub(super) fn has(&self, wanted: Quantity) -> bool {
-        self.pdos.iter().any(|pdo| pdo.is_on() && pdo.has(wanted))
+        self.pdos.iter().any(|pdo| has(pdo, wanted))
+    }
+
+    /// The identifiers of the TPDOs that have something of use.
+    pub(super) fn ids(&self) -> impl Iterator<Item = Id> + '_ {
+        let used = |pdo: &&Pdo| pdo.is_on() && !fields(pdo).0.is_empty();
+        let used = self.pdos.iter().filter(used);
+        used.map(|pdo| identifier(pdo.id.unwrap_or(0)))
     }
 
     /// The TPDOs that make one reading with the position, one bit each, if a SYNC causes them.
@@ -183,7 +171,7 @@ impl Layout {
             return None;
         }
         let belongs = |pdo: &Pdo| {
-            let (fields, _) = pdo.fields();
+            let (fields, _) = fields(pdo);
             let is_joint = |field: &Field| (field.quantity as usize) < Quantity::JOINT;
             pdo.is_on() && pdo.transmission == position.transmission && fields.iter().any(is_joint)
         };

@@ -1,6 +1,8 @@
 //! The keys of a drive in gateway.toml.
 
 use crate::SpecError;
+use crate::objects::Objects;
+use alloc::string::String;
 use alloc::vec::Vec;
 use core::f64::consts::TAU;
 use serde::Deserialize;
@@ -58,6 +60,8 @@ pub struct PdoKeys {
     /// After each n-th SYNC; 0, the default: by events or a timer.
     #[serde(default)]
     pub sync: u8,
+    /// Its identifier; default that of CiA 301.
+    pub id: Option<u16>,
 }
 
 /// The keys of `driver = "canopen_drive"`.
@@ -78,6 +82,11 @@ pub struct Options {
     pub hold_ms: f64,
     /// The mapping; default the drive's own.
     pub pdos: Vec<PdoKeys>,
+    /// The EDS or DCF file, relative to the configuration.
+    pub eds: Option<String>,
+    /// The contents of `eds`, which the gateway reads.
+    #[serde(skip)]
+    pub objects: Option<Objects>,
     /// Period of a simulated drive \[ms\]; default 10.
     pub period_ms: u32,
     /// After each n-th SYNC a simulated drive sends; 0, the default: by a timer.
@@ -94,6 +103,8 @@ impl Default for Options {
             current_unit: CurrentUnit::PerMille,
             hold_ms: 100.0,
             pdos: Vec::new(),
+            eds: None,
+            objects: None,
             period_ms: 10,
             sync: 0,
         }

@@ -2,7 +2,10 @@
 
 use super::layout::{Layout, Quantity};
 use super::options::{CurrentUnit, Options};
-use crate::canopen::{MAPPED_MOST, Object, Plan, Step, object};
+use crate::canopen::{MAPPED_MOST, Object, Plan, Step, identifier, object, tpdo};
+use crate::objects::Objects;
+use crate::{Id, Mode, SpecError};
+use arrayvec::ArrayVec;
 use proprio_topics::Refusal;
 
 /// The profile of drives.
@@ -19,17 +22,73 @@ const PER_PDO: usize = 3 + MAPPED_MOST as usize;
 /// The first step after all TPDOs.
 const SCALES: usize = 1 + 4 * PER_PDO;
 
-/// Mapping and scales of a drive.
+/// What a drive, or its file, tells of its scales.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct Told {
+    counts: Option<f64>,
+    turns: Option<f64>,
+    /// \[Nm\]
+    pub(super) rated_torque: Option<f64>,
+    /// \[A\]
+    pub(super) rated_current: Option<f64>,
+}
+
+impl Told {
+    /// What `file` tells of this very drive. (The scales of an EDS are those of some motor.)
+    pub(super) fn of_file(file: Option<&Objects>) -> Self {
+        let own = |object: Object, unit| {
+            let number = file?.own(object.index, object.sub)?;
+            Some(f64::from(number) * unit)
+        };
+        let counts = own(COUNTS, 1.0);
+        Self {
+            counts,
+            turns: own(TURNS, 1.0).or(counts.map(|_| 1.0)),
+            rated_torque: own(RATED_TORQUE, 1e-3),
+            rated_current: own(RATED_CURRENT, 1e-3),
+        }
+    }
+
+    pub(super) fn counts_per_turn(&self) -> Option<f64> {
+        Some(self.counts? / self.turns?)
+    }
+
+    /// The value of `object`.
+    const fn value(&mut self, object: Object) -> Option<&mut Option<f64>> {
+        match object {
+            COUNTS => Some(&mut self.counts),
+            TURNS => Some(&mut self.turns),
+            RATED_TORQUE => Some(&mut self.rated_torque),
+            RATED_CURRENT => Some(&mut self.rated_current),
+            _ => None,
+        }
+    }
+
+    /// These values, and those of `other` where there are none.
+    fn or(self, other: Self) -> Self {
+        Self {
+            counts: self.counts.or(other.counts),
+            turns: self.turns.or(other.turns),
+            rated_torque: self.rated_torque.or(other.rated_torque),
+            rated_current: self.rated_current.or(other.rated_current),
+        }
+    }
+}
+
+/// Mapping and scales of a drive: those of the keys, else what the drive says, else what its file
+/// says.
 #[derive(Debug)]
 pub(super) struct Start {
     options: Options,
     /// The mapping is that of the keys.
     configured: bool,
+    /// What is used until the drive says it: nothing, if it is asked.
+    initial: (Layout, Told),
     pub(super) layout: Layout,
-    counts: Option<f64>,
-    turns: Option<f64>,
-    rated_torque: Option<f64>,
-    rated_current: Option<f64>,
+    /// The identifiers of TPDOs that are received.
+    pub(super) ids: ArrayVec<Id, 4>,
+    file: Told,
+    told: Told,
 }
 
 /// SI units per step of what a drive sends.
@@ -40,35 +99,62 @@ pub(super) struct Scales {
 }
 
 impl Start {
-    pub(super) fn new(options: &Options, layout: Layout) -> Self {
-        Self {
-            configured: !options.pdos.is_empty(),
-            layout,
-            counts: options.counts_per_turn,
-            turns: options.counts_per_turn.map(|_| 1.0),
-            rated_torque: options.rated_torque,
-            rated_current: options.rated_current,
+    pub(super) fn new(node: u8, mode: Mode, options: &Options) -> Result<Self, SpecError> {
+        let configured = !options.pdos.is_empty();
+        let of_keys = Layout::of_keys(node, options)?;
+        let stated = match &options.objects {
+            Some(file) if !configured => Layout::of_file(node, file),
+            _ => of_keys,
+        };
+        let usual = |number| tpdo(node, number);
+        let ids = (0..4)
+            .zip(&stated.pdos)
+            .filter_map(|(number, pdo)| match pdo.id {
+                Some(id) if pdo.is_on() => Some(identifier(id)),
+                _ => (!configured).then(|| usual(number)),
+            });
+        let ids = ids.collect();
+        let file = Told::of_file(options.objects.as_ref());
+        let listens = mode == Mode::Listen;
+        let initial = (
+            if configured || listens {
+                stated
+            } else {
+                Layout::default()
+            },
+            if listens { file } else { Told::default() },
+        );
+        Ok(Self {
+            configured,
+            layout: initial.0.clone(),
+            initial,
+            ids,
+            file,
+            told: Told::default(),
             options: options.clone(),
-        }
+        })
     }
 
     /// The scales, once they are known. Torque and current are not a number if they are not sent.
     pub(super) fn scales(&self) -> Option<Scales> {
+        let (options, told) = (&self.options, self.told.or(self.initial.1));
         let needs = |quantity, known: Option<f64>| match known {
             Some(known) => Some(known * 1e-3),
             None if self.layout.has(quantity) => None,
             None => Some(f64::NAN),
         };
-        let counts_per_turn = self.counts? / self.turns?;
-        let torque = needs(Quantity::Torque, self.rated_torque)?;
-        let current = match self.options.current_unit {
+        let counts_per_turn = options.counts_per_turn.or(told.counts_per_turn())?;
+        let torque = options.rated_torque.or(told.rated_torque);
+        let torque = needs(Quantity::Torque, torque)?;
+        let current = options.rated_current.or(told.rated_current);
+        let current = match options.current_unit {
             CurrentUnit::Milliampere => 1e-3,
-            CurrentUnit::PerMille => needs(Quantity::Current, self.rated_current)?,
+            CurrentUnit::PerMille => needs(Quantity::Current, current)?,
         };
         Some(Scales {
             per_step: [
                 core::f64::consts::TAU / counts_per_turn,
-                self.options.velocity_unit.rad_per_s(counts_per_turn),
+                options.velocity_unit.rad_per_s(counts_per_turn),
                 torque,
                 current,
             ],
@@ -79,23 +165,19 @@ impl Start {
         self.options.current_unit == CurrentUnit::PerMille && self.layout.has(Quantity::Current)
     }
 
+    /// What the file says of a scale that the drive does not tell.
+    fn of_file(&self, object: Object) -> Option<f64> {
+        let mut file = self.file;
+        file.value(object).and_then(|value| *value)
+    }
+
     /// Takes an entry of a TPDO.
     fn take_pdo(&mut self, object: Object, value: Option<u32>) {
-        let [number, kind] = object.index.to_le_bytes();
-        let Some(pdo) = self.layout.pdos.get_mut(usize::from(number)) else {
-            return;
-        };
-        #[allow(clippy::cast_possible_truncation)] // these entries are bytes
-        match (kind, object.sub) {
-            (0x18, 1) => pdo.id = value,
-            (0x18, 2) => pdo.transmission = value.map_or(u8::MAX, |v| v as u8),
-            (0x1A, 0) => pdo.count = value.map_or(0, |v| v as u8).min(MAPPED_MOST),
-            (0x1A, sub) => {
-                if let Some(entry) = pdo.mapping.get_mut(usize::from(sub - 1)) {
-                    *entry = value.unwrap_or(0);
-                }
-            }
-            _ => {}
+        let [number, _] = object.index.to_le_bytes();
+        if let Some(pdo) = self.layout.pdos.get_mut(usize::from(number))
+            && !self.configured
+        {
+            pdo.take(object, value);
         }
     }
 }
@@ -162,34 +244,34 @@ impl Plan for Start {
                 Err(Refusal::OtherDevice { profile })
             }
             (_, Ok(Some(value))) if is_pdo => {
-                if !self.configured {
-                    self.take_pdo(object, Some(value));
-                }
+                self.take_pdo(object, Some(value));
                 Ok(())
             }
             // The drive has fewer of them.
             (_, Err(_)) if is_pdo => {
-                if !self.configured {
-                    self.take_pdo(object, None);
-                }
+                self.take_pdo(object, None);
                 Ok(())
             }
             (COUNTS, Ok(Some(told))) if self.options.counts_per_turn.is_none() => {
-                settle(&mut self.counts, told, 1.0)
+                settle(&mut self.told.counts, told, 1.0)
             }
             (TURNS, Ok(Some(told))) if self.options.counts_per_turn.is_none() => {
-                settle(&mut self.turns, told, 1.0)
+                settle(&mut self.told.turns, told, 1.0)
             }
             (RATED_TORQUE, Ok(Some(told))) if self.options.rated_torque.is_none() => {
-                settle(&mut self.rated_torque, told, 1e-3)
+                settle(&mut self.told.rated_torque, told, 1e-3)
             }
             (RATED_CURRENT, Ok(Some(told))) if self.options.rated_current.is_none() => {
-                settle(&mut self.rated_current, told, 1e-3)
+                settle(&mut self.told.rated_current, told, 1e-3)
             }
             (object::DEVICE_TYPE | COUNTS | TURNS | RATED_TORQUE | RATED_CURRENT, Err(_)) => {
-                Err(Refusal::Rejected {
+                let known = self.of_file(object).ok_or(Refusal::Rejected {
                     object: object.index,
-                })
+                })?;
+                if let Some(value) = self.told.value(object) {
+                    value.get_or_insert(known);
+                }
+                Ok(())
             }
             _ => Ok(()),
         }
@@ -199,17 +281,15 @@ impl Plan for Start {
         if self.layout.position().is_none() {
             return Err(Refusal::NotMapped);
         }
+        if let Some(id) = self.layout.ids().find(|id| !self.ids.contains(id)) {
+            return Err(Refusal::OtherIdentifier { id: id.raw() });
+        }
         self.scales().map(|_| ()).ok_or(Refusal::NoCalibration)
     }
 
     fn begin(&mut self) {
         // It may be another drive, or set up anew.
-        let layout = if self.configured {
-            core::mem::take(&mut self.layout)
-        } else {
-            Layout::default()
-        };
-        let options = core::mem::take(&mut self.options);
-        *self = Self::new(&options, layout);
+        self.layout = self.initial.0.clone();
+        self.told = Told::default();
     }
 }

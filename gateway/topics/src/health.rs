@@ -371,6 +371,11 @@ pub enum Refusal {
     },
     /// It does not send what is needed of it.
     NotMapped,
+    /// It sends with an identifier that is not received.
+    OtherIdentifier {
+        /// The identifier.
+        id: u32,
+    },
 }
 
 impl Refusal {
@@ -387,6 +392,7 @@ impl Refusal {
             Self::NotMapped => 5,
             Self::OtherDevice { profile } => 0x1_0000 | profile as u32,
             Self::Rejected { object } => 0x2_0000 | object as u32,
+            Self::OtherIdentifier { id } => 0x4000_0000 | id,
         }
     }
 
@@ -411,6 +417,9 @@ impl Refusal {
             }),
             0x2_0000..=0x2_FFFF => Some(Self::Rejected {
                 object: (code & 0xFFFF) as u16,
+            }),
+            0x4000_0000..=0x5FFF_FFFF => Some(Self::OtherIdentifier {
+                id: code & 0x1FFF_FFFF,
             }),
             _ => None,
         }
@@ -454,7 +463,13 @@ impl fmt::Display for Refusal {
                 "it refuses object {object:04X}; the driver's page says which key replaces it"
             ),
             Self::NotMapped => f.write_str(
-                "none of its process data has the position; map it with the maker's tool",
+                "none of its process data has the position; map it with the maker's tool, or, if \
+                 another program commands it, state the mapping (the driver's page says how)",
+            ),
+            Self::OtherIdentifier { id } => write!(
+                f,
+                "its process data has the identifier {id:03X}, which is not received; the driver's \
+                 page says which key states it"
             ),
         }
     }
@@ -709,11 +724,23 @@ mod tests {
             Refusal::OtherDevice { profile: 0 },
             Refusal::OtherDevice { profile: 0xFFFF },
             Refusal::Rejected { object: 0x608F },
+            Refusal::OtherIdentifier { id: 0x1B2 },
+            Refusal::OtherIdentifier { id: 0x1FFF_FFFF },
         ];
         for refusal in refusals.into_iter().chain(scales).chain(calibrations) {
             assert_eq!(Refusal::from_code(refusal.code()), Some(refusal));
         }
-        for none in [0, 6, 0xFF, 0x300, 0xFFFF, 0x3_0000, u32::MAX] {
+        for none in [
+            0,
+            6,
+            0xFF,
+            0x300,
+            0xFFFF,
+            0x3_0000,
+            0x3FFF_FFFF,
+            0x6000_0000,
+            u32::MAX,
+        ] {
             assert_eq!(Refusal::from_code(none), None, "{none}");
         }
     }

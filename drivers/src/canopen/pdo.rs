@@ -1,0 +1,100 @@
+//! Transmit process data (TPDO): which objects a node sends in which frame, from its objects 1800
+//! and 1A00, as the node or a file tells them.
+
+use super::protocol::{MAPPED_MOST, Object, TPDO_OFF, object};
+use crate::Id;
+use crate::objects::Objects;
+
+/// A TPDO.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct Pdo {
+    /// Object 1800 sub 1; `None`: there is none.
+    pub(crate) id: Option<u32>,
+    /// 0 to 240: by SYNC.
+    pub(crate) transmission: u8,
+    /// How many entries of the mapping count.
+    pub(crate) count: u8,
+    pub(crate) mapping: [u32; 8],
+}
+
+/// The identifier in a COB-ID.
+pub(crate) fn identifier(cob_id: u32) -> Id {
+    const EXTENDED: u32 = 1 << 29;
+    #[allow(clippy::cast_possible_truncation)] // 11 bits
+    match cob_id & EXTENDED {
+        0 => Id::standard((cob_id & 0x7FF) as u16),
+        _ => Id::extended(cob_id & 0x1FFF_FFFF),
+    }
+}
+
+impl Pdo {
+    /// TPDO `number`, from 0, of `node` as a file states it.
+    pub(crate) fn of_file(objects: &Objects, node: u8, number: u8) -> Self {
+        let value = |object: Object| objects.value(object.index, object.sub, node);
+        let mut this = Self::default();
+        this.take(object::tpdo_id(number), value(object::tpdo_id(number)));
+        this.take(
+            object::tpdo_transmission(number),
+            value(object::tpdo_transmission(number)),
+        );
+        let count = value(object::tpdo_mapping(number, 0));
+        this.take(
+            object::tpdo_mapping(number, 0),
+            count.or(Some(MAPPED_MOST.into())),
+        );
+        for sub in 1..=this.count {
+            let entry = object::tpdo_mapping(number, sub);
+            let told = value(entry);
+            // Makers leave out the number of entries, or the entries that are not used. Where
+            // those after a missing one are is not known.
+            if told.is_none_or(|told| told == 0) {
+                this.count = sub - 1;
+                break;
+            }
+            this.take(entry, told);
+        }
+        this
+    }
+
+    /// Takes the value of one of its objects; `None`: the node does not have it.
+    pub(crate) fn take(&mut self, object: Object, value: Option<u32>) {
+        let [_, kind] = object.index.to_le_bytes();
+        #[allow(clippy::cast_possible_truncation)] // these entries are bytes
+        match (kind, object.sub) {
+            (0x18, 1) => self.id = value,
+            (0x18, 2) => self.transmission = value.map_or(u8::MAX, |v| v as u8),
+            // Above 64 there is no mapping: each frame says which object it has.
+            (0x1A, 0) => {
+                let count = value.filter(|count| *count <= 64);
+                self.count = count.map_or(0, |v| v as u8).min(MAPPED_MOST);
+            }
+            (0x1A, sub) => {
+                if let Some(entry) = self.mapping.get_mut(usize::from(sub.wrapping_sub(1))) {
+                    *entry = value.unwrap_or(0);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// Whether it is sent at all.
+    pub(crate) fn is_on(&self) -> bool {
+        self.id.is_some_and(|id| id & TPDO_OFF == 0)
+    }
+
+    pub(crate) fn by_sync(&self) -> bool {
+        self.transmission <= 240
+    }
+
+    /// The mapped objects, each with its first bit and its length \[bits\].
+    pub(crate) fn objects(&self) -> impl Iterator<Item = (Object, u64, u64)> {
+        let mapped = self.mapping.iter().take(usize::from(self.count));
+        mapped.scan(0, |at, entry| {
+            let [bits, sub, low, high] = entry.to_le_bytes();
+            let (first, length) = (*at, u64::from(bits));
+            *at += length;
+            let index = u16::from_le_bytes([low, high]);
+            Some((Object::new(index, sub), first, length))
+        })
+    }
+}
