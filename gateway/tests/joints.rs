@@ -357,8 +357,9 @@ fn a_silent_motor_silences_its_coupling() {
     }
     send(&mut rig, &[0, 1, 2], 100.0);
     send(&mut rig, &[0, 1, 2], 104.0);
-    // All are silent, and come back one by one: the first two readings are old by then.
+    // All are silent, and come back one by one: the last two readings are old by then.
     send(&mut rig, &[0, 1], 108.0);
+    send(&mut rig, &[0, 1], 112.0);
     send(&mut rig, &[2], 300.0);
     send(&mut rig, &[1], 301.0);
     send(&mut rig, &[0], 302.0);

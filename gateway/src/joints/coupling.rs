@@ -98,3 +98,75 @@ impl Coupling {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proprio_topics::JointState;
+    use proptest::prelude::*;
+
+    /// A state that several devices have made has no device's time, number or counter.
+    #[test]
+    fn a_coupled_state_is_no_single_devices() {
+        let matrix = Matrix::new(&[vec![1.0, 1.0], vec![1.0, -1.0]], 2).unwrap();
+        let mut coupling = Coupling::new(matrix, 2);
+        let measured = |ms, stamp| Measured {
+            acquired: Nanos::from_millis(ms),
+            stamp,
+            device_time: Nanos(7),
+            device_counter: 9,
+            quality: Quality::DEVICE_COUNTER,
+            state: JointState::ABSENT,
+            max_silence: Nanos::from_millis(ms),
+        };
+        assert!(!coupling.give(0, measured(50, StampKind::Hardware)));
+        assert!(coupling.give(1, measured(60, StampKind::Software)));
+        let joint = coupling.joint(1).unwrap();
+        assert_eq!((joint.device_time, joint.device_counter), (Nanos::MIN, 0));
+        assert_eq!(
+            (joint.quality, joint.stamp),
+            (Quality::GOOD, StampKind::Software)
+        );
+        assert_eq!(joint.acquired, Nanos::from_millis(60));
+        assert_eq!(
+            joint.max_silence,
+            Nanos::from_millis(60),
+            "that of the slowest"
+        );
+    }
+
+    proptest! {
+        /// However readings come, stamps never run backward, and each state has a reading of each
+        /// motor that no state before had.
+        #[test]
+        fn stamps_never_run_backward(
+            steps in prop::collection::vec((0..3_usize, 0..20_i64), 1..200),
+        ) {
+            let unit = |k: usize| (0..3).map(|j| f64::from(u8::from(j == k))).collect();
+            let matrix = Matrix::new(&[unit(0), unit(1), unit(2)], 3).unwrap();
+            let mut coupling = Coupling::new(matrix, 3);
+            let (mut now, mut last, mut given) = ([0; 3], Nanos::MIN, [0; 3]);
+            for (motor, step) in steps {
+                // Each motor has stamps of its own, which may be behind the others'.
+                now[motor] += step;
+                given[motor] += 1;
+                let is_new = coupling.give(motor, Measured {
+                    acquired: Nanos(now[motor]),
+                    stamp: StampKind::Software,
+                    device_time: Nanos::MIN,
+                    device_counter: 0,
+                    quality: Quality::GOOD,
+                    state: JointState::ABSENT,
+                    max_silence: Nanos(100),
+                });
+                if is_new {
+                    prop_assert!(given.iter().all(|n| *n > 0));
+                    given = [0; 3];
+                    let t = coupling.joint(0).unwrap().acquired;
+                    prop_assert!(t >= last && t.0 == *now.iter().max().unwrap());
+                    last = t;
+                }
+            }
+        }
+    }
+}

@@ -51,13 +51,14 @@ impl Track {
             let continued = now.acquired - before.acquired <= now.max_silence
                 && !now.quality.intersects(doubtful)
                 && !before.quality.intersects(Quality::UNTRUSTED_ENCODER);
-            if elapsed > 0.0 && continued {
+            if continued {
                 differences = (
                     (state.position - before.state.position) / elapsed,
                     (state.velocity - before.state.velocity) / elapsed,
                 );
             }
         }
+        // Two readings of one instant give no finite one.
         let known = |reported: f64, difference: f64| {
             [reported, difference]
                 .into_iter()
