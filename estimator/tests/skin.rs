@@ -278,6 +278,8 @@ fn a_touch_says_where_a_contact_is() {
         (ContactKind::Force, 8.0),
         (ContactKind::ForceAlong, 8.0),
         (ContactKind::Wrench, 8.0),
+        // So strong that 3 mm are a moment far above the noise: it still explains the readings.
+        (ContactKind::Force, 60.0),
         // Too weak for the F/T sensor to show it, where masses are known to 20 %.
         (ContactKind::Force, 0.1),
     ] {
@@ -533,6 +535,38 @@ fn a_declared_place_is_as_good_as_a_configured_one() {
         std(&less),
         std(&found)
     );
+    // A wrong place does not explain the readings, unless it is said to be uncertain.
+    let beside = ContactState {
+        position: [0.01, -0.01, 0.02],
+        ..placed
+    };
+    let hand = far.robot.contact("hand").unwrap();
+    let needed = [f64::NAN, 0.05].map(|position_std| {
+        let state = ContactState {
+            position_std,
+            ..beside
+        };
+        let (found, _) = run_with(far.clone(), &all, told(state));
+        // Another contact must then be there, too, and which does what is not determined.
+        let contacts = at(&found, 2000).contacts.contacts().to_vec();
+        (contacts[hand].detected, contacts[forearm].valid)
+    });
+    assert_eq!(needed, [(1, 0), (0, 1)]);
+    // After a jump, within a tenth of a second, the deviations are those of the new place. Nothing
+    // pushes, so that no place is a wrong one.
+    let other = ContactState {
+        position: [-0.05, -0.1, 0.0],
+        ..placed
+    };
+    let calm = events(&near, &Push { force: 0.0, ..push }, 0);
+    let (jumped, _) = run_with(far.clone(), &calm, |pipeline, t| {
+        let is_before = t < Nanos::from_millis(2040);
+        pipeline.declare(forearm, t, if is_before { &placed } else { &other });
+    });
+    let [here, there] = [placed, other].map(|state| run_with(far.clone(), &calm, told(state)).0);
+    let stds = |e: &[Estimate]| at(e, 2050).contacts.contacts()[forearm].standard_deviation;
+    assert_ne!(stds(&here), stds(&there));
+    assert_eq!(stds(&jumped), stds(&there));
     // A place that makes no sense is ignored and counted.
     for wrong in [
         ContactState {
@@ -733,6 +767,21 @@ fn each_mistake_about_a_skin_has_one_clear_message() {
         error.contains("skin/forearm_skin; did you mean \"forearm_skn\"?"),
         "{error}"
     );
+}
+
+/// Taxels that are given in another frame of the link are where they are in the contact's.
+#[test]
+fn taxels_are_placed_in_the_frame_of_their_contact() {
+    let mut config = config(ContactKind::Force);
+    (config.skin[0].link, config.skin[0].contact) = ("l_hand_palm".into(), "hand".into());
+    let setup = setup(&config);
+    let palm = setup.robot.model.frame("l_hand_palm").unwrap().pose;
+    let hand = setup.robot.model.frame("l_hand").unwrap().pose;
+    assert!((palm.translation - hand.translation).norm() > 0.01);
+    let (own, given) = (setup.skins[0].taxels[13].unwrap(), taxels().0[13].unwrap());
+    let gap = hand.point(&own.position) - palm.point(&given.position);
+    let turn = hand.rotation * own.normal - palm.rotation * given.normal;
+    assert!(gap.norm() < 1e-12 && turn.norm() < 1e-12, "{gap} {turn}");
 }
 
 /// A plan that says what is read of the skin.
