@@ -364,6 +364,15 @@ fn findings_say_what_was_found() {
     assert_eq!(certainty, Certainty::Certain);
     let (_, keys, _) = found(row("icub_skin", "triangles = [2, 5]"), false);
     assert_eq!(keys, "period_ms = 50; triangles = [2, 5]");
+    let xsens = BOARDS
+        .iter()
+        .position(|row| row.1.contains("extended = true"));
+    let (_, keys, _) = found(xsens.unwrap(), false);
+    assert_eq!(
+        keys,
+        "quantities = [\"angular_velocity\", \"acceleration\"]; period_ms = 10; extended = true; \
+         high_rate = \"rate_first\""
+    );
     let (_, keys, certainty) = found(row("moteus", "host = 7"), false);
     assert_eq!(
         (keys.as_str(), certainty),
@@ -463,7 +472,24 @@ fn a_node_of_another_profile_is_no_drive() {
     let findings = recognise(&heard);
     assert_eq!(findings.len(), 1, "{findings:?}");
     assert!(findings[0].what.contains("profile 401"));
+    assert_eq!(findings[0].certainty(), Some(Certainty::Certain));
     assert!(findings[0].unusable.contains(".dbc"));
+}
+
+/// A node that does not tell its profile is rather an encoder if it sends four bytes.
+#[test]
+fn process_data_hint_at_a_profile() {
+    for (pdo, first) in [
+        ("189#00010203", "canopen_encoder"),
+        ("189#2706010203040A", "canopen_drive"),
+    ] {
+        let mut heard = Traffic::new();
+        heard.on_frame(&crate::rig::frame("709#05", 0.0));
+        heard.on_frame(&crate::rig::frame(pdo, 1.0));
+        let drivers: Vec<&str> = recognise(&heard).iter().map(|f| f.driver).collect();
+        assert_eq!(drivers.len(), 2);
+        assert_eq!(drivers[0], first);
+    }
 }
 
 /// A bus of streams, each of one length, whose bytes are constant, count, or are arbitrary.
