@@ -304,6 +304,15 @@ mod tests {
                 "{axis}: {found:?}"
             );
         }
+        // It is over at its first change, and found again.
+        let mut sensor = Sensor::new(20.0);
+        assert!((0..3000).all(|_| sensor.read(0.0, 0) == 0));
+        for axis in [2, 4, 1] {
+            assert!(sensor.until(1 << axis, 1 << axis).is_some(), "{axis}");
+            // (By chance the first reading is the same.)
+            sensor.read(0.0, 0);
+            assert!((0..40).all(|_| sensor.read(0.0, 0) == 0));
+        }
         // With little noise alone it may be chance: all axes together are needed.
         let mut sensor = Sensor::new(1.5);
         for _ in 0..3000 {
@@ -349,6 +358,39 @@ mod tests {
             .last();
         assert_eq!(found, Some(0b111));
         assert_eq!(sanity.look(&wrench(f64::NAN), Quality::GOOD), 0);
+    }
+
+    /// Three axes, of which none alone is noisy enough; then also one that never changes.
+    #[test]
+    fn axes_are_judged_together() {
+        for constant in [f64::NAN, 1.0] {
+            let (mut sanity, mut noise) = (Sanity::new(), Noise(11));
+            let mut fresh = || Wrench {
+                force: [(); 3].map(|()| (3.0 * noise.next()).round()),
+                torque: [constant; 3],
+            };
+            for _ in 0..3000 {
+                assert_eq!(sanity.look(&fresh(), Quality::GOOD), 0);
+            }
+            let last = fresh();
+            let masks: Vec<u16> = (0..60).map(|_| sanity.look(&last, Quality::GOOD)).collect();
+            let all = if constant.is_nan() { 0b111 } else { 0x3F };
+            let first = masks.iter().position(|mask| *mask != 0).expect("found");
+            assert!((15..40).contains(&first), "{first}");
+            assert!(masks[first..].iter().all(|mask| *mask == all), "{masks:?}");
+            // What the device says itself parts two runs.
+            for _ in 0..3000 {
+                sanity.look(&fresh(), Quality::GOOD);
+            }
+            let last = fresh();
+            for k in 0..200 {
+                let quality = match k % 12 {
+                    0 => Quality::SATURATED,
+                    _ => Quality::GOOD,
+                };
+                assert_eq!(sanity.look(&last, quality), 0, "{k}");
+            }
+        }
     }
 
     #[test]

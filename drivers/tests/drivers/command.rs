@@ -573,8 +573,8 @@ fn what_is_wrong_with_a_calibration_is_named() {
     // The size of the numbers does not matter.
     matrix = [[0; 6]; 6];
     (0..6_i16).for_each(|axis| matrix[usize::try_from(axis).unwrap()][0] = 1 + axis);
-    for axis in 1..6 {
-        matrix[axis][axis] = 5 * i16::try_from(axis).unwrap();
+    for (axis, row) in (0..6_i16).zip(&mut matrix) {
+        row[usize::try_from(axis).unwrap()] += 5 * axis;
     }
     assert_eq!(defects(full_scale, matrix), []);
 }
