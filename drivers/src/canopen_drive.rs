@@ -30,14 +30,14 @@
 //! A node that boots or leaves the operational state is started again.
 //!
 //! Mapping and scales are those of the keys; else what the drive says; else those of the maker's
-//! file, `eds`. A drive is asked. If another program commands it (`listen_only`, or a recorded log),
-//! its answers to that program count, and what that program writes to it. Of scales a file counts
-//! if it is a DCF that states them (ParameterValue), or if they are constants: an EDS is of a kind
-//! of drive, and knows no motor. The bus is opened for the identifiers of the keys or the file, else
-//! those of CiA 301. A drive that sends at another one is refused, with that identifier.
+//! file, `eds`. A drive is asked. If another program commands it (`listen_only`, or a recorded
+//! log), its answers to that program count, and what that program writes to it. Of scales a file
+//! counts if it is a DCF that states them (ParameterValue), or if they are constants: an EDS is of
+//! a kind of drive, and knows no motor. The bus is opened for the identifiers of the keys or the
+//! file, else those of CiA 301. A drive that sends at another one is refused, with that identifier.
 //!
-//! Sources: CiA 301 4.2, CiA 306 1.3, CiA 402 4.0 (IEC 61800-7-201). Certain, but for the units of velocity and
-//! current, in which makers differ: hence the keys.
+//! Sources: CiA 301 4.2, CiA 306 1.3, CiA 402 4.0 (IEC 61800-7-201). Certain, but for the units of
+//! velocity and current, in which makers differ: hence the keys.
 //!
 //! # Keys
 //! ```toml

@@ -31,8 +31,8 @@
 //! they are constants there. With `configure = false` such a file, `eds`, also says which TPDO has
 //! the position, and where in it.
 //!
-//! Sources: CiA 301 4.2, CiA 306 1.3, CiA 406 3.2 as public drivers use it. Certain; makers differ in objects
-//! that they leave out: 6000 and 1017 may be missing, and 6200 replaces the timer.
+//! Sources: CiA 301 4.2, CiA 306 1.3, CiA 406 3.2 as public drivers use it. Certain; makers differ
+//! in objects that they leave out: 6000 and 1017 may be missing, and 6200 replaces the timer.
 //!
 //! # Keys
 //! ```toml

@@ -289,8 +289,8 @@ mod tests {
         }
     }
 
-    /// Real files leave keys out, repeat names in another case, and hold texts, domains and types of
-    /// their own.
+    /// Real files leave keys out, repeat names in another case, and hold texts, domains and types
+    /// of their own.
     #[test]
     fn untidy_files_are_read() {
         let text = "\u{feff}; made by hand\r\n[fileinfo]\r\nFileName=a.eds\r\n\
@@ -301,6 +301,7 @@ mod tests {
             [1A00SUB0]\r\nDataType=5\r\nDefaultValue=1\r\n\
             [1a00Sub1]\r\nDataType=0x00A0\r\nDefaultValue=0x60640020\r\n\
             [6502]\r\nDataType=0x7\r\nDefaultValue=\r\n\
+            [1A01]\r\nObjectType=8\r\nDataType=7\r\nDefaultValue=3\r\n\
             [2000]\r\nDataType=0xF\r\nDefaultValue=#1\r\n\
             [Tools]\r\nItems=0\r\n";
         let objects = parse(text).unwrap();

@@ -236,6 +236,8 @@ fn what_a_node_says_counts_before_its_file() {
         "585#60001A0000000000",
         "605#23011801A5020080",
         "585#6001180100000000",
+        "605#23001801B2010000",
+        "585#8000180130000906", // refused, too
         "605#23031801850400C0",
         "585#6003180100000000",
         "585#438F600164000000",
@@ -348,6 +350,12 @@ fn an_encoder_is_read_as_its_file_says() {
     let read = joints(&mut *host, &["185#FFFF", "080#", "285#FFFF84030000"]);
     assert_eq!(read.len(), 1, "{:?}", host.state());
     assert!(near(read[0].position, 0.25 * TAU), "{read:?}");
+    // Its file says that it measures at a SYNC.
+    let mut out = Decoded::new();
+    for (text, ms) in [("080#", 50.0), ("285#FFFF84030000", 51.0)] {
+        host.on_frame(&frame(text, ms), &mut out);
+    }
+    assert_eq!(out.readings[0].acquired, Nanos::from_millis(50));
     let mut board = device.options.board(&device.spec).unwrap();
     let (mut frames, quarter) = (Frames::new(), 0.25 * TAU);
     let state = JointState {

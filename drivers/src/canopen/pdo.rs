@@ -44,14 +44,13 @@ impl Pdo {
         );
         for sub in 1..=this.count {
             let entry = object::tpdo_mapping(number, sub);
-            let told = value(entry);
-            // Makers leave out the number of entries, or the entries that are not used. Where
-            // those after a missing one are is not known.
-            if told.is_none_or(|told| told == 0) {
+            let Some(told) = value(entry) else {
+                // Makers leave out the number of entries, or entries that are not used. Where
+                // those after a missing one are is not known.
                 this.count = sub - 1;
                 break;
-            }
-            this.take(entry, told);
+            };
+            this.take(entry, Some(told));
         }
         this
     }
