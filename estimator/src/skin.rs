@@ -155,7 +155,7 @@ impl TaxelState {
     /// Takes a value; returns the pressure if it is pressed, else 0. `gain` is the share by which
     /// the rest follows.
     fn update(&mut self, t: Nanos, value: f64, threshold: f64, gain: f64) -> f64 {
-        if !(value.abs() < MEASURED) {
+        if value.is_nan() || value.abs() >= MEASURED {
             // Not measured: not known to be pressed.
             (self.is_pressed, self.wants_change, self.is_below) = (false, false, false);
             return 0.0;
