@@ -13,9 +13,9 @@ mod tables;
 pub use found::{Device, devices};
 pub use tables::{Bus, file, tables};
 
-use crate::log;
 use crate::clock::Clock;
 use crate::link::{Link, Received, SendError, send_by};
+use crate::log;
 use proprio_drivers::{Format, Traffic, questions};
 use proprio_topics::{LinkState, Nanos};
 use std::collections::BTreeMap;
