@@ -25,7 +25,7 @@ pub(crate) use node::Node;
 pub(crate) use protocol::{
     MAPPED_MOST, NMT, NO_RTR, Object, SYNC, TIMING, TPDO_OFF, nmt, object, sdo_from, tpdo,
 };
-pub(crate) use recognise::{Recognised, questions, recognise};
+pub(crate) use recognise::{Recognised, commands, questions, recognise};
 pub(crate) use script::{Plan, READ, Script, Step};
 
 use crate::bytes::u16_le;
