@@ -58,7 +58,7 @@ pub(crate) struct How {
     seconds: f64,
     /// Also ask: iCub boards (DISCOVER), CANopen nodes (SDO reads of 1000 and 1018), ODrives that
     /// are heard (Get_Version), and on CAN FD moteus controllers (a query). These questions start,
-    /// move and change nothing
+    /// move and change nothing, but for ODrives numbered 48 to 51 or 56 that send no heartbeat
     #[arg(long)]
     active: bool,
     /// Also ask devices of this driver: ati_netcanoem, robotous_rft or jr3_can; may be repeated.

@@ -27,7 +27,7 @@ pub(crate) use pdo::{Pdo, identifier};
 pub(crate) use protocol::{
     MAPPED_MOST, NMT, NO_RTR, Object, SYNC, TIMING, TPDO_OFF, nmt, object, sdo_from, sdo_to, tpdo,
 };
-pub(crate) use recognise::{Recognised, questions, recognise};
+pub(crate) use recognise::{Recognised, commands, questions, recognise};
 pub(crate) use script::{Plan, READ, Script, Step};
 
 use crate::bytes::u16_le;

@@ -117,7 +117,8 @@ impl Driver for Options {
                 }
             };
             let finding = (node.evidence).finding(Self::NAME, node.node.into(), what)?;
-            let finding = finding.with_joints([0]);
+            let commands = canopen::commands(node.node);
+            let finding = finding.with_joints([0]).with_commands(commands);
             Some(Finding {
                 unusable,
                 ..finding

@@ -223,7 +223,9 @@ impl Driver for Options {
             };
             let finding = evidence.finding(Self::NAME, node.node.into(), what)?;
             let period = Key::period_ms(first.and_then(Stream::period), 1, 65_535);
-            Some(finding.with_keys(period).with_joints([0]))
+            let commands = canopen::commands(node.node);
+            let finding = finding.with_keys(period).with_joints([0]);
+            Some(finding.with_commands(commands))
         };
         canopen::recognise(seen).filter_map(find).collect()
     }

@@ -59,6 +59,10 @@
 //! firmware 3 bytes, unreleased). Axis 0 is not asked: the identifier is that of CANopen's network
 //! management.
 //!
+//! Axes 48 to 51 would take questions to CANopen nodes (`600` + n), and axis 56 DISCOVER to iCub
+//! boards, for commands. These are not sent on the identifiers of an axis that is heard: so such
+//! an axis must send its heartbeat, as it does unless that is turned off.
+//!
 //! # Keys
 //! ```toml
 //! firmware = "0.6"          # "0.6" or "0.5"

@@ -18,6 +18,7 @@ use crate::{Format, Frame, Id};
 use alloc::collections::{BTreeMap, VecDeque};
 use alloc::string::{String, ToString};
 use alloc::vec::Vec;
+use core::ops::RangeInclusive;
 use proprio_topics::Nanos;
 
 /// The newest frames that are kept of each identifier.
@@ -277,6 +278,9 @@ pub struct Finding {
     pub joints: Vec<u8>,
     /// The identifiers whose frames are explained by it.
     pub explains: Vec<Id>,
+    /// The identifiers on which it takes commands that a question of another family might look
+    /// like: such questions are not sent.
+    pub commands: Vec<RangeInclusive<Id>>,
     /// Why the driver cannot be used for it; empty if it can.
     pub unusable: &'static str,
 }
@@ -450,6 +454,7 @@ impl<'t> Evidence<'t> {
             keys: Vec::new(),
             joints: Vec::new(),
             explains: self.explains,
+            commands: Vec::new(),
             unusable: "",
         };
         (holds && finding.certainty().is_some()).then_some(finding)
@@ -460,6 +465,15 @@ impl Finding {
     /// With these keys.
     pub(crate) fn with_keys(mut self, keys: impl IntoIterator<Item = Key>) -> Self {
         self.keys.extend(keys);
+        self
+    }
+
+    /// With commands on these identifiers.
+    pub(crate) fn with_commands(
+        mut self,
+        commands: impl IntoIterator<Item = RangeInclusive<Id>>,
+    ) -> Self {
+        self.commands.extend(commands);
         self
     }
 

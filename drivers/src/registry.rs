@@ -1,7 +1,7 @@
 //! The drivers: one list from which their names, their keys and their devices follow.
 
 use crate::objects::Objects;
-use crate::recognise::{Finding, Traffic};
+use crate::recognise::{Certainty, Finding, Traffic};
 use crate::signal::Message;
 use crate::{
     Board, Device, Driver, Frame, OutputInfo, Spec, SpecError, aidin_aft200, ati_netcanoem,
@@ -44,15 +44,23 @@ macro_rules! drivers {
         }
 
         /// The questions of all drivers ([`Driver::questions`]), each once; of those that are asked
-        /// by name only, the drivers in `named`.
+        /// by name only, the drivers in `named`. None is on an identifier on which a device of
+        /// another driver, if `seen` shows one that is at least likely, takes commands.
         #[must_use]
         pub fn questions(seen: &Traffic, named: &[&str]) -> Vec<Frame> {
             let mut all: Vec<Frame> = Vec::new();
+            let mut there = recognise(seen);
+            there.retain(|finding| finding.certainty() >= Some(Certainty::Likely));
+            let is_command = |driver: &str, question: &Frame| {
+                let mut others = there.iter().filter(|finding| finding.driver != driver);
+                others.any(|other| other.commands.iter().any(|c| c.contains(&question.id)))
+            };
             $(if !<$module::Options as Driver>::ASKED_BY_NAME
                 || named.contains(&<$module::Options as Driver>::NAME)
             {
+                let driver = <$module::Options as Driver>::NAME;
                 for question in <$module::Options as Driver>::questions(seen) {
-                    if !all.contains(&question) {
+                    if !all.contains(&question) && !is_command(driver, &question) {
                         all.push(question);
                     }
                 }

@@ -1,13 +1,14 @@
 //! Recognising nodes: by heartbeats, and by what they answer to questions about their identity.
 
-use super::protocol::{emcy, heartbeat, object, sdo_from, sdo_to, tpdo};
+use super::protocol::{NMT, emcy, heartbeat, object, sdo_from, sdo_to, tpdo};
 use super::{Object, READ};
 use crate::bytes::{u16_le, u32_le};
 use crate::recognise::{BYTE, Evidence, LENGTH, Stream, Traffic, byte_of};
-use crate::{Format, Frame};
+use crate::{Format, Frame, Id};
 use alloc::format;
 use alloc::string::String;
 use alloc::vec::Vec;
+use core::ops::RangeInclusive;
 
 /// Vendor, product, revision, serial number.
 const IDENTITY: [(u8, &str); 4] = [
@@ -107,6 +108,12 @@ pub(crate) fn recognise(seen: &Traffic) -> impl Iterator<Item = Recognised<'_>> 
             tpdos,
         })
     })
+}
+
+/// On what node `node` takes commands: the network management, and the process data of RPDO 1 to 4.
+pub(crate) fn commands(node: u8) -> impl Iterator<Item = RangeInclusive<Id>> {
+    let rpdos = [0x200, 0x300, 0x400, 0x500].map(|base| Id::standard(base + u16::from(node)));
+    rpdos.into_iter().chain([NMT]).map(|id| id..=id)
 }
 
 /// All nodes are asked for their profile, those that have answered for their identity. To read an

@@ -87,7 +87,9 @@ fn mit(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
         let host = (host != 0).then(|| Key::new("host_id", host));
         let is_its = |frame: &Frame| frame.data().first() == Some(number);
         let period = Key::period_ms(stream.period_of(is_its), 1, 60_000);
-        Some(finding.with_keys(host).with_keys(period))
+        let command = Id::standard((*number).into());
+        let finding = finding.with_keys(host).with_keys(period);
+        Some(finding.with_commands([command..=command]))
     };
     // A bus has not many motors: more numbers are no numbers.
     let few = numbers.len() <= 16;

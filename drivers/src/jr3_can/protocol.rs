@@ -10,9 +10,11 @@ pub(super) mod op {
     pub(in crate::jr3_can) const START: u16 = 0x200;
     pub(in crate::jr3_can) const STOP: u16 = 0x280;
     pub(in crate::jr3_can) const ZERO: u16 = 0x300;
+    pub(in crate::jr3_can) const FILTER: u16 = 0x380;
     pub(in crate::jr3_can) const GET_STATE: u16 = 0x400;
     pub(in crate::jr3_can) const GET_FORCE_SCALES: u16 = 0x480;
     pub(in crate::jr3_can) const GET_MOMENT_SCALES: u16 = 0x500;
+    pub(in crate::jr3_can) const RESET: u16 = 0x580;
     pub(in crate::jr3_can) const FORCE: u16 = 0x600;
     pub(in crate::jr3_can) const MOMENT: u16 = 0x680;
     pub(in crate::jr3_can) const BOOT_UP: u16 = 0x700;

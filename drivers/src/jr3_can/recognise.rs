@@ -43,11 +43,21 @@ pub(super) fn board(seen: &Traffic, driver: &'static str, node: u16) -> Option<F
     if scales {
         evidence.add(BYTE);
     }
-    let (Some(_), Some(_)) = (force, moment) else {
-        return scales.then(|| evidence.finding(driver, node.into(), WHAT))?;
-    };
+    if (force.is_none() || moment.is_none()) && !scales {
+        return None;
+    }
     let finding = evidence.finding(driver, node.into(), WHAT)?;
-    Some(finding.with_keys(Key::period_ms(force.and_then(Stream::period), 1, 1000)))
+    let commands = [
+        op::START_SYNC,
+        op::START,
+        op::STOP,
+        op::ZERO,
+        op::FILTER,
+        op::RESET,
+    ];
+    let commands = commands.map(|op| id(op, node)..=id(op, node));
+    let period = Key::period_ms(force.and_then(Stream::period), 1, 1000);
+    Some(finding.with_keys(period).with_commands(commands))
 }
 
 const WHAT: &str = "JR3 sensor at a board of UC3M";

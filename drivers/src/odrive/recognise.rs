@@ -69,12 +69,9 @@ pub(super) fn axis(seen: &Traffic, driver: &'static str, node: u16) -> Option<Fi
         known => Key::new("firmware", format!("{known:?}")),
     };
     let period = Key::period_ms(period, 1, 60_000);
-    Some(
-        finding
-            .with_keys([firmware])
-            .with_keys(period)
-            .with_joints([0]),
-    )
+    let commands = id(node, 0)..=id(node, 0x1F);
+    let finding = finding.with_keys([firmware]).with_keys(period);
+    Some(finding.with_joints([0]).with_commands([commands]))
 }
 
 /// Axes that are heard are asked for their version, by a remote frame.

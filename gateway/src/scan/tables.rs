@@ -202,6 +202,7 @@ mod tests {
                 keys: vec![],
                 joints: vec![],
                 explains: vec![],
+                commands: vec![],
                 unusable: "",
             },
             rivals: vec![],
