@@ -377,5 +377,15 @@ ratio = 100.0
         let gear = compared("ratio = 100.0", "ratio = 50.0").unwrap();
         assert_eq!((gear.len(), gear[0].what.as_slice()), (1, &["joints"][..]));
         assert_eq!(compared("schema", "# Nothing.\nschema"), Ok(vec![]));
+        // The turns of a motor alone.
+        let turns = |centre: f64| {
+            let keys = format!(
+                "wraps_rad = [0.0, 3.0]\ncentre_rad = {centre}\nmax_speed_radps = 9.0\nratio"
+            );
+            Plan::parse(&coupled.replacen("ratio", &keys, 1), Path::new(".")).unwrap()
+        };
+        assert_eq!(changes(&turns(0.1), &turns(0.1)), Ok(vec![]));
+        let gear = changes(&turns(0.1), &turns(0.2)).unwrap();
+        assert_eq!(gear[0].what.as_slice(), &["joints"][..]);
     }
 }
