@@ -5,7 +5,7 @@
 //! rest on needs a restart of the gateway: also which device gives what of a joint (`takes`), and
 //! couplings.
 
-use crate::joints::{CouplingPlan, Layout, Matrix, Takes, Target};
+use crate::joints::{Layout, Matrix, Takes, Target};
 use crate::plan::{BusPlan, DevicePlan, Plan, Route};
 use proprio_drivers::Claim;
 use std::collections::BTreeSet;
@@ -143,30 +143,37 @@ fn compare_buses(old: (&Plan, &BusPlan), new: (&Plan, &BusPlan), blocked: &mut V
     }
 }
 
-/// The couplings of a bus, by the names of their joints and motors.
-fn couplings(layout: &Layout) -> Vec<(Vec<&str>, Vec<&str>, &Matrix, Option<Takes>)> {
-    let shaft = |number: usize| layout.shafts.get(number);
-    let name = |number: usize| shaft(number).map_or("", |shaft| shaft.name.as_str());
-    let of = |coupling: &'_ CouplingPlan| {
-        let first = coupling.joints.first().copied();
-        let source = first.and_then(|(joint, place)| shaft(joint)?.sources.get(place));
-        (
-            coupling
-                .joints
-                .iter()
-                .map(|(joint, _)| name(*joint))
-                .collect(),
-            coupling.motors.iter().map(|motor| name(*motor)).collect(),
-            source.map(|source| source.takes),
-        )
+/// A coupling, by the names of its joints and motors.
+#[derive(PartialEq)]
+struct Coupled<'p> {
+    joints: Vec<&'p str>,
+    motors: Vec<&'p str>,
+    matrix: &'p Matrix,
+    takes: Option<Takes>,
+}
+
+/// The couplings of a bus.
+fn couplings(layout: &Layout) -> Vec<Coupled<'_>> {
+    let name = |shaft: usize| {
+        let shaft = layout.shafts.get(shaft);
+        shaft.map_or("", |shaft| shaft.name.as_str())
     };
-    let parts = layout
-        .couplings
-        .iter()
-        .map(|coupling| (of(coupling), &coupling.matrix));
-    parts
-        .map(|((joints, motors, takes), matrix)| (joints, motors, matrix, takes))
-        .collect()
+    let source = |(shaft, place): &(usize, usize)| layout.shafts.get(*shaft)?.sources.get(*place);
+    let each = layout.couplings.iter().map(|coupling| Coupled {
+        joints: coupling
+            .joints
+            .iter()
+            .map(|(joint, _)| name(*joint))
+            .collect(),
+        motors: coupling.motors.iter().map(|motor| name(*motor)).collect(),
+        matrix: &coupling.matrix,
+        takes: coupling
+            .joints
+            .first()
+            .and_then(source)
+            .map(|source| source.takes),
+    });
+    each.collect()
 }
 
 /// What changes of one device of the same name, driver, address and channels.
@@ -377,5 +384,15 @@ ratio = 100.0
         let gear = compared("ratio = 100.0", "ratio = 50.0").unwrap();
         assert_eq!((gear.len(), gear[0].what.as_slice()), (1, &["joints"][..]));
         assert_eq!(compared("schema", "# Nothing.\nschema"), Ok(vec![]));
+        // The turns of a motor alone.
+        let turns = |centre: f64| {
+            let keys = format!(
+                "wraps_rad = [0.0, 3.0]\ncentre_rad = {centre}\nmax_speed_radps = 9.0\nratio"
+            );
+            Plan::parse(&coupled.replacen("ratio", &keys, 1), Path::new(".")).unwrap()
+        };
+        assert_eq!(changes(&turns(0.1), &turns(0.1)), Ok(vec![]));
+        let gear = changes(&turns(0.1), &turns(0.2)).unwrap();
+        assert_eq!(gear[0].what.as_slice(), &["joints"][..]);
     }
 }

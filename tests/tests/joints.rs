@@ -309,7 +309,7 @@ fn a_gateway_publishes_one_channel_for_each_joint() {
         &log,
     ]);
     rig.run(&["decode", "--config", &config, "--log", &log, "--out", &back]);
-    let tables = [&truth, Path::new(&back)].map(|file| columns(file));
+    let tables = [&truth, Path::new(&back)].map(columns);
     for name in simulation.joint_names() {
         let [before, after] = tables
             .each_ref()

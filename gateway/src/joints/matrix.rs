@@ -249,6 +249,17 @@ mod tests {
         assert!(motor(2).position.is_nan() && motor(0).torque == 3.0);
     }
 
+    /// What is zero but for rounding is no dependence.
+    #[test]
+    fn rounding_makes_no_dependence() {
+        let wanted = rows([[0.7, 0.0, 0.3], [-0.6, 1.0, 0.7], [0.0, -0.3, 0.4]]);
+        let found = inverse(&inverse(&wanted).unwrap()).unwrap();
+        for (found, wanted) in found.iter().flatten().zip(wanted.iter().flatten()) {
+            assert!((found - wanted).abs() < 1e-14);
+            assert_eq!(*found == 0.0, *wanted == 0.0, "{found}");
+        }
+    }
+
     #[test]
     fn a_matrix_that_is_no_coupling_is_refused() {
         let of = |matrix: &[&[f64]]| {

@@ -370,7 +370,7 @@ fn wrap(at: &str, raw: &RawJoint, map: &JointMap) -> Result<Option<Wrap>, String
             low + turns.round() * TAU
         ));
     }
-    if !(centre.abs() <= TAU) {
+    if centre.is_nan() || centre.abs() > TAU {
         return Err(format!(
             "{at}: centre_rad = {centre} looks like degrees; in rad it is {:.6} (at most a full \
              turn, {TAU:.6}, is possible)",

@@ -173,8 +173,8 @@ pub struct Header {
     /// Counts this publisher's payloads on this service, from 0. A gap is a loss between publisher
     /// and reader.
     pub sequence: u64,
-    /// Receive time of the first CAN frame of this reading \[ns\]. For an estimate, the instant
-    /// that it refers to.
+    /// Receive time of the first CAN frame of this reading \[ns\]. For coupled joints, that of the
+    /// motors' newest reading. For an estimate, the instant that it refers to.
     pub acquired: Nanos,
     /// Time just before sending \[ns\].
     pub published: Nanos,
