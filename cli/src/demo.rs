@@ -137,15 +137,19 @@ fn copy_robot(robot: &Robot, buses: &[String], to: &Path) -> anyhow::Result<()> 
     if let (false, Some(toml::Value::Array(list))) = (buses.is_empty(), gateway.get_mut("bus")) {
         if buses.len() == 1 && list.len() > 1 {
             // One interface for all: all devices move to the first bus.
-            let devices: Vec<toml::Value> = list
-                .iter_mut()
-                .filter_map(|bus| bus.as_table_mut()?.remove("device"))
-                .filter_map(|devices| devices.as_array().cloned())
-                .flatten()
-                .collect();
+            let mut all = |key: &str| -> Vec<toml::Value> {
+                list.iter_mut()
+                    .filter_map(|bus| bus.as_table_mut()?.remove(key))
+                    .filter_map(|of_bus| of_bus.as_array().cloned())
+                    .flatten()
+                    .collect()
+            };
+            let parts = ["device", "coupling"].map(|key| (key, all(key)));
             list.truncate(1);
             if let Some(bus) = list.first_mut().and_then(toml::Value::as_table_mut) {
-                bus.insert("device".into(), devices.into());
+                for (key, of_all) in parts.into_iter().filter(|(_, of_all)| !of_all.is_empty()) {
+                    bus.insert(key.into(), of_all.into());
+                }
             }
         } else if buses.len() != list.len() {
             let problem = format!(
@@ -172,15 +176,25 @@ fn copy_robot(robot: &Robot, buses: &[String], to: &Path) -> anyhow::Result<()> 
         }
     }
     let mut estimator = read("estimator.toml")?;
-    let model = robot
-        .config
-        .model
-        .canonicalize()
-        .with_context(|| robot.config.model.display().to_string())?;
-    let model = model
-        .to_str()
-        .with_context(|| format!("{} is not UTF-8", model.display()))?;
-    estimator.insert("model".into(), model.into());
+    let absolute = |file: &Path| -> anyhow::Result<toml::Value> {
+        let file = file
+            .canonicalize()
+            .with_context(|| file.display().to_string())?;
+        let text = file.to_str();
+        let text = text.with_context(|| format!("{} is not UTF-8", file.display()))?;
+        Ok(text.into())
+    };
+    estimator.insert("model".into(), absolute(&robot.config.model)?);
+    let skins = estimator
+        .get_mut("skin")
+        .and_then(toml::Value::as_array_mut);
+    for skin in skins.into_iter().flatten() {
+        if let Some(taxels) = skin.get_mut("taxels")
+            && let Some(file) = taxels.as_str().map(|file| robot.folder.join(file))
+        {
+            *taxels = absolute(&file)?;
+        }
+    }
     // Parameters identified on a real robot do not apply to the simulated one.
     estimator.remove("parameters");
     if let Some(identification) = estimator

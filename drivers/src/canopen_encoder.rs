@@ -532,12 +532,10 @@ impl EncoderBoard {
     fn send(&mut self, out: &mut Frames) {
         let fault = self.quality.contains(Quality::DEVICE_FAULT);
         self.node.report(if fault { HARDWARE } else { 0 }, out);
-        if self.node.value(object::tpdo_mapping(0, 1)) == POSITION.mapped(32) {
-            let mut data = [0; 8];
-            self.place.bits.set(self.counts.into(), &mut data);
-            let data = data.get(..self.place.bits.reach()).unwrap_or_default();
-            let _ = out.try_push(Frame::new(self.place.id, data));
-        }
+        let mut data = [0; 8];
+        self.place.bits.set(self.counts.into(), &mut data);
+        let data = data.get(..self.place.bits.reach()).unwrap_or_default();
+        let _ = out.try_push(Frame::new(self.place.id, data));
     }
 }
 

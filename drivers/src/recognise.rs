@@ -396,7 +396,8 @@ impl<'t> Evidence<'t> {
     /// Frames of `second` follow those of `first` at once: within an eighth of their period, which
     /// two devices do once in 8 times.
     pub(crate) fn together(&mut self, first: &Stream, second: &Stream) {
-        let Some(period) = first.period() else {
+        // Frames without stamps have no period.
+        let Some(period) = first.period().filter(|period| *period > Nanos::ZERO) else {
             return;
         };
         let follows = |a: &&Frame| {

@@ -351,7 +351,10 @@ impl Pipeline {
         if let Some(instant) = identification.next_instant(t) {
             let active = self.active_contacts(instant);
             let base = self.setup.robot.base_motion(&active);
-            identification.observe(instant, &self.setup, &self.buffers, &active, base);
+            // The rows of identification have the contacts at their configured places.
+            if !(self.contacts).is_elsewhere(&self.setup.robot, &active, instant) {
+                identification.observe(instant, &self.setup, &self.buffers, &active, base);
+            }
             if identification.apply(&mut self.setup, &mut self.propagation) {
                 self.residuals.restart_means();
             }

@@ -25,8 +25,8 @@ const KEYS: &[(&str, &str)] = &[
     (
         "dbc",
         "file = \"bench.dbc\"\nperiod_ms = 1\n[[bus.device.reading]]\nkind = \"wrench\"\n\
-         pair_timeout_ms = 0.4\nfields = { fx = \"F.X\", fy = \"F.Y\", fz = \"F.Z\", tx = \"T.X\", ty = \"T.Y\", \
-         tz = \"T.Z\" }",
+         pair_timeout_ms = 0.4\nfields = { fx = \"F.X\", fy = \"F.Y\", fz = \"F.Z\", \
+         tx = \"T.X\", ty = \"T.Y\", tz = \"T.Z\" }",
     ),
 ];
 

@@ -171,9 +171,12 @@ impl Meter {
     /// The load of the time before `now`, with the totals until then. Without `rates` the share is
     /// NaN.
     pub fn measure(&mut self, now: Nanos, totals: Totals, rates: Option<BitRates>) -> Load {
-        // An interface that was set up again counts from zero.
+        // An interface that was set up again counts from zero; one that was not asked yet, or did
+        // not answer, tells zero.
         if let Some((_, last)) = self.past.front()
-            && (last.all_frames > totals.all_frames || last.frames > totals.frames)
+            && (last.all_frames > totals.all_frames
+                || last.frames > totals.frames
+                || (last.all_frames == 0) != (totals.all_frames == 0))
         {
             self.past.clear();
         }

@@ -86,8 +86,9 @@ impl Axis {
         if self.run > 0 {
             return;
         }
-        if std::mem::take(&mut self.frozen) {
-            // What was no measurement tells nothing of the noise.
+        if std::mem::take(&mut self.frozen) && change.abs() > 2.0 * self.step {
+            // What was no measurement tells nothing of the noise. But a value that goes on by a
+            // step was measured all the time: its noise at rest is below the resolution.
             self.noise = self.quiet;
         }
         let risen = self.quiet + (self.noise - self.quiet) / FORGET;

@@ -104,7 +104,7 @@ pub fn ask(
 /// What was heard on each interface of a recorded log, and what is to be said of the log.
 ///
 /// # Errors
-/// A read error.
+/// A read error, or why there is no frame in it.
 pub fn log(file: impl BufRead) -> io::Result<(BTreeMap<String, Traffic>, log::Report)> {
     let mut buses: BTreeMap<String, Traffic> = BTreeMap::new();
     let mut reader = log::Reader::new(file);
@@ -117,6 +117,10 @@ pub fn log(file: impl BufRead) -> io::Result<(BTreeMap<String, Traffic>, log::Re
                 buses.insert(record.interface.to_owned(), heard);
             }
         }
+    }
+    if buses.is_empty() {
+        let why = reader.why_empty();
+        return Err(io::Error::new(io::ErrorKind::InvalidData, why));
     }
     let report = reader.report().clone();
     Ok((buses, report))

@@ -139,6 +139,10 @@ impl BusStatus {
             let refusal = state.refusal().map_or(0, Refusal::code);
             status.state.store(state.published() as u32, Relaxed);
             status.refusal.store(refusal, Relaxed);
+            if state != State::Streaming {
+                // Nothing is known of readings that do not come.
+                status.axes.store(0, Relaxed);
+            }
         }
     }
 

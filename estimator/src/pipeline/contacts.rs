@@ -15,13 +15,16 @@ use proprio_dynamics::{ContactKind, ContactSet, ContactSpec, PlaceStd, Structure
 use proprio_identification::Robot;
 use proprio_topics::{ContactState, NO_CAUSE, Nanos, Quality, Skin};
 
-/// How many declarations of a contact are kept: those that may come while an instant waits, from a
-/// program that follows a moving contact a thousand times a second.
-const DECLARATIONS: usize = 256;
+/// How many declarations of a contact are kept: those of a second, from a program that follows a
+/// moving contact a thousand times a second. Identification looks back by up to half a second.
+const DECLARATIONS: usize = 1024;
 
 /// Standard deviation of the direction of a force on a touched skin \[rad\]: friction, which is a
 /// fifth of the pressure for a sliding finger, turns it from the normal.
 const NORMAL_STD: f64 = 0.2;
+/// The same where the normals of the touched taxels cancel out, so that the configured direction is
+/// a guess: about that of any direction.
+const NO_NORMAL_STD: f64 = 1.0;
 
 /// Where a contact is.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -148,6 +151,18 @@ impl Contacts {
         })
     }
 
+    /// Whether one of the `active` contacts was measured to be at another place than configured,
+    /// and its torque depends on that: a force, not a full wrench.
+    pub(super) fn is_elsewhere(&self, robot: &Robot, active: &ContactSet, t: Nanos) -> bool {
+        let specs = robot.structure.contacts().iter().enumerate();
+        let forces = specs.filter(|(_, spec)| spec.kind != ContactKind::Wrench);
+        let mut placed = forces.map(|(contact, _)| contact);
+        placed.any(|contact| {
+            let declared = self.declared(contact, t).is_some_and(|d| d.place.is_some());
+            active.contains(contact) && (declared || self.touch(contact, t).is_there())
+        })
+    }
+
     /// Moves the structure's contacts to their places at `t`.
     pub(super) fn place(&mut self, robot: &mut Robot, t: Nanos) {
         for contact in 0..self.configured.len() {
@@ -173,7 +188,7 @@ impl Contacts {
                     let (position, direction) = touch.place();
                     let std = PlaceStd {
                         position: touch.position_std,
-                        direction: direction.map_or(0.0, |_| NORMAL_STD),
+                        direction: direction.map_or(NO_NORMAL_STD, |_| NORMAL_STD),
                     };
                     configured.at(position, direction, std)
                 }

@@ -16,8 +16,8 @@
 //!
 //! A column of S is a finite difference. S is computed with the first estimate of each tenth of a
 //! second and when contacts or base change or a contact jumps, and held in between. The tenths are
-//! those of the stamps, so that a replay which begins elsewhere gives the same. Errors of velocities
-//! are smaller by an order of magnitude and are neglected.
+//! those of the stamps, so that a replay which begins elsewhere gives the same. Errors of
+//! velocities are smaller by an order of magnitude and are neglected.
 
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::model::Model;

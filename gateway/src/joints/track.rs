@@ -34,6 +34,9 @@ pub(crate) struct Measured {
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Track {
     newest: Option<Measured>,
+    /// The reading that differences are taken from, and how long it was after the one before it
+    /// \[ns\].
+    base: Option<(Measured, Nanos)>,
     /// Rates of the newest reading: of position \[rad/s\] and of velocity \[rad/s^2\]; 0 if
     /// unknown.
     rates: (f64, f64),
@@ -44,17 +47,22 @@ impl Track {
     pub(crate) fn push(&mut self, now: Measured) {
         let state = now.state;
         let (mut rates, mut differences) = ((0.0, 0.0), (f64::NAN, f64::NAN));
-        if let Some(before) = self.newest {
-            let elapsed = (now.acquired - before.acquired).seconds();
+        let mut base = (now, Nanos::ZERO);
+        if let (Some(before), Some((from, interval))) = (self.newest, self.base) {
             // Across a gap, or from or to an angle that its device doubts, there is no rate.
             let doubtful = Quality::UNTRUSTED_ENCODER | Quality::ZERO_CHANGED;
             let continued = now.acquired - before.acquired <= now.max_silence
                 && !now.quality.intersects(doubtful)
                 && !before.quality.intersects(Quality::UNTRUSTED_ENCODER);
-            if continued {
+            let elapsed = now.acquired - from.acquired;
+            // Frames that were held up arrive at once: so short a time would give a wild rate.
+            if continued && elapsed.0 * 2 < interval.0 {
+                base = (from, interval);
+            } else if continued {
+                base.1 = elapsed;
                 differences = (
-                    (state.position - before.state.position) / elapsed,
-                    (state.velocity - before.state.velocity) / elapsed,
+                    (state.position - from.state.position) / elapsed.seconds(),
+                    (state.velocity - from.state.velocity) / elapsed.seconds(),
                 );
             }
         }
@@ -70,7 +78,7 @@ impl Track {
         if let Some(rate) = known(state.acceleration, differences.1) {
             rates.1 = rate;
         }
-        (self.newest, self.rates) = (Some(now), rates);
+        (self.newest, self.base, self.rates) = (Some(now), Some(base), rates);
     }
 
     /// The newest reading.

@@ -451,7 +451,7 @@ impl<R: BufRead> Reader<R> {
             (LogFormat::Trc, Source::Trc(trc), parsed)
         } else if csv::has(line) {
             (LogFormat::Csv, Source::Csv, csv::parse(line))
-        } else if self.report.lines == 1 && csv::is_other_table(line) {
+        } else if self.report.lines == 1 && parsed.is_err() && csv::is_other_table(line) {
             return Err(LineError::Table);
         } else {
             return parsed;
