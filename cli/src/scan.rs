@@ -61,9 +61,9 @@ pub(crate) struct How {
     /// move and change nothing, but for ODrives numbered 48 to 51 or 56 that send no heartbeat
     #[arg(long)]
     active: bool,
-    /// As --active, and also ask devices of this driver: ati_netcanoem, robotous_rft or jr3_can; may be repeated.
-    /// Other devices take their questions for commands, and motors may move: only on a bus without
-    /// CANopen nodes, and without CubeMars motors
+    /// As --active, and also ask devices of this driver: ati_netcanoem, robotous_rft or jr3_can;
+    /// may be repeated. Other devices take their questions for commands, and motors may move: only
+    /// on a bus without CANopen nodes, and without CubeMars motors
     #[arg(long, value_name = "DRIVER", value_parser = asked_by_name)]
     ask: Vec<String>,
 }

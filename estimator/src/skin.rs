@@ -7,7 +7,7 @@
 //! ```
 //!
 //! - **Rest.** What an untouched taxel reads: the mean of its first second, which must be without a
-//!   touch; then it follows slowly ([`REST_TIME`]) while the taxel is not pressed. A taxel that
+//!   touch; then it follows slowly (`REST_TIME`) while the taxel is not pressed. A taxel that
 //!   reads less than its rest by the threshold, twice in a row, was touched in its first second: it
 //!   begins anew.
 //! - **Pressed.** Two readings in a row change a taxel's state: above the threshold it becomes
@@ -16,7 +16,7 @@
 //!   ([`threshold`]).
 //! - **Silence.** A triangle of twelve taxels that has not been heard for `max_silence`, or reports
 //!   a fault, shows no touch. If it showed one when it was last heard, the touch is lost: nobody
-//!   knows whether it is still there ([`Touch::lost`]).
+//!   knows whether it is still there (`Touch::lost`).
 //!
 //! Several touches on one link are one contact, at their common centroid. The centroid of a touch
 //! on a curved surface lies below the surface: by 1.7 mm for a touch 2 cm wide on a forearm of 3 cm
