@@ -414,10 +414,14 @@ impl Family for Strain {
                 Some(&command::GET_FULL_SCALES) if !self.exchange.expects(data) => {
                     link.questions.answer(data, link.bringup.mode(), frame, out);
                 }
-                Some(
-                    &(command::GET_FULL_SCALES | command::GET_CURR_TARE | command::GET_MATRIX_RC),
-                ) if link.bringup.mode() == Mode::Supervise => {
-                    self.exchange.answer(data, frame, out);
+                // As with full scales: live and in a log the same answers are malformed.
+                Some(&command::GET_MATRIX_RC) => {
+                    self.exchange.answer(data, link.bringup.mode(), frame, out);
+                }
+                Some(&(command::GET_FULL_SCALES | command::GET_CURR_TARE))
+                    if link.bringup.mode() == Mode::Supervise =>
+                {
+                    self.exchange.answer(data, Mode::Supervise, frame, out);
                 }
                 // Answers to other questions are for other devices.
                 Some(_) => {}

@@ -3,7 +3,7 @@
 
 use crate::bringup::Attempts;
 use crate::icub::{self, class, command};
-use crate::{COMMAND_TIME, Command, CommandFailed, Decoded, Frame, NotSent};
+use crate::{COMMAND_TIME, Command, CommandFailed, Decoded, Frame, Mode, NotSent};
 use proprio_topics::{Counter, Nanos};
 
 /// The mode of SET_CURR_TARE that takes minus the present force and torque of every axis.
@@ -194,8 +194,16 @@ impl Exchange {
     }
 
     /// Takes an answer of the board.
-    pub(super) fn answer(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    pub(super) fn answer(&mut self, data: &[u8], mode: Mode, frame: &Frame, out: &mut Decoded) {
+        if let [command::GET_MATRIX_RC, row, 0..6, _, _] = *data
+            && matches!((row >> 4, row & 0xF), (1..=3, 0..6))
+        {
+            // About a stored regulation set, not the one in use: another program has asked.
+            return;
+        }
         let (at, number) = match Self::parse(data) {
+            // Another program has asked.
+            Ok(_) if mode == Mode::Listen => return,
             Ok(parsed) => parsed,
             Err(counter) => return out.fault(counter, 1, frame.id),
         };

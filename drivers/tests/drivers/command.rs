@@ -684,3 +684,36 @@ fn sensors_that_do_not_tell_their_zero_are_tared() {
         "{refused:?}"
     );
 }
+
+/// Live and in a recorded log, the same answers about the matrix are malformed. Those about a stored
+/// regulation set are another program's; so are, in a log, all others.
+#[test]
+fn a_malformed_answer_about_the_matrix_is_one_whoever_asked() {
+    for (answer, counter) in [
+        ("210#0A", Some(Counter::Length)),
+        ("210#0A0000112233", Some(Counter::Length)),
+        ("210#0A06001122", Some(Counter::Value)),
+        ("210#0A00061122", Some(Counter::Value)),
+        ("210#0A46001122", Some(Counter::Value)),
+        ("210#0A15051122", None),
+        ("210#0A30001122", None),
+    ] {
+        let mut live = streaming(SCALES).device;
+        let mut listening = listener("icub_strain", SCALES, &[]);
+        for device in [&mut live, &mut listening] {
+            let (_, faults) = decode(&mut **device, &[frame(answer, 60.0)]);
+            let counters: Vec<Counter> = faults.iter().map(|fault| fault.counter).collect();
+            assert_eq!(
+                counters,
+                counter.into_iter().collect::<Vec<_>>(),
+                "{answer}"
+            );
+        }
+    }
+    let asked_by_another = [frame("210#0A00001122", 60.0), frame("210#16001122", 61.0)];
+    let (_, faults) = decode(
+        &mut *listener("icub_strain", SCALES, &[]),
+        &asked_by_another,
+    );
+    assert!(faults.is_empty(), "{faults:?}");
+}
