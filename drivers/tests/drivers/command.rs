@@ -685,8 +685,8 @@ fn sensors_that_do_not_tell_their_zero_are_tared() {
     );
 }
 
-/// Live and in a recorded log, the same answers about the matrix are malformed. Those about a stored
-/// regulation set are another program's; so are, in a log, all others.
+/// Live and in a recorded log, the same answers about the matrix are malformed. Those about a
+/// stored regulation set are another program's; so are, in a log, all others.
 #[test]
 fn a_malformed_answer_about_the_matrix_is_one_whoever_asked() {
     for (answer, counter) in [
