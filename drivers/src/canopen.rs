@@ -27,13 +27,13 @@ pub(crate) use pdo::{Pdo, identifier};
 pub(crate) use protocol::{
     MAPPED_MOST, NMT, NO_RTR, Object, SYNC, TIMING, TPDO_OFF, nmt, object, sdo_from, sdo_to, tpdo,
 };
-pub(crate) use recognise::{Recognised, commands, questions, recognise};
+pub(crate) use recognise::{NO_PROFILE, Recognised, commands, questions, recognise};
 pub(crate) use script::{Plan, READ, Script, Step};
 
 use crate::bytes::u16_le;
 use crate::family::Link;
 use crate::objects::Objects;
-use crate::{Claim, Decoded, Frame, Mode, Spec, SpecError, bytes};
+use crate::{Claim, Decoded, Frame, Spec, SpecError, bytes};
 use alloc::format;
 use proprio_topics::{Counter, Nanos, StampKind};
 use protocol::{emcy, heartbeat};
@@ -60,12 +60,11 @@ pub(crate) fn check_file(node: u8, file: Option<&Objects>) -> Result<(), SpecErr
     }
 }
 
-/// The identifiers of a node that its device listens to, beside its PDOs: in [`Mode::Listen`] what
-/// another program writes to it too.
-pub(crate) fn claims(node: u8, mode: Mode) -> impl Iterator<Item = Claim> {
+/// The identifiers of a node that its device listens to, beside its PDOs; among them what another
+/// program writes to it.
+pub(crate) fn claims(node: u8) -> impl Iterator<Item = Claim> {
     let from_node = [emcy(node), sdo_from(node), heartbeat(node)].map(Claim::exclusive);
-    let to_node = (mode == Mode::Listen).then(|| Claim::shared(sdo_to(node)));
-    from_node.into_iter().chain(to_node)
+    from_node.into_iter().chain([Claim::shared(sdo_to(node))])
 }
 
 /// Which SYNC a node answers.

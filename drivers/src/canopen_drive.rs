@@ -34,7 +34,8 @@
 //! log), its answers to that program count, and what that program writes to it. Of scales a file
 //! counts if it is a DCF that states them (ParameterValue), or if they are constants: an EDS is of
 //! a kind of drive, and knows no motor. The bus is opened for the identifiers of the keys or the
-//! file, else those of CiA 301. A drive that sends at another one is refused, with that identifier.
+//! file, else those of CiA 301, also for a TPDO that the file switches off: the drive may have it
+//! on. A drive that sends at another one is refused, with that identifier.
 //!
 //! Sources: CiA 301 4.2, CiA 306 1.3, CiA 402 4.0 (IEC 61800-7-201). Certain, but for the units of
 //! velocity and current, in which makers differ: hence the keys.
@@ -71,7 +72,7 @@ pub use options::{CurrentUnit, Options, PdoKeys, VelocityUnit};
 
 use crate::canopen::{self, Recognised};
 use crate::objects::Objects;
-use crate::recognise::{Finding, Traffic};
+use crate::recognise::{Finding, Key, Stream, Traffic};
 use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::format;
@@ -107,7 +108,7 @@ impl Driver for Options {
             let (what, unusable) = match node.profile {
                 Some(406) => return None,
                 Some(402) => (format!("CANopen drive (CiA 402){}", node.identity), ""),
-                None => ("CANopen node whose profile was not heard".into(), ""),
+                None => (canopen::NO_PROFILE.into(), ""),
                 Some(other) => {
                     let what = format!("CANopen node of profile {other}{}", node.identity);
                     (
@@ -117,10 +118,15 @@ impl Driver for Options {
                 }
             };
             let finding = (node.evidence).finding(Self::NAME, node.node.into(), what)?;
-            let commands = canopen::commands(node.node);
-            let finding = finding.with_joints([0]).with_commands(commands);
+            // Its position is rather in the most frequent of them.
+            let periods = node.tpdos.into_iter().flatten().filter_map(Stream::period);
+            let finding = finding
+                .with_keys(Key::period_ms(periods.min(), 1, 60_000))
+                .with_joints([0])
+                .with_commands(canopen::commands(node.node));
             Some(Finding {
                 unusable,
+                guess: node.profile.is_none(),
                 ..finding
             })
         };

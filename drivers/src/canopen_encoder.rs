@@ -218,10 +218,13 @@ impl Driver for Options {
                     let is_position = first.is_some_and(|stream| stream.lengths == (4, 4));
                     let alone = others.iter().all(Option::is_none);
                     evidence.add(if is_position && alone { 2.0 } else { -2.0 });
-                    "CANopen node whose profile was not heard".into()
+                    canopen::NO_PROFILE.into()
                 }
             };
-            let finding = evidence.finding(Self::NAME, node.node.into(), what)?;
+            let finding = Finding {
+                guess: node.profile.is_none(),
+                ..evidence.finding(Self::NAME, node.node.into(), what)?
+            };
             let period = Key::period_ms(first.and_then(Stream::period), 1, 65_535);
             let commands = canopen::commands(node.node);
             let finding = finding.with_keys(period).with_joints([0]);
@@ -390,7 +393,7 @@ impl Encoder {
             scaled: false,
             no_timer: false,
         };
-        let claims = canopen::claims(node, spec.mode)
+        let claims = canopen::claims(node)
             .chain([Claim::exclusive(place.id), Claim::shared(SYNC)])
             .collect::<Vec<_>>();
         let script = Script::new(node, spec.mode, start);

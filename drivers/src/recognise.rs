@@ -283,6 +283,8 @@ pub struct Finding {
     pub commands: Vec<RangeInclusive<Id>>,
     /// Why the driver cannot be used for it; empty if it can.
     pub unusable: &'static str,
+    /// The bits speak for a device of which the driver is a guess: it is possible, and no more.
+    pub guess: bool,
 }
 
 impl Finding {
@@ -290,6 +292,7 @@ impl Finding {
     #[must_use]
     pub fn certainty(&self) -> Option<Certainty> {
         match self.bits {
+            8.0.. if self.guess => Some(Certainty::Possible),
             32.0.. => Some(Certainty::Certain),
             16.0.. => Some(Certainty::Likely),
             8.0.. => Some(Certainty::Possible),
@@ -457,6 +460,7 @@ impl<'t> Evidence<'t> {
             explains: self.explains,
             commands: Vec::new(),
             unusable: "",
+            guess: false,
         };
         (holds && finding.certainty().is_some()).then_some(finding)
     }

@@ -20,6 +20,10 @@ const IDENTITY: [(u8, &str); 4] = [
 /// States in a heartbeat, without the bit that toggles in node guarding.
 const STATES: [u8; 4] = [0x00, 0x04, 0x05, 0x7F];
 
+/// What a node is that has not told.
+pub(crate) const NO_PROFILE: &str = "CANopen node whose profile (drive, encoder or another) was \
+                                     not heard: scan it with --active";
+
 /// A node.
 #[derive(Debug, Clone)]
 pub(crate) struct Recognised<'t> {

@@ -94,11 +94,13 @@ impl<P: Plan> Script<P> {
         }
     }
 
-    /// Takes an SDO frame of another program to the node: its writes in one frame are of interest.
+    /// Takes an SDO frame of another program to the node. In [`Mode::Listen`] its writes in one
+    /// frame are of interest; else the node answers the host alone.
     pub(crate) fn overhear(&mut self, data: &[u8]) {
         const KIND: u8 = 0b1110_0010;
         self.writes = None;
-        if let &[command, _, _, sub, ..] = data
+        if self.mode == Mode::Listen
+            && let &[command, _, _, sub, ..] = data
             && data.len() == 8
             && command & KIND == 0x22
         {

@@ -103,7 +103,7 @@ impl Drive {
         let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, tpdo(node, 0));
         bringup.start_with(NMT, &[nmt::START, node]);
         let pdos = start.ids.iter().map(|id| Claim::exclusive(*id));
-        let claims: Vec<Claim> = canopen::claims(node, spec.mode)
+        let claims: Vec<Claim> = canopen::claims(node)
             .chain(pdos)
             .chain([Claim::shared(SYNC)])
             .collect();

@@ -106,9 +106,6 @@ impl Layout {
             if pdo.is_on() || keys.sync > 240 {
                 return Err(wrong("each number once, with sync from 0 to 240"));
             }
-            if keys.id.is_some_and(|id| !(0x181..=0x6FF).contains(&id)) {
-                return Err(wrong("with an id from 0x181 to 0x6FF"));
-            }
             pdo.id = Some(keys.id.map_or(tpdo(node, number).raw(), u32::from));
             pdo.transmission = if keys.sync == 0 { 254 } else { keys.sync };
             let mut bits = 0;
@@ -135,6 +132,12 @@ impl Layout {
                 expected: "with a position, 0x6064 or 0x6063",
             });
         }
+        if !this.has_legal_ids() {
+            return Err(SpecError::Keys {
+                key: "pdos",
+                expected: "each with another id, from 0x181 to 0x580 or from 0x680 to 0x6DF",
+            });
+        }
         Ok(this)
     }
 
@@ -143,6 +146,22 @@ impl Layout {
         Self {
             pdos: [0, 1, 2, 3].map(|number| Pdo::of_file(file, node, number)),
         }
+    }
+
+    /// Whether each TPDO has an identifier of its own, and one that CiA 301 leaves to process data.
+    pub(super) fn has_legal_ids(&self) -> bool {
+        let mut seen = ArrayVec::<Id, 4>::new();
+        let mut sent = self.pdos.iter().filter(|pdo| pdo.is_on());
+        sent.all(|pdo| {
+            let id = identifier(pdo.id.unwrap_or(0));
+            let free = match id {
+                Id::Standard(raw) => matches!(raw, 0x181..=0x580 | 0x680..=0x6DF),
+                Id::Extended(_) => true,
+            };
+            let is_new = !seen.contains(&id);
+            let _ = seen.try_push(id);
+            free && is_new
+        })
     }
 
     /// The number of the TPDO that has the position.

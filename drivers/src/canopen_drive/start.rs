@@ -106,6 +106,11 @@ impl Start {
             Some(file) if !configured => Layout::of_file(node, file),
             _ => of_keys,
         };
+        if !stated.has_legal_ids() {
+            return Err(SpecError::Description(
+                "its file gives two TPDOs one identifier, or one that CiA 301 uses itself".into(),
+            ));
+        }
         let usual = |number| tpdo(node, number);
         let ids = (0..4)
             .zip(&stated.pdos)

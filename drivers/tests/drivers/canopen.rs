@@ -959,6 +959,12 @@ fn wrong_keys_are_refused() {
         "{ number = 1, objects = [0x6064, 0x606C, 0x6061] }",
         "{ number = 1, objects = [0x6064], sync = 241 }",
         "{ number = 1, objects = [0x6064] }, { number = 1, objects = [0x606C] }",
+        // Another device's, or the node's own answers and its commands, or twice the same.
+        "{ number = 1, objects = [0x6064], id = 0x180 }",
+        "{ number = 1, objects = [0x6064], id = 0x581 }",
+        "{ number = 1, objects = [0x6064], id = 0x601 }",
+        "{ number = 1, objects = [0x6064], id = 0x6E0 }",
+        "{ number = 1, objects = [0x6064] }, { number = 2, objects = [0x606C], id = 0x181 }",
     ] {
         let keys = format!("pdos = [{pdos}]");
         assert!(

@@ -9,6 +9,7 @@ mod canopen;
 mod command;
 mod cubemars;
 mod dbc;
+mod every_device;
 mod golden;
 mod icub_mc4;
 mod jr3_and_optoforce;

@@ -13,7 +13,7 @@ use proptest::prelude::*;
 use proptest::strategy::ValueTree;
 
 /// Every family: driver, keys, address, outputs that are joints.
-const BOARDS: &[(&str, &str, u32, &[u8])] = &[
+pub(crate) const BOARDS: &[Row] = &[
     ("icub_strain", "", 13, &[]),
     ("icub_strain", "stream = \"both\"", 1, &[]),
     ("icub_imu", "", 3, &[]),
@@ -138,18 +138,22 @@ fn readings(driver: &str, outputs: &[u8], t: Nanos) -> Vec<(u8, Reading)> {
     }
 }
 
+/// A row of [`BOARDS`]: driver, keys, address, outputs.
+pub(crate) type Row = (&'static str, &'static str, u32, &'static [u8]);
+
 /// A board on a bus, with all that is heard of it.
-struct Bus {
-    board: Box<dyn Board>,
+pub(crate) struct Bus {
+    pub(crate) board: Box<dyn Board>,
     driver: &'static str,
     outputs: &'static [u8],
-    now: Nanos,
+    pub(crate) now: Nanos,
     due: Option<Nanos>,
-    heard: Traffic,
+    pub(crate) heard: Traffic,
+    pub(crate) frames: Vec<Frame>,
 }
 
 impl Bus {
-    fn new(row: &(&'static str, &'static str, u32, &'static [u8])) -> Self {
+    pub(crate) fn new(row: &Row) -> Self {
         let (driver, keys, address, outputs) = *row;
         let spec = spec(address, Mode::Supervise, outputs);
         Self {
@@ -159,26 +163,28 @@ impl Bus {
             now: Nanos::from_millis(1000),
             due: None,
             heard: Traffic::new(),
+            frames: Vec::new(),
         }
     }
 
-    fn hear(&mut self, frames: &[Frame]) {
+    pub(crate) fn hear(&mut self, frames: &[Frame]) {
         for frame in frames {
             // A frame takes about 0.1 ms.
             self.now += Nanos::from_micros(100);
-            self.heard
-                .on_frame(&frame.at(self.now, StampKind::Software));
+            let frame = frame.at(self.now, StampKind::Software);
+            self.heard.on_frame(&frame);
+            self.frames.push(frame);
         }
     }
 
-    fn ask(&mut self, question: &Frame) -> Frames {
+    pub(crate) fn ask(&mut self, question: &Frame) -> Frames {
         let mut answers = Frames::new();
         self.board.on_frame(question, &mut answers);
         answers
     }
 
     /// A millisecond: the board sends what is due. Returns it.
-    fn turn(&mut self) -> Vec<Frame> {
+    pub(crate) fn turn(&mut self) -> Vec<Frame> {
         let turn = self.now.0 / 1_000_000;
         let mut sent = Frames::new();
         for (output, reading) in readings(self.driver, self.outputs, self.now) {
@@ -207,13 +213,22 @@ impl Bus {
 }
 
 /// What is heard while the board's own host starts it and reads it.
-fn overheard(row: &(&'static str, &'static str, u32, &'static [u8])) -> Traffic {
+fn overheard(row: &Row) -> Traffic {
+    started(row, 3000).heard
+}
+
+/// The frames of that, in `turns` milliseconds.
+pub(crate) fn recorded(row: &Row, turns: usize) -> Vec<Frame> {
+    started(row, turns).frames
+}
+
+fn started(row: &Row, turns: usize) -> Bus {
     let (driver, keys, address, outputs) = *row;
     let mut bus = Bus::new(row);
     let mut host = options(driver, keys)
         .device(&spec(address, Mode::Supervise, outputs))
         .expect("legal keys");
-    for _ in 0..3000 {
+    for _ in 0..turns {
         let mut out = Decoded::new();
         while let Some(transmit) = host.poll_transmit(bus.now, &mut out) {
             host.on_sent(&transmit.frame, Ok(bus.now));
@@ -234,11 +249,11 @@ fn overheard(row: &(&'static str, &'static str, u32, &'static [u8])) -> Traffic 
             host.on_frame(&frame.at(bus.now, StampKind::Software), &mut out);
         }
     }
-    bus.heard
+    bus
 }
 
 /// What is heard of a board that nobody has started, when it is asked.
-fn asked(row: &(&'static str, &'static str, u32, &'static [u8])) -> Traffic {
+fn asked(row: &Row) -> Traffic {
     let mut bus = Bus::new(row);
     let mut done: Vec<Frame> = Vec::new();
     let turns = |bus: &mut Bus| (0..500).for_each(|_| drop(bus.turn()));
@@ -259,7 +274,7 @@ fn asked(row: &(&'static str, &'static str, u32, &'static [u8])) -> Traffic {
 }
 
 /// The best finding of `driver` at `address`, after checks that hold for all.
-fn own(heard: &Traffic, row: &(&'static str, &'static str, u32, &'static [u8])) -> Option<Finding> {
+fn own(heard: &Traffic, row: &Row) -> Option<Finding> {
     let (driver, _, address, _) = *row;
     let findings = recognise(heard);
     for finding in &findings {
@@ -317,6 +332,58 @@ fn every_board_is_recognised_by_asking_it() {
         let own = own.unwrap_or_else(|| panic!("{row:?} is not found"));
         assert!(own.certainty() >= Some(Certainty::Likely), "{own:?}");
     }
+}
+
+/// How many bits speak for each of [`BOARDS`]: while it is read, and when it is asked. As an
+/// example, a CANopen node that is asked: one identifier (11 bits), 8 bytes (3.2), one of 40 first
+/// bytes (2.7), object 1000 and four of 1018 (24 each), less 7 bits for 127 nodes: 129.9.
+const BITS: &[(f64, f64)] = &[
+    (32.7, 38.9),  // icub_strain
+    (55.0, 38.9),  // icub_strain
+    (22.2, 37.6),  // icub_imu
+    (63.2, 37.6),  // icub_imu
+    (24.4, 37.6),  // icub_imu
+    (33.5, 73.0),  // icub_motor
+    (46.9, 87.0),  // icub_mc4
+    (18.8, 39.4),  // icub_pos
+    (71.6, 38.4),  // icub_skin
+    (24.4, 40.4),  // icub_mais
+    (82.4, 46.4),  // ati_netcanoem
+    (82.4, 46.4),  // ati_netcanoem
+    (48.9, 129.9), // canopen_drive
+    (48.1, 129.9), // canopen_drive
+    (40.9, 129.9), // canopen_encoder
+    (70.0, 37.0),  // moteus
+    (86.0, 55.0),  // moteus
+    (60.6, 60.6),  // odrive
+    (45.0, 45.0),  // odrive
+    (26.2, 26.2),  // cubemars
+    (18.2, 18.2),  // cubemars
+    (29.2, 29.2),  // cubemars
+    (37.8, 37.8),  // xsens_mti
+    (62.3, 62.3),  // xsens_mti
+    (53.4, 55.4),  // openimu
+    (36.2, 47.3),  // robotous_rft
+    (36.2, 47.3),  // robotous_rft
+    (25.0, 0.0),   // aidin_aft200
+    (54.8, 21.2),  // jr3_can
+    (54.8, 21.2),  // jr3_can
+    (48.0, 48.0),  // optoforce_daq
+];
+
+/// Weights are many and small; a wrong one shows in their sum.
+#[test]
+fn the_evidence_is_as_stated() {
+    for (row, bits) in BOARDS.iter().zip(BITS) {
+        let of = |heard: &Traffic| own(heard, row).map_or(0.0, |found| found.bits);
+        let found = (of(&overheard(row)), of(&asked(row)));
+        let is_near = |a: f64, b: f64| (a - b).abs() <= 0.051;
+        assert!(
+            is_near(found.0, bits.0) && is_near(found.1, bits.1),
+            "{row:?}: {found:?}"
+        );
+    }
+    assert_eq!(BOARDS.len(), BITS.len());
 }
 
 /// What a board tells of itself ends up in words and keys.
@@ -535,7 +602,8 @@ fn a_node_of_another_profile_is_no_drive() {
     assert!(findings[0].unusable.contains(".dbc"));
 }
 
-/// A node that does not tell its profile is rather an encoder if it sends four bytes.
+/// A node that does not tell its profile is rather an encoder if it sends four bytes; but which of
+/// both is a guess, however sure the node is.
 #[test]
 fn process_data_hint_at_a_profile() {
     for (pdo, first) in [
@@ -545,9 +613,20 @@ fn process_data_hint_at_a_profile() {
         let mut heard = Traffic::new();
         heard.on_frame(&crate::rig::frame("709#05", 0.0));
         heard.on_frame(&crate::rig::frame(pdo, 1.0));
-        let drivers: Vec<&str> = recognise(&heard).iter().map(|f| f.driver).collect();
+        for beat in 0..40 {
+            let t = 1.0 + f64::from(beat);
+            heard.on_frame(&crate::rig::frame("709#05", t));
+            heard.on_frame(&crate::rig::frame(pdo, 50.0 * t));
+        }
+        let findings = recognise(&heard);
+        let drivers: Vec<&str> = findings.iter().map(|f| f.driver).collect();
         assert_eq!(drivers.len(), 2);
         assert_eq!(drivers[0], first);
+        for finding in findings {
+            assert!(finding.bits > 16.0 && finding.certainty() == Some(Certainty::Possible));
+            let period = finding.keys.iter().find(|key| key.name == "period_ms");
+            assert_eq!(period.unwrap().value, "50");
+        }
     }
 }
 

@@ -204,6 +204,7 @@ mod tests {
                 explains: vec![],
                 commands: vec![],
                 unusable: "",
+                guess: false,
             },
             rivals: vec![],
             claims: vec![],

@@ -1,0 +1,192 @@
+//! What holds for every device, whatever its family: it claims the same identifiers whoever commands
+//! it, it sleeps until it has something to do, its start gets over lost answers, and after an
+//! interruption it mixes nothing old with anything new.
+
+use crate::recognise::{BOARDS, Bus, Row, recorded};
+use crate::rig::{options, spec};
+use proprio_drivers::{Decoded, Device, Frame, Id, Mode, Output, State};
+use proprio_topics::{Nanos, Reading, StampKind};
+
+fn device(row: &Row, mode: Mode) -> Box<dyn Device> {
+    let (driver, keys, address, outputs) = *row;
+    options(driver, keys)
+        .device(&spec(address, mode, outputs))
+        .expect("legal keys")
+}
+
+/// So `listen_only` can change while the gateway runs.
+#[test]
+fn claims_do_not_depend_on_who_commands() {
+    for row in BOARDS {
+        let [listens, commands] = [Mode::Listen, Mode::Supervise].map(|mode| device(row, mode));
+        assert_eq!(listens.claims(), commands.claims(), "{row:?}");
+    }
+}
+
+/// A host that polls only when a frame has come or [`Device::next_wake`] is over, while every
+/// `lost`-th answer of the first half second is lost.
+fn woken(row: &Row, lost: Option<usize>) -> (State, usize, usize) {
+    let mut bus = Bus::new(row);
+    let mut host = device(row, Mode::Supervise);
+    let (mut answered, mut readings, mut polls) = (0, 0, 0);
+    for turn in 0..4000 {
+        let mut out = Decoded::new();
+        let is_due = host.next_wake().is_some_and(|wake| wake <= bus.now);
+        let mut frames = bus.turn();
+        if row.1.contains("sync") && turn % 10 == 0 {
+            let sync = Frame::new(Id::standard(0x80), &[]).at(bus.now, StampKind::Software);
+            host.overhear(&sync, &mut out);
+            frames.extend(bus.ask(&sync));
+        }
+        let now = bus.now;
+        for frame in &frames {
+            host.on_frame(&frame.at(now, StampKind::Software), &mut out);
+        }
+        if is_due || !frames.is_empty() {
+            polls += usize::from(turn >= 3000);
+            while let Some(transmit) = host.poll_transmit(now, &mut out) {
+                host.on_sent(&transmit.frame, Ok(now));
+                for answer in bus.ask(&transmit.frame) {
+                    answered += 1;
+                    if turn < 500 && lost.is_some_and(|lost| answered % lost == 0) {
+                        continue;
+                    }
+                    host.on_frame(&answer.at(now, StampKind::Software), &mut out);
+                }
+            }
+            let wake = host.next_wake();
+            assert!(
+                wake.is_none_or(|wake| wake > now),
+                "{row:?} at {now:?}: {wake:?}"
+            );
+        }
+        readings += if turn >= 3000 { out.readings.len() } else { 0 };
+    }
+    (host.state(), readings, polls)
+}
+
+#[test]
+fn a_device_sleeps_until_it_has_something_to_do() {
+    for row in BOARDS {
+        let (state, readings, polls) = woken(row, None);
+        assert_eq!(state, State::Streaming, "{row:?}");
+        // Boards that are asked are asked at most each millisecond.
+        assert!(
+            readings >= 10 && polls <= 1000,
+            "{row:?}: {readings}, {polls}"
+        );
+    }
+}
+
+#[test]
+fn a_start_gets_over_lost_answers() {
+    for row in BOARDS {
+        for lost in [1, 2, 3] {
+            let (state, readings, _) = woken(row, Some(lost));
+            assert!(
+                state == State::Streaming && readings >= 10,
+                "{row:?}: {lost}"
+            );
+        }
+    }
+}
+
+/// The numbers of a reading.
+fn numbers(reading: &Reading) -> Vec<f64> {
+    match reading {
+        Reading::Joint(joint) => vec![
+            joint.position,
+            joint.velocity,
+            joint.torque,
+            joint.current,
+            joint.acceleration,
+        ],
+        Reading::Imu(imu) => [
+            &imu.proper_acceleration[..],
+            &imu.angular_velocity[..],
+            &imu.orientation[..],
+            &imu.magnetic_field[..],
+        ]
+        .concat(),
+        Reading::Wrench(wrench) => [&wrench.force[..], &wrench.torque[..]].concat(),
+        Reading::Skin(skin) => [&[f64::from(skin.triangle)][..], &skin.taxels[..]].concat(),
+        Reading::Temperature(_) | Reading::Actuator(_) | Reading::Gauges(_) => vec![],
+    }
+}
+
+/// The measurements from `frames`, with the time advanced to each.
+fn read(device: &mut dyn Device, frames: &[Frame]) -> Vec<Output> {
+    let mut readings = Vec::new();
+    for frame in frames {
+        let mut out = Decoded::new();
+        while device.poll_transmit(frame.t, &mut out).is_some() {}
+        if device.claims().iter().any(|claim| claim.matches(frame.id)) {
+            device.on_frame(frame, &mut out);
+        }
+        // States are told again after a start.
+        let is_measured = |output: &&Output| {
+            !matches!(
+                output.reading,
+                Reading::Actuator(_) | Reading::Temperature(_)
+            )
+        };
+        readings.extend(out.readings.iter().filter(is_measured).copied());
+    }
+    readings
+}
+
+/// Whether `part` is one of `whole`, but for values that it lacks. (Without the SYNC that caused it
+/// a reading has the time of its frame.)
+fn is_among(part: &Output, whole: &[Output], later: Nanos) -> bool {
+    whole.iter().any(|output| {
+        let mut pairs = numbers(&part.reading)
+            .into_iter()
+            .zip(numbers(&output.reading));
+        output.output == part.output
+            && output.reading.kind() == part.reading.kind()
+            && (output.acquired + later - part.acquired).0.abs() <= 500_000
+            && pairs.all(|(a, b)| a.is_nan() || a.to_bits() == b.to_bits())
+    })
+}
+
+/// Wherever frames are cut, and some after the cut are lost: what comes then is what would have
+/// come without it.
+#[test]
+fn an_interruption_mixes_nothing() {
+    for row in BOARDS {
+        let frames = recorded(row, 1000);
+        let whole = read(&mut *device(row, Mode::Listen), &frames);
+        assert!(whole.len() >= 20, "{row:?}");
+        for cut in frames.len() / 2..frames.len() / 2 + 10 {
+            for lost in 0..6 {
+                let (before, after) = (&frames[..cut], &frames[cut + lost..]);
+                // The board is started again.
+                let mut restarted = device(row, Mode::Listen);
+                read(&mut *restarted, before);
+                restarted.restart(frames[cut].t);
+                for output in &read(&mut *restarted, after) {
+                    assert!(
+                        is_among(output, &whole, Nanos::ZERO),
+                        "{row:?} {cut}+{lost}: {output:?}"
+                    );
+                }
+                // It is silent for a while.
+                let later = Nanos::from_millis(2000);
+                let shifted: Vec<Frame> = (after.iter())
+                    .map(|frame| frame.at(frame.t + later, frame.stamp))
+                    .collect();
+                let mut silent = device(row, Mode::Listen);
+                read(&mut *silent, before);
+                let after = read(&mut *silent, &shifted);
+                for output in &after {
+                    assert!(
+                        is_among(output, &whole, later),
+                        "{row:?} {cut}+{lost}: {output:?}"
+                    );
+                }
+                let end = whole.iter().filter(|o| o.acquired > frames[cut + lost].t);
+                assert!(after.len() + 30 >= end.count(), "{row:?} {cut}+{lost}");
+            }
+        }
+    }
+}
