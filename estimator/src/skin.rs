@@ -9,14 +9,14 @@
 //! - **Rest.** What an untouched taxel reads: the mean of its first second, which must be without a
 //!   touch; then it follows slowly (`REST_TIME`) while the taxel is not pressed. A taxel that
 //!   reads less than its rest by the threshold, twice in a row, was touched in its first second: it
-//!   begins anew.
+//!   begins anew. So does a triangle that was silent for `REST_TIME`: its rest may have drifted.
 //! - **Pressed.** Two readings in a row change a taxel's state: above the threshold it becomes
-//!   pressed, below half of it released. So one wrong reading changes nothing.
+//!   pressed, below half of it, or not measured, released. So one wrong reading changes nothing.
 //! - **Threshold.** From the noise of an untouched taxel and the false alarms that are accepted
 //!   ([`threshold`]).
-//! - **Silence.** A triangle of twelve taxels that has not been heard for `max_silence`, or reports
-//!   a fault, shows no touch. If it showed one when it was last heard, the touch is lost: nobody
-//!   knows whether it is still there (`Touch::lost`).
+//! - **Silence.** A triangle of twelve taxels that has not been heard for `max_silence` shows no
+//!   touch; readings with a fault do not count. If it showed one when it was last heard, the touch
+//!   is lost: nobody knows whether it is still there (`Touch::lost`).
 //!
 //! Several touches on one link are one contact, at their common centroid. The centroid of a touch
 //! on a curved surface lies below the surface: by 1.7 mm for a touch 2 cm wide on a forearm of 3 cm
@@ -145,6 +145,8 @@ struct TaxelState {
     first: Option<Nanos>,
     readings: u32,
     is_pressed: bool,
+    /// The last pressure, if it is pressed.
+    pressure: f64,
     /// The last reading said that `is_pressed` should change.
     wants_change: bool,
     /// The last reading was far below the rest.
@@ -156,9 +158,9 @@ impl TaxelState {
     /// the rest follows.
     fn update(&mut self, t: Nanos, value: f64, threshold: f64, gain: f64) -> f64 {
         if value.is_nan() || value.abs() >= MEASURED {
-            // Not measured: not known to be pressed.
-            (self.is_pressed, self.wants_change, self.is_below) = (false, false, false);
-            return 0.0;
+            self.is_pressed &= !self.wants_change;
+            (self.wants_change, self.is_below) = (self.is_pressed, false);
+            return if self.is_pressed { self.pressure } else { 0.0 };
         }
         let pressure = value - self.rest;
         let wants_change = match self.is_pressed {
@@ -191,11 +193,12 @@ impl TaxelState {
             self.rest += gain * pressure;
         }
         self.is_below = is_below;
-        if self.is_pressed {
+        self.pressure = if self.is_pressed {
             pressure.max(0.0)
         } else {
             0.0
-        }
+        };
+        self.pressure
     }
 }
 
@@ -237,6 +240,9 @@ impl Patch {
             return Taken::Backward;
         }
         let since = before.map_or(Nanos::ZERO, |before| t - before);
+        if since > REST_TIME {
+            triangle.taxels = Default::default();
+        }
         let gain = 1.0 - (-since.seconds() / REST_TIME.seconds()).exp();
         let places = self.setup.taxels.iter().skip(TRIANGLE * number);
         let mut sums = [0.0; 7];
@@ -407,6 +413,38 @@ mod tests {
         assert!((touch(&patch, MS(2900)).place().0.x - 0.045).abs() < 1e-3);
     }
 
+    /// After a pause in which the rest has risen by more than the threshold.
+    #[test]
+    fn a_rest_that_rose_in_a_long_pause_is_no_touch() {
+        let mut patch = patch();
+        run(&mut patch, 0, 1500, 0.0, &[]);
+        for (start, is_touch) in [(1480 + 60_000, true), (1480 + 600_000, false)] {
+            let mut after = patch.clone();
+            run(&mut after, start, start + 1500, 6.0, &[]);
+            assert_eq!(touch(&after, MS(start + 1500)).is_there(), is_touch);
+            run(&mut after, start + 1500, start + 1600, 6.0, &[(5, 50.0)]);
+            assert!(touch(&after, MS(start + 1600)).is_there());
+        }
+    }
+
+    #[test]
+    fn a_value_that_was_not_measured_counts_as_one_reading() {
+        let mut patch = patch();
+        run(&mut patch, 0, 1500, 0.0, &[]);
+        run(&mut patch, 1500, 1600, 0.0, &[(5, 50.0)]);
+        let held = touch(&patch, MS(1600));
+        run(&mut patch, 1600, 1620, 0.0, &[(5, f64::NAN)]);
+        assert!(held.is_there());
+        assert_eq!(touch(&patch, MS(1600)), held, "the last pressure");
+        run(&mut patch, 1620, 1640, 0.0, &[(5, f64::INFINITY)]);
+        assert!(!touch(&patch, MS(1620)).is_there());
+        // Of an untouched one it is no pressure: the next one is the first.
+        run(&mut patch, 1640, 1660, 0.0, &[(5, 50.0)]);
+        run(&mut patch, 1660, 1680, 0.0, &[(5, f64::NAN)]);
+        run(&mut patch, 1680, 1700, 0.0, &[(5, 50.0)]);
+        assert!(!touch(&patch, MS(1680)).is_there());
+    }
+
     #[test]
     fn a_touch_of_a_silent_triangle_is_lost_until_it_speaks_again() {
         let mut patch = patch();
@@ -432,7 +470,9 @@ mod tests {
             triangle: 0,
             taxels: again,
         };
-        assert_eq!(patch.push(MS(1950), &skin, Quality::GOOD), Taken::Yes);
+        for t in [1930, 1950] {
+            assert_eq!(patch.push(MS(t), &skin, Quality::GOOD), Taken::Yes);
+        }
         assert_eq!(lost(&patch, 1951), None);
         // Untouched, silence loses nothing.
         assert_eq!(lost(&patch, 9000), None);

@@ -435,9 +435,14 @@ fn flags_of_a_motor_are_those_of_its_joints() {
         of(0, fault, 4.0);
         of(0, good, 5.0);
         of(1, good, 6.0);
+        // M^-T is an upper triangle: the third motor's torque is in that of each joint.
+        assert_eq!(of(2, Quality::DRIVE_FAULT, 7.0), [Quality::DRIVE_FAULT; 3]);
+        of(0, Quality::DRIVE_FAULT, 8.0);
+        of(1, good, 9.0);
+        let (drive, moved) = (Quality::DRIVE_FAULT, [true, true, false]);
         assert_eq!(
-            of(2, Quality::DRIVE_FAULT, 7.0),
-            [good, good, Quality::DRIVE_FAULT]
+            of(2, good, 10.0),
+            moved.map(|m| if m { drive } else { good })
         );
         // A gap before a reading that was overtaken is still a gap before the sample.
         of(0, good, 40.0);

@@ -1,6 +1,6 @@
-//! What holds for every device, whatever its family: it claims the same identifiers whoever commands
-//! it, it sleeps until it has something to do, its start gets over lost answers, and after an
-//! interruption it mixes nothing old with anything new.
+//! What holds for every device, whatever its family: it claims the same identifiers whoever
+//! commands it, it sleeps until it has something to do, its start gets over lost answers, and after
+//! an interruption it mixes nothing old with anything new.
 
 use crate::recognise::{BOARDS, Bus, Row, recorded};
 use crate::rig::{options, spec};

@@ -77,14 +77,18 @@ impl Coupling {
         true
     }
 
-    /// The present state of joint number `joint`; its flags are those of the motors that move it.
+    /// The present state of joint number `joint`; its flags are those of the motors that move it. A
+    /// drive's fault counts too if its torque is in that of the joint.
     pub(crate) fn joint(&self, joint: usize) -> Option<Measured> {
         let motors = self.motors.iter().filter_map(|motor| motor.now.as_ref());
         let first = motors.clone().next()?;
         let mut quality = Quality::GOOD;
-        for (weight, motor) in self.matrix.row(joint).zip(motors.clone()) {
-            if weight != 0.0 {
+        let weights = self.matrix.row(joint).zip(self.matrix.torque_row(joint));
+        for ((motion, torque), motor) in weights.zip(motors.clone()) {
+            if motion != 0.0 {
                 quality |= motor.quality;
+            } else if torque != 0.0 && motor.quality.contains(Quality::DRIVE_FAULT) {
+                quality |= Quality::DRIVE_FAULT;
             }
         }
         let max_silence = motors.clone().map(|motor| motor.max_silence).max();

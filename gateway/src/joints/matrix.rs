@@ -87,6 +87,11 @@ impl Matrix {
         self.forward.get(joint).into_iter().flatten().copied()
     }
 
+    /// Row `joint` of M^-T: how much of each motor's torque is in the joint's.
+    pub fn torque_row(&self, joint: usize) -> impl Iterator<Item = f64> + Clone + '_ {
+        column(&self.inverse, joint)
+    }
+
     /// The state of joint number `joint` from the motors'; the current is that of the motor of the
     /// same number.
     #[must_use]
@@ -95,7 +100,7 @@ impl Matrix {
         joint: usize,
         motors: impl Iterator<Item = JointState> + Clone,
     ) -> JointState {
-        state(self.row(joint), column(&self.inverse, joint), motors, joint)
+        state(self.row(joint), self.torque_row(joint), motors, joint)
     }
 
     /// The state of motor number `motor` from the joints': the inverse of [`Matrix::joint`].

@@ -3,7 +3,8 @@
 //! The source of the position makes the samples: its stamp, flags and sequence number are the
 //! shaft's. The others' newest values are carried along ([`super::track`]) while they are fresh,
 //! else they are absent. A fault belongs to what it spoils: an encoder's fault in another source
-//! takes that source's velocity and acceleration away, and leaves the position as it is. A drive's
+//! takes that source's velocity and acceleration away, and leaves the position as it is. A fault of
+//! a device without a position, such as a torque sensor's, takes all that it gives away. A drive's
 //! fault is passed on, as it condemns nothing.
 
 use super::track::{Measured, Track};
@@ -114,6 +115,9 @@ impl Shaft {
             let Some(mut held) = other.track.at(measured.acquired) else {
                 continue;
             };
+            if held.quality.contains(Quality::DEVICE_FAULT) && held.state.position.is_nan() {
+                continue;
+            }
             if held.quality.intersects(Quality::UNTRUSTED_ENCODER) {
                 held.state.velocity = f64::NAN;
                 held.state.acceleration = f64::NAN;
@@ -124,5 +128,40 @@ impl Shaft {
             other.takes.copy(&held.state, &mut whole.state);
         }
         Some(whole)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proprio_topics::StampKind;
+    use proptest::prelude::*;
+
+    proptest! {
+        /// What a fault of the second source takes away depends on whether it has a position.
+        #[test]
+        fn a_torque_sensors_fault_takes_its_torque(has_position: bool, faulty: bool) {
+            let takes = [[Quantity::Position], [Quantity::Torque]].map(|list| Takes::of(&list));
+            let mut shaft = Shaft::new(takes.into_iter().map(|takes| (takes, Nanos(100))));
+            let measured = |state, quality| Measured {
+                acquired: Nanos(0),
+                stamp: StampKind::Software,
+                device_time: Nanos::MIN,
+                device_counter: 0,
+                quality,
+                state,
+                max_silence: Nanos(100),
+            };
+            let position = JointState { position: 1.0, ..JointState::ABSENT };
+            let mut sensor = JointState { torque: 2.0, ..JointState::ABSENT };
+            if has_position {
+                sensor.position = 7.0;
+            }
+            let quality = if faulty { Quality::DEVICE_FAULT } else { Quality::GOOD };
+            prop_assert!(shaft.give(1, measured(sensor, quality)).is_none());
+            let whole = shaft.give(0, measured(position, Quality::GOOD)).unwrap();
+            prop_assert_eq!((whole.quality, whole.state.position), (Quality::GOOD, 1.0));
+            prop_assert_eq!(whole.state.torque.is_nan(), faulty && !has_position);
+        }
     }
 }

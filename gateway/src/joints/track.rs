@@ -86,9 +86,11 @@ impl Track {
         self.newest.as_ref()
     }
 
-    /// The newest reading carried to `t`; `None` if there is none, or none that is fresh at `t`.
+    /// The newest reading carried to `t`, forward or backward; `None` if there is none, or none that
+    /// is fresh at `t`.
     pub(crate) fn at(&self, t: Nanos) -> Option<Measured> {
-        let newest = self.newest.filter(|m| t - m.acquired <= m.max_silence)?;
+        let is_near = |m: &Measured| (t - m.acquired).0.abs() <= m.max_silence.0;
+        let newest = self.newest.filter(is_near)?;
         let age = (t - newest.acquired).seconds();
         let state = JointState {
             position: newest.state.position + self.rates.0 * age,
@@ -141,6 +143,7 @@ mod tests {
         );
         // Backward too: a stamp of the bus's SYNC may be earlier.
         assert_eq!(at(&track, -10).unwrap().position, 0.98);
+        assert!(at(&track, -50).is_some() && at(&track, -51).is_none());
         assert!(
             at(&track, 50).is_some() && at(&track, 51).is_none(),
             "fresh or not"
