@@ -152,6 +152,7 @@ impl Driver for Options {
             return Vec::new();
         };
         evidence.together(force, torque);
+        evidence.belongs(COMMAND);
         let finding = evidence.finding(Self::NAME, 1, "AIDIN AFT200");
         let period = Key::period_ms(force.period(), 1, 65);
         (finding

@@ -13,7 +13,7 @@
 
 use crate::bringup::{Bringup, NoInquiry};
 use crate::canopen::{self, SYNC};
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Link, Supervised, next_in_step};
 use crate::{
     Board, Decoded, Device, Driver, EncodeError, Frame, Frames, OutputInfo, Spec, SpecError,
 };
@@ -97,9 +97,7 @@ impl Family for Producer {
         if now < self.next {
             return None;
         }
-        // In step with the first; what was missed is left out.
-        let due = self.next.max(now - self.period) + self.period;
-        self.next = if due > now { due } else { now + self.period };
+        self.next = next_in_step(self.next, self.period, now);
         // It works as long as the bus takes them.
         link.bringup.reading(now);
         Some(Frame::new(SYNC, &[]))

@@ -76,6 +76,14 @@ pub(crate) trait Family: Send {
     }
 }
 
+/// When the next periodic request is due, after one that was due at `due` and left at `now`: in
+/// step with it; those that were missed are left out.
+pub(crate) fn next_in_step(due: Nanos, period: Nanos, now: Nanos) -> Nanos {
+    // At the start `due` may be far in the past.
+    let next = due.max(now - period) + period;
+    if next > now { next } else { now + period }
+}
+
 /// The bring-up of a board, and what it has been asked.
 #[derive(Debug)]
 pub(crate) struct Link<Q> {

@@ -48,7 +48,7 @@
 
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes::{self, i16_le, u32_le};
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Link, Supervised, next_in_step};
 use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Format, Frame, Frames, Id, Output,
@@ -512,8 +512,7 @@ impl Family for Controller {
         if now < self.next {
             return None;
         }
-        let due = self.next.max(now - self.period) + self.period;
-        self.next = if due > now { due } else { now + self.period };
+        self.next = next_in_step(self.next, self.period, now);
         Some(self.query)
     }
 

@@ -528,6 +528,44 @@ mod tests {
         assert_eq!(other.rate(), 0.0);
     }
 
+    /// The usual time is the median: neither a pause nor a burst changes it.
+    #[test]
+    fn a_period_is_the_median() {
+        let stamps = [0.0, 50.0, 60.0, 70.0, 80.0, 80.1, 80.2];
+        let frames: Vec<(u16, &[u8], f64)> = stamps.iter().map(|t| (1, &[][..], *t)).collect();
+        let period = |count| {
+            let traffic = heard(&frames[..count]);
+            traffic.stream(Id::standard(1)).unwrap().period()
+        };
+        assert_eq!(period(7), Some(Nanos::from_millis(10)));
+        assert_eq!((period(4).is_some(), period(3)), (true, None));
+    }
+
+    #[test]
+    fn certainty_begins_at_the_stated_bits() {
+        let traffic = Traffic::new();
+        let of = |bits: f64, guess: bool| {
+            let mut evidence = Evidence::new(&traffic, 1);
+            evidence.explains(
+                Id::standard(1),
+                bits - evidence.traffic.id_bits(Id::standard(1)),
+            );
+            let finding = evidence.finding("driver", 1, "");
+            finding.and_then(|found| Finding { guess, ..found }.certainty())
+        };
+        for (bits, certainty) in [
+            (7.99, None),
+            (8.01, Some(Certainty::Possible)),
+            (15.99, Some(Certainty::Possible)),
+            (16.01, Some(Certainty::Likely)),
+            (31.99, Some(Certainty::Likely)),
+            (32.01, Some(Certainty::Certain)),
+        ] {
+            assert_eq!(of(bits, false), certainty, "{bits}");
+            assert_eq!(of(bits, true), certainty.map(|_| Certainty::Possible));
+        }
+    }
+
     /// An answer is kept, whatever comes after it; memory stays bounded.
     #[test]
     fn frames_with_new_beginnings_are_kept() {

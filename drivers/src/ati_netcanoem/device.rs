@@ -5,7 +5,7 @@ use super::frames::{STATUS_ANY, STATUS_BUS, STATUS_FAULTS, id, opcode, opcode_of
 use super::options::Options;
 use crate::bringup::Bringup;
 use crate::bytes::{self, i16_be, u16_be};
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Link, Supervised, next_in_step};
 use crate::pairing::within;
 use crate::{
     Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Mode,
@@ -238,8 +238,7 @@ impl Family for Netcanoem {
             return None;
         }
         self.open = Some(now + ANSWER);
-        let due = self.next + self.period;
-        self.next = if due > now { due } else { now + self.period };
+        self.next = next_in_step(self.next, self.period, now);
         Some(Frame::new(id(self.base, opcode::GAUGES), &[]))
     }
 

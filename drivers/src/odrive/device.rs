@@ -5,7 +5,7 @@ use super::frames::{FET, JOINT, LENGTH, MOTOR, command, is_request};
 use super::options::{Checked, Options};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes;
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Link, Supervised, next_in_step};
 use crate::held::Held;
 use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
 use alloc::boxed::Box;
@@ -176,8 +176,7 @@ impl Family for Axis {
         self.next += 1;
         if self.next == requests.len() {
             self.next = 0;
-            let due = self.due + period;
-            self.due = if due > now { due } else { now + period };
+            self.due = next_in_step(self.due, period, now);
         }
         Some(Frame::remote(self.keys.id(command), LENGTH))
     }

@@ -34,6 +34,7 @@ pub(super) fn sensor(seen: &Traffic) -> Option<Finding> {
     })?;
     let second = evidence.sends_length(IDS.second, 8)?;
     evidence.together(first, second);
+    evidence.belongs(IDS.command);
     let is_data = |frame: &Frame| frame.data().first() == Some(&command::START);
     if first.recent().all(is_data) {
         evidence.add(BYTE - byte_of(COMMANDS.len()));

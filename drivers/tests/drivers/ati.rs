@@ -2,8 +2,10 @@
 //! questions for the calibration.
 
 use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, spec};
-use proprio_drivers::{Device, Fault, Frame, Mode, NotSent, Options, Output, SpecError, State};
-use proprio_topics::{Counter, Quality, Reading, Refusal, Wrench};
+use proprio_drivers::{
+    Decoded, Device, Fault, Frame, Mode, NotSent, Options, Output, SpecError, State,
+};
+use proprio_topics::{Counter, Nanos, Quality, Reading, Refusal, Wrench};
 use proptest::prelude::*;
 
 /// A calibration in the keys: 0.01 N and 0.001 Nm per count.
@@ -461,6 +463,52 @@ fn a_calibration_that_changes_is_refused() {
     let (again, wrenches) = session(true);
     let (readings, _) = decode(&mut *device, &again);
     assert_eq!(readings.len(), wrenches.len());
+}
+
+/// What the keys state does not depend on which calibration is selected; the rest does.
+#[test]
+fn another_calibration_voids_what_is_not_configured() {
+    let parts = [
+        "counts_per_force = 100\ncounts_per_torque = 1000\n",
+        "force_unit = \"N\"\ntorque_unit = \"Nm\"\n",
+        &KEYS[KEYS.find("matrix").unwrap()..],
+    ];
+    let select = [frame("3F6#05", 990.0), frame("3F6#05", 990.1)];
+    let (frames, _) = session(true);
+    for without in 0..4 {
+        let keys: String = (0..3)
+            .filter(|part| *part != without)
+            .map(|part| parts[part])
+            .collect();
+        let mut device = session_listener(&keys);
+        decode(&mut *device, &frames);
+        decode(&mut *device, &select);
+        let (readings, _) = decode(&mut *device, &halves_at_3f(991.0));
+        assert_eq!(
+            readings.len(),
+            usize::from(without == 3),
+            "without {without}"
+        );
+    }
+}
+
+/// A device that selects a calibration counts an answer with another number, and asks again.
+#[test]
+fn an_answer_with_another_number_is_counted() {
+    let mut device = options("ati_netcanoem", "calibration = 3")
+        .device(&spec(0x20, Mode::Supervise, &[]))
+        .unwrap();
+    let mut out = Decoded::new();
+    let now = Nanos::from_millis(1000);
+    let asked = device.poll_transmit(now, &mut out).unwrap().frame;
+    assert_eq!(asked.to_string(), "206#03");
+    device.on_sent(&asked, Ok(now));
+    let (_, faults) = decode(&mut *device, &[frame("206#05", 1000.1)]);
+    assert_eq!(count(&faults, Counter::Value), 1);
+    let (_, faults) = decode(&mut *device, &[frame("206#03", 1000.2)]);
+    assert!(faults.is_empty(), "{faults:?}");
+    let next = device.poll_transmit(now + Nanos::from_millis(1), &mut out);
+    assert_eq!(next.unwrap().frame.to_string(), "207#");
 }
 
 fn halves_at_3f(ms: f64) -> [Frame; 2] {

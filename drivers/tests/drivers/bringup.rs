@@ -871,3 +871,21 @@ fn configurations_that_can_not_work_are_named() {
         assert!(Options::deserialize(driver, table).is_err(), "{driver}");
     }
 }
+
+/// A board that must not hear anything while it starts is stopped as any other once it runs.
+#[test]
+fn a_board_with_a_silence_at_power_on_is_stopped() {
+    let stopped = |keys: &str| {
+        let mut rig = Rig::new("icub_strain", keys, &[], wrench());
+        rig.run(300);
+        assert_eq!(rig.device.state(), State::Streaming);
+        let before = rig.sent.len();
+        rig.device.stop(rig.now);
+        rig.run(50);
+        assert_eq!(rig.device.state(), State::Stopped);
+        rig.sent.split_off(before)
+    };
+    let usual = stopped(SCALES);
+    assert!(!usual.is_empty());
+    assert_eq!(stopped(&format!("{SCALES}power_on_silence_ms = 20")), usual);
+}

@@ -837,6 +837,49 @@ fn the_status_word_is_told_and_judged() {
     }
 }
 
+/// The stamp and its kind are those of the SYNC.
+#[test]
+fn a_reading_has_the_stamp_of_its_sync() {
+    let mut device = at(
+        "canopen_encoder",
+        "sync = 1\ncounts_per_turn = 100",
+        9,
+        Mode::Listen,
+    );
+    let sync = frame("080#", 7.0);
+    let sync = sync.at(sync.t, StampKind::Hardware);
+    let (readings, _) = decode(&mut *device, &[sync, frame("189#19000000", 7.3)]);
+    assert_eq!(
+        (readings[0].acquired, readings[0].stamp),
+        (sync.t, StampKind::Hardware)
+    );
+    assert!(near(joint(&readings[0].reading).position, TAU / 4.0));
+}
+
+/// What another program writes, and the drive refuses, changes nothing; nor does an answer to
+/// another question.
+#[test]
+fn a_write_that_is_refused_changes_nothing() {
+    let (frames, _) = session("drive");
+    let reads = |more: &[&str]| {
+        let mut device = at("canopen_drive", "", 5, Mode::Listen);
+        let mut mine = claimed(&*device, &frames);
+        let answers = mine.iter().rposition(|f| f.id.raw() == 0x585).unwrap() + 1;
+        let after: Vec<Frame> = mine.split_off(answers);
+        decode(&mut *device, &mine);
+        let more: Vec<Frame> = more.iter().map(|text| frame(text, 90.0)).collect();
+        decode(&mut *device, &more);
+        decode(&mut *device, &after).0.len()
+    };
+    let all = reads(&[]);
+    assert!(all > 0);
+    // The mapping of TPDO 1, emptied: refused, confirmed, and refused to another question.
+    let write = "605#2F001A0000000000";
+    assert_eq!(reads(&[write, "585#80001A0021000108"]), all);
+    assert_eq!(reads(&[write, "585#60001A0000000000"]), 0);
+    assert_eq!(reads(&[write, "585#80FFFF0021000108"]), all);
+}
+
 #[test]
 fn scales_that_change_are_refused() {
     let (frames, _) = session("drive");
@@ -889,6 +932,9 @@ fn the_sync_is_sent_in_step() {
         "{steps:?}"
     );
     assert_eq!(times.len(), 32);
+    // Before and after, in step with the first.
+    let phases: Vec<i64> = times.iter().map(|t| t % 2_500_000).collect();
+    assert!(phases.iter().all(|phase| *phase == phases[0]), "{times:?}");
     assert_eq!(device.state(), State::Streaming);
     device.stop(now);
     assert!(device.poll_transmit(now, &mut out).is_none());

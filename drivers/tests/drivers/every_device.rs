@@ -3,9 +3,9 @@
 //! an interruption it mixes nothing old with anything new.
 
 use crate::recognise::{BOARDS, Bus, Row, recorded};
-use crate::rig::{options, spec};
+use crate::rig::{count, decode, encode, listener, options, spec};
 use proprio_drivers::{Decoded, Device, Frame, Id, Mode, Output, State};
-use proprio_topics::{Nanos, Reading, StampKind};
+use proprio_topics::{Counter, Nanos, Quality, Reading, Skin, StampKind, Wrench};
 
 fn device(row: &Row, mode: Mode) -> Box<dyn Device> {
     let (driver, keys, address, outputs) = *row;
@@ -87,6 +87,84 @@ fn a_start_gets_over_lost_answers() {
                 state == State::Streaming && readings >= 10,
                 "{row:?}: {lost}"
             );
+        }
+    }
+}
+
+/// A changed maximum silence holds from then on.
+#[test]
+fn the_maximum_silence_can_change() {
+    for row in BOARDS {
+        let frames = recorded(row, 1000);
+        for (ms, silences) in [(400, 0), (200, 1)] {
+            let mut device = device(row, Mode::Listen);
+            device.set_max_silence(Nanos::from_millis(ms));
+            read(&mut *device, &frames);
+            let last = frames.last().expect("frames").t;
+            let mut out = Decoded::new();
+            // A device that polls may have had its last reading some time before.
+            while (device.poll_transmit(last + Nanos::from_millis(300), &mut out)).is_some() {}
+            assert_eq!(
+                count(&out.faults, Counter::Silences),
+                silences,
+                "{row:?} {ms}"
+            );
+        }
+    }
+}
+
+/// The longest time from a reading's first frame to its second, as a key states it.
+#[test]
+fn a_pair_comes_within_the_stated_time() {
+    let wrench = |x: f64| {
+        Reading::Wrench(Wrench {
+            force: [x; 3],
+            torque: [x / 10.0; 3],
+        })
+    };
+    let skin = |x: f64| {
+        Reading::Skin(Skin {
+            triangle: 0,
+            taxels: [x.round(); 12],
+        })
+    };
+    let scales = "full_scale_n = [900, 900, 900]\nfull_scale_nm = [90, 90, 90]\n";
+    let dbc = crate::dbc::WRENCH;
+    let stated = "pair_timeout_ms = 2.0";
+    let cases: [(&str, String, &dyn Fn(f64) -> Reading); 3] = [
+        ("icub_strain", format!("{scales}{stated}"), &wrench),
+        ("icub_skin", format!("triangles = [0, 0]\n{stated}"), &skin),
+        ("dbc", dbc.into(), &wrench),
+    ];
+    for (driver, keys, reading) in cases {
+        for (ms, us, expected) in [
+            ("4.0", 3_500, 1),
+            ("4.0", 4_500, 0),
+            ("0.5", 450, 1),
+            ("0.5", 550, 0),
+            ("1000.0", 999_000, 1),
+        ] {
+            let keys = keys.replace(stated, &format!("pair_timeout_ms = {ms}"));
+            let mut board = crate::rig::board(driver, &keys, &[]);
+            let frames = encode(&mut *board, 0, &reading(9.0), Quality::GOOD);
+            let [first, second, ..] = frames[..] else {
+                panic!("{driver}: {frames:?}")
+            };
+            let mut device = listener(driver, &keys, &[]);
+            let t = Nanos::from_millis(50);
+            let frames = [
+                first.at(t, StampKind::Software),
+                second.at(t + Nanos::from_micros(us), StampKind::Software),
+            ];
+            let (readings, _) = decode(&mut *device, &frames);
+            assert_eq!(readings.len(), expected, "{driver} {ms} {us}");
+        }
+        for wrong in ["0.0", "-1.0", "1000.1", "nan"] {
+            let keys = keys.replace(stated, &format!("pair_timeout_ms = {wrong}"));
+            let options = options(driver, &keys);
+            let address = options.default_address().unwrap_or(1);
+            let refused = options.device(&spec(address, Mode::Listen, &[]));
+            assert!(refused.is_err(), "{driver} {wrong}");
         }
     }
 }

@@ -315,6 +315,25 @@ fn every_board_is_recognised_by_listening_to_it() {
         let own = own(&heard, row).unwrap_or_else(|| panic!("{row:?} is not found"));
         assert!(own.certainty() >= Some(Certainty::Likely), "{own:?}");
         assert_eq!(own.unusable, "");
+        // Nothing of what is heard of a board, and of its host, remains unknown, but for the SYNC
+        // and for the settings that a J1939 host sends to a group.
+        let by_host = |id: Id| match id {
+            Id::Standard(raw) => raw == 0x80,
+            Id::Extended(raw) => raw & 0xFFFF_00FF == 0x18FF_00F9,
+        };
+        let (driver, keys, address, outputs) = *row;
+        let claimed = options(driver, keys)
+            .device(&spec(address, Mode::Listen, outputs))
+            .expect("legal keys");
+        for stream in heard.streams().filter(|stream| !by_host(stream.id)) {
+            let known = own.explains.contains(&stream.id)
+                || claimed
+                    .claims()
+                    .iter()
+                    .any(|claim| claim.matches(stream.id))
+                || own.commands.iter().any(|ids| ids.contains(&stream.id));
+            assert!(known, "{row:?}: {}", stream.id);
+        }
     }
 }
 

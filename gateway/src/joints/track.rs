@@ -86,8 +86,8 @@ impl Track {
         self.newest.as_ref()
     }
 
-    /// The newest reading carried to `t`, forward or backward; `None` if there is none, or none that
-    /// is fresh at `t`.
+    /// The newest reading carried to `t`, forward or backward; `None` if there is none that is
+    /// fresh at `t`.
     pub(crate) fn at(&self, t: Nanos) -> Option<Measured> {
         let is_near = |m: &Measured| (t - m.acquired).0.abs() <= m.max_silence.0;
         let newest = self.newest.filter(is_near)?;
