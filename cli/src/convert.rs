@@ -276,6 +276,7 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
             "format": format,
             "frames": report.frames, "samples": report.samples, "unclaimed": report.unclaimed,
             "bad_lines": report.bad_lines, "other_interfaces": report.other_interfaces,
+            "other_interface_names": report.other_names,
             "error_frames": report.error_frames, "dropped": report.dropped,
             "out_of_order": report.out_of_order, "devices": devices,
         });
@@ -290,6 +291,14 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
             report.other_interfaces,
             report.bad_lines
         );
+        if !report.other_names.is_empty() {
+            // Of an adapter named by its serial number the log does not say which interface it was.
+            eprintln!(
+                "other interfaces: {}; a bus takes the frames of its interface, and of an \
+                 interface with the bus's own name",
+                report.other_names.join(", ")
+            );
+        }
     }
     if report.samples == 0 {
         let hint = if report.other_interfaces == report.frames {

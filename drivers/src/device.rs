@@ -457,8 +457,8 @@ pub trait Device: Send {
     }
 }
 
-/// The longest time from a command to its outcome. A board answers within milliseconds; within
-/// this time it has been asked as often as at its start.
+/// The longest time from a command to its outcome. A board answers within milliseconds. A tare of
+/// six questions gets over an answer lost to each; a calibration of 42 over a few in all.
 pub const COMMAND_TIME: Nanos = Nanos::from_millis(1000);
 
 /// Frames that a board sends at once: two for each of a skin board's 16 triangles.

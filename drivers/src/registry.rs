@@ -1,7 +1,7 @@
 //! The drivers: one list from which their names, their keys and their devices follow.
 
 use crate::objects::Objects;
-use crate::recognise::{Certainty, Finding, Traffic};
+use crate::recognise::{Finding, Traffic};
 use crate::signal::Message;
 use crate::{
     Board, Device, Driver, Frame, OutputInfo, Spec, SpecError, aidin_aft200, ati_netcanoem,
@@ -28,7 +28,7 @@ macro_rules! drivers {
         /// The names of all drivers, as gateway.toml writes them.
         pub const DRIVERS: &[&str] = &[$(<$module::Options as Driver>::NAME),+];
 
-        /// The drivers whose questions are sent only if they are named
+        /// Each driver, and whether its questions are sent only if it is named
         /// ([`Driver::ASKED_BY_NAME`]).
         pub const ASKED_BY_NAME: &[(&str, bool)] = &[
             $((<$module::Options as Driver>::NAME, <$module::Options as Driver>::ASKED_BY_NAME),)+
@@ -45,12 +45,11 @@ macro_rules! drivers {
 
         /// The questions of all drivers ([`Driver::questions`]), each once; of those that are asked
         /// by name only, the drivers in `named`. None is on an identifier on which a device of
-        /// another driver, if `seen` shows one that is at least likely, takes commands.
+        /// another driver takes commands, even if `seen` shows no more than that it is possible.
         #[must_use]
         pub fn questions(seen: &Traffic, named: &[&str]) -> Vec<Frame> {
             let mut all: Vec<Frame> = Vec::new();
-            let mut there = recognise(seen);
-            there.retain(|finding| finding.certainty() >= Some(Certainty::Likely));
+            let there = recognise(seen);
             let is_command = |driver: &str, question: &Frame| {
                 let mut others = there.iter().filter(|finding| finding.driver != driver);
                 others.any(|other| other.commands.iter().any(|c| c.contains(&question.id)))

@@ -52,6 +52,8 @@ pub struct DecodeReport {
     pub frames: u64,
     /// Of these, frames of an interface that is no bus of the configuration.
     pub other_interfaces: u64,
+    /// The names of those interfaces, at most eight.
+    pub other_names: Vec<String>,
     /// Of these, frames that no device claims.
     pub unclaimed: u64,
     /// Of these, error frames of the interface.
@@ -216,6 +218,11 @@ pub fn decode(
                 Some(bus) => last_bus = bus,
                 None => {
                     report.other_interfaces += 1;
+                    let name = record.interface;
+                    let names = &mut report.other_names;
+                    if names.len() < 8 && names.iter().all(|known| known != name) {
+                        names.push(name.to_owned());
+                    }
                     continue;
                 }
             }

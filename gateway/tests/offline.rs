@@ -140,3 +140,32 @@ fn a_value_beyond_the_full_scale_is_counted() {
     let counts = &report.devices[0].counts;
     assert!(counts.contains(&(Counter::OutOfRange, 1)), "{counts:?}");
 }
+
+/// Of an adapter that is named by its serial number a log does not say which interface it was: a
+/// bus takes the frames of an interface with its own name, and the others are named.
+#[test]
+fn interfaces_of_a_log_that_no_bus_takes_are_named() {
+    let adapter = "{ kind = \"socketcan\", serial = \"0042\" }";
+    let bus = |name: &str| {
+        ARM.replace("arm", name)
+            .replace("elbow", &format!("{name}_elbow"))
+    };
+    let second = bus("leg").replace("\"ft\"", "\"leg_ft\"");
+    let second = &second[second.find("[[bus]]").unwrap()..];
+    let text = format!("{ARM}{second}")
+        .replace("{ kind = \"virtual\", name = \"arm\" }", adapter)
+        .replace(
+            "{ kind = \"virtual\", name = \"leg\" }",
+            &adapter.replace("42", "43"),
+        );
+    let plan = Plan::parse(&text, Path::new(".")).unwrap();
+    let log: String = (["can7", "arm", "can3", "can7"].into_iter().zip(0..))
+        .map(|(name, t)| format!("({t}.000000) {name} 140#0000000000000000\n"))
+        .collect();
+    let report = decode(&plan, log.as_bytes(), &mut Vec::new(), Columns::Main).unwrap();
+    assert_eq!(
+        (report.frames, report.samples, report.other_interfaces),
+        (4, 1, 3)
+    );
+    assert_eq!(report.other_names, ["can7", "can3"]);
+}

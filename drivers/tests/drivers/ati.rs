@@ -358,8 +358,8 @@ fn an_answer_that_comes_twice_is_not_taken_for_another_row() {
     let mut late: Vec<(i64, Frame)> = Vec::new();
     let mut readings = Vec::new();
     for ms in 1000..2500 {
-        let now = proprio_topics::Nanos::from_millis(ms);
-        let mut out = proprio_drivers::Decoded::new();
+        let now = Nanos::from_millis(ms);
+        let mut out = Decoded::new();
         while let Some(sent) = device.poll_transmit(now, &mut out) {
             device.on_sent(&sent.frame, Ok(now));
             let mut answers = proprio_drivers::Frames::new();

@@ -562,6 +562,18 @@ fn nothing_is_asked_where_a_device_that_is_heard_takes_commands() {
         assert_eq!(drive.contains(&Id::standard(id)), !is_its, "{id:x}");
     }
     assert!(!ask(row("canopen_encoder"), &sensors).contains(&Id::standard(0x520)));
+    // Also a node that tells nothing of itself but that it is there.
+    let mut beats = Traffic::new();
+    beats.on_frame(&crate::rig::frame("703#05", 0.0));
+    let asks = questions(&beats, &sensors);
+    assert!(
+        asks.iter()
+            .all(|question| question.id != Id::standard(0x503))
+    );
+    assert!(
+        asks.iter()
+            .any(|question| question.id == Id::standard(0x308))
+    );
     // A JR3 board is started where others are asked.
     let jr3 = BOARDS
         .iter()
