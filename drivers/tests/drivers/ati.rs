@@ -300,6 +300,29 @@ fn what_the_keys_tell_is_not_asked() {
     }
 }
 
+#[test]
+fn what_the_keys_do_not_tell_is_asked() {
+    let matrix: Vec<String> = (0..6).map(|row| format!("202#{row:02}")).collect();
+    let asked: [Vec<String>; 3] = [vec!["207#".into()], vec!["208#".into()], matrix];
+    for (part, asked) in asked.iter().enumerate() {
+        let keys: String = (0..3).filter(|n| *n != part).map(|n| parts()[n]).collect();
+        let mut rig = rig(&keys);
+        rig.run(50);
+        let questions = rig.sent.iter().filter(|frame| *frame != "200#");
+        assert_eq!(questions.cloned().collect::<Vec<_>>(), *asked);
+        assert!(rig.readings.len() > 10);
+    }
+}
+
+/// The parts of [`KEYS`]: counts, units, matrix.
+fn parts() -> [&'static str; 3] {
+    let (units, matrix) = (
+        KEYS.find("force_unit").unwrap(),
+        KEYS.find("matrix").unwrap(),
+    );
+    [&KEYS[..units], &KEYS[units..matrix], &KEYS[matrix..]]
+}
+
 /// A request is sent when the last one is answered, or 30 ms after it.
 #[test]
 fn a_request_without_an_answer_costs_one_reading() {
@@ -468,17 +491,12 @@ fn a_calibration_that_changes_is_refused() {
 /// What the keys state does not depend on which calibration is selected; the rest does.
 #[test]
 fn another_calibration_voids_what_is_not_configured() {
-    let parts = [
-        "counts_per_force = 100\ncounts_per_torque = 1000\n",
-        "force_unit = \"N\"\ntorque_unit = \"Nm\"\n",
-        &KEYS[KEYS.find("matrix").unwrap()..],
-    ];
     let select = [frame("3F6#05", 990.0), frame("3F6#05", 990.1)];
     let (frames, _) = session(true);
     for without in 0..4 {
         let keys: String = (0..3)
             .filter(|part| *part != without)
-            .map(|part| parts[part])
+            .map(|part| parts()[part])
             .collect();
         let mut device = session_listener(&keys);
         decode(&mut *device, &frames);

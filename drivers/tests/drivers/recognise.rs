@@ -254,6 +254,10 @@ fn started(row: &Row, turns: usize) -> Bus {
 
 /// What is heard of a board that nobody has started, when it is asked.
 fn asked(row: &Row) -> Traffic {
+    asked_bus(row).heard
+}
+
+fn asked_bus(row: &Row) -> Bus {
     let mut bus = Bus::new(row);
     let mut done: Vec<Frame> = Vec::new();
     let turns = |bus: &mut Bus| (0..500).for_each(|_| drop(bus.turn()));
@@ -262,7 +266,7 @@ fn asked(row: &Row) -> Traffic {
         let all = questions(&bus.heard, DRIVERS);
         let new: Vec<Frame> = all.into_iter().filter(|q| !done.contains(q)).collect();
         if new.is_empty() {
-            return bus.heard;
+            return bus;
         }
         for question in new {
             let answers = bus.ask(&question);
@@ -333,6 +337,42 @@ fn every_board_is_recognised_by_listening_to_it() {
                     .any(|claim| claim.matches(stream.id))
                 || own.commands.iter().any(|ids| ids.contains(&stream.id));
             assert!(known, "{row:?}: {}", stream.id);
+        }
+    }
+}
+
+/// Frames that a device does not send, on an identifier that is its own, speak against it.
+#[test]
+fn foreign_frames_speak_against_a_device() {
+    // Anything may be on the identifiers of its host, and of process data.
+    let is_free = |driver: &str, address: u32, id: Id| match (driver, id.raw()) {
+        ("canopen_drive" | "canopen_encoder", id) => id - address != 0x580 && id - address != 0x700,
+        ("robotous_rft", id) => id == 0x64,
+        ("aidin_aft200", id) => id == 0x102,
+        (driver, id) => driver.starts_with("icub") && id == 0x200 + address,
+    };
+    for row in BOARDS {
+        let (driver, _, address, _) = *row;
+        for frames in [recorded(row, 1000), asked_bus(row).frames] {
+            let bits = |frames: &[Frame]| {
+                let mut heard = Traffic::new();
+                frames.iter().for_each(|frame| heard.on_frame(frame));
+                let findings = recognise(&heard);
+                let own = findings
+                    .into_iter()
+                    .find(|f| (f.driver, f.address) == (driver, address));
+                own.map_or((0.0, Vec::new()), |found| (found.bits, found.explains))
+            };
+            let (before, explained) = bits(&frames);
+            for id in explained {
+                let foreign = frames.iter().map(|frame| match frame.id == id {
+                    true => Frame::new(id, &[0xFF; 3]).at(frame.t, frame.stamp),
+                    false => *frame,
+                });
+                let (after, _) = bits(&foreign.collect::<Vec<_>>());
+                let free = is_free(driver, address, id);
+                assert!(after < before || free, "{row:?} {id}: {before} {after}");
+            }
         }
     }
 }
