@@ -1,4 +1,5 @@
-//! Values that come in other frames than the reading they belong to, and at another rate.
+//! Values that come in other frames than the reading they belong to, and at another rate; and
+//! states that come in every frame, and are not told with each.
 
 use crate::Frame;
 use crate::pairing::within;
@@ -36,5 +37,28 @@ impl Held {
         } else {
             f64::NAN
         }
+    }
+}
+
+/// How long a state that stays the same is not told again.
+const TOLD: Nanos = Nanos::from_millis(1000);
+
+/// A state that is told when it is new, and once a second.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct OnChange<T>(Option<(T, Nanos, StampKind)>);
+
+impl<T: PartialEq + Copy> OnChange<T> {
+    /// Nothing told.
+    pub(crate) const NOTHING: Self = Self(None);
+
+    /// Whether `state`, in `frame`, is to be told.
+    pub(crate) fn is_due(&mut self, state: T, frame: &Frame) -> bool {
+        let known = self.0.is_some_and(|(told, t, stamp)| {
+            told == state && within((t, stamp), (frame.t, frame.stamp), TOLD)
+        });
+        if !known {
+            self.0 = Some((state, frame.t, frame.stamp));
+        }
+        !known
     }
 }

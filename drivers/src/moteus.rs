@@ -30,6 +30,8 @@
 //! - Mode 1, fault: DRIVE_FAULT. Faults 35 (encoder), 36 (not configured), 42 (theta invalid) and
 //!   43 (position invalid) make the position doubtful: DEVICE_FAULT. They are the `faults` of the
 //!   actuator reading, the mode is its `mode`.
+//! - A joint reading comes with each reply; the actuator's if its mode or fault is new, and it and
+//!   the temperature once a second.
 //!
 //! The driver never commands: it reads registers, and sends nothing at the end.
 //!
@@ -49,6 +51,7 @@
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes::{self, i16_le, u32_le};
 use crate::family::{Family, Link, Supervised, next_in_step};
+use crate::held::OnChange;
 use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Format, Frame, Frames, Id, Output,
@@ -403,6 +406,8 @@ struct Controller {
     /// The last mode and fault.
     mode: u32,
     fault: u32,
+    actuator: OnChange<(u32, u32)>,
+    temperature: OnChange<()>,
 }
 
 impl Controller {
@@ -421,6 +426,8 @@ impl Controller {
             next: Nanos::MIN,
             mode: 0,
             fault: 0,
+            actuator: OnChange::NOTHING,
+            temperature: OnChange::NOTHING,
         };
         let claims = [Claim::exclusive(reply)];
         Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
@@ -461,6 +468,8 @@ impl Family for Controller {
         }
         if let Some(mode) = told.mode {
             self.mode = code(mode);
+        }
+        if told.mode.is_some() && self.actuator.is_due((self.mode, self.fault), frame) {
             let reading = Reading::Actuator(Actuator {
                 duty: f64::NAN,
                 mode: self.mode,
@@ -469,7 +478,9 @@ impl Family for Controller {
             });
             out.push(Output::new(0, frame, self.quality(), reading), frame.id);
         }
-        if let Some(celsius) = told.temperature.filter(|celsius| celsius.is_finite()) {
+        if let Some(celsius) = told.temperature.filter(|celsius| celsius.is_finite())
+            && self.temperature.is_due((), frame)
+        {
             let reading = Reading::Temperature(Temperature { celsius });
             out.push(Output::new(0, frame, Quality::GOOD, reading), frame.id);
         }
@@ -501,6 +512,7 @@ impl Family for Controller {
 
     fn reset(&mut self) {
         (self.mode, self.fault) = (0, 0);
+        (self.actuator, self.temperature) = (OnChange::NOTHING, OnChange::NOTHING);
     }
 
     fn request(

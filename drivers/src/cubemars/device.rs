@@ -5,12 +5,10 @@ use super::options::{Checked, Effort, Options};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes;
 use crate::family::{Family, Link, Supervised};
-use crate::pairing::within;
+use crate::held::OnChange;
 use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
 use alloc::boxed::Box;
-use proprio_topics::{
-    Actuator, Counter, JointState, Nanos, Quality, Reading, StampKind, Temperature,
-};
+use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
 
 /// Only the watching counts: nothing is sent. A motor that was not heard of for a second and a half
 /// is silent.
@@ -25,15 +23,12 @@ const TIMING: Timing = Timing {
     send_within: Nanos::from_millis(100),
 };
 
-/// How long the state of the power stage is not told again if its error stays the same.
-const STAGE_PERIOD: Nanos = Nanos::from_millis(1000);
-
 /// The host's side of a motor.
 #[derive(Debug)]
 pub(super) struct Motor {
     keys: Checked,
-    /// The error that was told last, and when.
-    told: Option<(u8, Nanos, StampKind)>,
+    /// The error of the power stage.
+    told: OnChange<u8>,
 }
 
 impl Motor {
@@ -44,19 +39,18 @@ impl Motor {
             Layout::Servo => Claim::exclusive(keys.id),
         };
         let bringup = Bringup::new(spec, Mode::Listen, TIMING, keys.id);
-        let this = Self { keys, told: None };
+        let this = Self {
+            keys,
+            told: OnChange::NOTHING,
+        };
         Ok(Supervised::boxed([claim], bringup, NoInquiry, this))
     }
 
     /// Tells the state of the power stage if its error is new, and now and then.
     fn stage(&mut self, stage: Stage, frame: &Frame, out: &mut Decoded) {
-        let known = self.told.is_some_and(|(error, t, stamp)| {
-            error == stage.error && within((t, stamp), (frame.t, frame.stamp), STAGE_PERIOD)
-        });
-        if known {
+        if !self.told.is_due(stage.error, frame) {
             return;
         }
-        self.told = Some((stage.error, frame.t, frame.stamp));
         let actuator = Reading::Actuator(Actuator {
             duty: f64::NAN,
             mode: 0,
@@ -132,6 +126,6 @@ impl Family for Motor {
     }
 
     fn reset(&mut self) {
-        self.told = None;
+        self.told = OnChange::NOTHING;
     }
 }

@@ -138,7 +138,8 @@ fn a_controller_is_asked_as_by_the_makers_package() {
     // One reply is lost: that reading alone.
     rig.board_loses = Box::new(|n, _| n == 30);
     rig.run(100);
-    assert_eq!(rig.readings.len(), 49 * 3);
+    // State and temperature are told once.
+    assert_eq!(rig.readings.len(), 49 + 2);
     rig.board_loses = Box::new(|_, _| true);
     rig.run(300);
     assert_eq!(rig.device.state(), State::Silent);
@@ -153,6 +154,42 @@ fn a_controller_is_asked_as_by_the_makers_package() {
     rig.device.stop(rig.now);
     rig.run(30);
     assert_eq!((rig.device.state(), rig.sent.len()), (State::Stopped, sent));
+}
+
+/// A state is told when it changes, and state and temperature once a second.
+#[test]
+fn states_are_told_on_change_and_once_a_second() {
+    let mut device = listener("moteus", "", &[0]);
+    // Mode 10 for 2.5 s; then mode 1 with fault 35, and again mode 10.
+    let mut told = Vec::new();
+    for ms in 0..2520 {
+        let (mode, fault) = if (2510..2515).contains(&ms) {
+            (1, 35)
+        } else {
+            (10, 0)
+        };
+        let reply = reply(&format!("2100{mode:02X}210E1F210F{fault:02X}505050"));
+        let t = Nanos::from_millis(ms);
+        let (readings, _) = decode(&mut *device, &[reply.at(t, StampKind::Software)]);
+        for output in readings {
+            match output.reading {
+                Reading::Actuator(state) => told.push((ms, state.mode, state.faults)),
+                Reading::Temperature(warmth) => told.push((ms, 0, warmth.celsius as u32)),
+                _ => {}
+            }
+        }
+    }
+    let expected = [
+        (0, 10, 0),
+        (0, 0, 31),
+        (1001, 10, 0),
+        (1001, 0, 31),
+        (2002, 10, 0),
+        (2002, 0, 31),
+        (2510, 1, 35),
+        (2515, 10, 0),
+    ];
+    assert_eq!(told, expected);
 }
 
 #[test]
