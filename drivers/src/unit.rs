@@ -206,7 +206,11 @@ mod tests {
             ("rpm", AngularVelocity, 0.104_719_755_119_659_77),
             ("rad/s2", AngularAcceleration, 1.0),
             ("deg/s2", AngularAcceleration, 0.017_453_292_519_943_295),
-            ("rev/s2", AngularAcceleration, 6.283_185_307_179_586),
+            (
+                "rev/s2",
+                AngularAcceleration,
+                360.0 * 0.017_453_292_519_943_295,
+            ),
             ("cm", Length, 0.01),
             ("mm", Length, 1e-3),
             ("um", Length, 1e-6),

@@ -116,25 +116,21 @@ fn the_maximum_silence_can_change() {
 /// The longest time from a reading's first frame to its second, as a key states it.
 #[test]
 fn a_pair_comes_within_the_stated_time() {
-    let wrench = |x: f64| {
-        Reading::Wrench(Wrench {
-            force: [x; 3],
-            torque: [x / 10.0; 3],
-        })
-    };
-    let skin = |x: f64| {
-        Reading::Skin(Skin {
-            triangle: 0,
-            taxels: [x.round(); 12],
-        })
-    };
+    let wrench = Reading::Wrench(Wrench {
+        force: [9.0; 3],
+        torque: [0.9; 3],
+    });
+    let skin = Reading::Skin(Skin {
+        triangle: 0,
+        taxels: [9.0; 12],
+    });
     let scales = "full_scale_n = [900, 900, 900]\nfull_scale_nm = [90, 90, 90]\n";
     let dbc = crate::dbc::WRENCH;
     let stated = "pair_timeout_ms = 2.0";
-    let cases: [(&str, String, &dyn Fn(f64) -> Reading); 3] = [
-        ("icub_strain", format!("{scales}{stated}"), &wrench),
-        ("icub_skin", format!("triangles = [0, 0]\n{stated}"), &skin),
-        ("dbc", dbc.into(), &wrench),
+    let cases = [
+        ("icub_strain", format!("{scales}{stated}"), wrench),
+        ("icub_skin", format!("triangles = [0, 0]\n{stated}"), skin),
+        ("dbc", dbc.into(), wrench),
     ];
     for (driver, keys, reading) in cases {
         for (ms, us, expected) in [
@@ -146,7 +142,7 @@ fn a_pair_comes_within_the_stated_time() {
         ] {
             let keys = keys.replace(stated, &format!("pair_timeout_ms = {ms}"));
             let mut board = crate::rig::board(driver, &keys, &[]);
-            let frames = encode(&mut *board, 0, &reading(9.0), Quality::GOOD);
+            let frames = encode(&mut *board, 0, &reading, Quality::GOOD);
             let [first, second, ..] = frames[..] else {
                 panic!("{driver}: {frames:?}")
             };
