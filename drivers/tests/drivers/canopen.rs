@@ -878,6 +878,11 @@ fn a_write_that_is_refused_changes_nothing() {
     assert_eq!(reads(&[write, "585#80001A0021000108"]), all);
     assert_eq!(reads(&[write, "585#60001A0000000000"]), 0);
     assert_eq!(reads(&[write, "585#80FFFF0021000108"]), all);
+    // The number that it is, in one byte of four.
+    assert_eq!(
+        reads(&["605#2F001A0003FFFFFF", "585#60001A0000000000"]),
+        all
+    );
 }
 
 #[test]

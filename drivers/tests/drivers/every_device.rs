@@ -210,6 +210,46 @@ fn a_board_is_set_to_the_period_of_its_keys() {
     }
 }
 
+/// A steady stream has no gaps; after a silence the first reading of each output has one.
+#[test]
+fn a_gap_is_told_once() {
+    for row in BOARDS {
+        let frames = recorded(row, 1000);
+        let (before, after) = frames.split_at(frames.len() / 2);
+        let later = Nanos::from_millis(2000);
+        let after = after
+            .iter()
+            .map(|frame| frame.at(frame.t + later, frame.stamp));
+        let mut device = device(row, Mode::Listen);
+        device.set_max_silence(Nanos::from_millis(200));
+        let steady = read(&mut *device, before);
+        let resumed = read(&mut *device, &after.collect::<Vec<_>>());
+        let gaps = |readings: &[Output]| {
+            let gaps = readings
+                .iter()
+                .filter(|r| r.quality.contains(Quality::GAP_BEFORE));
+            gaps.count()
+        };
+        let mut outputs: Vec<_> = resumed.iter().map(key).collect();
+        outputs.sort_unstable();
+        outputs.dedup();
+        println!(
+            "{row:?} {} {} {}",
+            gaps(&steady),
+            gaps(&resumed),
+            outputs.len()
+        );
+    }
+}
+
+/// What a reading is of: the output, and the triangle of a skin.
+fn key(output: &Output) -> (u8, u32) {
+    match output.reading {
+        Reading::Skin(skin) => (output.output, skin.triangle),
+        _ => (output.output, 0),
+    }
+}
+
 /// The numbers of a reading.
 fn numbers(reading: &Reading) -> Vec<f64> {
     match reading {
