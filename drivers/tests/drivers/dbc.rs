@@ -137,6 +137,29 @@ fn two_frames_are_one_reading_with_the_time_of_the_first() {
     assert_eq!(readings[0].device_counter, 7);
 }
 
+/// A signal's factor and offset come first, then its unit's.
+#[test]
+fn offsets_of_signals_and_units_add_up() {
+    for (unit, celsius) in [
+        ("degC", 60.0),
+        ("K", 60.0 - 273.15),
+        ("degF", (60.0 - 32.0) / 1.8),
+    ] {
+        let keys = format!("{DRIVE}units = {{ temperature = \"{unit}\" }}\n");
+        let mut messages = messages();
+        messages[3].signals[1].offset = -40.0;
+        let mut options = options("dbc", &keys);
+        options.describe(messages);
+        let spec = spec(options.default_address().unwrap_or(1), Mode::Listen, &[0]);
+        let mut device = options.device(&spec).unwrap();
+        let (readings, _) = decode(&mut *device, &[at(0x13, &[0, 100, 0, 0, 0, 0, 0, 0], 1.0)]);
+        let Reading::Temperature(told) = readings[0].reading else {
+            panic!("{readings:?}")
+        };
+        assert!((told.celsius - celsius).abs() < 1e-9, "{unit}: {told:?}");
+    }
+}
+
 /// Lost, late, doubled and swapped halves: no reading of two different halves, and each reading
 /// that does not come is counted.
 #[test]
