@@ -210,6 +210,29 @@ fn a_board_is_set_to_the_period_of_its_keys() {
     }
 }
 
+/// A reading has the stamp of one frame, and the kind of that stamp.
+#[test]
+fn stamps_and_their_kinds_belong_together() {
+    for row in BOARDS {
+        let kinds = [
+            StampKind::Hardware,
+            StampKind::Software,
+            StampKind::Software,
+        ];
+        let frames: Vec<Frame> = (recorded(row, 1000).iter().zip(kinds.into_iter().cycle()))
+            .map(|(frame, kind)| frame.at(frame.t, kind))
+            .collect();
+        for output in read(&mut *device(row, Mode::Listen), &frames) {
+            let of = frames.iter().filter(|frame| frame.t == output.acquired);
+            let kinds: Vec<StampKind> = of.map(|frame| frame.stamp).collect();
+            assert!(
+                kinds.contains(&output.stamp),
+                "{row:?}: {output:?}, {kinds:?}"
+            );
+        }
+    }
+}
+
 /// A steady stream has no gaps; after a silence the first reading of each output has one.
 #[test]
 fn a_gap_is_told_once() {
