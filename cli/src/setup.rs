@@ -48,7 +48,11 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     let present = adapter::present(Path::new(adapter::SYS));
     let mut sources = Vec::new();
     for bus in &args.bus {
-        sources.push(parse_bus(bus)?);
+        let source = parse_bus(bus)?;
+        if sources.contains(&source) {
+            bail!("--bus {bus} is given twice");
+        }
+        sources.push(source);
     }
     if args.bus.is_empty() {
         let all = present.iter().map(|present| present.interface.clone());

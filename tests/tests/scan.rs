@@ -180,6 +180,13 @@ fn a_configuration_is_written_that_the_gateway_runs() {
     }
     let plan = text(&rig.run(&["gateway", "--config", &config, "--check"]).stdout);
     assert!(plan.contains("robot found: 2 buses, 11 channels"), "{plan}");
+    let twice = [
+        &["setup", "--out", "unused"][..],
+        &["--bus", "virtual:a"].repeat(2),
+    ]
+    .concat();
+    let said = text(&rig.command(&twice).output().expect("proprio runs").stderr);
+    assert!(said.contains("--bus virtual:a is given twice"), "{said}");
     // It is not overwritten by accident.
     let again = rig.command(&setup).output().expect("proprio runs");
     let said = text(&again.stderr);
