@@ -210,6 +210,25 @@ fn a_board_is_set_to_the_period_of_its_keys() {
     }
 }
 
+/// A device that never hears anything is silent, woken by nothing but its own time, and sleeps.
+#[test]
+fn a_device_that_is_never_heard_is_silent() {
+    for row in BOARDS {
+        let mut device = device(row, Mode::Listen);
+        let (mut now, mut out) = (Nanos::from_millis(1000), Decoded::new());
+        let mut wakes = 0;
+        while device.poll_transmit(now, &mut out).is_none() {
+            match device.next_wake() {
+                Some(wake) if wake < Nanos::from_millis(60_000) => now = wake.max(now),
+                _ => break,
+            }
+            wakes += 1;
+            assert!(wakes < 10, "{row:?} does not sleep");
+        }
+        assert_eq!(device.state(), State::Silent, "{row:?}");
+    }
+}
+
 /// A reading has the stamp of one frame, and the kind of that stamp.
 #[test]
 fn stamps_and_their_kinds_belong_together() {
