@@ -76,12 +76,14 @@ pub(crate) trait Family: Send {
     }
 }
 
-/// When the next periodic request is due, after one that was due at `due` and left at `now`: in
-/// step with it; those that were missed are left out.
+/// When the next periodic request is due, after one that was due at `due` (MIN: there was none) and
+/// left at `now`: in step with it; those that were missed are left out.
 pub(crate) fn next_in_step(due: Nanos, period: Nanos, now: Nanos) -> Nanos {
-    // At the start `due` may be far in the past.
-    let next = due.max(now - period) + period;
-    if next > now { next } else { now + period }
+    if due == Nanos::MIN {
+        return now + period;
+    }
+    let passed = (now - due).0.max(0) / period.0.max(1);
+    due + Nanos(period.0.saturating_mul(passed + 1))
 }
 
 /// The bring-up of a board, and what it has been asked.

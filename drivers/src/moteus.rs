@@ -469,7 +469,9 @@ impl Family for Controller {
         if let Some(mode) = told.mode {
             self.mode = code(mode);
         }
-        if told.mode.is_some() && self.actuator.is_due((self.mode, self.fault), frame) {
+        if (told.mode.is_some() || told.fault.is_some())
+            && self.actuator.is_due((self.mode, self.fault), frame)
+        {
             let reading = Reading::Actuator(Actuator {
                 duty: f64::NAN,
                 mode: self.mode,

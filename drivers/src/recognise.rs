@@ -268,7 +268,7 @@ pub struct Finding {
     pub driver: &'static str,
     /// The device's address, as the driver defines it.
     pub address: u32,
-    /// The bits that speak for it.
+    /// The bits that speak for it; of a driver's own [`crate::Driver::recognise`] any number.
     pub bits: f64,
     /// What it is, in words: type, firmware, serial number, as far as it is known.
     pub what: String,
@@ -442,7 +442,7 @@ impl<'t> Evidence<'t> {
         !self.refuted && !self.explains.is_empty()
     }
 
-    /// The device at `address`, if this suffices for a possible one.
+    /// The device at `address`, if it holds.
     pub(crate) fn finding(
         self,
         driver: &'static str,
@@ -462,7 +462,7 @@ impl<'t> Evidence<'t> {
             unusable: "",
             guess: false,
         };
-        (holds && finding.certainty().is_some()).then_some(finding)
+        holds.then_some(finding)
     }
 }
 

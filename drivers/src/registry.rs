@@ -34,22 +34,39 @@ macro_rules! drivers {
             $((<$module::Options as Driver>::NAME, <$module::Options as Driver>::ASKED_BY_NAME),)+
         ];
 
-        /// The devices that `seen` shows, each driver's own, those with most bits first.
-        #[must_use]
-        pub fn recognise(seen: &Traffic) -> Vec<Finding> {
+        /// What nothing in `seen` refutes, however little speaks for it; that with most bits first.
+        fn suspect(seen: &Traffic) -> Vec<Finding> {
             let mut all = Vec::new();
             $(all.extend(<$module::Options as Driver>::recognise(seen));)+
             all.sort_by(|a: &Finding, b: &Finding| b.bits.total_cmp(&a.bits));
             all
         }
 
+        /// The devices that `seen` shows, each driver's own: the surest first, of those that are
+        /// equally sure that with most bits.
+        #[must_use]
+        pub fn recognise(seen: &Traffic) -> Vec<Finding> {
+            let mut all = suspect(seen);
+            all.retain(|finding| finding.certainty().is_some());
+            all.sort_by_key(|finding| core::cmp::Reverse(finding.certainty()));
+            all
+        }
+
         /// The questions of all drivers ([`Driver::questions`]), each once; of those that are asked
         /// by name only, the drivers in `named`. None is on an identifier on which a device of
-        /// another driver takes commands, even if `seen` shows no more than that it is possible.
+        /// another driver takes commands, however little speaks for that device, unless all that
+        /// does is explained by one for which more speaks.
         #[must_use]
         pub fn questions(seen: &Traffic, named: &[&str]) -> Vec<Frame> {
             let mut all: Vec<Frame> = Vec::new();
-            let there = recognise(seen);
+            let suspects = suspect(seen);
+            let mut there: Vec<&Finding> = Vec::new();
+            for finding in &suspects {
+                let explained = |id| there.iter().any(|better| better.explains.contains(id));
+                if !finding.explains.iter().all(explained) {
+                    there.push(finding);
+                }
+            }
             let is_command = |driver: &str, question: &Frame| {
                 let mut others = there.iter().filter(|finding| finding.driver != driver);
                 others.any(|other| other.commands.iter().any(|c| c.contains(&question.id)))

@@ -10,6 +10,7 @@
 //!   touch; then it follows slowly (`REST_TIME`) while the taxel is not pressed. A taxel that
 //!   reads less than its rest by the threshold, twice in a row, was touched in its first second: it
 //!   begins anew. So does a triangle that was silent for `REST_TIME`: its rest may have drifted.
+//!   What touched it before, and touches it still, is then not seen.
 //! - **Pressed.** Two readings in a row change a taxel's state: above the threshold it becomes
 //!   pressed, below half of it, or not measured, released. So one wrong reading changes nothing.
 //! - **Threshold.** From the noise of an untouched taxel and the false alarms that are accepted

@@ -60,7 +60,9 @@ pub(super) fn sensor(seen: &Traffic, driver: &'static str, base: u8) -> Option<F
     let finding = evidence.finding(driver, base.into(), what)?;
     let is_answer = |frame: &Frame| frame.len() == 8;
     let period = first.and_then(|stream| stream.period_of(is_answer));
-    Some(finding.with_keys(Key::period_ms(period, 1, 1000)))
+    let finding = finding.with_keys(Key::period_ms(period, 1, 1000));
+    // A frame without data may be a command, too: it selects, resets, or sets the bit rate.
+    Some(finding.with_commands([id(0)..=id(0xF)]))
 }
 
 /// All bases are asked for their units; those that have answered for their serial number and

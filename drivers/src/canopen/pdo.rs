@@ -27,6 +27,14 @@ pub(crate) fn identifier(cob_id: u32) -> Id {
     }
 }
 
+/// Whether CiA 301 leaves `id` to process data.
+pub(crate) fn is_free(id: Id) -> bool {
+    match id {
+        Id::Standard(raw) => matches!(raw, 0x181..=0x580 | 0x680..=0x6DF),
+        Id::Extended(_) => true,
+    }
+}
+
 impl Pdo {
     /// TPDO `number`, from 0, of `node` as a file states it.
     pub(crate) fn of_file(objects: &Objects, node: u8, number: u8) -> Self {
@@ -79,6 +87,12 @@ impl Pdo {
     /// Whether it is sent at all.
     pub(crate) fn is_on(&self) -> bool {
         self.id.is_some_and(|id| id & TPDO_OFF == 0)
+    }
+
+    /// Its identifier, if it is sent and holds something.
+    pub(crate) fn used_id(&self) -> Option<Id> {
+        let id = self.id.filter(|_| self.is_on() && self.count > 0)?;
+        Some(identifier(id))
     }
 
     pub(crate) fn by_sync(&self) -> bool {

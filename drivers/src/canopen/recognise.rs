@@ -21,8 +21,8 @@ const IDENTITY: [(u8, &str); 4] = [
 const STATES: [u8; 4] = [0x00, 0x04, 0x05, 0x7F];
 
 /// What a node is that has not told.
-pub(crate) const NO_PROFILE: &str = "CANopen node whose profile (drive, encoder or another) was \
-                                     not heard: scan it with --active";
+pub(crate) const NO_PROFILE: &str =
+    "CANopen node whose profile (drive, encoder or another) was not heard";
 
 /// A node.
 #[derive(Debug, Clone)]

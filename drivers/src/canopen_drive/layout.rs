@@ -1,7 +1,7 @@
 //! Which bits of which TPDO are which quantity: from a drive's mapping.
 
 use super::options::Options;
-use crate::canopen::{Object, Pdo, identifier, tpdo};
+use crate::canopen::{Object, Pdo, identifier, is_free, tpdo};
 use crate::objects::Objects;
 use crate::signal::{Bits, Raw};
 use crate::{Id, SpecError};
@@ -132,7 +132,7 @@ impl Layout {
                 expected: "with a position, 0x6064 or 0x6063",
             });
         }
-        if !this.has_legal_ids() {
+        if this.wrong_id().is_some() {
             return Err(SpecError::Keys {
                 key: "pdos",
                 expected: "each with another id, from 0x181 to 0x580 or from 0x680 to 0x6DF",
@@ -148,19 +148,13 @@ impl Layout {
         }
     }
 
-    /// Whether each TPDO has an identifier of its own, and one that CiA 301 leaves to process data.
-    pub(super) fn has_legal_ids(&self) -> bool {
+    /// The identifier of a TPDO that another one has too, or that CiA 301 keeps for other things.
+    pub(super) fn wrong_id(&self) -> Option<Id> {
         let mut seen = ArrayVec::<Id, 4>::new();
-        let mut sent = self.pdos.iter().filter(|pdo| pdo.is_on());
-        sent.all(|pdo| {
-            let id = identifier(pdo.id.unwrap_or(0));
-            let free = match id {
-                Id::Standard(raw) => matches!(raw, 0x181..=0x580 | 0x680..=0x6DF),
-                Id::Extended(_) => true,
-            };
-            let is_new = !seen.contains(&id);
-            let _ = seen.try_push(id);
-            free && is_new
+        self.pdos.iter().filter_map(Pdo::used_id).find(|id| {
+            let is_wrong = !is_free(*id) || seen.contains(id);
+            let _ = seen.try_push(*id);
+            is_wrong
         })
     }
 

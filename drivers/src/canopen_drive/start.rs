@@ -2,9 +2,10 @@
 
 use super::layout::{Layout, Quantity};
 use super::options::{CurrentUnit, Options};
-use crate::canopen::{MAPPED_MOST, Object, Plan, Step, identifier, object, tpdo};
+use crate::canopen::{MAPPED_MOST, Object, Plan, Step, object, tpdo};
 use crate::objects::Objects;
 use crate::{Id, Mode, SpecError};
+use alloc::format;
 use arrayvec::ArrayVec;
 use proprio_topics::Refusal;
 
@@ -106,18 +107,16 @@ impl Start {
             Some(file) if !configured => Layout::of_file(node, file),
             _ => of_keys,
         };
-        if !stated.has_legal_ids() {
-            return Err(SpecError::Description(
-                "its file gives two TPDOs one identifier, or one that CiA 301 uses itself".into(),
-            ));
+        if let Some(id) = stated.wrong_id() {
+            return Err(SpecError::Description(format!(
+                "its file gives a TPDO the identifier {id}, which another one, or CiA 301 itself, \
+                 uses"
+            )));
         }
         let usual = |number| tpdo(node, number);
-        let ids = (0..4)
-            .zip(&stated.pdos)
-            .filter_map(|(number, pdo)| match pdo.id {
-                Some(id) if pdo.is_on() => Some(identifier(id)),
-                _ => (!configured).then(|| usual(number)),
-            });
+        let ids = (0..4).zip(&stated.pdos).filter_map(|(number, pdo)| {
+            (pdo.used_id()).or_else(|| (!configured).then(|| usual(number)))
+        });
         let ids = ids.collect();
         let file = Told::of_file(options.objects.as_ref());
         let listens = mode == Mode::Listen;
@@ -286,7 +285,8 @@ impl Plan for Start {
         if self.layout.position().is_none() {
             return Err(Refusal::NotMapped);
         }
-        if let Some(id) = self.layout.ids().find(|id| !self.ids.contains(id)) {
+        let other = self.layout.ids().find(|id| !self.ids.contains(id));
+        if let Some(id) = other.or(self.layout.wrong_id()) {
             return Err(Refusal::OtherIdentifier { id: id.raw() });
         }
         self.scales().map(|_| ()).ok_or(Refusal::NoCalibration)

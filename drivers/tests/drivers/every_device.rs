@@ -24,11 +24,12 @@ fn claims_do_not_depend_on_who_commands() {
 }
 
 /// A host that polls only when a frame has come or [`Device::next_wake`] is over, while every
-/// `lost`-th answer of the first half second is lost.
+/// `lost`-th answer of the first half second is lost. Its state at the end, and in the last second
+/// how many readings came, and how often it woke in vain.
 fn woken(row: &Row, lost: Option<usize>) -> (State, usize, usize) {
     let mut bus = Bus::new(row);
     let mut host = device(row, Mode::Supervise);
-    let (mut answered, mut readings, mut polls) = (0, 0, 0);
+    let (mut answered, mut readings, mut needless) = (0, 0, 0);
     for turn in 0..4000 {
         let mut out = Decoded::new();
         let is_due = host.next_wake().is_some_and(|wake| wake <= bus.now);
@@ -43,8 +44,9 @@ fn woken(row: &Row, lost: Option<usize>) -> (State, usize, usize) {
             host.on_frame(&frame.at(now, StampKind::Software), &mut out);
         }
         if is_due || !frames.is_empty() {
-            polls += usize::from(turn >= 3000);
+            let mut sent = false;
             while let Some(transmit) = host.poll_transmit(now, &mut out) {
+                sent = true;
                 host.on_sent(&transmit.frame, Ok(now));
                 for answer in bus.ask(&transmit.frame) {
                     answered += 1;
@@ -54,6 +56,7 @@ fn woken(row: &Row, lost: Option<usize>) -> (State, usize, usize) {
                     host.on_frame(&answer.at(now, StampKind::Software), &mut out);
                 }
             }
+            needless += usize::from(turn >= 3000 && frames.is_empty() && !sent);
             let wake = host.next_wake();
             assert!(
                 wake.is_none_or(|wake| wake > now),
@@ -62,18 +65,18 @@ fn woken(row: &Row, lost: Option<usize>) -> (State, usize, usize) {
         }
         readings += if turn >= 3000 { out.readings.len() } else { 0 };
     }
-    (host.state(), readings, polls)
+    (host.state(), readings, needless)
 }
 
 #[test]
 fn a_device_sleeps_until_it_has_something_to_do() {
     for row in BOARDS {
-        let (state, readings, polls) = woken(row, None);
+        let (state, readings, needless) = woken(row, None);
         assert_eq!(state, State::Streaming, "{row:?}");
-        // Boards that are asked are asked at most each millisecond.
+        // The slowest boards send every 50 ms, which is the maximum silence here.
         assert!(
-            readings >= 10 && polls <= 1000,
-            "{row:?}: {readings}, {polls}"
+            readings >= 10 && needless <= 20,
+            "{row:?}: {readings}, {needless}"
         );
     }
 }
@@ -272,9 +275,10 @@ fn a_gap_is_told_once() {
                 .filter(|r| r.quality.contains(Quality::GAP_BEFORE));
             gaps.count()
         };
-        let mut outputs: Vec<_> = resumed.iter().map(key).collect();
+        let mut outputs: Vec<_> = steady.iter().map(key).collect();
         outputs.sort_unstable();
         outputs.dedup();
+        assert!(!outputs.is_empty());
         let told = (gaps(&steady), gaps(&resumed));
         assert_eq!(told, (0, outputs.len()), "{row:?}");
     }
@@ -347,7 +351,7 @@ fn is_among(part: &Output, whole: &[Output], later: Nanos) -> bool {
 }
 
 /// Wherever frames are cut, and some after the cut are lost: what comes then is what would have
-/// come without it.
+/// come without it, but for a few readings.
 #[test]
 fn an_interruption_mixes_nothing() {
     for row in BOARDS {
@@ -361,7 +365,11 @@ fn an_interruption_mixes_nothing() {
                 let mut restarted = device(row, Mode::Listen);
                 read(&mut *restarted, before);
                 restarted.restart(frames[cut].t);
-                for output in &read(&mut *restarted, after) {
+                let again = read(&mut *restarted, after);
+                let end = whole.iter().filter(|o| o.acquired > frames[cut + lost].t);
+                let end = end.count();
+                assert!(again.len() + 4 >= end, "{row:?} {cut}+{lost}");
+                for output in &again {
                     assert!(
                         is_among(output, &whole, Nanos::ZERO),
                         "{row:?} {cut}+{lost}: {output:?}"
@@ -381,8 +389,7 @@ fn an_interruption_mixes_nothing() {
                         "{row:?} {cut}+{lost}: {output:?}"
                     );
                 }
-                let end = whole.iter().filter(|o| o.acquired > frames[cut + lost].t);
-                assert!(after.len() + 30 >= end.count(), "{row:?} {cut}+{lost}");
+                assert!(after.len() + 4 >= end, "{row:?} {cut}+{lost}");
             }
         }
     }

@@ -190,6 +190,12 @@ fn states_are_told_on_change_and_once_a_second() {
         (2515, 10, 0),
     ];
     assert_eq!(told, expected);
+    // A fault alone, in the answer to another program's question.
+    let (readings, _) = decode(&mut *device, &[reply("210F2A50")]);
+    let Reading::Actuator(state) = readings[0].reading else {
+        panic!("{readings:?}")
+    };
+    assert_eq!((state.mode, state.faults), (10, 42));
 }
 
 #[test]

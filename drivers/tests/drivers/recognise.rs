@@ -614,6 +614,36 @@ fn nothing_is_asked_where_a_device_that_is_heard_takes_commands() {
         asks.iter()
             .any(|question| question.id == Id::standard(0x308))
     );
+    // Also among many others, where a heartbeat alone speaks for hardly anything; but not if what
+    // looks like one is explained by something for which more speaks.
+    for id in 0x80..0x180_u16 {
+        beats.on_frame(&Frame::new(Id::standard(id), &[0; 8]));
+    }
+    let is_node = |finding: &Finding| finding.driver.starts_with("canopen");
+    assert!(!recognise(&beats).iter().any(is_node));
+    let asks = questions(&beats, &sensors);
+    assert!(
+        asks.iter()
+            .all(|question| question.id != Id::standard(0x503))
+    );
+    let mut master = Traffic::new();
+    for (text, ms) in [
+        ("701#05", 0.0),
+        ("601#4000100000000000", 1.0),
+        ("581#4300100092010200", 1.5),
+    ] {
+        master.on_frame(&crate::rig::frame(text, ms));
+    }
+    let asks = questions(&master, &[]);
+    assert!(
+        asks.iter()
+            .any(|question| question.id == Id::standard(0x602))
+    );
+    // A board of ATI takes commands where one of JR3 is asked.
+    let board = ("ati_netcanoem", "", 0x49, &[][..]);
+    let asks = questions(&overheard(&board), &["jr3_can"]);
+    let is_its = |question: &Frame| (0x490..=0x49F).contains(&question.id.raw());
+    assert!(!asks.iter().any(is_its));
     // A JR3 board is started where others are asked.
     let jr3 = BOARDS
         .iter()
