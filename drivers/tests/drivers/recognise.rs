@@ -377,6 +377,44 @@ fn foreign_frames_speak_against_a_device() {
     }
 }
 
+/// So do contents that a device does not send: a value of a byte beyond the last, or a number of a
+/// size that nothing measures.
+#[test]
+fn foreign_contents_speak_against_a_device() {
+    let far = 1e20_f32.to_le_bytes();
+    for (driver, id, at, good, bad) in [
+        ("odrive", Id::standard(0x001), 4, &[14][..], &[15][..]),
+        ("odrive", Id::standard(0x009), 0, &[0; 4], &far),
+        ("odrive", Id::standard(0x009), 4, &[0; 4], &far),
+        ("cubemars", Id::extended(0x2968), 7, &[7], &[8]),
+        ("canopen_drive", Id::standard(0x583), 0, &[0x60], &[0x61]),
+        ("jr3_can", Id::standard(0x101), 0, &[1], &[2]),
+        ("robotous_rft", Id::standard(0x001), 0, &[0x0B], &[0x77]),
+    ] {
+        let row = BOARDS
+            .iter()
+            .find(|row| row.0 == driver && recorded(row, 1000).iter().any(|frame| frame.id == id));
+        let row = row.unwrap_or_else(|| panic!("{driver} sends no {id}"));
+        let bits = |part: &[u8]| {
+            let mut heard = Traffic::new();
+            for frame in recorded(row, 1000) {
+                let mut data = frame.data().to_vec();
+                if frame.id == id && data.len() >= at + part.len() {
+                    data[at..at + part.len()].copy_from_slice(part);
+                }
+                heard.on_frame(&Frame::new(frame.id, &data).at(frame.t, frame.stamp));
+            }
+            let findings = recognise(&heard);
+            let own = findings
+                .into_iter()
+                .find(|f| (f.driver, f.address) == (driver, row.2));
+            own.map_or(0.0, |found| found.bits)
+        };
+        let (of_good, of_bad) = (bits(good), bits(bad));
+        assert!(of_bad < of_good, "{row:?} {id}: {of_good}, {of_bad}");
+    }
+}
+
 /// Families that answer no question, and send nothing before they are started.
 const MUTE: [&str; 1] = ["aidin_aft200"];
 
