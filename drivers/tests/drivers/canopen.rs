@@ -920,6 +920,13 @@ fn scales_that_change_are_refused() {
         assert_eq!(count(&faults, Counter::Value), 1);
         assert_eq!(device.state(), State::Refused(Refusal::Changed), "{answer}");
     }
+    // A key that states a scale counts before what is told.
+    let answer = [frame("585#4376600001000000", 200.0)];
+    let mut device = at("canopen_drive", "rated_torque = 0.25", 5, Mode::Listen);
+    let mine = claimed(&*device, &frames);
+    decode(&mut *device, &mine);
+    let (_, faults) = decode(&mut *device, &answer);
+    assert_eq!((faults.len(), device.state()), (0, State::Streaming));
     // Without the master's questions the mapping is not known.
     let mut device = at("canopen_drive", "", 5, Mode::Listen);
     let (readings, _) = decode(&mut *device, &[frame("185#0ADE4291C54500", 1.0)]);

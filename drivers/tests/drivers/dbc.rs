@@ -137,6 +137,14 @@ fn two_frames_are_one_reading_with_the_time_of_the_first() {
     assert_eq!(readings[0].device_counter, 7);
 }
 
+#[test]
+fn a_simulated_device_sends_at_the_stated_period() {
+    for ms in [7, 20] {
+        let board = board("dbc", &format!("period_ms = {ms}\n{WRENCH}"), &[]);
+        assert_eq!(board.period(), Some(Nanos::from_millis(ms)));
+    }
+}
+
 /// A signal's factor and offset come first, then its unit's.
 #[test]
 fn offsets_of_signals_and_units_add_up() {
