@@ -686,6 +686,16 @@ fn a_log_at_once_keeps_its_stamps_and_its_lack_of_them() {
         (empty.recv(now() + PATIENCE), empty.state()),
         (Received::Ended, LinkState::Ended)
     );
+    // The log of the gateway says so; also of a bus that is listened to.
+    let note = ListenOnly(Box::new(link)).note().unwrap();
+    assert!(
+        note.starts_with("1 lines of the log were skipped; the first is "),
+        "{note}"
+    );
+    let link = Replay::open(&bus.write(b"(1.0) can0 123#11\n"), Pace::Fast, None, &[]);
+    let mut link = ListenOnly(Box::new(link.unwrap()));
+    assert!(matches!(link.recv(now() + PATIENCE), Received::Frame(_)));
+    assert_eq!(link.note(), None);
 }
 
 #[test]
