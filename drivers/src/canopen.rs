@@ -23,7 +23,7 @@ mod recognise;
 mod script;
 
 pub(crate) use node::Node;
-pub(crate) use pdo::{Pdo, identifier, is_free};
+pub(crate) use pdo::{Pdo, is_free};
 pub(crate) use protocol::{
     MAPPED_MOST, NMT, NO_RTR, Object, SYNC, TIMING, TPDO_OFF, nmt, object, sdo_from, sdo_to, tpdo,
 };

@@ -47,7 +47,7 @@ use crate::bringup::Bringup;
 use crate::bytes;
 use crate::canopen::{
     self, Cycle, NMT, NO_RTR, Node, NodeState, Object, Pdo, Plan, Recognised, SYNC, Script, Step,
-    TPDO_OFF, identifier, is_free, nmt, node_of, object, tpdo,
+    TPDO_OFF, is_free, nmt, node_of, object, tpdo,
 };
 use crate::family::{Family, Link, Supervised};
 use crate::objects::Objects;
@@ -152,22 +152,21 @@ impl Place {
     /// As the driver maps it, or as the file says of a node that it does not map.
     fn new(node: u8, options: &Options) -> Result<Self, SpecError> {
         let of_file = |file: &Objects| {
-            let pdos = (0..4).map(|number| Pdo::of_file(file, node, number));
-            pdos.filter(|pdo| pdo.used_id().is_some_and(is_free))
-                .find_map(|pdo| {
-                    let found =
-                        |(object, _, bits): &(Object, u64, u64)| *object == POSITION && *bits == 32;
-                    let (_, first, length) = pdo.objects().find(found)?;
-                    Some(Self {
-                        id: identifier(pdo.id?),
-                        bits: Bits::new(first, length, false)?,
-                        sync: if pdo.by_sync() {
-                            pdo.transmission.max(1)
-                        } else {
-                            0
-                        },
-                    })
+            let mut pdos = (0..4).map(|number| Pdo::of_file(file, node, number));
+            pdos.find_map(|pdo| {
+                let found =
+                    |(object, _, bits): &(Object, u64, u64)| *object == POSITION && *bits == 32;
+                let (_, first, length) = pdo.objects().find(found)?;
+                Some(Self {
+                    id: pdo.used_id().filter(|id| is_free(*id))?,
+                    bits: Bits::new(first, length, false)?,
+                    sync: if pdo.by_sync() {
+                        pdo.transmission.max(1)
+                    } else {
+                        0
+                    },
                 })
+            })
         };
         let no_place = SpecError::Keys {
             key: "eds",

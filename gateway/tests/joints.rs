@@ -439,11 +439,8 @@ fn flags_of_a_motor_are_those_of_its_joints() {
         assert_eq!(of(2, Quality::DRIVE_FAULT, 7.0), [Quality::DRIVE_FAULT; 3]);
         of(0, Quality::DRIVE_FAULT, 8.0);
         of(1, good, 9.0);
-        let (drive, moved) = (Quality::DRIVE_FAULT, [true, true, false]);
-        assert_eq!(
-            of(2, good, 10.0),
-            moved.map(|m| if m { drive } else { good })
-        );
+        let drive = Quality::DRIVE_FAULT;
+        assert_eq!(of(2, good, 10.0), [drive, drive, good]);
         // A gap before a reading that was overtaken is still a gap before the sample.
         of(0, good, 40.0);
         of(0, good, 41.0);

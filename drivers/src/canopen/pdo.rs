@@ -18,7 +18,7 @@ pub(crate) struct Pdo {
 }
 
 /// The identifier in a COB-ID.
-pub(crate) fn identifier(cob_id: u32) -> Id {
+fn identifier(cob_id: u32) -> Id {
     const EXTENDED: u32 = 1 << 29;
     #[allow(clippy::cast_possible_truncation)] // 11 bits
     match cob_id & EXTENDED {

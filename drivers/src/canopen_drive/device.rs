@@ -6,7 +6,7 @@ use super::start::{Scales, Start};
 use crate::bringup::Bringup;
 use crate::bytes;
 use crate::canopen::{
-    self, Cycle, NMT, NodeState, Plan, SYNC, Script, identifier, nmt, node_of, sdo_from, tpdo,
+    self, Cycle, NMT, NodeState, Plan, SYNC, Script, nmt, node_of, sdo_from, tpdo,
 };
 use crate::family::{Family, Link, Supervised};
 use crate::{Claim, Decoded, Device, Frame, Id, Output, Spec, SpecError};
@@ -43,14 +43,11 @@ impl Table {
     fn new(layout: &Layout, scales: Scales) -> Option<(Self, u8)> {
         let position = layout.position()?;
         let mut used = ArrayVec::new();
-        for (at, pdo) in layout
-            .pdos
-            .iter()
-            .enumerate()
-            .filter(|(_, pdo)| pdo.is_on())
-        {
+        for (at, pdo) in layout.pdos.iter().enumerate() {
+            let Some(id) = pdo.used_id() else {
+                continue;
+            };
             let (fields, bytes) = fields(pdo);
-            let id = identifier(pdo.id.unwrap_or(0));
             let bit = 1 << at;
             let _ = used.try_push(Used {
                 id,

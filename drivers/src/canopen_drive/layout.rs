@@ -1,7 +1,7 @@
 //! Which bits of which TPDO are which quantity: from a drive's mapping.
 
 use super::options::Options;
-use crate::canopen::{Object, Pdo, identifier, is_free, tpdo};
+use crate::canopen::{Object, Pdo, is_free, tpdo};
 use crate::objects::Objects;
 use crate::signal::{Bits, Raw};
 use crate::{Id, SpecError};
@@ -172,9 +172,8 @@ impl Layout {
 
     /// The identifiers of the TPDOs that have something of use.
     pub(super) fn ids(&self) -> impl Iterator<Item = Id> + '_ {
-        let used = |pdo: &&Pdo| pdo.is_on() && !fields(pdo).0.is_empty();
-        let used = self.pdos.iter().filter(used);
-        used.map(|pdo| identifier(pdo.id.unwrap_or(0)))
+        let of_use = self.pdos.iter().filter(|pdo| !fields(pdo).0.is_empty());
+        of_use.filter_map(Pdo::used_id)
     }
 
     /// The TPDOs that make one reading with the position, one bit each, if a SYNC causes them.

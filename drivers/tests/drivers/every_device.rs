@@ -2,9 +2,9 @@
 //! commands it, it sleeps until it has something to do, its start gets over lost answers, and after
 //! an interruption it mixes nothing old with anything new.
 
-use crate::recognise::{BOARDS, Bus, Row, recorded};
-use crate::rig::{count, decode, encode, listener, options, spec};
-use proprio_drivers::{Decoded, Device, Frame, Frames, Id, Mode, Options, Output, State};
+use crate::recognise::{BOARDS, Bus, Row, readings, recorded};
+use crate::rig::{Rig, board, count, decode, encode, listener, options, spec};
+use proprio_drivers::{Decoded, Device, Frame, Id, Mode, Options, Output, State};
 use proprio_topics::{Counter, Nanos, Quality, Reading, Skin, StampKind, Wrench};
 
 fn device(row: &Row, mode: Mode) -> Box<dyn Device> {
@@ -144,7 +144,7 @@ fn a_pair_comes_within_the_stated_time() {
             ("1000.0", 999_000, 1),
         ] {
             let keys = keys.replace(stated, &format!("pair_timeout_ms = {ms}"));
-            let mut board = crate::rig::board(driver, &keys, &[]);
+            let mut board = board(driver, &keys, &[]);
             let frames = encode(&mut *board, 0, &reading, Quality::GOOD);
             let [first, second, ..] = frames[..] else {
                 panic!("{driver}: {frames:?}")
@@ -184,7 +184,7 @@ const NOT_SET: [&str; 8] = [
 /// A board sends at the period of the keys, once the host has set it.
 #[test]
 fn a_board_is_set_to_the_period_of_its_keys() {
-    for (driver, keys, address, outputs) in BOARDS {
+    for (driver, keys, _, outputs) in BOARDS {
         let table: toml::Table = "period_ms = 8".parse().expect("TOML");
         let has_key = Options::deserialize(driver, table).is_ok();
         if !has_key || NOT_SET.contains(driver) {
@@ -193,22 +193,11 @@ fn a_board_is_set_to_the_period_of_its_keys() {
         for ms in [20, 40] {
             let usual = keys.replace("period_ms = 20", "");
             let keys = format!("{usual}\nperiod_ms = {ms}");
-            let spec = spec(*address, Mode::Supervise, outputs);
-            let mut board = options(driver, &usual).board(&spec).expect("legal keys");
-            let mut host = options(driver, &keys).device(&spec).expect("legal keys");
-            let mut out = Decoded::new();
-            for turn in 0..500 {
-                let now = Nanos::from_millis(1000 + turn);
-                while let Some(transmit) = host.poll_transmit(now, &mut out) {
-                    host.on_sent(&transmit.frame, Ok(now));
-                    let mut answers = Frames::new();
-                    board.on_frame(&transmit.frame, &mut answers);
-                    for answer in answers {
-                        host.on_frame(&answer.at(now, StampKind::Software), &mut out);
-                    }
-                }
-            }
-            assert_eq!(board.period(), Some(Nanos::from_millis(ms)), "{driver}");
+            let reading = readings(driver, outputs, Nanos::ZERO)[0];
+            let mut rig = Rig::with_board(driver, &keys, &usual, outputs, reading);
+            rig.run(500);
+            let set = rig.board.period();
+            assert_eq!(set, Some(Nanos::from_millis(ms)), "{driver}");
         }
     }
 }

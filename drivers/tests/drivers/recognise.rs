@@ -84,7 +84,7 @@ fn no_driver_is_left_out() {
 }
 
 /// What a board measures at `t`, moving.
-fn readings(driver: &str, outputs: &[u8], t: Nanos) -> Vec<(u8, Reading)> {
+pub(crate) fn readings(driver: &str, outputs: &[u8], t: Nanos) -> Vec<(u8, Reading)> {
     let x = (t.seconds() * 7.0).sin();
     let wrench = Wrench {
         force: [12.0 + x, -30.0, 5.0 * x],
@@ -143,13 +143,13 @@ pub(crate) type Row = (&'static str, &'static str, u32, &'static [u8]);
 
 /// A board on a bus, with all that is heard of it.
 pub(crate) struct Bus {
-    pub(crate) board: Box<dyn Board>,
+    board: Box<dyn Board>,
     driver: &'static str,
     outputs: &'static [u8],
     pub(crate) now: Nanos,
     due: Option<Nanos>,
-    pub(crate) heard: Traffic,
-    pub(crate) frames: Vec<Frame>,
+    heard: Traffic,
+    frames: Vec<Frame>,
 }
 
 impl Bus {
@@ -167,7 +167,7 @@ impl Bus {
         }
     }
 
-    pub(crate) fn hear(&mut self, frames: &[Frame]) {
+    fn hear(&mut self, frames: &[Frame]) {
         for frame in frames {
             // A frame takes about 0.1 ms.
             self.now += Nanos::from_micros(100);
@@ -341,6 +341,14 @@ fn every_board_is_recognised_by_listening_to_it() {
     }
 }
 
+/// The board of `row`, if `frames` show it.
+fn found_in(frames: &[Frame], row: &Row) -> Option<Finding> {
+    let mut heard = Traffic::new();
+    frames.iter().for_each(|frame| heard.on_frame(frame));
+    let mut findings = recognise(&heard).into_iter();
+    findings.find(|found| (found.driver, found.address) == (row.0, row.2))
+}
+
 /// Frames that a device does not send, on an identifier that is its own, speak against it.
 #[test]
 fn foreign_frames_speak_against_a_device() {
@@ -354,22 +362,21 @@ fn foreign_frames_speak_against_a_device() {
     for row in BOARDS {
         let (driver, _, address, _) = *row;
         for frames in [recorded(row, 1000), asked_bus(row).frames] {
-            let bits = |frames: &[Frame]| {
-                let mut heard = Traffic::new();
-                frames.iter().for_each(|frame| heard.on_frame(frame));
-                let findings = recognise(&heard);
-                let own = findings
-                    .into_iter()
-                    .find(|f| (f.driver, f.address) == (driver, address));
-                own.map_or((0.0, Vec::new()), |found| (found.bits, found.explains))
+            let Some(Finding {
+                bits: before,
+                explains,
+                ..
+            }) = found_in(&frames, row)
+            else {
+                continue;
             };
-            let (before, explained) = bits(&frames);
-            for id in explained {
+            for id in explains {
                 let foreign = frames.iter().map(|frame| match frame.id == id {
                     true => Frame::new(id, &[0xFF; 3]).at(frame.t, frame.stamp),
                     false => *frame,
                 });
-                let (after, _) = bits(&foreign.collect::<Vec<_>>());
+                let foreign: Vec<Frame> = foreign.collect();
+                let after = found_in(&foreign, row).map_or(0.0, |found| found.bits);
                 let free = is_free(driver, address, id);
                 assert!(after < before || free, "{row:?} {id}: {before} {after}");
             }
@@ -395,20 +402,17 @@ fn foreign_contents_speak_against_a_device() {
             .iter()
             .find(|row| row.0 == driver && recorded(row, 1000).iter().any(|frame| frame.id == id));
         let row = row.unwrap_or_else(|| panic!("{driver} sends no {id}"));
+        let frames = recorded(row, 1000);
         let bits = |part: &[u8]| {
-            let mut heard = Traffic::new();
-            for frame in recorded(row, 1000) {
+            let with_part = frames.iter().map(|frame| {
                 let mut data = frame.data().to_vec();
                 if frame.id == id && data.len() >= at + part.len() {
                     data[at..at + part.len()].copy_from_slice(part);
                 }
-                heard.on_frame(&Frame::new(frame.id, &data).at(frame.t, frame.stamp));
-            }
-            let findings = recognise(&heard);
-            let own = findings
-                .into_iter()
-                .find(|f| (f.driver, f.address) == (driver, row.2));
-            own.map_or(0.0, |found| found.bits)
+                Frame::new(frame.id, &data).at(frame.t, frame.stamp)
+            });
+            let found = found_in(&with_part.collect::<Vec<_>>(), row);
+            found.map_or(0.0, |found| found.bits)
         };
         let (of_good, of_bad) = (bits(good), bits(bad));
         assert!(of_bad < of_good, "{row:?} {id}: {of_good}, {of_bad}");
