@@ -2,6 +2,7 @@
 //! start-up against the boards, cycles of SYNC, and what nodes say of themselves.
 
 use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, spec};
+use proprio_drivers::objects::{Entry, Objects};
 use proprio_drivers::{Board, Decoded, Device, Frame, Frames, Mode, Output, SpecError, State};
 use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Refusal, StampKind};
 use proptest::prelude::*;
@@ -834,6 +835,67 @@ fn the_status_word_is_told_and_judged() {
             "{word}"
         );
         assert_eq!(count(&faults, Counter::DriveFault), u32::from(fault));
+    }
+}
+
+/// What a drive that is asked refuses to tell, its DCF file states; a default of an EDS file does
+/// not count, as it is of some motor.
+#[test]
+fn scales_that_a_drive_does_not_tell_are_those_of_its_file() {
+    let keys = "pdos = [{ number = 1, objects = [0x6064, 0x6077, 0x6078] }]";
+    for own in [true, false] {
+        let entry = |number| Entry {
+            number,
+            plus_node: false,
+            own,
+        };
+        let stated = [
+            ((0x608F, 1), entry(8192)),
+            ((0x608F, 2), entry(2)),
+            ((0x6076, 0), entry(500)),
+            ((0x6075, 0), entry(4000)),
+        ];
+        let mut options = options("canopen_drive", keys);
+        options.describe_objects(Objects {
+            entries: stated.into_iter().collect(),
+            ..Objects::default()
+        });
+        let spec = spec(5, Mode::Supervise, &[0]);
+        let mut device = options.device(&spec).unwrap();
+        let mut asked = Vec::new();
+        for ms in 1000..1200 {
+            let (now, mut out) = (Nanos::from_millis(ms), Decoded::new());
+            while let Some(transmit) = device.poll_transmit(now, &mut out) {
+                device.on_sent(&transmit.frame, Ok(now));
+                let question = transmit.frame.to_string();
+                let Some(object) = question.strip_prefix("605#40") else {
+                    continue;
+                };
+                asked.push(object[..6].to_owned());
+                let answer = match &object[..6] {
+                    "001000" => "585#4300100092010200".to_owned(),
+                    object => format!("585#80{object}00000206"),
+                };
+                let answer = frame(&answer, 0.0).at(now, StampKind::Software);
+                device.on_frame(&answer, &mut out);
+            }
+        }
+        let (readings, _) = decode(&mut *device, &[frame("185#00040000F401E803", 1200.0)]);
+        if !own {
+            let object = 0x608F;
+            let refusal = Refusal::Rejected { object };
+            assert_eq!(device.state(), State::Refused(refusal));
+            assert!(readings.is_empty());
+            continue;
+        }
+        // A quarter of the 4096 counts of a turn, half of 0.5 Nm, and all of 4 A.
+        let told = joint(&readings[0].reading);
+        assert!(
+            near(told.position, TAU / 4.0) && near(told.torque, 0.25),
+            "{told:?}"
+        );
+        assert!(near(told.current, 4.0), "{told:?}");
+        assert_eq!(asked, ["001000", "8F6001", "8F6002", "766000", "756000"]);
     }
 }
 
