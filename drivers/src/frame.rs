@@ -230,6 +230,9 @@ mod tests {
             Frame::remote(Id::extended(0x123), 4).to_string(),
             "00000123#R4"
         );
+        let empty = Frame::remote(Id::standard(0x705), 0);
+        assert_eq!(empty.to_string(), "705#R");
+        assert_eq!(std::format!("{:?} {empty:?}", empty.id), "705 (0) 705#R");
         let fd = Format::Fd {
             bit_rate_switch: true,
             error_state: false,

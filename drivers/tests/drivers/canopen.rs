@@ -327,7 +327,7 @@ fn a_late_answer_does_not_get_the_stamp_of_a_later_sync() {
             &[
                 (10.0, 0),
                 (20.0, 0),
-                (20.1, 1),
+                (20.0, 1),
                 (20.5, 2),
                 (30.0, 0),
                 (30.5, 3),

@@ -5,7 +5,7 @@
 use crate::recognise::{BOARDS, Bus, Row, readings, recorded};
 use crate::rig::{Rig, board, count, decode, encode, listener, options, spec};
 use proprio_drivers::{Decoded, Device, Frame, Id, Mode, Options, Output, State};
-use proprio_topics::{Counter, Nanos, Quality, Reading, Skin, StampKind, Wrench};
+use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, Skin, StampKind, Wrench};
 
 fn device(row: &Row, mode: Mode) -> Box<dyn Device> {
     let (driver, keys, address, outputs) = *row;
@@ -221,6 +221,119 @@ fn a_device_that_is_never_heard_is_silent() {
     }
 }
 
+/// How long a listening device waits for a board before it calls it silent.
+fn waits_for(keys: &str) -> Nanos {
+    let mut device = listener("icub_strain", keys, &[]);
+    let (start, mut out) = (Nanos::from_millis(1000), Decoded::new());
+    let mut now = start;
+    while device.state() != State::Silent {
+        assert_eq!(device.poll_transmit(now, &mut out), None);
+        now = device.next_wake().map_or(now, |wake| wake.max(now));
+    }
+    now - start
+}
+
+/// A board may be switched on together with the host, and sends nothing in its bootloader.
+#[test]
+fn a_listening_device_waits_for_the_bootloader_too() {
+    let longer = waits_for("power_on_silence_ms = 6000") - waits_for("power_on_silence_ms = 0");
+    assert_eq!(longer, Nanos::from_millis(6000));
+}
+
+/// A host that polls at the very instants that the device asks for, heard or not, is never asked
+/// for an instant that is over.
+#[test]
+fn a_device_does_what_it_has_to_when_it_says() {
+    let more: [Row; 2] = [
+        ("canopen_sync", "", 0, &[]),
+        ("icub_strain", "power_on_silence_ms = 100", 13, &[]),
+    ];
+    for row in BOARDS.iter().chain(&more) {
+        for (mode, frames) in [
+            (Mode::Listen, 0),
+            (Mode::Listen, 50),
+            (Mode::Supervise, 0),
+            (Mode::Supervise, 50),
+        ] {
+            let mut device = device(row, mode);
+            let (mut now, mut out) = (Nanos::from_millis(1000), Decoded::new());
+            for frame in recorded(row, 100).iter().take(frames) {
+                now = frame.t;
+                device.poll_transmit(now, &mut out);
+                device.on_frame(frame, &mut out);
+            }
+            for _ in 0..100 {
+                while let Some(transmit) = device.poll_transmit(now, &mut out) {
+                    device.on_sent(&transmit.frame, Ok(now));
+                }
+                let Some(wake) = device.next_wake() else {
+                    break;
+                };
+                assert!(wake > now, "{row:?} {mode:?} {frames}: {wake:?} at {now:?}");
+                now = wake;
+            }
+        }
+    }
+}
+
+/// A board that this host has not begun to start is not stopped: it may serve another program.
+#[test]
+fn a_board_that_was_not_started_is_not_stopped() {
+    for row in BOARDS {
+        let mut device = device(row, Mode::Supervise);
+        let (now, mut out) = (Nanos::from_millis(1000), Decoded::new());
+        device.stop(now);
+        assert_eq!(device.poll_transmit(now, &mut out), None, "{row:?}");
+        let end = (device.state(), device.next_wake());
+        assert_eq!(end, (State::Stopped, None), "{row:?}");
+    }
+}
+
+/// The names of its channels differ.
+#[test]
+fn each_output_has_its_own_name() {
+    for row in BOARDS {
+        let (driver, keys, ..) = *row;
+        let outputs = options(driver, keys).outputs();
+        let named = outputs.iter().filter(|output| output.kind != Kind::Joint);
+        let mut names: Vec<_> = named
+            .map(|output| (output.number, &output.suffix))
+            .collect();
+        let all = names.len();
+        names.sort_unstable();
+        names.dedup();
+        assert_eq!(names.len(), all, "{row:?}");
+        // The names of joints are their own.
+        let joints = outputs.iter().any(|output| output.kind == Kind::Joint);
+        let nameless = names.iter().any(|(_, suffix)| suffix.is_empty());
+        assert!(!(joints && nameless), "{row:?}: {outputs:?}");
+    }
+}
+
+/// Only force/torque sensors have full scales.
+#[test]
+fn what_is_no_wrench_has_no_full_scale() {
+    for row in BOARDS {
+        let outputs = options(row.0, row.1).outputs();
+        if outputs.iter().all(|output| output.kind != Kind::Wrench) {
+            assert_eq!(device(row, Mode::Listen).full_scale(), None, "{row:?}");
+        }
+    }
+}
+
+/// Only drivers with a key for it have a file to read.
+#[test]
+fn no_file_is_read_that_the_keys_do_not_name() {
+    for row in BOARDS {
+        let options = options(row.0, row.1);
+        assert_eq!(
+            (options.description(), options.eds()),
+            (None, None),
+            "{row:?}"
+        );
+    }
+}
+
 /// A reading has the stamp of one frame, and the kind of that stamp.
 #[test]
 fn stamps_and_their_kinds_belong_together() {
@@ -244,32 +357,39 @@ fn stamps_and_their_kinds_belong_together() {
     }
 }
 
-/// A steady stream has no gaps; after a silence the first reading of each output has one.
+/// A steady stream has no gaps; after a silence the first reading of each output has one, also
+/// where the silence was in the midst of a reading.
 #[test]
 fn a_gap_is_told_once() {
+    let gaps = |readings: &[Output]| {
+        let gaps = readings
+            .iter()
+            .filter(|r| r.quality.contains(Quality::GAP_BEFORE));
+        gaps.count()
+    };
     for row in BOARDS {
         let frames = recorded(row, 1000);
-        let (before, after) = frames.split_at(frames.len() / 2);
-        let later = Nanos::from_millis(2000);
-        let after = after
-            .iter()
-            .map(|frame| frame.at(frame.t + later, frame.stamp));
-        let mut device = device(row, Mode::Listen);
-        device.set_max_silence(Nanos::from_millis(200));
-        let steady = read(&mut *device, before);
-        let resumed = read(&mut *device, &after.collect::<Vec<_>>());
-        let gaps = |readings: &[Output]| {
-            let gaps = readings
+        for cut in frames.len() / 2..frames.len() / 2 + 3 {
+            let (before, after) = frames.split_at(cut);
+            let later = Nanos::from_millis(2000);
+            let after = after
                 .iter()
-                .filter(|r| r.quality.contains(Quality::GAP_BEFORE));
-            gaps.count()
-        };
-        let mut outputs: Vec<_> = steady.iter().map(key).collect();
-        outputs.sort_unstable();
-        outputs.dedup();
-        assert!(!outputs.is_empty());
-        let told = (gaps(&steady), gaps(&resumed));
-        assert_eq!(told, (0, outputs.len()), "{row:?}");
+                .map(|frame| frame.at(frame.t + later, frame.stamp));
+            let mut device = device(row, Mode::Listen);
+            device.set_max_silence(Nanos::from_millis(200));
+            let steady = read(&mut *device, before);
+            let resumed = read(&mut *device, &after.collect::<Vec<_>>());
+            let mut outputs: Vec<_> = steady.iter().map(key).collect();
+            outputs.sort_unstable();
+            outputs.dedup();
+            assert!(!outputs.is_empty());
+            let told = (gaps(&steady), gaps(&resumed));
+            assert_eq!(told, (0, outputs.len()), "{row:?} {cut}");
+            assert!(
+                resumed[0].quality.contains(Quality::GAP_BEFORE),
+                "{row:?} {cut}"
+            );
+        }
     }
 }
 

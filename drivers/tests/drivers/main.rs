@@ -6,6 +6,8 @@ mod any_frame;
 mod ati;
 mod bringup;
 mod canopen;
+mod canopen_exchange;
+mod canopen_file;
 mod command;
 mod cubemars;
 mod dbc;
