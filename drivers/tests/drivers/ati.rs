@@ -529,6 +529,184 @@ fn an_answer_with_another_number_is_counted() {
     assert_eq!(next.unwrap().frame.to_string(), "207#");
 }
 
+/// A device that asks, without a sensor: every answer is given by hand.
+fn asking(keys: &str) -> Box<dyn Device> {
+    options("ati_netcanoem", keys)
+        .device(&spec(0x20, Mode::Supervise, &[]))
+        .unwrap()
+}
+
+fn at(ms: i64) -> Nanos {
+    Nanos::from_millis(ms)
+}
+
+fn poll(device: &mut dyn Device, t: Nanos) -> Option<Frame> {
+    let transmit = device.poll_transmit(t, &mut Decoded::new());
+    transmit.map(|transmit| transmit.frame)
+}
+
+/// The device sends `question` at `t`, and is told that it left then, or that it did not.
+fn ask(device: &mut dyn Device, question: &str, t: Nanos, outcome: Result<Nanos, NotSent>) {
+    let next = poll(device, t).expect("a question");
+    assert_eq!(next.to_string(), question);
+    device.on_sent(&next, outcome);
+}
+
+fn faults_of(device: &mut dyn Device, text: &str, ms: f64) -> Vec<Counter> {
+    let (_, faults) = decode(device, &[frame(text, ms)]);
+    faults.iter().map(|fault| fault.counter).collect()
+}
+
+const COUNTS: &str = "207#0000006400000064";
+const UNITS: &str = "208#0203";
+
+/// A question is repeated 20 ms after it was sent. Then two answers may come: nothing else is asked
+/// before both are there or can not come any more.
+#[test]
+fn a_question_is_repeated_and_its_answers_are_waited_for() {
+    let mut device = asking("");
+    ask(&mut *device, "207#", at(1000), Ok(at(1005)));
+    assert_eq!(device.next_wake(), Some(at(1025)));
+    assert_eq!(poll(&mut *device, at(1025) - Nanos(1)), None);
+    ask(&mut *device, "207#", at(1025), Ok(at(1025)));
+    assert_eq!(faults_of(&mut *device, COUNTS, 1030.0), []);
+    assert_eq!(device.next_wake(), Some(at(1125) + Nanos(1)));
+    assert_eq!(poll(&mut *device, at(1125)), None);
+    assert_eq!(faults_of(&mut *device, COUNTS, 1125.0), []);
+    let next = at(1125) + Nanos(1);
+    ask(&mut *device, "208#", next, Ok(next));
+}
+
+/// An answer counts if this host has asked, for 100 ms.
+#[test]
+fn a_question_that_did_not_leave_has_no_answer() {
+    let unexpected = [Counter::Unexpected];
+    let mut device = asking("");
+    ask(&mut *device, "207#", at(1000), Err(NotSent::Refused));
+    assert_eq!(faults_of(&mut *device, COUNTS, 1001.0), unexpected);
+    ask(&mut *device, "207#", at(1020), Ok(at(1020)));
+    assert_eq!(faults_of(&mut *device, COUNTS, 1021.0), []);
+    // One question, one answer: the next is asked at once.
+    ask(&mut *device, "208#", at(1022), Err(NotSent::Refused));
+    assert_eq!(faults_of(&mut *device, UNITS, 1023.0), unexpected);
+    ask(&mut *device, "208#", at(1042), Ok(at(1042)));
+    assert_eq!(faults_of(&mut *device, UNITS, 1142.1), unexpected);
+    assert_eq!(faults_of(&mut *device, UNITS, 1142.0), []);
+}
+
+/// The sensor may be another one.
+#[test]
+fn a_restart_asks_for_the_calibration_anew() {
+    let mut rig = rig("");
+    rig.run(50);
+    let asked = rig.sent[..8].to_vec();
+    let sent = rig.sent.len();
+    rig.device.restart(rig.now);
+    rig.run(50);
+    assert_eq!(rig.sent[sent..sent + 8], asked);
+    assert_eq!(rig.device.state(), State::Streaming);
+    let before = rig.readings.len();
+    rig.board = board("ati_netcanoem", KEYS, &[]);
+    rig.device.restart(rig.now);
+    rig.run(50);
+    assert_eq!(rig.device.state(), State::Refused(Refusal::Changed));
+    assert_eq!(
+        (rig.count(Counter::Changed), rig.readings.len()),
+        (1, before)
+    );
+    assert_eq!(rig.device.next_wake(), None, "nothing is asked any more");
+}
+
+/// Another program asks for row 4 and gets no answer; the host's own question for row 0 gets two.
+#[test]
+fn the_rows_of_another_programs_questions_are_not_this_hosts() {
+    let mut device = asking(&parts()[..2].concat());
+    let mut sensor = board("ati_netcanoem", KEYS, &[]);
+    let mut answer = |device: &mut dyn Device, row: u8, ms: f64| {
+        let mut answers = proprio_drivers::Frames::new();
+        sensor.on_frame(&frame(&format!("202#0{row}"), ms), &mut answers);
+        for answer in answers {
+            assert_eq!(faults_of(device, &answer.to_string(), ms), []);
+        }
+    };
+    ask(&mut *device, "202#00", at(1000), Ok(at(1000)));
+    assert_eq!(faults_of(&mut *device, "202#04", 1010.0), []);
+    ask(&mut *device, "202#00", at(1020), Ok(at(1020)));
+    answer(&mut *device, 0, 1021.0);
+    answer(&mut *device, 0, 1022.0);
+    for row in 1..6 {
+        let ms = 1200 + i64::from(row);
+        ask(&mut *device, &format!("202#0{row}"), at(ms), Ok(at(ms)));
+        answer(&mut *device, row, ms as f64);
+    }
+    ask(&mut *device, "200#", at(1210), Ok(at(1210)));
+    let (readings, faults) = decode(&mut *device, &halves(5, 0, 1211.0));
+    assert!(faults.is_empty(), "{faults:?}");
+    let [force, torque] = [0.05, 0.005].map(|value| [value; 3]);
+    let read = values(&readings[0].reading);
+    for (value, right) in read.iter().zip([force, torque].concat()) {
+        assert!((value - right).abs() < 1e-12, "{read:?}");
+    }
+}
+
+/// A request has 10 ms from when it was sent. Its answer may come before the bus tells that.
+#[test]
+fn a_request_is_open_until_it_is_answered() {
+    let mut device = asking(KEYS);
+    ask(&mut *device, "200#", at(1000), Ok(at(1004)));
+    assert_eq!(device.next_wake(), Some(at(1014)));
+    let (readings, _) = decode(&mut *device, &halves(1, 0, 1005.0));
+    assert_eq!(numbers(&readings), [(1, false)]);
+    let request = poll(&mut *device, at(1006)).expect("a request");
+    let (readings, _) = decode(&mut *device, &halves(2, 0, 1007.0));
+    assert_eq!(numbers(&readings), [(2, false)]);
+    device.on_sent(&request, Ok(at(1006)));
+    assert_eq!(device.next_wake(), Some(at(1008)));
+    ask(&mut *device, "200#", at(1008), Ok(at(1008)));
+    // A restart does not wait for the answer, and does not count it as lost.
+    device.restart(at(1009));
+    let mut out = Decoded::new();
+    let request = device.poll_transmit(at(1009), &mut out);
+    assert_eq!(
+        request.map(|sent| sent.frame.to_string()).as_deref(),
+        Some("200#")
+    );
+    assert_eq!(count(&out.faults, Counter::Lost), 0);
+}
+
+/// Another program repeats its questions, before and after they are answered, and asks for a row
+/// that there is none of.
+#[test]
+fn questions_of_another_program_may_be_repeated() {
+    let (frames, wrenches) = session(true);
+    let mut repeated = vec![frame("3F2#06", 0.0)];
+    for frame in &frames {
+        repeated.push(*frame);
+        if frame.data().len() == 1 {
+            repeated.push(*frame);
+        }
+    }
+    let mut device = session_listener("");
+    for frames in [repeated, frames] {
+        let (readings, faults) = decode(&mut *device, &frames);
+        assert!(faults.is_empty(), "{faults:?}");
+        assert_read(&readings, &wrenches);
+    }
+}
+
+/// The matrix is configured: what is told of it does not matter.
+#[test]
+fn a_stray_row_does_not_void_a_configured_matrix() {
+    let mut device = session_listener(parts()[2]);
+    let stray = faults_of(&mut *device, "3F2#3F8000003F800000", 0.0);
+    assert_eq!(stray, [Counter::Unexpected]);
+    let told = ["3F7#", "3F7#00000064000003E8", "3F8#", "3F8#0203"];
+    let (_, faults) = decode(&mut *device, &told.map(|text| frame(text, 1.0)));
+    assert!(faults.is_empty(), "{faults:?}");
+    let (readings, _) = decode(&mut *device, &halves_at_3f(2.0));
+    assert_eq!(numbers(&readings), [(5, false)]);
+}
+
 fn halves_at_3f(ms: f64) -> [Frame; 2] {
     halves(5, 0, ms).map(|f| frame(&f.to_string().replacen("20", "3F", 1), ms))
 }
@@ -573,6 +751,10 @@ fn wrong_keys_are_refused() {
         refused("calibration = 16"),
         "calibration = 16 must be 0 to 15"
     );
+    for number in [0, 15] {
+        let options = options("ati_netcanoem", &format!("calibration = {number}"));
+        assert!(options.device(&spec(1, Mode::Listen, &[])).is_ok());
+    }
     assert!(refused("counts_per_force = 1").contains("counts_per_torque is missing"));
     assert!(refused("torque_unit = \"Nm\"").contains("force_unit is missing"));
     let zero = "counts_per_force = 0\ncounts_per_torque = 1";

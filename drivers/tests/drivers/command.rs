@@ -4,8 +4,8 @@
 use crate::rig::{Rig, board, decode, frame, listener, options, spec};
 use proprio_drivers::calibration::{Calibration, Defect, MOST_CONDITION};
 use proprio_drivers::{
-    Command, CommandFailed, CommandOutcome, CommandRefused, Device, Frame, Frames, Mode, NotSent,
-    State,
+    COMMAND_TIME, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame,
+    Frames, Mode, NotSent, State,
 };
 use proprio_topics::{Counter, Nanos, Quality, Reading, Wrench};
 
@@ -252,9 +252,7 @@ impl ByHand {
 
     fn poll(&mut self) -> Option<Frame> {
         let now = self.at();
-        let transmit = self
-            .device
-            .poll_transmit(now, &mut proprio_drivers::Decoded::new())?;
+        let transmit = self.device.poll_transmit(now, &mut Decoded::new())?;
         assert!(transmit.deadline > now && transmit.deadline <= now + Nanos::from_millis(100));
         Some(transmit.frame)
     }
@@ -579,6 +577,69 @@ fn what_is_wrong_with_a_calibration_is_named() {
     assert_eq!(defects(full_scale, matrix), []);
 }
 
+/// Counts and units as sensors have them: 1000 counts per 4 N, 500 counts per 0.25 Nm.
+#[test]
+fn what_a_gauge_count_means_follows_from_counts_and_units() {
+    let mut matrix = [[0.0_f32; 6]; 6];
+    for (entry, n) in matrix.iter_mut().flatten().zip(1_u8..) {
+        *entry = f32::from(n);
+    }
+    let told = Calibration::Counts {
+        matrix,
+        counts: [1000.0, 500.0],
+        units: [4.0, 0.25],
+    };
+    let per_count = told.per_count().expect("it is told");
+    for (axis, row) in per_count.iter().enumerate() {
+        let unit = if axis < 3 { 0.004 } else { 0.0005 };
+        for (value, entry) in row.iter().zip(matrix[axis]) {
+            assert!((value - f64::from(entry) * unit).abs() < 1e-15, "{axis}");
+        }
+    }
+}
+
+/// Two rows of length 1 at an angle `a`, and four at right angles: the squares of the matrix sum up
+/// to 6, those of its inverse to 4 + 2 / sin(a)^2.
+#[test]
+fn axes_that_can_not_be_told_from_each_other_have_a_high_condition_number() {
+    let full_scale = [100; 6];
+    let mut matrix = [[0; 6]; 6];
+    (0..6).for_each(|axis| matrix[axis][axis] = 30_000);
+    let words = |matrix| {
+        let told = Calibration::Fractions { full_scale, matrix };
+        let defects = told.defects();
+        (
+            defects.first().copied(),
+            defects.iter().map(ToString::to_string).collect::<Vec<_>>(),
+        )
+    };
+    for tenths in [10_i16, 20, 300] {
+        matrix[1] = [30_000, 3 * tenths, 0, 0, 0, 0];
+        let sine = (f64::from(tenths) / 10_000.0).atan().sin();
+        let right = (6.0 * (4.0 + 2.0 / (sine * sine))).sqrt();
+        let (first, words) = words(matrix);
+        if right < MOST_CONDITION {
+            assert_eq!(first, None, "{right}");
+            continue;
+        }
+        let Some(Defect::Condition { number }) = first else {
+            panic!("{first:?}")
+        };
+        assert!((number / right - 1.0).abs() < 1e-6, "{number} {right}");
+        let expected = format!(
+            "the condition number is {right:.0}, above 1000: axes can not be told from each other"
+        );
+        assert_eq!(words, [expected]);
+    }
+    matrix[0] = [30_000, 30_000, 0, 0, 0, 0];
+    matrix[1] = matrix[0];
+    assert_eq!(words(matrix).1, ["the matrix is singular"]);
+    matrix[0] = [30_000, 0, 0, 0, 0, 0];
+    // An axis with small numbers only is told as well as another.
+    matrix[1] = [0, 1, 0, 0, 0, 0];
+    assert_eq!(words(matrix).1, [""; 0]);
+}
+
 #[test]
 fn an_ati_sensor_tells_what_was_read_at_its_start() {
     let load = (0, Reading::Wrench(LOAD));
@@ -683,6 +744,76 @@ fn sensors_that_do_not_tell_their_zero_are_tared() {
         refused.is_some_and(|most| (most - 6.1).abs() < 1e-9),
         "{refused:?}"
     );
+}
+
+/// Nothing tells when a tare has taken effect: for 100 ms each reading may have either zero, and
+/// the first after that is the first that surely has the new one.
+#[test]
+fn every_reading_that_may_have_the_old_zero_is_marked() {
+    let (_, values) = tared("robotous_rft", "064#1101000000000000");
+    let marks: Vec<bool> = values.iter().map(|(_, mark)| *mark).collect();
+    let first = marks.iter().position(|mark| *mark).expect("a mark");
+    let count = marks.iter().filter(|mark| **mark).count();
+    // At 200 Hz.
+    assert_eq!(count, 21, "{marks:?}");
+    assert!(marks[first..first + count].iter().all(|mark| *mark));
+    assert!(marks.len() > first + count);
+}
+
+/// A sensor that streams, a tare that was just commanded, and no limit of silence.
+fn commanded(driver: &str) -> Rig {
+    let mut rig = Rig::new(driver, "", &[], (0, Reading::Wrench(LOAD)));
+    rig.run(100);
+    assert_eq!(rig.device.state(), State::Streaming);
+    rig.device.set_max_silence(Nanos::from_millis(10_000));
+    assert_eq!(tare(&mut rig), Ok(()));
+    assert_eq!(rig.device.next_wake(), Some(Nanos::MIN), "at once");
+    rig
+}
+
+fn poll(rig: &mut Rig, t: Nanos) -> Option<Frame> {
+    let transmit = rig.device.poll_transmit(t, &mut Decoded::new());
+    transmit.map(|transmit| transmit.frame)
+}
+
+/// It would zero a load that nobody has seen.
+#[test]
+fn a_tare_that_is_too_late_is_not_sent() {
+    for driver in ["robotous_rft", "jr3_can"] {
+        let mut rig = commanded(driver);
+        let last = rig.now + COMMAND_TIME;
+        assert!(poll(&mut rig, last).is_some(), "{driver}: in time");
+        let mut rig = commanded(driver);
+        let late = rig.now + COMMAND_TIME + Nanos(1);
+        assert_eq!(poll(&mut rig, late), None, "{driver}");
+        let outcome = rig.device.outcome();
+        assert_eq!(outcome, Some(Err(CommandFailed::NotSent)));
+        assert_eq!(poll(&mut rig, late), None, "it is over");
+    }
+}
+
+/// A JR3 has 100 ms for its answer, and the device tells when they are over.
+#[test]
+fn a_tare_is_confirmed_in_time_or_not_at_all() {
+    for answered in [true, false] {
+        let mut rig = commanded("jr3_can");
+        let now = rig.now;
+        let command = poll(&mut rig, now).expect("the command");
+        let sent = now + Nanos::from_millis(4);
+        rig.device.on_sent(&command, Ok(sent));
+        let last = sent + Nanos::from_millis(100);
+        assert_eq!(rig.device.next_wake(), Some(last + Nanos(1)));
+        assert_eq!(poll(&mut rig, last), None);
+        assert_eq!(rig.device.outcome(), None);
+        let expected = if answered {
+            decode(&mut *rig.device, &[frame("101#00", last.seconds() * 1e3)]);
+            Ok(CommandOutcome::Tared(None))
+        } else {
+            Err(CommandFailed::NoAnswer)
+        };
+        assert_eq!(poll(&mut rig, last + Nanos(1)), None);
+        assert_eq!(rig.device.outcome(), Some(expected));
+    }
 }
 
 /// Live and in a recorded log, the same answers about the matrix are malformed. Those about a

@@ -373,6 +373,19 @@ fn the_keys_of_the_page_are_legal_and_nothing_is_sent() {
 }
 
 #[test]
+fn the_temperature_has_a_channel_of_its_own() {
+    for keys in [MIT, SERVO] {
+        let outputs = options("cubemars", keys).outputs().into_iter();
+        let outputs: Vec<_> = outputs
+            .map(|o| (o.number, o.kind, o.suffix.into_owned()))
+            .collect();
+        let joint = (0, Kind::Joint, String::new());
+        let drive = (1, Kind::Temperature, "drive".to_owned());
+        assert_eq!(outputs, [joint, drive]);
+    }
+}
+
+#[test]
 fn wrong_keys_are_refused() {
     let refused = |keys: &str, address| {
         let options = options("cubemars", keys);

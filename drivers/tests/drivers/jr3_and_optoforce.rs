@@ -478,6 +478,35 @@ fn a_late_answer_of_a_jr3_is_not_taken_for_another_one() {
     ask(&mut *four, "201#000010270000", 97);
 }
 
+/// From when it was asked, even if they come before the bus tells that it was. Each question has
+/// one.
+#[test]
+fn answers_of_a_jr3_count_for_a_second() {
+    let forces = "101#0073006F00B900";
+    let device = || {
+        options("jr3_can", "")
+            .device(&spec(1, Mode::Supervise, &[]))
+            .unwrap()
+    };
+    let mut last = device();
+    ask(&mut *last, "481#", 0);
+    assert_eq!(last.state(), State::Asking);
+    assert!(decode(&mut *last, &[frame(forces, 1000.0)]).1.is_empty());
+    ask(&mut *last, "501#", 1001);
+    let mut two = device();
+    ask(&mut *two, "481#", 0);
+    ask(&mut *two, "481#", 1000);
+    for ms in [1000.0, 1000.5] {
+        assert!(decode(&mut *two, &[frame(forces, ms)]).1.is_empty());
+    }
+    let (mut early, mut out) = (device(), Decoded::new());
+    let now = Nanos::from_millis(1000);
+    let question = early.poll_transmit(now, &mut out).unwrap().frame;
+    assert!(decode(&mut *early, &[frame(forces, 1000.5)]).1.is_empty());
+    early.on_sent(&question, Ok(now));
+    ask(&mut *early, "501#", 1020);
+}
+
 #[test]
 fn a_jr3_without_usable_full_scales_is_refused() {
     let sent = (0, reading([1.0; 3], [0.1; 3]));
@@ -576,6 +605,42 @@ fn a_listener_learns_full_scales_from_what_it_hears() {
 }
 
 #[test]
+fn the_keys_of_a_jr3_stand_before_its_own_full_scales() {
+    let mut device = listener("jr3_can", JR3, &[]);
+    let heard = [
+        frame("481#", 0.0),
+        frame("101#000A000A000A00", 0.3),
+        frame("501#", 1.0),
+        frame("101#000A000A000A00", 1.3),
+    ];
+    assert!(decode(&mut *device, &heard).1.is_empty());
+    let pair = JR3_FRAMES.map(|text| frame(text, 10.0));
+    let (readings, _) = decode(&mut *device, &pair);
+    let read = wrench(&readings[0].reading);
+    assert!((read.force[0] - 115.0).abs() < 1e-9 && (read.torque[2] + 3.05).abs() < 1e-9);
+    assert_eq!(device.full_scale().map(|all| all[0]), Some(115.0));
+}
+
+/// Which of two full scales is right is not known, whatever is told after them.
+#[test]
+fn a_jr3_whose_full_scales_have_changed_stays_refused() {
+    let mut device = listener("jr3_can", "", &[]);
+    let mut hear = |question: &str, answer: &str| {
+        let (_, faults) = decode(&mut *device, &[frame(question, 0.0), frame(answer, 0.3)]);
+        (device.state(), faults_of(&faults))
+    };
+    let first = "101#0073006F00B900";
+    hear("481#", first);
+    hear("501#", "101#00380034003D00");
+    let refused = State::Refused(Refusal::Changed);
+    let (state, faults) = hear("481#", "101#0073006F00B800");
+    assert_eq!((state, faults), (refused, vec![(Counter::Changed, 1)]));
+    assert_eq!(hear("481#", first), (refused, vec![]));
+    let pair = JR3_FRAMES.map(|text| frame(text, 10.0));
+    assert!(decode(&mut *device, &pair).0.is_empty());
+}
+
+#[test]
 fn wrong_keys_of_a_jr3_are_refused() {
     for (keys, key, value, expected) in [
         (
@@ -611,6 +676,24 @@ fn wrong_keys_of_a_jr3_are_refused() {
         };
         assert_eq!(refused("jr3_can", keys, 1), wrong);
     }
+    // The key that is named is the one of the wrong number, and 65535 is the most that fits.
+    for (at, key) in (0..6).zip([["full_scale_n"; 3], ["full_scale_nm"; 3]].concat()) {
+        for value in [0.0, -1.0, 65536.0, f64::INFINITY] {
+            let mut all = [65535.0; 6];
+            all[at] = value;
+            let (force, torque) = all.split_at(3);
+            let keys = format!("full_scale_n = {force:?}\nfull_scale_nm = {torque:?}");
+            let wrong = SpecError::Key {
+                key,
+                value,
+                expected: "above 0 and at most 65535",
+            };
+            assert_eq!(refused("jr3_can", &keys, 1), wrong);
+        }
+    }
+    let most = "full_scale_n = [65535, 65535, 65535]\nfull_scale_nm = [65535, 65535, 65535]";
+    let scale = listener("jr3_can", most, &[]).full_scale();
+    assert_eq!(scale, Some([65535.0; 6]));
     let nan = options("jr3_can", "cutoff_hz = nan");
     assert!(nan.device(&spec(1, Mode::Supervise, &[])).is_err());
     let (given, missing) = ("full_scale_n", "full_scale_nm");

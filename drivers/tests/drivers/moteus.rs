@@ -2,7 +2,9 @@
 //! is asked.
 
 use crate::rig::{Rig, board, count, decode, encode, listener, options, spec};
-use proprio_drivers::{Board, Decoded, Format, Frame, Frames, Id, Mode, Output, SpecError, State};
+use proprio_drivers::{
+    Board, Decoded, Device, Format, Frame, Frames, Id, Mode, Output, SpecError, State,
+};
 use proprio_topics::{
     Actuator, Counter, JointState, Nanos, Quality, Reading, StampKind, Temperature,
 };
@@ -263,8 +265,12 @@ fn a_simulated_controller_answers_any_query() {
     assert_eq!(ask("1B01"), told("2B01A8610000400D0300000000805050"));
     assert_eq!(ask("110E5050"), told("210E1F"));
     assert_eq!(ask("10040D"), told("20040D301F0000"));
-    // No query, cut off, too long, a write.
-    for wrong in ["", "50", "11", "1F", "01000A", "14FF01", "2004000A"] {
+    // A register that it does not have is 0; it answers nothing about those above 127.
+    assert_eq!(ask("117F"), told("217F00"));
+    // No query, cut off, too long, a write, register 128.
+    for wrong in [
+        "", "50", "11", "1F", "01000A", "14FF01", "2004000A", "118001",
+    ] {
         assert_eq!(ask(wrong), None, "{wrong}");
     }
 }
@@ -293,6 +299,98 @@ fn replies_without_the_position_are_no_reading_of_the_joint() {
     assert!(readings.is_empty());
     let (readings, _) = read("20050001640A0201");
     assert_eq!(joint(&readings[1]).position, TAU);
+    // Register 129: its lower seven bits are those of the position's number.
+    let (readings, faults) = read("2181010A");
+    assert!(readings.is_empty() && faults.is_empty(), "{readings:?}");
+}
+
+/// As i8, i16, i32 and f32.
+#[test]
+fn temperatures_are_read_in_each_type() {
+    for (hex, right) in [
+        ("210E1F", 31.0),
+        ("250E3801", 31.2),
+        ("290EE0790000", 31.2),
+        ("2D0E0000FA41", 31.25),
+    ] {
+        let (readings, faults) = read(hex);
+        assert!(faults.is_empty());
+        let [
+            Output {
+                reading: Reading::Temperature(Temperature { celsius }),
+                ..
+            },
+        ] = readings[..]
+        else {
+            panic!("{readings:?}")
+        };
+        assert!((celsius - right).abs() < 1e-9, "{hex}: {celsius}");
+    }
+}
+
+/// The device tells when the next query is due, and sends it then.
+#[test]
+fn queries_leave_in_step() {
+    let mut device = options("moteus", "period_ms = 4")
+        .device(&spec(1, Mode::Supervise, &[0]))
+        .unwrap();
+    let mut out = Decoded::new();
+    let mut poll = |device: &mut dyn Device, t: Nanos| {
+        let sent = device.poll_transmit(t, &mut out)?;
+        device.on_sent(&sent.frame, Ok(t));
+        Some(sent.frame.id)
+    };
+    let query = Some(Id::extended(0x8001));
+    assert_eq!(poll(&mut *device, Nanos::from_millis(1000)), query);
+    for ms in [1004, 1008, 1012] {
+        let due = Nanos::from_millis(ms);
+        assert_eq!(device.next_wake(), Some(due));
+        assert_eq!(poll(&mut *device, due - Nanos(1)), None);
+        assert_eq!(poll(&mut *device, due), query);
+    }
+}
+
+/// Another controller may be there: what the last one told is forgotten.
+#[test]
+fn a_restart_forgets_the_fault() {
+    let mut device = listener("moteus", "", &[0]);
+    let fault = reply("210001210F2321010A");
+    let (readings, _) = decode(&mut *device, &[fault]);
+    let told = Quality::DRIVE_FAULT | Quality::DEVICE_FAULT;
+    assert_eq!(readings[1].quality, told);
+    device.restart(Nanos::ZERO);
+    let (readings, _) = decode(&mut *device, &[reply("21010A")]);
+    assert_eq!(readings[0].quality, Quality::GAP_BEFORE);
+    device.restart(Nanos::ZERO);
+    let (readings, _) = decode(&mut *device, &[fault]);
+    let first = readings[0].reading;
+    assert!(
+        matches!(first, Reading::Actuator(_)),
+        "told anew: {first:?}"
+    );
+}
+
+/// Fault 35 is one of the encoder, 38 is too hot.
+#[test]
+fn a_simulated_controller_tells_its_state_with_the_joints() {
+    let (drive, sensor) = (Quality::DRIVE_FAULT, Quality::DEVICE_FAULT);
+    for (quality, state) in [
+        (Quality::GOOD, (0, 0)),
+        (drive, (1, 38)),
+        (sensor, (1, 35)),
+        (drive | sensor, (1, 35)),
+    ] {
+        let mut node = board("moteus", "", &[0]);
+        let warmth = Reading::Temperature(Temperature { celsius: 61.0 });
+        assert!(encode(&mut *node, 0, &warmth, Quality::GOOD).is_empty());
+        let frames = encode(&mut *node, 0, &Reading::Joint(STATE), quality);
+        let (readings, _) = decode(&mut *listener("moteus", "", &[0]), &frames);
+        let Reading::Actuator(told) = readings[0].reading else {
+            panic!("{readings:?}")
+        };
+        assert_eq!((told.mode, told.faults), state, "{quality}");
+        assert_eq!(readings[1].reading, warmth);
+    }
 }
 
 #[test]
@@ -363,6 +461,10 @@ fn wrong_keys_are_refused() {
         "host = 5",
     ] {
         assert!(matches!(refused(5, keys), SpecError::Key { .. }), "{keys}");
+    }
+    for keys in ["period_ms = 1", "period_ms = 1000", "host = 127"] {
+        let device = options("moteus", keys).device(&spec(5, Mode::Listen, &[0]));
+        assert!(device.is_ok(), "{keys}");
     }
     assert!(options("moteus", "").needs_fd() && !options("icub_pos", "").needs_fd());
 }

@@ -4,7 +4,7 @@
 use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, shown_keys, spec};
 use proprio_drivers::odrive::{Firmware, error_words};
 use proprio_drivers::{
-    Device, EncodeError, Format, Frame, Frames, Id, Mode, NotSent, SpecError, State,
+    Decoded, Device, EncodeError, Format, Frame, Frames, Id, Mode, NotSent, SpecError, State,
 };
 use proprio_topics::{
     Actuator, Counter, JointState, Kind, Nanos, Quality, Reading, StampKind, Temperature,
@@ -425,13 +425,39 @@ fn an_old_firmware_is_asked() {
     }
 }
 
+/// The device tells when the next round is due, and sends it then.
+#[test]
+fn requests_leave_in_step() {
+    let keys = format!("request_period_ms = 10\n{OLD}");
+    let mut device = options("odrive", &keys)
+        .device(&spec(1, Mode::Supervise, &[0]))
+        .unwrap();
+    let mut out = Decoded::new();
+    let mut poll = |device: &mut dyn Device, t: Nanos| {
+        let sent = device.poll_transmit(t, &mut out)?;
+        device.on_sent(&sent.frame, Ok(t));
+        Some(sent.frame.to_string())
+    };
+    let round = ["034#R8", "029#R8"].map(|request| Some(request.to_owned()));
+    let begin = Nanos::from_millis(1000);
+    let first = [(); 2].map(|()| poll(&mut *device, begin));
+    assert_eq!(first, round);
+    for ms in [1010, 1020, 1030] {
+        let due = Nanos::from_millis(ms);
+        assert_eq!(device.next_wake(), Some(due));
+        assert_eq!(poll(&mut *device, due - Nanos(1)), None);
+        let sent = [(); 2].map(|()| poll(&mut *device, due));
+        assert_eq!(sent, round);
+    }
+}
+
 /// After a silence the errors and the values of before are forgotten.
 #[test]
 fn a_silence_ends_what_was_held() {
     let keys = "hold_ms = 60000";
     let mut rig = Rig::new("odrive", keys, &[0], still());
     rig.run(20);
-    let mut out = proprio_drivers::Decoded::new();
+    let mut out = Decoded::new();
     let fault = Frame::new(Id::standard(0x21), &[8, 0, 0, 0, 8, 0, 0, 0]);
     rig.device
         .on_frame(&fault.at(rig.now, StampKind::Software), &mut out);
@@ -534,6 +560,11 @@ fn a_simulated_axis_sends_what_it_is_given() {
     assert_eq!(answers.len(), 10);
     let same = answers.chunks(2).all(|pair| pair[0] == pair[1]);
     assert!(same && answers[2].to_string() == alone);
+    // The version in firmware 0.6: protocol 2, hardware 4.4.58, firmware 0.6.9, released.
+    let version = Frame::remote(Id::standard(0x20), 8);
+    answers.clear();
+    axis.on_frame(&version, &mut answers);
+    assert_eq!(texts(answers.to_vec()), ["020#0204043A00060900"]);
 
     let mut old = board("odrive", &format!("torque_constant = 0.5\n{OLD}"), &[0]);
     let torque = Reading::Joint(JointState {
@@ -544,6 +575,17 @@ fn a_simulated_axis_sends_what_it_is_given() {
     let sent = texts(encode(&mut *old, 0, &torque, quality));
     let expected = ["021#0041000008000100", "034#0000004000000040", alone];
     assert_eq!(sent, expected);
+    // The torque tells the current only where that is absent: 4 A.
+    let current = Reading::Joint(JointState {
+        torque: 1.0,
+        current: 4.0,
+        ..position
+    });
+    let sent = texts(encode(&mut *old, 0, &current, quality));
+    assert_eq!(sent, ["034#0000804000008040", alone]);
+    answers.clear();
+    old.on_frame(&version, &mut answers);
+    assert!(answers.is_empty());
     // What an axis cannot send.
     let mut out = Frames::new();
     let absent = Reading::Joint(JointState::ABSENT);

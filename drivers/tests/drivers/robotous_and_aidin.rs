@@ -1,7 +1,7 @@
 //! Robotous RFT and AIDIN AFT200 sensors: two frames without a sequence number for each reading.
 
 use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, shown_keys, spec};
-use proprio_drivers::{Format, Frame, Frames, Id, Mode, NotSent, Output, SpecError, State};
+use proprio_drivers::{Device, Format, Frame, Frames, Id, Mode, NotSent, Output, SpecError, State};
 use proprio_topics::{Counter, Nanos, Quality, Reading, Saturation, StampKind, Wrench};
 use proptest::array::{uniform3, uniform6};
 use proptest::prelude::*;
@@ -295,21 +295,68 @@ fn an_rft_gets_its_rate_once() {
     let commands = ["064#0C00000000000000", "064#1000000000000000"];
     assert_eq!(rig.sent[..2], commands);
     assert_eq!((rig.sent.len(), rig.device.state()), (3, State::Streaming));
-    // Code 0 is 200 Hz too.
+    // Code 0 is 200 Hz too, and no other rate.
+    for (keys, command) in [
+        ("", "064#0B00000000000000"),
+        ("rate_hz = 1000", "064#0F08000000000000"),
+    ] {
+        let mut device = options("robotous_rft", keys)
+            .device(&spec(0x64, Mode::Supervise, &[]))
+            .unwrap();
+        let mut out = proprio_drivers::Decoded::new();
+        let now = Nanos::from_millis(1000);
+        for command in commands {
+            let next = device.poll_transmit(now, &mut out).unwrap().frame;
+            assert_eq!(next.to_string(), command);
+            device.on_sent(&next, Ok(now));
+        }
+        let answer = ["001#1000000000000000", "002#0000000000000000"];
+        decode(&mut *device, &answer.map(|text| frame(text, 1000.2)));
+        let next = device.poll_transmit(now, &mut out).unwrap().frame;
+        assert_eq!(next.to_string(), command);
+    }
+}
+
+/// 20 ms after it was sent, which is later than it was given to the bus.
+#[test]
+fn an_rft_that_does_not_answer_is_asked_again() {
     let mut device = options("robotous_rft", "")
         .device(&spec(0x64, Mode::Supervise, &[]))
         .unwrap();
-    let mut out = proprio_drivers::Decoded::new();
-    let now = Nanos::from_millis(1000);
-    for command in commands {
-        let next = device.poll_transmit(now, &mut out).unwrap().frame;
-        assert_eq!(next.to_string(), command);
-        device.on_sent(&next, Ok(now));
+    let poll = |device: &mut dyn Device, t: Nanos, sent: Nanos| {
+        let mut out = proprio_drivers::Decoded::new();
+        let next = device.poll_transmit(t, &mut out)?.frame;
+        device.on_sent(&next, Ok(sent));
+        Some(next.to_string())
+    };
+    let [begin, sent, again] = [1000, 1010, 1030].map(Nanos::from_millis);
+    let question = Some("064#1000000000000000".to_owned());
+    poll(&mut *device, begin, begin);
+    assert_eq!(poll(&mut *device, begin, sent), question);
+    assert_eq!(device.next_wake(), Some(again));
+    assert_eq!(poll(&mut *device, again - Nanos(1), again), None);
+    assert_eq!(poll(&mut *device, again, again), question);
+}
+
+/// With argument 1 the present load becomes the zero, with 0 the sensor's own is back.
+#[test]
+fn the_bias_of_an_rft_is_set_and_reset() {
+    let mut board = board("robotous_rft", "", &[]);
+    let (readings, _) = decode(
+        &mut *listener("robotous_rft", "", &[]),
+        &[frame(RFT[0], 0.0), frame(RFT[1], 0.2)],
+    );
+    let load = readings[0].reading;
+    let none = ["001#0B00000000000000", "002#0000000000000000"];
+    for (command, sent) in [("064#1101", none), ("064#1100", RFT)] {
+        let mut answers = Frames::new();
+        board.on_frame(&frame(&format!("{command}000000000000"), 0.0), &mut answers);
+        assert!(answers.is_empty(), "not answered");
+        for _ in 0..2 {
+            let frames = encode(&mut *board, 0, &load, Quality::GOOD);
+            assert_eq!(texts(&frames), sent, "{command}");
+        }
     }
-    let answer = ["001#1000000000000000", "002#0000000000000000"].map(|text| frame(text, 1000.2));
-    decode(&mut *device, &answer);
-    let next = device.poll_transmit(now, &mut out).unwrap().frame;
-    assert_eq!(next.to_string(), "064#0B00000000000000");
 }
 
 /// Lost, refused and useless answers do not keep an RFT from streaming, and each set of its memory
@@ -427,7 +474,7 @@ fn two_rfts_do_not_disturb_each_other() {
     assert!(readings.is_empty() && faults.is_empty());
     let frames = RFT.map(|text| frame(&text.replacen("00", "0F", 1), 0.0));
     assert_eq!(decode(&mut *one, &frames).0.len(), 1);
-    let claims = |device: &dyn proprio_drivers::Device| {
+    let claims = |device: &dyn Device| {
         let of = |claim: &proprio_drivers::Claim| (claim.id, claim.exclusive);
         device.claims().iter().map(of).collect::<Vec<_>>()
     };

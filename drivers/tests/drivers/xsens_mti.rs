@@ -705,6 +705,22 @@ fn the_sensor_limits_what_it_sends() {
     assert_eq!(sent[1].to_string(), "006#0032");
 }
 
+/// Without an orientation, whose filter is a matter of its own.
+#[test]
+fn a_simulated_fault_is_one_of_the_self_test() {
+    let keys = r#"quantities = ["status", "acceleration"]"#;
+    let reading = at_rest().1;
+    for (quality, status) in [
+        (Quality::GOOD, STATUS_GOOD),
+        (Quality::DEVICE_FAULT, "011#00000002"),
+    ] {
+        let sent = encode(&mut *board("xsens_mti", keys, &[]), 0, &reading, quality);
+        assert_eq!(sent[0].to_string(), status);
+        let (readings, _) = decode(&mut *listener("xsens_mti", keys, &[]), &sent);
+        assert_eq!(readings[0].quality, quality);
+    }
+}
+
 /// Half a step plus floating-point rounding.
 fn near(a: f64, b: f64, step: f64) -> bool {
     (a - b).abs() <= step * 0.5 + 1e-12 * (a.abs() + b.abs())
