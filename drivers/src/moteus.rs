@@ -85,9 +85,8 @@ const NOTHING: u8 = 0x50;
 const QUERY: [u8; 6] = [0x11, 0x00, 0x1F, 0x01, 0x13, 0x0D];
 /// Asks for a reply.
 const WANTED: u16 = 0x8000;
-/// Mode of a controller with a fault, and of one that is stopped.
+/// Mode of a controller with a fault. Mode 0 is stopped.
 const MODE_FAULT: f64 = 1.0;
-const MODE_STOPPED: f64 = 0.0;
 /// Faults that concern the position.
 const POSITION_FAULTS: [u32; 4] = [35, 36, 42, 43];
 /// The fault of a simulated controller: of the encoder, or too hot.
@@ -572,7 +571,6 @@ impl MoteusBoard {
         );
         match register {
             register::MODE if sensor || drive => MODE_FAULT,
-            register::MODE => MODE_STOPPED,
             register::POSITION => self.joint.position / TAU,
             register::VELOCITY => self.joint.velocity / TAU,
             register::TORQUE => self.joint.torque,
@@ -580,6 +578,7 @@ impl MoteusBoard {
             register::TEMPERATURE => self.celsius,
             register::FAULT if sensor => ENCODER_FAULT,
             register::FAULT if drive => TOO_HOT,
+            // A mode without a fault is 0, stopped.
             _ => 0.0,
         }
     }

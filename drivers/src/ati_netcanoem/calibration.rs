@@ -332,7 +332,9 @@ impl Inquiry for Calibration {
         if !self.answered {
             self.attempts.sent(outcome);
         }
-        self.sent -= u8::from(outcome.is_err() && self.sent > 0);
+        if outcome.is_err() {
+            self.sent = self.sent.saturating_sub(1);
+        }
     }
 
     fn wake(&self) -> Option<Nanos> {

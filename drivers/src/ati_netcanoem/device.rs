@@ -246,13 +246,9 @@ impl Family for Netcanoem {
         Some(self.open.unwrap_or(self.next))
     }
 
-    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
-        let is_request = frame.id == id(self.base, opcode::GAUGES);
-        match outcome {
-            Ok(t) if is_request && self.open.is_some() => self.open = Some(t + ANSWER),
-            Err(_) if is_request => self.open = None,
-            _ => {}
-        }
+    fn on_sent(&mut self, _frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        // While a request is open, no other frame is under way.
+        self.open = (outcome.ok()).and_then(|t| self.open.map(|_| t + ANSWER));
     }
 
     fn interrupt(&mut self) {
