@@ -2,7 +2,9 @@
 //! stop.
 
 use crate::rig::{Rig, decode, frame, listener, options, spec};
-use proprio_drivers::{Decoded, Mode, NotSent, Options, SpecError, State};
+use proprio_drivers::{
+    Command, CommandFailed, CommandOutcome, Decoded, Mode, NotSent, Options, SpecError, State,
+};
 use proprio_topics::{Counter, Imu, JointState, Nanos, Quality, Reading, Refusal, Wrench};
 
 const SCALES: &str = "full_scale_n = [1804, 1804, 1804]\nfull_scale_nm = [31, 31, 31]\n";
@@ -857,6 +859,16 @@ fn configurations_that_can_not_work_are_named() {
         "joint channel 3 does not exist; this device has channels 0 to 0"
     );
     assert!(error("icub_pos", "sensors = []", 1, &[0]).starts_with("sensors must be"));
+    for driver in ["icub_strain", "icub_imu", "icub_skin"] {
+        for ms in [60_001, 70_000] {
+            assert_eq!(
+                error(driver, &format!("power_on_silence_ms = {ms}"), 1, &[]),
+                format!("power_on_silence_ms = {ms} must be at most 60000")
+            );
+        }
+        let most = options(driver, "power_on_silence_ms = 60000");
+        assert!(most.device(&spec(1, Mode::Supervise, &[])).is_ok());
+    }
     let missing = SpecError::Incomplete {
         given: "a",
         missing: "b",
@@ -888,4 +900,309 @@ fn a_board_with_a_silence_at_power_on_is_stopped() {
     let usual = stopped(SCALES);
     assert!(!usual.is_empty());
     assert_eq!(stopped(&format!("{SCALES}power_on_silence_ms = 20")), usual);
+}
+
+/// A sensor's first byte is 80 (enabled) and its label; its zero is in 0.1 deg.
+#[test]
+fn a_sensor_has_a_label_of_4_bits_and_a_zero_within_a_turn() {
+    let first = |sensor: &str| {
+        let options = options("icub_pos", &format!("sensors = [{sensor}]"));
+        let mut device = options.device(&spec(1, Mode::Supervise, &[0]))?;
+        let transmit = device.poll_transmit(Nanos::from_millis(1000), &mut Decoded::new());
+        Ok(transmit.expect("a configuration").frame.to_string())
+    };
+    for (sensor, sent) in [
+        ("{ label = 15 }", "201#52008F0000000000"),
+        ("{ zero_deg = 360.0 }", "201#520080100E000000"),
+        ("{ zero_deg = -360.0 }", "201#520080F0F1000000"),
+    ] {
+        assert_eq!(first(sensor), Ok(sent.to_owned()));
+    }
+    for (sensor, wrong) in [
+        ("{ label = 16 }", "label"),
+        ("{ label = 255 }", "label"),
+        ("{ zero_deg = 360.1 }", "zero_deg"),
+        ("{ zero_deg = -360.1 }", "zero_deg"),
+        ("{ zero_deg = nan }", "zero_deg"),
+        ("{ rotation_deg = 270 }", "rotation_deg"),
+    ] {
+        let refused = first(sensor);
+        let names = matches!(refused, Err(SpecError::Key { key, .. }) if key == wrong);
+        assert!(names, "{sensor}: {refused:?}");
+    }
+}
+
+/// 0 is no period: these boards keep the one that they have.
+#[test]
+fn a_period_of_zero_is_ignored() {
+    for (driver, outputs, zero, seven) in [
+        ("icub_strain", &[][..], "201#0800", "201#0807"),
+        ("icub_mais", &[0], "201#0800", "201#0807"),
+        ("icub_skin", &[], "201#4D0000F5", "201#4D0007F5"),
+    ] {
+        let spec = spec(1, Mode::Listen, outputs);
+        let mut board = options(driver, "period_ms = 20").board(&spec).unwrap();
+        for (text, ms) in [(zero, 20), (seven, 7), (zero, 7)] {
+            board.on_frame(&frame(text, 0.0), &mut proprio_drivers::Frames::new());
+            assert_eq!(board.period(), Some(Nanos::from_millis(ms)), "{driver}");
+        }
+    }
+}
+
+/// The answers of a board with the usual scales.
+const USUAL: [&str; 6] = [
+    "210#1800070C",
+    "210#1801070C",
+    "210#1802070C",
+    "210#1803001F",
+    "210#1804001F",
+    "210#1805001F",
+];
+/// The worked example of a strain board.
+const PAIR: [&str; 2] = ["31A#E380B76A1887", "31B#2184BE770881"];
+
+/// The upper half of the byte is the regulation set: 0 the one in use, 1 to 3 those stored.
+#[test]
+fn scales_of_stored_sets_are_for_other_programs() {
+    for (channel, is_wrong) in [
+        (0x10, false),
+        (0x11, false),
+        (0x15, false),
+        (0x35, false),
+        (0x06, true),
+        (0x16, true),
+        (0x17, true),
+        (0x36, true),
+        (0x40, true),
+        (0x45, true),
+        (0x51, true),
+    ] {
+        let mut device = listener("icub_strain", "", &[]);
+        let answer = frame(&format!("210#18{channel:02X}0000"), 0.0);
+        let (_, faults) = decode(&mut *device, &[answer]);
+        let counted: Vec<Counter> = faults.iter().map(|fault| fault.counter).collect();
+        let expected = if is_wrong { &[Counter::Value][..] } else { &[] };
+        assert_eq!(counted, expected, "{channel:x}");
+        assert_eq!(device.state(), State::Starting, "{channel:x}");
+    }
+}
+
+#[test]
+fn a_configured_scale_holds_whatever_the_board_answers() {
+    let mut device = listener("icub_strain", SCALES, &[]);
+    let mut read = |answers: &[&str]| {
+        let frames: Vec<_> = answers.iter().map(|text| frame(text, 0.0)).collect();
+        decode(&mut *device, &frames);
+        let (readings, _) = decode(&mut *device, &PAIR.map(|text| frame(text, 1.0)));
+        assert_eq!(device.state(), State::Streaming);
+        readings[0].reading
+    };
+    let first = read(&[]);
+    assert_eq!(read(&["210#18020000"]), first);
+    let others = [0, 1, 2, 3, 4, 5].map(|axis| format!("210#180{axis}0064"));
+    assert_eq!(read(&others.each_ref().map(String::as_str)), first);
+}
+
+/// A scale of zero is that axis's: an answer about another axis does not repair it.
+#[test]
+fn a_scale_of_zero_is_repaired_by_its_own_axis() {
+    let mut device = listener("icub_strain", "", &[]);
+    let mut state_after = |texts: &[&str]| {
+        let frames: Vec<_> = texts.iter().map(|text| frame(text, 0.0)).collect();
+        decode(&mut *device, &frames);
+        device.state()
+    };
+    let zero = State::Refused(Refusal::ZeroFullScale { channel: 2 });
+    assert_eq!(state_after(&["210#18020000"]), zero);
+    assert_eq!(state_after(&USUAL[..2]), zero);
+    assert_eq!(
+        state_after(&PAIR),
+        zero,
+        "this says more than that none is known"
+    );
+    assert_eq!(state_after(&USUAL[2..3]), State::Starting);
+    assert_eq!(state_after(&USUAL[3..]), State::Starting);
+    assert_eq!(state_after(&PAIR), State::Streaming);
+    // One that has changed is refused for good.
+    let changed = State::Refused(Refusal::Changed);
+    assert_eq!(state_after(&["210#18010001"]), changed);
+    assert_eq!(state_after(&USUAL), changed);
+    assert_eq!(state_after(&PAIR), changed);
+}
+
+/// Frames without a known scale are no reason to refuse a device that still asks for it, nor one
+/// that reads raw gauges alone.
+#[test]
+fn a_wrench_without_a_scale_refuses_only_who_needs_it() {
+    let pair = PAIR.map(|text| frame(text, 1000.0));
+    let mut asks = options("icub_strain", "")
+        .device(&spec(1, Mode::Supervise, &[]))
+        .unwrap();
+    let question = asks.poll_transmit(Nanos::from_millis(1000), &mut Decoded::new());
+    assert_eq!(question.unwrap().frame.to_string(), "201#1800");
+    let (readings, faults) = decode(&mut *asks, &pair);
+    assert!(readings.is_empty() && faults.is_empty());
+    assert_eq!(asks.state(), State::Asking);
+    let mut raw = listener("icub_strain", "stream = \"uncalibrated\"", &[]);
+    assert!(decode(&mut *raw, &pair).0.is_empty());
+    assert_eq!(raw.state(), State::Starting);
+}
+
+/// As many answers count as there were questions whose answers may still arrive, for a second.
+#[test]
+fn each_question_for_a_scale_has_one_answer() {
+    let mut rig = strain();
+    rig.run(100);
+    let now = rig.now.seconds() * 1e3;
+    let (_, faults) = decode(&mut *rig.device, &[frame(USUAL[0], now)]);
+    assert_eq!(faults.len(), 1);
+    assert_eq!(faults[0].counter, Counter::Unexpected);
+    // The second question is asked before the answer to the first, or when that is too late.
+    for (second, unexpected) in [(1020, 0), (2100, 1)] {
+        let mut device = options("icub_strain", "")
+            .device(&spec(1, Mode::Supervise, &[]))
+            .unwrap();
+        for ms in [1000, second] {
+            let now = Nanos::from_millis(ms);
+            let question = device.poll_transmit(now, &mut Decoded::new()).unwrap();
+            assert_eq!(question.frame.to_string(), "201#1800");
+            device.on_sent(&question.frame, Ok(now));
+        }
+        let answer = frame(USUAL[0], second as f64 + 1.0);
+        let (_, faults) = decode(&mut *device, &[answer, answer]);
+        let counted = faults.iter().filter(|f| f.counter == Counter::Unexpected);
+        assert_eq!((counted.count(), faults.len()), (unexpected, unexpected));
+    }
+}
+
+/// What a tare asks is asked as what a bring-up asks: a question that was not sent is no attempt,
+/// and each has one answer.
+#[test]
+fn a_question_of_a_tare_that_was_never_sent_is_no_attempt() {
+    let mut rig = Rig::new("icub_strain", SCALES, &[], wrench());
+    rig.run(50);
+    rig.interface =
+        Box::new(|frame| (frame.data().first() == Some(&0x16)).then_some(NotSent::Refused));
+    assert_eq!(rig.device.command(Command::Tare, rig.now), Ok(()));
+    // Longer than 15 attempts take.
+    rig.run(500);
+    assert_eq!(rig.device.outcome(), None);
+    rig.interface = Box::new(|_| None);
+    rig.run(30);
+    let outcome = rig.device.outcome();
+    assert!(
+        matches!(outcome, Some(Ok(CommandOutcome::Tared(Some(_))))),
+        "{outcome:?}"
+    );
+    assert_eq!(rig.count(Counter::Unexpected), 0);
+    let now = rig.now.seconds() * 1e3;
+    for axis in 0..6 {
+        let answer = frame(&format!("210#160{axis}0000"), now);
+        let (_, faults) = decode(&mut *rig.device, &[answer]);
+        assert_eq!(faults.len(), 1);
+        assert_eq!(faults[0].counter, Counter::Unexpected, "axis {axis}");
+    }
+}
+
+/// It is given up after a second, and the device asks to be woken for it.
+#[test]
+fn a_tare_without_an_answer_ends_on_time() {
+    let mut rig = Rig::new("icub_strain", SCALES, &[], wrench());
+    rig.run(50);
+    rig.board_loses = Box::new(|_, frame| frame.data().first() == Some(&0x16));
+    let limit = rig.now + Nanos::from_millis(1000);
+    assert_eq!(rig.device.command(Command::Tare, rig.now), Ok(()));
+    rig.run(1000);
+    assert_eq!(rig.now, limit);
+    let mut out = Decoded::new();
+    assert_eq!(rig.device.poll_transmit(limit, &mut out), None);
+    assert_eq!(rig.device.outcome(), None);
+    let wake = rig.device.next_wake().unwrap();
+    assert!(wake > limit && wake <= limit + Nanos::from_micros(1));
+    assert_eq!(rig.device.poll_transmit(wake, &mut out), None);
+    assert_eq!(rig.device.outcome(), Some(Err(CommandFailed::NoAnswer)));
+    assert_eq!(rig.device.state(), State::Streaming);
+}
+
+/// A question is on its way when the link is lost; what became of it is told after the restart, and
+/// says nothing of the tare that has been commanded since.
+#[test]
+fn a_late_outcome_is_that_of_the_tare_before_the_restart() {
+    for late in [Ok(Nanos::from_millis(1060)), Err(NotSent::LinkLost)] {
+        let mut rig = Rig::new("icub_strain", SCALES, &[], wrench());
+        rig.run(50);
+        let mut out = Decoded::new();
+        assert_eq!(rig.device.command(Command::Tare, rig.now), Ok(()));
+        let command = rig.device.poll_transmit(rig.now, &mut out).unwrap().frame;
+        rig.device.on_sent(&command, Ok(rig.now));
+        let question = rig.device.poll_transmit(rig.now, &mut out).unwrap().frame;
+        assert_eq!(question.to_string(), "201#1600");
+        rig.device.restart(rig.now);
+        let outcome = rig.device.outcome();
+        assert_eq!(outcome, Some(Err(CommandFailed::Interrupted)));
+        rig.run(50);
+        assert_eq!(rig.device.state(), State::Streaming);
+        assert_eq!(rig.device.command(Command::Tare, rig.now), Ok(()));
+        assert_eq!(rig.device.poll_transmit(rig.now, &mut out), None);
+        rig.device.on_sent(&question, late);
+        assert_eq!(rig.device.outcome(), None);
+        rig.run(10);
+        let outcome = rig.device.outcome();
+        assert!(
+            matches!(outcome, Some(Ok(CommandOutcome::Tared(Some(_))))),
+            "{outcome:?}"
+        );
+    }
+}
+
+/// Both a calibration and the bring-up ask for the full scales: each takes the answers to its own
+/// questions.
+#[test]
+fn a_calibration_does_not_take_the_answers_of_a_bringup() {
+    let mut rig = strain();
+    rig.run(50);
+    let usual = std::mem::take(&mut rig.sent);
+    assert_eq!(usual.len(), 8);
+    for is_interrupted in [false, true] {
+        assert_eq!(rig.device.command(Command::Calibration, rig.now), Ok(()));
+        if is_interrupted {
+            rig.board_loses = Box::new(|_, frame| frame.data().first() == Some(&0x18));
+        }
+        rig.run(3);
+        rig.board_loses = Box::new(|_, _| false);
+        rig.device.restart(rig.now);
+        let outcome = rig.device.outcome();
+        match is_interrupted {
+            true => assert_eq!(outcome, Some(Err(CommandFailed::Interrupted))),
+            false => assert!(matches!(outcome, Some(Ok(CommandOutcome::Calibration(_))))),
+        }
+        rig.sent.clear();
+        rig.run(50);
+        assert_eq!(rig.sent, usual);
+        assert_eq!(rig.count(Counter::Unexpected), 0);
+    }
+    // The late answer to a tare that was interrupted is nobody else's.
+    rig.board_loses = Box::new(|_, frame| frame.data().first() == Some(&0x16));
+    assert_eq!(rig.device.command(Command::Tare, rig.now), Ok(()));
+    rig.run(3);
+    rig.device.restart(rig.now);
+    let now = rig.now.seconds() * 1e3;
+    let (_, faults) = decode(&mut *rig.device, &[frame("210#16000000", now)]);
+    assert!(faults.is_empty(), "{faults:?}");
+}
+
+/// It takes the command within the 20 ms of an answer and sends a period later: until then a jump
+/// is excused.
+#[test]
+fn a_command_excuses_a_jump_of_an_imus_counter_for_a_while() {
+    for (ms, lost) in [(1029.9, 0), (1030.1, 92)] {
+        let device = options("icub_imu", "").device(&spec(1, Mode::Supervise, &[]));
+        let (mut device, now) = (device.unwrap(), Nanos::from_millis(1000));
+        let command = device.poll_transmit(now, &mut Decoded::new()).unwrap();
+        device.on_sent(&command.frame, Ok(now));
+        let texts = [7, 100].map(|sequence: u8| format!("513#{sequence:02X}00000000000000"));
+        let frames = [frame(&texts[0], 1001.0), frame(&texts[1], ms)];
+        let (_, faults) = decode(&mut *device, &frames);
+        assert_eq!(crate::rig::count(&faults, Counter::Lost), lost, "{ms}");
+    }
 }

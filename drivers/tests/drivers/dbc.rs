@@ -3,8 +3,10 @@
 
 use crate::rig::{board, count, decode, encode, listener, options, spec};
 use proprio_drivers::signal::{Bits, Message, Raw, Signal, Switch};
-use proprio_drivers::{Decoded, Frame, Id, Mode, Output, State};
-use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, StampKind, Wrench};
+use proprio_drivers::{Decoded, EncodeError, Frame, Frames, Id, Mode, Output, State};
+use proprio_topics::{
+    Counter, JointState, Nanos, Quality, Reading, StampKind, Temperature, Wrench,
+};
 use proptest::prelude::*;
 use std::f64::consts::TAU;
 
@@ -425,13 +427,219 @@ fn a_message_of_two_readings_is_sent_once() {
         torque: 0.5,
         ..JointState::ABSENT
     });
-    let temperature = Reading::Temperature(proprio_topics::Temperature { celsius: 20.0 });
+    let temperature = Reading::Temperature(Temperature { celsius: 20.0 });
     let first = encode(&mut *board, 0, &joint, Quality::GOOD);
     let second = encode(&mut *board, 1, &temperature, Quality::GOOD);
     let ids = |frames: &[Frame]| frames.iter().map(|frame| frame.id).collect::<Vec<_>>();
     assert_eq!(ids(&first), [Id::standard(0x12)]);
     assert_eq!(ids(&second), [Id::standard(0x13)]);
     assert_eq!(second[0].data(), [0, 20, 0xF4, 0x01, 0, 0, 0, 0]);
+}
+
+/// What is wrong with these keys, for a device at `address` that a file with `messages` describes.
+fn problem(keys: &str, messages: Vec<Message>, address: u32) -> Option<String> {
+    let mut options = options("dbc", keys);
+    options.describe(messages);
+    let joints: &[u8] = if keys.contains("joint") { &[0] } else { &[] };
+    let made = options.device(&spec(address, Mode::Listen, joints));
+    made.err().map(|problem| problem.to_string())
+}
+
+/// Mistakes are told in the words of the keys and of the file.
+#[test]
+fn mistakes_are_told() {
+    let hold = |ms: &str| DRIVE.replace("torque = 100.0", &format!("torque = {ms}"));
+    let units = |units: &str| format!("{WRENCH}units = {{ {units} }}\n");
+    let path = |path: &str| WRENCH.replace("F.X", path);
+    for (keys, told) in [
+        (WRENCH.to_owned(), None),
+        (hold("0.001"), None),
+        (hold("3600000.0"), None),
+        (hold("0.0"), Some("hold_ms.torque = 0 must be above 0")),
+        (hold("-1.0"), Some("hold_ms.torque = -1 must be above 0")),
+        (hold("3600000.1"), Some("at most an hour")),
+        (hold("nan"), Some("hold_ms.torque = NaN must be above 0")),
+        (
+            DRIVE.replace("hold_ms = { torque", "hold_ms = { current"),
+            Some("hold_ms.current: fields.current is missing"),
+        ),
+        (
+            DRIVE.replace("hold_ms = {", "units = { current = \"A\" }\nhold_ms = {"),
+            Some("units.current: fields.current is missing"),
+        ),
+        (
+            path("G.X"),
+            Some("no message \"G\"; it has F, T, Motion, State, Page"),
+        ),
+        (path("F.W"), Some("no signal \"W\"; it has X, Y, Z, Count")),
+        (path("T.X"), Some("its unit \"Nm\" does not fit")),
+        (
+            path("F.Count"),
+            Some("the file gives no unit: add units = { fx = "),
+        ),
+        (units("fx = \"\""), Some("its unit \"\" does not fit")),
+        (units("fx = \"rad\""), Some("its unit \"rad\" does not fit")),
+        (units("fx = \"*\""), Some("its unit \"*\" is not known")),
+        (units("fx = \"--\""), Some("its unit \"--\" is not known")),
+        (units("fx = \"kN\""), None),
+    ] {
+        let problem = problem(&keys, messages(), 0);
+        assert_eq!(problem.is_some(), told.is_some(), "{keys}{problem:?}");
+        let problem = problem.unwrap_or_default();
+        assert!(problem.contains(told.unwrap_or_default()), "{problem}");
+    }
+    // Of a long file some are named.
+    let mut many = messages();
+    many.extend((0..9).map(|n| Message {
+        name: format!("More{n}"),
+        ..messages()[0].clone()
+    }));
+    let told = problem(&path("G.X"), many, 0).unwrap();
+    assert!(told.contains("More5, More6 and 2 more"), "{told}");
+}
+
+/// The gateway reads the file that the keys name.
+#[test]
+fn the_file_is_that_of_the_keys() {
+    let keys = WRENCH.replace("device.dbc", "arm/left.dbc");
+    assert_eq!(options("dbc", &keys).description(), Some("arm/left.dbc"));
+    assert_eq!(options("odrive", "").description(), None);
+}
+
+/// Identifiers of 29 bits are shifted too, up to the largest one.
+#[test]
+fn the_address_shifts_long_identifiers() {
+    let of = |id: u32, address| {
+        let mut messages = messages();
+        messages[0].id = Id::extended(id);
+        let mut options = options("dbc", WRENCH);
+        options.describe(messages);
+        let device = options.device(&spec(address, Mode::Listen, &[])).ok()?;
+        let ids = device.claims().iter().map(|claim| claim.id);
+        ids.max()
+    };
+    assert_eq!(of(0x18FF_0000, 0x21), Some(Id::extended(0x18FF_0021)));
+    assert_eq!(of(0x1FFF_FFF0, 0xF), Some(Id::extended(0x1FFF_FFFF)));
+    assert_eq!(of(0x1FFF_FFF0, 0x10), None);
+}
+
+/// A reading has the stamp of the frame that opens it.
+#[test]
+fn the_stamp_is_that_of_the_first_frame() {
+    let first = half(false, 7, 1.0).at(Nanos::from_millis(1), StampKind::Hardware);
+    let (readings, _) = decode(
+        &mut *listener("dbc", WRENCH, &[]),
+        &[first, half(true, 7, 1.5)],
+    );
+    assert_eq!(readings[0].stamp, StampKind::Hardware);
+    assert_eq!(readings[0].acquired, Nanos::from_millis(1));
+}
+
+/// Halves from before and after a restart are no reading, and the gap is told once something had
+/// been read.
+#[test]
+fn a_restart_begins_anew() {
+    for has_read in [false, true] {
+        let mut device = listener("dbc", WRENCH, &[]);
+        if has_read {
+            let frames = [half(false, 1, 1.0), half(true, 1, 1.5), half(false, 2, 9.0)];
+            assert_eq!(decode(&mut *device, &frames).0.len(), 1);
+        }
+        device.restart(Nanos::from_millis(9));
+        let frames = [
+            half(true, 2, 9.5),
+            half(false, 3, 19.0),
+            half(true, 3, 19.5),
+        ];
+        let (readings, faults) = decode(&mut *device, &frames);
+        assert_eq!((numbers(&readings), faults.len()), (vec![(3, 3)], 0));
+        let gap = readings[0].quality.contains(Quality::GAP_BEFORE);
+        assert_eq!(gap, has_read);
+    }
+}
+
+/// A simulated device sends the message that opens a reading first, whatever its identifier.
+#[test]
+fn a_simulated_device_sends_the_first_message_first() {
+    let reading = Reading::Wrench(Wrench {
+        force: [1.0; 3],
+        torque: [2.0; 3],
+    });
+    let named = WRENCH.replace("counter = \"F.Count\"", "first = \"T\"");
+    for (keys, ids) in [(WRENCH, [0x10, 0x11]), (named.as_str(), [0x11, 0x10])] {
+        let keys = keys.replace("fault = \"State.Error\"\n", "");
+        let mut board = board("dbc", &keys, &[]);
+        let sent = encode(&mut *board, 0, &reading, Quality::GOOD);
+        let sent: Vec<Id> = sent.iter().map(|frame| frame.id).collect();
+        assert_eq!(sent, ids.map(Id::standard), "{keys}");
+    }
+}
+
+/// Each value that a reading needs must be a number; a held one need not.
+#[test]
+fn what_is_no_number_is_not_sent() {
+    let state = JointState {
+        position: 1.0,
+        velocity: 2.0,
+        torque: f64::NAN,
+        ..JointState::ABSENT
+    };
+    let encode = |state| {
+        let mut out = Frames::new();
+        let reading = Reading::Joint(state);
+        board("dbc", DRIVE, &[0]).encode(0, &reading, Quality::GOOD, &mut out)
+    };
+    assert_eq!(encode(state), Ok(()));
+    for (position, velocity) in [(f64::NAN, 2.0), (1.0, f64::NAN), (1.0, f64::INFINITY)] {
+        let state = JointState {
+            position,
+            velocity,
+            ..state
+        };
+        assert_eq!(encode(state), Err(EncodeError::NotFinite));
+    }
+}
+
+/// A simulated device sends the number that is read back as the value: less its offset, in steps
+/// of its factor, in its unit.
+#[test]
+fn factor_offset_and_unit_are_those_of_the_file() {
+    for (unit, celsius, raw) in [("degC", 60.0, 100), ("degF", 20.0, 108), ("K", -263.15, 50)] {
+        let keys = format!(
+            "file = \"device.dbc\"\n[[reading]]\nkind = \"temperature\"\n\
+             fields.temperature = \"State.Temperature\"\nunits.temperature = \"{unit}\"\n"
+        );
+        let mut messages = messages();
+        messages[3].signals[1].offset = -40.0;
+        let mut options = options("dbc", &keys);
+        options.describe(messages);
+        let mut board = options.board(&spec(0, Mode::Supervise, &[])).unwrap();
+        let reading = Reading::Temperature(Temperature { celsius });
+        let sent = encode(&mut *board, 0, &reading, Quality::GOOD);
+        assert_eq!(sent[0].data(), [0, raw, 0, 0, 0, 0, 0, 0], "{unit}");
+    }
+    // A pound-force inch, and counts, which have no unit.
+    for (kind, field, unit, value) in [
+        ("joint", "torque", "lbf-in", 0.112_984_829_027_616_7),
+        ("joint", "torque", "lbf in", 0.112_984_829_027_616_7),
+        ("actuator", "duty", "", 1.0),
+        ("actuator", "duty", "-", 1.0),
+        ("actuator", "duty", "%", 0.01),
+    ] {
+        let keys = format!(
+            "file = \"device.dbc\"\n[[reading]]\nkind = \"{kind}\"\n\
+             fields.{field} = \"State.Torque\"\nunits.{field} = \"{unit}\"\n"
+        );
+        let joints: &[u8] = if kind == "joint" { &[0] } else { &[] };
+        let frame = at(0x13, &[0, 0, 50, 0, 0, 0, 0, 0], 1.0);
+        let (readings, _) = decode(&mut *listener("dbc", &keys, joints), &[frame]);
+        let told = match readings[0].reading {
+            Reading::Joint(state) => state.torque,
+            Reading::Actuator(actuator) => actuator.duty,
+            other => panic!("{other:?}"),
+        };
+        assert!((told / 50.0 / value - 1.0).abs() < 1e-12, "{unit}: {told}");
+    }
 }
 
 proptest! {

@@ -1,11 +1,11 @@
 //! Golden bytes: the worked examples of the protocol's documents, and frames computed by hand from
 //! their tables.
 
-use crate::rig::{board, count, decode, encode, frame, listener};
+use crate::rig::{board, count, decode, encode, frame, listener, options, spec};
 use proprio_drivers::icub_motor::{encoder, fault};
-use proprio_drivers::{Board, Frame, Frames};
+use proprio_drivers::{Board, EncodeError, Frame, Frames, Mode};
 use proprio_topics::{
-    Actuator, Counter, Imu, JointState, Quality, Reading, Saturation, Temperature, Wrench,
+    Actuator, Counter, Imu, JointState, Nanos, Quality, Reading, Saturation, Temperature, Wrench,
 };
 
 const SCALES: &str = "full_scale_n = [1804, 1804, 1804]\nfull_scale_nm = [31, 31, 31]";
@@ -137,6 +137,44 @@ fn a_saturated_board_repeats_its_last_good_vector() {
     assert_eq!(texts(&frames), ["31A#00800080008001", "31B#00800080008081"]);
 }
 
+/// What is beyond the 16 bits of a count is at their end, on both sides.
+#[test]
+fn the_tare_of_a_strain_board_stays_within_its_bits() {
+    let mut board = board("icub_strain", SCALES, &[]);
+    let first = |board: &mut dyn Board, force: f64| {
+        let load = Wrench {
+            force: [force, 0.0, 0.0],
+            torque: [0.0; 3],
+        };
+        let frames = encode(board, 0, &Reading::Wrench(load), Quality::GOOD);
+        texts(&frames)[0].clone()
+    };
+    let (least, most) = (-1804.0, 1804.0 * 32767.0 / 32768.0);
+    assert_eq!(first(&mut *board, least), "31A#000000800080");
+    // 32768 steps do not fit.
+    answers(&mut *board, "201#1501");
+    assert_eq!(answers(&mut *board, "201#1600"), ["210#16007FFF"]);
+    assert_eq!(first(&mut *board, most), "31A#FFFF00800080");
+    answers(&mut *board, "201#1501");
+    assert_eq!(answers(&mut *board, "201#1600"), ["210#16008001"]);
+    assert_eq!(first(&mut *board, least), "31A#000000800080");
+}
+
+/// Its memory is corrupt: it sends zero, whatever the load.
+#[test]
+fn a_strain_board_with_a_scale_of_zero_sends_zero() {
+    let keys = "full_scale_n = [1804, 1804, 0]\nfull_scale_nm = [31, 31, 31]";
+    let mut board = board("icub_strain", keys, &[]);
+    for force in [-5.0, 0.0, 5.0] {
+        let load = Wrench {
+            force: [0.0, 0.0, force],
+            torque: [0.0; 3],
+        };
+        let frames = encode(&mut *board, 0, &Reading::Wrench(load), Quality::GOOD);
+        assert_eq!(texts(&frames), ["31A#008000800080", "31B#008000800080"]);
+    }
+}
+
 #[test]
 fn a_saturation_byte_that_contradicts_itself_is_counted() {
     let mut device = listener("icub_strain", SCALES, &[]);
@@ -165,6 +203,17 @@ fn temperatures_come_with_both_type_codes() {
             panic!("{readings:?}")
         };
         assert_near(&[temperature.celsius], &[celsius], 1e-9);
+    }
+    // Only the first thermometer is selected.
+    for (text, counter) in [
+        ("31E#00FA000000", Counter::Value),
+        ("31E#02FA000000", Counter::Value),
+        ("31E#01FA0000", Counter::Length),
+        ("31F#01FA00000000", Counter::Length),
+    ] {
+        let (readings, faults) = decode(&mut *device, &[frame(text, 1.0)]);
+        assert_eq!((readings.len(), faults.len()), (0, 1), "{text}");
+        assert_eq!(faults[0].counter, counter, "{text}");
     }
     let mut board = board("icub_strain", SCALES, &[]);
     let reading = Reading::Temperature(Temperature { celsius: 25.0 });
@@ -367,6 +416,294 @@ fn legacy_frames_have_the_scale_of_their_board() {
     assert!(readings.is_empty());
 }
 
+/// One frame of an acquisition with these counts.
+fn triple(sequence: u8, sensor: u8, ms: f64) -> Frame {
+    frame(&format!("513#{sequence:02X}{sensor:02X}0001FF000A00"), ms)
+}
+
+/// A frame of up to 4 acquisitions back is late; all other jumps are gaps, of up to 250.
+#[test]
+fn a_jump_of_seq_is_a_gap_or_a_late_frame() {
+    for (sequence, expected) in [
+        (104, (Counter::Lost, 3)),
+        (200, (Counter::Lost, 99)),
+        (95, (Counter::Lost, 250)),
+        (96, (Counter::Unpaired, 1)),
+        (99, (Counter::Unpaired, 1)),
+    ] {
+        let mut device = listener("icub_imu", "", &[]);
+        let frames = [triple(100, 0, 0.0), triple(100, 2, 0.2)];
+        assert_eq!(decode(&mut *device, &frames).0.len(), 1);
+        let (_, faults) = decode(&mut *device, &[triple(sequence, 0, 10.0)]);
+        let counted: Vec<_> = faults.iter().map(|f| (f.counter, f.count)).collect();
+        assert_eq!(counted, [expected], "{sequence}");
+    }
+}
+
+/// Nothing that the board sends besides changes a reading: here of acquisitions 7, 8 (without the
+/// angular velocity) and 9, each in the document's order.
+#[test]
+fn quantities_that_are_not_wanted_are_ignored() {
+    let acquisition = |seq: u8| {
+        let t = 10.0 * f64::from(seq);
+        let others = [3, 5, 6].map(|sensor| triple(seq, sensor, t + 0.6));
+        let last = [
+            frame("514#0040000000000000", t + 0.8),
+            frame(&format!("515#{seq:02X}00000000000000"), t + 1.0),
+        ];
+        let wanted = [0, 1, 2].map(|sensor| triple(seq, sensor, t));
+        let sent = if seq == 8 { 2 } else { 3 };
+        [&wanted[..sent], &others, &last].concat()
+    };
+    let frames: Vec<Frame> = (7..=9).flat_map(acquisition).collect();
+    let mut device = listener("icub_imu", "", &[]);
+    let (readings, faults) = decode(&mut *device, &frames);
+    let read: Vec<_> = readings
+        .iter()
+        .map(|r| (r.device_counter, r.quality))
+        .collect();
+    let good = Quality::DEVICE_COUNTER;
+    assert_eq!(read, [(7, good), (9, good | Quality::GAP_BEFORE)]);
+    assert_eq!((count(&faults, Counter::Unpaired), faults.len()), (1, 1));
+    let is_absent = |values: &[f64]| values.iter().all(|value| value.is_nan());
+    for reading in &readings {
+        let Reading::Imu(imu) = reading.reading else {
+            panic!("{reading:?}")
+        };
+        assert!(is_absent(&imu.magnetic_field) && is_absent(&imu.orientation));
+        assert!(!is_absent(&imu.angular_velocity));
+    }
+    // The quaternion that is heard first belongs to an earlier acquisition.
+    let keys = "quantities = [\"acceleration\", \"orientation\"]";
+    let mut device = listener("icub_imu", keys, &[]);
+    let early = frame("514#0040000000000000", 65.0);
+    let (readings, faults) = decode(&mut *device, &[&[early][..], &acquisition(7)].concat());
+    assert_eq!((readings.len(), faults.len()), (1, 0), "{faults:?}");
+    let Reading::Imu(imu) = readings[0].reading else {
+        panic!("{readings:?}")
+    };
+    assert!(is_absent(&imu.angular_velocity) && imu.orientation[0] == 1.0);
+}
+
+#[test]
+fn a_calibration_above_3_is_none() {
+    let mut device = listener("icub_imu", IMU, &[]);
+    for text in [
+        "515#0704030300000000",
+        "515#0703040300000000",
+        "515#0703030400000000",
+    ] {
+        let (readings, faults) = decode(&mut *device, &[frame(text, 0.0)]);
+        assert_eq!((readings.len(), faults.len()), (0, 1), "{text}");
+        assert_eq!(faults[0].counter, Counter::Value, "{text}");
+    }
+}
+
+/// Frames of a wrong length and answers without a command are counted; those of another board, and
+/// those of the other kind of IMU, are nothing to this one.
+#[test]
+fn an_imu_counts_only_its_own_frames() {
+    let legacy = "legacy = \"mtb\"";
+    for (keys, text, counts) in [
+        ("", "513#0700000000000000", false),
+        ("", "513#07000000000000", true),
+        ("", "513#", true),
+        (IMU, "514#00400000000000", true),
+        (IMU, "515#07030303000000", true),
+        ("", "210#", true),
+        ("", "220#", false),
+        ("", "523#07", false),
+        ("", "511#01", false),
+        (legacy, "511#0040000000C0", false),
+        (legacy, "511#0040000000C000", true),
+        (legacy, "510#0040000000", true),
+        (legacy, "210#", false),
+        (legacy, "513#07", false),
+    ] {
+        let (_, faults) = decode(&mut *listener("icub_imu", keys, &[]), &[frame(text, 0.0)]);
+        let counted: Vec<_> = faults.iter().map(|f| f.counter).collect();
+        let expected = if counts { &[Counter::Length][..] } else { &[] };
+        assert_eq!(counted, expected, "{keys} {text}");
+    }
+    let newer = [triple(7, 0, 0.0), triple(7, 2, 0.1)];
+    assert_eq!(
+        decode(&mut *listener("icub_imu", "", &[]), &newer).0.len(),
+        1
+    );
+    assert!(
+        decode(&mut *listener("icub_imu", legacy, &[]), &newer)
+            .0
+            .is_empty()
+    );
+}
+
+/// The halves of an acquisition before and after a restart do not belong together, and a gap before
+/// it is still one after it.
+#[test]
+fn an_imu_begins_anew_after_a_restart() {
+    let mut device = listener("icub_imu", "", &[]);
+    let frames = [triple(7, 0, 0.0), triple(7, 2, 0.1), triple(8, 0, 10.0)];
+    assert_eq!(decode(&mut *device, &frames).0.len(), 1);
+    // Acquisition 8 lacks its angular velocity, and 9 is cut.
+    let (readings, faults) = decode(&mut *device, &[triple(9, 0, 20.0)]);
+    assert!(readings.is_empty() && count(&faults, Counter::Unpaired) == 1);
+    device.restart(Nanos::from_millis(20));
+    let frames = [
+        triple(9, 2, 20.1),
+        triple(10, 0, 30.0),
+        triple(10, 2, 30.1),
+        triple(11, 0, 40.0),
+        triple(11, 2, 40.1),
+    ];
+    let (readings, faults) = decode(&mut *device, &frames);
+    assert!(faults.is_empty(), "{faults:?}");
+    let read: Vec<_> = readings
+        .iter()
+        .map(|r| (r.device_counter, r.quality))
+        .collect();
+    let good = Quality::DEVICE_COUNTER;
+    assert_eq!(read, [(10, good | Quality::GAP_BEFORE), (11, good)]);
+}
+
+#[test]
+fn legacy_frames_are_paired_in_the_order_of_their_board() {
+    let at = |text: &str, ms| frame(text, ms);
+    let (acceleration, rate) = ("511#0040000000C0", "510#00400000FFFF");
+    // A BNO055 sends the accelerometer first; the order of an mtb is not known.
+    for (keys, any_order) in [("legacy = \"bno055\"", false), ("legacy = \"mtb\"", true)] {
+        let mut device = listener("icub_imu", keys, &[]);
+        let frames = [at(rate, 0.0), at(acceleration, 0.3)];
+        let (readings, _) = decode(&mut *device, &frames);
+        assert_eq!(readings.len(), usize::from(any_order), "{keys}");
+    }
+    // The rates at 0 and at 10 ms are lost, or late: the next is dropped with its acceleration.
+    let mut device = listener("icub_imu", "legacy = \"bno055\"", &[]);
+    let frames = [
+        at(acceleration, 0.0),
+        at(acceleration, 10.0),
+        at(rate, 10.3),
+        at(acceleration, 20.0),
+        at(rate, 20.3),
+        at(acceleration, 30.0),
+        at(rate, 30.3),
+    ];
+    let (readings, faults) = decode(&mut *device, &frames);
+    let qualities: Vec<Quality> = readings.iter().map(|reading| reading.quality).collect();
+    assert_eq!(qualities, [Quality::GAP_BEFORE, Quality::GOOD]);
+    assert_eq!(count(&faults, Counter::Unpaired), 3);
+    // One quantity alone waits for nothing.
+    for (quantity, index) in [("acceleration", 0), ("angular_velocity", 1)] {
+        let keys = format!("legacy = \"mtb\"\nquantities = [\"{quantity}\"]");
+        let mut device = listener("icub_imu", &keys, &[]);
+        let frames = [0.0, 10.0, 20.0].map(|ms| [at(acceleration, ms), at(rate, ms + 0.3)]);
+        let (readings, faults) = decode(&mut *device, frames.as_flattened());
+        assert_eq!((readings.len(), faults.len()), (3, 0));
+        assert_eq!(readings[0].acquired, frames[0][index].t);
+        let Reading::Imu(imu) = readings[0].reading else {
+            panic!("{readings:?}")
+        };
+        let absent = [imu.proper_acceleration, imu.angular_velocity].map(|v| v[0].is_nan());
+        assert_eq!(absent, [index == 1, index == 0]);
+    }
+}
+
+/// It sends what it was told to send last, and a command of the other kind of boards is none.
+#[test]
+fn an_imu_board_does_what_it_is_told() {
+    let started = |keys: &str| {
+        let board = options("icub_imu", keys).board(&spec(1, Mode::Listen, &[]));
+        board.expect("legal keys")
+    };
+    let ids = |board: &mut dyn Board| -> Vec<String> {
+        let frames = encode(board, 0, &Reading::Imu(imu()), Quality::GOOD);
+        // The identifier, and the sensor of a triple.
+        let id = |text: String| match text.starts_with("513") {
+            true => format!("{}{}", &text[..4], &text[6..8]),
+            false => text[..3].to_owned(),
+        };
+        texts(&frames).into_iter().map(id).collect()
+    };
+    let mut newer = started(IMU);
+    assert_eq!(answers(&mut *newer, "70F#FF"), ["710#FF0C020008"]);
+    assert_eq!(
+        ids(&mut *newer),
+        ["513#00", "513#01", "513#02", "514", "515"]
+    );
+    answers(&mut *newer, "201#4F0000");
+    assert!(newer.period().is_some());
+    for (mask, sends) in [
+        ("0100", &["513#00"][..]),
+        ("1400", &["513#02", "514"]),
+        ("0080", &["515"]),
+        ("0000", &[]),
+    ] {
+        answers(&mut *newer, &format!("201#34{mask}0100000000"));
+        assert_eq!(newer.period(), None, "a new configuration stops it");
+        answers(&mut *newer, "201#3514");
+        assert_eq!(newer.period().is_some(), !sends.is_empty(), "{mask}");
+        assert_eq!(ids(&mut *newer), sends);
+        answers(&mut *newer, "201#3500");
+        assert_eq!(newer.period(), None);
+    }
+    for (keys, board) in [("legacy = \"mtb\"", "05"), ("legacy = \"bno055\"", "0C")] {
+        let mut legacy = started(keys);
+        assert_eq!(
+            answers(&mut *legacy, "70F#FF"),
+            [format!("710#FF{board}020008")]
+        );
+        for text in ["201#3401000100000000", "201#33", "201#3500"] {
+            assert_eq!(answers(&mut *legacy, text), [""; 0], "{text}");
+            assert_eq!(legacy.period(), Some(Nanos::from_millis(10)), "{text}");
+        }
+        assert_eq!(ids(&mut *legacy), ["511", "510"]);
+        for (command, sends, streams) in [
+            ("201#4F0214", &["511"][..], true),
+            ("201#4F0414", &["510"], true),
+            ("201#4F0014", &[], false),
+            ("201#4F0614", &["511", "510"], true),
+            ("201#4F0600", &["511", "510"], false),
+        ] {
+            answers(&mut *legacy, command);
+            let period = streams.then_some(Nanos::from_millis(20));
+            assert_eq!(legacy.period(), period, "{command}");
+            assert_eq!(ids(&mut *legacy), sends, "{command}");
+        }
+    }
+}
+
+/// These frames cannot mark a value as absent, of whichever quantity.
+#[test]
+fn each_quantity_of_an_imu_must_be_a_number() {
+    let mut board = board("icub_imu", IMU, &[]);
+    let absent = [
+        Imu {
+            proper_acceleration: [0.0, 0.0, f64::NAN],
+            ..imu()
+        },
+        Imu {
+            angular_velocity: [f64::NAN, 0.0, 0.0],
+            ..imu()
+        },
+        Imu {
+            magnetic_field: [0.0, f64::INFINITY, 0.0],
+            ..imu()
+        },
+        Imu {
+            orientation: [f64::NAN; 4],
+            ..imu()
+        },
+    ];
+    for imu in absent {
+        let mut out = Frames::new();
+        let encoded = board.encode(0, &Reading::Imu(imu), Quality::GOOD, &mut out);
+        assert_eq!(
+            (encoded, out.len()),
+            (Err(EncodeError::NotFinite), 0),
+            "{imu:?}"
+        );
+    }
+}
+
 #[test]
 fn a_motor_board() {
     let joint = JointState {
@@ -403,6 +740,12 @@ fn a_motor_board() {
     // The raw motor temperature has no known scale: a legal frame without a reading.
     let (readings, faults) = decode(&mut *device, &[frame("11C#00003412", 0.0)]);
     assert!(readings.is_empty() && faults.is_empty());
+    // The board's buffer overflows: a fault of it, whatever the frame holds.
+    for text in ["115#", "115#01", "115#0000000000000000"] {
+        let (readings, faults) = decode(&mut *device, &[frame(text, 0.0)]);
+        assert_eq!((readings.len(), faults.len()), (0, 1), "{text}");
+        assert_eq!(faults[0].counter, Counter::DeviceFault, "{text}");
+    }
 }
 
 #[test]

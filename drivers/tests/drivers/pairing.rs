@@ -174,6 +174,92 @@ fn in_doubt_a_torque_must_follow_its_force_as_quickly_as_usual() {
     );
 }
 
+/// A frame without a stamp has no time at which it could be too late or too early.
+#[test]
+fn nothing_expires_without_a_stamp() {
+    for stamped in [[false, true], [true, false], [false, false]] {
+        let mut frames = sequence(&[("F0", 3.0), ("T0", 9.0), ("F1", 10.0), ("T1", 10.015)]);
+        for (frame, has_stamp) in frames.iter_mut().zip(stamped) {
+            if !has_stamp {
+                *frame = frame.at(Nanos::ZERO, StampKind::None);
+            }
+        }
+        let (numbers, _, unpaired) = numbers(&frames);
+        assert_eq!((numbers, unpaired), (vec![0, 1], 0), "{stamped:?}");
+    }
+}
+
+/// In doubt, a second half must come within twice the usual delay and the time of a frame; as long
+/// as none is usual, within half of what the period allows. The usual delay follows the bus.
+#[test]
+fn in_doubt_the_usual_delay_decides() {
+    for (delays, delay, is_read) in [
+        // (2 * 150 + 125) us, and (2 * 400 + 125) us.
+        (&[(150, 1)][..], 420, true),
+        (&[(150, 1)], 430, false),
+        (&[(400, 30)], 900, true),
+        (&[(400, 30)], 950, false),
+        (&[(150, 1), (400, 60)], 900, true),
+        (&[(400, 1), (150, 60)], 420, true),
+        (&[(400, 1), (150, 60)], 700, false),
+        // Half of 0.3 ms and half a period.
+        (&[], 2600, true),
+        (&[], 2700, false),
+    ] {
+        let mut frames = Vec::new();
+        let mut number = 100_u16;
+        let mut reading = |frames: &mut Vec<Frame>, delays: &[i64]| {
+            let [force, torque] = halves(number);
+            let t = i64::from(number) * PERIOD_US;
+            frames.push(at(force, t));
+            frames.extend(delays.iter().map(|delay| at(torque, t + delay)));
+            number += 1;
+        };
+        for (delay, count) in delays {
+            (0..*count).for_each(|_| reading(&mut frames, &[*delay]));
+        }
+        let before = frames.len() / 2;
+        // A second half that is lost: the next one may be the late one.
+        reading(&mut frames, &[]);
+        reading(&mut frames, &[150]);
+        reading(&mut frames, &[delay]);
+        let (numbers, _, _) = numbers(&frames);
+        assert_eq!(
+            numbers.len() - before,
+            usize::from(is_read),
+            "{delays:?} {delay}"
+        );
+    }
+}
+
+/// At 1 kHz a second half may be late by the jitter of an adapter, unless the bus has been calm:
+/// all second halves came within 0.3 ms and a quarter of the period.
+#[test]
+fn a_calm_bus_has_a_shorter_limit() {
+    for (usual, readings, delay, is_read) in [
+        (150, 300, 790, true),
+        (150, 300, 810, false),
+        (540, 300, 810, false),
+        (560, 300, 810, true),
+        (560, 300, 1290, true),
+        (560, 300, 1310, false),
+        // Calm begins with 192 readings.
+        (150, 191, 810, true),
+        (150, 192, 810, false),
+    ] {
+        let mut frames = Vec::new();
+        for number in 0..=readings {
+            let [force, torque] = halves(number);
+            let t = i64::from(number) * 1000;
+            let delay = if number == readings { delay } else { usual };
+            frames.extend([at(force, t), at(torque, t + delay)]);
+        }
+        let (numbers, _, _) = numbers_at(1000, &frames);
+        let read = usize::from(readings) + usize::from(is_read);
+        assert_eq!(numbers.len(), read, "{usual} {readings} {delay}");
+    }
+}
+
 /// The stamps of a stream at 1 kHz, each frame delayed by 0 to 1 ms and none before the last.
 fn jittered(delays: impl Iterator<Item = i64>, lag: i64) -> Vec<i64> {
     let mut last = 0;

@@ -888,3 +888,29 @@ fn a_device_made_of_a_finding_claims_its_frames() {
         assert!(found.explains.iter().any(|id| claimed(&id)), "{found:?}");
     }
 }
+
+/// `frame` with another format.
+fn with_format(frame: &Frame, format: Format) -> Frame {
+    let other = Frame::with_format(frame.id, format, frame.data());
+    other.expect("a legal length").at(frame.t, frame.stamp)
+}
+
+/// Whoever asks for frames need not be there. A device of classic CAN sends no CAN FD.
+#[test]
+fn frames_of_another_format_are_no_device() {
+    let fd = Format::Fd {
+        bit_rate_switch: true,
+        error_state: false,
+    };
+    // Moteus sends CAN FD; the others are not told by the format of their frames.
+    let of_any = ["moteus", "icub_pos", "icub_skin", "optoforce_daq"];
+    for row in BOARDS {
+        let frames = recorded(row, 300);
+        let asked = frames.iter().map(|frame| Frame::remote(frame.id, 8));
+        assert_eq!(found_in(&asked.collect::<Vec<_>>(), row), None);
+        if !of_any.contains(&row.0) {
+            let fd: Vec<Frame> = frames.iter().map(|frame| with_format(frame, fd)).collect();
+            assert_eq!(found_in(&fd, row), None);
+        }
+    }
+}

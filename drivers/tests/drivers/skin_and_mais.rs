@@ -2,8 +2,8 @@
 //! against the boards.
 
 use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, spec};
-use proprio_drivers::{Mode, SpecError, State};
-use proprio_topics::{Counter, JointState, Quality, Reading, Skin};
+use proprio_drivers::{EncodeError, Frame, Frames, Mode, SpecError, State};
+use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Skin};
 use proptest::prelude::*;
 
 fn skin(reading: &Reading) -> Skin {
@@ -90,6 +90,77 @@ fn triangles_are_paired_apart() {
         .collect();
     assert_eq!(read, [(5, false), (15, false), (5, true)]);
     assert_eq!(count(&faults, Counter::Unpaired), 6, "{faults:?}");
+}
+
+/// Of each triangle but 5, the second frame at 50 ms is lost; 7 has not been read before.
+#[test]
+fn a_gap_is_that_of_its_triangle() {
+    let mut device = listener("icub_skin", "", &[]);
+    let both = |triangle: u8, ms: f64| {
+        let of = |text: &str, ms| frame(&text.replace("415", &format!("41{triangle:X}")), ms);
+        [of(FIRST, ms), of(SECOND, ms + 0.2)]
+    };
+    let mut frames: Vec<Frame> = Vec::new();
+    for (ms, used) in [
+        (0.0, [2, 0, 2]),
+        (50.0, [1, 1, 2]),
+        (100.0, [2, 2, 2]),
+        (150.0, [2, 2, 2]),
+        (200.0, [2, 2, 2]),
+    ] {
+        for (triangle, used) in [15, 7, 5].into_iter().zip(used) {
+            frames.extend(&both(triangle, ms)[..used]);
+        }
+    }
+    let (readings, _) = decode(&mut *device, &frames);
+    let gaps = |wanted: u32| -> Vec<bool> {
+        let own = readings
+            .iter()
+            .filter(|r| skin(&r.reading).triangle == wanted);
+        own.map(|r| r.quality.contains(Quality::GAP_BEFORE))
+            .collect()
+    };
+    assert_eq!(gaps(5), [false; 5]);
+    assert_eq!(gaps(15), [false, true, false]);
+    assert_eq!(gaps(7), [false, false]);
+}
+
+#[test]
+fn the_halves_of_a_triangle_before_and_after_a_restart_are_not_one() {
+    let mut device = listener("icub_skin", "", &[]);
+    assert!(decode(&mut *device, &[frame(FIRST, 0.0)]).0.is_empty());
+    device.restart(Nanos::ZERO);
+    assert!(decode(&mut *device, &[frame(SECOND, 0.2)]).0.is_empty());
+    let frames = [frame(FIRST, 50.0), frame(SECOND, 50.2)];
+    assert_eq!(decode(&mut *device, &frames).0.len(), 1);
+}
+
+#[test]
+fn a_skin_board_sends_the_triangles_that_it_is_told() {
+    let mut board = board("icub_skin", "triangles = [0, 15]", &[]);
+    let mut out = Frames::new();
+    board.on_frame(&frame("201#50020502010022", 0.0), &mut out);
+    assert!(out.is_empty(), "not acknowledged");
+    for (output, triangle, sends) in [
+        (0, 1, false),
+        (0, 2, true),
+        (0, 5, true),
+        (0, 6, false),
+        (0, 300, false),
+        (1, 3, false),
+    ] {
+        let reading = Reading::Skin(Skin {
+            triangle,
+            taxels: [0.0; 12],
+        });
+        let mut out = Frames::new();
+        let encoded = board.encode(output, &reading, Quality::GOOD, &mut out);
+        let expected = match sends {
+            true => (Ok(()), 2),
+            false => (Err(EncodeError::Output(output)), 0),
+        };
+        assert_eq!((encoded, out.len()), expected, "{output} {triangle}");
+    }
 }
 
 #[test]
@@ -237,6 +308,13 @@ fn a_mais_sends_all_sensors_of_a_frame_at_once() {
     assert_eq!(sent(9, 300.0), ["31D#0000FF0000000000"]);
     assert_eq!(sent(5, 5.0), ["31C#00010000000500"]);
     assert_eq!(sent(5, 6.0), [""; 0]);
+    // A frame without joints is never sent.
+    for (sensor, frame) in [(2, "31C#00000700000000"), (9, "31D#0000070000000000")] {
+        let mut board = crate::rig::board("icub_mais", "", &[sensor]);
+        let frames = encode(&mut *board, sensor, &joint(7.0), Quality::GOOD);
+        let texts: Vec<String> = frames.iter().map(ToString::to_string).collect();
+        assert_eq!(texts, [frame]);
+    }
 }
 
 proptest! {
