@@ -145,7 +145,7 @@ impl Driver for Options {
         let mut evidence = Evidence::new(seen, 1);
         let [force, torque] = [Self::default().id_force, Self::default().id_torque].map(|raw| {
             evidence.sends(Id::standard(raw), length_of(3), |frame| {
-                frame.format == Format::Classic && matches!(frame.len(), 6..=8)
+                matches!(frame.len(), 6..=8)
             })
         });
         let (Some(force), Some(torque)) = (force, torque) else {

@@ -424,9 +424,7 @@ impl Board for PosBoard {
             }
             Some(&[command::POS_TRANSMIT, ms]) => {
                 self.streaming = ms > 0;
-                if ms > 0 {
-                    self.period = Nanos::from_millis(i64::from(ms));
-                }
+                self.period = Nanos::from_millis(i64::from(ms));
             }
             _ => {}
         }

@@ -93,7 +93,7 @@ pub use options::{Options, Stream};
 
 use crate::icub::{self, board as boards, class};
 use crate::recognise::{self, Finding, Key, Traffic, length_of};
-use crate::{Board, Device, Driver, Format, Frame, OutputInfo, Spec, SpecError};
+use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use device::Strain;
@@ -119,11 +119,8 @@ impl Driver for Options {
         let types = [boards::STRAIN, boards::STRAIN2, boards::STRAIN2C];
         icub::recognise(seen, Self::NAME, &types, &[], |evidence, address, _| {
             let id = |kind| icub::stream(class::PERIODIC_ANALOG, address, kind);
-            let mut half = |kind| {
-                evidence.sends(id(kind), length_of(2), |frame| {
-                    frame.format == Format::Classic && matches!(frame.len(), 6 | 7)
-                })
-            };
+            let mut half =
+                |kind| evidence.sends(id(kind), length_of(2), |frame| matches!(frame.len(), 6 | 7));
             let calibrated = (half(kind::FORCE), half(kind::TORQUE));
             let raw = (half(kind::RAW_FORCE), half(kind::RAW_TORQUE));
             for pair in [calibrated, raw] {

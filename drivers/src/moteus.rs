@@ -180,12 +180,12 @@ impl Driver for Options {
             let first = stream.kept().next()?;
             let bits = f64::from(Told::parse(first.data())?.structure);
             // Of 127 controllers and 128 hosts.
-            let mut evidence = Evidence::new(seen, 127 * 128);
+            let mut evidence = Evidence::with_fd(seen, 127 * 128);
             evidence.sends(stream.id, bits, |frame| Told::parse(frame.data()).is_some());
             let query = id(host, node, WANTED);
             evidence.sends(query, f64::from(BITS), |frame| {
                 let opcode = frame.data().first();
-                opcode.is_some_and(|opcode| *opcode < READ_ERROR)
+                opcode.is_some_and(|opcode| *opcode < REPLY)
             });
             let what = "moteus controller";
             let finding = evidence.finding(Self::NAME, node.into(), what)?;

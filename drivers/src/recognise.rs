@@ -49,7 +49,8 @@ pub struct Stream {
     pub stamps: (Nanos, Nanos),
     /// The bits of the payload that are not the same in all frames.
     changing: [u8; Frame::MAX_LEN],
-    first: Option<Frame>,
+    /// Each byte as it came first.
+    first: [u8; Frame::MAX_LEN],
     recent: VecDeque<Frame>,
     heads: Vec<Frame>,
 }
@@ -64,7 +65,7 @@ impl Stream {
             lengths: (0, 0),
             stamps: (Nanos::ZERO, Nanos::ZERO),
             changing: [0; Frame::MAX_LEN],
-            first: None,
+            first: [0; Frame::MAX_LEN],
             recent: VecDeque::new(),
             heads: Vec::new(),
         }
@@ -78,15 +79,19 @@ impl Stream {
             Format::Error => return,
         }
         self.frames += 1;
-        let first = *self.first.get_or_insert(*frame);
+        let bytes = self.changing.iter_mut().zip(&mut self.first);
+        for ((place, (mask, first)), byte) in bytes.enumerate().zip(frame.data()) {
+            if place < self.lengths.1 {
+                *mask |= *first ^ byte;
+            } else {
+                *first = *byte;
+            }
+        }
         if self.frames == 1 {
             (self.lengths, self.stamps.0) = ((frame.len(), frame.len()), frame.t);
         }
         let (least, most) = self.lengths;
         (self.lengths, self.stamps.1) = ((least.min(frame.len()), most.max(frame.len())), frame.t);
-        for ((mask, a), b) in self.changing.iter_mut().zip(first.data()).zip(frame.data()) {
-            *mask |= a ^ b;
-        }
         fn head(frame: &Frame) -> (usize, &[u8]) {
             let data = frame.data();
             (data.len(), data.get(..HEAD).unwrap_or(data))
@@ -321,21 +326,32 @@ pub(crate) struct Evidence<'t> {
     bits: f64,
     explains: Vec<Id>,
     refuted: bool,
+    /// Its frames may be CAN FD.
+    fd: bool,
 }
 
 impl<'t> Evidence<'t> {
-    /// Nothing yet for a device that might have one of `addresses` addresses.
+    /// Nothing yet for a device of classic CAN that might have one of `addresses` addresses.
     pub(crate) fn new(traffic: &'t Traffic, addresses: usize) -> Self {
         Self {
             traffic,
             bits: -log2(addresses),
             explains: Vec::new(),
             refuted: false,
+            fd: false,
         }
     }
 
-    /// The device sends `id`, and all its data frames fulfil `rule`, which one of 2^`bits`
-    /// arbitrary frames does. Returns what was heard on it, if anything was.
+    /// As [`Evidence::new`], for a device that sends CAN FD too.
+    pub(crate) fn with_fd(traffic: &'t Traffic, addresses: usize) -> Self {
+        Self {
+            fd: true,
+            ..Self::new(traffic, addresses)
+        }
+    }
+
+    /// The device sends `id`, and all its data frames are of its format and fulfil `rule`, which
+    /// one of 2^`bits` arbitrary frames does. Returns what was heard on it, if anything was.
     pub(crate) fn sends(
         &mut self,
         id: Id,
@@ -346,7 +362,8 @@ impl<'t> Evidence<'t> {
         let (mut all, mut odd) = (0_u32, 0_u32);
         for frame in stream.kept() {
             all += 1;
-            odd += u32::from(!rule(frame));
+            let is_own = self.fd || frame.format == Format::Classic;
+            odd += u32::from(!(is_own && rule(frame)));
         }
         if f64::from(odd) > f64::from(all) * ODD {
             self.refuted = true;
@@ -356,11 +373,9 @@ impl<'t> Evidence<'t> {
         Some(stream)
     }
 
-    /// As [`Evidence::sends`], for classic frames of length `length`.
+    /// As [`Evidence::sends`], for frames of length `length`.
     pub(crate) fn sends_length(&mut self, id: Id, length: usize) -> Option<&'t Stream> {
-        self.sends(id, LENGTH, |frame| {
-            frame.format == Format::Classic && frame.len() == length
-        })
+        self.sends(id, LENGTH, |frame| frame.len() == length)
     }
 
     /// As [`Evidence::sends`], of a protocol in which a frame without data asks for another of the

@@ -1,8 +1,8 @@
 //! Recognising boards: by what they answer, to this host or to another program.
 
 use super::frames::{BASE_MOST, ForceUnit, TorqueUnit, id, opcode};
+use crate::Frame;
 use crate::recognise::{Evidence, Finding, Key, LENGTH, Traffic, byte_of, length_of};
-use crate::{Format, Frame};
 use alloc::format;
 use alloc::string::String;
 use alloc::vec::Vec;
@@ -31,9 +31,7 @@ fn is_text(frame: &Frame) -> bool {
 pub(super) fn sensor(seen: &Traffic, driver: &'static str, base: u8) -> Option<Finding> {
     let mut evidence = Evidence::new(seen, usize::from(BASE_MOST) + 1);
     let id = |opcode| id(base, opcode);
-    let has_length = |lengths: [usize; 2]| {
-        move |frame: &Frame| frame.format == Format::Classic && lengths.contains(&frame.len())
-    };
+    let has_length = |lengths: [usize; 2]| move |frame: &Frame| lengths.contains(&frame.len());
     let first = evidence.answers(id(opcode::GAUGES), LENGTH, has_length([8, 8]));
     let second = evidence.sends_length(id(opcode::GAUGES_SECOND), 6);
     if let (Some(first), Some(second)) = (first, second) {
@@ -72,7 +70,7 @@ pub(super) fn questions(seen: &Traffic) -> Vec<Frame> {
     for base in 0..=BASE_MOST {
         questions.push(Frame::new(id(base, opcode::UNITS), &[]));
         let heard = seen.stream(id(base, opcode::UNITS));
-        if heard.is_some_and(|stream| stream.kept().any(|f| f.len() == 2 && is_units(f))) {
+        if heard.is_some_and(|stream| stream.kept().any(is_units)) {
             questions.push(Frame::new(id(base, opcode::SERIAL), &[]));
             questions.push(Frame::new(id(base, opcode::COUNTS), &[]));
         }

@@ -94,11 +94,7 @@ pub(crate) fn recognise(seen: &Traffic) -> impl Iterator<Item = Recognised<'_>> 
                 words += &format!(", {name} {value:#x}");
             }
         }
-        let tpdos = [0, 1, 2, 3].map(|number| {
-            evidence.sends(tpdo(node, number), 0.0, |frame| {
-                frame.format == Format::Classic
-            })
-        });
+        let tpdos = [0, 1, 2, 3].map(|number| evidence.sends(tpdo(node, number), 0.0, |_| true));
         for id in [emcy(node), sdo_to(node)] {
             evidence.belongs(id);
         }

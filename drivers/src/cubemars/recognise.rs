@@ -3,7 +3,7 @@
 use super::frames::SERVO_STATUS;
 use super::options::Options;
 use crate::recognise::{BYTE, Evidence, Finding, Key, LENGTH, Stream, Traffic, byte_of, length_of};
-use crate::{Driver, Format, Frame, Id};
+use crate::{Driver, Frame, Id};
 use alloc::vec::Vec;
 
 /// Errors, and that there is none.
@@ -31,7 +31,7 @@ fn servo(seen: &Traffic, number: u8) -> Option<Finding> {
     let mut evidence = Evidence::new(seen, 0xFF);
     let id = Id::extended(SERVO_STATUS | u32::from(number));
     let stream = evidence.sends(id, LENGTH + byte_of(ERRORS), |frame| {
-        frame.format == Format::Classic && frame.len() == 8 && has_error(frame.data().get(7))
+        frame.len() == 8 && has_error(frame.data().get(7))
     })?;
     let finding = finding(
         evidence,
@@ -63,8 +63,7 @@ fn mit(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
     }
     let is_reply = |frame: &Frame| {
         let data = frame.data();
-        let has_stage = data.len() == 6 || data.len() == 8 && has_error(data.get(7));
-        frame.format == Format::Classic && has_stage
+        data.len() == 6 || data.len() == 8 && has_error(data.get(7))
     };
     let find = |number: &u8| {
         let mut evidence = Evidence::new(seen, if host == 0 { 1 } else { 0xFF });

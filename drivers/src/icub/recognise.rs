@@ -1,8 +1,8 @@
 //! Recognising boards of the protocol: by what they tell of themselves, and by their streams.
 
 use super::{ADDRESSES, BROADCAST, board, class, command, to_board, to_host};
+use crate::Frame;
 use crate::recognise::{BYTE, Evidence, Finding, Key, LENGTH, Stream, Traffic, byte_of, length_of};
-use crate::{Format, Frame};
 use alloc::format;
 use alloc::string::String;
 use alloc::vec::Vec;
@@ -25,8 +25,7 @@ fn told(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Result<Option
     // Commands of the bootloader are below 10.
     let rule = |frame: &Frame| {
         let first = frame.data().first().copied();
-        let is_command = first.is_some_and(|c| c == command::DISCOVER || c < 0x10);
-        frame.format == Format::Classic && is_command
+        first.is_some_and(|c| c == command::DISCOVER || c < 0x10)
     };
     if let Some(stream) = evidence.sends(id, byte_of(17), rule) {
         let mut texts: [Option<[u8; 4]>; 8] = [None; 8];

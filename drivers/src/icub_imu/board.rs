@@ -111,9 +111,7 @@ impl Board for ImuBoard {
             [command::ACC_GYRO_SETUP, mask, ms] if is_legacy => {
                 self.streaming = mask != 0 && ms > 0;
                 self.legacy_mask = Some(mask);
-                if ms > 0 {
-                    self.period = Nanos::from_millis(i64::from(ms));
-                }
+                self.period = Nanos::from_millis(i64::from(ms));
             }
             _ => {}
         }

@@ -1,9 +1,9 @@
 //! Recognising IMUs: by the type of their board, or by their streams.
 
 use super::frames::{kind, sensor};
+use crate::Frame;
 use crate::icub::{self, board, class};
 use crate::recognise::{Finding, Key, LENGTH, Stream, Traffic, byte_of};
-use crate::{Format, Frame};
 use alloc::format;
 use alloc::vec::Vec;
 
@@ -31,7 +31,7 @@ const SENSORS: [(u8, &str); 6] = [
 pub(super) fn boards(seen: &Traffic, driver: &'static str) -> Vec<Finding> {
     icub::recognise(seen, driver, &TYPES, &[], |evidence, address, board| {
         let id = |kind| icub::stream(class::PERIODIC_INERTIAL, address, kind);
-        let is_long = |frame: &Frame| frame.format == Format::Classic && frame.len() == 8;
+        let is_long = |frame: &Frame| frame.len() == 8;
         let mut keys = Vec::new();
         let mut quantities: Vec<&str> = Vec::new();
         let triple = evidence.sends(id(kind::TRIPLE), LENGTH + byte_of(SENSORS.len()), |frame| {
@@ -72,7 +72,7 @@ pub(super) fn boards(seen: &Traffic, driver: &'static str) -> Vec<Finding> {
         if let (Some(a), Some(b)) = (accelerometer, gyroscope) {
             evidence.together(a, b);
         }
-        let is_legacy = accelerometer.is_some() && gyroscope.is_some();
+        let is_legacy = accelerometer.is_some() || gyroscope.is_some();
         match board {
             _ if !quantities.is_empty() => {}
             Some(board::MTB) => keys.push(Key::new("legacy", "\"mtb\"")),
@@ -84,11 +84,14 @@ pub(super) fn boards(seen: &Traffic, driver: &'static str) -> Vec<Finding> {
             _ => {}
         }
         if quantities.is_empty() {
-            keys.extend(Key::period_ms(
-                accelerometer.and_then(Stream::period),
-                1,
-                255,
-            ));
+            let alone = match (accelerometer, gyroscope) {
+                (Some(_), None) => Some("[\"acceleration\"]"),
+                (None, Some(_)) => Some("[\"angular_velocity\"]"),
+                _ => None,
+            };
+            keys.extend(alone.map(|quantity| Key::new("quantities", quantity)));
+            let stream = accelerometer.or(gyroscope);
+            keys.extend(Key::period_ms(stream.and_then(Stream::period), 1, 255));
         }
         (keys, Vec::new())
     })

@@ -2,7 +2,7 @@
 
 use super::protocol::{READY, id, op};
 use crate::recognise::{BYTE, Evidence, Finding, Key, Stream, Traffic, byte_of, length_of};
-use crate::{Format, Frame, bytes};
+use crate::{Frame, bytes};
 use alloc::vec::Vec;
 
 /// Board `node`, if `seen` shows it.
@@ -28,7 +28,7 @@ pub(super) fn board(seen: &Traffic, driver: &'static str, node: u16) -> Option<F
     let acknowledged = evidence.sends(id(op::ACKNOWLEDGE, node), bits, |frame| {
         let state = frame.data().first();
         let is_state = state.is_some_and(|state| *state <= READY + 1);
-        frame.format == Format::Classic && is_state && matches!(frame.len(), 1 | 7)
+        is_state && matches!(frame.len(), 1 | 7)
     });
     let scales = acknowledged.is_some_and(|stream| {
         let plausible = |frame: &Frame| {

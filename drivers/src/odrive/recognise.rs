@@ -61,8 +61,7 @@ pub(super) fn axis(seen: &Traffic, driver: &'static str, node: u16) -> Option<Fi
         what = format!("ODrive {hardware}.{revision}, firmware 0.{minor}.{patch}");
         firmware = if minor == 5 { "0.5" } else { "0.6" };
     }
-    let is_joint = |frame: &Frame| is_answer(frame);
-    let period = estimates.and_then(|stream| stream.period_of(is_joint));
+    let period = estimates.and_then(|stream| stream.period_of(is_answer));
     let finding = evidence.finding(driver, node.into(), what)?;
     let firmware = match firmware {
         "" => Key::fill_in("firmware", "\"0.6\"", "or \"0.5\", for an ODrive v3"),

@@ -3,14 +3,15 @@
 use super::options::Options;
 use super::protocol::PACKET;
 use crate::recognise::{BYTE, Evidence, Finding, Key, Stream, Traffic};
-use crate::{Driver, Frame, Id, bytes};
+use crate::{Driver, Format, Frame, Id, bytes};
 
 /// The unit that sends on `stream`, if it is one.
 pub(super) fn unit(seen: &Traffic, stream: &Stream) -> Option<Finding> {
     let Id::Standard(address) = stream.id else {
         return None;
     };
-    let is_first = |frame: &Frame| frame.data().starts_with(&PACKET);
+    let is_first =
+        |frame: &Frame| frame.format == Format::Classic && frame.data().starts_with(&PACKET);
     let is_packet = |(first, second): (&Frame, &Frame)| {
         let all = first
             .data()

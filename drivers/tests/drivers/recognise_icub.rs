@@ -1,7 +1,7 @@
 //! What speaks for each board of the iCub protocol and what does not, and the keys that its streams
 //! tell: frames computed by hand from the tables of the drivers.
 
-use crate::rig::frame;
+use crate::rig::{decode, frame, listener};
 use proprio_drivers::{Finding, Format, Frame, Id, Traffic, recognise};
 
 /// The iCub boards that are found where these frames, at these times \[ms\], come every 10 ms.
@@ -257,14 +257,30 @@ fn the_scale_of_legacy_frames_is_that_of_the_boards_type() {
     let (mtb, strain2) = (("710#FF05020008", 5.0), ("710#FF0C020008", 5.0));
     let [a, b] = legacy;
     let newer = "period_ms = 10; quantities = [\"acceleration\"]";
+    let alone = |legacy: &str, quantity: &str| {
+        format!("legacy = \"{legacy}\"; quantities = [\"{quantity}\"]; period_ms = 10")
+    };
     for (frames, expected) in [
         (&[a, b, mtb][..], "legacy = \"mtb\"; period_ms = 10"),
         (&[a, b, strain2], "legacy = \"bno055\"; period_ms = 10"),
+        // A board that is set to send one of them.
+        (&[a, mtb], &alone("mtb", "acceleration")),
+        (&[b, mtb], &alone("mtb", "angular_velocity")),
+        (&[a, strain2], &alone("bno055", "acceleration")),
+        (&[b, strain2], &alone("bno055", "angular_velocity")),
         (&[a, b, triple, strain2], newer),
         (&[a, b, triple], newer),
         (&[strain2], ""),
     ] {
         assert_eq!(keys(&found(frames), "icub_imu"), expected);
+    }
+    // A device with these keys reads what was heard.
+    for heard in [&[a, mtb][..], &[b, mtb], &[a, b, mtb]] {
+        let keys = keys(&found(heard), "icub_imu").replace("; ", "\n");
+        let frames = heard.iter().map(|(text, ms)| frame(text, *ms));
+        let mut device = listener("icub_imu", &keys, &[]);
+        let (readings, _) = decode(&mut *device, &frames.collect::<Vec<_>>());
+        assert_eq!(readings.len(), 1, "{keys}");
     }
     // Of a board that has not told its type a person must say it.
     let findings = found(&legacy);

@@ -51,6 +51,14 @@ fn a_stream_has_the_numbers_of_its_frames() {
     assert!((stream.rate() - 80.0).abs() < 1e-9, "{}", stream.rate());
 }
 
+/// A byte is compared with the first that came in its place, also if the first frame was shorter.
+#[test]
+fn bytes_beyond_a_short_first_frame_change_too() {
+    let texts = ["123#01", "123#0102", "123#010A03", "123#01"];
+    let stream = heard(texts.map(|text| frame(text, 0.0)));
+    assert_eq!(stream.changing(), [0, 0x08, 0]);
+}
+
 #[test]
 fn a_rate_needs_two_instants() {
     for (stamps, hz) in [
