@@ -36,6 +36,7 @@
 //!
 //! If another program polls the sensor (`listen_only`, or a recorded log), its requests tell which
 //! row of the matrix a reply holds. So a log of such a program's start decodes without any key.
+//! No reply says which row it holds: two programs must not ask one sensor at a time.
 //!
 //! Sources: ATI manual 9610-05-1030-04 (Network F/T NETCANOEM). Certain: three programs of others
 //! that talk to these boards agree. Their baud rate is 2 Mbit/s / (divisor + 1), or 250 kbit/s by

@@ -232,7 +232,6 @@ mod tests {
         );
         let empty = Frame::remote(Id::standard(0x705), 0);
         assert_eq!(empty.to_string(), "705#R");
-        assert_eq!(std::format!("{:?} {empty:?}", empty.id), "705 (0) 705#R");
         let fd = Format::Fd {
             bit_rate_switch: true,
             error_state: false,

@@ -85,7 +85,7 @@ const NOTHING: u8 = 0x50;
 const QUERY: [u8; 6] = [0x11, 0x00, 0x1F, 0x01, 0x13, 0x0D];
 /// Asks for a reply.
 const WANTED: u16 = 0x8000;
-/// Mode of a controller with a fault. Mode 0 is stopped.
+/// Mode of a controller with a fault.
 const MODE_FAULT: f64 = 1.0;
 /// Faults that concern the position.
 const POSITION_FAULTS: [u32; 4] = [35, 36, 42, 43];
@@ -578,7 +578,7 @@ impl MoteusBoard {
             register::TEMPERATURE => self.celsius,
             register::FAULT if sensor => ENCODER_FAULT,
             register::FAULT if drive => TOO_HOT,
-            // A mode without a fault is 0, stopped.
+            // Without a fault the mode is 0, stopped; and so is a register that it does not have.
             _ => 0.0,
         }
     }

@@ -6,7 +6,7 @@
 //! counts 3 bits, a constant byte 8, an identifier that the device must have about 11 less the
 //! logarithm of how many there are on the bus. The number of addresses that the device might have
 //! counts against it: with 127 of them, 7 bits. Frames that the device does not send, on an
-//! identifier that is its own, refute it.
+//! identifier that is its own, refute it; CAN FD is such a frame for a device of classic CAN.
 //!
 //! So the bits say how many buses of arbitrary frames there are for one on which a driver finds a
 //! device that is not there. With about 20 drivers (4 bits), a *possible* device (8 bits) is found
@@ -520,29 +520,6 @@ mod tests {
         traffic
     }
 
-    #[test]
-    fn a_stream_is_summarised() {
-        let mut traffic = heard(&[
-            (0x123, &[1, 2, 3], 0.0),
-            (0x123, &[1, 2, 7], 10.0),
-            (0x123, &[1, 0x82, 3, 4], 20.0),
-            (0x123, &[1, 2, 3], 31.0),
-        ]);
-        traffic.on_frame(&Frame::remote(Id::standard(0x123), 4));
-        traffic.on_frame(&Frame::remote(Id::standard(0x124), 4));
-        let stream = traffic.stream(Id::standard(0x123)).unwrap();
-        assert_eq!(
-            (stream.frames, stream.remote, stream.lengths),
-            (4, 1, (3, 4))
-        );
-        assert_eq!(stream.changing(), [0, 0x80, 4, 0]);
-        assert_eq!(stream.period(), Some(Nanos::from_millis(10)));
-        assert!((stream.rate() - 3.0 / 0.031).abs() < 1e-9);
-        let other = traffic.stream(Id::standard(0x124)).unwrap();
-        assert_eq!((other.frames, other.remote, other.period()), (0, 1, None));
-        assert_eq!(other.rate(), 0.0);
-    }
-
     /// The usual time is the median: neither a pause nor a burst changes it.
     #[test]
     fn a_period_is_the_median() {
@@ -554,31 +531,6 @@ mod tests {
         };
         assert_eq!(period(7), Some(Nanos::from_millis(10)));
         assert_eq!((period(4).is_some(), period(3)), (true, None));
-    }
-
-    #[test]
-    fn certainty_begins_at_the_stated_bits() {
-        let traffic = Traffic::new();
-        let of = |bits: f64, guess: bool| {
-            let mut evidence = Evidence::new(&traffic, 1);
-            evidence.explains(
-                Id::standard(1),
-                bits - evidence.traffic.id_bits(Id::standard(1)),
-            );
-            let finding = evidence.finding("driver", 1, "");
-            finding.and_then(|found| Finding { guess, ..found }.certainty())
-        };
-        for (bits, certainty) in [
-            (7.99, None),
-            (8.01, Some(Certainty::Possible)),
-            (15.99, Some(Certainty::Possible)),
-            (16.01, Some(Certainty::Likely)),
-            (31.99, Some(Certainty::Likely)),
-            (32.01, Some(Certainty::Certain)),
-        ] {
-            assert_eq!(of(bits, false), certainty, "{bits}");
-            assert_eq!(of(bits, true), certainty.map(|_| Certainty::Possible));
-        }
     }
 
     /// An answer is kept, whatever comes after it; memory stays bounded.

@@ -246,9 +246,11 @@ impl Family for Netcanoem {
         Some(self.open.unwrap_or(self.next))
     }
 
-    fn on_sent(&mut self, _frame: &Frame, outcome: Result<Nanos, NotSent>) {
-        // While a request is open, no other frame is under way.
-        self.open = (outcome.ok()).and_then(|t| self.open.map(|_| t + ANSWER));
+    fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        // After a restart a late outcome may concern a question of before.
+        if frame.id == id(self.base, opcode::GAUGES) {
+            self.open = (outcome.ok()).and_then(|t| self.open.map(|_| t + ANSWER));
+        }
     }
 
     fn interrupt(&mut self) {

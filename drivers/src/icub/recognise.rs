@@ -1,8 +1,8 @@
 //! Recognising boards of the protocol: by what they tell of themselves, and by their streams.
 
 use super::{ADDRESSES, BROADCAST, board, class, command, to_board, to_host};
-use crate::Frame;
 use crate::recognise::{BYTE, Evidence, Finding, Key, LENGTH, Stream, Traffic, byte_of, length_of};
+use crate::{Format, Frame};
 use alloc::format;
 use alloc::string::String;
 use alloc::vec::Vec;
@@ -66,12 +66,9 @@ fn told(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Result<Option
         (class::POLLING_MOTOR, command::MOTOR_GET_FIRMWARE_VERSION),
     ] {
         let id = to_host(class, address);
-        let frames = evidence
-            .traffic
-            .stream(id)
-            .into_iter()
-            .flat_map(Stream::kept);
-        for frame in frames {
+        let stream = evidence.traffic.stream(id).into_iter();
+        let frames = stream.flat_map(Stream::kept);
+        for frame in frames.filter(|frame| frame.format == Format::Classic) {
             if let [command, board, major, minor, build, _, _, 0 | 1] = *frame.data()
                 && command == version
                 && board::NAMES.iter().any(|(known, _)| *known == board)

@@ -84,12 +84,19 @@ pub(super) fn boards(seen: &Traffic, driver: &'static str) -> Vec<Finding> {
             _ => {}
         }
         if quantities.is_empty() {
-            let alone = match (accelerometer, gyroscope) {
-                (Some(_), None) => Some("[\"acceleration\"]"),
-                (None, Some(_)) => Some("[\"angular_velocity\"]"),
-                _ => None,
-            };
-            keys.extend(alone.map(|quantity| Key::new("quantities", quantity)));
+            // Only what it sends is asked of it.
+            match (accelerometer, gyroscope) {
+                (Some(_), None) => {
+                    keys.push(Key::new("quantities", "[\"acceleration\"]"));
+                    let note = "or 8: is it an external accelerometer?";
+                    keys.push(Key::fill_in("legacy_mask", "2", note));
+                }
+                (None, Some(_)) => {
+                    keys.push(Key::new("quantities", "[\"angular_velocity\"]"));
+                    keys.push(Key::new("legacy_mask", "4"));
+                }
+                _ => {}
+            }
             let stream = accelerometer.or(gyroscope);
             keys.extend(Key::period_ms(stream.and_then(Stream::period), 1, 255));
         }

@@ -1,7 +1,9 @@
 //! ATI NETCANOEM: a session that Python wrote from the manual's tables, halves out of step, and the
 //! questions for the calibration.
 
-use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, spec};
+use crate::rig::{
+    Rig, board, count, decode, encode, frame, listener, options, poll, spec, supervisor,
+};
 use proprio_drivers::{
     Decoded, Device, Fault, Frame, Mode, NotSent, Options, Output, SpecError, State,
 };
@@ -513,9 +515,7 @@ fn another_calibration_voids_what_is_not_configured() {
 /// A device that selects a calibration counts an answer with another number, and asks again.
 #[test]
 fn an_answer_with_another_number_is_counted() {
-    let mut device = options("ati_netcanoem", "calibration = 3")
-        .device(&spec(0x20, Mode::Supervise, &[]))
-        .unwrap();
+    let mut device = supervisor("ati_netcanoem", "calibration = 3", &[]);
     let mut out = Decoded::new();
     let now = Nanos::from_millis(1000);
     let asked = device.poll_transmit(now, &mut out).unwrap().frame;
@@ -531,18 +531,11 @@ fn an_answer_with_another_number_is_counted() {
 
 /// A device that asks, without a sensor: every answer is given by hand.
 fn asking(keys: &str) -> Box<dyn Device> {
-    options("ati_netcanoem", keys)
-        .device(&spec(0x20, Mode::Supervise, &[]))
-        .unwrap()
+    supervisor("ati_netcanoem", keys, &[])
 }
 
 fn at(ms: i64) -> Nanos {
     Nanos::from_millis(ms)
-}
-
-fn poll(device: &mut dyn Device, t: Nanos) -> Option<Frame> {
-    let transmit = device.poll_transmit(t, &mut Decoded::new());
-    transmit.map(|transmit| transmit.frame)
 }
 
 /// The device sends `question` at `t`, and is told that it left then, or that it did not.

@@ -1,7 +1,7 @@
 //! Bring-up of each family against its own board: frames sent, losses, silence, restart, refusal,
 //! stop.
 
-use crate::rig::{Rig, decode, frame, listener, options, spec};
+use crate::rig::{Rig, decode, frame, listener, options, spec, supervisor};
 use proprio_drivers::{
     Command, CommandFailed, CommandOutcome, Decoded, Mode, NotSent, Options, SpecError, State,
 };
@@ -214,11 +214,7 @@ fn a_start_command_that_was_not_sent_is_repeated() {
 /// wait for it.
 #[test]
 fn one_frame_is_under_way_at_a_time() {
-    let device = || {
-        options("icub_strain", SCALES)
-            .device(&spec(1, Mode::Supervise, &[]))
-            .unwrap()
-    };
+    let device = || supervisor("icub_strain", SCALES, &[]);
     let mut out = Decoded::new();
     let (mut one, now) = (device(), Nanos::from_millis(1000));
     let first = one.poll_transmit(now, &mut out).unwrap();
@@ -255,9 +251,7 @@ fn one_frame_is_under_way_at_a_time() {
 /// The time-out of an answer begins when the question is sent.
 #[test]
 fn a_question_that_waited_for_the_bus_is_not_repeated_early() {
-    let mut device = options("icub_strain", "")
-        .device(&spec(1, Mode::Supervise, &[]))
-        .unwrap();
+    let mut device = supervisor("icub_strain", "", &[]);
     let (mut out, now) = (Decoded::new(), Nanos::from_millis(1000));
     let question = device.poll_transmit(now, &mut out).unwrap().frame;
     let sent = now + Nanos::from_millis(19);
@@ -1035,9 +1029,7 @@ fn a_scale_of_zero_is_repaired_by_its_own_axis() {
 #[test]
 fn a_wrench_without_a_scale_refuses_only_who_needs_it() {
     let pair = PAIR.map(|text| frame(text, 1000.0));
-    let mut asks = options("icub_strain", "")
-        .device(&spec(1, Mode::Supervise, &[]))
-        .unwrap();
+    let mut asks = supervisor("icub_strain", "", &[]);
     let question = asks.poll_transmit(Nanos::from_millis(1000), &mut Decoded::new());
     assert_eq!(question.unwrap().frame.to_string(), "201#1800");
     let (readings, faults) = decode(&mut *asks, &pair);
@@ -1059,9 +1051,7 @@ fn each_question_for_a_scale_has_one_answer() {
     assert_eq!(faults[0].counter, Counter::Unexpected);
     // The second question is asked before the answer to the first, or when that is too late.
     for (second, unexpected) in [(1020, 0), (2100, 1)] {
-        let mut device = options("icub_strain", "")
-            .device(&spec(1, Mode::Supervise, &[]))
-            .unwrap();
+        let mut device = supervisor("icub_strain", "", &[]);
         for ms in [1000, second] {
             let now = Nanos::from_millis(ms);
             let question = device.poll_transmit(now, &mut Decoded::new()).unwrap();

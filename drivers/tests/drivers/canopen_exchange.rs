@@ -1,8 +1,8 @@
 //! The exchange of a CANopen master with its nodes, answer by answer; nodes that are replaced; and
 //! which process data make a reading.
 
-use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, spec};
-use proprio_drivers::{Decoded, Device, EncodeError, Frame, Frames, Mode, NotSent, State};
+use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, spec, supervisor};
+use proprio_drivers::{Decoded, Device, EncodeError, Frame, Frames, Mode, NotSent, Output, State};
 use proprio_topics::{
     Actuator, Counter, JointState, Nanos, Quality, Reading, Refusal, StampKind, Temperature,
 };
@@ -19,8 +19,8 @@ fn turned(turns: f64) -> Reading {
 }
 
 /// The positions \[turns\] of joints in `readings`.
-fn positions(readings: &[proprio_drivers::Output]) -> Vec<f64> {
-    let joint = |output: &proprio_drivers::Output| match output.reading {
+fn positions(readings: &[Output]) -> Vec<f64> {
+    let joint = |output: &Output| match output.reading {
         Reading::Joint(joint) => Some(joint.position / TAU),
         _ => None,
     };
@@ -30,10 +30,7 @@ fn positions(readings: &[proprio_drivers::Output]) -> Vec<f64> {
 /// An encoder at node 1 that is started, while `answers` gives what the node sends after each of
 /// the host's frames. What the host has sent, and the device.
 fn start(answers: impl Fn(&str) -> Vec<String>) -> (Vec<String>, Box<dyn Device>, Decoded) {
-    let encoder = options("canopen_encoder", "");
-    let mut device = encoder
-        .device(&spec(1, Mode::Supervise, &[0]))
-        .expect("legal keys");
+    let mut device = supervisor("canopen_encoder", "", &[0]);
     let (mut sent, mut out) = (Vec::new(), Decoded::new());
     for ms in 0..30 {
         let now = Nanos::from_millis(ms);
@@ -107,9 +104,7 @@ fn a_scaled_encoder_is_asked_for_its_scale() {
 /// Eight objects, the most that a TPDO of one byte each holds, are all asked for.
 #[test]
 fn each_mapped_object_of_a_drive_is_asked_for() {
-    let mut device = options("canopen_drive", "")
-        .device(&spec(1, Mode::Supervise, &[0]))
-        .expect("legal keys");
+    let mut device = supervisor("canopen_drive", "", &[0]);
     let (mut asked, mut out) = (Vec::new(), Decoded::new());
     for ms in 0..50 {
         let now = Nanos::from_millis(ms);
@@ -178,9 +173,7 @@ fn what_another_program_is_answered_is_not_taken() {
 #[test]
 fn an_answer_that_comes_late_is_not_taken() {
     for (late, taken) in [(150, true), (300, false)] {
-        let mut device = options("canopen_encoder", "")
-            .device(&spec(1, Mode::Supervise, &[0]))
-            .expect("legal keys");
+        let mut device = supervisor("canopen_encoder", "", &[0]);
         let (mut out, mut asked) = (Decoded::new(), Nanos::ZERO);
         for now in (0..3000).map(Nanos::from_millis) {
             if asked > Nanos::from_millis(2000) {
@@ -400,9 +393,9 @@ fn an_identifier_matters_only_for_values_of_use() {
     }
 }
 
-/// An answer that is taken as late by its stamp belongs to the SYNC before the last.
+/// It answers the last SYNC before its stamp, also if a later one was received first.
 #[test]
-fn a_node_of_each_second_sync_answers_the_last() {
+fn a_node_of_each_second_sync_answers_the_last_before_its_stamp() {
     let keys = "sync = 2\ncounts_per_turn = 4";
     for (ms, acquired) in [(20.0, 20.0), (20.5, 20.0), (19.9, 10.0)] {
         let mut device = listener("canopen_encoder", keys, &[0]);
@@ -520,6 +513,7 @@ fn the_ends_of_ranges_are_legal() {
         let device = options(driver, keys).device(&spec(127, Mode::Listen, &[0]));
         assert!(device.is_ok(), "{driver} {keys}");
     }
+    // The longest period is below the maximum silence, 50 ms here.
     for period in [0.5, 49.9] {
         let keys = format!("period_ms = {period:?}");
         let device = options("canopen_sync", &keys).device(&spec(0, Mode::Listen, &[]));
@@ -527,13 +521,9 @@ fn the_ends_of_ranges_are_legal() {
     }
 }
 
-/// A bus of which the host is the source of SYNC has no board at its other end.
 #[test]
 fn a_source_of_sync_is_due_when_it_says() {
-    let source = options("canopen_sync", "period_ms = 2.5");
-    let mut device = source
-        .device(&spec(0, Mode::Supervise, &[]))
-        .expect("legal keys");
+    let mut device = supervisor("canopen_sync", "period_ms = 2.5", &[]);
     let (mut now, mut out) = (Nanos::from_millis(7), Decoded::new());
     // Its start.
     while device.next_wake().is_none_or(|wake| wake <= now) {
@@ -551,9 +541,12 @@ fn a_source_of_sync_is_due_when_it_says() {
         device.on_sent(&transmit.frame, Ok(now));
     }
     assert_eq!(count(&out.faults, Counter::Silences), 0);
-    let mut nothing = source
-        .board(&spec(0, Mode::Supervise, &[]))
-        .expect("legal keys");
+}
+
+/// The host itself is the source.
+#[test]
+fn there_is_no_simulated_source_of_sync() {
+    let mut nothing = board("canopen_sync", "", &[]);
     assert_eq!(nothing.period(), None);
     let refused = nothing.encode(3, &turned(0.0), Quality::GOOD, &mut Frames::new());
     assert_eq!(refused, Err(EncodeError::Output(3)));

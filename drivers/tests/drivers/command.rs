@@ -1,7 +1,7 @@
 //! Commands to a device that streams: tares and calibrations of F/T boards, with the bytes of their
 //! protocols, their confirmation, and every way in which they can fail.
 
-use crate::rig::{Rig, board, decode, frame, listener, options, spec};
+use crate::rig::{Rig, board, decode, frame, listener, options, poll, spec};
 use proprio_drivers::calibration::{Calibration, Defect, MOST_CONDITION};
 use proprio_drivers::{
     COMMAND_TIME, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame,
@@ -771,24 +771,19 @@ fn commanded(driver: &str) -> Rig {
     rig
 }
 
-fn poll(rig: &mut Rig, t: Nanos) -> Option<Frame> {
-    let transmit = rig.device.poll_transmit(t, &mut Decoded::new());
-    transmit.map(|transmit| transmit.frame)
-}
-
 /// It would zero a load that nobody has seen.
 #[test]
 fn a_tare_that_is_too_late_is_not_sent() {
     for driver in ["robotous_rft", "jr3_can"] {
         let mut rig = commanded(driver);
         let last = rig.now + COMMAND_TIME;
-        assert!(poll(&mut rig, last).is_some(), "{driver}: in time");
+        assert!(poll(&mut *rig.device, last).is_some(), "{driver}: in time");
         let mut rig = commanded(driver);
         let late = rig.now + COMMAND_TIME + Nanos(1);
-        assert_eq!(poll(&mut rig, late), None, "{driver}");
+        assert_eq!(poll(&mut *rig.device, late), None, "{driver}");
         let outcome = rig.device.outcome();
         assert_eq!(outcome, Some(Err(CommandFailed::NotSent)));
-        assert_eq!(poll(&mut rig, late), None, "it is over");
+        assert_eq!(poll(&mut *rig.device, late), None, "it is over");
     }
 }
 
@@ -798,12 +793,12 @@ fn a_tare_is_confirmed_in_time_or_not_at_all() {
     for answered in [true, false] {
         let mut rig = commanded("jr3_can");
         let now = rig.now;
-        let command = poll(&mut rig, now).expect("the command");
+        let command = poll(&mut *rig.device, now).expect("the command");
         let sent = now + Nanos::from_millis(4);
         rig.device.on_sent(&command, Ok(sent));
         let last = sent + Nanos::from_millis(100);
         assert_eq!(rig.device.next_wake(), Some(last + Nanos(1)));
-        assert_eq!(poll(&mut rig, last), None);
+        assert_eq!(poll(&mut *rig.device, last), None);
         assert_eq!(rig.device.outcome(), None);
         let expected = if answered {
             decode(&mut *rig.device, &[frame("101#00", last.seconds() * 1e3)]);
@@ -811,7 +806,7 @@ fn a_tare_is_confirmed_in_time_or_not_at_all() {
         } else {
             Err(CommandFailed::NoAnswer)
         };
-        assert_eq!(poll(&mut rig, last + Nanos(1)), None);
+        assert_eq!(poll(&mut *rig.device, last + Nanos(1)), None);
         assert_eq!(rig.device.outcome(), Some(expected));
     }
 }

@@ -1,8 +1,10 @@
 //! CubeMars motors: frames that other people's programs read, motors that share an identifier, ends
 //! of ranges, and errors.
 
-use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, shown_keys, spec};
-use proprio_drivers::{Claim, Device, EncodeError, Format, Frame, Frames, Id, Mode, SpecError};
+use crate::rig::{
+    FD, Rig, board, count, decode, encode, frame, listener, options, shown_keys, spec,
+};
+use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode, SpecError};
 use proprio_drivers::{Output, State};
 use proprio_topics::{
     Actuator, Counter, JointState, Kind, Nanos, Quality, Reading, StampKind, Temperature,
@@ -307,10 +309,6 @@ fn temperature_and_error_are_told_now_and_then() {
 
 #[test]
 fn frames_that_are_none_of_the_protocol_are_counted() {
-    let fd = Format::Fd {
-        bit_rate_switch: false,
-        error_state: false,
-    };
     for (keys, id, data) in [
         (MIT, Id::standard(0), &[1_u8, 0, 0, 0, 0, 0, 0, 0][..]),
         (SERVO, Id::extended(0x2901), &[0; 8]),
@@ -326,7 +324,7 @@ fn frames_that_are_none_of_the_protocol_are_counted() {
             );
             assert_eq!(count(&faults, Counter::Length), u32::from(!legal));
         }
-        let fd = Frame::with_format(id, fd, data).unwrap();
+        let fd = Frame::with_format(id, FD, data).unwrap();
         let (_, faults) = decode(&mut *device, &[fd]);
         assert_eq!(count(&faults, Counter::Value), 1);
         let (_, faults) = decode(&mut *device, &[Frame::remote(id, 8)]);

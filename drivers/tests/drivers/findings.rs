@@ -1,8 +1,8 @@
 //! What speaks for a device and what against it, family by family, in frames that are written by
 //! hand.
 
-use crate::rig::frame;
-use proprio_drivers::{Certainty, Finding, Format, Frame, Id, Traffic, questions, recognise};
+use crate::rig::{FD, frame};
+use proprio_drivers::{Certainty, Finding, Frame, Id, Traffic, questions, recognise};
 use proprio_topics::{Nanos, StampKind};
 
 fn traffic(frames: &[Frame]) -> Traffic {
@@ -78,10 +78,8 @@ fn a_few_odd_frames_do_not_refute_a_device() {
     for count in 4..60 {
         let mut frames = periodic(&[SLOPE, RATE], 10.0, count);
         frames[1] = frame("0CF02A80#00", 1000.0);
-        let seen = traffic(&frames);
-        let stream = seen.stream(Id::extended(0x0CF0_2A80)).unwrap();
-        let odd = stream.kept().filter(|frame| frame.len() == 1).count();
-        let is_few = odd * 20 <= stream.kept().count();
+        // The odd one, and the first of the others, are kept as beginnings too: 2 of 40 are odd.
+        let is_few = count >= 38;
         assert_eq!(found("openimu", &frames).is_some(), is_few, "{count}");
     }
 }
@@ -190,11 +188,7 @@ fn placeholders_are_explained() {
 /// A reply is from one of 127 controllers to one of 128 hosts, in the shortest identifier.
 #[test]
 fn a_moteus_is_a_controller_that_replies_to_a_host() {
-    let fd = Format::Fd {
-        bit_rate_switch: true,
-        error_state: false,
-    };
-    let with = |id, data: &[u8]| Frame::with_format(id, fd, data).unwrap();
+    let with = |id, data: &[u8]| Frame::with_format(id, FD, data).unwrap();
     let reply = |id| with(id, &[0x23, 0x00, 0x0A, 0x00, 0x00, 0x50, 0x50, 0x50]);
     for (id, controller) in [
         (Id::standard(0x100), Some((1, None))),
@@ -336,8 +330,7 @@ fn motors_of_one_host_are_told_apart() {
     assert!((one(8) - one(7) - 8.0).abs() < 1e-9);
 }
 
-/// Both halves of a reading with one counter, or full scales: any other frames of its identifiers
-/// are somebody else's.
+/// Both halves of a reading with one counter, or full scales.
 #[test]
 fn a_jr3_board_is_known_by_its_counter_or_its_scales() {
     let force = "605#0000000000000100";

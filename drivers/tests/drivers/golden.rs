@@ -1,7 +1,7 @@
 //! Golden bytes: the worked examples of the protocol's documents, and frames computed by hand from
 //! their tables.
 
-use crate::rig::{board, count, decode, encode, frame, listener, options, spec};
+use crate::rig::{board, count, decode, encode, frame, listener, options, spec, texts};
 use proprio_drivers::icub_motor::{encoder, fault};
 use proprio_drivers::{Board, EncodeError, Frame, Frames, Mode};
 use proprio_topics::{
@@ -9,10 +9,6 @@ use proprio_topics::{
 };
 
 const SCALES: &str = "full_scale_n = [1804, 1804, 1804]\nfull_scale_nm = [31, 31, 31]";
-
-fn texts(frames: &[Frame]) -> Vec<String> {
-    frames.iter().map(ToString::to_string).collect()
-}
 
 fn answers(board: &mut dyn Board, text: &str) -> Vec<String> {
     let mut out = Frames::new();
@@ -567,25 +563,24 @@ fn an_imu_begins_anew_after_a_restart() {
 
 #[test]
 fn legacy_frames_are_paired_in_the_order_of_their_board() {
-    let at = |text: &str, ms| frame(text, ms);
     let (acceleration, rate) = ("511#0040000000C0", "510#00400000FFFF");
     // A BNO055 sends the accelerometer first; the order of an mtb is not known.
     for (keys, any_order) in [("legacy = \"bno055\"", false), ("legacy = \"mtb\"", true)] {
         let mut device = listener("icub_imu", keys, &[]);
-        let frames = [at(rate, 0.0), at(acceleration, 0.3)];
+        let frames = [frame(rate, 0.0), frame(acceleration, 0.3)];
         let (readings, _) = decode(&mut *device, &frames);
         assert_eq!(readings.len(), usize::from(any_order), "{keys}");
     }
     // The rates at 0 and at 10 ms are lost, or late: the next is dropped with its acceleration.
     let mut device = listener("icub_imu", "legacy = \"bno055\"", &[]);
     let frames = [
-        at(acceleration, 0.0),
-        at(acceleration, 10.0),
-        at(rate, 10.3),
-        at(acceleration, 20.0),
-        at(rate, 20.3),
-        at(acceleration, 30.0),
-        at(rate, 30.3),
+        frame(acceleration, 0.0),
+        frame(acceleration, 10.0),
+        frame(rate, 10.3),
+        frame(acceleration, 20.0),
+        frame(rate, 20.3),
+        frame(acceleration, 30.0),
+        frame(rate, 30.3),
     ];
     let (readings, faults) = decode(&mut *device, &frames);
     let qualities: Vec<Quality> = readings.iter().map(|reading| reading.quality).collect();
@@ -595,7 +590,7 @@ fn legacy_frames_are_paired_in_the_order_of_their_board() {
     for (quantity, index) in [("acceleration", 0), ("angular_velocity", 1)] {
         let keys = format!("legacy = \"mtb\"\nquantities = [\"{quantity}\"]");
         let mut device = listener("icub_imu", &keys, &[]);
-        let frames = [0.0, 10.0, 20.0].map(|ms| [at(acceleration, ms), at(rate, ms + 0.3)]);
+        let frames = [0.0, 10.0, 20.0].map(|ms| [frame(acceleration, ms), frame(rate, ms + 0.3)]);
         let (readings, faults) = decode(&mut *device, frames.as_flattened());
         assert_eq!((readings.len(), faults.len()), (3, 0));
         assert_eq!(readings[0].acquired, frames[0][index].t);

@@ -1,8 +1,10 @@
 //! iCub mc4 boards: frames computed by hand from the host's formulas, velocities that join the
 //! positions, and faults of each joint.
 
-use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, shown_keys, spec};
-use proprio_drivers::{Claim, EncodeError, Format, Frame, Frames, Id, Mode, Output, SpecError};
+use crate::rig::{
+    FD, Rig, board, count, decode, encode, frame, listener, options, shown_keys, spec,
+};
+use proprio_drivers::{Claim, EncodeError, Frame, Frames, Id, Mode, Output, SpecError};
 use proprio_drivers::{State, icub_mc4::fault};
 use proprio_topics::{Actuator, Counter, JointState, Quality, Reading};
 use proptest::prelude::*;
@@ -169,12 +171,8 @@ fn frames_of_a_wrong_form_are_counted() {
             assert!(readings.is_empty());
             assert_eq!(count(&faults, Counter::Length), 1);
         }
-        let fd = Format::Fd {
-            bit_rate_switch: false,
-            error_state: false,
-        };
         let frames = [
-            Frame::with_format(id, fd, &[0; 8]).unwrap(),
+            Frame::with_format(id, FD, &[0; 8]).unwrap(),
             Frame::remote(id, 8),
         ];
         let (readings, faults) = decode(&mut *device, &frames);

@@ -1,6 +1,8 @@
 //! JR3 and OptoForce sensors: two frames with a sequence number for each reading.
 
-use crate::rig::{Rig, board, decode, encode, frame, listener, options, shown_keys, spec};
+use crate::rig::{
+    FD, Rig, board, decode, encode, frame, listener, options, shown_keys, spec, supervisor, texts,
+};
 use proprio_drivers::{
     Decoded, Device, Fault, Format, Frame, Frames, Id, Mode, NotSent, Output, SpecError, State,
 };
@@ -17,10 +19,6 @@ fn wrench(reading: &Reading) -> Wrench {
 
 fn reading(force: [f64; 3], torque: [f64; 3]) -> Reading {
     Reading::Wrench(Wrench { force, torque })
-}
-
-fn texts(frames: &[Frame]) -> Vec<String> {
-    frames.iter().map(ToString::to_string).collect()
 }
 
 /// Why `driver` refuses `keys` at `address`.
@@ -40,14 +38,10 @@ fn faults_of(faults: &[Fault]) -> Vec<(Counter, u32)> {
 /// Frames of every wrong form are counted and yield nothing.
 fn wrong_frames_are_counted(device: &mut dyn Device, id: u16, short: usize) {
     let id = Id::standard(id);
-    let fd = Format::Fd {
-        bit_rate_switch: false,
-        error_state: false,
-    };
     let frames = [
         Frame::new(id, &[0; 8][..short]),
         Frame::remote(id, 8),
-        Frame::with_format(id, fd, &[0; 8]).unwrap(),
+        Frame::with_format(id, FD, &[0; 8]).unwrap(),
         Frame::with_format(id, Format::Error, &[0; 8]).unwrap(),
     ];
     let (readings, faults) = decode(device, &frames);
@@ -405,11 +399,7 @@ fn quiet(device: &mut dyn Device, ms: i64) {
 /// taken for the full scales of moments.
 #[test]
 fn a_late_answer_of_a_jr3_is_not_taken_for_another_one() {
-    let device = || {
-        options("jr3_can", "")
-            .device(&spec(1, Mode::Supervise, &[]))
-            .unwrap()
-    };
+    let device = || supervisor("jr3_can", "", &[]);
     let forces = "101#0073006F00B900";
     let moments = "101#00380034003D00";
     let mut one = device();
@@ -483,11 +473,7 @@ fn a_late_answer_of_a_jr3_is_not_taken_for_another_one() {
 #[test]
 fn answers_of_a_jr3_count_for_a_second() {
     let forces = "101#0073006F00B900";
-    let device = || {
-        options("jr3_can", "")
-            .device(&spec(1, Mode::Supervise, &[]))
-            .unwrap()
-    };
+    let device = || supervisor("jr3_can", "", &[]);
     let mut last = device();
     ask(&mut *last, "481#", 0);
     assert_eq!(last.state(), State::Asking);
@@ -520,9 +506,7 @@ fn a_jr3_without_usable_full_scales_is_refused() {
     rig.run(2500);
     assert_eq!(rig.device.state(), State::Streaming);
     let answers = |texts: &[&str]| {
-        let mut device = options("jr3_can", "")
-            .device(&spec(1, Mode::Supervise, &[]))
-            .unwrap();
+        let mut device = supervisor("jr3_can", "", &[]);
         let mut faults = Vec::new();
         for (k, text) in (0..).zip(texts) {
             let question = if text.ends_with("3D00") {

@@ -1,10 +1,8 @@
 //! moteus: the query and replies of the package `moteus` in each resolution, and a controller that
 //! is asked.
 
-use crate::rig::{Rig, board, count, decode, encode, listener, options, spec};
-use proprio_drivers::{
-    Board, Decoded, Device, Format, Frame, Frames, Id, Mode, Output, SpecError, State,
-};
+use crate::rig::{FD, Rig, board, count, decode, encode, listener, options, spec, supervisor};
+use proprio_drivers::{Board, Decoded, Device, Frame, Frames, Id, Mode, Output, SpecError, State};
 use proprio_topics::{
     Actuator, Counter, JointState, Nanos, Quality, Reading, StampKind, Temperature,
 };
@@ -13,11 +11,6 @@ use std::f64::consts::TAU;
 
 /// `tests/oracle/frames/moteus_replies.py`.
 const GOLDEN: &str = include_str!("moteus.txt");
-
-const FD: Format = Format::Fd {
-    bit_rate_switch: true,
-    error_state: false,
-};
 
 fn bytes(hex: &str) -> Vec<u8> {
     let byte = |at| u8::from_str_radix(&hex[at..at + 2], 16).unwrap();
@@ -331,9 +324,7 @@ fn temperatures_are_read_in_each_type() {
 /// The device tells when the next query is due, and sends it then.
 #[test]
 fn queries_leave_in_step() {
-    let mut device = options("moteus", "period_ms = 4")
-        .device(&spec(1, Mode::Supervise, &[0]))
-        .unwrap();
+    let mut device = supervisor("moteus", "period_ms = 4", &[0]);
     let mut out = Decoded::new();
     let mut poll = |device: &mut dyn Device, t: Nanos| {
         let sent = device.poll_transmit(t, &mut out)?;

@@ -1,10 +1,12 @@
 //! ODrive axes: frames that cantools encoded from the maker's .dbc files, values that join the
 //! estimates for a while, faults, and requests.
 
-use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, shown_keys, spec};
+use crate::rig::{
+    FD, Rig, board, count, decode, encode, frame, listener, options, shown_keys, spec, supervisor,
+};
 use proprio_drivers::odrive::{Firmware, error_words};
 use proprio_drivers::{
-    Decoded, Device, EncodeError, Format, Frame, Frames, Id, Mode, NotSent, SpecError, State,
+    Decoded, Device, EncodeError, Frame, Frames, Id, Mode, NotSent, SpecError, State,
 };
 use proprio_topics::{
     Actuator, Counter, JointState, Kind, Nanos, Quality, Reading, StampKind, Temperature,
@@ -321,11 +323,7 @@ fn requests_of_others_are_no_faults_and_wrong_lengths_are() {
             assert!(readings.is_empty());
             assert_eq!(count(&faults, Counter::Length), 1);
         }
-        let fd = Format::Fd {
-            bit_rate_switch: false,
-            error_state: false,
-        };
-        let fd = Frame::with_format(id, fd, &[0; 8]).unwrap();
+        let fd = Frame::with_format(id, FD, &[0; 8]).unwrap();
         let (readings, faults) = decode(&mut *device, &[fd]);
         assert!(readings.is_empty());
         assert_eq!(count(&faults, Counter::Value), 1);
@@ -429,9 +427,7 @@ fn an_old_firmware_is_asked() {
 #[test]
 fn requests_leave_in_step() {
     let keys = format!("request_period_ms = 10\n{OLD}");
-    let mut device = options("odrive", &keys)
-        .device(&spec(1, Mode::Supervise, &[0]))
-        .unwrap();
+    let mut device = supervisor("odrive", &keys, &[0]);
     let mut out = Decoded::new();
     let mut poll = |device: &mut dyn Device, t: Nanos| {
         let sent = device.poll_transmit(t, &mut out)?;

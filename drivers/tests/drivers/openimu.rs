@@ -9,7 +9,7 @@
 //! formulas of `CAN_MTLT.py` (Aceinna/python-mtlt 1b99f92e) read them as roll -30.50, pitch 5.25;
 //! 2.25, 1.50, 9.75; -20.25, 10.50, 100.125. All others are computed by hand.
 
-use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, spec};
+use crate::rig::{FD, Rig, board, count, decode, encode, frame, listener, options, spec};
 use proprio_drivers::{EncodeError, Format, Frame, Frames, Id, Mode, Output, SpecError, State};
 use proprio_topics::{Counter, Imu, Nanos, Quality, Reading, Saturation, StampKind, Temperature};
 use proptest::array::uniform3;
@@ -286,13 +286,9 @@ fn wrong_lengths_and_formats_are_counted() {
             assert!(readings.is_empty());
             assert_eq!(count(&faults, Counter::Length), 1);
         }
-        let fd = Format::Fd {
-            bit_rate_switch: false,
-            error_state: false,
-        };
         let sent = [
             Frame::remote(id, 8),
-            Frame::with_format(id, fd, &[0x7D; 8]).unwrap(),
+            Frame::with_format(id, FD, &[0x7D; 8]).unwrap(),
             Frame::with_format(id, Format::Error, &[0x7D; 8]).unwrap(),
         ];
         let (readings, faults) = decode(&mut *device, &sent);
@@ -533,13 +529,9 @@ fn commands_name_their_sensor() {
     assert_eq!(tell("18FF5601#8000"), (0, Some(5)));
     assert_eq!(tell("18FF5501#8000"), (0, None));
     let id = Id::extended(0x18FF_5500);
-    let fd = Format::Fd {
-        bit_rate_switch: false,
-        error_state: false,
-    };
     for other in [
         Frame::remote(id, 2),
-        Frame::with_format(id, fd, &[0x80, 5]).unwrap(),
+        Frame::with_format(id, FD, &[0x80, 5]).unwrap(),
     ] {
         board.on_frame(&other, &mut Frames::new());
         assert_eq!(board.period(), None);

@@ -1,7 +1,7 @@
 //! Every simulated board is recognised as itself, by listening and by asking, and by no other
 //! driver with more certainty. Arbitrary traffic is nothing.
 
-use crate::rig::{options, spec};
+use crate::rig::{FD, options, spec};
 use proprio_drivers::{
     ASKED_BY_NAME, Board, Certainty, Claim, DRIVERS, Decoded, Finding, Format, Frame, Frames, Id,
     Mode, Options, Traffic, questions, recognise,
@@ -898,18 +898,12 @@ fn with_format(frame: &Frame, format: Format) -> Frame {
 /// Whoever asks for frames need not be there. A device of classic CAN sends no CAN FD.
 #[test]
 fn frames_of_another_format_are_no_device() {
-    let fd = Format::Fd {
-        bit_rate_switch: true,
-        error_state: false,
-    };
-    // It sends CAN FD.
-    let of_any = ["moteus"];
     for row in BOARDS {
         let frames = recorded(row, 300);
         let asked = frames.iter().map(|frame| Frame::remote(frame.id, 8));
         assert_eq!(found_in(&asked.collect::<Vec<_>>(), row), None);
-        if !of_any.contains(&row.0) {
-            let fd: Vec<Frame> = frames.iter().map(|frame| with_format(frame, fd)).collect();
+        if !options(row.0, row.1).needs_fd() {
+            let fd: Vec<Frame> = frames.iter().map(|frame| with_format(frame, FD)).collect();
             assert_eq!(found_in(&fd, row), None);
         }
     }

@@ -1,8 +1,8 @@
 //! What speaks for each board of the iCub protocol and what does not, and the keys that its streams
 //! tell: frames computed by hand from the tables of the drivers.
 
-use crate::rig::{decode, frame, listener};
-use proprio_drivers::{Finding, Format, Frame, Id, Traffic, recognise};
+use crate::rig::{FD, decode, frame, listener};
+use proprio_drivers::{Finding, Frame, Id, Traffic, recognise};
 
 /// The iCub boards that are found where these frames, at these times \[ms\], come every 10 ms.
 fn found(frames: &[(&str, f64)]) -> Vec<Finding> {
@@ -88,14 +88,18 @@ fn what_no_board_answers_is_no_answer() {
         assert_eq!(found(&[(answer, 0.0), (known, 1.0)]).len(), 2, "{known}");
     }
     // These boards know no CAN FD.
-    let fd = Format::Fd {
-        bit_rate_switch: false,
-        error_state: false,
-    };
-    let data = [0xFF, 0x0C, 2, 0, 8];
-    let mut heard = Traffic::new();
-    heard.on_frame(&Frame::with_format(Id::standard(0x730), fd, &data).unwrap());
-    assert_eq!(icub(&heard), []);
+    for (id, data) in [
+        (0x730, &[0xFF, 0x0C, 2, 0, 8][..]),
+        (0x230, &[0x1C, 0x0C, 2, 0, 8, 2, 0, 1]),
+    ] {
+        let classic = Frame::new(Id::standard(id), data);
+        let fd = Frame::with_format(Id::standard(id), FD, data).unwrap();
+        for (frame, boards) in [(classic, 2), (fd, 0)] {
+            let mut heard = Traffic::new();
+            heard.on_frame(&frame);
+            assert_eq!(icub(&heard).len(), boards, "{frame}");
+        }
+    }
 }
 
 /// Where another program has asked for the version, nobody needs to ask. The bits are those of the
@@ -258,7 +262,11 @@ fn the_scale_of_legacy_frames_is_that_of_the_boards_type() {
     let [a, b] = legacy;
     let newer = "period_ms = 10; quantities = [\"acceleration\"]";
     let alone = |legacy: &str, quantity: &str| {
-        format!("legacy = \"{legacy}\"; quantities = [\"{quantity}\"]; period_ms = 10")
+        let mask = if quantity == "acceleration" { 2 } else { 4 };
+        format!(
+            "legacy = \"{legacy}\"; quantities = [\"{quantity}\"]; legacy_mask = {mask}; \
+             period_ms = 10"
+        )
     };
     for (frames, expected) in [
         (&[a, b, mtb][..], "legacy = \"mtb\"; period_ms = 10"),
@@ -275,7 +283,13 @@ fn the_scale_of_legacy_frames_is_that_of_the_boards_type() {
         assert_eq!(keys(&found(frames), "icub_imu"), expected);
     }
     // A device with these keys reads what was heard.
-    for heard in [&[a, mtb][..], &[b, mtb], &[a, b, mtb]] {
+    for heard in [
+        &[a, mtb][..],
+        &[b, mtb],
+        &[a, b, mtb],
+        &[a, strain2],
+        &[b, strain2],
+    ] {
         let keys = keys(&found(heard), "icub_imu").replace("; ", "\n");
         let frames = heard.iter().map(|(text, ms)| frame(text, *ms));
         let mut device = listener("icub_imu", &keys, &[]);

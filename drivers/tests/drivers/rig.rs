@@ -2,8 +2,8 @@
 //! frames.
 
 use proprio_drivers::{
-    Board, Decoded, Device, Fault, Frame, Frames, Id, Mode, NotSent, Options, Output, Outputs,
-    Spec, State,
+    Board, Decoded, Device, Fault, Format, Frame, Frames, Id, Mode, NotSent, Options, Output,
+    Outputs, Spec, State,
 };
 use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind};
 
@@ -49,6 +49,32 @@ pub(crate) fn listener(driver: &str, keys: &str, outputs: &[u8]) -> Box<dyn Devi
     options
         .device(&spec(address, Mode::Listen, outputs))
         .expect("a legal configuration")
+}
+
+/// A device that commands its board.
+pub(crate) fn supervisor(driver: &str, keys: &str, outputs: &[u8]) -> Box<dyn Device> {
+    let options = options(driver, keys);
+    let address = options.default_address().unwrap_or(1);
+    options
+        .device(&spec(address, Mode::Supervise, outputs))
+        .expect("a legal configuration")
+}
+
+/// What the device sends at `t`.
+pub(crate) fn poll(device: &mut dyn Device, t: Nanos) -> Option<Frame> {
+    let transmit = device.poll_transmit(t, &mut Decoded::new());
+    transmit.map(|transmit| transmit.frame)
+}
+
+/// CAN FD, with the higher bit rate.
+pub(crate) const FD: Format = Format::Fd {
+    bit_rate_switch: true,
+    error_state: false,
+};
+
+/// Frames in can-utils' format.
+pub(crate) fn texts(frames: &[Frame]) -> Vec<String> {
+    frames.iter().map(ToString::to_string).collect()
 }
 
 /// A board.

@@ -1,6 +1,9 @@
 //! Robotous RFT and AIDIN AFT200 sensors: two frames without a sequence number for each reading.
 
-use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, shown_keys, spec};
+use crate::rig::{
+    Rig, board, count, decode, encode, frame, listener, options, shown_keys, spec, supervisor,
+    texts,
+};
 use proprio_drivers::{Device, Format, Frame, Frames, Id, Mode, NotSent, Output, SpecError, State};
 use proprio_topics::{Counter, Nanos, Quality, Reading, Saturation, StampKind, Wrench};
 use proptest::array::{uniform3, uniform6};
@@ -19,10 +22,6 @@ fn reading(force: [f64; 3], torque: [f64; 3]) -> Reading {
 
 fn near(a: f64, b: f64, step: f64) -> bool {
     (a - b).abs() <= step * 0.5 + 1e-9
-}
-
-fn texts(frames: &[Frame]) -> Vec<String> {
-    frames.iter().map(ToString::to_string).collect()
 }
 
 /// Why `driver` refuses `keys` at `address`.
@@ -300,9 +299,7 @@ fn an_rft_gets_its_rate_once() {
         ("", "064#0B00000000000000"),
         ("rate_hz = 1000", "064#0F08000000000000"),
     ] {
-        let mut device = options("robotous_rft", keys)
-            .device(&spec(0x64, Mode::Supervise, &[]))
-            .unwrap();
+        let mut device = supervisor("robotous_rft", keys, &[]);
         let mut out = proprio_drivers::Decoded::new();
         let now = Nanos::from_millis(1000);
         for command in commands {
@@ -320,9 +317,7 @@ fn an_rft_gets_its_rate_once() {
 /// 20 ms after it was sent, which is later than it was given to the bus.
 #[test]
 fn an_rft_that_does_not_answer_is_asked_again() {
-    let mut device = options("robotous_rft", "")
-        .device(&spec(0x64, Mode::Supervise, &[]))
-        .unwrap();
+    let mut device = supervisor("robotous_rft", "", &[]);
     let poll = |device: &mut dyn Device, t: Nanos, sent: Nanos| {
         let mut out = proprio_drivers::Decoded::new();
         let next = device.poll_transmit(t, &mut out)?.frame;
@@ -393,9 +388,7 @@ fn an_rft_streams_even_if_its_rate_is_not_known() {
     assert_eq!((sets(&rig), rig.count(Counter::Changed)), (1, 0));
     assert_eq!((rig.sent.len(), rig.unsent.len()), (5, 3));
     // An answer without a question.
-    let mut device = options("robotous_rft", "")
-        .device(&spec(0x64, Mode::Supervise, &[]))
-        .unwrap();
+    let mut device = supervisor("robotous_rft", "", &[]);
     let answer = ["001#1000000000000000", "002#0000000000000000"].map(|text| frame(text, 1000.2));
     let (_, faults) = decode(&mut *device, &answer);
     assert_eq!(count(&faults, Counter::Unexpected), 1);
