@@ -42,22 +42,22 @@ pub(crate) fn spec(address: u32, mode: Mode, outputs: &[u8]) -> Spec {
     }
 }
 
-/// A device that only listens.
-pub(crate) fn listener(driver: &str, keys: &str, outputs: &[u8]) -> Box<dyn Device> {
+fn device(driver: &str, keys: &str, mode: Mode, outputs: &[u8]) -> Box<dyn Device> {
     let options = options(driver, keys);
     let address = options.default_address().unwrap_or(1);
     options
-        .device(&spec(address, Mode::Listen, outputs))
+        .device(&spec(address, mode, outputs))
         .expect("a legal configuration")
+}
+
+/// A device that only listens.
+pub(crate) fn listener(driver: &str, keys: &str, outputs: &[u8]) -> Box<dyn Device> {
+    device(driver, keys, Mode::Listen, outputs)
 }
 
 /// A device that commands its board.
 pub(crate) fn supervisor(driver: &str, keys: &str, outputs: &[u8]) -> Box<dyn Device> {
-    let options = options(driver, keys);
-    let address = options.default_address().unwrap_or(1);
-    options
-        .device(&spec(address, Mode::Supervise, outputs))
-        .expect("a legal configuration")
+    device(driver, keys, Mode::Supervise, outputs)
 }
 
 /// What the device sends at `t`.
