@@ -22,6 +22,7 @@ mod demo;
 mod doctor;
 mod estimator;
 mod identify;
+mod install;
 mod report;
 mod scan;
 mod setup;
@@ -80,6 +81,8 @@ enum Verb {
     Ctl(ctl::Args),
     /// Check this machine: CAN, permissions, shared memory, buffers, real-time limits
     Doctor(doctor::Args),
+    /// Install this program, its systemd units and a robot's configuration, and start the services
+    Install(install::Args),
 }
 
 #[derive(clap::Args)]
@@ -115,6 +118,7 @@ fn main() -> ExitCode {
         Verb::Record(args) => system::record(&args, &domain),
         Verb::Ctl(args) => ctl::run(&args, &domain),
         Verb::Doctor(args) => doctor::run(&args, &domain),
+        Verb::Install(args) => install::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

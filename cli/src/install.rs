@@ -1,0 +1,226 @@
+//! `proprio install`: puts this program, its systemd units and a robot's configuration where they
+//! belong, and starts the services. `--dry-run` prints the steps instead.
+
+use anyhow::{Context as _, bail};
+use proprio_estimator::files;
+use proprio_gateway::plan::Plan;
+use std::fmt;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// systemd finds programs without a path here and in /usr/bin, where packages install them.
+const PROGRAM: &str = "usr/local/bin/proprio";
+const CONFIG: &str = "etc/proprio";
+const USER: (&str, &str) = (
+    "etc/sysusers.d/proprio.conf",
+    include_str!("../../config/systemd/proprio.sysusers"),
+);
+
+/// A daemon: its unit, and the file without which it can not run.
+struct Service {
+    unit: &'static str,
+    text: &'static str,
+    config: &'static str,
+}
+
+const SERVICES: [Service; 2] = [
+    Service {
+        unit: "proprio-gateway.service",
+        text: include_str!("../../config/systemd/proprio-gateway.service"),
+        config: "gateway.toml",
+    },
+    Service {
+        unit: "proprio-estimator.service",
+        text: include_str!("../../config/systemd/proprio-estimator.service"),
+        config: "estimator.toml",
+    },
+];
+
+/// `proprio install`.
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    /// The robot's folder: gateway.toml, estimator.toml or both, and the files that they name;
+    /// default: what /etc/proprio holds already
+    #[arg(long, value_name = "DIR")]
+    config: Option<PathBuf>,
+    /// Print the steps and change nothing
+    #[arg(long)]
+    dry_run: bool,
+    /// Install into the image of a system below this folder; start nothing
+    #[arg(long, value_name = "DIR", default_value = "/")]
+    root: PathBuf,
+    /// Overwrite files of /etc/proprio that differ
+    #[arg(long)]
+    force: bool,
+}
+
+/// What is done to the system; its text is what `--dry-run` prints.
+enum Step {
+    /// Writes `bytes` to `to`, in one step.
+    Write {
+        to: PathBuf,
+        bytes: Vec<u8>,
+        mode: u32,
+    },
+    Run(Vec<String>),
+}
+
+impl fmt::Display for Step {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Write { to, mode, .. } => write!(f, "write {} (mode {mode:o})", to.display()),
+            Self::Run(words) => write!(f, "run   {}", words.join(" ")),
+        }
+    }
+}
+
+impl Step {
+    fn run(&self) -> anyhow::Result<()> {
+        match self {
+            Self::Write { to, bytes, mode } => {
+                let write = || -> std::io::Result<()> {
+                    if let Some(folder) = to.parent() {
+                        fs::create_dir_all(folder)?;
+                    }
+                    // By renaming, because a program that runs can not be written to.
+                    let mut new = files::begin(to)?;
+                    std::io::Write::write_all(&mut new, bytes)?;
+                    files::end(new, to, *mode)
+                };
+                write().with_context(|| format!("cannot write {}", to.display()))
+            }
+            Self::Run(words) => {
+                let status = Command::new(&words[0]).args(&words[1..]).status();
+                let status = status.with_context(|| format!("cannot start {}", words[0]))?;
+                if !status.success() {
+                    bail!("`{}` failed ({status})", words.join(" "));
+                }
+                Ok(())
+            }
+        }
+    }
+}
+
+/// Installs.
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    let is_image = args.root != Path::new("/");
+    if !(args.dry_run || is_image || nix::unistd::geteuid().is_root()) {
+        bail!("only root can install: sudo proprio install ... (--dry-run prints the steps)");
+    }
+    let etc = args.root.join(CONFIG);
+    let from = args.config.as_deref().unwrap_or(&etc);
+    let services: Vec<&Service> = SERVICES
+        .iter()
+        .filter(|service| from.join(service.config).is_file())
+        .collect();
+    if services.is_empty() {
+        bail!(
+            "{} has neither gateway.toml nor estimator.toml: --config DIR names a folder that has \
+             (`proprio setup --out DIR` writes a gateway.toml)",
+            from.display()
+        );
+    }
+    check(from)?;
+
+    let mut steps = Vec::new();
+    let own = std::env::current_exe().context("cannot find this program's own file")?;
+    let program = args.root.join(PROGRAM);
+    if own != program {
+        let bytes = fs::read(&own).with_context(|| format!("cannot read {}", own.display()))?;
+        steps.push(write(program, bytes, 0o755));
+    }
+    steps.push(write(args.root.join(USER.0), USER.1.into(), 0o644));
+    if let Some(folder) = &args.config {
+        steps.extend(configuration(folder, &etc, args.force)?);
+    }
+    let configured = steps.len();
+    for service in &services {
+        let to = args.root.join("etc/systemd/system").join(service.unit);
+        steps.push(write(to, service.text.into(), 0o644));
+    }
+    let in_image = |name: &str| {
+        let root = is_image.then(|| format!("--root={}", args.root.display()));
+        [name.to_owned()].into_iter().chain(root)
+    };
+    let units = || services.iter().map(|service| service.unit.to_owned());
+    let words = |text: &'static str| text.split(' ').map(str::to_owned);
+    steps.push(Step::Run(in_image("systemd-sysusers").collect()));
+    let enable = in_image("systemctl").chain(words("enable"));
+    steps.push(Step::Run(enable.chain(units()).collect()));
+    if !is_image {
+        steps.push(Step::Run(words("systemctl daemon-reload").collect()));
+        let restart = words("systemctl restart").chain(units());
+        steps.push(Step::Run(restart.collect()));
+    }
+
+    for (number, step) in steps.iter().enumerate() {
+        print_line!("{step}");
+        if args.dry_run {
+            continue;
+        }
+        step.run()?;
+        if number + 1 == configured && args.config.is_some() {
+            check(&etc).with_context(|| {
+                format!(
+                    "{} works, but its copy does not: name files by their place in this folder, \
+                     or by their full path",
+                    from.display()
+                )
+            })?;
+        }
+    }
+    Ok(())
+}
+
+fn write(to: PathBuf, bytes: Vec<u8>, mode: u32) -> Step {
+    Step::Write { to, bytes, mode }
+}
+
+/// Reads the configuration in `folder` as the daemons do.
+fn check(folder: &Path) -> anyhow::Result<()> {
+    let [gateway, estimator] = SERVICES.map(|service| folder.join(service.config));
+    if gateway.is_file() {
+        Plan::load_live(&gateway)?;
+    }
+    if estimator.is_file() {
+        proprio_estimator::daemon::load(&estimator, |_| {})?;
+    }
+    Ok(())
+}
+
+/// The copies of the files of `folder` into `etc`. A file that is there and differs is an error,
+/// unless by `force`: it may hold what was measured on the robot.
+fn configuration(folder: &Path, etc: &Path, force: bool) -> anyhow::Result<Vec<Step>> {
+    let unreadable = || format!("cannot read {}", folder.display());
+    let mut names: Vec<PathBuf> = Vec::new();
+    for entry in fs::read_dir(folder).with_context(unreadable)? {
+        let path = entry.with_context(unreadable)?.path();
+        if path.is_file() {
+            names.push(path);
+        }
+    }
+    names.sort();
+    let (mut steps, mut differ) = (Vec::new(), Vec::new());
+    for path in names {
+        let Some(name) = path.file_name() else {
+            continue;
+        };
+        let bytes = fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        let to = etc.join(name);
+        match fs::read(&to) {
+            Ok(there) if there == bytes => continue,
+            Ok(_) if !force => differ.push(to.display().to_string()),
+            _ => {}
+        }
+        steps.push(write(to, bytes, 0o644));
+    }
+    if !differ.is_empty() {
+        bail!(
+            "{} would be overwritten by other content: nothing was installed; --force overwrites, \
+             and without --config the configuration stays as it is",
+            differ.join(", ")
+        );
+    }
+    Ok(steps)
+}
