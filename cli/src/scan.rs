@@ -207,6 +207,11 @@ fn certainty(finding: &Finding) -> &'static str {
     finding.certainty().map_or("", |certainty| certainty.word())
 }
 
+/// The word and the probability.
+fn sure(finding: &Finding) -> String {
+    format!("{} ({})", certainty(finding), finding.percent())
+}
+
 fn as_text(name: &str, how: &str, heard: &Traffic, devices: &[Device]) -> String {
     let mut text = String::new();
     let frames: u64 = heard.streams().map(|s| s.frames + s.remote).sum();
@@ -219,22 +224,22 @@ fn as_text(name: &str, how: &str, heard: &Traffic, devices: &[Device]) -> String
         let finding = &device.finding;
         let _ = writeln!(
             text,
-            "{:<9} {}: {}",
-            certainty(finding),
+            "{:<22} {}: {}",
+            sure(finding),
             device.name,
             finding.what
         );
         if !finding.unusable.is_empty() {
-            let _ = writeln!(text, "{:<9} {}", "", finding.unusable);
+            let _ = writeln!(text, "{:<22} {}", "", finding.unusable);
         }
         for rival in &device.rivals {
             let _ = writeln!(
                 text,
-                "{:<9} or {} at address {} ({})",
+                "{:<22} or {} at address {}: {}",
                 "",
                 rival.driver,
                 rival.address,
-                certainty(rival)
+                sure(rival)
             );
         }
     }
@@ -301,6 +306,7 @@ fn as_json(name: &str, heard: &Traffic, devices: &[Device]) -> Value {
             "driver": finding.driver,
             "address": finding.address,
             "certainty": certainty(finding),
+            "probability": finding.probability(),
             "bits": (finding.bits * 10.0).round() / 10.0,
             "what": finding.what,
             "keys": keys(finding),

@@ -32,8 +32,8 @@
 //! period; what it sends after its six bytes (the source's remark has two more).
 //!
 //! # Recognition
-//! A sensor that streams on the identifiers 1 and 2 is recognised by them and the lengths alone,
-//! and never as certain. No question is known that it answers.
+//! A sensor that streams on the identifiers 1 and 2 is recognised by forces and torques that it can
+//! measure, and by the commands of another program. No question is known that it answers.
 //!
 //! # Keys
 //! ```toml
@@ -45,7 +45,7 @@
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Link, Supervised};
 use crate::pairing::{Limit, Paired, Pairing};
-use crate::recognise::{Evidence, Finding, Key, Traffic, length_of};
+use crate::recognise::{Evidence, Finding, Key, Traffic};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Format, Frame, Frames, Id, Mode, Output,
     OutputInfo, Spec, SpecError, bytes, keys, wrench,
@@ -68,6 +68,9 @@ const CONTINUOUSLY: u8 = 1;
 const NEWTON: (f64, f64) = (0.01, -300.0);
 /// One step, and the value of code 0 \[Nm\].
 const NEWTON_METRE: (f64, f64) = (0.002, -50.0);
+
+/// What a sensor measures \[N, Nm\]: an AFT200-D80 200 N and 15 Nm.
+const FULL_SCALE: (f64, f64) = (200.0, 15.0);
 
 /// The keys of `driver = "aidin_aft200"`.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
@@ -140,19 +143,38 @@ impl Driver for Options {
         Ok(Box::new(AftBoard::new(spec, self)?))
     }
 
-    /// By the identifiers of delivery and the lengths alone.
+    /// By the identifiers of delivery, with forces and torques that it can measure.
     fn recognise(seen: &Traffic) -> Vec<Finding> {
         let mut evidence = Evidence::new(seen, 1);
-        let [force, torque] = [Self::default().id_force, Self::default().id_torque].map(|raw| {
-            evidence.sends(Id::standard(raw), length_of(3), |frame| {
-                matches!(frame.len(), 6..=8)
-            })
-        });
+        let keys = Self::default();
+        let half = |scale: (f64, f64), most: f64| {
+            move |frame: &Frame| match frame.data().first_chunk() {
+                Some(&half) => {
+                    let mut quality = Quality::GOOD;
+                    let values = axes(half, scale, 0, &mut quality);
+                    frame.len() <= 8 && values.iter().all(|value| value.abs() <= most)
+                }
+                None => false,
+            }
+        };
+        let force = evidence.sends(Id::standard(keys.id_force), half(NEWTON, FULL_SCALE.0));
+        let torque = evidence.sends(
+            Id::standard(keys.id_torque),
+            half(NEWTON_METRE, FULL_SCALE.1),
+        );
         let (Some(force), Some(torque)) = (force, torque) else {
             return Vec::new();
         };
         evidence.together(force, torque);
-        evidence.belongs(COMMAND);
+        evidence.measures(force);
+        evidence.measures(torque);
+        evidence.sends(COMMAND, |frame| match *frame.data() {
+            [number, command, ..] => {
+                let known = (command::TRANSMIT..=command::PERIOD).contains(&command);
+                number > 0 && known && frame.len() == 8
+            }
+            _ => false,
+        });
         let finding = evidence.finding(Self::NAME, 1, "AIDIN AFT200");
         let period = Key::period_ms(force.period(), 1, 65);
         (finding

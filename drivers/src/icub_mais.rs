@@ -99,6 +99,8 @@ impl Driver for Options {
                 let second = evidence.sends_length(id(HES7TO14), usize::from(SENSORS - SECOND));
                 if let (Some(first), Some(second)) = (first, second) {
                     evidence.together(first, second);
+                } else if first.is_some() || second.is_some() {
+                    evidence.lacks();
                 }
                 let keys = Key::period_ms(first.and_then(Stream::period), 1, 255);
                 (keys.into_iter().collect(), (0..SENSORS).collect())

@@ -53,7 +53,7 @@ use crate::family::{Family, Link, Supervised};
 use crate::held::Held;
 use crate::icub::{self, class};
 use crate::icub_motor::mode;
-use crate::recognise::{Finding, Key, LENGTH, Stream, Traffic, byte_of};
+use crate::recognise::{Finding, Key, Stream, Traffic};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
     Outputs, Spec, SpecError,
@@ -185,8 +185,7 @@ impl Driver for Options {
                 if let Some(velocities) = evidence.sends_length(id(kind::VELOCITY), FRAME) {
                     evidence.together(velocities, positions);
                 }
-                let bits = LENGTH + 2.0 * byte_of(MODES.len());
-                evidence.sends(id(kind::STATUS), bits, |frame| match *frame.data() {
+                evidence.sends(id(kind::STATUS), |frame| match *frame.data() {
                     [_, a, _, b, _, _, _, _] => MODES.contains(&a) && MODES.contains(&b),
                     _ => false,
                 });

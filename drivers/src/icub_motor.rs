@@ -64,7 +64,7 @@ use crate::bringup::{Bringup, NoInquiry};
 use crate::bytes;
 use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class};
-use crate::recognise::{Finding, Key, LENGTH, Stream, Traffic, byte_of};
+use crate::recognise::{Finding, Key, Stream, Traffic};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
     Spec, SpecError,
@@ -196,7 +196,6 @@ impl Driver for Options {
         icub::recognise(seen, Self::NAME, &types, &[], |evidence, address, _| {
             let id = |kind| icub::stream(class::PERIODIC_MOTOR, address, kind);
             let motion = evidence.sends_length(id(kind::TWO_FOC), 8);
-            let bits = LENGTH + byte_of(mode::ALL.len()) + byte_of(32);
             let is_status = |frame: &Frame| match *frame.data() {
                 [mode, encoder, _, _, _, _, _, _] => {
                     mode::ALL.contains(&u32::from(mode)) && encoder < 32
@@ -205,7 +204,7 @@ impl Driver for Options {
             };
             // Older boards have a status of the same identifier.
             if let Some(motion) = motion {
-                if let Some(status) = evidence.sends(id(kind::STATUS), bits, is_status) {
+                if let Some(status) = evidence.sends(id(kind::STATUS), is_status) {
                     evidence.together(motion, status);
                 }
                 evidence.sends_length(id(kind::ADDITIONAL_STATUS), 4);

@@ -48,7 +48,7 @@ use crate::bytes;
 use crate::configure::{Configure, Setting};
 use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
-use crate::recognise::{Finding, Key, LENGTH, Traffic, byte_of};
+use crate::recognise::{Finding, Key, Traffic};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
     Outputs, Spec, SpecError,
@@ -224,8 +224,7 @@ impl Driver for Options {
         let maybe = [icub::board::MTB4];
         icub::recognise(seen, Self::NAME, &types, &maybe, |evidence, address, _| {
             let id = icub::stream(class::PERIODIC_ANALOG, address, POS);
-            let bits = LENGTH + byte_of(2) + byte_of(3 * 16);
-            let stream = evidence.sends(id, bits, |frame| match *frame.data() {
+            let stream = evidence.sends(id, |frame| match *frame.data() {
                 [quantity, values, _, _, _, _, _, _] => {
                     quantity < 2 && (1..=VALUES).contains(&(values & 0xF))
                 }

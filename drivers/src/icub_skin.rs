@@ -45,7 +45,7 @@ use crate::bytes;
 use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{Limit, Paired, Pairing};
-use crate::recognise::{Finding, Key, LENGTH, Traffic, byte_of};
+use crate::recognise::{Finding, Key, Traffic};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Id, Mode, Output,
     OutputInfo, Spec, SpecError,
@@ -161,7 +161,7 @@ impl Driver for Options {
             let mut triangles: Option<(u8, u8)> = None;
             for triangle in 0..16 {
                 let id = icub::stream(class::PERIODIC_SKIN, address, triangle);
-                let stream = evidence.sends(id, LENGTH + byte_of(2), |frame| {
+                let stream = evidence.sends(id, |frame| {
                     matches!(*frame.data(), [FIRST | SECOND, _, _, _, _, _, _, _])
                 });
                 let Some(stream) = stream else { continue };

@@ -92,7 +92,7 @@ pub use board::StrainBoard;
 pub use options::{Options, Stream};
 
 use crate::icub::{self, board as boards, class};
-use crate::recognise::{self, Finding, Key, Traffic, length_of};
+use crate::recognise::{self, Finding, Key, Traffic};
 use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -119,13 +119,15 @@ impl Driver for Options {
         let types = [boards::STRAIN, boards::STRAIN2, boards::STRAIN2C];
         icub::recognise(seen, Self::NAME, &types, &[], |evidence, address, _| {
             let id = |kind| icub::stream(class::PERIODIC_ANALOG, address, kind);
-            let mut half =
-                |kind| evidence.sends(id(kind), length_of(2), |frame| matches!(frame.len(), 6 | 7));
+            let mut half = |kind| evidence.sends(id(kind), |frame| matches!(frame.len(), 6 | 7));
             let calibrated = (half(kind::FORCE), half(kind::TORQUE));
             let raw = (half(kind::RAW_FORCE), half(kind::RAW_TORQUE));
             for pair in [calibrated, raw] {
                 if let (Some(force), Some(torque)) = pair {
                     evidence.together(force, torque);
+                    evidence.measures(force);
+                } else if pair.0.is_some() || pair.1.is_some() {
+                    evidence.lacks();
                 }
             }
             for kind in kind::THERMOMETERS {

@@ -181,9 +181,9 @@ impl Driver for Options {
             let bits = f64::from(Told::parse(first.data())?.structure);
             // Of 127 controllers and 128 hosts.
             let mut evidence = Evidence::with_fd(seen, 127 * 128);
-            evidence.sends(stream.id, bits, |frame| Told::parse(frame.data()).is_some());
+            evidence.sends_rarely(stream.id, bits, |frame| Told::parse(frame.data()).is_some());
             let query = id(host, node, WANTED);
-            evidence.sends(query, f64::from(BITS), |frame| {
+            evidence.sends_rarely(query, f64::from(BITS), |frame| {
                 let opcode = frame.data().first();
                 opcode.is_some_and(|opcode| *opcode < REPLY)
             });

@@ -1,7 +1,7 @@
 //! The drivers: one list from which their names, their keys and their devices follow.
 
 use crate::objects::Objects;
-use crate::recognise::{Finding, Traffic};
+use crate::recognise::{self, Finding, Traffic};
 use crate::signal::Message;
 use crate::{
     Board, Device, Driver, Frame, OutputInfo, Spec, SpecError, aidin_aft200, ati_netcanoem,
@@ -34,16 +34,15 @@ macro_rules! drivers {
             $((<$module::Options as Driver>::NAME, <$module::Options as Driver>::ASKED_BY_NAME),)+
         ];
 
-        /// What nothing in `seen` refutes, however little speaks for it; that with most bits first.
+        /// What nothing in `seen` refutes, however little speaks for it; the most probable first.
         fn suspect(seen: &Traffic) -> Vec<Finding> {
             let mut all = Vec::new();
             $(all.extend(<$module::Options as Driver>::recognise(seen));)+
-            all.sort_by(|a: &Finding, b: &Finding| b.bits.total_cmp(&a.bits));
-            all
+            recognise::together(seen, all)
         }
 
-        /// The devices that `seen` shows, each driver's own: the surest first, of those that are
-        /// equally sure that with most bits.
+        /// The devices that `seen` shows, judged together: the surest first, of those that are
+        /// equally sure the most probable.
         #[must_use]
         pub fn recognise(seen: &Traffic) -> Vec<Finding> {
             let mut all = suspect(seen);
@@ -62,8 +61,8 @@ macro_rules! drivers {
             let suspects = suspect(seen);
             let mut there: Vec<&Finding> = Vec::new();
             for finding in &suspects {
-                let explained = |id| there.iter().any(|better| better.explains.contains(id));
-                if !finding.explains.iter().all(explained) {
+                let mut own = finding.explains.iter().map(|explained| explained.id);
+                if !own.all(|id| there.iter().any(|better| better.has(id))) {
                     there.push(finding);
                 }
             }

@@ -2,7 +2,7 @@
 
 use super::frames::{BASE_MOST, ForceUnit, TorqueUnit, id, opcode};
 use crate::Frame;
-use crate::recognise::{Evidence, Finding, Key, LENGTH, Traffic, byte_of, length_of};
+use crate::recognise::{Evidence, Finding, Key, Traffic};
 use alloc::format;
 use alloc::string::String;
 use alloc::vec::Vec;
@@ -32,24 +32,26 @@ pub(super) fn sensor(seen: &Traffic, driver: &'static str, base: u8) -> Option<F
     let mut evidence = Evidence::new(seen, usize::from(BASE_MOST) + 1);
     let id = |opcode| id(base, opcode);
     let has_length = |lengths: [usize; 2]| move |frame: &Frame| lengths.contains(&frame.len());
-    let first = evidence.answers(id(opcode::GAUGES), LENGTH, has_length([8, 8]));
+    let first = evidence.answers(id(opcode::GAUGES), has_length([8, 8]));
     let second = evidence.sends_length(id(opcode::GAUGES_SECOND), 6);
     if let (Some(first), Some(second)) = (first, second) {
         evidence.together(first, second);
+        evidence.measures(first);
+    } else if second.is_some() {
+        evidence.lacks();
     }
-    let units = evidence.answers(id(opcode::UNITS), LENGTH + 2.0 * byte_of(6), is_units);
-    evidence.answers(id(opcode::COUNTS), LENGTH, has_length([8, 8]));
+    let units = evidence.answers(id(opcode::UNITS), is_units);
+    evidence.answers(id(opcode::COUNTS), has_length([8, 8]));
     if second.is_none() && units.is_none() {
         return None;
     }
     // A row's question, and its three answers.
-    evidence.sends(id(opcode::MATRIX), length_of(2), has_length([1, 8]));
+    evidence.sends(id(opcode::MATRIX), has_length([1, 8]));
     for opcode in [opcode::MATRIX + 1, opcode::MATRIX_LAST] {
         evidence.sends_length(id(opcode), 8);
     }
     let mut what = String::from("ATI sensor at a NETCANOEM board");
-    // Each of four bytes or more is one of about 64: two bits.
-    if let Some(serial) = evidence.answers(id(opcode::SERIAL), 4.0 * byte_of(64), is_text) {
+    if let Some(serial) = evidence.answers(id(opcode::SERIAL), is_text) {
         let bytes = serial.kept().find(|frame| !frame.is_empty());
         let letters = bytes.into_iter().flat_map(Frame::data).copied();
         let letters: String = (letters.map(char::from).filter(char::is_ascii_graphic)).collect();

@@ -3,7 +3,7 @@
 use super::protocol::{NMT, emcy, heartbeat, object, sdo_from, sdo_to, tpdo};
 use super::{Object, READ};
 use crate::bytes::{u16_le, u32_le};
-use crate::recognise::{BYTE, Evidence, LENGTH, Stream, Traffic, byte_of};
+use crate::recognise::{Evidence, Stream, Traffic};
 use crate::{Format, Frame, Id};
 use alloc::format;
 use alloc::string::String;
@@ -17,6 +17,8 @@ const IDENTITY: [(u8, &str); 4] = [
     (3, "revision"),
     (4, "serial"),
 ];
+/// An index of 16 bits and a sub-index of 8 that are its own \[bits\].
+const OBJECT: f64 = 24.0;
 /// States in a heartbeat, without the bit that toggles in node guarding.
 const STATES: [u8; 4] = [0x00, 0x04, 0x05, 0x7F];
 
@@ -73,28 +75,24 @@ fn is_heartbeat(frame: &Frame) -> bool {
 pub(crate) fn recognise(seen: &Traffic) -> impl Iterator<Item = Recognised<'_>> {
     (1..=127).filter_map(|node| {
         let mut evidence = Evidence::new(seen, 127);
-        let beats = evidence.sends(
-            heartbeat(node),
-            LENGTH + byte_of(STATES.len()),
-            is_heartbeat,
-        );
-        let answers = evidence.sends(sdo_from(node), LENGTH + byte_of(40), is_answer);
+        let beats = evidence.sends(heartbeat(node), is_heartbeat);
+        let answers = evidence.sends(sdo_from(node), is_answer);
         if beats.is_none() && answers.is_none() {
             return None;
         }
         let device_type = told(seen, node, object::DEVICE_TYPE);
         let mut words = String::new();
         if device_type.is_some() {
-            // An index and a sub-index, as in each of the following.
-            evidence.add(3.0 * BYTE);
+            evidence.add(OBJECT);
         }
         for (sub, name) in IDENTITY {
             if let Some(value) = told(seen, node, identity(sub)) {
-                evidence.add(3.0 * BYTE);
+                evidence.add(OBJECT);
                 words += &format!(", {name} {value:#x}");
             }
         }
-        let tpdos = [0, 1, 2, 3].map(|number| evidence.sends(tpdo(node, number), 0.0, |_| true));
+        let tpdos =
+            [0, 1, 2, 3].map(|number| evidence.sends(tpdo(node, number), |frame| frame.len() <= 8));
         for id in [emcy(node), sdo_to(node)] {
             evidence.belongs(id);
         }

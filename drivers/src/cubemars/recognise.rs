@@ -2,7 +2,7 @@
 
 use super::frames::SERVO_STATUS;
 use super::options::Options;
-use crate::recognise::{BYTE, Evidence, Finding, Key, LENGTH, Stream, Traffic, byte_of, length_of};
+use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic};
 use crate::{Driver, Frame, Id};
 use alloc::vec::Vec;
 
@@ -30,9 +30,16 @@ fn finding(evidence: Evidence<'_>, number: u8, what: &str, mode: &str) -> Option
 fn servo(seen: &Traffic, number: u8) -> Option<Finding> {
     let mut evidence = Evidence::new(seen, 0xFF);
     let id = Id::extended(SERVO_STATUS | u32::from(number));
-    let stream = evidence.sends(id, LENGTH + byte_of(ERRORS), |frame| {
+    let stream = evidence.sends(id, |frame| {
         frame.len() == 8 && has_error(frame.data().get(7))
     })?;
+    evidence.moves(stream, |frame| match *frame.data() {
+        [a, b, c, d, ..] => {
+            let [position, velocity] = [[a, b], [c, d]].map(i16::from_be_bytes);
+            Some((position.into(), velocity.into()))
+        }
+        _ => None,
+    });
     let finding = finding(
         evidence,
         number,
@@ -67,26 +74,36 @@ fn mit(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
     };
     let find = |number: &u8| {
         let mut evidence = Evidence::new(seen, if host == 0 { 1 } else { 0xFF });
-        let stage = if stream.lengths.1 == 8 {
-            byte_of(ERRORS)
-        } else {
-            0.0
-        };
-        // The first byte is the identifier, or keeps to few numbers.
+        // Numbers are those that were heard: few of them tell something, and less than a rule.
         let few = stream.frames >= 8 * numbers.len() as u64;
-        let number_bits = match (host, few) {
-            (1.., _) => BYTE,
-            (0, true) => byte_of(numbers.len()),
-            (0, false) => 0.0,
-        };
-        evidence.sends(stream.id, length_of(2) + stage + number_bits, is_reply)?;
-        evidence.belongs(Id::standard((*number).into()));
+        if few && numbers.len() > 1 {
+            evidence.add(-3.0);
+        }
+        let part = Part::Sends((host == 0).then_some(*number));
+        evidence.sends_as(part, stream.id, |frame| {
+            let is_own = frame.data().first().is_some_and(|first| match host {
+                0 => !few || numbers.contains(first),
+                _ => u16::from(*first) == host,
+            });
+            is_own && is_reply(frame)
+        })?;
+        let command = Id::standard((*number).into());
+        let is_its = |frame: &Frame| frame.data().first() == Some(number);
+        if host == 0 {
+            evidence.is_commanded(command, stream, is_its);
+        }
+        evidence.moves(stream, |frame| match *frame.data() {
+            [first, a, b, c, d, ..] if first == *number => {
+                let velocity = u16::from_be_bytes([c, d]) >> 4;
+                let position = u16::from_be_bytes([a, b]);
+                Some((position.into(), f64::from(velocity) - 2047.5))
+            }
+            _ => None,
+        });
         let what = "CubeMars motor in MIT mode";
         let finding = finding(evidence, *number, what, "\"mit\"")?;
         let host = (host != 0).then(|| Key::new("host_id", host));
-        let is_its = |frame: &Frame| frame.data().first() == Some(number);
         let period = Key::period_ms(stream.period_of(is_its), 1, 60_000);
-        let command = Id::standard((*number).into());
         let finding = finding.with_keys(host).with_keys(period);
         Some(finding.with_commands([command..=command]))
     };

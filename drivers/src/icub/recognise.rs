@@ -1,7 +1,7 @@
 //! Recognising boards of the protocol: by what they tell of themselves, and by their streams.
 
 use super::{ADDRESSES, BROADCAST, board, class, command, to_board, to_host};
-use crate::recognise::{BYTE, Evidence, Finding, Key, LENGTH, Stream, Traffic, byte_of, length_of};
+use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic};
 use crate::{Format, Frame};
 use alloc::format;
 use alloc::string::String;
@@ -27,7 +27,7 @@ fn told(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Result<Option
         let first = frame.data().first().copied();
         first.is_some_and(|c| c == command::DISCOVER || c < 0x10)
     };
-    if let Some(stream) = evidence.sends(id, byte_of(17), rule) {
+    if let Some(stream) = evidence.sends_as(Part::Tells, id, rule) {
         let mut texts: [Option<[u8; 4]>; 8] = [None; 8];
         for frame in stream.kept() {
             match *frame.data() {
@@ -48,10 +48,11 @@ fn told(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Result<Option
             }
         }
         if let Some(told) = &mut told {
-            evidence.add(byte_of(types.len()) + length_of(2));
+            // A type that is one of 256.
+            evidence.add(8.0);
             if texts.iter().all(Option::is_some) {
-                // A command, a length, and eight numbers in their order.
-                evidence.add(2.0 * BYTE + LENGTH);
+                // A command, and eight numbers in their order.
+                evidence.add(16.0);
                 let bytes = texts.iter().flatten().flatten();
                 let text = bytes
                     .take_while(|byte| **byte != 0)
@@ -73,7 +74,8 @@ fn told(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Result<Option
                 && command == version
                 && board::NAMES.iter().any(|(known, _)| *known == board)
             {
-                evidence.explains(id, BYTE + LENGTH + byte_of(types.len()) + 7.0);
+                // A command and a type of 256 each, and a byte that is 0 or 1.
+                evidence.tells(id, 8.0 + 8.0 + 7.0);
                 told.get_or_insert(Told {
                     board,
                     version: [major, minor],
@@ -106,9 +108,8 @@ pub(crate) fn recognise(
         let mut evidence = Evidence::new(seen, ADDRESSES.count());
         let told = told(&mut evidence, address, types).ok()?;
         let board = told.as_ref().map(|told| told.board);
-        let before = evidence.clone();
         let (keys, joints) = streams(&mut evidence, address, board);
-        if board.is_none_or(|board| maybe.contains(&board)) && !evidence.has_more_than(&before) {
+        if board.is_none_or(|board| maybe.contains(&board)) && !evidence.is_sending() {
             return None;
         }
         let what = match &told {

@@ -3,7 +3,7 @@
 use super::frames::{kind, sensor};
 use crate::Frame;
 use crate::icub::{self, board, class};
-use crate::recognise::{Finding, Key, LENGTH, Stream, Traffic, byte_of};
+use crate::recognise::{Finding, Key, Stream, Traffic};
 use alloc::format;
 use alloc::vec::Vec;
 
@@ -34,11 +34,12 @@ pub(super) fn boards(seen: &Traffic, driver: &'static str) -> Vec<Finding> {
         let is_long = |frame: &Frame| frame.len() == 8;
         let mut keys = Vec::new();
         let mut quantities: Vec<&str> = Vec::new();
-        let triple = evidence.sends(id(kind::TRIPLE), LENGTH + byte_of(SENSORS.len()), |frame| {
+        let triple = evidence.sends(id(kind::TRIPLE), |frame| {
             let sensor = frame.data().get(1);
             is_long(frame) && SENSORS.iter().any(|(known, _)| Some(known) == sensor)
         });
         if let Some(triple) = triple {
+            evidence.measures(triple);
             evidence.counts(triple, |frame| frame.data().first().copied().unwrap_or(0));
             for (number, quantity) in SENSORS {
                 let is_it = |frame: &Frame| frame.data().get(1) == Some(&number);
@@ -50,14 +51,11 @@ pub(super) fn boards(seen: &Traffic, driver: &'static str) -> Vec<Finding> {
                 }
             }
         }
-        if evidence
-            .sends(id(kind::QUATERNION), LENGTH, is_long)
-            .is_some()
-        {
+        if evidence.sends(id(kind::QUATERNION), is_long).is_some() {
             quantities.push("orientation");
         }
         // Three calibrations from 0 to 3.
-        let status = evidence.sends(id(kind::STATUS), LENGTH + 3.0 * byte_of(4), |frame| {
+        let status = evidence.sends(id(kind::STATUS), |frame| {
             let mut calibrations = frame.data().iter().skip(1).take(3);
             is_long(frame) && calibrations.all(|calibration| *calibration <= 3)
         });

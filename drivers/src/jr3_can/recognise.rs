@@ -1,7 +1,7 @@
 //! Recognising boards: by the counter in both halves of a reading, and by their full scales.
 
 use super::protocol::{READY, id, op};
-use crate::recognise::{BYTE, Evidence, Finding, Key, Stream, Traffic, byte_of, length_of};
+use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
 use crate::{Frame, bytes};
 use alloc::vec::Vec;
 
@@ -22,10 +22,10 @@ pub(super) fn board(seen: &Traffic, driver: &'static str, node: u16) -> Option<F
             evidence.add(10.0);
         }
         evidence.together(force, moment);
+        evidence.measures(force);
     }
     // A state, alone or before three full scales.
-    let bits = length_of(2) + byte_of(2);
-    let acknowledged = evidence.sends(id(op::ACKNOWLEDGE, node), bits, |frame| {
+    let acknowledged = evidence.sends(id(op::ACKNOWLEDGE, node), |frame| {
         let state = frame.data().first();
         let is_state = state.is_some_and(|state| *state <= READY + 1);
         is_state && matches!(frame.len(), 1 | 7)
@@ -41,7 +41,8 @@ pub(super) fn board(seen: &Traffic, driver: &'static str, node: u16) -> Option<F
         stream.kept().any(plausible)
     });
     if scales {
-        evidence.add(BYTE);
+        // Each a number of 16 bits, one of seven.
+        evidence.add(8.0);
     }
     if (force.is_none() || moment.is_none()) && !scales {
         return None;

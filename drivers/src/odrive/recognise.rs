@@ -1,7 +1,7 @@
 //! Recognising axes: by heartbeat and estimates, and by the version that they tell.
 
 use super::frames::{NODE_MOST, command};
-use crate::recognise::{BYTE, Evidence, Finding, Key, LENGTH, Stream, Traffic, byte_of};
+use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
 use crate::{Format, Frame, Id, bytes};
 use alloc::format;
 use alloc::vec::Vec;
@@ -12,8 +12,6 @@ const fn id(node: u16, command: u8) -> Id {
 
 /// States of an axis, from undefined to the last calibration.
 const STATES: usize = 15;
-/// Of 256 exponents, those of numbers between 1e-7 and 1e8, and that of zero.
-const EXPONENTS: usize = 52;
 
 fn is_answer(frame: &Frame) -> bool {
     frame.format == Format::Classic && frame.len() == 8
@@ -37,17 +35,19 @@ fn is_heartbeat(frame: &Frame) -> bool {
 pub(super) fn axis(seen: &Traffic, driver: &'static str, node: u16) -> Option<Finding> {
     let mut evidence = Evidence::new(seen, usize::from(NODE_MOST) + 1);
     let heartbeat = id(node, command::HEARTBEAT);
-    let beats = evidence.sends(heartbeat, LENGTH + byte_of(STATES), is_heartbeat);
-    let mut measured = |command| {
-        let bits = LENGTH + 2.0 * byte_of(EXPONENTS);
-        evidence.answers(id(node, command), bits, is_measured)
-    };
-    let estimates = measured(command::ESTIMATES);
+    let beats = evidence.sends(heartbeat, is_heartbeat);
+    let estimates = evidence.answers(id(node, command::ESTIMATES), is_measured);
     if beats.is_none() && estimates.is_none() {
         return None;
     }
+    if let Some(estimates) = estimates {
+        evidence.moves(estimates, |frame| {
+            let number = |at| f64::from(f32::from_bits(bytes::u32_le(frame.data(), at)));
+            is_answer(frame).then(|| (number(0), number(4)))
+        });
+    }
     for command in [command::IQ, command::TEMPERATURE, command::TORQUES] {
-        measured(command);
+        evidence.answers(id(node, command), is_measured);
     }
     let mut what = "ODrive".into();
     let mut firmware = "";
@@ -57,7 +57,8 @@ pub(super) fn axis(seen: &Traffic, driver: &'static str, node: u16) -> Option<Fi
         .find(|frame| is_answer(frame));
     if let Some(&[_, hardware, revision, _, 0, minor @ (5 | 6), patch, _]) = answer.map(Frame::data)
     {
-        evidence.explains(id(node, command::VERSION), LENGTH + BYTE + byte_of(2));
+        // A byte that is 0, and one that is 5 or 6.
+        evidence.explains(id(node, command::VERSION), 8.0 + 7.0);
         what = format!("ODrive {hardware}.{revision}, firmware 0.{minor}.{patch}");
         firmware = if minor == 5 { "0.5" } else { "0.6" };
     }

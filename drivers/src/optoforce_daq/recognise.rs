@@ -2,7 +2,7 @@
 
 use super::options::Options;
 use super::protocol::PACKET;
-use crate::recognise::{BYTE, Evidence, Finding, Key, Stream, Traffic};
+use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
 use crate::{Driver, Format, Frame, Id, bytes};
 
 /// The unit that sends on `stream`, if it is one.
@@ -32,7 +32,7 @@ pub(super) fn unit(seen: &Traffic, stream: &Stream) -> Option<Finding> {
     }
     let mut evidence = Evidence::new(seen, 1 << 11);
     // Four bytes and a checksum.
-    evidence.explains(stream.id, 6.0 * BYTE);
+    evidence.explains(stream.id, 48.0);
     let finding = evidence.finding(Options::NAME, address.into(), "OptoForce sensor at a DAQ")?;
     let scale = "[1.0, 1.0, 1.0]";
     let note = "from the sensor's sensitivity report";

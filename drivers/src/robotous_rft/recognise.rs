@@ -2,7 +2,7 @@
 
 use super::options::{Model, Options};
 use super::protocol::{Ids, RATES, command, send};
-use crate::recognise::{BYTE, Evidence, Finding, Key, LENGTH, Traffic, byte_of};
+use crate::recognise::{Evidence, Finding, Key, Traffic};
 use crate::{Driver, Frame, Id};
 use alloc::format;
 use alloc::string::String;
@@ -27,17 +27,18 @@ const COMMANDS: [u8; 8] = [
 /// The sensor, if `seen` shows it.
 pub(super) fn sensor(seen: &Traffic) -> Option<Finding> {
     let mut evidence = Evidence::new(seen, 1);
-    let bits = LENGTH + byte_of(COMMANDS.len());
-    let first = evidence.sends(IDS.first, bits, |frame| match *frame.data() {
+    let first = evidence.sends(IDS.first, |frame| match *frame.data() {
         [command, _, _, _, _, _, _, _] => COMMANDS.contains(&command),
         _ => false,
     })?;
     let second = evidence.sends_length(IDS.second, 8)?;
     evidence.together(first, second);
+    evidence.measures(second);
     evidence.belongs(IDS.command);
     let is_data = |frame: &Frame| frame.data().first() == Some(&command::START);
     if first.recent().all(is_data) {
-        evidence.add(BYTE - byte_of(COMMANDS.len()));
+        // One of its commands alone.
+        evidence.add(3.0);
     }
     // The answer's two frames come in turn: the second of a text is the one after its first.
     let text = |wanted: u8| {
@@ -54,14 +55,14 @@ pub(super) fn sensor(seen: &Traffic) -> Option<Finding> {
     let mut model = Key::fill_in("model", "\"RFT40-SA01\"", "its scales depend on it");
     if let Some(name) = text(command::NAME) {
         // Fifteen letters, digits and signs.
-        evidence.add(BYTE);
+        evidence.add(8.0);
         if Model::NAMES.contains(&name.as_str()) {
             model = Key::new("model", format!("{name:?}"));
         }
         what = name;
     }
     if let Some(serial) = text(command::SERIAL) {
-        evidence.add(BYTE);
+        evidence.add(8.0);
         what = format!("{what}, serial {serial}");
     }
     let measured = first

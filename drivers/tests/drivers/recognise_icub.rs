@@ -103,35 +103,24 @@ fn what_no_board_answers_is_no_answer() {
 }
 
 /// Where another program has asked for the version, nobody needs to ask. The bits are those of the
-/// identifier (11), of the command, the length, the type (one of those that the driver reads) and
-/// the last byte (0 or 1), less those of 14 addresses.
+/// identifier (12), of the command, the type and the last byte (0 or 1), less those of one driver
+/// of 32 and of 14 addresses.
 #[test]
 fn an_answer_to_another_program_names_a_board() {
-    for (answer, driver, types, what) in [
+    for (answer, driver, what) in [
         (
             "230#1C0C020008020001",
             "icub_strain",
-            3,
             "strain2, firmware 2.0.8",
         ),
-        (
-            "230#1C07010203020000",
-            "icub_mais",
-            1,
-            "mais, firmware 1.2.3",
-        ),
-        (
-            "030#5B08020105020001",
-            "icub_motor",
-            4,
-            "2foc, firmware 2.1.5",
-        ),
+        ("230#1C07010203020000", "icub_mais", "mais, firmware 1.2.3"),
+        ("030#5B08020105020001", "icub_motor", "2foc, firmware 2.1.5"),
     ] {
         let findings = found(&[(answer, 0.0)]);
         let finding = findings.iter().find(|finding| finding.driver == driver);
         let finding = finding.unwrap_or_else(|| panic!("{driver} is not found"));
         assert_eq!((finding.address, finding.what.as_str()), (3, what));
-        let bits = 11.0 + 8.0 + 3.17 + (8.0 - f64::log2(f64::from(types))) + 7.0 - 14_f64.log2();
+        let bits = 12.0 + 8.0 + 8.0 + 7.0 - 5.0 - 14_f64.log2();
         assert!((finding.bits - bits).abs() < 0.01, "{finding:?}");
     }
     // It does not say whether the protocols fit; it answers a motor's question.

@@ -23,7 +23,7 @@ impl Device {
     #[must_use]
     pub fn explains(&self, id: Id) -> bool {
         let claimed = self.claims.iter().any(|claim| claim.matches(id));
-        claimed || self.finding.explains.contains(&id)
+        claimed || self.finding.has(id)
     }
 }
 
@@ -51,7 +51,7 @@ fn claims(finding: &Finding) -> Result<Vec<Claim>, String> {
     Ok(device.claims().to_vec())
 }
 
-/// The devices on the bus of `heard`, those with most evidence first. `prefix` begins their names.
+/// The devices on the bus of `heard`, the surest first. `prefix` begins their names.
 #[must_use]
 pub fn devices(heard: &Traffic, prefix: &str) -> Vec<Device> {
     let mut devices: Vec<Device> = Vec::new();
@@ -86,5 +86,11 @@ pub fn devices(heard: &Traffic, prefix: &str) -> Vec<Device> {
             claims,
         });
     }
+    // Of those that are equally sure, as a person counts them.
+    devices.sort_by(|a, b| {
+        let order = |device: &Device| (device.finding.driver, device.finding.address);
+        let by_certainty = b.finding.certainty().cmp(&a.finding.certainty());
+        by_certainty.then(order(a).cmp(&order(b)))
+    });
     devices
 }

@@ -40,7 +40,7 @@ pub fn tables(devices: &[Device], joints: &mut usize) -> String {
         let finding = &device.finding;
         let certainty = finding.certainty().unwrap_or(Certainty::Possible);
         let mut table = String::new();
-        let _ = writeln!(table, "# {}: {}", certainty.word(), line(&finding.what));
+        let _ = writeln!(table, "# {}: {}", sure(finding), line(&finding.what));
         for rival in &device.rivals {
             let _ = writeln!(table, "# or: {}", said(rival));
         }
@@ -67,15 +67,17 @@ pub fn tables(devices: &[Device], joints: &mut usize) -> String {
     text
 }
 
+/// How sure it is, in a word and as a probability.
+fn sure(finding: &Finding) -> String {
+    let certainty = finding.certainty().unwrap_or(Certainty::Possible);
+    format!("{} ({})", certainty.word(), finding.percent())
+}
+
 /// A finding in a line.
 fn said(finding: &Finding) -> String {
-    let certainty = finding.certainty().unwrap_or(Certainty::Possible);
     let (driver, address) = (finding.driver, finding.address);
-    format!(
-        "{driver} at address {address}: {}, {}",
-        certainty.word(),
-        line(&finding.what)
-    )
+    let what = line(&finding.what);
+    format!("{driver} at address {address}: {}, {what}", sure(finding))
 }
 
 /// What a device says of itself, for a comment.
@@ -199,12 +201,7 @@ mod tests {
                 address,
                 bits,
                 what: "a board\nwith \"a text\"".into(),
-                keys: vec![],
-                joints: vec![],
-                explains: vec![],
-                commands: vec![],
-                unusable: "",
-                guess: false,
+                ..Finding::default()
             },
             rivals: vec![],
             claims: vec![],
@@ -215,13 +212,13 @@ mod tests {
     fn the_file_is_a_legal_plan_and_says_what_is_missing() {
         let mut strain = device("icub_strain", 13, 40.0);
         strain.finding.keys = vec![Key::new("period_ms", 30)];
-        let mut hand = device("icub_pos", 2, 20.0);
+        let mut hand = device("icub_pos", 2, 10.0);
         hand.finding.joints = vec![0, 3];
-        let mut motor = device("cubemars", 7, 20.0);
+        let mut motor = device("cubemars", 7, 10.0);
         motor.finding.keys = vec![Key::fill_in("model", "\"AK80-9\"", "its ranges")];
         motor.finding.joints = vec![0];
-        motor.rivals = vec![device("odrive", 3, 9.0).finding];
-        let possible = device("aidin_aft200", 1, 9.0);
+        motor.rivals = vec![device("odrive", 3, 0.0).finding];
+        let possible = device("aidin_aft200", 1, 3.0);
         let mut foreign = device("canopen_drive", 5, 60.0);
         foreign.finding.unusable = "no driver";
         let text = file(
@@ -252,11 +249,11 @@ mod tests {
         assert_eq!(arm.devices[1].spec.outputs.0[..], [0, 3]);
         for part in [
             "serial = \"00\\\"42\", channel = 1 }  # can3 when it was scanned",
-            "# or: odrive at address 3: possible",
+            "# or: odrive at address 3: possible (50 %)",
             "model = \"AK80-9\"  # fill in: its ranges",
             "  # driver = \"aidin_aft200\"",
             "# no driver\n",
-            "# certain: a board with \"a text\"",
+            "# certain (>99.9999 %): a board with \"a text\"",
             "# No device was recognised on it.",
         ] {
             assert!(text.contains(part), "{part}:\n{text}");

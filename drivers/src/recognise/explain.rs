@@ -1,0 +1,187 @@
+//! Which devices explain a bus best, together.
+//!
+//! The device with the highest probability is taken first; its frames are explained then, and
+//! count against every other that needs them: each by four bits, as if it were one of sixteen
+//! buses on which two devices send on one identifier. The frames that remain are fewer, so an
+//! identifier among them counts more.
+
+use super::background::{common, identifier};
+use super::traffic::Traffic;
+use super::{Certainty, Explained, Finding, PRIOR, Part};
+use crate::Id;
+use alloc::collections::BTreeSet;
+use alloc::vec::Vec;
+
+/// What two senders on one identifier count.
+const CONTESTED: f64 = 4.0;
+/// Where one of a family is sure, another has an even chance to be there: at which address is
+/// still open.
+const FAMILY: f64 = PRIOR - 1.0;
+
+/// The probability of odds of so many bits.
+pub(super) fn probability(bits: f64) -> f64 {
+    1.0 / (1.0 + libm::exp2(-bits))
+}
+
+/// Whether both cannot be true: each has frames of one identifier for itself.
+fn contests(a: &Finding, b: &Finding, of: &Explained) -> bool {
+    of.part != Part::Takes
+        && b.explains.iter().any(|other| {
+            let shared = match (of.part, other.part) {
+                (_, Part::Takes) => true,
+                (Part::Tells, Part::Tells) => a.address == b.address,
+                (Part::Sends(Some(one)), Part::Sends(Some(another))) => {
+                    a.driver == b.driver && one != another
+                }
+                (Part::Takes | Part::Tells | Part::Sends(_), _) => false,
+            };
+            other.id == of.id && !shared
+        })
+}
+
+/// The count of the identifiers of 11 or 29 bits, as `id` has them.
+const fn of_format(counts: &mut [usize; 2], id: Id) -> &mut usize {
+    let [standard, extended] = counts;
+    match id {
+        Id::Standard(_) => standard,
+        Id::Extended(_) => extended,
+    }
+}
+
+/// A finding that is not yet judged.
+struct Open {
+    finding: Finding,
+    /// Without those before it \[bits\].
+    full: f64,
+    /// The probability that nothing before it is there that contests it.
+    free: f64,
+    /// The streams that nobody of its family explains, with 11 and 29 bits.
+    others: [usize; 2],
+    /// The family's identifiers.
+    family: BTreeSet<Id>,
+}
+
+impl Open {
+    /// The bits for it, where `sure` are there.
+    fn bits(&self, sure: &[Finding]) -> f64 {
+        let finding = &self.finding;
+        let mut bits = finding.bits;
+        let is_one = |known: &&Finding| known.certainty() >= Some(Certainty::Likely);
+        if (sure.iter().filter(is_one)).any(|known| known.driver == finding.driver) {
+            bits += FAMILY;
+        }
+        let mut before: Vec<Id> = Vec::new();
+        for explained in &finding.explains {
+            let part = explained.part;
+            if part == Part::Takes {
+                continue;
+            }
+            if sure.iter().any(|known| contests(finding, known, explained)) {
+                bits -= CONTESTED;
+                continue;
+            }
+            let mut alike: Vec<u32> = (explained.alike.iter())
+                .filter(|id| !self.family.contains(id))
+                .filter(|id| {
+                    matches!(id, Id::Standard(_)) == matches!(explained.id, Id::Standard(_))
+                })
+                .map(|id| id.raw())
+                .collect();
+            alike.sort_unstable();
+            let mut others = self.others;
+            let others = *of_format(&mut others, explained.id);
+            let is_next = |id: &Id| id.raw().abs_diff(explained.id.raw()) == 1;
+            let is_next = before.iter().any(is_next);
+            bits += common(explained.bits, others, alike.len());
+            bits += identifier(explained.id, others, &alike, is_next);
+            before.push(explained.id);
+        }
+        bits
+    }
+}
+
+/// `findings` with the odds that each has beside the others, the surest first. In: what speaks for
+/// each but for its identifiers.
+pub(super) fn explain(seen: &Traffic, findings: Vec<Finding>) -> Vec<Finding> {
+    let own = |finding: &Finding| {
+        let explains = finding.explains.iter();
+        let own = explains.filter(|explained| explained.part != Part::Takes);
+        own.map(|explained| explained.id).collect::<Vec<Id>>()
+    };
+    let mut open: Vec<Open> = Vec::new();
+    let all: Vec<(&'static str, Vec<Id>)> = findings
+        .iter()
+        .map(|finding| (finding.driver, own(finding)))
+        .collect();
+    for finding in findings {
+        let mine = all.iter().filter(|(driver, _)| *driver == finding.driver);
+        let family: BTreeSet<Id> = mine.flat_map(|(_, ids)| ids).copied().collect();
+        let mut others = [0; 2];
+        for stream in seen.streams().filter(|stream| !family.contains(&stream.id)) {
+            *of_format(&mut others, stream.id) += 1;
+        }
+        open.push(Open {
+            finding,
+            full: 0.0,
+            free: 1.0,
+            others,
+            family,
+        });
+    }
+    let mut sure: Vec<Finding> = Vec::new();
+    for one in &mut open {
+        one.full = one.bits(&sure);
+    }
+    loop {
+        let odds = |one: &Open| {
+            // Nothing contests it, or something does and it is there all the same.
+            let (full, beside) = (one.full, one.bits(&sure));
+            let taken = 1.0 - one.free;
+            let yes = one.free * probability(full) + taken * probability(beside);
+            let no = one.free * probability(-full) + taken * probability(-beside);
+            libm::log2(yes / no)
+        };
+        let all: Vec<f64> = open.iter().map(odds).collect();
+        let best = (all.iter().enumerate()).max_by(|a, b| a.1.total_cmp(b.1).then(b.0.cmp(&a.0)));
+        let Some((place, bits)) = best.map(|(place, bits)| (place, *bits)) else {
+            return sure;
+        };
+        if bits < Certainty::POSSIBLE {
+            open.iter_mut()
+                .zip(all)
+                .for_each(|(one, bits)| one.finding.bits = bits);
+            open.sort_by(|a, b| b.finding.bits.total_cmp(&a.finding.bits));
+            sure.extend(open.into_iter().map(|one| one.finding));
+            return sure;
+        }
+        let mut best = open.remove(place).finding;
+        let contested = |one: &Open| {
+            best.explains
+                .iter()
+                .any(|e| contests(&best, &one.finding, e))
+        };
+        // The others that would explain the same frames, too, are there instead of it.
+        let rivals: Vec<usize> = (0..open.len())
+            .filter(|k| open.get(*k).is_some_and(&contested))
+            .collect();
+        let instead: f64 = (rivals.iter().filter_map(|k| open.get(*k)))
+            .map(|rival| libm::exp2(rival.full.min(500.0)) * rival.free)
+            .sum();
+        let bits = bits.min(500.0) - libm::log2(1.0 + instead);
+        for rival in rivals {
+            if let Some(rival) = open.get_mut(rival) {
+                rival.free *= probability(-bits);
+            }
+        }
+        if bits >= Certainty::LIKELY {
+            for one in &mut open {
+                for id in own(&best).iter().filter(|id| one.family.insert(**id)) {
+                    let count = of_format(&mut one.others, *id);
+                    *count = count.saturating_sub(1);
+                }
+            }
+        }
+        best.bits = bits;
+        sure.push(best);
+    }
+}
