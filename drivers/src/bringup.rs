@@ -103,6 +103,26 @@ impl Timing {
         start_most: Nanos::from_millis(500),
         send_within: Nanos::from_millis(100),
     };
+
+    /// Of motors that send by themselves, or that another program commands. Only the watching
+    /// counts: one that was not heard of for a second and a half is silent.
+    pub(crate) const LISTENED: Self = Self {
+        answer_timeout: Nanos::from_millis(20),
+        attempts: 3,
+        answer_counts: Nanos::from_millis(100),
+        ..Self::USUAL
+    };
+
+    /// Of motors that answer each request with a reading. One that was not taken by the bus within
+    /// 5 ms is useless.
+    pub(crate) const POLLED: Self = Self {
+        attempts: 5,
+        answer_counts: Nanos::from_millis(100),
+        start: Nanos::from_millis(100),
+        start_most: Nanos::from_millis(2000),
+        send_within: Nanos::from_millis(5),
+        ..Self::USUAL
+    };
 }
 
 /// The pace of one question: it is repeated after `Timing::answer_timeout`, and after

@@ -8,11 +8,11 @@
 use crate::bringup::{Bringup, Inquiry};
 use crate::{
     Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Mode,
-    NotSent, State, Transmit,
+    NotSent, Output, State, Transmit,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use proprio_topics::Nanos;
+use proprio_topics::{Counter, JointState, Nanos, Quality, Reading};
 
 /// What the host's side of a family has of its own.
 pub(crate) trait Family: Send {
@@ -96,6 +96,31 @@ pub(crate) struct Link<Q> {
 impl<Q: Inquiry> Link<Q> {
     pub(crate) fn state(&self) -> State {
         self.bringup.state(&self.questions)
+    }
+
+    /// Adds the joint's state in `frame`, and counts the faults in `quality`.
+    pub(crate) fn joint(
+        &mut self,
+        output: u8,
+        frame: &Frame,
+        mut quality: Quality,
+        state: JointState,
+        out: &mut Decoded,
+    ) {
+        for (flag, counter) in [
+            (Quality::SATURATED, Counter::Saturated),
+            (Quality::DEVICE_FAULT, Counter::DeviceFault),
+            (Quality::DRIVE_FAULT, Counter::DriveFault),
+        ] {
+            if quality.contains(flag) {
+                out.fault(counter, 1, frame.id);
+            }
+        }
+        if self.bringup.reading(frame.t) {
+            quality |= Quality::GAP_BEFORE;
+        }
+        let reading = Reading::Joint(state);
+        out.push(Output::new(output, frame, quality, reading), frame.id);
     }
 
     /// Whether a command can be sent to the board now.

@@ -2,6 +2,7 @@
 
 use crate::{Id, Spec, SpecError};
 use core::ops::RangeInclusive;
+use proprio_topics::Nanos;
 
 /// The address of `spec`, if it is one of `legal`.
 ///
@@ -38,4 +39,53 @@ pub(crate) fn id(
         value,
         expected,
     })
+}
+
+/// The value of key `key` as a duration of 1 ms to 1 minute.
+///
+/// # Errors
+/// [`SpecError::Key`].
+pub(crate) fn duration(key: &'static str, ms: u32) -> Result<Nanos, SpecError> {
+    if !(1..=60_000).contains(&ms) {
+        return Err(SpecError::Key {
+            key,
+            value: f64::from(ms),
+            expected: "1 to 60000",
+        });
+    }
+    Ok(Nanos::from_millis(i64::from(ms)))
+}
+
+/// The value of key `key`: a number above 0.
+///
+/// # Errors
+/// [`SpecError::Key`].
+pub(crate) fn above_zero(key: &'static str, value: f64) -> Result<f64, SpecError> {
+    if value > 0.0 && value.is_finite() {
+        return Ok(value);
+    }
+    let expected = "a number above 0";
+    Err(SpecError::Key {
+        key,
+        value,
+        expected,
+    })
+}
+
+/// The value of key `key`, or the model's: a number above 0.
+///
+/// # Errors
+/// [`SpecError::Keys`] of one that is not known, [`SpecError::Key`] of one that is not legal.
+pub(crate) fn known(
+    key: &'static str,
+    given: Option<f64>,
+    of_model: Option<f64>,
+) -> Result<f64, SpecError> {
+    match given.or(of_model) {
+        Some(value) => above_zero(key, value),
+        None => Err(SpecError::Keys {
+            key,
+            expected: "given where the model is not",
+        }),
+    }
 }

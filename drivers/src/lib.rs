@@ -17,6 +17,7 @@
 //! | [`moteus`] | moteus controllers (CAN FD) | joint, actuator, temperature |
 //! | [`odrive`] | ODrive motor controllers | joint, actuator, temperature |
 //! | [`cubemars`] | CubeMars AK actuators | joint, actuator, temperature |
+//! | [`vesc`] | VESC motor controllers | joint, actuator, temperature |
 //! | [`xsens_mti`] | Xsens MTi-600, Avior, Sirius | imu |
 //! | [`openimu`] | Aceinna OpenIMU300RI, OpenIMU335RI, MTLT | imu |
 //! | [`robotous_rft`] | Robotous RFT force/torque sensors | wrench |
@@ -71,6 +72,7 @@ pub mod icub_skin;
 pub mod icub_strain;
 pub mod jr3_can;
 mod keys;
+mod mit;
 pub mod moteus;
 pub mod objects;
 pub mod odrive;
@@ -82,6 +84,7 @@ mod registry;
 pub mod robotous_rft;
 pub mod signal;
 mod unit;
+pub mod vesc;
 mod wrench;
 pub mod xsens_mti;
 

@@ -93,18 +93,6 @@ const POSITION_FAULTS: [u32; 4] = [35, 36, 42, 43];
 const ENCODER_FAULT: f64 = 35.0;
 const TOO_HOT: f64 = 38.0;
 
-/// A query that was not taken by the bus within this time is useless.
-const TIMING: Timing = Timing {
-    power_on_silence: Nanos::ZERO,
-    answer_timeout: Nanos::from_millis(20),
-    attempts: 5,
-    slow_attempt: Nanos::from_millis(500),
-    answer_counts: Nanos::from_millis(100),
-    start: Nanos::from_millis(100),
-    start_most: Nanos::from_millis(2000),
-    send_within: Nanos::from_millis(5),
-};
-
 /// The keys of `driver = "moteus"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -414,7 +402,7 @@ impl Controller {
         let (node, period) = options.check(spec)?;
         let reply = id(node, options.host, 0);
         let query = id(options.host, node, WANTED);
-        let bringup = Bringup::new(spec, spec.mode, TIMING, reply);
+        let bringup = Bringup::new(spec, spec.mode, Timing::POLLED, reply);
         let Some(query) = fd(query, &QUERY) else {
             return Err(SpecError::Joints("the query does not fit a frame"));
         };
@@ -491,24 +479,14 @@ impl Family for Controller {
         if !position.is_finite() {
             return out.fault(Counter::Value, 1, frame.id);
         }
-        let mut quality = self.quality();
-        if quality.contains(Quality::DRIVE_FAULT) {
-            out.fault(Counter::DriveFault, 1, frame.id);
-        }
-        if quality.contains(Quality::DEVICE_FAULT) {
-            out.fault(Counter::DeviceFault, 1, frame.id);
-        }
-        if link.bringup.reading(frame.t) {
-            quality |= Quality::GAP_BEFORE;
-        }
         let finite = |value: Option<f64>| value.filter(|v| v.is_finite()).unwrap_or(f64::NAN);
-        let reading = Reading::Joint(JointState {
+        let state = JointState {
             position: position * TAU,
             velocity: finite(told.velocity) * TAU,
             torque: finite(told.torque),
             ..JointState::ABSENT
-        });
-        out.push(Output::new(0, frame, quality, reading), frame.id);
+        };
+        link.joint(0, frame, self.quality(), state, out);
     }
 
     fn reset(&mut self) {

@@ -7,7 +7,7 @@ use crate::{
     Board, Device, Driver, Frame, OutputInfo, Spec, SpecError, aidin_aft200, ati_netcanoem,
     canopen_drive, canopen_encoder, canopen_sync, cubemars, dbc, icub_imu, icub_mais, icub_mc4,
     icub_motor, icub_pos, icub_skin, icub_strain, jr3_can, moteus, odrive, openimu, optoforce_daq,
-    robotous_rft, xsens_mti,
+    robotous_rft, vesc, xsens_mti,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -216,6 +216,8 @@ drivers! {
     Odrive: odrive,
     /// CubeMars actuators.
     Cubemars: cubemars,
+    /// VESC motor controllers.
+    Vesc: vesc,
     /// Xsens MTi.
     XsensMti: xsens_mti,
     /// Aceinna OpenIMU and MTLT.

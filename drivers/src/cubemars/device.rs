@@ -8,20 +8,7 @@ use crate::family::{Family, Link, Supervised};
 use crate::held::OnChange;
 use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
-
-/// Only the watching counts: nothing is sent. A motor that was not heard of for a second and a half
-/// is silent.
-const TIMING: Timing = Timing {
-    power_on_silence: Nanos::ZERO,
-    answer_timeout: Nanos::from_millis(100),
-    attempts: 3,
-    slow_attempt: Nanos::from_millis(500),
-    answer_counts: Nanos::from_millis(100),
-    start: Nanos::from_millis(250),
-    start_most: Nanos::from_millis(500),
-    send_within: Nanos::from_millis(100),
-};
+use proprio_topics::{Actuator, Counter, JointState, Quality, Reading, Temperature};
 
 /// The host's side of a motor.
 #[derive(Debug)]
@@ -38,7 +25,7 @@ impl Motor {
             Layout::Mit { .. } => Claim::shared(keys.id),
             Layout::Servo => Claim::exclusive(keys.id),
         };
-        let bringup = Bringup::new(spec, Mode::Listen, TIMING, keys.id);
+        let bringup = Bringup::new(spec, Mode::Listen, Timing::LISTENED, keys.id);
         let this = Self {
             keys,
             told: OnChange::NOTHING,
@@ -96,16 +83,6 @@ impl Family for Motor {
         let [position, velocity, effort] = raw;
         if p.is_saturated(position) || v.is_saturated(velocity) || e.is_saturated(effort) {
             quality |= Quality::SATURATED;
-            out.fault(Counter::Saturated, 1, frame.id);
-        }
-        if quality.contains(Quality::DEVICE_FAULT) {
-            out.fault(Counter::DeviceFault, 1, frame.id);
-        }
-        if quality.contains(Quality::DRIVE_FAULT) {
-            out.fault(Counter::DriveFault, 1, frame.id);
-        }
-        if link.bringup.reading(frame.t) {
-            quality |= Quality::GAP_BEFORE;
         }
         let effort = e.value(effort);
         let (torque, current) = match self.keys.effort {
@@ -115,14 +92,14 @@ impl Family for Motor {
                 effort,
             ),
         };
-        let reading = Reading::Joint(JointState {
+        let state = JointState {
             position: p.value(position),
             velocity: v.value(velocity),
             torque,
             current,
             ..JointState::ABSENT
-        });
-        out.push(Output::new(JOINT, frame, quality, reading), frame.id);
+        };
+        link.joint(JOINT, frame, quality, state, out);
     }
 
     fn reset(&mut self) {

@@ -1,6 +1,6 @@
-//! The frames of both modes: raw values and their scales.
+//! The frames of both modes: raw values and the state of the power stage.
 
-use crate::bytes;
+use crate::{bytes, mit};
 use proprio_topics::Quality;
 
 /// The outputs.
@@ -17,51 +17,6 @@ pub(super) fn quality_of(error: u8) -> Quality {
         0 => Quality::GOOD,
         ENCODER_ERROR => Quality::DEVICE_FAULT,
         _ => Quality::DRIVE_FAULT,
-    }
-}
-
-/// A raw value in SI units: `offset` + `step` x raw. At `least` and `most` it is saturated.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Scale {
-    step: f64,
-    offset: f64,
-    least: i64,
-    most: i64,
-}
-
-impl Scale {
-    /// From -`end` to `end` in `bits` bits.
-    pub(super) fn range(end: f64, bits: u32) -> Self {
-        let most = (1_i64 << bits) - 1;
-        Self {
-            step: 2.0 * end / most as f64,
-            offset: -end,
-            least: 0,
-            most,
-        }
-    }
-
-    /// Steps of `step` on both sides of zero, up to `most`.
-    pub(super) const fn steps(step: f64, most: i64) -> Self {
-        Self {
-            step,
-            offset: 0.0,
-            least: -most,
-            most,
-        }
-    }
-
-    pub(super) fn value(&self, raw: i64) -> f64 {
-        self.offset + self.step * raw as f64
-    }
-
-    pub(super) const fn is_saturated(&self, raw: i64) -> bool {
-        raw <= self.least || raw >= self.most
-    }
-
-    /// The raw value nearest to `value`, limited to the range.
-    pub(super) fn raw(&self, value: f64) -> i64 {
-        bytes::quantise(value - self.offset, self.step, self.least, self.most)
     }
 }
 
@@ -88,7 +43,8 @@ impl Layout {
     /// wrong length.
     pub(super) fn unpack(self, data: &[u8]) -> Option<([i64; 3], Option<Stage>)> {
         match (self, data) {
-            (Self::Mit { celsius_at_zero }, &[_, _, _, high, both, low, ref stage @ ..]) => {
+            (Self::Mit { celsius_at_zero }, [_, measured @ ..]) => {
+                let (raw, stage) = mit::unpack(measured)?;
                 let stage = match stage {
                     [] => None,
                     &[celsius, error] => Some(Stage {
@@ -97,10 +53,7 @@ impl Layout {
                     }),
                     _ => return None,
                 };
-                let velocity = u16::from(high) << 4 | u16::from(both >> 4);
-                let effort = u16::from(both & 0xF) << 8 | u16::from(low);
-                let raw = [bytes::u16_be(data, 1), velocity, effort];
-                Some((raw.map(i64::from), stage))
+                Some((raw, stage))
             }
             (Self::Servo, &[_, _, _, _, _, _, celsius, error]) => {
                 let raw = [0, 2, 4].map(|at| i64::from(bytes::i16_be(data, at)));
@@ -117,11 +70,9 @@ impl Layout {
         let Stage { celsius, error } = stage;
         match self {
             Self::Mit { celsius_at_zero } => {
-                let [position, velocity, effort] = raw.map(|raw| raw as u16);
-                let ([p0, p1], [e0, e1]) = (position.to_be_bytes(), effort.to_be_bytes());
-                let [v0, v1] = (velocity << 4).to_be_bytes();
+                let [p0, p1, v0, both, e1] = mit::pack(raw);
                 let celsius = bytes::quantise(celsius - celsius_at_zero, 1.0, 0, 255) as u8;
-                [number, p0, p1, v0, v1 | e0, e1, celsius, error]
+                [number, p0, p1, v0, both, e1, celsius, error]
             }
             Self::Servo => {
                 let [[p0, p1], [v0, v1], [e0, e1]] = raw.map(|raw| (raw as i16).to_be_bytes());

@@ -1,6 +1,8 @@
 //! The keys of a motor in gateway.toml, for both sides of the driver.
 
-use super::frames::{Layout, SERVO_STATUS, Scale};
+use super::frames::{Layout, SERVO_STATUS};
+use crate::keys::{above_zero, address, duration, known};
+use crate::mit::Scale;
 use crate::{Id, Spec, SpecError};
 use core::f64::consts::TAU;
 use proprio_topics::Nanos;
@@ -127,7 +129,7 @@ impl Default for Options {
 }
 
 /// The highest number of a motor. (The first byte of a special command is 255.)
-const NUMBER_MOST: u32 = 254;
+const NUMBER_MOST: u16 = 254;
 /// A tenth of a degree \[rad\].
 const RAD_PER_STEP: f64 = TAU / 3600.0;
 /// Ten revolutions per minute \[rad/s\].
@@ -149,41 +151,9 @@ pub(super) struct Checked {
     pub(super) period: Nanos,
 }
 
-/// The value of key `key`, or the model's; a number above 0.
-fn above_zero(
-    key: &'static str,
-    given: Option<f64>,
-    of_model: Option<f64>,
-) -> Result<f64, SpecError> {
-    let Some(value) = given.or(of_model) else {
-        return Err(SpecError::Keys {
-            key,
-            expected: "given where the model is not",
-        });
-    };
-    if !(value > 0.0 && value.is_finite()) {
-        let expected = "a number above 0";
-        return Err(SpecError::Key {
-            key,
-            value,
-            expected,
-        });
-    }
-    Ok(value)
-}
-
 impl Checked {
     pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        let number = match u8::try_from(spec.address) {
-            Ok(number) if spec.address <= NUMBER_MOST => number,
-            _ => {
-                return Err(SpecError::Address {
-                    address: spec.address,
-                    least: 0,
-                    most: NUMBER_MOST,
-                });
-            }
-        };
+        let number = address(spec, 0..=NUMBER_MOST)? as u8;
         let wrong = |key, value, expected| SpecError::Key {
             key,
             value,
@@ -197,24 +167,19 @@ impl Checked {
             let celsius = options.celsius_at_zero;
             return Err(wrong("celsius_at_zero", celsius, "-100 to 100"));
         }
-        if !(1..=60_000).contains(&options.period_ms) {
-            let period = f64::from(options.period_ms);
-            return Err(wrong("period_ms", period, "1 to 60000"));
-        }
-        let torque_constant = match options.torque_constant {
-            None => None,
-            given => Some(above_zero("torque_constant", given, None)?),
-        };
+        let torque_constant = (options.torque_constant)
+            .map(|constant| above_zero("torque_constant", constant))
+            .transpose()?;
         let model = options.model.map(Model::numbers);
         let (id, layout, scales, effort) = match options.mode {
             Mode::Mit => {
-                let position = above_zero("position_max", Some(options.position_max), None)?;
+                let position = above_zero("position_max", options.position_max)?;
                 let of_model = model.map(|(velocity, ..)| velocity);
-                let velocity = above_zero("velocity_max", options.velocity_max, of_model)?;
+                let velocity = known("velocity_max", options.velocity_max, of_model)?;
                 // A model has no range of currents.
                 let of_model = model.map(|(_, torque, ..)| torque);
                 let of_model = of_model.filter(|_| options.effort == Effort::Torque);
-                let effort = above_zero("effort_max", options.effort_max, of_model)?;
+                let effort = known("effort_max", options.effort_max, of_model)?;
                 let scales = [
                     Scale::range(position, 16),
                     Scale::range(velocity, 12),
@@ -228,9 +193,9 @@ impl Checked {
             }
             Mode::Servo => {
                 let of_model = model.map(|(_, _, pairs, _)| f64::from(pairs));
-                let pairs = above_zero("pole_pairs", options.pole_pairs.map(f64::from), of_model)?;
+                let pairs = known("pole_pairs", options.pole_pairs.map(f64::from), of_model)?;
                 let of_model = model.map(|(.., ratio)| ratio);
-                let ratio = above_zero("gear_ratio", options.gear_ratio, of_model)?;
+                let ratio = known("gear_ratio", options.gear_ratio, of_model)?;
                 let per_turn = match options.angle {
                     Angle::Output => 1.0,
                     Angle::Electrical => pairs * ratio,
@@ -251,7 +216,7 @@ impl Checked {
             scales,
             effort,
             torque_constant,
-            period: Nanos::from_millis(i64::from(options.period_ms)),
+            period: duration("period_ms", options.period_ms)?,
         })
     }
 }

@@ -12,19 +12,6 @@ use alloc::boxed::Box;
 use core::f64::consts::TAU;
 use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
 
-/// The pace of watching: an ODrive that was not heard of for a second and a half is silent. With
-/// requests that is also how long they last before they begin again.
-const TIMING: Timing = Timing {
-    power_on_silence: Nanos::ZERO,
-    answer_timeout: Nanos::from_millis(20),
-    attempts: 3,
-    slow_attempt: Nanos::from_millis(500),
-    answer_counts: Nanos::from_millis(100),
-    start: Nanos::from_millis(250),
-    start_most: Nanos::from_millis(500),
-    send_within: Nanos::from_millis(100),
-};
-
 /// The float in half `half` of a payload.
 fn float(data: &[u8], half: usize) -> f64 {
     f64::from(f32::from_bits(bytes::u32_le(data, 4 * half)))
@@ -50,7 +37,7 @@ impl Axis {
             Some(_) => spec.mode,
             None => Mode::Listen,
         };
-        let bringup = Bringup::new(spec, mode, TIMING, keys.id(command::ESTIMATES));
+        let bringup = Bringup::new(spec, mode, Timing::LISTENED, keys.id(command::ESTIMATES));
         let commands = keys.firmware.commands().iter();
         let claims = commands.map(|command| Claim::exclusive(keys.id(*command)));
         let this = Self {
@@ -70,22 +57,12 @@ impl Axis {
             link.bringup.lost();
             return out.fault(Counter::Value, 1, frame.id);
         }
-        let mut quality = self.status;
-        if quality.contains(Quality::DEVICE_FAULT) {
-            out.fault(Counter::DeviceFault, 1, frame.id);
-        }
-        if quality.contains(Quality::DRIVE_FAULT) {
-            out.fault(Counter::DriveFault, 1, frame.id);
-        }
-        if link.bringup.reading(frame.t) {
-            quality |= Quality::GAP_BEFORE;
-        }
         let current = self.current.at(frame, self.keys.hold);
         let torque = match self.keys.torque_constant {
             Some(constant) => constant * current,
             None => self.torque.at(frame, self.keys.hold),
         };
-        let reading = Reading::Joint(JointState {
+        let state = JointState {
             position,
             velocity: if velocity.is_finite() {
                 velocity
@@ -95,8 +72,8 @@ impl Axis {
             torque,
             current,
             ..JointState::ABSENT
-        });
-        out.push(Output::new(JOINT, frame, quality, reading), frame.id);
+        };
+        link.joint(JOINT, frame, self.status, state, out);
     }
 
     fn heartbeat(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {

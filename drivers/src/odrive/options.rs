@@ -2,6 +2,7 @@
 
 use super::firmware::Firmware;
 use super::frames::NODE_MOST;
+use crate::keys::{above_zero, address, duration};
 use crate::{Id, Spec, SpecError};
 use proprio_topics::Nanos;
 use serde::Deserialize;
@@ -34,18 +35,6 @@ impl Default for Options {
     }
 }
 
-/// The value of key `key` as a duration.
-fn duration(key: &'static str, ms: u32) -> Result<Nanos, SpecError> {
-    if !(1..=60_000).contains(&ms) {
-        return Err(SpecError::Key {
-            key,
-            value: f64::from(ms),
-            expected: "1 to 60000",
-        });
-    }
-    Ok(Nanos::from_millis(i64::from(ms)))
-}
-
 /// The keys of a device, checked.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Checked {
@@ -59,30 +48,15 @@ pub(super) struct Checked {
 
 impl Checked {
     pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        let node = match u16::try_from(spec.address) {
-            Ok(node) if node <= NODE_MOST => node,
-            _ => {
-                return Err(SpecError::Address {
-                    address: spec.address,
-                    least: 0,
-                    most: u32::from(NODE_MOST),
-                });
-            }
-        };
-        if let Some(value) = options.torque_constant
-            && !(value > 0.0 && value.is_finite())
-        {
-            return Err(SpecError::Key {
-                key: "torque_constant",
-                value,
-                expected: "a number above 0",
-            });
-        }
+        let node = address(spec, 0..=NODE_MOST)?;
+        let torque_constant = (options.torque_constant)
+            .map(|constant| above_zero("torque_constant", constant))
+            .transpose()?;
         let request = options.request_period_ms;
         Ok(Self {
             node,
             firmware: options.firmware,
-            torque_constant: options.torque_constant,
+            torque_constant,
             hold: duration("hold_ms", options.hold_ms)?,
             request_period: request
                 .map(|ms| duration("request_period_ms", ms))

@@ -74,6 +74,8 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
         "mode = \"servo\"\nmodel = \"AK10-9\"\nangle = \"electrical\"\ntorque_constant = 1.0",
         &[0],
     ),
+    ("vesc", "pole_pairs = 7\ntorque_constant = 0.1", &[0]),
+    ("vesc", "pole_pairs = 7\nposition = \"tachometer\"", &[0]),
     ("xsens_mti", "", &[]),
     (
         "xsens_mti",

@@ -28,4 +28,5 @@ mod round_trip;
 mod signals;
 mod skin_and_mais;
 mod traffic;
+mod vesc;
 mod xsens_mti;

@@ -1,0 +1,122 @@
+//! The device's own side: a controller that sends its status once a period.
+
+use super::frames::{
+    AMPERE_PER_STEP, DUTY_PER_STEP, FET, JOINT, KELVIN_PER_STEP, MOTOR, STEPS_PER_TURN, command,
+};
+use super::options::{Checked, Options, Position};
+use crate::bytes::{quantise, quantise_i16};
+use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
+use proprio_topics::{Nanos, Quality, Reading};
+
+/// A simulated controller.
+#[derive(Debug)]
+pub struct VescBoard {
+    keys: Checked,
+    /// The duty cycle that it was told.
+    duty: f64,
+    /// Of FETs and motor \[degrees Celsius\].
+    temperatures: [f64; 2],
+}
+
+impl VescBoard {
+    /// A controller at 25 degrees Celsius.
+    ///
+    /// # Errors
+    /// [`SpecError`]: an address above 254, a key out of range or missing.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        Ok(Self {
+            keys: Checked::new(spec, options)?,
+            duty: 0.0,
+            temperatures: [25.0; 2],
+        })
+    }
+
+    fn status(&self, velocity: f64, amperes: f64) -> [u8; 8] {
+        let most = i64::from(i32::MAX);
+        #[allow(clippy::cast_possible_truncation)] // limited
+        let erpm = quantise(velocity, self.keys.velocity_step, -most, most) as i32;
+        let [r0, r1, r2, r3] = erpm.to_be_bytes();
+        let mut duty = quantise_i16(self.duty, DUTY_PER_STEP);
+        if duty == 0 && amperes != 0.0 {
+            duty = if amperes < 0.0 { -1 } else { 1 };
+        }
+        let current = if duty < 0 { -amperes } else { amperes };
+        let [c0, c1] = quantise_i16(current, AMPERE_PER_STEP).to_be_bytes();
+        let [d0, d1] = duty.to_be_bytes();
+        [r0, r1, r2, r3, c0, c1, d0, d1]
+    }
+
+    /// The message with the temperatures, and this PID position \[steps\].
+    fn status_4(&self, position: i64) -> [u8; 8] {
+        let [[f0, f1], [m0, m1]] =
+            (self.temperatures).map(|celsius| quantise_i16(celsius, KELVIN_PER_STEP).to_be_bytes());
+        #[allow(clippy::cast_possible_truncation)] // within a turn
+        let [p0, p1] = (position as i16).to_be_bytes();
+        [f0, f1, m0, m1, 0, 0, p0, p1]
+    }
+
+    fn send(&self, command: u8, data: [u8; 8], out: &mut Frames) {
+        let _ = out.try_push(Frame::new(self.keys.id(command), &data));
+    }
+}
+
+impl Board for VescBoard {
+    fn on_frame(&mut self, _frame: &Frame, _out: &mut Frames) {}
+
+    fn period(&self) -> Option<Nanos> {
+        Some(self.keys.period)
+    }
+
+    /// A PID position is sent within its turn. An absent torque or current is sent as 0.
+    /// Temperatures are sent with the next PID position, or by themselves beside a tachometer.
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        _quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        match (output, reading) {
+            (JOINT, Reading::Joint(joint)) => {
+                let amperes = match self.keys.torque_constant {
+                    Some(constant) if joint.current.is_nan() => joint.torque / constant,
+                    _ => joint.current,
+                };
+                let amperes = if amperes.is_nan() { 0.0 } else { amperes };
+                let values = [joint.position, joint.velocity, amperes];
+                if values.iter().any(|value| !value.is_finite()) {
+                    return Err(EncodeError::NotFinite);
+                }
+                self.send(command::STATUS, self.status(joint.velocity, amperes), out);
+                let (step, most) = (self.keys.position_step, i64::from(i32::MAX));
+                match self.keys.position {
+                    Position::Pid => {
+                        let steps = quantise(joint.position, step, i64::MIN, i64::MAX);
+                        let data = self.status_4(steps.rem_euclid(STEPS_PER_TURN));
+                        self.send(command::STATUS_4, data, out);
+                    }
+                    Position::Tachometer => {
+                        #[allow(clippy::cast_possible_truncation)] // limited
+                        let count = quantise(joint.position, step, -most, most) as i32;
+                        let [t0, t1, t2, t3] = count.to_be_bytes();
+                        self.send(command::STATUS_5, [t0, t1, t2, t3, 0, 0, 0, 0], out);
+                    }
+                }
+            }
+            (JOINT, Reading::Actuator(actuator)) => self.duty = actuator.duty,
+            (MOTOR | FET, Reading::Temperature(temperature)) => {
+                if !temperature.celsius.is_finite() {
+                    return Err(EncodeError::NotFinite);
+                }
+                let [fet, motor] = &mut self.temperatures;
+                *(if output == MOTOR { motor } else { fet }) = temperature.celsius;
+                if self.keys.position == Position::Tachometer {
+                    self.send(command::STATUS_4, self.status_4(0), out);
+                }
+            }
+            (JOINT..=FET, _) => return Err(EncodeError::Kind),
+            _ => return Err(EncodeError::Output(output)),
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,113 @@
+//! The host's side: joins speed and current to the positions.
+
+use super::frames::{
+    AMPERE_PER_STEP, COLDEST, DUTY_PER_STEP, FET, JOINT, KELVIN_PER_STEP, LENGTH, MOTOR, command,
+};
+use super::options::{Checked, Options, Position};
+use crate::bringup::{Bringup, NoInquiry, Timing};
+use crate::bytes::{self, i16_be, u32_be};
+use crate::family::{Family, Link, Supervised};
+use crate::held::Held;
+use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
+use alloc::boxed::Box;
+use proprio_topics::{Actuator, Counter, JointState, Quality, Reading, Temperature};
+
+/// The host's side of a controller.
+#[derive(Debug)]
+pub(super) struct Controller {
+    keys: Checked,
+    velocity: Held,
+    /// Positive along the shaft's axis.
+    current: Held,
+}
+
+impl Controller {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        let keys = Checked::new(spec, options)?;
+        let watched = keys.id(keys.with_position());
+        let bringup = Bringup::new(spec, Mode::Listen, Timing::LISTENED, watched);
+        let commands = [command::STATUS, command::STATUS_4, command::STATUS_5];
+        let claims = commands.map(|command| Claim::exclusive(keys.id(command)));
+        let this = Self {
+            keys,
+            velocity: Held::ABSENT,
+            current: Held::ABSENT,
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+
+    fn status(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+        let [current, duty] = [4, 6].map(|at| i16_be(data, at));
+        let velocity = f64::from(u32_be(data, 0).cast_signed()) * self.keys.velocity_step;
+        self.velocity = Held::new(frame, velocity);
+        let amperes = match (current, duty) {
+            (0, _) => 0.0,
+            (_, 0) => f64::NAN,
+            _ => f64::from(current) * f64::from(duty.signum()) * AMPERE_PER_STEP,
+        };
+        self.current = Held::new(frame, amperes);
+        let actuator = Reading::Actuator(Actuator {
+            duty: f64::from(duty) * DUTY_PER_STEP,
+            mode: 0,
+            encoder: 0,
+            faults: 0,
+        });
+        let output = Output::new(JOINT, frame, Quality::GOOD, actuator);
+        out.push(output, frame.id);
+    }
+
+    fn position(&self, raw: i32, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+        let hold = self.keys.hold;
+        let current = self.current.at(frame, hold);
+        let constant = self.keys.torque_constant.unwrap_or(f64::NAN);
+        let state = JointState {
+            position: f64::from(raw) * self.keys.position_step,
+            velocity: self.velocity.at(frame, hold),
+            torque: constant * current,
+            current,
+            ..JointState::ABSENT
+        };
+        link.joint(JOINT, frame, Quality::GOOD, state, out);
+    }
+}
+
+impl Family for Controller {
+    type Questions = NoInquiry;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+        let commands = [command::STATUS, command::STATUS_4, command::STATUS_5];
+        let is_its = |command: &u8| self.keys.id(*command) == frame.id;
+        let Some(command) = commands.into_iter().find(is_its) else {
+            return;
+        };
+        let Some(data) = bytes::payload(frame, out) else {
+            return;
+        };
+        if data.len() != LENGTH {
+            return out.fault(Counter::Length, 1, frame.id);
+        }
+        match (command, self.keys.position) {
+            (command::STATUS, _) => self.status(data, frame, out),
+            (command::STATUS_4, position) => {
+                for (output, at) in [(FET, 0), (MOTOR, 2)] {
+                    let celsius = f64::from(i16_be(data, at)) * KELVIN_PER_STEP;
+                    if celsius >= COLDEST {
+                        let reading = Reading::Temperature(Temperature { celsius });
+                        out.push(Output::new(output, frame, Quality::GOOD, reading), frame.id);
+                    }
+                }
+                if position == Position::Pid {
+                    self.position(i32::from(i16_be(data, 6)), frame, link, out);
+                }
+            }
+            (_, Position::Tachometer) => {
+                self.position(u32_be(data, 0).cast_signed(), frame, link, out);
+            }
+            _ => {}
+        }
+    }
+
+    fn reset(&mut self) {
+        (self.velocity, self.current) = (Held::ABSENT, Held::ABSENT);
+    }
+}

@@ -1,0 +1,103 @@
+//! The keys of a controller in gateway.toml, for both sides of the driver.
+
+use super::frames::{ADDRESS_MOST, RAD_PER_COUNT, RAD_PER_S_PER_RPM, RAD_PER_STEP, command};
+use crate::keys::{above_zero, address, duration};
+use crate::{Id, Spec, SpecError};
+use proprio_topics::Nanos;
+use serde::Deserialize;
+
+/// Where the position is taken from.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Position {
+    /// The PID position in status 4.
+    #[default]
+    Pid,
+    /// The tachometer in status 5.
+    Tachometer,
+}
+
+/// The keys of `driver = "vesc"`.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// Where the position is taken from; default the PID position.
+    pub position: Position,
+    /// Pairs of the motor's poles.
+    pub pole_pairs: Option<u32>,
+    /// Turns of the motor per turn of the shaft whose position is read; default 1.
+    pub gear_ratio: f64,
+    /// Torque of that shaft per current \[Nm/A\]; default: none follows from the current.
+    pub torque_constant: Option<f64>,
+    /// How long speed and current are used \[ms\]; default 100.
+    pub hold_ms: u32,
+    /// Period of a simulated controller \[ms\]; default 20.
+    pub period_ms: u32,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            position: Position::Pid,
+            pole_pairs: None,
+            gear_ratio: 1.0,
+            torque_constant: None,
+            hold_ms: 100,
+            period_ms: 20,
+        }
+    }
+}
+
+/// The keys of a controller, checked.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Checked {
+    address: u16,
+    pub(super) position: Position,
+    /// A step of the position \[rad\], and of the speed \[rad/s\].
+    pub(super) position_step: f64,
+    pub(super) velocity_step: f64,
+    pub(super) torque_constant: Option<f64>,
+    pub(super) hold: Nanos,
+    pub(super) period: Nanos,
+}
+
+impl Checked {
+    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        let address = address(spec, 0..=ADDRESS_MOST)?;
+        let Some(pairs) = options.pole_pairs else {
+            return Err(SpecError::Keys {
+                key: "pole_pairs",
+                expected: "given: the speed is in electrical revolutions",
+            });
+        };
+        let pairs = above_zero("pole_pairs", f64::from(pairs))?;
+        let electrical = pairs * above_zero("gear_ratio", options.gear_ratio)?;
+        let torque_constant = (options.torque_constant)
+            .map(|constant| above_zero("torque_constant", constant))
+            .transpose()?;
+        Ok(Self {
+            address,
+            position: options.position,
+            position_step: match options.position {
+                Position::Pid => RAD_PER_STEP,
+                Position::Tachometer => RAD_PER_COUNT / electrical,
+            },
+            velocity_step: RAD_PER_S_PER_RPM / electrical,
+            torque_constant,
+            hold: duration("hold_ms", options.hold_ms)?,
+            period: duration("period_ms", options.period_ms)?,
+        })
+    }
+
+    pub(super) fn id(&self, command: u8) -> Id {
+        Id::extended(u32::from(command) << 8 | u32::from(self.address))
+    }
+
+    /// The message with the position.
+    pub(super) const fn with_position(&self) -> u8 {
+        match self.position {
+            Position::Pid => command::STATUS_4,
+            Position::Tachometer => command::STATUS_5,
+        }
+    }
+}
