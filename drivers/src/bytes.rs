@@ -15,6 +15,14 @@ pub(crate) fn payload<'f>(frame: &'f Frame, out: &mut Decoded) -> Option<&'f [u8
     None
 }
 
+/// The payload of a data frame, classic or CAN FD. Other frames are counted, except error frames.
+pub(crate) fn fd_payload<'f>(frame: &'f Frame, out: &mut Decoded) -> Option<&'f [u8]> {
+    match frame.format {
+        Format::Fd { .. } => Some(frame.data()),
+        _ => payload(frame, out),
+    }
+}
+
 /// Little-endian 16 bits at `at`; 0 beyond the end (callers have checked the length).
 pub(crate) fn u16_le(data: &[u8], at: usize) -> u16 {
     match data.get(at..at + 2) {

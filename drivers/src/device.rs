@@ -533,8 +533,11 @@ pub trait Driver {
     /// The address of a device whose table has none: the one that its maker delivers it with. None
     /// if each device needs an address of its own.
     const ADDRESS: Option<u32> = None;
-    /// Its devices send or need frames of CAN FD.
-    const NEEDS_FD: bool = false;
+
+    /// Whether a device with these keys needs frames of CAN FD.
+    fn needs_fd(&self) -> bool {
+        false
+    }
 
     /// The .dbc file that the keys name, relative to the configuration.
     fn description(&self) -> Option<&str> {

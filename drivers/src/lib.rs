@@ -17,6 +17,7 @@
 //! | [`moteus`] | moteus controllers (CAN FD) | joint, actuator, temperature |
 //! | [`odrive`] | ODrive motor controllers | joint, actuator, temperature |
 //! | [`cubemars`] | CubeMars AK actuators | joint, actuator, temperature |
+//! | [`damiao`] | Damiao actuators | joint, actuator, temperature |
 //! | [`vesc`] | VESC motor controllers | joint, actuator, temperature |
 //! | [`xsens_mti`] | Xsens MTi-600, Avior, Sirius | imu |
 //! | [`openimu`] | Aceinna OpenIMU300RI, OpenIMU335RI, MTLT | imu |
@@ -56,6 +57,7 @@ pub mod canopen_encoder;
 pub mod canopen_sync;
 mod configure;
 pub mod cubemars;
+pub mod damiao;
 pub mod dbc;
 pub mod device;
 mod family;

@@ -143,7 +143,9 @@ impl Options {
 impl Driver for Options {
     const NAME: &'static str = "moteus";
     const ADDRESS: Option<u32> = Some(1);
-    const NEEDS_FD: bool = true;
+    fn needs_fd(&self) -> bool {
+        true
+    }
 
     fn outputs(&self) -> Vec<OutputInfo> {
         [OutputInfo::new(0, Kind::Joint)].to_vec()
@@ -437,10 +439,8 @@ impl Family for Controller {
 
     fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
         // Short frames are sent as classic ones by some programs.
-        let data = match frame.format {
-            Format::Classic | Format::Fd { .. } => frame.data(),
-            Format::Remote => return out.fault(Counter::Length, 1, frame.id),
-            Format::Error => return,
+        let Some(data) = bytes::fd_payload(frame, out) else {
+            return;
         };
         if frame.id != self.reply {
             return;

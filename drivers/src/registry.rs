@@ -5,9 +5,9 @@ use crate::recognise::{self, Finding, Traffic};
 use crate::signal::Message;
 use crate::{
     Board, Device, Driver, Frame, OutputInfo, Spec, SpecError, aidin_aft200, ati_netcanoem,
-    canopen_drive, canopen_encoder, canopen_sync, cubemars, dbc, icub_imu, icub_mais, icub_mc4,
-    icub_motor, icub_pos, icub_skin, icub_strain, jr3_can, moteus, odrive, openimu, optoforce_daq,
-    robotous_rft, vesc, xsens_mti,
+    canopen_drive, canopen_encoder, canopen_sync, cubemars, damiao, dbc, icub_imu, icub_mais,
+    icub_mc4, icub_motor, icub_pos, icub_skin, icub_strain, jr3_can, moteus, odrive, openimu,
+    optoforce_daq, robotous_rft, vesc, xsens_mti,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -116,11 +116,11 @@ macro_rules! drivers {
                 }
             }
 
-            /// Whether its devices need a bus with CAN FD ([`Driver::NEEDS_FD`]).
+            /// Whether its devices need a bus with CAN FD ([`Driver::needs_fd`]).
             #[must_use]
-            pub const fn needs_fd(&self) -> bool {
+            pub fn needs_fd(&self) -> bool {
                 match self {
-                    $(Self::$variant(_) => <$module::Options as Driver>::NEEDS_FD,)+
+                    $(Self::$variant(options) => options.needs_fd(),)+
                 }
             }
 
@@ -216,6 +216,8 @@ drivers! {
     Odrive: odrive,
     /// CubeMars actuators.
     Cubemars: cubemars,
+    /// Damiao actuators.
+    Damiao: damiao,
     /// VESC motor controllers.
     Vesc: vesc,
     /// Xsens MTi.

@@ -74,6 +74,13 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
         "mode = \"servo\"\nmodel = \"AK10-9\"\nangle = \"electrical\"\ntorque_constant = 1.0",
         &[0],
     ),
+    ("damiao", "model = \"DM4310\"", &[0]),
+    ("damiao", "host_id = 0x11\nrequest_period_ms = 2", &[0]),
+    (
+        "damiao",
+        "model = \"DM8009\"\nrequest_period_ms = 2\nfd = true",
+        &[0],
+    ),
     ("vesc", "pole_pairs = 7\ntorque_constant = 0.1", &[0]),
     ("vesc", "pole_pairs = 7\nposition = \"tachometer\"", &[0]),
     ("xsens_mti", "", &[]),

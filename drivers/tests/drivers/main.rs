@@ -10,6 +10,7 @@ mod canopen_exchange;
 mod canopen_file;
 mod command;
 mod cubemars;
+mod damiao;
 mod dbc;
 mod every_device;
 mod findings;

@@ -1,0 +1,180 @@
+//! The device's own side: a motor that answers questions, or sends its state as if it were
+//! commanded once a period.
+
+use super::frames::{
+    DISABLED, ENABLED, FET, JOINT, MOTOR, OVERLOAD, QUESTIONS, RANGES, READ, SENSOR, STATE, State,
+    frame, quality_of,
+};
+use super::options::{Checked, Options};
+use crate::mit::Scale;
+use crate::{Board, EncodeError, Format, Frame, Frames, Spec, SpecError};
+use proprio_topics::{JointState, Nanos, Quality, Reading};
+
+/// The ranges of a motor that neither keys nor a model describe: those of a DM4310.
+const RANGES_USUAL: [f64; 3] = [12.5, 30.0, 10.0];
+
+/// A simulated motor.
+#[derive(Debug)]
+pub struct DamiaoBoard {
+    keys: Checked,
+    /// The ends of its ranges, and their scales.
+    ends: [f64; 3],
+    scales: [Scale; 3],
+    state: State,
+}
+
+impl DamiaoBoard {
+    /// An enabled motor at 25 degrees Celsius.
+    ///
+    /// # Errors
+    /// [`SpecError`]: an address outside 1 to 255, a key out of range, ranges that are not known.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        let keys = Checked::new(spec, options)?;
+        let mut ends = RANGES_USUAL;
+        let known = keys.stated.iter().zip(&keys.of_model);
+        for (end, (stated, model)) in ends.iter_mut().zip(known) {
+            *end = stated.or(*model).unwrap_or(*end);
+        }
+        let [position, velocity, torque] = ends;
+        let scales = [
+            Scale::range(position, 16),
+            Scale::range(velocity, 12),
+            Scale::range(torque, 12),
+        ];
+        let state = State {
+            state: ENABLED,
+            raw: scales.map(|scale| scale.raw(0.0)),
+            celsius: [25; 2],
+        };
+        Ok(Self {
+            keys,
+            ends,
+            scales,
+            state,
+        })
+    }
+
+    fn frame(&self) -> Frame {
+        let data = self.state.pack(self.keys.address);
+        frame(self.keys.id, self.keys.fd, data)
+    }
+
+    fn measure(&mut self, joint: &JointState, quality: Quality) -> Result<(), EncodeError> {
+        let torque = if joint.torque.is_nan() {
+            0.0
+        } else {
+            joint.torque
+        };
+        let values = [joint.position, joint.velocity, torque];
+        if values.iter().any(|value| !value.is_finite()) {
+            return Err(EncodeError::NotFinite);
+        }
+        let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
+        if quality_of(self.state.state).0 != quality.0 & told.0 {
+            self.state.state = if quality.contains(Quality::DEVICE_FAULT) {
+                SENSOR
+            } else if quality.contains(Quality::DRIVE_FAULT) {
+                OVERLOAD
+            } else {
+                ENABLED
+            };
+        }
+        for ((raw, scale), value) in self.state.raw.iter_mut().zip(&self.scales).zip(values) {
+            *raw = scale.raw(value);
+        }
+        Ok(())
+    }
+
+    /// Takes a reading; whether it is one that is sent at once.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // limited; casts saturate
+    fn take(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+    ) -> Result<bool, EncodeError> {
+        match (output, reading) {
+            (JOINT, Reading::Joint(joint)) => return self.measure(joint, quality).map(|()| true),
+            (JOINT, Reading::Actuator(actuator)) => {
+                self.state.state = match (actuator.faults, actuator.mode) {
+                    (0, 0) => DISABLED,
+                    (0, _) => ENABLED,
+                    (faults, _) => faults.min(0xF) as u8,
+                };
+            }
+            (MOTOR | FET, Reading::Temperature(temperature)) => {
+                if !temperature.celsius.is_finite() {
+                    return Err(EncodeError::NotFinite);
+                }
+                let [fet, rotor] = &mut self.state.celsius;
+                let place = if output == MOTOR { rotor } else { fet };
+                *place = libm::round(temperature.celsius) as u8;
+            }
+            (JOINT..=FET, _) => return Err(EncodeError::Kind),
+            _ => return Err(EncodeError::Output(output)),
+        }
+        Ok(false)
+    }
+}
+
+impl Board for DamiaoBoard {
+    /// Answers questions, and commands in each of its modes.
+    #[allow(clippy::cast_possible_truncation)] // registers have single precision
+    fn on_frame(&mut self, question: &Frame, out: &mut Frames) {
+        if matches!(question.format, Format::Remote | Format::Error) {
+            return;
+        }
+        let address = self.keys.address;
+        if question.id != QUESTIONS {
+            let is_command = |base: u32| question.id.raw() == base + u32::from(address);
+            let command = question.id.raw() < 0x400 && question.len() == 8;
+            if command && [0, 0x100, 0x200, 0x300].into_iter().any(is_command) {
+                let _ = out.try_push(self.frame());
+            }
+            return;
+        }
+        let &[low, 0, command, register, ..] = question.data() else {
+            return;
+        };
+        if low != address {
+            return;
+        }
+        let range = RANGES.iter().position(|range| *range == register);
+        let end = range.and_then(|place| self.ends.get(place));
+        let answer = match (command, end) {
+            (STATE, _) => self.frame(),
+            (READ, Some(end)) => {
+                let [a, b, c, d] = (*end as f32).to_le_bytes();
+                let data = [low, 0, READ, register, a, b, c, d];
+                frame(self.keys.id, self.keys.fd, data)
+            }
+            _ => return,
+        };
+        let _ = out.try_push(answer);
+    }
+
+    fn period(&self) -> Option<Nanos> {
+        match self.keys.request_period {
+            Some(_) => None,
+            None => Some(self.keys.period),
+        }
+    }
+
+    fn present(&mut self, output: u8, reading: &Reading, quality: Quality) {
+        let _ = self.take(output, reading, quality);
+    }
+
+    /// Temperatures and state are sent with the next joint reading. An absent torque is sent as 0.
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        if self.take(output, reading, quality)? {
+            let _ = out.try_push(self.frame());
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,124 @@
+//! The host's side: takes the frames of one motor, and asks for them if it is told to.
+
+use super::frames::{
+    ENABLED, FET, JOINT, MOTOR, Message, SENSOR, STATE, State, quality_of, question,
+};
+use super::options::{Checked, Options};
+use super::ranges::Ranges;
+use crate::bringup::{Bringup, Timing};
+use crate::bytes;
+use crate::family::{Family, Link, Supervised, next_in_step};
+use crate::held::OnChange;
+use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
+use alloc::boxed::Box;
+use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
+
+/// The host's side of a motor.
+#[derive(Debug)]
+pub(super) struct Motor {
+    keys: Checked,
+    /// The motor's state.
+    told: OnChange<u8>,
+    /// When the next question for it is due.
+    due: Nanos,
+}
+
+impl Motor {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        let keys = Checked::new(spec, options)?;
+        let (mode, timing) = match keys.request_period {
+            Some(_) => (spec.mode, Timing::POLLED),
+            None => (Mode::Listen, Timing::LISTENED),
+        };
+        let bringup = Bringup::new(spec, mode, timing, keys.id);
+        let this = Self {
+            keys,
+            told: OnChange::NOTHING,
+            due: Nanos::MIN,
+        };
+        let claims = [Claim::shared(keys.id)];
+        let ranges = Ranges::new(keys, mode);
+        Ok(Supervised::boxed(claims, bringup, ranges, this))
+    }
+
+    fn state(&mut self, told: &State, frame: &Frame, link: &mut Link<Ranges>, out: &mut Decoded) {
+        let Some([p, v, t]) = link.questions.scales() else {
+            return out.fault(Counter::Unexpected, 1, frame.id);
+        };
+        let state = told.state;
+        let mut quality = quality_of(state);
+        if self.told.is_due(state, frame) {
+            let faults = if quality == Quality::GOOD { 0 } else { state };
+            let actuator = Reading::Actuator(Actuator {
+                duty: f64::NAN,
+                mode: u32::from(state == ENABLED),
+                encoder: u32::from(state == SENSOR),
+                faults: u32::from(faults),
+            });
+            out.push(Output::new(JOINT, frame, quality, actuator), frame.id);
+            for (output, celsius) in [FET, MOTOR].into_iter().zip(told.celsius) {
+                let reading = Reading::Temperature(Temperature {
+                    celsius: f64::from(celsius),
+                });
+                out.push(Output::new(output, frame, Quality::GOOD, reading), frame.id);
+            }
+        }
+        let [position, velocity, torque] = told.raw;
+        if p.is_saturated(position) || v.is_saturated(velocity) || t.is_saturated(torque) {
+            quality |= Quality::SATURATED;
+        }
+        let state = JointState {
+            position: p.value(position),
+            velocity: v.value(velocity),
+            torque: t.value(torque),
+            ..JointState::ABSENT
+        };
+        link.joint(JOINT, frame, quality, state, out);
+    }
+}
+
+impl Family for Motor {
+    type Questions = Ranges;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Ranges>, out: &mut Decoded) {
+        if frame.id != self.keys.id {
+            return;
+        }
+        let Some(data) = bytes::fd_payload(frame, out) else {
+            return;
+        };
+        if data.len() != 8 {
+            return out.fault(Counter::Length, 1, frame.id);
+        }
+        match Message::parse(self.keys.address, data) {
+            Some(Message::State(state)) => self.state(&state, frame, link, out),
+            Some(Message::Register(register, value)) => {
+                link.questions.answer(register, value, frame, out);
+            }
+            // Answers to other programs, and frames of other motors.
+            Some(Message::Other) | None => {}
+        }
+    }
+
+    fn reset(&mut self) {
+        self.told = OnChange::NOTHING;
+    }
+
+    fn request(
+        &mut self,
+        now: Nanos,
+        _link: &mut Link<Ranges>,
+        _out: &mut Decoded,
+    ) -> Option<Frame> {
+        let period = self.keys.request_period?;
+        if now < self.due {
+            return None;
+        }
+        self.due = next_in_step(self.due, period, now);
+        Some(question(self.keys.address, self.keys.fd, STATE, 0))
+    }
+
+    fn request_at(&self) -> Option<Nanos> {
+        self.keys.request_period.map(|_| self.due)
+    }
+}

@@ -1,0 +1,115 @@
+//! The ends of a motor's ranges: of the keys, as the motor tells them, or of its model.
+
+use super::frames::{RANGES, READ, question};
+use super::options::Checked;
+use crate::bringup::{Ask, Attempts, Inquiry, Timing};
+use crate::mit::Scale;
+use crate::{Decoded, Frame, Mode, NotSent};
+use proprio_topics::{Counter, Nanos, Refusal};
+
+/// Asks a motor for the ranges that no key states.
+#[derive(Debug)]
+pub(super) struct Ranges {
+    keys: Checked,
+    mode: Mode,
+    /// As the motor has told them.
+    told: [Option<f64>; 3],
+    /// Which of [`RANGES`] is asked.
+    next: usize,
+    attempts: Attempts,
+}
+
+impl Ranges {
+    pub(super) const fn new(keys: Checked, mode: Mode) -> Self {
+        Self {
+            keys,
+            mode,
+            told: [None; 3],
+            next: 0,
+            attempts: Attempts::new(Timing::POLLED),
+        }
+    }
+
+    /// The end of range `place`, if it is known.
+    fn end(&self, place: usize) -> Option<f64> {
+        let of = |ends: &[Option<f64>; 3]| ends.get(place).copied().flatten();
+        of(&self.keys.stated)
+            .or_else(|| of(&self.told))
+            .or_else(|| of(&self.keys.of_model))
+    }
+
+    /// Position, velocity and torque, if all are known.
+    pub(super) fn scales(&self) -> Option<[Scale; 3]> {
+        let [position, velocity, torque] = [self.end(0)?, self.end(1)?, self.end(2)?];
+        Some([
+            Scale::range(position, 16),
+            Scale::range(velocity, 12),
+            Scale::range(torque, 12),
+        ])
+    }
+
+    /// The motor has told the value of a register in `frame`.
+    pub(super) fn answer(&mut self, register: u8, value: f32, frame: &Frame, out: &mut Decoded) {
+        let Some(place) = RANGES.iter().position(|range| *range == register) else {
+            // Another program's question.
+            return;
+        };
+        if !(value > 0.0 && value.is_finite()) {
+            return out.fault(Counter::Value, 1, frame.id);
+        }
+        let value = f64::from(value);
+        let told = self
+            .told
+            .get_mut(place)
+            .and_then(|told| told.replace(value));
+        if told.is_some_and(|told| told != value) {
+            out.fault(Counter::Changed, 1, frame.id);
+        }
+        if place == self.next && self.mode == Mode::Supervise {
+            self.next += 1;
+            self.attempts.begin();
+        }
+    }
+
+    /// The next range to ask for, from `place` on.
+    fn unstated(&self, place: usize) -> usize {
+        let later = self.keys.stated.iter().skip(place);
+        place + later.take_while(|stated| stated.is_some()).count()
+    }
+}
+
+impl Inquiry for Ranges {
+    fn begin(&mut self) {
+        self.next = 0;
+        self.attempts.begin();
+    }
+
+    fn poll(&mut self, now: Nanos) -> Ask {
+        self.next = self.unstated(self.next);
+        // Old firmware does not answer.
+        if self.attempts.exhausted() && self.scales().is_some() && now >= self.attempts.next() {
+            self.next = RANGES.len();
+        }
+        let Some(register) = RANGES.get(self.next) else {
+            return Ask::Done;
+        };
+        if now < self.attempts.next() {
+            return Ask::Wait;
+        }
+        self.attempts.ask(now);
+        Ask::Send(question(self.keys.address, self.keys.fd, READ, *register))
+    }
+
+    fn sent(&mut self, outcome: Result<Nanos, NotSent>) {
+        self.attempts.sent(outcome);
+    }
+
+    fn wake(&self) -> Option<Nanos> {
+        Some(self.attempts.next())
+    }
+
+    fn refusal(&self) -> Option<Refusal> {
+        let waits = self.attempts.exhausted() && self.scales().is_none();
+        waits.then_some(Refusal::NoAnswer)
+    }
+}
