@@ -12,11 +12,14 @@
 //! | `contact/<name>/detected` | 1 if F/T readings show it without a declaration, else 0 |
 //! | `contact/<name>/px py pz` | where it is taken to be \[m\], in the same axes |
 //! | `contact/<name>/located` | 1 if a declaration or a skin says so, 0 if it is `position_m` |
-//! | `valid/<joint>` | 1 if the torque is valid, else 0 |
+//! | `valid/<joint>` | 1 if the torque is valid, else 0: it is withheld |
 //! | `reason/<joint>` | why it is not valid: a word, and the channel at fault after a colon |
 //! | `residual/<link>/fx fy fz tx ty tz` | \[N, Nm\], the residual of a sub-tree; see below |
 //! | `residual/<link>/significance` | its normal deviate; empty where it cannot be tested |
 //! | `residual/<link>/reason` | its cause: the contact detected there, or `unexplained` |
+//!
+//! Cells of a withheld torque or wrench are empty; of a torque that is `uncertain` alone, the
+//! standard deviation is told.
 //!
 //! A contact wrench is given in the axes and at the origin of the frame that `link` names. The
 //! residual of a sub-tree is the wrench that links, sensors and known contacts do not explain, at

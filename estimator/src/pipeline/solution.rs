@@ -181,12 +181,16 @@ impl Pipeline {
             if !is_solved || !torque.is_finite() || !deviation.is_finite() {
                 (reason, cause) = (Reason::NotFinite, NO_CAUSE);
             }
-            // Without any sample of a channel that it depends on there is no value.
-            let known = is_solved && reason != Reason::NeverSeen;
+            let is_valid = reason == Reason::None;
             *place = JointTorque {
-                torque: if known { *torque } else { f64::NAN },
-                standard_deviation: if known { deviation } else { f64::NAN },
-                valid: u32::from(reason == Reason::None),
+                torque: if is_valid { *torque } else { f64::NAN },
+                // Of an uncertain torque the deviation is the reason.
+                standard_deviation: if is_valid || reason == Reason::Uncertain {
+                    deviation
+                } else {
+                    f64::NAN
+                },
+                valid: u32::from(is_valid),
                 reason: reason.in_memory(),
                 cause,
                 reserved: 0,
@@ -232,17 +236,14 @@ impl Pipeline {
             if !is_solved || !is_finite {
                 (reason, cause) = (Reason::NotFinite, NO_CAUSE);
             }
-            let known = is_solved && reason != Reason::NeverSeen;
-            let [fx, fy, fz, tx, ty, tz] = if known {
-                result.wrench.force_first()
-            } else {
-                [f64::NAN; 6]
-            };
+            let is_valid = reason == Reason::None;
+            let unless_withheld = |values| if is_valid { values } else { [f64::NAN; 6] };
+            let [fx, fy, fz, tx, ty, tz] = unless_withheld(result.wrench.force_first());
             *place = ContactWrench {
                 force: [fx, fy, fz],
                 torque: [tx, ty, tz],
-                standard_deviation: if known { deviation } else { [f64::NAN; 6] },
-                valid: u32::from(reason == Reason::None),
+                standard_deviation: unless_withheld(deviation),
+                valid: u32::from(is_valid),
                 reason: reason.in_memory(),
                 cause,
                 detected: u32::from(detected.contains(number)),

@@ -7,7 +7,7 @@ use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 use zerocopy::FromBytes;
 
-/// Why an estimate is withheld. Its value is published but must not be used.
+/// Why an estimate is withheld. A withheld estimate has no value: its numbers are NaN.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, ZeroCopySend)]
 pub enum Reason {
@@ -78,9 +78,11 @@ pub const NO_CAUSE: u32 = u32::MAX;
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
 pub struct JointTorque {
     /// Torque \[Nm\] (force \[N\] for a prismatic joint) exerted by the parent link on the child
-    /// link along the URDF axis. It is the link-side torque: without rotor inertia and friction.
+    /// link along the URDF axis. It is the link-side torque: without rotor inertia and friction. NaN
+    /// if it is withheld.
     pub torque: f64,
-    /// Its standard deviation \[Nm\]; NaN where it is not known.
+    /// Its standard deviation \[Nm\]. NaN if it is withheld, except for [`Reason::Uncertain`]: then
+    /// it is what exceeds the bound.
     pub standard_deviation: f64,
     /// 1 if it may be used, 0 if it is withheld.
     pub valid: u32,
@@ -134,11 +136,12 @@ impl TorqueEstimate {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
 pub struct ContactWrench {
-    /// Force \[N\], in the axes of the frame that the configuration's `link` names.
+    /// Force \[N\], in the axes of the frame that the configuration's `link` names. NaN if it is
+    /// withheld.
     pub force: [f64; 3],
-    /// Torque \[Nm\], in the same axes, about that frame's origin.
+    /// Torque \[Nm\], in the same axes, about that frame's origin. NaN if it is withheld.
     pub torque: [f64; 3],
-    /// Standard deviations of force \[N\] and torque \[Nm\]; NaN where not known.
+    /// Standard deviations of force \[N\] and torque \[Nm\]. NaN if it is withheld.
     pub standard_deviation: [f64; 6],
     /// 1 if it may be used, 0 if it is withheld.
     pub valid: u32,

@@ -25,7 +25,7 @@
 //! # Conventions
 //! Angles in rad, forces in N, torques in Nm, right-handed frames. *Absent is not zero*: a quantity
 //! that a device does not report is NaN. Whether a missing sample is overdue is the reader's
-//! [`Freshness`](ipc::Freshness). An estimate that must not be used keeps its value, with `valid =
+//! [`Freshness`](ipc::Freshness). An estimate that must not be used is withheld: NaN, with `valid =
 //! 0` and the reason.
 #![no_std]
 #[cfg(any(feature = "std", test))]

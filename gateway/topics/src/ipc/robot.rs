@@ -87,7 +87,7 @@ pub enum Unavailable {
     NotDescribed,
     /// The publisher has nothing of that name and kind.
     Unknown,
-    /// It is withheld: its value must not be used.
+    /// It is withheld.
     Withheld {
         /// The reason.
         reason: Reason,
