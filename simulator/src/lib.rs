@@ -39,4 +39,4 @@ pub use run::{
 };
 pub use settings::Settings;
 pub use simulator::{Simulator, SimulatorError};
-pub use truth::{Simulation, Touch, Truth};
+pub use truth::{PlannedPush, Simulation, Touch, Truth};

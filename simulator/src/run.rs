@@ -5,7 +5,7 @@ use crate::record::write_truth;
 use crate::robot::Robot;
 use crate::settings::Settings;
 use crate::simulator::{BusCounts, BusSimulator, Simulator};
-use crate::truth::{Simulation, Touch};
+use crate::truth::{PlannedPush, Simulation, Touch};
 use anyhow::Context as _;
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::config::Source;
@@ -201,6 +201,12 @@ pub fn run_with_skin(
         buses = buses.len(),
         "the simulated robot is powered on"
     );
+    if let Some(push) = simulation.push() {
+        tracing::info!(
+            "{}",
+            push_text(robot, &push, options.seconds.is_some(), skin.is_some())
+        );
+    }
     let mut summaries = Vec::new();
     thread::scope(|scope| {
         let threads: Vec<_> = simulator
@@ -274,6 +280,35 @@ pub fn is_configuration(error: &anyhow::Error) -> bool {
             || cause.is::<crate::RobotError>()
             || cause.is::<crate::FaultError>()
     })
+}
+
+/// What is pushed, when and how hard, for a person who wonders what the sensors read.
+fn push_text(robot: &Robot, push: &PlannedPush, is_once: bool, is_declared: bool) -> String {
+    let contact = robot.config.contact.get(push.contact);
+    let (name, link) = contact.map_or(("", ""), |c| (c.name(), c.link.as_str()));
+    let every = if is_once {
+        String::new()
+    } else {
+        format!(" of every {} s", rounded(push.cycle))
+    };
+    let declared = if is_declared {
+        "it is declared, as by a skin"
+    } else {
+        "nobody declares it (--skin does)"
+    };
+    format!(
+        "link {link} is pushed at contact {name} with up to {} N and {} Nm, from {} s to {} \
+         s{every}; {declared}; --no-push leaves it out",
+        rounded(push.force),
+        rounded(push.torque),
+        rounded(push.from),
+        rounded(push.until)
+    )
+}
+
+/// A number for a text, to a hundredth.
+fn rounded(number: f64) -> f64 {
+    (100.0 * number).round() / 100.0
 }
 
 /// The loop of one bus: send the frames that are due, then wait for a frame or for the next due

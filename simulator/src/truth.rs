@@ -45,6 +45,23 @@ pub struct Touch {
     pub begins: bool,
 }
 
+/// The push on the hand, once in every cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PlannedPush {
+    /// The contact's number in estimator.toml.
+    pub contact: usize,
+    /// Its largest force \[N\] and torque about the contact's frame \[Nm\].
+    pub force: f64,
+    /// See `force`.
+    pub torque: f64,
+    /// Its begin and end in each cycle \[s\].
+    pub from: f64,
+    /// See `from`.
+    pub until: f64,
+    /// Duration of a cycle \[s\].
+    pub cycle: f64,
+}
+
 /// The truth at one instant.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Truth {
@@ -452,11 +469,18 @@ impl Simulation {
         self.contacts.iter().map(|(name, _)| name.as_str())
     }
 
-    /// The number in estimator.toml of the contact that is pushed in every cycle; `None` if there
-    /// is none.
+    /// The push on the hand; `None` if there is none.
     #[must_use]
-    pub fn pushed(&self) -> Option<usize> {
-        self.push.map(|push| push.contact)
+    pub fn push(&self) -> Option<PlannedPush> {
+        let (from, until, _) = PUSH_TIME;
+        self.push.map(|push| PlannedPush {
+            contact: push.contact,
+            force: push.wrench.force.norm(),
+            torque: push.wrench.torque.norm(),
+            from: from * push.cycle,
+            until: until * push.cycle,
+            cycle: push.cycle,
+        })
     }
 
     /// The next beginning or end of a touch after `t` seconds; `None` if there is none.
@@ -856,7 +880,23 @@ mod tests {
                 (16.0, 1, false)
             ]
         );
-        assert_eq!(simulation.pushed(), Some(1));
+        let push = simulation.push().unwrap();
+        assert_eq!((push.contact, push.cycle), (1, 10.0));
+        for (told, expected) in [
+            (push.force, PUSH.0),
+            (push.torque, PUSH.1),
+            (push.from, 4.0),
+            (push.until, 6.0),
+        ] {
+            assert!((told - expected).abs() < 1e-9, "{push:?}");
+        }
+        let calm = Settings {
+            push: false,
+            ..Settings::default()
+        };
+        let mut calm = Simulation::new(&robot(), &calm).unwrap();
+        assert_eq!((calm.push(), calm.next_touch(0.0)), (None, None));
+        assert_eq!(calm.at(10.0).contacts[1], [0.0; 6]);
         // The push begins and ends smoothly.
         let steepest = (0..2000)
             .map(|k| f64::from(k) * 1e-3 + 4.0)
