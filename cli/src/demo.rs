@@ -2,12 +2,14 @@
 //! gateway and the estimator run as three processes. The command reads their outputs from shared
 //! memory, as any consumer does, and compares them with the simulator's truth at the end.
 //!
-//! The estimator gets a deliberately wrong URDF (`cad.urdf`) and identifies the robot's inertial
-//! parameters and its sensors' offsets on-line. The robot first stands still, which gives no
-//! information, and then moves. For comparison, a second pipeline runs without identification.
+//! The estimator gets a deliberately wrong URDF (`cad.urdf`, called the CAD) and identifies the
+//! robot's inertial parameters and its sensors' offsets on-line. The robot first stands still, which
+//! gives no information, and then moves. For comparison, a second pipeline uses the CAD's
+//! parameters to the end, with the same offsets.
 
 mod baseline;
 mod experiment;
+mod folder;
 mod processes;
 mod result;
 mod watching;
@@ -17,12 +19,10 @@ pub(crate) use experiment::Args;
 use anyhow::{Context, bail};
 use experiment::Experiment;
 use processes::Processes;
-use proprio_estimator::config::ConfigError;
 use proprio_simulator::{Fault, FaultError, Robot, Settings, Simulator};
 use proprio_topics::Nanos;
 use proprio_topics::ipc::{Domain, DomainConfig};
 use std::fs::{self};
-use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
@@ -82,7 +82,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         .context("cannot create a folder in shared memory")?;
     let domain = DomainConfig::new(shared.path(), &format!("demo-{}", std::process::id()));
     let folder = private.path().join("robot");
-    copy_robot(&original, &args.bus, &folder)?;
+    folder::copy_robot(&original, &args.bus, &folder)?;
     let robot = Robot::load(&folder)?;
     let experiment = Experiment::prepare(args, &robot, &out)?;
 
@@ -122,89 +122,4 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         &watched,
         &private.path().join("truth.csv"),
     )
-}
-
-/// Copies the robot's configuration to `to`. If `buses` are given, they replace the sources of its
-/// buses.
-fn copy_robot(robot: &Robot, buses: &[String], to: &Path) -> anyhow::Result<()> {
-    let read = |name: &str| -> anyhow::Result<toml::Table> {
-        let file = robot.folder.join(name);
-        let text = fs::read_to_string(&file)
-            .with_context(|| format!("{}: cannot be read", file.display()))?;
-        text.parse().with_context(|| file.display().to_string())
-    };
-    let mut gateway = read("gateway.toml")?;
-    if let (false, Some(toml::Value::Array(list))) = (buses.is_empty(), gateway.get_mut("bus")) {
-        if buses.len() == 1 && list.len() > 1 {
-            // One interface for all: all devices move to the first bus.
-            let mut all = |key: &str| -> Vec<toml::Value> {
-                list.iter_mut()
-                    .filter_map(|bus| bus.as_table_mut()?.remove(key))
-                    .filter_map(|of_bus| of_bus.as_array().cloned())
-                    .flatten()
-                    .collect()
-            };
-            let parts = ["device", "coupling"].map(|key| (key, all(key)));
-            list.truncate(1);
-            if let Some(bus) = list.first_mut().and_then(toml::Value::as_table_mut) {
-                for (key, of_all) in parts.into_iter().filter(|(_, of_all)| !of_all.is_empty()) {
-                    bus.insert(key.into(), of_all.into());
-                }
-            }
-        } else if buses.len() != list.len() {
-            let problem = format!(
-                "--bus is given {} times; the robot has {} buses: give one interface for each, or \
-                 one for all",
-                buses.len(),
-                list.len()
-            );
-            return Err(ConfigError {
-                file: robot.folder.join("gateway.toml"),
-                problem,
-            }
-            .into());
-        }
-        for (bus, interface) in list.iter_mut().zip(buses) {
-            if let Some(bus) = bus.as_table_mut() {
-                let source = [("kind", "socketcan"), ("interface", interface.as_str())];
-                let source: toml::Table = source
-                    .into_iter()
-                    .map(|(k, v)| (k.to_owned(), v.into()))
-                    .collect();
-                bus.insert("source".into(), source.into());
-            }
-        }
-    }
-    let mut estimator = read("estimator.toml")?;
-    let absolute = |file: &Path| -> anyhow::Result<toml::Value> {
-        let file = file
-            .canonicalize()
-            .with_context(|| file.display().to_string())?;
-        let text = file.to_str();
-        let text = text.with_context(|| format!("{} is not UTF-8", file.display()))?;
-        Ok(text.into())
-    };
-    estimator.insert("model".into(), absolute(&robot.config.model)?);
-    let skins = estimator
-        .get_mut("skin")
-        .and_then(toml::Value::as_array_mut);
-    for skin in skins.into_iter().flatten() {
-        if let Some(taxels) = skin.get_mut("taxels")
-            && let Some(file) = taxels.as_str().map(|file| robot.folder.join(file))
-        {
-            *taxels = absolute(&file)?;
-        }
-    }
-    // Parameters identified on a real robot do not apply to the simulated one.
-    estimator.remove("parameters");
-    if let Some(identification) = estimator
-        .get_mut("identification")
-        .and_then(toml::Value::as_table_mut)
-    {
-        identification.remove("state");
-    }
-    fs::create_dir_all(to)?;
-    fs::write(to.join("gateway.toml"), gateway.to_string())?;
-    fs::write(to.join("estimator.toml"), estimator.to_string())?;
-    Ok(())
 }

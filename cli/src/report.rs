@@ -29,6 +29,17 @@ pub(crate) fn page(title: &str, blocks: &[String]) -> String {
     html
 }
 
+/// The verdict of a page: its class (`good`, `care`, `bad`), its heading and what it rests on.
+pub(crate) fn verdict(class: &str, heading: &str, figures: &str) -> String {
+    let (heading, figures) = (escape(heading), paragraph(&unbroken(figures)));
+    format!("<div class=\"verdict {class}\"><h2>{heading}</h2>{figures}</div>")
+}
+
+/// The text with numbers and their per cent signs on one line.
+fn unbroken(text: &str) -> String {
+    text.replace(" %", "\u{a0}%")
+}
+
 /// A section: a heading and its contents.
 pub(crate) fn section(title: &str, body: &[String]) -> String {
     format!(
@@ -48,9 +59,12 @@ pub(crate) fn folded(title: &str, open: bool, body: &[String]) -> String {
     )
 }
 
-/// A paragraph of plain text.
+/// A paragraph of plain text; empty HTML without any.
 pub(crate) fn paragraph(text: &str) -> String {
-    format!("<p>{}</p>", escape(text))
+    match text {
+        "" => String::new(),
+        text => format!("<p>{}</p>", escape(text)),
+    }
 }
 
 /// A list of plain texts; empty HTML if there is none.
@@ -199,8 +213,7 @@ impl Table {
 pub(crate) fn facts(facts: &[(&str, String)]) -> String {
     let rows: String = facts
         .iter()
-        // A number and its unit stay on one line.
-        .map(|(name, value)| (escape(name), escape(value).replace(" %", "\u{a0}%")))
+        .map(|(name, value)| (escape(name), unbroken(&escape(value))))
         .map(|(name, value)| format!("<div><dt>{name}</dt><dd>{value}</dd></div>"))
         .collect();
     format!("<dl class=\"facts\">{rows}</dl>")

@@ -289,6 +289,16 @@ impl Pipeline {
         }
     }
 
+    /// Replaces the offset in use of F/T sensor number `sensor`; its standard deviation stays. Does
+    /// nothing if there is no such sensor. With identification on, its next solution replaces the
+    /// offset again.
+    pub fn set_offset(&mut self, sensor: usize, offset: Wrench) {
+        if let Some(place) = self.setup.state.offsets.get_mut(sensor) {
+            *place = offset;
+            self.residuals.restart_means();
+        }
+    }
+
     /// The setup, with the parameters in use.
     #[must_use]
     pub fn setup(&self) -> &Setup {

@@ -1,11 +1,12 @@
-//! The estimates without identification: a second pipeline with the CAD's parameters, which
-//! processes the samples of the running demonstration.
+//! The estimates with the CAD's inertial parameters: a second pipeline, which processes the samples
+//! of the running demonstration, with the offsets that identification finds.
 
+use proprio_dynamics::spatial::Wrench;
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
 use proprio_topics::ipc::{Reader, TakeError};
 use proprio_topics::{
-    ContactDeclaration, Description, MAX_CHANNELS, Nanos, Publisher, Role, Sample,
+    ContactDeclaration, Description, MAX_CHANNELS, Nanos, Publisher, Role, Sample, SensorOffset,
 };
 
 /// The second pipeline and its inputs.
@@ -39,6 +40,17 @@ impl Baseline {
             epoch: 0,
             inbox: vec![],
             torques: vec![],
+        }
+    }
+
+    /// Uses these offsets of F/T sensors from now on, so that the CAD's torques and the identified
+    /// ones differ in the inertial parameters alone.
+    pub(super) fn take_offsets(&mut self, offsets: &[SensorOffset]) {
+        for offset in offsets.iter().filter(|offset| offset.accepted == 1) {
+            if let Some(sensor) = self.pipeline.setup().robot.sensor(offset.name.as_str()) {
+                let reading = Wrench::from_parts(offset.force, offset.torque);
+                self.pipeline.set_offset(sensor, reading);
+            }
         }
     }
 
@@ -105,8 +117,7 @@ impl Baseline {
         }
     }
 
-    /// The instants, ascending, with the joints' torques \[Nm\]; NaN where a channel was never
-    /// seen.
+    /// The instants, ascending, with the joints' torques \[Nm\]; NaN where withheld.
     pub(super) fn finish(mut self) -> Vec<(Nanos, Box<[f64]>)> {
         self.pipeline.finish();
         self.keep();

@@ -1,12 +1,12 @@
-//! The setup of the demonstration: robot, motion, wrong URDF, and the configuration of its
-//! processes.
+//! The setup of the demonstration: robot, motion, CAD, and the configuration of its processes.
 
+use super::folder::{read, with_files};
 use proprio_dynamics::model::Model;
 use proprio_dynamics::spatial::RigidInertia;
 use proprio_estimator::config::{Config, ConfigError};
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
-use proprio_simulator::{Robot, Settings, Simulation, wrong_urdf};
+use proprio_simulator::{PlannedPush, Robot, Settings, Simulation, wrong_urdf};
 use std::fs::{self};
 use std::path::{Path, PathBuf};
 
@@ -19,19 +19,19 @@ pub(crate) struct Args {
     /// Duration [s]: the robot stands still for a quarter of it (at most 10 s), then moves
     #[arg(long, value_name = "N", default_value_t = 40.0, value_parser = seconds)]
     pub(crate) seconds: f64,
-    /// Relative error of masses and first moments in the estimator's URDF; moments of inertia have
-    /// about the same
+    /// Relative error of masses and first moments in the estimator's URDF, the CAD; moments of inertia
+    /// have about the same
     #[arg(long, value_name = "SHARE", default_value_t = 0.2, value_parser = share)]
     pub(crate) cad_error: f64,
-    /// Output folder for report.html, estimates.csv, summary.json, the wrong URDF, the estimator's
-    /// configuration and the processes' logs
+    /// Output folder for report.html, estimates.csv, summary.json, the CAD, the configuration and the
+    /// processes' logs
     #[arg(long, value_name = "DIR", default_value = "proprio-demo")]
     pub(crate) out: PathBuf,
     /// CAN interfaces to use instead of virtual buses: one per bus of the robot, or a single one
     /// for all devices
     #[arg(long, value_name = "INTERFACE")]
     pub(crate) bus: Vec<String>,
-    /// The seed of trajectory, noise and the URDF's errors
+    /// The seed of trajectory, noise and the CAD's errors
     #[arg(long, default_value_t = 1)]
     pub(crate) seed: u64,
     /// A fault of the robot, as in `proprio simulate --help`; may be repeated
@@ -73,20 +73,28 @@ impl Args {
 /// Bound of the torques' standard deviations if the robot's configuration has none [Nm].
 pub(crate) const MOST_STD: f64 = 0.5;
 
+/// The file of the estimator's URDF, which is wrong on purpose.
+const CAD: &str = "cad.urdf";
+
 /// A link's name and its ten inertial parameters.
 pub(crate) type Link = (String, [f64; 10]);
 
 /// The configurations of the estimator with and without identification, and the truth.
 pub(crate) struct Experiment {
-    /// The estimator's configuration, with the wrong URDF beside it.
+    /// The gateway's configuration, with all files that it names beside it.
+    pub(crate) gateway: PathBuf,
+    /// The estimator's configuration, likewise, with the CAD.
     pub(crate) config: PathBuf,
     /// The estimator's setup at the start.
     pub(crate) setup: Setup,
     /// The same without identification and without a bound.
     pub(crate) baseline: Setup,
-    /// The contact that is pushed and declared, and the times of the push [s] of the simulation.
-    pub(crate) pushed: Option<String>,
-    pub(crate) touched: Vec<(f64, f64)>,
+    /// The joints in the order in which they are told: those beyond an F/T sensor, whose links are
+    /// identified, come first. And how many these are.
+    pub(crate) order: Vec<usize>,
+    pub(crate) beyond: usize,
+    /// The push, which is declared, and the name of its contact.
+    pub(crate) push: Option<(PlannedPush, String)>,
     /// Per link, the inertial parameters of the robot and of the CAD.
     pub(crate) truth: Vec<Link>,
     pub(crate) cad: Vec<Link>,
@@ -99,31 +107,22 @@ pub(crate) struct Experiment {
 }
 
 impl Experiment {
-    /// Writes `cad.urdf` and `estimator.toml` to `out`: the configuration of `robot` with
-    /// identification on, with that URDF, and with the pushed contact as a possible one.
+    /// Writes a configuration that stands alone to `out`: that of `robot`, the estimator's with
+    /// identification on, with the CAD, and with the pushed contact as a possible one.
     pub(crate) fn prepare(args: &Args, robot: &Robot, out: &Path) -> anyhow::Result<Self> {
         let settings = args.settings();
-        fs::write(
-            out.join("cad.urdf"),
-            wrong_urdf(robot, &settings, args.cad_error)?,
-        )?;
-        let simulation = Simulation::new(robot, &settings)?;
-        let pushed = simulation.pushed();
-        let mut touched = vec![];
-        let mut next = simulation.next_touch(0.0);
-        while let Some(touch) = next.filter(|touch| touch.t < args.seconds) {
-            if touch.begins {
-                touched.push((touch.t, args.seconds));
-            } else if let Some((_, until)) = touched.last_mut() {
-                *until = touch.t;
-            }
-            next = simulation.next_touch(touch.t);
-        }
-        let mut table: toml::Table =
-            fs::read_to_string(robot.folder.join("estimator.toml"))?.parse()?;
-        table.insert("model".into(), "cad.urdf".into());
+        let push = Simulation::new(robot, &settings)?.push();
+        let gateway = out.join("gateway.toml");
+        let table = read(&robot.folder.join("gateway.toml"))?;
+        let table = with_files(table, &robot.folder, out)?;
+        fs::write(&gateway, table.to_string())?;
+        let mut table = read(&robot.folder.join("estimator.toml"))?;
+        table.remove("model");
+        let mut table = with_files(table, &robot.folder, out)?;
+        table.insert("model".into(), CAD.into());
+        fs::write(out.join(CAD), wrong_urdf(robot, &settings, args.cad_error)?)?;
         let contacts = table.get_mut("contact").and_then(toml::Value::as_array_mut);
-        if let Some(contact) = pushed.and_then(|c| contacts?.get_mut(c)?.as_table_mut()) {
+        if let Some(contact) = push.and_then(|p| contacts?.get_mut(p.contact)?.as_table_mut()) {
             contact.insert("presence".into(), "possible".into());
         }
         let mut set = |section: &str, key: &str, value: toml::Value| {
@@ -139,7 +138,7 @@ impl Experiment {
         set("output", "max_torque_std_nm", most_std.into());
         let file = out.join("estimator.toml");
         let head = "# The estimator's configuration of the demonstration: the robot's own with \
-                identification on\n# and a deliberately wrong URDF.\n";
+                identification on\n# and a deliberately wrong URDF, the CAD.\n";
         fs::write(&file, format!("{head}{table}"))?;
         let mut config = Config::load(&file)?;
         let setup = |config: &Config| {
@@ -156,14 +155,18 @@ impl Experiment {
                 .collect()
         };
         config.identification.enabled = false;
-        config.output.max_torque_std_nm = None;
+        // Without identification the CAD's own torques are all wanted.
+        config.output.max_torque_std_nm = Some(f64::MAX);
+        let named = |push: PlannedPush| {
+            let contact = robot.config.contact.get(push.contact)?;
+            Some((push, contact.name().to_owned()))
+        };
+        let (order, beyond) = order(&with);
         Ok(Self {
+            order,
+            beyond,
             baseline: setup(&config)?,
-            pushed: simulation
-                .contact_names()
-                .nth(pushed.unwrap_or(usize::MAX))
-                .map(ToOwned::to_owned),
-            touched,
+            push: push.and_then(named),
             truth: links(&robot.model, robot.model.inertias()),
             cad: links(&with.robot.model, with.robot.model.inertias()),
             offsets: (robot.config.force_torque.iter())
@@ -175,6 +178,7 @@ impl Experiment {
                 .map(ToString::to_string),
             setup: with,
             config: file,
+            gateway,
         })
     }
 
@@ -182,9 +186,9 @@ impl Experiment {
     pub(crate) fn story(&self, args: &Args) -> String {
         let error = 100.0 * args.cad_error;
         let mut story = format!(
-            "The robot stands still for {} s, then it moves. The estimator's URDF is deliberately \
-             wrong: masses and first moments by {error:.0} %, moments of inertia by about as much \
-             (cad.urdf). ",
+            "The robot stands still for {} s, then it moves. The estimator's URDF, called the CAD, \
+             is wrong on purpose: masses and first moments by {error:.0} %, moments of inertia by \
+             about as much (cad.urdf). ",
             args.still()
         );
         match &self.refused {
@@ -199,12 +203,46 @@ impl Experiment {
                 why.trim_end_matches('.')
             )),
         }
-        if let (Some(contact), Some((from, until))) = (&self.pushed, self.touched.first()) {
+        if let Some((push, contact)) = &self.push {
             story.push_str(&format!(
-                " From {from:.1} s to {until:.1} s contact {contact:?} is pushed, and the push is \
-                 declared, as by a skin: identification pauses meanwhile."
+                " From {:.1} s to {:.1} s contact {contact:?} is pushed with {:.0} N, and the push \
+                 is declared, as by a skin: identification pauses meanwhile.",
+                push.from, push.until, push.force
             ));
         }
         story
+    }
+}
+
+/// The joints, those beyond an F/T sensor first, and how many these are.
+fn order(setup: &Setup) -> (Vec<usize>, usize) {
+    let structure = &setup.robot.structure;
+    // The root is in the only sub-tree that no sensor holds from above.
+    let is_beyond = |dof: &usize| {
+        let subtree = structure
+            .link_of(*dof)
+            .and_then(|link| structure.subtree_of(link));
+        subtree.is_some_and(|number| structure.subtrees().get(number).is_some_and(|s| s.top != 0))
+    };
+    let (mut order, before): (Vec<usize>, Vec<usize>) =
+        (0..setup.robot.model.dof_count()).partition(is_beyond);
+    let beyond = order.len();
+    order.extend(before);
+    (order, beyond)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn joints_beyond_a_sensor_come_first() {
+        for (robot, expected) in [
+            ("icub_left_arm", (vec![3, 4, 5, 6, 0, 1, 2], 4)),
+            ("six_axis_arm", (vec![0, 1, 2, 3, 4, 5], 6)),
+        ] {
+            let robot = Robot::open(robot).unwrap();
+            assert_eq!(order(&Setup::new(&robot.config).unwrap()), expected);
+        }
     }
 }

@@ -21,7 +21,7 @@ use std::time::Duration;
 pub(crate) struct Watched {
     pub(crate) joints: Vec<String>,
     pub(crate) estimates: Vec<Seen>,
-    /// The CAD's estimates from the same samples.
+    /// The torques with the CAD's parameters, from the same samples.
     pub(crate) baseline: Vec<(Nanos, Box<[f64]>)>,
     /// The identified parameters of each solution.
     pub(crate) learnt: Vec<Learnt>,
@@ -108,10 +108,7 @@ pub(crate) fn watch(
     args.fault
         .iter()
         .for_each(|f| simulate.extend(["--fault", f.as_str()]));
-    let (gateway_toml, estimator_toml) = (
-        text(&robot.folder.join("gateway.toml"))?,
-        text(&experiment.config)?,
-    );
+    let (gateway_toml, estimator_toml) = (text(&experiment.gateway)?, text(&experiment.config)?);
     processes.start("gateway", &["--config", &gateway_toml])?;
     processes.start("estimator", &["--config", &estimator_toml])?;
 
@@ -143,7 +140,7 @@ pub(crate) fn watch(
         .joint_names()
         .map(ToOwned::to_owned)
         .collect();
-    let mut screen = Screen::new(args, &joints, experiment.refused.is_none());
+    let mut screen = Screen::new(args, experiment, &joints);
     let mut watched = Watched {
         joints,
         estimates: Vec::with_capacity((args.seconds * 1100.0) as usize),
@@ -182,6 +179,7 @@ pub(crate) fn watch(
             }
         }
         while let Some(inertia) = inertias.as_mut().map_or(Ok(None), Reader::try_take)? {
+            baseline.take_offsets(inertia.offsets());
             // Before the first solution the CAD's parameters are in use.
             if inertia.links().iter().any(|link| link.accepted == 1) {
                 watched.learnt.push(Learnt {
@@ -256,11 +254,22 @@ pub(crate) fn wait_for<T: Topic>(
     }
 }
 
+/// Why a torque has no value.
+fn withheld(torque: &JointTorque) -> String {
+    let reason = torque.reason.get().unwrap_or_default();
+    if torque.standard_deviation.is_finite() {
+        format!("withheld ({reason}, +- {:.2})", torque.standard_deviation)
+    } else {
+        format!("withheld ({reason})")
+    }
+}
+
 /// The live table and the progress bar; one line per second if the output is not a terminal.
 pub(crate) struct Screen {
     pub(crate) terminal: bool,
     pub(crate) bar: ProgressBar,
-    pub(crate) joints: Vec<String>,
+    /// Number and name of each joint, in the order in which they are told.
+    pub(crate) joints: Vec<(usize, String)>,
     /// Start of the motion [s].
     pub(crate) still: f64,
     /// Whether anything can be identified.
@@ -272,7 +281,8 @@ pub(crate) struct Screen {
 }
 
 impl Screen {
-    pub(crate) fn new(args: &Args, joints: &[String], learns: bool) -> Self {
+    pub(crate) fn new(args: &Args, experiment: &Experiment, joints: &[String]) -> Self {
+        let named = |&joint: &usize| Some((joint, joints.get(joint)?.clone()));
         let terminal = std::io::stdout().is_terminal();
         let bar = if terminal {
             ProgressBar::new((args.seconds * 10.0) as u64)
@@ -286,9 +296,9 @@ impl Screen {
         Self {
             terminal,
             bar,
-            joints: joints.to_vec(),
+            joints: experiment.order.iter().filter_map(named).collect(),
             still: args.still(),
-            learns,
+            learns: experiment.refused.is_none(),
             has_told: false,
             begin: None,
             next: Nanos::ZERO,
@@ -317,13 +327,12 @@ impl Screen {
             let cells: Vec<_> = self
                 .joints
                 .iter()
-                .enumerate()
                 .map(|(i, j)| {
-                    of(i).map_or_else(String::new, |t| {
+                    of(*i).map_or_else(String::new, |t| {
                         if t.valid == 1 {
                             format!("{j} {:.2}", t.torque)
                         } else {
-                            format!("{j} withheld ({})", t.reason.get().unwrap_or_default())
+                            format!("{j} {}", withheld(t))
                         }
                     })
                 })
@@ -332,17 +341,17 @@ impl Screen {
             return;
         }
         let mut text = String::new();
-        for (i, joint) in self.joints.iter().enumerate() {
-            let Some(torque) = of(i) else { continue };
-            let state = if torque.valid == 1 {
-                "valid"
+        for (i, joint) in &self.joints {
+            let Some(torque) = of(*i) else { continue };
+            let value = if torque.valid == 1 {
+                format!(
+                    "{:>9.3} Nm  +- {:.3}",
+                    torque.torque, torque.standard_deviation
+                )
             } else {
-                torque.reason.get().unwrap_or_default().word()
+                format!("{:>9}     {}", "", withheld(torque))
             };
-            text.push_str(&format!(
-                "\x1b[2K{joint:<20} {:>9.3} Nm  +- {:>6.3}  {state}\n",
-                torque.torque, torque.standard_deviation
-            ));
+            text.push_str(&format!("\x1b[2K{joint:<20} {value}\n"));
         }
         self.bar.suspend(|| {
             if self.lines > 0 {

@@ -1,12 +1,12 @@
-//! Compares every estimate with the simulator's truth and with the CAD's estimate from the same
-//! samples, and computes the accuracy of the torques in each phase of the run.
+//! Compares every estimate with the simulator's truth and with the torque that the CAD's parameters
+//! give from the same samples, and computes the accuracy of the torques in each phase of the run.
 
 use crate::demo::watching::Watched;
 use anyhow::Context;
 use proprio_topics::JointTorque;
 use proprio_topics::csv::{self, Value};
 use proprio_topics::{Kind, Nanos, Reading};
-use serde_json::json;
+use serde_json::{Value as Json, json};
 use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
@@ -75,7 +75,7 @@ pub(super) fn ratio(part: usize, whole: usize) -> f64 {
     part as f64 / whole as f64
 }
 
-/// Every estimate with the truth and the CAD's estimate from the same samples.
+/// Every estimate with the truth and the CAD's torque from the same samples.
 pub(super) struct Compared {
     /// The instant of the first estimate, the origin of the report's time.
     pub(super) first: Nanos,
@@ -91,7 +91,7 @@ pub(super) struct Compared {
 pub(super) struct Instant {
     pub(super) t: Nanos,
     pub(super) estimate: JointTorque,
-    /// With the CAD alone, and the truth \[Nm\]; NaN where unknown.
+    /// With the CAD's parameters, and the truth \[Nm\]; NaN where unknown.
     pub(super) cad: f64,
     pub(super) truth: f64,
 }
@@ -142,11 +142,10 @@ impl Compared {
         (t - self.first).seconds()
     }
 
-    /// The accuracy of the torques from `from` until before `until`; `None` if a joint has no
-    /// torque to compare.
+    /// The accuracy of the torques from `from` until before `until`; `None` without an estimate
+    /// that has a truth.
     pub(super) fn phase(&self, from: Nanos, until: Nanos) -> Option<Phase> {
-        let (mut phase, mut count, mut valid, mut within, mut known) =
-            (Phase::default(), 0, 0, 0, 0);
+        let (mut phase, mut count, mut valid, mut within) = (Phase::default(), 0, 0, 0);
         for instants in &self.joints {
             let inside = instants
                 .iter()
@@ -155,25 +154,28 @@ impl Compared {
                 (Mean::default(), Mean::default(), Mean::default());
             for instant in inside {
                 count += 1;
-                valid += usize::from(instant.estimate.valid == 1);
-                if instant.estimate.torque.is_finite() {
-                    known += 1;
-                    within += usize::from(
-                        instant.error().abs() <= 2.0 * instant.estimate.standard_deviation,
-                    );
-                    identified.see(instant.error());
-                    size.see(instant.truth);
+                // Of a withheld torque there is no figure, of the CAD's at that instant neither.
+                if instant.estimate.valid != 1 {
+                    continue;
                 }
+                valid += 1;
+                within +=
+                    usize::from(instant.error().abs() <= 2.0 * instant.estimate.standard_deviation);
+                identified.see(instant.error());
+                size.see(instant.truth);
                 if instant.cad.is_finite() {
                     cad.see(instant.cad - instant.truth);
                 }
             }
-            phase.identified.push(identified.rms()?);
-            phase.cad.push(cad.rms().unwrap_or(f64::NAN));
-            phase.size.push(size.rms()?);
+            phase.joints.push(Accuracy {
+                cad: cad.rms(),
+                identified: identified.rms(),
+                size: size.rms(),
+                valid: identified.count,
+            });
         }
-        (phase.valid_share, phase.within_2_sigma) = (ratio(valid, count), ratio(within, known));
-        Some(phase)
+        (phase.valid_share, phase.within_2_sigma) = (ratio(valid, count), ratio(within, valid));
+        (count > 0).then_some(phase)
     }
 }
 
@@ -181,7 +183,7 @@ impl Compared {
 #[derive(Default)]
 struct Mean {
     sum: f64,
-    count: u32,
+    count: usize,
 }
 
 impl Mean {
@@ -190,37 +192,53 @@ impl Mean {
         self.count += 1;
     }
 
-    fn rms(&self) -> Option<f64> {
-        (self.count > 0).then(|| (self.sum / f64::from(self.count)).sqrt())
+    /// NaN of nothing.
+    fn rms(&self) -> f64 {
+        (self.sum / self.count as f64).sqrt()
     }
 }
 
 /// The accuracy in a part of the run.
 #[derive(Clone, Default)]
 pub(super) struct Phase {
-    /// Per joint, RMS errors and RMS torque \[Nm\].
-    pub(super) cad: Vec<f64>,
-    pub(super) identified: Vec<f64>,
-    pub(super) size: Vec<f64>,
+    pub(super) joints: Vec<Accuracy>,
+    /// Fraction of the torques that were not withheld.
     pub(super) valid_share: f64,
+    /// Fraction of these whose error is within twice the stated deviation; NaN without any.
     pub(super) within_2_sigma: f64,
 }
 
+/// The accuracy of a joint's torques, over its valid estimates.
+#[derive(Clone, Copy)]
+pub(super) struct Accuracy {
+    /// RMS errors with the CAD's and with identified parameters, and RMS torque \[Nm\]; NaN
+    /// without a valid estimate.
+    pub(super) cad: f64,
+    pub(super) identified: f64,
+    pub(super) size: f64,
+    /// Number of valid estimates.
+    pub(super) valid: usize,
+}
+
 impl Phase {
-    pub(super) fn json(phase: Option<&Self>, names: &[String]) -> serde_json::Value {
+    pub(super) fn json(phase: Option<&Self>, names: &[String]) -> Json {
         let Some(phase) = phase else {
-            return serde_json::Value::Null;
-        };
-        let of = |values: &[f64]| -> serde_json::Map<_, _> {
-            let named = names.iter().zip(values);
-            named
-                .map(|(name, value)| (name.clone(), json!(value)))
-                .collect()
+            return Json::Null;
         };
         json!({
-            "cad": of(&phase.cad), "identified": of(&phase.identified),
+            "cad": phase.each(names, |joint| joint.cad.into()),
+            "identified": phase.each(names, |joint| joint.identified.into()),
+            "valid_estimates": phase.each(names, |joint| joint.valid.into()),
             "valid_share": phase.valid_share, "within_2_sigma": phase.within_2_sigma,
         })
+    }
+
+    /// A figure of each joint, by its name.
+    pub(super) fn each(&self, names: &[String], figure: impl Fn(&Accuracy) -> Json) -> Json {
+        let named = names.iter().zip(&self.joints);
+        named
+            .map(|(name, joint)| (name.clone(), figure(joint)))
+            .collect()
     }
 }
 
@@ -228,31 +246,32 @@ impl Phase {
 mod tests {
     use super::*;
 
-    fn instant(t: f64, torque: f64, valid: bool) -> Instant {
+    fn instant(t: f64, torque: f64) -> Instant {
+        let valid = torque.is_finite();
         Instant {
             t: Nanos::from_seconds(t),
             estimate: JointTorque {
                 torque,
-                standard_deviation: 0.5,
+                standard_deviation: if valid { 0.5 } else { 930.0 },
                 valid: u32::from(valid),
                 ..JointTorque::ABSENT
             },
-            cad: 3.0,
+            cad: if valid { 3.0 } else { 933.0 },
             truth: 1.0,
         }
     }
 
     #[test]
-    fn phases_are_told_apart_and_nothing_is_said_of_what_was_not() {
-        // Before the motion the error is 2 Nm and the torque is withheld; in motion three of four
-        // are right.
+    fn phases_are_told_apart_and_withheld_torques_enter_no_figure() {
+        // Before the motion one torque of two is withheld; in motion three of four are right.
         let joint = vec![
-            instant(1.0, 3.0, false),
-            instant(2.0, -1.0, false),
-            instant(5.0, 1.0, true),
-            instant(6.0, 1.0, true),
-            instant(7.0, 1.0, true),
-            instant(8.0, 3.0, false),
+            instant(1.0, f64::NAN),
+            instant(2.0, -1.0),
+            instant(5.0, 1.0),
+            instant(6.0, 1.0),
+            instant(7.0, 1.0),
+            instant(8.0, 3.0),
+            instant(15.0, f64::NAN),
         ];
         let compared = Compared {
             first: Nanos::ZERO,
@@ -260,19 +279,30 @@ mod tests {
             settled: Nanos::from_seconds(14.0),
             joints: vec![joint],
         };
-        let before = compared.phase(Nanos::ZERO, compared.moving).unwrap();
-        assert_eq!(
-            (&before.identified[..], &before.cad[..]),
-            (&[2.0][..], &[2.0][..])
+        let figures = |from, until| {
+            let phase = compared.phase(from, until).unwrap();
+            let joint = phase.joints[0];
+            let errors = [joint.identified, joint.cad, joint.size];
+            let shares = [phase.valid_share, phase.within_2_sigma];
+            (errors, joint.valid, shares)
+        };
+        let before = figures(Nanos::ZERO, compared.moving);
+        assert_eq!(before, ([2.0, 2.0, 1.0], 1, [0.5, 0.0]));
+        let learning = figures(compared.moving, compared.settled);
+        assert_eq!(learning, ([1.0, 2.0, 1.0], 4, [1.0, 0.75]));
+        // Withheld throughout: no figure.
+        let after = compared.phase(compared.settled, Nanos::MAX).unwrap();
+        let told = Phase::json(Some(&after), &["elbow".to_owned()]);
+        let expected = json!({
+            "cad": {"elbow": null}, "identified": {"elbow": null}, "valid_estimates": {"elbow": 0},
+            "valid_share": 0.0, "within_2_sigma": null,
+        });
+        assert_eq!(told, expected);
+        assert!(
+            compared
+                .phase(Nanos::from_seconds(20.0), Nanos::MAX)
+                .is_none()
         );
-        assert_eq!((before.valid_share, before.within_2_sigma), (0.0, 0.0));
-        let after = compared.phase(compared.moving, compared.settled).unwrap();
-        assert_eq!(
-            (after.identified[0], after.cad[0], after.size[0]),
-            (1.0, 2.0, 1.0)
-        );
-        assert_eq!((after.valid_share, after.within_2_sigma), (0.75, 0.75));
-        assert!(compared.phase(compared.settled, Nanos::MAX).is_none());
-        assert_eq!(Phase::json(None, &[]), serde_json::Value::Null);
+        assert_eq!(Phase::json(None, &[]), Json::Null);
     }
 }

@@ -1,7 +1,8 @@
 //! A demonstration compared with the simulator's truth: counts, errors, latencies, parameters.
 
-use super::compared::{Compared, Phase, Truth, ratio};
+use super::compared::{Accuracy, Compared, Phase, Truth, ratio};
 use super::learnt::{Course, courses};
+use super::verdict::{Findings, Verdict};
 use crate::demo::experiment::{Args, Experiment};
 use crate::demo::watching::Watched;
 use anyhow::{Context, bail};
@@ -69,6 +70,7 @@ pub(super) struct Evaluation<'a> {
     /// The phase after learning, or the whole run if that is too short; and its begin in words.
     pub(super) judged: Phase,
     pub(super) since: &'static str,
+    pub(super) verdict: Verdict,
     /// Stamp of the last estimate.
     pub(super) last: Nanos,
     pub(super) rate_hz: f64,
@@ -107,11 +109,43 @@ impl<'a> Evaluation<'a> {
             );
         };
         let (parameters, offsets) = courses(experiment, watched, &compared);
+        let counts = Counts::of(watched)?;
+        let (order, beyond) = (&experiment.order, experiment.beyond);
+        let first = match beyond {
+            0 => &order[..],
+            _ => order.get(..beyond).unwrap_or_default(),
+        };
+        let [cad, identified] = [
+            |joint: &Accuracy| joint.cad,
+            |joint: &Accuracy| joint.identified,
+        ]
+        .map(|error| combined(first.iter().filter_map(|i| judged.joints.get(*i)), error));
+        let skipped = |bus: &Json| bus["skipped"].as_u64();
+        let buses = watched.simulator["buses"].as_array();
+        let verdict = Verdict::of(&Findings {
+            since,
+            moved: compared.time(last) - compared.time(compared.moving),
+            has_settled: after.is_some(),
+            refused: experiment.refused.as_deref(),
+            solutions: watched.learnt.len(),
+            cad_error: args.cad_error,
+            joints: first.len(),
+            sensors: experiment.offsets.len(),
+            is_beyond: beyond > 0,
+            cad,
+            identified,
+            valid: judged.joints.iter().map(|joint| joint.valid).sum(),
+            valid_share: judged.valid_share,
+            within_2_sigma: judged.within_2_sigma,
+            lost: counts.lost,
+            skipped: buses.into_iter().flatten().filter_map(skipped).sum(),
+        });
         Ok(Self {
             args,
             experiment,
             watched,
-            counts: Counts::of(watched)?,
+            counts,
+            verdict,
             before: compared.phase(start, compared.moving),
             learning: compared.phase(compared.moving, compared.settled),
             after,
@@ -135,10 +169,11 @@ impl<'a> Evaluation<'a> {
     pub(super) fn summary(&self) -> Json {
         let (args, watched, counts) = (self.args, self.watched, &self.counts);
         let seconds = |t: Nanos| (t <= self.last).then(|| self.compared.time(t));
-        let errors: serde_json::Map<_, _> = (watched.joints.iter().zip(&self.judged.identified))
-            .map(|(name, error)| (name.clone(), json!(error)))
-            .collect();
+        let errors = (self.judged).each(&watched.joints, |joint| joint.identified.into());
+        let valid = (self.judged).each(&watched.joints, |joint| joint.valid.into());
         json!({
+            "verdict": self.verdict.sentence(),
+            "worked": self.verdict.worked,
             "robot": self.experiment.setup.robot.name,
             "seconds": args.seconds,
             "seed": args.seed,
@@ -157,6 +192,7 @@ impl<'a> Evaluation<'a> {
                 "p999": self.latency(0.999),
             },
             "torque_rms_error_nm": errors,
+            "valid_estimates": valid,
             "identification": {
                 "cad_error": args.cad_error,
                 "refused": self.experiment.refused,
@@ -172,6 +208,19 @@ impl<'a> Evaluation<'a> {
             "simulator": watched.simulator,
         })
     }
+}
+
+/// The RMS error over all valid estimates of several joints; NaN without any.
+fn combined<'a>(
+    joints: impl Iterator<Item = &'a Accuracy>,
+    error: impl Fn(&Accuracy) -> f64,
+) -> f64 {
+    let (mut squares, mut count) = (0.0, 0.0);
+    for joint in joints.filter(|joint| error(joint).is_finite()) {
+        squares += error(joint).powi(2) * joint.valid as f64;
+        count += joint.valid as f64;
+    }
+    (squares / count).sqrt()
 }
 
 /// The q-quantile of sorted numbers; NaN of nothing.
@@ -248,6 +297,22 @@ mod tests {
             Course::ending(0.0, 1.0, 1.5),
         ];
         assert_eq!(within_2_sigma(&courses), Some(0.75));
+    }
+
+    #[test]
+    fn errors_of_joints_combine_by_their_counts() {
+        let joint = |identified, valid| Accuracy {
+            cad: f64::NAN,
+            identified,
+            size: 1.0,
+            valid,
+        };
+        let joints = [joint(1.0, 3), joint(3.0, 1), joint(f64::NAN, 0)];
+        assert_eq!(
+            combined(joints.iter(), |j| j.identified),
+            f64::sqrt(12.0 / 4.0)
+        );
+        assert!(combined(joints.iter(), |j| j.cad).is_nan());
     }
 
     #[test]

@@ -54,18 +54,11 @@ pub(super) fn torque_plots(
             .map(|i| (compared.time(i.t), of(i)))
             .collect()
     };
-    // Withheld torques have no line and no band, because consumers do not get these values.
-    let told = |i: &Instant, value: f64| {
-        if i.estimate.valid == 1 {
-            value
-        } else {
-            f64::NAN
-        }
-    };
+    // Withheld torques are NaN: they have no line and no band.
     let band = |of: &dyn Fn(&Instant) -> f64| -> Vec<(f64, f64, f64)> {
         let around = instants
             .iter()
-            .map(|i| (i, told(i, of(i)), 2.0 * i.estimate.standard_deviation));
+            .map(|i| (i, of(i), 2.0 * i.estimate.standard_deviation));
         around
             .map(|(i, value, two)| (compared.time(i.t), value - two, value + two))
             .collect()
@@ -77,11 +70,7 @@ pub(super) fn torque_plots(
             vec![
                 Series::band("± 2σ", Ink::Identified, band(&|i| i.estimate.torque)),
                 Series::line("CAD", Ink::Cad, line(&|i| i.cad)),
-                Series::line(
-                    "identified",
-                    Ink::Identified,
-                    line(&|i| told(i, i.estimate.torque)),
-                ),
+                Series::line("identified", Ink::Identified, line(&|i| i.estimate.torque)),
                 Series::line("truth", Ink::Measured, line(&|i| i.truth)),
             ],
         ),
@@ -89,9 +78,9 @@ pub(super) fn torque_plots(
             "estimated − truth",
             "error",
             vec![
-                Series::band("± 2σ", Ink::Identified, band(&|_| 0.0)),
+                Series::band("± 2σ", Ink::Identified, band(&|i| 0.0 * i.estimate.torque)),
                 Series::line("CAD", Ink::Cad, line(&|i| i.cad - i.truth)),
-                Series::line("identified", Ink::Identified, line(&|i| told(i, i.error()))),
+                Series::line("identified", Ink::Identified, line(&Instant::error)),
             ],
         ),
     ]
