@@ -4,9 +4,10 @@
 use anyhow::{Context as _, bail};
 use proprio_estimator::files;
 use proprio_gateway::plan::Plan;
+use std::collections::BTreeSet;
 use std::fmt;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 use std::process::Command;
 
 /// systemd finds programs without a path here and in /usr/bin, where packages install them.
@@ -134,7 +135,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     if let Some(folder) = &args.config {
         steps.extend(configuration(folder, &etc, args.force)?);
     }
-    let configured = steps.len();
     for service in &services {
         let to = args.root.join("etc/systemd/system").join(service.unit);
         steps.push(write(to, service.text.into(), 0o644));
@@ -154,20 +154,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         steps.push(Step::Run(restart.collect()));
     }
 
-    for (number, step) in steps.iter().enumerate() {
+    for step in &steps {
         print_line!("{step}");
-        if args.dry_run {
-            continue;
-        }
-        step.run()?;
-        if number + 1 == configured && args.config.is_some() {
-            check(&etc).with_context(|| {
-                format!(
-                    "{} works, but its copy does not: name files by their place in this folder, \
-                     or by their full path",
-                    from.display()
-                )
-            })?;
+        if !args.dry_run {
+            step.run()?;
         }
     }
     Ok(())
@@ -189,25 +179,35 @@ fn check(folder: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The copies of the files of `folder` into `etc`. A file that is there and differs is an error,
-/// unless by `force`: it may hold what was measured on the robot.
+/// The copies of the configuration in `folder` into `etc`, with the files that it names. A file that
+/// is there and differs is an error, unless by `force`: it may hold what was measured on the robot.
 fn configuration(folder: &Path, etc: &Path, force: bool) -> anyhow::Result<Vec<Step>> {
-    let unreadable = || format!("cannot read {}", folder.display());
-    let mut names: Vec<PathBuf> = Vec::new();
-    for entry in fs::read_dir(folder).with_context(unreadable)? {
-        let path = entry.with_context(unreadable)?.path();
-        if path.is_file() {
-            names.push(path);
-        }
-    }
-    names.sort();
-    let (mut steps, mut differ) = (Vec::new(), Vec::new());
-    for path in names {
-        let Some(name) = path.file_name() else {
+    let mut names = BTreeSet::new();
+    for config in SERVICES.map(|service| service.config) {
+        let file = folder.join(config);
+        if !file.is_file() {
             continue;
-        };
-        let bytes = fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
-        let to = etc.join(name);
+        }
+        let unreadable = || format!("cannot read {}", file.display());
+        let text = fs::read_to_string(&file).with_context(unreadable)?;
+        names.insert(PathBuf::from(config));
+        named(&text.parse::<toml::Table>()?.into(), folder, &mut names);
+    }
+    let (mut steps, mut differ) = (Vec::new(), Vec::new());
+    for name in names {
+        let from = folder.join(&name);
+        if !name
+            .components()
+            .all(|part| matches!(part, Component::Normal(_)))
+        {
+            bail!(
+                "{} lies outside {}: put it into this folder, or name it by its full path",
+                from.display(),
+                folder.display()
+            );
+        }
+        let bytes = fs::read(&from).with_context(|| format!("cannot read {}", from.display()))?;
+        let to = etc.join(&name);
         match fs::read(&to) {
             Ok(there) if there == bytes => continue,
             Ok(_) if !force => differ.push(to.display().to_string()),
@@ -223,4 +223,20 @@ fn configuration(folder: &Path, etc: &Path, force: bool) -> anyhow::Result<Vec<S
         );
     }
     Ok(steps)
+}
+
+/// The files that `value`, of a configuration in `folder`, names by their place in it: which keys
+/// name files is the drivers' matter, so it is any text that leads to one.
+fn named(value: &toml::Value, folder: &Path, names: &mut BTreeSet<PathBuf>) {
+    match value {
+        toml::Value::Table(table) => table.values().for_each(|v| named(v, folder, names)),
+        toml::Value::Array(values) => values.iter().for_each(|v| named(v, folder, names)),
+        toml::Value::String(name) if Path::new(name).is_relative() => {
+            if folder.join(name).is_file() {
+                let parts = Path::new(name).components();
+                names.insert(parts.filter(|part| *part != Component::CurDir).collect());
+            }
+        }
+        _ => {}
+    }
 }

@@ -191,5 +191,17 @@ fn nothing_is_done_by_a_dry_run_or_with_a_configuration_that_is_wrong() {
     )
     .expect("a file");
     fails(&install(&[], root, Some(empty.path())), 2, "robots");
+    // A file that would not be there after the copy.
+    let folder = empty.path().join("robot");
+    fs::create_dir(&folder).expect("a folder");
+    for file in ["gateway.toml", "estimator.toml", "model.urdf"] {
+        fs::copy(robot().join(file), folder.join(file)).expect("a copy");
+    }
+    good(&install(&["--dry-run"], root, Some(&folder)));
+    fs::rename(folder.join("model.urdf"), empty.path().join("model.urdf")).expect("it moves");
+    let config = fs::read_to_string(folder.join("estimator.toml")).expect("it is there");
+    let config = config.replace("\"model.urdf\"", "\"../model.urdf\"");
+    fs::write(folder.join("estimator.toml"), config).expect("it is written");
+    fails(&install(&[], root, Some(&folder)), 1, "lies outside");
     assert_eq!(fs::read_dir(root).expect("a folder").count(), 0);
 }
