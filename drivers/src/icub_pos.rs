@@ -225,8 +225,15 @@ impl Driver for Options {
         icub::recognise(seen, Self::NAME, &types, &maybe, |evidence, address, _| {
             let id = icub::stream(class::PERIODIC_ANALOG, address, POS);
             let stream = evidence.sends(id, |frame| match *frame.data() {
-                [quantity, values, _, _, _, _, _, _] => {
-                    quantity < 2 && (1..=VALUES).contains(&(values & 0xF))
+                [quantity, values, ref bytes @ ..] if frame.len() == 8 => {
+                    let count = values & 0xF;
+                    let (values, _) = bytes.as_chunks();
+                    let mut own = values.iter().take(count.into());
+                    // A length may be any.
+                    let is_angle = |value| i16::from_le_bytes(value).unsigned_abs() <= 3600;
+                    quantity < 2
+                        && (1..=VALUES).contains(&count)
+                        && own.all(|value| quantity == 1 || is_angle(*value))
                 }
                 _ => false,
             });

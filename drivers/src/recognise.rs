@@ -33,7 +33,7 @@ pub use traffic::{Stream, Traffic};
 use crate::{Format, Frame, Id};
 use alloc::string::{String, ToString};
 use alloc::vec::Vec;
-use background::log2;
+pub(crate) use background::log2;
 use core::ops::RangeInclusive;
 use proprio_topics::Nanos;
 

@@ -9,6 +9,9 @@ use alloc::vec::Vec;
 /// Errors, and that there is none.
 const ERRORS: usize = 8;
 
+/// The largest current of an upload \[0.01 A\].
+const CURRENT: u16 = 6000;
+
 fn has_error(byte: Option<&u8>) -> bool {
     byte.is_some_and(|error| usize::from(*error) < ERRORS)
 }
@@ -30,8 +33,12 @@ fn finding(evidence: Evidence<'_>, number: u8, what: &str, mode: &str) -> Option
 fn servo(seen: &Traffic, number: u8) -> Option<Finding> {
     let mut evidence = Evidence::new(seen, 0xFF);
     let id = Id::extended(SERVO_STATUS | u32::from(number));
-    let stream = evidence.sends(id, |frame| {
-        frame.len() == 8 && has_error(frame.data().get(7))
+    let stream = evidence.sends(id, |frame| match *frame.data() {
+        [_, _, _, _, a, b, _, error] => {
+            let current = i16::from_be_bytes([a, b]);
+            current.unsigned_abs() <= CURRENT && has_error(Some(&error))
+        }
+        _ => false,
     })?;
     evidence.moves(stream, |frame| match *frame.data() {
         [a, b, c, d, ..] => {
@@ -73,7 +80,13 @@ fn mit(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
         data.len() == 6 || data.len() == 8 && has_error(data.get(7))
     };
     let find = |number: &u8| {
-        let mut evidence = Evidence::new(seen, if host == 0 { 1 } else { 0xFF });
+        let addresses = match (host, number) {
+            (0, _) => 1,
+            // Like other devices, half of the motors have such a number.
+            (_, ..0x20) => 0x40,
+            _ => 0xFF,
+        };
+        let mut evidence = Evidence::new(seen, addresses);
         // Numbers are those that were heard: few of them tell something, and less than a rule.
         let few = stream.frames >= 8 * numbers.len() as u64;
         if few && numbers.len() > 1 {

@@ -1,7 +1,7 @@
 //! Recognising boards of the protocol: by what they tell of themselves, and by their streams.
 
 use super::{ADDRESSES, BROADCAST, board, class, command, to_board, to_host};
-use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic};
+use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic, log2};
 use crate::{Format, Frame};
 use alloc::format;
 use alloc::string::String;
@@ -29,9 +29,12 @@ fn told(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Result<Option
     };
     if let Some(stream) = evidence.sends_as(Part::Tells, id, rule) {
         let mut texts: [Option<[u8; 4]>; 8] = [None; 8];
+        let (mut frames, mut answers) = (0, 0_usize);
         for frame in stream.kept() {
+            frames += 1;
             match *frame.data() {
                 [command::DISCOVER, board, major, minor, ref build @ ..] if build.len() < 2 => {
+                    answers += 1;
                     told = Some(Told {
                         board,
                         version: [major, minor],
@@ -48,8 +51,8 @@ fn told(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Result<Option
             }
         }
         if let Some(told) = &mut told {
-            // A type that is one of 256.
-            evidence.add(8.0);
+            // A type of 256; among many frames one is like it by chance.
+            evidence.add(8.0 - log2(types.len()) - log2(frames / answers.max(1)));
             if texts.iter().all(Option::is_some) {
                 // A command, and eight numbers in their order.
                 evidence.add(16.0);
@@ -66,26 +69,36 @@ fn told(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Result<Option
         (class::POLLING_ANALOG, command::GET_FIRMWARE_VERSION),
         (class::POLLING_MOTOR, command::MOTOR_GET_FIRMWARE_VERSION),
     ] {
+        evidence.belongs(to_board(class, address));
         let id = to_host(class, address);
         let stream = evidence.traffic.stream(id).into_iter();
-        let frames = stream.flat_map(Stream::kept);
-        for frame in frames.filter(|frame| frame.format == Format::Classic) {
-            if let [command, board, major, minor, build, _, _, 0 | 1] = *frame.data()
-                && command == version
-                && board::NAMES.iter().any(|(known, _)| *known == board)
+        let answers = stream.flat_map(Stream::kept);
+        let answers: Vec<&Frame> = answers.filter(|f| f.format == Format::Classic).collect();
+        let versions = answers.iter().filter_map(|frame| match *frame.data() {
+            [command, board, major, minor, build, _, _, fits @ (0 | 1)]
+                if command == version && board::NAMES.iter().any(|(known, _)| *known == board) =>
             {
-                // A command and a type of 256 each, and a byte that is 0 or 1.
-                evidence.tells(id, 8.0 + 8.0 + 7.0);
-                told.get_or_insert(Told {
-                    board,
-                    version: [major, minor],
-                    build: Some(build),
-                    info: String::new(),
-                });
-                break;
+                Some((board, [major, minor], build, fits))
             }
+            _ => None,
+        });
+        let count = versions.clone().count();
+        let Some((board, version, build, fits)) = versions.clone().next() else {
+            continue;
+        };
+        // Among many frames one is like it by chance.
+        if count * 32 >= answers.len() {
+            // A command and a type of 256 each, and a byte that is 1; 0 is in many frames.
+            let fits = if fits == 1 { 7.0 } else { 1.0 };
+            let bits = 8.0 + (8.0 - log2(types.len())) + fits;
+            evidence.tells(id, bits - log2(answers.len() / count));
+            told.get_or_insert(Told {
+                board,
+                version,
+                build: Some(build),
+                info: String::new(),
+            });
         }
-        evidence.belongs(to_board(class, address));
     }
     match told {
         Some(told) if !types.contains(&told.board) => Err(()),

@@ -17,7 +17,9 @@ pub(super) fn board(seen: &Traffic, driver: &'static str, node: u16) -> Option<F
             moment.recent().count(),
             moment.recent().filter(shared).count(),
         );
-        if same * 10 >= all * 9 {
+        let goes_on = moment.recent().zip(moment.recent().skip(1));
+        let goes_on = goes_on.filter(|(a, b)| counter(a) != counter(b)).count();
+        if same * 10 >= all * 9 && goes_on * 10 >= all.saturating_sub(1) * 9 {
             // One of 48 that are kept, of 65536.
             evidence.add(10.0);
         }
@@ -38,7 +40,8 @@ pub(super) fn board(seen: &Traffic, driver: &'static str, node: u16) -> Option<F
                     .into_iter()
                     .all(|at| (1..10_000).contains(&scale(at)))
         };
-        stream.kept().any(plausible)
+        let mut told = stream.kept().filter(|frame| frame.len() == 7).peekable();
+        told.peek().is_some() && told.all(plausible)
     });
     if scales {
         // Each a number of 16 bits, one of seven.

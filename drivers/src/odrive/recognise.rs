@@ -40,6 +40,9 @@ pub(super) fn axis(seen: &Traffic, driver: &'static str, node: u16) -> Option<Fi
     if beats.is_none() && estimates.is_none() {
         return None;
     }
+    if beats.is_none() || estimates.is_none() {
+        evidence.lacks();
+    }
     if let Some(estimates) = estimates {
         evidence.moves(estimates, |frame| {
             let number = |at| f64::from(f32::from_bits(bytes::u32_le(frame.data(), at)));

@@ -7,8 +7,8 @@
 //!   send frames of one length.
 //! - **Bytes**: each byte of a frame is replaced by others, to see of how many values the rule
 //!   takes. A byte that is always 00 or FF counts one bit at most: that is what unused bytes are.
-//!   One that changes, and that the rule still fits, counts up to three bits more: other devices,
-//!   too, have states and small numbers.
+//!   If the rule takes 00 or FF, another value counts two bits at most: other devices, too, have
+//!   states and small numbers. One that changes, and that the rule still fits, counts one bit more.
 //! - **Identifier**: half of the devices have a number below 20 (hexadecimal) as their identifier,
 //!   the others any of 11 bits, or of about 20 bits that are in use of 29. Any of the identifiers
 //!   that are heard might have been this one. An identifier next to one that is already explained
@@ -16,7 +16,8 @@
 //! - **This bus**: the streams of it that no device of the family explains tell, too, how often
 //!   other devices fulfil the rule. Where the rule fits other streams too, which are none
 //!   of this family, the identifier is one of theirs: it counts no more than the density with which
-//!   they fill the range from the first to the last of them.
+//!   they fill the range from the first to the last of them. So it is where four streams or more
+//!   are within 32 identifiers of it, whatever their form: devices have blocks of identifiers.
 
 use super::traffic::{Stream, Traffic};
 use crate::{Format, Frame, Id};
@@ -31,13 +32,17 @@ const PROBES: [u8; 32] = [
 const LENGTH_MOST: f64 = 6.0;
 /// What a byte counts that is always 00 or FF, at most.
 const IDLE: f64 = 1.0;
+/// What a byte counts that might be so, at most.
+const SMALL: f64 = 2.0;
 /// How much more a byte counts that changes.
-const CHANGING: f64 = 3.0;
+const CHANGING: f64 = 1.0;
+/// How far the identifiers of a block are from each other.
+pub(super) const NEAR: u32 = 32;
 /// The bits of an identifier next to one that is explained.
 const NEXT: f64 = 1.0;
 
 #[allow(clippy::cast_precision_loss)] // counts
-pub(super) fn log2(count: usize) -> f64 {
+pub(crate) fn log2(count: usize) -> f64 {
     libm::log2(count.max(1) as f64)
 }
 
@@ -106,11 +111,15 @@ fn bytes(stream: &Stream, longest: &Frame, rule: &dyn Fn(&Frame) -> bool) -> f64
                 values.push(*value);
             }
         }
+        let most = if passes(0x00) || passes(0xFF) {
+            SMALL
+        } else {
+            f64::INFINITY
+        };
         all += match values[..] {
             [0x00 | 0xFF] => bits.min(IDLE),
-            [_] => bits,
-            #[allow(clippy::cast_precision_loss)] // a count
-            _ => (bits * values.len() as f64).min(bits + CHANGING),
+            [_] => bits.min(most),
+            _ => (2.0 * bits).min(bits + CHANGING).min(most),
         };
     }
     all
@@ -136,8 +145,9 @@ pub(super) fn alike(traffic: &Traffic, own: Id, rule: &dyn Fn(&Frame) -> bool) -
 }
 
 /// What the identifier `id` counts among `others` that nobody explains, of which those in `alike`
-/// fit the same rule; `is_next`: one next to it is explained by the same device.
-pub(super) fn identifier(id: Id, others: usize, alike: &[u32], is_next: bool) -> f64 {
+/// fit the same rule, and `near` are within [`NEAR`]; `is_next`: one next to it is explained by the
+/// same device.
+pub(super) fn identifier(id: Id, others: usize, alike: &[u32], near: usize, is_next: bool) -> f64 {
     if is_next {
         return NEXT;
     }
@@ -163,5 +173,9 @@ pub(super) fn identifier(id: Id, others: usize, alike: &[u32], is_next: bool) ->
         }
         _ => f64::INFINITY,
     };
-    chance.min(density).max(0.0)
+    let block = match near {
+        4.. => log2(2 * NEAR as usize) - log2(near),
+        _ => f64::INFINITY,
+    };
+    chance.min(density).min(block).max(0.0)
 }

@@ -5,7 +5,7 @@
 //! buses on which two devices send on one identifier. The frames that remain are fewer, so an
 //! identifier among them counts more.
 
-use super::background::{common, identifier};
+use super::background::{NEAR, common, identifier};
 use super::traffic::Traffic;
 use super::{Certainty, Explained, Finding, PRIOR, Part};
 use crate::Id;
@@ -51,8 +51,6 @@ const fn of_format(counts: &mut [usize; 2], id: Id) -> &mut usize {
 /// A finding that is not yet judged.
 struct Open {
     finding: Finding,
-    /// Without those before it \[bits\].
-    full: f64,
     /// The probability that nothing before it is there that contests it.
     free: f64,
     /// The streams that nobody of its family explains, with 11 and 29 bits.
@@ -62,8 +60,19 @@ struct Open {
 }
 
 impl Open {
-    /// The bits for it, where `sure` are there.
-    fn bits(&self, sure: &[Finding]) -> f64 {
+    /// How many streams that nobody of its family explains are near `id`.
+    fn near(&self, seen: &Traffic, id: Id) -> usize {
+        let same = |raw: u32| match id {
+            Id::Standard(_) => u16::try_from(raw.min(0x7FF)).map_or(id, Id::standard),
+            Id::Extended(_) => Id::extended(raw.min(0x1FFF_FFFF)),
+        };
+        let range = same(id.raw().saturating_sub(NEAR))..=same(id.raw() + NEAR);
+        let near = seen.between(range).filter(|other| *other != id);
+        near.filter(|other| !self.family.contains(other)).count()
+    }
+
+    /// The bits for it, where `sure` are there: also those that contest it, or (`alone`) not they.
+    fn bits(&self, seen: &Traffic, sure: &[Finding], alone: bool) -> f64 {
         let finding = &self.finding;
         let mut bits = finding.bits;
         let is_one = |known: &&Finding| known.certainty() >= Some(Certainty::Likely);
@@ -76,7 +85,7 @@ impl Open {
             if part == Part::Takes {
                 continue;
             }
-            if sure.iter().any(|known| contests(finding, known, explained)) {
+            if !alone && sure.iter().any(|known| contests(finding, known, explained)) {
                 bits -= CONTESTED;
                 continue;
             }
@@ -88,12 +97,13 @@ impl Open {
                 .map(|id| id.raw())
                 .collect();
             alike.sort_unstable();
+            let near = self.near(seen, explained.id);
             let mut others = self.others;
             let others = *of_format(&mut others, explained.id);
             let is_next = |id: &Id| id.raw().abs_diff(explained.id.raw()) == 1;
             let is_next = before.iter().any(is_next);
             bits += common(explained.bits, others, alike.len());
-            bits += identifier(explained.id, others, &alike, is_next);
+            bits += identifier(explained.id, others, &alike, near, is_next);
             before.push(explained.id);
         }
         bits
@@ -105,8 +115,7 @@ impl Open {
 pub(super) fn explain(seen: &Traffic, findings: Vec<Finding>) -> Vec<Finding> {
     let own = |finding: &Finding| {
         let explains = finding.explains.iter();
-        let own = explains.filter(|explained| explained.part != Part::Takes);
-        own.map(|explained| explained.id).collect::<Vec<Id>>()
+        explains.map(|explained| explained.id).collect::<Vec<Id>>()
     };
     let mut open: Vec<Open> = Vec::new();
     let all: Vec<(&'static str, Vec<Id>)> = findings
@@ -122,23 +131,23 @@ pub(super) fn explain(seen: &Traffic, findings: Vec<Finding>) -> Vec<Finding> {
         }
         open.push(Open {
             finding,
-            full: 0.0,
             free: 1.0,
             others,
             family,
         });
     }
     let mut sure: Vec<Finding> = Vec::new();
-    for one in &mut open {
-        one.full = one.bits(&sure);
-    }
     loop {
         let odds = |one: &Open| {
-            // Nothing contests it, or something does and it is there all the same.
-            let (full, beside) = (one.full, one.bits(&sure));
+            let alone = one.bits(seen, &sure, true);
             let taken = 1.0 - one.free;
-            let yes = one.free * probability(full) + taken * probability(beside);
-            let no = one.free * probability(-full) + taken * probability(-beside);
+            if taken <= 0.0 {
+                return alone;
+            }
+            // What contests it is not there, or it is there all the same.
+            let beside = one.bits(seen, &sure, false);
+            let yes = one.free * probability(alone) + taken * probability(beside);
+            let no = one.free * probability(-alone) + taken * probability(-beside);
             libm::log2(yes / no)
         };
         let all: Vec<f64> = open.iter().map(odds).collect();
@@ -165,7 +174,7 @@ pub(super) fn explain(seen: &Traffic, findings: Vec<Finding>) -> Vec<Finding> {
             .filter(|k| open.get(*k).is_some_and(&contested))
             .collect();
         let instead: f64 = (rivals.iter().filter_map(|k| open.get(*k)))
-            .map(|rival| libm::exp2(rival.full.min(500.0)) * rival.free)
+            .map(|rival| libm::exp2(rival.bits(seen, &sure, true).min(500.0)) * rival.free)
             .sum();
         let bits = bits.min(500.0) - libm::log2(1.0 + instead);
         for rival in rivals {

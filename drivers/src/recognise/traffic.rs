@@ -3,6 +3,7 @@
 use crate::{Format, Frame, Id};
 use alloc::collections::{BTreeMap, VecDeque};
 use alloc::vec::Vec;
+use core::ops::RangeInclusive;
 use proprio_topics::Nanos;
 
 /// The newest frames that are kept of each identifier.
@@ -170,6 +171,11 @@ impl Traffic {
     #[must_use]
     pub fn stream(&self, id: Id) -> Option<&Stream> {
         self.0.get(&id)
+    }
+
+    /// The identifiers in `range` on which something was heard.
+    pub(super) fn between(&self, range: RangeInclusive<Id>) -> impl Iterator<Item = Id> {
+        self.0.range(range).map(|(id, _)| *id)
     }
 
     /// What was heard, by identifier.

@@ -9,6 +9,7 @@ mod canopen;
 mod canopen_exchange;
 mod canopen_file;
 mod command;
+mod controls;
 mod cubemars;
 mod damiao;
 mod dbc;

@@ -103,24 +103,38 @@ fn what_no_board_answers_is_no_answer() {
 }
 
 /// Where another program has asked for the version, nobody needs to ask. The bits are those of the
-/// identifier (12), of the command, the type and the last byte (0 or 1), less those of one driver
+/// identifier (12), of the command, the type and the last byte (1; 0 counts one), less those of one driver
 /// of 32 and of 14 addresses.
 #[test]
 fn an_answer_to_another_program_names_a_board() {
-    for (answer, driver, what) in [
+    for (answer, driver, what, types, fits) in [
         (
             "230#1C0C020008020001",
             "icub_strain",
             "strain2, firmware 2.0.8",
+            3_f64,
+            7.0,
         ),
-        ("230#1C07010203020000", "icub_mais", "mais, firmware 1.2.3"),
-        ("030#5B08020105020001", "icub_motor", "2foc, firmware 2.1.5"),
+        (
+            "230#1C07010203020000",
+            "icub_mais",
+            "mais, firmware 1.2.3",
+            1.0,
+            1.0,
+        ),
+        (
+            "030#5B08020105020001",
+            "icub_motor",
+            "2foc, firmware 2.1.5",
+            4.0,
+            7.0,
+        ),
     ] {
         let findings = found(&[(answer, 0.0)]);
         let finding = findings.iter().find(|finding| finding.driver == driver);
         let finding = finding.unwrap_or_else(|| panic!("{driver} is not found"));
         assert_eq!((finding.address, finding.what.as_str()), (3, what));
-        let bits = 12.0 + 8.0 + 8.0 + 7.0 - 5.0 - 14_f64.log2();
+        let bits = 12.0 + 8.0 + (8.0 - types.log2()) + fits - 5.0 - 14_f64.log2();
         assert!((finding.bits - bits).abs() < 0.01, "{finding:?}");
     }
     // It does not say whether the protocols fit; it answers a motor's question.

@@ -277,7 +277,7 @@ mod tests {
             let plan = Plan::parse(&text, Path::new("."));
             let plan = plan.unwrap_or_else(|e| panic!("{e}\n{text}"));
             let drivers: Vec<&str> = plan.buses[0].devices.iter().map(|d| &*d.driver).collect();
-            assert_eq!(drivers, ["icub_strain", "icub_imu"]);
+            assert_eq!(drivers, ["icub_imu", "icub_strain"]);
         }
         let text = file("r", &[bus("b", devices(&heard, ""))]);
         Plan::parse(&text, Path::new(".")).unwrap_or_else(|e| panic!("{e}\n{text}"));
