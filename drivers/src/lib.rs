@@ -18,6 +18,7 @@
 //! | [`odrive`] | ODrive motor controllers | joint, actuator, temperature |
 //! | [`cubemars`] | CubeMars AK actuators | joint, actuator, temperature |
 //! | [`damiao`] | Damiao actuators | joint, actuator, temperature |
+//! | [`robstride`] | RobStride actuators, CyberGear | joint, actuator, temperature |
 //! | [`vesc`] | VESC motor controllers | joint, actuator, temperature |
 //! | [`xsens_mti`] | Xsens MTi-600, Avior, Sirius | imu |
 //! | [`openimu`] | Aceinna OpenIMU300RI, OpenIMU335RI, MTLT | imu |
@@ -84,6 +85,7 @@ mod pairing;
 pub mod recognise;
 mod registry;
 pub mod robotous_rft;
+pub mod robstride;
 pub mod signal;
 mod unit;
 pub mod vesc;

@@ -81,6 +81,13 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
         "model = \"DM8009\"\nrequest_period_ms = 2\nfd = true",
         &[0],
     ),
+    ("robstride", "model = \"RS03\"", &[0]),
+    (
+        "robstride",
+        "model = \"CyberGear\"\nprotocol = \"mit\"",
+        &[0],
+    ),
+    ("robstride", "model = \"RS00\"\nrequest_period_ms = 2", &[0]),
     ("vesc", "pole_pairs = 7\ntorque_constant = 0.1", &[0]),
     ("vesc", "pole_pairs = 7\nposition = \"tachometer\"", &[0]),
     ("xsens_mti", "", &[]),

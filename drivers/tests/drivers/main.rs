@@ -26,6 +26,7 @@ mod recognise;
 mod recognise_icub;
 mod rig;
 mod robotous_and_aidin;
+mod robstride;
 mod round_trip;
 mod signals;
 mod skin_and_mais;

@@ -73,7 +73,7 @@ pub(crate) const BOARDS: &[Row] = &[
     ),
 ];
 /// Drivers without a device that speaks, or with one that a file describes.
-const NOT_RECOGNISED: [&str; 4] = ["canopen_sync", "damiao", "dbc", "vesc"];
+const NOT_RECOGNISED: [&str; 5] = ["canopen_sync", "damiao", "dbc", "robstride", "vesc"];
 
 #[test]
 fn no_driver_is_left_out() {

@@ -1,0 +1,218 @@
+//! The device's own side: a motor that answers questions, or sends its state as if it were
+//! commanded once a period.
+
+use super::frames::{
+    JOINT, LENGTH, MOTOR, OF_STATE, RUNNING, State, fault, id, kind, parameter, quality_of,
+};
+use super::options::{Checked, Options, Protocol};
+use crate::bytes;
+use crate::{Board, EncodeError, Format, Frame, Frames, Id, Spec, SpecError};
+use proprio_topics::{JointState, Nanos, Quality, Reading};
+
+/// The number of a simulated motor's processor.
+const UID: [u8; 8] = [0x36, 0x31, 0x30, 0x14, 0x0B, 0x33, 0x33, 0x31];
+
+/// A simulated motor.
+#[derive(Debug)]
+pub struct RobstrideBoard {
+    keys: Checked,
+    joint: JointState,
+    mode: u8,
+    /// The six faults of a state, and those of a frame of their own.
+    of_state: u8,
+    faults: u32,
+    /// Temperature \[0.1 degrees Celsius\].
+    tenths: u16,
+}
+
+impl RobstrideBoard {
+    /// A running motor at 25 degrees Celsius.
+    ///
+    /// # Errors
+    /// [`SpecError`]: an address outside 1 to 253, a key out of range, ranges that are not known.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        Ok(Self {
+            keys: Checked::new(spec, options)?,
+            joint: JointState {
+                position: 0.0,
+                velocity: 0.0,
+                ..JointState::ABSENT
+            },
+            mode: RUNNING,
+            of_state: 0,
+            faults: 0,
+            tenths: 250,
+        })
+    }
+
+    /// The current state; an absent torque is 0.
+    fn state(&self) -> Frame {
+        let Checked {
+            address,
+            host,
+            scales: [p, v, t],
+            ..
+        } = self.keys;
+        let JointState {
+            position,
+            velocity,
+            torque,
+            ..
+        } = self.joint;
+        let torque = if torque.is_nan() { 0.0 } else { torque };
+        let state = State {
+            told: None,
+            raw: [p.raw(position), v.raw(velocity), t.raw(torque)],
+            tenths: self.tenths,
+        };
+        match self.keys.protocol {
+            Protocol::Private => {
+                let upper = self.mode << 6 | self.of_state;
+                Frame::new(id(kind::STATE, upper, address, host), &state.pack())
+            }
+            Protocol::Mit => Frame::new(Id::standard(host.into()), &state.pack_mit(address)),
+        }
+    }
+
+    /// The frame about its faults.
+    fn told_faults(&self) -> Frame {
+        let Checked { address, host, .. } = self.keys;
+        let [a, b, c, d] = self.faults.to_le_bytes();
+        match self.keys.protocol {
+            Protocol::Private => {
+                let data = [a, b, c, d, 0, 0, 0, 0];
+                Frame::new(id(kind::FAULT, 0, address, host), &data)
+            }
+            Protocol::Mit => Frame::new(Id::standard(host.into()), &[address, a, b, c, d, 0, 0, 0]),
+        }
+    }
+
+    /// Takes a reading; gives the frames that tell of it.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // limited or masked
+    fn take(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+    ) -> Result<[Option<Frame>; 2], EncodeError> {
+        let mut frames = [None; 2];
+        let [first, second] = &mut frames;
+        match (output, reading) {
+            (JOINT, Reading::Joint(joint)) => {
+                let values = [joint.position, joint.velocity];
+                if values.iter().any(|value| !value.is_finite()) || joint.torque.is_infinite() {
+                    return Err(EncodeError::NotFinite);
+                }
+                self.joint = *joint;
+                let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
+                let all = u32::from(self.of_state) << OF_STATE | self.faults;
+                if quality_of(all, self.keys.encoder).0 != quality.0 & told.0 {
+                    let set = |flag, bit: u32| {
+                        if quality.contains(flag) {
+                            bit >> OF_STATE
+                        } else {
+                            0
+                        }
+                    };
+                    let encoder = set(Quality::DEVICE_FAULT, fault::MAGNETIC_ENCODER);
+                    self.of_state =
+                        (encoder | set(Quality::DRIVE_FAULT, fault::OVER_TEMPERATURE)) as u8;
+                    let was = self.faults;
+                    self.faults = 0;
+                    if self.keys.protocol == Protocol::Mit {
+                        if quality.contains(Quality::DEVICE_FAULT) {
+                            self.faults |= fault::NOT_CALIBRATED;
+                        }
+                        // Bit 0: too hot.
+                        self.faults |= u32::from(quality.contains(Quality::DRIVE_FAULT));
+                    }
+                    if self.faults != was {
+                        *first = Some(self.told_faults());
+                    }
+                }
+                *second = Some(self.state());
+            }
+            (JOINT, Reading::Actuator(actuator)) => {
+                self.mode = actuator.mode as u8 & 3;
+                self.of_state = (actuator.faults >> OF_STATE) as u8 & 0x3F;
+                let was = self.faults;
+                self.faults = actuator.faults & ((1 << OF_STATE) - 1);
+                if self.faults != was {
+                    *first = Some(self.told_faults());
+                }
+            }
+            (MOTOR, Reading::Temperature(temperature)) if temperature.celsius.is_finite() => {
+                self.tenths = bytes::quantise(temperature.celsius, 0.1, 0, 0xFFFF) as u16;
+            }
+            (MOTOR, Reading::Temperature(_)) => return Err(EncodeError::NotFinite),
+            (JOINT | MOTOR, _) => return Err(EncodeError::Kind),
+            _ => return Err(EncodeError::Output(output)),
+        }
+        Ok(frames)
+    }
+}
+
+impl Board for RobstrideBoard {
+    /// Answers questions for its number and for parameters.
+    #[allow(clippy::cast_possible_truncation)] // parameters have single precision
+    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
+        let Checked { address, .. } = self.keys;
+        if self.keys.protocol == Protocol::Mit
+            || frame.format != Format::Classic
+            || frame.len() != LENGTH
+        {
+            return;
+        }
+        let [destination, host, 0, kind] = frame.id.raw().to_le_bytes() else {
+            return;
+        };
+        if destination != address || !matches!(frame.id, Id::Extended(_)) {
+            return;
+        }
+        let answer = match kind {
+            kind::DEVICE => Frame::new(id(kind::DEVICE, 0, address, 0xFE), &UID),
+            kind::PARAMETER => {
+                let asked = bytes::u16_le(frame.data(), 0);
+                let (upper, value) = match asked {
+                    parameter::POSITION => (0, self.joint.position),
+                    parameter::VELOCITY => (0, self.joint.velocity),
+                    parameter::CURRENT if self.joint.current.is_finite() => (0, self.joint.current),
+                    parameter::CURRENT => (0, 0.0),
+                    _ => (1, 0.0),
+                };
+                let ([low, high], [a, b, c, d]) =
+                    (asked.to_le_bytes(), (value as f32).to_le_bytes());
+                let data = [low, high, 0, 0, a, b, c, d];
+                Frame::new(id(kind::PARAMETER, upper, address, host), &data)
+            }
+            _ => return,
+        };
+        let _ = out.try_push(answer);
+    }
+
+    fn period(&self) -> Option<Nanos> {
+        match self.keys.request_period {
+            Some(_) => None,
+            None => Some(self.keys.period),
+        }
+    }
+
+    fn present(&mut self, output: u8, reading: &Reading, quality: Quality) {
+        let _ = self.take(output, reading, quality);
+    }
+
+    /// Faults beyond those of a state precede it in a frame of their own. The temperature is sent
+    /// with the next joint reading.
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        for frame in self.take(output, reading, quality)?.into_iter().flatten() {
+            let _ = out.try_push(frame);
+        }
+        Ok(())
+    }
+}

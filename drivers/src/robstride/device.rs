@@ -1,0 +1,225 @@
+//! The host's side: takes the frames of one motor, and reads its parameters if it is told to.
+
+use super::frames::{
+    JOINT, LENGTH, MOTOR, Message, OF_STATE, RUNNING, State, claim, id, kind, parameter, quality_of,
+};
+use super::options::{Checked, Options, Protocol};
+use crate::bringup::{Bringup, NoInquiry, Timing};
+use crate::bytes;
+use crate::family::{Family, Link, Supervised, next_in_step};
+use crate::held::{Held, OnChange};
+use crate::{Claim, Decoded, Device, Frame, Id, Mode, Output, Spec, SpecError};
+use alloc::boxed::Box;
+use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
+
+/// The host's side of a motor.
+#[derive(Debug)]
+pub(super) struct Motor {
+    keys: Checked,
+    /// As they were told last: mode; faults of a frame of their own; those of a state.
+    mode: u8,
+    faults: u32,
+    of_state: u32,
+    told: OnChange<(u8, u32)>,
+    velocity: Held,
+    current: Held,
+    /// The next question: its place in [`parameter::ASKED`], and when that round is due.
+    next: usize,
+    due: Nanos,
+}
+
+impl Motor {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        let keys = Checked::new(spec, options)?;
+        let (mode, timing) = match keys.request_period {
+            Some(_) => (spec.mode, Timing::POLLED),
+            None => (Mode::Listen, Timing::LISTENED),
+        };
+        let (address, host) = (keys.address, keys.host);
+        let mut claims = match keys.protocol {
+            Protocol::Private => kind::READ.map(|kind| claim(kind, address, host)).to_vec(),
+            Protocol::Mit => [Claim::shared(Id::standard(host.into()))].to_vec(),
+        };
+        // What is watched is the first.
+        if keys.request_period.is_some() {
+            claims.swap(0, 1);
+        }
+        let watched = claims.first().map_or(Id::standard(0), |claim| claim.id);
+        let bringup = Bringup::new(spec, mode, timing, watched);
+        let this = Self {
+            keys,
+            mode: 0,
+            faults: 0,
+            of_state: 0,
+            told: OnChange::NOTHING,
+            velocity: Held::ABSENT,
+            current: Held::ABSENT,
+            next: 0,
+            due: Nanos::MIN,
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+
+    /// Tells mode and faults if they are new, and now and then. Returns whether it did.
+    fn tell(&mut self, frame: &Frame, out: &mut Decoded) -> bool {
+        let faults = self.faults | self.of_state;
+        let due = self.told.is_due((self.mode, faults), frame);
+        if due {
+            let reading = Reading::Actuator(Actuator {
+                duty: f64::NAN,
+                mode: u32::from(self.mode),
+                encoder: faults & self.keys.encoder,
+                faults,
+            });
+            out.push(Output::new(JOINT, frame, self.quality(), reading), frame.id);
+        }
+        due
+    }
+
+    fn quality(&self) -> Quality {
+        quality_of(self.faults | self.of_state, self.keys.encoder)
+    }
+
+    fn state(
+        &mut self,
+        state: &State,
+        frame: &Frame,
+        link: &mut Link<NoInquiry>,
+        out: &mut Decoded,
+    ) {
+        if let Some((mode, faults)) = state.told {
+            self.mode = mode;
+            self.of_state = u32::from(faults) << OF_STATE;
+            if mode == RUNNING && faults == 0 {
+                self.faults = 0;
+            }
+        }
+        if self.tell(frame, out) {
+            let celsius = f64::from(state.tenths) / 10.0;
+            let reading = Reading::Temperature(Temperature { celsius });
+            out.push(Output::new(MOTOR, frame, Quality::GOOD, reading), frame.id);
+        }
+        if self.keys.request_period.is_some() {
+            return;
+        }
+        let [p, v, t] = self.keys.scales;
+        let [position, velocity, torque] = state.raw;
+        let mut quality = self.quality();
+        if p.is_saturated(position) || v.is_saturated(velocity) || t.is_saturated(torque) {
+            quality |= Quality::SATURATED;
+        }
+        let state = JointState {
+            position: p.value(position),
+            velocity: v.value(velocity),
+            torque: t.value(torque),
+            ..JointState::ABSENT
+        };
+        link.joint(JOINT, frame, quality, state, out);
+    }
+
+    fn parameter(
+        &mut self,
+        (parameter, value): (u16, f64),
+        frame: &Frame,
+        link: &mut Link<NoInquiry>,
+        out: &mut Decoded,
+    ) {
+        // Answers to another program.
+        let Some(period) = self.keys.request_period else {
+            return;
+        };
+        match parameter {
+            parameter::VELOCITY => self.velocity = Held::new(frame, value),
+            parameter::CURRENT => self.current = Held::new(frame, value),
+            parameter::POSITION if value.is_finite() => {
+                let current = self.current.at(frame, period);
+                let state = JointState {
+                    position: value,
+                    velocity: self.velocity.at(frame, period),
+                    torque: self.keys.torque_constant.unwrap_or(f64::NAN) * current,
+                    current,
+                    ..JointState::ABSENT
+                };
+                link.joint(JOINT, frame, self.quality(), state, out);
+            }
+            parameter::POSITION => out.fault(Counter::Value, 1, frame.id),
+            _ => {}
+        }
+    }
+
+    /// What `frame` tells.
+    fn message(&self, frame: &Frame, out: &mut Decoded) -> Option<Message> {
+        let (address, host) = (self.keys.address, self.keys.host);
+        let kind = match self.keys.protocol {
+            Protocol::Private => {
+                let mut kinds = kind::READ.into_iter();
+                Some(kinds.find(|kind| claim(*kind, address, host).matches(frame.id))?)
+            }
+            Protocol::Mit if frame.id == Id::standard(host.into()) => None,
+            Protocol::Mit => return None,
+        };
+        let data = bytes::payload(frame, out)?;
+        if data.len() != LENGTH {
+            out.fault(Counter::Length, 1, frame.id);
+            return None;
+        }
+        let [_, _, upper, _] = frame.id.raw().to_le_bytes();
+        match kind {
+            Some(kind) => Some(Message::of_private(kind, upper, data)),
+            None => Message::of_mit(address, data),
+        }
+    }
+}
+
+impl Family for Motor {
+    type Questions = NoInquiry;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+        match self.message(frame, out) {
+            Some(Message::State(state)) => self.state(&state, frame, link, out),
+            Some(Message::Faults(faults)) => {
+                self.faults = faults & ((1 << OF_STATE) - 1);
+                self.tell(frame, out);
+            }
+            Some(Message::Parameter(parameter, Some(value))) => {
+                self.parameter((parameter, f64::from(value)), frame, link, out);
+            }
+            Some(Message::Parameter(parameter, None)) => {
+                if self.keys.request_period.is_some() && parameter::ASKED.contains(&parameter) {
+                    out.fault(Counter::Value, 1, frame.id);
+                }
+            }
+            None => {}
+        }
+    }
+
+    fn reset(&mut self) {
+        (self.mode, self.faults, self.of_state) = (0, 0, 0);
+        self.told = OnChange::NOTHING;
+        (self.velocity, self.current) = (Held::ABSENT, Held::ABSENT);
+    }
+
+    fn request(
+        &mut self,
+        now: Nanos,
+        _link: &mut Link<NoInquiry>,
+        _out: &mut Decoded,
+    ) -> Option<Frame> {
+        let period = self.keys.request_period?;
+        if now < self.due {
+            return None;
+        }
+        let [low, high] = parameter::ASKED.get(self.next)?.to_le_bytes();
+        self.next += 1;
+        if self.next == parameter::ASKED.len() {
+            self.next = 0;
+            self.due = next_in_step(self.due, period, now);
+        }
+        let id = id(kind::PARAMETER, 0, self.keys.host, self.keys.address);
+        Some(Frame::new(id, &[low, high, 0, 0, 0, 0, 0, 0]))
+    }
+
+    fn request_at(&self) -> Option<Nanos> {
+        self.keys.request_period.map(|_| self.due)
+    }
+}
