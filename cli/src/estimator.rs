@@ -13,9 +13,14 @@ pub(crate) struct Args {
     /// The configuration file
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// Check the configuration, print the plan, masses and expected F/T readings at rest, and exit
+    /// Check the configuration, print the plan, masses, F/T readings to expect at rest and torques
+    /// that will be withheld, and exit
     #[arg(long)]
     check: bool,
+    /// With --check: the position of a joint [rad or m]; may be repeated; default: that of the robot
+    /// if its gateway runs, else zero
+    #[arg(long, value_name = "JOINT=RAD", requires = "check")]
+    at: Vec<String>,
     /// With --check: also check that this gateway.toml publishes all channels that the estimator
     /// reads
     #[arg(long, value_name = "FILE", requires = "check")]
@@ -27,7 +32,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     if !args.check {
         return daemon::run(&args.config, domain);
     }
-    let setup = daemon::check(&args.config)?;
+    let setup = daemon::check(&args.config, &args.at, domain)?;
     match &args.gateway {
         Some(gateway) => fits(&args.config, &setup, gateway),
         None => Ok(()),

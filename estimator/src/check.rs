@@ -2,34 +2,55 @@
 //! prints them after the setup.
 //!
 //! - masses: of the whole robot, and beyond each F/T sensor;
-//! - the readings of the F/T sensors without offsets, with the robot held at rest by its root link,
-//!   whose z axis is up, all joints at zero (or the nearest limit, or their locked position), and
-//!   without contacts;
+//! - the readings of the F/T sensors without offsets, with the robot at rest in a posture
+//!   ([`Posture`]), held by its base, under the configured gravity, and without contacts; beside what
+//!   a running robot measures;
+//! - which torques are withheld in that posture, and why ([`Withheld`]);
 //! - joints whose effort limit could not hold the limb beyond them: masses or limits are in other
 //!   units;
 //! - joints of sub-trees with an F/T sensor whose torque can never be determined, because the
 //!   contacts that are always present have more unknowns than there are equations.
 
+mod running;
+mod withheld;
+
+pub use running::posture as running_posture;
+pub use withheld::Withheld;
+
 use crate::config::STANDARD_GRAVITY;
-use crate::setup::{Setup, gravity_loads};
+use crate::pipeline::Pipeline;
+use crate::plausible;
+use crate::setup::{Setup, gravity_loads, nearest};
 use proprio_dynamics::model::Limits;
 use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{
-    Certainty, DynamicsError, FrameMotion, InverseDynamics, JointState, Kinematics, Solver,
+    Certainty, ContactKind, DynamicsError, FrameMotion, InverseDynamics, JointState, Kinematics,
+    Solver,
 };
+use proprio_identification::robot::BaseMotion;
 use std::fmt;
 
 /// Largest credible gravity load of a limb, stretched out, as a multiple of its joint's effort
 /// limit. It is above one because no posture has all lengths in one line.
 const HOLDS: f64 = 10.0;
 
+/// A robot whose joints move by more while its posture is read does not stand still \[rad or m\]:
+/// more than noise, and a hundredth of a limb's load.
+const MOVED: f64 = 0.01;
+
 /// The plausibility figures.
 #[derive(Clone, Debug)]
 pub struct Check {
     /// Mass of all links \[kg\].
     pub mass: f64,
+    /// The posture, and what holds the robot, in words.
+    pub posture: String,
     /// Per F/T sensor, its load at rest.
     pub sensors: Vec<AtRest>,
+    /// What is withheld at rest.
+    pub withheld: Withheld,
+    /// Why nothing can be identified on-line although it is configured.
+    pub refused: Option<String>,
     /// Joints that could not hold their limb: the name, the gravity load of the limb, stretched
     /// out, and the effort limit [Nm or N].
     pub overloaded: Vec<(String, f64, f64)>,
@@ -48,6 +69,76 @@ pub struct AtRest {
     pub mass: f64,
     /// Its reading without offset, in its measurement frame.
     pub reading: Wrench,
+    /// What it measures now, calibrated, if the posture is that of a running robot.
+    pub measured: Option<Wrench>,
+    /// Its offset, if it is known.
+    pub offset: Option<Wrench>,
+}
+
+/// A posture of the robot.
+#[derive(Clone, Debug)]
+pub struct Posture {
+    /// Per degree of freedom, its position \[rad or m\]; NaN: its locked position, else zero, or the
+    /// nearest limit.
+    position: Vec<f64>,
+    /// The proper acceleration that the IMU at the base measures, in its axes \[m/s^2\].
+    proper_acceleration: Option<Vec3>,
+    /// Per F/T sensor, what it measures.
+    measured: Option<Vec<Wrench>>,
+    /// By how much a joint moved while this was measured \[rad or m\].
+    moved: f64,
+}
+
+impl Posture {
+    /// No position is known.
+    #[must_use]
+    pub fn unknown(setup: &Setup) -> Self {
+        Self {
+            position: vec![f64::NAN; setup.robot.model.dof_count()],
+            proper_acceleration: None,
+            measured: None,
+            moved: 0.0,
+        }
+    }
+
+    /// Reads `JOINT=POSITION` \[rad or m\], once for each joint that is not at zero.
+    ///
+    /// # Errors
+    /// A text: what is wrong, and what is allowed.
+    pub fn parse(setup: &Setup, given: &[String]) -> Result<Self, String> {
+        let mut posture = Self::unknown(setup);
+        for text in given {
+            let (name, number) = text.split_once('=').ok_or_else(|| {
+                format!("--at {text}: give a joint and its position: l_elbow=1.2")
+            })?;
+            let name = name.trim();
+            let dof = setup.robot.joint_names().position(|own| own == name);
+            let dof = dof.ok_or_else(|| {
+                let names = nearest(name, setup.robot.joint_names());
+                format!("--at {text}: {name:?} is not a moving joint of the URDF{names}")
+            })?;
+            let position: Option<f64> = number.trim().parse().ok();
+            let position = position
+                .filter(|position| position.is_finite())
+                .ok_or_else(|| format!("--at {text}: {number:?} must be a number [rad or m]"))?;
+            plausible::angle(&format!("--at {name}"), position)?;
+            if let Some(place) = posture.position.get_mut(dof) {
+                *place = position;
+            }
+        }
+        Ok(posture)
+    }
+}
+
+/// The robot at rest in a posture.
+struct Still {
+    position: Vec<f64>,
+    /// The motion of the base link.
+    base: FrameMotion,
+    /// A contact that is declared to be present: that of the foot on which the robot stands.
+    declared: Option<usize>,
+    /// Per F/T sensor, its reading without offset.
+    loads: Vec<Wrench>,
 }
 
 impl Check {
@@ -55,7 +146,13 @@ impl Check {
     ///
     /// # Errors
     /// Never with a [`Setup`] from its own constructors.
-    pub fn of(setup: &Setup) -> Result<Self, DynamicsError> {
+    pub fn of(setup: &Setup, posture: &Posture) -> Result<Self, DynamicsError> {
+        let pipeline = Pipeline::new(setup.clone());
+        let refused = pipeline.identification_refused().map(ToString::to_string);
+        // Then everything is as without identification: stated offsets are used.
+        let mut setup = setup.clone();
+        setup.identifies &= refused.is_none();
+        let setup = &setup;
         let model = &setup.state.model;
         let bodies = model.inertias();
         let mut beyond: Vec<f64> = bodies.iter().map(|body| body.mass).collect();
@@ -63,36 +160,96 @@ impl Check {
             beyond[joint.parent] += beyond[joint.child];
         }
         let still = vec![0.0; model.dof_count()];
-        let gravity = Vec3::new(0.0, 0.0, -STANDARD_GRAVITY);
-        let pose = |position: &[f64]| -> Result<Kinematics, DynamicsError> {
-            let mut kinematics = Kinematics::new(model, 0)?;
+        let pose = |position: &[f64], base: usize, motion: &FrameMotion| {
+            let mut kinematics = Kinematics::new(model, base)?;
             let state = JointState {
                 position,
                 velocity: &still,
                 acceleration: &still,
             };
-            kinematics.update(model, state, &FrameMotion::standing(&gravity))?;
-            Ok(kinematics)
+            kinematics.update(model, state, motion)?;
+            Ok::<_, DynamicsError>(kinematics)
         };
-        let kinematics = pose(&positions(
+        let mut position = positions(
             setup,
             |limits| 0.0_f64.clamp(limits.lower, limits.upper),
             0.0,
-        ))?;
+        );
+        for (place, given) in position.iter_mut().zip(&posture.position) {
+            if given.is_finite() {
+                *place = *given;
+            }
+        }
+        let upright = FrameMotion::standing(&Vec3::new(0.0, 0.0, -STANDARD_GRAVITY));
+        let mut declared = None;
+        // Where gravity is known, and the link by which the robot is held.
+        let (known, motion, held, words) = match &setup.robot.base {
+            BaseMotion::Imu(x_li) => {
+                let measured = posture.proper_acceleration;
+                let base = setup.robot.base_link;
+                let (known, motion) = measured.map_or((0, upright), |proper| {
+                    let imu = FrameMotion::standing(&-proper);
+                    (base, FrameMotion::of_link_from_imu(&imu, x_li))
+                });
+                let whose = match measured {
+                    Some(_) => "gravity as the IMU measures it",
+                    None => "the root link's z axis up",
+                };
+                (known, motion, support(setup).unwrap_or(0), whose.to_owned())
+            }
+            BaseMotion::Standing(motion) => {
+                let base = setup.robot.base_link;
+                (base, *motion, base, gravity_words(motion))
+            }
+            BaseMotion::Stance(stances) => {
+                declared = stances.first().map(|stance| stance.contact);
+                let (link, motion) =
+                    (stances.first()).map_or((0, upright), |stance| (stance.link, stance.motion));
+                (link, motion, link, gravity_words(&motion))
+            }
+        };
+        let start = pose(&position, known, &motion)?;
+        let kinematics = pose(&position, held, start.motion(held))?;
         let mut dynamics = InverseDynamics::new(model);
         dynamics.update(model, &kinematics, &[])?;
-        let cuts = setup
+        let cuts = setup.robot.structure.sensors().iter();
+        let loads: Vec<Wrench> = cuts
+            .map(|cut| cut.reading(&dynamics.transmitted(&kinematics, cut.joint())))
+            .collect();
+        let measured = |number: usize| {
+            let raw = posture.measured.as_ref()?.get(number)?;
+            let calibration = setup.state.calibrations.get(number)?;
+            Some(calibration.apply(raw, f64::NAN))
+        };
+        let names = setup
             .robot
             .structure
             .sensors()
             .iter()
             .zip(setup.robot.sensor_names());
-        let sensors = cuts.map(|(cut, name)| AtRest {
+        let sensors = names.zip(&loads).enumerate();
+        let sensors = sensors.map(|(number, ((cut, name), load))| AtRest {
             name: name.to_owned(),
             mass: beyond[cut.joint() + 1],
-            reading: cut.reading(&dynamics.transmitted(&kinematics, cut.joint())),
+            reading: *load,
+            measured: measured(number),
+            offset: setup.known_offset(number),
         });
         let sensors: Vec<AtRest> = sensors.collect();
+        let posture = format!(
+            "{}; held at rest by {}, {words}; no contacts",
+            posture_words(setup, posture, &position),
+            model.link_name(held)
+        );
+        let withheld = Withheld::of(
+            setup,
+            &Still {
+                base: *kinematics.motion(setup.robot.base_link),
+                position,
+                declared,
+                loads,
+            },
+        );
         let loads = gravity_loads(model);
         let overloaded = model
             .joints()
@@ -105,7 +262,7 @@ impl Check {
             });
         // A general posture: where axes are aligned, the result would be a special case.
         let somewhere = |limits: Limits| limits.lower + 0.618 * (limits.upper - limits.lower);
-        let kinematics = pose(&positions(setup, somewhere, 0.7))?;
+        let kinematics = pose(&positions(setup, somewhere, 0.7), 0, &upright)?;
         let mut solver = Solver::new(&setup.robot.structure);
         let nothing = vec![Wrench::zero(); sensors.len()];
         solver.solve(
@@ -136,7 +293,10 @@ impl Check {
             .flat_map(|(_, subtree)| subtree.contacts.intersection(&setup.robot.always).iter());
         Ok(Self {
             mass: bodies.iter().map(|body| body.mass).sum(),
+            posture,
             sensors,
+            withheld,
+            refused,
             overloaded: overloaded.collect(),
             hiding: hiding
                 .map(|contact| setup.robot.contact_label(contact).to_owned())
@@ -181,31 +341,116 @@ fn positions(setup: &Setup, within: impl Fn(Limits) -> f64, without: f64) -> Vec
     positions
 }
 
+/// The link at which a robot with an IMU is held: that of the first contact that is always present
+/// and carries any load.
+fn support(setup: &Setup) -> Option<usize> {
+    let contacts = setup.robot.always.iter();
+    let mut specs = contacts.filter_map(|contact| setup.robot.structure.contacts().get(contact));
+    let spec = specs.find(|spec| spec.kind == ContactKind::Wrench)?;
+    Some(spec.frame.link)
+}
+
+/// Gravity in the axes of a link at rest, in words.
+fn gravity_words(motion: &FrameMotion) -> String {
+    let [x, y, z]: [f64; 3] = rounded(-motion.proper_acceleration).into();
+    format!("gravity [{x}, {y}, {z}] m/s^2 in its axes")
+}
+
+/// Where the joints are, in words.
+fn posture_words(setup: &Setup, posture: &Posture, position: &[f64]) -> String {
+    let named = setup
+        .robot
+        .joint_names()
+        .zip(position)
+        .zip(&posture.position);
+    let given: Vec<String> = named
+        .filter(|(_, given)| given.is_finite())
+        .map(|((name, position), _)| format!("{name} {}", (1e3 * position).round() / 1e3 + 0.0))
+        .collect();
+    let moved = if posture.moved > MOVED {
+        " (it moves, so what it measures is not at rest)"
+    } else {
+        ""
+    };
+    match (posture.measured.is_some(), given.is_empty()) {
+        (true, _) => format!("of the running robot{moved}: {}", given.join(", ")),
+        (false, true) => "joints at zero, or the nearest limit (--at JOINT=RAD)".to_owned(),
+        (false, false) => format!("{}, others at zero or the nearest limit", given.join(", ")),
+    }
+}
+
+/// Three numbers to a thousandth.
+fn rounded(three: Vec3) -> Vec3 {
+    // Adding 0.0 turns -0 into 0.
+    three.map(|x| (1e3 * x).round() / 1e3 + 0.0)
+}
+
+/// A wrench, in words.
+fn wrench(wrench: &Wrench) -> String {
+    let [fx, fy, fz]: [f64; 3] = rounded(wrench.force).into();
+    let [tx, ty, tz]: [f64; 3] = rounded(wrench.torque).into();
+    format!("force [{fx}, {fy}, {fz}] N, torque [{tx}, {ty}, {tz}] Nm")
+}
+
+impl Check {
+    fn write_withheld(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Withheld { reasons, largest } = &self.withheld;
+        if reasons.is_empty() {
+            write!(f, "withheld at rest in this posture: nothing")?;
+        } else {
+            writeln!(
+                f,
+                "withheld at rest in this posture, however well all channels work:"
+            )?;
+        }
+        for (why, names) in reasons {
+            writeln!(f, "  {}: {why}", names.join(", "))?;
+        }
+        if let Some((joint, std)) = largest {
+            let valid = if reasons.is_empty() {
+                ";"
+            } else {
+                "  all other torques:"
+            };
+            writeln!(f, "{valid} standard deviations up to {std:.3} Nm ({joint})")?;
+        } else if reasons.is_empty() {
+            writeln!(f)?;
+        }
+        Ok(())
+    }
+}
+
 impl fmt::Display for Check {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "mass of all links: {:.3} kg", self.mass)?;
+        writeln!(f, "posture: {}", self.posture)?;
         if !self.sensors.is_empty() {
-            writeln!(
-                f,
-                "readings of the F/T sensors without offsets, robot held at rest by the root link \
-                 (z axis up), joints at zero, no contacts:"
-            )?;
+            writeln!(f, "readings of the F/T sensors in it, without offsets:")?;
         }
-        for AtRest {
-            name,
-            mass,
-            reading,
-        } in &self.sensors
-        {
-            // Adding 0.0 turns -0 into 0.
-            let list = |three: Vec3| three.map(|x| (1e3 * x).round() / 1e3 + 0.0);
-            let ([fx, fy, fz], [tx, ty, tz]): ([f64; 3], [f64; 3]) =
-                (list(reading.force).into(), list(reading.torque).into());
+        for sensor in &self.sensors {
             writeln!(
                 f,
-                "  {name}: force [{fx}, {fy}, {fz}] N, torque [{tx}, {ty}, {tz}] Nm, from \
-                 {mass:.3} kg beyond it"
+                "  {}: {}, from {:.3} kg beyond it",
+                sensor.name,
+                wrench(&sensor.reading),
+                sensor.mass
             )?;
+            if let Some(measured) = &sensor.measured {
+                writeln!(f, "    measured now: {}", wrench(measured))?;
+                writeln!(
+                    f,
+                    "    the difference: {}; if nothing touches the robot, it is the offset",
+                    wrench(&(*measured - sensor.reading))
+                )?;
+            }
+            match &sensor.offset {
+                Some(offset) => writeln!(f, "    its offset in use: {}", wrench(offset))?,
+                None => writeln!(f, "    its offset is not known")?,
+            }
+        }
+        self.write_withheld(f)?;
+        if let Some(why) = &self.refused {
+            writeln!(f, "note: nothing can be identified on-line: {why}")?;
         }
         for (joint, load, effort) in &self.overloaded {
             writeln!(

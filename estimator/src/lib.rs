@@ -53,6 +53,7 @@ pub mod inertial;
 pub mod offline;
 pub mod parameters;
 pub mod pipeline;
+mod plausible;
 pub mod propagation;
 pub mod reading;
 pub mod setup;

@@ -8,10 +8,11 @@ use crate::config::{
 use crate::differentiate::Settings;
 use crate::inertial::InertialState;
 use crate::parameters::{Parameters, ParametersError};
+use crate::plausible;
 use crate::skin::{PatchSetup, TRIANGLE, TRIANGLES, Taxel, TaxelMap, threshold};
-use proprio_dynamics::calibration::{self, Calibration};
+use proprio_dynamics::calibration::{self, Calibration, UNKNOWN_OFFSET};
 use proprio_dynamics::model::{Frame, JointKind, MeasurementDirection, MeasurementFrame, Model};
-use proprio_dynamics::spatial::{Pose, Vec3};
+use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
 use proprio_dynamics::{
     ContactKind, ContactSet, ContactSpec, FrameMotion, Noise, SensorCut, Structure, StructureError,
 };
@@ -84,6 +85,7 @@ impl Setup {
     /// As [`Setup::new`].
     pub fn with_model(config: &Config, model: Model) -> Result<Self, String> {
         let mut warnings: Vec<String> = model.warnings().to_vec();
+        warnings.extend(plausible::check(config, &model)?);
         let identification = &config.identification;
         if identification.enabled && identification.inputs.contains(&IdentificationInput::Torque) {
             warnings.push(
@@ -333,6 +335,19 @@ impl Setup {
             .iter()
             .map(|c| (c.kind, c.name.as_str()));
         of_robot.chain(skins.map(|skin| (Kind::Skin, skin.channel.as_str())))
+    }
+
+    /// The offset in use of F/T sensor number `sensor`; none if it is not known.
+    #[must_use]
+    pub fn known_offset(&self, sensor: usize) -> Option<Wrench> {
+        let (_, deviation) = self.robot.offsets.get(sensor)?;
+        let name = self.robot.sensor_names().nth(sensor)?;
+        let is_identified = (self.state.identified())
+            .is_some_and(|found| found.offsets().iter().any(|offset| offset.sensor == name));
+        let is_known = is_identified || *deviation != UNKNOWN_OFFSET;
+        (is_known && !self.identifies)
+            .then(|| self.state.offsets.get(sensor).copied())
+            .flatten()
     }
 
     /// Whether channel number `channel` is an F/T sensor whose calibration depends on the

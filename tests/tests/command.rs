@@ -2865,10 +2865,19 @@ fn a_demonstration_learns_what_its_urdf_has_wrong() {
     }
     assert!(place.read("d/estimator.toml").contains("cad.urdf"));
     // The output is complete: both daemons run with it.
-    for program in ["gateway", "estimator"] {
+    let [_, told] = ["gateway", "estimator"].map(|program| {
         let config = format!("d/{program}.toml");
-        place.run(&[program, "--config", &config, "--check"]).good();
-    }
+        place.run(&[program, "--config", &config, "--check"]).good()
+    });
+    // The torques that were withheld before the motion, and why.
+    let why = "l_shoulder_yaw (+- ";
+    let line = told.out.lines().find(|line| line.contains(why));
+    let line = line.unwrap_or_else(|| panic!("{}", told.out));
+    assert!(
+        line.contains("until on-line identification has found the offset of l_arm_ft_sensor")
+            && !line.contains("l_elbow"),
+        "{line}"
+    );
 }
 
 #[test]

@@ -916,3 +916,44 @@ fn the_command_says_it_in_words() {
     good(&["status"], &["robot icub_left_arm"]);
     running.end();
 }
+
+/// `estimator --check` beside a running gateway: the readings to expect in the robot's own posture,
+/// and what is measured, which differs by the offset.
+#[test]
+fn a_check_compares_with_what_the_running_robot_measures() {
+    let running = Running::start(Arm::new(), &["--still", "600", "--no-push"]);
+    let check = |more: &[&str]| {
+        let arguments = ["estimator", "--config", &running.arm.estimator, "--check"];
+        let output = running.rig.run(&[&arguments[..], more].concat());
+        String::from_utf8(output.stdout).expect("text")
+    };
+    let text = check(&[]);
+    assert!(
+        text.contains("posture: of the running robot: l_shoulder_pitch "),
+        "{text}"
+    );
+    assert!(text.contains("gravity as the IMU measures it"), "{text}");
+    let numbers = |after: &str| -> Vec<f64> {
+        let line = text
+            .lines()
+            .find_map(|line| line.trim().strip_prefix(after));
+        let line = line.unwrap_or_else(|| panic!("{after}: {text}"));
+        let inside = line.split(['[', ']']).skip(1).step_by(2).take(2);
+        let each = inside.flat_map(|three| three.split(", "));
+        each.map(|number| number.parse().expect("a number"))
+            .collect()
+    };
+    let (offset, used) = (numbers("the difference: "), numbers("its offset in use: "));
+    // The load of 19 N and 1 Nm, turned by a degree: what noise of encoders and IMU amounts to at
+    // most, beside that of the sensor's mean.
+    let bounds = [0.5, 0.5, 0.5, 0.05, 0.05, 0.05];
+    for ((offset, used), bound) in offset.iter().zip(&used).zip(bounds) {
+        assert!((offset - used).abs() < bound, "{text}");
+    }
+    // A posture that is given needs no robot.
+    let text = check(&["--at", "l_elbow=1"]);
+    assert!(
+        text.contains("posture: l_elbow 1, others") && !text.contains("measured"),
+        "{text}"
+    );
+}
