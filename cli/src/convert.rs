@@ -8,7 +8,7 @@ use proprio_estimator::config::ConfigError;
 use proprio_estimator::reading::{self, ReadingError};
 use proprio_estimator::setup::Setup;
 use proprio_estimator::{files, offline as estimates};
-use proprio_gateway::log::LogFormat;
+use proprio_gateway::log::{LogFormat, Stamps};
 use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
 use proprio_identification::{Role, implausible};
@@ -28,6 +28,8 @@ pub(crate) struct Decode {
     /// name; - for standard input
     #[arg(long, value_name = "FILE")]
     log: PathBuf,
+    #[command(flatten)]
+    stamps: StatedStamps,
     /// The table to write; - for standard output
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
@@ -38,6 +40,32 @@ pub(crate) struct Decode {
     /// Print a summary of the conversion as JSON
     #[arg(long)]
     json: bool,
+}
+
+/// What the stamps of a recorded log mean.
+#[derive(clap::Args)]
+pub(crate) struct StatedStamps {
+    /// What the relative time stamps of a candump log count from: its start (candump -t z, or -t a
+    /// with a clock that was not set), or each from the line before (-t d); default: the whole log
+    /// tells
+    #[arg(long, value_name = "MEANING")]
+    stamps: Option<Meaning>,
+}
+
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum Meaning {
+    SinceStart,
+    SincePrevious,
+}
+
+impl StatedStamps {
+    pub(crate) const fn meaning(&self) -> Stamps {
+        match self.stamps {
+            None => Stamps::Detect,
+            Some(Meaning::SinceStart) => Stamps::SinceStart,
+            Some(Meaning::SincePrevious) => Stamps::SincePrevious,
+        }
+    }
 }
 
 /// `proprio encode`.
@@ -68,8 +96,8 @@ pub(crate) struct Estimate {
     #[arg(long, value_name = "FILE")]
     parameters: Option<PathBuf>,
     /// The table of samples; - for standard input
-    #[arg(long, value_name = "FILE")]
-    log: PathBuf,
+    #[arg(long, alias = "log", value_name = "FILE")]
+    samples: PathBuf,
     /// The table of estimates to write; - for standard output
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
@@ -223,7 +251,8 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
     } else {
         Columns::Main
     };
-    let report = offline::decode(&plan, log, out.writer(), columns)
+    let stamps = args.stamps.meaning();
+    let report = offline::decode_with(&plan, log, stamps, out.writer(), columns)
         .map_err(|e| with_file(e, &args.log, &args.out))?;
     // A result without rows does not replace an existing file.
     if report.samples > 0 {
@@ -232,6 +261,9 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
     }
     for bad in &report.bad {
         eprintln!("{}: skipped: {bad}", args.log.display());
+    }
+    if let Some(doubt) = &report.doubt {
+        eprintln!("{}: {doubt}", args.log.display());
     }
     if report.dropped > 0 {
         eprintln!(
@@ -273,7 +305,7 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
             .collect();
         let format = report.format.map(|format| format.to_string());
         let summary = json!({
-            "format": format,
+            "format": format, "stamps": report.stamps.word(),
             "frames": report.frames, "samples": report.samples, "unclaimed": report.unclaimed,
             "bad_lines": report.bad_lines, "other_interfaces": report.other_interfaces,
             "other_interface_names": report.other_names,
@@ -392,28 +424,28 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
     })?;
     warn_of_implausible(args, &setup);
     let mut assessor = args.assess.then(|| assessor(args, &setup)).transpose()?;
-    let log = input(&args.log)?;
+    let log = input(&args.samples)?;
     let mut out = Output::new(&args.out)?;
     let report = estimates::estimate(setup, log, out.writer(), assessor.as_mut());
     let report = match report {
         Ok(report) => report,
         Err(error @ estimates::OfflineError::MissingChannels(_)) => {
-            return Err(unfit(&args.config, &args.log, &error).into());
+            return Err(unfit(&args.config, &args.samples, &error).into());
         }
         Err(estimates::OfflineError::Write(error)) => {
             bail!("{}: cannot be written: {error}", args.out.display())
         }
-        Err(error) => return Err(error).with_context(|| args.log.display().to_string()),
+        Err(error) => return Err(error).with_context(|| args.samples.display().to_string()),
     };
     if report.estimates > 0 {
         out.finish()
             .with_context(|| args.out.display().to_string())?;
     }
-    report_table(&args.log, &report.log);
+    report_table(&args.samples, &report.log);
     if !report.unused_channels.is_empty() {
         eprintln!(
             "{}: not in {}: {}",
-            args.log.display(),
+            args.samples.display(),
             args.config.display(),
             report.unused_channels.join(", ")
         );
@@ -424,7 +456,7 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
             "{}: samples dropped, the first in line {}: {late} late (stamped before an estimate \
              that was already made), {backward} not later than their channel's last, \
              {not_finite} not finite",
-            args.log.display(),
+            args.samples.display(),
             report.first_dropped.unwrap_or_default()
         );
     }
@@ -459,7 +491,7 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
     if report.estimates == 0 {
         bail!(
             "{}: the trigger channel has no sample, so there is no estimate",
-            args.log.display()
+            args.samples.display()
         );
     }
     Ok(())
@@ -477,8 +509,8 @@ fn is_file(log: &Path) -> bool {
 /// Warns of implausible channels in the log before the estimation. Errors of reading are reported
 /// by the estimation itself; a log that can be read only once is not checked.
 fn warn_of_implausible(args: &Estimate, setup: &Setup) {
-    let log = is_file(&args.log)
-        .then(|| File::open(&args.log).ok())
+    let log = is_file(&args.samples)
+        .then(|| File::open(&args.samples).ok())
         .flatten();
     let robot = &setup.robot;
     let read = |log: File| reading::dataset(robot, "", Role::Validate, log.take(CHECKED)).ok();
@@ -488,7 +520,7 @@ fn warn_of_implausible(args: &Estimate, setup: &Setup) {
     for finding in found.into_iter().flatten() {
         eprintln!(
             "warning: {}: {}",
-            args.log.display(),
+            args.samples.display(),
             sentence(&finding.text)
         );
     }
@@ -496,13 +528,15 @@ fn warn_of_implausible(args: &Estimate, setup: &Setup) {
 
 /// Reads the log once before the estimation.
 fn assessor(args: &Estimate, setup: &Setup) -> anyhow::Result<Assessor> {
-    let log = input(&args.log)?;
-    if !is_file(&args.log) {
-        bail!("--assess reads the log twice: give a file with --log, not standard input or a pipe");
+    let log = input(&args.samples)?;
+    if !is_file(&args.samples) {
+        bail!(
+            "--assess reads the table twice: give a file with --samples, not standard input or a pipe"
+        );
     }
     Assessor::new(setup, log).map_err(|error| match error {
-        ReadingError::MissingChannels(_) => unfit(&args.config, &args.log, &error).into(),
-        error => anyhow::Error::from(error).context(args.log.display().to_string()),
+        ReadingError::MissingChannels(_) => unfit(&args.config, &args.samples, &error).into(),
+        error => anyhow::Error::from(error).context(args.samples.display().to_string()),
     })
 }
 

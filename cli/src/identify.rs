@@ -27,10 +27,10 @@ pub(crate) struct Args {
     /// estimator.toml
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// A log (CSV) to identify from; may be given several times
-    #[arg(long, value_name = "FILE", required = true)]
-    log: Vec<PathBuf>,
-    /// A log (CSV) for validation, not used for training; may be given several times
+    /// A table of samples to identify from; may be given several times
+    #[arg(long, alias = "log", value_name = "FILE", required = true)]
+    samples: Vec<PathBuf>,
+    /// A table of samples for validation, not used for training; may be given several times
     #[arg(long, value_name = "FILE")]
     validate: Vec<PathBuf>,
     /// Folder for summary.json, parameters.toml, identified.urdf and report.html
@@ -60,7 +60,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let urdf = fs::read_to_string(&config.model)
         .with_context(|| format!("{}: cannot be read", config.model.display()))?;
     let files: Vec<(&PathBuf, Role)> = args
-        .log
+        .samples
         .iter()
         .map(|f| (f, Role::Train))
         .chain(args.validate.iter().map(|f| (f, Role::Validate)))

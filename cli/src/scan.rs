@@ -1,5 +1,6 @@
 //! `proprio scan`: which devices are on a bus, or were when a log was recorded.
 
+use crate::convert::StatedStamps;
 use anyhow::Context as _;
 use proprio_drivers::recognise::Stream;
 use proprio_drivers::{ASKED_BY_NAME, Finding, Traffic};
@@ -43,6 +44,8 @@ pub(crate) struct Args {
     /// Scan a recorded log (any format that decode reads) instead of a bus
     #[arg(long, value_name = "FILE", conflicts_with_all = ["active", "ask", "seconds"])]
     log: Option<PathBuf>,
+    #[command(flatten)]
+    stamps: StatedStamps,
     #[command(flatten)]
     how: How,
     /// Print the findings as JSON
@@ -123,7 +126,7 @@ impl How {
 /// Scans a bus or a log, and prints what is found.
 pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     let mut buses = Vec::new();
-    let mut note = String::new();
+    let mut notes = Vec::new();
     match (&args.bus, &args.log) {
         (Some(bus), _) => {
             let source = parse_bus(bus)?;
@@ -135,11 +138,11 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
             buses.push((bus.clone(), how, heard.traffic));
         }
         (None, Some(log)) => {
-            let open = || -> std::io::Result<_> { scan::log(BufReader::new(File::open(log)?)) };
-            let (found, report) = open().with_context(|| log.display().to_string())?;
-            if report.bad > 0 {
-                note = format!("{} lines of the log could not be read", report.bad);
-            }
+            let open = || -> std::io::Result<_> {
+                scan::log(BufReader::new(File::open(log)?), args.stamps.meaning())
+            };
+            let (found, told) = open().with_context(|| log.display().to_string())?;
+            notes = told;
             let found = found.into_iter();
             buses.extend(found.map(|(name, heard)| (name, "a recorded log".to_owned(), heard)));
         }
@@ -159,7 +162,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     if args.json {
         print_line!("{}", Value::from(rows));
     }
-    if !note.is_empty() {
+    for note in notes {
         tracing::warn!("{note}");
     }
     Ok(())
@@ -257,7 +260,7 @@ fn as_text(name: &str, how: &str, heard: &Traffic, devices: &[Device]) -> String
     }
     let _ = writeln!(
         text,
-        "\n{:<8} {:>9} {:>8} {:>5}  {:<8} {:<16} device",
+        "\n{:<10} {:>9} {:>8} {:>5}  {:<8} {:<16} device",
         "id", "frames", "1/s", "bytes", "format", "changing bits"
     );
     let mut unknown = false;
@@ -275,7 +278,7 @@ fn as_text(name: &str, how: &str, heard: &Traffic, devices: &[Device]) -> String
         };
         let _ = writeln!(
             text,
-            "{:<8} {:>9} {:>8.1} {:>5}  {:<8} {:<16} {device}",
+            "{:<10} {:>9} {:>8.1} {:>5}  {:<8} {:<16} {device}",
             stream.id.to_string(),
             stream.frames + stream.remote,
             stream.rate(),

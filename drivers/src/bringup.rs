@@ -411,7 +411,8 @@ impl Bringup {
         inquiry: &mut impl Inquiry,
         out: &mut Decoded,
     ) -> Option<Transmit> {
-        // Each turn returns or advances to a later phase, so the loop ends.
+        // A turn that begins a wait returns: that wait is over at a later call, whatever the clock
+        // says. Every other turn returns or advances to a later phase, so the loop ends.
         loop {
             match self.phase {
                 Phase::Fresh if self.mode == Mode::Listen => {
@@ -421,15 +422,14 @@ impl Bringup {
                         now + self.timing.power_on_silence + self.listens_for()
                     };
                     self.phase = Phase::Watching { until };
+                    return None;
                 }
-                Phase::Fresh => {
-                    let until = if self.timing.power_on_silence > Nanos::ZERO {
-                        now + self.timing.power_on_silence
-                    } else {
-                        Nanos::MIN
-                    };
+                Phase::Fresh if self.timing.power_on_silence > Nanos::ZERO => {
+                    let until = now + self.timing.power_on_silence;
                     self.phase = Phase::Waiting { until };
+                    return None;
                 }
+                Phase::Fresh => self.phase = Phase::Waiting { until: Nanos::MIN },
                 Phase::Waiting { until } if now < until => return None,
                 Phase::Waiting { .. } => {
                     out.fault(Counter::Starts, 1, self.watched);
@@ -468,6 +468,7 @@ impl Bringup {
                 Phase::Watching { .. } if self.mode == Mode::Listen => {
                     self.starts = self.timing.attempts;
                     self.phase = Phase::Watching { until: Nanos::MAX };
+                    return None;
                 }
                 Phase::Watching { .. } => {
                     self.starts = self.timing.attempts.min(self.starts.saturating_add(1));

@@ -37,12 +37,21 @@ impl Id {
 }
 
 impl fmt::Display for Id {
-    /// As can-utils write it: three hexadecimal digits for a standard identifier, eight for an
+    /// `0x123`, or `0x1F334455`: three hexadecimal digits for a standard identifier, eight for an
     /// extended one.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Standard(id) => write!(f, "{id:03X}"),
-            Self::Extended(id) => write!(f, "{id:08X}"),
+        write!(f, "0x{}", Digits(*self))
+    }
+}
+
+/// An identifier as can-utils write it, as part of a frame: without `0x`.
+struct Digits(Id);
+
+impl fmt::Display for Digits {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.0 {
+            Id::Standard(id) => write!(f, "{id:03X}"),
+            Id::Extended(id) => write!(f, "{id:08X}"),
         }
     }
 }
@@ -184,21 +193,21 @@ impl fmt::Display for Frame {
     /// As can-utils' log format writes a frame, without stamp and interface: `31A#E380B76A1887`,
     /// `123##1AABB`, `123#R4`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let id = Digits(self.id);
         match self.format {
-            Format::Classic => write!(f, "{}#", self.id)?,
+            Format::Classic => write!(f, "{id}#")?,
             Format::Fd {
                 bit_rate_switch,
                 error_state,
             } => {
                 write!(
                     f,
-                    "{}##{:X}",
-                    self.id,
+                    "{id}##{:X}",
                     u8::from(bit_rate_switch) | u8::from(error_state) << 1
                 )?;
             }
-            Format::Remote if self.len == 0 => return write!(f, "{}#R", self.id),
-            Format::Remote => return write!(f, "{}#R{}", self.id, self.len),
+            Format::Remote if self.len == 0 => return write!(f, "{id}#R"),
+            Format::Remote => return write!(f, "{id}#R{}", self.len),
             // In that format the error flag is part of the identifier: 20000000 + classes.
             Format::Error => write!(f, "{:08X}#", self.id.raw() | 0x2000_0000)?,
         }

@@ -6,6 +6,7 @@
 use proprio_dynamics::calibration::{Calibration, Gain, UNKNOWN_OFFSET, gain_from_force_first};
 use proprio_dynamics::spatial::Wrench;
 use proprio_identification::robot::{IdentificationInput, TorqueSide};
+use proprio_topics::{ROBOT_NAME, is_robot_name};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
 use std::collections::BTreeMap;
@@ -537,6 +538,9 @@ impl Config {
                 self.schema
             ));
         }
+        if !is_robot_name(&self.robot) {
+            return Err(format!("robot = {:?}: {ROBOT_NAME}", self.robot));
+        }
         if let Some(Realtime {
             priority: Some(priority),
             ..
@@ -829,6 +833,11 @@ mod tests {
     #[test]
     fn each_mistake_has_one_clear_message() {
         for (from, to, expected) in [
+            (
+                "robot = \"icub\"",
+                "robot = \"-x\"",
+                "robot = \"-x\": a robot's name begins with a letter or a digit",
+            ),
             ("schema = 1", "schema = 3", "schema = 3 is not known"),
             (
                 "kind = \"fixed\"",

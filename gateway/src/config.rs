@@ -2,6 +2,7 @@
 //! uses this form.
 
 use crate::link::adapter::Adapter;
+use crate::log::Stamps;
 use serde::Deserialize;
 use std::path::PathBuf;
 use toml::Spanned;
@@ -64,6 +65,9 @@ pub enum Source {
         /// The replay speed.
         #[serde(default)]
         pace: Pace,
+        /// What relative stamps count from; by default the log tells.
+        #[serde(default)]
+        stamps: Stamps,
     },
 }
 

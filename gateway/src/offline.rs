@@ -6,7 +6,7 @@ use crate::decoder::Decoder;
 use crate::joints::Inverse;
 use crate::link::adapter::Adapter;
 use crate::link::replay::Matching;
-use crate::log::{self, LogFormat, candump};
+use crate::log::{self, LogFormat, Stamps, candump};
 use crate::plan::{BusPlan, ChannelPlan, Plan};
 use crate::status::BusStatus;
 use proprio_drivers::{Board, Format, Frame, Frames, Mode, Spec};
@@ -70,6 +70,10 @@ pub struct DecodeReport {
     pub bad_lines: u64,
     /// The first of them, with number and error.
     pub bad: Vec<String>,
+    /// The meaning of relative stamps; [`Stamps::Detect`] if there are none.
+    pub stamps: Stamps,
+    /// What a person should be told if that is a guess: it can be stated with `--stamps`.
+    pub doubt: Option<String>,
     /// The result per device.
     pub devices: Vec<DeviceReport>,
 }
@@ -172,6 +176,20 @@ pub fn decode(
     table: impl Write,
     columns: Columns,
 ) -> Result<DecodeReport, OfflineError> {
+    decode_with(plan, log, Stamps::Detect, table, columns)
+}
+
+/// As [`decode`], with the meaning of relative stamps stated.
+///
+/// # Errors
+/// As [`decode`].
+pub fn decode_with(
+    plan: &Plan,
+    log: impl BufRead,
+    stamps: Stamps,
+    table: impl Write,
+    columns: Columns,
+) -> Result<DecodeReport, OfflineError> {
     let series: Vec<Series> = plan
         .channels
         .iter()
@@ -195,7 +213,7 @@ pub fn decode(
     let mut report = DecodeReport::default();
     let mut order = InOrder::new(REORDER);
     let mut failure = None;
-    let mut reader = log::Reader::new(log);
+    let mut reader = log::Reader::with_stamps(log, stamps);
     let mut last_bus = 0;
     let takes = |matching: &Option<Matching>, interface: &str| {
         matching.as_ref().is_none_or(|m| m.takes(interface))
@@ -257,6 +275,7 @@ pub fn decode(
     (report.bad_lines, report.dropped) = (reader.report().bad, reader.report().dropped);
     report.format = reader.format();
     report.bad = reader.bad().collect();
+    (report.stamps, report.doubt) = (reader.stamps(), reader.doubt(log::STAMPS_OPTION));
     if report.frames == 0 {
         return Err(OfflineError::NoFrame(reader.why_empty()));
     }

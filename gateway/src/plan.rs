@@ -15,10 +15,12 @@ use crate::joints::{CouplingPlan, Feed, Layout, Takes, Target};
 use crate::link::adapter::Adapter;
 use crate::link::replay::Matching;
 use crate::load::{self, BitRates, Load, Member};
+use crate::log::Stamps;
 use crate::{dbc, eds};
 use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, OutputInfo, Outputs, Spec};
 use proprio_topics::{
-    Description, Entry, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, Role,
+    Description, Entry, Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, Publisher, ROBOT_NAME, Role,
+    is_robot_name,
 };
 use std::f64::consts::TAU;
 use std::fmt::{self, Write as _};
@@ -257,7 +259,9 @@ impl Builder<'_> {
                 raw.schema
             ));
         }
-        check_service_name("robot", &raw.robot)?;
+        if !is_robot_name(&raw.robot) {
+            return Err(format!("robot = {:?}: {ROBOT_NAME}", raw.robot));
+        }
         if raw.bus.is_empty() {
             return Err("there is no [[bus]]: a gateway needs at least one".into());
         }
@@ -711,22 +715,6 @@ fn check_name(place: &str, name: &str) -> Result<(), String> {
     Ok(())
 }
 
-/// Checks a name that is part of a service name: the transport allows only 7-bit ASCII.
-fn check_service_name(place: &str, name: &str) -> Result<(), String> {
-    let fits = !name.is_empty() && name.len() <= Name::CAPACITY;
-    if !fits
-        || !name
-            .bytes()
-            .all(|b| b.is_ascii_alphanumeric() || matches!(b, b'_' | b'-' | b'.'))
-    {
-        return Err(format!(
-            "{place} = {name:?} must have 1 to {} letters, digits, _ - or .",
-            Name::CAPACITY
-        ));
-    }
-    Ok(())
-}
-
 impl fmt::Display for Plan {
     /// A readable table; `proprio gateway --check` prints it.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -742,16 +730,17 @@ impl fmt::Display for Plan {
                 Source::SocketCan(Adapter::Interface(name)) => format!("CAN interface {name}"),
                 Source::SocketCan(named) => format!("CAN adapter with {named}"),
                 Source::Virtual { name } => format!("virtual bus {name}"),
-                Source::Replay { log, pace } => {
-                    format!(
-                        "log {} ({})",
-                        log.display(),
-                        if *pace == Pace::Fast {
-                            "fast"
-                        } else {
-                            "as recorded"
-                        }
-                    )
+                Source::Replay { log, pace, stamps } => {
+                    let pace = match pace {
+                        Pace::Fast => "fast",
+                        Pace::Recorded => "as recorded",
+                    };
+                    let stamps = match stamps {
+                        Stamps::Detect => "",
+                        Stamps::SinceStart => ", stamps since its start",
+                        Stamps::SincePrevious => ", stamps since the previous line",
+                    };
+                    format!("log {} ({pace}{stamps})", log.display())
                 }
             };
             write!(f, "\nbus {}: {source}", bus.name)?;
@@ -959,7 +948,12 @@ mod tests {
             (
                 "robot = \"icub\"",
                 "robot = \"i cub\"",
-                "robot = \"i cub\" must have",
+                "robot = \"i cub\": a robot's name begins with a letter or a digit",
+            ),
+            (
+                "robot = \"icub\"",
+                "robot = \"..\"",
+                "robot = \"..\": a robot's name begins with a letter or a digit",
             ),
             (
                 "robot = \"icub\"",
@@ -1118,7 +1112,7 @@ mod tests {
                       address = 13\n [[bus.device]]";
         let problem = problem("[[bus.device]]", second);
         assert!(
-            problem.contains("\"ft\" and \"ft2\" both claim identifier 3DA"),
+            problem.contains("\"ft\" and \"ft2\" both claim identifier 0x3DA"),
             "{problem}"
         );
     }

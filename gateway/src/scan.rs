@@ -101,13 +101,17 @@ pub fn ask(
     Ok(asked.len())
 }
 
-/// What was heard on each interface of a recorded log, and what is to be said of the log.
+/// What was heard on each interface of a recorded log, whose relative stamps mean `stamps`, and
+/// what is to be told of the log.
 ///
 /// # Errors
 /// A read error, or why there is no frame in it.
-pub fn log(file: impl BufRead) -> io::Result<(BTreeMap<String, Traffic>, log::Report)> {
+pub fn log(
+    file: impl BufRead,
+    stamps: log::Stamps,
+) -> io::Result<(BTreeMap<String, Traffic>, Vec<String>)> {
     let mut buses: BTreeMap<String, Traffic> = BTreeMap::new();
-    let mut reader = log::Reader::new(file);
+    let mut reader = log::Reader::with_stamps(file, stamps);
     while let Some(record) = reader.next_record()? {
         match buses.get_mut(record.interface) {
             Some(heard) => heard.on_frame(&record.frame),
@@ -122,8 +126,16 @@ pub fn log(file: impl BufRead) -> io::Result<(BTreeMap<String, Traffic>, log::Re
         let why = reader.why_empty();
         return Err(io::Error::new(io::ErrorKind::InvalidData, why));
     }
-    let report = reader.report().clone();
-    Ok((buses, report))
+    let mut notes = Vec::new();
+    if let Some(first) = reader.bad().next() {
+        let parts = reader.format().map_or("lines", log::LogFormat::parts);
+        let bad = reader.report().bad;
+        notes.push(format!(
+            "{bad} {parts} of the log were skipped; the first is {first}"
+        ));
+    }
+    notes.extend(reader.doubt(log::STAMPS_OPTION));
+    Ok((buses, notes))
 }
 
 #[cfg(test)]
@@ -271,11 +283,12 @@ mod tests {
     #[test]
     fn each_interface_of_a_log_is_a_bus() {
         let text = "(1.0) can0 31A#000000000000\n(1.1) can1 123#01\n(1.2) can0 123#02\nbad\n";
-        let (buses, report) = log(text.as_bytes()).unwrap();
+        let (buses, notes) = log(text.as_bytes(), log::Stamps::Detect).unwrap();
         let counts: Vec<(&str, usize)> = (buses.iter())
             .map(|(name, heard)| (name.as_str(), heard.streams().count()))
             .collect();
         assert_eq!(counts, [("can0", 2), ("can1", 1)]);
-        assert_eq!((report.records, report.bad), (3, 1));
+        assert_eq!(notes.len(), 1);
+        assert!(notes[0].starts_with("1 lines of the log were skipped; the first is line 4: "));
     }
 }

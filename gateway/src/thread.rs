@@ -106,13 +106,9 @@ impl BusThread {
         let listens = bus.listen_only || matches!(bus.source, Source::Replay { .. });
         let mode = listens.then_some(Mode::Listen);
         let decoder = Decoder::new(number, bus, mode, Arc::clone(&status))?;
-        let mut link: Box<dyn Link> = if let Source::Replay { log, pace } = &bus.source {
-            let mut replay = Replay::open(
-                log,
-                *pace,
-                plan.matching(number as usize),
-                &decoder.claims(),
-            )?;
+        let mut link: Box<dyn Link> = if let Source::Replay { log, pace, stamps } = &bus.source {
+            let matching = plan.matching(number as usize);
+            let mut replay = Replay::open_with(log, *pace, *stamps, matching, &decoder.claims())?;
             replay.start_at(replay_start);
             Box::new(replay)
         } else {
@@ -196,7 +192,9 @@ pub fn open_link(
             Box::new(link)
         }
         Source::Virtual { name } => Box::new(VirtualBus::open(domain, name, claims)?),
-        Source::Replay { log, pace } => Box::new(Replay::open(log, *pace, None, claims)?),
+        Source::Replay { log, pace, stamps } => {
+            Box::new(Replay::open_with(log, *pace, *stamps, None, claims)?)
+        }
     })
 }
 

@@ -296,7 +296,7 @@ fn what_is_written_is_what_candump_writes() {
 #[test]
 fn relative_stamps_are_told_apart() {
     for (log, stamps) in [
-        (SCREEN_T_ZERO, Stamps::SinceOrigin),
+        (SCREEN_T_ZERO, Stamps::SinceStart),
         (SCREEN_T_DELTA, Stamps::SincePrevious),
     ] {
         let (records, reader) = read(log.as_bytes());
@@ -322,6 +322,11 @@ fn relative_stamps_are_told_apart() {
         last = record.stamp.unwrap();
     }
     assert_eq!(last, Nanos::from_micros(RELATIVE_US.iter().sum()));
+    // Both are short: what they mean is a guess, which is told.
+    for log in [SCREEN_T_ZERO, SCREEN_T_DELTA] {
+        let doubt = read(log.as_bytes()).1.doubt("--stamps").unwrap();
+        assert!(doubt.ends_with("State it with --stamps"), "{doubt}");
+    }
     // The log format has no stamps since the previous line; other programs write short ones since
     // the origin.
     let (records, reader) = read(b"(0.5) can0 123#\n(0.45) can0 123#\n(0.75) can0 123#\n");
@@ -333,6 +338,194 @@ fn relative_stamps_are_told_apart() {
         [500, 450, 750]
     );
     assert_eq!(reader.report().backwards, 1);
+}
+
+/// A screen log with these stamps.
+fn screen(us: &[i64]) -> String {
+    let line = |us: &i64| {
+        let (s, us) = (us / 1_000_000, us % 1_000_000);
+        format!(" ({s:03}.{us:06})  can0  123   [1]  00\n")
+    };
+    us.iter().map(line).collect()
+}
+
+/// The stamps read \[us\], whether they were added up, and whether that is told as a guess.
+fn meaning(us: &[i64]) -> (Vec<i64>, Stamps, bool) {
+    let log = screen(us);
+    let (records, reader) = read(log.as_bytes());
+    let stamps = records.iter().map(|r| r.stamp.unwrap().0 / 1_000);
+    (
+        stamps.collect(),
+        reader.stamps(),
+        reader.doubt("").is_some(),
+    )
+}
+
+/// Each added to those before.
+fn added_up(us: &[i64]) -> Vec<i64> {
+    let mut sum = 0;
+    let add = |us: &i64| {
+        sum += us;
+        sum
+    };
+    us.iter().map(add).collect()
+}
+
+#[test]
+fn the_whole_log_tells_relative_stamps_apart() {
+    let mut random = 7_u64;
+    let mut noise = |most: i64| {
+        random = random
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1);
+        (random >> 33) as i64 % (2 * most + 1) - most
+    };
+    // Of a bus with a frame every 10 ms: one step back of 15 us, as of a host with several
+    // processors.
+    let zero = [0, 10_113, 10_098, 20_101, 30_107, 40_099, 50_102, 60_102];
+    assert_eq!(meaning(&zero).0, zero);
+    // Steps of each interface's turn: the second is read 3 ms late.
+    let turns: Vec<i64> = (0..400)
+        .map(|i| i * 500 + if i % 2 == 1 { 0 } else { 3_000 })
+        .collect();
+    // A recording that begins in the middle.
+    let middle: Vec<i64> = (0..40).map(|i| 7_000_000 + i * 1_000).collect();
+    // A clock that was not set (`-t a`), and a silence.
+    let silence: Vec<i64> = (0..40)
+        .map(|i| i * 1_000 + i / 20 * 3_600_000_000)
+        .collect();
+    // Three frames of each instant, as a program makes them.
+    let made: Vec<i64> = (0..60).map(|i| i / 3 * 10_000).collect();
+    // More lines than are in the reader's buffer before the first step back.
+    let mut long: Vec<i64> = (0..3_000).map(|i| i * 1_000).collect();
+    long[2_900] -= 1_500;
+    for since_start in [&turns, &middle, &silence, &made, &long] {
+        let (stamps, means, doubtful) = meaning(since_start);
+        assert_eq!((&stamps, means), (since_start, Stamps::SinceStart));
+        assert!(!doubtful, "{since_start:?}");
+    }
+    let jitter: Vec<i64> = (0..40)
+        .map(|i| i64::from(i > 0) * (10_000 + noise(60)))
+        .collect();
+    let exact = vec![10_000; 40];
+    let burst: Vec<i64> = (0..64)
+        .map(|i| if i % 8 == 0 { 9_300 + noise(5) } else { 100 })
+        .collect();
+    // A bus that became slow: all its stamps are later than those before.
+    let slow: Vec<i64> = (0..400)
+        .map(|i| i / 200 * 100_000 + 1_000 + noise(1))
+        .collect();
+    let mut long: Vec<i64> = (0..3_000).map(|i| 1_000 + i / 2_000 * 50).collect();
+    long[2_900] = 990;
+    for since_previous in [&jitter, &exact, &burst, &slow, &long] {
+        let (stamps, means, doubtful) = meaning(since_previous);
+        assert_eq!(
+            (stamps, means),
+            (added_up(since_previous), Stamps::SincePrevious)
+        );
+        assert!(!doubtful, "{since_previous:?}");
+    }
+    // What both meanings agree on is no guess.
+    for us in [&[][..], &[0], &[7], &[0, 5_000], &[0, 0, 0]] {
+        let (stamps, _, doubtful) = meaning(us);
+        assert_eq!((stamps, doubtful), (added_up(us), false), "{us:?}");
+    }
+    // It does not depend on the buffer.
+    let text = screen(&turns);
+    let small = BufReader::with_capacity(64, text.as_bytes());
+    let mut reader = Reader::new(small);
+    while reader.next_record().unwrap().is_some() {}
+    assert_eq!(
+        (reader.stamps(), reader.report().bad),
+        (Stamps::SinceStart, 0)
+    );
+    assert_eq!(reader.report().lines, 400);
+}
+
+#[test]
+fn a_stated_meaning_holds_for_short_stamps_of_both_formats() {
+    let log = "(1.0) can0 123#\n(0.5) can0 123#\n(1436509052.0) can0 123#\n";
+    let mut reader = Reader::with_stamps(log.as_bytes(), Stamps::SincePrevious);
+    let mut stamps = Vec::new();
+    while let Some(record) = reader.next_record().unwrap() {
+        stamps.push(record.stamp.unwrap().to_string());
+    }
+    assert_eq!(stamps, ["1", "1.5", "1436509052"]);
+}
+
+/// `candump -c`, `-c -c`, and other sequences that begin with `ESC [`.
+#[test]
+fn colours_are_ignored() {
+    let plain = " (1700000000.100000)  can0  123   [2]  34 00\n";
+    let lines = [
+        " (1700000000.100000)  \x1b[34mcan0\x1b[0m  123   [2]  34 00\n",
+        "\x1b[1;31m (1700000000.100000)  can0  123   [2]  34 00\x1b[0m\n",
+        " (1700000000.100000)  \x1b[38;5;208mcan0  123\x1b[m   [2]  34 \x1b[K00\n",
+        "\x1b[0m (1700000000.100000)  \x1b[34mcan0  123   [2]  34 00\r\n",
+    ];
+    for line in lines {
+        let (records, reader) = read(line.as_bytes());
+        assert_eq!(
+            (&records, reader.report().bad),
+            (&read(plain.as_bytes()).0, 0),
+            "{line:?}"
+        );
+    }
+    // Relative stamps in colours are told apart, too.
+    let coloured = screen(&[10_000; 40]).replace("can0", "\x1b[34mcan0\x1b[0m");
+    assert_eq!(read(coloured.as_bytes()).1.stamps(), Stamps::SincePrevious);
+    // Of a name, nothing else reaches a terminal either.
+    for name in [
+        "ca\x07n0",
+        "\x1b]0;title\x07can0",
+        "can\u{9b}0",
+        "\x1bcan0\x7f",
+    ] {
+        let log = format!("(1.0) {name} 123#00\n");
+        let (records, reader) = read(log.as_bytes());
+        assert_eq!((records.len(), reader.report().bad), (0, 1), "{name:?}");
+    }
+}
+
+/// A stamp at an end of the range, of any form, costs its own frame.
+#[test]
+fn a_stamp_out_of_range_costs_one_frame() {
+    const ENDS: [&str; 4] = [
+        "9223372036.854775807",
+        "9223372036.0",
+        "-9223372036.854775807",
+        "99999999999999999999",
+    ];
+    for end in ENDS {
+        for place in 0..3 {
+            let mut stamps = vec!["1700000000.0", "1700000000.1"];
+            stamps.insert(place, end);
+            let log: String = stamps
+                .iter()
+                .map(|t| format!("({t}) can0 123#\n"))
+                .collect();
+            let (records, reader) = read(log.as_bytes());
+            assert_eq!((records.len(), reader.report().bad), (2, 1), "{log}");
+            let line = reader.report().first_bad[0].0;
+            assert_eq!(line, place as u64 + 1);
+            assert_eq!(reader.report().backwards, 0, "{log}");
+        }
+    }
+    // Each since the previous line: the others count on as if it were not there.
+    let mut log = screen(&[10_000; 12]);
+    let far = " (999999999.0)  can0  123   [1]  00\n (9223372036.0)  can0  123   [1]  00\n";
+    log.insert_str(log.len() / 2, far);
+    let mut reader = Reader::with_stamps(log.as_bytes(), Stamps::SincePrevious);
+    let mut count = 0;
+    while let Some(record) = reader.next_record().unwrap() {
+        count += 1;
+        assert!(record.stamp.unwrap().is_instant());
+    }
+    assert_eq!((count, reader.report().bad), (13, 1));
+    // A relative stamp may be negative.
+    let log = " (-00.000015)  can0  123   [1]  00\n (-1.5)  can0  123   [1]  00\n";
+    let (records, _) = read(log.as_bytes());
+    assert_eq!(records.len(), 2);
 }
 
 #[test]
@@ -628,7 +821,7 @@ proptest! {
     #[test]
     fn what_is_written_is_read(
         mut records in proptest::collection::vec(
-            (any_frame(), any::<i64>(), "[a-z_.0-9A-Zäß-]{1,20}"), 0..20
+            (any_frame(), -(i64::MAX / 2)..=i64::MAX / 2, "[a-z_.0-9A-Zäß-]{1,20}"), 0..20
         ),
         buffer in 1_usize..200,
     ) {

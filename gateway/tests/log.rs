@@ -355,10 +355,153 @@ fn the_start_of_a_text_of_vector_is_that_of_its_measurement() {
     assert_eq!(first(header).0, 1_506_783_973_500_000_000);
     let header = format!("{header}\n 0.0 Start of measurement");
     assert_eq!(first(&header).0, 1_506_783_980_500_000_000);
-    // A date in another language is told, and the times count from the start.
-    let found = read("date lun juil. 30 15:06:13 2017\n 0.5 1 100 Rx d 0\n".as_bytes());
+    // asammdf writes microseconds, and no trigger block.
+    for (fraction, ns) in [
+        (".123456", 123_456_000),
+        (".1234", 123_400_000),
+        (".123456789", 123_456_789),
+        (",123456", 123_456_000),
+        (".12", 12_000_000),
+    ] {
+        let date = format!("date Mon May 06 07:08:09{fraction} AM 2024\nbase hex");
+        assert_eq!(first(&date).0, 1_714_979_289_500_000_000 + ns, "{fraction}");
+    }
+    // Other languages, in UTF-8 and Latin-1, and other orders.
+    for date in [
+        "lun. juil. 30 15:06:13 2018",
+        "lun lug 30 15:06:13 2018",
+        "seg jul 30 15:06:13 2018",
+        "Mo 30. Juli 2018 15:06:13",
+        "30 Jul 2018, 03:06:13 p.m.",
+        "Mon 2018-07-30 15:06:13.000000",
+        "Mo 30.07.2018 15:06:13 h",
+        "Mon Jul 30 15:06:13 pm 2018",
+    ] {
+        let start = 1_532_963_173_500_000_000;
+        assert_eq!(
+            first(&format!("date {date}\nbase hex")),
+            (start, 0),
+            "{date}"
+        );
+    }
+    for (month, seconds) in [
+        ("f\u{e9}vr.", 1_517_443_200),
+        ("ao\u{fb}t", 1_533_081_600),
+        ("d\u{e9}c.", 1_543_622_400),
+        ("J\u{e4}n", 1_514_764_800),
+        ("avr.", 1_522_540_800),
+        ("juin", 1_527_811_200),
+        ("ott", 1_538_352_000),
+        ("ene", 1_514_764_800),
+    ] {
+        let text = format!("date mar. {month} 1 00:00:00 2018\n 0.5 1 100 Rx d 0\n");
+        let latin: Vec<u8> = text.chars().map(|c| u8::try_from(c).unwrap()).collect();
+        for bytes in [text.as_bytes(), &latin] {
+            assert_eq!(
+                stamps(&read(bytes)),
+                [seconds * 1_000_000_000 + 500_000_000],
+                "{month}"
+            );
+        }
+    }
+    // A date that cannot be read is told, and the times count from the start.
+    let found = read("date Mon 7/8 15:06:13 2017\n 0.5 1 100 Rx d 0\n".as_bytes());
     assert_eq!(found.report.first_bad.as_slice(), [(1, LineError::Date)]);
     assert_eq!(stamps(&found), [500_000_000]);
+}
+
+/// CANoe with symbolic names: the identifier is at the end of the line, in decimal.
+#[test]
+fn messages_of_vector_may_have_names() {
+    let log = "date Sat Sep 30 03:06:13.191 pm 2017\n\
+               base hex  timestamps absolute\n\
+               0.037 1  BRAKE_01   Rx   d 4 34 00 00 08  Length = 160000 BitCount = 84 ID = 1638\n\
+               0.038 1  EF         Rx   d 2 C0 C0  Length = 124000 BitCount = 66 ID = 1623\n\
+               0.039 1  EEC1       Rx   d 1 11  Length = 124000 BitCount = 66 ID = 217056256x\n\
+               0.040 1  ADD        Tx   r 8 Length = 124000 BitCount = 66 ID = 291\n\
+               0.041 1  18EBFF00x  Rx   d 1 22  Length = 124000 BitCount = 66 ID = 418119424x\n\
+               0.042 1  Unknown    Rx   d 1 33\n\
+               0.043 1  ADD        Rx   d 1 44\n\
+               0.044 1  Large      Rx   d 1 44 ID = 2048\n";
+    let found = read(log.as_bytes());
+    let expected = [
+        classic(1638, &[0x34, 0, 0, 8]),
+        classic(1623, &[0xC0, 0xC0]),
+        Frame::new(Id::extended(0x0CF0_0400), &[0x11]),
+        Frame::remote(Id::standard(291), 8),
+        Frame::new(Id::extended(0x18EB_FF00), &[0x22]),
+    ];
+    assert_eq!(frames(&found), expected);
+    // Without an identifier at the end of the line, what can be a number is one.
+    let bad: Vec<_> = found
+        .report
+        .first_bad
+        .iter()
+        .map(|(line, _)| *line)
+        .collect();
+    assert_eq!(bad, [8, 9, 10]);
+    assert_eq!(found.report.first_bad[0].1, LineError::Symbolic);
+    // Cut off, it is none of these lines: an identifier may be half, or not there yet.
+    let line = log.lines().nth(3).unwrap();
+    for end in 0..line.len() {
+        let cut = format!("base hex\n{}", &line[..end]);
+        assert_eq!(read(cut.as_bytes()).entries.len(), 0, "{cut}");
+    }
+}
+
+/// A stamp at an end of the range costs its own record, in every format.
+#[test]
+fn a_time_out_of_range_costs_one_record() {
+    let message = |t: i64, flags: u32| {
+        let mut body = vec![1, 0, 0, 1, 1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0];
+        body.extend([0; 8]);
+        padded(object(86, 1, flags, t, &body))
+    };
+    for (t, flags) in [
+        (i64::MAX, 2),
+        (i64::MIN, 2),
+        (i64::MAX / 2 + 1, 2),
+        (i64::MAX, 1),
+        (i64::MAX / 10_000, 1),
+        (i64::MIN, 1),
+    ] {
+        let objects = [numbered(1), message(t, flags), numbered(2)].concat();
+        for container in [container(0, &objects), container(2, &objects)] {
+            let found = read(&blf(&[&container]));
+            assert_eq!(stamps(&found), [BLF_START + 1, BLF_START + 2], "{t}");
+            assert_eq!(
+                found.report.first_bad.as_slice(),
+                [(2, LineError::Range)],
+                "{t}"
+            );
+        }
+    }
+    let far = "9223372036.8";
+    let asc = |base: &str| {
+        let log = format!(
+            "date Sat Sep 30 15:06:13 2017\nbase hex timestamps {base}\n\
+             0.5 1 100 Rx d 0\n{far} 1 100 Rx d 0\n-{far} 1 100 Rx d 0\n0.6 1 100 Rx d 0\n"
+        );
+        read(log.as_bytes())
+    };
+    let start = 1_506_783_973_000_000_000;
+    for (base, last) in [("absolute", 600_000_000), ("relative", 1_100_000_000)] {
+        let found = asc(base);
+        assert_eq!(
+            stamps(&found),
+            [start + 500_000_000, start + last],
+            "{base}"
+        );
+        assert_eq!(found.report.bad, 2, "{base}");
+    }
+    let trc = "1) 1.0 Rx 0100 0\n2) 9223372036800 Rx 0100 0\n3) 2.0 Rx 0100 0\n";
+    let found = read(format!(";$FILEVERSION=1.1\n{trc}").as_bytes());
+    assert_eq!(stamps(&found), [1_000_000, 2_000_000]);
+    let csv = "timestamp,arbitration_id,extended,remote,error,dlc,data\n\
+               1.0,0x1,0,0,0,0,\n9.2e+09,0x1,0,0,0,0,\n-9223372036,0x1,0,0,0,0,\n\
+               1.1,0x1,0,0,0,0,\n";
+    let found = read(csv.as_bytes());
+    assert_eq!((stamps(&found).len(), found.report.bad), (2, 2));
 }
 
 #[test]
@@ -372,6 +515,7 @@ fn faults_in_a_text_of_vector_are_named() {
         ("1.0", LineError::NoFrame),
         ("1.0 1", LineError::NoFrame),
         ("1.0 1 10G Rx d 0", LineError::Number),
+        ("1.0 1 G10 Rx d 0", LineError::Symbolic),
         (
             "1.0 1 800 Rx d 0",
             LineError::IdentifierRange {

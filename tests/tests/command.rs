@@ -404,7 +404,7 @@ fn a_wrong_gateway_toml_is_told_with_file_place_and_what_would_be_legal() {
             &[
                 "l_shoulder_roll_motor",
                 "l_shoulder_pitch_motor",
-                "both claim identifier 110",
+                "both claim identifier 0x110",
             ],
         ),
         (

@@ -409,7 +409,7 @@ fn the_address_shifts_the_identifiers() {
     let problem = options.device(&spec(0x7F0, Mode::Listen, &[])).map(|_| ());
     let problem = problem.unwrap_err().to_string();
     assert!(
-        problem.contains("the identifier 010 plus address is too large"),
+        problem.contains("the identifier 0x010 plus address is too large"),
         "{problem}"
     );
 }

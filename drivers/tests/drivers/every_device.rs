@@ -4,7 +4,7 @@
 
 use crate::recognise::{BOARDS, Bus, Row, readings, recorded};
 use crate::rig::{Rig, board, count, decode, encode, listener, options, spec};
-use proprio_drivers::{Decoded, Device, Frame, Id, Mode, Options, Output, State};
+use proprio_drivers::{Decoded, Device, Frame, Id, Mode, NotSent, Options, Output, State};
 use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, Skin, StampKind, Wrench};
 
 fn device(row: &Row, mode: Mode) -> Box<dyn Device> {
@@ -90,6 +90,43 @@ fn a_start_gets_over_lost_answers() {
                 state == State::Streaming && readings >= 10,
                 "{row:?}: {lost}"
             );
+        }
+    }
+}
+
+/// Arithmetic of instants saturates: at the ends of their range a wait is over as soon as it
+/// begins. Every call ends all the same.
+#[test]
+fn no_device_turns_for_ever_at_an_end_of_time() {
+    for row in BOARDS {
+        let frames = recorded(row, 200);
+        let ends = [
+            Nanos::MIN,
+            Nanos(i64::MIN + 1),
+            Nanos(i64::MAX - 1),
+            Nanos::MAX,
+        ];
+        let modes = [Mode::Listen, Mode::Supervise];
+        for (mode, now) in modes
+            .into_iter()
+            .flat_map(|mode| ends.map(|end| (mode, end)))
+        {
+            let mut device = device(row, mode);
+            let mut out = Decoded::new();
+            for frame in frames.iter().take(100) {
+                out = Decoded::new();
+                device.on_frame(&frame.at(now, StampKind::Log), &mut out);
+                // One frame is under way at a time; it is not sent, as of a log.
+                if let Some(transmit) = device.poll_transmit(now, &mut out) {
+                    assert_eq!(mode, Mode::Supervise, "{row:?}");
+                    device.on_sent(&transmit.frame, Err(NotSent::Refused));
+                }
+                device.next_wake();
+            }
+            device.restart(now);
+            device.poll_transmit(now, &mut out);
+            device.stop(now);
+            device.poll_transmit(now, &mut out);
         }
     }
 }

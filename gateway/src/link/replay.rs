@@ -14,7 +14,7 @@
 use super::{Link, LinkCounters, OpenError, Received, SendError, passes};
 use crate::clock::{Clock, Monotonic, sleep_until};
 pub use crate::config::Pace;
-use crate::log::{LogFormat, Reader, Report};
+use crate::log::{LogFormat, Reader, Report, Stamps};
 use proprio_drivers::{Claim, Format, Frame};
 use proprio_topics::{LinkState, Nanos, StampKind};
 use std::fs::File;
@@ -79,15 +79,29 @@ pub struct Replay {
 }
 
 impl Replay {
-    /// Opens the log at `path`. Only frames that `interface` takes (all if `None`) and that one of
-    /// `claims` matches (all if there are none) are returned.
+    /// Opens the log at `path`, whose own content tells what its stamps mean.
+    ///
+    /// # Errors
+    /// As [`Replay::open_with`].
+    pub fn open(
+        path: &Path,
+        pace: Pace,
+        interface: Option<Matching>,
+        claims: &[Claim],
+    ) -> Result<Self, OpenError> {
+        Self::open_with(path, pace, Stamps::Detect, interface, claims)
+    }
+
+    /// Opens the log at `path`, whose relative stamps mean `stamps`. Only frames that `interface`
+    /// takes (all if `None`) and that one of `claims` matches (all if there are none) are returned.
     ///
     /// # Errors
     /// [`OpenError::Log`]: it cannot be read, or has no time stamps but the recorded pace needs
     /// them.
-    pub fn open(
+    pub fn open_with(
         path: &Path,
         pace: Pace,
+        stamps: Stamps,
         interface: Option<Matching>,
         claims: &[Claim],
     ) -> Result<Self, OpenError> {
@@ -97,7 +111,7 @@ impl Replay {
         };
         let file = File::open(path).map_err(fail)?;
         let mut replay = Self {
-            log: Reader::new(BufReader::with_capacity(BUFFER, file)),
+            log: Reader::with_stamps(BufReader::with_capacity(BUFFER, file), stamps),
             pace,
             matching: interface,
             claims: claims.to_vec(),
@@ -219,6 +233,8 @@ impl Link for Replay {
                 report.bad
             ));
         }
+        let key = "stamps = \"since_start\" or \"since_previous\" of the source";
+        notes.extend(self.log.doubt(key));
         if self.counters.received == 0 {
             notes.push(format!(
                 "none of the log's {} frames is for this bus",

@@ -1,7 +1,7 @@
 //! Vector ASC: the text format of CANoe and CANalyzer.
 //!
 //! ```text
-//! date Sat Sep 30 15:06:13.191 2017                 or 03:06:13.191 pm; English or German names
+//! date Sat Sep 30 15:06:13.191 2017                 or 03:06:13.191 pm; see below
 //! base hex  timestamps absolute                     or dec; or relative
 //! // version 9.0.0
 //! Begin Triggerblock Sat Sep 30 15:06:13.191 2017
@@ -16,6 +16,9 @@
 //! End TriggerBlock
 //! ```
 //!
+//! - CANoe may be set to write the name of the message in the identifier's column. A name begins
+//!   with a letter, as a number may: then `ID = 1638` (decimal; `x` marks an extended one) at the
+//!   end of the line counts, if it is there.
 //! - The number after `d` is a length code: 9 to F stand for 8 bytes.
 //! - Lines with `CANFD` are hexadecimal even in `base dec`, but for the length. Their flags tell
 //!   whether the frame was CAN FD (0x1000) at all, and whether a classic one was a remote request
@@ -23,7 +26,10 @@
 //! - `timestamps relative`: each line counts from the one before, whatever it is.
 //! - The recording began at the date of the trigger block in which `Start of measurement` stands,
 //!   else at that of the header. python-can's header has the time at which the file was opened.
-//! - Milliseconds of a date are a number: python-can writes `13.5` for 13.005 s.
+//! - The words of a date come in any order. Months have English, German, French, Italian, Spanish
+//!   or Portuguese names, or are numbers in a date such as 2017-09-30 or 30.09.2017.
+//! - Up to three digits after the seconds of a date are a number of milliseconds: python-can writes
+//!   `13.5` for 13.005 s. More are a fraction: asammdf writes microseconds.
 //! - `TxRq` asks for a frame, which has a line of its own once it is sent.
 //!
 //! Sources: can-utils `asc2log.c`, `log2asc.c`; python-can `io/asc.py` and the files of its tests.
@@ -33,6 +39,7 @@ use super::record::{
     identifier,
 };
 use super::text::{civil, decimal, number, words};
+use arrayvec::ArrayVec;
 use proprio_drivers::{Format, Frame, Id};
 use proprio_topics::Nanos;
 
@@ -73,8 +80,8 @@ impl Asc {
         let mut next = || words.next().unwrap_or_default();
         let (first, second) = (next(), next());
         if is(first, "date") {
-            // A weekday, a month, a day, a time and a year, in whatever language.
-            return words.count() >= 3;
+            // Words of a date in whatever language and order, and a time.
+            return words.any(|word| word.contains(&b':'));
         }
         if is(first, "base") {
             return is(second, "hex") || is(second, "dec");
@@ -98,15 +105,15 @@ impl Asc {
         };
         if let [b'0'..=b'9' | b'-' | b'.', ..] = first {
             let t = decimal(first, SECOND).ok_or(LineError::Time)?;
-            self.last = if self.relative {
-                self.last.saturating_add(t)
-            } else {
-                t
-            };
+            let t = if self.relative { self.last + t } else { t };
+            if !t.is_instant() {
+                return Err(LineError::Range);
+            }
+            self.last = t;
             return self.event(words);
         }
         if is(first, "date") {
-            (self.start, self.last) = (parse_date(line), Nanos::ZERO);
+            (self.start, self.last) = (parse_date(words), Nanos::ZERO);
             return self.start.map(|_| ParsedLine::Note).ok_or(LineError::Date);
         }
         if is(first, "base") {
@@ -114,7 +121,7 @@ impl Asc {
             (self.decimal, self.relative) = (has("dec"), has("relative"));
         } else if is(first, "begin") {
             words.next();
-            self.block = words.next().and_then(|_| after_weekday(words));
+            self.block = parse_date(words);
             self.start = self.start.or(self.block);
         } else if !["internal", "no", "end"].iter().any(|w| is(first, w))
             && !first.starts_with(b"//")
@@ -196,6 +203,18 @@ fn parse_id(word: &[u8], radix: u32) -> Result<Id, LineError> {
     identifier(number(digits, radix).ok_or(LineError::Number)?, extended)
 }
 
+/// Finds `ID = 1638` at the end of a line: its identifier, and whether it is surely complete.
+fn stated_id<'a>(words: impl Iterator<Item = &'a [u8]>) -> Result<Option<(Id, bool)>, LineError> {
+    let mut last: [&[u8]; 3] = [&[]; 3];
+    for word in words {
+        last = [last[1], last[2], word];
+    }
+    match last {
+        [b"ID", b"=", id] => Ok(Some((parse_id(id, 10)?, id.ends_with(b"x")))),
+        _ => Ok(None),
+    }
+}
+
 /// Parses the `declared` bytes of a frame; also returns whether the last has all its digits.
 fn parse_data<'a>(
     words: &mut impl Iterator<Item = &'a [u8]>,
@@ -215,7 +234,7 @@ fn parse_data<'a>(
 
 /// Parses what follows the channel of a line of a classic frame; `None` if it is none.
 fn classic_frame<'a>(
-    mut words: impl Iterator<Item = &'a [u8]>,
+    mut words: impl Iterator<Item = &'a [u8]> + Clone,
     radix: u32,
 ) -> Result<Option<Found>, LineError> {
     let id = words.next().ok_or(LineError::NoFrame)?;
@@ -228,7 +247,15 @@ fn classic_frame<'a>(
     {
         return Ok(None);
     }
-    let id = parse_id(id, radix)?;
+    // What begins with a letter may be a name, and what tells its identifier be cut off.
+    let (id, id_is_whole) = match id.first().is_some_and(u8::is_ascii_digit) {
+        true => (parse_id(id, radix)?, true),
+        false => match (stated_id(words.clone())?, parse_id(id, radix)) {
+            (Some(stated), _) => stated,
+            (None, Err(LineError::Number)) => return Err(LineError::Symbolic),
+            (None, number) => (number?, false),
+        },
+    };
     let Some(direction) = way(words.next().unwrap_or_default()).ok_or(LineError::Direction)? else {
         return Ok(None);
     };
@@ -240,13 +267,13 @@ fn classic_frame<'a>(
         let declared = length(code.ok_or(LineError::Length)?);
         let (data, whole) = parse_data(&mut words, declared, radix)?;
         let frame = Frame::new(id, data.get(..declared).unwrap_or(&data));
-        (frame, Some(direction), whole)
+        (frame, Some(direction), whole && id_is_whole)
     } else if is(kind, "r") {
         // Old files state no length; their next word is that of a comment.
         let stated = code.flatten().filter(|code| *code < 16);
         #[allow(clippy::cast_possible_truncation)] // at most 8
         let frame = Frame::remote(id, stated.map_or(0, length) as u8);
-        (frame, Some(direction), code.is_some())
+        (frame, Some(direction), code.is_some() && id_is_whole)
     } else {
         return Err(LineError::Kind {
             format: LogFormat::Asc,
@@ -312,60 +339,122 @@ fn fd_frame<'a>(
     Ok(Some((frame, Some(direction), whole)))
 }
 
-/// Parses `date Sat Sep 30 03:06:13.191 pm 2017`.
-fn parse_date(line: &[u8]) -> Option<Nanos> {
-    let mut words = words(line);
-    words.next();
-    words.next();
-    after_weekday(words)
-}
-
-/// Parses `Sep 30 03:06:13.191 pm 2017` or `Sep 30 15:06:13.191 2017`.
-fn after_weekday<'a>(mut words: impl Iterator<Item = &'a [u8]>) -> Option<Nanos> {
-    let month = month(words.next()?)?;
+/// Parses the words of a date: `Sat Sep 30 03:06:13.191 pm 2017`, or the same in another order.
+fn parse_date<'a>(words: impl Iterator<Item = &'a [u8]>) -> Option<Nanos> {
     let whole = |word: &[u8]| number(word, 10).map(i64::from);
-    let day = whole(words.next()?)?;
-    let mut time = words.next()?.split(|c| *c == b':');
-    let (hour, minute, second) = (whole(time.next()?)?, whole(time.next()?)?, time.next()?);
-    let mut second = second.split(|c| *c == b'.');
-    let (second, ms) = (whole(second.next()?)?, second.next().map(whole));
-    let ms = ms.unwrap_or(Some(0)).filter(|ms| *ms < 1_000)?;
-    let next = words.next()?;
-    let (hour, year) = match next {
-        b"am" | b"AM" => (hour % 12, words.next()?),
-        b"pm" | b"PM" => (hour % 12 + 12, words.next()?),
-        _ => (hour, next),
+    let (mut year, mut at_month, mut day) = (None, None, None);
+    let (mut time, mut afternoon) = (None, None);
+    for word in words {
+        let word = word.strip_suffix(b",").unwrap_or(word);
+        let numeric = word.first().is_some_and(u8::is_ascii_digit);
+        if word.contains(&b':') {
+            time = Some(parse_time(word)?);
+        } else if let Some(half) = half_of_day(word) {
+            afternoon = Some(half);
+        } else if let Some(date) = numeric.then(|| parse_numeric_date(word)).flatten() {
+            let [y, m, d] = date;
+            (year, at_month, day) = (Some(y), Some(m), Some(d));
+        } else if numeric {
+            // A German day has a point.
+            let value = whole(word.strip_suffix(b".").unwrap_or(word))?;
+            let place = if word.len() == 4 { &mut year } else { &mut day };
+            *place = Some(value);
+        } else {
+            // Else it is the day of the week.
+            at_month = month(word).or(at_month);
+        }
+    }
+    let ([hour, minute, second], ns) = time?;
+    let hour = match afternoon {
+        None => hour,
+        Some(afternoon) => hour % 12 + if afternoon { 12 } else { 0 },
     };
-    let seconds = civil([whole(year)?, month, day], [hour, minute, second])?;
-    let ms = seconds.checked_mul(1_000)?.checked_add(ms)?;
-    Some(Nanos(ms.checked_mul(1_000_000)?))
+    let seconds = civil([year?, at_month?, day?], [hour, minute, second])?;
+    let ns = seconds.checked_mul(1_000_000_000)?.checked_add(ns)?;
+    Some(Nanos(ns))
 }
 
-/// The number of a month with an English or German name.
+/// Parses `15:06:13.191`: hour, minute, second, and the rest in nanoseconds.
+fn parse_time(word: &[u8]) -> Option<([i64; 3], i64)> {
+    let whole = |word: &[u8]| number(word, 10).map(i64::from);
+    let mut parts = word.splitn(3, |c| *c == b':');
+    let (hour, minute, second) = (whole(parts.next()?)?, whole(parts.next()?)?, parts.next()?);
+    let mut parts = second.splitn(2, |c| matches!(c, b'.' | b','));
+    let (second, rest) = (whole(parts.next()?)?, parts.next());
+    let ns = match rest {
+        None => 0,
+        Some(ms) if ms.len() <= 3 => whole(ms)? * 1_000_000,
+        Some(fraction) => {
+            let digits = u32::try_from(fraction.len()).ok().filter(|n| *n <= 9)?;
+            whole(fraction)? * 10_i64.pow(9 - digits)
+        }
+    };
+    Some(([hour, minute, second], ns))
+}
+
+/// Whether a word stands for the second half of the day (`pm`), or for the first (`am`).
+fn half_of_day(word: &[u8]) -> Option<bool> {
+    match word {
+        [half, b'm' | b'M'] | [half, b'.', b'm' | b'M', b'.'] => match half {
+            b'a' | b'A' => Some(false),
+            b'p' | b'P' => Some(true),
+            _ => None,
+        },
+        _ => None,
+    }
+}
+
+/// Parses `2017-09-30` or `30.09.2017`: year, month, day.
+fn parse_numeric_date(word: &[u8]) -> Option<[i64; 3]> {
+    let three = |mark: u8| {
+        let mut parts = word.split(|c| *c == mark).map(|part| number(part, 10));
+        let three = [parts.next()??, parts.next()??, parts.next()??].map(i64::from);
+        parts.next().is_none().then_some(three)
+    };
+    match (three(b'-'), three(b'.')) {
+        (Some(date @ [1000..=9999, ..]), _) => Some(date),
+        (_, Some([day, month, year @ 1000..=9999])) => Some([year, month, day]),
+        _ => None,
+    }
+}
+
+/// The number of a month with an English, German, French, Italian, Spanish or Portuguese name,
+/// which may be cut after three letters (French `juin` and `juil` after four).
 fn month(name: &[u8]) -> Option<i64> {
+    // What is not ASCII, in any encoding, is a question mark here.
     const NAMES: [&[&str]; 12] = [
-        &["jan"],
-        &["feb"],
-        // "Mär" in any encoding is not ASCII.
-        &["mar", "mrz"],
-        &["apr"],
-        &["may", "mai"],
-        &["jun"],
-        &["jul"],
-        &["aug"],
-        &["sep"],
-        &["oct", "okt"],
+        &["jan", "j?n", "gen", "ene"],
+        &["feb", "f?v", "fev"],
+        &["mar", "m?r", "mrz"],
+        &["apr", "avr", "abr"],
+        &["may", "mai", "mag"],
+        &["jun", "juin", "giu"],
+        &["jul", "juil", "lug"],
+        &["aug", "ao?", "aou", "ago"],
+        &["sep", "set"],
+        &["oct", "okt", "ott", "out"],
         &["nov"],
-        &["dec", "dez"],
+        &["dec", "dez", "d?c", "dic"],
     ];
-    if let [b'M' | b'm', second, ..] = name
-        && !second.is_ascii()
-    {
-        return Some(3);
+    let mut plain = ArrayVec::<u8, 4>::new();
+    for c in name {
+        let c = if c.is_ascii() {
+            c.to_ascii_lowercase()
+        } else {
+            b'?'
+        };
+        // One letter may have several bytes.
+        if c == b'?' && plain.last() == Some(&b'?') {
+            continue;
+        }
+        if plain.try_push(c).is_err() {
+            break;
+        }
     }
     let begins = |names: &&[&str]| {
-        let start = name.get(..3).unwrap_or_default();
-        names.iter().any(|other| is(start, other))
+        names
+            .iter()
+            .any(|other| plain.starts_with(other.as_bytes()))
     };
     let at = NAMES.iter().position(begins)?;
     i64::try_from(at).ok().map(|at| at + 1)

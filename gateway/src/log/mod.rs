@@ -30,6 +30,8 @@
 //! **Error frames** of other formats than candump's become an error frame of class bus error
 //! without data: what more they tell differs between programs and adapters.
 //!
+//! A stamp more than 146 years from its origin is no instant; its record is skipped.
+//!
 //! **Damage.** A line or object that cannot be read is skipped, counted and reported; so is the
 //! end of a file that was cut off. What comes before and after is read.
 
@@ -39,8 +41,10 @@ pub mod candump;
 mod csv;
 mod reader;
 mod record;
+mod stamps;
 mod text;
 mod trc;
 
-pub use reader::{REORDER, Reader, Report, Stamps};
+pub use reader::{REORDER, Reader, Report};
 pub use record::{Direction, LineError, LogFormat, Record};
+pub use stamps::{STAMPS_OPTION, Stamps};

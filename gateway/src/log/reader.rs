@@ -8,6 +8,8 @@ use super::csv;
 use super::record::{
     Interface, LineError, LogFormat, MAX_LINE, Parsed, ParsedLine, Record, StampForm,
 };
+use super::stamps::{Stamps, judge};
+use super::text::without_escapes;
 use super::trc::Trc;
 use arrayvec::ArrayVec;
 use proprio_topics::Nanos;
@@ -18,18 +20,6 @@ const NAMED: usize = 8;
 /// The order of the frames in a log is that of their stamps, except within this time \[ns\]: the
 /// recorder reads one interface after the other.
 pub const REORDER: Nanos = Nanos::from_millis(100);
-
-/// The meaning of the relative stamps of candump's screen format.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Stamps {
-    /// Detect it, as the module documentation describes.
-    #[default]
-    Detect,
-    /// Each counts from the log's origin.
-    SinceOrigin,
-    /// Each counts from the previous line (`candump -t d`).
-    SincePrevious,
-}
 
 /// The counts of a [`Reader`] so far.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -103,6 +93,52 @@ const UTF_16: &str = "text in UTF-16: save it as UTF-8 first (iconv -f UTF-16 -t
 const UTF_8_MARK: &[u8] = b"\xEF\xBB\xBF";
 /// Bytes that are read first: the longest of these beginnings.
 const HEAD: usize = 8;
+/// Bytes that are read ahead to tell relative stamps apart: a million lines.
+const LOOK_AHEAD: usize = 64 << 20;
+
+/// A log, of which some bytes were read ahead.
+#[derive(Debug)]
+struct Ahead<R> {
+    held: Vec<u8>,
+    /// So many of them are used.
+    used: usize,
+    rest: R,
+}
+
+impl<R: BufRead> Ahead<R> {
+    /// Reads until `count` bytes are held or the log ends; returns what is held.
+    fn hold(&mut self, count: usize) -> io::Result<&[u8]> {
+        self.held.drain(..self.used);
+        self.used = 0;
+        let more = count.saturating_sub(self.held.len()) as u64;
+        self.rest.by_ref().take(more).read_to_end(&mut self.held)?;
+        Ok(&self.held)
+    }
+}
+
+impl<R: BufRead> Read for Ahead<R> {
+    fn read(&mut self, to: &mut [u8]) -> io::Result<usize> {
+        let count = self.fill_buf()?.read(to)?;
+        self.consume(count);
+        Ok(count)
+    }
+}
+
+impl<R: BufRead> BufRead for Ahead<R> {
+    fn fill_buf(&mut self) -> io::Result<&[u8]> {
+        match self.held.get(self.used..) {
+            Some(held) if !held.is_empty() => Ok(held),
+            _ => self.rest.fill_buf(),
+        }
+    }
+
+    fn consume(&mut self, count: usize) {
+        match self.used < self.held.len() {
+            true => self.used += count,
+            false => self.rest.consume(count),
+        }
+    }
+}
 
 /// The source of lines or objects.
 #[derive(Debug)]
@@ -139,11 +175,12 @@ impl Report {
 ///
 /// A stamp that is later than the next frame's by more than [`REORDER`], while the next is not
 /// earlier than the one before, is wrong: its frame is skipped and reported. (Everything after it
-/// would otherwise seem late.)
+/// would otherwise seem late.) So is one that is no instant ([`Nanos::is_instant`]).
+///
+/// Escape sequences of a terminal, such as the colours of `candump -c`, are ignored.
 #[derive(Debug)]
 pub struct Reader<R> {
-    /// The first bytes, which tell what the file is, and the others.
-    inner: io::Chain<io::Cursor<ArrayVec<u8, HEAD>>, R>,
+    inner: Ahead<R>,
     source: Source,
     format: Option<LogFormat>,
     line: Vec<u8>,
@@ -152,14 +189,16 @@ pub struct Reader<R> {
     next_line: Vec<u8>,
     next: Option<(u64, Parsed)>,
     stamps: Stamps,
+    /// Whether the meaning of the stamps was guessed from too little.
+    doubtful: bool,
     sum: Nanos,
     last: Option<Nanos>,
     report: Report,
 }
 
 impl<R: BufRead> Reader<R> {
-    /// Reads from `inner`. To detect the meaning of relative stamps it looks ahead in `inner`'s
-    /// buffer.
+    /// Reads from `inner`. To detect the meaning of relative stamps it reads ahead: the whole log,
+    /// or its first 64 MiB.
     pub fn new(inner: R) -> Self {
         Self::with_stamps(inner, Stamps::Detect)
     }
@@ -168,13 +207,18 @@ impl<R: BufRead> Reader<R> {
     pub fn with_stamps(inner: R, stamps: Stamps) -> Self {
         let line = || Vec::with_capacity(MAX_LINE + 16);
         Self {
-            inner: io::Cursor::new(ArrayVec::new()).chain(inner),
+            inner: Ahead {
+                held: Vec::with_capacity(HEAD),
+                used: 0,
+                rest: inner,
+            },
             source: Source::Unopened,
             format: None,
             next_line: line(),
             line: line(),
             next: None,
             stamps,
+            doubtful: false,
             sum: Nanos::ZERO,
             last: None,
             report: Report::default(),
@@ -228,42 +272,53 @@ impl<R: BufRead> Reader<R> {
         self.stamps
     }
 
+    /// What a person should be told if the meaning of relative stamps is a guess; `key` is how it
+    /// can be stated.
+    pub fn doubt(&self, key: &str) -> Option<String> {
+        self.doubtful.then(|| {
+            format!(
+                "the time stamps may count from the start of the log or each from the line before; \
+                 they are taken as {}. State it with {key}",
+                match self.stamps {
+                    Stamps::SincePrevious => "the latter",
+                    Stamps::Detect | Stamps::SinceStart => "the former",
+                }
+            )
+        })
+    }
+
     /// The next record; `None` at the end of the log.
     ///
     /// # Errors
     /// A read error of `inner`. A bad line is not an error: see [`Reader::report`].
     pub fn next_record(&mut self) -> io::Result<Option<Record<'_>>> {
-        let parsed = loop {
+        let (parsed, stamp) = loop {
             let Some((number, parsed)) = self.next_frame()? else {
                 return Ok(None);
             };
-            match self.ahead(&parsed)? {
-                None => break parsed,
-                Some(ahead) => self.report.reject(number, LineError::Ahead { ahead }),
-            }
-        };
-        let stamp = match parsed.stamp {
-            None => {
+            let Some((t, form)) = parsed.stamp else {
                 self.report.unstamped += 1;
-                None
+                break (parsed, None);
+            };
+            if form == StampForm::Relative && self.stamps == Stamps::Detect {
+                let verdict = judge(t, self.inner.hold(LOOK_AHEAD)?);
+                (self.stamps, self.doubtful) = (verdict.stamps, verdict.doubtful);
             }
-            Some((t, StampForm::Relative)) => {
-                if self.stamps == Stamps::Detect {
-                    self.stamps = look_ahead(t, self.inner.fill_buf()?);
+            let adds_up = self.adds_up(form);
+            let t = if adds_up { self.sum + t } else { t };
+            if !t.is_instant() {
+                self.report.reject(number, LineError::Range);
+            } else if let Some(ahead) = self.ahead(t, adds_up)? {
+                self.report.reject(number, LineError::Ahead { ahead });
+            } else {
+                if adds_up {
+                    self.sum = t;
                 }
-                self.sum = self.sum.saturating_add(t);
-                Some(if self.stamps == Stamps::SincePrevious {
-                    self.sum
-                } else {
-                    t
-                })
+                self.report.backwards += u64::from(self.last.is_some_and(|last| t < last));
+                self.last = Some(t);
+                break (parsed, Some(t));
             }
-            Some((t, _)) => Some(t),
         };
-        if stamp.is_some() {
-            self.report.backwards += u64::from(stamp < self.last);
-            self.last = stamp;
-        }
         self.report.records += 1;
         Ok(parsed.record(&self.line, stamp))
     }
@@ -290,24 +345,28 @@ impl<R: BufRead> Reader<R> {
         }
     }
 
-    /// By how much the stamp of `parsed` is too late to be right \[ns\], if it is. Only a stamp
-    /// that jumps is compared with the next one, which is then read.
-    fn ahead(&mut self, parsed: &Parsed) -> io::Result<Option<Nanos>> {
-        let counts_from_origin = |form: StampForm| match form {
-            StampForm::Absolute | StampForm::Origin => true,
-            StampForm::Relative => self.stamps == Stamps::SinceOrigin,
+    /// Whether a stamp of this form counts from the one before.
+    fn adds_up(&self, form: StampForm) -> bool {
+        let may = match form {
+            StampForm::Absolute => false,
+            StampForm::Origin => self.format == Some(LogFormat::Candump),
+            StampForm::Relative => true,
         };
-        let Some((t, form)) = parsed.stamp else {
-            return Ok(None);
-        };
+        may && self.stamps == Stamps::SincePrevious
+    }
+
+    /// By how much the stamp `t` of the current frame is too late to be right \[ns\], if it is.
+    /// Only a stamp that jumps is compared with the next one, which is then read.
+    fn ahead(&mut self, t: Nanos, adds_up: bool) -> io::Result<Option<Nanos>> {
         let last = self.last.unwrap_or(Nanos::MIN);
-        if !counts_from_origin(form) || t.saturating_sub(last) <= REORDER {
+        if adds_up || t.saturating_sub(last) <= REORDER {
             return Ok(None);
         }
         std::mem::swap(&mut self.line, &mut self.next_line);
         self.next = self.next_frame()?;
         std::mem::swap(&mut self.line, &mut self.next_line);
-        let Some((next, _)) = self.next.as_ref().and_then(|(_, next)| next.stamp) else {
+        let next = self.next.as_ref().and_then(|(_, next)| next.stamp);
+        let Some((next, _)) = next.filter(|(next, _)| next.is_instant()) else {
             return Ok(None);
         };
         let ahead = t.saturating_sub(next);
@@ -352,18 +411,9 @@ impl<R: BufRead> Reader<R> {
 
     /// Reads the first bytes; the error is that they are no log's.
     fn open(&mut self) -> io::Result<Result<(), LineError>> {
-        let (head, rest) = self.inner.get_mut();
-        let head = head.get_mut();
-        while head.len() < HEAD {
-            let byte = rest.fill_buf()?.first().copied();
-            rest.consume(usize::from(byte.is_some()));
-            let Some(byte) = byte else { break };
-            head.push(byte);
-        }
-        let is_utf_16 = matches!(
-            head.as_slice(),
-            [_, 0, _, 0, _, 0, ..] | [0, _, 0, _, 0, _, ..]
-        ) && head.iter().any(|c| *c != 0);
+        let head = self.inner.hold(HEAD)?;
+        let is_utf_16 = matches!(head, [_, 0, _, 0, _, 0, ..] | [0, _, 0, _, 0, _, ..])
+            && head.iter().any(|c| *c != 0);
         let what = NO_LOGS
             .iter()
             .find(|(beginning, _)| head.starts_with(beginning));
@@ -375,13 +425,13 @@ impl<R: BufRead> Reader<R> {
             self.source = Source::Ended;
             return Ok(Err(LineError::NoLog(UTF_16)));
         }
-        if head.starts_with(UTF_8_MARK) {
-            head.drain(..UTF_8_MARK.len());
-        }
         self.source = if head.starts_with(blf::SIGNATURE) {
             self.format = Some(LogFormat::Blf);
             Source::Blf(Box::new(Blf::new()))
         } else {
+            if head.starts_with(UTF_8_MARK) {
+                self.inner.consume(UTF_8_MARK.len());
+            }
             Source::Unknown
         };
         Ok(Ok(()))
@@ -418,6 +468,7 @@ impl<R: BufRead> Reader<R> {
             }
             return Ok(Some(Err(LineError::LineTooLong)));
         }
+        without_escapes(&mut self.line);
         let parsed = match &mut self.source {
             Source::Candump => parse_line(&self.line),
             Source::Asc(asc) => asc.parse(&self.line),
@@ -459,22 +510,4 @@ impl<R: BufRead> Reader<R> {
         (self.format, self.source) = (Some(format), source);
         parsed
     }
-}
-
-/// Whether the stamps that follow `first` in `buffered` ever decrease.
-fn look_ahead(first: Nanos, buffered: &[u8]) -> Stamps {
-    let mut last = first;
-    for line in buffered.split(|c| *c == b'\n') {
-        if let Ok(ParsedLine::Record(Parsed {
-            stamp: Some((t, StampForm::Relative)),
-            ..
-        })) = parse_line(line)
-        {
-            if t < last {
-                return Stamps::SincePrevious;
-            }
-            last = t;
-        }
-    }
-    Stamps::SinceOrigin
 }

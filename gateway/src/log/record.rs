@@ -94,6 +94,9 @@ pub enum LineError {
         /// By how much \[ns\].
         ahead: Nanos,
     },
+    /// The stamp is no instant that anything could be waited for from.
+    #[error("the time stamp is out of range: more than 146 years from the origin")]
+    Range,
     /// There is no interface, or it is not text.
     #[error("there is no interface name")]
     Interface,
@@ -109,7 +112,7 @@ pub enum LineError {
         digits: usize,
     },
     /// The identifier is larger than 11 or 29 bits.
-    #[error("the identifier {id:X} is larger than its {bits} bits")]
+    #[error("the identifier {id:#X} is larger than its {bits} bits")]
     IdentifierRange {
         /// The identifier read.
         id: u32,
@@ -166,6 +169,12 @@ pub enum LineError {
     /// An identifier without a fixed number of digits cannot be read.
     #[error("the identifier is not a number")]
     Number,
+    /// A message is named, and nothing tells its identifier.
+    #[error(
+        "the message has a name instead of an identifier, and no \"ID = \" at the end of the line \
+         tells that: record without symbolic names"
+    )]
+    Symbolic,
     /// The direction is neither of the two.
     #[error("the direction is neither Rx nor Tx")]
     Direction,
@@ -190,7 +199,8 @@ pub enum LineError {
     /// A table of another program.
     #[error(
         "it is a table with columns other than python-can's, which are \
-         timestamp,arbitration_id,extended,remote,error,dlc,data"
+         timestamp,arbitration_id,extended,remote,error,dlc,data; a table of samples is what \
+         `proprio decode` writes, for --samples of other verbs"
     )]
     Table,
     /// A row of python-can's table has another number of fields, or a flag is not 0 or 1.

@@ -41,6 +41,23 @@ pub(super) fn words(line: &[u8]) -> impl Iterator<Item = &[u8]> + Clone {
         .filter(|word| !word.is_empty())
 }
 
+/// Takes the escape sequences of a terminal (`ESC [ .. letter`, as those of colours) out of a line.
+pub(super) fn without_escapes(line: &mut Vec<u8>) {
+    const ESCAPE: u8 = 0x1B;
+    if !line.contains(&ESCAPE) {
+        return;
+    }
+    let (mut before, mut inside) = (0, false);
+    line.retain(|&c| {
+        let begins = before == ESCAPE && c == b'[';
+        let keep = !inside && !begins && c != ESCAPE;
+        // Its last character is a letter or one of a few signs, 0x40 to 0x7E.
+        inside = begins || inside && matches!(c, b' '..=b'?');
+        before = c;
+        keep
+    });
+}
+
 /// A whole number without a sign, in base `radix` (2 to 16).
 pub(super) fn number(text: &[u8], radix: u32) -> Option<u32> {
     let digit = |c: &u8| hex(*c).map(u32::from).filter(|digit| *digit < radix);

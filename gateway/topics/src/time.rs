@@ -25,6 +25,14 @@ impl Nanos {
     /// Earlier than every instant.
     pub const MIN: Self = Self(i64::MIN);
 
+    /// Whether it can be an instant: so far (146 years) from both ends that any wait can be added
+    /// to it or subtracted from it. Arithmetic saturates, and at an end a wait of any length would
+    /// be over at once.
+    #[must_use]
+    pub const fn is_instant(self) -> bool {
+        self.0.unsigned_abs() <= Self::MAX.0.unsigned_abs() / 2
+    }
+
     /// A duration of `ms` milliseconds.
     #[must_use]
     pub const fn from_millis(ms: i64) -> Self {
@@ -201,6 +209,22 @@ mod tests {
             "1e99",
         ] {
             assert_eq!(Nanos::parse_seconds(text), None, "{text}");
+        }
+    }
+
+    #[test]
+    fn an_instant_leaves_room_for_waits() {
+        let half = i64::MAX / 2;
+        for (ns, is) in [(0, true), (half, true), (-half, true), (half + 1, false)] {
+            assert_eq!(Nanos(ns).is_instant(), is, "{ns}");
+        }
+        for end in [
+            Nanos::MIN,
+            Nanos(i64::MIN + 1),
+            Nanos(i64::MAX - 1),
+            Nanos::MAX,
+        ] {
+            assert!(!end.is_instant());
         }
     }
 

@@ -69,10 +69,11 @@ pub(in crate::log) fn parse_line(line: &[u8]) -> Result<ParsedLine, LineError> {
         .position(|c| *c == b' ' || *c == b'\t')
         .unwrap_or(rest.len());
     let interface = start..start + length;
-    if length == 0
-        || rest.first() == Some(&b'(')
-        || std::str::from_utf8(rest.get(..length).unwrap_or(&[])).is_err()
-    {
+    // A name with control characters would reach a terminal.
+    let is_name = |name: &[u8]| {
+        std::str::from_utf8(name).is_ok_and(|name| !name.chars().any(char::is_control))
+    };
+    if length == 0 || rest.first() == Some(&b'(') || !rest.get(..length).is_some_and(is_name) {
         return Err(LineError::Interface);
     }
     rest = rest.get(length..).unwrap_or(&[]).trim_ascii_start();

@@ -33,10 +33,9 @@
 //!
 //! An absolute stamp has ten digits of seconds or a date. A shorter stamp is relative. In the log
 //! format it counts from the origin of the log (other programs write such stamps). In the screen
-//! format it is `-t z` or `-t d`, which one line cannot distinguish; therefore [`Reader`] looks
-//! ahead in its buffer. Stamps since the first line never decrease. Stamps since the previous line
-//! soon do, because of the bus's jitter; the reader adds those up. [`Reader::with_stamps`] sets the
-//! meaning explicitly.
+//! format it is `-t z` or `-t d`, which one line cannot distinguish: the whole log tells
+//! (`log/stamps.rs`), or [`Reader::with_stamps`] states it. Stamps since the previous line are
+//! added up.
 //!
 //! [`Reader`]: super::Reader
 //! [`Reader::with_stamps`]: super::Reader::with_stamps

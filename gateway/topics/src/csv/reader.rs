@@ -31,7 +31,10 @@ pub enum Error {
     #[error("it is not a CSV table")]
     Csv(#[from] ::csv::Error),
     /// It has no column `t`.
-    #[error("its first row must name the columns, `t` among them; it begins with {0:?}")]
+    #[error(
+        "its first row must name the columns, `t` among them; it begins with {0:?} (`proprio decode` \
+         makes such a table of a recorded bus)"
+    )]
     NoHeader(String),
     /// Two columns have one name.
     #[error("two columns are named {0:?}")]
@@ -338,6 +341,7 @@ impl<R: io::Read> Reader<R> {
             if at == self.t_column {
                 row.t = Some(
                     Nanos::parse_seconds(text)
+                        .filter(|t| t.is_instant())
                         .ok_or_else(|| format!("t is {text:?}, not a number of seconds"))?,
                 );
             } else if let Some(Some(column)) = self.columns.get(at) {
@@ -393,11 +397,12 @@ mod tests {
                     x,1,,,,,,,\n\
                     0.8,,1,2,3,,,,\n\
                     0.9 , ,1 ,2, 3,4,5,\t6,7\n\
-                    1.0,2";
+                    1.0,2\n\
+                    9223372036.8,1,,,,,,,\n";
         let Ok((rows, report, series)) = read(text) else {
             panic!("readable")
         };
-        assert_eq!((rows.len(), report.bad_rows), (2, 4));
+        assert_eq!((rows.len(), report.bad_rows), (2, 5));
         assert_eq!(report.unknown_columns, ["note/x"]);
         assert_eq!(series.len(), 2);
         let reasons: Vec<_> = report
@@ -412,6 +417,7 @@ mod tests {
                 (4, "t is \"x\", not a number of seconds"),
                 (5, "wrench/s holds some of fx fy fz tx ty tz, but not all"),
                 (7, "it has 2 cells instead of 9"),
+                (8, "t is \"9223372036.8\", not a number of seconds"),
             ]
         );
     }

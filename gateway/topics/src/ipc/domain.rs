@@ -390,8 +390,7 @@ impl<S: Service> Drop for Inner<S> {
 
 /// The name of a robot's service.
 pub(super) fn service_name(robot: &str, suffix: &str) -> Result<ServiceName, PortError> {
-    let legal = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
-    if robot.is_empty() || robot.len() > 64 || !robot.chars().all(legal) {
+    if !crate::is_robot_name(robot) {
         return Err(PortError::Robot {
             robot: robot.to_owned(),
         });

@@ -1,5 +1,6 @@
 //! Errors of domains and ports, with the information needed to correct them.
 
+use crate::ROBOT_NAME;
 use core::fmt;
 use nix::sys::resource::{Resource, getrlimit};
 use nix::sys::statvfs::statvfs;
@@ -159,7 +160,7 @@ impl DomainError {
 #[non_exhaustive]
 pub enum PortError {
     /// The robot's name has characters that cannot be in it, or too many.
-    #[error("robot {robot:?}: a name is 1 to 64 letters, digits, `-`, `_` or `.`")]
+    #[error("robot {robot:?}: {ROBOT_NAME}")]
     Robot {
         /// The name.
         robot: String,
