@@ -14,7 +14,8 @@ use crate::gateway_log::{ChannelStatus, GatewayLog};
 use crate::pipeline::{Job, Pipeline};
 use crate::setup::Setup;
 use anyhow::{Context, anyhow};
-use proprio_identification::online::Paused;
+use proprio_identification::online::{Online, Paused};
+use proprio_identification::robot::{ChannelRole, Robot};
 use proprio_topics::ipc::{
     Domain, DomainConfig, DomainError, PortError, Reader, Topic, Watch, Writer, monotonic,
     open_files_remedy,
@@ -248,6 +249,7 @@ impl DataPlane {
         let now = monotonic();
         description_writer.send(&setup.description(), now)?;
         let first_look = FirstLook::start(&setup)?;
+        let of_setup = setup.robot.clone();
         let mut pipeline = Pipeline::new(setup);
         if let Some(state_file) = &state_file {
             state_file.resume(&mut pipeline);
@@ -257,7 +259,7 @@ impl DataPlane {
         }
         let identification = pipeline
             .identification()
-            .map(|online| IdentificationThread::start(online.component_count(), state_file))
+            .map(|online| IdentificationThread::start(online, of_setup, state_file))
             .transpose()?;
         let inertias = match identification {
             Some(_) => Some(Writer::create(&domain, robot, epoch)?),
@@ -553,13 +555,14 @@ impl DataPlane {
                 // Common to all components.
                 sum.late = counts.late;
                 sum.failed += counts.failed;
+                let group = identification.groups.get(component).map(String::as_str);
                 if std::mem::replace(reported, paused) != paused {
-                    tracing::info!(component, "{paused}");
+                    tracing::info!(group, "{}", paused.describe(&identification.robot));
                 }
                 if std::mem::replace(changes, counts.changes) != counts.changes
                     && let Some(change) = online.last_change(component)
                 {
-                    tracing::warn!(component, "{change}");
+                    tracing::warn!(group, "{change}");
                 }
             }
             self.health.identification = sum;
@@ -625,31 +628,45 @@ struct IdentificationThread {
     thread: Option<std::thread::JoinHandle<()>>,
     /// Per component, what was last reported: why it pauses, and its number of changes.
     reported: Vec<(Paused, u64)>,
+    /// Per component, the names of its F/T sensors.
+    groups: Vec<String>,
+    robot: Robot,
 }
 
 impl IdentificationThread {
     /// Starts the thread. It ends when this is dropped, and then writes its state.
-    fn start(components: usize, state_file: Option<StateFile>) -> anyhow::Result<Self> {
+    fn start(online: &Online, robot: Robot, state_file: Option<StateFile>) -> anyhow::Result<Self> {
+        let name = |sensor: &usize| {
+            let role = ChannelRole::Sensor(*sensor);
+            let channel = robot.channels.iter().find(|channel| channel.role == role);
+            channel.map(|channel| channel.name.as_str())
+        };
+        let components = online.solution().components.iter();
+        let groups: Vec<String> = components
+            .map(|component| {
+                let names: Vec<_> = component.sensors.iter().filter_map(name).collect();
+                names.join(", ")
+            })
+            .collect();
+        let named = groups.clone();
         let (jobs, queue) = mpsc::sync_channel::<Job>(1);
         let (results, done) = mpsc::sync_channel(1);
         let work = move || {
             let (mut unwritten, mut written) = (None, monotonic());
-            let mut failing = vec![false; components];
+            let mut failing = vec![false; named.len()];
             while let Ok(mut job) = queue.recv() {
                 job.run();
-                for (component, (fails, failure)) in
-                    failing.iter_mut().zip(job.failures()).enumerate()
-                {
+                let of_groups = failing.iter_mut().zip(&named);
+                for ((fails, group), failure) in of_groups.zip(job.failures()) {
                     match failure {
                         Some(error) if !*fails => tracing::error!(
-                            component,
+                            group,
                             "identification cannot solve for the parameters: {error}; the earlier \
                              parameters stay in use"
                         ),
-                        None if *fails => tracing::info!(
-                            component,
-                            "identification solves for the parameters again"
-                        ),
+                        None if *fails => {
+                            tracing::info!(group, "identification solves for the parameters again")
+                        }
                         _ => {}
                     }
                     *fails = failure.is_some();
@@ -679,7 +696,9 @@ impl IdentificationThread {
             jobs: Some(jobs),
             done,
             thread: Some(thread),
-            reported: vec![(Paused::No, 0); components],
+            reported: vec![(Paused::No, 0); groups.len()],
+            groups,
+            robot,
         })
     }
 }

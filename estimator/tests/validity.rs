@@ -206,8 +206,10 @@ fn a_frozen_sensor_gives_no_valid_torque() {
         (valid(25), valid(40)),
         (setup.robot.joint_names().count(), 0)
     );
-    let mut reasons = found[40].torques.joints().iter().map(|joint| joint.reason);
-    assert!(reasons.all(|reason| reason == Reason::Saturated));
+    for joint in found[40].torques.joints() {
+        assert_eq!(joint.reason, Reason::Frozen);
+        assert_eq!(joint.cause as usize, sensor);
+    }
 }
 
 /// Two unknown wrenches in one sub-tree are twelve unknowns in six equations: each may be anything,

@@ -335,7 +335,9 @@ pub(crate) fn finding(defect: &Defect) -> Finding {
         Defect::Repeated { channel, .. } => (FindingCode::Repeated, channel.clone()),
         Defect::Stamps { channel, .. } => (FindingCode::Timestamps, channel.clone()),
         Defect::Gaps { channel, .. } => (FindingCode::Gap, channel.clone()),
-        Defect::Frozen { channel, .. } => (FindingCode::Frozen, channel.clone()),
+        Defect::Frozen { channel, .. } | Defect::MarkedFrozen { channel, .. } => {
+            (FindingCode::Frozen, channel.clone())
+        }
         Defect::Still { channel } => (FindingCode::JointStill, channel.clone()),
         Defect::Saturated { channel, .. } => (FindingCode::Saturated, channel.clone()),
         Defect::WrongUnits { channels, .. } => (FindingCode::WrongUnits, channels.join(", ")),

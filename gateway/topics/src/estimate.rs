@@ -38,6 +38,9 @@ pub enum Reason {
     /// Neither the model nor a possible contact explains the readings of the F/T sensors of its
     /// sub-tree.
     Unexplained = 11,
+    /// A sensor it depends on repeats its readings instead of measuring ([`Quality::FROZEN`]), and
+    /// is not saturated.
+    Frozen = 12,
 }
 
 coded!(Reason {
@@ -53,6 +56,7 @@ coded!(Reason {
     Starting = "starting",
     NoStance = "no_stance",
     Unexplained = "unexplained",
+    Frozen = "frozen",
 });
 
 impl Reason {
@@ -60,8 +64,11 @@ impl Reason {
     /// device fault.
     #[must_use]
     pub const fn of_quality(quality: Quality, faults: Quality) -> Self {
-        if quality.intersects(Quality(Quality::SATURATED.0 | Quality::FROZEN.0)) {
+        // A board may repeat its readings because it is saturated.
+        if quality.intersects(Quality::SATURATED) {
             Self::Saturated
+        } else if quality.intersects(Quality::FROZEN) {
+            Self::Frozen
         } else if quality.intersects(faults) {
             Self::DeviceFault
         } else {

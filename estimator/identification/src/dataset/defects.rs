@@ -103,6 +103,15 @@ pub enum Defect {
         /// End.
         to: Nanos,
     },
+    /// Readings that their device repeats instead of measuring, as the log's quality tells.
+    MarkedFrozen {
+        /// The channel.
+        channel: String,
+        /// Number of samples.
+        samples: usize,
+        /// Time of the first.
+        first: Nanos,
+    },
     /// A joint whose position never changes.
     Still {
         /// The channel.
@@ -272,6 +281,16 @@ impl fmt::Display for Defect {
                 f,
                 "{channel} does not change from {from} s to {to} s while the robot moves: this \
                  time is excluded; check the cable and the board"
+            ),
+            Self::MarkedFrozen {
+                channel,
+                samples,
+                first,
+            } => write!(
+                f,
+                "{channel} is frozen in {samples} samples, the first at {first} s: its board \
+                 repeats its readings instead of measuring; they are excluded; check the board, \
+                 its cable and its temperature, and switch it off and on"
             ),
             Self::Still { channel } => write!(
                 f,

@@ -52,19 +52,26 @@ pub(crate) fn inspect(recording: &mut Recording, robot: &Robot) {
                     });
                     continue;
                 }
-                let faulty: Vec<Nanos> = stream
-                    .faulty
-                    .iter()
-                    .filter(|(_, r)| *r == Reason::Saturated)
-                    .map(|(t, _)| *t)
-                    .collect();
-                if let Some(first) = faulty.first() {
+                let marked = |reason| {
+                    let of = stream.faulty.iter().filter(|(_, r)| *r == reason);
+                    let mut stamps = of.map(|(t, _)| *t);
+                    let first = stamps.next()?;
+                    Some((first, 1 + stamps.count()))
+                };
+                if let Some((first, samples)) = marked(Reason::Saturated) {
                     found.push(Defect::Saturated {
                         channel: label(channel),
                         axis: "",
-                        samples: faulty.len(),
-                        first: *first,
+                        samples,
+                        first,
                         value: f64::NAN,
+                    });
+                }
+                if let Some((first, samples)) = marked(Reason::Frozen) {
+                    found.push(Defect::MarkedFrozen {
+                        channel: label(channel),
+                        samples,
+                        first,
                     });
                 }
                 for (axis, word) in AXES.into_iter().enumerate() {

@@ -6,6 +6,7 @@ use crate::linear::simd::{self, VECTORS};
 use crate::online::channel::Channel;
 use crate::online::rows::{Kinds, ObservationRows, Rows, spread};
 use crate::online::solution::{BLOCK, Change, ComponentSolution, Counts, Observation, Paused};
+use crate::robot::ChannelRole;
 use crate::statistics::chi_square;
 use nalgebra::DMatrix;
 use proprio_dynamics::model::Model;
@@ -334,21 +335,21 @@ impl Component {
             self.close(t, known);
             self.block_from = t;
         }
-        let of_sensors = self.sensors.iter().filter_map(|&s| seen.sensors.get(s));
+        let of_sensors = (self.sensors.iter())
+            .filter_map(|&s| Some((*seen.sensors.get(s)?, ChannelRole::Sensor(s))));
         let base = seen.kinematics.base();
-        let of_joints = self.dofs[base]
-            .iter()
-            .filter_map(|dof| seen.joints.get(dof));
-        let fault = std::iter::once(&seen.base)
+        let of_joints = (self.dofs[base].iter())
+            .filter_map(|dof| Some((*seen.joints.get(dof)?, ChannelRole::Joint(dof))));
+        let mut faults = std::iter::once((seen.base, ChannelRole::Base))
             .chain(of_sensors)
             .chain(of_joints);
-        if let Some(reason) = fault.copied().find(|reason| *reason != Reason::None) {
-            self.paused = Paused::Fault(reason);
+        if let Some((reason, channel)) = faults.find(|(reason, _)| *reason != Reason::None) {
+            self.paused = Paused::Fault(reason, channel);
             let counts = &mut self.counts;
             *match reason {
                 Reason::Stale => &mut counts.stale,
                 Reason::Saturated => &mut counts.saturated,
-                Reason::DeviceFault => &mut counts.device_fault,
+                Reason::DeviceFault | Reason::Frozen => &mut counts.device_fault,
                 _ => &mut counts.unseen,
             } += 1;
             return;

@@ -2,6 +2,7 @@
 
 use crate::linear::information::InformationError;
 use crate::prior::PriorError;
+use crate::robot::{Channel, ChannelRole, Robot};
 use nalgebra::DMatrix;
 use proprio_dynamics::spatial::{RigidInertia, Wrench};
 use proprio_dynamics::{ContactSet, DofSet, DynamicsError, Kinematics};
@@ -67,8 +68,42 @@ pub enum Paused {
     /// Noise and the uncertainty of the solution do not explain its readings: an undeclared
     /// contact, an outlier, or a change.
     Suspected,
-    /// A channel that it needs is faulty.
-    Fault(Reason),
+    /// A channel that it needs is faulty: why, and which.
+    Fault(Reason, ChannelRole),
+}
+
+impl Paused {
+    /// For a person, with the channels' names. Does not allocate.
+    #[must_use]
+    pub const fn describe<'r>(&self, robot: &'r Robot) -> impl std::fmt::Display + use<'r> {
+        PausedOf {
+            paused: *self,
+            robot,
+        }
+    }
+}
+
+/// Why identification of a component of `robot` pauses.
+struct PausedOf<'r> {
+    paused: Paused,
+    robot: &'r Robot,
+}
+
+impl std::fmt::Display for PausedOf<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Paused::Fault(reason, role) = self.paused else {
+            return self.paused.fmt(f);
+        };
+        let channel = self.robot.channels.iter().find(|c| c.role == role);
+        match channel {
+            Some(Channel { kind, name, .. }) => write!(
+                f,
+                "identification pauses: the {kind} channel {name} is faulty ({reason})"
+            ),
+            // A base without an IMU has no channel.
+            None => self.paused.fmt(f),
+        }
+    }
 }
 
 impl std::fmt::Display for Paused {
@@ -81,8 +116,7 @@ impl std::fmt::Display for Paused {
                 "identification pauses: the readings do not fit the solution; an undeclared \
                  contact, or a change"
             ),
-            Self::Fault(reason) => {
-                let reason = reason.word().replace('_', " ");
+            Self::Fault(reason, _) => {
                 write!(f, "identification pauses: a channel is faulty ({reason})")
             }
         }
