@@ -1,10 +1,17 @@
 //! The `proprio` command with all subcommands. `proprio --help` lists them.
 
-/// `println!` that ignores a closed standard output, so that piping into `head` is not an error.
+use std::sync::atomic::AtomicBool;
+
+/// Whoever read standard output has closed it.
+static CLOSED: AtomicBool = AtomicBool::new(false);
+
+/// `println!` that is no error if standard output is closed, as by `head`: see [`CLOSED`].
 macro_rules! print_line {
     ($($text:tt)*) => {{
         use std::io::Write as _;
-        let _ = writeln!(std::io::stdout(), $($text)*);
+        if writeln!(std::io::stdout(), $($text)*).is_err() {
+            crate::CLOSED.store(true, std::sync::atomic::Ordering::Relaxed);
+        }
     }};
 }
 
@@ -20,9 +27,11 @@ mod convert;
 mod ctl;
 mod demo;
 mod doctor;
+mod echo;
 mod estimator;
 mod identify;
 mod install;
+mod record;
 mod report;
 mod scan;
 mod setup;
@@ -73,10 +82,10 @@ enum Verb {
     Identify(identify::Args),
     /// Show the robots of a running system: processes, buses, devices, channels, estimates
     Status(system::Status),
-    /// Print the samples of a channel as they come
-    Echo(system::Echo),
+    /// Print the samples of a channel, the torques or the contacts as they come
+    Echo(echo::Echo),
     /// Record samples and declared contacts into the table that `identify` reads
-    Record(system::Record),
+    Record(record::Record),
     /// Ask a running gateway: its state, its devices, a tare, a changed configuration
     Ctl(ctl::Args),
     /// Check this machine: CAN, permissions, shared memory, buffers, real-time limits
@@ -114,8 +123,8 @@ fn main() -> ExitCode {
         Verb::Estimate(args) => convert::estimate(&args),
         Verb::Identify(args) => identify::run(&args),
         Verb::Status(args) => system::status(&args, &domain),
-        Verb::Echo(args) => system::echo(&args, &domain),
-        Verb::Record(args) => system::record(&args, &domain),
+        Verb::Echo(args) => echo::run(&args, &domain),
+        Verb::Record(args) => record::run(&args, &domain),
         Verb::Ctl(args) => ctl::run(&args, &domain),
         Verb::Doctor(args) => doctor::run(&args, &domain),
         Verb::Install(args) => install::run(&args),

@@ -1,19 +1,17 @@
-//! `proprio status`, `echo` and `record`: what a running system does, from shared memory alone.
+//! `proprio status`: what a running system does, from shared memory alone; and what `echo` and
+//! `record` share with it.
 
+use crate::echo::{of_joints, torque_json};
 use anyhow::{Context, bail};
-use proprio_gateway::offline::InOrder;
-use proprio_topics::csv::{Columns, Series, Value, What, Writer};
 use proprio_topics::ipc::{
-    Domain, DomainConfig, PortError, Reader, RobotPresence, Topic, monotonic,
+    Domain, DomainConfig, PortError, Reader, RobotPresence, Topic, Unavailable, monotonic,
 };
 use proprio_topics::{
-    ContactDeclaration, Controller, Counter, Description, DeviceState, EstimatorHealth,
-    GatewayHealth, Kind, LinkState, MAX_CHANNELS, Nanos, Publisher, Quality, Role, Sample, axes,
+    Controller, Counter, Description, DeviceState, EstimatorHealth, GatewayHealth, Kind, LinkState,
+    MAX_CHANNELS, Nanos, Publisher, Quality, Role, Sample, TorqueEstimate, axes,
 };
 use serde_json::{Value as Json, json};
-use std::fs::File;
-use std::io::BufWriter;
-use std::path::PathBuf;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
@@ -22,10 +20,8 @@ use std::sync::atomic::Ordering::Relaxed;
 const WINDOW: Nanos = Nanos::from_millis(1000);
 /// A description or health message is sent again to a new reader within this time.
 const HISTORY: Nanos = Nanos::from_millis(500);
-
-/// How late a sample is still sorted into its place in a recording: a gateway that starts publishes
-/// the frames that arrived meanwhile.
-const REORDER: Nanos = Nanos::from_millis(2000);
+/// How often it is looked for: nothing tells of a payload that is sent again.
+const LOOK: Nanos = Nanos::from_millis(5);
 
 /// `proprio status`.
 #[derive(clap::Args)]
@@ -41,41 +37,8 @@ pub(crate) struct Status {
     watch: bool,
 }
 
-/// `proprio echo`.
-#[derive(clap::Args)]
-pub(crate) struct Echo {
-    /// The channel: the name of a joint or sensor
-    channel: String,
-    /// The robot; default: the only one
-    #[arg(long, value_name = "NAME")]
-    robot: Option<String>,
-    /// End after so many samples
-    #[arg(long, value_name = "N")]
-    count: Option<u64>,
-    /// Print each sample as a JSON object
-    #[arg(long)]
-    json: bool,
-}
-
-/// `proprio record`.
-#[derive(clap::Args)]
-pub(crate) struct Record {
-    /// The table of samples
-    #[arg(long, value_name = "FILE")]
-    out: PathBuf,
-    /// The robot; default: the only one
-    #[arg(long, value_name = "NAME")]
-    robot: Option<String>,
-    /// End after so many seconds; default: at Ctrl-C
-    #[arg(long, value_name = "N")]
-    seconds: Option<f64>,
-    /// Write all columns, such as gauges and temperatures, not only those that the estimator reads
-    #[arg(long)]
-    all: bool,
-}
-
 /// Set by SIGINT and SIGTERM.
-fn interrupted() -> anyhow::Result<Arc<AtomicBool>> {
+pub(crate) fn interrupted() -> anyhow::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot catch signals")?;
@@ -84,7 +47,7 @@ fn interrupted() -> anyhow::Result<Arc<AtomicBool>> {
 }
 
 /// Opens the domain for reading; the error names the domains that there are.
-fn open(config: &DomainConfig) -> anyhow::Result<Domain> {
+pub(crate) fn open(config: &DomainConfig) -> anyhow::Result<Domain> {
     Domain::open_existing(config).map_err(|error| {
         let siblings = config.siblings();
         match siblings.is_empty() {
@@ -110,7 +73,7 @@ fn robots(domain: &Domain, name: Option<&str>) -> anyhow::Result<Vec<RobotPresen
 }
 
 /// The name of the robot to read: the named one, or the only one.
-fn one_robot(domain: &Domain, name: Option<&str>) -> anyhow::Result<String> {
+pub(crate) fn one_robot(domain: &Domain, name: Option<&str>) -> anyhow::Result<String> {
     let mut found = robots(domain, name)?;
     match (found.pop(), found.is_empty()) {
         (Some(robot), true) => Ok(robot.name),
@@ -138,34 +101,73 @@ fn newest<T: Topic>(domain: &Domain, robot: &str) -> Result<Option<T>, PortError
         if let Ok(Some(newest)) = reader.latest() {
             return Ok(Some(newest));
         }
-        if !reader.wait(deadline) {
+        if monotonic() >= deadline {
             return Ok(None);
         }
+        reader.wait(monotonic() + LOOK);
     }
 }
 
-/// The newest description of one publisher.
-fn described(
-    domain: &Domain,
-    robot: &str,
+/// The descriptions of one publisher, over its restarts.
+pub(crate) struct Described {
+    reader: Reader<Description>,
     publisher: Publisher,
-) -> Result<Option<Description>, PortError> {
-    let mut reader = match Reader::<Description>::open(domain, robot) {
-        Ok(reader) => reader,
-        Err(PortError::NotYet { .. }) => return Ok(None),
-        Err(error) => return Err(error),
-    };
-    let (mut found, deadline) = (None, monotonic() + HISTORY);
-    loop {
-        while let Ok(Some(description)) = reader.try_take() {
-            if description.publisher == publisher {
-                found = Some(description);
+    newest: Description,
+}
+
+impl Described {
+    /// Those of `publisher`; `None` if it does not run.
+    pub(crate) fn by(
+        domain: &Domain,
+        robot: &str,
+        publisher: Publisher,
+    ) -> Result<Option<Self>, PortError> {
+        let mut reader = match Reader::<Description>::open(domain, robot) {
+            Ok(reader) => reader,
+            Err(PortError::NotYet { .. }) => return Ok(None),
+            Err(error) => return Err(error),
+        };
+        let deadline = monotonic() + HISTORY;
+        loop {
+            if let Some(newest) = take_newest(&mut reader, publisher) {
+                return Ok(Some(Self {
+                    reader,
+                    publisher,
+                    newest,
+                }));
             }
-        }
-        if found.is_some() || !reader.wait(deadline) {
-            return Ok(found);
+            if monotonic() >= deadline {
+                return Ok(None);
+            }
+            reader.wait(monotonic() + LOOK);
         }
     }
+
+    /// The newest one.
+    pub(crate) const fn newest(&self) -> &Description {
+        &self.newest
+    }
+
+    /// That of the publisher's start `epoch`; `None` if it has not come yet.
+    pub(crate) fn of(&mut self, epoch: u64) -> Option<&Description> {
+        if self.newest.header.epoch != epoch
+            && let Some(newest) = take_newest(&mut self.reader, self.publisher)
+        {
+            self.newest = newest;
+        }
+        (self.newest.header.epoch == epoch).then_some(&self.newest)
+    }
+}
+
+/// The newest description of `publisher` that waits.
+fn take_newest(reader: &mut Reader<Description>, publisher: Publisher) -> Option<Description> {
+    let mut newest = None;
+    while let Ok(Some(description)) = reader.try_take() {
+        if description.publisher == publisher {
+            newest = Some(description);
+        }
+    }
+    newest
 }
 
 /// What a channel sent during the window.
@@ -185,6 +187,8 @@ struct Glance {
     estimates: f64,
     description: Option<Description>,
     channels: Vec<Seen>,
+    /// The newest torques of the window, and the estimator's names.
+    torques: Option<(TorqueEstimate, Description)>,
     /// The end of the window in which they were counted, and its duration.
     now: Nanos,
     window: Nanos,
@@ -193,7 +197,10 @@ struct Glance {
 impl Glance {
     fn take(domain: &Domain, presence: RobotPresence) -> anyhow::Result<Self> {
         let robot = presence.name.clone();
-        let description = described(domain, &robot, Publisher::Gateway)?;
+        let description = Described::by(domain, &robot, Publisher::Gateway)?;
+        let description = description.map(|described| *described.newest());
+        let names = Described::by(domain, &robot, Publisher::Estimator)?;
+        let mut estimates = Reader::<TorqueEstimate>::open(domain, &robot).ok();
         let mut channels = vec![Seen::default(); MAX_CHANNELS];
         let before = newest::<EstimatorHealth>(domain, &robot)?;
         let mut samples = Reader::<Sample>::open(domain, &robot).ok();
@@ -216,6 +223,14 @@ impl Glance {
         }
         let now = monotonic();
         let window = now - began;
+        let newest_torques = estimates.as_mut().and_then(|reader| reader.latest().ok());
+        let torques = newest_torques
+            .flatten()
+            .zip(names)
+            .and_then(|(torques, mut names)| {
+                let description = *names.of(torques.header.epoch)?;
+                Some((torques, description))
+            });
         let estimator = newest::<EstimatorHealth>(domain, &robot)?;
         let estimates = match (&before, &estimator) {
             (Some(a), Some(b)) if b.header.published > a.header.published => {
@@ -231,30 +246,45 @@ impl Glance {
             estimates,
             description,
             channels,
+            torques,
             now,
             window,
         })
     }
 
-    /// Name, kind, rate \[Hz\], age \[s\] and quality of each channel.
-    fn channels(&self) -> impl Iterator<Item = (&str, Kind, f64, Option<f64>, Quality)> {
+    /// Name, kind, rate \[Hz\], age \[s\] of the last sample, and quality of each channel. One that
+    /// sent nothing during the window has no quality.
+    fn channels(&self) -> impl Iterator<Item = (&str, Kind, f64, Option<f64>, Option<Quality>)> {
         let entries = self.description.as_ref().map(Description::entries);
         entries.unwrap_or_default().iter().filter_map(|entry| {
             let seen = self.channels.get(entry.index as usize)?;
             let rate = seen.count as f64 / self.window.seconds();
-            let age = seen
-                .last
-                .map(|last| self.now.saturating_sub(last).seconds());
+            let before = self.gateway.as_ref().and_then(|health| {
+                let newest = *health.newest.get(entry.index as usize)?;
+                (newest > Nanos::MIN).then_some(newest)
+            });
+            let age = (seen.last.or(before)).map(|last| self.now.saturating_sub(last).seconds());
             (entry.role == Role::Channel).then(|| {
                 Some((
                     entry.name.as_str(),
                     entry.kind.get()?,
                     rate,
                     age,
-                    seen.quality,
+                    seen.last.map(|_| seen.quality),
                 ))
             })?
         })
+    }
+
+    fn torques(&self) -> impl Iterator<Item = (&str, f64, f64, Option<Unavailable>)> {
+        let newest = self.torques.iter();
+        newest.flat_map(|(torques, description)| of_joints(description, torques))
+    }
+
+    /// The time since the instant of the last estimate \[s\]; `None` before the first.
+    fn since_last_estimate(&self) -> Option<f64> {
+        let last = self.estimator.as_ref()?.last_estimate;
+        (last > Nanos::ZERO).then(|| self.now.saturating_sub(last).seconds())
     }
 
     fn json(&self) -> Json {
@@ -308,6 +338,13 @@ impl Glance {
                 "devices": devices,
             })
         });
+        let torques: serde_json::Map<_, _> = self
+            .torques()
+            .map(|(name, torque, deviation, withheld)| {
+                let value = torque_json(torque, deviation, withheld.as_ref());
+                (name.to_owned(), value)
+            })
+            .collect();
         let estimator = self.estimator.as_ref().map(|health| {
             let identification: serde_json::Map<_, _> = health
                 .identification
@@ -320,6 +357,8 @@ impl Glance {
                 "estimates_hz": self.estimates,
                 "estimates": health.estimates, "withheld": health.withheld,
                 "samples": health.samples, "lost": health.lost, "late": health.late,
+                "last_estimate_s": self.since_last_estimate(),
+                "torques": torques,
                 "identification": {
                     "groups": health.identification.groups,
                     "paused": health.identification.paused,
@@ -332,7 +371,7 @@ impl Glance {
             .map(|(name, kind, rate, age, quality)| {
                 json!({
                     "name": name, "kind": kind.word(), "rate_hz": rate, "age_s": age,
-                    "quality": quality.to_string(),
+                    "quality": quality.map(|quality| quality.to_string()),
                 })
             })
             .collect();
@@ -383,13 +422,12 @@ impl Glance {
             );
         }
         for (name, kind, rate, age, quality) in self.channels() {
-            let age = age.map_or("never seen".into(), |age| {
-                format!("{:.1} ms old", age * 1e3)
-            });
-            print_line!(
-                "    {:<8} {name:<23} {rate:>7.1} Hz, {age}, {quality}",
-                kind.word()
-            );
+            let state = match (age, quality) {
+                (Some(age), Some(quality)) => format!("{:.1} ms old, {quality}", age * 1e3),
+                (Some(age), None) => format!("last seen {age:.0} s ago"),
+                (None, _) => "never seen".to_owned(),
+            };
+            print_line!("    {:<8} {name:<23} {rate:>7.1} Hz, {state}", kind.word());
         }
         print_line!("  estimator {estimator}");
         if let Some(health) = &self.estimator {
@@ -401,6 +439,20 @@ impl Glance {
                 health.lost,
                 health.late
             );
+            if self.torques.is_none()
+                && let Some(seconds) = self.since_last_estimate()
+            {
+                print_line!("    the last estimate was {seconds:.0} s ago");
+            }
+            let mut withheld = BTreeMap::<String, Vec<&str>>::new();
+            for (name, .., why) in self.torques() {
+                if let Some(why) = why {
+                    withheld.entry(why.to_string()).or_default().push(name);
+                }
+            }
+            for (why, joints) in withheld {
+                print_line!("    torque of {} {why}", joints.join(", "));
+            }
             if health.identification.groups > 0 {
                 print_line!("    identification: {}", health.identification);
             }
@@ -443,212 +495,8 @@ pub(crate) fn status(args: &Status, config: &DomainConfig) -> anyhow::Result<()>
             }
             glances.iter().for_each(Glance::print);
         }
-        if !args.watch || stop.load(Relaxed) {
+        if !args.watch || stop.load(Relaxed) || crate::CLOSED.load(Relaxed) {
             return Ok(());
         }
     }
-}
-
-/// Prints the samples of a channel.
-pub(crate) fn echo(args: &Echo, config: &DomainConfig) -> anyhow::Result<()> {
-    let stop = interrupted()?;
-    let domain = open(config)?;
-    let robot = one_robot(&domain, args.robot.as_deref())?;
-    let description = described(&domain, &robot, Publisher::Gateway)?
-        .context("the robot's gateway is not running")?;
-    let names = || {
-        let channels = description
-            .entries()
-            .iter()
-            .filter(|e| e.role == Role::Channel);
-        channels.map(|entry| entry.name.as_str())
-    };
-    let Some(number) = description.index(Role::Channel, &args.channel) else {
-        let hint = proprio_estimator::setup::nearest(&args.channel, names());
-        bail!("there is no channel {:?}{hint}", args.channel);
-    };
-    let mut samples = Reader::<Sample>::open(&domain, &robot)?;
-    let mut printed = 0;
-    while !stop.load(Relaxed) && args.count.is_none_or(|count| printed < count) {
-        while let Some(sample) = samples.try_take()? {
-            let Some(kind) = sample.kind.get().filter(|_| sample.channel == number) else {
-                continue;
-            };
-            if args.count.is_some_and(|count| printed >= count) {
-                break;
-            }
-            printed += 1;
-            let (t, quality) = (sample.header.acquired, sample.header.quality);
-            let values = kind.fields().iter().zip(sample.values);
-            if args.json {
-                let values: serde_json::Map<_, _> = values
-                    .map(|(field, value)| ((*field).to_owned(), json!(value)))
-                    .collect();
-                print_line!(
-                    "{}",
-                    json!({
-                        "t_ns": t.0, "kind": kind.word(), "values": values,
-                        "quality": quality.to_string(),
-                    })
-                );
-            } else {
-                let values: Vec<_> = values
-                    .filter(|(_, value)| !value.is_nan())
-                    .map(|(field, value)| format!("{field} {value:.6}"))
-                    .collect();
-                print_line!("{t} {} {}  {quality}", kind.word(), values.join(" "));
-            }
-        }
-        samples.wait(monotonic() + Nanos::from_millis(200));
-    }
-    Ok(())
-}
-
-/// The channels of a gateway.
-fn channels_of(description: &Description) -> Vec<Series> {
-    let channels = description
-        .entries()
-        .iter()
-        .filter(|e| e.role == Role::Channel);
-    channels
-        .filter_map(|entry| {
-            Some(Series {
-                what: What::Channel(entry.kind.get()?),
-                name: entry.name.as_str().to_owned(),
-            })
-        })
-        .collect()
-}
-
-/// The series of each channel number of one run of the gateway.
-struct Numbers {
-    epoch: u64,
-    series: Vec<Option<usize>>,
-}
-
-impl Numbers {
-    fn new(description: &Description, series: &[Series]) -> Self {
-        let mut numbers = vec![None; MAX_CHANNELS];
-        for entry in description.entries() {
-            let what = entry.kind.get().map(What::Channel);
-            if entry.role == Role::Channel
-                && let Some(number) = numbers.get_mut(entry.index as usize)
-            {
-                *number = series
-                    .iter()
-                    .position(|one| Some(one.what) == what && one.name == entry.name.as_str());
-            }
-        }
-        Self {
-            epoch: description.header.epoch,
-            series: numbers,
-        }
-    }
-
-    fn series(&self, sample: &Sample) -> Option<usize> {
-        let series = self.series.get(sample.channel as usize).copied().flatten();
-        series.filter(|_| sample.header.epoch == self.epoch)
-    }
-}
-
-/// Records samples and declared contacts.
-pub(crate) fn record(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
-    let stop = interrupted()?;
-    let domain = open(config)?;
-    let robot = one_robot(&domain, args.robot.as_deref())?;
-    // The readers first: what comes while the table is prepared is recorded, too.
-    let mut samples = Reader::<Sample>::open(&domain, &robot)?;
-    let mut declarations = Reader::<ContactDeclaration>::open(&domain, &robot).ok();
-    let mut descriptions = Reader::<Description>::open(&domain, &robot)?;
-    let description = described(&domain, &robot, Publisher::Gateway)?
-        .context("the robot's gateway is not running")?;
-    let estimator = described(&domain, &robot, Publisher::Estimator)?;
-    let mut series = channels_of(&description);
-    for contact in estimator.iter().flat_map(Description::entries) {
-        if contact.role == Role::Contact {
-            series.push(Series {
-                what: What::Contact,
-                name: contact.name.as_str().to_owned(),
-            });
-        }
-    }
-    let mut numbers = Numbers::new(&description, &series);
-    let columns = match args.all {
-        true => Columns::All,
-        false => Columns::Main,
-    };
-    let file = File::create(&args.out).with_context(|| args.out.display().to_string())?;
-    let mut table = Writer::new(BufWriter::new(file), &series, columns)?;
-    let (mut order, mut inbox) = (InOrder::<(usize, Value)>::new(REORDER), Vec::new());
-    let began = monotonic();
-    let end = args
-        .seconds
-        .map(|seconds| began + Nanos::from_seconds(seconds));
-    let (mut count, mut others, mut next_flush) = (0_u64, 0_u64, began);
-    while !stop.load(Relaxed) && end.is_none_or(|end| monotonic() < end) {
-        while let Some(declared) = declarations.as_mut().map_or(Ok(None), Reader::try_take)? {
-            let contact = Series {
-                what: What::Contact,
-                name: declared.contact.as_str().to_owned(),
-            };
-            let Some(at) = series.iter().position(|one| *one == contact) else {
-                others += 1;
-                continue;
-            };
-            let value = Value::Contact(declared.state());
-            // What was declared long before arrives with the next declaration.
-            let t = declared.header.acquired.max(order.passed_on());
-            order.push(t, (at, value), |t, (at, value)| {
-                table.push(Some(t), *at, value)
-            })?;
-        }
-        // Shared memory delivers all samples of one bus before those of the next.
-        while let Some(sample) = samples.try_take()? {
-            inbox.push(sample);
-        }
-        inbox.sort_by_key(|sample| sample.header.acquired);
-        for sample in inbox.drain(..) {
-            if sample.header.epoch != numbers.epoch {
-                // The gateway was restarted: the same channels may have other numbers.
-                while let Some(description) = descriptions.try_take()? {
-                    if description.publisher == Publisher::Gateway {
-                        numbers = Numbers::new(&description, &series);
-                    }
-                }
-            }
-            let (Some(at), Some(reading)) = (numbers.series(&sample), sample.reading()) else {
-                others += 1;
-                continue;
-            };
-            count += 1;
-            let value = Value::Reading(reading, sample.header.quality);
-            let t = sample.header.acquired;
-            order.push(t, (at, value), |t, (at, value)| {
-                table.push(Some(t), *at, value)
-            })?;
-        }
-        let now = monotonic();
-        if now >= next_flush {
-            // If this program is killed, the rows of the last moments are lost, not the table.
-            next_flush = now + Nanos::from_millis(500);
-            table.flush()?;
-        }
-        samples.wait((now + Nanos::from_millis(100)).min(end.unwrap_or(Nanos::MAX)));
-    }
-    order.finish(|t, (at, value)| table.push(Some(t), *at, value))?;
-    table.finish()?;
-    print_line!(
-        "{}: {count} samples in {:.1} s, {} lost, {} out of order",
-        args.out.display(),
-        (monotonic() - began).seconds(),
-        samples.lost(),
-        order.out_of_order()
-    );
-    if others > 0 {
-        print_line!(
-            "{others} samples and declarations are not in the table: they are of channels or \
-             contacts that were not there when the recording began"
-        );
-    }
-    Ok(())
 }

@@ -132,6 +132,7 @@ impl<S: Sink> Bus<S> {
                     .on_frame(&frame, |sample| match sink.publish(sample, clock.now()) {
                         Ok(connections) => {
                             status.published.fetch_add(1, Relaxed);
+                            status.set_newest(sample.channel, sample.header.acquired);
                             status
                                 .connections
                                 .fetch_add(u64::from(connections), Relaxed);

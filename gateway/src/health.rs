@@ -8,7 +8,7 @@ use crate::plan::{BusPlan, Plan};
 use crate::status::BusStatus;
 use proprio_topics::{
     BusError, BusHealth, Controller, Counter, DeviceHealth, DeviceState, GatewayHealth,
-    InterfaceHealth, LinkState, Nanos, Refusal, axes,
+    InterfaceHealth, LinkState, MAX_CHANNELS, Nanos, Refusal, axes,
 };
 
 /// Fills the health message from the counters of the buses and what is known of their interfaces.
@@ -40,6 +40,12 @@ pub(crate) fn fill_health(
     {
         *slot = device;
         health.device_count += 1;
+    }
+    health.newest = [Nanos::MIN; MAX_CHANNELS];
+    for status in buses {
+        for (slot, newest) in health.newest.iter_mut().zip(status.newest()) {
+            *slot = newest.max(*slot);
+        }
     }
 }
 
@@ -273,6 +279,11 @@ impl HealthLog {
                 let of = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
                 let count = of(device).unwrap_or(0);
                 let new = increase(count, before.and_then(of));
+                // Who joins a stream hears parts of groups that began before.
+                let joins = before.is_none_or(|b| b.state != DeviceState::Streaming);
+                if joins && counter == Counter::Unpaired {
+                    continue;
+                }
                 // A silence that goes on has been told by the state.
                 let told = counter == Counter::Silences && device.state == DeviceState::Silent;
                 if run.begins(new > 0) && !told {
@@ -701,6 +712,32 @@ mod tests {
             "{overflow:?}"
         );
         assert!(overflow[1].contains("frames were lost"), "{overflow:?}");
+    }
+
+    /// Who joins a stream hears halves of groups: that is no warning. Later ones are.
+    #[test]
+    fn an_ordinary_start_is_quiet() {
+        let mut log = HealthLog::default();
+        let mut health = health(BusHealth::EMPTY);
+        health.device_count = 1;
+        let mut tick = |state: DeviceState, unpaired: u64, lost: u64| {
+            health.devices[0].state = state.in_memory();
+            health.devices[0].counters[Counter::Unpaired as usize] += unpaired;
+            health.devices[0].counters[Counter::Lost as usize] += lost;
+            let lines = logged(|| log.log_changes(&health, &[]));
+            lines.iter().filter(|line| line.contains("WARN")).count()
+        };
+        assert_eq!(tick(DeviceState::Waiting, 0, 0), 0);
+        assert_eq!(tick(DeviceState::Starting, 1, 0), 0);
+        assert_eq!(tick(DeviceState::Streaming, 2, 0), 0);
+        assert_eq!(tick(DeviceState::Streaming, 1, 0), 1, "the first of a run");
+        assert_eq!(tick(DeviceState::Streaming, 1, 0), 0);
+        assert_eq!(tick(DeviceState::Silent, 0, 0), 1);
+        assert_eq!(
+            tick(DeviceState::Streaming, 1, 1),
+            1,
+            "what is no matter of joining"
+        );
     }
 
     #[test]

@@ -7,7 +7,7 @@ use crate::load::{Bits, Totals, bits_on_wire};
 use crate::plan::BusPlan;
 use proprio_drivers::{Frame, State};
 use proprio_topics::{
-    BusError, BusHealth, Code, Counter, DeviceHealth, LinkState, Name, Nanos, Refusal,
+    BusError, BusHealth, Code, Counter, DeviceHealth, LinkState, MAX_CHANNELS, Name, Nanos, Refusal,
 };
 use std::sync::atomic::Ordering::Relaxed;
 use std::sync::atomic::{AtomicI64, AtomicU32, AtomicU64, Ordering, fence};
@@ -41,6 +41,8 @@ pub struct BusStatus {
     link_state: AtomicU32,
     errors: [ErrorStatus; BusError::ALL.len()],
     devices: Vec<DeviceStatus>,
+    /// When the newest sample of each channel was acquired.
+    newest: [AtomicI64; MAX_CHANNELS],
 }
 
 /// The number of error frames with one cause, and the newest of them.
@@ -119,7 +121,21 @@ impl BusStatus {
             link_state: AtomicU32::new(LinkState::Up as u32),
             errors: Default::default(),
             devices: devices.collect(),
+            newest: [const { AtomicI64::new(i64::MIN) }; MAX_CHANNELS],
         }
+    }
+
+    /// A sample of `channel`, acquired at `t`, was published.
+    pub fn set_newest(&self, channel: u32, t: Nanos) {
+        if let Some(newest) = self.newest.get(channel as usize) {
+            newest.store(t.0, Relaxed);
+        }
+    }
+
+    /// When the newest sample of each channel was acquired; [`Nanos::MIN`] for a channel that had
+    /// none, or is not of this bus.
+    pub fn newest(&self) -> impl Iterator<Item = Nanos> {
+        self.newest.iter().map(|t| Nanos(t.load(Relaxed)))
     }
 
     /// Adds `n` to a counter of a device.

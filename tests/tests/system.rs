@@ -1,11 +1,15 @@
 //! `proprio status`, `echo` and `record` beside a running system.
 #![allow(missing_docs)]
 
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
 use proprio_tests::watch::{open, valid_since};
 use proprio_tests::{Arm, PATIENCE, Rig, until};
 use proprio_topics::csv::{Reader, Row, Value, What};
 use proprio_topics::{Kind, Nanos, TorqueEstimate};
 use serde_json::Value as Json;
+use std::io::Read as _;
+use std::process::Stdio;
 
 #[test]
 fn a_running_system_says_what_it_does() {
@@ -98,10 +102,57 @@ fn a_running_system_says_what_it_does() {
         "{err}"
     );
 
+    // Lines arrive as they come, not in blocks.
+    let piped = || {
+        let mut command = rig.command(&["echo", "l_elbow"]);
+        command.stdout(Stdio::piped()).stderr(Stdio::piped());
+        command.spawn().expect("it runs")
+    };
+    let mut echo = piped();
+    let mut pipe = echo.stdout.take().expect("a pipe");
+    let mut read = || {
+        let mut bytes = vec![0; 1 << 16];
+        let count = pipe.read(&mut bytes).expect("readable");
+        String::from_utf8(bytes[..count].to_vec()).expect("text")
+    };
+    let pieces: Vec<String> = (0..10).map(|_| read()).collect();
+    assert!(pieces.iter().any(|piece| piece.len() < 4096), "{pieces:?}");
+    // A signal ends it with a whole line.
+    let pid = Pid::from_raw(i32::try_from(echo.id()).expect("a process"));
+    kill(pid, Signal::SIGINT).expect("it runs");
+    let mut rest = pieces.concat();
+    loop {
+        match read() {
+            piece if piece.is_empty() => break,
+            piece => rest.push_str(&piece),
+        }
+    }
+    assert_eq!(echo.wait().expect("it ends").code(), Some(0));
+    assert!(rest.ends_with('\n') && rest.lines().all(|line| line.contains(" joint position ")));
+    // Who reads may stop: it ends, and says nothing.
+    let mut echo = piped();
+    drop(echo.stdout.take());
+    let ended = until(PATIENCE, || echo.try_wait().expect("a process"));
+    let mut said = String::new();
+    let mut log = echo.stderr.take().expect("a pipe");
+    log.read_to_string(&mut said).expect("text");
+    assert_eq!(
+        (ended.and_then(|end| end.code()), said.as_str()),
+        (Some(0), "")
+    );
+
     // A recording holds what was published, in order, over a restart of the gateway.
     let table = rig.path("samples.csv");
     let table_text = table.to_string_lossy().into_owned();
-    let mut recording = rig.start(&["record", "--out", &table_text, "--seconds", "3"]);
+    // It does not overwrite unless it is asked to.
+    std::fs::write(&table, "mine").expect("a file");
+    let (code, _, err) = out(&["record", "--out", &table_text, "--seconds", "3"]);
+    assert!(
+        code == Some(1) && err.contains("overwrite it with --force"),
+        "{err}"
+    );
+    assert_eq!(std::fs::read_to_string(&table).expect("a file"), "mine");
+    let mut recording = rig.start(&["record", "--out", &table_text, "--force", "--seconds", "3"]);
     let begun = || std::fs::metadata(&table).is_ok_and(|m| m.len() > 64 << 10);
     assert!(
         until(PATIENCE, || begun().then_some(())).is_some(),
@@ -112,6 +163,12 @@ fn a_running_system_says_what_it_does() {
     recording.wait();
     let said = recording.output();
     assert!(said.contains(" 0 lost, 0 out of order"), "{said}");
+    assert!(said.contains("1 restarts of the gateway ("), "{said}");
+    let log = recording.log();
+    assert!(
+        log.contains("the gateway was restarted: a gap of "),
+        "{log}"
+    );
     let mut reader = Reader::new(std::fs::File::open(&table).expect("a table")).expect("a table");
     let series = reader.series().to_vec();
     assert!(
@@ -139,6 +196,135 @@ fn a_running_system_says_what_it_does() {
     assert_eq!(reader.report().bad_rows, 0);
     // Most of three seconds at 250 Hz, on a machine that may catch up in bursts.
     assert!((400..=2000).contains(&count), "{count}");
+    [&mut estimator, &mut gateway, &mut simulator]
+        .into_iter()
+        .for_each(proprio_tests::Process::end);
+    drop((torques, domain));
+    rig.assert_nothing_left();
+}
+
+/// A board that fell silent was seen, and what depends on it is withheld: `status` and `echo` say
+/// so, and why.
+#[test]
+fn what_fell_silent_was_last_seen_and_withholds_torques() {
+    let rig = Rig::new();
+    let arm = Arm::new()
+        .periods(4, 10, 4)
+        .on_virtual(["a", "b"])
+        .write(&rig.path("robot"));
+    let out = |arguments: &[&str]| {
+        let output = rig.command(arguments).output().expect("it runs");
+        let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+        (
+            output.status.code(),
+            text(&output.stdout),
+            text(&output.stderr),
+        )
+    };
+    let silent = ["--fault", "silent:l_elbow_motor@6.."];
+    let simulate = ["simulate", "--robot", &arm.folder, silent[0], silent[1]];
+    let mut simulator = rig.start(&simulate);
+    let mut gateway = rig.start(&["gateway", "--config", &arm.gateway]);
+    let (_, _, err) = out(&["echo", "--robot", "icub_left_arm", "--torques"]);
+    assert!(!err.is_empty(), "no estimator runs");
+    let mut estimator = rig.start(&["estimator", "--config", &arm.estimator]);
+    let domain = rig.open();
+    let mut torques = open::<TorqueEstimate>(&domain, "icub_left_arm");
+    assert!(valid_since(&mut torques, Nanos::ZERO, PATIENCE).is_some());
+
+    // Before: values with their standard deviations.
+    let (code, text, err) = out(&["echo", "--torques", "l_elbow", "--count", "1"]);
+    assert_eq!(code, Some(0), "{err}");
+    assert!(
+        text.contains(" l_elbow ") && text.contains(" +- "),
+        "{text}"
+    );
+    assert!(!text.contains("l_wrist_yaw"), "{text}");
+    let (code, text, err) = out(&["echo", "--contacts", "--count", "2", "--json"]);
+    assert_eq!(code, Some(0), "{err}");
+    let lines: Vec<Json> = text
+        .lines()
+        .map(|line| serde_json::from_str(line).expect("JSON"))
+        .collect();
+    assert_eq!(lines.len(), 2);
+    let hand = &lines[0]["contacts"]["hand"];
+    let keys = [
+        "force", "torque", "std", "valid", "reason", "cause", "located", "detected",
+    ];
+    assert!(keys.iter().all(|key| hand.get(key).is_some()), "{text}");
+    assert_eq!(hand["valid"] == true, hand["force"].is_array(), "{text}");
+    let (code, text, err) = out(&["echo", "--contacts", "hand", "--count", "1"]);
+    assert_eq!(code, Some(0), "{err}");
+    assert!(
+        text.contains(" hand fx ") || text.contains(" hand withheld: "),
+        "{text}"
+    );
+    for (arguments, what) in [
+        (
+            ["echo", "--torques", "l_elbw"],
+            "no joint \"l_elbw\"; did you mean \"l_elbow\"?",
+        ),
+        (["echo", "--contacts", "foot"], "no contact \"foot\""),
+    ] {
+        let (code, _, err) = out(&arguments);
+        assert!(code == Some(1) && err.contains(what), "{err}");
+    }
+
+    // After: the channel was last seen then, without a quality, and the torques say why.
+    let channel = |status: &Json| {
+        let channels = status["robots"][0]["channels"].as_array();
+        let mut channels = channels.into_iter().flatten();
+        channels
+            .find(|channel| channel["name"] == "l_elbow")
+            .cloned()
+    };
+    let status = until(PATIENCE, || {
+        let (_, text, _) = out(&["status", "--json"]);
+        let status: Json = serde_json::from_str(&text).ok()?;
+        (channel(&status)?["age_s"].as_f64()? > 1.5).then_some(status)
+    });
+    let status = status.expect("it falls silent");
+    let elbow = channel(&status).expect("a channel");
+    assert_eq!(
+        (&elbow["quality"], &elbow["rate_hz"]),
+        (&Json::Null, &Json::from(0.0))
+    );
+    let torque = &status["robots"][0]["estimator"]["health"]["torques"]["l_elbow"];
+    assert_eq!(torque["valid"], false, "{status}");
+    assert_eq!(
+        (&torque["reason"], &torque["cause"]),
+        (&"stale".into(), &"l_elbow".into())
+    );
+    assert_eq!(
+        (&torque["torque"], &torque["std"]),
+        (&Json::Null, &Json::Null)
+    );
+    let (_, text, _) = out(&["status"]);
+    let line = text.lines().find(|line| line.contains("joint    l_elbow "));
+    let line = line.expect("a line");
+    assert!(
+        line.contains("last seen ") && !line.contains("good"),
+        "{line}"
+    );
+    let withheld = text.lines().find(|line| line.contains("torque of "));
+    let withheld = withheld.expect("a line");
+    assert!(
+        withheld.contains("l_elbow") && withheld.contains("withheld: stale (l_elbow)"),
+        "{withheld}"
+    );
+    let (_, text, _) = out(&["echo", "--torques", "l_elbow", "--count", "1"]);
+    assert!(
+        text.trim_end()
+            .ends_with(" l_elbow withheld: stale (l_elbow)"),
+        "{text}"
+    );
+    let (_, text, _) = out(&["echo", "--torques", "--count", "1", "--json"]);
+    let line: Json = serde_json::from_str(&text).expect("JSON");
+    assert!(line["t_ns"].is_i64());
+    let of_joints = line["torques"].as_object().expect("an object");
+    assert_eq!(of_joints.len(), 7);
+    assert_eq!(of_joints["l_elbow"]["reason"], "stale");
+
     [&mut estimator, &mut gateway, &mut simulator]
         .into_iter()
         .for_each(proprio_tests::Process::end);

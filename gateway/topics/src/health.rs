@@ -468,7 +468,7 @@ impl fmt::Display for Refusal {
             ),
             Self::OtherIdentifier { id } => write!(
                 f,
-                "its process data has the identifier {id:03X}, which is not received; the driver's \
+                "its process data has the identifier 0x{id:03X}, which is not received; the driver's \
                  page says which key states it"
             ),
         }
@@ -518,7 +518,7 @@ pub fn axes(mask: u16) -> impl fmt::Display {
 /// State and counters of the gateway, published ten times a second.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
-#[type_name("proprio/GatewayHealth/3")]
+#[type_name("proprio/GatewayHealth/4")]
 pub struct GatewayHealth {
     /// When.
     pub header: Header,
@@ -535,6 +535,9 @@ pub struct GatewayHealth {
     pub buses: [BusHealth; MAX_BUSES],
     /// The devices.
     pub devices: [DeviceHealth; MAX_CHANNELS],
+    /// When the newest sample of each channel was acquired \[ns\], by its number;
+    /// [`Nanos::MIN`] if there was none since the gateway started.
+    pub newest: [Nanos; MAX_CHANNELS],
 }
 
 impl DeviceHealth {
@@ -562,6 +565,7 @@ impl GatewayHealth {
             device_count: 0,
             buses: [BusHealth::EMPTY; MAX_BUSES],
             devices: [DeviceHealth::EMPTY; MAX_CHANNELS],
+            newest: [Nanos::MIN; MAX_CHANNELS],
         }
     }
 
@@ -609,7 +613,7 @@ pub struct IdentificationHealth {
     pub stale: u64,
     /// Excluded: a sensor was saturated.
     pub saturated: u64,
-    /// Excluded: a device reported a fault.
+    /// Excluded: a device reported a fault, or repeated its readings instead of measuring.
     pub device_fault: u64,
     /// Excluded: a channel was not seen yet or had too few samples, or the base motion was not
     /// known.
@@ -702,7 +706,7 @@ const _: () = {
     assert!(size_of::<InterfaceHealth>() == 8 * 8 + 8 * 4);
     assert!(size_of::<BusHealth>() == 64 + 28 * 8 + size_of::<InterfaceHealth>() + 8);
     assert!(size_of::<DeviceHealth>() == 64 + 17 * 8 + 16);
-    assert!(size_of::<GatewayHealth>() == 80 + 392 * MAX_BUSES + 216 * MAX_CHANNELS);
+    assert!(size_of::<GatewayHealth>() == 80 + 392 * MAX_BUSES + 224 * MAX_CHANNELS);
     assert!(size_of::<IdentificationHealth>() == 15 * 8);
     assert!(size_of::<EstimatorHealth>() == 56 + 13 * 8 + 15 * 8);
 };

@@ -1,0 +1,322 @@
+//! `proprio record`: the samples and declared contacts of a running system, as the table that
+//! `identify` reads.
+
+use crate::system::{Described, interrupted, one_robot, open};
+use anyhow::{Context, bail};
+use proprio_gateway::offline::InOrder;
+use proprio_topics::csv::{Columns, Series, Value, What, Writer};
+use proprio_topics::ipc::{DomainConfig, Reader, TakeError, Topic, monotonic};
+use proprio_topics::{
+    ContactDeclaration, Description, MAX_CHANNELS, Nanos, Publisher, Role, Sample,
+};
+use std::fs::File;
+use std::io::{BufWriter, ErrorKind};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering::Relaxed;
+
+/// How late a sample is still sorted into its place in a recording: a gateway that starts publishes
+/// the frames that arrived meanwhile.
+const REORDER: Nanos = Nanos::from_millis(2000);
+
+/// `proprio record`.
+#[derive(clap::Args)]
+pub(crate) struct Record {
+    /// The table of samples: a new file
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Overwrite the file if it exists
+    #[arg(long)]
+    force: bool,
+    /// The robot; default: the only one
+    #[arg(long, value_name = "NAME")]
+    robot: Option<String>,
+    /// End after so many seconds; default: at Ctrl-C
+    #[arg(long, value_name = "N")]
+    seconds: Option<f64>,
+    /// Write all columns, such as gauges and temperatures, not only those that the estimator reads
+    #[arg(long)]
+    all: bool,
+}
+
+/// The channels of a gateway.
+fn channels_of(description: &Description) -> Vec<Series> {
+    let channels = description
+        .entries()
+        .iter()
+        .filter(|e| e.role == Role::Channel);
+    channels
+        .filter_map(|entry| {
+            Some(Series {
+                what: What::Channel(entry.kind.get()?),
+                name: entry.name.as_str().to_owned(),
+            })
+        })
+        .collect()
+}
+
+/// The series of each channel number of one run of the gateway.
+struct Numbers {
+    epoch: u64,
+    series: Vec<Option<usize>>,
+}
+
+impl Numbers {
+    fn new(description: &Description, series: &[Series]) -> Self {
+        let mut numbers = vec![None; MAX_CHANNELS];
+        for entry in description.entries() {
+            let what = entry.kind.get().map(What::Channel);
+            if entry.role == Role::Channel
+                && let Some(number) = numbers.get_mut(entry.index as usize)
+            {
+                *number = series
+                    .iter()
+                    .position(|one| Some(one.what) == what && one.name == entry.name.as_str());
+            }
+        }
+        Self {
+            epoch: description.header.epoch,
+            series: numbers,
+        }
+    }
+
+    fn series(&self, sample: &Sample) -> Option<usize> {
+        let series = self.series.get(sample.channel as usize).copied().flatten();
+        series.filter(|_| sample.header.epoch == self.epoch)
+    }
+}
+
+/// Creates the file of a recording. An existing one is overwritten only if that is asked for; what
+/// is no file, such as a pipe, has nothing to lose.
+fn create(path: &Path, force: bool) -> anyhow::Result<File> {
+    let special = std::fs::metadata(path).is_ok_and(|m| !m.is_file());
+    let created = match force || special {
+        true => File::create(path),
+        false => File::create_new(path),
+    };
+    match created {
+        Err(error) if error.kind() == ErrorKind::AlreadyExists => bail!(
+            "{} exists: name another file, or overwrite it with --force",
+            path.display()
+        ),
+        created => created.with_context(|| path.display().to_string()),
+    }
+}
+
+/// A time without samples.
+struct Gap {
+    from: Nanos,
+    to: Nanos,
+    restarted: bool,
+}
+
+impl Gap {
+    fn seconds(&self) -> f64 {
+        (self.to - self.from).seconds()
+    }
+}
+
+/// Finds the times without samples.
+struct Gaps {
+    /// Longer than between two samples of the slowest channel.
+    silence: Nanos,
+    /// The start of the gateway that sends, and the stamp of its newest sample.
+    last: Option<(u64, Nanos)>,
+    found: Vec<Gap>,
+    /// That nothing comes has been told.
+    told: bool,
+}
+
+impl Gaps {
+    fn new(description: &Description) -> Self {
+        let slowest = description.entries().iter().map(|entry| entry.max_silence);
+        let slowest = slowest.max().unwrap_or_default();
+        Self {
+            silence: Nanos::from_millis(500).max(slowest + slowest),
+            last: None,
+            found: Vec::new(),
+            told: false,
+        }
+    }
+
+    /// A sample of the start `epoch` of the gateway, acquired at `t`.
+    fn see(&mut self, epoch: u64, t: Nanos) {
+        if let Some((of, from)) = self.last {
+            let gap = Gap {
+                from,
+                to: t,
+                restarted: epoch != of,
+            };
+            if gap.restarted || t - from > self.silence {
+                let why = match gap.restarted {
+                    true => "the gateway was restarted",
+                    false => "no channel had a sample",
+                };
+                tracing::warn!("{why}: a gap of {:.3} s after {from} s", gap.seconds());
+                self.found.push(gap);
+            }
+        }
+        let newest = self
+            .last
+            .filter(|(of, _)| *of == epoch)
+            .map_or(t, |(_, last)| last.max(t));
+        (self.last, self.told) = (Some((epoch, newest)), false);
+    }
+
+    /// Nothing came until `now`: tells it, once.
+    fn wait(&mut self, now: Nanos) {
+        if let Some((_, last)) = self.last
+            && now - last > self.silence
+            && !std::mem::replace(&mut self.told, true)
+        {
+            tracing::warn!(
+                "no samples since {last} s; recording goes on when they come (`proprio status`)"
+            );
+        }
+    }
+
+    /// What to say of them when the recording ends at `end`; empty if there are none.
+    fn summary(&self, end: Nanos) -> String {
+        let seconds = |gaps: &mut dyn Iterator<Item = &Gap>| gaps.map(Gap::seconds).sum::<f64>();
+        let mut parts = Vec::new();
+        let restarts = || self.found.iter().filter(|gap| gap.restarted);
+        let others = || self.found.iter().filter(|gap| !gap.restarted);
+        if restarts().count() > 0 {
+            let (count, time) = (restarts().count(), seconds(&mut restarts()));
+            parts.push(format!("{count} restarts of the gateway ({time:.3} s)"));
+        }
+        if others().count() > 0 {
+            let (count, time) = (others().count(), seconds(&mut others()));
+            parts.push(format!("{count} silences of all channels ({time:.3} s)"));
+        }
+        match self.last {
+            Some((_, last)) if end - last > self.silence => {
+                parts.push(format!("none in the last {:.3} s", (end - last).seconds()));
+            }
+            _ => {}
+        }
+        match parts.is_empty() {
+            true => String::new(),
+            false => format!("times without samples: {}", parts.join(", ")),
+        }
+    }
+}
+
+/// The next payload; `None` if none is waiting, or its writer cannot be reached now.
+fn next<T: Topic>(reader: &mut Reader<T>) -> anyhow::Result<Option<T>> {
+    match reader.try_take() {
+        Err(TakeError::Connection) => Ok(None),
+        taken => Ok(taken?),
+    }
+}
+
+/// Records samples and declared contacts.
+pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
+    let stop = interrupted()?;
+    let domain = open(config)?;
+    let robot = one_robot(&domain, args.robot.as_deref())?;
+    // The readers first: what comes while the table is prepared is recorded, too.
+    let mut samples = Reader::<Sample>::open(&domain, &robot)?;
+    let mut declarations = Reader::<ContactDeclaration>::open(&domain, &robot).ok();
+    let mut descriptions = Reader::<Description>::open(&domain, &robot)?;
+    let description = Described::by(&domain, &robot, Publisher::Gateway)?;
+    let description = *description
+        .context("the robot's gateway is not running")?
+        .newest();
+    let estimator = Described::by(&domain, &robot, Publisher::Estimator)?;
+    let estimator = estimator.as_ref().map(Described::newest);
+    let mut series = channels_of(&description);
+    for contact in estimator.into_iter().flat_map(Description::entries) {
+        if contact.role == Role::Contact {
+            series.push(Series {
+                what: What::Contact,
+                name: contact.name.as_str().to_owned(),
+            });
+        }
+    }
+    let mut numbers = Numbers::new(&description, &series);
+    let columns = match args.all {
+        true => Columns::All,
+        false => Columns::Main,
+    };
+    let file = create(&args.out, args.force)?;
+    let mut gaps = Gaps::new(&description);
+    let mut table = Writer::new(BufWriter::new(file), &series, columns)?;
+    let (mut order, mut inbox) = (InOrder::<(usize, Value)>::new(REORDER), Vec::new());
+    let began = monotonic();
+    let end = args
+        .seconds
+        .map(|seconds| began + Nanos::from_seconds(seconds));
+    let (mut count, mut others, mut next_flush) = (0_u64, 0_u64, began);
+    while !stop.load(Relaxed) && end.is_none_or(|end| monotonic() < end) {
+        while let Some(declared) = declarations.as_mut().map_or(Ok(None), next)? {
+            let contact = Series {
+                what: What::Contact,
+                name: declared.contact.as_str().to_owned(),
+            };
+            let Some(at) = series.iter().position(|one| *one == contact) else {
+                others += 1;
+                continue;
+            };
+            let value = Value::Contact(declared.state());
+            // What was declared long before arrives with the next declaration.
+            let t = declared.header.acquired.max(order.passed_on());
+            order.push(t, (at, value), |t, (at, value)| {
+                table.push(Some(t), *at, value)
+            })?;
+        }
+        // Shared memory delivers all samples of one bus before those of the next.
+        while let Some(sample) = next(&mut samples)? {
+            inbox.push(sample);
+        }
+        inbox.sort_by_key(|sample| sample.header.acquired);
+        for sample in inbox.drain(..) {
+            gaps.see(sample.header.epoch, sample.header.acquired);
+            if sample.header.epoch != numbers.epoch {
+                // The gateway was restarted: the same channels may have other numbers.
+                while let Some(description) = next(&mut descriptions)? {
+                    if description.publisher == Publisher::Gateway {
+                        numbers = Numbers::new(&description, &series);
+                    }
+                }
+            }
+            let (Some(at), Some(reading)) = (numbers.series(&sample), sample.reading()) else {
+                others += 1;
+                continue;
+            };
+            count += 1;
+            let value = Value::Reading(reading, sample.header.quality);
+            let t = sample.header.acquired;
+            order.push(t, (at, value), |t, (at, value)| {
+                table.push(Some(t), *at, value)
+            })?;
+        }
+        let now = monotonic();
+        if now >= next_flush {
+            // If this program is killed, the rows of the last moments are lost, not the table.
+            next_flush = now + Nanos::from_millis(500);
+            table.flush()?;
+        }
+        gaps.wait(now);
+        samples.wait((now + Nanos::from_millis(100)).min(end.unwrap_or(Nanos::MAX)));
+    }
+    order.finish(|t, (at, value)| table.push(Some(t), *at, value))?;
+    table.finish()?;
+    print_line!(
+        "{}: {count} samples in {:.1} s, {} lost, {} out of order",
+        args.out.display(),
+        (monotonic() - began).seconds(),
+        samples.lost(),
+        order.out_of_order()
+    );
+    let without = gaps.summary(monotonic());
+    if !without.is_empty() {
+        print_line!("{without}");
+    }
+    if others > 0 {
+        print_line!(
+            "{others} samples and declarations are not in the table: they are of channels or \
+             contacts that were not there when the recording began"
+        );
+    }
+    Ok(())
+}
