@@ -8,6 +8,16 @@
 //!   multiplexed ones, also by a multiplexed multiplexor or by ranges (`SG_MUL_VAL_`), frames of
 //!   CAN FD, standard and extended identifiers. A signal that all pages of a multiplexed message
 //!   have is taken from the pages that have other signals of the reading.
+//! - A message or signal that can not be used does no harm unless it is named: one of more than 64
+//!   bits, or an identifier of more than 11 bits that is not marked as an extended one.
+//! - SAE J1939 (attribute `VFrameFormat` or `ProtocolType`): the parameter group counts, and not the
+//!   priority, the source and, where the group has one, the destination that are in the file. If
+//!   the file has several messages of one group, their addresses count. Messages of more than 8
+//!   bytes, which come in several packets, are not read.
+//! - Names: those in the file, and the long ones that editors keep beside them
+//!   (`SystemMessageLongSymbol`, `SystemSignalLongSymbol`). Where several messages have one name,
+//!   the identifier stands for it, three digits or eight: `"0x1A0.Position"`,
+//!   `"0x18FF0001.Position"`.
 //! - Units: the file's own unit is converted to SI, and must fit the value. Where the file has none
 //!   (or one that is not known), `units` gives it; `units` also overrides the file's.
 //! - A reading is complete when each of its signals has come once. If they come in several frames,
@@ -19,7 +29,7 @@
 //!   else none. So a drive's torque, sent ten times a second, joins its position.
 //!
 //! `address` is added to the identifiers of the file: for a file that describes node 0 of a
-//! protocol with the node in the identifier.
+//! protocol with the node in the identifier. (Not for J1939: that is what `source_address` is for.)
 //!
 //! Sources: the format as Vector's "DBC File Format Documentation" 1.0.5 and `cantools` 45.1 read
 //! it (certain: the tests compare with frames that cantools encodes). The contents of a file are
@@ -28,7 +38,10 @@
 //! # Keys
 //! ```toml
 //! file = "drive.dbc"       # relative to gateway.toml
-//! period_ms = 10           # of the readings; only a simulated device uses it
+//! period_ms = 10           # of the readings: for the load of the bus, and a simulated device (10)
+//! j1939 = true             # default: as the file says; false: whole identifiers count
+//! # Of J1939: without these, any frame of the parameter group counts.
+//! # source_address = 0x23, destination_address = 0x00, priority = 6
 //!
 //! [[reading]]
 //! kind = "joint"           # joint, wrench, imu, gauges, temperature, actuator or skin
@@ -81,6 +94,10 @@ impl Driver for Options {
             suffix: Cow::Owned(reading.name.clone()),
         };
         (0..).zip(&self.reading).map(info).collect()
+    }
+
+    fn states_period(&self) -> bool {
+        self.period_ms.is_some()
     }
 
     fn description(&self) -> Option<&str> {

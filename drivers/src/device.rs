@@ -143,12 +143,16 @@ pub struct Fault {
 #[derive(Debug, Default)]
 pub struct Decoded {
     /// Readings that the frame completes.
-    pub readings: ArrayVec<Output, 8>,
+    pub readings: ArrayVec<Output, { Self::MOST }>,
     /// Faults in the frame. They do not affect the readings.
     pub faults: ArrayVec<Fault, 4>,
 }
 
 impl Decoded {
+    /// The most readings that one frame completes: one for each byte of a frame of CAN FD. No
+    /// sensor is known whose readings are shorter.
+    pub const MOST: usize = 64;
+
     /// An empty result.
     #[must_use]
     pub fn new() -> Self {
@@ -161,16 +165,21 @@ impl Decoded {
         self.faults.clear();
     }
 
-    /// Adds a reading; one that does not fit is counted as lost (no protocol here yields that
-    /// many).
+    /// Adds a reading; one that does not fit is counted as lost (no device is built that yields
+    /// that many).
     pub fn push(&mut self, output: Output, id: Id) {
         if self.readings.try_push(output).is_err() {
             self.fault(Counter::Lost, 1, id);
         }
     }
 
-    /// Adds a fault.
+    /// Adds a fault: to the count of one of its kind, if the frame has shown one already.
     pub fn fault(&mut self, counter: Counter, count: u32, id: Id) {
+        let same = |fault: &&mut Fault| fault.counter == counter && fault.id == id;
+        if let Some(known) = self.faults.iter_mut().find(same) {
+            known.count = known.count.saturating_add(count);
+            return;
+        }
         // If there is no room, four other faults are reported already.
         let _ = self.faults.try_push(Fault { counter, count, id });
     }
@@ -316,7 +325,7 @@ pub enum CommandFailed {
 
 /// The outputs of a device that the configuration uses.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Outputs(pub ArrayVec<u8, 16>);
+pub struct Outputs(pub ArrayVec<u8, { Decoded::MOST }>);
 
 /// The settings common to all drivers.
 #[derive(Debug, Clone, PartialEq)]
@@ -537,6 +546,11 @@ pub trait Driver {
     /// Whether a device with these keys needs frames of CAN FD.
     fn needs_fd(&self) -> bool {
         false
+    }
+
+    /// Whether it is known how often its devices send.
+    fn states_period(&self) -> bool {
+        true
     }
 
     /// The .dbc file that the keys name, relative to the configuration.

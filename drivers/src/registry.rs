@@ -124,6 +124,14 @@ macro_rules! drivers {
                 }
             }
 
+            /// Whether it is known how often its devices send ([`Driver::states_period`]).
+            #[must_use]
+            pub fn states_period(&self) -> bool {
+                match self {
+                    $(Self::$variant(options) => options.states_period(),)+
+                }
+            }
+
             /// The file that describes the device ([`Driver::description`]).
             #[must_use]
             pub fn description(&self) -> Option<&str> {

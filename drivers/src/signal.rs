@@ -10,8 +10,12 @@ use alloc::vec::Vec;
 pub struct Message {
     /// Its name.
     pub name: String,
-    /// Its identifier.
-    pub id: Id,
+    /// Its whole name, where the file keeps one that is longer than names in it may be.
+    pub long_name: Option<String>,
+    /// Its identifier, or why its frames can not be read: told only to somebody who uses them.
+    pub id: Result<Id, String>,
+    /// The identifier is one of SAE J1939: the parameter group in it tells what a frame holds.
+    pub j1939: bool,
     /// The length of its frames \[bytes\].
     pub size: usize,
     /// Its signals.
@@ -23,8 +27,10 @@ pub struct Message {
 pub struct Signal {
     /// Its name.
     pub name: String,
-    /// Where its bits are.
-    pub bits: Bits,
+    /// Its whole name, as [`Message::long_name`].
+    pub long_name: Option<String>,
+    /// Where its bits are, or why it can not be read.
+    pub bits: Result<Bits, String>,
     /// What its bits are.
     pub raw: Raw,
     /// The value of one.

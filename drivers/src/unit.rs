@@ -1,5 +1,8 @@
 //! The units of numbers that other files describe, and their conversion to SI.
 
+use alloc::format;
+use alloc::string::{String, ToString};
+use alloc::vec::Vec;
 use proprio_topics::Kind;
 
 /// What a number measures.
@@ -43,115 +46,279 @@ use Quantity::{
     MagneticField, Number, Pressure, Temperature, Torque, Velocity,
 };
 
-/// The spellings of each unit, in lower case and with `spelling`'s replacements.
+/// The spellings of each unit as [`plain`] writes them, the usual one first. Rates are left out:
+/// they are an angle or a length over times.
 const UNITS: &[(&[&str], Quantity, f64, f64)] = &[
-    (&["rad"], Angle, 1.0, 0.0),
+    (&["rad", "rads", "radian", "radians"], Angle, 1.0, 0.0),
     (&["mrad"], Angle, 1e-3, 0.0),
-    (&["deg", "degree", "degrees"], Angle, DEGREE, 0.0),
-    (&["rev", "turn", "turns"], Angle, TURN, 0.0),
-    (&["rad/s"], AngularVelocity, 1.0, 0.0),
-    (&["mrad/s"], AngularVelocity, 1e-3, 0.0),
-    (&["deg/s", "dps"], AngularVelocity, DEGREE, 0.0),
-    (&["rev/s", "turn/s", "turns/s"], AngularVelocity, TURN, 0.0),
+    (&["deg", "degs", "degree", "degrees"], Angle, DEGREE, 0.0),
+    (&["mdeg"], Angle, DEGREE * 1e-3, 0.0),
     (
-        &["rpm", "1/min", "rev/min"],
+        &[
+            "rev",
+            "revs",
+            "revolution",
+            "revolutions",
+            "turn",
+            "turns",
+            "r",
+            "u",
+        ],
+        Angle,
+        TURN,
+        0.0,
+    ),
+    (
+        &["rpm", "1/min", "/min", "upm", "rpms"],
         AngularVelocity,
         TURN / 60.0,
         0.0,
     ),
-    (&["rad/s2"], AngularAcceleration, 1.0, 0.0),
-    (&["deg/s2"], AngularAcceleration, DEGREE, 0.0),
-    (&["rev/s2", "turn/s2"], AngularAcceleration, TURN, 0.0),
-    (&["m"], Length, 1.0, 0.0),
+    (&["krpm"], AngularVelocity, TURN / 60.0 * 1e3, 0.0),
+    (&["dps"], AngularVelocity, DEGREE, 0.0),
+    (&["mdps"], AngularVelocity, DEGREE * 1e-3, 0.0),
+    (
+        &["m", "meter", "meters", "metre", "metres"],
+        Length,
+        1.0,
+        0.0,
+    ),
     (&["cm"], Length, 1e-2, 0.0),
     (&["mm"], Length, 1e-3, 0.0),
     (&["um"], Length, 1e-6, 0.0),
-    (&["m/s"], Velocity, 1.0, 0.0),
-    (&["mm/s"], Velocity, 1e-3, 0.0),
-    (&["m/s2"], Acceleration, 1.0, 0.0),
-    (&["mm/s2"], Acceleration, 1e-3, 0.0),
-    (&["g"], Acceleration, G, 0.0),
+    (&["km"], Length, 1e3, 0.0),
+    (&["in", "inch", "inches"], Length, INCH, 0.0),
+    (&["ft", "foot", "feet"], Length, FOOT, 0.0),
+    (&["kph", "kmh", "kmph"], Velocity, 1e3 / 3600.0, 0.0),
+    (&["mph"], Velocity, 5280.0 * FOOT / 3600.0, 0.0),
+    (&["g", "gs"], Acceleration, G, 0.0),
     (&["mg"], Acceleration, G * 1e-3, 0.0),
-    (&["n", "newton"], Force, 1.0, 0.0),
+    (&["n", "newton", "newtons"], Force, 1.0, 0.0),
     (&["mn"], Force, 1e-3, 0.0),
     (&["kn"], Force, 1e3, 0.0),
+    (&["dan"], Force, 10.0, 0.0),
     (&["kgf"], Force, G, 0.0),
+    (&["gf"], Force, G * 1e-3, 0.0),
     (&["lbf"], Force, POUND * G, 0.0),
-    (&["nm"], Torque, 1.0, 0.0),
+    (
+        &[
+            "nm",
+            "newtonmeter",
+            "newtonmeters",
+            "newtonmetre",
+            "newtonmetres",
+        ],
+        Torque,
+        1.0,
+        0.0,
+    ),
     (&["mnm", "nmm"], Torque, 1e-3, 0.0),
+    (&["unm"], Torque, 1e-6, 0.0),
     (&["ncm"], Torque, 1e-2, 0.0),
     (&["knm"], Torque, 1e3, 0.0),
-    (&["lbfin"], Torque, POUND * G * INCH, 0.0),
-    (&["lbfft"], Torque, POUND * G * FOOT, 0.0),
-    (&["a", "ampere"], Current, 1.0, 0.0),
-    (&["ma"], Current, 1e-3, 0.0),
+    (&["kgfcm"], Torque, G * 1e-2, 0.0),
+    (&["kgfm"], Torque, G, 0.0),
+    (
+        &["lbfin", "inlbf", "inlb", "inlbs"],
+        Torque,
+        POUND * G * INCH,
+        0.0,
+    ),
+    (
+        &["lbfft", "ftlbf", "ftlb", "ftlbs"],
+        Torque,
+        POUND * G * FOOT,
+        0.0,
+    ),
+    (
+        &["ozfin", "ozin", "inoz"],
+        Torque,
+        POUND / 16.0 * G * INCH,
+        0.0,
+    ),
+    (
+        &[
+            "a", "amp", "amps", "ampere", "amperes", "arms", "apk", "adc", "aac",
+        ],
+        Current,
+        1.0,
+        0.0,
+    ),
+    (
+        &["ma", "mamp", "mamps", "milliamp", "milliamps"],
+        Current,
+        1e-3,
+        0.0,
+    ),
+    (&["ua"], Current, 1e-6, 0.0),
+    (&["ka"], Current, 1e3, 0.0),
     (&["t", "tesla"], MagneticField, 1.0, 0.0),
     (&["mt"], MagneticField, 1e-3, 0.0),
     (&["ut"], MagneticField, 1e-6, 0.0),
-    (&["gauss"], MagneticField, 1e-4, 0.0),
-    (&["degc", "c"], Temperature, 1.0, 0.0),
-    (&["k"], Temperature, 1.0, -273.15),
-    (&["degf"], Temperature, 5.0 / 9.0, -160.0 / 9.0),
-    (&["pa"], Pressure, 1.0, 0.0),
+    (&["nt"], MagneticField, 1e-9, 0.0),
+    (&["gauss", "gs"], MagneticField, 1e-4, 0.0),
+    (&["mgauss"], MagneticField, 1e-7, 0.0),
+    (
+        &[
+            "degc",
+            "c",
+            "celsius",
+            "degcelsius",
+            "degreec",
+            "degreesc",
+            "degreecelsius",
+            "degreescelsius",
+        ],
+        Temperature,
+        1.0,
+        0.0,
+    ),
+    (&["k", "degk", "kelvin"], Temperature, 1.0, -273.15),
+    (
+        &["degf", "f", "fahrenheit", "degfahrenheit", "degreesf"],
+        Temperature,
+        5.0 / 9.0,
+        -160.0 / 9.0,
+    ),
+    (&["pa", "pascal"], Pressure, 1.0, 0.0),
+    (&["hpa"], Pressure, 1e2, 0.0),
     (&["kpa"], Pressure, 1e3, 0.0),
+    (&["mpa"], Pressure, 1e6, 0.0),
+    (&["bar", "bars"], Pressure, 1e5, 0.0),
     (&["mbar"], Pressure, 1e2, 0.0),
-    (&["", "-", "1", "count", "counts", "raw"], Number, 1.0, 0.0),
-    (&["%"], Number, 1e-2, 0.0),
+    (&["psi"], Pressure, POUND * G / (INCH * INCH), 0.0),
+    (
+        &[
+            "", "1", "count", "counts", "cnt", "tick", "ticks", "bit", "bits", "lsb", "raw",
+        ],
+        Number,
+        1.0,
+        0.0,
+    ),
+    (&["%", "percent", "pct"], Number, 1e-2, 0.0),
 ];
 
-/// Whether `word` written as .dbc files write units is `spelling`.
-fn reads(word: &str, spelling: &str) -> bool {
-    let (word, mut rest) = (word.trim(), spelling);
-    if word.is_empty() || spelling.is_empty() {
-        return word == spelling;
-    }
-    for letter in word.chars() {
-        let letters = match letter {
-            '\u{b0}' => "deg",
-            '\u{b2}' => "2",
-            '\u{b5}' | '\u{3bc}' => "u",
-            ' ' | '*' | '.' | '\u{b7}' | '^' => "",
-            // Of lbf-in; alone it is a unit of its own.
-            '-' if word.len() > 1 => "",
-            other => {
-                let lower = other.to_ascii_lowercase();
-                match rest.strip_prefix(lower) {
-                    Some(left) => {
-                        rest = left;
-                        continue;
-                    }
-                    None => return false,
-                }
-            }
-        };
-        match rest.strip_prefix(letters) {
-            Some(left) => rest = left,
-            None => return false,
+/// The spellings of times \[s\].
+const TIMES: &[(&[&str], f64)] = &[
+    (&["s", "sec", "secs", "second", "seconds"], 1.0),
+    (&["ms"], 1e-3),
+    (&["min", "minute", "minutes"], 60.0),
+    (&["h", "hr", "hour", "hours"], 3600.0),
+];
+
+/// What a quantity over a time is.
+const RATES: &[(Quantity, Quantity)] = &[
+    (Angle, AngularVelocity),
+    (AngularVelocity, AngularAcceleration),
+    (Length, Velocity),
+    (Velocity, Acceleration),
+];
+
+/// `word` in lower case, with signs spelled out, without spaces, brackets and signs of products,
+/// and with a slash before what divides. So `[N·m]` is `nm`, and `°/s²` and
+/// `deg s^-2` are `deg/s2`.
+fn plain(word: &str) -> String {
+    let mut text = String::new();
+    for letter in word.trim().chars() {
+        match letter {
+            '\u{b0}' | '\u{ba}' => text += "deg",
+            '\u{b2}' => text += "2",
+            '\u{b5}' | '\u{3bc}' => text += "u",
+            '\u{207b}' | '\u{2212}' => text += "-",
+            '\u{b9}' => text += "1",
+            // UTF-8 that was taken for Latin-1 has it before a degree sign.
+            '\u{c2}' => {}
+            '*' | '.' | '\u{b7}' | '\u{22c5}' => text.push(' '),
+            '^' | '_' | '[' | ']' | '(' | ')' | '\'' => {}
+            other => text.extend(other.to_lowercase()),
         }
     }
-    rest.is_empty()
+    let mut plain = String::new();
+    for part in text.split_whitespace() {
+        match part.split_once('-') {
+            _ if part == "per" => plain.push('/'),
+            // A negative power divides. Other lines join words, as in lbf-in.
+            Some((unit, "1")) => plain += &format!("/{unit}"),
+            Some((unit, "2")) => plain += &format!("/{unit}2"),
+            _ if part != "-" => plain.extend(part.chars().filter(|c| *c != '-')),
+            _ => {}
+        }
+    }
+    plain
 }
 
-/// The unit that `word` means, if it is one of those known.
-pub(crate) fn unit(word: &str) -> Option<Unit> {
-    UNITS
-        .iter()
-        .find_map(|&(spellings, quantity, factor, offset)| {
-            let found = spellings.iter().any(|spelling| reads(word, spelling));
-            found.then_some(Unit {
+/// The time that a unit is divided by, one or two factors: how many, and their product \[s\].
+fn times(text: &str) -> Option<(usize, f64)> {
+    let time = |text: &str| {
+        let found = TIMES
+            .iter()
+            .find(|(spellings, _)| spellings.contains(&text));
+        found.map(|(_, seconds)| *seconds)
+    };
+    if let Some((first, second)) = text.split_once('/') {
+        return Some((2, time(first)? * time(second)?));
+    }
+    if let Some(seconds) = time(text) {
+        return Some((1, seconds));
+    }
+    let squared = text.strip_suffix('2').or((text == "ss").then_some("s"));
+    squared.and_then(time).map(|seconds| (2, seconds * seconds))
+}
+
+/// The unit that `word` means among those of `legal`, else among all that are known.
+pub(crate) fn unit(word: &str, legal: &[Quantity]) -> Option<Unit> {
+    let text = plain(word);
+    // Lines alone: "-" is how some write that there is none.
+    if text.is_empty() && !matches!(word.trim(), "" | "-") {
+        return None;
+    }
+    let spelled = |text: &str, legal: &[Quantity]| {
+        let mut units = UNITS.iter();
+        let found = units.find(|u| legal.contains(&u.1) && u.0.contains(&text));
+        let all = || UNITS.iter().find(|unit| unit.0.contains(&text));
+        found
+            .or_else(all)
+            .map(|&(_, quantity, factor, offset)| Unit {
                 quantity,
                 factor,
                 offset,
             })
-        })
+    };
+    if let Some(unit) = spelled(&text, legal) {
+        return Some(unit);
+    }
+    let (of, over) = text.split_once('/')?;
+    let (number, seconds) = times(over)?;
+    // Units of a number per time are left out: a frequency is no rate of anything.
+    let mut unit = spelled(of, &[Angle, AngularVelocity, Length, Velocity])?;
+    for _ in 0..number {
+        unit.quantity = RATES.iter().find(|(of, _)| *of == unit.quantity)?.1;
+    }
+    unit.factor /= seconds;
+    Some(unit)
 }
 
-/// The spellings of the units of `quantities`, for messages.
-pub(crate) fn spellings(quantities: &'static [Quantity]) -> impl Iterator<Item = &'static str> {
-    let units = UNITS
-        .iter()
-        .filter(move |unit| quantities.contains(&unit.1));
-    units.filter_map(|unit| unit.0.first().copied())
+/// The usual spellings of the units of `quantities`, for messages.
+pub(crate) fn spellings(quantities: &[Quantity]) -> Vec<String> {
+    let mut words = Vec::new();
+    for quantity in quantities {
+        let (of, over) = match quantity {
+            AngularVelocity => (Angle, "/s"),
+            AngularAcceleration => (Angle, "/s^2"),
+            Velocity => (Length, "/s"),
+            Acceleration => (Length, "/s^2"),
+            _ => (*quantity, ""),
+        };
+        let named = |quantity| {
+            let units = UNITS.iter().filter(move |unit| unit.1 == quantity);
+            units.filter_map(|unit| unit.0.first())
+        };
+        words.extend(named(of).map(|word| format!("{word}{over}")));
+        if of != *quantity {
+            words.extend(named(*quantity).map(ToString::to_string));
+        }
+    }
+    words
 }
 
 /// What value number `field` of a reading of kind `kind` measures.
@@ -227,8 +394,65 @@ mod tests {
             ("lbf-ft", Torque, 1.355_817_948_331_400_4),
             ("mA", Current, 1e-3),
             ("mT", MagneticField, 1e-3),
+            // Spellings of public files.
+            ("deg/sec", AngularVelocity, 0.017_453_292_519_943_295),
+            ("degrees/s", AngularVelocity, 0.017_453_292_519_943_295),
+            (
+                "Degree per second",
+                AngularVelocity,
+                0.017_453_292_519_943_295,
+            ),
+            (
+                "\u{c2}\u{b0}/sec",
+                AngularVelocity,
+                0.017_453_292_519_943_295,
+            ),
+            ("[\u{ba}/s]", AngularVelocity, 0.017_453_292_519_943_295),
+            ("rad s^-1", AngularVelocity, 1.0),
+            ("rad/min", AngularVelocity, 1.0 / 60.0),
+            ("U/min", AngularVelocity, 0.104_719_755_119_659_77),
+            ("1/min", AngularVelocity, 0.104_719_755_119_659_77),
+            ("min^-1", AngularVelocity, 0.104_719_755_119_659_77),
+            ("min-1", AngularVelocity, 0.104_719_755_119_659_77),
+            ("rev/min", AngularVelocity, 0.104_719_755_119_659_77),
+            ("revs per minute", AngularVelocity, 0.104_719_755_119_659_77),
+            ("r/min", AngularVelocity, 0.104_719_755_119_659_77),
+            ("Rev/Sec", AngularVelocity, TURN),
+            (
+                "degrees/sec\u{b2}",
+                AngularAcceleration,
+                0.017_453_292_519_943_295,
+            ),
+            ("deg/s/s", AngularAcceleration, 0.017_453_292_519_943_295),
+            ("deg/(s*s)", AngularAcceleration, 0.017_453_292_519_943_295),
+            ("rpm/s", AngularAcceleration, 0.104_719_755_119_659_77),
+            ("rad\u{b7}s\u{207b}\u{b2}", AngularAcceleration, 1.0),
+            ("m/sec^2", Acceleration, 1.0),
+            ("m s-2", Acceleration, 1.0),
+            ("m/sec", Velocity, 1.0),
+            ("km/h", Velocity, 1.0 / 3.6),
+            ("kph", Velocity, 1.0 / 3.6),
+            ("mph", Velocity, 0.447_04),
+            ("Amps", Current, 1.0),
+            ("A_rms", Current, 1.0),
+            ("mAmp", Current, 1e-3),
+            ("Newton-meter", Torque, 1.0),
+            ("N*m", Torque, 1.0),
+            ("ft-lbs", Torque, 1.355_817_948_331_400_4),
+            ("oz-in", Torque, 7.061_551_814_226_044e-3),
+            ("Newtons", Force, 1.0),
+            ("daN", Force, 10.0),
+            ("bar", Pressure, 1e5),
+            ("hPa", Pressure, 1e2),
+            ("MPa", Pressure, 1e6),
+            ("psi", Pressure, 6_894.757_293_168_361),
+            ("deg C", Temperature, 1.0),
+            ("Celsius", Temperature, 1.0),
+            ("degrees C", Temperature, 1.0),
+            ("Gauss", MagneticField, 1e-4),
+            ("percent", Number, 0.01),
         ] {
-            let unit = unit(word).unwrap_or_else(|| panic!("{word:?} is not known"));
+            let unit = unit(word, &[]).unwrap_or_else(|| panic!("{word:?} is not known"));
             assert_eq!(unit.quantity, quantity, "{word:?}");
             assert!(
                 (unit.factor / factor - 1.0).abs() < 1e-14,
@@ -236,29 +460,71 @@ mod tests {
             );
         }
         for word in ["°F", "K"] {
-            let unit = unit(word).unwrap();
+            let unit = unit(word, &[]).unwrap();
             let boiling = if word == "K" { 373.15 } else { 212.0 };
             assert!(
                 (unit.factor * boiling + unit.offset - 100.0).abs() < 1e-9,
                 "{word}"
             );
         }
-        for word in ["furlong", "Nmm/s", "deg/", "mradd", "--", "ms/10"] {
-            assert_eq!(unit(word), None, "{word:?}");
+        for word in [
+            "furlong",
+            "Nmm/s",
+            "deg/",
+            "mradd",
+            "--",
+            "ms/10",
+            "1/s",
+            "deg/s/s/s",
+            "rad/s^3",
+            "*",
+            "V",
+        ] {
+            assert_eq!(unit(word, &[]), None, "{word:?}");
         }
     }
 
-    /// Milli and mega are told apart by nothing but the case of other letters here: no spelling
-    /// is that of two units.
+    /// Where a spelling is that of two units, what the number measures tells them apart: no two of
+    /// one quantity have the same.
     #[test]
     fn no_spelling_has_two_meanings() {
-        let all = || UNITS.iter().flat_map(|unit| unit.0);
-        for spelling in all() {
-            assert_eq!(
-                all().filter(|other| *other == spelling).count(),
-                1,
-                "{spelling:?}"
-            );
+        for (at, one) in UNITS.iter().enumerate() {
+            let others = UNITS.iter().skip(at + 1).filter(|other| other.1 == one.1);
+            for spelling in others.flat_map(|other| other.0) {
+                assert!(!one.0.contains(spelling), "{spelling:?}");
+            }
+        }
+        assert_eq!(
+            unit("Gs", &[MagneticField]).unwrap().quantity,
+            MagneticField
+        );
+        assert_eq!(unit("g's", &[Acceleration]).unwrap().quantity, Acceleration);
+    }
+
+    /// What a message offers is read as what it says.
+    #[test]
+    fn the_spellings_of_messages_are_read() {
+        for quantity in [
+            Angle,
+            AngularVelocity,
+            AngularAcceleration,
+            Length,
+            Velocity,
+            Acceleration,
+            Force,
+            Torque,
+            Current,
+            MagneticField,
+            Temperature,
+            Pressure,
+            Number,
+        ] {
+            let words = spellings(&[quantity]);
+            assert!(!words.is_empty());
+            for word in words {
+                let found = unit(&word, &[quantity]).map(|unit| unit.quantity);
+                assert_eq!(found, Some(quantity), "{word}");
+            }
         }
     }
 }

@@ -227,7 +227,7 @@ pub struct Member<'p> {
 }
 
 /// The load of a bus with these devices: boards that stream send each period; what the others send,
-/// and the host, is counted for a second.
+/// and the host, is counted for a second. Devices whose period nobody knows are left out.
 ///
 /// # Errors
 /// [`SpecError`]: a device that its driver cannot build.
@@ -239,7 +239,8 @@ pub fn of_bus(members: &[Member<'_>], rates: BitRates) -> Result<Load, SpecError
         all.share += time / period;
     };
     let mut polled = Vec::new();
-    for member in members {
+    let known = members.iter().filter(|m| m.options.states_period());
+    for member in known {
         // A board that has been started.
         let mode = Mode::Listen;
         let mut board = member.options.board(&Spec {
@@ -498,13 +499,31 @@ mod tests {
                 .to_string()
                 .contains("above 70 %")
         );
-        let problem = plan(&boards(5), "").unwrap_err();
+        let folder = tempfile::tempdir().unwrap();
+        let live = |source: &str, devices: &str, more: &str| {
+            let file = folder.path().join("gateway.toml");
+            let text = format!(
+                "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\nsource = {source}\n\
+                 {more}\n{devices}"
+            );
+            std::fs::write(&file, text).unwrap();
+            Plan::load_live(&file)
+                .map(|_| ())
+                .map_err(|e| e.to_string())
+        };
+        let can = "{ kind = \"socketcan\", interface = \"can0\" }";
+        let problem = live(can, &boards(5), "").unwrap_err();
         assert!(
             problem.contains("bus \"b\": its devices need up to 115 % of 1 Mbit/s"),
             "{problem}"
         );
-        let problem = plan(&boards(3), "bit_rate = 500000").unwrap_err();
+        let problem = live(can, &boards(3), "bit_rate = 500000").unwrap_err();
         assert!(problem.contains("up to 138 % of 500 kbit/s"), "{problem}");
+        // What was recorded, or is sent anyway, was carried.
+        let log = "{ kind = \"replay\", log = \"a.log\", pace = \"recorded\" }";
+        assert_eq!(live(log, &boards(5), ""), Ok(()));
+        assert_eq!(live(can, &boards(5), "listen_only = true"), Ok(()));
+        assert!(plan(&boards(5), "").is_ok());
         let problem = plan(&boards(1), "bit_rate = 5").unwrap_err();
         assert!(problem.contains("bit_rate = 5 must be"), "{problem}");
     }

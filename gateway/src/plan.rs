@@ -71,6 +71,15 @@ pub struct BusPlan {
     pub joints: Layout,
 }
 
+impl BusPlan {
+    /// Whether it can not carry what its devices send. A log was carried, and so is what another
+    /// program has set up.
+    fn is_overloaded(&self) -> bool {
+        let is_log = matches!(self.source, Source::Replay { .. });
+        self.load.share > 1.0 && !self.listen_only && !is_log
+    }
+}
+
 /// One device.
 #[derive(Debug, Clone)]
 pub struct DevicePlan {
@@ -132,7 +141,8 @@ impl Plan {
         Self::parse(&text, file.parent().unwrap_or(Path::new("."))).map_err(error)
     }
 
-    /// As [`Plan::load`], for a daemon, which replays logs only as they were recorded.
+    /// As [`Plan::load`], for a daemon, which replays logs only as they were recorded, and needs
+    /// buses that carry what its devices send.
     ///
     /// # Errors
     /// As [`Plan::load`].
@@ -147,17 +157,25 @@ impl Plan {
                 }
             )
         };
-        match plan.buses.iter().find(fast) {
-            None => Ok(plan),
-            Some(bus) => Err(ConfigError {
-                file: file.to_owned(),
-                problem: format!(
-                    "bus {:?}: pace = \"fast\" is for offline use (proprio decode); a daemon \
-                     replays with pace = \"recorded\"",
-                    bus.name
-                ),
-            }),
-        }
+        let problem = if let Some(bus) = plan.buses.iter().find(fast) {
+            format!(
+                "bus {:?}: pace = \"fast\" is for offline use (proprio decode); a daemon replays \
+                 with pace = \"recorded\"",
+                bus.name
+            )
+        } else if let Some(bus) = plan.buses.iter().find(|bus| bus.is_overloaded()) {
+            format!(
+                "bus {:?}: its devices need up to {:.0} % of {}: make periods longer, or move \
+                 devices to another bus",
+                bus.name,
+                bus.load.share * 100.0,
+                bit_rate(bus.rates.nominal)
+            )
+        } else {
+            return Ok(plan);
+        };
+        let file = file.to_owned();
+        Err(ConfigError { file, problem })
     }
 
     /// Checks a configuration given as text; paths in it are relative to `folder`.
@@ -359,11 +377,11 @@ impl Builder<'_> {
             bus.joints = joints;
         }
         self.check_claims(&place)?;
-        self.check_load(&place)
+        self.compute_load(&place)
     }
 
-    /// Computes the load of the last bus, and refuses more than it can carry.
-    fn check_load(&mut self, place: &str) -> Result<(), String> {
+    /// Computes the load of the last bus.
+    fn compute_load(&mut self, place: &str) -> Result<(), String> {
         let Some(bus) = self.plan.buses.last_mut() else {
             return Ok(());
         };
@@ -379,14 +397,6 @@ impl Builder<'_> {
             })
             .collect();
         bus.load = load::of_bus(&members, bus.rates).map_err(|e| format!("{place}: {e}"))?;
-        if bus.load.share > 1.0 {
-            return Err(format!(
-                "{place}: its devices need up to {:.0} % of {}: make periods longer, or move \
-                 devices to another bus",
-                bus.load.share * 100.0,
-                bit_rate(bus.rates.nominal)
-            ));
-        }
         Ok(())
     }
 
@@ -769,6 +779,11 @@ impl fmt::Display for Plan {
                     ""
                 }
             )?;
+            for device in &bus.devices {
+                if !device.options.states_period() {
+                    writeln!(f, "  without {:?}: its period_ms is not given", device.name)?;
+                }
+            }
             for device in &bus.devices {
                 let mut ids = String::new();
                 if let Ok(built) = device.options.device(&device.spec) {

@@ -197,7 +197,7 @@ fn mistakes_in_the_keys_are_explained() {
         ),
         (
             joint("position = \"Floats.Double\"", ""),
-            "its unit \"rpm\" does not fit: it must be one of rad, mrad, deg, rev, m, cm, mm, um",
+            "its unit \"rpm\" does not fit: it must be one of rad, mrad, deg, mdeg, rev, m, cm, ",
         ),
         (
             joint("position = \"Wide.Start\"", ""),

@@ -36,10 +36,11 @@ impl DbcBoard {
     /// period outside 1 to 60000 ms.
     pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
         let layout = Layout::new(spec, options)?;
-        if !(1..=60_000).contains(&options.period_ms) {
+        let period_ms = options.period_ms.unwrap_or(10);
+        if !(1..=60_000).contains(&period_ms) {
             return Err(SpecError::Key {
                 key: "period_ms",
-                value: f64::from(options.period_ms),
+                value: f64::from(period_ms),
                 expected: "1 to 60000",
             });
         }
@@ -77,7 +78,7 @@ impl DbcBoard {
                 .collect(),
             counts: readings.map(|_| 0).collect(),
             layout,
-            period: Nanos::from_millis(i64::from(options.period_ms)),
+            period: Nanos::from_millis(i64::from(period_ms)),
             frames,
         })
     }
@@ -157,7 +158,7 @@ impl Board for DbcBoard {
                 if pending.fresh == all {
                     pending.fresh = 0;
                     let data = pending.data.get(..layout.size).unwrap_or_default();
-                    let frame = Frame::with_format(layout.id, layout.format(), data);
+                    let frame = Frame::with_format(layout.frames.id, layout.format(), data);
                     let _ = frame.map(|frame| out.try_push(frame));
                 }
             }

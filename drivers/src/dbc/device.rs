@@ -45,6 +45,8 @@ struct Assembly {
     have: u16,
     t: Nanos,
     stamp: StampKind,
+    /// Its sender, where several may send the same message.
+    sender: Option<u8>,
     /// A frame came again before the others: the next reading may be a mixture.
     suspect: bool,
     /// No reading was opened yet: a frame before it belongs to one that was not heard from its
@@ -68,12 +70,10 @@ impl DbcDevice {
     /// [`SpecError::Description`]: keys and file do not fit each other.
     pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
         let layout = Layout::new(spec, options)?;
-        let claims: Vec<Claim> = (layout.messages.iter())
-            .map(|message| Claim::shared(message.id))
-            .collect();
+        let claims: Vec<Claim> = layout.messages.iter().map(|m| m.frames).collect();
         let watched = (layout.order(0).first())
             .and_then(|number| layout.messages.get(*number))
-            .map_or(Id::standard(0), |message| message.id);
+            .map_or(Id::standard(0), |message| message.frames.id);
         let readings = layout.readings.iter().enumerate();
         let readings = readings.map(|(number, reading)| {
             let parts = layout.messages.iter().flat_map(|message| &message.parts);
@@ -121,6 +121,7 @@ impl Assembly {
             have: 0,
             t: Nanos::ZERO,
             stamp: StampKind::None,
+            sender: None,
             suspect: false,
             joined: true,
             gap: false,
@@ -133,12 +134,21 @@ impl Assembly {
     }
 
     /// Takes the values of a frame. True if the reading is complete.
-    fn take(&mut self, part: &Part, data: &[u8], frame: &Frame, out: &mut Decoded) -> bool {
+    fn take(&mut self, part: &Part, sender: Option<u8>, frame: &Frame, out: &mut Decoded) -> bool {
+        let begun = (self.t, self.stamp);
+        let in_time = within(begun, (frame.t, frame.stamp), self.layout.limit);
+        if self.have != 0 && in_time && sender.zip(self.sender).is_some_and(|(a, b)| a != b) {
+            // Of another device that sends the same message.
+            out.fault(Counter::Unexpected, 1, frame.id);
+            return false;
+        }
         let mut values = [0.0; VALUES];
         // The values that have come, and those that ride along, one bit each.
         let (mut come, mut along): (u16, u16) = (0, 0);
         for Field { role, bits, raw } in &part.fields {
-            let Some(found) = bits.of(data) else { continue };
+            let Some(found) = bits.of(frame.data()) else {
+                continue;
+            };
             match *role {
                 Role::Counter => self.count = Some(found),
                 Role::Fault => self.fault = found != 0,
@@ -170,9 +180,8 @@ impl Assembly {
         if come == 0 {
             return false;
         }
-        let begun = (self.t, self.stamp);
         let again = self.have & come != 0;
-        if self.have != 0 && (again || !within(begun, (frame.t, frame.stamp), self.layout.limit)) {
+        if self.have != 0 && (again || !in_time) {
             self.drop_one(frame, out);
             self.suspect = again;
         }
@@ -186,7 +195,7 @@ impl Assembly {
                 return false;
             }
             self.joined = false;
-            (self.t, self.stamp) = (frame.t, frame.stamp);
+            (self.t, self.stamp, self.sender) = (frame.t, frame.stamp, sender);
         }
         for (index, (place, value)) in self.values.iter_mut().zip(values).enumerate() {
             if (come | along) & 1 << index != 0 {
@@ -271,27 +280,27 @@ impl Family for DbcDevice {
         if frame.format == Format::Error {
             return;
         }
-        let found = self
-            .layout
-            .messages
-            .binary_search_by_key(&frame.id, |message| message.id);
-        let Some(message) = found.ok().and_then(|at| self.layout.messages.get(at)) else {
-            return;
-        };
         let data = frame.data();
-        for part in &message.parts {
+        let messages = self.layout.messages.iter();
+        let messages = messages.filter(|message| message.frames.matches(frame.id));
+        let mut is_short = false;
+        let parts = messages.flat_map(|message| {
+            let sender = message.sender(frame.id);
+            message.parts.iter().map(move |part| (part, sender))
+        });
+        for (part, sender) in parts {
             let Some(assembly) = self.readings.get_mut(part.reading) else {
                 continue;
             };
             if data.len() < part.reach {
-                out.fault(Counter::Length, 1, frame.id);
+                is_short = true;
                 continue;
             }
             let has = part
                 .conditions
                 .iter()
                 .all(|condition| condition.holds(data));
-            if !has || !assembly.take(part, data, frame, out) {
+            if !has || !assembly.take(part, sender, frame, out) {
                 continue;
             }
             let after_silence = link.bringup.reading(frame.t);
@@ -299,6 +308,9 @@ impl Family for DbcDevice {
             if let Some(output) = assembly.finish(number, after_silence, frame, out) {
                 out.push(output, frame.id);
             }
+        }
+        if is_short {
+            out.fault(Counter::Length, 1, frame.id);
         }
     }
 

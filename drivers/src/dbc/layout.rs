@@ -4,11 +4,12 @@
 use super::options::{Options, ReadingKeys};
 use crate::signal::{Bits, Message, Raw, Signal};
 use crate::unit::{Unit, quantities, spellings, unit};
-use crate::{Format, Id, Spec, SpecError};
+use crate::{Claim, Decoded, Format, Id, Spec, SpecError};
 use alloc::collections::BTreeMap;
 use alloc::format;
 use alloc::string::{String, ToString};
 use alloc::vec::Vec;
+use core::ptr;
 use proprio_topics::{Kind, Nanos};
 
 /// What a signal is for its reading.
@@ -69,6 +70,12 @@ pub(super) struct Part {
 }
 
 impl Part {
+    /// Whether each frame that has these signals also has those of `other`.
+    fn has_conditions_of(&self, other: &Self) -> bool {
+        let mut conditions = other.conditions.iter();
+        conditions.all(|condition| self.conditions.contains(condition))
+    }
+
     /// The values that only these frames have and each reading needs, one bit each.
     pub(super) fn needed(&self) -> u16 {
         let bit = |field: &Field| match field.role {
@@ -84,24 +91,35 @@ impl Part {
     }
 }
 
-/// The frames of one identifier.
+/// The frames of one message.
 #[derive(Debug, Clone)]
 pub(super) struct MessageLayout {
-    pub(super) id: Id,
+    /// Which they are. Of the identifiers, a simulated device sends the one that is named.
+    pub(super) frames: Claim,
+    /// They are frames of J1939.
+    pub(super) j1939: bool,
     pub(super) size: usize,
     pub(super) parts: Vec<Part>,
 }
 
 impl MessageLayout {
+    /// The sender of `frame`, if it is one of several that may send this message.
+    #[allow(clippy::cast_possible_truncation)] // the low 8 bits
+    pub(super) const fn sender(&self, id: Id) -> Option<u8> {
+        match self.j1939 && self.frames.mask & SOURCE == 0 {
+            true => Some(id.raw() as u8),
+            false => None,
+        }
+    }
+
     /// Moves the signals of reading `reading` that more frames have than others of its signals into
     /// the parts of those.
     fn join_riders(&mut self, reading: usize) {
         let mine = |part: &&Part| part.reading == reading;
         let parts: Vec<Part> = self.parts.iter().filter(mine).cloned().collect();
-        let has_all = |part: &Part, of: &Part| {
-            (of.conditions.iter()).all(|condition| part.conditions.contains(condition))
+        let is_narrower = |part: &Part, than: &Part| {
+            part.has_conditions_of(than) && !than.has_conditions_of(part)
         };
-        let is_narrower = |part: &Part, than: &Part| has_all(part, than) && !has_all(than, part);
         let rides = |part: &Part| parts.iter().any(|other| is_narrower(other, part));
         self.parts
             .retain(|part| part.reading != reading || !rides(part));
@@ -168,7 +186,22 @@ impl Layout {
                 return fail(format!("{place}: {problem}"));
             }
         }
-        this.messages.sort_by_key(|message| message.id);
+        let asks = [
+            ("source_address", options.source_address),
+            ("destination_address", options.destination_address),
+            ("priority", options.priority),
+        ];
+        let used = |(key, asked): (_, Option<u8>)| asked.map(|_| key);
+        if let Some(key) = asks.into_iter().find_map(used)
+            && this.messages.iter().all(|message| !message.j1939)
+        {
+            return fail(format!(
+                "{key}: none of its messages is one of J1939; j1939 = true takes their extended \
+                 identifiers for such ones"
+            ));
+        }
+        this.messages.sort_by_key(|message| message.frames.id);
+        this.check_number()?;
         Ok(this)
     }
 
@@ -217,8 +250,12 @@ impl Layout {
             }
         }
         let all = |kind| matches!(kind, Kind::Wrench | Kind::Gauges);
-        let mut opener: Option<&str> = keys.first.as_deref();
-        let mut messages: Vec<&str> = Vec::new();
+        let first = keys.first.as_deref();
+        let mut opener = match first.map(|first| find_message(options, first)) {
+            Some(found) => Some(found.map_err(|e| format!("first = {first:?}: {e}"))?),
+            None => None,
+        };
+        let mut messages: Vec<&Message> = Vec::new();
         for (index, name) in known.iter().enumerate() {
             let Some(path) = keys.fields.get(*name) else {
                 if all(kind) {
@@ -239,9 +276,9 @@ impl Layout {
                 }
             };
             if hold.is_none() {
-                opener.get_or_insert(&message.name);
-                if !messages.contains(&message.name.as_str()) {
-                    messages.push(&message.name);
+                opener.get_or_insert(message);
+                if !messages.iter().any(|known| ptr::eq(*known, message)) {
+                    messages.push(message);
                 }
             }
             let role = Role::Value {
@@ -251,14 +288,19 @@ impl Layout {
                 hold,
                 rides: false,
             };
-            self.field(spec, number, message, signal, role)
+            self.field(options, spec, number, (message, signal), role)
                 .map_err(at)?;
         }
-        let opener = opener.unwrap_or_default();
-        if keys.first.is_some() && !messages.contains(&opener) {
+        let Some(opener) = opener else {
+            return Err("it needs a value without hold_ms".into());
+        };
+        let names = || messages.iter().map(|message| name(message));
+        let names = || names().collect::<Vec<_>>().join(", ");
+        if !messages.is_empty() && !messages.iter().any(|message| ptr::eq(*message, opener)) {
             return Err(format!(
-                "first = {opener:?} must be a message of its fields: {}",
-                messages.join(", ")
+                "first = {:?} must be a message of its fields: {}",
+                name(opener),
+                names()
             ));
         }
         for (key, path, role) in [
@@ -268,17 +310,16 @@ impl Layout {
             let Some(path) = path else { continue };
             let at = |problem: String| format!("{key} = {path:?}: {problem}");
             let (message, signal) = find(options, path).map_err(at)?;
-            if role == Role::Counter && message.name != opener {
-                return Err(at(format!("it must be a signal of {opener}")));
+            if role == Role::Counter && !ptr::eq(message, opener) {
+                return Err(at(format!("it must be a signal of {}", name(opener))));
             }
             if matches!(signal.raw, Raw::Float32 | Raw::Float64) {
                 return Err(at("it must be an integer".into()));
             }
-            self.field(spec, number, message, signal, role)
+            self.field(options, spec, number, (message, signal), role)
                 .map_err(at)?;
         }
-        let opener = options.messages.iter().find(|m| m.name == opener);
-        let opener = opener.and_then(|message| shifted(message.id, spec.address));
+        let (opener, _) = frames(options, spec, opener)?;
         let mut reading = ReadingLayout {
             kind,
             needed: 0,
@@ -292,7 +333,7 @@ impl Layout {
                 let needed = part.needed();
                 frames += usize::from(needed != 0);
                 reading.needed |= needed;
-                if Some(message.id) == opener && reading.opening == 0 {
+                if message.frames == opener && reading.opening == 0 {
                     reading.opening = needed;
                 }
             }
@@ -313,7 +354,7 @@ impl Layout {
                         "pair_timeout_ms is missing: its values come in several frames ({}), and \
                          the last must come within this time after the first: less than half the \
                          period",
-                        messages.join(", ")
+                        names()
                     ));
                 }
             };
@@ -322,19 +363,48 @@ impl Layout {
         Ok(())
     }
 
+    /// Refuses a frame that may complete more readings than one result holds.
+    fn check_number(&self) -> Result<(), SpecError> {
+        let most = Decoded::MOST;
+        for message in &self.messages {
+            let overlaps = |other: &&MessageLayout| other.frames.overlaps(&message.frames);
+            for part in &message.parts {
+                // Those of the same frames, and of more.
+                let others = self.messages.iter().filter(overlaps);
+                let comes = |other: &&Part| part.has_conditions_of(other);
+                let mut readings: Vec<usize> = others
+                    .flat_map(|other| &other.parts)
+                    .filter(comes)
+                    .map(|part| part.reading)
+                    .collect();
+                readings.sort_unstable();
+                readings.dedup();
+                if readings.len() > most {
+                    return Err(SpecError::Description(format!(
+                        "{} readings have signals of frame {}, and a frame has at most {most}: \
+                         leave some out",
+                        readings.len(),
+                        message.frames.id
+                    )));
+                }
+            }
+        }
+        Ok(())
+    }
+
     /// Adds a signal to the part that has the same frames.
     fn field(
         &mut self,
+        options: &Options,
         spec: &Spec,
         reading: usize,
-        message: &Message,
-        signal: &Signal,
+        (message, signal): (&Message, &Signal),
         role: Role,
     ) -> Result<(), String> {
-        let id = shifted(message.id, spec.address)
-            .ok_or_else(|| format!("the identifier {} plus address is too large", message.id))?;
+        let (frames, j1939) = frames(options, spec, message)?;
+        let bits = signal.bits.clone()?;
         let conditions = conditions(message, signal)?;
-        let used = core::iter::once(signal.bits).chain(conditions.iter().map(|c| c.bits));
+        let used = core::iter::once(bits).chain(conditions.iter().map(|c| c.bits));
         let reach = used.map(Bits::reach).max().unwrap_or(0);
         if reach > message.size {
             return Err(format!(
@@ -344,13 +414,15 @@ impl Layout {
         }
         let field = Field {
             role,
-            bits: signal.bits,
+            bits,
             raw: signal.raw,
         };
         let messages = &mut self.messages;
-        let at = messages.iter().position(|m| m.id == id).unwrap_or_else(|| {
+        let known = messages.iter().position(|m| m.frames == frames);
+        let at = known.unwrap_or_else(|| {
             messages.push(MessageLayout {
-                id,
+                frames,
+                j1939,
                 size: message.size,
                 parts: Vec::new(),
             });
@@ -392,25 +464,142 @@ fn shifted(id: Id, by: u32) -> Option<Id> {
     }
 }
 
+/// Of an identifier of J1939 (SAE J1939-21): its priority, its parameter group, the destination
+/// that the group has if its format is below 240, and its source.
+const PRIORITY: u32 = 0x1C00_0000;
+const GROUP: u32 = 0x03FF_0000;
+const DESTINATION: u32 = 0xFF00;
+const SOURCE: u32 = 0xFF;
+/// The source address that stands for none.
+const NO_SOURCE: u32 = 0xFE;
+
+/// The bits of an identifier of J1939 that tell what a frame holds.
+const fn group(raw: u32) -> u32 {
+    const FORMAT: u32 = 0x00FF_0000;
+    const BROADCAST: u32 = 0x00F0_0000;
+    match raw & FORMAT < BROADCAST {
+        true => GROUP,
+        false => GROUP | DESTINATION,
+    }
+}
+
+/// Which frames are those of `message`, and whether they are of J1939: then their parameter group
+/// counts, and what the keys ask for. Where the file has several messages of one group, their
+/// addresses count.
+fn frames(options: &Options, spec: &Spec, message: &Message) -> Result<(Claim, bool), String> {
+    let id = message.id.clone()?;
+    let (Id::Extended(mut raw), true) = (id, options.j1939.unwrap_or(message.j1939)) else {
+        let id = shifted(id, spec.address)
+            .ok_or_else(|| format!("the identifier {id} plus address is too large"))?;
+        return Ok((Claim::shared(id), false));
+    };
+    if spec.address != 0 {
+        return Err(format!(
+            "address is added to identifiers, and of {id}, which is one of J1939, the parameter \
+             group counts: source_address tells the devices apart (j1939 = false: the whole \
+             identifier counts)"
+        ));
+    }
+    let group = group(raw);
+    let differs = |other: &Message| match other.id {
+        Ok(Id::Extended(of)) => (of ^ raw) & group == 0 && of & !PRIORITY != raw & !PRIORITY,
+        _ => false,
+    };
+    let mut mask = group;
+    if options.messages.iter().any(differs) {
+        mask |= DESTINATION | if raw & SOURCE == NO_SOURCE { 0 } else { SOURCE };
+    }
+    for (asked, field) in [
+        (options.source_address, SOURCE),
+        (options.destination_address, DESTINATION & !group),
+        (options.priority, PRIORITY),
+    ] {
+        // A group without a destination is for all.
+        if let Some(asked) = asked.filter(|_| field != 0) {
+            raw = raw & !field | u32::from(asked) << field.trailing_zeros() & field;
+            mask |= field;
+        }
+    }
+    let claim = Claim {
+        mask,
+        ..Claim::shared(Id::extended(raw))
+    };
+    Ok((claim, true))
+}
+
+/// The name of a message as its file's readers see it.
+fn name(message: &Message) -> &str {
+    message.long_name.as_deref().unwrap_or(&message.name)
+}
+
+/// The identifier of a message, for a person.
+fn shown(message: &Message) -> String {
+    let id = message.id.as_ref();
+    id.map_or_else(Clone::clone, |id| format!("0x{id}"))
+}
+
+/// The message that has the name `wanted`, or the identifier.
+fn find_message<'o>(options: &'o Options, wanted: &str) -> Result<&'o Message, String> {
+    let digits = wanted.strip_prefix("0x").filter(|digits| digits.len() <= 8);
+    let raw = digits.and_then(|digits| u32::from_str_radix(digits, 16).ok());
+    // As candump writes them: eight digits are an extended identifier.
+    let is_extended = digits.is_some_and(|digits| digits.len() == 8);
+    let is_wanted = |message: &&Message| match (raw, &message.id) {
+        (Some(raw), Ok(id)) => id.raw() == raw && matches!(id, Id::Extended(_)) == is_extended,
+        (Some(_), Err(_)) => false,
+        (None, _) => message.name == wanted || message.long_name.as_deref() == Some(wanted),
+    };
+    let found: Vec<&Message> = options.messages.iter().filter(is_wanted).collect();
+    match *found {
+        // Some files have the same message twice.
+        [message, ref others @ ..] if others.iter().all(|other| *other == message) => Ok(message),
+        [] if raw.is_some() => Err(format!(
+            "{:?} has no message with this identifier; a standard one has three digits, an \
+             extended one eight",
+            options.file
+        )),
+        [] => {
+            let names = options.messages.iter().map(name);
+            Err(format!(
+                "{:?} has no message {wanted:?}; it has {}",
+                options.file,
+                listed(names)
+            ))
+        }
+        _ => {
+            let all: Vec<String> = (found.iter())
+                .map(|message| format!("{} {}", name(message), shown(message)))
+                .collect();
+            Err(format!(
+                "{:?} has several messages {wanted:?}: {}; write the {} of one of them instead",
+                options.file,
+                all.join(", "),
+                if raw.is_some() { "name" } else { "identifier" }
+            ))
+        }
+    }
+}
+
 /// The message and the signal of `path`.
 fn find<'o>(options: &'o Options, path: &str) -> Result<(&'o Message, &'o Signal), String> {
     let Some((message, signal)) = path.split_once('.') else {
         return Err("it must be written Message.Signal".into());
     };
-    let mut named = options.messages.iter().filter(|m| m.name == message);
-    let Some(found) = named.next() else {
-        let names = options.messages.iter().map(|m| m.name.as_str());
-        return Err(format!(
-            "{:?} has no message {message:?}; it has {}",
-            options.file,
-            listed(names)
-        ));
-    };
-    match found.signals.iter().find(|s| s.name == signal) {
-        Some(signal) => Ok((found, signal)),
-        None => Err(format!(
-            "the message has no signal {signal:?}; it has {}",
-            listed(found.signals.iter().map(|s| s.name.as_str()))
+    let found = find_message(options, message)?;
+    let is_wanted = |s: &&Signal| s.name == signal || s.long_name.as_deref() == Some(signal);
+    let wanted: Vec<&Signal> = found.signals.iter().filter(is_wanted).collect();
+    match *wanted {
+        [signal] => Ok((found, signal)),
+        [] => {
+            let names = found.signals.iter();
+            let names = names.map(|s| s.long_name.as_deref().unwrap_or(&s.name));
+            Err(format!(
+                "the message has no signal {signal:?}; it has {}",
+                listed(names)
+            ))
+        }
+        _ => Err(format!(
+            "the message has several signals {signal:?}: give them different names in the file"
         )),
     }
 }
@@ -435,8 +624,8 @@ fn convert(
 ) -> Result<Unit, String> {
     let (legal, word) = (quantities(kind, index), given.unwrap_or(&signal.unit));
     let name = kind.fields().get(index).copied().unwrap_or_default();
-    let units = || spellings(legal).collect::<Vec<_>>().join(", ");
-    match unit(word) {
+    let units = || spellings(legal).join(", ");
+    match unit(word, legal) {
         Some(unit) if legal.contains(&unit.quantity) => Ok(unit),
         Some(_) if given.is_none() && word.trim().is_empty() => Err(format!(
             "the file gives no unit: add units = {{ {name} = \"...\" }}, one of {}",
@@ -473,7 +662,7 @@ fn conditions(message: &Message, signal: &Signal) -> Result<Vec<Condition>, Stri
             return Err("its multiplexors select each other in a circle".to_string());
         }
         conditions.push(Condition {
-            bits: multiplexor.bits,
+            bits: multiplexor.bits.clone()?,
             ranges: switch.ranges.clone(),
         });
         at = multiplexor;

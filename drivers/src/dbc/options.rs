@@ -14,8 +14,15 @@ pub struct Options {
     /// The .dbc file, relative to the configuration.
     pub file: String,
     /// The period of the readings of a simulated device \[ms\].
-    #[serde(default = "ten")]
-    pub period_ms: u32,
+    pub period_ms: Option<u32>,
+    /// Whether extended identifiers are those of SAE J1939; default as the file says.
+    pub j1939: Option<bool>,
+    /// Of J1939: the only source address whose frames count.
+    pub source_address: Option<u8>,
+    /// Of J1939: the only destination whose frames count, for messages that have one.
+    pub destination_address: Option<u8>,
+    /// Of J1939: the only priority whose frames count.
+    pub priority: Option<u8>,
     /// What is read.
     pub reading: Vec<ReadingKeys>,
     /// The contents of `file`, which the gateway reads.
@@ -49,10 +56,6 @@ pub struct ReadingKeys {
     pub fault: Option<String>,
     /// The signal that counts the readings.
     pub counter: Option<String>,
-}
-
-const fn ten() -> u32 {
-    10
 }
 
 fn kind<'de, D: Deserializer<'de>>(word: D) -> Result<Kind, D::Error> {

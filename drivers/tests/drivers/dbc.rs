@@ -3,7 +3,7 @@
 
 use crate::rig::{board, count, decode, encode, listener, options, spec};
 use proprio_drivers::signal::{Bits, Message, Raw, Signal, Switch};
-use proprio_drivers::{Decoded, EncodeError, Frame, Frames, Id, Mode, Output, State};
+use proprio_drivers::{Decoded, EncodeError, Format, Frame, Frames, Id, Mode, Output, State};
 use proprio_topics::{
     Counter, JointState, Nanos, Quality, Reading, StampKind, Temperature, Wrench,
 };
@@ -46,7 +46,8 @@ pair_timeout_ms = 2.0
 fn signal(name: &str, start: u64, length: u64, raw: Raw, factor: f64, unit: &str) -> Signal {
     Signal {
         name: name.to_owned(),
-        bits: Bits::new(start, length, false).unwrap(),
+        long_name: None,
+        bits: Bits::new(start, length, false).ok_or_else(String::new),
         raw,
         factor,
         offset: 0.0,
@@ -59,7 +60,9 @@ fn signal(name: &str, start: u64, length: u64, raw: Raw, factor: f64, unit: &str
 pub(crate) fn messages() -> Vec<Message> {
     let message = |name: &str, id, signals: &[Signal]| Message {
         name: name.to_owned(),
-        id: Id::standard(id),
+        long_name: None,
+        id: Ok(Id::standard(id)),
+        j1939: false,
         size: 8,
         signals: signals.to_vec(),
     };
@@ -511,7 +514,7 @@ fn the_file_is_that_of_the_keys() {
 fn the_address_shifts_long_identifiers() {
     let of = |id: u32, address| {
         let mut messages = messages();
-        messages[0].id = Id::extended(id);
+        messages[0].id = Ok(Id::extended(id));
         let mut options = options("dbc", WRENCH);
         options.describe(messages);
         let device = options.device(&spec(address, Mode::Listen, &[])).ok()?;
@@ -640,6 +643,262 @@ fn factor_offset_and_unit_are_those_of_the_file() {
         };
         assert!((told / 50.0 / value - 1.0).abs() < 1e-12, "{unit}: {told}");
     }
+}
+
+/// As many readings as a frame has bytes, one joint in each; one more is refused.
+#[test]
+fn a_frame_has_as_many_readings_as_bytes() {
+    let keys = |readings: usize| {
+        let reading = |n: usize| {
+            format!(
+                "[[reading]]\nkind = \"skin\"\nname = \"f{n}\"\nfields = {{ p0 = \"Hand.S{}\" }}\n",
+                n % 64
+            )
+        };
+        let readings: String = (0..readings).map(reading).collect();
+        format!("file = \"device.dbc\"\n{readings}")
+    };
+    let hand = Message {
+        size: 64,
+        signals: (0..64)
+            .map(|n| signal(&format!("S{n}"), 8 * n, 8, Raw::Unsigned, 1.0, ""))
+            .collect(),
+        ..messages()[0].clone()
+    };
+    let device = |readings| {
+        let mut options = options("dbc", &keys(readings));
+        let name = "Hand".to_owned();
+        options.describe(vec![Message {
+            name,
+            ..hand.clone()
+        }]);
+        options.device(&spec(0, Mode::Listen, &[]))
+    };
+    let bytes: Vec<u8> = (100..164).collect();
+    let format = Format::Fd {
+        bit_rate_switch: true,
+        error_state: false,
+    };
+    let frame = |bytes| Frame::with_format(Id::standard(0x10), format, bytes).unwrap();
+    let mut hand = device(64).unwrap();
+    let (readings, faults) = decode(&mut *hand, &[frame(&bytes)]);
+    assert!(faults.is_empty(), "{faults:?}");
+    let values: Vec<(u8, u8)> = (readings.iter())
+        .map(|output| (output.output, output.reading.values()[1] as u8))
+        .collect();
+    assert_eq!(values, (0..).zip(bytes.clone()).collect::<Vec<_>>());
+    // All that are too far back in a short frame are one fault.
+    let (readings, faults) = decode(&mut *hand, &[frame(&bytes[..48])]);
+    assert_eq!((readings.len(), count(&faults, Counter::Length)), (48, 1));
+    let problem = device(65).map(|_| ()).unwrap_err().to_string();
+    assert!(problem.contains("65 readings have signals of frame 010, and a frame has at most 64"));
+}
+
+/// What a file has that can not be used is told to who names it, and to nobody else.
+#[test]
+fn what_can_not_be_used_harms_nothing_else() {
+    let mut messages = messages();
+    messages[2].id = Err("its identifier 0x1e36001e has more than 11 bits".to_owned());
+    messages[3].signals[1].bits = Err("65 bits".to_owned());
+    let (readings, _) = {
+        let mut options = options("dbc", WRENCH);
+        options.describe(messages.clone());
+        let mut device = options.device(&spec(0, Mode::Listen, &[])).unwrap();
+        decode(&mut *device, &[half(false, 7, 1.0), half(true, 7, 1.5)])
+    };
+    assert_eq!(numbers(&readings), [(7, 7)]);
+    let named = |keys: &str| problem(keys, messages.clone(), 0).unwrap();
+    let told = named(DRIVE);
+    assert!(told.contains("0x1e36001e has more than 11 bits"), "{told}");
+    let told = named(
+        "file = \"device.dbc\"\n[[reading]]\nkind = \"temperature\"\n\
+         fields.temperature = \"State.Temperature\"\n",
+    );
+    assert!(told.contains("State.Temperature\": 65 bits"), "{told}");
+}
+
+/// Long names and short ones; an identifier where one name is that of two messages.
+#[test]
+fn messages_have_two_names_and_an_identifier() {
+    let keys = |path: &str| {
+        format!(
+            "file = \"device.dbc\"\n[[reading]]\nkind = \"temperature\"\n\
+             fields.temperature = \"{path}\"\n"
+        )
+    };
+    let mut messages = messages();
+    messages[3].long_name = Some("StateOfTheMotor".to_owned());
+    messages[3].signals[1].long_name = Some("TemperatureOfTheMotor".to_owned());
+    let celsius = |path: &str, messages: &[Message], id| {
+        let mut options = options("dbc", &keys(path));
+        options.describe(messages.to_vec());
+        let mut device = options.device(&spec(0, Mode::Listen, &[])).unwrap();
+        let frame = Frame::new(id, &[0, 100, 0, 0, 0, 0, 0, 0]);
+        decode(&mut *device, &[frame]).0.len()
+    };
+    let id = Id::standard(0x13);
+    for path in [
+        "State.Temperature",
+        "StateOfTheMotor.TemperatureOfTheMotor",
+        "StateOfTheMotor.Temperature",
+        "0x013.Temperature",
+    ] {
+        assert_eq!(celsius(path, &messages, id), 1, "{path}");
+    }
+    // The same message twice is no other one.
+    messages.push(messages[3].clone());
+    assert_eq!(celsius("State.Temperature", &messages, id), 1);
+    messages[5].id = Ok(Id::extended(0x13));
+    let told = problem(&keys("State.Temperature"), messages.clone(), 0).unwrap();
+    assert!(
+        told.contains(
+            "several messages \"State\": StateOfTheMotor 0x013, StateOfTheMotor 0x00000013"
+        ),
+        "{told}"
+    );
+    assert!(
+        told.contains("write the identifier of one of them"),
+        "{told}"
+    );
+    assert_eq!(celsius("0x013.Temperature", &messages, id), 1);
+    assert_eq!(
+        celsius("0x013.Temperature", &messages, Id::extended(0x13)),
+        0
+    );
+    assert_eq!(
+        celsius("0x00000013.Temperature", &messages, Id::extended(0x13)),
+        1
+    );
+    let told = problem(&keys("0x77.Temperature"), messages.clone(), 0).unwrap();
+    assert!(told.contains("no message with this identifier"), "{told}");
+    let again = messages[3].signals[1].clone();
+    messages[3].signals.push(again);
+    let told = problem(&keys("0x013.Temperature"), messages, 0).unwrap();
+    assert!(told.contains("several signals \"Temperature\""), "{told}");
+}
+
+/// A message of J1939 with one temperature, and its file.
+fn group(ids: &[u32]) -> Vec<Message> {
+    let message = |(number, id): (usize, &u32)| Message {
+        name: format!("G{number}"),
+        id: Ok(Id::extended(*id)),
+        j1939: true,
+        ..messages()[3].clone()
+    };
+    ids.iter().enumerate().map(message).collect()
+}
+
+/// The parameter group counts, and what the keys ask for.
+#[test]
+fn frames_of_j1939_are_told_by_their_group() {
+    let ids = |more: &str, file: &[u32], heard: &[u32]| {
+        let keys = format!(
+            "file = \"device.dbc\"\n{more}\n[[reading]]\nkind = \"temperature\"\n\
+             fields.temperature = \"G0.Temperature\"\n"
+        );
+        let mut options = options("dbc", &keys);
+        options.describe(group(file));
+        let spec = spec(0, Mode::Listen, &[]);
+        let mut device = options.device(&spec).unwrap();
+        let claims = device.claims().to_vec();
+        let read = |id: &&u32| {
+            let frame = Frame::new(Id::extended(**id), &[0, 100, 0, 0, 0, 0, 0, 0]);
+            let is_read = !decode(&mut *device, &[frame]).0.is_empty();
+            // The kernel's filters pass it.
+            assert_eq!(claims.iter().any(|claim| claim.matches(frame.id)), is_read);
+            is_read
+        };
+        let found: Vec<u32> = heard.iter().filter(read).copied().collect();
+        // A simulated device is heard.
+        let mut board = options.board(&spec).unwrap();
+        let reading = Reading::Temperature(Temperature { celsius: 1.0 });
+        let sent = encode(&mut *board, 0, &reading, Quality::GOOD);
+        assert_eq!(
+            decode(&mut *options.device(&spec).unwrap(), &sent).0.len(),
+            1
+        );
+        found
+    };
+    let heard = [
+        0x0CF0_0400,
+        0x18F0_0417,
+        0x0CF0_04FE,
+        0x0CF0_0500,
+        0x0DF0_0400,
+    ];
+    let engine = [0x0CF0_04FE];
+    assert_eq!(ids("", &engine, &heard), heard[..3]);
+    assert_eq!(ids("source_address = 0x17", &engine, &heard), heard[1..2]);
+    assert_eq!(ids("priority = 6", &engine, &heard), heard[1..2]);
+    assert_eq!(ids("j1939 = false", &engine, &heard), heard[2..3]);
+    // A group without a destination.
+    assert_eq!(ids("destination_address = 4", &engine, &heard), heard[..3]);
+    // A group with one.
+    let heard = [0x18EF_2305, 0x0CEF_FF07, 0x18EF_2405, 0x18EE_2305];
+    let proprietary = [0x18EF_2305];
+    assert_eq!(ids("", &proprietary, &heard), heard[..3]);
+    assert_eq!(
+        ids("destination_address = 0xFF", &proprietary, &heard),
+        heard[1..2]
+    );
+    // Several messages of one group are told by their addresses.
+    let both = [0x18EF_2305, 0x18EF_2306];
+    assert_eq!(
+        ids("", &both, &[0x18EF_2306, 0x0CEF_2305, 0x18EF_2405]),
+        [0x0CEF_2305]
+    );
+
+    let keys = "file = \"device.dbc\"\n[[reading]]\nkind = \"temperature\"\n\
+                fields.temperature = \"G0.Temperature\"\n";
+    let told = problem(keys, group(&engine), 1).unwrap();
+    assert!(
+        told.contains("source_address tells the devices apart"),
+        "{told}"
+    );
+    let asks = format!("source_address = 3\nj1939 = false\n{keys}");
+    let told = problem(&asks, group(&engine), 0).unwrap();
+    assert!(
+        told.contains("source_address: none of its messages is one of J1939"),
+        "{told}"
+    );
+}
+
+/// Two devices send the same two messages: their halves are never combined.
+#[test]
+fn halves_of_two_senders_are_never_combined() {
+    let mut messages = messages();
+    for (message, group) in messages.iter_mut().zip([0xFF10, 0xFF11]) {
+        message.id = Ok(Id::extended(0x1800_0000 | group << 8 | 0xFE));
+        message.j1939 = true;
+    }
+    let keys = WRENCH.replace("counter = \"F.Count\"\nfault = \"State.Error\"\n", "");
+    let mut options = options("dbc", &keys);
+    options.describe(messages);
+    let mut device = options.device(&spec(0, Mode::Listen, &[])).unwrap();
+    let half = |second: u32, source: u32, n: u8, ms| {
+        let id = Id::extended(0x18FF_1000 | second << 8 | source);
+        let frame = half(false, n, ms);
+        Frame::new(id, frame.data()).at(frame.t, frame.stamp)
+    };
+    let frames = [
+        half(0, 5, 1, 0.0),
+        half(0, 6, 2, 0.1),
+        half(1, 6, 2, 0.2),
+        half(1, 5, 1, 0.3),
+        half(0, 6, 3, 10.0),
+        half(1, 6, 3, 10.1),
+    ];
+    let (readings, faults) = decode(&mut *device, &frames);
+    assert_eq!(numbers(&readings), [(1, 1), (3, 3)]);
+    assert_eq!(count(&faults, Counter::Unexpected), 2);
+}
+
+/// Without the key it is not known.
+#[test]
+fn the_period_is_that_of_the_keys_or_unknown() {
+    assert!(!options("dbc", WRENCH).states_period());
+    assert!(options("dbc", &format!("period_ms = 20\n{WRENCH}")).states_period());
+    assert!(options("odrive", "").states_period());
 }
 
 proptest! {
