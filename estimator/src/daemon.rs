@@ -249,7 +249,6 @@ impl DataPlane {
         let now = monotonic();
         description_writer.send(&setup.description(), now)?;
         let first_look = FirstLook::start(&setup)?;
-        let of_setup = setup.robot.clone();
         let mut pipeline = Pipeline::new(setup);
         if let Some(state_file) = &state_file {
             state_file.resume(&mut pipeline);
@@ -259,7 +258,7 @@ impl DataPlane {
         }
         let identification = pipeline
             .identification()
-            .map(|online| IdentificationThread::start(online, of_setup, state_file))
+            .map(|online| IdentificationThread::start(online, &pipeline.setup().robot, state_file))
             .transpose()?;
         let inertias = match identification {
             Some(_) => Some(Writer::create(&domain, robot, epoch)?),
@@ -557,7 +556,7 @@ impl DataPlane {
                 sum.failed += counts.failed;
                 let group = identification.groups.get(component).map(String::as_str);
                 if std::mem::replace(reported, paused) != paused {
-                    tracing::info!(group, "{}", paused.describe(&identification.robot));
+                    tracing::info!(group, "{}", paused.describe(&self.pipeline.setup().robot));
                 }
                 if std::mem::replace(changes, counts.changes) != counts.changes
                     && let Some(change) = online.last_change(component)
@@ -630,12 +629,15 @@ struct IdentificationThread {
     reported: Vec<(Paused, u64)>,
     /// Per component, the names of its F/T sensors.
     groups: Vec<String>,
-    robot: Robot,
 }
 
 impl IdentificationThread {
     /// Starts the thread. It ends when this is dropped, and then writes its state.
-    fn start(online: &Online, robot: Robot, state_file: Option<StateFile>) -> anyhow::Result<Self> {
+    fn start(
+        online: &Online,
+        robot: &Robot,
+        state_file: Option<StateFile>,
+    ) -> anyhow::Result<Self> {
         let name = |sensor: &usize| {
             let role = ChannelRole::Sensor(*sensor);
             let channel = robot.channels.iter().find(|channel| channel.role == role);
@@ -698,7 +700,6 @@ impl IdentificationThread {
             thread: Some(thread),
             reported: vec![(Paused::No, 0); groups.len()],
             groups,
-            robot,
         })
     }
 }
@@ -760,6 +761,7 @@ mod tests {
             done,
             thread: Some(thread),
             reported: Vec::new(),
+            groups: Vec::new(),
         };
         let end = monotonic() + Nanos::from_millis(20_000);
         while !identification
