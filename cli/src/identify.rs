@@ -14,6 +14,7 @@ use crate::convert::check_columns;
 use advice::{Advice, findings, sentence};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
+use proprio_dynamics::model::Model;
 use proprio_estimator::setup::Setup;
 use proprio_estimator::{export, reading};
 use proprio_identification::{Options, Outcome, Progress, Role, Severity, Verdict, identify};
@@ -57,8 +58,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         config.identification.enabled = false;
     })?;
     // Read now: it may be a result of an earlier run, which is removed below.
-    let urdf = fs::read_to_string(&config.model)
-        .with_context(|| format!("{}: cannot be read", config.model.display()))?;
+    let urdf = Model::read_text(&config.model)?;
     let files: Vec<(&PathBuf, Role)> = args
         .samples
         .iter()

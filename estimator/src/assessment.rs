@@ -131,7 +131,11 @@ impl Assessor {
             } else {
                 0.0
             };
-            let each = earlier.iter().zip(joints).zip(&instant.torque);
+            let measured = self
+                .robot
+                .published()
+                .filter_map(|dof| instant.torque.get(dof));
+            let each = earlier.iter().zip(joints).zip(measured);
             for (((one, other), measured), tally) in each.zip(&mut self.joints) {
                 if measured.is_finite() && one.valid == 1 && other.valid == 1 {
                     let estimated = one.torque + late * (other.torque - one.torque);

@@ -251,15 +251,11 @@ impl Check {
             },
         );
         let loads = gravity_loads(model);
-        let overloaded = model
-            .joints()
-            .iter()
-            .enumerate()
-            .filter_map(|(number, joint)| {
-                let (dof, effort) = (joint.dof?, model.effort(number)?);
-                (loads[dof] > HOLDS * effort)
-                    .then(|| (model.dof_name(dof).to_owned(), loads[dof], effort))
-            });
+        let overloaded = (loads.iter().enumerate()).filter_map(|(dof, _)| {
+            let effort = model.effort(model.dof_joint(dof)?)?;
+            (loads[dof] > HOLDS * effort)
+                .then(|| (model.dof_name(dof).to_owned(), loads[dof], effort))
+        });
         // A general posture: where axes are aligned, the result would be a special case.
         let somewhere = |limits: Limits| limits.lower + 0.618 * (limits.upper - limits.lower);
         let kinematics = pose(&positions(setup, somewhere, 0.7), 0, &upright)?;
@@ -328,14 +324,12 @@ impl Check {
 /// without limits, `without`.
 fn positions(setup: &Setup, within: impl Fn(Limits) -> f64, without: f64) -> Vec<f64> {
     let mut positions = setup.robot.locked.clone();
-    for (number, joint) in setup.state.model.joints().iter().enumerate() {
-        if let Some(dof) = joint.dof.filter(|&dof| positions[dof].is_nan()) {
-            let limits = setup
-                .state
-                .model
-                .limits(number)
-                .filter(|limits| limits.upper > limits.lower);
-            positions[dof] = limits.map_or(without, &within);
+    let model = &setup.state.model;
+    for (dof, position) in positions.iter_mut().enumerate() {
+        if position.is_nan() {
+            let limits = model.dof_joint(dof).and_then(|joint| model.limits(joint));
+            let limits = limits.filter(|limits| limits.upper > limits.lower);
+            *position = limits.map_or(without, &within);
         }
     }
     positions

@@ -42,7 +42,9 @@ pub struct Config {
     pub realtime: Option<Realtime>,
     /// Where kinematics start.
     pub base: Base,
-    /// Joints that are not measured, and their fixed positions \[rad or m\].
+    /// Joints that are not measured, and their fixed positions \[rad or m\]. Joints that follow
+    /// another one in the URDF (`<mimic>`) are neither measured nor locked; one that is named here
+    /// does not follow.
     #[serde(default)]
     pub locked: BTreeMap<String, f64>,
     /// The force/torque sensors, at which the tree is cut.
@@ -153,7 +155,8 @@ const fn standard_gravity() -> [f64; 3] {
 pub struct ForceTorque {
     /// Its channel.
     pub sensor: String,
-    /// The URDF joint that it is mounted in; the tree is cut here.
+    /// The URDF joint that it is mounted in; the tree is cut here. If the joint moves, the sensor is
+    /// on the side of its child.
     pub joint: String,
     /// The measurement frame: axes and origin of its reading; default: that of the URDF's sensor
     /// element, else `child`.

@@ -298,6 +298,15 @@ impl fmt::Display for Setup {
                 1e3 * skin.position_std
             )?;
         }
+        let model = &self.robot.model;
+        for joint in (0..model.joint_count()).map(|joint| model.joint_name(joint)) {
+            if let Some(leader) = model.follows(joint) {
+                writeln!(
+                    f,
+                    "  {joint} follows {leader}; the torque of {leader} includes its torque"
+                )?;
+            }
+        }
         for (dof, position) in self.robot.locked.iter().enumerate() {
             if !position.is_nan() {
                 writeln!(

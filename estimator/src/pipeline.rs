@@ -187,7 +187,7 @@ impl Pipeline {
             setup.robot.base_link,
         );
         let mut estimate = Box::new(Estimate::absent(Nanos::ZERO));
-        estimate.torques.count = u32::try_from(dofs).unwrap_or(0);
+        estimate.torques.count = u32::try_from(setup.robot.published().count()).unwrap_or(0);
         estimate.contacts.count = u32::try_from(setup.robot.contacts.len()).unwrap_or(0);
         estimate.contacts.residual_count =
             u32::try_from(setup.robot.subtree_names().count()).unwrap_or(0);
@@ -552,9 +552,8 @@ fn predicted<const N: usize, const D: usize>(
 fn encoder_offset_std(model: &Model) -> Vec<f64> {
     let of_dof = |dof: usize| {
         let kind = model
-            .joints()
-            .iter()
-            .find(|joint| joint.dof == Some(dof))
+            .dof_joint(dof)
+            .and_then(|joint| model.joints().get(joint))
             .map(|joint| &joint.kind);
         ENCODER_OFFSET_STD[usize::from(matches!(kind, Some(JointKind::Prismatic(_))))]
     };

@@ -260,6 +260,7 @@ impl WithSimd for Update<'_> {
             imbalances,
             ..
         } = propagation;
+        torque.fill(0.0);
         for ((part, subtree), imbalance) in subtrees
             .iter_mut()
             .zip(structure.subtrees())
@@ -289,7 +290,7 @@ impl WithSimd for Update<'_> {
                 let Some(dof) = structure.dof_of(link.link) else {
                     continue;
                 };
-                let (axis, response) = solver.torque_rows(dof);
+                let (axis, response) = solver.torque_rows(link.link);
                 let below = structure.below(link.link);
                 let drift = from_drift(&|other| {
                     if below.contains(&other) {
@@ -298,7 +299,12 @@ impl WithSimd for Update<'_> {
                         -*response
                     }
                 });
-                torque[dof] = (part.variance(simd, place, axis, response) + drift).sqrt();
+                let std = (part.variance(simd, place, axis, response) + drift).sqrt();
+                match structure.moved_by(dof) {
+                    [_] => torque[dof] = std,
+                    // The deviation of a sum is at most the sum of the deviations.
+                    _ => torque[dof] += std,
+                }
             }
             for contact in subtree.contacts.iter() {
                 let motions = solver.contact_rows(contact);

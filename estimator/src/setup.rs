@@ -11,7 +11,9 @@ use crate::parameters::{Parameters, ParametersError};
 use crate::plausible;
 use crate::skin::{PatchSetup, TRIANGLE, TRIANGLES, Taxel, TaxelMap, threshold};
 use proprio_dynamics::calibration::{self, Calibration, UNKNOWN_OFFSET};
-use proprio_dynamics::model::{Frame, JointKind, MeasurementDirection, MeasurementFrame, Model};
+use proprio_dynamics::model::{
+    Frame, JointKind, MeasurementDirection, MeasurementFrame, Model, ModelError,
+};
 use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
 use proprio_dynamics::{
     ContactKind, ContactSet, ContactSpec, FrameMotion, Noise, SensorCut, Structure, StructureError,
@@ -67,14 +69,11 @@ impl Setup {
             .iter()
             .map(|f| f.joint.as_str())
             .collect();
-        let model = Model::from_file(&config.model, &keep).map_err(|e| {
-            let text = e.to_string();
-            if text.contains(&*config.model.to_string_lossy()) {
-                text
-            } else {
-                format!("{}: {text}", config.model.display())
-            }
+        let mut model = Model::from_file(&config.model, &keep).map_err(|e| match e {
+            ModelError::Read { .. } => e.to_string(),
+            e => format!("{}: {e}", config.model.display()),
         })?;
+        hold(config, &mut model);
         Self::with_model(config, model)
     }
 
@@ -95,20 +94,29 @@ impl Setup {
             );
         }
         let dofs = model.dof_count();
-        if dofs > MAX_JOINTS {
-            return Err(format!(
-                "the model has {dofs} moving joints; at most {MAX_JOINTS} are possible: make some \
-                 of them fixed in the URDF"
-            ));
-        }
         let mut locked = vec![f64::NAN; dofs];
         for (joint, position) in &config.locked {
+            if let Some(leader) = model.follows(joint) {
+                warnings.push(format!(
+                    "locked.{joint}: in the URDF this joint follows {leader} (<mimic>); here it is \
+                     held at {position}"
+                ));
+                continue;
+            }
             let dof = model
                 .dof(joint)
                 .ok_or_else(|| format!("locked.{joint}: {}", no_joint(&model, joint)))?;
             if let Some(place) = locked.get_mut(dof) {
                 *place = *position;
             }
+        }
+        let measured = locked.iter().filter(|position| position.is_nan()).count();
+        if measured > MAX_JOINTS {
+            return Err(format!(
+                "{}: {measured} joints are to be measured; {MAX_JOINTS} at most: name joints that \
+                 nobody measures in [locked], with their positions, or make them fixed in the URDF",
+                config.model.display()
+            ));
         }
         let mut channels = Vec::new();
         let mut add =
@@ -369,6 +377,13 @@ impl Setup {
     }
 }
 
+/// Holds the joints at the positions of `[locked]` that follow another one in the URDF.
+pub fn hold(config: &Config, model: &mut Model) {
+    for (joint, position) in &config.locked {
+        model.hold(joint, *position);
+    }
+}
+
 /// Per degree of freedom, the default of [`Setup::max_deviation`] \[Nm or N\].
 fn default_max_deviation(model: &Model) -> Vec<f64> {
     /// The effort of a drive is typically ten times the gravity load of the links. A limit above
@@ -376,8 +391,8 @@ fn default_max_deviation(model: &Model) -> Vec<f64> {
     const USUAL: f64 = 10.0;
     const CREDIBLE: f64 = 100.0;
     let mut bounds = gravity_loads(model);
-    for (number, joint) in model.joints().iter().enumerate() {
-        if let Some(bound) = joint.dof.and_then(|dof| bounds.get_mut(dof)) {
+    for (dof, bound) in bounds.iter_mut().enumerate() {
+        if let Some(number) = model.dof_joint(dof) {
             let effort = model
                 .effort(number)
                 .filter(|effort| *effort <= CREDIBLE * *bound);
@@ -401,7 +416,9 @@ pub(crate) fn gravity_loads(model: &Model) -> Vec<f64> {
         let (mass, moment) = (mass + more, moment + moment_of_more);
         if let Some(load) = joint.dof.and_then(|dof| loads.get_mut(dof)) {
             let is_prismatic = matches!(joint.kind, JointKind::Prismatic(_));
-            *load = STANDARD_GRAVITY * if is_prismatic { mass } else { moment };
+            let own = STANDARD_GRAVITY * if is_prismatic { mass } else { moment };
+            // Joints that follow add what they carry.
+            *load += own * joint.ratio.abs();
         }
         if let Some((sum, moments)) = beyond.get_mut(joint.parent) {
             *sum += mass;

@@ -302,3 +302,204 @@ fn what_will_be_withheld_is_told_with_its_cause() {
         .expect("it");
     assert!(names.contains(&"wrist".to_owned()), "{told:?}");
 }
+
+/// A chain of `moving` joints, of which the last `locked` are locked.
+fn chain(moving: usize, locked: usize) -> Result<Setup, String> {
+    let mut urdf = String::from("<robot name=\"r\"><link name=\"l0\"/>");
+    for joint in 1..=moving {
+        urdf += &format!(
+            "<link name=\"l{joint}\"><inertial><origin xyz=\"0 0 0.05\"/><mass value=\"0.1\"/>\
+             <inertia ixx=\"1e-4\" ixy=\"0\" ixz=\"0\" iyy=\"1e-4\" iyz=\"0\" izz=\"1e-4\"/>\
+             </inertial></link><joint name=\"j{joint}\" type=\"continuous\"><parent link=\"l{}\"/>\
+             <child link=\"l{joint}\"/><origin xyz=\"0 0 0.1\"/><axis xyz=\"0 1 0\"/></joint>",
+            joint - 1
+        );
+    }
+    let mut config = String::from(
+        "schema = 1\nrobot = \"r\"\nmodel = \"r.urdf\"\n[base]\nkind = \"fixed\"\nlink = \"l0\"\n\
+         [locked]\n",
+    );
+    (moving - locked + 1..=moving).for_each(|joint| config += &format!("j{joint} = 0.1\n"));
+    let model = Model::from_urdf(&(urdf + "</robot>"), &[]).expect("a model");
+    Setup::with_model(&Config::parse(&config).expect("a configuration"), model)
+}
+
+/// A humanoid with hands; locked joints do not count. Their torques are published where they fit.
+#[test]
+fn only_measured_joints_are_limited() {
+    let names =
+        |setup: &Setup| -> Vec<String> { setup.robot.joint_names().map(str::to_owned).collect() };
+    let setup = chain(75, 35).expect("40 measured joints");
+    assert_eq!((names(&setup).len(), setup.robot.channels.len()), (75, 40));
+    let setup = chain(120, 0).expect("120 measured joints");
+    assert_eq!(names(&setup).len(), 120);
+    let setup = chain(150, 30).expect("120 measured joints");
+    assert_eq!(names(&setup).len(), 120);
+    assert_eq!(names(&setup).last().map(String::as_str), Some("j120"));
+    assert_eq!(
+        chain(150, 21).expect_err("129 measured joints"),
+        "r.urdf: 129 joints are to be measured; 128 at most: name joints that nobody measures in \
+         [locked], with their positions, or make them fixed in the URDF"
+    );
+}
+
+const GRIPPER: &str = "<robot name=\"r\"><link name=\"base\"/>\
+    <link name=\"a\"><inertial><origin xyz=\"0.1 0 0.2\"/><mass value=\"1\"/><inertia ixx=\"0.02\" \
+    ixy=\"0\" ixz=\"0\" iyy=\"0.03\" iyz=\"0\" izz=\"0.025\"/></inertial></link>\
+    <link name=\"b\"><inertial><origin xyz=\"0 0 0.1\"/><mass value=\"0.5\"/><inertia ixx=\"1e-3\" \
+    ixy=\"0\" ixz=\"0\" iyy=\"1e-3\" iyz=\"0\" izz=\"1e-3\"/></inertial></link>\
+    <joint name=\"j1\" type=\"continuous\"><parent link=\"base\"/><child link=\"a\"/>\
+    <axis xyz=\"0 1 0\"/></joint>\
+    <joint name=\"j2\" type=\"continuous\"><parent link=\"a\"/><child link=\"b\"/>\
+    <origin xyz=\"0 0 0.4\"/><axis xyz=\"0 1 0\"/>\
+    <mimic joint=\"j1\" multiplier=\"-1.5\" offset=\"0.2\"/></joint></robot>";
+
+/// A robot in files, as the programs read it.
+fn files(urdf: &[u8], config: &str) -> (tempfile::TempDir, Result<Setup, String>) {
+    let folder = tempfile::tempdir().unwrap();
+    let text = "schema = 1\nrobot = \"r\"\nmodel = \"r.urdf\"\n[base]\nkind = \"fixed\"\n\
+                link = \"base\"\n";
+    std::fs::write(folder.path().join("r.urdf"), urdf).unwrap();
+    let file = folder.path().join("estimator.toml");
+    std::fs::write(&file, text.to_owned() + config).unwrap();
+    let setup = Config::load(&file).map_err(|error| error.to_string());
+    let setup = setup.and_then(|config| Setup::new(&config));
+    (folder, setup)
+}
+
+/// From a log of the first joint alone. The torque of the actuated joint includes that of the
+/// follower: -1.106490 Nm + 1.5 x 0.039074 Nm, which Pinocchio computes along their own axes.
+#[test]
+fn a_joint_that_follows_another_is_not_measured() {
+    let (_folder, setup) = files(GRIPPER.as_bytes(), "");
+    let setup = setup.expect("one channel");
+    let names: Vec<&str> = setup.channels().map(|(_, name)| name).collect();
+    assert_eq!(names, ["j1"]);
+    assert!(
+        setup
+            .to_string()
+            .contains("  j2 follows j1; the torque of j1 includes its torque\n"),
+        "{setup}"
+    );
+    let rows: String = (0..3).map(|row| format!("0.0{row},0.1,0.5,2\n")).collect();
+    let log = "t,joint/j1/position,joint/j1/velocity,joint/j1/acceleration\n".to_owned() + &rows;
+    let mut out = Vec::new();
+    proprio_estimator::offline::estimate(setup, log.as_bytes(), &mut out, None).expect("estimates");
+    let out = String::from_utf8(out).unwrap();
+    let mut lines = out.lines();
+    let column = lines
+        .next()
+        .unwrap()
+        .split(',')
+        .position(|name| name == "torque/j1")
+        .unwrap();
+    let mut count = 0;
+    for line in lines {
+        let torque: f64 = line.split(',').nth(column).unwrap().parse().unwrap();
+        assert!((torque + 1.047_879).abs() < 1e-6, "{torque}");
+        count += 1;
+    }
+    assert_eq!(count, 3);
+
+    // The configuration wins over the URDF, and says so.
+    let (_folder, setup) = files(GRIPPER.as_bytes(), "[locked]\nj2 = 0.5\n");
+    let setup = setup.expect("a held follower");
+    let joint = setup.robot.model.joints()[setup.robot.model.joint("j2").unwrap()];
+    assert_eq!((joint.ratio, joint.offset), (0.0, 0.5));
+    assert!(setup.warnings().iter().any(|warning| {
+        warning == "locked.j2: in the URDF this joint follows j1 (<mimic>); here it is held at 0.5"
+    }));
+    // With the leader locked, the follower is where that puts it.
+    let (_folder, setup) = files(GRIPPER.as_bytes(), "[locked]\nj1 = 0.5\n");
+    assert!(setup.unwrap_err().starts_with("no channel is read"));
+}
+
+#[test]
+fn a_urdf_is_read_in_the_encoding_that_it_declares() {
+    let declared = |encoding: &str| {
+        format!("<?xml version=\"1.0\" encoding=\"{encoding}\"?><!-- \u{e9} -->{GRIPPER}")
+            .replace("\"a\"", "\"\u{e9}paule\"")
+    };
+    let latin = |text: &str| text.chars().map(|c| c as u8).collect::<Vec<u8>>();
+    let utf16 = |text: &str| -> Vec<u8> {
+        let marked = format!("\u{feff}{text}");
+        marked.encode_utf16().flat_map(u16::to_le_bytes).collect()
+    };
+    for bytes in [
+        declared("UTF-8").into_bytes(),
+        latin(&declared("ISO-8859-1")),
+        latin(&declared("windows-1252")),
+        latin(&declared("utf-8")),
+        utf16(&declared("UTF-16")),
+    ] {
+        let (folder, setup) = files(&bytes, "");
+        let model = setup.expect("it is read").robot.model;
+        assert!(model.frame("\u{e9}paule").is_some());
+        // As text it can be written again in UTF-8.
+        let text = Model::read_text(&folder.path().join("r.urdf")).unwrap();
+        assert!(text.to_lowercase().contains("encoding=\"utf-8\""), "{text}");
+        let new = Model::rewrite_urdf(&text, &[], model.inertias()).unwrap();
+        assert_eq!(new, text);
+    }
+    let broken = GRIPPER.replace("<axis xyz=\"0 1 0\"/>", "<axis xzy=\"0 1 0\"/>");
+    let (folder, setup) = files(broken.as_bytes(), "");
+    let file = folder.path().join("r.urdf");
+    assert_eq!(
+        setup.unwrap_err(),
+        format!(
+            "{}: line 1: joint j1: its <axis> has no xyz (it has xzy); write its direction, such as \
+             xyz=\"0 0 1\"",
+            file.display()
+        )
+    );
+}
+
+/// The six axes of a wrist are those of the last moving joint: the torque about its axis is read.
+#[test]
+fn a_sensor_in_a_moving_joint_is_on_the_side_of_its_child() {
+    let sensor = "[[force_torque]]\nsensor = \"s\"\njoint = \"j1\"\n";
+    let urdf = GRIPPER.replace("<mimic", "<ignored");
+    let (_folder, setup) = files(urdf.as_bytes(), sensor);
+    let setup = setup.expect("a cut in a moving joint");
+    let names: Vec<&str> = setup.channels().map(|(_, name)| name).collect();
+    assert_eq!(names, ["s", "j1", "j2"]);
+    let check = Check::of(&setup).expect("numbers");
+    let [at_rest] = &check.sensors[..] else {
+        panic!("one sensor")
+    };
+    // Child to parent, at rest: the weight of both links, 1 kg at x = 0.1 m.
+    assert!((at_rest.mass - 1.5).abs() < 1e-12);
+    let expected = [
+        0.0,
+        0.0,
+        -1.5 * STANDARD_GRAVITY,
+        0.0,
+        0.1 * STANDARD_GRAVITY,
+        0.0,
+    ];
+    for (read, expected) in at_rest.reading.force_first().into_iter().zip(expected) {
+        assert!((read - expected).abs() < 1e-9, "{:?}", at_rest.reading);
+    }
+    // The torque of j1, by the parent on the child, is what the sensor reads about its axis.
+    let log = "t,joint/j1/position,joint/j1/velocity,joint/j1/acceleration,joint/j2/position,\
+               joint/j2/velocity,joint/j2/acceleration,wrench/s/fx,wrench/s/fy,wrench/s/fz,\
+               wrench/s/tx,wrench/s/ty,wrench/s/tz\n0,0.3,0,0,0.2,0,0,1,2,-15,0.1,0.7,0.2\n";
+    let mut out = Vec::new();
+    proprio_estimator::offline::estimate(setup, log.as_bytes(), &mut out, None).expect("estimates");
+    let out = String::from_utf8(out).unwrap();
+    let (header, row) = out.trim_end().split_once('\n').unwrap();
+    let column = header
+        .split(',')
+        .position(|name| name == "torque/j1")
+        .unwrap();
+    let torque: f64 = row.split(',').nth(column).unwrap().parse().unwrap();
+    assert!((torque + 0.7).abs() < 1e-9, "{torque}");
+    // The parent moves against the sensor.
+    let (_folder, setup) = files(urdf.as_bytes(), &format!("{sensor}frame = \"parent\"\n"));
+    let error = setup.unwrap_err();
+    assert!(
+        error.starts_with("force_torque \"s\": the F/T sensor in joint j1 cannot measure in the")
+            && error.contains("use the frame of the child"),
+        "{error}"
+    );
+}

@@ -1647,7 +1647,7 @@ fn everything_but_the_inertials_stays_byte_for_byte() {
     assert!(Model::rewrite_urdf(urdf, &[], &infinite).is_err());
     assert!(matches!(
         Model::rewrite_urdf("<robot", &[], &[]),
-        Err(ModelError::Syntax(_))
+        Err(ModelError::Syntax { .. })
     ));
 }
 

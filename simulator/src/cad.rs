@@ -33,8 +33,7 @@ pub fn wrong_urdf(robot: &Robot, settings: &Settings, relative: f64) -> Result<S
         file: file.clone(),
         cause: Box::new(cause),
     };
-    let text = std::fs::read_to_string(file)
-        .map_err(|e| robot.mismatch(format!("{}: {e}", file.display())))?;
+    let text = Model::read_text(file).map_err(wrong)?;
     let truth = torques(robot, settings)?;
     let enough = ENOUGH.min(0.5 * relative);
     let mut best: Option<(f64, Model)> = None;

@@ -128,10 +128,12 @@ impl Robot {
             .iter()
             .map(|ft| ft.joint.as_str())
             .collect();
-        let model = Model::from_file(&config.model, &keep).map_err(|cause| RobotError::Model {
-            file: config.model.clone(),
-            cause: Box::new(cause),
-        })?;
+        let mut model =
+            Model::from_file(&config.model, &keep).map_err(|cause| RobotError::Model {
+                file: config.model.clone(),
+                cause: Box::new(cause),
+            })?;
+        proprio_estimator::setup::hold(&config, &mut model);
         if plan.robot != config.robot {
             let problem = format!(
                 "gateway.toml has robot = {:?}, estimator.toml robot = {:?}: they would not find \

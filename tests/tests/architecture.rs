@@ -65,7 +65,7 @@ const CONFINED: [(&str, &[&str]); 5] = [
         ],
     ),
     // The estimator uses it in a test to read its own output.
-    ("urdf-rs", &["proprio-dynamics", "proprio-estimator"]),
+    ("urdf-rs", &["proprio-estimator"]),
     ("tokio", &["proprio-gateway", "proprio-estimator"]),
 ];
 

@@ -750,9 +750,9 @@ fn a_malformed_urdf_is_told_with_its_place() {
         ),
         (
             urdf.replacen("<axis xyz=\"", "<axis xyz=\"0 0 0\" was=\"", 1),
-            &["axis is zero"],
+            &["line ", "xyz is zero"],
         ),
-        (urdf[..urdf.len() / 2].to_owned(), &["not well-formed XML"]),
+        (urdf[..urdf.len() / 2].to_owned(), &["is not XML: line "]),
         (String::new(), &["wrong.urdf"]),
         ("<sdf><model/></sdf>".to_owned(), &["<sdf>, not <robot>"]),
     ] {

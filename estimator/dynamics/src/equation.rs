@@ -65,7 +65,7 @@ pub struct EquationOfMotion {
     // Scratch.
     /// Per link; unused for the base.
     inward: Vec<Inward>,
-    /// Per degree of freedom: unit motion of the outer link relative to the inner one.
+    /// Per link: motion of it, as the outer link, relative to the inner one at unit rate.
     axes: Vec<Motion>,
     twists: Vec<Motion>,
     accelerations: Vec<Motion>,
@@ -84,7 +84,7 @@ impl EquationOfMotion {
             bias_torque: vec![0.0; dofs],
             composite: vec![RigidInertia::zero(); links],
             inward: vec![Inward { link: 0, dof: None }; links],
-            axes: vec![Motion::zero(); dofs],
+            axes: vec![Motion::zero(); links],
             twists: vec![Motion::zero(); links],
             accelerations: vec![Motion::zero(); links],
             wrenches: vec![Wrench::zero(); links],
@@ -132,12 +132,12 @@ impl EquationOfMotion {
         check_size(
             "degrees of freedom of the model",
             model.dof_count(),
-            self.axes.len(),
+            self.bias_torque.len(),
         )?;
         check_size(
             "degrees of freedom of the kinematics",
             kinematics.joint_velocity().len(),
-            self.axes.len(),
+            self.bias_torque.len(),
         )?;
         if let Some(index) = gravity.iter().position(|x| !x.is_finite()) {
             return Err(DynamicsError::NotFinite {
@@ -200,25 +200,27 @@ impl EquationOfMotion {
         self.bias_wrench = self.wrenches[self.base];
 
         // Joints that are not on one path outward from the base have no coupling; which joints
-        // these are depends on the base.
+        // these are depends on the base. Several joints may have one degree of freedom.
         self.joint_inertia.fill(0.0);
+        self.coupling.fill(0.0);
+        self.bias_torque.fill(0.0);
         for outer in 0..self.inward.len() {
             let Inward { mut link, dof } = self.inward[outer];
             let Some(dof) = dof.filter(|_| outer != self.base) else {
                 continue;
             };
-            let axis = &self.axes[dof];
-            self.bias_torque[dof] = axis.dot(&self.wrenches[outer]);
+            let axis = &self.axes[outer];
+            self.bias_torque[dof] += axis.dot(&self.wrenches[outer]);
             let momentum = self.composite[outer].momentum(axis);
-            self.coupling
-                .set_column(dof, &stack(&momentum.torque, &momentum.force));
-            self.joint_inertia[(dof, dof)] = axis.dot(&momentum);
+            let mut column = self.coupling.column_mut(dof);
+            column += stack(&momentum.torque, &momentum.force);
+            self.joint_inertia[(dof, dof)] += axis.dot(&momentum);
             while link != self.base {
                 let next = self.inward[link];
                 if let Some(other) = next.dof {
-                    let value = self.axes[other].dot(&momentum);
-                    self.joint_inertia[(dof, other)] = value;
-                    self.joint_inertia[(other, dof)] = value;
+                    let value = self.axes[link].dot(&momentum);
+                    self.joint_inertia[(dof, other)] += value;
+                    self.joint_inertia[(other, dof)] += value;
                 }
                 link = next.link;
             }
@@ -240,7 +242,7 @@ impl EquationOfMotion {
         let (mut twist, mut acceleration) = (self.twists[inner], self.accelerations[inner]);
         if let (Some(dof), Some(axis)) = (joint.dof, kinematics.joint_axis(joint)) {
             let axis = if reversed { -axis } else { axis };
-            self.axes[dof] = axis;
+            self.axes[outer] = axis;
             let rate = axis * kinematics.joint_velocity()[dof];
             acceleration += twist.cross(&rate);
             twist += rate;
@@ -326,9 +328,9 @@ impl EquationOfMotion {
         check_size(
             "joint accelerations",
             joint_acceleration.len(),
-            self.axes.len(),
+            self.bias_torque.len(),
         )?;
-        check_size("torques", torque.len(), self.axes.len())?;
+        check_size("torques", torque.len(), self.bias_torque.len())?;
         let a_b = stack(&base_acceleration.angular, &base_acceleration.linear);
         let mut wrench = self.composite_inertia().momentum(base_acceleration) + self.bias_wrench;
         torque.copy_from_slice(&self.bias_torque);
@@ -457,7 +459,8 @@ impl Kinematics {
             let joint = &model.joints()[*lower - 1];
             if let (Some(dof), Some(axis)) = (joint.dof, self.joint_axis(joint)) {
                 let twist = x_bf.twist_back(&if reversed { -axis } else { axis });
-                out.set_column(before + dof, &stack(&twist.angular, &twist.linear));
+                let mut column = out.column_mut(before + dof);
+                column += stack(&twist.angular, &twist.linear);
             }
             *lower = joint.parent;
         }

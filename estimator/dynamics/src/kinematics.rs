@@ -18,7 +18,7 @@
 use wide::f64x4;
 
 use crate::error::{DynamicsError, check_size};
-use crate::model::{Frame, Joint, JointKind, Model};
+use crate::model::{Axis, Frame, Joint, JointKind, Model};
 use crate::spatial::{Motion, Pose, Vec3, Wrench};
 
 /// Angles beyond this [rad] are computed by the standard library: their reduction to one turn needs
@@ -79,7 +79,8 @@ impl FrameMotion {
 }
 
 /// Positions [rad or m], velocities and accelerations of all joints, by degree of freedom. A locked
-/// joint has its position, and zero velocity and acceleration.
+/// joint has its position, and zero velocity and acceleration; one that follows another one
+/// ([`Joint::ratio`]) has none.
 #[derive(Clone, Copy, Debug)]
 pub struct JointState<'a> {
     /// Positions.
@@ -118,9 +119,10 @@ pub struct Kinematics {
     steps: Vec<Step>,
     /// Whether joint `j` is crossed from child to parent: the base lies beyond it.
     reversed: Vec<bool>,
-    /// Sine and cosine of each degree of freedom's position.
+    /// Position of each joint, and its sine and cosine; zero for a fixed one.
+    positions: Vec<f64>,
     sines: Vec<(f64, f64)>,
-    /// Joint velocities of the last update, for users of its poses and motions.
+    /// Velocities of the degrees of freedom at the last update, for users of its poses and motions.
     velocity: Vec<f64>,
     /// Pose of each joint's child in its parent, `x_pc`.
     local: Vec<Pose>,
@@ -141,7 +143,8 @@ impl Kinematics {
             base: 0,
             steps: Vec::with_capacity(model.joint_count()),
             reversed: vec![false; model.joint_count()],
-            sines: vec![(0.0, 1.0); model.dof_count()],
+            positions: vec![0.0; model.joint_count()],
+            sines: vec![(0.0, 1.0); model.joint_count()],
             velocity: vec![0.0; model.dof_count()],
             local: vec![Pose::identity(); model.joint_count()],
             links: vec![
@@ -216,7 +219,7 @@ impl Kinematics {
         check_size(
             "degrees of freedom of the model",
             model.dof_count(),
-            self.sines.len(),
+            self.velocity.len(),
         )
     }
 
@@ -273,17 +276,23 @@ impl Kinematics {
         };
         // Quantities that do not depend on the previous links come first: this keeps the dependency
         // chain along the tree short.
-        sin_cos(state.position, &mut self.sines);
-        for (x_pc, joint) in self.local.iter_mut().zip(model.joints()) {
-            let (q, sin_cos) = joint.dof.map_or((0.0, (0.0, 1.0)), |dof| {
-                (state.position[dof], self.sines[dof])
-            });
-            *x_pc = joint.pose_by(q, sin_cos);
+        for (q, joint) in self.positions.iter_mut().zip(model.joints()) {
+            *q = joint
+                .dof
+                .map_or(0.0, |dof| joint.ratio * state.position[dof] + joint.offset);
+        }
+        sin_cos(&self.positions, &mut self.sines);
+        let positions = self.positions.iter().zip(&self.sines);
+        for ((x_pc, joint), (q, sin_cos)) in
+            self.local.iter_mut().zip(model.joints()).zip(positions)
+        {
+            *x_pc = joint.pose_by(*q, *sin_cos);
         }
         for step in &self.steps {
             let (joint, x_pc) = (&model.joints()[step.joint], &self.local[step.joint]);
             let (dq, ddq) = joint.dof.map_or((0.0, 0.0), |dof| {
-                (state.velocity[dof], state.acceleration[dof])
+                let ratio = joint.ratio;
+                (ratio * state.velocity[dof], ratio * state.acceleration[dof])
             });
             if step.reversed {
                 self.links[step.to] = down_to_parent(&self.links[step.from], joint, x_pc, dq, ddq);
@@ -353,18 +362,16 @@ impl Kinematics {
         self.reversed[joint]
     }
 
-    /// Unit motion of the child of a joint relative to its parent, in base coordinates; `None` for
-    /// a fixed joint.
+    /// Motion of the child of a joint relative to its parent at unit rate of its degree of freedom,
+    /// in base coordinates; `None` for a fixed joint.
     // Always inlined: it has many callers and is on the critical path of inverse dynamics.
     #[inline(always)]
     pub fn joint_axis(&self, joint: &Joint) -> Option<Motion> {
         let pose = &self.links[joint.child].pose;
+        let along = |axis: &Axis| pose.rotation * axis.vector * joint.ratio;
         match &joint.kind {
-            JointKind::Revolute(axis) => Some(Motion::rotation(
-                &(pose.rotation * axis.vector),
-                &pose.translation,
-            )),
-            JointKind::Prismatic(axis) => Some(Motion::translation(&(pose.rotation * axis.vector))),
+            JointKind::Revolute(axis) => Some(Motion::rotation(&along(axis), &pose.translation)),
+            JointKind::Prismatic(axis) => Some(Motion::translation(&along(axis))),
             JointKind::Fixed => None,
         }
     }
@@ -522,6 +529,7 @@ impl InverseDynamics {
             self.transmitted[joint.parent] += wrench;
         }
         self.base_wrench = self.transmitted[0];
+        self.torque.fill(0.0);
         for (number, joint) in model.joints().iter().enumerate() {
             if kinematics.is_reversed(number) {
                 // The base, and with it the wrench on the base, is below this joint.
@@ -529,14 +537,15 @@ impl InverseDynamics {
                 self.transmitted[joint.child] -= wrench;
             }
             if let (Some(dof), Some(axis)) = (joint.dof, kinematics.joint_axis(joint)) {
-                self.torque[dof] = axis.dot(&self.transmitted[joint.child]);
+                self.torque[dof] += axis.dot(&self.transmitted[joint.child]);
             }
         }
         Ok(())
     }
 
     /// Joint torques [Nm or N], by degree of freedom: along the URDF axis, exerted by the parent on
-    /// the child.
+    /// the child. With joints that follow this one ([`Joint::ratio`]), their torques times their
+    /// ratios are added: it is the torque at the actuated joint.
     pub fn torque(&self) -> &[f64] {
         &self.torque
     }

@@ -12,7 +12,10 @@
 //! - body `b > 0` is moved by joint `b - 1`, its only joint towards the root. Its frame is that of
 //!   the URDF link that this joint moves;
 //! - degrees of freedom ("dofs") are numbered in the order in which the URDF lists the moving
-//!   joints, which may differ from the order of the bodies.
+//!   joints, which may differ from the order of the bodies. A joint with a `<mimic>` has none of
+//!   its own. So the positions of the joints are a linear map of those of the dofs, and this map is
+//!   in the joints alone: `q_j = ratio_j q_dof(j) + offset_j` ([`Joint::ratio`]). Velocities,
+//!   torques (its transpose) and regressors follow.
 //!
 //! Every URDF link remains available: [`Model::frame`] finds any link by name, folded or not, and
 //! returns its body and its pose in that body.
@@ -22,8 +25,10 @@
 
 mod rewrite;
 mod urdf;
+mod xml;
 
 use std::collections::HashMap;
+use std::fmt;
 use std::path::PathBuf;
 
 use crate::spatial::{Mat3, Pose, RigidInertia, Vec3};
@@ -136,6 +141,11 @@ pub struct Joint {
     pub placement: Pose,
     /// Number of its degree of freedom, unless it is fixed.
     pub dof: Option<usize>,
+    /// Its position is `ratio q + offset` and its rate `ratio dq`, where `q` is the position of its
+    /// degree of freedom: 1 and 0, except for a joint that follows another one (`<mimic>`).
+    pub ratio: f64,
+    /// See [`Joint::ratio`] [rad or m].
+    pub offset: f64,
 }
 
 impl Joint {
@@ -266,7 +276,7 @@ impl Model {
         self.joints.len()
     }
 
-    /// Number of degrees of freedom: the moving joints.
+    /// Number of degrees of freedom: the moving joints, without those that follow another one.
     pub fn dof_count(&self) -> usize {
         self.dofs.len()
     }
@@ -296,6 +306,15 @@ impl Model {
             .map(|facts| (facts.parent_link.as_str(), facts.child_link.as_str()))
     }
 
+    /// Index of the fixed joint where an F/T sensor in the joint of this name cuts the tree. If the
+    /// joint moves, this one is on the side of its child, behind a body without mass.
+    pub fn cut(&self, name: &str) -> Option<usize> {
+        let number = self.joint(name)?;
+        (number..self.joints.len().min(number + 2)).find(|&joint| {
+            self.joints[joint].kind == JointKind::Fixed && self.joint_name(joint) == name
+        })
+    }
+
     /// Index of the joint of this name, if it is in the URDF and was not folded.
     pub fn joint(&self, name: &str) -> Option<usize> {
         self.joint_numbers.get(name).copied()
@@ -306,12 +325,33 @@ impl Model {
         self.folded_joints.contains_key(joint)
     }
 
-    /// Index of the degree of freedom of the moving joint of this name.
+    /// Index of the degree of freedom of the moving joint of this name; none if the joint follows
+    /// another one.
     pub fn dof(&self, joint: &str) -> Option<usize> {
-        self.joints.get(self.joint(joint)?)?.dof
+        let number = self.joint(joint)?;
+        let dof = self.joints.get(number)?.dof?;
+        (self.dof_joint(dof) == Some(number)).then_some(dof)
     }
 
-    /// The joint that has this degree of freedom.
+    /// The joint that a joint follows (its `<mimic>`, if necessary through others).
+    pub fn follows(&self, joint: &str) -> Option<&str> {
+        let dof = self.joints.get(self.joint(joint)?)?.dof?;
+        let leader = self.dof_name(dof);
+        (leader != joint).then_some(leader)
+    }
+
+    /// Holds a joint that follows another one at a position [rad or m] of its own. False if there is
+    /// no such joint.
+    pub fn hold(&mut self, joint: &str, position: f64) -> bool {
+        let follower = self.follows(joint).and_then(|_| self.joint(joint));
+        let Some(joint) = follower.and_then(|number| self.joints.get_mut(number)) else {
+            return false;
+        };
+        (joint.ratio, joint.offset) = (0.0, position);
+        true
+    }
+
+    /// The joint that a degree of freedom is named after. Others may follow it.
     pub fn dof_joint(&self, dof: usize) -> Option<usize> {
         self.dofs.get(dof).copied()
     }
@@ -377,7 +417,22 @@ impl Model {
     }
 }
 
-/// Why a URDF, or a change of the model made from it, is refused.
+/// A place in a URDF: `line 8: joint turn`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Place {
+    /// The line, from 1.
+    pub line: usize,
+    /// The element that is there, such as `link chest`.
+    pub owner: String,
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "line {}: {}", self.line, self.owner)
+    }
+}
+
+/// Why a URDF, or a change of the model made from it, is refused. Messages say what to do.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum ModelError {
@@ -389,26 +444,52 @@ pub enum ModelError {
         /// The system's error message.
         reason: String,
     },
-    /// Not well-formed XML.
-    #[error("the URDF is not well-formed XML: {0}")]
-    Syntax(String),
-    /// Well-formed XML that urdf-rs does not accept as a URDF.
-    #[error("not a URDF: {0}")]
-    NotUrdf(String),
+    /// Not XML.
+    #[error("the URDF is not XML: line {line}: {reason}")]
+    Syntax {
+        /// Line of the URDF.
+        line: usize,
+        /// What is wrong there.
+        reason: String,
+    },
+    /// XML, but not a URDF.
+    #[error("not a URDF: its root element is <{root}>, not <robot>{}", advice(.root))]
+    NotUrdf {
+        /// The root element.
+        root: String,
+    },
     /// No `<link>` at all.
-    #[error("the URDF has no link")]
+    #[error("the URDF has no link: nothing in its <robot> is a <link>")]
     NoLinks,
-    /// Two links of one name.
-    #[error("two links are named {0}; names must be unique")]
-    DuplicateLink(String),
-    /// Two joints of one name.
-    #[error("two joints are named {0}; names must be unique")]
-    DuplicateJoint(String),
+    /// Two links or two joints of one name.
+    #[error("{place}: the {kind} on line {first} has the same name; rename one of them")]
+    Duplicate {
+        /// The second one.
+        place: Place,
+        /// `link` or `joint`.
+        kind: &'static str,
+        /// The line of the first one.
+        first: usize,
+    },
+    /// An element or an attribute that is needed and is not there.
+    #[error("{place}: {what} has no {missing}{}; {remedy}", instead(.there))]
+    Missing {
+        /// The link or joint.
+        place: Place,
+        /// The element that lacks it, such as `<axis>`.
+        what: String,
+        /// What it lacks: `xyz`, or `<mass>`.
+        missing: &'static str,
+        /// The attributes that it has instead.
+        there: Vec<String>,
+        /// What to do.
+        remedy: &'static str,
+    },
     /// A joint refers to a link that does not exist.
-    #[error("joint {joint}: its {role} link {link} is not in the URDF")]
+    #[error("{place}: its {role} link {link} is not in the URDF; correct the name or add the link")]
     UnknownLink {
         /// The joint.
-        joint: String,
+        place: Place,
         /// `parent` or `child`.
         role: &'static str,
         /// The name that no link has.
@@ -416,33 +497,36 @@ pub enum ModelError {
     },
     /// A link is the child of two joints.
     #[error(
-        "link {link} is the child of two joints, {first} and {second}; loops cannot be described, \
-         only trees"
+        "{place}: its child {link} is already the child of joint {first} (line {line}); loops \
+         cannot be described, only trees: remove one of the joints"
     )]
     TwoParents {
+        /// The second joint.
+        place: Place,
         /// The link.
         link: String,
-        /// One joint.
+        /// The first joint.
         first: String,
-        /// The other.
-        second: String,
+        /// Its line.
+        line: usize,
     },
     /// More than one link has no parent.
     #[error(
-        "links {} have no parent; a robot has one root, connect the others to it by joints",
+        "links {} have no parent; a robot has one root: connect the others to it by joints, or \
+         remove them",
         .0.join(", ")
     )]
     SeveralRoots(Vec<String>),
     /// Joints that form a loop.
-    #[error("the joints above link {0} form a loop; only trees can be described")]
-    Loop(String),
+    #[error("{0}: the joints above it form a loop; only trees can be described: remove a joint")]
+    Loop(Place),
     /// A number that cannot be parsed.
-    #[error("line {line}: {owner}: {element} {attribute}=\"{value}\" is not {expected}")]
+    #[error(
+        "{place}: {element} {attribute}=\"{value}\" is not {expected}{}", macros(.value)
+    )]
     Number {
-        /// Line of the URDF.
-        line: u32,
-        /// The owner of the element, such as `link chest`.
-        owner: String,
+        /// The owner of the element, at the element's line.
+        place: Place,
         /// The element, such as `<origin>`.
         element: String,
         /// The attribute.
@@ -453,12 +537,12 @@ pub enum ModelError {
         expected: &'static str,
     },
     /// NaN or infinity.
-    #[error("line {line}: {owner}: {element} {attribute}=\"{value}\" is not finite")]
+    #[error(
+        "{place}: {element} {attribute}=\"{value}\" is not finite; write the number that it is"
+    )]
     NotFinite {
-        /// Line of the URDF.
-        line: u32,
-        /// The owner of the element, such as `link chest`.
-        owner: String,
+        /// The owner of the element, at the element's line.
+        place: Place,
         /// The element, such as `<origin>`.
         element: String,
         /// The attribute.
@@ -467,59 +551,62 @@ pub enum ModelError {
         value: String,
     },
     /// The axis of a moving joint has no direction.
-    #[error("joint {0}: its axis is zero")]
-    ZeroAxis(String),
+    #[error("{0}: its <axis> xyz is zero; write a direction, such as xyz=\"0 0 1\"")]
+    ZeroAxis(Place),
     /// A joint of a type that is not supported.
-    #[error(
-        "joint {joint}: type {kind} is not supported (revolute, continuous, prismatic and fixed \
-         are); a floating base needs no joint"
-    )]
+    #[error("{place}: type=\"{kind}\" {}", unsupported(.kind))]
     UnsupportedJoint {
         /// The joint.
-        joint: String,
+        place: Place,
         /// Its type.
-        kind: &'static str,
+        kind: String,
     },
-    /// A negative mass.
-    #[error("link {link}: its mass is {mass} kg; a mass cannot be negative")]
-    NegativeMass {
-        /// The link.
-        link: String,
-        /// Its mass.
-        mass: f64,
+    /// A joint that cannot follow another one as its `<mimic>` says.
+    #[error("{place}: its <mimic> joint=\"{follows}\" {reason}")]
+    Mimic {
+        /// The joint.
+        place: Place,
+        /// The joint that it should follow.
+        follows: String,
+        /// Why it cannot, and what to do.
+        reason: &'static str,
     },
-    /// A tensor of inertia that is not positive semidefinite.
+    /// A body whose mass is negative.
     #[error(
-        "link {link}: its inertia is not positive semidefinite (least principal moment \
-         {least:.3e} kg m^2)"
+        "{place}: the mass is {mass} kg{}; a mass cannot be negative: correct the <mass>",
+        together(.with)
+    )]
+    NegativeMass {
+        /// The link with the least mass, at its `<inertial>`.
+        place: Place,
+        /// The mass of the body.
+        mass: f64,
+        /// The links that are fixed to it.
+        with: Vec<String>,
+    },
+    /// A body whose tensor of inertia is not positive semidefinite.
+    #[error(
+        "{place}: the inertia is not positive semidefinite (least principal moment about the \
+         centre of mass {least:.3e} kg m^2){}; no body has this inertia: correct ixx to izz of the \
+         <inertia> (about the centre of mass, in kg m^2)",
+        together(.with)
     )]
     InertiaNotPositive {
-        /// The link.
-        link: String,
-        /// The least eigenvalue [kg m^2].
+        /// The link with the least moment of its own, at its `<inertial>`.
+        place: Place,
+        /// The least eigenvalue of the body's tensor [kg m^2].
         least: f64,
+        /// The links that are fixed to it.
+        with: Vec<String>,
     },
-    /// A moving body none of whose links has an `<inertial>`.
+    /// Moving bodies none of whose links has an `<inertial>`: per body its link and its joint.
     #[error(
-        "link {link}, moved by joint {joint}, has no <inertial>, nor has any link fixed to it: \
-         its mass is unknown; add one (with mass 0 and inertia 0 if it is meant to be massless)"
+        "{}: the mass is unknown, because no <inertial> is there or in a link fixed to it; add one \
+         (with mass 0 and inertia 0 if it is meant to be massless)",
+        .0.iter().map(|(place, joint)| format!("{place}, moved by joint {joint}"))
+            .collect::<Vec<_>>().join("; ")
     )]
-    MissingInertial {
-        /// The link.
-        link: String,
-        /// The joint.
-        joint: String,
-    },
-    /// An `<inertial>` without one of its parts.
-    #[error("line {line}: link {link}: its <inertial> has no <{missing}>")]
-    IncompleteInertial {
-        /// Line of the URDF.
-        line: u32,
-        /// The link.
-        link: String,
-        /// `mass` or `inertia`.
-        missing: &'static str,
-    },
+    MissingInertial(Vec<(Place, String)>),
     /// A joint to be kept that the URDF does not have.
     #[error(
         "joint {joint}, named as the joint of an F/T sensor, is not in the URDF; \
@@ -532,12 +619,6 @@ pub enum ModelError {
         /// Fixed joints of the URDF with an F/T `<sensor>` element, or else all of them, up to ten.
         fixed: Vec<String>,
     },
-    /// A joint to be kept that moves.
-    #[error(
-        "joint {0} is named as the joint of an F/T sensor, but it moves; a sensor sits in a \
-         fixed joint"
-    )]
-    SensorJointMoves(String),
     /// There is no body with this index.
     #[error("there is no link {0}")]
     NoLink(usize),
@@ -562,6 +643,56 @@ fn or_none(names: &[String]) -> String {
         "none".to_owned()
     } else {
         names.join(", ")
+    }
+}
+
+/// What to do with a file of another kind.
+fn advice(root: &str) -> &'static str {
+    match root {
+        "sdf" => "; convert it, for example with gz sdf or sdformat_urdf",
+        "mujoco" => "; export a URDF of the same robot",
+        _ => "",
+    }
+}
+
+fn instead(attributes: &[String]) -> String {
+    if attributes.is_empty() {
+        String::new()
+    } else {
+        format!(" (it has {})", attributes.join(", "))
+    }
+}
+
+fn together(with: &[String]) -> String {
+    if with.is_empty() {
+        String::new()
+    } else {
+        format!(
+            ", together with the links fixed to it ({})",
+            with.join(", ")
+        )
+    }
+}
+
+/// What to do about a value that is not expanded.
+fn macros(value: &str) -> &'static str {
+    if value.contains("${") || value.contains("$(") {
+        "; the file is a xacro: expand it first (xacro FILE > model.urdf)"
+    } else {
+        ""
+    }
+}
+
+fn unsupported(kind: &str) -> &'static str {
+    match kind {
+        "floating" | "planar" => {
+            "is possible only between the root and the robot, where it is dropped because any \
+             link can be the base; remove the joint, or make it of prismatic and continuous joints"
+        }
+        "spherical" | "ball" => {
+            "is not supported; write three continuous joints with massless links between them"
+        }
+        _ => "is not a type of joint; types are revolute, continuous, prismatic and fixed",
     }
 }
 

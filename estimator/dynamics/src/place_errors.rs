@@ -111,12 +111,18 @@ impl PlaceErrors {
                 continue;
             };
             // The joint above the top link belongs to no sub-tree: it is a sensor's, and fixed.
-            let (axis, response) = solver.torque_rows(dof);
+            let (axis, response) = solver.torque_rows(link);
             let motion = match structure.below(link).contains(&frame.link) {
                 true => *axis - *response,
                 false => -*response,
             };
-            self.torque[dof] += variance(&motion);
+            if let [_] = structure.moved_by(dof) {
+                self.torque[dof] += variance(&motion);
+            } else {
+                // The deviation of the sum of their torques is at most that of each together.
+                let sum = self.torque[dof].sqrt() + variance(&motion).sqrt();
+                self.torque[dof] = sum * sum;
+            }
         }
         let x_bf = *kinematics.pose(frame.link) * frame.pose;
         for other in structure.subtrees()[number].contacts.iter() {

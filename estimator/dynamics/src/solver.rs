@@ -67,9 +67,9 @@ pub struct Solver {
     /// Per link: `F_j`, the net wrench of it and of the links below it in its sub-tree, minus the
     /// known wrenches.
     wrenches: Vec<Wrench>,
-    /// Per joint, `s_j`.
+    /// Per link, `s_j` of the joint above it.
     axes: Vec<Motion>,
-    /// Per joint, `h_j`.
+    /// Per link, `h_j` of the joint above it.
     torque_rows: Vec<Motion>,
     /// Per contact, its rows of `K`, as the contact's wrench is reported.
     contact_rows: Vec<[Motion; 6]>,
@@ -101,8 +101,8 @@ impl Solver {
             ],
             active: None,
             wrenches: vec![Wrench::zero(); structure.link_count()],
-            axes: vec![still; dofs],
-            torque_rows: vec![still; dofs],
+            axes: vec![still; structure.link_count()],
+            torque_rows: vec![still; structure.link_count()],
             contact_rows: vec![[still; 6]; contacts],
             sensor_poses: vec![Pose::identity(); structure.sensors().len()],
             least: LeastSquares::with_capacity(6 * contacts),
@@ -172,6 +172,9 @@ impl Solver {
                 self.wrenches[place.parent] += below;
             }
         }
+        // Of several joints with one degree of freedom, the torques add up.
+        self.torque.fill(0.0);
+        self.torque_certainty.fill(Certainty::Determined);
         for number in 0..structure.subtrees().len() {
             self.solve_subtree(number, model, structure, kinematics, active);
         }
@@ -322,14 +325,16 @@ impl Solver {
                     about_origin(&h, &point)
                 }
             };
-            self.torque[dof] = match route {
+            self.torque[dof] += match route {
                 Route::Child => axis.dot(&self.wrenches[link]),
                 Route::Parent => axis.dot(&(self.wrenches[link] - b)),
                 _ => axis.dot(&self.wrenches[link]) - response.dot(&b),
             };
-            self.torque_certainty[dof] = certainty;
-            self.axes[dof] = axis;
-            self.torque_rows[dof] = response;
+            if certainty == Certainty::Assumed {
+                self.torque_certainty[dof] = certainty;
+            }
+            self.axes[link] = axis;
+            self.torque_rows[link] = response;
         }
     }
 
@@ -481,22 +486,30 @@ impl Solver {
         let variance = |sensor: usize, motion: &Motion| {
             variance(structure, sensor, &sensor_poses[sensor], motion)
         };
-        for link in 1..structure.link_count() {
-            let Some(dof) = structure.dof_of(link) else {
-                continue;
+        for (dof, deviation) in torque_deviation.iter_mut().enumerate() {
+            let of_sensor = |sensor: usize| {
+                let child = structure.sensors()[sensor].joint() + 1;
+                let mut motion = None::<Motion>;
+                for &link in structure.moved_by(dof) {
+                    let place = &structure.places[link];
+                    if !structure.subtrees()[place.subtree].sensors.contains(sensor) {
+                        continue;
+                    }
+                    let (s, h) = (axes[link], torque_rows[link]);
+                    let own = if place.sensors_below.contains(sensor) {
+                        h - s
+                    } else {
+                        h
+                    };
+                    // What the sensor transmits has opposite signs on its two sides.
+                    let is_beyond = structure.places[child].subtree == place.subtree;
+                    let own = if is_beyond { -own } else { own };
+                    motion = Some(motion.map_or(own, |sum| sum + own));
+                }
+                motion.map_or(0.0, |motion| variance(sensor, &motion))
             };
-            let place = &structure.places[link];
-            let (s, h) = (axes[dof], torque_rows[dof]);
-            let mut sum = 0.0;
-            for sensor in structure.subtrees()[place.subtree].sensors.iter() {
-                let motion = if place.sensors_below.contains(sensor) {
-                    h - s
-                } else {
-                    h
-                };
-                sum += variance(sensor, &motion);
-            }
-            torque_deviation[dof] = sum.sqrt();
+            let sum: f64 = (0..structure.sensors().len()).map(of_sensor).sum();
+            *deviation = sum.sqrt();
         }
         for subtree in structure.subtrees() {
             for contact in subtree.contacts.iter() {
@@ -519,7 +532,7 @@ impl Solver {
     /// [`Route`] is `Child` or `Parent`, that side's torque equals [`Solver::torque`] to the last
     /// bit. Where it is `Fused`, both sides exist and the torque is a weighted mean (see
     /// [`Sides`]). Neither side exists before the first solution, or if there is no such degree of
-    /// freedom.
+    /// freedom, or if several joints have it ([`crate::model::Joint::ratio`]).
     ///
     /// All cost is in the call. It does not need [`Solver::update_deviations`].
     ///
@@ -527,12 +540,12 @@ impl Solver {
     /// The structure is not the one that was solved.
     pub fn sides(&self, structure: &Structure, dof: usize) -> Result<Sides, DynamicsError> {
         self.check_structure(structure)?;
-        let (Some(active), Some(link)) = (&self.active, structure.link_of(dof)) else {
+        let (Some(active), &[link]) = (&self.active, structure.moved_by(dof)) else {
             return Ok(Sides::default());
         };
         let place = &structure.places[link];
         let subtree = &structure.subtrees()[place.subtree];
-        let (axis, below) = (&self.axes[dof], self.wrenches[link]);
+        let (axis, below) = (&self.axes[link], self.wrenches[link]);
         let side = |contacts: &ContactSet, sensors: SensorSet, wrench: Wrench| {
             contacts
                 .intersection(active)
@@ -557,10 +570,11 @@ impl Solver {
         })
     }
 
-    /// `s_j` and `h_j` of the last solution, in base coordinates: `tau_j = s_j . F_j - h_j . b`
-    /// (see the top of this file).
-    pub fn torque_rows(&self, dof: usize) -> (&Motion, &Motion) {
-        (&self.axes[dof], &self.torque_rows[dof])
+    /// `s_j` and `h_j` of the joint above a link in the last solution, in base coordinates:
+    /// `tau_j = s_j . F_j - h_j . b` (see the top of this file). The torque of a degree of freedom
+    /// is the sum over its joints; `s_j` includes the joint's ratio.
+    pub fn torque_rows(&self, link: usize) -> (&Motion, &Motion) {
+        (&self.axes[link], &self.torque_rows[link])
     }
 
     /// Rows `k` of the last solution in base coordinates, `x_i = k_i . b`, force first, as the

@@ -16,7 +16,7 @@ mod bit_set;
 pub use bit_set::{BitSet, ContactSet, DofSet, LinkSet, SensorSet};
 
 use crate::kinematics::Kinematics;
-use crate::model::{Frame, JointKind, MeasurementDirection, MeasurementFrame, Model};
+use crate::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
 use crate::spatial::{Motion, Pose, Vec3, Wrench};
 
 /// Standard deviations of the noise of an F/T sensor's six channels, in its measurement frame.
@@ -30,7 +30,8 @@ pub struct Noise {
 }
 
 /// An F/T sensor: the fixed joint where the tree is cut, and how the sensor measures the wrench
-/// through it.
+/// through it. In a moving joint the cut is on the child's side, as Gazebo, Universal Robots and
+/// Kinova have it: the torque about its axis is measured too.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SensorCut {
     joint: usize,
@@ -48,8 +49,8 @@ impl SensorCut {
     /// only.
     ///
     /// # Errors
-    /// The model has no such joint, the joint moves, the noise is not positive and finite, or the
-    /// pose is not finite.
+    /// The model has no such joint, or was read without keeping it; the parent's frame is given for
+    /// a moving joint; the noise is not positive and finite; or the pose is not finite.
     pub fn new(
         model: &Model,
         joint: &str,
@@ -59,16 +60,15 @@ impl SensorCut {
         noise: &Noise,
     ) -> Result<Self, StructureError> {
         let name = || joint.to_owned();
-        let number = model
-            .joint(joint)
-            .ok_or_else(|| StructureError::NoJoint(name()))?;
+        let number = model.cut(joint).ok_or_else(|| match model.joint(joint) {
+            Some(_) => StructureError::JointMoves(name()),
+            None => StructureError::NoJoint(name()),
+        })?;
         let folded = model
             .joints()
             .get(number)
             .ok_or_else(|| StructureError::NoJoint(name()))?;
-        if folded.kind != JointKind::Fixed {
-            return Err(StructureError::JointMoves(name()));
-        }
+        let is_moving = model.joint(joint) != Some(number);
         if noise
             .force
             .iter()
@@ -85,6 +85,9 @@ impl SensorCut {
             // A body has the frame of the link that its joint moves, so the frame of the child link
             // is that of the body.
             MeasurementFrame::Child => Pose::identity(),
+            MeasurementFrame::Parent if is_moving => {
+                return Err(StructureError::ParentFrame(name()));
+            }
             MeasurementFrame::Parent => {
                 let parent_link = model
                     .joint_links(number)
@@ -286,7 +289,8 @@ pub struct Structure {
     contacts: Vec<ContactSpec>,
     pub(super) places: Vec<LinkPlace>,
     subtrees: Vec<SubTree>,
-    dof_links: Vec<usize>,
+    /// Per degree of freedom, the links that it moves: first that of the joint with its name.
+    dof_links: Vec<Vec<usize>>,
     link_dofs: Vec<Option<usize>>,
     pub(super) length_scale: f64,
 }
@@ -400,13 +404,18 @@ impl Structure {
                 above.sensors_below = above.sensors_below.union(&sensors_below);
             }
         }
-        let dof_links: Vec<usize> = (0..model.dof_count())
+        let mut dof_links: Vec<Vec<usize>> = (0..model.dof_count())
             .filter_map(|dof| model.dof_joint(dof))
-            .map(|joint| joint + 1)
+            .map(|joint| vec![joint + 1])
             .collect();
         let mut link_dofs = vec![None; places.len()];
-        for (dof, &link) in dof_links.iter().enumerate() {
-            link_dofs[link] = Some(dof);
+        for joint in model.joints() {
+            link_dofs[joint.child] = joint.dof;
+            if let Some(links) = joint.dof.and_then(|dof| dof_links.get_mut(dof))
+                && !links.contains(&joint.child)
+            {
+                links.push(joint.child);
+            }
         }
         Ok(Self {
             sensors: sensors.to_vec(),
@@ -468,12 +477,10 @@ impl Structure {
         self.places.len()
     }
 
-    /// Route of the torque of a degree of freedom while the contacts in `active` are present;
-    /// `None` if there is no such degree of freedom.
+    /// Route of the torque of a degree of freedom while the contacts in `active` are present, at
+    /// the joint with its name; `None` if there is no such degree of freedom.
     pub fn route(&self, dof: usize, active: &ContactSet) -> Option<Route> {
-        self.dof_links
-            .get(dof)
-            .map(|&link| self.route_above(link, active))
+        self.link_of(dof).map(|link| self.route_above(link, active))
     }
 
     /// Route of the joint above a link.
@@ -502,14 +509,33 @@ impl Structure {
 
     /// What the torque of a degree of freedom depends on, by the locality theorem, with the current
     /// base of the kinematics and the contacts in `active` present. It depends on one side of the
-    /// joint alone where no unknown contact acts on that side ([`Route`]).
+    /// joint alone where no unknown contact acts on that side ([`Route`]). With joints that follow
+    /// it, it depends on what any of their torques depends on.
     pub fn torque_dependence(
         &self,
         dof: usize,
         kinematics: &Kinematics,
         active: &ContactSet,
     ) -> Option<Dependence> {
-        let &link = self.dof_links.get(dof)?;
+        let links = self.dof_links.get(dof)?.iter();
+        let each = links.map(|&link| self.dependence_above(link, kinematics, active));
+        each.reduce(|a, b| Dependence {
+            sensors: a.sensors.union(&b.sensors),
+            dofs: a.dofs.union(&b.dofs),
+            links: a.links.union(&b.links),
+            base: a.base || b.base,
+            contacts: a.contacts.union(&b.contacts),
+            absent: a.absent.union(&b.absent),
+        })
+    }
+
+    /// What the torque of the joint above a link depends on.
+    fn dependence_above(
+        &self,
+        link: usize,
+        kinematics: &Kinematics,
+        active: &ContactSet,
+    ) -> Dependence {
         let place = &self.places[link];
         let subtree = &self.subtrees[place.subtree];
         let is_below = |other: usize| (link..place.end).contains(&other);
@@ -534,7 +560,7 @@ impl Structure {
                 self.links_of(place.subtree).collect(),
             ),
         };
-        Some(self.dependence(sensors, contacts, links, kinematics, active))
+        self.dependence(sensors, contacts, links, kinematics, active)
     }
 
     /// What the wrench of a contact depends on: its whole sub-tree.
@@ -605,9 +631,15 @@ impl Structure {
         self.length_scale
     }
 
-    /// The link that a degree of freedom moves.
+    /// The link that a degree of freedom moves: that of the joint with its name.
     pub fn link_of(&self, dof: usize) -> Option<usize> {
-        self.dof_links.get(dof).copied()
+        self.moved_by(dof).first().copied()
+    }
+
+    /// The links that a degree of freedom moves: that of the joint with its name, then those of the
+    /// joints that follow it.
+    pub fn moved_by(&self, dof: usize) -> &[usize] {
+        self.dof_links.get(dof).map_or(&[], Vec::as_slice)
     }
 
     /// The degree of freedom of the joint above a link.
@@ -630,12 +662,16 @@ pub enum StructureError {
     /// was read.
     #[error("joint {0}, named as the joint of an F/T sensor, is not in the model")]
     NoJoint(String),
-    /// The joint moves.
-    #[error(
-        "joint {0} is named as the joint of an F/T sensor, but it moves; a sensor sits in a \
-         fixed joint"
-    )]
+    /// The joint moves, and was not named when the model was read.
+    #[error("joint {0} moves; name it as the joint of an F/T sensor when the model is read")]
     JointMoves(String),
+    /// The parent of a moving joint moves against the sensor, which is on the child's side.
+    #[error(
+        "the F/T sensor in joint {0} cannot measure in the parent's frame, because the joint moves \
+         and the sensor is on its child's side; use the frame of the child, or one of the sensor's \
+         own"
+    )]
+    ParentFrame(String),
     /// Two sensors in one joint.
     #[error("two F/T sensors are in joint {0}")]
     TwoSensors(String),

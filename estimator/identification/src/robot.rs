@@ -8,7 +8,7 @@ use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
 use proprio_dynamics::{
     ContactKind, ContactSet, ContactSpec, FrameMotion, SensorCut, Structure, StructureError,
 };
-use proprio_topics::{Kind, MAX_SUBTREES, Nanos, Reason};
+use proprio_topics::{Kind, MAX_JOINTS, MAX_SUBTREES, Nanos, Reason};
 use serde::Deserialize;
 
 /// Names of the axes of a wrench, in the order of samples.
@@ -285,9 +285,22 @@ impl Robot {
         self.contacts.iter().position(|c| c.name == name)
     }
 
+    /// The degrees of freedom whose torques are published, in the order of the estimates: all, but
+    /// without the locked ones if there are more than [`MAX_JOINTS`].
+    pub fn published(&self) -> impl Iterator<Item = usize> {
+        (0..self.locked.len()).filter(|&dof| self.is_published(dof))
+    }
+
+    /// Whether the torque of a degree of freedom is among [`Robot::published`].
+    #[must_use]
+    pub fn is_published(&self, dof: usize) -> bool {
+        let position = self.locked.get(dof);
+        position.is_some_and(|q| q.is_nan() || self.locked.len() <= MAX_JOINTS)
+    }
+
     /// The names of the joints, in the order of the estimates.
     pub fn joint_names(&self) -> impl Iterator<Item = &str> {
-        (0..self.model.dof_count()).map(|dof| self.model.dof_name(dof))
+        self.published().map(|dof| self.model.dof_name(dof))
     }
 
     /// The names of the contacts, in the order of the estimates.

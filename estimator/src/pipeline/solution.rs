@@ -149,17 +149,14 @@ impl Pipeline {
                 .and_then(|number| self.residuals.subtrees().nth(number));
             residual.is_some_and(|residual| residual.is_unexplained)
         };
-        let unexplained = |dof: usize| structure.link_of(dof).is_some_and(is_unexplained);
-        let places = self
-            .estimate
-            .torques
-            .joints
-            .iter_mut()
-            .zip(&self.dependences.torques);
+        let unexplained = |dof: usize| structure.moved_by(dof).iter().copied().any(is_unexplained);
+        let robot = &self.setup.robot;
+        let results = (results.zip(&self.dependences.torques).enumerate())
+            .filter(|(dof, _)| robot.is_published(*dof));
         for (
-            dof,
-            ((place, dependence), (((((torque, noise), model), certainty), motion), located)),
-        ) in places.zip(results).enumerate()
+            place,
+            (dof, ((((((torque, noise), model), certainty), motion), located), dependence)),
+        ) in self.estimate.torques.joints.iter_mut().zip(results)
         {
             let (mut reason, mut cause) = validity.reason_and_cause(dependence);
             let deviation = noise.hypot(*model).hypot(*motion).hypot(*located);

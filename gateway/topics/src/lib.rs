@@ -80,10 +80,11 @@ pub fn is_robot_name(name: &str) -> bool {
             .is_some_and(|c| c.is_ascii_alphanumeric())
 }
 
-/// Maximum number of channels of one gateway.
-pub const MAX_CHANNELS: usize = 128;
-/// Maximum number of joints in one estimate.
-pub const MAX_JOINTS: usize = 64;
+/// Maximum number of channels of one gateway: all joints of an estimate, and as many others.
+pub const MAX_CHANNELS: usize = 2 * MAX_JOINTS;
+/// Maximum number of joints in one estimate: a humanoid with two hands has 75 to 120. A reader
+/// copies 32 bytes for each, 4 KiB in all.
+pub const MAX_JOINTS: usize = 128;
 /// Maximum number of contacts in one estimate.
 pub const MAX_CONTACTS: usize = 16;
 /// Maximum number of links in one estimate of inertial parameters.

@@ -20,6 +20,7 @@ use std::ops::Range;
 
 use nalgebra::Matrix4;
 
+use super::xml::Node;
 use super::{Model, ModelError, urdf};
 use crate::spatial::{Mat3, Pose, RigidInertia};
 
@@ -58,9 +59,8 @@ pub(super) fn rewrite(
     for (link, inertia) in inertias.iter().enumerate() {
         model.set_inertia(link, *inertia)?;
     }
-    let document =
-        roxmltree::Document::parse(text).map_err(|error| ModelError::Syntax(error.to_string()))?;
-    let raw = urdf::link_inertias(text)?;
+    let document = urdf::parse(text)?;
+    let raw = urdf::link_inertias(&document)?;
     let mut bodies: Vec<Vec<Share<'_>>> = before.iter().map(|_| Vec::new()).collect();
     for (name, inertia) in &raw {
         if let Some(frame) = model.frame(name) {
@@ -69,6 +69,14 @@ pub(super) fn rewrite(
                 pose: frame.pose,
                 old: inertia.transformed(&frame.pose),
             });
+        }
+    }
+    // The body between a moving joint and the F/T sensor in it is no link of the URDF; the link
+    // beyond it gets its inertia.
+    let mut inertias = inertias.to_vec();
+    for joint in model.joints() {
+        if bodies[joint.parent].is_empty() {
+            inertias[joint.child] = inertias[joint.child] + inertias[joint.parent];
         }
     }
     let mut changed = HashMap::new();
@@ -91,10 +99,9 @@ pub(super) fn rewrite(
         }
     }
     let mut patches = Vec::new();
-    for node in document
-        .root_element()
+    for node in urdf::robot(&document)?
         .children()
-        .filter(|n| n.has_tag_name("link"))
+        .filter(|node| node.name() == "link")
     {
         if let Some(inertia) = node.attribute("name").and_then(|name| changed.get(name)) {
             patch(text, node, inertia.as_ref(), &mut patches);
@@ -193,13 +200,13 @@ fn scaled(inertia: &RigidInertia, factor: f64) -> RigidInertia {
 /// The replacement in a link's text. The first `<inertial>` counts, as everywhere.
 fn patch(
     text: &str,
-    node: roxmltree::Node<'_, '_>,
+    node: Node<'_>,
     inertia: Option<&RigidInertia>,
     patches: &mut Vec<(Range<usize>, String)>,
 ) {
     let inertials: Vec<_> = node
         .children()
-        .filter(|child| child.has_tag_name("inertial"))
+        .filter(|child| child.name() == "inertial")
         .collect();
     let Some(inertia) = inertia else {
         patches.extend(
@@ -220,17 +227,10 @@ fn patch(
     let range = node.range();
     let own = text.get(range.clone()).unwrap_or_default();
     let new = element(inertia, None);
-    match node.first_child() {
-        Some(child) => patches.push((child.range().start..child.range().start, new)),
-        // <link .../>
-        None if own.ends_with("/>") => {
-            patches.push((range.end - 2..range.end, format!(">{new}</link>")));
-        }
-        // <link ...></link>
-        None => {
-            let at = range.start + own.rfind("</").unwrap_or(own.len());
-            patches.push((at..at, new));
-        }
+    if own.ends_with("/>") && node.content() == range.end {
+        patches.push((range.end - 2..range.end, format!(">{new}</link>")));
+    } else {
+        patches.push((node.content()..node.content(), new));
     }
 }
 

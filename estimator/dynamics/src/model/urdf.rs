@@ -1,269 +1,374 @@
-//! Makes a [`Model`] from a URDF text: parsed by urdf-rs, checked here (urdf-rs has no checks),
-//! folded and numbered.
+//! Makes a [`Model`] from a URDF text: read by `xml.rs`, checked, folded and numbered here.
 //!
-//! The text is read twice. First by roxmltree: for the elements that urdf-rs drops (`<sensor>`,
-//! `<gazebo>`, the presence of an `<inertial>`) and for the line of an invalid number. Then by
-//! urdf-rs, for everything else, with only the links and joints.
+//! Not by urdf-rs: it checks nothing, its messages have no place, and it refuses files for the lack
+//! of attributes that nobody uses.
 //!
-//! Errors are defects that would silently make the dynamics wrong or meaningless. A violated
-//! triangle inequality (common in CAD exports) is only a warning: the inertia is used as written.
+//! Errors are defects that would silently make the dynamics wrong or meaningless. What does no harm
+//! is a warning: a violated triangle inequality (common in CAD exports), or an impossible inertia
+//! of a part whose body, the links that are fixed together, has a possible one. Such inertias are
+//! used as written.
 
 mod elements;
 
-use crate::model::urdf::elements::{check_numbers, dynamics_only, read_sensors};
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
-use urdf_rs::JointType;
-
+use self::elements::{numbers, once, part, place, read_sensors, required};
+use super::xml::{self, Document, Node, XmlError};
 use super::{
-    Axis, Frame, Joint, JointFacts, JointKind, Limits, MeasurementDirection, MeasurementFrame,
-    Model, ModelError, SensorElement,
+    Axis, AxisKind, Frame, Joint, JointFacts, JointKind, Limits, MeasurementDirection,
+    MeasurementFrame, Model, ModelError, SensorElement,
 };
-use crate::spatial::{Inconsistency, Mat3, Pose, RigidInertia, Vec3};
+use crate::spatial::{Mat3, Pose, RigidInertia, Vec3};
 
 /// Tolerance on the signs of principal moments, relative to the greatest: a URDF is written by hand
 /// or with six digits.
 const INERTIA_TOLERANCE: f64 = 1e-5;
 
+/// A principal moment below the mass times this \[m^2\] is zero: it is that of the mass 0.03 mm
+/// away, and lengths of a URDF are given to 0.1 mm at best.
+const POINT: f64 = 1e-9;
+
 /// A link of the URDF, before folding.
-struct RawLink {
-    name: String,
+struct RawLink<'d> {
+    node: Node<'d>,
+    name: &'d str,
     inertia: RigidInertia,
     has_inertial: bool,
+    /// The least principal moment about its own centre of mass, where it is negative beyond
+    /// tolerance.
+    negative: Option<f64>,
 }
 
 /// A joint of the URDF, before folding.
-struct RawJoint {
-    name: String,
-    kind: JointKind,
+struct RawJoint<'d> {
+    node: Node<'d>,
+    name: &'d str,
+    /// None if it is `floating` or `planar`.
+    kind: Option<JointKind>,
     parent: usize,
     child: usize,
     origin: Pose,
     limits: Option<Limits>,
     effort: Option<f64>,
+    /// The joint that it follows, with multiplier and offset.
+    mimic: Option<(&'d str, f64, f64)>,
 }
 
 /// Reads and checks a URDF, folds fixed joints and numbers the result.
 pub(super) fn read(text: &str, keep: &[&str]) -> Result<Model, ModelError> {
-    let document =
-        roxmltree::Document::parse(text).map_err(|error| ModelError::Syntax(error.to_string()))?;
+    let document = parse(text)?;
+    let robot = robot(&document)?;
     let mut warnings = Vec::new();
-    let with_inertial = check_numbers(&document)?;
-    let sensors = read_sensors(&document, &mut warnings);
-    let robot = urdf_rs::read_from_string(&dynamics_only(text, &document, &mut warnings))
-        .map_err(|error| ModelError::NotUrdf(error.to_string()))?;
-
-    let (links, numbers) = read_links(&robot, &with_inertial, &mut warnings)?;
-    let joints = read_joints(&robot, &numbers, &mut warnings)?;
-    let tree = Tree::build(&links, &joints)?;
+    let sensors = read_sensors(robot, &mut warnings);
+    let (links, numbers) = read_links(robot, &mut warnings)?;
+    let mut joints = read_joints(robot, &numbers, &mut warnings)?;
+    let tree = Tree::build(&links, &mut joints, &mut warnings)?;
     check_kept(keep, &joints, &sensors)?;
+    let coordinates = Coordinates::of(&mut joints, &mut warnings)?;
     Folder {
         links: &links,
         joints: &joints,
         keep: keep.iter().copied().collect(),
+        coordinates,
     }
-    .fold(&tree, robot.name, sensors, warnings)
+    .fold(
+        &tree,
+        robot.attribute("name").unwrap_or_default().to_owned(),
+        sensors,
+        warnings,
+    )
+}
+
+/// The XML of a text.
+pub(super) fn parse(text: &str) -> Result<Document<'_>, ModelError> {
+    Document::parse(text).map_err(|XmlError { line, reason }| ModelError::Syntax { line, reason })
+}
+
+/// The `<robot>` of a document.
+pub(super) fn robot<'d>(document: &'d Document<'_>) -> Result<Node<'d>, ModelError> {
+    let root = document.root("robot");
+    if root.name() == "robot" {
+        Ok(root)
+    } else {
+        Err(ModelError::NotUrdf {
+            root: root.name().to_owned(),
+        })
+    }
 }
 
 /// The links of a URDF with their own inertias, each about its own origin, in the order of the
 /// text.
-pub(super) fn link_inertias(text: &str) -> Result<Vec<(String, RigidInertia)>, ModelError> {
-    let document =
-        roxmltree::Document::parse(text).map_err(|error| ModelError::Syntax(error.to_string()))?;
-    let mut warnings = Vec::new();
-    let with_inertial = check_numbers(&document)?;
-    let robot = urdf_rs::read_from_string(&dynamics_only(text, &document, &mut warnings))
-        .map_err(|error| ModelError::NotUrdf(error.to_string()))?;
-    let (links, _) = read_links(&robot, &with_inertial, &mut warnings)?;
+pub(super) fn link_inertias<'d>(
+    document: &'d Document<'_>,
+) -> Result<Vec<(&'d str, RigidInertia)>, ModelError> {
+    let (links, _) = read_links(robot(document)?, &mut Vec::new())?;
     Ok(links
         .into_iter()
         .map(|link| (link.name, link.inertia))
         .collect())
 }
 
-// ---------------------------------------------------------------- numbers, as text
-
-// ---------------------------------------------------------------- sensors
-
 // ---------------------------------------------------------------- links and joints
 
-fn pose(origin: &urdf_rs::Pose) -> Pose {
-    Pose::from_xyz_rpy(origin.xyz.0, origin.rpy.0)
+/// The pose that an element's `<origin>` gives.
+fn origin(node: Node<'_>, owner: Node<'_>) -> Result<Pose, ModelError> {
+    let Some(origin) = node.child("origin") else {
+        return Ok(Pose::identity());
+    };
+    let three = |attribute| numbers(origin, owner, attribute).map(Option::unwrap_or_default);
+    Ok(Pose::from_xyz_rpy(three("xyz")?, three("rpy")?))
 }
 
-fn read_links(
-    robot: &urdf_rs::Robot,
-    with_inertial: &HashSet<String>,
-    warnings: &mut Vec<String>,
-) -> Result<(Vec<RawLink>, HashMap<String, usize>), ModelError> {
-    if robot.links.is_empty() {
-        return Err(ModelError::NoLinks);
+/// The name of a link or a joint, which must be the first of its name.
+fn name<'d>(
+    node: Node<'d>,
+    kind: &'static str,
+    seen: &mut HashMap<&'d str, usize>,
+    nodes: impl Fn(usize) -> Node<'d>,
+) -> Result<&'d str, ModelError> {
+    let name = required(
+        node,
+        node,
+        "name",
+        "write name=\"...\": joints, sensors and configurations refer to it",
+    )?;
+    match seen.insert(name, seen.len()) {
+        None => Ok(name),
+        Some(first) => Err(ModelError::Duplicate {
+            place: place(node, node),
+            kind,
+            first: nodes(first).line(),
+        }),
     }
-    let mut links = Vec::with_capacity(robot.links.len());
-    let mut numbers = HashMap::with_capacity(robot.links.len());
-    for (number, link) in robot.links.iter().enumerate() {
-        if numbers.insert(link.name.clone(), number).is_some() {
-            return Err(ModelError::DuplicateLink(link.name.clone()));
-        }
-        let has_inertial = with_inertial.contains(&link.name);
-        let inertia = if has_inertial {
-            read_inertia(link, warnings)?
-        } else {
-            RigidInertia::zero()
+}
+
+fn read_links<'d>(
+    robot: Node<'d>,
+    warnings: &mut Vec<String>,
+) -> Result<(Vec<RawLink<'d>>, HashMap<&'d str, usize>), ModelError> {
+    let mut links: Vec<RawLink<'_>> = Vec::new();
+    let mut numbers = HashMap::new();
+    for node in robot.children().filter(|node| node.name() == "link") {
+        let name = name(node, "link", &mut numbers, |first| links[first].node)?;
+        let mut link = RawLink {
+            node,
+            name,
+            inertia: RigidInertia::zero(),
+            has_inertial: false,
+            negative: None,
         };
-        links.push(RawLink {
-            name: link.name.clone(),
-            inertia,
-            has_inertial,
-        });
+        once(node, &["inertial"], warnings);
+        if let Some(inertial) = node.child("inertial") {
+            link.has_inertial = true;
+            read_inertia(&mut link, inertial, warnings)?;
+        }
+        links.push(link);
+    }
+    if links.is_empty() {
+        return Err(ModelError::NoLinks);
     }
     Ok((links, numbers))
 }
 
 fn read_inertia(
-    link: &urdf_rs::Link,
+    link: &mut RawLink<'_>,
+    inertial: Node<'_>,
     warnings: &mut Vec<String>,
-) -> Result<RigidInertia, ModelError> {
-    let (mass, i) = (link.inertial.mass.value, &link.inertial.inertia);
-    let name = &link.name;
+) -> Result<(), ModelError> {
+    let (owner, name) = (link.node, link.name);
+    once(inertial, &["origin", "mass", "inertia"], warnings);
+    let mass = part(inertial, owner, "<mass>", "add <mass value=\"...\"/> in kg")?;
+    let remedy = "add <inertia ixx=\"...\" .../> about the centre of mass, in kg m^2";
+    let tensor = part(inertial, owner, "<inertia>", remedy)?;
+    let number = |node: Node<'_>, attribute, remedy| {
+        required(node, owner, attribute, remedy)?;
+        numbers(node, owner, attribute).map(|one| one.map_or(0.0, |[number]| number))
+    };
+    let mass = number(mass, "value", "write value=\"...\", the mass in kg")?;
+    let product = "write all six of ixx, ixy, ixz, iyy, iyz, izz; a product of inertia of a \
+                   symmetric body is 0";
+    let moment = |attribute| number(tensor, attribute, product);
+    let (xx, xy, xz) = (moment("ixx")?, moment("ixy")?, moment("ixz")?);
+    let (yy, yz, zz) = (moment("iyy")?, moment("iyz")?, moment("izz")?);
     #[rustfmt::skip]
     let centroidal = Mat3::new(
-        i.ixx, i.ixy, i.ixz,
-        i.ixy, i.iyy, i.iyz,
-        i.ixz, i.iyz, i.izz,
+        xx, xy, xz,
+        xy, yy, yz,
+        xz, yz, zz,
     );
-    if mass < 0.0 {
-        return Err(ModelError::NegativeMass {
-            link: name.clone(),
-            mass,
-        });
-    }
-    // The mass is checked above; a unit mass allows the other conditions to be checked where it is
-    // zero.
-    let unit = RigidInertia {
-        mass: 1.0,
-        first_moment: Vec3::zeros(),
-        inertia: centroidal,
-    };
-    match unit.check(INERTIA_TOLERANCE) {
-        Err(Inconsistency::NotPositive { least }) => {
-            return Err(ModelError::InertiaNotPositive {
-                link: name.clone(),
-                least,
-            });
-        }
-        Err(Inconsistency::Triangle { moments: [a, b, c] }) => warnings.push(format!(
+    let mut moments: [f64; 3] = centroidal.symmetric_eigenvalues().into();
+    moments.sort_by(f64::total_cmp);
+    let [a, b, c] = moments;
+    let slack = INERTIA_TOLERANCE * c.abs() + POINT * mass.abs();
+    if a < -slack {
+        link.negative = Some(a);
+    } else if c > a + b + slack {
+        warnings.push(format!(
             "link {name}: principal moments {a:.3e}, {b:.3e}, {c:.3e} kg m^2 violate the triangle \
              inequality: no body has this inertia; it is used as written"
-        )),
-        _ => {}
+        ));
     }
     if mass == 0.0 && centroidal != Mat3::zeros() {
         warnings.push(format!(
             "link {name}: it has no mass but a moment of inertia; both are used as written"
         ));
     }
-    let origin = pose(&link.inertial.origin);
+    let origin = origin(inertial, owner)?;
     let turned = origin.rotation * centroidal * origin.rotation.transpose();
-    Ok(RigidInertia::from_centroidal(
-        mass,
-        &origin.translation,
-        &turned,
-    ))
+    link.inertia = RigidInertia::from_centroidal(mass, &origin.translation, &turned);
+    Ok(())
 }
 
-fn read_joints(
-    robot: &urdf_rs::Robot,
-    numbers: &HashMap<String, usize>,
+fn read_joints<'d>(
+    robot: Node<'d>,
+    links: &HashMap<&'d str, usize>,
     warnings: &mut Vec<String>,
-) -> Result<Vec<RawJoint>, ModelError> {
-    let mut joints = Vec::with_capacity(robot.joints.len());
-    let mut names = HashSet::with_capacity(robot.joints.len());
-    for joint in &robot.joints {
-        let name = &joint.name;
-        if !names.insert(name.as_str()) {
-            return Err(ModelError::DuplicateJoint(name.clone()));
-        }
-        let find = |role: &'static str, link: &String| {
-            numbers
-                .get(link)
-                .copied()
-                .ok_or_else(|| ModelError::UnknownLink {
-                    joint: name.clone(),
-                    role,
-                    link: link.clone(),
-                })
-        };
-        let (parent, child) = (
-            find("parent", &joint.parent.link)?,
-            find("child", &joint.child.link)?,
-        );
-        let axis = || {
-            Axis::new(Vec3::from(joint.axis.xyz.0))
-                .ok_or_else(|| ModelError::ZeroAxis(name.clone()))
-        };
-        let unsupported = |kind| {
-            Err(ModelError::UnsupportedJoint {
-                joint: name.clone(),
-                kind,
-            })
-        };
-        let kind = match joint.joint_type {
-            JointType::Revolute | JointType::Continuous => JointKind::Revolute(axis()?),
-            JointType::Prismatic => JointKind::Prismatic(axis()?),
-            JointType::Fixed => JointKind::Fixed,
-            JointType::Floating => return unsupported("floating"),
-            JointType::Planar => return unsupported("planar"),
-            JointType::Spherical => return unsupported("spherical"),
-        };
-        if let Some(mimic) = &joint.mimic {
-            warnings.push(format!(
-                "joint {name}: <mimic> of {} is ignored; its position must be measured or locked",
-                mimic.joint
-            ));
-        }
-        let limited = matches!(joint.joint_type, JointType::Revolute | JointType::Prismatic);
-        let limits = limited.then_some(Limits {
-            lower: joint.limit.lower,
-            upper: joint.limit.upper,
-        });
-        if let Some(Limits { lower, upper }) = limits
+) -> Result<Vec<RawJoint<'d>>, ModelError> {
+    let mut joints: Vec<RawJoint<'_>> = Vec::new();
+    let mut seen = HashMap::new();
+    for node in robot.children().filter(|node| node.name() == "joint") {
+        let name = name(node, "joint", &mut seen, |first| joints[first].node)?;
+        let used = ["origin", "parent", "child", "axis", "limit", "mimic"];
+        once(node, &used, warnings);
+        let joint = read_joint(node, name, links)?;
+        if let Some(Limits { lower, upper }) = joint.limits
             && lower > upper
         {
             warnings.push(format!(
                 "joint {name}: its lower limit {lower} is above its upper limit {upper}"
             ));
         }
-        joints.push(RawJoint {
-            name: name.clone(),
-            kind,
-            parent,
-            child,
-            origin: pose(&joint.origin),
-            limits,
-            effort: Some(joint.limit.effort).filter(|effort| *effort > 0.0 && effort.is_finite()),
-        });
+        joints.push(joint);
     }
     Ok(joints)
+}
+
+fn read_joint<'d>(
+    node: Node<'d>,
+    name: &'d str,
+    links: &HashMap<&'d str, usize>,
+) -> Result<RawJoint<'d>, ModelError> {
+    let types = "write type=\"revolute\", \"continuous\", \"prismatic\" or \"fixed\"";
+    let word = required(node, node, "type", types)?;
+    let link = |role, tag, remedy| {
+        let element = part(node, node, tag, remedy)?;
+        let link = required(
+            element,
+            node,
+            "link",
+            "write link=\"...\", the name of a link",
+        )?;
+        links
+            .get(link)
+            .copied()
+            .ok_or_else(|| ModelError::UnknownLink {
+                place: place(element, node),
+                role,
+                link: link.to_owned(),
+            })
+    };
+    let parent = link("parent", "<parent>", "add <parent link=\"...\"/>")?;
+    let child = link("child", "<child>", "add <child link=\"...\"/>")?;
+    let axis = || {
+        let Some(axis) = node.child("axis") else {
+            let x = AxisKind::X(1.0);
+            return Ok(Axis {
+                vector: Vec3::x(),
+                kind: x,
+            });
+        };
+        let remedy = "write its direction, such as xyz=\"0 0 1\"";
+        required(axis, node, "xyz", remedy)?;
+        let direction = numbers(axis, node, "xyz")?.unwrap_or_default();
+        Axis::new(Vec3::from(direction)).ok_or_else(|| ModelError::ZeroAxis(place(axis, node)))
+    };
+    let kind = match word {
+        "revolute" | "continuous" => Some(JointKind::Revolute(axis()?)),
+        "prismatic" => Some(JointKind::Prismatic(axis()?)),
+        "fixed" => Some(JointKind::Fixed),
+        "floating" | "planar" => None,
+        _ => {
+            return Err(ModelError::UnsupportedJoint {
+                place: place(node, node),
+                kind: word.to_owned(),
+            });
+        }
+    };
+    let moves = !matches!(kind, Some(JointKind::Fixed) | None);
+    let limit = |attribute| match node.child("limit") {
+        Some(limit) if moves => numbers(limit, node, attribute),
+        _ => Ok(None),
+    };
+    let (lower, upper, effort) = (limit("lower")?, limit("upper")?, limit("effort")?);
+    let is_limited = word != "continuous" && (lower.is_some() || upper.is_some());
+    let limits = is_limited.then(|| Limits {
+        lower: lower.map_or(0.0, |[lower]| lower),
+        upper: upper.map_or(0.0, |[upper]| upper),
+    });
+    let mimic = match node.child("mimic").filter(|_| moves) {
+        None => None,
+        Some(mimic) => {
+            let remedy = "write joint=\"...\", the joint that it follows";
+            let follows = required(mimic, node, "joint", remedy)?;
+            let [multiplier] = numbers(mimic, node, "multiplier")?.unwrap_or([1.0]);
+            let [offset] = numbers(mimic, node, "offset")?.unwrap_or([0.0]);
+            Some((follows, multiplier, offset))
+        }
+    };
+    Ok(RawJoint {
+        node,
+        name,
+        kind,
+        parent,
+        child,
+        origin: origin(node, node)?,
+        limits,
+        effort: effort
+            .map(|[effort]| effort)
+            .filter(|effort| *effort > 0.0 && effort.is_finite()),
+        mimic,
+    })
+}
+
+/// The pose of a joint's child in the joint's parent, with the joint at a position.
+fn moved(placement: &Pose, kind: Option<JointKind>, position: f64) -> Pose {
+    let (kind, placement) = (kind.unwrap_or(JointKind::Fixed), *placement);
+    Joint {
+        kind,
+        parent: 0,
+        child: 0,
+        placement,
+        dof: None,
+        ratio: 0.0,
+        offset: 0.0,
+    }
+    .pose(position)
 }
 
 /// The URDF's tree: its root, and the joints below each link in the order of the file.
 struct Tree {
     root: usize,
     children: Vec<Vec<usize>>,
+    /// The links above the robot: those of a floating base that was dropped.
+    dropped: HashSet<usize>,
 }
 
 impl Tree {
-    fn build(links: &[RawLink], joints: &[RawJoint]) -> Result<Self, ModelError> {
+    fn build(
+        links: &[RawLink<'_>],
+        joints: &[RawJoint<'_>],
+        warnings: &mut Vec<String>,
+    ) -> Result<Self, ModelError> {
         let mut above: Vec<Option<usize>> = vec![None; links.len()];
         let mut children = vec![Vec::new(); links.len()];
         for (number, joint) in joints.iter().enumerate() {
             if let Some(first) = above[joint.child].replace(number) {
                 return Err(ModelError::TwoParents {
-                    link: links[joint.child].name.clone(),
-                    first: joints[first].name.clone(),
-                    second: joint.name.clone(),
+                    place: place(joint.node, joint.node),
+                    link: links[joint.child].name.to_owned(),
+                    first: joints[first].name.to_owned(),
+                    line: joints[first].node.line(),
                 });
             }
             children[joint.parent].push(number);
@@ -272,9 +377,11 @@ impl Tree {
             .filter(|&link| above[link].is_none())
             .collect();
         if roots.len() > 1 {
-            return Err(ModelError::SeveralRoots(
-                roots.iter().map(|&link| links[link].name.clone()).collect(),
-            ));
+            let name = |&link: &usize| {
+                let RawLink { node, name, .. } = &links[link];
+                format!("{name} (line {})", node.line())
+            };
+            return Err(ModelError::SeveralRoots(roots.iter().map(name).collect()));
         }
         // Each link has at most one parent, so a link not reached from the root is in a loop or
         // below one.
@@ -284,16 +391,60 @@ impl Tree {
             reached[link] = true;
             stack.extend(children[link].iter().map(|&joint| joints[joint].child));
         }
-        match (roots.first(), reached.iter().position(|&found| !found)) {
-            (Some(&root), None) => Ok(Self { root, children }),
-            (_, lost) => Err(ModelError::Loop(links[lost.unwrap_or(0)].name.clone())),
+        let (Some(&root), None) = (roots.first(), reached.iter().position(|&found| !found)) else {
+            let lost = reached.iter().position(|&found| !found).unwrap_or(0);
+            let node = links[lost].node;
+            return Err(ModelError::Loop(place(node, node)));
+        };
+        let mut tree = Self {
+            root,
+            children,
+            dropped: HashSet::new(),
+        };
+        tree.drop_floating_base(links, joints, warnings)?;
+        Ok(tree)
+    }
+
+    /// A joint that lets the whole robot float, or move in a plane, needs no coordinates: any link
+    /// can be the base, whose motion is measured or which stands still. The links above it must be
+    /// frames: massless, without other joints.
+    fn drop_floating_base(
+        &mut self,
+        links: &[RawLink<'_>],
+        joints: &[RawJoint<'_>],
+        warnings: &mut Vec<String>,
+    ) -> Result<(), ModelError> {
+        let (mut link, mut above) = (self.root, HashSet::new());
+        while links[link].inertia == RigidInertia::zero()
+            && let [only] = self.children[link][..]
+            && let Some(JointKind::Fixed) | None = joints[only].kind
+        {
+            above.insert(link);
+            link = joints[only].child;
+            if joints[only].kind.is_none() {
+                warnings.push(format!(
+                    "joint {}: it is the motion of the whole robot, so it is dropped: link {} is \
+                     the root",
+                    joints[only].name, links[link].name
+                ));
+                self.root = link;
+                self.dropped.extend(above.iter().copied());
+            }
+        }
+        let is_robot = |joint: &&RawJoint<'_>| !self.dropped.contains(&joint.parent);
+        match (joints.iter().filter(is_robot)).find(|joint| joint.kind.is_none()) {
+            None => Ok(()),
+            Some(joint) => Err(ModelError::UnsupportedJoint {
+                place: place(joint.node, joint.node),
+                kind: joint.node.attribute("type").unwrap_or_default().to_owned(),
+            }),
         }
     }
 }
 
 fn check_kept(
     keep: &[&str],
-    joints: &[RawJoint],
+    joints: &[RawJoint<'_>],
     sensors: &[SensorElement],
 ) -> Result<(), ModelError> {
     for &name in keep {
@@ -302,8 +453,8 @@ fn check_kept(
                 let all = || {
                     joints
                         .iter()
-                        .filter(|joint| joint.kind == JointKind::Fixed)
-                        .map(|joint| joint.name.clone())
+                        .filter(|joint| joint.kind == Some(JointKind::Fixed))
+                        .map(|joint| joint.name.to_owned())
                 };
                 let mut fixed: Vec<String> = all()
                     .filter(|joint| sensors.iter().any(|sensor| sensor.joint == *joint))
@@ -316,71 +467,150 @@ fn check_kept(
                     fixed,
                 });
             }
-            Some(joint) if joint.kind != JointKind::Fixed => {
-                return Err(ModelError::SensorJointMoves(name.to_owned()));
-            }
             Some(_) => {}
         }
     }
     Ok(())
 }
 
+/// How the positions of the moving joints follow from the degrees of freedom: joint `j` is at
+/// `ratio_j q_dof(j) + offset_j`.
+struct Coordinates {
+    /// Per joint; none for one that does not move.
+    of: Vec<Option<(usize, f64, f64)>>,
+    /// Per degree of freedom, the joint that it is named after.
+    leaders: Vec<usize>,
+}
+
+impl Coordinates {
+    /// Degrees of freedom are numbered in the order of the file. A joint with a `<mimic>` has the
+    /// one of the joint that it follows, if necessary through others. One that follows a fixed joint
+    /// is made fixed where that holds it.
+    fn of(joints: &mut [RawJoint<'_>], warnings: &mut Vec<String>) -> Result<Self, ModelError> {
+        let mut held = Vec::new();
+        let coordinates = Self::resolve(joints, &mut held)?;
+        for (number, position) in held {
+            let joint = &mut joints[number];
+            warnings.push(format!(
+                "joint {}: it follows a fixed joint (<mimic>), so it is fixed, at {position}",
+                joint.name
+            ));
+            joint.origin = moved(&joint.origin, joint.kind, position);
+            joint.kind = Some(JointKind::Fixed);
+        }
+        Ok(coordinates)
+    }
+
+    /// The same without changing the joints: those to be fixed, and where, are added to `held`.
+    fn resolve(joints: &[RawJoint<'_>], held: &mut Vec<(usize, f64)>) -> Result<Self, ModelError> {
+        let moves = |joint: &RawJoint<'_>| !matches!(joint.kind, Some(JointKind::Fixed) | None);
+        let leads = |joint: &RawJoint<'_>| moves(joint) && joint.mimic.is_none();
+        let leaders: Vec<usize> = (0..joints.len()).filter(|&j| leads(&joints[j])).collect();
+        let numbers: HashMap<&str, usize> =
+            joints.iter().map(|j| j.name).zip(0..joints.len()).collect();
+        let mut of = Vec::with_capacity(joints.len());
+        for (number, joint) in joints.iter().enumerate() {
+            if !moves(joint) {
+                of.push(None);
+                continue;
+            }
+            let (mut leader, mut ratio, mut offset) = (joint, 1.0, 0.0);
+            for steps in 0.. {
+                let Some((follows, multiplier, shift)) = leader.mimic else {
+                    break;
+                };
+                let wrong = |reason| ModelError::Mimic {
+                    place: leader.node.child("mimic").map_or_else(
+                        || place(leader.node, leader.node),
+                        |mimic| place(mimic, leader.node),
+                    ),
+                    follows: follows.to_owned(),
+                    reason,
+                };
+                let next = numbers
+                    .get(follows)
+                    .and_then(|&number| joints.get(number))
+                    .ok_or_else(|| {
+                        wrong("is not a joint of the URDF; correct it, or remove the <mimic>")
+                    })?;
+                if next.kind.is_none() {
+                    return Err(wrong(
+                        "is the motion of the whole robot; name a joint of the robot, or remove \
+                         the <mimic>",
+                    ));
+                }
+                if steps == joints.len() {
+                    return Err(wrong(
+                        "leads back to the joint itself; one of these joints must follow none",
+                    ));
+                }
+                // q = ratio (multiplier q_next + shift) + offset
+                (ratio, offset) = (ratio * multiplier, ratio * shift + offset);
+                leader = next;
+            }
+            if !moves(leader) {
+                held.push((number, offset));
+            }
+            let dof = leaders.iter().position(|&l| joints[l].name == leader.name);
+            of.push(dof.map(|dof| (dof, ratio, offset)));
+        }
+        Ok(Self { of, leaders })
+    }
+}
+
 // ---------------------------------------------------------------- folding
 
 /// Folds fixed joints and numbers the remaining bodies and joints.
-struct Folder<'a> {
-    links: &'a [RawLink],
-    joints: &'a [RawJoint],
+struct Folder<'a, 'd> {
+    links: &'a [RawLink<'d>],
+    joints: &'a [RawJoint<'d>],
     keep: HashSet<&'a str>,
+    coordinates: Coordinates,
 }
 
-impl Folder<'_> {
+impl Folder<'_, '_> {
     fn fold(
         &self,
         tree: &Tree,
         name: String,
         sensors: Vec<SensorElement>,
-        mut warnings: Vec<String>,
+        warnings: Vec<String>,
     ) -> Result<Model, ModelError> {
-        // Degrees of freedom in the order of the file.
-        let mut count = 0;
-        let dofs: Vec<Option<usize>> = self
-            .joints
-            .iter()
-            .map(|joint| {
-                (joint.kind != JointKind::Fixed).then(|| {
-                    count += 1;
-                    count - 1
-                })
-            })
-            .collect();
         let mut model = Model {
             name,
             inertias: Vec::new(),
             joints: Vec::new(),
-            dofs: vec![0; count],
+            dofs: vec![0; self.coordinates.leaders.len()],
             link_names: Vec::new(),
             joint_facts: Vec::new(),
             joint_numbers: HashMap::new(),
             folded_joints: HashMap::new(),
             frames: HashMap::with_capacity(self.links.len()),
             sensors,
-            warnings: Vec::new(),
+            warnings,
         };
+        let robot = (0..self.links.len()).filter(|link| !tree.dropped.contains(link));
+        let total: f64 = robot.map(|link| self.links[link].inertia.mass.abs()).sum();
+        let mut unknown = Vec::new();
         // Bodies depth first: the top link of each, and the joint that moves it, with its parent
         // body and its pose there.
         let mut bodies = vec![(tree.root, None::<(usize, usize, Pose)>)];
         while let Some((top, above)) = bodies.pop() {
+            if let Some((number, parent, placement)) = above {
+                self.add_joint(&mut model, number, parent, placement);
+            }
             let body = model.inertias.len();
             let mut inertia = RigidInertia::zero();
             let mut has_inertial = false;
             let mut below = Vec::new();
+            let mut members = Vec::new();
             let mut group = vec![(top, Pose::identity())];
             while let Some((link, x_body_link)) = group.pop() {
+                members.push(link);
                 inertia = inertia + self.links[link].inertia.transformed(&x_body_link);
                 has_inertial |= self.links[link].has_inertial;
                 model.frames.insert(
-                    self.links[link].name.clone(),
+                    self.links[link].name.to_owned(),
                     Frame {
                         link: body,
                         pose: x_body_link,
@@ -389,62 +619,158 @@ impl Folder<'_> {
                 for &number in &tree.children[link] {
                     let joint = &self.joints[number];
                     let x_body_joint = x_body_link * joint.origin;
-                    if joint.kind == JointKind::Fixed && !self.keep.contains(joint.name.as_str()) {
-                        model.folded_joints.insert(joint.name.clone(), ());
+                    let is_fixed = joint.kind == Some(JointKind::Fixed);
+                    if is_fixed && !self.keep.contains(joint.name) {
+                        model.folded_joints.insert(joint.name.to_owned(), ());
                         group.push((joint.child, x_body_joint));
                     } else {
                         below.push((joint.child, Some((number, body, x_body_joint))));
                     }
                 }
             }
-            let link_name = self.links[top].name.clone();
-            if let Some((number, parent, placement)) = above {
-                let joint = &self.joints[number];
-                if !has_inertial {
-                    return Err(ModelError::MissingInertial {
-                        link: link_name,
-                        joint: joint.name.clone(),
-                    });
+            let RawLink { node, name, .. } = self.links[top];
+            self.check_body(&members, &inertia, total, &mut model.warnings)?;
+            match above {
+                Some((number, ..)) if !has_inertial => {
+                    unknown.push((place(node, node), self.joints[number].name.to_owned()));
                 }
-                if inertia.mass == 0.0 {
-                    warnings.push(format!(
-                        "link {link_name}: the body that joint {} moves is massless",
-                        joint.name
-                    ));
-                }
-                let new = model.joints.len();
-                model.joint_numbers.insert(joint.name.clone(), new);
-                if let Some(dof) = dofs[number] {
-                    model.dofs[dof] = new;
-                }
-                model.joints.push(Joint {
-                    kind: joint.kind,
-                    parent,
-                    child: body,
-                    placement,
-                    dof: dofs[number],
-                });
-                model.joint_facts.push(JointFacts {
-                    name: joint.name.clone(),
-                    parent_link: self.links[joint.parent].name.clone(),
-                    child_link: self.links[joint.child].name.clone(),
-                    limits: joint.limits,
-                    effort: joint.effort,
-                });
-            } else if !has_inertial {
-                warnings.push(format!(
-                    "root link {link_name}: neither it nor a link fixed to it has an <inertial>; \
+                Some((number, ..)) if inertia.mass == 0.0 => model.warnings.push(format!(
+                    "link {name}: the body that joint {} moves is massless",
+                    self.joints[number].name
+                )),
+                None if !has_inertial => model.warnings.push(format!(
+                    "root link {name}: neither it nor a link fixed to it has an <inertial>; \
                      it is assumed massless"
-                ));
+                )),
+                _ => {}
             }
             model.inertias.push(inertia);
-            model.link_names.push(link_name);
+            model.link_names.push(name.to_owned());
             // The stack is last in, first out: pushed in reverse, the joints of a body come in the
             // order of the file.
             bodies.extend(below.into_iter().rev());
         }
-        model.warnings = warnings;
+        if !unknown.is_empty() {
+            return Err(ModelError::MissingInertial(unknown));
+        }
         Ok(model)
+    }
+
+    /// Adds the joint above the next body. A moving joint with an F/T sensor is divided: into the
+    /// joint, which moves a body without mass in the place of its child, and the sensor's cut, a
+    /// fixed joint of the same name at the child's side.
+    fn add_joint(&self, model: &mut Model, number: usize, parent: usize, placement: Pose) {
+        let joint = &self.joints[number];
+        let (dof, ratio, offset) = match self.coordinates.of[number] {
+            Some((dof, ratio, offset)) => (Some(dof), ratio, offset),
+            None => (None, 0.0, 0.0),
+        };
+        let facts = JointFacts {
+            name: joint.name.to_owned(),
+            parent_link: self.links[joint.parent].name.to_owned(),
+            child_link: self.links[joint.child].name.to_owned(),
+            limits: joint.limits,
+            effort: joint.effort,
+        };
+        let new = model.joints.len();
+        model.joint_numbers.insert(joint.name.to_owned(), new);
+        if let Some(dof) = dof.filter(|&dof| self.coordinates.leaders[dof] == number) {
+            model.dofs[dof] = new;
+        }
+        model.joints.push(Joint {
+            kind: joint.kind.unwrap_or(JointKind::Fixed),
+            parent,
+            child: new + 1,
+            placement,
+            dof,
+            ratio,
+            offset,
+        });
+        model.joint_facts.push(facts.clone());
+        if dof.is_some() && self.keep.contains(joint.name) {
+            model.inertias.push(RigidInertia::zero());
+            let child = &facts.child_link;
+            model
+                .link_names
+                .push(format!("{child} above {}", joint.name));
+            model.joints.push(Joint {
+                kind: JointKind::Fixed,
+                parent: new + 1,
+                child: new + 2,
+                placement: Pose::identity(),
+                dof: None,
+                ratio: 0.0,
+                offset: 0.0,
+            });
+            model.joint_facts.push(facts);
+        }
+    }
+
+    /// Judges the inertia of the links that are fixed together. Up to rounding, it must be possible;
+    /// that of one of the links need not be. `total` is the mass of the robot.
+    fn check_body(
+        &self,
+        members: &[usize],
+        body: &RigidInertia,
+        total: f64,
+        warnings: &mut Vec<String>,
+    ) -> Result<(), ModelError> {
+        let centre = body.centre().unwrap_or_default();
+        let part = Mat3::from_diagonal_element(centre.dot(&centre)) - centre * centre.transpose();
+        let moments = (body.inertia - part * body.mass).symmetric_eigenvalues();
+        // What the sum of the robot's masses, with arms of a metre, has as rounding error.
+        let rounding = f64::EPSILON * total;
+        let slack = INERTIA_TOLERANCE * moments.amax() + POINT * body.mass.abs() + rounding;
+        let named = |worst: Option<&usize>| {
+            let worst = worst.copied().unwrap_or(members[0]);
+            let link = &self.links[worst];
+            let node = link.node.child("inertial").unwrap_or(link.node);
+            let others = members.iter().filter(|&&other| other != worst);
+            let others = others.map(|&other| &self.links[other]);
+            let others = others.filter(|other| other.has_inertial);
+            let names = others.map(|other| other.name.to_owned()).collect();
+            (place(node, link.node), names)
+        };
+        if body.mass < -rounding {
+            let mass = |&link: &usize| self.links[link].inertia.mass;
+            let worst = (members.iter()).min_by(|a, b| mass(a).total_cmp(&mass(b)));
+            let (place, with) = named(worst);
+            return Err(ModelError::NegativeMass {
+                place,
+                mass: body.mass,
+                with,
+            });
+        }
+        let negative = |&link: &usize| self.links[link].negative.unwrap_or(0.0);
+        if moments.min() < -slack {
+            let worst = members
+                .iter()
+                .min_by(|a, b| negative(a).total_cmp(&negative(b)));
+            let (place, with) = named(worst);
+            return Err(ModelError::InertiaNotPositive {
+                place,
+                least: moments.min(),
+                with,
+            });
+        }
+        for link in members.iter().map(|&link| &self.links[link]) {
+            let name = link.name;
+            if let Some(least) = link.negative.filter(|least| *least < -rounding) {
+                warnings.push(format!(
+                    "link {name}: its inertia is not positive semidefinite (least principal moment \
+                     {least:.3e} kg m^2): no body has this inertia; it is used as written, because \
+                     with the links fixed to it the inertia is possible"
+                ));
+            }
+            if link.inertia.mass < 0.0 {
+                warnings.push(format!(
+                    "link {name}: its mass is {} kg; it is used as written, because with the links \
+                     fixed to it the mass is not negative",
+                    link.inertia.mass
+                ));
+            }
+        }
+        Ok(())
     }
 }
 
@@ -464,10 +790,19 @@ impl Model {
     /// # Errors
     /// The file cannot be read, or as [`Model::from_urdf`].
     pub fn from_file(path: &Path, keep: &[&str]) -> Result<Self, ModelError> {
-        let text = std::fs::read_to_string(path).map_err(|error| ModelError::Read {
+        Self::from_urdf(&Self::read_text(path)?, keep)
+    }
+
+    /// The text of a URDF file, whatever its encoding: that of its byte order mark or of its
+    /// declaration, which then says UTF-8.
+    ///
+    /// # Errors
+    /// The file cannot be read.
+    pub fn read_text(path: &Path) -> Result<String, ModelError> {
+        let bytes = std::fs::read(path).map_err(|error| ModelError::Read {
             path: path.to_path_buf(),
             reason: error.to_string(),
         })?;
-        Self::from_urdf(&text, keep)
+        Ok(xml::decode(&bytes))
     }
 }

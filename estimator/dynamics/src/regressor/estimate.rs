@@ -67,9 +67,12 @@ impl<'a> EstimateRows<'a> {
     }
 
     /// The sub-tree on which a joint's torque depends; `None` if there is no such degree of
-    /// freedom.
+    /// freedom, or if its joints are in several sub-trees.
     pub fn torque_subtree(&self, dof: usize) -> Option<usize> {
-        self.structure.subtree_of(self.structure.link_of(dof)?)
+        let links = self.structure.moved_by(dof).iter();
+        let mut subtrees = links.map(|&link| self.structure.subtree_of(link));
+        let first = subtrees.next()??;
+        subtrees.all(|other| other == Some(first)).then_some(first)
     }
 
     /// The sub-tree on which a contact's wrench depends; `None` if there is no such contact.
@@ -124,8 +127,8 @@ impl<'a> EstimateRows<'a> {
     /// There is no such degree of freedom, or the length of `row` is not the number of columns of
     /// its sub-tree. Nothing is changed in that case.
     pub fn torque_row(&self, dof: usize, row: &mut [f64]) -> Result<(), DynamicsError> {
-        let (link, subtree) = self.place_of(dof)?;
-        self.write(subtree, |other| self.torque_motion(dof, link, other), row)
+        let subtree = self.place_of(dof)?;
+        self.write(subtree, |other| self.torque_motion(dof, other), row)
     }
 
     /// Writes the row of a component of a contact's wrench, [torque; force] at the origin and in
@@ -156,8 +159,8 @@ impl<'a> EstimateRows<'a> {
         readings: &[Wrench],
         external: &[ExternalWrench],
     ) -> Result<f64, DynamicsError> {
-        let (link, subtree) = self.place_of(dof)?;
-        let motion = |other| self.torque_motion(dof, link, other);
+        let subtree = self.place_of(dof)?;
+        let motion = |other| self.torque_motion(dof, other);
         self.measured(subtree, motion, readings, external)
     }
 
@@ -178,26 +181,26 @@ impl<'a> EstimateRows<'a> {
         self.measured(subtree, |_| motion, readings, external)
     }
 
-    /// The link that a degree of freedom moves, and its sub-tree.
-    fn place_of(&self, dof: usize) -> Result<(usize, usize), DynamicsError> {
-        let link = self.structure.link_of(dof);
-        link.and_then(|link| Some((link, self.structure.subtree_of(link)?)))
-            .ok_or(DynamicsError::Index {
-                what: "degrees of freedom",
-                index: dof,
-                count: self.structure.dof_count(),
-            })
+    /// The sub-tree of the links that a degree of freedom moves.
+    fn place_of(&self, dof: usize) -> Result<usize, DynamicsError> {
+        self.torque_subtree(dof).ok_or(DynamicsError::Index {
+            what: "degrees of freedom",
+            index: dof,
+            count: self.structure.dof_count(),
+        })
     }
 
-    /// `[other below j] s_j - h_j`.
-    fn torque_motion(&self, dof: usize, link: usize, other: usize) -> Motion {
-        let (axis, response) = self.solver.torque_rows(dof);
-        let axis = if self.structure.below(link).contains(&other) {
-            *axis
-        } else {
-            Motion::zero()
-        };
-        axis - *response
+    /// Sum of `[other below j] s_j - h_j` over the joints of the degree of freedom.
+    fn torque_motion(&self, dof: usize, other: usize) -> Motion {
+        let links = self.structure.moved_by(dof).iter();
+        links.fold(Motion::zero(), |sum, &link| {
+            let (axis, response) = self.solver.torque_rows(link);
+            if self.structure.below(link).contains(&other) {
+                sum + *axis - *response
+            } else {
+                sum - *response
+            }
+        })
     }
 
     fn contact_motion(

@@ -6,7 +6,7 @@ use nalgebra::{Const, DMatrixView, DVector, Dyn};
 use super::link::{LINK_PARAMETERS, WITH_FORCE, link_rows, row_along};
 use crate::error::{DynamicsError, check_size};
 use crate::kinematics::Kinematics;
-use crate::model::Model;
+use crate::model::{Joint, Model};
 use crate::spatial::Motion;
 
 /// The order of the columns of links and of the rows of degrees of freedom: the paper's
@@ -133,6 +133,10 @@ pub enum SerializationError {
 #[derive(Clone, Copy, Debug)]
 struct Hop {
     dof: usize,
+    /// The child of the joint.
+    child: usize,
+    /// Other joints have the same degree of freedom.
+    is_shared: bool,
     /// The link on its other side.
     next: usize,
 }
@@ -174,9 +178,10 @@ pub struct Regressor {
     reversed: Vec<bool>,
     /// Per link: the next moving joint towards the base.
     hops: Vec<Option<Hop>>,
-    /// Per degree of freedom: its axis in base coordinates, with the sign for which the net
+    /// Per link: the axis of the joint above in base coordinates, with the sign for which the net
     /// wrenches beyond the joint give its torque.
     axes: Vec<Motion>,
+    dofs: usize,
 }
 
 impl Regressor {
@@ -216,7 +221,8 @@ impl Regressor {
             base: None,
             reversed: vec![false; joints],
             hops: vec![None; links],
-            axes: vec![Motion::zero(); dofs],
+            axes: vec![Motion::zero(); links],
+            dofs,
         }
     }
 
@@ -231,7 +237,7 @@ impl Regressor {
         check_size(
             "degrees of freedom of the model",
             model.dof_count(),
-            self.axes.len(),
+            self.dofs,
         )?;
         check_size(
             "links of the kinematics",
@@ -242,8 +248,8 @@ impl Regressor {
             self.rebase(model, kinematics);
         }
         for joint in model.joints() {
-            if let (Some(dof), Some(axis)) = (joint.dof, kinematics.joint_axis(joint)) {
-                self.axes[dof] = if self.reversed[joint.child - 1] {
+            if let Some(axis) = kinematics.joint_axis(joint) {
+                self.axes[joint.child] = if self.reversed[joint.child - 1] {
                     -axis
                 } else {
                     axis
@@ -274,23 +280,29 @@ impl Regressor {
             }
         }
         let base = kinematics.base();
+        let mut joints = vec![0; self.dofs];
+        (model.joints().iter().filter_map(|joint| joint.dof)).for_each(|dof| joints[dof] += 1);
+        let hop = |joint: &Joint, next| {
+            joint.dof.map(|dof| Hop {
+                dof,
+                child: joint.child,
+                is_shared: joints[dof] > 1,
+                next,
+            })
+        };
         self.hops[base] = None;
         // First from the base up to the root, whose next link towards the base is a child; then
         // down, parents first.
         let mut link = base;
         while link > 0 {
             let joint = &model.joints()[link - 1];
-            self.hops[joint.parent] = joint
-                .dof
-                .map_or(self.hops[link], |dof| Some(Hop { dof, next: link }));
+            self.hops[joint.parent] = hop(joint, link).or(self.hops[link]);
             link = joint.parent;
         }
         for (number, joint) in model.joints().iter().enumerate() {
             if !self.reversed[number] {
                 let next = joint.parent;
-                self.hops[joint.child] = joint
-                    .dof
-                    .map_or(self.hops[next], |dof| Some(Hop { dof, next }));
+                self.hops[joint.child] = hop(joint, next).or(self.hops[next]);
             }
         }
         self.base = Some(base);
@@ -303,7 +315,7 @@ impl Regressor {
 
     /// Number of rows, `6 + n`.
     pub fn row_count(&self) -> usize {
-        6 + self.axes.len()
+        6 + self.dofs
     }
 
     /// Number of columns, `10 N_B`.
@@ -371,13 +383,20 @@ fn fill(
             let force = &mut wrench[(axis + 3) * stride + column..][..WITH_FORCE];
             force.copy_from_slice(&rows[axis + 3][..WITH_FORCE]);
         }
-        let mut hop = hops[link];
-        while let Some(Hop { dof, next }) = hop {
-            let start = stride * serialization.dofs[dof] + column;
-            if let Some(out) = joints[start..].first_chunk_mut::<LINK_PARAMETERS>() {
-                *out = row_along(&axes[dof], &rows);
+        let path = || std::iter::successors(hops[link], |hop| hops[hop.next]);
+        let start = |hop: &Hop| stride * serialization.dofs[hop.dof] + column;
+        for hop in path().filter(|hop| hop.is_shared) {
+            joints[start(&hop)..][..LINK_PARAMETERS].fill(0.0);
+        }
+        for hop in path() {
+            if let Some(out) = joints[start(&hop)..].first_chunk_mut::<LINK_PARAMETERS>() {
+                let row = row_along(&axes[hop.child], &rows);
+                if hop.is_shared {
+                    out.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
+                } else {
+                    *out = row;
+                }
             }
-            hop = hops[next];
         }
     }
 }

@@ -13,7 +13,7 @@ use proprio_dynamics::model::Model;
 use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::regressor::StackedRegressor;
 use proprio_dynamics::spatial::{RigidInertia, Vec3, Wrench};
-use proprio_dynamics::{ContactSet, DofSet};
+use proprio_dynamics::{ContactSet, DofSet, LinkSet};
 use proprio_topics::{Nanos, Reason};
 use pulp::{Arch, Simd, WithSimd};
 use std::sync::Arc;
@@ -173,26 +173,25 @@ impl Component {
             })
             .collect();
         let to_root = |mut link: usize| {
-            let mut dofs = DofSet::default();
+            let mut above = LinkSet::default();
             while link > 0 {
-                let joint = &model.joints()[link - 1];
-                if let Some(dof) = joint.dof {
-                    dofs.insert(dof);
-                }
-                link = joint.parent;
+                above.insert(link);
+                link = model.joints()[link - 1].parent;
             }
-            dofs
+            above
         };
-        let to_root: Vec<DofSet> = (0..model.link_count()).map(to_root).collect();
+        let to_root: Vec<LinkSet> = (0..model.link_count()).map(to_root).collect();
         // From a base to a link: joints on the paths of both to the root are not crossed.
-        let crossed = |base: &DofSet| {
-            links.iter().fold(DofSet::default(), |dofs, &link| {
+        let crossed = |base: &LinkSet| -> DofSet {
+            let moved = links.iter().fold(LinkSet::default(), |moved, &link| {
                 let (there, back) = (
                     to_root[link].difference(base),
                     base.difference(&to_root[link]),
                 );
-                dofs.union(&there).union(&back)
-            })
+                moved.union(&there).union(&back)
+            });
+            let dofs = moved.iter().filter_map(|link| model.joints()[link - 1].dof);
+            dofs.collect()
         };
         let dofs = to_root.iter().map(crossed).collect();
         let parents: Vec<usize> = model.joints().iter().map(|joint| joint.parent).collect();

@@ -1,186 +1,126 @@
-//! Handles the parts of a URDF that urdf-rs drops or refuses: sensor elements, invalid numbers,
-//! extensions.
+//! Reads the elements of a URDF: their numbers and names, with a message that has the place where
+//! one is missing or wrong, and the elements of F/T sensors.
 
-use super::{MeasurementDirection, MeasurementFrame, ModelError, SensorElement};
+use super::{MeasurementDirection, MeasurementFrame, ModelError, Node, SensorElement};
+use crate::model::Place;
 use crate::spatial::Pose;
 use std::collections::HashSet;
 
-/// Checks every number of `<inertial>`, `<origin>`, `<axis>` and `<limit>`, while their line
-/// numbers are known. Returns the links that have an `<inertial>`.
-pub(crate) fn check_numbers(
-    document: &roxmltree::Document<'_>,
-) -> Result<HashSet<String>, ModelError> {
-    let robot = document.root_element();
-    if !robot.has_tag_name("robot") {
-        return Err(ModelError::NotUrdf(format!(
-            "its root element is <{}>, not <robot>",
-            robot.tag_name().name()
-        )));
+/// The place of an element of a link or joint.
+pub(super) fn place(element: Node<'_>, owner: Node<'_>) -> Place {
+    let name = owner.attribute("name").unwrap_or("(without a name)");
+    Place {
+        line: element.line(),
+        owner: format!("{} {name}", owner.name()),
     }
-    let line = |node: roxmltree::Node<'_, '_>| document.text_pos_at(node.range().start).row;
-    let mut with_inertial = HashSet::new();
-    for owner in robot
-        .children()
-        .filter(|node| node.has_tag_name("link") || node.has_tag_name("joint"))
-    {
-        let name = owner.attribute("name").unwrap_or("(without a name)");
-        let label = format!("{} {name}", owner.tag_name().name());
-        let mut elements: Vec<_> = owner.children().collect();
-        if owner.has_tag_name("link") {
-            elements.clear();
-            if let Some(inertial) = owner.children().find(|node| node.has_tag_name("inertial")) {
-                with_inertial.insert(name.to_owned());
-                elements.extend(inertial.children());
-                for missing in ["mass", "inertia"] {
-                    if !elements.iter().any(|node| node.has_tag_name(missing)) {
-                        return Err(ModelError::IncompleteInertial {
-                            line: line(inertial),
-                            link: name.to_owned(),
-                            missing,
-                        });
-                    }
-                }
-            }
-        }
-        for element in elements {
-            let (attributes, count): (&[&str], usize) = match element.tag_name().name() {
-                "origin" => (&["xyz", "rpy"], 3),
-                "axis" => (&["xyz"], 3),
-                "mass" => (&["value"], 1),
-                "inertia" => (&["ixx", "ixy", "ixz", "iyy", "iyz", "izz"], 1),
-                "limit" => (&["lower", "upper"], 1),
-                _ => continue,
-            };
-            for &attribute in attributes {
-                let Some(value) = element.attribute(attribute) else {
-                    continue;
-                };
-                let numbers: Result<Vec<f64>, _> =
-                    value.split_whitespace().map(str::parse).collect();
-                let is_number = matches!(&numbers, Ok(numbers) if numbers.len() == count);
-                // An infinite limit means no limit.
-                let is_wrong =
-                    |x: &f64| x.is_nan() || (x.is_infinite() && !element.has_tag_name("limit"));
-                if is_number && !numbers.iter().flatten().any(is_wrong) {
-                    continue;
-                }
-                // The line is computed only for an error, because this scans the text from its
-                // beginning.
-                let (line, owner, attribute, value) =
-                    (line(element), label, attribute.to_owned(), value.to_owned());
-                let element = format!("<{}>", element.tag_name().name());
-                return Err(if is_number {
-                    ModelError::NotFinite {
-                        line,
-                        owner,
-                        element,
-                        attribute,
-                        value,
-                    }
-                } else {
-                    ModelError::Number {
-                        line,
-                        owner,
-                        element,
-                        attribute,
-                        value,
-                        expected: if count == 3 {
-                            "three numbers"
-                        } else {
-                            "a number"
-                        },
-                    }
-                });
-            }
-        }
-    }
-    Ok(with_inertial)
 }
 
-/// The text without elements that the dynamics do not need (shapes, materials, extensions: most of
-/// a URDF) and without repeated elements, which urdf-rs refuses. Of repeated elements the first one
-/// counts, as in urdfdom.
-pub(crate) fn dynamics_only(
-    text: &str,
-    document: &roxmltree::Document<'_>,
-    warnings: &mut Vec<String>,
-) -> String {
-    let mut dropped = Vec::new();
-    let mut keep_first = |node: roxmltree::Node<'_, '_>, wanted: &[&str], owner: &str| {
-        let mut seen = HashSet::new();
-        for child in node.children().filter(roxmltree::Node::is_element) {
-            let tag = child.tag_name().name();
-            if wanted.contains(&tag) && !seen.insert(tag) {
-                warnings.push(format!(
-                    "{owner}: <{tag}> occurs twice; the first one counts"
-                ));
-                dropped.push(child.range());
-            } else if !wanted.contains(&tag) {
-                dropped.push(child.range());
-            }
-        }
+/// An element's name as it is written.
+fn tag(element: Node<'_>) -> String {
+    format!("<{}>", element.name())
+}
+
+/// The element `<...>` directly in another one.
+pub(super) fn part<'d>(
+    parent: Node<'d>,
+    owner: Node<'d>,
+    missing: &'static str,
+    remedy: &'static str,
+) -> Result<Node<'d>, ModelError> {
+    let name = missing.trim_matches(['<', '>']);
+    parent.child(name).ok_or_else(|| ModelError::Missing {
+        place: place(parent, owner),
+        what: format!("its {}", tag(parent)),
+        missing,
+        there: Vec::new(),
+        remedy,
+    })
+}
+
+/// The value of an attribute.
+pub(super) fn required<'d>(
+    element: Node<'d>,
+    owner: Node<'d>,
+    attribute: &'static str,
+    remedy: &'static str,
+) -> Result<&'d str, ModelError> {
+    element
+        .attribute(attribute)
+        .ok_or_else(|| ModelError::Missing {
+            place: place(element, owner),
+            what: format!("its {}", tag(element)),
+            missing: attribute,
+            there: element.attributes().map(str::to_owned).collect(),
+            remedy,
+        })
+}
+
+/// The `N` numbers of an attribute; none if it is missing or empty.
+pub(super) fn numbers<const N: usize>(
+    element: Node<'_>,
+    owner: Node<'_>,
+    attribute: &str,
+) -> Result<Option<[f64; N]>, ModelError> {
+    let Some(value) = element.attribute(attribute) else {
+        return Ok(None);
     };
-    let mut others = Vec::new();
-    for node in document
-        .root_element()
-        .children()
-        .filter(roxmltree::Node::is_element)
-    {
-        let owner = format!(
-            "{} {}",
-            node.tag_name().name(),
-            node.attribute("name").unwrap_or("(without a name)")
-        );
-        match node.tag_name().name() {
-            "link" => {
-                keep_first(node, &["inertial"], &owner);
-                if let Some(inertial) = node.children().find(|child| child.has_tag_name("inertial"))
-                {
-                    keep_first(inertial, &["origin", "mass", "inertia"], &owner);
-                }
-            }
-            "joint" => keep_first(
-                node,
-                &["origin", "parent", "child", "axis", "limit", "mimic"],
-                &owner,
-            ),
-            _ => others.push(node.range()),
+    let parsed: Result<Vec<f64>, _> = value.split_whitespace().map(str::parse).collect();
+    let numbers = parsed.ok().and_then(|n| <[f64; N]>::try_from(n).ok());
+    // An infinite limit means no limit.
+    let is_limit = element.name() == "limit";
+    let is_wrong = |x: &f64| x.is_nan() || (x.is_infinite() && !is_limit);
+    match numbers {
+        Some(numbers) if !numbers.iter().any(is_wrong) => Ok(Some(numbers)),
+        Some(_) => Err(ModelError::NotFinite {
+            place: place(element, owner),
+            element: tag(element),
+            attribute: attribute.to_owned(),
+            value: value.to_owned(),
+        }),
+        None => Err(ModelError::Number {
+            place: place(element, owner),
+            element: tag(element),
+            attribute: attribute.to_owned(),
+            value: value.to_owned(),
+            expected: if N == 3 {
+                "three numbers with spaces between them"
+            } else {
+                "a number"
+            },
+        }),
+    }
+}
+
+/// Warns of elements that occur twice: the first one counts, as in urdfdom.
+pub(super) fn once(owner: Node<'_>, names: &[&str], warnings: &mut Vec<String>) {
+    let mut seen = HashSet::new();
+    for child in owner.children() {
+        let name = child.name();
+        if names.contains(&name) && !seen.insert(name) {
+            let Place { line, owner } = place(child, owner);
+            warnings.push(format!(
+                "line {line}: {owner}: <{name}> occurs twice; the first one counts"
+            ));
         }
     }
-    dropped.extend(others);
-    dropped.sort_by_key(|range| range.start);
-    let mut kept = String::with_capacity(text.len());
-    let mut end = 0;
-    for range in dropped {
-        kept.push_str(text.get(end..range.start).unwrap_or_default());
-        end = end.max(range.end);
-    }
-    kept.push_str(text.get(end..).unwrap_or_default());
-    kept
 }
 
 /// Reads both forms of F/T `<sensor>` elements. An element that cannot be understood becomes a
 /// warning, because the configuration can replace it.
-pub(crate) fn read_sensors(
-    document: &roxmltree::Document<'_>,
-    warnings: &mut Vec<String>,
-) -> Vec<SensorElement> {
+pub(super) fn read_sensors(robot: Node<'_>, warnings: &mut Vec<String>) -> Vec<SensorElement> {
     let mut sensors: Vec<SensorElement> = Vec::new();
-    let is_sensor = |node: &roxmltree::Node<'_, '_>| {
-        node.has_tag_name("sensor") && node.attribute("type") == Some("force_torque")
-    };
-    let robot = document.root_element();
+    let is_sensor =
+        |node: &Node<'_>| node.name() == "sensor" && node.attribute("type") == Some("force_torque");
     let plain = robot.children().filter(is_sensor).map(|node| {
         (
             node,
-            node.children()
-                .find(|child| child.has_tag_name("parent"))
+            node.child("parent")
                 .and_then(|parent| parent.attribute("joint")),
         )
     });
     let gazebo = robot
         .children()
-        .filter(|node| node.has_tag_name("gazebo"))
+        .filter(|node| node.name() == "gazebo")
         .flat_map(|node| {
             node.children()
                 .filter(is_sensor)
@@ -210,16 +150,15 @@ pub(crate) fn read_sensors(
     sensors
 }
 
-pub(crate) fn read_sensor(
-    node: roxmltree::Node<'_, '_>,
+pub(super) fn read_sensor(
+    node: Node<'_>,
     name: &str,
     joint: &str,
 ) -> Result<SensorElement, String> {
     let inner = |wanted: &str| {
-        node.descendants()
-            .find(|child| child.has_tag_name(wanted))
-            .and_then(|child| child.text())
-            .map(str::trim)
+        node.descendant(wanted)
+            .map(Node::text)
+            .filter(|text| !text.is_empty())
     };
     let frame = match inner("frame") {
         None | Some("child") => MeasurementFrame::Child,
@@ -238,13 +177,17 @@ pub(crate) fn read_sensor(
     };
     let triple =
         |text: Option<&str>| -> Result<[f64; 3], String> { floats(text.unwrap_or("0 0 0")) };
-    let pose = if let Some(origin) = node.children().find(|child| child.has_tag_name("origin")) {
+    let pose = if let Some(origin) = node.child("origin") {
         Pose::from_xyz_rpy(
             triple(origin.attribute("xyz"))?,
             triple(origin.attribute("rpy"))?,
         )
-    } else if let Some(pose) = node.children().find(|child| child.has_tag_name("pose")) {
-        let [x, y, z, roll, pitch, yaw] = floats(pose.text().unwrap_or("0 0 0 0 0 0"))?;
+    } else if let Some(pose) = node.child("pose") {
+        let [x, y, z, roll, pitch, yaw] = floats(if pose.text().is_empty() {
+            "0 0 0 0 0 0"
+        } else {
+            pose.text()
+        })?;
         Pose::from_xyz_rpy([x, y, z], [roll, pitch, yaw])
     } else {
         Pose::identity()
@@ -258,7 +201,7 @@ pub(crate) fn read_sensor(
     })
 }
 
-pub(crate) fn floats<const N: usize>(text: &str) -> Result<[f64; N], String> {
+pub(super) fn floats<const N: usize>(text: &str) -> Result<[f64; N], String> {
     let numbers: Option<Vec<f64>> = text
         .split_whitespace()
         .map(|word| word.parse().ok().filter(|x: &f64| x.is_finite()))
@@ -268,7 +211,7 @@ pub(crate) fn floats<const N: usize>(text: &str) -> Result<[f64; N], String> {
         .ok_or_else(|| format!("its pose \"{text}\" is not {N} finite numbers"))
 }
 
-pub(crate) fn same_sensor(a: &SensorElement, b: &SensorElement) -> bool {
+pub(super) fn same_sensor(a: &SensorElement, b: &SensorElement) -> bool {
     a.joint == b.joint
         && a.frame == b.frame
         && a.direction == b.direction

@@ -72,7 +72,14 @@ impl Step {
         } else {
             (joint.placement, twist)
         };
+        // Joints that follow one another count as if each moved for itself: nearly any ratio but 1
+        // and -1 leaves as much to identify.
         let motion = joint.dof.and_then(|dof| regime.joints.get(dof).copied());
+        let motion = motion.map(|motion| match motion {
+            JointMotion::Locked(q) => JointMotion::Locked(joint.ratio * q + joint.offset),
+            _ if joint.ratio == 0.0 => JointMotion::Locked(joint.offset),
+            moving => moving,
+        });
         Body {
             parent: self.parent,
             placement,
