@@ -4,6 +4,8 @@ Usage: python generate.py [--out DIR]
            all golden files; DIR is this file's folder by default
        python generate.py --icub URDF --out DIR
            only the iCub's file, which is not part of the repository
+       python generate.py --robots WHEEL... --out DIR
+           only the URDFs in these wheels, and robots.json
        python generate.py --sessions [--icub URDF] --out DIR
            only sessions of the arm or of the iCub, with full length and rate
 
@@ -22,6 +24,7 @@ sys.dont_write_bytecode = True  # no __pycache__ beside the golden files
 
 import arm
 import icub
+import robots
 import sessions
 import walker
 from libraries import made_with, must, pinned
@@ -42,6 +45,13 @@ def main():
         "--icub",
         type=pathlib.Path,
         help="iCubGazeboV2_5.urdf of icub-models: make only icub_v25.json",
+    )
+    arguments.add_argument(
+        "--robots",
+        type=pathlib.Path,
+        nargs="+",
+        metavar="WHEEL",
+        help="wheels with URDFs (example-robot-data, icub-models): make only robots.json",
     )
     arguments.add_argument(
         "--sessions", action="store_true", help="make only sessions, with full length and rate"
@@ -72,8 +82,8 @@ def main():
         "generate.py: --seed and --encoder-step-deg need --sessions: golden files have fixed ones",
     )
     must(
-        not arguments.icub or out != HERE,
-        "generate.py: --icub needs another --out: what is made from that URDF has its licence and "
+        not (arguments.icub or arguments.robots) or out != HERE,
+        "generate.py: --icub and --robots need another --out: what is made from that URDF has its licence and "
         "must not be in the repository",
     )
     here = made_with()
@@ -97,6 +107,8 @@ def main():
             arguments.seed,
             arguments.encoder_step_deg,
         )
+    elif arguments.robots:
+        robots.write(arguments.robots, out)
     elif arguments.icub:
         icub.write(arguments.icub, out)
     else:
