@@ -60,6 +60,22 @@ pub(crate) fn check_file(node: u8, file: Option<&Objects>) -> Result<(), SpecErr
     }
 }
 
+/// Refuses a file in which an object that is `wanted` of it can not be read.
+pub(crate) fn check_objects(
+    file: Option<&Objects>,
+    wanted: impl Fn(u16) -> bool,
+) -> Result<(), SpecError> {
+    match file.and_then(|file| file.problem(wanted)) {
+        Some(problem) => Err(SpecError::Description(format!("its file, {problem}"))),
+        None => Ok(()),
+    }
+}
+
+/// Whether an object describes TPDO 1 to 4.
+pub(crate) const fn is_pdo(index: u16) -> bool {
+    matches!(index, 0x1800..=0x1803 | 0x1A00..=0x1A03)
+}
+
 /// The identifiers of a node that its device listens to, beside its PDOs; among them what another
 /// program writes to it.
 pub(crate) fn claims(node: u8) -> impl Iterator<Item = Claim> {

@@ -173,6 +173,7 @@ impl Place {
             expected: "a file in which a TPDO has the position (6004), if configure = false",
         };
         if let (false, Some(file)) = (options.configure, &options.objects) {
+            canopen::check_objects(Some(file), canopen::is_pdo)?;
             return of_file(file).ok_or(no_place);
         }
         Ok(Self {
@@ -251,6 +252,11 @@ struct Start {
     no_timer: bool,
 }
 
+/// The steps that set TPDO 1 up. The last one switches it on, after the cycle time.
+const FIRST_SETUP: usize = 4;
+const CYCLE_STEP: usize = FIRST_SETUP + Pdo::SETUP - 1;
+const LAST_SETUP: usize = CYCLE_STEP + 1;
+
 impl Plan for Start {
     fn step(&self, at: usize) -> Option<Step> {
         let write = |object, value, bytes| Step::Write {
@@ -258,47 +264,37 @@ impl Plan for Start {
             value,
             bytes,
         };
-        let id = tpdo(self.node, 0).raw() | NO_RTR;
-        let transmission = match self.options.sync {
-            0 => BY_EVENT,
-            n => n,
-        };
         let asks = self.options.counts_per_turn.is_none();
-        let (configures, by_timer) = (self.options.configure, self.options.sync == 0);
         let period = self.options.period_ms;
+        let pdo = Pdo {
+            id: Some(tpdo(self.node, 0).raw()),
+            transmission: match self.options.sync {
+                0 => BY_EVENT,
+                n => n,
+            },
+            count: 1,
+            mapping: [POSITION.mapped(32), 0, 0, 0, 0, 0, 0, 0],
+        };
+        let setup = |at| pdo.setup(0, period, at).filter(|_| self.options.configure);
         let (step, needed) = match at {
             0 => (Step::Nmt(nmt::PRE_OPERATIONAL), true),
             1 => (Step::Read(object::DEVICE_TYPE), true),
             2 => (Step::Read(OPERATING), asks),
             3 if self.scaled => (Step::Read(SCALED_PER_TURN), asks),
             3 => (Step::Read(PER_TURN), asks),
-            4 => (write(object::tpdo_id(0), id | TPDO_OFF, 4), configures),
-            5 => (write(object::tpdo_mapping(0, 0), 0, 1), configures),
-            6 => (
-                write(object::tpdo_mapping(0, 1), POSITION.mapped(32), 4),
-                configures,
-            ),
-            7 => (write(object::tpdo_mapping(0, 0), 1, 1), configures),
-            8 => (
-                write(object::tpdo_transmission(0), transmission.into(), 1),
-                configures,
-            ),
-            9 => (
-                write(object::tpdo_timer(0), period, 2),
-                configures && by_timer,
-            ),
-            10 => (
-                write(CYCLE, period, 2),
-                configures && by_timer && self.no_timer,
-            ),
-            11 => (write(object::tpdo_id(0), id, 4), configures),
+            LAST_SETUP => return setup(Pdo::SETUP - 1),
+            at if at < CYCLE_STEP => return setup(at - FIRST_SETUP),
+            CYCLE_STEP => {
+                let configures = self.options.configure && self.options.sync == 0;
+                (write(CYCLE, period, 2), configures && self.no_timer)
+            }
             _ => (write(object::HEARTBEAT, HEARTBEAT_MS, 2), true),
         };
         needed.then_some(step)
     }
 
     fn steps(&self) -> usize {
-        13
+        LAST_SETUP + 2
     }
 
     fn take(&mut self, object: Object, answer: Result<Option<u32>, u32>) -> Result<(), Refusal> {
@@ -382,6 +378,11 @@ impl Encoder {
         canopen::check_file(node, options.objects.as_ref())?;
         let place = Place::new(node, options)?;
         let listens = spec.mode == Mode::Listen;
+        if listens && options.counts_per_turn.is_none() {
+            let scales = [OPERATING, SCALED_PER_TURN, PER_TURN];
+            let is_scale = |index| scales.iter().any(|scale| scale.index == index);
+            canopen::check_objects(options.objects.as_ref(), is_scale)?;
+        }
         let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, place.id);
         bringup.start_with(NMT, &[nmt::START, node]);
         bringup.stop_with(NMT, &[nmt::PRE_OPERATIONAL, node]);

@@ -2,6 +2,7 @@
 //! reads the file; drivers get this table.
 
 use alloc::collections::BTreeMap;
+use alloc::string::String;
 
 /// What a file says of a device.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -10,8 +11,12 @@ pub struct Objects {
     pub node: Option<u8>,
     /// The bit rate that it configures \[bit/s\].
     pub bit_rate: Option<u32>,
+    /// The maker's number (as object 1018 sub 1).
+    pub vendor: Option<u32>,
     /// The integers of up to 32 bits, by index and sub-index.
     pub entries: BTreeMap<(u16, u8), Entry>,
+    /// Why others can not be read: told only to somebody who needs them.
+    pub unreadable: BTreeMap<(u16, u8), String>,
 }
 
 /// The value of an object.
@@ -33,6 +38,15 @@ impl Objects {
         let entry = self.entries.get(&(index, sub))?;
         let node = if entry.plus_node { node } else { 0 };
         Some(entry.number.wrapping_add(u32::from(node)))
+    }
+
+    /// Why one of the objects `wanted` can not be read, if one can not.
+    pub(crate) fn problem(&self, wanted: impl Fn(u16) -> bool) -> Option<&str> {
+        let found = self
+            .unreadable
+            .iter()
+            .find(|((index, _), _)| wanted(*index));
+        found.map(|(_, problem)| problem.as_str())
     }
 
     /// The value of an object that this very device has ([`Entry::own`]); `None` for 0, by which

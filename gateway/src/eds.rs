@@ -8,6 +8,8 @@
 //!   which a file leaves out the first four transmit PDOs because they have the identifiers of
 //!   CiA 301.
 //! - Sections and keys in any case. Objects that are no integers of up to 32 bits are left out.
+//! - A value that is no number is kept with its place, and told only if a driver needs it. What is
+//!   wrong elsewhere does no harm.
 
 use configparser::ini::{Ini, IniDefault};
 use proprio_drivers::objects::{Entry, Objects};
@@ -57,9 +59,11 @@ fn parse(text: &str) -> Result<Objects, String> {
     let mut form = IniDefault::default();
     form.delimiters = vec!['='];
     form.comment_symbols = vec![';'];
-    let text = text.trim_start_matches('\u{feff}');
+    // A section's name that does not end would refuse the whole file.
+    let is_broken = |line: &&str| line.trim_start().starts_with('[') && !line.contains(']');
+    let lines = text.lines().filter(|line| !is_broken(line));
     let sections = Ini::new_from_defaults(form)
-        .read(text.to_owned())
+        .read(lines.collect::<Vec<_>>().join("\n"))
         .map_err(|e| format!("is no EDS or DCF file: {e}"))?;
     // In order, because explicit entries count before those of a short form.
     let sections: BTreeMap<String, Section> = sections.into_iter().collect();
@@ -67,65 +71,55 @@ fn parse(text: &str) -> Result<Objects, String> {
         .iter()
         .filter_map(|(name, section)| Some((Place::of(name)?, name, section)))
         .collect();
-    let mut entries = BTreeMap::new();
+    let mut objects = Objects::default();
     for (place, name, section) in &places {
         let Place::Object(index) = *place else {
             continue;
         };
-        let at = |problem| format!("[{name}]: {problem}");
-        let compact = number(section, "compactsubobj")
-            .map_err(at)?
-            .map_or(0, |n| n.0);
-        let template = entry(section).map_err(at)?;
-        let is_list = matches!(number(section, "objecttype").map_err(at)?, Some((8 | 9, _)));
-        match u8::try_from(compact) {
-            Ok(count @ 1..) => {
-                entries.insert((index, 0), plain(count.into()));
-                entries.extend((1..=count).filter_map(|sub| Some(((index, sub), template?))));
+        let template = entry(name, section);
+        let compact = number(section, "compactsubobj").map(u8::try_from);
+        let is_list = matches!(number(section, "objecttype"), Some(8 | 9));
+        match compact {
+            Some(Ok(count @ 1..)) => {
+                objects.entries.insert((index, 0), plain(count.into()));
+                for sub in 1..=count {
+                    put(&mut objects, (index, sub), template.clone());
+                }
             }
-            _ if !is_list => entries.extend(template.map(|entry| ((index, 0), entry))),
+            _ if !is_list => put(&mut objects, (index, 0), template),
             _ => {}
         }
     }
     for (place, name, section) in &places {
-        let at = |problem| format!("[{name}]: {problem}");
         match *place {
-            Place::Sub(index, sub) => {
-                let entry = entry(section).map_err(at)?;
-                entries.extend(entry.map(|entry| ((index, sub), entry)));
-            }
+            Place::Sub(index, sub) => put(&mut objects, (index, sub), entry(name, section)),
             Place::Values(index) => {
                 for (key, value) in *section {
                     let (Ok(sub), Some(value)) = (key.parse::<u8>(), value) else {
                         continue;
                     };
-                    let (number, plus_node) = parse_number(value)
-                        .ok_or_else(|| at(format!("{key} = {value:?} is no number")))?;
-                    let own = true;
-                    entries.insert(
-                        (index, sub),
-                        Entry {
-                            number,
-                            plus_node,
-                            own,
-                        },
-                    );
+                    let found = parse_number(value).map(|(number, plus_node)| Entry {
+                        number,
+                        plus_node,
+                        own: true,
+                    });
+                    let found =
+                        found.ok_or_else(|| format!("[{name}]: {key} = {value:?} is no number"));
+                    put(&mut objects, (index, sub), found.map(Some));
                 }
-                let count = number(section, "nrofentries").map_err(at)?;
-                if let Some((count, _)) = count {
-                    entries.entry((index, 0)).or_insert(plain(count));
+                if let Some(count) = number(section, "nrofentries") {
+                    objects.entries.entry((index, 0)).or_insert(plain(count));
                 }
             }
             Place::Object(_) => {}
         }
     }
-    if entries.is_empty() {
+    if objects.entries.is_empty() && objects.unreadable.is_empty() {
         return Err("has no objects: it is no EDS or DCF file".into());
     }
-    let of = |name: &str, key| sections.get(name).map_or(Ok(None), |s| number(s, key));
-    let info = |key| of("deviceinfo", key).map_err(|e| format!("[DeviceInfo]: {e}"));
-    if info("compactpdo")?.is_some_and(|(mask, _)| mask != 0) {
-        let count = info("nroftxpdo")?.map_or(0, |(count, _)| count.min(4));
+    let of = |name: &str, key| sections.get(name).and_then(|section| number(section, key));
+    if of("deviceinfo", "compactpdo").is_some_and(|mask| mask != 0) {
+        let count = of("deviceinfo", "nroftxpdo").map_or(0, |count| count.min(4));
         for at in 0..count {
             #[allow(clippy::cast_possible_truncation)] // below 4
             let index = 0x1800 + at as u16;
@@ -133,22 +127,26 @@ fn parse(text: &str) -> Result<Objects, String> {
                 plus_node: true,
                 ..plain(0x180 + 0x100 * at)
             };
-            entries.entry((index, 1)).or_insert(id);
+            objects.entries.entry((index, 1)).or_insert(id);
         }
     }
     // With one m in the standard.
-    let commissioning = |key| {
-        let (one, two) = ("devicecomissioning", "devicecommissioning");
-        let found =
-            of(one, key).and_then(|found| found.map_or_else(|| of(two, key), |n| Ok(Some(n))));
-        found.map_err(|e| format!("[DeviceComissioning]: {e}"))
-    };
-    let node = commissioning("nodeid")?.filter(|(node, _)| *node != 0);
-    Ok(Objects {
-        node: node.map(|(node, _)| u8::try_from(node).unwrap_or(u8::MAX)),
-        bit_rate: commissioning("baudrate")?.map(|(kbit, _)| kbit.saturating_mul(1000)),
-        entries,
-    })
+    let commissioning = |key| of("devicecomissioning", key).or(of("devicecommissioning", key));
+    let node = commissioning("nodeid").filter(|node| *node != 0);
+    objects.node = node.map(|node| u8::try_from(node).unwrap_or(u8::MAX));
+    objects.bit_rate = commissioning("baudrate").map(|kbit| kbit.saturating_mul(1000));
+    objects.vendor = of("deviceinfo", "vendornumber").filter(|vendor| *vendor != 0);
+    Ok(objects)
+}
+
+/// Puts what a file has of an object to the others.
+fn put(objects: &mut Objects, at: (u16, u8), found: Result<Option<Entry>, String>) {
+    match found {
+        Ok(entry) => objects.entries.extend(entry.map(|entry| (at, entry))),
+        Err(problem) => {
+            objects.unreadable.insert(at, problem);
+        }
+    }
 }
 
 /// A default.
@@ -160,14 +158,15 @@ const fn plain(number: u32) -> Entry {
     }
 }
 
-/// The value of an object's section; `None` if it has none, or is no integer of up to 32 bits.
-fn entry(section: &Section) -> Result<Option<Entry>, String> {
+/// The value of an object's section `name`; `None` if it has none, or is no integer of up to 32
+/// bits.
+fn entry(name: &str, section: &Section) -> Result<Option<Entry>, String> {
     // Boolean, integers of 8, 16, 32, 24 bits, and their unsigned ones.
     const INTEGERS: [u32; 9] = [1, 2, 3, 4, 5, 6, 7, 0x10, 0x16];
-    let is_integer = match number(section, "datatype")? {
-        Some((kind, _)) if INTEGERS.contains(&kind) => true,
+    let is_integer = match number(section, "datatype") {
+        Some(kind) if INTEGERS.contains(&kind) => true,
         // Real numbers, texts, times, domains, longer integers, structures.
-        Some((8..0x80, _)) => return Ok(None),
+        Some(8..0x80) => return Ok(None),
         // A type that the file itself defines, or a file without types.
         _ => false,
     };
@@ -180,7 +179,7 @@ fn entry(section: &Section) -> Result<Option<Entry>, String> {
         }
         let Some((number, plus_node)) = parse_number(value) else {
             return match is_integer {
-                true => Err(format!("{key} = {value:?} is no number")),
+                true => Err(format!("[{name}]: {key} = {value:?} is no number")),
                 false => Ok(None),
             };
         };
@@ -195,27 +194,31 @@ fn entry(section: &Section) -> Result<Option<Entry>, String> {
     Ok(None)
 }
 
-/// The number of a key; `None` without it, or if it is empty.
-fn number(section: &Section, key: &str) -> Result<Option<(u32, bool)>, String> {
-    match section.get(key).and_then(Option::as_ref) {
-        Some(value) if !value.trim().is_empty() => match parse_number(value) {
-            None => Err(format!("{key} = {value:?} is no number")),
-            found => Ok(found),
-        },
-        _ => Ok(None),
-    }
+/// The number of a key; `None` without it, or if it is none.
+fn number(section: &Section, key: &str) -> Option<u32> {
+    let value = section.get(key)?.as_ref()?;
+    parse_number(value).map(|(number, _)| number)
 }
 
 /// A number of up to 32 bits, and whether that of the node is added to it.
 fn parse_number(text: &str) -> Option<(u32, bool)> {
-    let text: String = text.split_whitespace().collect();
+    let text: String = text
+        .chars()
+        .filter(|c| !c.is_whitespace() && *c != '"')
+        .collect();
     let text = text.to_ascii_lowercase();
-    let (literal, plus_node) = match text.split_once("$nodeid") {
+    let (literal, plus_node) = match text.split_once("nodeid") {
         None => (text.as_str(), false),
-        Some(("", "")) => ("0", true),
-        Some(("", rest)) => (rest.strip_prefix('+')?, true),
-        Some((rest, "")) => (rest.strip_suffix('+')?, true),
-        Some(_) => return None,
+        Some((before, after)) => {
+            let before = before.strip_suffix('$').unwrap_or(before);
+            let literal = match (before, after) {
+                ("", "") => "0",
+                ("", rest) => rest.strip_prefix('+')?,
+                (rest, "") => rest.strip_suffix('+')?,
+                _ => return None,
+            };
+            (literal, true)
+        }
     };
     let (digits, negative) = match literal.strip_prefix('-') {
         Some(digits) => (digits, true),
@@ -223,7 +226,10 @@ fn parse_number(text: &str) -> Option<(u32, bool)> {
     };
     let magnitude = match (digits.strip_prefix("0x"), digits.strip_prefix('0')) {
         (Some(hexadecimal), _) => u32::from_str_radix(hexadecimal, 16),
-        (_, Some(octal)) if !octal.is_empty() => u32::from_str_radix(octal, 8),
+        // Some write decimal numbers with zeros before them.
+        (_, Some(octal)) if !octal.is_empty() && !octal.contains(['8', '9']) => {
+            u32::from_str_radix(octal, 8)
+        }
         _ => digits.parse(),
     };
     let magnitude = magnitude.ok()?;
@@ -255,7 +261,9 @@ mod tests {
             ("0x40000180+$NODEID", Some((0x4000_0180, true))),
             ("$NODEID0x180", None),
             ("1+$NODEID+1", None),
-            ("08", None),
+            ("08", Some((8, false))),
+            ("\"0x20\"", Some((32, false))),
+            ("NodeID+0x180", Some((0x180, true))),
             ("0x", None),
             ("+1", Some((1, false))),
             ("", None),
@@ -265,27 +273,40 @@ mod tests {
         }
     }
 
+    /// A value that is no number has its place, and harms nothing else.
     #[test]
     fn mistakes_have_a_place() {
         for (text, expected) in [
             ("", "has no objects"),
             ("[DeviceInfo]\nVendorName=X\n", "has no objects"),
-            ("[1800\nx=1\n", "is no EDS or DCF file"),
+        ] {
+            let problem = parse(text).unwrap_err();
+            assert!(problem.contains(expected), "{text}: {problem}");
+        }
+        for (text, at, expected) in [
             (
                 "[1800sub1]\nDataType=0x7\nDefaultValue=$NODE+0x180\n",
+                (0x1800, 1),
                 "[1800sub1]: defaultvalue = \"$NODE+0x180\" is no number",
             ),
             (
                 "[1A00Value]\n1=position\n",
+                (0x1A00, 1),
                 "[1a00value]: 1 = \"position\" is no number",
             ),
             (
-                "[1000]\nObjectType=VAR\n",
-                "[1000]: objecttype = \"VAR\" is no number",
+                "[2000]\nDataType=6\nDefaultValue=0x\n[6098\nDefaultValue=1\n",
+                (0x2000, 0),
+                "[2000]: defaultvalue = \"0x\" is no number",
             ),
         ] {
-            let problem = parse(text).unwrap_err();
-            assert!(problem.contains(expected), "{text}: {problem}");
+            let right = "[1000]\nObjectType=VAR\nDataType=7\nDefaultValue=0x20192\n";
+            let commissioning = "[DeviceComissioning]\nNodeID=x\nBaudrate=fast\n";
+            let objects = parse(&format!("{text}{right}{commissioning}")).unwrap();
+            assert_eq!(objects.unreadable.len(), 1, "{text}");
+            assert_eq!(objects.unreadable[&at], expected);
+            assert_eq!(objects.value(0x1000, 0, 1), Some(0x20192));
+            assert_eq!((objects.node, objects.bit_rate), (None, None));
         }
     }
 

@@ -1,7 +1,8 @@
 //! Transmit process data (TPDO): which objects a node sends in which frame, from its objects 1800
 //! and 1A00, as the node or a file tells them.
 
-use super::protocol::{MAPPED_MOST, Object, TPDO_OFF, object};
+use super::protocol::{MAPPED_MOST, NO_RTR, Object, TPDO_OFF, object};
+use super::script::Step;
 use crate::Id;
 use crate::objects::Objects;
 
@@ -61,6 +62,54 @@ impl Pdo {
             this.take(entry, Some(told));
         }
         this
+    }
+
+    /// TPDO `number` of a node whose objects have these values.
+    pub(crate) fn of_node(number: u8, value: impl Fn(Object) -> u32) -> Self {
+        let mut this = Self::default();
+        let entries = (0..=MAPPED_MOST).map(|sub| object::tpdo_mapping(number, sub));
+        let objects = [object::tpdo_id(number), object::tpdo_transmission(number)];
+        for object in objects.into_iter().chain(entries) {
+            this.take(object, Some(value(object)));
+        }
+        this
+    }
+
+    /// The number of steps of [`Pdo::setup`].
+    pub(crate) const SETUP: usize = 6 + MAPPED_MOST as usize;
+
+    /// Step `at` of those that set TPDO `number` of a pre-operational node to this: it is off while
+    /// its mapping changes. What no SYNC causes is sent each `timer_ms`. `None`: the step is not
+    /// needed.
+    pub(crate) fn setup(&self, number: u8, timer_ms: u32, at: usize) -> Option<Step> {
+        const ID: usize = Pdo::SETUP - 1;
+        const TIMER: usize = Pdo::SETUP - 2;
+        const TRANSMISSION: usize = Pdo::SETUP - 3;
+        const COUNT: usize = Pdo::SETUP - 4;
+        let id = self.id? & !TPDO_OFF | NO_RTR;
+        #[allow(clippy::cast_possible_truncation)] // at most 8
+        let (object, value, bytes) = match at {
+            0 => (object::tpdo_id(number), id | TPDO_OFF, 4),
+            1 => (object::tpdo_mapping(number, 0), 0, 1),
+            COUNT => (object::tpdo_mapping(number, 0), self.count.into(), 1),
+            TRANSMISSION => {
+                let transmission = self.transmission.into();
+                (object::tpdo_transmission(number), transmission, 1)
+            }
+            TIMER if self.by_sync() => return None,
+            TIMER => (object::tpdo_timer(number), timer_ms, 2),
+            ID => (object::tpdo_id(number), id, 4),
+            at => {
+                let mapped = self.mapping.iter().take(usize::from(self.count));
+                let entry = mapped.copied().nth(at - 2)?;
+                (object::tpdo_mapping(number, at as u8 - 1), entry, 4)
+            }
+        };
+        Some(Step::Write {
+            object,
+            value,
+            bytes,
+        })
     }
 
     /// Takes the value of one of its objects; `None`: the node does not have it.

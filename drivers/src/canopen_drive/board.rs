@@ -1,9 +1,9 @@
 //! A drive's own side: a node with mapped process data.
 
 use super::layout::{Field, Layout, Quantity, fields};
-use super::options::{CurrentUnit, Options, PdoKeys};
+use super::options::{CurrentUnit, Options, TorqueUnit, VelocityUnit};
 use super::start::{COUNTS, PROFILE, RATED_CURRENT, RATED_TORQUE, TURNS, Told};
-use crate::canopen::{NO_RTR, Node, SYNC, TPDO_OFF, check_file, node_of, object, tpdo};
+use crate::canopen::{NO_RTR, Node, Pdo, SYNC, TPDO_OFF, check_file, node_of, object, tpdo};
 use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
 use alloc::vec::Vec;
 use core::f64::consts::TAU;
@@ -27,7 +27,6 @@ const OVERCURRENT: u16 = 0x2310;
 #[derive(Debug)]
 pub struct DriveBoard {
     node: Node,
-    layout: Layout,
     /// SI units per step of position, velocity, torque and current.
     per_step: [f64; Quantity::JOINT],
     state: JointState,
@@ -44,38 +43,34 @@ impl DriveBoard {
         options.check()?;
         let id = node_of(spec)?;
         check_file(id, options.objects.as_ref())?;
-        let mut options = options.clone();
-        let of_file = options
-            .objects
-            .as_ref()
-            .map(|file| Layout::of_file(id, file));
-        let of_file = of_file.filter(|file| options.pdos.is_empty() && file.position().is_some());
-        if options.pdos.is_empty() {
-            let pdo = |number, objects: &[u16]| PdoKeys {
-                number,
-                objects: objects.to_vec(),
-                sync: options.sync,
-                id: None,
-            };
-            options.pdos = Vec::from([pdo(1, &[0x6041, 0x6064, 0x6061]), pdo(2, &[0x606C])]);
-        }
-        let layout = match of_file {
+        let pdos = options.pdos();
+        let of_file = options.objects.as_ref().filter(|_| pdos.is_empty());
+        let of_file = of_file.map(|file| Layout::of_file(id, file));
+        let layout = match of_file.filter(|file| file.position().is_some()) {
             Some(layout) => layout,
-            None => Layout::of_keys(id, &options)?,
+            // As its maker delivers it: nothing is mapped.
+            None if options.configure && spec.mode == Mode::Supervise => Layout::default(),
+            None if pdos.is_empty() => Layout::of_keys(id, &options.usual_pdos())?,
+            None => Layout::of_keys(id, &pdos)?,
         };
         let file = Told::of_file(options.objects.as_ref());
         let counts_per_turn = options.counts_per_turn.or(file.counts_per_turn());
         let counts_per_turn = counts_per_turn.unwrap_or(COUNTS_PER_TURN);
-        let torque = options.rated_torque.or(file.rated_torque).unwrap_or(TORQUE);
-        let current = options
-            .rated_current
-            .or(file.rated_current)
-            .unwrap_or(CURRENT);
+        let torque_unit = options.rated_torque_unit.unwrap_or(TorqueUnit::Milli);
+        let of_file = file.rated_torque(options.rated_torque_unit);
+        let torque = options.rated_torque.or(of_file).unwrap_or(TORQUE);
+        let current = options.rated_current.or(file.rated_current());
+        let current = current.unwrap_or(CURRENT);
+        let velocity = options.velocity_unit.unwrap_or(VelocityUnit::Counts);
         let mut entries = Vec::from([
             (object::DEVICE_TYPE, 0x0002_0000 | PROFILE, 4),
             (COUNTS, counts_per_turn as u32, 4),
             (TURNS, 1, 4),
-            (RATED_TORQUE, (torque * 1e3) as u32, 4),
+            (
+                RATED_TORQUE,
+                libm::round(torque / torque_unit.newton_metres()) as u32,
+                4,
+            ),
             (RATED_CURRENT, (current * 1e3) as u32, 4),
         ]);
         for (number, pdo) in (0_u8..).zip(&layout.pdos) {
@@ -94,10 +89,9 @@ impl DriveBoard {
         }
         Ok(Self {
             node: Node::new(id, spec.mode == Mode::Listen, &entries),
-            layout,
             per_step: [
                 TAU / counts_per_turn,
-                options.velocity_unit.rad_per_s(counts_per_turn),
+                velocity.unit().radians(TAU / counts_per_turn),
                 torque * 1e-3,
                 match options.current_unit {
                     CurrentUnit::Milliampere => 1e-3,
@@ -107,6 +101,14 @@ impl DriveBoard {
             state: JointState::ABSENT,
             quality: Quality::GOOD,
         })
+    }
+
+    /// Its mapping, as it is set now.
+    fn layout(&self) -> Layout {
+        let of_node = |number| Pdo::of_node(number, |object| self.node.value(object));
+        Layout {
+            pdos: [0, 1, 2, 3].map(of_node),
+        }
     }
 
     /// The raw number of a field; 0 for a value that the joint does not have.
@@ -148,7 +150,7 @@ impl DriveBoard {
     /// Sends the TPDOs in `which`, one bit each.
     fn send(&mut self, which: u8, out: &mut Frames) {
         self.node.report(self.error(), out);
-        for (number, pdo) in (0_u8..).zip(&self.layout.pdos) {
+        for (number, pdo) in (0_u8..).zip(&self.layout().pdos) {
             if which & 1 << number == 0 || !pdo.is_on() {
                 continue;
             }
@@ -173,7 +175,7 @@ impl Board for DriveBoard {
     }
 
     fn period(&self) -> Option<Nanos> {
-        let number = u8::try_from(self.layout.position()?).ok()?;
+        let number = u8::try_from(self.layout().position()?).ok()?;
         self.node.period(number)
     }
 

@@ -1,6 +1,6 @@
 //! The host's side of a drive: puts the values of its TPDOs together.
 
-use super::layout::{Layout, Quantity, fields};
+use super::layout::{Layout, Quantity, fields, values};
 use super::options::Options;
 use super::start::{Scales, Start};
 use crate::bringup::Bringup;
@@ -24,6 +24,7 @@ struct Used {
     id: Id,
     /// Its bit in the group.
     bit: u8,
+    rank: Rank,
     fields: ArrayVec<super::layout::Field, 8>,
     bytes: usize,
 }
@@ -33,38 +34,51 @@ struct Used {
 struct Table {
     scales: Scales,
     used: ArrayVec<Used, 4>,
-    /// The TPDOs of one reading.
+    /// The TPDOs of one reading that a SYNC causes.
     group: u8,
-    /// The reading is made by a SYNC.
-    by_sync: bool,
+    /// Those of which each makes a reading.
+    alone: u8,
 }
 
 impl Table {
-    fn new(layout: &Layout, scales: Scales) -> Option<(Self, u8)> {
-        let position = layout.position()?;
+    fn new(layout: &Layout, scales: Scales) -> (Self, u8) {
         let mut used = ArrayVec::new();
-        for (at, pdo) in layout.pdos.iter().enumerate() {
+        for (at, pdo) in (0_u8..).zip(&layout.pdos) {
             let Some(id) = pdo.used_id() else {
                 continue;
             };
             let (fields, bytes) = fields(pdo);
-            let bit = 1 << at;
             let _ = used.try_push(Used {
                 id,
-                bit,
+                bit: 1 << at,
+                rank: Rank::alone(values(pdo), at),
                 fields,
                 bytes,
             });
         }
-        let every = layout.pdos.get(position)?.transmission;
-        let group = layout.group();
+        let (group, every) = layout.group().unwrap_or((0, 0));
         let this = Self {
             scales,
             used,
-            group: group.unwrap_or(1 << position),
-            by_sync: group.is_some(),
+            group,
+            alone: layout.alone(),
         };
-        Some((this, if group.is_some() { every.max(1) } else { 0 }))
+        (this, if group == 0 { 0 } else { every.max(1) })
+    }
+}
+
+/// Which of the TPDOs that have a position makes the readings: the best one that comes. So two that
+/// an event causes are not two readings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Rank(usize);
+
+impl Rank {
+    /// Those that a SYNC causes are best: the time is known.
+    const BY_SYNC: Self = Self(usize::MAX);
+
+    /// Of TPDO `number` with this number of values: those with most values, then the first.
+    fn alone(values: usize, number: u8) -> Self {
+        Self(values * 4 + usize::from(3 - number.min(3)))
     }
 }
 
@@ -82,6 +96,8 @@ pub(super) struct Drive {
     began: Nanos,
     /// The reading before was incomplete: a late value of it may be in the next.
     suspect: bool,
+    /// What has made the last reading, and when.
+    giver: Option<(Rank, Nanos)>,
     /// The last values in SI units, and when they came.
     values: [Option<(Nanos, f64)>; Quantity::JOINT],
     status: u32,
@@ -114,6 +130,7 @@ impl Drive {
             have: 0,
             began: Nanos::MIN,
             suspect: false,
+            giver: None,
             values: [None; Quantity::JOINT],
             status: 0,
             mode: 0,
@@ -126,7 +143,8 @@ impl Drive {
     /// Makes the table, if all that it needs is known.
     fn prepare(&mut self, plan: &Start) {
         let scales = plan.scales().filter(|_| plan.ready().is_ok());
-        if let Some((table, every)) = scales.and_then(|scales| Table::new(&plan.layout, scales)) {
+        if let Some(scales) = scales {
+            let (table, every) = Table::new(&plan.layout, scales);
             self.table = Some(table);
             self.cycle.set_every(every);
         }
@@ -183,7 +201,7 @@ impl Drive {
                 }
             }
         }
-        let (bit, group, by_sync) = (used.bit, table.group, table.by_sync);
+        let (bit, rank, group, alone) = (used.bit, used.rank, table.group, table.alone);
         if tells_status {
             let reading = Reading::Actuator(Actuator {
                 duty: f64::NAN,
@@ -192,6 +210,14 @@ impl Drive {
                 faults: self.error.unwrap_or(u32::from(self.state.error)),
             });
             out.push(Output::new(0, frame, self.quality(), reading), frame.id);
+        }
+        if alone & bit != 0 {
+            let better = |(giver, t)| giver > rank && self.is_fresh(t, frame.t);
+            if !self.giver.is_some_and(better) {
+                self.giver = Some((rank, frame.t));
+                self.give(None, frame, link, out);
+            }
+            return;
         }
         if group & bit == 0 {
             return;
@@ -210,11 +236,13 @@ impl Drive {
             return;
         }
         self.have = 0;
-        if core::mem::take(&mut self.suspect) && by_sync {
+        if core::mem::take(&mut self.suspect) {
             out.fault(Counter::Unpaired, 1, frame.id);
             return link.bringup.lost();
         }
-        self.give(frame, link, out);
+        self.giver = Some((Rank::BY_SYNC, frame.t));
+        let measured = self.measured.take();
+        self.give(measured, frame, link, out);
     }
 
     fn quality(&self) -> Quality {
@@ -234,7 +262,14 @@ impl Drive {
         (t..=t + self.hold).contains(&now)
     }
 
-    fn give(&mut self, frame: &Frame, link: &mut Link<Script<Start>>, out: &mut Decoded) {
+    /// Makes a reading, measured when `frame` came, or at another time.
+    fn give(
+        &mut self,
+        measured: Option<(Nanos, StampKind)>,
+        frame: &Frame,
+        link: &mut Link<Script<Start>>,
+        out: &mut Decoded,
+    ) {
         let values = self.values.map(|value| match value {
             Some((t, value)) if self.is_fresh(t, frame.t) => value,
             _ => f64::NAN,
@@ -262,7 +297,7 @@ impl Drive {
             ..JointState::ABSENT
         });
         let mut output = Output::new(0, frame, quality, reading);
-        (output.acquired, output.stamp) = self.measured.take().unwrap_or((frame.t, frame.stamp));
+        (output.acquired, output.stamp) = measured.unwrap_or((frame.t, frame.stamp));
         out.push(output, frame.id);
     }
 }
@@ -282,7 +317,7 @@ impl Family for Drive {
             return;
         };
         if frame.id == SYNC {
-            if self.table.as_ref().is_some_and(|table| table.by_sync) {
+            if self.table.as_ref().is_some_and(|table| table.group != 0) {
                 self.abandon(frame.id, link, out);
             }
             self.cycle.sync(frame);
@@ -296,6 +331,7 @@ impl Family for Drive {
         self.have = 0;
         self.measured = None;
         self.suspect = false;
+        self.giver = None;
         self.values = [None; Quantity::JOINT];
         self.table = None;
     }

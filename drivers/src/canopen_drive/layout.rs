@@ -1,11 +1,15 @@
 //! Which bits of which TPDO are which quantity: from a drive's mapping.
 
-use super::options::Options;
+use super::options::PdoKeys;
 use crate::canopen::{Object, Pdo, is_free, tpdo};
 use crate::objects::Objects;
 use crate::signal::{Bits, Raw};
 use crate::{Id, SpecError};
 use arrayvec::ArrayVec;
+
+/// Transmission by events and the timer. (Drives have 255, of the profile, rather than 254, of the
+/// maker.)
+const BY_EVENT: u8 = 255;
 
 /// What a drive sends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -92,9 +96,9 @@ pub(super) struct Layout {
 
 impl Layout {
     /// As the keys state it, with the identifiers that CiA 301 gives a node.
-    pub(super) fn of_keys(node: u8, options: &Options) -> Result<Self, SpecError> {
+    pub(super) fn of_keys(node: u8, pdos: &[PdoKeys]) -> Result<Self, SpecError> {
         let mut this = Self::default();
-        for keys in &options.pdos {
+        for keys in pdos {
             let wrong = |expected| SpecError::Keys {
                 key: "pdos",
                 expected,
@@ -107,7 +111,7 @@ impl Layout {
                 return Err(wrong("each number once, with sync from 0 to 240"));
             }
             pdo.id = Some(keys.id.map_or(tpdo(node, number).raw(), u32::from));
-            pdo.transmission = if keys.sync == 0 { 254 } else { keys.sync };
+            pdo.transmission = if keys.sync == 0 { BY_EVENT } else { keys.sync };
             let mut bits = 0;
             for index in &keys.objects {
                 let object = Object::new(*index, 0);
@@ -126,7 +130,7 @@ impl Layout {
                 return Err(wrong("of 1 to 8 bytes per number"));
             }
         }
-        if !options.pdos.is_empty() && this.position().is_none() {
+        if !pdos.is_empty() && this.position().is_none() {
             return Err(SpecError::Keys {
                 key: "pdos",
                 expected: "with a position, 0x6064 or 0x6063",
@@ -176,18 +180,30 @@ impl Layout {
         of_use.filter_map(Pdo::used_id)
     }
 
-    /// The TPDOs that make one reading with the position, one bit each, if a SYNC causes them.
-    pub(super) fn group(&self) -> Option<u8> {
-        let position = self.pdos.get(self.position()?)?;
-        if !position.by_sync() {
-            return None;
-        }
-        let belongs = |pdo: &Pdo| {
-            let (fields, _) = fields(pdo);
-            let is_joint = |field: &Field| (field.quantity as usize) < Quantity::JOINT;
-            pdo.is_on() && pdo.transmission == position.transmission && fields.iter().any(is_joint)
-        };
-        let bits = self.pdos.iter().enumerate();
-        Some(bits.fold(0, |all, (at, pdo)| all | u8::from(belongs(pdo)) << at))
+    /// The TPDOs that make one reading with a position, one bit each, if a SYNC causes them; and
+    /// after how many.
+    pub(super) fn group(&self) -> Option<(u8, u8)> {
+        let has_position = |pdo: &&Pdo| pdo.by_sync() && has(pdo, Quantity::Position);
+        let every = self.pdos.iter().find(has_position)?.transmission;
+        let belongs = |pdo: &Pdo| pdo.transmission == every && pdo.is_on() && values(pdo) > 0;
+        Some((self.bits(belongs), every))
     }
+
+    /// The TPDOs of which each makes a reading, one bit each: those with a position that no SYNC
+    /// causes.
+    pub(super) fn alone(&self) -> u8 {
+        self.bits(|pdo| !pdo.by_sync() && has(pdo, Quantity::Position))
+    }
+
+    fn bits(&self, which: impl Fn(&Pdo) -> bool) -> u8 {
+        let bits = self.pdos.iter().enumerate();
+        bits.fold(0, |all, (at, pdo)| all | u8::from(which(pdo)) << at)
+    }
+}
+
+/// How many values of a joint a TPDO has.
+pub(super) fn values(pdo: &Pdo) -> usize {
+    let (fields, _) = fields(pdo);
+    let is_joint = |field: &&Field| (field.quantity as usize) < Quantity::JOINT;
+    fields.iter().filter(is_joint).count()
 }

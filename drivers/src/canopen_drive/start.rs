@@ -1,78 +1,122 @@
 //! What a drive is asked at its start: its profile, its mapping, and its scales.
 
 use super::layout::{Layout, Quantity};
-use super::options::{CurrentUnit, Options};
-use crate::canopen::{MAPPED_MOST, Object, Plan, Step, object, tpdo};
+use super::options::{CurrentUnit, Options, TorqueUnit, Unit};
+use crate::canopen::{self, MAPPED_MOST, Object, Pdo, Plan, Step, nmt, object, tpdo};
 use crate::objects::Objects;
 use crate::{Id, Mode, SpecError};
 use alloc::format;
 use arrayvec::ArrayVec;
+use core::f64::consts::TAU;
+use core::ops::RangeInclusive;
 use proprio_topics::Refusal;
 
 /// The profile of drives.
 pub(super) const PROFILE: u32 = 402;
 pub(super) const COUNTS: Object = Object::new(0x608F, 1);
 pub(super) const TURNS: Object = Object::new(0x608F, 2);
-/// \[mNm\]
 pub(super) const RATED_TORQUE: Object = Object::new(0x6076, 0);
 /// \[mA\]
 pub(super) const RATED_CURRENT: Object = Object::new(0x6075, 0);
+/// Units as [`Unit::of_code`] reads them.
+const POSITION_UNIT: Object = Object::new(0x60A8, 0);
+const VELOCITY_UNIT: Object = Object::new(0x60A9, 0);
+/// \[rpm\]
+const MOST_SPEED: Object = Object::new(0x6080, 0);
+const VENDOR: Object = Object::new(0x1018, 1);
+
+/// What a drive is asked of its scales. Its unit of the position tells whether counts are needed.
+const SCALES: [Object; 8] = [
+    POSITION_UNIT,
+    COUNTS,
+    TURNS,
+    VELOCITY_UNIT,
+    VENDOR,
+    RATED_TORQUE,
+    RATED_CURRENT,
+    MOST_SPEED,
+];
+
+/// Above this a greatest speed says nothing of a motor: drives have it as a default \[rpm\].
+const FASTEST: f64 = 10_000.0;
+/// No joint of a robot has more \[W\]. A torque of millionths that is read as thousandths is a
+/// thousandfold: it is found from 50 W on.
+const MOST_POWER: f64 = 50e3;
+/// Rated torque by rated current \[Nm/A\]. A motor turns at no more than its voltage by this: at
+/// 48 V at 917000 rpm with the least one, at 9 rpm with the greatest.
+const TORQUE_CONSTANTS: RangeInclusive<f64> = 5e-4..=50.0;
 
 /// Entries that are read of each TPDO: identifier, transmission, number of mapped objects, these.
 const PER_PDO: usize = 3 + MAPPED_MOST as usize;
-/// The first step after all TPDOs.
-const SCALES: usize = 1 + 4 * PER_PDO;
+/// The first of the steps that ask for the TPDOs, that set them, and that ask for the scales.
+const MAPPING: usize = 2;
+const SETUP: usize = MAPPING + 4 * PER_PDO;
+const FIRST_SCALE: usize = SETUP + 4 * Pdo::SETUP;
 
-/// What a drive, or its file, tells of its scales.
+/// What a drive, or its file, tells of its scales: the values of [`SCALES`]; none is 0, by which
+/// makers mean that it is not stated.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Told {
-    counts: Option<f64>,
-    turns: Option<f64>,
-    /// \[Nm\]
-    pub(super) rated_torque: Option<f64>,
-    /// \[A\]
-    pub(super) rated_current: Option<f64>,
-}
+pub(super) struct Told([Option<u32>; SCALES.len()]);
 
 impl Told {
-    /// What `file` tells of this very drive. (The scales of an EDS are those of some motor.)
+    /// What `file` tells of this very drive. (The scales of an EDS are those of some motor; its
+    /// units and its maker are those of all drives of the kind.)
     pub(super) fn of_file(file: Option<&Objects>) -> Self {
-        let own = |object: Object, unit| {
-            let number = file?.own(object.index, object.sub)?;
-            Some(f64::from(number) * unit)
+        let value = |object: Object| {
+            let (file, Object { index, sub }) = (file?, object);
+            match object {
+                VENDOR => file.value(index, sub, 0).or(file.vendor),
+                POSITION_UNIT | VELOCITY_UNIT => file.value(index, sub, 0),
+                TURNS => {
+                    let counts = file.own(COUNTS.index, COUNTS.sub);
+                    file.own(index, sub).or(counts.map(|_| 1))
+                }
+                _ => file.own(index, sub),
+            }
         };
-        let counts = own(COUNTS, 1.0);
-        Self {
-            counts,
-            turns: own(TURNS, 1.0).or(counts.map(|_| 1.0)),
-            rated_torque: own(RATED_TORQUE, 1e-3),
-            rated_current: own(RATED_CURRENT, 1e-3),
+        let mut this = Self::default();
+        for scale in SCALES {
+            value(scale).map(|told| this.set(scale, told));
+        }
+        this
+    }
+
+    fn at(object: Object) -> Option<usize> {
+        SCALES.iter().position(|scale| *scale == object)
+    }
+
+    fn value(&self, object: Object) -> Option<u32> {
+        *self.0.get(Self::at(object)?)?
+    }
+
+    fn set(&mut self, object: Object, told: u32) {
+        if let Some(value) = Self::at(object).and_then(|at| self.0.get_mut(at)) {
+            *value = (told != 0).then_some(told);
         }
     }
 
     pub(super) fn counts_per_turn(&self) -> Option<f64> {
-        Some(self.counts? / self.turns?)
+        Some(f64::from(self.value(COUNTS)?) / f64::from(self.value(TURNS)?))
     }
 
-    /// The value of `object`.
-    const fn value(&mut self, object: Object) -> Option<&mut Option<f64>> {
-        match object {
-            COUNTS => Some(&mut self.counts),
-            TURNS => Some(&mut self.turns),
-            RATED_TORQUE => Some(&mut self.rated_torque),
-            RATED_CURRENT => Some(&mut self.rated_current),
-            _ => None,
-        }
+    /// \[Nm\], in the unit of the keys, else in that of its maker.
+    pub(super) fn rated_torque(&self, unit: Option<TorqueUnit>) -> Option<f64> {
+        let unit = unit.unwrap_or(TorqueUnit::of_vendor(self.value(VENDOR)));
+        Some(f64::from(self.value(RATED_TORQUE)?) * unit.newton_metres())
+    }
+
+    /// \[A\]
+    pub(super) fn rated_current(&self) -> Option<f64> {
+        Some(f64::from(self.value(RATED_CURRENT)?) * 1e-3)
     }
 
     /// These values, and those of `other` where there are none.
     fn or(self, other: Self) -> Self {
-        Self {
-            counts: self.counts.or(other.counts),
-            turns: self.turns.or(other.turns),
-            rated_torque: self.rated_torque.or(other.rated_torque),
-            rated_current: self.rated_current.or(other.rated_current),
+        let mut both = self;
+        for (value, other) in both.0.iter_mut().zip(other.0) {
+            *value = value.or(other);
         }
+        both
     }
 }
 
@@ -83,6 +127,8 @@ pub(super) struct Start {
     options: Options,
     /// The mapping is that of the keys.
     configured: bool,
+    /// The drive is set to it.
+    sets: bool,
     /// What is used until the drive says it: nothing, if it is asked.
     initial: (Layout, Told),
     pub(super) layout: Layout,
@@ -101,10 +147,15 @@ pub(super) struct Scales {
 
 impl Start {
     pub(super) fn new(node: u8, mode: Mode, options: &Options) -> Result<Self, SpecError> {
-        let configured = !options.pdos.is_empty();
-        let of_keys = Layout::of_keys(node, options)?;
-        let stated = match &options.objects {
-            Some(file) if !configured => Layout::of_file(node, file),
+        let file = options.objects.as_ref();
+        let of_keys = Layout::of_keys(node, &options.pdos())?;
+        let configured = of_keys.position().is_some();
+        let listens = mode == Mode::Listen;
+        let stated = match file {
+            Some(file) if !configured => {
+                canopen::check_objects(Some(file), canopen::is_pdo)?;
+                Layout::of_file(node, file)
+            }
             _ => of_keys,
         };
         if let Some(id) = stated.wrong_id() {
@@ -113,13 +164,33 @@ impl Start {
                  uses"
             )));
         }
+        if listens {
+            // One that is asked need not have them in its file.
+            let (torque, current) = (options.rated_torque, options.rated_current);
+            let wanted = [
+                (COUNTS, options.counts_per_turn.is_none()),
+                (
+                    RATED_TORQUE,
+                    torque.is_none() && stated.has(Quantity::Torque),
+                ),
+                (
+                    RATED_CURRENT,
+                    current.is_none() && stated.has(Quantity::Current),
+                ),
+            ];
+            let is_wanted = |index| {
+                wanted
+                    .iter()
+                    .any(|(of, wanted)| *wanted && of.index == index)
+            };
+            canopen::check_objects(file, is_wanted)?;
+        }
         let usual = |number| tpdo(node, number);
         let ids = (0..4).zip(&stated.pdos).filter_map(|(number, pdo)| {
             (pdo.used_id()).or_else(|| (!configured).then(|| usual(number)))
         });
         let ids = ids.collect();
-        let file = Told::of_file(options.objects.as_ref());
-        let listens = mode == Mode::Listen;
+        let file = Told::of_file(file);
         let initial = (
             if configured || listens {
                 stated
@@ -130,6 +201,7 @@ impl Start {
         );
         Ok(Self {
             configured,
+            sets: options.configure && !listens,
             layout: initial.0.clone(),
             initial,
             ids,
@@ -139,40 +211,134 @@ impl Start {
         })
     }
 
+    /// What is known.
+    fn known(&self) -> Told {
+        self.told.or(self.initial.1)
+    }
+
+    /// One step of the position \[rad\].
+    fn position(&self) -> Option<f64> {
+        if let Some(counts) = self.options.counts_per_turn {
+            return Some(TAU / counts);
+        }
+        let known = self.known();
+        let unit = known.value(POSITION_UNIT);
+        match unit.map_or(Some(Unit::Positions(1.0)), Unit::of_code)? {
+            Unit::Radians(radians) => Some(radians),
+            Unit::Positions(counts) => Some(counts * TAU / known.counts_per_turn()?),
+        }
+    }
+
+    /// The unit of the velocity; `None`: one that is not known.
+    fn velocity(&self) -> Option<Unit> {
+        if let Some(unit) = self.options.velocity_unit {
+            return Some(unit.unit());
+        }
+        let told = self.known().value(VELOCITY_UNIT);
+        told.map_or(Some(Unit::Positions(1.0)), Unit::of_code)
+    }
+
+    fn rated_torque(&self) -> Option<f64> {
+        let told = self.known().rated_torque(self.options.rated_torque_unit);
+        self.options.rated_torque.or(told)
+    }
+
+    fn rated_current(&self) -> Option<f64> {
+        self.options.rated_current.or(self.known().rated_current())
+    }
+
     /// The scales, once they are known. Torque and current are not a number if they are not sent.
     pub(super) fn scales(&self) -> Option<Scales> {
-        let (options, told) = (&self.options, self.told.or(self.initial.1));
         let needs = |quantity, known: Option<f64>| match known {
-            Some(known) => Some(known * 1e-3),
+            Some(known) => Some(known),
             None if self.layout.has(quantity) => None,
             None => Some(f64::NAN),
         };
-        let counts_per_turn = options.counts_per_turn.or(told.counts_per_turn())?;
-        let torque = options.rated_torque.or(told.rated_torque);
-        let torque = needs(Quantity::Torque, torque)?;
-        let current = options.rated_current.or(told.rated_current);
-        let current = match options.current_unit {
+        let position = self.position()?;
+        let velocity = self.velocity().map(|unit| unit.radians(position));
+        let current = match self.options.current_unit {
             CurrentUnit::Milliampere => 1e-3,
-            CurrentUnit::PerMille => needs(Quantity::Current, current)?,
+            CurrentUnit::PerMille => needs(Quantity::Current, self.rated_current())? * 1e-3,
         };
         Some(Scales {
             per_step: [
-                core::f64::consts::TAU / counts_per_turn,
-                options.velocity_unit.rad_per_s(counts_per_turn),
-                torque,
+                position,
+                needs(Quantity::Velocity, velocity)?,
+                needs(Quantity::Torque, self.rated_torque())? * 1e-3,
                 current,
             ],
         })
     }
 
-    fn asks_current(&self) -> bool {
-        self.options.current_unit == CurrentUnit::PerMille && self.layout.has(Quantity::Current)
+    /// Whether what is told of `object` counts: no key states it.
+    fn counts(&self, object: Object) -> bool {
+        let options = &self.options;
+        match object {
+            COUNTS | TURNS | POSITION_UNIT => options.counts_per_turn.is_none(),
+            VELOCITY_UNIT => options.velocity_unit.is_none(),
+            VENDOR | MOST_SPEED => {
+                options.rated_torque.is_none() && options.rated_torque_unit.is_none()
+            }
+            RATED_TORQUE => options.rated_torque.is_none(),
+            _ => options.rated_current.is_none(),
+        }
     }
 
-    /// What the file says of a scale that the drive does not tell.
-    fn of_file(&self, object: Object) -> Option<f64> {
-        let mut file = self.file;
-        file.value(object).and_then(|value| *value)
+    /// Whether there are no readings without `object`.
+    fn needs(&self, object: Object) -> bool {
+        let has = |quantity| self.layout.has(quantity);
+        let is_needed = match object {
+            COUNTS | TURNS => {
+                let unit = self.known().value(POSITION_UNIT).and_then(Unit::of_code);
+                !matches!(unit, Some(Unit::Radians(_)))
+            }
+            RATED_TORQUE => has(Quantity::Torque),
+            RATED_CURRENT => {
+                self.options.current_unit == CurrentUnit::PerMille && has(Quantity::Current)
+            }
+            _ => false,
+        };
+        is_needed && self.counts(object)
+    }
+
+    /// Whether the drive is asked for `object`.
+    fn asks(&self, object: Object) -> bool {
+        let is_of_use = match object {
+            POSITION_UNIT => true,
+            VELOCITY_UNIT => self.layout.has(Quantity::Velocity),
+            VENDOR | MOST_SPEED => self.checks_torque(),
+            RATED_CURRENT => self.needs(object) || self.checks_torque(),
+            _ => self.needs(object),
+        };
+        is_of_use && self.counts(object)
+    }
+
+    /// Whether the rated torque is the drive's own, in a unit that no key states.
+    fn checks_torque(&self) -> bool {
+        self.layout.has(Quantity::Torque) && self.counts(VENDOR)
+    }
+
+    /// The object whose value can not be, if there is one.
+    fn implausible(&self) -> Option<u16> {
+        let known = self.known();
+        let (has_velocity, units) = (
+            self.layout.has(Quantity::Velocity),
+            [POSITION_UNIT, VELOCITY_UNIT],
+        );
+        let unknown = |unit: &Object| {
+            let code = known.value(*unit);
+            code.is_some_and(|code| Unit::of_code(code).is_none())
+                && self.counts(*unit)
+                && (*unit == POSITION_UNIT || has_velocity)
+        };
+        if let Some(unit) = units.into_iter().find(unknown) {
+            return Some(unit.index);
+        }
+        let torque = self.rated_torque().filter(|_| self.checks_torque())?;
+        let speed = known.value(MOST_SPEED).map_or(0.0, f64::from).min(FASTEST);
+        let is_wrong = |current: f64| !TORQUE_CONSTANTS.contains(&(torque / current));
+        (torque * speed * TAU / 60.0 > MOST_POWER || self.rated_current().is_some_and(is_wrong))
+            .then_some(RATED_TORQUE.index)
     }
 
     /// Takes an entry of a TPDO.
@@ -184,43 +350,53 @@ impl Start {
             pdo.take(object, value);
         }
     }
-}
 
-/// A scale that a drive tells; it may not change.
-fn settle(known: &mut Option<f64>, told: u32, unit: f64) -> Result<(), Refusal> {
-    let told = f64::from(told) * unit;
-    if told <= 0.0 {
-        return Err(Refusal::BadCalibration { channel: 0 });
-    }
-    match *known {
-        Some(known) if known != told => Err(Refusal::Changed),
-        _ => {
-            *known = Some(told);
-            Ok(())
+    /// Takes a value of [`SCALES`].
+    fn take_scale(
+        &mut self,
+        object: Object,
+        answer: Result<Option<u32>, u32>,
+    ) -> Result<(), Refusal> {
+        // What only other values depend on may change.
+        let is_fixed = matches!(object, COUNTS | TURNS | RATED_TORQUE | RATED_CURRENT);
+        let told = match answer {
+            _ if !self.counts(object) => return Ok(()),
+            Ok(None) => return Ok(()),
+            Ok(Some(0)) if self.needs(object) => {
+                return Err(Refusal::BadCalibration { channel: 0 });
+            }
+            Ok(Some(told)) => told,
+            Err(_) => match self.told.value(object).or(self.file.value(object)) {
+                Some(known) => known,
+                None if self.needs(object) => {
+                    return Err(Refusal::Rejected {
+                        object: object.index,
+                    });
+                }
+                None => return Ok(()),
+            },
+        };
+        if is_fixed && self.told.value(object).is_some_and(|known| known != told) {
+            return Err(Refusal::Changed);
         }
+        self.told.set(object, told);
+        Ok(())
     }
 }
 
 impl Plan for Start {
     fn step(&self, at: usize) -> Option<Step> {
-        let (object, needed) = match at {
-            0 => (object::DEVICE_TYPE, true),
-            SCALES => (COUNTS, self.options.counts_per_turn.is_none()),
-            at if at == SCALES + 1 => (TURNS, self.options.counts_per_turn.is_none()),
-            at if at == SCALES + 2 => {
-                let asks = self.options.rated_torque.is_none();
-                (RATED_TORQUE, asks && self.layout.has(Quantity::Torque))
-            }
-            at if at > SCALES + 2 => {
-                let asks = self.options.rated_current.is_none();
-                (RATED_CURRENT, asks && self.asks_current())
-            }
-            at => {
-                #[allow(clippy::cast_possible_truncation)] // at most 4 and 11
-                let (number, entry) = (((at - 1) / PER_PDO) as u8, ((at - 1) % PER_PDO) as u8);
+        #[allow(clippy::cast_possible_truncation)] // at most 4
+        let part = |at: usize, of: usize| ((at / of) as u8, at % of);
+        let object = match at {
+            0 => return self.sets.then_some(Step::Nmt(nmt::PRE_OPERATIONAL)),
+            1 => Some(object::DEVICE_TYPE),
+            MAPPING..SETUP => {
+                let (number, entry) = part(at - MAPPING, PER_PDO);
                 let pdo = self.layout.pdos.get(usize::from(number));
                 let (is_on, count) = pdo.map_or((false, 0), |pdo| (pdo.is_on(), pdo.count));
-                let (object, needed) = match entry {
+                #[allow(clippy::cast_possible_truncation)] // at most 10
+                let (object, needed) = match entry as u8 {
                     0 => (object::tpdo_id(number), true),
                     1 => (object::tpdo_transmission(number), is_on),
                     2 => (object::tpdo_mapping(number, 0), is_on),
@@ -229,24 +405,42 @@ impl Plan for Start {
                         is_on && sub - 2 <= count,
                     ),
                 };
-                (object, needed && !self.configured)
+                (needed && !self.configured).then_some(object)
+            }
+            SETUP..FIRST_SCALE => {
+                let (number, entry) = part(at - SETUP, Pdo::SETUP);
+                let pdo = self.layout.pdos.get(usize::from(number))?;
+                let is_set = self.sets && pdo.is_on();
+                return pdo
+                    .setup(number, self.options.period_ms, entry)
+                    .filter(|_| is_set);
+            }
+            at => {
+                let scale = SCALES.get(at - FIRST_SCALE).copied();
+                scale.filter(|scale| self.asks(*scale))
             }
         };
-        needed.then_some(Step::Read(object))
+        object.map(Step::Read)
     }
 
     fn steps(&self) -> usize {
-        SCALES + 4
+        FIRST_SCALE + SCALES.len()
     }
 
     fn take(&mut self, object: Object, answer: Result<Option<u32>, u32>) -> Result<(), Refusal> {
-        let is_pdo = matches!(object.index, 0x1800..=0x1803 | 0x1A00..=0x1A03);
+        let is_pdo = canopen::is_pdo(object.index);
         match (object, answer) {
             (object::DEVICE_TYPE, Ok(Some(device))) if device & 0xFFFF != PROFILE => {
                 #[allow(clippy::cast_possible_truncation)] // 16 bits
                 let profile = (device & 0xFFFF) as u16;
                 Err(Refusal::OtherDevice { profile })
             }
+            (object::DEVICE_TYPE, Err(_)) => Err(Refusal::Rejected {
+                object: object.index,
+            }),
+            (_, Err(_)) if is_pdo && self.sets => Err(Refusal::Rejected {
+                object: object.index,
+            }),
             (_, Ok(Some(value))) if is_pdo => {
                 self.take_pdo(object, Some(value));
                 Ok(())
@@ -256,27 +450,7 @@ impl Plan for Start {
                 self.take_pdo(object, None);
                 Ok(())
             }
-            (COUNTS, Ok(Some(told))) if self.options.counts_per_turn.is_none() => {
-                settle(&mut self.told.counts, told, 1.0)
-            }
-            (TURNS, Ok(Some(told))) if self.options.counts_per_turn.is_none() => {
-                settle(&mut self.told.turns, told, 1.0)
-            }
-            (RATED_TORQUE, Ok(Some(told))) if self.options.rated_torque.is_none() => {
-                settle(&mut self.told.rated_torque, told, 1e-3)
-            }
-            (RATED_CURRENT, Ok(Some(told))) if self.options.rated_current.is_none() => {
-                settle(&mut self.told.rated_current, told, 1e-3)
-            }
-            (object::DEVICE_TYPE | COUNTS | TURNS | RATED_TORQUE | RATED_CURRENT, Err(_)) => {
-                let known = self.of_file(object).ok_or(Refusal::Rejected {
-                    object: object.index,
-                })?;
-                if let Some(value) = self.told.value(object) {
-                    value.get_or_insert(known);
-                }
-                Ok(())
-            }
+            _ if Told::at(object).is_some() => self.take_scale(object, answer),
             _ => Ok(()),
         }
     }
@@ -288,6 +462,9 @@ impl Plan for Start {
         let other = self.layout.ids().find(|id| !self.ids.contains(id));
         if let Some(id) = other.or(self.layout.wrong_id()) {
             return Err(Refusal::OtherIdentifier { id: id.raw() });
+        }
+        if let Some(object) = self.implausible() {
+            return Err(Refusal::Implausible { object });
         }
         self.scales().map(|_| ()).ok_or(Refusal::NoCalibration)
     }

@@ -539,6 +539,108 @@ fn a_drive_that_is_set_up_later_is_used() {
     assert!(!rig.sent.iter().any(|f| f.contains("6076")), "not needed");
 }
 
+/// With `configure` a drive that nobody has set up is set to the keys: by its timer, and by SYNC.
+#[test]
+fn a_drive_is_configured_as_the_keys_say() {
+    let torque = "pdos = [{ number = 2, objects = [0x6064, 0x6077], sync = 1 }]";
+    for (keys, mapping) in [
+        (
+            "",
+            &[
+                "601#2300180181010 0C0",
+                "601#2F001A0000000000",
+                "601#23001A0110004160",
+                "601#23001A0220006460",
+                "601#23001A0308006160",
+                "601#2F001A0003000000",
+                "601#2F001802FF000000",
+                "601#2B00180505000000",
+                "601#2300180181010040",
+                "601#2301180181020 0C0",
+                "601#2F011A0000000000",
+                "601#23011A0120006C60",
+                "601#2F011A0001000000",
+                "601#2F011802FF000000",
+                "601#2B01180505000000",
+                "601#2301180181020040",
+            ][..],
+        ),
+        (
+            torque,
+            &[
+                "601#2301180181020 0C0",
+                "601#2F011A0000000000",
+                "601#23011A0120006460",
+                "601#23011A0210007760",
+                "601#2F011A0002000000",
+                "601#2F01180201000000",
+                "601#2301180181020040",
+            ],
+        ),
+    ] {
+        let keys = format!("period_ms = 5\nconfigure = true\n{keys}");
+        let mut rig = Rig::with_board(
+            "canopen_drive",
+            &keys,
+            &keys,
+            &[0],
+            (0, Reading::Joint(STATE)),
+        );
+        rig.run(100);
+        assert_eq!(rig.sent[0], "000#8001");
+        let written: Vec<&String> = rig.sent.iter().filter(|f| f.starts_with("601#2")).collect();
+        let right: Vec<String> = mapping.iter().map(|text| text.replace(' ', "")).collect();
+        assert_eq!(written, right.iter().collect::<Vec<_>>());
+        assert!(
+            !rig.sent.iter().any(|f| f.starts_with("601#40001A")),
+            "its mapping is known"
+        );
+        assert_eq!(rig.sent.last().unwrap(), "000#0101");
+        if keys.contains("sync") {
+            continue;
+        }
+        assert_eq!(rig.device.state(), State::Streaming);
+        let read = joints(&rig.readings);
+        assert!((12..=20).contains(&read.len()), "{}", read.len());
+        assert!((joint(&read[3].reading).position - 1.5).abs() < TAU / 4096.0);
+        assert!((joint(&read[3].reading).velocity + 2.0).abs() < TAU / 4096.0);
+    }
+    // What a drive does not take is told.
+    let mut device = at("canopen_drive", "configure = true", 1, Mode::Supervise);
+    let mut out = Decoded::new();
+    for ms in 0..100 {
+        let now = Nanos::from_millis(ms);
+        while let Some(transmit) = device.poll_transmit(now, &mut out) {
+            let text = transmit.frame.to_string();
+            device.on_sent(&transmit.frame, Ok(now));
+            let object = text.get(6..12).unwrap_or("").to_owned();
+            let answer = match object.as_str() {
+                "" => continue,
+                "001000" => "4300100092010200".to_owned(),
+                "001805" => format!("80{object}00000206"),
+                _ => format!("60{object}00000000"),
+            };
+            device.on_frame(&frame(&format!("581#{answer}"), ms as f64), &mut out);
+        }
+        out.clear();
+    }
+    let refusal = Refusal::Rejected { object: 0x1800 };
+    assert_eq!(device.state(), State::Refused(refusal));
+    // Nothing is written where another program commands the drive.
+    let listener = at(
+        "canopen_drive",
+        "configure = true\ncounts_per_turn = 4",
+        1,
+        Mode::Listen,
+    );
+    let mut listener = listener;
+    let (readings, _) = decode(&mut *listener, &[frame("181#27060100000000", 1.0)]);
+    assert!(near(
+        joint(&joints(&readings)[0].reading).position,
+        TAU / 4.0
+    ));
+}
+
 #[test]
 fn a_drive_is_asked_for_its_mapping_and_started() {
     let mut rig = Rig::with_board("canopen_drive", "", FULL, &[0], (0, Reading::Joint(STATE)));
@@ -559,12 +661,17 @@ fn a_drive_is_asked_for_its_mapping_and_started() {
         "it is off"
     );
     let end = [
+        "601#40A8600000000000",
         "601#408F600100000000",
         "601#408F600200000000",
+        "601#40A9600000000000",
+        "601#4018100100000000",
         "601#4076600000000000",
+        "601#4075600000000000",
+        "601#4080600000000000",
+        "000#0101",
     ];
-    assert_eq!(sent[sent.len() - 5..sent.len() - 2], end);
-    assert_eq!(sent[sent.len() - 2..], ["601#4075600000000000", "000#0101"]);
+    assert_eq!(sent[sent.len() - end.len()..], end);
     assert!(
         !sent.iter().any(|f| f.starts_with("601#2")),
         "nothing is written"
@@ -908,7 +1015,10 @@ fn scales_that_a_drive_does_not_tell_are_those_of_its_file() {
             "{told:?}"
         );
         assert!(near(told.current, 4.0), "{told:?}");
-        assert_eq!(asked, ["001000", "8F6001", "8F6002", "766000", "756000"]);
+        let right = [
+            "001000", "A86000", "8F6001", "8F6002", "181001", "766000", "756000", "806000",
+        ];
+        assert_eq!(asked, right);
     }
 }
 

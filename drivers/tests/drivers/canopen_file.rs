@@ -2,8 +2,8 @@
 
 use crate::rig::{decode, frame, options, spec};
 use proprio_drivers::objects::{Entry, Objects};
-use proprio_drivers::{Device, Mode, Options, Output, SpecError};
-use proprio_topics::Reading;
+use proprio_drivers::{Device, Mode, Options, Output, SpecError, State};
+use proprio_topics::{Reading, Refusal};
 use std::f64::consts::TAU;
 
 /// A file that states these entries of this very device: index, sub-index, number.
@@ -161,5 +161,275 @@ fn a_drive_has_the_mapping_of_its_file() {
         };
         assert!((position - 0.25).abs() < 1e-12 && (velocity - 0.5).abs() < 1e-12);
         assert_eq!(readings[0].acquired, frames[0].t);
+    }
+}
+
+/// Two TPDOs of which each has the position, by events: the one with most values that comes makes
+/// the readings.
+#[test]
+fn two_tpdos_with_the_position_are_one_series_of_readings() {
+    let entries = [
+        (0x608F, 1, 4096),
+        (0x1801, 1, 0x280),
+        (0x1801, 2, 255),
+        (0x1A01, 1, 0x6041_0010),
+        (0x1A01, 2, 0x6064_0020),
+        (0x1803, 1, 0x480),
+        (0x1803, 2, 255),
+        (0x1A03, 1, 0x6064_0020),
+        (0x1A03, 2, 0x606C_0020),
+    ];
+    let heard = |frames: &[(&str, f64)]| {
+        let mut device = listener("canopen_drive", "", file(&entries));
+        let frames: Vec<_> = frames.iter().map(|(text, ms)| frame(text, *ms)).collect();
+        let (readings, faults) = decode(&mut *device, &frames);
+        assert!(faults.is_empty(), "{faults:?}");
+        let at = |output: &Output| (output.acquired.0 / 1_000_000, output.reading.values()[0]);
+        let joints = readings
+            .iter()
+            .filter(|output| matches!(output.reading, Reading::Joint(_)));
+        joints.map(at).collect::<Vec<_>>()
+    };
+    let quarter = |n: i64| (10 * n, n as f64 * TAU / 4.0);
+    // Only one of them comes.
+    let (two, four) = (
+        [("285#270400040000", 10.0), ("285#270400080000", 20.0)],
+        [
+            ("485#0004000064000000", 10.0),
+            ("485#0008000064000000", 20.0),
+        ],
+    );
+    assert_eq!(heard(&two), [quarter(1), quarter(2)]);
+    assert_eq!(heard(&four), [quarter(1), quarter(2)]);
+    // Both, then the better one falls silent for longer than hold_ms.
+    let both = [
+        ("485#0004000064000000", 10.0),
+        ("285#270400040000", 10.5),
+        ("285#270400080000", 20.0),
+        ("485#0008000064000000", 20.5),
+        ("285#2704000C0000", 120.0),
+        ("285#270400100000", 130.0),
+        ("285#270400140000", 140.0),
+    ];
+    assert_eq!(
+        heard(&both),
+        [quarter(1), quarter(2), (130, TAU), (140, 1.25 * TAU)]
+    );
+    // One by SYNC is better than any.
+    let mut mixed = entries;
+    mixed[2].2 = 1;
+    let mut device = listener("canopen_drive", "", file(&mixed));
+    let frames = [
+        frame("080#", 10.0),
+        frame("485#0004000064000000", 10.1),
+        frame("285#270400040000", 10.2),
+        frame("485#0004000064000000", 10.3),
+        frame("080#", 20.0),
+        frame("285#270400080000", 20.2),
+    ];
+    let (readings, _) = decode(&mut *device, &frames);
+    let joints = readings
+        .iter()
+        .filter(|output| matches!(output.reading, Reading::Joint(_)));
+    let times: Vec<i64> = joints.map(|output| output.acquired.0 / 100_000).collect();
+    assert_eq!(times, [101, 100, 200]);
+}
+
+/// The torque \[Nm\] of 1000 per mille, or why there is none.
+fn rated(keys: &str, vendor: Option<u32>, entries: &[(u16, u8, u32)]) -> Result<f64, State> {
+    let objects = Objects {
+        vendor,
+        ..file(entries)
+    };
+    let keys = format!(
+        "counts_per_turn = 3200\npdos = [{{ number = 1, objects = [0x6064, 0x6077] }}]\n{keys}"
+    );
+    let mut device = listener("canopen_drive", &keys, objects);
+    let (readings, _) = decode(&mut *device, &[frame("185#00000000E803", 1.0)]);
+    match readings.first().map(|output| output.reading) {
+        Some(Reading::Joint(joint)) => Ok(joint.torque),
+        _ => Err(device.state()),
+    }
+}
+
+/// maxon's EPOS4 tells millionths: 4760 mA x 107746 uNm/A = 512871 uNm, in EPOS Studio's file.
+#[test]
+fn the_unit_of_the_rated_torque_is_its_makers() {
+    let near = |found: Result<f64, State>, right: f64| {
+        let found = found.unwrap();
+        assert!((found / right - 1.0).abs() < 1e-12, "{found}");
+    };
+    let epos = [(0x6076, 0, 512_871)];
+    near(rated("", Some(0xFB), &epos), 0.512_871);
+    near(rated("", None, &[(0x1018, 1, 0xFB), epos[0]]), 0.512_871);
+    near(rated("rated_torque_unit = \"uNm\"", None, &epos), 0.512_871);
+    near(
+        rated("rated_torque_unit = \"mNm\"", Some(0xFB), &epos),
+        512.871,
+    );
+    near(rated("rated_torque = 0.5", Some(0xFB), &epos), 0.5);
+    near(rated("", Some(0x9A), &[(0x6076, 0, 512)]), 0.512);
+}
+
+/// No motor has the torque with its current, or with its speed.
+#[test]
+fn a_rated_torque_that_can_not_be_is_refused() {
+    let refused = Err(State::Refused(Refusal::Implausible { object: 0x6076 }));
+    let torque = |number| (0x6076, 0, number);
+    let (current, speed) = (|ma| (0x6075, 0, ma), |rpm| (0x6080, 0, rpm));
+    for (entries, is_plausible) in [
+        (vec![torque(512_871), current(4760)], false),
+        (vec![torque(512), current(4760)], true),
+        // 50 Nm/A, and a little more; half a thousandth, and a little less.
+        (vec![torque(50_000), current(1000)], true),
+        (vec![torque(50_001), current(1000)], false),
+        (vec![torque(50), current(100_000)], true),
+        (vec![torque(49), current(100_000)], false),
+        // 50 kW: 1300 rpm and 367 Nm.
+        (vec![torque(512_871), speed(1300)], false),
+        (vec![torque(367_000), speed(1300)], true),
+        (vec![torque(368_000), speed(1300)], false),
+        // A speed that is rather a default.
+        (vec![torque(40_000), speed(200_000)], true),
+        (vec![torque(48_000), speed(200_000)], false),
+    ] {
+        let found = rated("", None, &entries);
+        match is_plausible {
+            true => assert!(found.is_ok(), "{entries:?} {found:?}"),
+            false => assert_eq!(found, refused, "{entries:?}"),
+        }
+        assert!(rated("rated_torque = 1.0", None, &entries).is_ok());
+        assert!(rated("rated_torque_unit = \"mNm\"", None, &entries).is_ok());
+    }
+    let told = Refusal::Implausible { object: 0x6076 }.to_string();
+    assert!(
+        told.contains("object 6076") && told.contains("rated_torque_unit"),
+        "{told}"
+    );
+}
+
+/// Codes of CiA 303-2, as drives of several makers have them: power of ten, unit, time.
+#[test]
+fn positions_and_velocities_are_in_the_units_that_the_drive_states() {
+    const KEYS: &str = "pdos = [{ number = 1, objects = [0x6064, 0x606C] }]";
+    let read = |keys: &str, units: &[(u16, u8, u32)]| {
+        let mut objects = file(&[(0x608F, 1, 1000)]);
+        let more = file(units).entries.into_iter();
+        // Defaults of a kind of drive.
+        objects.entries.extend(more.map(|(at, entry)| {
+            (
+                at,
+                Entry {
+                    own: false,
+                    ..entry
+                },
+            )
+        }));
+        let mut device = listener("canopen_drive", &format!("{keys}\n{KEYS}"), objects);
+        let (readings, _) = decode(&mut *device, &[frame("185#6400000064000000", 1.0)]);
+        let found = turns(&readings);
+        found.first().copied().ok_or(device.state())
+    };
+    let (position, velocity) = (|code| (0x60A8, 0, code), |code| (0x60A9, 0, code));
+    for (units, right) in [
+        (vec![], (0.1, 0.1)),
+        (
+            vec![position(0x00B5_0000), velocity(0x00B5_0300)],
+            (0.1, 0.1),
+        ),
+        // rpm, and thousandths of it.
+        (vec![velocity(0x00B4_4700)], (0.1, 100.0 / 60.0)),
+        (vec![velocity(0xFDB4_4700)], (0.1, 0.1 / 60.0)),
+        // Revolutions, degrees, and milliradians per second.
+        (vec![velocity(0x00B4_0300)], (0.1, 100.0)),
+        (vec![velocity(0x0041_0300)], (0.1, 100.0 / 360.0)),
+        (vec![velocity(0xFD10_0300)], (0.1, 0.1 / TAU)),
+        // Thousandths of a degree; velocities are in the same over seconds.
+        (vec![position(0xFD41_0000)], (0.1 / 360.0, 0.1 / 360.0)),
+        // 0: not stated.
+        (vec![position(0), velocity(0)], (0.1, 0.1)),
+    ] {
+        let found = read("", &units).unwrap();
+        assert!((found.0 - right.0).abs() < 1e-12, "{units:?} {found:?}");
+        assert!((found.1 - right.1).abs() < 1e-12, "{units:?} {found:?}");
+    }
+    // Keys count before what is told.
+    let rpm = [velocity(0x00B4_4700)];
+    let found = read("velocity_unit = \"0.1 counts/s\"", &rpm).unwrap();
+    assert!((found.1 - 0.01).abs() < 1e-12);
+    let degrees = [position(0x0041_0000)];
+    let found = read("counts_per_turn = 200", &degrees).unwrap();
+    assert!((found.0 - 0.5).abs() < 1e-12);
+    // Metres are no angle.
+    let metres = [velocity(0x0001_0300)];
+    let refusal = Refusal::Implausible { object: 0x60A9 };
+    assert_eq!(read("", &metres), Err(State::Refused(refusal)));
+    assert!(read("velocity_unit = \"rpm\"", &metres).is_ok());
+    let metres = [position(0x0001_0000)];
+    let refusal = Refusal::Implausible { object: 0x60A8 };
+    assert_eq!(read("", &metres), Err(State::Refused(refusal)));
+    assert!(read("counts_per_turn = 200", &metres).is_ok());
+}
+
+/// A value that is no number is told to a driver that needs it.
+#[test]
+fn what_is_wrong_in_a_file_harms_only_where_it_is_needed() {
+    let told = |driver: &str, keys: &str, at: (u16, u8), mode| {
+        let mut objects = file(&[
+            (0x608F, 1, 1000),
+            (0x6501, 0, 1000),
+            (0x1800, 1, 0x180),
+            (0x1A00, 1, 0x6064_0020),
+        ]);
+        objects
+            .unreadable
+            .insert(at, "[6076]: defaultvalue = \"x\" is no number".to_owned());
+        let made = described(driver, keys, objects).device(&spec(5, mode, &[0]));
+        made.map(|_| ()).map_err(|e| e.to_string())
+    };
+    let (drive, encoder) = ("canopen_drive", "canopen_encoder");
+    let pdos = "pdos = [{ number = 1, objects = [0x6064, 0x6077] }]";
+    for (driver, keys, at, mode, is_needed) in [
+        (drive, "", (0x2000, 1), Mode::Listen, false),
+        (drive, "", (0x1A02, 3), Mode::Listen, true),
+        (drive, pdos, (0x1A02, 3), Mode::Listen, false),
+        (drive, "", (0x6076, 0), Mode::Listen, false),
+        (drive, pdos, (0x6076, 0), Mode::Listen, true),
+        (drive, pdos, (0x6076, 0), Mode::Supervise, false),
+        (drive, "", (0x608F, 2), Mode::Listen, true),
+        (
+            drive,
+            "counts_per_turn = 10",
+            (0x608F, 2),
+            Mode::Listen,
+            false,
+        ),
+        (encoder, "", (0x1A00, 1), Mode::Listen, false),
+        (
+            encoder,
+            "configure = false",
+            (0x1A00, 1),
+            Mode::Listen,
+            true,
+        ),
+        (encoder, "", (0x6001, 0), Mode::Listen, true),
+        (encoder, "", (0x6001, 0), Mode::Supervise, false),
+        (
+            encoder,
+            "counts_per_turn = 10",
+            (0x6001, 0),
+            Mode::Listen,
+            false,
+        ),
+    ] {
+        let problem = told(driver, keys, at, mode);
+        assert_eq!(
+            problem.is_err(),
+            is_needed,
+            "{driver} {keys} {at:x?} {problem:?}"
+        );
+        if let Err(problem) = problem {
+            assert!(problem.contains("[6076]: defaultvalue"), "{problem}");
+        }
     }
 }

@@ -369,6 +369,12 @@ pub enum Refusal {
         /// What: the index of the object of a CANopen node.
         object: u16,
     },
+    /// What it tells of itself can not be, beside what else it tells, or is in a unit that is not
+    /// known.
+    Implausible {
+        /// What: the index of the object of a CANopen node.
+        object: u16,
+    },
     /// It does not send what is needed of it.
     NotMapped,
     /// It sends with an identifier that is not received.
@@ -392,6 +398,7 @@ impl Refusal {
             Self::NotMapped => 5,
             Self::OtherDevice { profile } => 0x1_0000 | profile as u32,
             Self::Rejected { object } => 0x2_0000 | object as u32,
+            Self::Implausible { object } => 0x3_0000 | object as u32,
             Self::OtherIdentifier { id } => 0x4000_0000 | id,
         }
     }
@@ -416,6 +423,9 @@ impl Refusal {
                 profile: (code & 0xFFFF) as u16,
             }),
             0x2_0000..=0x2_FFFF => Some(Self::Rejected {
+                object: (code & 0xFFFF) as u16,
+            }),
+            0x3_0000..=0x3_FFFF => Some(Self::Implausible {
                 object: (code & 0xFFFF) as u16,
             }),
             0x4000_0000..=0x5FFF_FFFF => Some(Self::OtherIdentifier {
@@ -462,6 +472,19 @@ impl fmt::Display for Refusal {
                 f,
                 "it refuses object {object:04X}; the driver's page says which key replaces it"
             ),
+            Self::Implausible { object } => {
+                let (problem, keys) = match object {
+                    0x6076 => (
+                        "a rated torque that no motor with its rated current (6075) or speed \
+                         (6080) has",
+                        "rated_torque_unit or rated_torque",
+                    ),
+                    0x60A8 => ("a unit that is not known", "counts_per_turn"),
+                    0x60A9 => ("a unit that is not known", "velocity_unit"),
+                    _ => ("what can not be", "the key that replaces it"),
+                };
+                write!(f, "object {object:04X} tells {problem}; set {keys}")
+            }
             Self::NotMapped => f.write_str(
                 "none of its process data has the position; map it with the maker's tool, or, if \
                  another program commands it, state the mapping (the driver's page says how)",
@@ -728,6 +751,7 @@ mod tests {
             Refusal::OtherDevice { profile: 0 },
             Refusal::OtherDevice { profile: 0xFFFF },
             Refusal::Rejected { object: 0x608F },
+            Refusal::Implausible { object: 0x6076 },
             Refusal::OtherIdentifier { id: 0x1B2 },
             Refusal::OtherIdentifier { id: 0x1FFF_FFFF },
         ];
@@ -740,7 +764,7 @@ mod tests {
             0xFF,
             0x300,
             0xFFFF,
-            0x3_0000,
+            0x4_0000,
             0x3FFF_FFFF,
             0x6000_0000,
             u32::MAX,
