@@ -18,6 +18,7 @@
 //! | [`odrive`] | ODrive motor controllers | joint, actuator, temperature |
 //! | [`cubemars`] | CubeMars AK actuators | joint, actuator, temperature |
 //! | [`damiao`] | Damiao actuators | joint, actuator, temperature |
+//! | [`myactuator`] | MyActuator RMD and LKMTech motors | joint, actuator, temperature |
 //! | [`robstride`] | RobStride actuators, CyberGear | joint, actuator, temperature |
 //! | [`vesc`] | VESC motor controllers | joint, actuator, temperature |
 //! | [`xsens_mti`] | Xsens MTi-600, Avior, Sirius | imu |
@@ -77,6 +78,7 @@ pub mod jr3_can;
 mod keys;
 mod mit;
 pub mod moteus;
+pub mod myactuator;
 pub mod objects;
 pub mod odrive;
 pub mod openimu;

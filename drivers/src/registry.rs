@@ -6,8 +6,8 @@ use crate::signal::Message;
 use crate::{
     Board, Device, Driver, Frame, OutputInfo, Spec, SpecError, aidin_aft200, ati_netcanoem,
     canopen_drive, canopen_encoder, canopen_sync, cubemars, damiao, dbc, icub_imu, icub_mais,
-    icub_mc4, icub_motor, icub_pos, icub_skin, icub_strain, jr3_can, moteus, odrive, openimu,
-    optoforce_daq, robotous_rft, robstride, vesc, xsens_mti,
+    icub_mc4, icub_motor, icub_pos, icub_skin, icub_strain, jr3_can, moteus, myactuator, odrive,
+    openimu, optoforce_daq, robotous_rft, robstride, vesc, xsens_mti,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -226,6 +226,8 @@ drivers! {
     Cubemars: cubemars,
     /// Damiao actuators.
     Damiao: damiao,
+    /// MyActuator RMD actuators.
+    Myactuator: myactuator,
     /// RobStride actuators and CyberGear.
     Robstride: robstride,
     /// VESC motor controllers.

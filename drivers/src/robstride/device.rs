@@ -184,12 +184,12 @@ impl Family for Motor {
             Some(Message::Parameter(parameter, Some(value))) => {
                 self.parameter((parameter, f64::from(value)), frame, link, out);
             }
-            Some(Message::Parameter(parameter, None)) => {
-                if self.keys.request_period.is_some() && parameter::ASKED.contains(&parameter) {
-                    out.fault(Counter::Value, 1, frame.id);
-                }
+            Some(Message::Parameter(parameter, None))
+                if self.keys.request_period.is_some() && parameter::ASKED.contains(&parameter) =>
+            {
+                out.fault(Counter::Value, 1, frame.id);
             }
-            None => {}
+            Some(Message::Parameter(_, None)) | None => {}
         }
     }
 

@@ -81,6 +81,13 @@ const SETUPS: &[(&str, &str, &[u8])] = &[
         "model = \"DM8009\"\nrequest_period_ms = 2\nfd = true",
         &[0],
     ),
+    ("myactuator", "", &[0]),
+    ("myactuator", "position = \"motion\"", &[0]),
+    (
+        "myactuator",
+        "protocol = \"v2\"\nrequest_period_ms = 2",
+        &[0],
+    ),
     ("robstride", "model = \"RS03\"", &[0]),
     (
         "robstride",

@@ -19,6 +19,7 @@ mod golden;
 mod icub_mc4;
 mod jr3_and_optoforce;
 mod moteus;
+mod myactuator;
 mod odrive;
 mod openimu;
 mod pairing;

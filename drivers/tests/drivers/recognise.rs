@@ -73,7 +73,14 @@ pub(crate) const BOARDS: &[Row] = &[
     ),
 ];
 /// Drivers without a device that speaks, or with one that a file describes.
-const NOT_RECOGNISED: [&str; 5] = ["canopen_sync", "damiao", "dbc", "robstride", "vesc"];
+const NOT_RECOGNISED: [&str; 6] = [
+    "canopen_sync",
+    "damiao",
+    "dbc",
+    "myactuator",
+    "robstride",
+    "vesc",
+];
 
 #[test]
 fn no_driver_is_left_out() {

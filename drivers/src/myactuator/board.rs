@@ -1,0 +1,213 @@
+//! The device's own side: a motor that answers questions, or sends what it measures as if it were
+//! asked once a period.
+
+use super::frames::{ANY_ERROR, Answer, ENCODER_ERROR, JOINT, LENGTH, MOTOR, State, command};
+use super::options::{Checked, Options, Position, Protocol};
+use crate::bytes::{quantise, quantise_i16};
+use crate::{Board, EncodeError, Format, Frame, Frames, Spec, SpecError, mit};
+use proprio_topics::{JointState, Nanos, Quality, Reading};
+
+/// A simulated motor.
+#[derive(Debug)]
+pub struct MyactuatorBoard {
+    keys: Checked,
+    joint: JointState,
+    errors: u16,
+    celsius: i8,
+}
+
+impl MyactuatorBoard {
+    /// A motor at 25 degrees Celsius.
+    ///
+    /// # Errors
+    /// [`SpecError`]: an address outside 1 to 32, a key out of range.
+    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+        Ok(Self {
+            keys: Checked::new(spec, options)?,
+            joint: JointState {
+                position: 0.0,
+                velocity: 0.0,
+                ..JointState::ABSENT
+            },
+            errors: 0,
+            celsius: 25,
+        })
+    }
+
+    fn frame(&self, answer: Answer) -> Frame {
+        let data = answer.pack(self.keys.protocol, self.celsius);
+        Frame::new(self.keys.answers(), &data)
+    }
+
+    #[allow(clippy::cast_possible_truncation)] // limited, or within a turn
+    fn state(&self) -> Answer {
+        let Checked {
+            protocol,
+            place_step,
+            speed_step,
+            ampere_per_step,
+            torque_constant,
+            encoder_bits,
+            ..
+        } = self.keys;
+        let JointState {
+            position,
+            velocity,
+            torque,
+            current,
+            ..
+        } = self.joint;
+        let current = if current.is_nan() {
+            torque / torque_constant
+        } else {
+            current
+        };
+        let current = current / ampere_per_step;
+        let place = match protocol {
+            Protocol::V3 => i64::from(quantise_i16(position, place_step)),
+            Protocol::V2 => {
+                let steps = quantise(position, place_step, i64::MIN, i64::MAX);
+                steps.rem_euclid(1 << encoder_bits)
+            }
+        };
+        Answer::State(State {
+            celsius: self.celsius,
+            current: if current.is_finite() {
+                quantise_i16(current, 1.0)
+            } else {
+                0
+            },
+            speed: quantise_i16(velocity, speed_step),
+            place: place as i32,
+        })
+    }
+
+    fn angle(&self) -> Answer {
+        let most = match self.keys.protocol {
+            Protocol::V3 => i64::from(i32::MAX),
+            Protocol::V2 => (1 << 55) - 1,
+        };
+        Answer::Angle(quantise(
+            self.joint.position,
+            self.keys.angle_step,
+            -most,
+            most,
+        ))
+    }
+
+    #[allow(clippy::cast_possible_truncation)] // an address is a byte
+    fn motion(&self) -> Frame {
+        let [p, v, t] = self.keys.scales;
+        let torque = if self.joint.torque.is_nan() {
+            0.0
+        } else {
+            self.joint.torque
+        };
+        let raw = [
+            p.raw(self.joint.position),
+            v.raw(self.joint.velocity),
+            t.raw(torque),
+        ];
+        let [p0, p1, v0, both, t1] = mit::pack(raw);
+        let data = [self.keys.address as u8, p0, p1, v0, both, t1, 0, 0];
+        Frame::new(self.keys.motion(), &data)
+    }
+
+    /// Takes a reading; whether the errors are new, and whether it is one that is sent at once.
+    #[allow(clippy::cast_possible_truncation)] // limited or masked
+    fn take(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+    ) -> Result<(bool, bool), EncodeError> {
+        let errors = self.errors;
+        let mut sent = false;
+        match (output, reading) {
+            (JOINT, Reading::Joint(joint)) => {
+                let values = [joint.position, joint.velocity];
+                let others = [joint.torque, joint.current];
+                if values.iter().any(|value| !value.is_finite())
+                    || others.iter().any(|value| value.is_infinite())
+                {
+                    return Err(EncodeError::NotFinite);
+                }
+                self.joint = *joint;
+                let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
+                if self.keys.quality(errors).0 != quality.0 & told.0 {
+                    let set = |flag, error| if quality.contains(flag) { error } else { 0 };
+                    // V2 has no error of the encoder.
+                    let sensor = match self.keys.protocol {
+                        Protocol::V3 => ENCODER_ERROR,
+                        Protocol::V2 => ANY_ERROR,
+                    };
+                    self.errors =
+                        set(Quality::DEVICE_FAULT, sensor) | set(Quality::DRIVE_FAULT, ANY_ERROR);
+                }
+                sent = true;
+            }
+            (JOINT, Reading::Actuator(actuator)) => self.errors = actuator.faults as u16,
+            (MOTOR, Reading::Temperature(temperature)) if temperature.celsius.is_finite() => {
+                self.celsius = quantise(temperature.celsius, 1.0, -128, 127) as i8;
+            }
+            (MOTOR, Reading::Temperature(_)) => return Err(EncodeError::NotFinite),
+            (JOINT | MOTOR, _) => return Err(EncodeError::Kind),
+            _ => return Err(EncodeError::Output(output)),
+        }
+        Ok((self.errors != errors, sent))
+    }
+}
+
+impl Board for MyactuatorBoard {
+    /// Answers questions, and commands that move.
+    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
+        let is_its = frame.id == self.keys.commands() && frame.len() == LENGTH;
+        if !is_its || frame.format != Format::Classic {
+            return;
+        }
+        let answer = match frame.data().first() {
+            Some(&command::ANGLE) => self.angle(),
+            Some(&command::ERRORS) => Answer::Errors(self.errors),
+            Some(&command::STATE) => self.state(),
+            Some(moves) if command::MOVES.contains(moves) => self.state(),
+            _ => return,
+        };
+        let _ = out.try_push(self.frame(answer));
+    }
+
+    fn period(&self) -> Option<Nanos> {
+        match self.keys.request_period {
+            Some(_) => None,
+            None => Some(self.keys.period),
+        }
+    }
+
+    fn present(&mut self, output: u8, reading: &Reading, quality: Quality) {
+        let _ = self.take(output, reading, quality);
+    }
+
+    /// New errors are sent at once, before a joint reading. The temperature is sent with the next.
+    fn encode(
+        &mut self,
+        output: u8,
+        reading: &Reading,
+        quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        let (new, sent) = self.take(output, reading, quality)?;
+        let errors = new.then(|| self.frame(Answer::Errors(self.errors)));
+        let joint = match self.keys.position {
+            _ if !sent => [None, None],
+            Position::Angle => [
+                Some(self.frame(self.state())),
+                Some(self.frame(self.angle())),
+            ],
+            Position::Status => [Some(self.frame(self.state())), None],
+            Position::Motion => [Some(self.motion()), None],
+        };
+        for frame in errors.into_iter().chain(joint.into_iter().flatten()) {
+            let _ = out.try_push(frame);
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,220 @@
+//! The host's side: takes the answers of one motor, and asks for them if it is told to.
+
+use super::frames::{Answer, JOINT, LENGTH, MOTOR, State, command};
+use super::options::{Checked, Options, Position, Protocol};
+use crate::bringup::{Bringup, NoInquiry, Timing};
+use crate::family::{Family, Link, Supervised, next_in_step};
+use crate::held::{Held, OnChange};
+use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, bytes, mit};
+use alloc::boxed::Box;
+use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
+
+/// How often the errors are asked for.
+const ERRORS_PERIOD: Nanos = Nanos::from_millis(1000);
+
+/// The host's side of a motor.
+#[derive(Debug)]
+pub(super) struct Motor {
+    keys: Checked,
+    errors: u16,
+    told: OnChange<u16>,
+    temperature: OnChange<()>,
+    velocity: Held,
+    current: Held,
+    /// The next question: its place in a round, when that is due, and when the errors are.
+    next: usize,
+    due: Nanos,
+    errors_due: Nanos,
+}
+
+impl Motor {
+    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+        let keys = Checked::new(spec, options)?;
+        let (mode, timing) = match keys.request_period {
+            Some(_) => (spec.mode, Timing::POLLED),
+            None => (Mode::Listen, Timing::LISTENED),
+        };
+        let mut claims = [Claim::exclusive(keys.answers())].to_vec();
+        if keys.position == Position::Motion {
+            claims.insert(0, Claim::exclusive(keys.motion()));
+        }
+        let watched = claims.first().map_or(keys.answers(), |claim| claim.id);
+        let bringup = Bringup::new(spec, mode, timing, watched);
+        let this = Self {
+            keys,
+            errors: 0,
+            told: OnChange::NOTHING,
+            temperature: OnChange::NOTHING,
+            velocity: Held::ABSENT,
+            current: Held::ABSENT,
+            next: 0,
+            due: Nanos::MIN,
+            errors_due: Nanos::MIN,
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+
+    /// A reading at `position`, with the speed and the current that are known.
+    fn joint(
+        &self,
+        position: f64,
+        saturated: bool,
+        frame: &Frame,
+        link: &mut Link<NoInquiry>,
+        out: &mut Decoded,
+    ) {
+        let mut quality = self.keys.quality(self.errors);
+        if saturated {
+            quality |= Quality::SATURATED;
+        }
+        let current = self.current.at(frame, self.keys.hold);
+        let state = JointState {
+            position,
+            velocity: self.velocity.at(frame, self.keys.hold),
+            torque: self.keys.torque_constant * current,
+            current,
+            ..JointState::ABSENT
+        };
+        link.joint(JOINT, frame, quality, state, out);
+    }
+
+    fn state(
+        &mut self,
+        state: State,
+        frame: &Frame,
+        link: &mut Link<NoInquiry>,
+        out: &mut Decoded,
+    ) {
+        let Checked {
+            speed_step,
+            ampere_per_step,
+            place_step,
+            ..
+        } = self.keys;
+        self.velocity = Held::new(frame, f64::from(state.speed) * speed_step);
+        self.current = Held::new(frame, f64::from(state.current) * ampere_per_step);
+        if self.temperature.is_due((), frame) {
+            let celsius = f64::from(state.celsius);
+            let reading = Reading::Temperature(Temperature { celsius });
+            out.push(Output::new(MOTOR, frame, Quality::GOOD, reading), frame.id);
+        }
+        if self.keys.position != Position::Status {
+            return;
+        }
+        let is_end = |value: i16| value == i16::MIN || value == i16::MAX;
+        // An encoder begins anew.
+        let place = match self.keys.protocol {
+            Protocol::V3 => i16::try_from(state.place).is_ok_and(is_end),
+            Protocol::V2 => false,
+        };
+        let saturated = place || is_end(state.speed) || is_end(state.current);
+        let position = f64::from(state.place) * place_step;
+        self.joint(position, saturated, frame, link, out);
+    }
+
+    fn errors(&mut self, errors: u16, frame: &Frame, out: &mut Decoded) {
+        self.errors = errors;
+        if self.told.is_due(errors, frame) {
+            let reading = Reading::Actuator(Actuator {
+                duty: f64::NAN,
+                mode: 0,
+                encoder: u32::from(errors & self.keys.encoder_errors()),
+                faults: u32::from(errors),
+            });
+            let quality = self.keys.quality(errors);
+            out.push(Output::new(JOINT, frame, quality, reading), frame.id);
+        }
+    }
+
+    fn motion(&self, data: &[u8], frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+        let measured = (data.split_first()).filter(|(id, _)| u16::from(**id) == self.keys.address);
+        let Some((raw, _)) = measured.and_then(|(_, measured)| mit::unpack(measured)) else {
+            return out.fault(Counter::Value, 1, frame.id);
+        };
+        let [p, v, t] = self.keys.scales;
+        let [position, velocity, torque] = raw;
+        let mut quality = self.keys.quality(self.errors);
+        if p.is_saturated(position) || v.is_saturated(velocity) || t.is_saturated(torque) {
+            quality |= Quality::SATURATED;
+        }
+        let state = JointState {
+            position: p.value(position),
+            velocity: v.value(velocity),
+            torque: t.value(torque),
+            ..JointState::ABSENT
+        };
+        link.joint(JOINT, frame, quality, state, out);
+    }
+}
+
+impl Family for Motor {
+    type Questions = NoInquiry;
+
+    #[allow(clippy::cast_precision_loss)] // an angle of 2^53 steps is none
+    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+        let is_motion = self.keys.position == Position::Motion && frame.id == self.keys.motion();
+        if !is_motion && frame.id != self.keys.answers() {
+            return;
+        }
+        let Some(data) = bytes::payload(frame, out) else {
+            return;
+        };
+        if data.len() != LENGTH {
+            return out.fault(Counter::Length, 1, frame.id);
+        }
+        if is_motion {
+            return self.motion(data, frame, link, out);
+        }
+        let asks = link.bringup.mode() == Mode::Supervise;
+        match Answer::parse(self.keys.protocol, asks, data) {
+            Some(Answer::State(state)) => self.state(state, frame, link, out),
+            Some(Answer::Angle(angle)) if self.keys.position == Position::Angle => {
+                self.joint(angle as f64 * self.keys.angle_step, false, frame, link, out);
+            }
+            Some(Answer::Errors(errors)) => self.errors(errors, frame, out),
+            // Answers to other programs.
+            Some(Answer::Angle(_)) | None => {}
+        }
+    }
+
+    fn reset(&mut self) {
+        self.errors = 0;
+        self.told = OnChange::NOTHING;
+        self.temperature = OnChange::NOTHING;
+        (self.velocity, self.current) = (Held::ABSENT, Held::ABSENT);
+    }
+
+    fn request(
+        &mut self,
+        now: Nanos,
+        _link: &mut Link<NoInquiry>,
+        _out: &mut Decoded,
+    ) -> Option<Frame> {
+        let period = self.keys.request_period?;
+        if now < self.due {
+            return None;
+        }
+        let round: &[u8] = match self.keys.position {
+            Position::Angle => &[command::STATE, command::ANGLE],
+            Position::Status | Position::Motion => &[command::STATE],
+        };
+        let command = if self.next == 0 && now >= self.errors_due {
+            self.errors_due = next_in_step(self.errors_due, ERRORS_PERIOD, now);
+            command::ERRORS
+        } else {
+            let command = *round.get(self.next)?;
+            self.next += 1;
+            if self.next == round.len() {
+                self.next = 0;
+                self.due = next_in_step(self.due, period, now);
+            }
+            command
+        };
+        let data = [command, 0, 0, 0, 0, 0, 0, 0];
+        Some(Frame::new(self.keys.commands(), &data))
+    }
+
+    fn request_at(&self) -> Option<Nanos> {
+        self.keys.request_period.map(|_| self.due)
+    }
+}
