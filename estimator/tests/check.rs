@@ -463,7 +463,7 @@ fn a_sensor_in_a_moving_joint_is_on_the_side_of_its_child() {
     let setup = setup.expect("a cut in a moving joint");
     let names: Vec<&str> = setup.channels().map(|(_, name)| name).collect();
     assert_eq!(names, ["s", "j1", "j2"]);
-    let check = Check::of(&setup).expect("numbers");
+    let check = checked(&setup);
     let [at_rest] = &check.sensors[..] else {
         panic!("one sensor")
     };
