@@ -38,14 +38,11 @@ impl Setup {
                 {
                     break true;
                 }
-                if self
-                    .robot
-                    .model
-                    .joints()
-                    .get(joint)
-                    .is_some_and(|j| j.dof.is_some())
-                {
-                    joints.push(self.robot.model.joint_name(joint));
+                let model = &self.robot.model;
+                let moves = model.joints().get(joint).is_some_and(|j| j.dof.is_some());
+                // Between a moving joint and a sensor in it there is no mass.
+                if moves && model.cut(model.joint_name(joint)) != Some(sensor.joint()) {
+                    joints.push(model.joint_name(joint));
                 }
             };
             if !joints.is_empty() && !bounded {
@@ -299,6 +296,16 @@ impl fmt::Display for Setup {
             )?;
         }
         let model = &self.robot.model;
+        let sensors = self.robot.structure.sensors().iter();
+        for (sensor, name) in sensors.zip(self.robot.sensor_names()) {
+            let joint = model.joint_name(sensor.joint());
+            if model.joint(joint) != Some(sensor.joint()) {
+                writeln!(
+                    f,
+                    "  {name} is in the moving joint {joint}, on the side of its child"
+                )?;
+            }
+        }
         for joint in (0..model.joint_count()).map(|joint| model.joint_name(joint)) {
             if let Some(leader) = model.follows(joint) {
                 writeln!(

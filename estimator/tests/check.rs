@@ -463,6 +463,12 @@ fn a_sensor_in_a_moving_joint_is_on_the_side_of_its_child() {
     let setup = setup.expect("a cut in a moving joint");
     let names: Vec<&str> = setup.channels().map(|(_, name)| name).collect();
     assert_eq!(names, ["s", "j1", "j2"]);
+    let text = setup.to_string();
+    assert!(
+        text.contains("  s is in the moving joint j1, on the side of its child\n")
+            && !text.contains("mounted beyond"),
+        "{text}"
+    );
     let check = checked(&setup);
     let [at_rest] = &check.sensors[..] else {
         panic!("one sensor")

@@ -1018,8 +1018,12 @@ fn each_mistake_between_configuration_and_model_has_one_clear_message() {
              that could carry one: l_arm_ft_sensor",
         ),
         (
-            &|c: &mut Config| c.force_torque[0].joint = "l_elbow".into(),
-            "joint l_elbow is named as the joint of an F/T sensor, but it moves",
+            &|c: &mut Config| {
+                c.force_torque[0].joint = "l_elbow".into();
+                c.force_torque[0].frame = Some(SensorFrame::Parent);
+            },
+            "the F/T sensor in joint l_elbow cannot measure in the parent's frame, because the \
+             joint moves",
         ),
         (
             &|c: &mut Config| {

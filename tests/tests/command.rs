@@ -523,9 +523,9 @@ fn a_wrong_estimator_toml_is_told_with_file_place_and_what_would_be_legal() {
             &["l_arm_ft", "is not in the URDF", "l_arm_ft_sensor"],
         ),
         (
-            "joint = \"l_arm_ft_sensor\"",
-            "joint = \"l_elbow\"",
-            &["l_elbow", "it moves"],
+            "joint = \"l_arm_ft_sensor\"\nframe = \"child\"",
+            "joint = \"l_elbow\"\nframe = \"parent\"",
+            &["l_elbow", "the joint moves"],
         ),
         (
             "[differentiation]",
