@@ -63,7 +63,7 @@ pub(super) fn read(text: &str, keep: &[&str]) -> Result<Model, ModelError> {
     let sensors = read_sensors(robot, &mut warnings);
     let (links, numbers) = read_links(robot, &mut warnings)?;
     let mut joints = read_joints(robot, &numbers, &mut warnings)?;
-    let tree = Tree::build(&links, &mut joints, &mut warnings)?;
+    let tree = Tree::build(&links, &joints, &mut warnings)?;
     check_kept(keep, &joints, &sensors)?;
     let coordinates = Coordinates::of(&mut joints, &mut warnings)?;
     Folder {
@@ -448,27 +448,25 @@ fn check_kept(
     sensors: &[SensorElement],
 ) -> Result<(), ModelError> {
     for &name in keep {
-        match joints.iter().find(|joint| joint.name == name) {
-            None => {
-                let all = || {
-                    joints
-                        .iter()
-                        .filter(|joint| joint.kind == Some(JointKind::Fixed))
-                        .map(|joint| joint.name.to_owned())
-                };
-                let mut fixed: Vec<String> = all()
-                    .filter(|joint| sensors.iter().any(|sensor| sensor.joint == *joint))
-                    .collect();
-                if fixed.is_empty() {
-                    fixed = all().take(10).collect();
-                }
-                return Err(ModelError::UnknownSensorJoint {
-                    joint: name.to_owned(),
-                    fixed,
-                });
-            }
-            Some(_) => {}
+        if joints.iter().any(|joint| joint.name == name) {
+            continue;
         }
+        let all = || {
+            joints
+                .iter()
+                .filter(|joint| joint.kind == Some(JointKind::Fixed))
+                .map(|joint| joint.name.to_owned())
+        };
+        let mut fixed: Vec<String> = all()
+            .filter(|joint| sensors.iter().any(|sensor| sensor.joint == *joint))
+            .collect();
+        if fixed.is_empty() {
+            fixed = all().take(10).collect();
+        }
+        return Err(ModelError::UnknownSensorJoint {
+            joint: name.to_owned(),
+            fixed,
+        });
     }
     Ok(())
 }
