@@ -531,7 +531,7 @@ fn assessor(args: &Estimate, setup: &Setup) -> anyhow::Result<Assessor> {
     let log = input(&args.samples)?;
     if !is_file(&args.samples) {
         bail!(
-            "--assess reads the table twice: give a file with --samples, not standard input or a pipe"
+            "--assess reads the table twice: give a file with --samples, no standard input or pipe"
         );
     }
     Assessor::new(setup, log).map_err(|error| match error {

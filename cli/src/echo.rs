@@ -144,7 +144,8 @@ fn channels(args: &Echo, domain: &Domain, robot: &str, channel: &str) -> anyhow:
                     .map(|(field, value)| ((*field).to_owned(), json!(value)))
                     .collect();
                 let line = json!({
-                    "t_ns": t.0, "kind": kind.word(), "values": values, "quality": quality.to_string(),
+                    "t_ns": t.0, "kind": kind.word(), "values": values,
+                    "quality": quality.to_string(),
                 });
                 writeln!(out, "{line}")?;
             } else {

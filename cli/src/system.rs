@@ -72,20 +72,19 @@ fn robots(domain: &Domain, name: Option<&str>) -> anyhow::Result<Vec<RobotPresen
     }
 }
 
-/// The name of the robot to read: the named one, or the only one.
+/// The name of the robot to read: the named one, or the only one. Whether it runs is not asked:
+/// that takes a second.
 pub(crate) fn one_robot(domain: &Domain, name: Option<&str>) -> anyhow::Result<String> {
-    let mut found = robots(domain, name)?;
-    match (found.pop(), found.is_empty()) {
-        (Some(robot), true) => Ok(robot.name),
-        (Some(robot), false) => {
-            let names: Vec<_> = found.into_iter().map(|robot| robot.name).collect();
-            bail!(
-                "there are several robots: name one with --robot: {}, {}",
-                names.join(", "),
-                robot.name
-            )
-        }
-        (None, _) => bail!("there is no robot in the domain"),
+    let names: Vec<String> = domain.robot_names().into_iter().collect();
+    match (name, names.as_slice()) {
+        (_, []) => bail!("there is no robot in the domain"),
+        (None, [only]) => Ok(only.clone()),
+        (None, _) => bail!(
+            "there are several robots: name one with --robot: {}",
+            names.join(", ")
+        ),
+        (Some(name), _) if names.iter().any(|known| known == name) => Ok(name.to_owned()),
+        (Some(name), _) => bail!("there is no robot {name:?}; there is {}", names.join(", ")),
     }
 }
 

@@ -13,6 +13,7 @@ use proprio_gateway::link::replay::{Matching, Pace, Replay};
 use proprio_gateway::link::socketcan::SocketCan;
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, ListenOnly, OpenError, Received, SendError, send_by};
+use proprio_gateway::log::Stamps;
 use proprio_gateway::log::candump::write_log_line;
 use proprio_topics::{BusError, Controller, LinkState, Nanos, StampKind};
 use std::path::PathBuf;
@@ -621,6 +622,27 @@ fn a_log_at_its_pace_is_moved_to_now() {
         link.start_at(start);
         assert_eq!(exactly(&mut link, 4)[3].t, start + Nanos::from_millis(205));
     }
+}
+
+/// `stamps` in the source: what relative stamps count from.
+#[test]
+fn a_source_may_state_what_stamps_count_from() {
+    let bus = Log::new(Pace::Fast);
+    let line = " (000.010000)  can0  001   [0]\n";
+    let path = bus.write(line.repeat(3).as_bytes());
+    for (stamps, ms) in [
+        (Stamps::SinceStart, [10, 10, 10]),
+        (Stamps::SincePrevious, [10, 20, 30]),
+    ] {
+        let mut link = Replay::open_with(&path, Pace::Fast, stamps, None, &[]).unwrap();
+        let times: Vec<_> = exactly(&mut link, 3).iter().map(|frame| frame.t).collect();
+        assert_eq!(times, ms.map(Nanos::from_millis));
+        assert_eq!(link.note(), None);
+    }
+    let mut link = Replay::open(&path, Pace::Fast, None, &[]).unwrap();
+    exactly(&mut link, 3);
+    let note = link.note().expect("three lines prove nothing");
+    assert!(note.contains("State it with stamps = "), "{note}");
 }
 
 /// It has the stamp of the line before it, as it was recorded after that one.

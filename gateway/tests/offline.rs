@@ -1,7 +1,8 @@
 //! A recorded log gives the samples and the quality that its frames gave live.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-use proprio_gateway::offline::{DecodeReport, decode};
+use proprio_gateway::log::Stamps;
+use proprio_gateway::offline::{DecodeReport, decode, decode_with};
 use proprio_gateway::plan::Plan;
 use proprio_topics::csv::Columns;
 use proprio_topics::{Counter, Quality};
@@ -54,6 +55,49 @@ fn log(times_ms: impl IntoIterator<Item = u32>) -> String {
         writeln!(log, "({:.6}) can0 3DB#008000800080", t + 2e-4).unwrap();
     }
     log
+}
+
+/// What relative stamps mean may be stated; a guess is reported, a statement is none.
+#[test]
+fn the_meaning_of_stamps_may_be_stated() {
+    let plan = Plan::parse(ARM, Path::new(".")).unwrap();
+    let log: String = [0, 10, 20, 30]
+        .map(|ms| format!(" (000.{ms:03}000)  can0  140   [8]  00 00 00 00 00 00 00 00\n"))
+        .concat();
+    for (stated, means, times) in [
+        (
+            Stamps::Detect,
+            Stamps::SinceStart,
+            ["0", "0.01", "0.02", "0.03"],
+        ),
+        (
+            Stamps::SinceStart,
+            Stamps::SinceStart,
+            ["0", "0.01", "0.02", "0.03"],
+        ),
+        (
+            Stamps::SincePrevious,
+            Stamps::SincePrevious,
+            ["0", "0.01", "0.03", "0.06"],
+        ),
+    ] {
+        let mut table = Vec::new();
+        let report = decode_with(&plan, log.as_bytes(), stated, &mut table, Columns::Main).unwrap();
+        let table = String::from_utf8(table).unwrap();
+        let first: Vec<_> = (table.lines().skip(1))
+            .filter_map(|row| row.split(',').next())
+            .collect();
+        assert_eq!((first, report.stamps), (times.to_vec(), means));
+        let doubt = report.doubt.unwrap_or_default();
+        assert_eq!(
+            doubt.contains("--stamps since-previous"),
+            stated == Stamps::Detect
+        );
+    }
+    // A log with dates has no such meaning.
+    let log = log.replace("(000.", "(1700000000.");
+    let report = decode(&plan, log.as_bytes(), &mut Vec::new(), Columns::Main).unwrap();
+    assert_eq!((report.stamps, report.doubt), (Stamps::Detect, None));
 }
 
 #[test]

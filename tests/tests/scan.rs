@@ -239,13 +239,13 @@ fn a_recorded_log_is_scanned_by_interface() {
     }
     let line = said
         .lines()
-        .find(|line| line.starts_with("31A"))
+        .find(|line| line.starts_with("0x31A"))
         .expect("a row");
     let words: Vec<&str> = line.split_whitespace().collect();
     assert_eq!(
         words,
         [
-            "31A",
+            "0x31A",
             "100",
             "100.0",
             "6",

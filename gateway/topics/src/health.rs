@@ -491,8 +491,8 @@ impl fmt::Display for Refusal {
             ),
             Self::OtherIdentifier { id } => write!(
                 f,
-                "its process data has the identifier 0x{id:03X}, which is not received; the driver's \
-                 page says which key states it"
+                "its process data has the identifier 0x{id:03X}, which is not received; the \
+                 driver's page says which key states it"
             ),
         }
     }

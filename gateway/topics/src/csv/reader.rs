@@ -32,8 +32,8 @@ pub enum Error {
     Csv(#[from] ::csv::Error),
     /// It has no column `t`.
     #[error(
-        "its first row must name the columns, `t` among them; it begins with {0:?} (`proprio decode` \
-         makes such a table of a recorded bus)"
+        "its first row must name the columns, `t` among them; it begins with {0:?} \
+         (`proprio decode` makes such a table of a recorded bus)"
     )]
     NoHeader(String),
     /// Two columns have one name.

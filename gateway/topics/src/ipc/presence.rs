@@ -153,8 +153,9 @@ impl Domain {
 }
 
 impl<S: Service> Domain<S> {
-    /// The names of the robots that have services in this domain.
-    pub(super) fn robot_names(&self) -> BTreeSet<String> {
+    /// The names of the robots that have services in this domain, whether or not they run now.
+    #[must_use]
+    pub fn robot_names(&self) -> BTreeSet<String> {
         let mut names = BTreeSet::new();
         let suffixes = [GatewayHealth::SUFFIX, EstimatorHealth::SUFFIX];
         let _ = S::list(self.iceoryx(), |details| {
