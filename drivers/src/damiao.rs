@@ -73,6 +73,11 @@
 //! A frame of a disabled motor whose position is the raw value `0033`, `0055` or `00AA`, hundredths
 //! of a radian from the lower end, looks like an answer about a register, and is taken for one.
 //!
+//! # Recognition
+//! By its frames: state, temperatures, and a position that goes on as the velocity says; and by
+//! commands or questions that they answer. A scan that asks sends the questions `CC` and `33` for
+//! register 21 to the motors 1 to 32, classic frames.
+//!
 //! # Keys
 //! ```toml
 //! model = "DM4310"        # default: none
@@ -90,11 +95,13 @@ mod device;
 mod frames;
 mod options;
 mod ranges;
+mod recognise;
 
 pub use board::DamiaoBoard;
 pub use options::{Model, Options};
 
-use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
+use crate::recognise::{Finding, Traffic};
+use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::borrow::Cow;
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -124,5 +131,13 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(DamiaoBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        recognise::motors(seen)
+    }
+
+    fn questions(_seen: &Traffic) -> Vec<Frame> {
+        recognise::questions()
     }
 }

@@ -40,6 +40,10 @@
 //! measured, not what was commanded; that MyActuator's own V2 has the layout of LKMTech. Steps of
 //! current: 33/4096 A (LKMTech MF), 66/4096 A (MG).
 //!
+//! # Recognition
+//! By answers on `240` + ID (V3) and to questions on `140` + ID (V2). A scan asks `9A` and `9C` of
+//! all IDs only if `--ask myactuator` is given: other devices may have such an identifier.
+//!
 //! # Keys
 //! ```toml
 //! protocol = "v3"         # "v3" (V4 too) or "v2" (LKMTech too)
@@ -60,11 +64,13 @@ mod board;
 mod device;
 mod frames;
 mod options;
+mod recognise;
 
 pub use board::MyactuatorBoard;
 pub use options::{Options, Position, Protocol};
 
-use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
+use crate::recognise::{Finding, Traffic};
+use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::borrow::Cow;
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -74,6 +80,7 @@ use proprio_topics::Kind;
 
 impl Driver for Options {
     const NAME: &'static str = "myactuator";
+    const ASKED_BY_NAME: bool = true;
 
     fn outputs(&self) -> Vec<OutputInfo> {
         let motor = OutputInfo {
@@ -89,5 +96,13 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(MyactuatorBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        recognise::motors(seen)
+    }
+
+    fn questions(_seen: &Traffic) -> Vec<Frame> {
+        recognise::questions()
     }
 }

@@ -71,6 +71,10 @@
 //! `CyberGearDriver` 0.2.0; LeRobot 7427f318. Layouts are certain. Highly probable: the ranges, and
 //! the frame about faults of the MIT protocol.
 //!
+//! # Recognition
+//! By frames 02 and 18, and by answers. A scan asks for the number of each motor (type 00, host FD)
+//! only if `--ask robstride` is given: on the identifier of a moteus controller's commands.
+//!
 //! # Keys
 //! ```toml
 //! model = "RS03"          # default: none; the keys marked * must be given then
@@ -89,11 +93,13 @@ mod board;
 mod device;
 mod frames;
 mod options;
+mod recognise;
 
 pub use board::RobstrideBoard;
 pub use options::{Model, Options, Protocol};
 
-use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
+use crate::recognise::{Finding, Traffic};
+use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::borrow::Cow;
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -103,6 +109,7 @@ use proprio_topics::Kind;
 
 impl Driver for Options {
     const NAME: &'static str = "robstride";
+    const ASKED_BY_NAME: bool = true;
 
     fn outputs(&self) -> Vec<OutputInfo> {
         let motor = OutputInfo {
@@ -118,5 +125,13 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(RobstrideBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        recognise::motors(seen)
+    }
+
+    fn questions(_seen: &Traffic) -> Vec<Frame> {
+        recognise::questions()
     }
 }

@@ -38,6 +38,9 @@
 //! the range of the position are certain. Highly probable: that the same holds for motors in BLDC
 //! mode.
 //!
+//! # Recognition
+//! By the status messages. Nothing is asked.
+//!
 //! # Keys
 //! ```toml
 //! position = "pid"        # "pid" (status 4) or "tachometer" (status 5)
@@ -52,10 +55,12 @@ mod board;
 mod device;
 mod frames;
 mod options;
+mod recognise;
 
 pub use board::VescBoard;
 pub use options::{Options, Position};
 
+use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
 use alloc::borrow::Cow;
 use alloc::boxed::Box;
@@ -82,5 +87,9 @@ impl Driver for Options {
 
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(VescBoard::new(spec, self)?))
+    }
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        recognise::controllers(seen)
     }
 }

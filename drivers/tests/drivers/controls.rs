@@ -280,7 +280,7 @@ fn controls(seed: u64) -> Vec<(String, &'static [&'static str], Traffic)> {
             vec![0x9C, 35, 0x10, 0, 0xF4, 1, a, b]
         });
     }
-    all.push(("MyActuator".into(), &["myactuator_rmd"], bus));
+    all.push(("MyActuator".into(), &["myactuator"], bus));
     // VESC: status 1 of controllers 1 to 4.
     let mut bus = Bus::default();
     for motor in 1..=4_u32 {

@@ -207,14 +207,18 @@ fn a_pair_comes_within_the_stated_time() {
 
 /// Those with the key `period_ms` whose boards do not take it from the host: they are polled, or
 /// set by another program.
-const NOT_SET: [&str; 8] = [
+const NOT_SET: [&str; 12] = [
     "ati_netcanoem",
     "canopen_drive",
     "cubemars",
+    "damiao",
     "icub_mc4",
     "icub_motor",
     "moteus",
+    "myactuator",
     "odrive",
+    "robstride",
+    "vesc",
     "xsens_mti",
 ];
 

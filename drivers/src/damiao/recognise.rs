@@ -1,0 +1,154 @@
+//! Recognising motors by the frames with which they answer commands and questions.
+
+use super::frames::{Message, QUESTIONS, RANGES, READ, STATE, State, question};
+use super::options::Options;
+use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic};
+use crate::{Driver, Frame, Id};
+use alloc::vec::Vec;
+
+/// How many motors a scan asks: people number them from 1 on.
+const ASKED: u8 = 0x20;
+/// The temperatures of a motor that works \[degrees Celsius\].
+const CELSIUS: core::ops::RangeInclusive<u8> = 1..=130;
+/// The ends that a range has.
+const ENDS: core::ops::Range<f32> = 0.5..1000.0;
+/// What an answer with a range counts \[bits\]: four bytes that others send once in 2^32 times, but
+/// small numbers.
+const TELLS: f64 = 16.0;
+
+/// What `frame` tells of the motor at `address`, if it may be its frame.
+fn message(frame: &Frame, address: u8) -> Option<Message> {
+    let data = (frame.len() == 8).then(|| frame.data())?;
+    Message::parse(address, data).filter(|message| match message {
+        Message::State(State { state, celsius, .. }) => {
+            let is_known = matches!(state, 0 | 1 | 5 | 6 | 8..=0xE);
+            is_known && celsius.iter().all(|celsius| CELSIUS.contains(celsius))
+        }
+        Message::Register(..) | Message::Other => true,
+    })
+}
+
+/// The motors that `seen` shows.
+pub(super) fn motors(seen: &Traffic) -> Vec<Finding> {
+    seen.streams().flat_map(|stream| on(seen, stream)).collect()
+}
+
+/// The motors that answer on the identifier of `stream`.
+fn on(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
+    let Id::Standard(host @ 0..0x7FF) = stream.id else {
+        return Vec::new();
+    };
+    // The low halves of their numbers.
+    let mut halves: Vec<u8> = Vec::new();
+    for frame in stream.kept() {
+        if let Some(first) = frame.data().first()
+            && !halves.contains(&(first & 0xF))
+        {
+            halves.push(first & 0xF);
+        }
+    }
+    if halves.len() > 8 {
+        return Vec::new();
+    }
+    // Most streams are none, and this is quick.
+    let is_usual = |frame: &Frame| {
+        let half = frame.data().first().map(|first| first & 0xF);
+        half.is_some_and(|half| message(frame, half).is_some())
+    };
+    if !stream.recent().rev().take(4).all(is_usual) {
+        return Vec::new();
+    }
+    let find = |half: &u8| {
+        // Commands tell the number; without any it is a small one.
+        let numbers = (0..=0xF_u8).map(|high| high << 4 | half);
+        let is_commanded = |number: &u8| {
+            let id = Id::standard((*number).into());
+            *number > 0 && id != stream.id && seen.stream(id).is_some_and(|s| s.frames > 0)
+        };
+        let address = numbers.clone().find(is_commanded).unwrap_or(*half);
+        motor(seen, stream, host, &halves, address)
+    };
+    halves.iter().filter_map(find).collect()
+}
+
+fn motor(
+    seen: &Traffic,
+    stream: &Stream,
+    host: u16,
+    halves: &[u8],
+    address: u8,
+) -> Option<Finding> {
+    if address == 0 {
+        return None;
+    }
+    // Usual are 0 as it is delivered, and the number plus 10 (hexadecimal); and numbers up to 8.
+    let is_usual = host == 0 || host == u16::from(address) + 0x10;
+    let addresses = match (is_usual, address) {
+        (true, 1..=8) => 16,
+        (true, _) => 64,
+        (false, _) => 0x7FF * 15,
+    };
+    let mut evidence = Evidence::with_fd(seen, addresses);
+    let shared = (halves.len() > 1 || host == 0).then_some(address & 0xF);
+    if halves.len() > 1 {
+        evidence.add(-3.0);
+    }
+    evidence.sends_as(Part::Sends(shared), stream.id, |frame| {
+        let own = frame.data().first().map(|first| first & 0xF);
+        own.is_some_and(|own| halves.contains(&own) && message(frame, own).is_some())
+    })?;
+    let is_its =
+        |frame: &Frame| frame.data().first().map(|first| first & 0xF) == Some(address & 0xF);
+    let has_told = |frame: &Frame| match message(frame, address) {
+        Some(Message::Register(register, value)) => {
+            RANGES.contains(&register) && ENDS.contains(&value)
+        }
+        _ => false,
+    };
+    if stream.kept().any(has_told) {
+        evidence.add(TELLS);
+    }
+    evidence.moves(stream, |frame| match message(frame, address) {
+        Some(Message::State(State {
+            raw: [position, velocity, _],
+            ..
+        })) if is_its(frame) => Some((position as f64, velocity as f64 - 2047.5)),
+        _ => None,
+    });
+    let command = Id::standard(address.into());
+    let asks = |frame: &Frame| matches!(frame.data(), [low, 0, ..] if *low == address);
+    let asked = seen.stream(QUESTIONS);
+    if asked.is_some_and(|asked| asked.kept().any(asks)) {
+        evidence.belongs(QUESTIONS);
+    } else {
+        evidence.is_commanded(command, stream, is_its);
+    }
+    // Modes that are not MIT's.
+    for base in [0x100, 0x200, 0x300] {
+        evidence.belongs(Id::standard(base + u16::from(address)));
+    }
+    let finding = evidence.finding(Options::NAME, address.into(), "Damiao motor")?;
+    let model = Key::fill_in("model", "\"DM4310\"", "its ranges depend on it");
+    let host = (host != 0).then(|| Key::new("host_id", host));
+    let period = Key::period_ms(stream.period_of(is_its), 1, 60_000);
+    Some(
+        finding
+            .with_keys([model])
+            .with_keys(host)
+            .with_keys(period)
+            .with_joints([0])
+            .with_commands([command..=command]),
+    )
+}
+
+/// The state and a range of the first motors.
+pub(super) fn questions() -> Vec<Frame> {
+    let [range, ..] = RANGES;
+    let asked = |address| {
+        [
+            question(address, false, STATE, 0),
+            question(address, false, READ, range),
+        ]
+    };
+    (1..=ASKED).flat_map(asked).collect()
+}
