@@ -3,8 +3,8 @@
 //! memory, as any consumer does, and compares them with the simulator's truth at the end.
 //!
 //! The estimator gets a deliberately wrong URDF (`cad.urdf`, called the CAD) and identifies the
-//! robot's inertial parameters and its sensors' offsets on-line. The robot first stands still, which
-//! gives no information, and then moves. For comparison, a second pipeline uses the CAD's
+//! robot's inertial parameters and its sensors' offsets on-line. The robot first stands still,
+//! which gives no information, and then moves. For comparison, a second pipeline uses the CAD's
 //! parameters to the end, with the same offsets.
 
 mod baseline;

@@ -1,5 +1,8 @@
 //! `proprio estimator`: runs the daemon, or checks its configuration against the gateway's.
 
+mod running;
+
+use proprio_estimator::check::Posture;
 use proprio_estimator::config::ConfigError;
 use proprio_estimator::daemon;
 use proprio_estimator::setup::{Setup, nearest};
@@ -17,8 +20,8 @@ pub(crate) struct Args {
     /// that will be withheld, and exit
     #[arg(long)]
     check: bool,
-    /// With --check: the position of a joint [rad or m]; may be repeated; default: that of the robot
-    /// if its gateway runs, else zero
+    /// With --check: the position of a joint [rad or m]; may be repeated; default: that of the
+    /// robot if its gateway runs, else zero
     #[arg(long, value_name = "JOINT=RAD", requires = "check")]
     at: Vec<String>,
     /// With --check: also check that this gateway.toml publishes all channels that the estimator
@@ -32,11 +35,23 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     if !args.check {
         return daemon::run(&args.config, domain);
     }
-    let setup = daemon::check(&args.config, &args.at, domain)?;
+    let setup = daemon::check(&args.config, |setup| posture(setup, &args.at, domain))?;
     match &args.gateway {
         Some(gateway) => fits(&args.config, &setup, gateway),
         None => Ok(()),
     }
+}
+
+/// The posture that is given; without any, that of the robot if its gateway runs.
+fn posture(setup: &Setup, at: &[String], domain: &DomainConfig) -> Result<Posture, String> {
+    if at.is_empty() {
+        match running::posture(setup, domain) {
+            Ok(Some(posture)) => return Ok(posture),
+            Ok(None) => {}
+            Err(why) => tracing::warn!("the posture of the running robot is not known: {why}"),
+        }
+    }
+    Posture::parse(setup, at)
 }
 
 /// Checks that the gateway publishes all channels that the estimator reads; prints the result.

@@ -27,8 +27,8 @@ pub(crate) struct Args {
     /// Duration without motion at the start [s]
     #[arg(long, value_name = "N", default_value_t = 1.0, value_parser = still)]
     still: f64,
-    /// Do not push the robot's hand; otherwise it is pushed from 40 % to 60 % of the duration, or of
-    /// every 20 s without one
+    /// Do not push the robot's hand; otherwise it is pushed from 40 % to 60 % of the duration, or
+    /// of every 20 s without one
     #[arg(long)]
     no_push: bool,
     /// Declare touches of the robot on ROBOT/contact/declared, as a skin does

@@ -3,18 +3,17 @@
 //!
 //! - masses: of the whole robot, and beyond each F/T sensor;
 //! - the readings of the F/T sensors without offsets, with the robot at rest in a posture
-//!   ([`Posture`]), held by its base, under the configured gravity, and without contacts; beside what
-//!   a running robot measures;
+//!   ([`Posture`]), held by its base, under the configured gravity, and without contacts; beside
+//!   what a running robot measures;
 //! - which torques are withheld in that posture, and why ([`Withheld`]);
 //! - joints whose effort limit could not hold the limb beyond them: masses or limits are in other
 //!   units;
 //! - joints of sub-trees with an F/T sensor whose torque can never be determined, because the
 //!   contacts that are always present have more unknowns than there are equations.
 
-mod running;
 mod withheld;
 
-pub use running::posture as running_posture;
+use withheld::Still;
 pub use withheld::Withheld;
 
 use crate::config::STANDARD_GRAVITY;
@@ -78,26 +77,40 @@ pub struct AtRest {
 /// A posture of the robot.
 #[derive(Clone, Debug)]
 pub struct Posture {
-    /// Per degree of freedom, its position \[rad or m\]; NaN: its locked position, else zero, or the
-    /// nearest limit.
+    /// Per degree of freedom, its position \[rad or m\]; NaN: its locked position, else zero, or
+    /// the nearest limit.
     position: Vec<f64>,
-    /// The proper acceleration that the IMU at the base measures, in its axes \[m/s^2\].
-    proper_acceleration: Option<Vec3>,
-    /// Per F/T sensor, what it measures.
-    measured: Option<Vec<Wrench>>,
-    /// By how much a joint moved while this was measured \[rad or m\].
-    moved: f64,
+    measured: Option<Measured>,
+}
+
+/// What a running robot measures in a posture.
+#[derive(Clone, Debug)]
+pub struct Measured {
+    /// Per F/T sensor, its reading.
+    pub wrenches: Vec<Wrench>,
+    /// The proper acceleration of the IMU at the base, in its axes \[m/s^2\].
+    pub proper_acceleration: Option<Vec3>,
+    /// By how much a joint moved meanwhile \[rad or m\].
+    pub moved: f64,
 }
 
 impl Posture {
+    /// The posture of a running robot: per degree of freedom the position \[rad or m\], NaN where
+    /// nobody measures it.
+    #[must_use]
+    pub const fn measured(position: Vec<f64>, measured: Measured) -> Self {
+        Self {
+            position,
+            measured: Some(measured),
+        }
+    }
+
     /// No position is known.
     #[must_use]
     pub fn unknown(setup: &Setup) -> Self {
         Self {
             position: vec![f64::NAN; setup.robot.model.dof_count()],
-            proper_acceleration: None,
             measured: None,
-            moved: 0.0,
         }
     }
 
@@ -128,17 +141,6 @@ impl Posture {
         }
         Ok(posture)
     }
-}
-
-/// The robot at rest in a posture.
-struct Still {
-    position: Vec<f64>,
-    /// The motion of the base link.
-    base: FrameMotion,
-    /// A contact that is declared to be present: that of the foot on which the robot stands.
-    declared: Option<usize>,
-    /// Per F/T sensor, its reading without offset.
-    loads: Vec<Wrench>,
 }
 
 impl Check {
@@ -185,7 +187,8 @@ impl Check {
         // Where gravity is known, and the link by which the robot is held.
         let (known, motion, held, words) = match &setup.robot.base {
             BaseMotion::Imu(x_li) => {
-                let measured = posture.proper_acceleration;
+                let measured = posture.measured.as_ref();
+                let measured = measured.and_then(|measured| measured.proper_acceleration);
                 let base = setup.robot.base_link;
                 let (known, motion) = measured.map_or((0, upright), |proper| {
                     let imu = FrameMotion::standing(&-proper);
@@ -217,7 +220,7 @@ impl Check {
             .map(|cut| cut.reading(&dynamics.transmitted(&kinematics, cut.joint())))
             .collect();
         let measured = |number: usize| {
-            let raw = posture.measured.as_ref()?.get(number)?;
+            let raw = posture.measured.as_ref()?.wrenches.get(number)?;
             let calibration = setup.state.calibrations.get(number)?;
             Some(calibration.apply(raw, f64::NAN))
         };
@@ -361,15 +364,17 @@ fn posture_words(setup: &Setup, posture: &Posture, position: &[f64]) -> String {
         .filter(|(_, given)| given.is_finite())
         .map(|((name, position), _)| format!("{name} {}", (1e3 * position).round() / 1e3 + 0.0))
         .collect();
-    let moved = if posture.moved > MOVED {
-        " (it moves, so what it measures is not at rest)"
-    } else {
-        ""
-    };
-    match (posture.measured.is_some(), given.is_empty()) {
-        (true, _) => format!("of the running robot{moved}: {}", given.join(", ")),
-        (false, true) => "joints at zero, or the nearest limit (--at JOINT=RAD)".to_owned(),
-        (false, false) => format!("{}, others at zero or the nearest limit", given.join(", ")),
+    match (&posture.measured, given.is_empty()) {
+        (Some(measured), _) => {
+            let moved = if measured.moved > MOVED {
+                " (it moves, so what it measures is not at rest)"
+            } else {
+                ""
+            };
+            format!("of the running robot{moved}: {}", given.join(", "))
+        }
+        (None, true) => "joints at zero, or the nearest limit (--at JOINT=RAD)".to_owned(),
+        (None, false) => format!("{}, others at zero or the nearest limit", given.join(", ")),
     }
 }
 

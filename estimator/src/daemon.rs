@@ -6,7 +6,7 @@
 //! services that are not there yet, so gateway and estimator can start in any order, and either can
 //! be killed and started again.
 
-use crate::check::{Check, Posture, running_posture};
+use crate::check::{Check, Posture};
 use crate::config::{Config, ConfigError};
 use crate::files;
 use crate::first_look::FirstLook;
@@ -46,26 +46,22 @@ const STALLED: Nanos = Nanos::from_millis(500);
 /// Most samples taken at once: as many as can be queued from all buses (6 MB).
 const INBOX: usize = <Sample as Topic>::QUALITY.buffer * <Sample as Topic>::QUALITY.publishers;
 
-/// Checks a configuration, and prints what the estimator would read and estimate (`--check`), with
-/// the joints `at` these positions ([`Posture::parse`]). Without any, the posture is that of the
-/// robot if its gateway runs in `domain`.
+/// Checks a configuration, and prints what the estimator would read and estimate (`--check`), in
+/// the `posture` that is returned for its setup.
 ///
 /// # Errors
 /// As for [`run`].
-pub fn check(config: &Path, at: &[String], domain: &DomainConfig) -> anyhow::Result<Setup> {
+pub fn check(
+    config: &Path,
+    posture: impl FnOnce(&Setup) -> Result<Posture, String>,
+) -> anyhow::Result<Setup> {
     let (_, setup) = load(config, |_| {})?;
     let file = config.to_owned();
-    let posture = Posture::parse(&setup, at);
-    let mut posture = posture.map_err(|problem| ConfigError {
+    let wrong = |problem| ConfigError {
         file: file.clone(),
         problem,
-    })?;
-    if at.is_empty() {
-        match running_posture(&setup, domain) {
-            Ok(running) => posture = running.unwrap_or(posture),
-            Err(why) => tracing::warn!("the posture of the running robot is not known: {why}"),
-        }
-    }
+    };
+    let posture = posture(&setup).map_err(wrong)?;
     let checked = Check::of(&setup, &posture).context("the configuration cannot be checked")?;
     // The reader of a pipe may close it early.
     let _ = write!(std::io::stdout(), "{setup}{checked}");

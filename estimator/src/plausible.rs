@@ -7,16 +7,15 @@
 //! | quantity | credible | because |
 //! |---|---|---|
 //! | length of `gravity_mps2` | 9.7 to 9.9 m/s^2 | 9.764 to 9.834 on Earth, and rounding |
-//! | `xyz_m`, `position_m` | the robot's length, 2 m at least | a point on a link lies on the robot |
+//! | `xyz_m`, `position_m` | the robot's length, 2 m at least | points lie on the robot |
 //! | `rpy_rad`, a locked revolute joint | a full turn | more is no other angle |
 //! | a link's density | osmium, 22590 kg/m^3 | no material is denser |
 //! | a link's radius of gyration, centre of mass | as for `xyz_m` | the same |
 //!
 //! The density is the least that mass and inertia allow: of all bodies of one density with a given
-//! radius of gyration (root of the mean square distance of their mass from its centre), the ball has
-//! the largest volume; its radius is the root of 5/3 times that. The robot's length is that of its
-//! longest chain of joint origins. Distances of centres of mass and radii of gyration are not part of
-//! it, so a robot whose joints are all in one place counts as 2 m long, as few links are longer.
+//! radius of gyration (root of the mean square distance of their mass from its centre), the ball
+//! has the largest volume; its radius is the root of 5/3 times that. The robot's length is that of
+//! its longest chain of joint origins, but 2 m at least: few links are longer.
 
 use crate::config::{Base, Config};
 use proprio_dynamics::model::{JointKind, Model};
@@ -280,15 +279,16 @@ mod tests {
     fn urdf(mass: f64, com: f64, inertia: f64) -> String {
         let link = |name: &str, mass: f64, com: f64, i: f64| {
             format!(
-                "<link name=\"{name}\"><inertial><origin xyz=\"{com} 0 0\"/><mass value=\"{mass}\"/>\
+                "<link name=\"{name}\"><inertial><origin xyz=\"{com} 0 0\"/>\
+                 <mass value=\"{mass}\"/>\
                  <inertia ixx=\"{i}\" ixy=\"0\" ixz=\"0\" iyy=\"{i}\" iyz=\"0\" izz=\"{i}\"/>\
                  </inertial></link>"
             )
         };
         format!(
             "<robot name=\"r\">{}{}<joint name=\"j\" type=\"revolute\"><parent link=\"base\"/>\
-             <child link=\"arm\"/><origin xyz=\"0 0 0.5\"/><axis xyz=\"0 1 0\"/><limit lower=\"-2\" \
-             upper=\"2\" effort=\"9\" velocity=\"5\"/></joint></robot>",
+             <child link=\"arm\"/><origin xyz=\"0 0 0.5\"/><axis xyz=\"0 1 0\"/>\
+             <limit lower=\"-2\" upper=\"2\" effort=\"9\" velocity=\"5\"/></joint></robot>",
             link("base", 5.0, 0.0, 0.02),
             link("arm", mass, com, inertia)
         )
@@ -307,7 +307,7 @@ mod tests {
             (
                 "-9.81]",
                 "-1]",
-                "base.gravity_mps2 = [0, 0, -1] looks like a multiple of g; in m/s^2 it is [0, 0, -9.80665]",
+                "looks like a multiple of g; in m/s^2 it is [0, 0, -9.80665]",
             ),
             (
                 "[0, 0, -9.81]",
@@ -323,7 +323,7 @@ mod tests {
             (
                 "[0.01, 0, -0.02]",
                 "[10, 0, -20]",
-                "force_torque \"ft\": xyz_m = [10, 0, -20] looks like millimetres; in m it is [0.01, 0, -0.02]",
+                "\"ft\": xyz_m = [10, 0, -20] looks like millimetres; in m it is [0.01, 0, -0.02]",
             ),
             (
                 "[0, 3.14, -6.283186]",

@@ -593,7 +593,8 @@ fn a_wrong_estimator_toml_is_told_with_file_place_and_what_would_be_legal() {
     );
     for what in [
         "mass of all links: ",
-        "readings of the F/T sensors without offsets",
+        "readings of the F/T sensors in it, without offsets",
+        "withheld at rest in this posture: nothing",
         "  l_arm_ft_sensor: force [",
     ] {
         assert!(check.contains(what), "{check}");

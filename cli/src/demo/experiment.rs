@@ -19,12 +19,12 @@ pub(crate) struct Args {
     /// Duration [s]: the robot stands still for a quarter of it (at most 10 s), then moves
     #[arg(long, value_name = "N", default_value_t = 40.0, value_parser = seconds)]
     pub(crate) seconds: f64,
-    /// Relative error of masses and first moments in the estimator's URDF, the CAD; moments of inertia
-    /// have about the same
+    /// Relative error of masses and first moments in the estimator's URDF, the CAD; moments of
+    /// inertia have about the same
     #[arg(long, value_name = "SHARE", default_value_t = 0.2, value_parser = share)]
     pub(crate) cad_error: f64,
-    /// Output folder for report.html, estimates.csv, summary.json, the CAD, the configuration and the
-    /// processes' logs
+    /// Output folder for report.html, estimates.csv, summary.json, the CAD, the configuration and
+    /// the processes' logs
     #[arg(long, value_name = "DIR", default_value = "proprio-demo")]
     pub(crate) out: PathBuf,
     /// CAN interfaces to use instead of virtual buses: one per bus of the robot, or a single one

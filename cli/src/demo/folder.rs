@@ -16,8 +16,8 @@ pub(super) fn read(file: &Path) -> anyhow::Result<toml::Table> {
     text.parse().with_context(|| file.display().to_string())
 }
 
-/// Copies the robot's configuration, and all files that it names, to the folder `to`. If `buses` are
-/// given, they replace the sources of its buses.
+/// Copies the robot's configuration, and all files that it names, to the folder `to`. If `buses`
+/// are given, they replace the sources of its buses.
 pub(super) fn copy_robot(robot: &Robot, buses: &[String], to: &Path) -> anyhow::Result<()> {
     let mut gateway = read(&robot.folder.join("gateway.toml"))?;
     if let (false, Some(toml::Value::Array(list))) = (buses.is_empty(), gateway.get_mut("bus")) {

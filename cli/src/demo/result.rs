@@ -6,7 +6,7 @@
 //! |---|---|
 //! | `verdict`, `worked` | one sentence, and true, false, or null if it cannot be told |
 //! | `torque_rms_error_nm` | per joint, RMS of estimated minus true torque \[Nm\] (1, 4) |
-//! | `valid_estimates` | per joint, the number of estimates in this figure: those not withheld (1) |
+//! | `valid_estimates` | per joint, the number of estimates in that figure: the valid ones (1) |
 //! | `valid_share` | fraction of the torques that were not withheld (1) |
 //! | `identification.cad_error` | relative error of masses and first moments of `cad.urdf` (2) |
 //! | `identification.refused` | why nothing was identified; null if something was |
@@ -31,11 +31,11 @@
 //! (5) Those whose true value is within twice the stated standard deviation of the last solution;
 //! null without a solution.
 //!
-//! Each of the three phases contains, over the valid estimates, `cad` and `identified`: per joint the
-//! RMS error \[Nm\] with the CAD's inertial parameters and with those identified on-line, both with
-//! the offsets that identification found; `valid_estimates`: per joint, their number; `valid_share`;
-//! and `within_2_sigma`, the fraction of these torques whose error is within twice the stated
-//! standard deviation.
+//! Each of the three phases contains, over the valid estimates, `cad` and `identified`: per joint
+//! the RMS error \[Nm\] with the CAD's inertial parameters and with those identified on-line, both
+//! with the offsets that identification found; `valid_estimates`: per joint, their number;
+//! `valid_share`; and `within_2_sigma`, the fraction of these torques whose error is within twice
+//! the stated standard deviation.
 
 mod compared;
 mod evaluation;

@@ -5,12 +5,12 @@
 //! The cause of an uncertain torque is what makes it certain when it is taken as known: first the
 //! offsets of the F/T sensors, then the URDF's inertial parameters, too.
 
-use super::Still;
 use crate::inertial::InertialState;
 use crate::pipeline::Pipeline;
 use crate::setup::Setup;
 use nalgebra::Vector6;
-use proprio_dynamics::spatial::Wrench;
+use proprio_dynamics::FrameMotion;
+use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_identification::robot::{BaseMotion, ChannelRole};
 use proprio_topics::{
     ContactState, Imu, JointState, JointTorque, Nanos, Quality, Reading, Reason, Temperature,
@@ -21,6 +21,18 @@ use proprio_topics::{
 const INSTANTS: i64 = 128;
 /// Longest time between two instants.
 const PERIOD: Nanos = Nanos::from_millis(5);
+
+/// The robot at rest in a posture.
+pub(super) struct Still {
+    /// Per degree of freedom \[rad or m\].
+    pub(super) position: Vec<f64>,
+    /// The motion of the base link.
+    pub(super) base: FrameMotion,
+    /// A contact that is declared to be present: that of the foot on which the robot stands.
+    pub(super) declared: Option<usize>,
+    /// Per F/T sensor, its reading without offset.
+    pub(super) loads: Vec<Wrench>,
+}
 
 /// What would be withheld.
 #[derive(Clone, Debug, Default)]
@@ -242,7 +254,7 @@ fn raw(setup: &Setup, still: &Still, sensor: usize) -> proprio_topics::Wrench {
 
 impl Still {
     /// What an IMU as base measures.
-    fn imu(&self, base: &BaseMotion) -> proprio_dynamics::spatial::Vec3 {
+    fn imu(&self, base: &BaseMotion) -> Vec3 {
         match base {
             BaseMotion::Imu(pose) => self.base.at(pose).proper_acceleration,
             _ => self.base.proper_acceleration,

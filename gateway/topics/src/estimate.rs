@@ -85,8 +85,8 @@ pub const NO_CAUSE: u32 = u32::MAX;
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
 pub struct JointTorque {
     /// Torque \[Nm\] (force \[N\] for a prismatic joint) exerted by the parent link on the child
-    /// link along the URDF axis. It is the link-side torque: without rotor inertia and friction. NaN
-    /// if it is withheld.
+    /// link along the URDF axis. It is the link-side torque: without rotor inertia and friction.
+    /// NaN if it is withheld.
     pub torque: f64,
     /// Its standard deviation \[Nm\]. NaN if it is withheld, except for [`Reason::Uncertain`]: then
     /// it is what exceeds the bound.

@@ -172,10 +172,10 @@ mod tests {
     fn a_verdict_says_what_it_rests_on() {
         assert_eq!(
             Verdict::of(&GOOD).sentence(),
-            "It worked: at the 4 joints beyond the F/T sensor the RMS error of the torques is 0.030 \
-             Nm with the identified parameters and 0.070 Nm with the CAD's, from 10 s of motion on; \
-             99.9 % of all torques were valid, 98.0 % of these within two standard deviations of \
-             the truth."
+            "It worked: at the 4 joints beyond the F/T sensor the RMS error of the torques is \
+             0.030 Nm with the identified parameters and 0.070 Nm with the CAD's, from 10 s of \
+             motion on; 99.9 % of all torques were valid, 98.0 % of these within two \
+             standard deviations of the truth."
         );
         for (findings, worked, words) in [
             (

@@ -1,8 +1,8 @@
 //! The posture of a running robot, and what its sensors measure meanwhile, from shared memory.
 
-use super::Posture;
-use crate::setup::Setup;
 use proprio_dynamics::spatial::{Vec3, Wrench};
+use proprio_estimator::check::{Measured, Posture};
+use proprio_estimator::setup::Setup;
 use proprio_identification::robot::ChannelRole;
 use proprio_topics::Nanos;
 use proprio_topics::ipc::{
@@ -19,7 +19,7 @@ const STEP: Nanos = Nanos::from_millis(5);
 ///
 /// # Errors
 /// A text: the gateway runs, but a channel cannot be read.
-pub fn posture(setup: &Setup, domain: &DomainConfig) -> Result<Option<Posture>, String> {
+pub(crate) fn posture(setup: &Setup, domain: &DomainConfig) -> Result<Option<Posture>, String> {
     let Ok(open) = Domain::open_existing(domain) else {
         return Ok(None);
     };
@@ -75,27 +75,29 @@ pub fn posture(setup: &Setup, domain: &DomainConfig) -> Result<Option<Posture>, 
             Err(why) => return Err(why),
         }
     }
-    let mut posture = Posture::unknown(setup);
-    let mut loads = vec![Wrench::zero(); setup.robot.structure.sensors().len()];
+    let mut position = vec![f64::NAN; setup.robot.model.dof_count()];
+    let mut measured = Measured {
+        wrenches: vec![Wrench::zero(); setup.robot.structure.sensors().len()],
+        proper_acceleration: None,
+        moved,
+    };
     for ((role, ..), sum) in channels.iter().zip(&sums) {
         let [a, b, c, d, e, f] = sum.map(|sum| sum / count);
         match role {
             ChannelRole::Joint(dof) => {
-                if let Some(place) = posture.position.get_mut(*dof) {
+                if let Some(place) = position.get_mut(*dof) {
                     *place = a;
                 }
             }
             ChannelRole::Sensor(sensor) => {
-                if let Some(place) = loads.get_mut(*sensor) {
+                if let Some(place) = measured.wrenches.get_mut(*sensor) {
                     *place = Wrench::from_parts([a, b, c], [d, e, f]);
                 }
             }
-            ChannelRole::Base => posture.proper_acceleration = Some(Vec3::new(a, b, c)),
+            ChannelRole::Base => measured.proper_acceleration = Some(Vec3::new(a, b, c)),
         }
     }
-    posture.measured = Some(loads);
-    posture.moved = moved;
-    Ok(Some(posture))
+    Ok(Some(Posture::measured(position, measured)))
 }
 
 /// The numbers of a channel that the posture needs.
