@@ -8,7 +8,7 @@
 use crate::inertial::InertialState;
 use crate::pipeline::Pipeline;
 use crate::setup::Setup;
-use nalgebra::Vector6;
+use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::FrameMotion;
 use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_identification::robot::{BaseMotion, ChannelRole};
@@ -241,7 +241,7 @@ fn raw(setup: &Setup, still: &Still, sensor: usize) -> proprio_topics::Wrench {
     let of = |wrenches: &[Wrench]| wrenches.get(sensor).copied().unwrap_or(Wrench::zero());
     let corrected = of(&still.loads) + of(&setup.state.offsets);
     let gain = setup.state.calibrations.get(sensor).map(|c| *c.gain());
-    let inverse = gain.and_then(|gain| gain.try_inverse());
+    let inverse = gain.and_then(Matrix6::try_inverse);
     let corrected = Vector6::from(corrected.torque_first());
     let [tx, ty, tz, fx, fy, fz] = inverse
         .map_or(corrected, |inverse| inverse * corrected)
