@@ -76,7 +76,9 @@ impl Told {
         };
         let mut this = Self::default();
         for scale in SCALES {
-            value(scale).map(|told| this.set(scale, told));
+            if let Some(told) = value(scale) {
+                this.set(scale, told);
+            }
         }
         this
     }
