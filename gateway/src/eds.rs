@@ -59,9 +59,11 @@ fn parse(text: &str) -> Result<Objects, String> {
     let mut form = IniDefault::default();
     form.delimiters = vec!['='];
     form.comment_symbols = vec![';'];
-    // A section's name that does not end would refuse the whole file.
-    let is_broken = |line: &&str| line.trim_start().starts_with('[') && !line.contains(']');
-    let lines = text.lines().filter(|line| !is_broken(line));
+    // A section's name that does not end would refuse the whole file. What follows is of no section
+    // that is known.
+    let is_broken = |line: &str| line.trim_start().starts_with('[') && !line.contains(']');
+    let lines = text.lines();
+    let lines = lines.map(|line| if is_broken(line) { "[?]" } else { line });
     let sections = Ini::new_from_defaults(form)
         .read(lines.collect::<Vec<_>>().join("\n"))
         .map_err(|e| format!("is no EDS or DCF file: {e}"))?;
