@@ -179,8 +179,9 @@ fn check(folder: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The copies of the configuration in `folder` into `etc`, with the files that it names. A file that
-/// is there and differs is an error, unless by `force`: it may hold what was measured on the robot.
+/// The copies of the configuration in `folder` into `etc`, with the files that it names. A file
+/// that is there and differs is an error, unless by `force`: it may hold what was measured on the
+/// robot.
 fn configuration(folder: &Path, etc: &Path, force: bool) -> anyhow::Result<Vec<Step>> {
     let mut names = BTreeSet::new();
     for config in SERVICES.map(|service| service.config) {

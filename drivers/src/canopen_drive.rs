@@ -25,10 +25,11 @@
 //! say, else status, position and mode (TPDO 1) and velocity (TPDO 2): by `sync`, or each
 //! `period_ms` (1800 sub 5). Other TPDOs stay as they are. Nothing is stored in the node.
 //!
-//! - The rated torque of maxon's drives (maker 0xFB: object 1018 sub 1, or VendorNumber of the file)
-//!   is in millionths of a newton metre. Others may have other units, too: a rated torque that no
-//!   motor has with its rated current (less than 0.0005 or more than 50 Nm/A), or with its greatest
-//!   speed (6080; more than 50 kW), is refused. `rated_torque_unit` or `rated_torque` settle it.
+//! - The rated torque of maxon's drives (maker 0xFB: object 1018 sub 1, or VendorNumber of the
+//!   file) is in millionths of a newton metre. Others may have other units, too: a rated torque
+//!   that no motor has with its rated current (less than 0.0005 or more than 50 Nm/A), or with its
+//!   greatest speed (6080; more than 50 kW), is refused. `rated_torque_unit` or `rated_torque`
+//!   settle it.
 //! - If the position is sent by SYNC (transmission 0 to 240), a reading holds the values of all
 //!   TPDOs that one SYNC has caused, and `acquired` is the time of that SYNC. An incomplete reading
 //!   is dropped, and the next one too: it may hold a late value of the one before.
@@ -41,12 +42,13 @@
 //! A node that boots or leaves the operational state is started again.
 //!
 //! Mapping and scales are those of the keys; else what the drive says; else those of the maker's
-//! file, `eds`, in which what is not used may be wrong. A drive is asked. If another program commands it (`listen_only`, or a recorded
-//! log), its answers to that program count, and what that program writes to it. Of scales a file
-//! counts if it is a DCF that states them (ParameterValue), or if they are constants: an EDS is of
-//! a kind of drive, and knows no motor; but its units (60A8, 60A9) and its maker count. The bus is opened for the identifiers of the keys or the
-//! file, else those of CiA 301, also for a TPDO that the file switches off: the drive may have it
-//! on. A drive that sends at another one is refused, with that identifier.
+//! file, `eds`, in which what is not used may be wrong. A drive is asked. If another program
+//! commands it (`listen_only`, or a recorded log), its answers to that program count, and what that
+//! program writes to it. Of scales a file counts if it is a DCF that states them (ParameterValue),
+//! or if they are constants: an EDS is of a kind of drive, and knows no motor; but its units (60A8,
+//! 60A9) and its maker count. The bus is opened for the identifiers of the keys or the file, else
+//! those of CiA 301, also for a TPDO that the file switches off: the drive may have it on. A drive
+//! that sends at another one is refused, with that identifier.
 //!
 //! Sources: CiA 301 4.2, CiA 303-2 (codes of units), CiA 306 1.3, CiA 402 4.0 (IEC 61800-7-201); a
 //! file that EPOS Studio made of an EPOS4. Certain, but for the units of velocity, torque and

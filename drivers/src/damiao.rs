@@ -8,14 +8,14 @@
 //!
 //! | identifier | from | content |
 //! |---|---|---|
-//! | `host_id` | motor | ID and state u4 each, position u16, velocity u12, torque u12, temperatures |
-//! | `host_id` | motor | ID u16, `33`, register, value: answers a question; `55`, `AA` other requests |
+//! | `host_id` | motor | ID, state u4, position u16, velocity u12, torque u12, temperatures |
+//! | `host_id` | motor | ID u16, `33`, register, value: an answer; `55`, `AA`: to other requests |
 //! | `7FF` | host | ID u16, `CC`, 0: asks for the first of these frames |
 //! | `7FF` | host | ID u16, `33`, register, 0: asks for a register |
 //!
 //! - The first byte is the state << 4 | the low half of the ID. ID and values of registers are
-//!   little-endian, the rest is big-endian. Raw 0 is the lower end of a range, the largest raw value
-//!   its upper end; ranges are symmetric. A value at an end is SATURATED.
+//!   little-endian, the rest is big-endian. Raw 0 is the lower end of a range, the largest raw
+//!   value its upper end; ranges are symmetric. A value at an end is SATURATED.
 //! - Motors may share a `host_id`, if the low halves of their IDs differ: each device takes the
 //!   frames with its own.
 //! - The temperatures, u8 in degrees Celsius, are those of the power stage and of the rotor, with
@@ -35,17 +35,17 @@
 //! # What is sent
 //! Without `request_period_ms` nothing: another program commands the motors, and its answers are
 //! read. With it, the driver asks for the state that often; the motor needs not be enabled for
-//! that. It never sends anything else than the two frames of the table on `7FF`, with `CC`, and with
-//! `33` and the registers 21, 22 and 23: none enables, disables, moves or configures a motor. Not
-//! known is whether a question counts as a command for the time-out of register 9: where a program
-//! commands the motors as well, do not rely on that time-out.
+//! that. It never sends anything else than the two frames of the table on `7FF`, with `CC`, and
+//! with `33` and the registers 21, 22 and 23: none enables, disables, moves or configures a
+//! motor. Not known is whether a question counts as a command for the time-out of register 9: where
+//! a program commands the motors as well, do not rely on that time-out.
 //!
 //! # Ranges
 //! A range is that of its key if one is given, else the one that the motor itself tells (registers
-//! 21, 22, 23, asked at each start if `request_period_ms` is given, or by another program), else the
-//! model's. Without any, the motor's frames count as unexpected until it has told. **A wrong range
-//! gives wrong values that look right.** The ranges can be set in the motor; a DM3507 has 50 rad/s
-//! and 5 Nm or 30 and 10, a DM4340 has 8 or 10 rad/s, as its firmware was made.
+//! 21, 22, 23, asked at each start if `request_period_ms` is given, or by another program), else
+//! the model's. Without any, the motor's frames count as unexpected until it has told. **A wrong
+//! range gives wrong values that look right.** The ranges can be set in the motor; a DM3507 has 50
+//! rad/s and 5 Nm or 30 and 10, a DM4340 has 8 or 10 rad/s, as its firmware was made.
 //!
 //! | model | velocity \[rad/s\] | torque \[Nm\] |
 //! |---|---|---|
@@ -66,9 +66,9 @@
 //! it is not known: if it goes on at the other end, `wraps_rad` (docs/joints.md) counts on.
 //!
 //! Sources: `openarm_can` 98666042 (enactic), LeRobot 7427f318, `damiao-motor` 1.0.6, `pydamiao`
-//! 0.1.4, edometro/DAMIAO_Control_Arduino (states 5 and 6); default ranges of Seeed's wiki on Damiao
-//! motors. Layouts and states are certain, but for states 5 and 6 (highly probable); the ranges of
-//! the models are highly probable.
+//! 0.1.4, edometro/DAMIAO_Control_Arduino (states 5 and 6); default ranges of Seeed's wiki on
+//! Damiao motors. Layouts and states are certain, but for states 5 and 6 (highly probable); the
+//! ranges of the models are highly probable.
 //!
 //! A frame of a disabled motor whose position is the raw value `0033`, `0055` or `00AA`, hundredths
 //! of a radian from the lower end, looks like an answer about a register, and is taken for one.

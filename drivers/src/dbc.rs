@@ -10,9 +10,9 @@
 //!   have is taken from the pages that have other signals of the reading.
 //! - A message or signal that can not be used does no harm unless it is named: one of more than 64
 //!   bits, or an identifier of more than 11 bits that is not marked as an extended one.
-//! - SAE J1939 (attribute `VFrameFormat` or `ProtocolType`): the parameter group counts, and not the
-//!   priority, the source and, where the group has one, the destination that are in the file. If
-//!   the file has several messages of one group, their addresses count. Messages of more than 8
+//! - SAE J1939 (attribute `VFrameFormat` or `ProtocolType`): the parameter group counts, and not
+//!   the priority, the source and, where the group has one, the destination that are in the file.
+//!   If the file has several messages of one group, their addresses count. Messages of more than 8
 //!   bytes, which come in several packets, are not read.
 //! - Names: those in the file, and the long ones that editors keep beside them
 //!   (`SystemMessageLongSymbol`, `SystemSignalLongSymbol`). Where several messages have one name,

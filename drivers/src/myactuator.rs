@@ -11,9 +11,9 @@
 //! | the same | motor | 9A | temperature i8; errors: bytes 6 and 7 (V2: 7) |
 //! | `500` + ID | motor | | V4: ID u8, position u16, velocity u12, torque u12 (big-endian) |
 //!
-//! - Speed i16 \[deg/s\]. V3: current i16 \[0.01 A\], place i16 \[deg\]. V2: current i16 \[its steps
-//!   depend on the model: `ampere_per_step`\], place u16 of an encoder with `encoder_bits`, which
-//!   begins anew each turn. A value at an end of its range is SATURATED.
+//! - Speed i16 \[deg/s\]. V3: current i16 \[0.01 A\], place i16 \[deg\]. V2: current i16 \[its
+//!   steps depend on the model: `ampere_per_step`\], place u16 of an encoder with `encoder_bits`,
+//!   which begins anew each turn. A value at an end of its range is SATURATED.
 //! - `position` chooses what is a reading of the joint: an `angle` (92), which counts turns and is
 //!   fine; the place in a `status` (9C and answers to commands), which is coarse in V3 and within a
 //!   turn in V2 (`wraps_rad`, docs/joints.md); or a frame of the `motion` mode. Speed and current
@@ -25,14 +25,14 @@
 //!   is DEVICE_FAULT; any other, in V2 all, DRIVE_FAULT.
 //!
 //! In V2 commands and answers have one identifier. What cannot be an answer is taken for a command:
-//! zeros alone, and A1 to A9 with a temperature of 0 or 1. (An angle of exactly 0 is such a frame: a
-//! device that asks itself takes it, one that listens misses it.)
+//! zeros alone, and A1 to A9 with a temperature of 0 or 1. (An angle of exactly 0 is such a frame:
+//! a device that asks itself takes it, one that listens misses it.)
 //!
 //! # What is sent
-//! Without `request_period_ms` nothing: the answers to another program are read. With it, the driver
-//! asks that often for `9C`, and for `92` if `position = "angle"`, and once a second for `9A`, with
-//! seven zeros each: none of them enables, stops, moves or configures a motor, and it never sends
-//! anything else. Whether a question feeds the motor's watchdog (`B3`) is not known.
+//! Without `request_period_ms` nothing: the answers to another program are read. With it, the
+//! driver asks that often for `9C`, and for `92` if `position = "angle"`, and once a second for
+//! `9A`, with seven zeros each: none of them enables, stops, moves or configures a motor, and it
+//! never sends anything else. Whether a question feeds the motor's watchdog (`B3`) is not known.
 //!
 //! Sources: 2b-t/myactuator_rmd c43980ca (protocol V3.8, with test vectors),
 //! yukunlin1124/myactuator_rmd_v4.3 564d3cda, `pylkmotor` 1.0.6, `NekoRMD` 0.2.2. Layouts of V3 and

@@ -10,28 +10,28 @@
 //!
 //! | type | from | upper byte | content |
 //! |---|---|---|---|
-//! | 02, 18 | motor | mode << 6, faults | position, velocity, torque, temperature \[0.1 deg\]: u16 |
+//! | 02, 18 | motor | mode << 6, faults | position, velocity, torque u16, temperature u16 |
 //! | 15 | motor | | faults u32, warnings u32 |
 //! | 11 | motor | 0: read | parameter u16, 0, value f32: an answer |
 //! | 11 | host | 0 | parameter u16, 0: a question |
 //!
-//! Values of 02 (and 18, the active report) are big-endian, the others little-endian. Raw 0 is the
-//! lower end of a range, 65535 its upper end; a value at an end is SATURATED. Positions go on at
-//! the other end of their range, four turns away, in newer firmware: `wraps_rad =
-//! [-12.566370614359172, 12.566370614359172]` (docs/joints.md).
+//! The temperature is in 0.1 deg. Values of 02 (and 18, the active report) are big-endian, the
+//! others little-endian. Raw 0 is the lower end of a range, 65535 its upper end; a value at an end
+//! is SATURATED. Positions go on at the other end of their range, four turns away, in newer
+//! firmware: `wraps_rad = [-12.566370614359172, 12.566370614359172]` (docs/joints.md).
 //!
 //! # MIT protocol
-//! With `protocol = "mit"`, as LeRobot sets these motors: standard identifiers, frames of 8 bytes on
-//! `host_id`: address u8, position u16, velocity u12, torque u12, temperature u16 \[0.1 deg\]. One
-//! whose last three bytes are 0 is an answer about faults (u32, little-endian, after the address).
-//! Motors may share a `host_id`.
+//! With `protocol = "mit"`, as LeRobot sets these motors: standard identifiers, frames of 8 bytes
+//! on `host_id`: address u8, position u16, velocity u12, torque u12, temperature u16 \[0.1 deg\].
+//! One whose last three bytes are 0 is an answer about faults (u32, little-endian, after the
+//! address). Motors may share a `host_id`.
 //!
 //! # State
 //! Temperature and faults are told once a second, and when the faults or the mode change. The
 //! temperature's channel is `<device>_motor`; `mode` of the actuator reading is 0 reset, 1
 //! calibration, 2 running. `faults`: bits 0 to 16 are those of a frame 15 (or of the MIT protocol),
-//! bits 24 to 29 the six of a frame 02. A frame 15 holds until the next one, or until the motor runs
-//! without faults.
+//! bits 24 to 29 the six of a frame 02. A frame 15 holds until the next one, or until the motor
+//! runs without faults.
 //!
 //! | bits | meaning | effect on a joint reading |
 //! |---|---|---|
@@ -43,10 +43,10 @@
 //! # What is sent
 //! Without `request_period_ms` nothing: another program commands the motors, or has turned their
 //! active report on. With it, the driver reads the parameters 701B, 701A and 7019 that often:
-//! velocity, current, position, of which the last counts its turns. It never sends anything but these
-//! questions (type 11): none enables, stops, moves or configures a motor. Then the position comes
-//! from these answers alone, and frames 02 give the state. Not known is whether a question counts as
-//! a command for the motor's time-out (7028).
+//! velocity, current, position, of which the last counts its turns. It never sends anything but
+//! these questions (type 11): none enables, stops, moves or configures a motor. Then the position
+//! comes from these answers alone, and frames 02 give the state. Not known is whether a question
+//! counts as a command for the motor's time-out (7028).
 //!
 //! | model | velocity \[rad/s\]: private, MIT | torque \[Nm\] |
 //! |---|---|---|

@@ -6,7 +6,7 @@
 //!
 //! | command | name | bytes | content |
 //! |---|---|---|---|
-//! | 09 | status | 8 | speed i32 \[electrical rev/min\], current i16 \[0.1 A\], duty i16 \[1/1000\] |
+//! | 09 | status | 8 | electrical speed i32 \[rev/min\], current i16 \[0.1 A\], duty i16 \[0.1 %\] |
 //! | 0E | status 2 | 8 | charge i32: used, charged \[0.1 mAh\] |
 //! | 0F | status 3 | 8 | energy i32: used, charged \[0.1 mWh\] |
 //! | 10 | status 4 | 8 | temperature i16: FET, motor \[0.1 deg Celsius\]; input current, position |
@@ -20,8 +20,9 @@
 //! - Each frame with the position is a reading of the joint. Speed and current of status 1 join
 //!   the readings that follow within `hold_ms`, and are absent after that.
 //! - **The current's sign is not the torque's**: positive drives the motor, negative brakes it. The
-//!   direction is that of the duty cycle, so current and torque are the current times its sign. With
-//!   a duty of 0 and a current that is not 0, both are absent: the direction is lost in rounding.
+//!   direction is that of the duty cycle, so current and torque are the current times its sign.
+//!   With a duty of 0 and a current that is not 0, both are absent: the direction is lost in
+//!   rounding.
 //! - Velocity and torque are those of the shaft whose position is read: `gear_ratio` and
 //!   `torque_constant` say how many turns and how much torque that is. `ratio` in the joint's table
 //!   makes them the joint's, if there is a gear after it.

@@ -155,8 +155,8 @@ const fn standard_gravity() -> [f64; 3] {
 pub struct ForceTorque {
     /// Its channel.
     pub sensor: String,
-    /// The URDF joint that it is mounted in; the tree is cut here. If the joint moves, the sensor is
-    /// on the side of its child.
+    /// The URDF joint that it is mounted in; the tree is cut here. If the joint moves, the sensor
+    /// is on the side of its child.
     pub joint: String,
     /// The measurement frame: axes and origin of its reading; default: that of the URDF's sensor
     /// element, else `child`.

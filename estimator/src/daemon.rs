@@ -663,7 +663,7 @@ impl IdentificationThread {
                              parameters stay in use"
                         ),
                         None if *fails => {
-                            tracing::info!(group, "identification solves for the parameters again")
+                            tracing::info!(group, "identification solves for the parameters again");
                         }
                         _ => {}
                     }

@@ -447,7 +447,8 @@ fn a_urdf_is_read_in_the_encoding_that_it_declares() {
     assert_eq!(
         setup.unwrap_err(),
         format!(
-            "{}: line 1: joint j1: its <axis> has no xyz (it has xzy); write its direction, such as \
+            "{}: line 1: joint j1: its <axis> has no xyz (it has xzy); write its direction, \
+             such as \
              xyz=\"0 0 1\"",
             file.display()
         )

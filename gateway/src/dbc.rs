@@ -494,7 +494,8 @@ mod tests {
     fn texts_hold_anything() {
         let messages = messages(
             "BO_ 1 A: 8 Node\n SG_ S : 0|8@1+ (1E-003,-.5) [0|0] \"a:b\" Node\n\
-             CM_ BO_ 1 \"he said \"no\"\nBO_ 7 Fake: 8 Node\n SG_ T : 0|8@1+ (1,0) [0|0] \"\"\n\";\n\
+             CM_ BO_ 1 \"he said \"no\"\nBO_ 7 Fake: 8 Node\n SG_ T : 0|8@1+ (1,0) [0|0] \
+             \"\"\n\";\n\
              BA_ \"Path\" \"C:\\dir\\\";\n\
              BO_ 2 B : 8 Vector__XXX\n",
         );
@@ -571,7 +572,8 @@ mod tests {
             ),
             ("BA_DEF_DEF_ \"VFrameFormat\" \"J1939PG\";\n", [true, true]),
             (
-                "BA_DEF_DEF_ \"VFrameFormat\" \"J1939PG\";\nBA_ \"VFrameFormat\" BO_ 2147483649 1;\n",
+                "BA_DEF_DEF_ \"VFrameFormat\" \"J1939PG\";\nBA_ \"VFrameFormat\" BO_ 2147483649 \
+                 1;\n",
                 [false, true],
             ),
             (

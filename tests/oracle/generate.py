@@ -83,7 +83,8 @@ def main():
     )
     must(
         not (arguments.icub or arguments.robots) or out != HERE,
-        "generate.py: --icub and --robots need another --out: what is made from that URDF has its licence and "
+        "generate.py: --icub and --robots need another --out: what is made from that URDF "
+        "has its licence and "
         "must not be in the repository",
     )
     here = made_with()

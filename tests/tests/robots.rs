@@ -91,7 +91,8 @@ fn robots_of_other_projects_load_and_have_pinocchios_torques() {
 fn load(urdf: &Path) -> Result<Setup, String> {
     let text = |link: &str| {
         format!(
-            "schema = 1\nrobot = \"r\"\nmodel = {urdf:?}\n[base]\nkind = \"fixed\"\nlink = {link:?}\n"
+            "schema = 1\nrobot = \"r\"\nmodel = {urdf:?}\n[base]\nkind = \"fixed\"\nlink = \
+             {link:?}\n"
         )
     };
     let file = tempfile::NamedTempFile::new().unwrap();

@@ -63,8 +63,8 @@ fn agrees(stream: &Stream) -> bool {
     matches!(told, (Some(a), Some(b)) if a.abs_diff(b) <= 1)
 }
 
-/// What that counts \[bits\]: a byte of two frames is the same, within 1, once in 85 times; but more
-/// often if it is a small number.
+/// What that counts \[bits\]: a byte of two frames is the same, within 1, once in 85 times; but
+/// more often if it is a small number.
 const AGREE: f64 = 5.0;
 
 fn finding(evidence: Evidence<'_>, address: u16, stream: &Stream) -> Option<Finding> {

@@ -28,6 +28,6 @@ pub(super) const RAD_PER_COUNT: f64 = TAU / 6.0;
 pub(super) const AMPERE_PER_STEP: f64 = 0.1;
 pub(super) const KELVIN_PER_STEP: f64 = 0.1;
 pub(super) const DUTY_PER_STEP: f64 = 1e-3;
-/// The coldest that the parts of a controller work at \[degrees Celsius\]. The input of a thermometer
-/// that is not there is read as -87 or so, or as -100.
+/// The coldest that the parts of a controller work at \[degrees Celsius\]. The input of a
+/// thermometer that is not there is read as -87 or so, or as -100.
 pub(super) const COLDEST: f64 = -40.0;

@@ -436,8 +436,8 @@ fn nothing_is_likely_on_a_bus_without_a_device_that_is_known() {
     );
 }
 
-/// Motors of CubeMars 1 and 2 and their controller: the frames on the identifiers of delivery of two
-/// other sensors are these motors' commands.
+/// Motors of CubeMars 1 and 2 and their controller: the frames on the identifiers of delivery of
+/// two other sensors are these motors' commands.
 #[test]
 fn the_commands_of_motors_are_no_sensor() {
     for torque in [0x7FF, 0x801] {

@@ -1,5 +1,5 @@
-//! Damiao motors: frames that other people's programs read, ranges that the motor tells, motors that
-//! share an identifier, what may be sent, ends of ranges, and states.
+//! Damiao motors: frames that other people's programs read, ranges that the motor tells, motors
+//! that share an identifier, what may be sent, ends of ranges, and states.
 
 use crate::rig::{
     FD, Rig, board, count, decode, encode, frame, listener, options, poll, shown_keys, spec, texts,

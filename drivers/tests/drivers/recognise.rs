@@ -896,8 +896,8 @@ fn with_format(frame: &Frame, format: Format) -> Frame {
     other.expect("a legal length").at(frame.t, frame.stamp)
 }
 
-/// Whoever asks for frames need not be there. A device of classic CAN sends no CAN FD; Damiao's send
-/// either.
+/// Whoever asks for frames need not be there. A device of classic CAN sends no CAN FD; Damiao's
+/// send either.
 #[test]
 fn frames_of_another_format_are_no_device() {
     for row in BOARDS {

@@ -103,8 +103,8 @@ fn what_no_board_answers_is_no_answer() {
 }
 
 /// Where another program has asked for the version, nobody needs to ask. The bits are those of the
-/// identifier (12), of the command, the type and the last byte (1; 0 counts one), less those of one driver
-/// of 32 and of 14 addresses.
+/// identifier (12), of the command, the type and the last byte (1; 0 counts one), less those of one
+/// driver of 32 and of 14 addresses.
 #[test]
 fn an_answer_to_another_program_names_a_board() {
     for (answer, driver, what, types, fits) in [

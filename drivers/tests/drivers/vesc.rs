@@ -11,8 +11,8 @@ use proptest::prelude::*;
 use std::f64::consts::TAU;
 
 /// Values, and the frames that the firmware makes of them: address, speed \[erpm\], current \[A\]
-/// along the shaft's axis, duty, temperatures of FET and motor, position \[deg\], tachometer; status
-/// 1, 4, 5, 2, 3, 6. Made with the firmware's own functions `comm_can_send_status1` to `6`,
+/// along the shaft's axis, duty, temperatures of FET and motor, position \[deg\], tachometer;
+/// status 1, 4, 5, 2, 3, 6. Made with the firmware's own functions `comm_can_send_status1` to `6`,
 /// `utils_norm_angle` and `util/buffer.c` (vedderb/bldc b9d287b3) for arbitrary values; the sign of
 /// the current is that of `mcpwm_foc_get_tot_current_filtered`.
 const FRAMES: &str = include_str!("vesc.txt");

@@ -229,12 +229,14 @@ fn malformed_files_have_one_clear_message_each() {
     is(
         "<child link=\"tip\"/>",
         "<child link=\"tap\"/>",
-        "line 10: joint end: its child link tap is not in the URDF; correct the name or add the link",
+        "line 10: joint end: its child link tap is not in the URDF; correct the name or add the \
+         link",
     );
     is(
         "<parent link=\"tool\"/>",
         "<parent link=\"toll\"/>",
-        "line 7: joint slide: its parent link toll is not in the URDF; correct the name or add the link",
+        "line 7: joint slide: its parent link toll is not in the URDF; correct the name or add \
+         the link",
     );
     is(
         "mass value=\"2\"",
@@ -296,13 +298,15 @@ fn malformed_files_have_one_clear_message_each() {
     is(
         "<child link=\"tip\"/>",
         "<child link=\"arm\"/>",
-        "line 10: joint end: its child arm is already the child of joint turn (line 8); loops cannot \
+        "line 10: joint end: its child arm is already the child of joint turn (line 8); loops \
+         cannot \
          be described, only trees: remove one of the joints",
     );
     is(
         "type=\"prismatic\"",
         "type=\"planar\"",
-        "line 7: joint slide: type=\"planar\" is possible only between the root and the robot, where \
+        "line 7: joint slide: type=\"planar\" is possible only between the root and the robot, \
+         where \
          it is dropped because any link can be the base; remove the joint, or make it of prismatic \
          and continuous joints",
     );
@@ -346,7 +350,8 @@ fn malformed_files_have_one_clear_message_each() {
     );
     assert_eq!(
         read("<sdf/>").unwrap_err().to_string(),
-        "not a URDF: its root element is <sdf>, not <robot>; convert it, for example with gz sdf or \
+        "not a URDF: its root element is <sdf>, not <robot>; convert it, for example with gz \
+         sdf or \
          sdformat_urdf"
     );
     assert_eq!(
@@ -712,7 +717,8 @@ fn what_is_missing_has_its_place_and_the_remedy() {
     );
     assert_eq!(
         read(&text).unwrap_err().to_string(),
-        "line 3: link arm, moved by joint turn; line 5: link finger, moved by joint slide: the mass \
+        "line 3: link arm, moved by joint turn; line 5: link finger, moved by joint slide: the \
+         mass \
          is unknown, because no <inertial> is there or in a link fixed to it; add one (with mass 0 \
          and inertia 0 if it is meant to be massless)"
     );
@@ -736,7 +742,8 @@ fn an_impossible_part_of_a_possible_body_is_a_warning() {
         model.warnings(),
         [
             "link tool: its inertia is not positive semidefinite (least principal moment -3.600e-8 \
-             kg m^2): no body has this inertia; it is used as written, because with the links fixed \
+             kg m^2): no body has this inertia; it is used as written, because with the links \
+             fixed \
              to it the inertia is possible"
         ]
     );
@@ -804,7 +811,8 @@ fn a_floating_root_joint_is_dropped() {
         assert_eq!(
             model.warnings(),
             [
-                "joint free: it is the motion of the whole robot, so it is dropped: link base is the \
+                "joint free: it is the motion of the whole robot, so it is dropped: link base \
+                 is the \
               root"
             ]
         );

@@ -64,4 +64,5 @@ for address in (3, 0x1A):
         payload = bytes([address, 0, 0x33, register]) + struct.pack("<f", value)
         asking.decode_register_reply(payload)
         read = asking.registers[register]
-        print("answer", address, register, repr(read), f"{0x10 + address:03X}#{payload.hex().upper()}")
+        frame = f"{0x10 + address:03X}#{payload.hex().upper()}"
+        print("answer", address, register, repr(read), frame)

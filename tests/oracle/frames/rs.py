@@ -56,7 +56,8 @@ for model, number in (("RS01", 1), ("RS04", 4)):
         message, mode, faults = state(address)
         client = Client(None, host_can_id=HOST)
         # Its modes are one bit: 2 is read apart here.
-        told = SimpleNamespace(arbitration_id=message.arbitration_id & ~(3 << 22), data=message.data)
+        identifier = message.arbitration_id & ~(3 << 22)
+        told = SimpleNamespace(arbitration_id=identifier, data=message.data)
         read = client._parse_feedback_resp(told, address, number)
         assert sum(error.value for error in read.errors) == faults & 0x1F  # It leaves out bit 5.
         with contextlib.redirect_stdout(io.StringIO()):

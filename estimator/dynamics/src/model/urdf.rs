@@ -482,8 +482,8 @@ struct Coordinates {
 
 impl Coordinates {
     /// Degrees of freedom are numbered in the order of the file. A joint with a `<mimic>` has the
-    /// one of the joint that it follows, if necessary through others. One that follows a fixed joint
-    /// is made fixed where that holds it.
+    /// one of the joint that it follows, if necessary through others. One that follows a fixed
+    /// joint is made fixed where that holds it.
     fn of(joints: &mut [RawJoint<'_>], warnings: &mut Vec<String>) -> Result<Self, ModelError> {
         let mut held = Vec::new();
         let coordinates = Self::resolve(joints, &mut held)?;
@@ -704,8 +704,8 @@ impl Folder<'_, '_> {
         }
     }
 
-    /// Judges the inertia of the links that are fixed together. Up to rounding, it must be possible;
-    /// that of one of the links need not be. `total` is the mass of the robot.
+    /// Judges the inertia of the links that are fixed together. Up to rounding, it must be
+    /// possible; that of one of the links need not be. `total` is the mass of the robot.
     fn check_body(
         &self,
         members: &[usize],

@@ -380,7 +380,8 @@ mod tests {
 
     #[test]
     fn a_tree_is_read_with_its_places() {
-        let text = "<?xml version=\"1.0\"?>\n<!DOCTYPE robot [<!ENTITY a \"b>\">]>\n<!-- a--b --->\n\
+        let text = "<?xml version=\"1.0\"?>\n<!DOCTYPE robot [<!ENTITY a \"b>\">]>\n<!-- a--b \
+         --->\n\
             <note/>\n<robot name='r'a:b=\"1\"><x:y>\n1 &lt; <z/>2 & &foo;<![CDATA[<]]></x:y>\
             < e f = \"'>\" /></robot >\n<robot/> &\0";
         let document = Document::parse(text).unwrap();
