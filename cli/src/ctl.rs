@@ -1,6 +1,6 @@
 //! `proprio ctl`: asks a running gateway over its control socket.
 
-use crate::system::load;
+use crate::status::load;
 use anyhow::{Context, anyhow, bail};
 use proprio_gateway::control::{ask, gateways};
 use proprio_gateway::plan::ConfigError;

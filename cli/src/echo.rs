@@ -1,7 +1,7 @@
 //! `proprio echo`: the samples of a channel, the torques or the contacts of a running system, as
 //! they come.
 
-use crate::system::{Described, interrupted, one_robot, open};
+use crate::running::{Described, interrupted, one_robot, open};
 use anyhow::{Context, bail};
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, TakeError, Topic, Unavailable, monotonic};
 use proprio_topics::{

@@ -232,11 +232,12 @@ fn named(value: &toml::Value, folder: &Path, names: &mut BTreeSet<PathBuf>) {
     match value {
         toml::Value::Table(table) => table.values().for_each(|v| named(v, folder, names)),
         toml::Value::Array(values) => values.iter().for_each(|v| named(v, folder, names)),
-        toml::Value::String(name) if Path::new(name).is_relative() => {
-            if folder.join(name).is_file() {
-                let parts = Path::new(name).components();
-                names.insert(parts.filter(|part| *part != Component::CurDir).collect());
-            }
+        toml::Value::String(name)
+            if Path::new(name).is_relative() && folder.join(name).is_file() =>
+        {
+            // `./x` is `x`.
+            let parts = Path::new(name).components();
+            names.insert(parts.filter(|part| *part != Component::CurDir).collect());
         }
         _ => {}
     }

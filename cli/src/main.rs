@@ -1,27 +1,7 @@
 //! The `proprio` command with all subcommands. `proprio --help` lists them.
 
-use std::sync::atomic::AtomicBool;
-
-/// Whoever read standard output has closed it.
-static CLOSED: AtomicBool = AtomicBool::new(false);
-
-/// `println!` that is no error if standard output is closed, as by `head`: see [`CLOSED`].
-macro_rules! print_line {
-    ($($text:tt)*) => {{
-        use std::io::Write as _;
-        if writeln!(std::io::stdout(), $($text)*).is_err() {
-            crate::CLOSED.store(true, std::sync::atomic::Ordering::Relaxed);
-        }
-    }};
-}
-
-/// The same without a line break.
-macro_rules! print_part {
-    ($($text:tt)*) => {{
-        use std::io::Write as _;
-        let _ = write!(std::io::stdout(), $($text)*);
-    }};
-}
+#[macro_use]
+mod print;
 
 mod convert;
 mod ctl;
@@ -33,10 +13,11 @@ mod identify;
 mod install;
 mod record;
 mod report;
+mod running;
 mod scan;
 mod setup;
 mod simulate;
-mod system;
+mod status;
 
 use clap::{Parser, Subcommand};
 use proprio_topics::ipc::DomainConfig;
@@ -81,7 +62,7 @@ enum Verb {
     /// Identify inertial parameters from recorded tables of samples and write a report
     Identify(identify::Args),
     /// Show the robots of a running system: processes, buses, devices, channels, estimates
-    Status(system::Status),
+    Status(status::Status),
     /// Print the samples of a channel, the torques or the contacts as they come
     Echo(echo::Echo),
     /// Record samples and declared contacts into the table that `identify` reads
@@ -122,7 +103,7 @@ fn main() -> ExitCode {
         Verb::Encode(args) => convert::encode(&args),
         Verb::Estimate(args) => convert::estimate(&args),
         Verb::Identify(args) => identify::run(&args),
-        Verb::Status(args) => system::status(&args, &domain),
+        Verb::Status(args) => status::run(&args, &domain),
         Verb::Echo(args) => echo::run(&args, &domain),
         Verb::Record(args) => record::run(&args, &domain),
         Verb::Ctl(args) => ctl::run(&args, &domain),

@@ -1,7 +1,7 @@
 //! `proprio record`: the samples and declared contacts of a running system, as the table that
 //! `identify` reads.
 
-use crate::system::{Described, interrupted, one_robot, open};
+use crate::running::{Described, interrupted, one_robot, open};
 use anyhow::{Context, bail};
 use proprio_gateway::offline::InOrder;
 use proprio_topics::csv::{Columns, Series, Value, What, Writer};

@@ -6,7 +6,7 @@
 //!
 //! | command | name | bytes | content |
 //! |---|---|---|---|
-//! | 09 | status | 8 | electrical speed i32 \[rev/min\], current i16 \[0.1 A\], duty i16 \[0.1 %\] |
+//! | 09 | status | 8 | electrical speed i32 \[rpm\], current i16 \[0.1 A\], duty i16 \[0.1 %\] |
 //! | 0E | status 2 | 8 | charge i32: used, charged \[0.1 mAh\] |
 //! | 0F | status 3 | 8 | energy i32: used, charged \[0.1 mWh\] |
 //! | 10 | status 4 | 8 | temperature i16: FET, motor \[0.1 deg Celsius\]; input current, position |

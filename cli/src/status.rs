@@ -1,8 +1,9 @@
-//! `proprio status`: what a running system does, from shared memory alone; and what `echo` and
-//! `record` share with it.
+//! `proprio status`: what a running system does, from shared memory alone.
 
 use crate::echo::{of_joints, torque_json};
-use anyhow::{Context, bail};
+use crate::print::CLOSED;
+use crate::running::{Described, HISTORY, LOOK, interrupted, open};
+use anyhow::bail;
 use proprio_topics::ipc::{
     Domain, DomainConfig, PortError, Reader, RobotPresence, Topic, Unavailable, monotonic,
 };
@@ -12,17 +13,10 @@ use proprio_topics::{
 };
 use serde_json::{Value as Json, json};
 use std::collections::BTreeMap;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
 
 /// How long `status` counts samples and estimates.
 const WINDOW: Nanos = Nanos::from_millis(1000);
-/// A description or health message is sent again to a new reader within this time.
-const HISTORY: Nanos = Nanos::from_millis(500);
-/// How often it is looked for: nothing tells of a payload that is sent again.
-const LOOK: Nanos = Nanos::from_millis(5);
-
 /// `proprio status`.
 #[derive(clap::Args)]
 pub(crate) struct Status {
@@ -37,27 +31,6 @@ pub(crate) struct Status {
     watch: bool,
 }
 
-/// Set by SIGINT and SIGTERM.
-pub(crate) fn interrupted() -> anyhow::Result<Arc<AtomicBool>> {
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot catch signals")?;
-    }
-    Ok(stop)
-}
-
-/// Opens the domain for reading; the error names the domains that there are.
-pub(crate) fn open(config: &DomainConfig) -> anyhow::Result<Domain> {
-    Domain::open_existing(config).map_err(|error| {
-        let siblings = config.siblings();
-        match siblings.is_empty() {
-            true => error.into(),
-            false => anyhow::Error::new(error)
-                .context(format!("the domains here are {}", siblings.join(", "))),
-        }
-    })
-}
-
 /// The robots to show: the named one, or all.
 fn robots(domain: &Domain, name: Option<&str>) -> anyhow::Result<Vec<RobotPresence>> {
     let all = domain.robots();
@@ -69,22 +42,6 @@ fn robots(domain: &Domain, name: Option<&str>) -> anyhow::Result<Vec<RobotPresen
             let names: Vec<_> = all.into_iter().map(|robot| robot.name).collect();
             bail!("there is no robot {name:?}; there is {}", names.join(", "))
         }
-    }
-}
-
-/// The name of the robot to read: the named one, or the only one. Whether it runs is not asked:
-/// that takes a second.
-pub(crate) fn one_robot(domain: &Domain, name: Option<&str>) -> anyhow::Result<String> {
-    let names: Vec<String> = domain.robot_names().into_iter().collect();
-    match (name, names.as_slice()) {
-        (_, []) => bail!("there is no robot in the domain"),
-        (None, [only]) => Ok(only.clone()),
-        (None, _) => bail!(
-            "there are several robots: name one with --robot: {}",
-            names.join(", ")
-        ),
-        (Some(name), _) if names.iter().any(|known| known == name) => Ok(name.to_owned()),
-        (Some(name), _) => bail!("there is no robot {name:?}; there is {}", names.join(", ")),
     }
 }
 
@@ -105,68 +62,6 @@ fn newest<T: Topic>(domain: &Domain, robot: &str) -> Result<Option<T>, PortError
         }
         reader.wait(monotonic() + LOOK);
     }
-}
-
-/// The descriptions of one publisher, over its restarts.
-pub(crate) struct Described {
-    reader: Reader<Description>,
-    publisher: Publisher,
-    newest: Description,
-}
-
-impl Described {
-    /// Those of `publisher`; `None` if it does not run.
-    pub(crate) fn by(
-        domain: &Domain,
-        robot: &str,
-        publisher: Publisher,
-    ) -> Result<Option<Self>, PortError> {
-        let mut reader = match Reader::<Description>::open(domain, robot) {
-            Ok(reader) => reader,
-            Err(PortError::NotYet { .. }) => return Ok(None),
-            Err(error) => return Err(error),
-        };
-        let deadline = monotonic() + HISTORY;
-        loop {
-            if let Some(newest) = take_newest(&mut reader, publisher) {
-                return Ok(Some(Self {
-                    reader,
-                    publisher,
-                    newest,
-                }));
-            }
-            if monotonic() >= deadline {
-                return Ok(None);
-            }
-            reader.wait(monotonic() + LOOK);
-        }
-    }
-
-    /// The newest one.
-    pub(crate) const fn newest(&self) -> &Description {
-        &self.newest
-    }
-
-    /// That of the publisher's start `epoch`; `None` if it has not come yet.
-    pub(crate) fn of(&mut self, epoch: u64) -> Option<&Description> {
-        if self.newest.header.epoch != epoch
-            && let Some(newest) = take_newest(&mut self.reader, self.publisher)
-        {
-            self.newest = newest;
-        }
-        (self.newest.header.epoch == epoch).then_some(&self.newest)
-    }
-}
-
-/// The newest description of `publisher` that waits.
-fn take_newest(reader: &mut Reader<Description>, publisher: Publisher) -> Option<Description> {
-    let mut newest = None;
-    while let Ok(Some(description)) = reader.try_take() {
-        if description.publisher == publisher {
-            newest = Some(description);
-        }
-    }
-    newest
 }
 
 /// What a channel sent during the window.
@@ -469,7 +364,7 @@ pub(crate) fn load(share: f64, frame_rate: f64) -> String {
 }
 
 /// Shows the robots of the domain.
-pub(crate) fn status(args: &Status, config: &DomainConfig) -> anyhow::Result<()> {
+pub(crate) fn run(args: &Status, config: &DomainConfig) -> anyhow::Result<()> {
     let stop = interrupted()?;
     let domain = open(config)?;
     loop {
@@ -494,7 +389,7 @@ pub(crate) fn status(args: &Status, config: &DomainConfig) -> anyhow::Result<()>
             }
             glances.iter().for_each(Glance::print);
         }
-        if !args.watch || stop.load(Relaxed) || crate::CLOSED.load(Relaxed) {
+        if !args.watch || stop.load(Relaxed) || CLOSED.load(Relaxed) {
             return Ok(());
         }
     }
