@@ -59,7 +59,7 @@ pub(crate) struct How {
     /// How long to listen [s]
     #[arg(long, value_name = "N", default_value_t = 5.0, value_parser = seconds)]
     seconds: f64,
-    /// Also ask: iCub boards (DISCOVER), CANopen nodes (SDO reads of 1000 and 1018), ODrives that
+    /// Also ask: iCub boards (DISCOVER), CANopen nodes (SDO reads of 1000, 1018 and 1800 to 1803), ODrives that
     /// are heard (Get_Version), and on CAN FD moteus controllers (a query). These questions start,
     /// move and change nothing, but for ODrives numbered 48 to 51 or 56 that send no heartbeat
     #[arg(long)]

@@ -143,6 +143,7 @@ impl Driver for Options {
             Some(Finding {
                 unusable,
                 guess: node.profile.is_none(),
+                needs_sync: node.needs_sync,
                 ..finding
             })
         };

@@ -18,11 +18,17 @@
 //!
 //! So the sum of the bits is the odds that the device is there, and a finding has a probability:
 //!
-//! | word | probability | wrong, if the model of other devices is right |
+//! | word | probability of | on a bus without such a device, at most one of |
 //! |---|---|---|
-//! | possible | 10 % | nine of ten |
-//! | likely | 99 % | one of 100 |
-//! | certain | 99.9999 % | one of a million |
+//! | possible | 10 % | 1 bus |
+//! | likely | 99 % | 120 buses |
+//! | certain | 99.9999 % | 1.2 million buses |
+//!
+//! The last column follows from the prior, whatever the address: for odds of 99 to 1 what was heard
+//! must be 31 * 99 times as probable with the device as without it, which happens once in so many
+//! buses, for each of 25 drivers. Measured, with contents made up as those of cars are, on the
+//! identifiers of 66 cars and radars of opendbc 7343a66d, eight times each: something was possible
+//! on 157 of 528 buses, and likely on two.
 
 mod background;
 mod explain;
@@ -162,6 +168,8 @@ pub struct Finding {
     pub commands: Vec<RangeInclusive<Id>>,
     /// Why the driver cannot be used for it; empty if it can.
     pub unusable: &'static str,
+    /// It sends when a SYNC of CANopen comes, and nobody sends one.
+    pub needs_sync: bool,
     /// The bits speak for a device of which the driver is a guess: it is possible, and no more.
     pub guess: bool,
 }

@@ -16,15 +16,17 @@ use crate::link::adapter::{self, Adapter};
 use crate::link::interface::{Netlink, Observer};
 use crate::operator::Operator;
 use crate::plan::{ConfigError, Plan};
+use crate::scan::{FILL_IN, placeholders};
 use crate::thread::{BusThread, join, statuses};
+use crate::watch;
 use anyhow::{Context, anyhow, bail};
 use proprio_topics::ipc::{Domain, DomainConfig, DomainError, Writer, open_files_remedy};
 use proprio_topics::{Description, GatewayHealth, Nanos};
 use sd_notify::NotifyState;
 use std::io::Write as _;
 use std::path::Path;
-use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -43,6 +45,19 @@ const LOOK: Duration = Duration::from_millis(5);
 pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<()> {
     let plan = Plan::load_live(config)?;
     if check {
+        let text = std::fs::read_to_string(config).unwrap_or_default();
+        let left = placeholders(&text);
+        if !left.is_empty() {
+            return Err(ConfigError {
+                file: config.to_owned(),
+                problem: format!(
+                    "placeholders are not filled in; put in what is right, and remove the comment \
+                     `{FILL_IN}`:\n{}",
+                    left.join("\n")
+                ),
+            }
+            .into());
+        }
         // The reader of standard output may close it early.
         let _ = write!(
             std::io::stdout(),
@@ -152,6 +167,14 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
             None
         }
     };
+    let watched = Arc::new(Mutex::new(plan.clone()));
+    if let Err(error) = watch::start(
+        Arc::clone(&watched),
+        domain_config.name.clone(),
+        Arc::clone(&stop),
+    ) {
+        tracing::warn!("devices that the configuration does not know are not told: {error}");
+    }
     let mut loads = Loads::new(&plan);
     let mut operator = Operator::new(config, plan);
     tracing::info!(
@@ -176,6 +199,8 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
                 operator.begin(asked, &mut threads, &health, clock.now());
                 if operator.has_reloaded() {
                     let _ = description_writer.send(&operator.plan().description(), clock.now());
+                    *watched.lock().unwrap_or_else(PoisonError::into_inner) =
+                        operator.plan().clone();
                 }
                 continue;
             }

@@ -23,6 +23,7 @@
 //! - [`offline`]: converts a log to a table of samples and back, without a daemon.
 //! - [`daemon`]: the control plane: threads, signals, health, log lines, watchdog; [`control`]: the
 //!   socket over which it is asked while it runs.
+//! - `watch`: tells of devices that the configuration does not know.
 //! - [`clock`]: the only place that reads a clock.
 
 pub mod bus;
@@ -49,3 +50,4 @@ mod sanity;
 pub mod scan;
 pub mod status;
 mod thread;
+mod watch;

@@ -11,7 +11,7 @@ mod found;
 mod tables;
 
 pub use found::{Device, devices};
-pub use tables::{Bus, file, tables};
+pub use tables::{Bus, FILL_IN, file, placeholders, tables};
 
 use crate::clock::Clock;
 use crate::link::{Link, Received, SendError, send_by};

@@ -178,7 +178,20 @@ fn a_configuration_is_written_that_the_gateway_runs() {
     ] {
         assert!(written.contains(part), "{part}:\n{written}");
     }
-    let plan = text(&rig.run(&["gateway", "--config", &config, "--check"]).stdout);
+    // Placeholders are refused, each by its key, until somebody has looked at them.
+    let check = ["gateway", "--config", &config, "--check"];
+    let refused = rig.command(&check).output().expect("proprio runs");
+    let said = text(&refused.stderr);
+    assert_eq!(refused.status.code(), Some(2), "{said}");
+    for part in ["name = \"joint_7\"", "ratio = 1.0", "fill in"] {
+        assert!(said.contains(part), "{part}:\n{said}");
+    }
+    let filled: Vec<&str> = (written.lines())
+        .map(|line| line.split("  # fill in").next().unwrap_or_default())
+        .collect();
+    fs::write(&config, filled.join("\n")).expect("the file");
+    let plan = text(&rig.run(&check).stdout);
+    fs::write(&config, &written).expect("the file");
     assert!(plan.contains("robot found: 2 buses, 11 channels"), "{plan}");
     let twice = [
         &["setup", "--out", "unused"][..],
@@ -229,7 +242,8 @@ fn a_recorded_log_is_scanned_by_interface() {
     for part in [
         "bus can0: 300 frames, 3 identifiers",
         "bus can1: 100 frames, 1 identifiers",
-        "likely    icub_strain_1: iCub board",
+        "likely (99.",
+        "icub_strain_1: iCub board",
         "driver = \"icub_strain\"",
         "period_ms = 10",
         "unknown",

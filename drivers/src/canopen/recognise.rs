@@ -1,6 +1,6 @@
 //! Recognising nodes: by heartbeats, and by what they answer to questions about their identity.
 
-use super::protocol::{NMT, emcy, heartbeat, object, sdo_from, sdo_to, tpdo};
+use super::protocol::{NMT, SYNC, emcy, heartbeat, object, sdo_from, sdo_to, tpdo};
 use super::{Object, READ};
 use crate::bytes::{u16_le, u32_le};
 use crate::recognise::{Evidence, Stream, Traffic};
@@ -19,6 +19,8 @@ const IDENTITY: [(u8, &str); 4] = [
 ];
 /// An index of 16 bits and a sub-index of 8 that are its own \[bits\].
 const OBJECT: f64 = 24.0;
+/// The device profile of drives.
+const DRIVE: u32 = 402;
 /// States in a heartbeat, without the bit that toggles in node guarding.
 const STATES: [u8; 4] = [0x00, 0x04, 0x05, 0x7F];
 
@@ -35,6 +37,8 @@ pub(crate) struct Recognised<'t> {
     pub(crate) profile: Option<u16>,
     /// Its identity in words, after a comma; empty if it has not told.
     pub(crate) identity: String,
+    /// It sends when a SYNC comes, and none comes.
+    pub(crate) needs_sync: bool,
     /// TPDO 1 to 4, if they are sent.
     pub(crate) tpdos: [Option<&'t Stream>; 4],
 }
@@ -47,11 +51,25 @@ const fn identity(sub: u8) -> Object {
 fn told(seen: &Traffic, node: u8, object: Object) -> Option<u32> {
     let stream = seen.stream(sdo_from(node))?;
     stream.kept().find_map(|frame| match *frame.data() {
-        [0x43, _, _, sub, _, _, _, _] if sub == object.sub => {
-            (u16_le(frame.data(), 1) == object.index).then(|| u32_le(frame.data(), 4))
+        // Of four bytes so many are unused.
+        [0x43 | 0x47 | 0x4B | 0x4F, _, _, sub, _, _, _, _] if sub == object.sub => {
+            let unused = frame.data().first().map_or(0, |first| first >> 2 & 3);
+            let value = u32_le(frame.data(), 4) & u32::MAX >> (8 * unused);
+            (u16_le(frame.data(), 1) == object.index).then_some(value)
         }
         _ => None,
     })
+}
+
+/// Whether node `node` has told of a TPDO that it sends when a SYNC comes, and none is heard.
+fn needs_sync(seen: &Traffic, node: u8) -> bool {
+    let by_sync = |number| {
+        let is_on = |id: u32| id >> 31 == 0;
+        let by_sync = told(seen, node, object::tpdo_transmission(number));
+        by_sync.is_some_and(|transmission| transmission <= 240)
+            && told(seen, node, object::tpdo_id(number)).is_none_or(is_on)
+    };
+    seen.stream(SYNC).is_none_or(|sync| sync.frames == 0) && (0..4).any(by_sync)
 }
 
 /// Whether it is an answer to an SDO command: 8 bytes, one of about 40 first bytes.
@@ -103,6 +121,7 @@ pub(crate) fn recognise(seen: &Traffic) -> impl Iterator<Item = Recognised<'_>> 
             node,
             profile,
             identity: words,
+            needs_sync: needs_sync(seen, node),
             tpdos,
         })
     })
@@ -114,8 +133,8 @@ pub(crate) fn commands(node: u8) -> impl Iterator<Item = RangeInclusive<Id>> {
     rpdos.into_iter().chain([NMT]).map(|id| id..=id)
 }
 
-/// All nodes are asked for their profile, those that have answered for their identity. To read an
-/// object changes nothing.
+/// All nodes are asked for their profile, those that have answered for their identity, and drives
+/// for what makes them send. To read an object changes nothing.
 pub(crate) fn questions(seen: &Traffic) -> Vec<Frame> {
     let read = |node, object: Object| {
         let [low, high] = object.index.to_le_bytes();
@@ -124,8 +143,15 @@ pub(crate) fn questions(seen: &Traffic) -> Vec<Frame> {
     let mut questions = Vec::new();
     for node in 1..=127 {
         questions.push(read(node, object::DEVICE_TYPE));
-        if told(seen, node, object::DEVICE_TYPE).is_some() {
+        let device_type = told(seen, node, object::DEVICE_TYPE);
+        if device_type.is_some() {
             questions.extend(IDENTITY.map(|(sub, _)| read(node, identity(sub))));
+        }
+        if device_type.is_some_and(|device_type| device_type & 0xFFFF == DRIVE) {
+            for number in 0..4 {
+                questions.push(read(node, object::tpdo_id(number)));
+                questions.push(read(node, object::tpdo_transmission(number)));
+            }
         }
     }
     questions

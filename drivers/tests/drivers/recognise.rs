@@ -742,6 +742,35 @@ fn a_node_of_another_profile_is_no_drive() {
     assert!(findings[0].unusable.contains(".dbc"));
 }
 
+/// A drive that is asked tells of a TPDO by SYNC, which is missing unless somebody sends it.
+#[test]
+fn a_drive_that_waits_for_a_sync_says_so() {
+    for (keys, is_heard, needs) in [
+        ("sync = 1", false, true),
+        ("sync = 1", true, false),
+        ("sync = 0", false, false),
+    ] {
+        let row: Row = ("canopen_drive", keys, 9, &[0]);
+        let mut heard = asked(&row);
+        if is_heard {
+            heard.on_frame(&Frame::new(Id::standard(0x80), &[]));
+        }
+        let found = own(&heard, &row).unwrap();
+        assert_eq!(found.needs_sync, needs, "{keys} {is_heard}: {found:?}");
+        assert_eq!(found.certainty(), Some(Certainty::Certain));
+    }
+    // A TPDO that is off waits for nothing.
+    let mut heard = Traffic::new();
+    for (text, ms) in [
+        ("585#4300100092010200", 0.0),
+        ("585#4F00180201000000", 1.0),
+        ("585#4300180185010080", 2.0),
+    ] {
+        heard.on_frame(&crate::rig::frame(text, ms));
+    }
+    assert!(!recognise(&heard)[0].needs_sync);
+}
+
 /// A node that does not tell its profile is rather an encoder if it sends four bytes; but which of
 /// both is a guess, however sure the node is.
 #[test]

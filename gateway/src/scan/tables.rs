@@ -27,6 +27,24 @@ pub struct Bus {
 /// 100 ms: four periods.
 const USUAL_PERIOD_MS: u32 = 25;
 
+/// What the comment behind a placeholder begins with.
+pub const FILL_IN: &str = "fill in";
+
+/// The lines of a gateway.toml whose placeholders are not filled in, with their numbers. Nobody
+/// can tell a placeholder from a value that is right: the comment is the mark.
+#[must_use]
+pub fn placeholders(text: &str) -> Vec<String> {
+    let mark = format!("# {FILL_IN}:");
+    let lines = text.lines().zip(1..);
+    let marked = lines.filter_map(|(line, number)| {
+        let (key, note) = line.split_once(&mark)?;
+        let key = key.trim();
+        (!key.is_empty() && !key.starts_with('#'))
+            .then(|| format!("  line {number}: {key} ({})", note.trim()))
+    });
+    marked.collect()
+}
+
 /// A text as TOML writes it.
 fn quoted(text: &str) -> String {
     toml::Value::from(text).to_string()
@@ -96,7 +114,7 @@ fn keys_of(device: &Device, joints: &mut usize, text: &mut String) {
     for key in &finding.keys {
         let note = match key.note {
             "" => String::new(),
-            note => format!("  # fill in: {note}"),
+            note => format!("  # {FILL_IN}: {note}"),
         };
         let _ = writeln!(text, "{} = {}{note}", key.name, key.value);
     }
@@ -111,16 +129,35 @@ fn keys_of(device: &Device, joints: &mut usize, text: &mut String) {
         let _ = writeln!(text, "  [[bus.device.joint]]");
         let _ = writeln!(
             text,
-            "  name = \"joint_{joints}\"  # fill in: its name in the URDF"
+            "  name = \"joint_{joints}\"  # {FILL_IN}: its name in the URDF"
         );
         if *channel != 0 {
             let _ = writeln!(text, "  channel = {channel}");
         }
         let _ = writeln!(
             text,
-            "  ratio = 1.0  # fill in: gear ratio, and sign, offset_rad"
+            "  ratio = 1.0  # {FILL_IN}: gear ratio, and sign, offset_rad"
         );
     }
+}
+
+/// The sender of the SYNC, if a device waits for one.
+fn sync(devices: &[Device]) -> String {
+    let waits = |device: &&Device| {
+        let finding = &device.finding;
+        finding.needs_sync && finding.certainty() > Some(Certainty::Possible)
+    };
+    let Some(first) = devices.iter().find(waits) else {
+        return String::new();
+    };
+    let own = format!("{}_{}", first.finding.driver, first.finding.address);
+    let prefix = first.name.strip_suffix(&own).unwrap_or_default();
+    let name = quoted(&format!("{prefix}canopen_sync"));
+    let who = line(&first.name);
+    format!(
+        "\n  # {who} sends when a SYNC comes, and nobody sends one.\n  [[bus.device]]\n  \
+         driver = \"canopen_sync\"\n  name = {name}\n  period_ms = 10.0\n"
+    )
 }
 
 /// A whole gateway.toml for robot `robot`.
@@ -128,7 +165,8 @@ fn keys_of(device: &Device, joints: &mut usize, text: &mut String) {
 pub fn file(robot: &str, buses: &[Bus]) -> String {
     let mut text = format!(
         "# Written by `proprio setup`. `fill in` marks what nobody but a person knows; devices in\n\
-         # comments are possible, and not sure enough to be used. To check it:\n\
+         # comments are possible, and not sure enough to be used. To check it, which refuses what is\n\
+         # still marked:\n\
          #\n\
          #     proprio gateway --config gateway.toml --check\n\
          #\n\
@@ -166,6 +204,7 @@ pub fn file(robot: &str, buses: &[Bus]) -> String {
             text.push_str("# No device was recognised on it.\n");
         }
         text.push_str(&tables(&bus.devices, &mut joints));
+        text.push_str(&sync(&bus.devices));
     }
     text
 }
@@ -219,12 +258,15 @@ mod tests {
         motor.finding.joints = vec![0];
         motor.rivals = vec![device("odrive", 3, 0.0).finding];
         let possible = device("aidin_aft200", 1, 3.0);
+        let mut drive = device("canopen_drive", 4, 60.0);
+        drive.finding.joints = vec![0];
+        drive.finding.needs_sync = true;
         let mut foreign = device("canopen_drive", 5, 60.0);
         foreign.finding.unusable = "no driver";
         let text = file(
             "new-robot",
             &[
-                bus("arm", vec![strain, hand, motor, possible, foreign]),
+                bus("arm", vec![strain, hand, motor, drive, possible, foreign]),
                 Bus {
                     source: Source::Virtual { name: "v".into() },
                     interface: String::new(),
@@ -241,10 +283,19 @@ mod tests {
         assert_eq!((arm.rates.nominal, arm.rates_assumed), (500_000, false));
         assert!(empty.devices.is_empty() && empty.rates_assumed);
         let names: Vec<&str> = arm.devices.iter().map(|d| d.name.as_str()).collect();
-        assert_eq!(names, ["icub_strain_13", "icub_pos_2", "cubemars_7"]);
+        assert_eq!(
+            names,
+            [
+                "icub_strain_13",
+                "icub_pos_2",
+                "cubemars_7",
+                "canopen_drive_4",
+                "canopen_sync"
+            ]
+        );
         let joints = plan.channels.iter().filter(|c| c.kind == Kind::Joint);
         let joints: Vec<&str> = joints.map(|c| c.name.as_str()).collect();
-        assert_eq!(joints, ["joint_1", "joint_2", "joint_3"]);
+        assert_eq!(joints, ["joint_1", "joint_2", "joint_3", "joint_4"]);
         assert_eq!(arm.devices[0].spec.max_silence.0, 120_000_000);
         assert_eq!(arm.devices[1].spec.outputs.0[..], [0, 3]);
         for part in [
@@ -259,6 +310,16 @@ mod tests {
             assert!(text.contains(part), "{part}:\n{text}");
         }
         assert!(text.lines().all(|line| line.trim_end() == line), "{text}");
+        // Each mark is told, but for those in comments; without its comment a value is filled in.
+        let left = placeholders(&text);
+        assert_eq!(left.len(), text.matches("# fill in:").count(), "{left:#?}");
+        let model = "model = \"AK80-9\" (its ranges)";
+        assert!(left.iter().any(|line| line.ends_with(model)), "{left:#?}");
+        let filled: Vec<&str> = (text.lines())
+            .map(|line| line.split("  # fill in").next().unwrap_or_default())
+            .collect();
+        assert_eq!(placeholders(&filled.join("\n")), [""; 0]);
+        assert_eq!(placeholders("  # model = 1  # fill in: what"), [""; 0]);
     }
 
     /// Whatever a bus of arbitrary frames is taken for, its configuration is legal.
