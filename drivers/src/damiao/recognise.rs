@@ -28,9 +28,23 @@ fn message(frame: &Frame, address: u8) -> Option<Message> {
     })
 }
 
+/// A bus has not more motors than this: more streams of their form are of other devices, but for
+/// those with the identifiers that most motors have.
+const MOTORS: usize = 32;
+
 /// The motors that `seen` shows.
 pub(super) fn motors(seen: &Traffic) -> Vec<Finding> {
-    seen.streams().flat_map(|stream| on(seen, stream)).collect()
+    let form = |frame: &Frame| {
+        let half = frame.data().first().map(|first| first & 0xF);
+        half.is_some_and(|half| message(frame, half).is_some())
+    };
+    let has_form = |stream: &&Stream| stream.frames > 0 && stream.recent().rev().take(4).all(form);
+    let mut streams: Vec<&Stream> = seen.streams().filter(has_form).collect();
+    if streams.len() > MOTORS {
+        streams.retain(|stream| stream.id.raw() < 0x20);
+    }
+    let on = |stream: &Stream| on(seen, stream);
+    streams.into_iter().flat_map(on).collect()
 }
 
 /// The motors that answer on the identifier of `stream`.
@@ -48,14 +62,6 @@ fn on(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
         }
     }
     if halves.len() > 8 {
-        return Vec::new();
-    }
-    // Most streams are none, and this is quick.
-    let is_usual = |frame: &Frame| {
-        let half = frame.data().first().map(|first| first & 0xF);
-        half.is_some_and(|half| message(frame, half).is_some())
-    };
-    if !stream.recent().rev().take(4).all(is_usual) {
         return Vec::new();
     }
     let find = |half: &u8| {
