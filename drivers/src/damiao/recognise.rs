@@ -8,13 +8,19 @@ use alloc::vec::Vec;
 
 /// How many motors a scan asks: people number them from 1 on.
 const ASKED: u8 = 0x20;
-/// The temperatures of a motor that works \[degrees Celsius\].
-const CELSIUS: core::ops::RangeInclusive<u8> = 1..=130;
+/// The temperatures of a motor that works \[degrees Celsius\], and how far those of power stage and
+/// rotor are from each other.
+const CELSIUS: core::ops::RangeInclusive<u8> = 5..=120;
+const APART: u8 = 50;
 /// The ends that a range has.
 const ENDS: core::ops::Range<f32> = 0.5..1000.0;
 /// What an answer with a range counts \[bits\]: four bytes that others send once in 2^32 times, but
 /// small numbers.
 const TELLS: f64 = 16.0;
+
+/// What a question to the motor counts that is heard \[bits\]: others have its bytes less often, but
+/// a question for one motor may be on a bus without it.
+const ASKS: f64 = 6.0;
 
 /// What `frame` tells of the motor at `address`, if it may be its frame.
 fn message(frame: &Frame, address: u8) -> Option<Message> {
@@ -22,7 +28,9 @@ fn message(frame: &Frame, address: u8) -> Option<Message> {
     Message::parse(address, data).filter(|message| match message {
         Message::State(State { state, celsius, .. }) => {
             let is_known = matches!(state, 0 | 1 | 5 | 6 | 8..=0xE);
-            is_known && celsius.iter().all(|celsius| CELSIUS.contains(celsius))
+            let [fet, rotor] = celsius;
+            let are_usual = CELSIUS.contains(fet) && CELSIUS.contains(rotor);
+            is_known && are_usual && fet.abs_diff(*rotor) <= APART
         }
         Message::Register(..) | Message::Other => true,
     })
@@ -114,6 +122,7 @@ fn motor(
     if stream.kept().any(has_told) {
         evidence.add(TELLS);
     }
+    evidence.measures(stream);
     evidence.moves(stream, |frame| match message(frame, address) {
         Some(Message::State(State {
             raw: [position, velocity, _],
@@ -126,6 +135,7 @@ fn motor(
     let asked = seen.stream(QUESTIONS);
     if asked.is_some_and(|asked| asked.kept().any(asks)) {
         evidence.belongs(QUESTIONS);
+        evidence.add(ASKS);
     } else {
         evidence.is_commanded(command, stream, is_its);
     }

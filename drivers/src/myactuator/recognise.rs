@@ -90,6 +90,7 @@ fn v3(seen: &Traffic, address: u16) -> Option<Finding> {
     });
     let stream = answers.or(moves)?;
     if let Some(answers) = answers {
+        evidence.measures(answers);
         evidence.moves(answers, |frame| match *frame.data() {
             [command::STATE | 0xA1..=0xA9, _, _, _, _, _, _, _] => {
                 let [speed, place] = [4, 6].map(|at| f64::from(i16_le(frame.data(), at)));
