@@ -132,7 +132,7 @@ fn strangers(bus: &BusPlan, frames: &[Frame]) -> Vec<String> {
         if !is_sure || own.clone().any(known) || bus.has(finding.driver, finding.address) {
             continue;
         }
-        let ids: Vec<String> = own.map(|id| format!("0x{id}")).collect();
+        let ids: Vec<String> = own.map(|id| id.to_string()).collect();
         let (ids, s) = (ids.join(", "), if ids.len() == 1 { "s" } else { "" });
         let (driver, address, what) = (finding.driver, finding.address, &finding.what);
         all.push(format!(

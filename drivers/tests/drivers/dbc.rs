@@ -691,7 +691,9 @@ fn a_frame_has_as_many_readings_as_bytes() {
     let (readings, faults) = decode(&mut *hand, &[frame(&bytes[..48])]);
     assert_eq!((readings.len(), count(&faults, Counter::Length)), (48, 1));
     let problem = device(65).map(|_| ()).unwrap_err().to_string();
-    assert!(problem.contains("65 readings have signals of frame 010, and a frame has at most 64"));
+    assert!(
+        problem.contains("65 readings have signals of frame 0x010, and a frame has at most 64")
+    );
 }
 
 /// What a file has that can not be used is told to who names it, and to nobody else.
