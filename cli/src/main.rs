@@ -71,7 +71,7 @@ enum Verb {
     Ctl(ctl::Args),
     /// Check this machine: CAN, permissions, shared memory, buffers, real-time limits
     Doctor(doctor::Args),
-    /// Install this program, its systemd units and a robot's configuration, and start the services
+    /// Install this program, its systemd units and a robot's configuration
     Install(install::Args),
 }
 

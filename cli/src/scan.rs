@@ -59,9 +59,10 @@ pub(crate) struct How {
     /// How long to listen [s]
     #[arg(long, value_name = "N", default_value_t = 5.0, value_parser = seconds)]
     seconds: f64,
-    /// Also ask: iCub boards (DISCOVER), CANopen nodes (SDO reads of 1000, 1018 and 1800 to 1803), ODrives that
-    /// are heard (Get_Version), and on CAN FD moteus controllers (a query). These questions start,
-    /// move and change nothing, but for ODrives numbered 48 to 51 or 56 that send no heartbeat
+    /// Also ask: iCub boards (DISCOVER), CANopen nodes (SDO reads of 1000, 1018 and 1800 to 1803),
+    /// ODrives that are heard (Get_Version), and on CAN FD moteus controllers (a query). These
+    /// questions start, move and change nothing, but for ODrives numbered 48 to 51 or 56 that send
+    /// no heartbeat
     #[arg(long)]
     active: bool,
     /// As --active, and also ask devices of this driver: ati_netcanoem, robotous_rft or jr3_can;

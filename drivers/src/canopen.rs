@@ -14,8 +14,8 @@
 //! | `700` + n | heartbeat | 00 boot-up, 04 stopped, 05 operational, 7F pre-operational |
 //!
 //! Nodes are recognised by heartbeats and by SDO answers that are heard. A scan that asks reads
-//! object 1000 (device type) of all nodes, 1018 sub 1 to 4 (identity) of those that answer, and 1800
-//! to 1803 sub 1 and 2 (identifier and transmission of each TPDO) of drives.
+//! object 1000 (device type) of all nodes, 1018 sub 1 to 4 (identity) of those that answer, and
+//! 1800 to 1803 sub 1 and 2 (identifier and transmission of each TPDO) of drives.
 
 mod node;
 mod pdo;

@@ -67,7 +67,8 @@ mod options;
 mod recognise;
 
 pub use board::MyactuatorBoard;
-pub use options::{Options, Position, Protocol};
+pub use frames::Protocol;
+pub use options::{Options, Position};
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};

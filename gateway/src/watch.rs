@@ -98,7 +98,8 @@ fn listen(source: &Source, domain: &str, stop: &AtomicBool) -> Option<Vec<Frame>
     Some(frames)
 }
 
-/// What is to be told of bus number `number` with these frames: texts that do not change from look to look.
+/// What is to be told of bus number `number` with these frames: texts that do not change from look
+/// to look.
 fn look(plan: &Plan, number: usize, frames: &[Frame]) -> Vec<String> {
     let Some(bus) = plan.buses.get(number) else {
         return Vec::new();

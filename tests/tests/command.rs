@@ -326,7 +326,10 @@ fn typing_mistakes_end_with_2_and_say_what_was_meant() {
         (&["decod"][..], "decode"),
         (&["gateway", "--confg", "x"], "--config"),
         (&["gateway"], "--config <FILE>"),
-        (&["estimate", "--config", "estimator.toml"], "--log <FILE>"),
+        (
+            &["estimate", "--config", "estimator.toml"],
+            "--samples <FILE>",
+        ),
         (&["demo", "--seconds", "0"], "must be 2 to 600"),
         (&["demo", "--seconds", "nan"], "must be 2 to 600"),
         (&["demo", "--cad-error", "0.7"], "must be 0 to 0.5"),
@@ -1472,7 +1475,7 @@ fn what_is_no_log_at_all_is_told_and_leaves_no_file() {
         let assess = |log: &str| place.run(&[&assess[..], &["--log", log]].concat());
         assess("none").fails(1, &["none: cannot be read", "No such file"]);
         assess("text").fails(1, &["text: ", "must name the columns"]);
-        assess("-").fails(1, &["--assess reads the log twice", "--log"]);
+        assess("-").fails(1, &["--assess reads the table twice", "--samples"]);
         assess("header.csv").fails(2, &["header.csv", "no column for"]);
         estimate("header.csv").fails(2, &["header.csv", "no column for"]);
         let encode = |log: &str| {

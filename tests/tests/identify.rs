@@ -304,7 +304,7 @@ fn wrong_arguments_and_configurations_end_with_2_and_touch_nothing() {
     );
 
     let said = place.identify(2, &["--config", "estimator.toml"]);
-    assert!(said.contains("--log <FILE>"), "{said}");
+    assert!(said.contains("--samples <FILE>"), "{said}");
     let said = place.identify(
         2,
         &[

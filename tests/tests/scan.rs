@@ -278,7 +278,7 @@ fn a_wrong_command_line_is_told() {
         (&["scan", "--bus", "virtual:"], "virtual:left_arm"),
         (
             &["scan", "--bus", "virtual:a", "--ask", "moteus"],
-            "ati_netcanoem or robotous_rft",
+            "must be ati_netcanoem or ",
         ),
         (&["scan", "--log", "a", "--active"], "--active"),
         (

@@ -18,8 +18,8 @@ const ENDS: core::ops::Range<f32> = 0.5..1000.0;
 /// small numbers.
 const TELLS: f64 = 16.0;
 
-/// What a question to the motor counts that is heard \[bits\]: others have its bytes less often, but
-/// a question for one motor may be on a bus without it.
+/// What a question to the motor counts that is heard \[bits\]: others have its bytes less often,
+/// but a question for one motor may be on a bus without it.
 const ASKS: f64 = 6.0;
 
 /// What `frame` tells of the motor at `address`, if it may be its frame.

@@ -1,8 +1,10 @@
 //! The device's own side: a motor that answers questions, or sends what it measures as if it were
 //! asked once a period.
 
-use super::frames::{ANY_ERROR, Answer, ENCODER_ERROR, JOINT, LENGTH, MOTOR, State, command};
-use super::options::{Checked, Options, Position, Protocol};
+use super::frames::{
+    ANY_ERROR, Answer, ENCODER_ERROR, JOINT, LENGTH, MOTOR, Protocol, State, command,
+};
+use super::options::{Checked, Options, Position};
 use crate::bytes::{quantise, quantise_i16};
 use crate::{Board, EncodeError, Format, Frame, Frames, Spec, SpecError, mit};
 use proprio_topics::{JointState, Nanos, Quality, Reading};

@@ -1,7 +1,7 @@
 //! The host's side: takes the answers of one motor, and asks for them if it is told to.
 
-use super::frames::{Answer, JOINT, LENGTH, MOTOR, State, command};
-use super::options::{Checked, Options, Position, Protocol};
+use super::frames::{Answer, JOINT, LENGTH, MOTOR, Protocol, State, command};
+use super::options::{Checked, Options, Position};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Link, Supervised, next_in_step};
 use crate::held::{Held, OnChange};

@@ -1,7 +1,18 @@
 //! The frames of the protocols V3 and V2.
 
-use super::options::Protocol;
 use crate::bytes::{i16_le, u16_le, u32_le};
+use serde::Deserialize;
+
+/// A motor's protocol.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Protocol {
+    /// V3 and V4.
+    #[default]
+    V3,
+    /// V2, and LKMTech's.
+    V2,
+}
 
 /// The outputs.
 pub(super) const JOINT: u8 = 0;

@@ -1,23 +1,12 @@
 //! The keys of a motor in gateway.toml, for both sides of the driver.
 
-use super::frames::{ANSWERS, COMMANDS, ENCODER_ERROR, MOTION};
+use super::frames::{ANSWERS, COMMANDS, ENCODER_ERROR, MOTION, Protocol};
 use crate::keys::{above_zero, address, duration};
 use crate::mit::Scale;
 use crate::{Id, Spec, SpecError};
 use core::f64::consts::TAU;
 use proprio_topics::{Nanos, Quality};
 use serde::Deserialize;
-
-/// A motor's protocol.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Protocol {
-    /// V3 and V4.
-    #[default]
-    V3,
-    /// V2, and LKMTech's.
-    V2,
-}
 
 /// Which frames are a reading of the joint.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]

@@ -165,8 +165,8 @@ fn sync(devices: &[Device]) -> String {
 pub fn file(robot: &str, buses: &[Bus]) -> String {
     let mut text = format!(
         "# Written by `proprio setup`. `fill in` marks what nobody but a person knows; devices in\n\
-         # comments are possible, and not sure enough to be used. To check it, which refuses what is\n\
-         # still marked:\n\
+         # comments are possible, and not sure enough to be used. To check it (which refuses what\n\
+         # is still marked):\n\
          #\n\
          #     proprio gateway --config gateway.toml --check\n\
          #\n\

@@ -181,6 +181,8 @@ pub struct Regressor {
     /// Per link: the axis of the joint above in base coordinates, with the sign for which the net
     /// wrenches beyond the joint give its torque.
     axes: Vec<Motion>,
+    /// Per degree of freedom: how many joints have it.
+    sharing: Vec<usize>,
     dofs: usize,
 }
 
@@ -222,6 +224,7 @@ impl Regressor {
             reversed: vec![false; joints],
             hops: vec![None; links],
             axes: vec![Motion::zero(); links],
+            sharing: vec![0; dofs],
             dofs,
         }
     }
@@ -280,13 +283,14 @@ impl Regressor {
             }
         }
         let base = kinematics.base();
-        let mut joints = vec![0; self.dofs];
-        (model.joints().iter().filter_map(|joint| joint.dof)).for_each(|dof| joints[dof] += 1);
+        let sharing = &mut self.sharing;
+        sharing.fill(0);
+        (model.joints().iter().filter_map(|joint| joint.dof)).for_each(|dof| sharing[dof] += 1);
         let hop = |joint: &Joint, next| {
             joint.dof.map(|dof| Hop {
                 dof,
                 child: joint.child,
-                is_shared: joints[dof] > 1,
+                is_shared: sharing[dof] > 1,
                 next,
             })
         };
