@@ -94,7 +94,6 @@ pub use options::{Angle, Effort, Mode, Model, Options};
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
-use alloc::borrow::Cow;
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use device::Motor;
@@ -105,10 +104,7 @@ impl Driver for Options {
     const NAME: &'static str = "cubemars";
 
     fn outputs(&self) -> Vec<OutputInfo> {
-        let drive = OutputInfo {
-            suffix: Cow::Borrowed("drive"),
-            ..OutputInfo::new(DRIVE, Kind::Temperature)
-        };
+        let drive = OutputInfo::temperature(DRIVE, "drive");
         [OutputInfo::new(JOINT, Kind::Joint), drive].to_vec()
     }
 

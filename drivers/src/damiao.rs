@@ -102,7 +102,6 @@ pub use options::{Model, Options};
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
-use alloc::borrow::Cow;
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use device::Motor;
@@ -117,10 +116,7 @@ impl Driver for Options {
     }
 
     fn outputs(&self) -> Vec<OutputInfo> {
-        let temperature = |number, suffix| OutputInfo {
-            suffix: Cow::Borrowed(suffix),
-            ..OutputInfo::new(number, Kind::Temperature)
-        };
+        let temperature = OutputInfo::temperature;
         let joint = OutputInfo::new(JOINT, Kind::Joint);
         [joint, temperature(MOTOR, "motor"), temperature(FET, "fet")].to_vec()
     }

@@ -126,6 +126,15 @@ impl OutputInfo {
             suffix: Cow::Borrowed(""),
         }
     }
+
+    /// Output `number`, a temperature with a channel of its own.
+    #[must_use]
+    pub fn temperature(number: u8, suffix: &'static str) -> Self {
+        Self {
+            suffix: Cow::Borrowed(suffix),
+            ..Self::new(number, Kind::Temperature)
+        }
+    }
 }
 
 /// A fault in the frames of a device. It is counted and never stops the gateway.

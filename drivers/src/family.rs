@@ -12,7 +12,7 @@ use crate::{
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use proprio_topics::{Counter, JointState, Nanos, Quality, Reading};
+use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Temperature};
 
 /// What the host's side of a family has of its own.
 pub(crate) trait Family: Send {
@@ -84,6 +84,50 @@ pub(crate) fn next_in_step(due: Nanos, period: Nanos, now: Nanos) -> Nanos {
     }
     let passed = (now - due).0.max(0) / period.0.max(1);
     due + Nanos(period.0.saturating_mul(passed + 1))
+}
+
+/// Questions that are asked one after another, in rounds; without a period, none is.
+#[derive(Debug)]
+pub(crate) struct Rounds {
+    period: Option<Nanos>,
+    /// The place of the next question in its round, and when that round is due.
+    next: usize,
+    due: Nanos,
+}
+
+impl Rounds {
+    pub(crate) const fn new(period: Option<Nanos>) -> Self {
+        Self {
+            period,
+            next: 0,
+            due: Nanos::MIN,
+        }
+    }
+
+    /// The next of `questions`, those of a round, if it is due at `now`.
+    pub(crate) fn ask<T: Copy>(&mut self, questions: &[T], now: Nanos) -> Option<T> {
+        let period = self.period.filter(|_| now >= self.due)?;
+        let question = *questions.get(self.next)?;
+        self.next += 1;
+        if self.next == questions.len() {
+            self.next = 0;
+            self.due = next_in_step(self.due, period, now);
+        }
+        Some(question)
+    }
+
+    /// When the next question is due.
+    pub(crate) fn due(&self) -> Option<Nanos> {
+        self.period.map(|_| self.due)
+    }
+}
+
+/// The reading of a thermometer, if there is one.
+pub(crate) fn temperature(output: u8, celsius: f64, frame: &Frame, out: &mut Decoded) {
+    if celsius.is_finite() {
+        let reading = Reading::Temperature(Temperature { celsius });
+        out.push(Output::new(output, frame, Quality::GOOD, reading), frame.id);
+    }
 }
 
 /// The bring-up of a board, and what it has been asked.

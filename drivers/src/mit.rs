@@ -2,6 +2,7 @@
 //! Cheetah, which many makers send: position of 16 bits, velocity and torque of 12 bits each.
 
 use crate::bytes;
+use proprio_topics::{JointState, Quality};
 
 /// A raw value in SI units: `offset` + `step` x raw. At `least` and `most` it is saturated.
 #[derive(Debug, Clone, Copy)]
@@ -46,6 +47,33 @@ impl Scale {
     pub(crate) fn raw(&self, value: f64) -> i64 {
         bytes::quantise(value - self.offset, self.step, self.least, self.most)
     }
+}
+
+/// The state that these raw values of position, velocity and torque tell; SATURATED if one is at an
+/// end of its range.
+pub(crate) fn measured(scales: [Scale; 3], raw: [i64; 3]) -> (JointState, Quality) {
+    let ([p, v, t], [position, velocity, torque]) = (scales, raw);
+    let state = JointState {
+        position: p.value(position),
+        velocity: v.value(velocity),
+        torque: t.value(torque),
+        ..JointState::ABSENT
+    };
+    let mut ends = scales.iter().zip(raw);
+    match ends.any(|(scale, raw)| scale.is_saturated(raw)) {
+        true => (state, Quality::SATURATED),
+        false => (state, Quality::GOOD),
+    }
+}
+
+/// The raw position, velocity and torque nearest to `state`; an absent torque is 0.
+pub(crate) fn raw([p, v, t]: [Scale; 3], state: &JointState) -> [i64; 3] {
+    let torque = if state.torque.is_nan() {
+        0.0
+    } else {
+        state.torque
+    };
+    [p.raw(state.position), v.raw(state.velocity), t.raw(torque)]
 }
 
 /// The raw position, velocity and torque in the first five bytes, and the bytes after them.

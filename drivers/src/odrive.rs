@@ -85,7 +85,6 @@ pub use options::Options;
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
-use alloc::borrow::Cow;
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use device::Axis;
@@ -96,10 +95,7 @@ impl Driver for Options {
     const NAME: &'static str = "odrive";
 
     fn outputs(&self) -> Vec<OutputInfo> {
-        let temperature = |number, suffix| OutputInfo {
-            suffix: Cow::Borrowed(suffix),
-            ..OutputInfo::new(number, Kind::Temperature)
-        };
+        let temperature = OutputInfo::temperature;
         let joint = OutputInfo::new(JOINT, Kind::Joint);
         match self.firmware {
             Firmware::V0_5 => [joint].to_vec(),

@@ -100,7 +100,6 @@ pub use options::{Model, Options, Protocol};
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
-use alloc::borrow::Cow;
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use device::Motor;
@@ -112,10 +111,7 @@ impl Driver for Options {
     const ASKED_BY_NAME: bool = true;
 
     fn outputs(&self) -> Vec<OutputInfo> {
-        let motor = OutputInfo {
-            suffix: Cow::Borrowed("motor"),
-            ..OutputInfo::new(MOTOR, Kind::Temperature)
-        };
+        let motor = OutputInfo::temperature(MOTOR, "motor");
         [OutputInfo::new(JOINT, Kind::Joint), motor].to_vec()
     }
 

@@ -63,7 +63,6 @@ pub use options::{Options, Position};
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
-use alloc::borrow::Cow;
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use device::Controller;
@@ -74,10 +73,7 @@ impl Driver for Options {
     const NAME: &'static str = "vesc";
 
     fn outputs(&self) -> Vec<OutputInfo> {
-        let temperature = |number, suffix| OutputInfo {
-            suffix: Cow::Borrowed(suffix),
-            ..OutputInfo::new(number, Kind::Temperature)
-        };
+        let temperature = OutputInfo::temperature;
         let joint = OutputInfo::new(JOINT, Kind::Joint);
         [joint, temperature(MOTOR, "motor"), temperature(FET, "fet")].to_vec()
     }

@@ -3,12 +3,11 @@
 use super::frames::{DRIVE, ENCODER_ERROR, JOINT, Layout, Stage, quality_of};
 use super::options::{Checked, Effort, Options};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::bytes;
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Link, Supervised, temperature};
 use crate::held::OnChange;
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
+use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, bytes, mit};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, JointState, Quality, Reading, Temperature};
+use proprio_topics::{Actuator, Counter, Reading};
 
 /// The host's side of a motor.
 #[derive(Debug)]
@@ -46,12 +45,7 @@ impl Motor {
         });
         let quality = quality_of(stage.error);
         out.push(Output::new(JOINT, frame, quality, actuator), frame.id);
-        let celsius = stage.celsius;
-        let temperature = Reading::Temperature(Temperature { celsius });
-        out.push(
-            Output::new(DRIVE, frame, Quality::GOOD, temperature),
-            frame.id,
-        );
+        temperature(DRIVE, stage.celsius, frame, out);
     }
 }
 
@@ -74,31 +68,15 @@ impl Family for Motor {
         let Some((raw, stage)) = self.keys.layout.unpack(data) else {
             return out.fault(Counter::Length, 1, frame.id);
         };
-        let mut quality = Quality::GOOD;
+        let (mut state, mut quality) = mit::measured(self.keys.scales, raw);
         if let Some(stage) = stage {
-            quality = quality_of(stage.error);
+            quality |= quality_of(stage.error);
             self.stage(stage, frame, out);
         }
-        let [p, v, e] = self.keys.scales;
-        let [position, velocity, effort] = raw;
-        if p.is_saturated(position) || v.is_saturated(velocity) || e.is_saturated(effort) {
-            quality |= Quality::SATURATED;
+        if self.keys.effort == Effort::Current {
+            state.current = state.torque;
+            state.torque = self.keys.torque_constant.unwrap_or(f64::NAN) * state.current;
         }
-        let effort = e.value(effort);
-        let (torque, current) = match self.keys.effort {
-            Effort::Torque => (effort, f64::NAN),
-            Effort::Current => (
-                self.keys.torque_constant.map_or(f64::NAN, |k| k * effort),
-                effort,
-            ),
-        };
-        let state = JointState {
-            position: p.value(position),
-            velocity: v.value(velocity),
-            torque,
-            current,
-            ..JointState::ABSENT
-        };
         link.joint(JOINT, frame, quality, state, out);
     }
 

@@ -6,7 +6,7 @@ use super::frames::{
     frame, quality_of,
 };
 use super::options::{Checked, Options};
-use crate::mit::Scale;
+use crate::mit::{self, Scale};
 use crate::{Board, EncodeError, Format, Frame, Frames, Spec, SpecError};
 use proprio_topics::{JointState, Nanos, Quality, Reading};
 
@@ -60,13 +60,8 @@ impl DamiaoBoard {
     }
 
     fn measure(&mut self, joint: &JointState, quality: Quality) -> Result<(), EncodeError> {
-        let torque = if joint.torque.is_nan() {
-            0.0
-        } else {
-            joint.torque
-        };
-        let values = [joint.position, joint.velocity, torque];
-        if values.iter().any(|value| !value.is_finite()) {
+        let values = [joint.position, joint.velocity];
+        if values.iter().any(|value| !value.is_finite()) || joint.torque.is_infinite() {
             return Err(EncodeError::NotFinite);
         }
         let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
@@ -79,9 +74,7 @@ impl DamiaoBoard {
                 ENABLED
             };
         }
-        for ((raw, scale), value) in self.state.raw.iter_mut().zip(&self.scales).zip(values) {
-            *raw = scale.raw(value);
-        }
+        self.state.raw = mit::raw(self.scales, joint);
         Ok(())
     }
 
@@ -154,10 +147,8 @@ impl Board for DamiaoBoard {
     }
 
     fn period(&self) -> Option<Nanos> {
-        match self.keys.request_period {
-            Some(_) => None,
-            None => Some(self.keys.period),
-        }
+        let asked = self.keys.request_period.is_some();
+        (!asked).then_some(self.keys.period)
     }
 
     fn present(&mut self, output: u8, reading: &Reading, quality: Quality) {

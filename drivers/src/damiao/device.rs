@@ -6,12 +6,11 @@ use super::frames::{
 use super::options::{Checked, Options};
 use super::ranges::Ranges;
 use crate::bringup::{Bringup, Timing};
-use crate::bytes;
-use crate::family::{Family, Link, Supervised, next_in_step};
+use crate::family::{Family, Link, Rounds, Supervised, temperature};
 use crate::held::OnChange;
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
+use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, bytes, mit};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
+use proprio_topics::{Actuator, Counter, Nanos, Quality, Reading};
 
 /// The host's side of a motor.
 #[derive(Debug)]
@@ -19,8 +18,7 @@ pub(super) struct Motor {
     keys: Checked,
     /// The motor's state.
     told: OnChange<u8>,
-    /// When the next question for it is due.
-    due: Nanos,
+    questions: Rounds,
 }
 
 impl Motor {
@@ -34,7 +32,7 @@ impl Motor {
         let this = Self {
             keys,
             told: OnChange::NOTHING,
-            due: Nanos::MIN,
+            questions: Rounds::new(keys.request_period),
         };
         let claims = [Claim::shared(keys.id)];
         let ranges = Ranges::new(keys, mode);
@@ -42,11 +40,11 @@ impl Motor {
     }
 
     fn state(&mut self, told: &State, frame: &Frame, link: &mut Link<Ranges>, out: &mut Decoded) {
-        let Some([p, v, t]) = link.questions.scales() else {
+        let Some(scales) = link.questions.scales() else {
             return out.fault(Counter::Unexpected, 1, frame.id);
         };
         let state = told.state;
-        let mut quality = quality_of(state);
+        let quality = quality_of(state);
         if self.told.is_due(state, frame) {
             let faults = if quality == Quality::GOOD { 0 } else { state };
             let actuator = Reading::Actuator(Actuator {
@@ -57,23 +55,11 @@ impl Motor {
             });
             out.push(Output::new(JOINT, frame, quality, actuator), frame.id);
             for (output, celsius) in [FET, MOTOR].into_iter().zip(told.celsius) {
-                let reading = Reading::Temperature(Temperature {
-                    celsius: f64::from(celsius),
-                });
-                out.push(Output::new(output, frame, Quality::GOOD, reading), frame.id);
+                temperature(output, f64::from(celsius), frame, out);
             }
         }
-        let [position, velocity, torque] = told.raw;
-        if p.is_saturated(position) || v.is_saturated(velocity) || t.is_saturated(torque) {
-            quality |= Quality::SATURATED;
-        }
-        let state = JointState {
-            position: p.value(position),
-            velocity: v.value(velocity),
-            torque: t.value(torque),
-            ..JointState::ABSENT
-        };
-        link.joint(JOINT, frame, quality, state, out);
+        let (state, saturated) = mit::measured(scales, told.raw);
+        link.joint(JOINT, frame, quality | saturated, state, out);
     }
 }
 
@@ -110,15 +96,11 @@ impl Family for Motor {
         _link: &mut Link<Ranges>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
-        let period = self.keys.request_period?;
-        if now < self.due {
-            return None;
-        }
-        self.due = next_in_step(self.due, period, now);
-        Some(question(self.keys.address, self.keys.fd, STATE, 0))
+        let command = self.questions.ask(&[STATE], now)?;
+        Some(question(self.keys.address, self.keys.fd, command, 0))
     }
 
     fn request_at(&self) -> Option<Nanos> {
-        self.keys.request_period.map(|_| self.due)
+        self.questions.due()
     }
 }

@@ -99,17 +99,7 @@ impl MyactuatorBoard {
 
     #[allow(clippy::cast_possible_truncation)] // an address is a byte
     fn motion(&self) -> Frame {
-        let [p, v, t] = self.keys.scales;
-        let torque = if self.joint.torque.is_nan() {
-            0.0
-        } else {
-            self.joint.torque
-        };
-        let raw = [
-            p.raw(self.joint.position),
-            v.raw(self.joint.velocity),
-            t.raw(torque),
-        ];
+        let raw = mit::raw(self.keys.scales, &self.joint);
         let [p0, p1, v0, both, t1] = mit::pack(raw);
         let data = [self.keys.address as u8, p0, p1, v0, both, t1, 0, 0];
         Frame::new(self.keys.motion(), &data)
@@ -178,10 +168,8 @@ impl Board for MyactuatorBoard {
     }
 
     fn period(&self) -> Option<Nanos> {
-        match self.keys.request_period {
-            Some(_) => None,
-            None => Some(self.keys.period),
-        }
+        let asked = self.keys.request_period.is_some();
+        (!asked).then_some(self.keys.period)
     }
 
     fn present(&mut self, output: u8, reading: &Reading, quality: Quality) {

@@ -3,11 +3,11 @@
 use super::frames::{Answer, JOINT, LENGTH, MOTOR, Protocol, State, command};
 use super::options::{Checked, Options, Position};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Link, Supervised, next_in_step};
+use crate::family::{Family, Link, Rounds, Supervised, temperature};
 use crate::held::{Held, OnChange};
 use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, bytes, mit};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
+use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading};
 
 /// How often the errors are asked for.
 const ERRORS_PERIOD: Nanos = Nanos::from_millis(1000);
@@ -21,10 +21,9 @@ pub(super) struct Motor {
     temperature: OnChange<()>,
     velocity: Held,
     current: Held,
-    /// The next question: its place in a round, when that is due, and when the errors are.
-    next: usize,
-    due: Nanos,
-    errors_due: Nanos,
+    /// The questions for what is measured, and the one for the errors.
+    questions: Rounds,
+    of_errors: Rounds,
 }
 
 impl Motor {
@@ -47,9 +46,8 @@ impl Motor {
             temperature: OnChange::NOTHING,
             velocity: Held::ABSENT,
             current: Held::ABSENT,
-            next: 0,
-            due: Nanos::MIN,
-            errors_due: Nanos::MIN,
+            questions: Rounds::new(keys.request_period),
+            of_errors: Rounds::new(keys.request_period.map(|_| ERRORS_PERIOD)),
         };
         Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
@@ -94,9 +92,7 @@ impl Motor {
         self.velocity = Held::new(frame, f64::from(state.speed) * speed_step);
         self.current = Held::new(frame, f64::from(state.current) * ampere_per_step);
         if self.temperature.is_due((), frame) {
-            let celsius = f64::from(state.celsius);
-            let reading = Reading::Temperature(Temperature { celsius });
-            out.push(Output::new(MOTOR, frame, Quality::GOOD, reading), frame.id);
+            temperature(MOTOR, f64::from(state.celsius), frame, out);
         }
         if self.keys.position != Position::Status {
             return;
@@ -131,18 +127,8 @@ impl Motor {
         let Some((raw, _)) = measured.and_then(|(_, measured)| mit::unpack(measured)) else {
             return out.fault(Counter::Value, 1, frame.id);
         };
-        let [p, v, t] = self.keys.scales;
-        let [position, velocity, torque] = raw;
-        let mut quality = self.keys.quality(self.errors);
-        if p.is_saturated(position) || v.is_saturated(velocity) || t.is_saturated(torque) {
-            quality |= Quality::SATURATED;
-        }
-        let state = JointState {
-            position: p.value(position),
-            velocity: v.value(velocity),
-            torque: t.value(torque),
-            ..JointState::ABSENT
-        };
+        let (state, saturated) = mit::measured(self.keys.scales, raw);
+        let quality = self.keys.quality(self.errors) | saturated;
         link.joint(JOINT, frame, quality, state, out);
     }
 }
@@ -190,31 +176,17 @@ impl Family for Motor {
         _link: &mut Link<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
-        let period = self.keys.request_period?;
-        if now < self.due {
-            return None;
-        }
         let round: &[u8] = match self.keys.position {
             Position::Angle => &[command::STATE, command::ANGLE],
             Position::Status | Position::Motion => &[command::STATE],
         };
-        let command = if self.next == 0 && now >= self.errors_due {
-            self.errors_due = next_in_step(self.errors_due, ERRORS_PERIOD, now);
-            command::ERRORS
-        } else {
-            let command = *round.get(self.next)?;
-            self.next += 1;
-            if self.next == round.len() {
-                self.next = 0;
-                self.due = next_in_step(self.due, period, now);
-            }
-            command
-        };
+        let errors = self.of_errors.ask(&[command::ERRORS], now);
+        let command = errors.or_else(|| self.questions.ask(round, now))?;
         let data = [command, 0, 0, 0, 0, 0, 0, 0];
         Some(Frame::new(self.keys.commands(), &data))
     }
 
     fn request_at(&self) -> Option<Nanos> {
-        self.keys.request_period.map(|_| self.due)
+        self.questions.due().min(self.of_errors.due())
     }
 }

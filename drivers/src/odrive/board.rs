@@ -148,10 +148,8 @@ impl Board for OdriveBoard {
     }
 
     fn period(&self) -> Option<Nanos> {
-        match self.keys.request_period {
-            Some(_) => None,
-            None => Some(self.keys.period),
-        }
+        let asked = self.keys.request_period.is_some();
+        (!asked).then_some(self.keys.period)
     }
 
     fn present(&mut self, output: u8, reading: &Reading, quality: Quality) {

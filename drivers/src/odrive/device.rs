@@ -5,12 +5,12 @@ use super::frames::{FET, JOINT, LENGTH, MOTOR, command, is_request};
 use super::options::{Checked, Options};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes;
-use crate::family::{Family, Link, Supervised, next_in_step};
+use crate::family::{Family, Link, Rounds, Supervised, temperature};
 use crate::held::Held;
 use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
 use alloc::boxed::Box;
 use core::f64::consts::TAU;
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
+use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading};
 
 /// The float in half `half` of a payload.
 fn float(data: &[u8], half: usize) -> f64 {
@@ -25,9 +25,7 @@ pub(super) struct Axis {
     status: Quality,
     current: Held,
     torque: Held,
-    /// The next request: its place in [`Firmware::requests`], and when that round is due.
-    next: usize,
-    due: Nanos,
+    requests: Rounds,
 }
 
 impl Axis {
@@ -45,8 +43,7 @@ impl Axis {
             status: Quality::GOOD,
             current: Held::ABSENT,
             torque: Held::ABSENT,
-            next: 0,
-            due: Nanos::MIN,
+            requests: Rounds::new(keys.request_period),
         };
         Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
@@ -97,14 +94,6 @@ impl Axis {
     }
 }
 
-/// The reading of a thermometer, if there is one.
-fn temperature(output: u8, celsius: f64, frame: &Frame, out: &mut Decoded) {
-    if celsius.is_finite() {
-        let reading = Reading::Temperature(Temperature { celsius });
-        out.push(Output::new(output, frame, Quality::GOOD, reading), frame.id);
-    }
-}
-
 impl Family for Axis {
     type Questions = NoInquiry;
 
@@ -144,21 +133,11 @@ impl Family for Axis {
         _link: &mut Link<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
-        let period = self.keys.request_period?;
-        if now < self.due {
-            return None;
-        }
-        let requests = self.keys.firmware.requests();
-        let command = *requests.get(self.next)?;
-        self.next += 1;
-        if self.next == requests.len() {
-            self.next = 0;
-            self.due = next_in_step(self.due, period, now);
-        }
+        let command = self.requests.ask(self.keys.firmware.requests(), now)?;
         Some(Frame::remote(self.keys.id(command), LENGTH))
     }
 
     fn request_at(&self) -> Option<Nanos> {
-        self.keys.request_period.map(|_| self.due)
+        self.requests.due()
     }
 }

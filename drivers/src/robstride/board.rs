@@ -5,8 +5,7 @@ use super::frames::{
     JOINT, LENGTH, MOTOR, OF_STATE, RUNNING, State, fault, id, kind, parameter, quality_of,
 };
 use super::options::{Checked, Options, Protocol};
-use crate::bytes;
-use crate::{Board, EncodeError, Format, Frame, Frames, Id, Spec, SpecError};
+use crate::{Board, EncodeError, Format, Frame, Frames, Id, Spec, SpecError, bytes, mit};
 use proprio_topics::{JointState, Nanos, Quality, Reading};
 
 /// The number of a simulated motor's processor.
@@ -47,22 +46,10 @@ impl RobstrideBoard {
 
     /// The current state; an absent torque is 0.
     fn state(&self) -> Frame {
-        let Checked {
-            address,
-            host,
-            scales: [p, v, t],
-            ..
-        } = self.keys;
-        let JointState {
-            position,
-            velocity,
-            torque,
-            ..
-        } = self.joint;
-        let torque = if torque.is_nan() { 0.0 } else { torque };
+        let Checked { address, host, .. } = self.keys;
         let state = State {
             told: None,
-            raw: [p.raw(position), v.raw(velocity), t.raw(torque)],
+            raw: mit::raw(self.keys.scales, &self.joint),
             tenths: self.tenths,
         };
         match self.keys.protocol {
@@ -191,10 +178,8 @@ impl Board for RobstrideBoard {
     }
 
     fn period(&self) -> Option<Nanos> {
-        match self.keys.request_period {
-            Some(_) => None,
-            None => Some(self.keys.period),
-        }
+        let asked = self.keys.request_period.is_some();
+        (!asked).then_some(self.keys.period)
     }
 
     fn present(&mut self, output: u8, reading: &Reading, quality: Quality) {

@@ -5,12 +5,11 @@ use super::frames::{
 };
 use super::options::{Checked, Options, Protocol};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::bytes;
-use crate::family::{Family, Link, Supervised, next_in_step};
+use crate::family::{Family, Link, Rounds, Supervised, temperature};
 use crate::held::{Held, OnChange};
-use crate::{Claim, Decoded, Device, Frame, Id, Mode, Output, Spec, SpecError};
+use crate::{Claim, Decoded, Device, Frame, Id, Mode, Output, Spec, SpecError, bytes, mit};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
+use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading};
 
 /// The host's side of a motor.
 #[derive(Debug)]
@@ -23,9 +22,7 @@ pub(super) struct Motor {
     told: OnChange<(u8, u32)>,
     velocity: Held,
     current: Held,
-    /// The next question: its place in [`parameter::ASKED`], and when that round is due.
-    next: usize,
-    due: Nanos,
+    questions: Rounds,
 }
 
 impl Motor {
@@ -54,8 +51,7 @@ impl Motor {
             told: OnChange::NOTHING,
             velocity: Held::ABSENT,
             current: Held::ABSENT,
-            next: 0,
-            due: Nanos::MIN,
+            questions: Rounds::new(keys.request_period),
         };
         Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
@@ -95,26 +91,13 @@ impl Motor {
             }
         }
         if self.tell(frame, out) {
-            let celsius = f64::from(state.tenths) / 10.0;
-            let reading = Reading::Temperature(Temperature { celsius });
-            out.push(Output::new(MOTOR, frame, Quality::GOOD, reading), frame.id);
+            temperature(MOTOR, f64::from(state.tenths) / 10.0, frame, out);
         }
         if self.keys.request_period.is_some() {
             return;
         }
-        let [p, v, t] = self.keys.scales;
-        let [position, velocity, torque] = state.raw;
-        let mut quality = self.quality();
-        if p.is_saturated(position) || v.is_saturated(velocity) || t.is_saturated(torque) {
-            quality |= Quality::SATURATED;
-        }
-        let state = JointState {
-            position: p.value(position),
-            velocity: v.value(velocity),
-            torque: t.value(torque),
-            ..JointState::ABSENT
-        };
-        link.joint(JOINT, frame, quality, state, out);
+        let (state, saturated) = mit::measured(self.keys.scales, state.raw);
+        link.joint(JOINT, frame, self.quality() | saturated, state, out);
     }
 
     fn parameter(
@@ -205,21 +188,12 @@ impl Family for Motor {
         _link: &mut Link<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
-        let period = self.keys.request_period?;
-        if now < self.due {
-            return None;
-        }
-        let [low, high] = parameter::ASKED.get(self.next)?.to_le_bytes();
-        self.next += 1;
-        if self.next == parameter::ASKED.len() {
-            self.next = 0;
-            self.due = next_in_step(self.due, period, now);
-        }
+        let [low, high] = (self.questions.ask(&parameter::ASKED, now)?).to_le_bytes();
         let id = id(kind::PARAMETER, 0, self.keys.host, self.keys.address);
         Some(Frame::new(id, &[low, high, 0, 0, 0, 0, 0, 0]))
     }
 
     fn request_at(&self) -> Option<Nanos> {
-        self.keys.request_period.map(|_| self.due)
+        self.questions.due()
     }
 }

@@ -6,11 +6,11 @@ use super::frames::{
 use super::options::{Checked, Options, Position};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes::{self, i16_be, u32_be};
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Link, Supervised, temperature};
 use crate::held::Held;
 use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, JointState, Quality, Reading, Temperature};
+use proprio_topics::{Actuator, Counter, JointState, Quality, Reading};
 
 /// The host's side of a controller.
 #[derive(Debug)]
@@ -92,8 +92,7 @@ impl Family for Controller {
                 for (output, at) in [(FET, 0), (MOTOR, 2)] {
                     let celsius = f64::from(i16_be(data, at)) * KELVIN_PER_STEP;
                     if celsius >= COLDEST {
-                        let reading = Reading::Temperature(Temperature { celsius });
-                        out.push(Output::new(output, frame, Quality::GOOD, reading), frame.id);
+                        temperature(output, celsius, frame, out);
                     }
                 }
                 if position == Position::Pid {
