@@ -2,13 +2,12 @@
 //! of ranges, and errors.
 
 use crate::rig::{
-    FD, Rig, board, count, decode, encode, frame, listener, options, shown_keys, spec,
+    FD, Rig, actuator, board, count, decode, encode, frame, is_saturated, joints, listener, near,
+    options, refused, shown_keys, spec, texts,
 };
-use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode, SpecError};
+use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode};
 use proprio_drivers::{Output, State};
-use proprio_topics::{
-    Actuator, Counter, JointState, Kind, Nanos, Quality, Reading, StampKind, Temperature,
-};
+use proprio_topics::{Counter, JointState, Kind, Nanos, Quality, Reading, StampKind, Temperature};
 use proptest::prelude::*;
 use std::f64::consts::TAU;
 
@@ -22,19 +21,6 @@ fn motor(keys: &str, number: u32) -> Box<dyn Device> {
     options("cubemars", keys)
         .device(&spec(number, Mode::Listen, &[0]))
         .expect("a legal configuration")
-}
-
-fn joint(output: &Output) -> JointState {
-    match output.reading {
-        Reading::Joint(joint) if output.output == 0 => joint,
-        _ => panic!("{output:?}"),
-    }
-}
-
-fn joints(readings: &[Output]) -> Vec<&Output> {
-    (readings.iter())
-        .filter(|output| output.reading.kind() == Kind::Joint)
-        .collect()
 }
 
 /// Errors and temperatures told.
@@ -51,22 +37,6 @@ fn told(readings: &[Output]) -> Vec<(u32, f64)> {
         }
     }
     told
-}
-
-fn near(a: f64, b: f64) -> bool {
-    (a - b).abs() <= 1e-9 * b.abs().max(1.0)
-}
-
-/// A frame with a standard or an extended identifier.
-fn wide(text: &str, ms: f64) -> Frame {
-    let (id, data) = text.split_once('#').unwrap();
-    let mut frame = frame(&format!("0#{data}"), ms);
-    let raw = u32::from_str_radix(id, 16).unwrap();
-    frame.id = match id.len() {
-        8 => Id::extended(raw),
-        _ => Id::standard(raw as u16),
-    };
-    frame
 }
 
 #[test]
@@ -90,9 +60,8 @@ fn frames_are_read_as_other_programs_read_them() {
         let number = |word: &str| word.parse::<f64>().unwrap();
         let keys = format!("mode = {mode:?}\nmodel = {model:?}");
         let mut device = motor(&keys, 3);
-        let (readings, faults) = decode(&mut *device, &[wide(text, 0.0)]);
-        let read = joints(&readings)[0];
-        let joint = joint(read);
+        let (readings, faults) = decode(&mut *device, &[frame(text, 0.0)]);
+        let (joint, read) = joints(&readings)[0];
         assert!(near(joint.position, number(position)), "{line}");
         assert!(near(joint.velocity, number(velocity)), "{line}");
         let (given, absent) = match mode {
@@ -111,7 +80,7 @@ fn frames_are_read_as_other_programs_read_them() {
                 5 => Quality::DEVICE_FAULT,
                 _ => Quality::DRIVE_FAULT,
             };
-            assert!(read.quality.contains(quality));
+            assert!(read.contains(quality));
             let faulty = [Counter::DeviceFault, Counter::DriveFault].map(|c| count(&faults, c));
             let expected = [error == 5, error != 5 && error != 0].map(u32::from);
             assert_eq!(faulty, expected);
@@ -127,8 +96,8 @@ fn frames_are_read_as_other_programs_read_them() {
 fn fields_are_where_the_manual_has_them() {
     let mut mit = motor(MIT, 1);
     let read = |device: &mut dyn Device, text: &str| {
-        let (readings, _) = decode(device, &[wide(text, 0.0)]);
-        let joint = joint(joints(&readings)[0]);
+        let (readings, _) = decode(device, &[frame(text, 0.0)]);
+        let joint = joints(&readings)[0].0;
         [joint.position, joint.velocity, joint.torque, joint.current]
     };
     assert_eq!(
@@ -159,16 +128,16 @@ fn keys_replace_the_models_ranges() {
     for model in ["", "model = \"AK80-6\"\n"] {
         let mut device = motor(&format!("{model}{keys}"), 2);
         let text = "7FF#02FFFFFFFFFF2A00";
-        let (readings, _) = decode(&mut *device, &[wide(text, 0.0)]);
-        let read = joint(joints(&readings)[0]);
+        let (readings, _) = decode(&mut *device, &[frame(text, 0.0)]);
+        let read = joints(&readings)[0].0;
         assert!(near(read.position, 95.5) && near(read.velocity, 45.0));
         assert!(near(read.current, 40.0) && near(read.torque, 20.0));
         assert_eq!(told(&readings), [(0, 42.0)]);
     }
     let keys = "mode = \"servo\"\nmodel = \"AK10-9\"\npole_pairs = 14\ngear_ratio = 6.0";
     let mut device = motor(keys, 2);
-    let (readings, _) = decode(&mut *device, &[wide("00002902#0000000100000000", 0.0)]);
-    let read = joint(joints(&readings)[0]);
+    let (readings, _) = decode(&mut *device, &[frame("00002902#0000000100000000", 0.0)]);
+    let read = joints(&readings)[0].0;
     assert!(near(read.velocity, TAU / 6.0 / 84.0));
 }
 
@@ -182,16 +151,16 @@ fn models_have_the_numbers_of_the_page() {
         let cells: Vec<&str> = row.split(" | ").collect();
         let number = |cell: usize| cells[cell].parse::<f64>().unwrap();
         let keys = format!("model = {:?}\n", cells[0]);
-        let (readings, _) = decode(&mut *motor(&keys, 1), &[wide("000#01FFFFFFFFFF", 0.0)]);
-        let read = joint(&readings[0]);
+        let (readings, _) = decode(&mut *motor(&keys, 1), &[frame("000#01FFFFFFFFFF", 0.0)]);
+        let read = joints(&readings)[0].0;
         assert!(near(read.position, 12.5));
         assert!(
             near(read.velocity, number(1)) && near(read.torque, number(2)),
             "{row}"
         );
         let mut servo = motor(&format!("{keys}mode = \"servo\""), 1);
-        let (readings, _) = decode(&mut *servo, &[wide("00002901#0000000100000000", 0.0)]);
-        let read = joint(joints(&readings)[0]);
+        let (readings, _) = decode(&mut *servo, &[frame("00002901#0000000100000000", 0.0)]);
+        let read = joints(&readings)[0].0;
         assert!(
             near(read.velocity, TAU / 6.0 / number(3) / number(4)),
             "{row}"
@@ -205,12 +174,12 @@ fn models_have_the_numbers_of_the_page() {
 #[test]
 fn motors_share_an_identifier() {
     let frames = [
-        wide("000#017FFF7FF7FF", 0.0),
-        wide("000#02FFFF7FF7FF", 0.2),
-        wide("000#09FFFF7FF7FF", 0.4),
+        frame("000#017FFF7FF7FF", 0.0),
+        frame("000#02FFFF7FF7FF", 0.2),
+        frame("000#09FFFF7FF7FF", 0.4),
         // A command to all in MIT mode, an empty frame, a request.
-        wide("000#FFFFFFFFFFFFFFFC", 0.6),
-        wide("000#", 0.8),
+        frame("000#FFFFFFFFFFFFFFFC", 0.6),
+        frame("000#", 0.8),
         Frame::remote(Id::standard(0), 8),
     ];
     let mut first = motor(MIT, 1);
@@ -218,7 +187,7 @@ fn motors_share_an_identifier() {
     for (device, position) in [(&mut first, 0.0), (&mut second, 12.5)] {
         let (readings, faults) = decode(&mut **device, &frames);
         assert_eq!(readings.len(), 1);
-        assert!((joint(&readings[0]).position - position).abs() < 4e-4);
+        assert!((joints(&readings)[0].0.position - position).abs() < 4e-4);
         assert_eq!(faults.len(), usize::from(position > 0.0), "{faults:?}");
     }
     assert_eq!(first.claims(), [Claim::shared(Id::standard(0))]);
@@ -227,9 +196,9 @@ fn motors_share_an_identifier() {
     let mut own = motor(&format!("{MIT}\nhost_id = 7"), 7);
     assert_eq!(own.claims(), [Claim::shared(Id::standard(7))]);
     let frames = [
-        wide("007#80007FF000000800", 0.0),
-        wide("007#FFFFFFFFFFFFFFFC", 0.5),
-        wide("007#0780007FF8004100", 1.0),
+        frame("007#80007FF000000800", 0.0),
+        frame("007#FFFFFFFFFFFFFFFC", 0.5),
+        frame("007#0780007FF8004100", 1.0),
     ];
     let (readings, faults) = decode(&mut *own, &frames);
     assert!(faults.is_empty());
@@ -266,10 +235,11 @@ fn a_value_at_an_end_of_its_range_is_saturated() {
         (SERVO, "00002901#0000000017701900", true),
         (SERVO, "00002901#00000000E8901900", true),
     ] {
-        let (readings, faults) = decode(&mut *motor(keys, 1), &[wide(text, 0.0)]);
-        let quality = joints(&readings)[0].quality;
-        assert_eq!(quality.contains(Quality::SATURATED), saturated, "{text}");
-        assert_eq!(count(&faults, Counter::Saturated), u32::from(saturated));
+        assert_eq!(
+            is_saturated(&mut *motor(keys, 1), text),
+            saturated,
+            "{text}"
+        );
     }
 }
 
@@ -361,7 +331,7 @@ fn the_keys_of_the_page_are_legal_and_nothing_is_sent() {
     assert_eq!(rig.count(Counter::Silences), 1);
     rig.board_loses = Box::new(|_, _| false);
     rig.run(20);
-    assert_eq!(joints(&rig.readings)[50].quality, Quality::GAP_BEFORE);
+    assert_eq!(joints(&rig.readings)[50].1, Quality::GAP_BEFORE);
     assert_eq!(told(&rig.readings).len(), 2);
     rig.device.stop(rig.now);
     rig.run(20);
@@ -385,20 +355,9 @@ fn the_temperature_has_a_channel_of_its_own() {
 
 #[test]
 fn wrong_keys_are_refused() {
-    let refused = |keys: &str, address| {
-        let options = options("cubemars", keys);
-        let spec = spec(address, Mode::Listen, &[0]);
-        let error = options.device(&spec).map(|_| ()).unwrap_err();
-        let board = options.board(&spec).map(|_| ()).unwrap_err();
-        assert_eq!(board.to_string(), error.to_string());
-        match error {
-            SpecError::Key { key, .. } | SpecError::Keys { key, .. } => key,
-            SpecError::Address { most: 254, .. } => "address",
-            other => panic!("{other:?}"),
-        }
-    };
+    let refused = |keys: &str, address| refused("cubemars", keys, address);
     for address in [255, 256, 257] {
-        assert_eq!(refused(MIT, address), "address");
+        assert_eq!(refused(MIT, address), "0 to 254");
     }
     for (keys, key) in [
         ("", "velocity_max"),
@@ -440,7 +399,6 @@ fn wrong_keys_are_refused() {
 
 #[test]
 fn a_simulated_motor_sends_what_it_is_given() {
-    let texts = |frames: Vec<Frame>| frames.iter().map(ToString::to_string).collect::<Vec<_>>();
     let reading = |position, velocity, torque, current| {
         Reading::Joint(JointState {
             position,
@@ -453,7 +411,7 @@ fn a_simulated_motor_sends_what_it_is_given() {
     let (good, absent) = (Quality::GOOD, f64::NAN);
     let mut mit = board("cubemars", MIT, &[0]);
     let mut send =
-        |output, reading: &Reading, quality| texts(encode(&mut *mit, output, reading, quality));
+        |output, reading: &Reading, quality| texts(&encode(&mut *mit, output, reading, quality));
     let high = reading(99.0, 99.0, 99.0, absent);
     assert_eq!(send(0, &high, good), ["000#01FFFFFFFFFF4100"]);
     let low = reading(-99.0, -99.0, -99.0, absent);
@@ -463,13 +421,7 @@ fn a_simulated_motor_sends_what_it_is_given() {
     );
     let both = Quality::DRIVE_FAULT | Quality::DEVICE_FAULT;
     assert_eq!(send(0, &low, both), ["000#0100000000004105"]);
-    let told = Reading::Actuator(Actuator {
-        duty: 0.0,
-        mode: 0,
-        encoder: 0,
-        faults: 7,
-    });
-    assert_eq!(send(0, &told, good), [""; 0]);
+    assert_eq!(send(0, &actuator(0, 7), good), [""; 0]);
     let temperature = |celsius| Reading::Temperature(Temperature { celsius });
     assert_eq!(send(1, &temperature(300.0), good), [""; 0]);
     // An error of that kind stays as it was told.
@@ -481,7 +433,7 @@ fn a_simulated_motor_sends_what_it_is_given() {
     let keys = format!("{SERVO}\ntorque_constant = 2.0");
     let mut servo = board("cubemars", &keys, &[0]);
     let mut send =
-        |output, reading: &Reading, quality| texts(encode(&mut *servo, output, reading, quality));
+        |output, reading: &Reading, quality| texts(&encode(&mut *servo, output, reading, quality));
     send(1, &temperature(-300.0), good);
     let given = reading(TAU / 4.0, -TAU, 8.0, 1.0);
     assert_eq!(send(0, &given, good), ["00002901#0384FB9200648000"]);
@@ -536,18 +488,17 @@ proptest! {
             };
             *(if keys == MIT { &mut state.torque } else { &mut state.current }) = sent[2];
             let mut board = board("cubemars", keys, &[0]);
-            let told = Reading::Temperature(Temperature { celsius });
-            encode(&mut *board, 1, &told, Quality::GOOD);
+            let warm = Reading::Temperature(Temperature { celsius });
+            encode(&mut *board, 1, &warm, Quality::GOOD);
             let frames = encode(&mut *board, 0, &Reading::Joint(state), quality);
             let (readings, _) = decode(&mut *listener("cubemars", keys, &[0]), &frames);
-            let output = joints(&readings)[0];
-            let back = joint(output);
+            let (back, told) = joints(&readings)[0];
             let effort = if keys == MIT { back.torque } else { back.current };
             let read = [back.position, back.velocity, effort];
             for ((a, b), step) in read.iter().zip(sent).zip(steps) {
                 prop_assert!((a - b).abs() <= step * (0.5 + 1e-9), "{} {} {}", a, b, step);
             }
-            prop_assert_eq!(output.quality.0 & !Quality::SATURATED.0, quality.0);
+            prop_assert_eq!(told.0 & !Quality::SATURATED.0, quality.0);
             let (_, read) = told_once(&readings);
             prop_assert!((read - celsius).abs() <= 0.5 + 1e-9);
         }

@@ -2,12 +2,13 @@
 //! that share an identifier, what may be sent, ends of ranges, and states.
 
 use crate::rig::{
-    FD, Rig, board, count, decode, encode, frame, listener, options, poll, shown_keys, spec, texts,
+    FD, Rig, actuator, asked, board, count, decode, encode, frame, is_saturated, joints, listener,
+    near, options, poll, refused, sends_nothing, shown_keys, spec, texts,
 };
+use proprio_drivers::State;
 use proprio_drivers::{Claim, Decoded, Device, EncodeError, Frame, Frames, Id, Mode, Output};
-use proprio_drivers::{SpecError, State};
 use proprio_topics::{
-    Actuator, Counter, JointState, Nanos, Quality, Reading, Refusal, StampKind, Temperature,
+    Counter, JointState, Nanos, Quality, Reading, Refusal, StampKind, Temperature,
 };
 use proptest::prelude::*;
 
@@ -21,15 +22,6 @@ fn motor(keys: &str, address: u32, mode: Mode) -> Box<dyn Device> {
     options("damiao", keys)
         .device(&spec(address, mode, &[0]))
         .expect("a legal configuration")
-}
-
-fn joints(readings: &[Output]) -> Vec<(JointState, Quality)> {
-    (readings.iter())
-        .filter_map(|output| match output.reading {
-            Reading::Joint(joint) => Some((joint, output.quality)),
-            _ => None,
-        })
-        .collect()
 }
 
 /// Mode and faults, temperatures of FET and motor.
@@ -50,22 +42,6 @@ fn told(readings: &[Output]) -> Vec<(u32, u32, f64, f64)> {
         }
     });
     told.collect()
-}
-
-fn near(a: f64, b: f64) -> bool {
-    (a - b).abs() <= 1e-9 * b.abs().max(1.0)
-}
-
-/// Polls `device` for `ms` milliseconds, and answers nothing.
-fn sent(device: &mut dyn Device, from_ms: i64, ms: i64) -> Vec<String> {
-    let mut sent = Vec::new();
-    for now in (from_ms..from_ms + ms).map(Nanos::from_millis) {
-        while let Some(frame) = poll(device, now) {
-            device.on_sent(&frame, Ok(now));
-            sent.push(frame.to_string());
-        }
-    }
-    sent
 }
 
 #[test]
@@ -226,10 +202,8 @@ fn a_value_at_an_end_of_its_range_is_saturated() {
         ("011#1180008000001919", true),
         ("011#118000800FFF1919", true),
     ] {
-        let (readings, faults) = decode(&mut *motor(MODEL, 1, Mode::Listen), &[frame(text, 0.0)]);
-        let quality = joints(&readings)[0].1;
-        assert_eq!(quality.contains(Quality::SATURATED), saturated, "{text}");
-        assert_eq!(count(&faults, Counter::Saturated), u32::from(saturated));
+        let mut device = motor(MODEL, 1, Mode::Listen);
+        assert_eq!(is_saturated(&mut *device, text), saturated, "{text}");
     }
 }
 
@@ -290,18 +264,7 @@ fn no_command_is_ever_sent() {
     ];
     let mut rig = Rig::new("damiao", ASKED, &[0], still());
     rig.run(300);
-    // The motor is lost, comes back, and the bus as well.
-    rig.board_loses = Box::new(|_, _| true);
-    rig.run(1000);
-    rig.board_loses = Box::new(|n, _| n % 3 == 0);
-    rig.run(300);
-    rig.device.restart(rig.now);
-    rig.run(300);
-    rig.device.stop(rig.now);
-    let before = rig.sent.len();
-    rig.run(100);
-    assert_eq!(rig.sent.len(), before);
-    assert_eq!(rig.device.state(), State::Stopped);
+    rig.disturb();
     for text in &rig.sent {
         assert!(legal.contains(&text.as_str()), "{text}");
     }
@@ -311,9 +274,7 @@ fn no_command_is_ever_sent() {
     // Without the key, and where another program commands, nothing.
     for (keys, mode) in [(MODEL, Mode::Supervise), (ASKED, Mode::Listen)] {
         let mut device = motor(keys, 1, mode);
-        assert_eq!(sent(&mut *device, 1000, 3000), [""; 0]);
-        device.stop(Nanos::from_millis(5000));
-        assert_eq!(sent(&mut *device, 5000, 100), [""; 0]);
+        sends_nothing(&mut *device);
     }
 }
 
@@ -473,24 +434,9 @@ fn the_keys_of_the_page_are_legal() {
 
 #[test]
 fn wrong_keys_are_refused() {
-    let refused = |keys: &str, address| {
-        let options = options("damiao", keys);
-        let spec = spec(address, Mode::Listen, &[0]);
-        let error = options.device(&spec).map(|_| ()).unwrap_err();
-        let board = options.board(&spec).map(|_| ()).unwrap_err();
-        assert_eq!(board.to_string(), error.to_string());
-        match error {
-            SpecError::Key { key, .. } | SpecError::Keys { key, .. } => key,
-            SpecError::Address {
-                least: 1,
-                most: 255,
-                ..
-            } => "address",
-            other => panic!("{other:?}"),
-        }
-    };
+    let refused = |keys: &str, address| refused("damiao", keys, address);
     for address in [0, 256] {
-        assert_eq!(refused(MODEL, address), "address");
+        assert_eq!(refused(MODEL, address), "1 to 255");
     }
     for keys in ["", "position_max = 12.5\nvelocity_max = 30.0"] {
         assert_eq!(refused(keys, 1), "model");
@@ -538,14 +484,6 @@ fn a_simulated_motor_answers_as_real_ones_do() {
     );
     let both = Quality::DRIVE_FAULT | Quality::DEVICE_FAULT;
     assert_eq!(send(0, &low, both), ["011#5100000000001919"]);
-    let actuator = |mode, faults| {
-        Reading::Actuator(Actuator {
-            duty: 0.0,
-            mode,
-            encoder: 0,
-            faults,
-        })
-    };
     assert_eq!(send(0, &actuator(0, 0xB), good), [""; 0]);
     // A fault of that kind stays as it was told.
     assert_eq!(
@@ -572,11 +510,7 @@ fn a_simulated_motor_answers_as_real_ones_do() {
         assert_eq!(motor.encode(output, &reading, good, &mut out), Err(error));
     }
     // Commands in each mode are answered; those to others are not.
-    let mut ask = |text: &str| {
-        let mut out = Frames::new();
-        motor.on_frame(&frame(text, 0.0), &mut out);
-        texts(&out)
-    };
+    let mut ask = |text: &str| asked(&mut *motor, text);
     let state = ["011#0180008008000051"];
     for command in [
         "001#8000800000000800",

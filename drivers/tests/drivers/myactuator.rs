@@ -2,11 +2,12 @@
 //! may be sent, commands that are no answers, ends of ranges, and errors.
 
 use crate::rig::{
-    FD, Rig, board, count, decode, encode, frame, listener, options, poll, shown_keys, spec, texts,
+    Rig, actuator, asked, board, count, decode, encode, frame, is_saturated, joints, listener,
+    options, refused, sends_nothing, shown_keys, spec, takes_eight_bytes, temperatures, texts,
 };
-use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode, Output};
-use proprio_drivers::{SpecError, State};
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
+use proprio_drivers::State;
+use proprio_drivers::{Claim, Device, EncodeError, Frames, Id, Mode, Output};
+use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Temperature};
 use proptest::prelude::*;
 use std::f64::consts::TAU;
 
@@ -30,28 +31,10 @@ fn motor(keys: &str, address: u32, mode: Mode) -> Box<dyn Device> {
         .expect("a legal configuration")
 }
 
-fn joints(readings: &[Output]) -> Vec<(JointState, Quality)> {
-    (readings.iter())
-        .filter_map(|output| match output.reading {
-            Reading::Joint(joint) => Some((joint, output.quality)),
-            _ => None,
-        })
-        .collect()
-}
-
 fn faults(readings: &[Output]) -> Vec<u32> {
     (readings.iter())
         .filter_map(|output| match output.reading {
             Reading::Actuator(actuator) => Some(actuator.faults),
-            _ => None,
-        })
-        .collect()
-}
-
-fn temperatures(readings: &[Output]) -> Vec<f64> {
-    (readings.iter())
-        .filter_map(|output| match output.reading {
-            Reading::Temperature(temperature) if output.output == 1 => Some(temperature.celsius),
             _ => None,
         })
         .collect()
@@ -95,7 +78,7 @@ fn answers_are_read_as_other_programs_read_them() {
                 assert!(near(joint.velocity, speed.to_radians()), "{line}");
                 assert!(near(joint.current, current), "{line}");
                 assert_eq!(joint.torque, 2.0 * joint.current);
-                assert_eq!(temperatures(&readings), [celsius], "{line}");
+                assert_eq!(temperatures(&readings), [(1, celsius)], "{line}");
             }
             ("angle", &[angle]) => {
                 let (joint, _) = joints(&readings)[0];
@@ -154,7 +137,7 @@ fn answers_of_the_older_protocol_are_read_as_other_programs_read_them() {
                 assert!(near(joint.position, position), "{line}");
                 assert!(near(joint.velocity, speed.to_radians() / 6.0), "{line}");
                 assert_eq!(joint.current, current * 0.5, "{line}");
-                assert_eq!(temperatures(&readings), [celsius]);
+                assert_eq!(temperatures(&readings), [(1, celsius)]);
             }
             [error] if words[1].starts_with("143#9A") => {
                 assert_eq!(faults(&readings), [error as u32], "{line}");
@@ -229,7 +212,7 @@ fn speed_and_current_join_the_angles_for_a_while() {
         error(1003.0),
     ];
     let (readings, _) = decode(&mut *motor("", 1, Mode::Listen), &frames);
-    assert_eq!(temperatures(&readings), [32.0, 32.0]);
+    assert_eq!(temperatures(&readings), [(1, 32.0); 2]);
     assert_eq!(faults(&readings), [2]);
 }
 
@@ -259,32 +242,26 @@ fn no_command_is_ever_sent() {
         let coarse = if round.len() == 2 { 0.01 } else { 1e-4 };
         assert!((joint.position - 20.0).abs() < coarse, "{joint:?}");
         assert!((joint.velocity + 1.5).abs() < 0.02, "{joint:?}");
-        rig.board_loses = Box::new(|_, _| true);
-        rig.run(1000);
-        rig.board_loses = Box::new(|n, _| n % 3 == 0);
-        rig.run(300);
-        rig.device.restart(rig.now);
-        rig.run(300);
-        rig.device.stop(rig.now);
-        let before = rig.sent.len();
-        rig.run(100);
-        assert_eq!(rig.sent.len(), before);
+        rig.disturb();
         for text in &rig.sent {
             assert!(legal.contains(text), "{text}");
         }
         let mut device = motor(&keys, 1, Mode::Listen);
-        for now in (1000..4000).map(Nanos::from_millis) {
-            assert_eq!(poll(&mut *device, now), None);
-        }
+        sends_nothing(&mut *device);
     }
     for keys in ["", MOTION, OLD_STATUS] {
         let mut device = motor(keys, 1, Mode::Supervise);
-        for now in (1000..4000).map(Nanos::from_millis) {
-            assert_eq!(poll(&mut *device, now), None);
-        }
-        device.stop(Nanos::from_millis(5000));
-        assert_eq!(poll(&mut *device, Nanos::from_millis(5000)), None);
+        sends_nothing(&mut *device);
     }
+}
+
+/// Errors are asked for once a second, however rare the other questions are.
+#[test]
+fn errors_are_asked_for_by_themselves() {
+    let mut rig = Rig::new("myactuator", "request_period_ms = 5000", &[0], still());
+    rig.run(2500);
+    let commands: Vec<&str> = rig.sent.iter().map(|text| &text[4..6]).collect();
+    assert_eq!(commands, ["9A", "9C", "92", "9A", "9A"]);
 }
 
 /// In V2 commands have the identifier of the answers.
@@ -341,10 +318,8 @@ fn a_value_at_an_end_of_its_range_is_saturated() {
         (MOTION, "501#0180000008000000", true),
         (MOTION, "501#018000800FFF0000", true),
     ] {
-        let (readings, counted) = decode(&mut *motor(keys, 1, Mode::Listen), &[frame(text, 0.0)]);
-        let quality = joints(&readings)[0].1;
-        assert_eq!(quality.contains(Quality::SATURATED), saturated, "{text}");
-        assert_eq!(count(&counted, Counter::Saturated), u32::from(saturated));
+        let mut device = motor(keys, 1, Mode::Listen);
+        assert_eq!(is_saturated(&mut *device, text), saturated, "{text}");
     }
 }
 
@@ -353,21 +328,7 @@ fn frames_that_are_none_of_the_protocol_are_counted() {
     for (keys, id) in [("", 0x241), (OLD, 0x141), (MOTION, 0x501), (MOTION, 0x241)] {
         let mut device = motor(keys, 1, Mode::Listen);
         let id = Id::standard(id);
-        for length in 0..8 {
-            let short = Frame::new(id, &[0x92; 8][..length]);
-            let (readings, counted) = decode(&mut *device, &[short]);
-            assert_eq!((readings.len(), count(&counted, Counter::Length)), (0, 1));
-        }
-        let fd = Frame::with_format(id, FD, &[0x92; 8]).unwrap();
-        let (readings, counted) = decode(&mut *device, &[fd, Frame::remote(id, 8)]);
-        assert!(readings.is_empty());
-        assert_eq!(
-            (
-                count(&counted, Counter::Value),
-                count(&counted, Counter::Length)
-            ),
-            (1, 1)
-        );
+        takes_eight_bytes(&mut *device, id, 0x92);
     }
     // Other answers, commands, other motors; the motion mode of another ID.
     for text in [
@@ -409,22 +370,9 @@ fn the_keys_of_the_page_are_legal() {
 
 #[test]
 fn wrong_keys_are_refused() {
-    let refused = |keys: &str, address| {
-        let options = options("myactuator", keys);
-        let spec = spec(address, Mode::Listen, &[0]);
-        let error = options.device(&spec).map(|_| ()).unwrap_err();
-        let board = options.board(&spec).map(|_| ()).unwrap_err();
-        assert_eq!(board.to_string(), error.to_string());
-        match error {
-            SpecError::Key { key, .. } | SpecError::Keys { key, .. } => key,
-            SpecError::Address {
-                least: 1, most: 32, ..
-            } => "address",
-            other => panic!("{other:?}"),
-        }
-    };
+    let refused = |keys: &str, address| refused("myactuator", keys, address);
     for address in [0, 33] {
-        assert_eq!(refused("", address), "address");
+        assert_eq!(refused("", address), "1 to 32");
     }
     for (keys, key) in [
         ("protocol = \"v2\"\nposition = \"motion\"", "position"),
@@ -476,13 +424,10 @@ fn a_simulated_motor_answers_as_real_ones_do() {
     assert_eq!(send(1, &temperature(200.0), good), [""; 0]);
     let over = ["241#9A7F000100000000", "241#9C7F9600680198FE", sent[1]];
     assert_eq!(send(0, &turn, good), over);
-    let told = Reading::Actuator(Actuator {
-        duty: 0.0,
-        mode: 0,
-        encoder: 0,
-        faults: 0x1002,
-    });
-    assert_eq!(send(0, &told, good), ["241#9A7F000100000210"]);
+    assert_eq!(
+        send(0, &actuator(0, 0x1002), good),
+        ["241#9A7F000100000210"]
+    );
     let far = reading(1e9, 1e9, absent, 1e9);
     let ends = ["241#9C7FFF7FFF7FFF7F", "241#92000000FFFFFF7F"];
     assert_eq!(send(0, &far, Quality::DRIVE_FAULT), ends);
@@ -507,11 +452,7 @@ fn a_simulated_motor_answers_as_real_ones_do() {
     ] {
         assert_eq!(angle.encode(output, &reading, good, &mut out), Err(error));
     }
-    let mut ask = |text: &str| {
-        let mut out = Frames::new();
-        angle.on_frame(&frame(text, 0.0), &mut out);
-        texts(&out)
-    };
+    let mut ask = |text: &str| asked(&mut *angle, text);
     assert_eq!(ask("141#9C00000000000000"), [ends[0]]);
     assert_eq!(ask("141#9200000000000000"), [ends[1]]);
     assert_eq!(ask("141#9A00000000000000"), ["241#9A7F000100000210"]);

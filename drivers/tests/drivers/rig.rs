@@ -3,9 +3,9 @@
 
 use proprio_drivers::{
     Board, Decoded, Device, Fault, Format, Frame, Frames, Id, Mode, NotSent, Options, Output,
-    Outputs, Spec, State,
+    Outputs, Spec, SpecError, State,
 };
-use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind};
+use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, StampKind};
 
 /// The keys of a driver, read from TOML.
 pub(crate) fn options(driver: &str, keys: &str) -> Options {
@@ -284,7 +284,120 @@ impl Rig {
         self
     }
 
+    /// The board is lost, comes back, frames are lost, and the device is restarted and stopped:
+    /// then it sends nothing.
+    pub(crate) fn disturb(&mut self) {
+        self.board_loses = Box::new(|_, _| true);
+        self.run(1000);
+        self.board_loses = Box::new(|n, _| n % 3 == 0);
+        self.run(300);
+        self.device.restart(self.now);
+        self.run(300);
+        self.device.stop(self.now);
+        let before = self.sent.len();
+        self.run(100);
+        assert_eq!(self.sent.len(), before);
+        assert_eq!(self.device.state(), State::Stopped);
+    }
+
     pub(crate) fn count(&self, counter: Counter) -> u32 {
         count(&self.faults, counter)
+    }
+}
+
+/// The states of joints among `readings`.
+pub(crate) fn joints(readings: &[Output]) -> Vec<(JointState, Quality)> {
+    (readings.iter())
+        .filter_map(|output| match output.reading {
+            Reading::Joint(joint) if output.output == 0 => Some((joint, output.quality)),
+            _ => None,
+        })
+        .collect()
+}
+
+/// The temperatures among `readings`, with the numbers of their outputs.
+pub(crate) fn temperatures(readings: &[Output]) -> Vec<(u8, f64)> {
+    (readings.iter())
+        .filter_map(|output| match output.reading {
+            Reading::Temperature(temperature) => Some((output.output, temperature.celsius)),
+            _ => None,
+        })
+        .collect()
+}
+
+/// Whether the numbers are the same but for their rounding.
+pub(crate) fn near(a: f64, b: f64) -> bool {
+    (a - b).abs() <= 1e-9 * b.abs().max(1.0)
+}
+
+/// Whether the first joint reading of this frame is SATURATED, which is counted too.
+pub(crate) fn is_saturated(device: &mut dyn Device, text: &str) -> bool {
+    let (readings, faults) = decode(device, &[frame(text, 0.0)]);
+    let saturated = joints(&readings)[0].1.contains(Quality::SATURATED);
+    assert_eq!(count(&faults, Counter::Saturated), u32::from(saturated));
+    saturated
+}
+
+/// Frames with `id` that are no classic ones of eight bytes are counted, and give no readings.
+pub(crate) fn takes_eight_bytes(device: &mut dyn Device, id: Id, fill: u8) {
+    let mut counted = |frame, counter| {
+        let (readings, faults) = decode(device, &[frame]);
+        assert_eq!((readings.len(), count(&faults, counter)), (0, 1), "{frame}");
+    };
+    for length in 0..8 {
+        counted(Frame::new(id, &[fill; 8][..length]), Counter::Length);
+    }
+    counted(Frame::remote(id, 8), Counter::Length);
+    let fd = Frame::with_format(id, FD, &[fill; 8]).unwrap();
+    counted(fd, Counter::Value);
+}
+
+/// What `device` sends in `ms` milliseconds from `from_ms` on, without any answer.
+pub(crate) fn sent(device: &mut dyn Device, from_ms: i64, ms: i64) -> Vec<String> {
+    let mut sent = Vec::new();
+    for now in (from_ms..from_ms + ms).map(Nanos::from_millis) {
+        while let Some(frame) = poll(device, now) {
+            device.on_sent(&frame, Ok(now));
+            sent.push(frame.to_string());
+        }
+    }
+    sent
+}
+
+/// `device` never sends anything, stopped or not.
+pub(crate) fn sends_nothing(device: &mut dyn Device) {
+    assert_eq!(sent(device, 1000, 3000), [""; 0]);
+    device.stop(Nanos::from_millis(5000));
+    assert_eq!(sent(device, 5000, 100), [""; 0]);
+}
+
+/// What `board` answers to the frame `text`.
+pub(crate) fn asked(board: &mut dyn Board, text: &str) -> Vec<String> {
+    let mut out = Frames::new();
+    board.on_frame(&frame(text, 0.0), &mut out);
+    texts(&out)
+}
+
+/// A drive's state, without a duty cycle.
+pub(crate) fn actuator(mode: u32, faults: u32) -> Reading {
+    Reading::Actuator(Actuator {
+        duty: 0.0,
+        mode,
+        encoder: 0,
+        faults,
+    })
+}
+
+/// The key that device and board refuse, or the legal addresses.
+pub(crate) fn refused(driver: &str, keys: &str, address: u32) -> String {
+    let options = options(driver, keys);
+    let spec = spec(address, Mode::Listen, &[0]);
+    let error = options.device(&spec).map(|_| ()).unwrap_err();
+    let board = options.board(&spec).map(|_| ()).unwrap_err();
+    assert_eq!(board.to_string(), error.to_string());
+    match error {
+        SpecError::Key { key, .. } | SpecError::Keys { key, .. } => key.to_owned(),
+        SpecError::Address { least, most, .. } => format!("{least} to {most}"),
+        other => panic!("{other:?}"),
     }
 }

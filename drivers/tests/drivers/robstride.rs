@@ -2,11 +2,13 @@
 //! sent, ends of ranges, and the MIT protocol.
 
 use crate::rig::{
-    FD, Rig, board, count, decode, encode, frame, listener, options, poll, shown_keys, spec, texts,
+    Rig, actuator, asked, board, count, decode, encode, frame, is_saturated, joints, listener,
+    near, options, refused, sends_nothing, sent, shown_keys, spec, takes_eight_bytes, temperatures,
+    texts,
 };
-use proprio_drivers::{Board, Claim, Device, EncodeError, Frame, Frames, Id, Mode, Output};
-use proprio_drivers::{SpecError, State};
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
+use proprio_drivers::State;
+use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode, Output};
+use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Temperature};
 use proptest::prelude::*;
 use std::f64::consts::{PI, TAU};
 
@@ -23,15 +25,6 @@ fn motor(keys: &str, address: u32, mode: Mode) -> Box<dyn Device> {
         .expect("a legal configuration")
 }
 
-fn joints(readings: &[Output]) -> Vec<(JointState, Quality)> {
-    (readings.iter())
-        .filter_map(|output| match output.reading {
-            Reading::Joint(joint) => Some((joint, output.quality)),
-            _ => None,
-        })
-        .collect()
-}
-
 /// Modes and faults.
 fn told(readings: &[Output]) -> Vec<(u32, u32)> {
     (readings.iter())
@@ -40,19 +33,6 @@ fn told(readings: &[Output]) -> Vec<(u32, u32)> {
             _ => None,
         })
         .collect()
-}
-
-fn temperatures(readings: &[Output]) -> Vec<f64> {
-    (readings.iter())
-        .filter_map(|output| match output.reading {
-            Reading::Temperature(temperature) if output.output == 1 => Some(temperature.celsius),
-            _ => None,
-        })
-        .collect()
-}
-
-fn near(a: f64, b: f64) -> bool {
-    (a - b).abs() <= 1e-9 * b.abs().max(1.0)
 }
 
 fn still() -> (u8, Reading) {
@@ -76,13 +56,7 @@ fn frames_are_read_as_other_programs_read_them() {
         match words[..] {
             ["read", parameter, question, answer, value] => {
                 let mut device = motor(ASKED, address(answer), Mode::Supervise);
-                let mut sent = Vec::new();
-                for now in (1000..1010).map(Nanos::from_millis) {
-                    while let Some(frame) = poll(&mut *device, now) {
-                        device.on_sent(&frame, Ok(now));
-                        sent.push(frame.to_string());
-                    }
-                }
+                let sent = sent(&mut *device, 1000, 10);
                 assert!(sent.iter().any(|sent| sent == question), "{line}: {sent:?}");
                 let id = &answer[..8];
                 let position = format!("{id}#1970000000000000");
@@ -126,7 +100,10 @@ fn frames_are_read_as_other_programs_read_them() {
                     [(mode.parse().unwrap(), faults << 24)],
                     "{line}"
                 );
-                assert!(near(temperatures(&readings)[0], number(celsius)), "{line}");
+                assert!(
+                    near(temperatures(&readings)[0].1, number(celsius)),
+                    "{line}"
+                );
                 // 8: magnetic encoder, 32: not calibrated; 16: Hall encoder of a CyberGear.
                 let encoder = if model == "CyberGear" { 0x38 } else { 0x28 };
                 let expected = [faults & encoder != 0, faults & !encoder != 0];
@@ -244,10 +221,7 @@ fn a_value_at_an_end_of_its_range_is_saturated() {
         ("028001FD#80008000FFFF0140", true),
     ] {
         let mut device = motor(MODEL, 1, Mode::Listen);
-        let (readings, faults) = decode(&mut *device, &[frame(text, 0.0)]);
-        let quality = joints(&readings)[0].1;
-        assert_eq!(quality.contains(Quality::SATURATED), saturated, "{text}");
-        assert_eq!(count(&faults, Counter::Saturated), u32::from(saturated));
+        assert_eq!(is_saturated(&mut *device, text), saturated, "{text}");
     }
 }
 
@@ -269,16 +243,7 @@ fn no_command_is_ever_sent() {
     assert_eq!(read[0].0.position, 20.0);
     assert_eq!((read[0].0.velocity, read[0].0.current), (-1.5, 0.5));
     assert_eq!(read[0].0.torque, 1.0);
-    rig.board_loses = Box::new(|_, _| true);
-    rig.run(1000);
-    rig.board_loses = Box::new(|n, _| n % 3 == 0);
-    rig.run(300);
-    rig.device.restart(rig.now);
-    rig.run(300);
-    rig.device.stop(rig.now);
-    let before = rig.sent.len();
-    rig.run(100);
-    assert_eq!(rig.sent.len(), before);
+    rig.disturb();
     for text in &rig.sent {
         assert!(legal.contains(&text.as_str()), "{text}");
     }
@@ -288,11 +253,7 @@ fn no_command_is_ever_sent() {
         (ASKED, Mode::Listen),
     ] {
         let mut device = motor(keys, 1, mode);
-        for now in (1000..4000).map(Nanos::from_millis) {
-            assert_eq!(poll(&mut *device, now), None);
-        }
-        device.stop(Nanos::from_millis(5000));
-        assert_eq!(poll(&mut *device, Nanos::from_millis(5000)), None);
+        sends_nothing(&mut *device);
     }
 }
 
@@ -312,7 +273,7 @@ fn answers_and_states_are_not_mixed() {
     let (readings, _) = decode(&mut *device, &[state]);
     assert!(joints(&readings).is_empty());
     assert_eq!(told(&readings), [(2, 0x1000_0000)]);
-    assert_eq!(temperatures(&readings), [32.0]);
+    assert_eq!(temperatures(&readings), [(1, 32.0)]);
     let frames = [
         answer("1B70", 3.0, 1.0),
         answer("1A70", 4.0, 1.1),
@@ -373,7 +334,7 @@ fn the_mit_protocol_has_its_own_frames() {
         [Quality::GOOD, Quality::DEVICE_FAULT, Quality::GOOD]
     );
     assert_eq!(told(&readings), [(0, 0), (0, 0x80), (0, 0)]);
-    assert_eq!(temperatures(&readings), [32.0]);
+    assert_eq!(temperatures(&readings), [(1, 32.0)]);
 }
 
 #[test]
@@ -382,21 +343,7 @@ fn frames_that_are_none_of_the_protocol_are_counted() {
     let cases = private.map(|id| (MODEL, id)).into_iter();
     for (keys, id) in cases.chain([(MIT, Id::standard(0xFD))]) {
         let mut device = motor(keys, 1, Mode::Listen);
-        for length in 0..8 {
-            let short = Frame::new(id, &[1; 8][..length]);
-            let (readings, faults) = decode(&mut *device, &[short]);
-            assert_eq!((readings.len(), count(&faults, Counter::Length)), (0, 1));
-        }
-        let fd = Frame::with_format(id, FD, &[1; 8]).unwrap();
-        let (readings, faults) = decode(&mut *device, &[fd, Frame::remote(id, 8)]);
-        assert!(readings.is_empty());
-        assert_eq!(
-            (
-                count(&faults, Counter::Value),
-                count(&faults, Counter::Length)
-            ),
-            (1, 1)
-        );
+        takes_eight_bytes(&mut *device, id, 1);
     }
     // Commands, other motors, other hosts.
     let mut device = motor(MODEL, 1, Mode::Listen);
@@ -427,24 +374,9 @@ fn the_keys_of_the_page_are_legal() {
 
 #[test]
 fn wrong_keys_are_refused() {
-    let refused = |keys: &str, address| {
-        let options = options("robstride", keys);
-        let spec = spec(address, Mode::Listen, &[0]);
-        let error = options.device(&spec).map(|_| ()).unwrap_err();
-        let board = options.board(&spec).map(|_| ()).unwrap_err();
-        assert_eq!(board.to_string(), error.to_string());
-        match error {
-            SpecError::Key { key, .. } | SpecError::Keys { key, .. } => key,
-            SpecError::Address {
-                least: 1,
-                most: 253,
-                ..
-            } => "address",
-            other => panic!("{other:?}"),
-        }
-    };
+    let refused = |keys: &str, address| refused("robstride", keys, address);
     for address in [0, 254] {
-        assert_eq!(refused(MODEL, address), "address");
+        assert_eq!(refused(MODEL, address), "1 to 253");
     }
     for (keys, key) in [("", "velocity_max"), ("velocity_max = 20.0", "torque_max")] {
         assert_eq!(refused(keys, 1), key);
@@ -467,12 +399,6 @@ fn wrong_keys_are_refused() {
     motor("velocity_max = 20.0\ntorque_max = 1.0", 252, Mode::Listen);
 }
 
-fn asked(motor: &mut dyn Board, text: &str) -> Vec<String> {
-    let mut out = Frames::new();
-    motor.on_frame(&frame(text, 0.0), &mut out);
-    texts(&out)
-}
-
 #[test]
 fn a_simulated_motor_sends_what_it_is_given() {
     let reading = |position, velocity, torque| {
@@ -486,14 +412,6 @@ fn a_simulated_motor_sends_what_it_is_given() {
     let (good, absent) = (Quality::GOOD, f64::NAN);
     let both = Quality::DRIVE_FAULT | Quality::DEVICE_FAULT;
     let temperature = |celsius| Reading::Temperature(Temperature { celsius });
-    let actuator = |mode, faults| {
-        Reading::Actuator(Actuator {
-            duty: 0.0,
-            mode,
-            encoder: 0,
-            faults,
-        })
-    };
     let mut motor = board("robstride", MODEL, &[0]);
     let mut send =
         |output, reading: &Reading, quality| texts(&encode(&mut *motor, output, reading, quality));

@@ -2,10 +2,11 @@
 //! the direction of a current, and thermometers that are not there.
 
 use crate::rig::{
-    FD, Rig, board, count, decode, encode, frame, listener, options, shown_keys, spec, texts,
+    Rig, board, decode, encode, frame, joints, listener, options, refused, shown_keys, spec,
+    takes_eight_bytes, temperatures, texts,
 };
 use proprio_drivers::State;
-use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode, Output, SpecError};
+use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode, Output};
 use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
 use proptest::prelude::*;
 use std::f64::consts::TAU;
@@ -24,24 +25,6 @@ fn controller(keys: &str, address: u32) -> Box<dyn Device> {
     options("vesc", keys)
         .device(&spec(address, Mode::Supervise, &[0]))
         .expect("a legal configuration")
-}
-
-fn joints(readings: &[Output]) -> Vec<JointState> {
-    (readings.iter())
-        .filter_map(|output| match output.reading {
-            Reading::Joint(joint) => Some(joint),
-            _ => None,
-        })
-        .collect()
-}
-
-fn temperatures(readings: &[Output]) -> Vec<(u8, f64)> {
-    (readings.iter())
-        .filter_map(|output| match output.reading {
-            Reading::Temperature(Temperature { celsius }) => Some((output.output, celsius)),
-            _ => None,
-        })
-        .collect()
 }
 
 fn near(a: f64, b: f64, within: f64) -> bool {
@@ -64,7 +47,7 @@ fn frames_of_the_firmware_are_read() {
             let keys = format!("{keys}\ngear_ratio = 2.0\ntorque_constant = 0.5");
             let (readings, faults) = decode(&mut *controller(&keys, address as u32), &frames);
             assert!(faults.is_empty(), "{line}: {faults:?}");
-            let [joint] = joints(&readings)[..] else {
+            let [(joint, _)] = joints(&readings)[..] else {
                 panic!("{line}: {readings:?}");
             };
             let (position, step) = if tachometer {
@@ -112,12 +95,16 @@ fn frames_that_somebody_recorded_are_read() {
     };
     assert!(near(fet, 28.2, 1e-9));
     assert!(near(
-        joints(&readings)[0].position,
+        joints(&readings)[0].0.position,
         127.78_f64.to_radians(),
         1e-12
     ));
     let (readings, _) = decode(&mut *controller(TACHOMETER, 1), &frames);
-    assert!(near(joints(&readings)[0].position, 25.0 * TAU / 7.0, 1e-12));
+    assert!(near(
+        joints(&readings)[0].0.position,
+        25.0 * TAU / 7.0,
+        1e-12
+    ));
 }
 
 /// Positive drives the motor, whichever way it turns.
@@ -137,7 +124,7 @@ fn a_current_has_the_direction_of_the_duty_cycle() {
         let keys = format!("{PID}\ntorque_constant = 0.25");
         let frames = [frame(status, 0.0), position];
         let (readings, _) = decode(&mut *controller(&keys, 1), &frames);
-        let joint = joints(&readings)[0];
+        let joint = joints(&readings)[0].0;
         assert_eq!(
             joint.current.total_cmp(&current),
             std::cmp::Ordering::Equal,
@@ -147,7 +134,7 @@ fn a_current_has_the_direction_of_the_duty_cycle() {
         assert!(current.is_nan() || joint.torque == 0.25 * current);
         assert!(!joint.velocity.is_nan());
         let (readings, _) = decode(&mut *controller(PID, 1), &frames);
-        assert!(joints(&readings)[0].torque.is_nan());
+        assert!(joints(&readings)[0].0.torque.is_nan());
     }
 }
 
@@ -156,11 +143,11 @@ fn speed_and_current_join_the_positions_for_a_while() {
     let status = frame("00000901#00000064000A0064", 10.0);
     let position = |ms| frame("00001001#00FA00FA00000000", ms);
     let mut device = controller("pole_pairs = 7\nhold_ms = 30", 1);
-    let mut joined = |frame: Frame| joints(&decode(&mut *device, &[frame]).0)[0];
+    let mut joined = |frame: Frame| joints(&decode(&mut *device, &[frame]).0)[0].0;
     let absent = |joint: JointState| joint.velocity.is_nan() && joint.current.is_nan();
     assert!(absent(joined(position(5.0))));
     let mut device = controller("pole_pairs = 7\nhold_ms = 30", 1);
-    let mut joined = |frame: Frame| joints(&decode(&mut *device, &[status, frame]).0)[0];
+    let mut joined = |frame: Frame| joints(&decode(&mut *device, &[status, frame]).0)[0].0;
     assert_eq!(joined(position(40.0)).current, 1.0);
     assert!(absent(joined(position(40.5))));
     // After a start, nothing of before is used.
@@ -168,7 +155,7 @@ fn speed_and_current_join_the_positions_for_a_while() {
     decode(&mut *device, &[status]);
     device.restart(Nanos::from_millis(20));
     let (readings, _) = decode(&mut *device, &[position(21.0)]);
-    assert!(absent(joints(&readings)[0]));
+    assert!(absent(joints(&readings)[0].0));
 }
 
 #[test]
@@ -177,16 +164,7 @@ fn frames_that_are_none_of_the_protocol_are_counted() {
         let id = Id::extended(command);
         for keys in [PID, TACHOMETER] {
             let mut device = controller(keys, 1);
-            for length in 0..8 {
-                let (readings, faults) = decode(&mut *device, &[Frame::new(id, &[0; 8][..length])]);
-                assert!(readings.is_empty());
-                assert_eq!(count(&faults, Counter::Length), 1);
-            }
-            let fd = Frame::with_format(id, FD, &[0; 8]).unwrap();
-            let (readings, faults) = decode(&mut *device, &[fd]);
-            assert_eq!((readings.len(), count(&faults, Counter::Value)), (0, 1));
-            let (readings, faults) = decode(&mut *device, &[Frame::remote(id, 8)]);
-            assert_eq!((readings.len(), count(&faults, Counter::Length)), (0, 1));
+            takes_eight_bytes(&mut *device, id, 0);
         }
     }
     // Commands, other messages, other controllers, the same number as a standard identifier.
@@ -229,20 +207,9 @@ fn nothing_is_sent() {
 
 #[test]
 fn wrong_keys_are_refused() {
-    let refused = |keys: &str, address| {
-        let options = options("vesc", keys);
-        let spec = spec(address, Mode::Listen, &[0]);
-        let error = options.device(&spec).map(|_| ()).unwrap_err();
-        let board = options.board(&spec).map(|_| ()).unwrap_err();
-        assert_eq!(board.to_string(), error.to_string());
-        match error {
-            SpecError::Key { key, .. } | SpecError::Keys { key, .. } => key,
-            SpecError::Address { most: 254, .. } => "address",
-            other => panic!("{other:?}"),
-        }
-    };
+    let refused = |keys: &str, address| refused("vesc", keys, address);
     assert_eq!(refused("", 1), "pole_pairs");
-    assert_eq!(refused(PID, 255), "address");
+    assert_eq!(refused(PID, 255), "0 to 254");
     for (keys, key) in [
         ("gear_ratio = 0.0", "gear_ratio"),
         ("gear_ratio = nan", "gear_ratio"),
@@ -331,7 +298,7 @@ proptest! {
             let frames = encode(&mut *board, 0, &Reading::Joint(state), Quality::GOOD);
             let (readings, faults) = decode(&mut *listener("vesc", keys, &[0]), &frames);
             prop_assert!(faults.is_empty());
-            let back = joints(&readings)[0];
+            let back = joints(&readings)[0].0;
             let (expected, step) = match keys {
                 PID => (p.rem_euclid(TAU), TAU / 18_000.0),
                 _ => (p, TAU / 42.0),
