@@ -60,14 +60,14 @@ pub(crate) struct How {
     #[arg(long, value_name = "N", default_value_t = 5.0, value_parser = seconds)]
     seconds: f64,
     /// Also ask: iCub boards (DISCOVER), CANopen nodes (SDO reads of 1000, 1018 and 1800 to 1803),
-    /// ODrives that are heard (Get_Version), and on CAN FD moteus controllers (a query). These
-    /// questions start, move and change nothing, but for ODrives numbered 48 to 51 or 56 that send
-    /// no heartbeat
+    /// ODrives that are heard (Get_Version), Damiao motors 1 to 32 (state and a register, on 7FF),
+    /// and on CAN FD moteus controllers (a query). These questions start, move and change nothing,
+    /// but for ODrives numbered 48 to 51 or 56 that send no heartbeat
     #[arg(long)]
     active: bool,
-    /// As --active, and also ask devices of this driver: ati_netcanoem, robotous_rft or jr3_can;
-    /// may be repeated. Other devices take their questions for commands, and motors may move: only
-    /// on a bus without CANopen nodes, and without CubeMars motors
+    /// As --active, and also ask devices of this driver: ati_netcanoem, robotous_rft, jr3_can,
+    /// robstride or myactuator; may be repeated. Other devices take their questions for commands,
+    /// and motors may move: only on a bus without CANopen nodes, and without CubeMars motors
     #[arg(long, value_name = "DRIVER", value_parser = asked_by_name)]
     ask: Vec<String>,
 }

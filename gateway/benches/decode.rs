@@ -22,6 +22,9 @@ const KEYS: &[(&str, &str)] = &[
     ),
     ("optoforce_daq", "counts_per_newton = [26.42, 28.8, 3.02]"),
     ("cubemars", "model = \"AK80-9\""),
+    ("damiao", "model = \"DM4310\""),
+    ("robstride", "model = \"RS03\""),
+    ("vesc", "pole_pairs = 7"),
     (
         "dbc",
         "file = \"bench.dbc\"\nperiod_ms = 1\n[[bus.device.reading]]\nkind = \"wrench\"\n\
