@@ -34,6 +34,7 @@ mod background;
 mod explain;
 mod traffic;
 
+pub(crate) use explain::explain as together;
 pub use traffic::{Stream, Traffic};
 
 use crate::{Format, Frame, Id};
@@ -184,7 +185,7 @@ impl Finding {
     /// The probability that it is there. Of a guess it is that of a device that some driver reads.
     #[must_use]
     pub fn probability(&self) -> f64 {
-        explain::probability(self.bits)
+        probability(self.bits)
     }
 
     /// The probability in percent, with as many digits as tell it from 100.
@@ -474,9 +475,9 @@ fn follows(first: &Stream, second: &Stream, is_own: &dyn Fn(&Frame) -> bool) -> 
     all >= 3 && followed * 10 >= all * 9
 }
 
-/// The findings of all drivers, judged together: the most probable first.
-pub(crate) fn together(seen: &Traffic, findings: Vec<Finding>) -> Vec<Finding> {
-    explain::explain(seen, findings)
+/// The probability of odds of so many bits.
+fn probability(bits: f64) -> f64 {
+    1.0 / (1.0 + libm::exp2(-bits))
 }
 
 impl Finding {

@@ -7,7 +7,7 @@
 
 use super::background::{NEAR, common, identifier};
 use super::traffic::Traffic;
-use super::{Certainty, Explained, Finding, PRIOR, Part};
+use super::{Certainty, Explained, Finding, PRIOR, Part, probability};
 use crate::Id;
 use alloc::collections::BTreeSet;
 use alloc::vec::Vec;
@@ -17,11 +17,6 @@ const CONTESTED: f64 = 4.0;
 /// Where one of a family is sure, another has an even chance to be there: at which address is
 /// still open.
 const FAMILY: f64 = PRIOR - 1.0;
-
-/// The probability of odds of so many bits.
-pub(super) fn probability(bits: f64) -> f64 {
-    1.0 / (1.0 + libm::exp2(-bits))
-}
 
 /// Whether both cannot be true: each has frames of one identifier for itself.
 fn contests(a: &Finding, b: &Finding, of: &Explained) -> bool {
@@ -112,7 +107,7 @@ impl Open {
 
 /// `findings` with the odds that each has beside the others, the surest first. In: what speaks for
 /// each but for its identifiers.
-pub(super) fn explain(seen: &Traffic, findings: Vec<Finding>) -> Vec<Finding> {
+pub(crate) fn explain(seen: &Traffic, findings: Vec<Finding>) -> Vec<Finding> {
     let own = |finding: &Finding| {
         let explains = finding.explains.iter();
         explains.map(|explained| explained.id).collect::<Vec<Id>>()

@@ -199,9 +199,52 @@ const _: () = assert!(
     size_of::<Entry>() == 152 && size_of::<Description>() == 64 + 152 * Description::CAPACITY
 );
 
+/// What a robot's name is, in words: see [`is_robot_name`].
+pub const ROBOT_NAME: &str = "a robot's name begins with a letter or a digit and has at most 63 \
+                              letters, digits, `-`, `_` or `.`";
+
+/// Whether `name` can be a robot's: it is part of the names of services, of files, and of command
+/// lines.
+#[must_use]
+pub fn is_robot_name(name: &str) -> bool {
+    let legal = |c: u8| c.is_ascii_alphanumeric() || matches!(c, b'-' | b'_' | b'.');
+    name.len() <= Name::CAPACITY
+        && name.bytes().all(legal)
+        && name
+            .bytes()
+            .next()
+            .is_some_and(|c| c.is_ascii_alphanumeric())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_robots_name_begins_with_a_letter_or_a_digit() {
+        let longest = "x".repeat(63);
+        for name in ["r", "7", "iCub_2.left-arm", "a..", longest.as_str()] {
+            assert!(is_robot_name(name), "{name}");
+        }
+        let longer = "x".repeat(64);
+        for name in [
+            "",
+            ".",
+            "..",
+            "-x",
+            "_x",
+            ".r",
+            "../x",
+            "a/b",
+            "a b",
+            "r\u{f6}bi",
+            "r\0",
+            "r\n",
+            longer.as_str(),
+        ] {
+            assert!(!is_robot_name(name), "{name:?}");
+        }
+    }
     use std::string::ToString;
 
     #[test]

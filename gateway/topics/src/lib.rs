@@ -47,7 +47,7 @@ pub mod sample;
 pub mod time;
 
 pub use code::{Code, Coded};
-pub use description::{Description, Entry, Name, Publisher, Role};
+pub use description::{Description, Entry, Name, Publisher, ROBOT_NAME, Role, is_robot_name};
 pub use estimate::{
     ContactDeclaration, ContactEstimate, ContactState, ContactWrench, JointTorque, NO_CAUSE,
     NO_CONTACT, Reason, Residual, TorqueEstimate,
@@ -62,23 +62,6 @@ pub use reading::{
 };
 pub use sample::{Header, Quality, Sample, Saturation, StampKind};
 pub use time::Nanos;
-
-/// What a robot's name is, in words: see [`is_robot_name`].
-pub const ROBOT_NAME: &str = "a robot's name begins with a letter or a digit and has at most 63 \
-                              letters, digits, `-`, `_` or `.`";
-
-/// Whether `name` can be a robot's: it is part of the names of services, of files, and of command
-/// lines.
-#[must_use]
-pub fn is_robot_name(name: &str) -> bool {
-    let legal = |c: u8| c.is_ascii_alphanumeric() || matches!(c, b'-' | b'_' | b'.');
-    name.len() <= Name::CAPACITY
-        && name.bytes().all(legal)
-        && name
-            .bytes()
-            .next()
-            .is_some_and(|c| c.is_ascii_alphanumeric())
-}
 
 /// Maximum number of channels of one gateway: all joints of an estimate, and as many others.
 pub const MAX_CHANNELS: usize = 2 * MAX_JOINTS;
@@ -95,37 +78,6 @@ pub const MAX_SENSORS: usize = 32;
 pub const MAX_SUBTREES: usize = MAX_SENSORS + 1;
 /// Maximum number of buses of one gateway; also the maximum number of publishers of samples.
 pub const MAX_BUSES: usize = 16;
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_robots_name_begins_with_a_letter_or_a_digit() {
-        let longest = "x".repeat(63);
-        for name in ["r", "7", "iCub_2.left-arm", "a..", longest.as_str()] {
-            assert!(is_robot_name(name), "{name}");
-        }
-        let longer = "x".repeat(64);
-        for name in [
-            "",
-            ".",
-            "..",
-            "-x",
-            "_x",
-            ".r",
-            "../x",
-            "a/b",
-            "a b",
-            "r\u{f6}bi",
-            "r\0",
-            "r\n",
-            longer.as_str(),
-        ] {
-            assert!(!is_robot_name(name), "{name:?}");
-        }
-    }
-}
 
 /// The programs in README.md and in the documents compile.
 #[cfg(all(doctest, feature = "ipc"))]
