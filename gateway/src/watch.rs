@@ -315,7 +315,7 @@ mod tests {
     #[test]
     fn a_device_that_nobody_reads_is_told() {
         let own = board(("odrive", 5), 0.002, joint(0.0));
-        assert_eq!(told(&[own.clone()]), [""; 0]);
+        assert_eq!(told(std::slice::from_ref(&own)), [""; 0]);
         let other = board(("odrive", 3), 0.004, joint(1.0));
         let said = told(&[own, other]);
         let [line] = &said[..] else {

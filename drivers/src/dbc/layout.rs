@@ -535,7 +535,7 @@ fn name(message: &Message) -> &str {
 /// The identifier of a message, for a person.
 fn shown(message: &Message) -> String {
     let id = message.id.as_ref();
-    id.map_or_else(Clone::clone, alloc::string::ToString::to_string)
+    id.map_or_else(Clone::clone, ToString::to_string)
 }
 
 /// The message that has the name `wanted`, or the identifier.

@@ -444,7 +444,7 @@ fn names_are_checked() {
         .path()
         .join("y".repeat(64 - base.path().as_os_str().len()));
     let domain = Domain::open(&DomainConfig::new(&longest, &"x".repeat(32))).unwrap();
-    let robot = "r".repeat(64);
+    let robot = "r".repeat(63);
     let mut writer = Writer::<ContactDeclaration>::create(&domain, &robot, 1).unwrap();
     let mut reader = Reader::<ContactDeclaration>::open(&domain, &robot).unwrap();
     let state = ContactState {
@@ -647,7 +647,7 @@ fn every_payload_is_checked() {
         reserved: 0,
         joints: [JointTorque::ABSENT; MAX_JOINTS],
     };
-    torques.joints[1].reason = Code::of_number(12);
+    torques.joints[1].reason = Code::of_number(13);
     assert!(torques.is_valid(), "what is not counted is not looked at");
     torques.count = 2;
     assert!(!torques.is_valid());
