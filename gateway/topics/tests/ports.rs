@@ -10,8 +10,8 @@ use proprio_topics::ipc::{
 };
 use proprio_topics::{
     Code, ContactDeclaration, ContactState, Description, Entry, EstimatorHealth, GatewayHealth,
-    Header, InertiaEstimate, JointState, JointTorque, Kind, LinkInertia, MAX_JOINTS, Name, Nanos,
-    Publisher, Reading, Role, Sample, TorqueEstimate,
+    Header, InertiaEstimate, JointState, JointTorque, Kind, LinkInertia, MAX_CHANNELS, MAX_JOINTS,
+    Name, Nanos, Publisher, Reading, Role, Sample, TorqueEstimate,
 };
 use std::fs::File;
 use std::os::unix::fs::MetadataExt;
@@ -662,7 +662,7 @@ fn every_payload_is_checked() {
         |h| h.buses[0].interface.controller = Code::of_number(7),
         |h| h.devices[0].state = Code::of_number(7),
         |h| h.bus_count = 17,
-        |h| h.device_count = 129,
+        |h| h.device_count = MAX_CHANNELS as u32 + 1,
     ];
     for change in changes {
         let mut health = health.clone();
