@@ -9,20 +9,22 @@
 
 mod baseline;
 mod experiment;
-mod folder;
 mod processes;
 mod result;
 mod watching;
 
 pub(crate) use experiment::Args;
 
+use crate::folder::{read, with_files};
 use anyhow::{Context, bail};
 use experiment::Experiment;
 use processes::Processes;
+use proprio_estimator::config::ConfigError;
 use proprio_simulator::{Fault, FaultError, Robot, Settings, Simulator};
 use proprio_topics::Nanos;
 use proprio_topics::ipc::{Domain, DomainConfig};
-use std::fs::{self};
+use std::fs;
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
@@ -82,7 +84,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         .context("cannot create a folder in shared memory")?;
     let domain = DomainConfig::new(shared.path(), &format!("demo-{}", std::process::id()));
     let folder = private.path().join("robot");
-    folder::copy_robot(&original, &args.bus, &folder)?;
+    copy_robot(&original, &args.bus, &folder)?;
     let robot = Robot::load(&folder)?;
     let experiment = Experiment::prepare(args, &robot, &out)?;
 
@@ -122,4 +124,66 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         &watched,
         &private.path().join("truth.csv"),
     )
+}
+
+/// Copies the robot's configuration, and all files that it names, to the folder `to`. If `buses`
+/// are given, they replace the sources of its buses.
+fn copy_robot(robot: &Robot, buses: &[String], to: &Path) -> anyhow::Result<()> {
+    let mut gateway = read(&robot.folder.join("gateway.toml"))?;
+    if let (false, Some(toml::Value::Array(list))) = (buses.is_empty(), gateway.get_mut("bus")) {
+        if buses.len() == 1 && list.len() > 1 {
+            // One interface for all: all devices move to the first bus.
+            let mut all = |key: &str| -> Vec<toml::Value> {
+                list.iter_mut()
+                    .filter_map(|bus| bus.as_table_mut()?.remove(key))
+                    .filter_map(|of_bus| of_bus.as_array().cloned())
+                    .flatten()
+                    .collect()
+            };
+            let parts = ["device", "coupling"].map(|key| (key, all(key)));
+            list.truncate(1);
+            if let Some(bus) = list.first_mut().and_then(toml::Value::as_table_mut) {
+                for (key, of_all) in parts.into_iter().filter(|(_, of_all)| !of_all.is_empty()) {
+                    bus.insert(key.into(), of_all.into());
+                }
+            }
+        } else if buses.len() != list.len() {
+            let problem = format!(
+                "--bus is given {} times; the robot has {} buses: give one interface for each, or \
+                 one for all",
+                buses.len(),
+                list.len()
+            );
+            return Err(ConfigError {
+                file: robot.folder.join("gateway.toml"),
+                problem,
+            }
+            .into());
+        }
+        for (bus, interface) in list.iter_mut().zip(buses) {
+            if let Some(bus) = bus.as_table_mut() {
+                let source = [("kind", "socketcan"), ("interface", interface.as_str())];
+                let source: toml::Table = source
+                    .into_iter()
+                    .map(|(k, v)| (k.to_owned(), v.into()))
+                    .collect();
+                bus.insert("source".into(), source.into());
+            }
+        }
+    }
+    let mut estimator = read(&robot.folder.join("estimator.toml"))?;
+    // Parameters identified on a real robot do not apply to the simulated one.
+    estimator.remove("parameters");
+    if let Some(identification) = estimator
+        .get_mut("identification")
+        .and_then(toml::Value::as_table_mut)
+    {
+        identification.remove("state");
+    }
+    fs::create_dir_all(to)?;
+    for (name, table) in [("gateway.toml", gateway), ("estimator.toml", estimator)] {
+        let table = with_files(table, &robot.folder, to)?;
+        fs::write(to.join(name), table.to_string())?;
+    }
+    Ok(())
 }

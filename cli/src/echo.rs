@@ -1,9 +1,9 @@
 //! `proprio echo`: the samples of a channel, the torques or the contacts of a running system, as
 //! they come.
 
-use crate::running::{Described, interrupted, one_robot, open};
+use crate::running::{Described, interrupted, next, one_robot, open};
 use anyhow::{Context, bail};
-use proprio_topics::ipc::{Domain, DomainConfig, Reader, TakeError, Topic, Unavailable, monotonic};
+use proprio_topics::ipc::{Domain, DomainConfig, Reader, Topic, Unavailable, monotonic};
 use proprio_topics::{
     Code, ContactEstimate, Description, Name, Nanos, Publisher, Reason, Role, Sample,
     TorqueEstimate,
@@ -102,13 +102,9 @@ fn follow<T: Topic>(
     let is_enough = |printed| args.count.is_some_and(|count| printed >= count);
     let mut printed = 0_u64;
     while !stop.load(Relaxed) && !is_enough(printed) {
-        while !is_enough(printed) {
-            let payload = match payloads.try_take() {
-                Ok(Some(payload)) => payload,
-                // It is tried again.
-                Ok(None) | Err(TakeError::Connection) => break,
-                Err(error) => return Err(error.into()),
-            };
+        while !is_enough(printed)
+            && let Some(payload) = next(&mut payloads)?
+        {
             if let Some(description) = described.of(payload.header().epoch) {
                 printed += u64::from(print(&mut out, description, &payload)?);
             }

@@ -1,6 +1,7 @@
 //! `proprio install`: puts this program, its systemd units and a robot's configuration where they
 //! belong, and starts the services. `--dry-run` prints the steps instead.
 
+use crate::folder::{each_file, read};
 use anyhow::{Context as _, bail};
 use proprio_estimator::files;
 use proprio_gateway::plan::Plan;
@@ -189,10 +190,15 @@ fn configuration(folder: &Path, etc: &Path, force: bool) -> anyhow::Result<Vec<S
         if !file.is_file() {
             continue;
         }
-        let unreadable = || format!("cannot read {}", file.display());
-        let text = fs::read_to_string(&file).with_context(unreadable)?;
         names.insert(PathBuf::from(config));
-        named(&text.parse::<toml::Table>()?.into(), folder, &mut names);
+        each_file(&mut read(&file)?, folder, &mut |name| {
+            let parts = Path::new(&*name).components();
+            if Path::new(&*name).is_relative() {
+                // `./x` is `x`.
+                names.insert(parts.filter(|part| *part != Component::CurDir).collect());
+            }
+            Ok(())
+        })?;
     }
     let (mut steps, mut differ) = (Vec::new(), Vec::new());
     for name in names {
@@ -224,21 +230,4 @@ fn configuration(folder: &Path, etc: &Path, force: bool) -> anyhow::Result<Vec<S
         );
     }
     Ok(steps)
-}
-
-/// The files that `value`, of a configuration in `folder`, names by their place in it: which keys
-/// name files is the drivers' matter, so it is any text that leads to one.
-fn named(value: &toml::Value, folder: &Path, names: &mut BTreeSet<PathBuf>) {
-    match value {
-        toml::Value::Table(table) => table.values().for_each(|v| named(v, folder, names)),
-        toml::Value::Array(values) => values.iter().for_each(|v| named(v, folder, names)),
-        toml::Value::String(name)
-            if Path::new(name).is_relative() && folder.join(name).is_file() =>
-        {
-            // `./x` is `x`.
-            let parts = Path::new(name).components();
-            names.insert(parts.filter(|part| *part != Component::CurDir).collect());
-        }
-        _ => {}
-    }
 }

@@ -9,6 +9,7 @@ mod demo;
 mod doctor;
 mod echo;
 mod estimator;
+mod folder;
 mod identify;
 mod install;
 mod record;

@@ -1,11 +1,11 @@
 //! `proprio record`: the samples and declared contacts of a running system, as the table that
 //! `identify` reads.
 
-use crate::running::{Described, interrupted, one_robot, open};
+use crate::running::{Described, interrupted, next, one_robot, open};
 use anyhow::{Context, bail};
 use proprio_gateway::offline::InOrder;
 use proprio_topics::csv::{Columns, Series, Value, What, Writer};
-use proprio_topics::ipc::{DomainConfig, Reader, TakeError, Topic, monotonic};
+use proprio_topics::ipc::{DomainConfig, Reader, monotonic};
 use proprio_topics::{
     ContactDeclaration, Description, MAX_CHANNELS, Nanos, Publisher, Role, Sample,
 };
@@ -201,14 +201,6 @@ impl Gaps {
     }
 }
 
-/// The next payload; `None` if none is waiting, or its writer cannot be reached now.
-fn next<T: Topic>(reader: &mut Reader<T>) -> anyhow::Result<Option<T>> {
-    match reader.try_take() {
-        Err(TakeError::Connection) => Ok(None),
-        taken => Ok(taken?),
-    }
-}
-
 /// Records samples and declared contacts.
 pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
     let stop = interrupted()?;
@@ -217,11 +209,9 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
     // The readers first: what comes while the table is prepared is recorded, too.
     let mut samples = Reader::<Sample>::open(&domain, &robot)?;
     let mut declarations = Reader::<ContactDeclaration>::open(&domain, &robot).ok();
-    let mut descriptions = Reader::<Description>::open(&domain, &robot)?;
-    let description = Described::by(&domain, &robot, Publisher::Gateway)?;
-    let description = *description
-        .context("the robot's gateway is not running")?
-        .newest();
+    let mut gateway = Described::by(&domain, &robot, Publisher::Gateway)?
+        .context("the robot's gateway is not running")?;
+    let description = *gateway.newest();
     let estimator = Described::by(&domain, &robot, Publisher::Estimator)?;
     let estimator = estimator.as_ref().map(Described::newest);
     let mut series = channels_of(&description);
@@ -271,13 +261,11 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
         inbox.sort_by_key(|sample| sample.header.acquired);
         for sample in inbox.drain(..) {
             gaps.see(sample.header.epoch, sample.header.acquired);
-            if sample.header.epoch != numbers.epoch {
+            if sample.header.epoch != numbers.epoch
+                && let Some(description) = gateway.of(sample.header.epoch)
+            {
                 // The gateway was restarted: the same channels may have other numbers.
-                while let Some(description) = next(&mut descriptions)? {
-                    if description.publisher == Publisher::Gateway {
-                        numbers = Numbers::new(&description, &series);
-                    }
-                }
+                numbers = Numbers::new(description, &series);
             }
             let (Some(at), Some(reading)) = (numbers.series(&sample), sample.reading()) else {
                 others += 1;

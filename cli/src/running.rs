@@ -2,15 +2,15 @@
 //! publishers, and when to end.
 
 use anyhow::{Context, bail};
-use proprio_topics::ipc::{Domain, DomainConfig, PortError, Reader, monotonic};
+use proprio_topics::ipc::{Domain, DomainConfig, PortError, Reader, TakeError, Topic, monotonic};
 use proprio_topics::{Description, Nanos, Publisher};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 /// A description or health message is sent again to a new reader within this time.
-pub(crate) const HISTORY: Nanos = Nanos::from_millis(500);
+const HISTORY: Nanos = Nanos::from_millis(500);
 /// How often it is looked for: nothing tells of a payload that is sent again.
-pub(crate) const LOOK: Nanos = Nanos::from_millis(5);
+const LOOK: Nanos = Nanos::from_millis(5);
 
 /// Set by SIGINT and SIGTERM.
 pub(crate) fn interrupted() -> anyhow::Result<Arc<AtomicBool>> {
@@ -49,6 +49,38 @@ pub(crate) fn one_robot(domain: &Domain, name: Option<&str>) -> anyhow::Result<S
     }
 }
 
+/// The next payload; `None` if none is waiting, or its writer cannot be reached now.
+pub(crate) fn next<T: Topic>(reader: &mut Reader<T>) -> anyhow::Result<Option<T>> {
+    match reader.try_take() {
+        Err(TakeError::Connection) => Ok(None),
+        taken => Ok(taken?),
+    }
+}
+
+/// A reader of a topic with history, and the first that `take` finds in it; `None` if nobody
+/// publishes it.
+pub(crate) fn first_of<T: Topic, R>(
+    domain: &Domain,
+    robot: &str,
+    mut take: impl FnMut(&mut Reader<T>) -> Option<R>,
+) -> Result<Option<(Reader<T>, R)>, PortError> {
+    let mut reader = match Reader::<T>::open(domain, robot) {
+        Ok(reader) => reader,
+        Err(PortError::NotYet { .. }) => return Ok(None),
+        Err(error) => return Err(error),
+    };
+    let deadline = monotonic() + HISTORY;
+    loop {
+        if let Some(found) = take(&mut reader) {
+            return Ok(Some((reader, found)));
+        }
+        if monotonic() >= deadline {
+            return Ok(None);
+        }
+        reader.wait(monotonic() + LOOK);
+    }
+}
+
 /// The descriptions of one publisher, over its restarts.
 pub(crate) struct Described {
     reader: Reader<Description>,
@@ -63,25 +95,12 @@ impl Described {
         robot: &str,
         publisher: Publisher,
     ) -> Result<Option<Self>, PortError> {
-        let mut reader = match Reader::<Description>::open(domain, robot) {
-            Ok(reader) => reader,
-            Err(PortError::NotYet { .. }) => return Ok(None),
-            Err(error) => return Err(error),
-        };
-        let deadline = monotonic() + HISTORY;
-        loop {
-            if let Some(newest) = take_newest(&mut reader, publisher) {
-                return Ok(Some(Self {
-                    reader,
-                    publisher,
-                    newest,
-                }));
-            }
-            if monotonic() >= deadline {
-                return Ok(None);
-            }
-            reader.wait(monotonic() + LOOK);
-        }
+        let found = first_of(domain, robot, |reader| take_newest(reader, publisher))?;
+        Ok(found.map(|(reader, newest)| Self {
+            reader,
+            publisher,
+            newest,
+        }))
     }
 
     /// The newest one.

@@ -2,7 +2,7 @@
 
 use crate::echo::{of_joints, torque_json};
 use crate::print::CLOSED;
-use crate::running::{Described, HISTORY, LOOK, interrupted, open};
+use crate::running::{Described, first_of, interrupted, open};
 use anyhow::bail;
 use proprio_topics::ipc::{
     Domain, DomainConfig, PortError, Reader, RobotPresence, Topic, Unavailable, monotonic,
@@ -47,21 +47,10 @@ fn robots(domain: &Domain, name: Option<&str>) -> anyhow::Result<Vec<RobotPresen
 
 /// The newest payload of a topic with history.
 fn newest<T: Topic>(domain: &Domain, robot: &str) -> Result<Option<T>, PortError> {
-    let mut reader = match Reader::<T>::open(domain, robot) {
-        Ok(reader) => reader,
-        Err(PortError::NotYet { .. }) => return Ok(None),
-        Err(error) => return Err(error),
-    };
-    let deadline = monotonic() + HISTORY;
-    loop {
-        if let Ok(Some(newest)) = reader.latest() {
-            return Ok(Some(newest));
-        }
-        if monotonic() >= deadline {
-            return Ok(None);
-        }
-        reader.wait(monotonic() + LOOK);
-    }
+    let found = first_of(domain, robot, |reader: &mut Reader<T>| {
+        reader.latest().ok()?
+    })?;
+    Ok(found.map(|(_, newest)| newest))
 }
 
 /// What a channel sent during the window.

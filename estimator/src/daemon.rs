@@ -15,7 +15,7 @@ use crate::pipeline::{Job, Pipeline};
 use crate::setup::Setup;
 use anyhow::{Context, anyhow};
 use proprio_identification::online::{Online, Paused};
-use proprio_identification::robot::{ChannelRole, Robot};
+use proprio_identification::robot::Robot;
 use proprio_topics::ipc::{
     Domain, DomainConfig, DomainError, PortError, Reader, Topic, Watch, Writer, monotonic,
     open_files_remedy,
@@ -634,14 +634,10 @@ impl IdentificationThread {
         robot: &Robot,
         state_file: Option<StateFile>,
     ) -> anyhow::Result<Self> {
-        let name = |sensor: &usize| {
-            let role = ChannelRole::Sensor(*sensor);
-            let channel = robot.channels.iter().find(|channel| channel.role == role);
-            channel.map(|channel| channel.name.as_str())
-        };
         let components = online.solution().components.iter();
         let groups: Vec<String> = components
             .map(|component| {
+                let name = |sensor: &usize| robot.sensor_names().nth(*sensor);
                 let names: Vec<_> = component.sensors.iter().filter_map(name).collect();
                 names.join(", ")
             })

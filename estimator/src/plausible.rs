@@ -207,7 +207,7 @@ fn bodies(model: &Model, longest: f64) -> impl Iterator<Item = String> {
             .zip(0..)
             .filter(|(body, _)| body.mass > 0.0)
     };
-    let named = |found: Vec<(usize, f64)>, what: &dyn Fn(&str, f64) -> String| {
+    let named = |found: Vec<(usize, f64)>, what: &dyn Fn(usize, f64) -> String| {
         let (first, value) = *found.first()?;
         let others: Vec<&str> = (found.iter().skip(1).take(NAMED))
             .map(|(link, _)| model.link_name(*link))
@@ -220,28 +220,25 @@ fn bodies(model: &Model, longest: f64) -> impl Iterator<Item = String> {
                 if is_more { ", ..." } else { "" }
             ),
         };
-        Some(what(model.link_name(first), value) + &more)
+        Some(what(first, value) + &more)
     };
     let dense = links().map(|(body, link)| (link, density(body)));
     let dense: Vec<(usize, f64)> = dense.filter(|(_, density)| *density > DENSEST).collect();
     let far = links().map(|(body, link)| (link, extent(body)));
     let far: Vec<(usize, f64)> = far.filter(|(_, extent)| *extent > longest).collect();
-    let mass = |link: &str| {
-        let mut all = links();
-        let own = all.find(|(_, number)| model.link_name(*number) == link);
-        own.map_or(f64::NAN, |(body, _)| body.mass)
-    };
     let too_dense = named(dense, &|link, density| {
         format!(
-            "link {link:?} of the URDF: {} kg with its inertia are {density:.2e} kg/m^3, denser \
-             than any material ({DENSEST}): masses are in kg, inertias in kg m^2",
-            text(&[mass(link)])
+            "link {:?} of the URDF: {} kg with its inertia are {density:.2e} kg/m^3, denser than \
+             any material ({DENSEST}): masses are in kg, inertias in kg m^2",
+            model.link_name(link),
+            text(&[model.inertias()[link].mass])
         )
     });
     let too_far = named(far, &|link, extent| {
         format!(
-            "link {link:?} of the URDF: its mass lies {extent:.3} m from its origin, but the robot \
-             is {longest:.3} m long: lengths are in m, inertias in kg m^2"
+            "link {:?} of the URDF: its mass lies {extent:.3} m from its origin, but the robot is \
+             {longest:.3} m long: lengths are in m, inertias in kg m^2",
+            model.link_name(link)
         )
     });
     [too_dense, too_far].into_iter().flatten()

@@ -299,12 +299,8 @@ impl WithSimd for Update<'_> {
                         -*response
                     }
                 });
-                let std = (part.variance(simd, place, axis, response) + drift).sqrt();
-                match structure.moved_by(dof) {
-                    [_] => torque[dof] = std,
-                    // The deviation of a sum is at most the sum of the deviations.
-                    _ => torque[dof] += std,
-                }
+                // The deviation of a sum is at most the sum of the deviations.
+                torque[dof] += (part.variance(simd, place, axis, response) + drift).sqrt();
             }
             for contact in subtree.contacts.iter() {
                 let motions = solver.contact_rows(contact);

@@ -448,8 +448,7 @@ fn a_urdf_is_read_in_the_encoding_that_it_declares() {
         setup.unwrap_err(),
         format!(
             "{}: line 1: joint j1: its <axis> has no xyz (it has xzy); write its direction, \
-             such as \
-             xyz=\"0 0 1\"",
+             such as xyz=\"0 0 1\"",
             file.display()
         )
     );

@@ -98,14 +98,12 @@ fn another_body(body: &RigidInertia, relative: f64, random: &mut Random) -> Rigi
             -relative
         }
     };
-    let Some(centre) = body.centre() else {
+    if body.centre().is_none() {
         return *body;
-    };
+    }
     let mass = body.mass * (1.0 + off());
     let first_moment = body.first_moment.map(|h| h * (1.0 + off()));
-    let about_centre = body.inertia
-        - (Mat3::from_diagonal_element(centre.dot(&centre)) - centre * centre.transpose())
-            * body.mass;
+    let about_centre = body.about_centre();
     // Second moments of the mass, not moments of inertia: any positive values are physically
     // possible.
     let spread = Mat3::from_diagonal_element(about_centre.trace() / 2.0) - about_centre;

@@ -128,7 +128,8 @@ fn a_running_system_says_what_it_does() {
         }
     }
     assert_eq!(echo.wait().expect("it ends").code(), Some(0));
-    assert!(rest.ends_with('\n') && rest.lines().all(|line| line.contains(" joint position ")));
+    let is_whole = |line: &str| line.contains(" joint ") && line.contains("  ");
+    assert!(rest.ends_with('\n') && rest.lines().all(is_whole), "{rest}");
     // Who reads may stop: it ends, and says nothing.
     let mut echo = piped();
     drop(echo.stdout.take());

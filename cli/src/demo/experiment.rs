@@ -1,6 +1,6 @@
 //! The setup of the demonstration: robot, motion, CAD, and the configuration of its processes.
 
-use super::folder::{read, with_files};
+use crate::folder::{read, with_files};
 use proprio_dynamics::model::Model;
 use proprio_dynamics::spatial::RigidInertia;
 use proprio_estimator::config::{Config, ConfigError};

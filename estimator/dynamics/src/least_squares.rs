@@ -249,7 +249,10 @@ mod tests {
             let inverse = DMatrix::from_fn(n, 6, |j, i| {
                 (lower.transpose() * solver.gain(j))[i] / weights[j]
             });
-            let tolerance = 1e-12 * (1.0 + inverse.amax().powi(2));
+            // Rounding is magnified by the conditions of the equations and of their weighting.
+            let condition = m.norm() * inverse.norm() * lower.norm() * whiten.norm();
+            let scale = 1.0 + m.norm().max(inverse.norm());
+            let tolerance = 1e-14 * condition * scale;
             let near = |a: &DMatrix<f64>, b: &DMatrix<f64>| (a - b).amax() < tolerance;
             prop_assert!(near(&(&m * &inverse * &m), &m));
             prop_assert!(near(&(&inverse * &m * &inverse), &inverse));
@@ -269,7 +272,8 @@ mod tests {
             for j in 0..n {
                 let determined =
                     solver.determines(|k| if k == j { (1.0, 1.0) } else { (0.0, 0.0) }, 1e-5);
-                prop_assert_eq!(determined, rows[(j, j)] > 1.0 - 1e-10);
+                let beyond = rows[(j, j)] - (1.0 - 1e-10);
+                prop_assert!(determined == (beyond > 0.0) || beyond.abs() < tolerance);
             }
         }
     }

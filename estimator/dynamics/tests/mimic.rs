@@ -349,8 +349,7 @@ fn a_joint_that_cannot_follow_says_where_and_why() {
     assert_eq!(
         error("<mimic joint=\"lead\"", "<mimic joint=\"led\""),
         "line 19: joint close: its <mimic> joint=\"led\" is not a joint of the URDF; correct \
-         it, or \
-         remove the <mimic>"
+         it, or remove the <mimic>"
     );
     assert_eq!(
         error("<mimic joint=\"lead\"", "<mimic joint=\"cable\""),

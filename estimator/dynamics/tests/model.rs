@@ -299,16 +299,14 @@ fn malformed_files_have_one_clear_message_each() {
         "<child link=\"tip\"/>",
         "<child link=\"arm\"/>",
         "line 10: joint end: its child arm is already the child of joint turn (line 8); loops \
-         cannot \
-         be described, only trees: remove one of the joints",
+         cannot be described, only trees: remove one of the joints",
     );
     is(
         "type=\"prismatic\"",
         "type=\"planar\"",
         "line 7: joint slide: type=\"planar\" is possible only between the root and the robot, \
-         where \
-         it is dropped because any link can be the base; remove the joint, or make it of prismatic \
-         and continuous joints",
+         where it is dropped because any link can be the base; remove the joint, or make it \
+         of prismatic and continuous joints",
     );
     is(
         "type=\"prismatic\"",
@@ -351,8 +349,7 @@ fn malformed_files_have_one_clear_message_each() {
     assert_eq!(
         read("<sdf/>").unwrap_err().to_string(),
         "not a URDF: its root element is <sdf>, not <robot>; convert it, for example with gz \
-         sdf or \
-         sdformat_urdf"
+         sdf or sdformat_urdf"
     );
     assert_eq!(
         read("<robot name=\"r\"></robot>").unwrap_err(),
@@ -718,9 +715,8 @@ fn what_is_missing_has_its_place_and_the_remedy() {
     assert_eq!(
         read(&text).unwrap_err().to_string(),
         "line 3: link arm, moved by joint turn; line 5: link finger, moved by joint slide: the \
-         mass \
-         is unknown, because no <inertial> is there or in a link fixed to it; add one (with mass 0 \
-         and inertia 0 if it is meant to be massless)"
+         mass is unknown, because no <inertial> is there or in a link fixed to it; add one \
+         (with mass 0 and inertia 0 if it is meant to be massless)"
     );
 }
 
@@ -743,8 +739,7 @@ fn an_impossible_part_of_a_possible_body_is_a_warning() {
         [
             "link tool: its inertia is not positive semidefinite (least principal moment -3.600e-8 \
              kg m^2): no body has this inertia; it is used as written, because with the links \
-             fixed \
-             to it the inertia is possible"
+             fixed to it the inertia is possible"
         ]
     );
     let whole = with(&part(1e-6, 0.0)).unwrap();

@@ -205,15 +205,19 @@ fn trial(setup: &Setup, still: &Still) -> Outcome {
         torques: Vec::new(),
         contacts: Vec::new(),
     };
+    let calibrations = setup.state.calibrations.iter().enumerate();
+    let temperatures: Vec<(usize, Reading)> = calibrations
+        .filter_map(|(number, calibration)| {
+            let own = ChannelRole::Sensor(number);
+            let channel = robot.channels.iter().position(|c| c.role == own)?;
+            let celsius = calibration.reference()?;
+            Some((channel, Reading::Temperature(Temperature { celsius })))
+        })
+        .collect();
     for instant in 0..INSTANTS {
         let t = Nanos(period.0 * (instant + 1));
-        for (number, calibration) in setup.state.calibrations.iter().enumerate() {
-            let is_own = |role| role == ChannelRole::Sensor(number);
-            let channel = robot.channels.iter().position(|c| is_own(c.role));
-            if let (Some(channel), Some(celsius)) = (channel, calibration.reference()) {
-                let temperature = Reading::Temperature(Temperature { celsius });
-                pipeline.push(channel, t, &temperature, Quality::GOOD);
-            }
+        for (channel, temperature) in &temperatures {
+            pipeline.push(*channel, t, temperature, Quality::GOOD);
         }
         // The trigger comes last: what waits for no one has everything.
         let others = (0..readings.len()).filter(|channel| *channel != robot.trigger);

@@ -70,6 +70,11 @@ impl Truth {
     }
 }
 
+/// A share in percent.
+pub(super) fn percent(share: f64) -> String {
+    format!("{:.1} %", 100.0 * share)
+}
+
 /// `part / whole`; NaN if `whole` is zero.
 pub(super) fn ratio(part: usize, whole: usize) -> f64 {
     part as f64 / whole as f64

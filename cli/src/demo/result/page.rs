@@ -1,5 +1,6 @@
 //! `report.html` of a demonstration, and its short form for the terminal.
 
+use super::compared::percent;
 use super::evaluation::Evaluation;
 use super::learnt::learnt_section;
 use super::torques::torque_plots;
@@ -10,10 +11,6 @@ use proprio_topics::Nanos;
 /// What the two columns of errors have in common.
 const SAME_OFFSETS: &str = "Both use the offsets of the F/T sensors that identification found, so \
                             they differ in the inertial parameters of the links alone.";
-
-fn percent(share: f64) -> String {
-    format!("{:.1} %", 100.0 * share)
-}
 
 /// The most important numbers, each with its name.
 fn facts(evaluation: &Evaluation<'_>) -> Vec<(&'static str, String)> {

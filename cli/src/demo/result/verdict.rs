@@ -1,5 +1,7 @@
 //! Whether the demonstration worked: one sentence with its figures.
 
+use super::compared::percent;
+
 /// The share of errors within two standard deviations below which the deviations are said to be too
 /// small. Of correct ones 95.4 % are expected; 90 % is what a fifth too small gives.
 const COVERED: f64 = 0.9;
@@ -56,7 +58,6 @@ impl Verdict {
             within_2_sigma,
             ..
         } = findings;
-        let percent = |share: f64| format!("{:.1} %", 100.0 * share);
         let place = match (findings.is_beyond, findings.sensors) {
             (true, 1) => " beyond the F/T sensor",
             (true, _) => " beyond the F/T sensors",

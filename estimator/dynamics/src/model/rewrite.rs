@@ -243,8 +243,7 @@ fn element(inertia: &RigidInertia, indent: Option<&str>) -> String {
         buffer.format(value + 0.0).to_owned()
     };
     let c = inertia.centre().unwrap_or_default();
-    let shift = (Mat3::from_diagonal_element(c.dot(&c)) - c * c.transpose()) * inertia.mass;
-    let i = inertia.inertia - shift;
+    let i = inertia.about_centre();
     let origin = format!(
         "<origin xyz=\"{} {} {}\" rpy=\"0 0 0\"/>",
         number(c.x),

@@ -244,6 +244,11 @@ fn read_joints<'d>(
     Ok(joints)
 }
 
+/// Whether a joint has a coordinate; one without a kind lets the whole robot float.
+fn is_moving(kind: Option<&JointKind>) -> bool {
+    kind.is_some_and(|kind| *kind != JointKind::Fixed)
+}
+
 fn read_joint<'d>(
     node: Node<'d>,
     name: &'d str,
@@ -295,7 +300,7 @@ fn read_joint<'d>(
             });
         }
     };
-    let moves = !matches!(kind, Some(JointKind::Fixed) | None);
+    let moves = is_moving(kind.as_ref());
     let limit = |attribute| match node.child("limit") {
         Some(limit) if moves => numbers(limit, node, attribute),
         _ => Ok(None),
@@ -391,13 +396,13 @@ impl Tree {
             reached[link] = true;
             stack.extend(children[link].iter().map(|&joint| joints[joint].child));
         }
-        let (Some(&root), None) = (roots.first(), reached.iter().position(|&found| !found)) else {
-            let lost = reached.iter().position(|&found| !found).unwrap_or(0);
+        if let Some(lost) = reached.iter().position(|&found| !found) {
             let node = links[lost].node;
             return Err(ModelError::Loop(place(node, node)));
-        };
+        }
         let mut tree = Self {
-            root,
+            // There is one, because it was reached.
+            root: roots[0],
             children,
             dropped: HashSet::new(),
         };
@@ -501,7 +506,7 @@ impl Coordinates {
 
     /// The same without changing the joints: those to be fixed, and where, are added to `held`.
     fn resolve(joints: &[RawJoint<'_>], held: &mut Vec<(usize, f64)>) -> Result<Self, ModelError> {
-        let moves = |joint: &RawJoint<'_>| !matches!(joint.kind, Some(JointKind::Fixed) | None);
+        let moves = |joint: &RawJoint<'_>| is_moving(joint.kind.as_ref());
         let leads = |joint: &RawJoint<'_>| moves(joint) && joint.mimic.is_none();
         let leaders: Vec<usize> = (0..joints.len()).filter(|&j| leads(&joints[j])).collect();
         let numbers: HashMap<&str, usize> =
@@ -713,9 +718,7 @@ impl Folder<'_, '_> {
         total: f64,
         warnings: &mut Vec<String>,
     ) -> Result<(), ModelError> {
-        let centre = body.centre().unwrap_or_default();
-        let part = Mat3::from_diagonal_element(centre.dot(&centre)) - centre * centre.transpose();
-        let moments = (body.inertia - part * body.mass).symmetric_eigenvalues();
+        let moments = body.about_centre().symmetric_eigenvalues();
         // What the sum of the robot's masses, with arms of a metre, has as rounding error.
         let rounding = f64::EPSILON * total;
         let slack = INERTIA_TOLERANCE * moments.amax() + POINT * body.mass.abs() + rounding;

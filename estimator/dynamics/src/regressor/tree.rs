@@ -183,13 +183,12 @@ pub struct Regressor {
     axes: Vec<Motion>,
     /// Per degree of freedom: how many joints have it.
     sharing: Vec<usize>,
-    dofs: usize,
 }
 
 impl Regressor {
     /// For a model, in the model's order of links and degrees of freedom.
     pub fn new(model: &Model) -> Self {
-        Self::room(Serialization::of_model(model), model.joint_count())
+        Self::room(model, Serialization::of_model(model))
     }
 
     /// For a model, in another order.
@@ -210,22 +209,24 @@ impl Regressor {
             serialization.dof_count(),
             model.dof_count(),
         )?;
-        Ok(Self::room(serialization, model.joint_count()))
+        Ok(Self::room(model, serialization))
     }
 
-    fn room(serialization: Serialization, joints: usize) -> Self {
+    fn room(model: &Model, serialization: Serialization) -> Self {
         let (links, dofs) = (serialization.link_count(), serialization.dof_count());
+        let mut sharing = vec![0; dofs];
+        let joints = model.joints().iter();
+        (joints.filter_map(|joint| joint.dof)).for_each(|dof| sharing[dof] += 1);
         let stride = LINK_PARAMETERS * links;
         Self {
             serialization,
             values: vec![0.0; (6 + dofs) * stride],
             stride,
             base: None,
-            reversed: vec![false; joints],
+            reversed: vec![false; model.joint_count()],
             hops: vec![None; links],
             axes: vec![Motion::zero(); links],
-            sharing: vec![0; dofs],
-            dofs,
+            sharing,
         }
     }
 
@@ -240,7 +241,7 @@ impl Regressor {
         check_size(
             "degrees of freedom of the model",
             model.dof_count(),
-            self.dofs,
+            self.serialization.dof_count(),
         )?;
         check_size(
             "links of the kinematics",
@@ -283,9 +284,7 @@ impl Regressor {
             }
         }
         let base = kinematics.base();
-        let sharing = &mut self.sharing;
-        sharing.fill(0);
-        (model.joints().iter().filter_map(|joint| joint.dof)).for_each(|dof| sharing[dof] += 1);
+        let sharing = &self.sharing;
         let hop = |joint: &Joint, next| {
             joint.dof.map(|dof| Hop {
                 dof,
@@ -319,7 +318,7 @@ impl Regressor {
 
     /// Number of rows, `6 + n`.
     pub fn row_count(&self) -> usize {
-        6 + self.dofs
+        6 + self.serialization.dof_count()
     }
 
     /// Number of columns, `10 N_B`.

@@ -106,6 +106,14 @@ impl RigidInertia {
         (self.mass > 0.0).then(|| self.first_moment / self.mass)
     }
 
+    /// The tensor of inertia about the centre of mass in link axes [kg m^2], the inverse of
+    /// [`RigidInertia::from_centroidal`]; about the origin if the mass is not positive.
+    pub fn about_centre(&self) -> Mat3 {
+        let c = self.centre().unwrap_or_default();
+        let shift = Mat3::from_diagonal_element(c.dot(&c)) - c * c.transpose();
+        self.inertia - shift * self.mass
+    }
+
     /// The same body in frame `a`; `self` describes it in frame `b`. `x_ab` is the pose of `b` in
     /// `a`.
     pub fn transformed(&self, x_ab: &Pose) -> Self {
@@ -176,9 +184,7 @@ impl RigidInertia {
         if self.mass.is_nan() || self.mass <= 0.0 {
             return Err(Inconsistency::Mass(self.mass));
         }
-        let c = self.first_moment / self.mass;
-        let shift = (Mat3::from_diagonal_element(c.dot(&c)) - c * c.transpose()) * self.mass;
-        let mut moments: [f64; 3] = (self.inertia - shift).symmetric_eigenvalues().into();
+        let mut moments: [f64; 3] = self.about_centre().symmetric_eigenvalues().into();
         moments.sort_by(f64::total_cmp);
         // Subtracting the parallel-axis part leaves rounding errors of its size.
         let slack = tolerance * moments[2].abs() + 64.0 * f64::EPSILON * self.inertia.amax();
