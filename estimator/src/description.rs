@@ -306,12 +306,17 @@ impl fmt::Display for Setup {
                 )?;
             }
         }
-        for joint in (0..model.joint_count()).map(|joint| model.joint_name(joint)) {
-            if let Some(leader) = model.follows(joint) {
-                writeln!(
+        for (number, joint) in model.joints().iter().enumerate() {
+            let name = model.joint_name(number);
+            match joint.dof.and_then(|_| model.follows(name)) {
+                Some(_) if joint.ratio == 0.0 => {
+                    writeln!(f, "  locked {name} at {}", joint.offset)?;
+                }
+                Some(leader) => writeln!(
                     f,
-                    "  {joint} follows {leader}; the torque of {leader} includes its torque"
-                )?;
+                    "  {name} follows {leader}; the torque of {leader} includes its torque"
+                )?,
+                None => (),
             }
         }
         for (dof, position) in self.robot.locked.iter().enumerate() {

@@ -375,12 +375,8 @@ fn a_joint_that_follows_another_is_not_measured() {
     let setup = setup.expect("one channel");
     let names: Vec<&str> = setup.channels().map(|(_, name)| name).collect();
     assert_eq!(names, ["j1"]);
-    assert!(
-        setup
-            .to_string()
-            .contains("  j2 follows j1; the torque of j1 includes its torque\n"),
-        "{setup}"
-    );
+    let follows = "  j2 follows j1; the torque of j1 includes its torque\n";
+    assert_eq!(setup.to_string().matches(follows).count(), 1, "{setup}");
     let rows: String = (0..3).map(|row| format!("0.0{row},0.1,0.5,2\n")).collect();
     let log = "t,joint/j1/position,joint/j1/velocity,joint/j1/acceleration\n".to_owned() + &rows;
     let mut out = Vec::new();
@@ -409,6 +405,9 @@ fn a_joint_that_follows_another_is_not_measured() {
     assert!(setup.warnings().iter().any(|warning| {
         warning == "locked.j2: in the URDF this joint follows j1 (<mimic>); here it is held at 0.5"
     }));
+    let text = setup.to_string();
+    assert!(text.contains("  locked j2 at 0.5\n"), "{text}");
+    assert!(!text.contains(follows), "{text}");
     // With the leader locked, the follower is where that puts it.
     let (_folder, setup) = files(GRIPPER.as_bytes(), "[locked]\nj1 = 0.5\n");
     assert!(setup.unwrap_err().starts_with("no channel is read"));
@@ -458,6 +457,11 @@ fn a_urdf_is_read_in_the_encoding_that_it_declares() {
 #[test]
 fn a_sensor_in_a_moving_joint_is_on_the_side_of_its_child() {
     let sensor = "[[force_torque]]\nsensor = \"s\"\njoint = \"j1\"\n";
+    // A joint that follows another one is such a joint, and is listed once.
+    let in_follower = sensor.replace("j1", "j2");
+    let (_folder, setup) = files(GRIPPER.as_bytes(), &in_follower);
+    let text = setup.expect("a cut in a following joint").to_string();
+    assert_eq!(text.matches("j2 follows j1").count(), 1, "{text}");
     let urdf = GRIPPER.replace("<mimic", "<ignored");
     let (_folder, setup) = files(urdf.as_bytes(), sensor);
     let setup = setup.expect("a cut in a moving joint");
