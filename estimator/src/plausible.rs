@@ -24,6 +24,8 @@ use std::f64::consts::{PI, TAU};
 
 /// The density of osmium \[kg/m^3\].
 const DENSEST: f64 = 22590.0;
+/// A body with a smaller square of its radius of gyration is meant to be a point \[m^2\].
+const POINT: f64 = 1e-9;
 /// The least length that a robot is credited with \[m\].
 const SHORTEST: f64 = 2.0;
 /// Most links that one note names.
@@ -222,7 +224,8 @@ fn bodies(model: &Model, longest: f64) -> impl Iterator<Item = String> {
         };
         Some(what(first, value) + &more)
     };
-    let dense = links().map(|(body, link)| (link, density(body)));
+    let solid = links().filter(|(body, _)| gyration(body) > POINT);
+    let dense = solid.map(|(body, link)| (link, density(body)));
     let dense: Vec<(usize, f64)> = dense.filter(|(_, density)| *density > DENSEST).collect();
     let far = links().map(|(body, link)| (link, extent(body)));
     let far: Vec<(usize, f64)> = far.filter(|(_, extent)| *extent > longest).collect();
@@ -388,6 +391,8 @@ mod tests {
                 "{note}"
             );
         }
+        // A point mass is a usual simplification.
+        assert_eq!(checked(CONFIG, &urdf(1.3, 0.0, 0.0)), Ok(vec![]));
         // A ball of osmium is possible, and a denser one is not: a tenth of a litre.
         let radius = (1e-4_f64 * 3.0 / (4.0 * PI)).cbrt();
         for (density, is_told) in [(22580.0, false), (22600.0, true)] {

@@ -329,11 +329,12 @@ fn the_demonstration_runs_on_interfaces() {
             .as_object()
             .expect("an error per joint");
         assert_eq!(errors.len(), 7);
-        assert!(
-            errors
-                .keys()
-                .all(|joint| number(&summary["torque_rms_error_nm"], joint).is_finite())
-        );
+        // On a slow machine the joints before the sensor may have no valid torque in this time.
+        for (joint, error) in errors {
+            let valid = number(&summary["valid_estimates"], joint);
+            assert_eq!(error.is_number(), valid > 0.0, "{joint}: {summary}");
+        }
+        assert!(errors["l_elbow"].is_number(), "{summary}");
         for file in [
             "report.html",
             "estimates.csv",
