@@ -13,6 +13,8 @@
 //!   one triple of three is so, of smooth ones fewer; [`TRIPLES`] of them in turn are so once in
 //!   3^20 = 3.5e9 looks. What is decoded here is what was heard in the look: a device of which only
 //!   its own answer tells how to read it, such as a full scale, is not judged unless its keys do.
+//!   Nor is one whose frames carry a counter (`icub_imu`): the second counter looks like lost and
+//!   unpaired readings, which health counts.
 
 use crate::clock::{Clock, Monotonic, sleep_until};
 use crate::config::Source;
